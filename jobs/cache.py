@@ -1,0 +1,111 @@
+"""Arrays that are costly to make and the same for everybody: kept on disc, keyed by what they were made from.
+
+cache_dir       where they lie
+content_key     the key: sha256 of everything that goes into the making
+cached_arrays   load, or make and load
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema import layout
+from lake_schema.errors import BadInput
+
+Array = npt.NDArray[Any]
+
+_KEY_LENGTH = 32
+
+
+def cache_dir() -> Path:
+    """$TRUESKY_CACHE, else $XDG_CACHE_HOME/truesky, else ~/.cache/truesky; it need not exist yet."""
+    if own := os.environ.get("TRUESKY_CACHE"):
+        return Path(own).expanduser()
+    if home := os.environ.get("XDG_CACHE_HOME"):
+        return Path(home).expanduser() / "truesky"
+    return Path.home() / ".cache" / "truesky"
+
+
+def content_key(*parts: bytes | str | int | float | Array) -> str:
+    """sha256 (hex) of the parts, each with its type, shape and length: ("ab", "c") and ("a", "bc") differ."""
+    digest = hashlib.sha256()
+    for part in parts:
+        label, content = _canonical(part)
+        digest.update(f"{label}:{len(content)}:".encode())
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def _canonical(part: object) -> tuple[str, bytes]:
+    if isinstance(part, np.ndarray):
+        if part.dtype.hasobject:
+            raise BadInput("an array of Python objects has no content key")
+        return f"array {part.dtype.str} {part.shape}", np.ascontiguousarray(part).tobytes()
+    if isinstance(part, bytes):
+        return "bytes", part
+    if isinstance(part, str):
+        return "str", part.encode()
+    if isinstance(part, (int, float)) and not isinstance(part, bool):
+        return type(part).__name__, repr(part).encode()
+    raise BadInput(f"a content key is made of bytes, strings, numbers and arrays, not {type(part).__name__}")
+
+
+def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
+    """The arrays that `make()` returns, made once per key and afterwards mapped from disc, read-only.
+
+    name : legible beginning of the folder's name;  key : from content_key
+    make : called only if nothing usable is stored; where two processes race, both use what the first one published
+    """
+    folder = cache_dir() / f"{layout.name(name)}-{layout.name(key[:_KEY_LENGTH])}"
+    stored = _load(folder)
+    if stored is not None:
+        return stored
+    _publish(make(), folder)
+    stored = _load(folder)
+    if stored is None:
+        raise BadInput(f"cache {folder}: what was just written cannot be read")
+    return stored
+
+
+def _load(folder: Path) -> dict[str, Array] | None:
+    files = sorted(folder.glob("*.npy"))
+    try:
+        return {file.stem: _map(file) for file in files} or None
+    except (ValueError, EOFError, OSError):
+        # Cut short by a crash of the machine: make it again.
+        shutil.rmtree(folder, ignore_errors=True)
+        return None
+
+
+def _map(file: Path) -> Array:
+    mapped: Array = np.load(file, mmap_mode="r", allow_pickle=False)
+    # A plain view: numpy.memmap is slower to index.
+    return np.asarray(mapped)
+
+
+def _publish(arrays: Mapping[str, Array], folder: Path) -> None:
+    """Write the arrays beside `folder` and rename once; who comes second discards its own copy."""
+    if not arrays:
+        raise BadInput(f"cache {folder.name}: nothing to store")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    staged = Path(tempfile.mkdtemp(prefix=".making-", dir=folder.parent))
+    try:
+        for stem, array in arrays.items():
+            np.save(staged / f"{layout.name(stem)}.npy", np.ascontiguousarray(array), allow_pickle=False)
+        staged.chmod(0o755)
+        try:
+            staged.rename(folder)
+        except OSError:
+            if not folder.is_dir():
+                raise
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)

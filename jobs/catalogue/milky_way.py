@@ -1,0 +1,289 @@
+"""The Milky Way's stars: density laws, luminosity functions, and draws along a line of sight.
+
+density         of thin disc, thick disc and halo, relative to each one's at the Sun
+luminosity      stars pc^-3 per bin of M_H at the Sun, dwarfs and giants of the three components
+expected        stars of a cell in every (population, shell of distance, bin of M_H)
+draw            Poisson sample of it
+teff, log_g, metallicity   labels of the sample
+
+Ref: Juric et al. 2008 (density), Kroupa 2001 (masses), Pecaut & Mamajek 2013 (mass to luminosity); the numbers and their
+sources are in milky_way.toml. Types later than M9 are brown dwarfs, a population of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from jobs.catalogue import parameters
+from jobs.fluxes import stellar
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+
+THIN, THICK, HALO = 0, 1, 2
+COMPONENTS = 3
+_FILE = "milky_way.toml"
+_SR_PER_DEG2 = np.radians(1.0) ** 2
+
+
+@dataclass(frozen=True, slots=True)
+class Sun:
+    """The Sun's distance from the centre and height above the plane, pc."""
+
+    radius: float
+    height: float
+
+
+@dataclass(frozen=True, slots=True)
+class Disc:
+    """Double-exponential disc: lengths in pc, density share against the thin disc at the Sun."""
+
+    length: float
+    height: float
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Halo:
+    """Flattened power-law halo, core in pc."""
+
+    flattening: float
+    slope: float
+    core: float
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class MassFunction:
+    """Broken power law of stellar systems (milky_way.toml, [mass_function])."""
+
+    lightest: float
+    reference: float
+    breaks: tuple[float, ...]
+    slopes: tuple[float, ...]
+    local: float
+    heaviest: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Giants:
+    """Luminosity function of giants (milky_way.toml, [giants])."""
+
+    local: float
+    relative: tuple[float, ...]
+    clump_fraction: float
+    clump_m_h: float
+    clump_scatter: float
+    slope: float
+    brightest: float
+    faintest: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sequence:
+    """Temperature (K), log gravity (cm s-2) and log mass (Msun; giants: 0) against M_H (ascending)."""
+
+    m_h: Float
+    teff: Float
+    log_g: Float
+    log_mass: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Metallicity:
+    """Normal distributions of [M/H] of the three components (milky_way.toml, [metallicity])."""
+
+    mean: tuple[float, ...]
+    scatter: tuple[float, ...]
+    limits: tuple[float, float]
+    poor: float
+    hotter: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MilkyWay:
+    """Everything that stars are drawn from, made once by `milky_way`.
+
+    distance : [s + 1] pc, edges of the shells; m_h : [b + 1] mag, edges of the bins
+    local    : [6, b] pc^-3 at the Sun: dwarfs of thin disc, thick disc, halo, then giants of the three
+    """
+
+    sun: Sun
+    thin: Disc
+    thick: Disc
+    halo: Halo
+    dwarfs: Sequence
+    giants: Sequence
+    metallicity: Metallicity
+    distance: Float
+    m_h: Float
+    local: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """Stars: component code[n], whether a giant[n], distance[n] pc, M_H[n] mag (Vega)."""
+
+    component: Int
+    giant: npt.NDArray[np.bool_]
+    distance: Float
+    m_h: Float
+
+
+def milky_way() -> MilkyWay:
+    """The Milky Way of the embedded universe: numbers read, tables made (a few ms)."""
+    sampling = parameters.section(_FILE, "sampling")
+    thin, thick = (Disc(**parameters.section(_FILE, name)) for name in ("thin", "thick"))
+    halo = Halo(**parameters.section(_FILE, "halo"))
+    dwarfs, giants = dwarf_sequence(), _giant_sequence()
+    start = min(dwarfs.m_h[0], giants.m_h[0])
+    stop = max(dwarfs.m_h[-1], giants.m_h[-1])
+    m_h = start + sampling["bin_mag"] * np.arange(np.ceil((stop - start) / sampling["bin_mag"]) + 1)
+    shares = np.array([thin.share, thick.share, halo.share])
+    functions = luminosity(m_h, dwarfs, shares / shares.sum())
+    distance = np.geomspace(sampling["nearest"], sampling["farthest"], sampling["shells"] + 1)
+    metallicity = Metallicity(**parameters.section(_FILE, "metallicity"))
+    sun = Sun(**parameters.section(_FILE, "sun"))
+    return MilkyWay(sun, thin, thick, halo, dwarfs, giants, metallicity, distance, m_h, functions)
+
+
+def dwarf_sequence() -> Sequence:
+    """The main sequence, bright to faint.  Ref: Pecaut & Mamajek 2013, Table 5 and its updates."""
+    types = stellar.types()
+    order = np.argsort(types.abs_mag_h)
+    log_mass = np.log10(types.mass[order])
+    # Types of nearly equal mass are not in order: half-way between the two monotone envelopes.
+    down = np.minimum.accumulate(log_mass)
+    up = np.maximum.accumulate(log_mass[::-1])[::-1]
+    return Sequence(types.abs_mag_h[order], types.teff[order], types.log_g[order], 0.5 * (down + up))
+
+
+def _giant_sequence() -> Sequence:
+    numbers = parameters.section(_FILE, "giant_sequence")
+    m_h, teff, log_g = (np.array(numbers[name]) for name in ("m_h", "teff", "log_g"))
+    return Sequence(m_h, teff, log_g, np.zeros(m_h.size))
+
+
+def luminosity(m_h: Float, dwarfs: Sequence, share: Float) -> Float:
+    """Stars pc^-3 at the Sun in each bin of M_H, [6, b]: dwarfs of the three components, then their giants.
+
+    m_h : [b + 1] edges; share : [3] of each component in the density at the Sun, summing to 1
+    """
+    masses = MassFunction(**parameters.section(_FILE, "mass_function"))
+    giants = Giants(**parameters.section(_FILE, "giants"))
+    mass = 10.0 ** np.interp(m_h, dwarfs.m_h, dwarfs.log_mass)
+    main = [part * -np.diff(mass_below(masses, np.minimum(mass, top))) for part, top in zip(share, masses.heaviest, strict=True)]
+    branch = np.diff(_giants_below(giants, m_h))
+    evolved = [part * times * branch for part, times in zip(share, giants.relative, strict=True)]
+    return np.stack([*main, *evolved])
+
+
+def mass_below(masses: MassFunction, m: npt.ArrayLike) -> Float:
+    """Systems pc^-3 at the Sun of mass between the lightest and m, all components together.  Ref: Kroupa 2001, eq. 2."""
+    return masses.local * _power_law(masses, np.asarray(m, float)) / _power_law(masses, np.asarray(masses.reference))
+
+
+def _power_law(masses: MassFunction, m: Float) -> Float:
+    edges = (masses.lightest, *masses.breaks, np.inf)
+    total, height = np.zeros(m.shape), 1.0
+    for i, slope in enumerate(masses.slopes):
+        low, rise = edges[i], slope + 1.0
+        top = np.clip(m, low, edges[i + 1])
+        total = total + height * low * np.expm1(rise * np.log(top / low)) / rise
+        height *= (edges[i + 1] / low) ** slope if np.isfinite(edges[i + 1]) else 1.0
+    return np.asarray(total)
+
+
+def _giants_below(giants: Giants, m_h: Float) -> Float:
+    """Giants pc^-3 at the Sun brighter than M_H, thin disc."""
+    clump = ndtr((m_h - giants.clump_m_h) / giants.clump_scatter)
+    inside = np.clip(m_h, giants.brightest, giants.faintest)
+    branch = 10.0 ** (giants.slope * (inside - giants.faintest)) - 10.0 ** (giants.slope * (giants.brightest - giants.faintest))
+    branch /= branch.max()
+    return giants.local * (giants.clump_fraction * clump + (1.0 - giants.clump_fraction) * branch)
+
+
+def density(galaxy: MilkyWay, component: int, radius: npt.ArrayLike, height: npt.ArrayLike) -> Float:
+    """Density of a component (THIN, THICK, HALO) relative to its own at the Sun.
+
+    radius, height : Galactocentric cylindrical R, z, pc
+    Ref: Juric et al. 2008, eq. 22-26
+    """
+    r, z = np.asarray(radius, float), np.asarray(height, float)
+    if component == HALO:
+        return (_halo_distance2(galaxy.halo, r, z) / _halo_distance2(galaxy.halo, *_sun(galaxy))) ** (0.5 * galaxy.halo.slope)
+    disc = galaxy.thin if component == THIN else galaxy.thick
+    sun_r, sun_z = _sun(galaxy)
+    return np.asarray(np.exp(-(r - sun_r) / disc.length - (np.abs(z) - np.abs(sun_z)) / disc.height))
+
+
+def _sun(galaxy: MilkyWay) -> tuple[Float, Float]:
+    return np.asarray(galaxy.sun.radius), np.asarray(galaxy.sun.height)
+
+
+def _halo_distance2(halo: Halo, r: Float, z: Float) -> Float:
+    return np.asarray(r**2 + (z / halo.flattening) ** 2 + halo.core**2)
+
+
+def cylindrical(galaxy: MilkyWay, lon: float, lat: float, distance: Float) -> tuple[Float, Float]:
+    """Galactocentric R[n], z[n] pc at heliocentric distances[n] along Galactic (l, b) deg."""
+    l_rad, b_rad = np.radians(lon), np.radians(lat)
+    across = distance * np.cos(b_rad)
+    r = np.hypot(galaxy.sun.radius - across * np.cos(l_rad), across * np.sin(l_rad))
+    return r, galaxy.sun.height + distance * np.sin(b_rad)
+
+
+def expected(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float) -> Float:
+    """Stars of a cell in every (population, shell, bin), [6, s, b], that may be brighter than h_limit without extinction.
+
+    lon, lat : Galactic, of the cell's centre, deg; area : deg2
+    """
+    near, far = galaxy.distance[:-1], galaxy.distance[1:]
+    r, z = cylindrical(galaxy, lon, lat, np.sqrt(near * far))
+    relative = np.stack([density(galaxy, component, r, z) for component in (THIN, THICK, HALO)])
+    volume = area * _SR_PER_DEG2 * (far - near) * (far**2 + far * near + near**2) / 3.0
+    brightest = galaxy.m_h[None, :-1] + 5.0 * np.log10(near[:, None]) - 5.0
+    per_shell = np.concatenate([relative, relative]) * volume
+    return np.where(brightest < h_limit, per_shell[:, :, None] * galaxy.local[:, None, :], 0.0)
+
+
+def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> Sample:
+    """Poisson sample of `expected` numbers; uniform in volume within a shell and in M_H within a bin."""
+    boxes = np.flatnonzero(mean)
+    cumulative = np.cumsum(mean.ravel()[boxes])
+    total = float(cumulative[-1]) if boxes.size else 0.0
+    n = int(rng.poisson(total))
+    # The product may round up to the total itself.
+    drawn = np.minimum(np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0))
+    population, shell, m_bin = np.unravel_index(boxes[drawn], mean.shape)
+    near3, far3 = galaxy.distance[shell] ** 3, galaxy.distance[shell + 1] ** 3
+    distance = np.cbrt(near3 + (far3 - near3) * rng.random(n))
+    m_h = galaxy.m_h[m_bin] + (galaxy.m_h[m_bin + 1] - galaxy.m_h[m_bin]) * rng.random(n)
+    return Sample(population % COMPONENTS, population >= COMPONENTS, distance, m_h)
+
+
+def metallicity(galaxy: MilkyWay, component: Int, rng: np.random.Generator) -> Float:
+    """[M/H][n], dex."""
+    law = galaxy.metallicity
+    mean, scatter = np.array(law.mean)[component], np.array(law.scatter)[component]
+    return np.clip(mean + scatter * rng.standard_normal(component.size), *law.limits)
+
+
+def teff(galaxy: MilkyWay, stars: Sample, metals: Float) -> Float:
+    """Effective temperature[n], K; metal-poor stars are hotter at their luminosity."""
+    return _of_sequence(galaxy, stars, "teff") + np.where(metals < galaxy.metallicity.poor, galaxy.metallicity.hotter, 0.0)
+
+
+def log_g(galaxy: MilkyWay, stars: Sample) -> Float:
+    """log10 surface gravity[n], cm s-2."""
+    return _of_sequence(galaxy, stars, "log_g")
+
+
+def _of_sequence(galaxy: MilkyWay, stars: Sample, name: str) -> Float:
+    dwarf = np.interp(stars.m_h, galaxy.dwarfs.m_h, getattr(galaxy.dwarfs, name))
+    giant = np.interp(stars.m_h, galaxy.giants.m_h, getattr(galaxy.giants, name))
+    return np.where(stars.giant, giant, dwarf)

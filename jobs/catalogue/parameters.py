@@ -1,0 +1,25 @@
+"""Numbers of the models, read from the data files beside the modules: every table of a file states its source."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from lake_schema.errors import BadInput
+
+_HERE = Path(__file__).resolve().parent
+
+
+def section(file: str, name: str) -> dict[str, Any]:
+    """One table of a TOML file of this folder, without its `source`, ready to be the arguments of a dataclass.
+
+    Errors: BadInput where the table is absent or has no source
+    """
+    tables = tomllib.loads((_HERE / file).read_text(encoding="utf-8"))
+    if name not in tables:
+        raise BadInput(f"{file} has no table [{name}]")
+    numbers = dict(tables[name])
+    if not str(numbers.pop("source", "")).strip():
+        raise BadInput(f"{file}: table [{name}] states no source")
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in numbers.items()}

@@ -1,0 +1,141 @@
+"""The embedded libraries of spectra: 31 galaxies and the dwarf stars.
+
+galaxy_library     early to late, mixed from the four spectra of Coleman, Wu & Weedman 1980 and a young burst
+stellar_library    O9 to M9, shaped until their colours are those of Pecaut & Mamajek 2013
+vega               the spectrum of Vega, for magnitudes that are not AB
+GALAXY_LIBRARY_SIZE, emission_wavelengths
+
+Both are made once (seconds), kept in the cache, and afterwards mapped from disc.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs import cache
+from jobs.fluxes import passbands, stellar
+from jobs.fluxes.stellar import normalised, planck
+from lake_schema.errors import BadInput
+
+Float = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+
+# Rest frame of galaxies: 24000 A seen at z = -0.02, and 600 A seen at z = 6.5.
+_REST_FIRST, _REST_LAST = 80, 24500
+_ANCHORS = ("E", "Sbc", "Scd", "Im")
+# The published spectra end at 22050 A.
+_INFRARED_SLOPE = -3.2
+# The weak lines in the observed spectra are bridged by a straight line this far on both sides.
+_LINE_MASK = 40.0
+
+# The sequence: (first template, last template, earlier anchor, later anchor, offset, denominator, factor) with
+# x = factor (k - offset) / denominator, spectrum = (1 - x) earlier + x later. Adopted to span the colours of the 31
+# templates of Ilbert et al. 2009 (NUV - r from 5.7 to -0.7).
+_SEQUENCE = (
+    (0, 7, "E", "Sbc", 0, 7, 0.72),
+    (8, 13, "Sbc", "Scd", 8, 5, 1.0),
+    (14, 19, "Scd", "Im", 13, 6, 1.0),
+    (20, 30, "Im", "young", 19, 11, 0.95),
+)
+GALAXY_LIBRARY_SIZE = 31
+# The young end: Planck spectra (K, share of f_lambda at 5500 A, factor below the Balmer edge), and the Lyman edge's factor.
+_YOUNG = ((28000.0, 0.70, 1.0), (9500.0, 0.22, 0.45), (4200.0, 0.08, 1.0))
+_BALMER_EDGE, _LYMAN_EDGE, _BELOW_LYMAN = 3646.0, 912.0, 0.02
+
+# Vega's Rayleigh-Jeans tail beyond the end of the CALSPEC extract, 22008 A.
+_VEGA_SLOPE = -3.95
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """Template spectra, all on one grid.
+
+    wavelength : float64[n_lambda] A, whole numbers in steps of 1
+    flux       : float32[n, n_lambda] f_lambda, mean 1 between 5450 and 5550 A
+    names      : n labels
+    types      : what is known of the n stars, None for galaxies
+    """
+
+    wavelength: Float
+    flux: Float32
+    names: tuple[str, ...]
+    types: stellar.StellarTypes | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def galaxy_library() -> Library:
+    """The 31 galaxy templates, 0 the earliest (elliptical), 30 the latest (starburst), 80 .. 24500 A rest frame."""
+    key = cache.content_key(
+        Path(__file__).read_bytes(), emission_wavelengths(), *(_spectrum_file(f"CWW_{name}_ext.sed") for name in _ANCHORS)
+    )
+    wavelength = np.arange(_REST_FIRST, _REST_LAST + 1, dtype=float)
+    arrays = cache.cached_arrays("galaxy_library", key, lambda: {"flux": _galaxies(wavelength).astype(np.float32)})
+    names = tuple(name for first, last, early, late, *_ in _SEQUENCE for name in [f"{early}-{late}"] * (last - first + 1))
+    return Library(wavelength, arrays["flux"], tuple(f"{k:02d} {name}" for k, name in enumerate(names)))
+
+
+def stellar_library() -> Library:
+    """The dwarf sequence O9V .. M9V on the observed grid, hottest first, with its table of types."""
+    types = stellar.types()
+    key = cache.content_key(Path(__file__).read_bytes(), stellar.fingerprint(), _spectrum_file("vega.txt"))
+    arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": stellar.spectra(types, *vega()).astype(np.float32)})
+    return Library(passbands.grid(), arrays["flux"], types.names, types)
+
+
+def vega() -> tuple[Float, Float]:
+    """Vega: wavelength A, f_lambda erg s-1 cm-2 A-1, 900 .. 24000 A.  Ref: CALSPEC alpha_lyr_mod_001, as shipped by GalSim"""
+    table = np.loadtxt(_spectrum_file("vega.txt").decode().splitlines())
+    # The file is in nm and per nm.
+    wavelength, flux = table[:, 0] * 10.0, table[:, 1] / 10.0
+    tail = np.arange(np.ceil(wavelength[-1]), _REST_LAST + 1.0)[1:]
+    return np.append(wavelength, tail), np.append(flux, flux[-1] * (tail / wavelength[-1]) ** _VEGA_SLOPE)
+
+
+def emission_wavelengths() -> Float:
+    """Vacuum wavelengths of the ten emission lines, float64[10] A (lines.csv)."""
+    with Path(__file__).with_name("lines.csv").open(newline="", encoding="utf-8") as file:
+        return np.array([float(row["vacuum"]) for row in csv.DictReader(file)])
+
+
+def _galaxies(wavelength: Float) -> Float:
+    anchors = {name: _anchor(name, wavelength) for name in _ANCHORS}
+    anchors["young"] = _young(wavelength)
+    spectra = []
+    for first, last, early, late, offset, denominator, factor in _SEQUENCE:
+        for k in range(first, last + 1):
+            x = factor * (k - offset) / denominator
+            spectra.append((1.0 - x) * anchors[early] + x * anchors[late])
+    return normalised(wavelength, np.stack(spectra))
+
+
+def _anchor(name: str, wavelength: Float) -> Float:
+    table = np.loadtxt(_spectrum_file(f"CWW_{name}_ext.sed").decode().splitlines())
+    at, flux = table[:, 0], table[:, 1]
+    sampled = np.interp(wavelength, at, flux, left=0.0)
+    sampled = np.where(wavelength > at[-1], flux[-1] * (wavelength / at[-1]) ** _INFRARED_SLOPE, sampled)
+    away = (np.abs(wavelength[:, None] - emission_wavelengths()) > _LINE_MASK).all(1)
+    return normalised(wavelength, np.interp(wavelength, wavelength[away], sampled[away]))
+
+
+def _young(wavelength: Float) -> Float:
+    parts = [
+        share * planck(wavelength, temperature) * np.where(wavelength < _BALMER_EDGE, factor, 1.0)
+        for temperature, share, factor in _YOUNG
+    ]
+    return normalised(wavelength, np.sum(parts, 0) * np.where(wavelength < _LYMAN_EDGE, _BELOW_LYMAN, 1.0))
+
+
+def _spectrum_file(name: str) -> bytes:
+    """Content of a spectrum that GalSim ships; GalSim itself, slow to import, is not loaded."""
+    spec = importlib.util.find_spec("galsim")
+    if spec is None or not spec.submodule_search_locations:
+        raise BadInput("GalSim is not installed: its spectra of galaxies and Vega are needed")
+    return (Path(spec.submodule_search_locations[0]) / "share" / "SEDs" / name).read_bytes()

@@ -1,0 +1,269 @@
+"""Cameras: where detectors lie in the focal plane, and where their pixels look.
+
+Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, as the sky is seen from inside: with
+y to the north, x points west (east is left).  Pixel coordinates (column, row) are 0-based, a pixel's centre is whole.
+
+detectors       the detectors of a camera, from the layout rules
+boresight_for   the pointing that puts a detector's centre on a target
+wcs             the TAN world coordinate system of a detector (astropy)
+sky_of_pixel, pixel_of_sky, jacobian
+corners, s_region, radius
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from astropy.wcs import WCS
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+
+Float = npt.NDArray[np.float64]
+
+# Corner rafts of LSSTCam carry no science sensors (Rubin Observatory, obs_lsst camera description).
+_LSST_CORNERS = ("R00", "R04", "R40", "R44")
+_LSST_RAFTS, _LSST_SENSORS = 5, 3
+# VIS CCDs of the right half of the focal plane are mounted upside down (Euclid Data Product Description Document, LE1 VIS).
+_VIS_FIRST_ROTATED_COLUMN = 4
+_ARCSEC = np.pi / 180.0 / 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Detector:
+    """One detector of a camera.
+
+    section     : prefix of its parameters in the mission database, "vis" or "ext.lsstcam"
+    nx, ny      : columns and rows of its image
+    x, y        : arcsec, its centre in the focal plane
+    rotation    : deg, of its columns-rows axes against the focal plane's, from x to y
+    pixel_scale : arcsec
+    """
+
+    name: str
+    section: str
+    nx: int
+    ny: int
+    x: float
+    y: float
+    rotation: float
+    pixel_scale: float
+
+    @property
+    def half_diagonal(self) -> float:
+        """Centre to corner, arcsec."""
+        return 0.5 * self.pixel_scale * float(np.hypot(self.nx, self.ny))
+
+
+def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
+    """The detectors of "vis" (36) or "lsstcam" (189), in the order of the layout rule.
+
+    Ref : VIS, Scaramella et al. 2022, Table 1 (gaps); LSSTCam, Rubin Observatory, obs_lsst camera description
+    """
+    if camera == "vis":
+        return _vis(mission)
+    if camera == "lsstcam":
+        return _lsstcam(mission)
+    raise BadInput(f"camera {camera!r} is not one of vis, lsstcam")
+
+
+def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
+    """One detector of a camera by name."""
+    for candidate in detectors(camera, mission):
+        if candidate.name == name:
+            return candidate
+    raise BadInput(f"camera {camera} has no detector {name!r}")
+
+
+def _vis(mission: MissionConfiguration) -> tuple[Detector, ...]:
+    """6 x 6, named row-column: rows from the top, columns from the left."""
+    scale = mission.value("vis.fpa.pixel_scale", "arcsec / pix")
+    nx, ny, rows, columns = (int(mission.value(f"vis.fpa.{key}")) for key in ("nx", "ny", "rows", "columns"))
+    pitch_x = nx * scale + mission.value("vis.fpa.gap_x", "arcsec")
+    pitch_y = ny * scale + mission.value("vis.fpa.gap_y", "arcsec")
+    return tuple(
+        Detector(
+            name=f"{row}-{column}",
+            section="vis",
+            nx=nx,
+            ny=ny,
+            x=(column - (columns + 1) / 2) * pitch_x,
+            y=((rows + 1) / 2 - row) * pitch_y,
+            rotation=180.0 if column >= _VIS_FIRST_ROTATED_COLUMN else 0.0,
+            pixel_scale=scale,
+        )
+        for row in range(1, rows + 1)
+        for column in range(1, columns + 1)
+    )
+
+
+def _lsstcam(mission: MissionConfiguration) -> tuple[Detector, ...]:
+    """21 rafts of 3 x 3, named R<row><column>_S<row><column>, all of one make (as in Serrano et al. 2024)."""
+    prefix = "ext.lsstcam.fpa"
+    plate_scale = mission.value(f"{prefix}.plate_scale", "arcsec / mm")
+    raft_pitch = mission.value(f"{prefix}.raft_pitch", "mm") * plate_scale
+    sensor_pitch = mission.value(f"{prefix}.sensor_pitch", "mm") * plate_scale
+    scale = mission.value(f"{prefix}.pixel_size", "mm / pix") * plate_scale
+    nx, ny = (int(mission.value(f"{prefix}.{key}")) for key in ("nx", "ny"))
+    places = [
+        (f"R{i}{j}", i, j, k, m)
+        for i in range(_LSST_RAFTS)
+        for j in range(_LSST_RAFTS)
+        for k in range(_LSST_SENSORS)
+        for m in range(_LSST_SENSORS)
+    ]
+    return tuple(
+        Detector(
+            name=f"{raft}_S{k}{m}",
+            section="ext.lsstcam",
+            nx=nx,
+            ny=ny,
+            x=raft_pitch * (j - _LSST_RAFTS // 2) + sensor_pitch * (m - _LSST_SENSORS // 2),
+            y=raft_pitch * (i - _LSST_RAFTS // 2) + sensor_pitch * (k - _LSST_SENSORS // 2),
+            rotation=0.0,
+            pixel_scale=scale,
+        )
+        for raft, i, j, k, m in places
+        if raft not in _LSST_CORNERS
+    )
+
+
+# ------------------------------------------------------------------------------------------------ pointing
+
+
+def boresight_for(detector: Detector, ra: float, dec: float, position_angle: float) -> tuple[float, float, float]:
+    """The pointing that puts a detector's centre on a target.
+
+    ra, dec        : deg, target
+    position_angle : deg, of the focal plane's y axis *at the target*, north through east
+    returns        : ra, dec, position angle of the boresight, deg; the angle differs from the one at the target because
+                     meridians converge; defined everywhere, poles included
+    """
+    # Right-handed: (east-like = -x, y, outward).
+    centre = np.array([-detector.x * _ARCSEC, detector.y * _ARCSEC, 1.0])
+    camera = _triad(centre, np.array([0.0, 1.0, 0.0]))
+    east, north, out = _basis(ra, dec)
+    angle = np.radians(position_angle)
+    sky = _triad(out, np.sin(angle) * east + np.cos(angle) * north)
+    rotation = sky @ camera.T
+    boresight, up = rotation[:, 2], rotation[:, 1]
+    ra0 = float(np.degrees(np.arctan2(boresight[1], boresight[0])) % 360.0)
+    dec0 = float(np.degrees(np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1]))))
+    east0, north0, _ = _basis(ra0, dec0)
+    return ra0, dec0, float(np.degrees(np.arctan2(up @ east0, up @ north0)))
+
+
+def _basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
+    """East, north and outward unit vectors [3, ...] at sky positions, deg."""
+    lon, lat = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
+    zero = np.zeros_like(lon * lat)
+    east = np.stack([-np.sin(lon) + zero, np.cos(lon) + zero, zero])
+    north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat) + zero])
+    out = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat) + zero])
+    return east, north, out
+
+
+def _triad(direction: Float, along: Float) -> Float:
+    """Orthonormal columns: direction, `along` made perpendicular to it, their cross product."""
+    first = direction / np.linalg.norm(direction)
+    second = along - first * (first @ along)
+    second = second / np.linalg.norm(second)
+    return np.stack([first, second, np.cross(first, second)], axis=1)
+
+
+# ------------------------------------------------------------------------------------------------ pixels
+
+
+def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS:
+    """The world coordinate system of a detector: ICRS, TAN about the boresight, no distortion; exact in its header.
+
+    ra, dec        : deg, boresight
+    position_angle : deg, of the focal plane's y axis at the boresight, north through east
+    """
+    angle, turn = np.radians(position_angle), np.radians(detector.rotation)
+    # Columns: the directions (east, north) of the focal plane's x and y axes.
+    axes = np.array([[-np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    from_centre = rotation.T @ np.array([-detector.x, -detector.y]) / detector.pixel_scale
+    system = WCS(naxis=2)
+    system.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    system.wcs.cunit = ["deg", "deg"]
+    system.wcs.crval = [ra, dec]
+    system.wcs.crpix = [(detector.nx + 1) / 2 + from_centre[0], (detector.ny + 1) / 2 + from_centre[1]]
+    system.wcs.cd = axes @ rotation * detector.pixel_scale / 3600.0
+    system.wcs.radesys = "ICRS"
+    system.wcs.set()
+    return system
+
+
+def sky_of_pixel(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
+    """0-based pixel coordinates [n] -> ra [n] in [0, 360), dec [n], deg."""
+    ra, dec = system.all_pix2world(np.asarray(column, float), np.asarray(row, float), 0)
+    return np.mod(ra, 360.0), np.asarray(dec)
+
+
+def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
+    """ra, dec [n] deg -> 0-based column [n], row [n]; only for positions within 90 deg of the boresight."""
+    column, row = system.all_world2pix(np.asarray(ra, float), np.asarray(dec, float), 0)
+    return np.asarray(column), np.asarray(row)
+
+
+def jacobian(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> Float:
+    """Derivative of the local tangent plane (u west, v north), arcsec, by pixel coordinates.
+
+    column, row : [n] 0-based
+    returns     : [n, 2, 2] ((du/dx, du/dy), (dv/dx, dv/dy))
+    Error       : 2e-8 relative (central difference of one pixel; rounding of the positions)
+    """
+    x, y = np.asarray(column, float), np.asarray(row, float)
+    east, north, _ = _basis(*sky_of_pixel(system, x, y))
+    step_x = _direction(system, x + 0.5, y) - _direction(system, x - 0.5, y)
+    step_y = _direction(system, x, y + 0.5) - _direction(system, x, y - 0.5)
+    rows = [[-np.sum(east * step, 0) for step in (step_x, step_y)], [np.sum(north * step, 0) for step in (step_x, step_y)]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1)) / _ARCSEC
+
+
+def _direction(system: WCS, x: Float, y: Float) -> Float:
+    return _basis(*sky_of_pixel(system, x, y))[2]
+
+
+def corners(detector: Detector, system: WCS) -> Float:
+    """[4, 2] ra, dec deg of the detector's outer corners, in order around it."""
+    x = np.array([-0.5, detector.nx - 0.5, detector.nx - 0.5, -0.5])
+    y = np.array([-0.5, -0.5, detector.ny - 0.5, detector.ny - 0.5])
+    return np.stack(sky_of_pixel(system, x, y), axis=1)
+
+
+def centre(detector: Detector, system: WCS) -> tuple[float, float]:
+    """ra, dec of the detector's centre, deg."""
+    ra, dec = sky_of_pixel(system, [(detector.nx - 1) / 2], [(detector.ny - 1) / 2])
+    return float(ra[0]), float(dec[0])
+
+
+def s_region(detector: Detector, system: WCS) -> str:
+    """The footprint as an STC-S polygon."""
+    return "POLYGON ICRS " + " ".join(f"{value:.7f}" for value in corners(detector, system).ravel())
+
+
+def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
+    """The world coordinate system as FITS cards, every digit kept."""
+    header = system.wcs
+    return (
+        ("WCSAXES", 2, "number of world coordinate axes"),
+        ("CTYPE1", "RA---TAN", "gnomonic projection"),
+        ("CTYPE2", "DEC--TAN", "gnomonic projection"),
+        ("CUNIT1", "deg", "unit of CRVAL1, CD1_1, CD1_2"),
+        ("CUNIT2", "deg", "unit of CRVAL2, CD2_1, CD2_2"),
+        ("CRVAL1", float(header.crval[0]), "[deg] boresight right ascension"),
+        ("CRVAL2", float(header.crval[1]), "[deg] boresight declination"),
+        ("CRPIX1", float(header.crpix[0]), "[pix] boresight, first pixel = 1"),
+        ("CRPIX2", float(header.crpix[1]), "[pix] boresight, first pixel = 1"),
+        ("CD1_1", float(header.cd[0, 0]), "[deg/pix]"),
+        ("CD1_2", float(header.cd[0, 1]), "[deg/pix]"),
+        ("CD2_1", float(header.cd[1, 0]), "[deg/pix]"),
+        ("CD2_2", float(header.cd[1, 1]), "[deg/pix]"),
+        ("RADESYS", "ICRS", "celestial reference system"),
+    )

@@ -1,0 +1,210 @@
+"""Catalogue rows -> galsim light profiles, lensed, on the sky.
+
+World frame of galsim: u to the west, v to the north, arcsec; an axis at position angle PA (north through east) lies at
+90 deg + PA from u.
+
+shapes        rows -> Shapes, checked arrays
+profile       one galaxy of unit flux in the world frame
+surface, outside   its light beyond a radius, for the choice of a stamp's size
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import galsim
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from scipy.special import gammaincc, gammaln
+
+Float = npt.NDArray[np.float64]
+
+# Bulges take the nearest Sersic index of this step (Serrano et al. 2024), so that one table of each serves all.
+SERSIC_STEP = 0.1
+# galsim.Sersic accepts [0.3, 6.2].
+_SERSIC_LO, _SERSIC_HI = 0.3, 6.2
+# Ratio of scale height to scale length (Serrano et al. 2024).
+SCALE_H_OVER_R = 0.1
+# Disc: half-light radius / scale length, root of (1 + x) exp(-x) = 1/2.
+_DISC_HALF_LIGHT = 1.6783469900166605
+# Reduced shear and inverse magnification near a critical line: beyond these a single source is not a lensed ellipse.
+_MOST_SHEAR = 0.9
+_LEAST_DETERMINANT = 1e-3
+_SLIMMEST = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Shapes:
+    """Structure of n galaxies, arrays [n].
+
+    bulge_radius, disk_radius : half-light semi-major axis, arcsec, before lensing
+    beta                      : radian, major axis from u towards v
+    g1, g2                    : reduced shear in the world frame
+    magnification             : > 0, used for sizes alone (catalogue fluxes hold it already)
+    """
+
+    bulge_radius: Float
+    disk_radius: Float
+    bulge_fraction: Float
+    sersic_index: Float
+    bulge_axis_ratio: Float
+    inclination: Float
+    beta: Float
+    g1: Float
+    g2: Float
+    magnification: Float
+
+    def __len__(self) -> int:
+        return len(self.beta)
+
+
+def shapes(galaxies: pa.Table, sersic_step: float = SERSIC_STEP) -> Shapes:
+    """Rows of the table `galaxies` -> Shapes.
+
+    sersic_step : bulges take the nearest multiple as their index
+    Lensing     : g = gamma / (1 - kappa), held below 0.9; mu = 1 / |(1 - kappa)^2 - gamma^2|, the determinant held above 1e-3
+    """
+    columns = {name: np.asarray(galaxies[name].to_numpy(), float) for name in _COLUMNS}
+    stretch = 1.0 - columns["kappa"]
+    gamma = np.hypot(columns["gamma1"], columns["gamma2"])
+    determinant = np.maximum(np.abs((stretch - gamma) * (stretch + gamma)), _LEAST_DETERMINANT)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reduced = np.where(gamma > 0, np.minimum(1.0, _MOST_SHEAR * np.abs(stretch) / gamma) / stretch, 0.0)
+    index = np.rint(columns["bulge_sersic_index"] / sersic_step) * sersic_step
+    return Shapes(
+        bulge_radius=columns["bulge_half_light_radius"],
+        disk_radius=columns["disk_half_light_radius"],
+        bulge_fraction=columns["bulge_fraction"],
+        sersic_index=np.round(np.clip(index, _SERSIC_LO, _SERSIC_HI), 6),
+        bulge_axis_ratio=np.clip(columns["bulge_axis_ratio"], _SLIMMEST, 1.0),
+        inclination=columns["inclination"],
+        beta=np.radians(90.0 + columns["position_angle"]),
+        g1=np.nan_to_num(columns["gamma1"] * reduced),
+        # Positive gamma2 stretches along north-east, which in (west, north) is the second quadrant.
+        g2=np.nan_to_num(-columns["gamma2"] * reduced),
+        magnification=1.0 / determinant,
+    )
+
+
+_COLUMNS = (
+    "bulge_half_light_radius",
+    "disk_half_light_radius",
+    "bulge_fraction",
+    "bulge_sersic_index",
+    "bulge_axis_ratio",
+    "inclination",
+    "position_angle",
+    "kappa",
+    "gamma1",
+    "gamma2",
+)
+
+
+def profile(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
+    """Galaxy i, flux 1, world frame, arcsec.
+
+    smallest : arcsec; a component of a smaller half-light radius is a point
+    """
+    fraction = float(shape.bulge_fraction[i])
+    parts = []
+    if fraction > 0:
+        parts.append(fraction * _bulge(shape, i, smallest))
+    if fraction < 1:
+        parts.append((1 - fraction) * _disk(shape, i, smallest))
+    body = parts[0] if len(parts) == 1 else galsim.Sum(parts)
+    turned = body.rotate(float(shape.beta[i]) * galsim.radians)
+    lensed = turned.lens(float(shape.g1[i]), float(shape.g2[i]), float(shape.magnification[i]))
+    return lensed.withFlux(1.0)
+
+
+def _bulge(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
+    # galsim's shear keeps the area, so the circle that it starts from has the geometric mean of the axes as its radius.
+    q = float(shape.bulge_axis_ratio[i])
+    radius = float(shape.bulge_radius[i]) * np.sqrt(q)
+    if radius < smallest:
+        return galsim.DeltaFunction()
+    round_one = _sersic(float(shape.sersic_index[i])).dilate(radius)
+    return round_one.shear(q=q, beta=0.0 * galsim.radians)
+
+
+@lru_cache(maxsize=256)
+def _sersic(index: float) -> galsim.Sersic:
+    return galsim.Sersic(index, half_light_radius=1.0)
+
+
+def _disk(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
+    radius = float(shape.disk_radius[i])
+    if radius < smallest:
+        return galsim.DeltaFunction()
+    return galsim.InclinedExponential(
+        float(shape.inclination[i]) * galsim.degrees, half_light_radius=radius, scale_h_over_r=SCALE_H_OVER_R
+    )
+
+
+# ------------------------------------------------------------------------------------------------ extent
+
+
+def half_light_radius(shape: Shapes) -> Float:
+    """[n] arcsec: an upper bound, the larger component's semi-major axis, lensed."""
+    larger = np.maximum(
+        np.where(shape.bulge_fraction > 0, shape.bulge_radius, 0.0),
+        np.where(shape.bulge_fraction < 1, shape.disk_radius, 0.0),
+    )
+    return larger * _lensed_stretch(shape)
+
+
+def surface(shape: Shapes, radius: Float) -> Float:
+    """Fraction of the flux per arcsec2 along the major axis, an upper bound for every other direction.
+
+    radius : [m] arcsec;  returns [n, m]
+    """
+    stretch = _lensed_stretch(shape)
+    area = 1.0 / shape.magnification
+    bulge = shape.bulge_fraction * area / shape.bulge_axis_ratio
+    disk = (1 - shape.bulge_fraction) * area / _apparent_axis_ratio(shape)
+    return np.asarray(
+        bulge[:, None] * _sersic_surface(radius, shape.bulge_radius * stretch, shape.sersic_index, stretch)
+        + disk[:, None] * _sersic_surface(radius, shape.disk_radius * stretch, np.ones(len(shape)), stretch)
+    )
+
+
+def outside(shape: Shapes, radius: Float) -> Float:
+    """Fraction of the flux beyond a radius, seen face-on: an upper bound.  radius : [m] arcsec;  returns [n, m]"""
+    stretch = _lensed_stretch(shape)
+    bulge = _sersic_outside(radius, shape.bulge_radius * stretch, shape.sersic_index)
+    disk = _sersic_outside(radius, shape.disk_radius * stretch, np.ones(len(shape)))
+    fraction = shape.bulge_fraction[:, None]
+    return np.asarray(fraction * bulge + (1 - fraction) * disk)
+
+
+def _lensed_stretch(shape: Shapes) -> Float:
+    """Largest linear stretch by lensing."""
+    g = np.hypot(shape.g1, shape.g2)
+    return np.asarray(np.sqrt(shape.magnification * (1 + g) / (1 - g)))
+
+
+def _apparent_axis_ratio(shape: Shapes) -> Float:
+    cosine = np.cos(np.radians(shape.inclination))
+    return np.asarray(np.hypot(cosine, SCALE_H_OVER_R))
+
+
+def _b(index: Float) -> Float:
+    """Sersic's b_n.  Error: 1e-4 for n > 0.36.  Ref: Ciotti & Bertin 1999, eq. 18."""
+    n = np.maximum(index, 0.36)
+    return np.asarray(2 * n - 1 / 3 + 4 / (405 * n) + 46 / (25515 * n**2))
+
+
+def _sersic_surface(radius: Float, half_light: Float, index: Float, stretch: Float) -> Float:
+    """[n, m] per arcsec2 of the unlensed circle scaled back by stretch^2; axis ratio and magnification are the caller's."""
+    r_e = np.maximum(half_light, 1e-6)[:, None]
+    n, b = index[:, None], _b(index)[:, None]
+    log_norm = np.log(2 * np.pi * n) - 2 * n * np.log(b) + gammaln(2 * n) + 2 * np.log(r_e / stretch[:, None])
+    return np.asarray(np.exp(-b * (radius[None, :] / r_e) ** (1 / n) - log_norm))
+
+
+def _sersic_outside(radius: Float, half_light: Float, index: Float) -> Float:
+    r_e = np.maximum(half_light, 1e-6)[:, None]
+    n, b = index[:, None], _b(index)[:, None]
+    return np.asarray(gammaincc(2 * n, b * (radius[None, :] / r_e) ** (1 / n)))

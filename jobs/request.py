@@ -1,0 +1,344 @@
+"""The simulation request: a TOML file of at most a screen, read into frozen records; every number has bounds.
+
+    name = "demo"                       seed = 2024                    accuracy = "survey" | "draft" | "reference" | {flux = ..}
+    [area]       polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}     deg
+    [universe]   galaxy_limit (I_E), star_limit (H, Vega), z_max
+    [mission]    ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
+    [fluxes]     bands = [..]           default: the bands of the pointings
+    [[pointing]] channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
+    [products]   truth = ["noise_free"]
+
+A key that is not here, a wrong type or a number out of bounds is refused with the key's full path.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from jobs.accuracy import SURVEY, Accuracy, preset
+from lake_schema import layout, sky
+from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.ids import GENERATION_ORDER
+
+Toml = Mapping[str, Any]
+
+_MOST_BYTES = 1 << 20
+_MOST_POINTINGS = 100_000
+STATUSES = ("REQ", "DES", "BLT", "CBE", "SIM")
+LADDER = ("CBE", "BLT", "DES", "REQ", "SIM")
+CHANNELS = ("VIS", "EXT")
+TRUTH = ("noise_free",)
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A convex spherical polygon (vertices) or a circle (ra, dec, radius), deg."""
+
+    vertices: tuple[tuple[float, float], ...] = ()
+    ra: float = 0.0
+    dec: float = 0.0
+    radius: float = 0.0
+
+    def cells(self, order: int = GENERATION_ORDER) -> list[int]:
+        """Nested cells of `order` that the area touches, ascending."""
+        if self.vertices:
+            return sky.cells_in_polygon(self.vertices, order).tolist()
+        return sky.cells_in_cone(self.ra, self.dec, self.radius, order).tolist()
+
+
+@dataclass(frozen=True, slots=True)
+class Universe:
+    """How deep: I_E of galaxies (AB, before Milky Way dust), H of stars (Vega, as observed), highest redshift."""
+
+    galaxy_limit: float = 26.0
+    star_limit: float = 26.0
+    z_max: float = 2.3
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """A value that replaces what the mission's ladder would choose."""
+
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class MissionChoice:
+    """Which statuses of the mission's parameters are preferred, and what is overridden."""
+
+    ladder: tuple[str, ...] = LADDER
+    overrides: tuple[tuple[str, Override], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Pointing:
+    """One exposure that is asked for.
+
+    ra, dec         : deg, of the boresight, or of the centre of detector `centre_on` where that is given
+    position_angle  : deg, of the focal plane's y axis, north through east
+    detectors       : names, () = all of the camera
+    exposure_time_s : None = the mission's
+    """
+
+    channel: str
+    camera: str
+    band: str
+    ra: float
+    dec: float
+    position_angle: float
+    mjd: float
+    detectors: tuple[str, ...] = ()
+    centre_on: str | None = None
+    exposure_time_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A simulation request, checked."""
+
+    name: str
+    seed: int
+    accuracy: Accuracy
+    area: Area
+    universe: Universe
+    mission: MissionChoice
+    bands: tuple[str, ...]
+    pointings: tuple[Pointing, ...]
+    truth: tuple[str, ...]
+
+    def facts(self, *parts: str) -> dict[str, Any]:
+        """The named parts of the request as JSON values, for the key of what depends on them."""
+        everything = asdict(self)
+        return {part: everything[part] for part in parts}
+
+
+def parse(path: Path) -> Request:
+    """Read and check a request file.
+
+    Errors : BadInput, one line that names the file and the key
+    """
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise BadInput(f"is larger than {_MOST_BYTES} bytes")
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise BadInput(f"request {path}: no such file") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, BadInput) as error:
+        raise BadInput(f"request {path}: {_one_line(error)}") from None
+    try:
+        return from_table(table)
+    except BadInput as error:
+        raise BadInput(f"request {path}: {error}") from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def from_table(table: Toml) -> Request:
+    """A parsed TOML table -> Request; BadInput names the key."""
+    _known(table, "", {"name", "seed", "accuracy", "area", "universe", "mission", "fluxes", "pointing", "products"})
+    pointings = _pointings(table)
+    bands = _strings(_section(table, "fluxes", {"bands"}), "fluxes.bands")
+    return Request(
+        name=layout.name(_string(table, "name")),
+        seed=_integer(table, "seed", 0, 2**63 - 1),
+        accuracy=_accuracy(table.get("accuracy")),
+        area=_area(_section(table, "area", {"polygon", "cone", "box"})),
+        universe=_universe(_section(table, "universe", {"galaxy_limit", "star_limit", "z_max"})),
+        mission=_mission(_section(table, "mission", {"ladder", "overrides"})),
+        bands=bands or tuple(dict.fromkeys(p.band for p in pointings)),
+        pointings=pointings,
+        truth=_truth(_section(table, "products", {"truth"})),
+    )
+
+
+# ------------------------------------------------------------------------------------------------ sections
+
+
+def _accuracy(value: object) -> Accuracy:
+    if value is None:
+        return SURVEY
+    if isinstance(value, str):
+        return preset(value)
+    table = _table(value, "accuracy", {"flux", "shape", "position", "background"})
+    return Accuracy(**{key: _number(table, f"accuracy.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
+
+
+def _area(table: Toml) -> Area:
+    if len(table) != 1:
+        raise BadInput("area wants exactly one of polygon, cone, box")
+    if "polygon" in table:
+        return _polygon(table["polygon"], "area.polygon")
+    if "cone" in table:
+        cone = _table(table["cone"], "area.cone", {"ra", "dec", "radius"})
+        ra = _number(cone, "area.cone.ra", -360.0, 360.0) % 360.0
+        dec = _number(cone, "area.cone.dec", -90.0, 90.0)
+        radius = _number(cone, "area.cone.radius", 0.0, 180.0)
+        return Area(ra=ra, dec=dec, radius=radius)
+    box = _table(table["box"], "area.box", {"ra", "dec"})
+    west, east = _pair(box, "area.box.ra", -360.0, 360.0)
+    south, north = _pair(box, "area.box.dec", -90.0, 90.0)
+    if not 0.0 < east - west < 180.0:
+        raise BadInput(f"area.box.ra = [{west}, {east}]: the second must be larger, by less than 180")
+    if not north > south:
+        raise BadInput(f"area.box.dec = [{south}, {north}]: the second must be larger")
+    return _polygon([[west, south], [east, south], [east, north], [west, north]], "area.box")
+
+
+def _polygon(value: object, path: str) -> Area:
+    if not isinstance(value, list) or not 3 <= len(value) <= 1000:
+        raise BadInput(f"{path} wants a list of 3 to 1000 [ra, dec] pairs")
+    vertices = []
+    for i, pair in enumerate(value):
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise BadInput(f"{path}[{i}] wants [ra, dec]")
+        ra = _checked_number(pair[0], f"{path}[{i}].ra", -360.0, 360.0) % 360.0
+        vertices.append((ra, _checked_number(pair[1], f"{path}[{i}].dec", -90.0, 90.0)))
+    try:
+        sky.cells_in_polygon(vertices, 0)
+    except BadInput as error:
+        raise BadInput(f"{path}: {error}") from None
+    return Area(vertices=tuple(vertices))
+
+
+def _universe(table: Toml) -> Universe:
+    default = Universe()
+    return Universe(
+        galaxy_limit=_number(table, "universe.galaxy_limit", 10.0, 30.0, default.galaxy_limit),
+        star_limit=_number(table, "universe.star_limit", 0.0, 30.0, default.star_limit),
+        z_max=_number(table, "universe.z_max", 0.01, 3.0, default.z_max),
+    )
+
+
+def _mission(table: Toml) -> MissionChoice:
+    ladder = _strings(table, "mission.ladder", STATUSES) or LADDER
+    if len(set(ladder)) != len(ladder):
+        raise BadInput(f"mission.ladder = {list(ladder)} names a status twice")
+    overrides = _table(table.get("overrides", {}), "mission.overrides", None)
+    return MissionChoice(ladder, tuple(sorted((key, _override(value, key)) for key, value in overrides.items())))
+
+
+def _override(value: object, key: str) -> Override:
+    path = f"mission.overrides.{key}"
+    table = _table(value, path, {"value", "unit"})
+    return Override(_number(table, f"{path}.value", -math.inf, math.inf), _string(table, f"{path}.unit"))
+
+
+def _pointings(table: Toml) -> tuple[Pointing, ...]:
+    found = table.get("pointing", [])
+    if not isinstance(found, list) or len(found) > _MOST_POINTINGS:
+        raise BadInput(f"pointing wants a list of at most {_MOST_POINTINGS} tables")
+    return tuple(_pointing(value, f"pointing[{i}]") for i, value in enumerate(found))
+
+
+def _pointing(value: object, path: str) -> Pointing:
+    table = _table(value, path, set(Pointing.__slots__))
+    channel = _string(table, f"{path}.channel", CHANNELS)
+    exposure = _number(table, f"{path}.exposure_time_s", 0.0, 1e6, math.nan)
+    return Pointing(
+        channel=channel,
+        camera=layout.name(_string(table, f"{path}.camera")) if "camera" in table else channel.lower(),
+        band=layout.name(_string(table, f"{path}.band")),
+        ra=_number(table, f"{path}.ra", -360.0, 360.0) % 360.0,
+        dec=_number(table, f"{path}.dec", -90.0, 90.0),
+        position_angle=_number(table, f"{path}.position_angle", -360.0, 360.0, 0.0),
+        mjd=_number(table, f"{path}.mjd", 40_000.0, 100_000.0),
+        detectors=_strings(table, f"{path}.detectors"),
+        centre_on=_string(table, f"{path}.centre_on") if "centre_on" in table else None,
+        exposure_time_s=None if math.isnan(exposure) else exposure,
+    )
+
+
+def _truth(table: Toml) -> tuple[str, ...]:
+    return _strings(table, "products.truth", TRUTH)
+
+
+# ------------------------------------------------------------------------------------------------ values
+
+
+def _known(table: Toml, path: str, keys: set[str]) -> None:
+    unknown = sorted(set(table) - keys)
+    if unknown:
+        where = f"{path}.{unknown[0]}" if path else unknown[0]
+        raise BadInput(f"{where} is not a key of a request; known here: {', '.join(sorted(keys))}")
+
+
+def _section(table: Toml, key: str, keys: set[str]) -> Toml:
+    return _table(table.get(key, {}), key, keys)
+
+
+def _table(value: object, path: str, keys: set[str] | None) -> Toml:
+    if not isinstance(value, dict):
+        raise BadInput(f"{path} wants a table, got {_shown(value)}")
+    if keys is not None:
+        _known(value, path, keys)
+    return cast(Toml, value)
+
+
+def _value(table: Toml, path: str) -> object:
+    key = path.rpartition(".")[2]
+    if key not in table:
+        raise BadInput(f"{path} is missing")
+    return table[key]
+
+
+def _string(table: Toml, path: str, legal: Sequence[str] = ()) -> str:
+    value = _value(table, path)
+    if not isinstance(value, str):
+        raise BadInput(f"{path} wants text, got {_shown(value)}")
+    if legal and value not in legal:
+        raise BadInput(f"{path} = {_shown(value)} is not one of {', '.join(legal)}")
+    return value
+
+
+def _strings(table: Toml, path: str, legal: Sequence[str] = ()) -> tuple[str, ...]:
+    value = table.get(path.rpartition(".")[2], [])
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise BadInput(f"{path} wants a list of texts, got {_shown(value)}")
+    for item in value:
+        if legal and item not in legal:
+            raise BadInput(f"{path}: {_shown(item)} is not one of {', '.join(legal)}")
+    return tuple(value)
+
+
+def _number(table: Toml, path: str, lo: float, hi: float, default: float | None = None) -> float:
+    if default is not None and path.rpartition(".")[2] not in table:
+        return default
+    return _checked_number(_value(table, path), path, lo, hi)
+
+
+def _checked_number(value: object, path: str, lo: float, hi: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise BadInput(f"{path} wants a number, got {_shown(value)}")
+    if not math.isfinite(value) or not lo <= value <= hi:
+        raise OutOfRange(path, value, lo, hi)
+    return float(value)
+
+
+def _integer(table: Toml, path: str, lo: int, hi: int) -> int:
+    value = _value(table, path)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise BadInput(f"{path} wants a whole number, got {_shown(value)}")
+    if not lo <= value <= hi:
+        raise OutOfRange(path, value, lo, hi)
+    return value
+
+
+def _pair(table: Toml, path: str, lo: float, hi: float) -> tuple[float, float]:
+    value = _value(table, path)
+    if not isinstance(value, list) or len(value) != 2:
+        raise BadInput(f"{path} wants [from, to], got {_shown(value)}")
+    first, second = (_checked_number(item, path, lo, hi) for item in value)
+    return first, second
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,272 @@
+"""From a command line to published tables: the only file, with session.py, that knows Spark.
+
+A job is a function (lake, request) -> steps; a step is a plan (what to make of what) and the function that makes one part
+of it.  Spark carries the parts' numbers out and their receipts back; rows go from the kernel straight to their file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+from tqdm import tqdm
+
+from jobs import request as requests
+from lake_schema import __version__, layout, publish, read
+from lake_schema.errors import BadInput, LakeError, PartsFailed
+from lake_schema.provenance import code_version, git_commit
+from lake_schema.publish import Json, Part, Plan, Work
+
+if TYPE_CHECKING:
+    from pyspark.sql import SparkSession
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One table of a job.
+
+    on_driver : the work is too small to be worth a trip to the workers
+    """
+
+    plan: Plan
+    work: Work
+    on_driver: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A job: its name, what it does (the text of --help), and its steps for a lake and a request."""
+
+    name: str
+    doc: str
+    steps: Callable[[Path, requests.Request], Sequence[Step]]
+
+
+_RESULT = pa.schema(
+    [
+        pa.field("part", pa.string()),
+        pa.field("rows", pa.int64()),
+        pa.field("seconds", pa.float64()),
+        pa.field("peak_gb", pa.float64()),
+        pa.field("error", pa.string()),
+        pa.field("traceback", pa.string()),
+    ]
+)
+
+
+def main(job: Job, argv: Sequence[str] | None = None) -> int:
+    """Run a job from its command line; returns the exit status: 0, 1 a part failed, 2 bad input, 130/143 stopped."""
+    options = _options(job, argv)
+    signal.signal(signal.SIGTERM, _stop)
+    try:
+        run(job, layout.lake(options.lake), requests.parse(options.request), options.verbose)
+    except BadInput as error:
+        return _say(job, error, 2)
+    except LakeError as error:
+        return _say(job, error, 1)
+    except KeyboardInterrupt:
+        return _say(job, "stopped; a second run continues where this one ended", 130)
+    except SystemExit as stopped:
+        return int(stopped.code or 0)
+    return 0
+
+
+def run(job: Job, root: Path, request: requests.Request, verbose: bool = False) -> None:
+    """Make and publish every table of a job that is not there yet; raises what `publish.make` raises."""
+    for step in job.steps(root, request):
+        _run(job, step, root, request, verbose)
+
+
+def common_facts(request: requests.Request, *parts: str) -> dict[str, Any]:
+    """What every plan of a request holds: the named parts of the request, and the code."""
+    return {"request": request.facts(*parts), "code": code_version()}
+
+
+def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog=job.name, description=job.doc, epilog=f"truesky {__version__}", formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--lake", required=True, type=Path, help="folder of the lake (made where it is not there)")
+    parser.add_argument("--request", required=True, type=Path, help="simulation request, a TOML file")
+    parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and Spark's own messages")
+    return parser.parse_args(argv)
+
+
+def _say(job: Job, error: object, status: int) -> int:
+    print(f"{job.name}: {error}", file=sys.stderr)
+    return status
+
+
+def _stop(signum: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + signum)
+
+
+# ------------------------------------------------------------------------------------------------ one step
+
+
+def _run(job: Job, step: Step, root: Path, request: requests.Request, verbose: bool) -> None:
+    plan, started = step.plan, time.time()
+    log = _RunLog(root, job, step, request)
+    results: list[Json] = []
+    before = layout.version(root, plan.table.name, plan.key).exists()
+
+    def mapper(function: Callable[[Part], Json], parts: Sequence[Part]) -> Iterable[Json]:
+        measured = _Measured(function)
+        with _bar(root, plan):
+            outcome = map(measured, parts) if step.on_driver else _spark_map(measured, parts, job.name, verbose)
+            for result in outcome:
+                results.append(result)
+                log.write(result)
+                yield result
+
+    root.mkdir(parents=True, exist_ok=True)
+    try:
+        publish.make(root, plan, step.work, mapper)
+    except PartsFailed:
+        if verbose:
+            for result in results:
+                print(result.get("traceback") or "", file=sys.stderr)
+        raise
+    finally:
+        log.close(time.time() - started)
+    version = read.version(root, plan.table.name, plan.key)
+    _summary(version, len(results), time.time() - started, before)
+
+
+def _summary(version: read.Version, made: int, seconds: float, before: bool) -> None:
+    size = sum(entry["bytes"] for entry in version.manifest["files"])
+    note = "already there" if before else f"{version.num_rows / max(seconds, 1e-3):,.0f} rows/s"
+    parts = f"{made} of {len(version.parts)} parts made"
+    print(f"{version.table:16} {version.num_rows:12,} rows {size / 1e6:10.1f} MB {seconds:8.1f} s   {note}, {parts}")
+
+
+class _Measured:
+    """A part's function with the clock and the memory beside its receipt; crosses to the workers."""
+
+    def __init__(self, function: Callable[[Part], Json]) -> None:
+        self.function = function
+
+    def __call__(self, part: Part) -> Json:
+        started = time.perf_counter()
+        result = self.function(part)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        return {**result, "seconds": time.perf_counter() - started, "peak_gb": peak}
+
+
+class _RunLog:
+    """LAKE/runs/<id>.jsonl: a line at the start, one a part, one at the end."""
+
+    def __init__(self, root: Path, job: Job, step: Step, request: requests.Request) -> None:
+        folder = layout.runs(root)
+        folder.mkdir(parents=True, exist_ok=True)
+        now = datetime.now(UTC)
+        self.common = {"job": job.name, "table": step.plan.table.name}
+        self.stream = (folder / f"{now:%Y%m%dT%H%M%S.%f}-{step.plan.table.name}-{os.getpid()}.jsonl").open("w")
+        about = {"started": now.isoformat(), "request": request.name, "key": step.plan.key}
+        self.write({**about, "truesky": __version__, "commit": git_commit(), "parts": len(step.plan.parts)})
+
+    def write(self, line: Json) -> None:
+        kept = {k: v for k, v in line.items() if k not in ("files", "final")}
+        print(json.dumps({**self.common, **kept}), file=self.stream, flush=True)
+
+    def close(self, seconds: float) -> None:
+        self.write({"ended": datetime.now(UTC).isoformat(), "seconds": seconds})
+        self.stream.close()
+
+
+@contextmanager
+def _bar(root: Path, plan: Plan) -> Iterator[None]:
+    """A progress bar that counts receipts, so that it is right after a resume and under any scheduler."""
+    folder = publish.receipts(layout.stage(root, plan.table.name, plan.key))
+
+    def count() -> int:
+        return sum(1 for path in folder.glob("*.json") if not path.name.startswith("."))
+
+    quiet = not sys.stderr.isatty() and "TRUESKY_PROGRESS" not in os.environ
+    with tqdm(total=len(plan.parts), initial=count(), desc=plan.table.name, unit="part", disable=quiet, leave=False) as bar:
+        done = threading.Event()
+
+        def follow() -> None:
+            while not done.wait(0.25):
+                bar.update(count() - bar.n)
+                bar.refresh()
+
+        thread = threading.Thread(target=follow, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+            bar.update(count() - bar.n)
+
+
+# ------------------------------------------------------------------------------------------------ Spark
+
+
+def _spark_map(function: Callable[[Part], Json], parts: Sequence[Part], name: str, verbose: bool) -> Iterable[Json]:
+    """Map over parts, one Spark task each; a part that kills its worker is found by running what is left one by one."""
+    from py4j.protocol import Py4JError
+    from pyspark.errors import PySparkException
+
+    from jobs.session import session
+
+    spark = session(name)
+    if not verbose:
+        # Whatever fails is reported by us, in one line.
+        spark.sparkContext.setLogLevel("OFF")
+    try:
+        return _collect(spark, function, parts)
+    except (Py4JError, PySparkException):
+        if len(parts) == 1:
+            return [{"part": parts[0].name, "error": "its worker died"}]
+    results: list[Json] = []
+    for part in parts:
+        results += _spark_map(function, [part], name, verbose)
+    return results
+
+
+def _collect(spark: SparkSession, function: Callable[[Part], Json], parts: Sequence[Part]) -> list[Json]:
+    tries = _tries(spark)
+    todo = list(parts)
+
+    def run(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+        from pyspark import TaskContext
+
+        for batch in batches:
+            for index in batch["id"].to_pylist():
+                result = function(todo[index])
+                context = TaskContext.get()
+                last = context is None or context.attemptNumber() >= tries - 1
+                if "error" in result and not result.get("final") and not last:
+                    raise RuntimeError(result["error"])
+                row = {field.name: [result.get(field.name)] for field in _RESULT}
+                yield pa.RecordBatch.from_pydict(row, _RESULT)
+
+    schema = "part string, rows long, seconds double, peak_gb double, error string, traceback string"
+    frame = spark.range(0, len(todo), 1, numPartitions=len(todo)).mapInArrow(run, schema)
+    return [{k: v for k, v in row.asDict().items() if v is not None} for row in frame.collect()]
+
+
+def _tries(spark: SparkSession) -> int:
+    """How often Spark runs a failing task: F of local[N,F], 1 of local[N], spark.task.maxFailures of a cluster."""
+    master = spark.sparkContext.master
+    local = re.fullmatch(r"local(?:\[[^,\]]+(?:,\s*(\d+))?\])?", master)
+    if local:
+        return int(local[1] or 1)
+    return int(spark.conf.get("spark.task.maxFailures", "4") or 4)

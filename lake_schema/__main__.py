@@ -1,0 +1,68 @@
+"""Look after a lake: python -m lake_schema verify|gc|describe LAKE [TABLE]."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from lake_schema import __version__, layout, publish, read
+from lake_schema.errors import BadInput, LakeError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit status: 0 all well, 1 something is wrong with the lake, 2 the call is wrong."""
+    parser = argparse.ArgumentParser(prog="python -m lake_schema", description=__doc__, epilog=f"truesky {__version__}")
+    parser.add_argument("command", choices=("verify", "gc", "describe"))
+    parser.add_argument("lake", type=Path)
+    parser.add_argument("table", nargs="?", help="one table (default: all of them)")
+    parser.add_argument("--deep", action="store_true", help="verify: read every byte and compare its sha256")
+    options = parser.parse_args(argv)
+    try:
+        root = layout.lake(options.lake)
+        names = [options.table] if options.table else read.tables(root)
+        if not names:
+            raise BadInput(f"lake {root} holds no table")
+        actions = {"verify": _verify, "gc": _gc, "describe": _describe}
+        wrong = [actions[options.command](root, name, options.deep) for name in names]
+    except BadInput as error:
+        print(error, file=sys.stderr)
+        return 2
+    except LakeError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return int(any(wrong))
+
+
+def _verify(root: Path, name: str, deep: bool) -> bool:
+    version = read.version(root, name)
+    found = read.verify(version, deep)
+    for line in found:
+        print(line)
+    size = sum(entry["bytes"] for entry in version.manifest["files"])
+    verdict = f"{len(found)} faults" if found else "sound"
+    print(f"{name:16} v-{version.key} {version.num_rows:12,} rows {size / 1e6:10.1f} MB   {verdict}")
+    return bool(found)
+
+
+def _gc(root: Path, name: str, deep: bool) -> bool:
+    for path in publish.gc(root, name):
+        print(f"removed {path}")
+    return False
+
+
+def _describe(root: Path, name: str, deep: bool) -> bool:
+    version = read.version(root, name)
+    schema = version.schema()
+    print(f"{name}: {(schema.metadata or {}).get(b'description', b'').decode()}")
+    print(f"  version {version.key}, {version.num_rows:,} rows in {len(version.parts)} files")
+    width = max(len(field.name) for field in schema)
+    for field in schema:
+        facts = {k.decode(): v.decode() for k, v in (field.metadata or {}).items()}
+        print(f"  {field.name:{width}}  {field.type!s:8} {facts.get('unit', ''):20} {facts.get('description', '')}")
+    return False
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,199 @@
+"""FITS files: the one module that touches astropy.io.fits.
+
+Image           an image with its header cards
+write_images    images -> one file: checksums, the same bytes for the same input
+read_images     a file -> images; checksums are demanded and verified, sizes are checked before any data is read
+table_to_fits   an Arrow table -> a binary table, units and UCDs from the table's declaration
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from astropy.io import fits
+from astropy.utils.exceptions import AstropyUserWarning
+
+from lake_schema.columns import Column, Table
+from lake_schema.errors import BadInput, Damaged
+
+Card = tuple[str, str | int | float | bool, str]
+
+# A header that promises more than this is a mistake or an attack; the largest product is far below.
+MOST_BYTES = 8 << 30
+_CHECKSUM_COMMENTS = {"CHECKSUM": "HDU checksum", "DATASUM": "data unit checksum"}
+_STRUCTURE = {"SIMPLE", "XTENSION", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "NAXIS3", "EXTEND", "PCOUNT", "GCOUNT"}
+_STRUCTURE |= {"BZERO", "BSCALE", "EXTNAME", "CHECKSUM", "DATASUM"}
+_TABLE_FORMATS = {"int64": "K", "int32": "J", "int16": "I", "int8": "I", "float64": "D", "float32": "E", "bool": "L"}
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """One header-data unit.
+
+    data  : [ny, nx] uint8, int16, uint16, int32, float32 or float64; None = a header alone
+    cards : (keyword, value, comment), in order, structural keywords left out
+    """
+
+    data: npt.NDArray[Any] | None
+    cards: tuple[Card, ...] = ()
+    name: str = ""
+
+
+def write_images(path: Path, images: Sequence[Image]) -> None:
+    """Write a file of images, the first as the primary one; replaces `path` in one rename, leaves nothing on failure."""
+    if not images:
+        raise BadInput(f"{path}: a FITS file wants at least one image")
+    units = [_primary(images[0]), *(_extension(image) for image in images[1:])]
+    _write(path, fits.HDUList(units))
+
+
+def read_images(path: Path, most_bytes: int = MOST_BYTES) -> list[Image]:
+    """Read every image of a file that `write_images` wrote.
+
+    most_bytes : refuse a file whose headers promise more data
+    Errors     : Damaged for a bad or missing checksum and for a file that is cut short; BadInput for one too large
+    """
+    with _refusing(path):
+        with fits.open(path, memmap=False, lazy_load_hdus=True) as units:
+            _check_size(path, units, most_bytes)
+        with fits.open(path, memmap=False, checksum=True) as units:
+            missing = [unit.name or "primary" for unit in units if "CHECKSUM" not in unit.header]
+            if missing:
+                raise Damaged(f"{path}: no checksum in {', '.join(missing)}")
+            return [_image(unit) for unit in units]
+
+
+def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
+    """Export rows of a declared table as a binary table extension; list columns are left out, as FITS cannot name their unit.
+
+    table : Arrow table with (some of) the declared columns; null becomes NaN, or TNULL for integers
+    """
+    columns = [declared.column(name) for name in table.column_names]
+    kept = [c for c in columns if not c.type.startswith("list")]
+    unit = fits.BinTableHDU.from_columns([_fits_column(c, table.column(c.name)) for c in kept], name=declared.name.upper())
+    for number, column in enumerate(kept, start=1):
+        if column.ucd:
+            unit.header[f"TUCD{number}"] = (column.ucd, "IVOA UCD")
+    unit.header["TABLEVER"] = (declared.version, "version of the table's declaration")
+    _write(path, fits.HDUList([fits.PrimaryHDU(), unit]))
+
+
+# ------------------------------------------------------------------------------------------------ writing
+
+
+def _primary(image: Image) -> fits.PrimaryHDU:
+    unit = fits.PrimaryHDU(data=None if image.data is None else _big_enough(image.data))
+    return _dressed(unit, image)
+
+
+def _extension(image: Image) -> fits.ImageHDU:
+    return _dressed(fits.ImageHDU(data=None if image.data is None else _big_enough(image.data)), image)
+
+
+def _dressed(unit: Any, image: Image) -> Any:
+    for keyword, value, comment in image.cards:
+        if keyword.upper() in _STRUCTURE:
+            raise BadInput(f"FITS card {keyword} is set by the writer")
+        try:
+            unit.header.append(fits.Card(keyword, value, comment), end=True)
+        except ValueError as error:
+            raise BadInput(f"FITS card {keyword}: {error}") from None
+    if image.name:
+        unit.header["EXTNAME"] = image.name
+    return unit
+
+
+def _big_enough(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    if data.ndim != 2 or data.dtype.kind not in "fiu" or data.dtype.itemsize > 8:
+        raise BadInput(f"a FITS image wants numbers in two dimensions, got {data.dtype}{list(data.shape)}")
+    return np.ascontiguousarray(data)
+
+
+def _write(path: Path, units: fits.HDUList) -> None:
+    # The comments that astropy would add hold the time of day.
+    for unit in units:
+        unit.add_checksum(when=_CHECKSUM_COMMENTS["CHECKSUM"])
+        for keyword, comment in _CHECKSUM_COMMENTS.items():
+            unit.header.comments[keyword] = comment
+    handle, temporary = tempfile.mkstemp(suffix=".part", prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            units.writeto(stream, output_verify="exception")
+            stream.flush()
+            os.fsync(stream.fileno())
+        # mkstemp makes files private; a product is as readable as anything else that is written here.
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _fits_column(column: Column, values: pa.ChunkedArray) -> fits.Column:
+    unit = {"unit": column.unit} if column.unit else {}
+    if column.type == "string":
+        texts = [value or "" for value in values.to_pylist()]
+        width = max([1, *(len(text.encode()) for text in texts)])
+        return fits.Column(column.name, f"{width}A", array=np.array(texts, dtype=f"U{width}"), **unit)
+    code = _TABLE_FORMATS[column.type]
+    if code in "DEL" or values.null_count == 0:
+        filled = values if values.null_count == 0 or code == "L" else values.fill_null(float("nan"))
+        return fits.Column(column.name, code, array=filled.to_numpy(), **unit)
+    missing = -1 if column.lo is not None and column.lo >= 0 else -(2**15)
+    return fits.Column(column.name, code, array=values.fill_null(missing).to_numpy(), null=missing, **unit)
+
+
+# ------------------------------------------------------------------------------------------------ reading
+
+
+@contextmanager
+def _refusing(path: Path) -> Iterator[None]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", AstropyUserWarning)
+            yield
+    except (OSError, AstropyUserWarning, fits.VerifyError, TypeError, IndexError) as error:
+        raise Damaged(f"{path}: {' '.join(str(error).split())}") from None
+
+
+def _check_size(path: Path, units: fits.HDUList, most_bytes: int) -> None:
+    promised = 0
+    for unit in units:
+        header = unit.header
+        axes = [int(header[f"NAXIS{i}"]) for i in range(1, int(header["NAXIS"]) + 1)]
+        if any(axis < 0 for axis in axes):
+            raise Damaged(f"{path}: a negative NAXIS")
+        pixels = 1
+        for axis in axes:
+            pixels *= axis
+        promised += (pixels if axes else 0) * abs(int(header["BITPIX"])) // 8
+        if promised > most_bytes:
+            raise BadInput(f"{path}: holds more than {most_bytes} bytes")
+    if promised > path.stat().st_size:
+        raise Damaged(f"{path}: is cut short, {promised} bytes promised, {path.stat().st_size} there")
+
+
+def _image(unit: Any) -> Image:
+    data = None if unit.data is None else np.asarray(unit.data)
+    if data is not None:
+        data = data.astype(data.dtype.newbyteorder("="), copy=False)
+    cards = tuple(
+        (card.keyword, card.value, card.comment) for card in unit.header.cards if card.keyword not in _STRUCTURE
+    )
+    return Image(data, cards, unit.header.get("EXTNAME", ""))

@@ -1,0 +1,140 @@
+"""What makes a folder of cells a HATS collection: metadata, the 10 arcsec margin, the properties.
+
+<version>/collection.properties
+<version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,_common_metadata,...}
+<version>/<table>_margin/   the same for the rows just outside each cell, so that a cross-match loses no pair at an edge
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lake_schema import layout, parquet, sky
+from lake_schema.columns import Table
+
+MARGIN_ARCSEC = 10.0
+# Cells of order 13 are 26" wide: the rim of them about a cell holds everything within 10" of it.
+_MARGIN_ORDER = 13
+_SKYMAP_ORDER = 8
+# Above this many files the merged footers of `_metadata` outgrow their use.
+_MOST_FILES_IN_METADATA = 1000
+_CELL = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet")
+# The properties want a date; a clock's would make equal lakes differ.
+_DATE = "2000-01-01T00:00UTC"
+
+
+def write(version: Path, table: Table, parts: Sequence[tuple[str, int]]) -> None:
+    """Write the metadata of a catalogue whose cells lie in `version`/<table>/dataset.
+
+    parts : (HATS path below dataset/, rows) of each cell
+    """
+    cells = [cell_of_part(name) for name, _ in parts]
+    root, margin = version / table.name, version / f"{table.name}_margin"
+    files = {cell: root / "dataset" / name for cell, (name, _) in zip(cells, parts, strict=True)}
+    margin_rows = _write_margin(margin, table, files)
+    _write_catalogue(root, table, cells, sum(rows for _, rows in parts), files)
+    _write_catalogue(margin, table, cells, margin_rows, None)
+    _write_collection(version, table)
+
+
+def cell_of_part(name: str) -> tuple[int, int]:
+    """HATS path below dataset/ -> (order, cell)."""
+    match = _CELL.fullmatch(name)
+    if match is None:
+        raise ValueError(f"{name} is not a cell's path")
+    return int(match[1]), int(match[2])
+
+
+def _write_margin(folder: Path, table: Table, files: dict[tuple[int, int], Path]) -> int:
+    total = 0
+    for order, cell in files:
+        rim = sky.margin_cells(order, cell, _MARGIN_ORDER)
+        pieces = [_rows_in(path, rim) for other, path in files.items() if _touch(other, rim)]
+        rows = pa.concat_tables([table.empty(), *pieces]).sort_by([("_healpix_29", "ascending"), ("id", "ascending")])
+        target = folder / "dataset" / layout.cell_file(order, cell)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        parquet.write(target, rows, table)
+        total += rows.num_rows
+    return total
+
+
+def _touch(cell: tuple[int, int], rim: sky.Int) -> bool:
+    order, index = cell
+    return bool((sky.parent(rim, _MARGIN_ORDER, order) == index).any())
+
+
+def _rows_in(path: Path, rim: sky.Int) -> pa.Table:
+    """Rows of a cell's file that lie in the rim, reading only the row groups that can hold some."""
+    file = pq.ParquetFile(path, page_checksum_verification=True)
+    column = file.schema_arrow.get_field_index("_healpix_29")
+    keep = []
+    for group in range(file.metadata.num_row_groups):
+        facts = file.metadata.row_group(group).column(column).statistics
+        if facts is None:  # a group of no rows has none
+            continue
+        first, last = (sky.parent([x], sky.DEEPEST, _MARGIN_ORDER)[0] for x in (facts.min, facts.max))
+        if np.searchsorted(rim, last, "right") > np.searchsorted(rim, first, "left"):
+            keep.append(group)
+    if not keep:
+        return file.schema_arrow.empty_table()
+    rows = file.read_row_groups(keep)
+    fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, _MARGIN_ORDER)
+    return rows.filter(pa.array(np.isin(fine, rim)))
+
+
+def _write_catalogue(
+    root: Path, table: Table, cells: list[tuple[int, int]], rows: int, files: dict[tuple[int, int], Path] | None
+) -> None:
+    from hats.catalog import TableProperties
+    from hats.catalog.partition_info import PartitionInfo
+    from hats.io.file_io import write_fits_image
+    from hats.io.parquet_metadata import write_parquet_metadata
+    from hats.io.paths import get_skymap_file_pointer
+    from hats.pixel_math import HealpixPixel
+
+    write_parquet_metadata(root, create_metadata=len(cells) <= _MOST_FILES_IN_METADATA)
+    PartitionInfo([HealpixPixel(order, cell) for order, cell in cells]).write_to_file(catalog_path=root)
+    facts: dict[str, object] = {
+        "total_rows": rows,
+        "ra_column": "ra",
+        "dec_column": "dec",
+        "healpix_column": "_healpix_29",
+        "healpix_order": sky.DEEPEST,
+        "npix_suffix": ".parquet",
+    }
+    if files is None:
+        facts |= {"catalog_name": f"{table.name}_margin", "catalog_type": "margin"}
+        facts |= {"primary_catalog": f"../{table.name}", "margin_threshold": MARGIN_ARCSEC}
+    else:
+        write_fits_image(_skymap(files), get_skymap_file_pointer(root))
+        facts |= {"catalog_name": table.name, "catalog_type": "object", "skymap_order": _SKYMAP_ORDER}
+    about = TableProperties.new_provenance_dict(root, builder="truesky")
+    about["hats_creation_date"] = _DATE
+    # The size on disk would differ by a byte with the length of a path.
+    about.pop("hats_estsize", None)
+    TableProperties(**facts, **about).to_properties_file(root)
+
+
+def _skymap(files: dict[tuple[int, int], Path]) -> sky.Int:
+    counts = np.zeros(12 << (2 * _SKYMAP_ORDER), np.int64)
+    for path in files.values():
+        index = pq.read_table(path, columns=["_healpix_29"], partitioning=None)["_healpix_29"].to_numpy()
+        counts += np.bincount(sky.parent(index, sky.DEEPEST, _SKYMAP_ORDER), minlength=counts.size)
+    return counts
+
+
+def _write_collection(version: Path, table: Table) -> None:
+    from hats.catalog.dataset.collection_properties import CollectionProperties
+
+    margin = f"{table.name}_margin"
+    about = {"hats_builder": "truesky", "hats_creation_date": _DATE}
+    CollectionProperties(
+        name=table.name, hats_primary_table_url=table.name, all_margins=[margin], default_margin=margin, **about
+    ).to_properties_file(version)
+

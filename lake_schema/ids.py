@@ -1,0 +1,47 @@
+"""Source identifiers: int64 that carry the kind, the order-5 cell, the parent halo and the member.
+
+id = kind (3 bits) << 60 | order-5 cell, nested (14) << 46 | index (28) << 18 | member (18; 0 = the halo's own central)
+index = generation cell within the order-5 cell (6 bits) << 22 | running number in that generation cell (22)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.errors import BadInput
+
+GENERATION_ORDER = 8
+FILE_ORDER = 5
+_SUB_BITS = 2 * (GENERATION_ORDER - FILE_ORDER)
+_NUMBER_BITS = 22
+_MEMBER_BITS = 18
+
+Int64 = npt.NDArray[np.int64]
+
+
+def source_id(kind: npt.ArrayLike, cell: int, number: npt.ArrayLike, member: npt.ArrayLike = 0) -> Int64:
+    """Identifiers of sources drawn in one generation cell.
+
+    kind : int[n]; cell : order-8 nested cell; number : int[n] running number of the halo in the cell; member : int[n]
+    returns int64[n].  Errors: BadInput where a number needs more bits than it has
+    """
+    kinds, numbers, members = (np.asarray(x, np.int64) for x in (kind, number, member))
+    for name, values, bits in (("kind", kinds, 3), ("number", numbers, _NUMBER_BITS), ("member", members, _MEMBER_BITS)):
+        if values.size and (values.min() < 0 or values.max() >= 1 << bits):
+            raise BadInput(f"source id: {name} needs {bits} bits, got {values.min()} .. {values.max()}")
+    if not 0 <= cell < 12 << (2 * GENERATION_ORDER):
+        raise BadInput(f"source id: {cell} is not a cell of order {GENERATION_ORDER}")
+    file_cell, sub = cell >> _SUB_BITS, cell & ((1 << _SUB_BITS) - 1)
+    index = np.int64(sub) << _NUMBER_BITS | numbers
+    return kinds << 60 | np.int64(file_cell) << 46 | index << _MEMBER_BITS | members
+
+
+def halo_of(ids: Int64) -> Int64:
+    """int64[n] -> identifier of each source's halo: the kind and member bits cleared."""
+    return ids & np.int64((1 << 60) - 1) & ~np.int64((1 << _MEMBER_BITS) - 1)
+
+
+def kind_of(ids: Int64) -> Int64:
+    """int64[n] -> kind code of each source."""
+    return ids >> 60

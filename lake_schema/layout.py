@@ -1,0 +1,71 @@
+"""The one grammar of paths in a lake; a name that could leave the lake is refused here.
+
+LAKE/<table>/current -> v-<key>               the published version
+LAKE/<table>/v-<key>/manifest.json            every file of the version with rows, bytes and sha256
+LAKE/<table>/v-<key>/<table>/dataset/...      a catalogue: HATS, beside <table>_margin/ and collection.properties
+LAKE/<table>/v-<key>/dataset/<part>.parquet   any other table
+LAKE/<table>/v-<key>/images/...               files that belong to rows
+LAKE/<table>/.stage-<key>/                    a version in the making
+LAKE/runs/<id>.jsonl                          what each run did
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from lake_schema.errors import BadInput
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
+_REMOTE = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://")
+
+
+def name(text: str) -> str:
+    """`text` where it is a legal name of a table, request or file stem; else BadInput."""
+    if not isinstance(text, str) or _NAME.fullmatch(text) is None:
+        raise BadInput(f"name {text!r} is not of the form [a-z0-9][a-z0-9_-]* with at most 64 characters")
+    return text
+
+
+def lake(text: str | Path) -> Path:
+    """The root of a lake: a folder of a POSIX file system, absolute; object stores are refused (they cannot rename)."""
+    if _REMOTE.match(str(text)):
+        raise BadInput(f"lake {text}: only a POSIX file system can publish by rename; mount it and give the path")
+    return Path(text).expanduser().resolve()
+
+
+def table(root: Path, table_name: str) -> Path:
+    """Folder of a table."""
+    return within(root, root / name(table_name))
+
+
+def stage(root: Path, table_name: str, key: str) -> Path:
+    """Folder of a version in the making."""
+    return table(root, table_name) / f".stage-{name(key)}"
+
+
+def version(root: Path, table_name: str, key: str) -> Path:
+    """Folder of a published version."""
+    return table(root, table_name) / f"v-{name(key)}"
+
+
+def current(root: Path, table_name: str) -> Path:
+    """The link to the published version."""
+    return table(root, table_name) / "current"
+
+
+def runs(root: Path) -> Path:
+    """Folder of the run logs."""
+    return within(root, root / "runs")
+
+
+def cell_file(order: int, cell: int) -> str:
+    """Path of a cell's file below dataset/, as HATS wants it."""
+    return f"Norder={order}/Dir={cell // 10_000 * 10_000}/Npix={cell}.parquet"
+
+
+def within(root: Path, path: Path) -> Path:
+    """`path` where, links followed, it lies in `root`; else BadInput."""
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise BadInput(f"path {path} leaves {root}")
+    return path

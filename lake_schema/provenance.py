@@ -1,0 +1,62 @@
+"""What made a product: the fingerprint of the code, and the canonical form of whatever else goes into a key."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import subprocess
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+_ROOT = Path(__file__).resolve().parents[1]
+_PACKAGES = ("lake_schema", "jobs")
+_DATA = {".py", ".csv", ".toml"}
+# Libraries whose version can change a byte of a product.
+_LIBRARIES = ("numpy", "pyarrow", "numba", "scipy", "astropy", "galsim")
+
+
+def canonical(value: Any) -> bytes:
+    """JSON with sorted keys and no spaces: equal values give equal bytes; NaN and infinities are refused."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode()
+
+
+def digest(value: Any) -> str:
+    """sha256 of the canonical form, hexadecimal."""
+    return hashlib.sha256(canonical(value)).hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """sha256 of a file's bytes, hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def code_version(root: Path = _ROOT) -> str:
+    """Fingerprint of the code: every source and data file of lake_schema and jobs, and the versions of the libraries."""
+    files = sorted(
+        path
+        for package in _PACKAGES
+        for path in (root / package).rglob("*")
+        if path.suffix in _DATA and "__pycache__" not in path.parts
+    )
+    sums = {path.relative_to(root).as_posix(): file_sha256(path) for path in files}
+    return digest({"files": sums, "libraries": libraries()})
+
+
+def libraries() -> Mapping[str, str]:
+    """Python and the libraries that shape the bytes, with their versions."""
+    return {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}
+
+
+def git_commit(root: Path = _ROOT) -> str:
+    """The commit that is checked out, "unknown" outside a checkout; recorded, never part of a key."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return done.stdout.strip()

@@ -1,0 +1,164 @@
+"""The sphere: HEALPix cells (nested), cones and polygons, separations, Galactic coordinates.
+
+healpix_29          sky -> order-29 index
+cell_of             sky -> cell of an order
+cells_in_cone       cells that a circle touches (never misses one)
+cells_in_polygon    cells that a spherical polygon touches
+random_in_cell      uniform positions inside one cell, sorted
+"""
+
+from __future__ import annotations
+
+import healpy as hp
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.errors import BadInput, OutOfRange
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+
+DEEPEST = 29
+
+
+def checked(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
+    """ra, dec [any shape] deg -> the same with ra in [0, 360); refuses NaN, infinities and |dec| > 90 by name."""
+    ra_deg, dec_deg = np.asarray(ra, float), np.asarray(dec, float)
+    if not np.isfinite(ra_deg).all():
+        raise OutOfRange("ra", _first(ra_deg[~np.isfinite(ra_deg)]), 0.0, 360.0)
+    bad = ~(np.abs(dec_deg) <= 90.0)
+    if bad.any():
+        raise OutOfRange("dec", _first(dec_deg[bad]), -90.0, 90.0)
+    wrapped = np.mod(ra_deg, 360.0)
+    # A tiny negative angle rounds up to exactly 360.
+    return np.where(wrapped >= 360.0, 0.0, wrapped), dec_deg
+
+
+def _first(values: Float) -> float:
+    return float(values.ravel()[0])
+
+
+def healpix_29(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
+    """ra, dec [n] deg -> int64[n], the nested HEALPix index of order 29 (0.4 mas)."""
+    return cell_of(ra, dec, DEEPEST)
+
+
+def cell_of(ra: npt.ArrayLike, dec: npt.ArrayLike, order: int) -> Int:
+    """ra, dec [n] deg -> int64[n], the nested cell of `order` that holds each position."""
+    ra_deg, dec_deg = checked(ra, dec)
+    return np.asarray(hp.ang2pix(1 << order, ra_deg, dec_deg, nest=True, lonlat=True), np.int64)
+
+
+def cell_area(order: int) -> float:
+    """Area of a cell of `order`, deg2."""
+    return float(hp.nside2pixarea(1 << order, degrees=True))
+
+
+def cell_centre(order: int, cell: int) -> tuple[float, float]:
+    """ra, dec of a cell's centre, deg."""
+    ra, dec = hp.pix2ang(1 << order, cell, nest=True, lonlat=True)
+    return float(ra), float(dec)
+
+
+def cell_range(order: int, cell: int) -> tuple[int, int]:
+    """The half-open range of order-29 indices inside a cell."""
+    shift = 2 * (DEEPEST - order)
+    return int(cell) << shift, (int(cell) + 1) << shift
+
+
+def parent(cells: npt.ArrayLike, order: int, coarser: int) -> Int:
+    """int[n] nested cells of `order` -> the cells of the `coarser` order that hold them."""
+    return np.asarray(cells, np.int64) >> (2 * (order - coarser))
+
+
+def cell_radius(order: int) -> float:
+    """Largest distance of a point of any cell of `order` from the cell's centre, deg."""
+    return float(np.degrees(hp.max_pixrad(1 << order)))
+
+
+def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
+    """Cells of `order` that a circle touches, sorted.
+
+    ra, dec, radius : deg, radius in [0, 180]
+    returns         : int64[n]; holds every touched cell, and may hold a neighbour whose edge is just outside
+    """
+    (ra_deg,), (dec_deg,) = checked([ra], [dec])
+    if not 0.0 <= radius <= 180.0:
+        raise OutOfRange("radius", radius, 0.0, 180.0)
+    centre = hp.ang2vec(ra_deg, dec_deg, lonlat=True)
+    fine = min(order + 3, DEEPEST)
+    found = hp.query_disc(1 << fine, centre, np.radians(min(radius + cell_radius(fine), 180.0)), nest=True)
+    own = cell_of([ra], [dec], order)
+    return np.unique(np.concatenate([parent(found, fine, order), own]))
+
+
+def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
+    """Cells of `order` that a convex spherical polygon touches, sorted.
+
+    vertices : [n, 2] ra, dec deg, in order around the polygon, n >= 3
+    returns  : int64[m]; holds every touched cell, and may hold a neighbour whose edge is just outside
+    """
+    corners = np.asarray(vertices, float)
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        raise BadInput(f"a polygon wants at least 3 vertices (ra, dec), got shape {corners.shape}")
+    ra, dec = checked(corners[:, 0], corners[:, 1])
+    vectors = hp.ang2vec(ra, dec, lonlat=True)
+    sides = np.einsum("ij,ij->i", np.cross(vectors, np.roll(vectors, -1, 0)), np.roll(vectors, -2, 0))
+    if not ((sides > 0).all() or (sides < 0).all()):
+        raise BadInput("a polygon must be convex, with no repeated vertex and no angle of 180 deg")
+    fine = min(order + 3, DEEPEST)
+    inside = hp.query_polygon(1 << fine, vectors, inclusive=True, fact=4, nest=True)
+    return np.unique(parent(inside, fine, order))
+
+
+def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2: npt.ArrayLike) -> Float:
+    """Great-circle distance, deg, by the haversine (accurate from 0 to 180 deg); all angles deg, broadcast."""
+    lon1, lat1, lon2, lat2 = (np.radians(np.asarray(x, float)) for x in (ra1, dec1, ra2, dec2))
+    dlon, dlat = np.sin((lon2 - lon1) / 2), np.sin((lat2 - lat1) / 2)
+    near = dlat**2 + np.cos(lat1) * np.cos(lat2) * dlon**2
+    # The complement keeps its digits near the antipode, where 1 - near has lost them.
+    far = np.sin((lat1 + lat2) / 2) ** 2 + np.cos(lat1) * np.cos(lat2) * np.cos((lon2 - lon1) / 2) ** 2
+    return np.asarray(np.degrees(2 * np.arctan2(np.sqrt(near), np.sqrt(far))))
+
+
+def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> tuple[Int, Float, Float]:
+    """n positions uniform in a cell: (int64[n] order-29 index, ascending; ra[n], dec[n] deg)."""
+    first, _ = cell_range(order, cell)
+    index = np.sort(rng.integers(0, 1 << (2 * (DEEPEST - order)), n, dtype=np.int64)) | np.int64(first)
+    ra, dec = hp.pix2ang(1 << DEEPEST, index, nest=True, lonlat=True)
+    return index, ra, dec
+
+
+def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
+    """ICRS ra, dec [n] deg -> Galactic l, b [n] deg (rotation matrix of the Hipparcos catalogue, ESA 1997, eq. 1.5.11)."""
+    ra_rad, dec_rad = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
+    vector = np.stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)])
+    x, y, z = np.tensordot(_TO_GALACTIC, vector, 1)
+    return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+
+
+_TO_GALACTIC = np.array(
+    [
+        [-0.0548755604162154, -0.8734370902348850, -0.4838350155487132],
+        [+0.4941094278755837, -0.4448296299600112, +0.7469822444972189],
+        [-0.8676661490190047, -0.1980763734312015, +0.4559837761750669],
+    ]
+)
+
+
+def margin_cells(order: int, cell: int, fine: int) -> Int:
+    """Cells of the finer order that lie outside `cell` and touch its border (8 neighbours), sorted: a rim about the cell."""
+    side = 1 << (fine - order)
+    x, y = np.meshgrid(np.arange(side), np.arange(side))
+    rim = (x == 0) | (y == 0) | (x == side - 1) | (y == side - 1)
+    inside = (np.int64(cell) << (2 * (fine - order))) + _interleave(x[rim]) + 2 * _interleave(y[rim])
+    around = hp.get_all_neighbours(1 << fine, inside, nest=True).ravel()
+    around = np.unique(around[around >= 0]).astype(np.int64)
+    return around[parent(around, fine, order) != cell]
+
+
+def _interleave(values: npt.NDArray[np.int64]) -> Int:
+    spread = np.zeros_like(values, np.int64)
+    for bit in range(DEEPEST):
+        spread |= ((values >> bit) & 1) << (2 * bit)
+    return spread

@@ -1,0 +1,19 @@
+"""The declared tables of the lake, one a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lake_schema.columns import Table
+
+
+def declared(bands: Sequence[str]) -> list[Table]:
+    """Every table of the lake, the flux tables with these bands."""
+    from lake_schema.tables.exposures import EXPOSURES
+    from lake_schema.tables.fluxes import fluxes
+    from lake_schema.tables.galaxies import GALAXIES
+    from lake_schema.tables.products import PRODUCTS
+    from lake_schema.tables.stars import STARS
+    from lake_schema.tables.tasks import TASKS
+
+    return [GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands), EXPOSURES, TASKS, PRODUCTS]

@@ -1,0 +1,28 @@
+"""Columns that several tables share: identifiers and positions."""
+
+from __future__ import annotations
+
+from lake_schema.columns import Column
+
+KINDS = (
+    (0, "central galaxy"),
+    (1, "satellite galaxy"),
+    (2, "QSO"),
+    (3, "high-redshift galaxy"),
+    (4, "strong lens"),
+    (5, "star"),
+)
+
+ID = Column(
+    "id",
+    "int64",
+    ucd="meta.id;meta.main",
+    lo=0,
+    doc="source identifier: kind, order-5 cell, parent halo and member (lake_schema.ids)",
+)
+RA = Column("ra", "float64", "deg", "pos.eq.ra;meta.main", "right ascension, ICRS, true (unlensed)", 0.0, 360.0)
+DEC = Column("dec", "float64", "deg", "pos.eq.dec;meta.main", "declination, ICRS, true (unlensed)", -90.0, 90.0)
+HEALPIX_29 = Column(
+    "_healpix_29", "int64", ucd="pos.healpix", doc="HEALPix index of (ra, dec), order 29, nested: the sort key", lo=0
+)
+SKY = (ID, RA, DEC, HEALPIX_29)

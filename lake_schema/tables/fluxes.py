@@ -1,0 +1,28 @@
+"""Tables `galaxy_fluxes` and `star_fluxes`: band fluxes, row by row beside the catalogue they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lake_schema.columns import Column, Table
+from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
+
+_CONTENT = {
+    "galaxy": "with internal dust, emission lines, magnification and the Milky Way's dust",
+    "star": "with the dust on the way to it",
+}
+
+
+def fluxes(kind: str, bands: Sequence[str]) -> Table:
+    """The flux table of `kind` ("galaxy" or "star") with one column a band: f_nu_<band>, microjansky."""
+    columns = [
+        Column(f"f_nu_{band}", "float32", "uJy", "phot.flux.density", f"band-averaged f_nu in {band}, {_CONTENT[kind]}", 0.0, 1e15)
+        for band in bands
+    ]
+    return Table(
+        f"{kind}_fluxes",
+        1,
+        (ID, RA, DEC, HEALPIX_29, *columns),
+        f"Band fluxes of the table {'galaxies' if kind == 'galaxy' else 'stars'}, in the same cells and row order.",
+        order=5,
+    )

@@ -1,0 +1,28 @@
+"""Table `products`: the archive, one row a file."""
+
+from __future__ import annotations
+
+from lake_schema.columns import Column, Table
+from lake_schema.tables.exposures import CHANNELS
+
+CONTENTS = (("science", "what the detector delivers"), ("noise_free", "expected electrons of the sources alone"))
+
+PRODUCTS = Table(
+    "products",
+    1,
+    (
+        Column("path", "string", ucd="meta.ref.uri", doc="file, relative to this version of the table"),
+        Column("content", "string", ucd="meta.code.class", doc="what the file holds", codes=CONTENTS),
+        Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure", lo=0),
+        Column("detector", "string", ucd="meta.id;instr.det", doc="detector name"),
+        Column("channel", "string", ucd="instr", doc="channel", codes=CHANNELS),
+        Column("band", "string", ucd="instr.bandpass", doc="passband name"),
+        Column("ra", "float64", "deg", "pos.eq.ra", "right ascension of the detector's centre", 0.0, 360.0),
+        Column("dec", "float64", "deg", "pos.eq.dec", "declination of the detector's centre", -90.0, 90.0),
+        Column("s_region", "string", ucd="pos.outline;obs.field", doc="footprint, STC-S polygon in ICRS"),
+        Column("mission", "string", ucd="meta.code", doc="fingerprint of the mission configuration"),
+        Column("sources", "int64", ucd="meta.number", doc="number of sources drawn", lo=0),
+    ),
+    "Published images and truth maps.",
+    key=("path",),
+)

@@ -1,0 +1,128 @@
+"""Requests: what is good is kept, what is bad is refused with its key."""
+
+import copy
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from jobs import request
+from lake_schema.errors import BadInput
+
+DEMO = Path(__file__).parents[2] / "requests" / "demo.toml"
+GOOD = tomllib.loads(DEMO.read_text())
+
+BAD = [
+    ("colour", "red", "colour"),
+    ("seed", -1, "seed"),
+    ("seed", 1.5, "seed"),
+    ("seed", True, "seed"),
+    ("seed", 2**63, "seed"),
+    ("name", "../x", "name"),
+    ("name", 5, "name"),
+    ("accuracy", "sloppy", "accuracy"),
+    ("accuracy", {"flux": 0.0, "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
+    ("accuracy", {"flux": -1.0, "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
+    ("accuracy", {"flux": float("nan"), "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
+    ("accuracy", {"flux": 1e-3}, "accuracy.shape is missing"),
+    ("area", {}, "area wants exactly one"),
+    ("area", {"cone": {"ra": 0, "dec": 0, "radius": 1}, "box": {"ra": [0, 1], "dec": [0, 1]}}, "area wants"),
+    ("area", {"cone": {"ra": 0, "dec": 95, "radius": 1}}, "area.cone.dec"),
+    ("area", {"cone": {"ra": 0, "dec": 0, "radius": -1}}, "area.cone.radius"),
+    ("area", {"cone": {"ra": float("nan"), "dec": 0, "radius": 1}}, "area.cone.ra"),
+    ("area", {"cone": {"ra": 0, "dec": 0}}, "area.cone.radius is missing"),
+    ("area", {"cone": {"ra": 0, "dec": 0, "radius": 1, "x": 1}}, "area.cone.x"),
+    ("area", {"box": {"ra": [1, 0], "dec": [0, 1]}}, "area.box.ra"),
+    ("area", {"box": {"ra": [0, 1], "dec": [1, 0]}}, "area.box.dec"),
+    ("area", {"box": {"ra": [0, 1], "dec": [0, 1, 2]}}, "area.box.dec"),
+    ("area", {"polygon": [[0, 0], [1, 0]]}, "area.polygon"),
+    ("area", {"polygon": [[0, 0], [1, 0], [1, 95]]}, r"area.polygon\[2\].dec"),
+    ("area", {"polygon": [[0, 0], [2, 0], [1, 0.5], [2, 2]]}, "area.polygon"),
+    ("area", {"polygon": [[0, 0], 1, [1, 1]]}, r"area.polygon\[1\]"),
+    ("area", "all", "area"),
+    ("universe", {"galaxy_limit": 99}, "universe.galaxy_limit"),
+    ("universe", {"galaxy_limit": "26"}, "universe.galaxy_limit"),
+    ("universe", {"z_max": 0}, "universe.z_max"),
+    ("universe", {"deep": True}, "universe.deep"),
+    ("mission", {"ladder": ["BEST"]}, "mission.ladder"),
+    ("mission", {"ladder": ["CBE", "CBE"]}, "mission.ladder"),
+    ("mission", {"ladder": "CBE"}, "mission.ladder"),
+    ("mission", {"overrides": {"vis.gain": 3}}, "mission.overrides.vis.gain"),
+    ("mission", {"overrides": {"vis.gain": {"value": 3.0}}}, "mission.overrides.vis.gain.unit"),
+    ("mission", {"overrides": {"vis.gain": {"value": float("inf"), "unit": ""}}}, "vis.gain.value"),
+    ("fluxes", {"bands": "r"}, "fluxes.bands"),
+    ("products", {"truth": ["everything"]}, "products.truth"),
+    ("pointing", {}, "pointing wants a list"),
+    ("pointing", [3], r"pointing\[0\]"),
+    ("pointing.channel", "RADIO", r"pointing\[0\].channel"),
+    ("pointing.ra", "north", r"pointing\[0\].ra"),
+    ("pointing.dec", -91, r"pointing\[0\].dec"),
+    ("pointing.mjd", 0, r"pointing\[0\].mjd"),
+    ("pointing.exposure_time_s", -1, r"pointing\[0\].exposure_time_s"),
+    ("pointing.detectors", "3-4", r"pointing\[0\].detectors"),
+    ("pointing.camera", "../vis", "name"),
+    ("pointing.colour", 1, r"pointing\[0\].colour"),
+]
+
+
+def with_(key, value):
+    table = copy.deepcopy(GOOD)
+    if key.startswith("pointing."):
+        table["pointing"][0][key.partition(".")[2]] = value
+    else:
+        table[key] = value
+    return table
+
+
+@pytest.mark.parametrize(("key", "value", "words"), BAD)
+def test_bad_requests_are_refused_with_their_key(key, value, words):
+    with pytest.raises(BadInput, match=words) as caught:
+        request.from_table(with_(key, value))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["name", "seed"])
+def test_what_must_be_there(key):
+    table = copy.deepcopy(GOOD)
+    del table[key]
+    with pytest.raises(BadInput, match=f"{key} is missing"):
+        request.from_table(table)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name = ", "Invalid value"),
+        ("name = 'x'\nname = 'y'", "overwrite a value"),
+        ("\ud800", "surrogates|codec"),
+        ("x = " + "[" * 100_000, "."),
+        ("# " + "x" * 2_000_000, "larger than"),
+    ],
+)
+def test_files_that_are_no_request(tmp_path, text, words):
+    path = tmp_path / "r.toml"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(BadInput, match=words) as caught:
+        request.parse(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(BadInput, match="no such file"):
+        request.parse(tmp_path / "x.toml")
+
+
+def test_the_demo():
+    demo = request.parse(DEMO)
+    assert demo.bands == ("euclid_vis", "lsst_r")
+    assert demo.pointings[0].detectors == ("3-4",)
+    assert demo.accuracy == request.SURVEY
+    assert set(demo.facts("seed", "universe")) == {"seed", "universe"}
+
+
+def test_areas_are_the_same_sky_in_any_form():
+    west = request.from_table(with_("area", {"box": {"ra": [-0.5, 0.5], "dec": [-0.5, 0.5]}}))
+    polygon = request.from_table(with_("area", {"polygon": [[359.5, -0.5], [0.5, -0.5], [0.5, 0.5], [359.5, 0.5]]}))
+    assert west.area == polygon.area
+    assert west.area.cells() == polygon.area.cells()

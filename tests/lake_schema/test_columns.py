@@ -1,0 +1,103 @@
+"""Declarations: what they promise about schemas, metadata and values."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from astropy import units
+from astropy.io.votable.ucd import check_ucd
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema import parquet
+from lake_schema.columns import Column, Table, round_mantissa
+from lake_schema.errors import BadInput
+from lake_schema.tables import declared
+from tests.universe import TOY, rows_of
+
+TABLES = declared(["euclid_vis", "lsst_r"])
+COLUMNS = [pytest.param(column, id=f"{t.name}.{column.name}") for t in TABLES for column in t.columns]
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+def test_unit_and_ucd_are_standard(column):
+    units.Unit(column.unit, parse_strict="raise")
+    assert column.doc
+    if column.ucd:
+        assert check_ucd(column.ucd, check_controlled_vocabulary=True), column.ucd
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)
+def test_metadata_survives_into_the_file(table, tmp_path):
+    parquet.write(tmp_path / "x.parquet", rows_of(table, 5), table)
+    assert pq.read_schema(tmp_path / "x.parquet").equals(table.arrow(), check_metadata=True)
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)
+def test_values_survive_the_encodings(table, tmp_path):
+    rows = rows_of(table, 1000)
+    parquet.write(tmp_path / "x.parquet", rows, table)
+    assert parquet.dataset([tmp_path / "x.parquet"], table.arrow()).to_table().equals(rows)
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)
+def test_markdown_names_every_column(table):
+    page = table.markdown()
+    assert all(f"| `{name}` |" in page for name in table.names)
+
+
+def build(**changes):
+    good = {"id": [1, 2], "ra": [0.0, 1.0], "dec": [0.0, 1.0], "_healpix_29": [0, 1], "flux": np.zeros(2)}
+    return TOY.build({**good, **changes})
+
+
+def test_build_refuses_by_name():
+    for changes, words in (
+        ({"speed": [1, 2]}, "no column speed"),
+        ({"id": np.array([1.5, 2.5])}, "column id wants int64"),
+        ({"ra": ["a", "b"]}, "column ra wants float64"),
+        ({"flux": [None, 1.0]}, "column flux has 1 missing"),
+    ):
+        with pytest.raises(BadInput, match=words):
+            build(**changes)
+    with pytest.raises(BadInput, match="flux is missing"):
+        TOY.build({"id": [1], "ra": [0.0], "dec": [0.0], "_healpix_29": [0]})
+
+
+def test_masked_values_become_null_only_where_declared():
+    table = Table("t", 1, (Column("id", "int64"), Column("x", "float32", nullable=True)), "t")
+    rows = table.build({"id": [1, 2], "x": np.ma.masked_array([1.0, np.nan], [False, True])})
+    assert rows["x"].to_pylist() == [1.0, None]
+    assert table.build({"id": [1]})["x"].null_count == 1
+
+
+def test_small_integers_do_not_wrap():
+    table = Table("t", 1, (Column("k", "int8"),), "t", key=("k",))
+    with pytest.raises(BadInput, match="does not fit int8"):
+        table.build({"k": np.array([300])})
+
+
+def test_a_column_declared_twice_is_refused():
+    with pytest.raises(BadInput, match="twice"):
+        Table("t", 1, (Column("id", "int64"), Column("id", "int64")), "t")
+
+
+@given(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=1), st.integers(1, 22))
+def test_rounding_keeps_its_relative_error(values, bits):
+    given_values = np.array(values, np.float32)
+    # The largest numbers round up to infinity; subnormal ones have fewer bits to begin with.
+    normal = (np.abs(given_values) < 1e38) & (np.abs(given_values) > 1e-37)
+    rounded = round_mantissa(given_values, bits)
+    error = np.abs(rounded.astype(float) - given_values.astype(float))[normal]
+    assert (error <= 2.0 ** -(bits + 1) * np.abs(given_values[normal].astype(float))).all()
+    assert np.array_equal(round_mantissa(rounded, bits)[normal], rounded[normal])
+
+
+def test_rounding_leaves_infinities():
+    values = np.array([np.inf, -np.inf, np.nan], np.float32)
+    assert np.array_equal(round_mantissa(values, 5), values, equal_nan=True)
+
+
+def test_list_columns_are_lists_of_numbers():
+    table = Table("t", 1, (Column("id", "int64"), Column("cells", "list<int64>")), "t")
+    assert pa.types.is_list(table.build({"id": [1], "cells": [[1, 2]]}).schema.field("cells").type)

@@ -1,0 +1,120 @@
+"""The sphere, against astropy, healpy and closed forms."""
+
+import astropy.units as u
+import healpy as hp
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema import sky
+from lake_schema.errors import BadInput, OutOfRange
+
+RA = st.floats(-360, 720)
+DEC = st.floats(-90, 90)
+
+
+@given(RA, DEC, st.floats(0, 30), st.integers(0, 8), st.integers(0, 2**32 - 1))
+def test_a_cone_never_misses_a_cell(ra, dec, radius, order, seed):
+    rng = np.random.default_rng(seed)
+    around = SkyCoord(ra % 360 * u.deg, dec * u.deg).directional_offset_by(
+        rng.uniform(0, 360, 200) * u.deg, radius * np.sqrt(rng.random(200)) * u.deg
+    )
+    cells = sky.cells_in_cone(ra, dec, radius, order)
+    assert np.isin(sky.cell_of(around.ra.deg, around.dec.deg, order), cells).all()
+    assert (np.diff(cells) > 0).all()
+
+
+def test_a_cone_takes_few_cells_too_many():
+    cells = sky.cells_in_cone(53.1, -27.8, 0.5, 8)
+    centres = np.array([sky.cell_centre(8, c) for c in cells])
+    assert (sky.separation(*centres.T, 53.1, -27.8) < 0.5 + 1.3 * sky.cell_radius(8)).all()
+
+
+@given(RA, st.floats(-89, 89), st.floats(0.01, 5), st.integers(3, 12), st.integers(0, 9), st.integers(0, 2**32 - 1))
+def test_a_polygon_never_misses_a_cell(ra, dec, size, corners, order, seed):
+    rng = np.random.default_rng(seed)
+    centre = SkyCoord(ra % 360 * u.deg, dec * u.deg)
+    ring = centre.directional_offset_by(np.arange(corners) * 360 / corners * u.deg, size * u.deg)
+    vectors = ring.cartesian.xyz.value.T
+    weights = rng.dirichlet(np.ones(corners), 100)
+    inside = weights @ vectors
+    lon, lat = hp.vec2ang(inside, lonlat=True)
+    cells = sky.cells_in_polygon(np.stack([ring.ra.deg, ring.dec.deg], 1), order)
+    assert np.isin(sky.cell_of(lon, lat, order), cells).all()
+
+
+def test_bad_polygons_are_refused():
+    for polygon, words in (
+        ([[0, 0], [1, 0]], "at least 3"),
+        ([[0, 0], [1, 0], [1, 0]], "convex"),
+        ([[0, 0], [2, 0], [1, 0.5], [2, 2]], "convex"),
+    ):
+        with pytest.raises(BadInput, match=words):
+            sky.cells_in_polygon(polygon, 5)
+
+
+@given(RA, DEC, RA, DEC)
+def test_separation_agrees_with_astropy(ra1, dec1, ra2, dec2):
+    theirs = SkyCoord(ra1 * u.deg, dec1 * u.deg).separation(SkyCoord(ra2 * u.deg, dec2 * u.deg)).deg
+    assert sky.separation(ra1, dec1, ra2, dec2) == pytest.approx(theirs, abs=1e-12, rel=1e-10)
+
+
+@pytest.mark.parametrize("tiny", [1e-9 / 3600, 1e-6, 1.0])
+def test_separation_at_both_ends(tiny):
+    assert sky.separation(10, 0, 10, tiny) == pytest.approx(tiny, rel=1e-12)
+    assert sky.separation(0, 0, 180, tiny) == pytest.approx(180 - tiny, rel=1e-12)
+    assert sky.separation(0, 90, 123, 90) == pytest.approx(0, abs=1e-13)
+    assert sky.separation(0, 90, 77, -90) == pytest.approx(180)
+
+
+@given(RA, DEC)
+def test_galactic_agrees_with_astropy(ra, dec):
+    ours = SkyCoord(*sky.galactic(ra, dec), unit="deg", frame="galactic")
+    assert ours.separation(SkyCoord(ra, dec, unit="deg").galactic).arcsec < 0.05
+
+
+@pytest.mark.parametrize(("ra", "dec"), [(np.nan, 0), (np.inf, 0), (0, np.nan), (0, 90.0000001), (0, -91)])
+def test_positions_that_are_none_are_refused(ra, dec):
+    with pytest.raises(OutOfRange):
+        sky.healpix_29([ra], [dec])
+
+
+def test_right_ascension_is_wrapped():
+    ra, _ = sky.checked([-1e-20, -1e-9, 0, 360, 720, 359.5], [0] * 6)
+    assert ((ra >= 0) & (ra < 360)).all()
+    assert ra[[0, 2, 3, 4]].tolist() == [0, 0, 0, 0]
+    assert ra[1] == pytest.approx(360)
+
+
+@pytest.mark.parametrize("cell", [0, 1607, 8191])
+def test_random_positions_are_uniform_and_sorted(cell):
+    index, ra, dec = sky.random_in_cell(5, cell, 20_000, np.random.default_rng(1))
+    assert (np.diff(index) >= 0).all()
+    assert (sky.cell_of(ra, dec, 5) == cell).all()
+    assert np.array_equal(sky.healpix_29(ra, dec), index)
+    counts = np.bincount(sky.cell_of(ra, dec, 7) - 16 * cell, minlength=16)
+    assert ((counts - 1250) ** 2 / 1250).sum() < 40  # chi2 of 15 degrees of freedom: 40 is one in 2000
+
+
+def test_cells_tile_the_sphere():
+    assert sky.cell_area(5) * 12 * 4**5 == pytest.approx(4 * np.pi * np.degrees(1) ** 2)
+    first, last = sky.cell_range(8, 7)
+    assert sky.parent([first, last - 1], 29, 8).tolist() == [7, 7]
+
+
+@pytest.mark.parametrize("cell", [0, 1607, 12287, 4095])
+def test_the_margin_holds_all_within_ten_arcsec(cell):
+    """Points just outside a cell's edge, at random around it, must lie in its rim."""
+    rim = sky.margin_cells(5, cell, 13)
+    assert (sky.parent(rim, 13, 5) != cell).all()
+    edge = hp.boundaries(32, cell, step=500, nest=True).T
+    lon, lat = hp.vec2ang(edge, lonlat=True)
+    rng = np.random.default_rng(cell)
+    near = SkyCoord(lon, lat, unit="deg").directional_offset_by(
+        rng.uniform(0, 360, lon.size) * u.deg, rng.uniform(0, 10, lon.size) * u.arcsec
+    )
+    outside = sky.cell_of(near.ra.deg, near.dec.deg, 5) != cell
+    assert outside.sum() > 500
+    assert np.isin(sky.cell_of(near.ra.deg[outside], near.dec.deg[outside], 13), rim).all()

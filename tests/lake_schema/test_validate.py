@@ -1,0 +1,112 @@
+"""Validation: every declared table, every column, every kind of wrong."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from lake_schema import validate
+from lake_schema.errors import BadInput
+from lake_schema.tables import declared
+from tests.universe import TOY, rows_of, toy_rows
+
+TABLES = declared(["euclid_vis", "lsst_r"])
+COLUMNS = [pytest.param(t, c, id=f"{t.name}.{c.name}") for t in TABLES for c in t.columns]
+FLOATS = [pytest.param(t, c, id=f"{t.name}.{c.name}") for t in TABLES for c in t.columns if c.is_float]
+BOUNDED = [p for p in COLUMNS if p.values[1].lo is not None or p.values[1].hi is not None]
+
+
+def refused(rows, table, *words):
+    found = validate.violations(rows, table)
+    assert found, "nothing was found wrong"
+    assert all(word in found[0] for word in (table.name, *words)), found[0]
+    with pytest.raises(BadInput):
+        validate.check(rows, table)
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)
+def test_good_rows_pass(table):
+    assert validate.violations(rows_of(table, 50), table) == []
+    assert validate.violations(table.empty(), table) == []
+
+
+@pytest.mark.parametrize(("table", "column"), COLUMNS)
+def test_a_missing_renamed_or_extra_column(table, column):
+    rows = rows_of(table, 3)
+    refused(rows.drop_columns([column.name]), table, column.name, "missing")
+    names = [f"{n}_" if n == column.name else n for n in rows.column_names]
+    refused(rows.rename_columns(names), table, column.name, "missing")
+    refused(rows.append_column("extra", pa.array([1, 2, 3])), table, "extra")
+
+
+@pytest.mark.parametrize(("table", "column"), COLUMNS)
+def test_a_wrong_type_unit_or_nullability(table, column):
+    rows = rows_of(table, 3)
+    place = rows.column_names.index(column.name)
+    field = rows.schema.field(place)
+    other = pa.float64() if field.type != pa.float64() else pa.float32()
+    refused(rows.set_column(place, field.with_type(other), pa.array([0, 0, 0], other)), table, column.name, "wanted")
+    metadata = {**field.metadata, b"unit": b"furlong"}
+    refused(rows.set_column(place, field.with_metadata(metadata), rows.column(place)), table, column.name, "furlong")
+    flipped = field.with_nullable(not field.nullable)
+    refused(rows.set_column(place, flipped, rows.column(place)), table, column.name, "nullable")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize(("table", "column"), FLOATS)
+def test_a_number_that_is_none(table, column, bad):
+    refused(changed(rows_of(table, 3), column, bad), table, column.name, "row 1")
+
+
+@pytest.mark.parametrize(("table", "column"), BOUNDED)
+def test_a_value_out_of_bounds(table, column):
+    limits = np.finfo(column.type) if column.is_float else np.iinfo(column.type.removeprefix("list<").removesuffix(">"))
+    for bound, beyond in ((column.lo, limits.min), (column.hi, limits.max)):
+        if bound is not None and beyond != bound:
+            refused(changed(rows_of(table, 3), column, beyond), table, column.name, "row 1")
+
+
+@pytest.mark.parametrize(("table", "column"), BOUNDED)
+def test_the_bounds_themselves_are_legal(table, column):
+    for bound in (column.lo, column.hi):
+        if bound is not None and column.name not in table.key and not column.codes:
+            value = bound if column.is_float else int(bound)
+            assert validate.violations(changed(rows_of(table, 3), column, value), table) == []
+
+
+@pytest.mark.parametrize(("table", "column"), COLUMNS)
+def test_a_missing_value_only_where_declared(table, column):
+    rows = rows_of(table, 3)
+    place = rows.column_names.index(column.name)
+    values = rows.column(place).to_pylist()
+    values[1] = None
+    holed = rows.set_column(place, rows.schema.field(place), pa.array(values, rows.schema.field(place).type))
+    if column.nullable:
+        assert validate.violations(holed, table) == []
+    else:
+        refused(holed, table, column.name, "row 1")
+
+
+def changed(rows, column, value):
+    place = rows.column_names.index(column.name)
+    field = rows.schema.field(place)
+    values = rows.column(place).to_pylist()
+    values[1] = [value] if column.type.startswith("list") else value
+    return rows.set_column(place, field, pa.array(values, field.type))
+
+
+def test_a_duplicate_id_names_both_rows():
+    rows = toy_rows(1607, 10)
+    ids = rows["id"].to_pylist()
+    ids[7] = ids[2]
+    refused(rows.set_column(0, rows.schema.field(0), pa.array(ids)), TOY, "rows 2 and 7")
+
+
+def test_an_unknown_code():
+    exposures = next(t for t in TABLES if t.name == "exposures")
+    refused(changed(rows_of(exposures, 3), exposures.column("channel"), "RADIO"), exposures, "channel", "RADIO")
+
+
+def test_a_compound_key():
+    tasks = next(t for t in TABLES if t.name == "tasks")
+    rows = rows_of(tasks, 3)
+    refused(pa.concat_tables([rows, rows]), tasks, "rows 0 and 3")
