@@ -63,7 +63,7 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) 
     """The arrays that `make()` returns, made once per key and afterwards mapped from disc, read-only.
 
     name : legible beginning of the folder's name;  key : from content_key
-    make : called only if nothing usable is stored; where two processes race, both use what the first one published
+    make : called only if nothing usable is stored; of processes that race, all use what the first published
     """
     folder = cache_dir() / f"{layout.name(name)}-{layout.name(key[:_KEY_LENGTH])}"
     stored = _load(folder)

@@ -2,7 +2,7 @@
 
 Image           an image with its header cards
 write_images    images -> one file: checksums, the same bytes for the same input
-read_images     a file -> images; checksums are demanded and verified, sizes are checked before any data is read
+read_images     a file -> images; checksums are demanded and verified, sizes checked before data
 table_to_fits   an Arrow table -> a binary table, units and UCDs from the table's declaration
 """
 
@@ -30,10 +30,28 @@ Card = tuple[str, str | int | float | bool, str]
 
 # A header that promises more than this is a mistake or an attack; the largest product is far below.
 MOST_BYTES = 8 << 30
-_CHECKSUM_COMMENTS = {"CHECKSUM": "HDU checksum", "DATASUM": "data unit checksum"}
-_STRUCTURE = {"SIMPLE", "XTENSION", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "NAXIS3", "EXTEND", "PCOUNT", "GCOUNT"}
+_STRUCTURE = {
+    "SIMPLE",
+    "XTENSION",
+    "BITPIX",
+    "NAXIS",
+    "NAXIS1",
+    "NAXIS2",
+    "NAXIS3",
+    "EXTEND",
+    "PCOUNT",
+    "GCOUNT",
+}
 _STRUCTURE |= {"BZERO", "BSCALE", "EXTNAME", "CHECKSUM", "DATASUM"}
-_TABLE_FORMATS = {"int64": "K", "int32": "J", "int16": "I", "int8": "I", "float64": "D", "float32": "E", "bool": "L"}
+_TABLE_FORMATS = {
+    "int64": "K",
+    "int32": "J",
+    "int16": "I",
+    "int8": "I",
+    "float64": "D",
+    "float32": "E",
+    "bool": "L",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +68,7 @@ class Image:
 
 
 def write_images(path: Path, images: Sequence[Image]) -> None:
-    """Write a file of images, the first as the primary one; replaces `path` in one rename, leaves nothing on failure."""
+    """Write a file of images, the first as the primary one; replaces `path` in one rename."""
     if not images:
         raise BadInput(f"{path}: a FITS file wants at least one image")
     units = [_primary(images[0]), *(_extension(image) for image in images[1:])]
@@ -61,7 +79,8 @@ def read_images(path: Path, most_bytes: int = MOST_BYTES) -> list[Image]:
     """Read every image of a file that `write_images` wrote.
 
     most_bytes : refuse a file whose headers promise more data
-    Errors     : Damaged for a bad or missing checksum and for a file that is cut short; BadInput for one too large
+    Errors     : Damaged for a bad or missing checksum and for a file that is cut short; BadInput for one too
+                 large
     """
     with _refusing(path):
         with fits.open(path, memmap=False, lazy_load_hdus=True) as units:
@@ -74,13 +93,15 @@ def read_images(path: Path, most_bytes: int = MOST_BYTES) -> list[Image]:
 
 
 def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
-    """Export rows of a declared table as a binary table extension; list columns are left out, as FITS cannot name their unit.
+    """Export rows of a declared table as a binary table extension; columns of lists are left out.
 
     table : Arrow table with (some of) the declared columns; null becomes NaN, or TNULL for integers
     """
     columns = [declared.column(name) for name in table.column_names]
     kept = [c for c in columns if not c.type.startswith("list")]
-    unit = fits.BinTableHDU.from_columns([_fits_column(c, table.column(c.name)) for c in kept], name=declared.name.upper())
+    unit = fits.BinTableHDU.from_columns(
+        [_fits_column(c, table.column(c.name)) for c in kept], name=declared.name.upper()
+    )
     for number, column in enumerate(kept, start=1):
         if column.ucd:
             unit.header[f"TUCD{number}"] = (column.ucd, "IVOA UCD")
@@ -105,9 +126,14 @@ def _dressed(unit: Any, image: Image) -> Any:
         if keyword.upper() in _STRUCTURE:
             raise BadInput(f"FITS card {keyword} is set by the writer")
         try:
-            unit.header.append(fits.Card(keyword, value, comment), end=True)
-        except ValueError as error:
-            raise BadInput(f"FITS card {keyword}: {error}") from None
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", AstropyUserWarning)
+                card = fits.Card(keyword, value, comment)
+                # A card is judged when it is formatted; astropy would cut a long comment and go on.
+                str(card)
+        except (ValueError, AstropyUserWarning) as error:
+            raise BadInput(f"FITS card {keyword}: {' '.join(str(error).split())}") from None
+        unit.header.append(card, end=True)
     if image.name:
         unit.header["EXTNAME"] = image.name
     return unit
@@ -122,9 +148,8 @@ def _big_enough(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def _write(path: Path, units: fits.HDUList) -> None:
     # The comments that astropy would add hold the time of day.
     for unit in units:
-        unit.add_checksum(when=_CHECKSUM_COMMENTS["CHECKSUM"])
-        for keyword, comment in _CHECKSUM_COMMENTS.items():
-            unit.header.comments[keyword] = comment
+        unit.add_datasum(when="checksum of the data")
+        unit.add_checksum(when="checksum of header and data", override_datasum=True)
     handle, temporary = tempfile.mkstemp(suffix=".part", prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as stream:
@@ -194,6 +219,8 @@ def _image(unit: Any) -> Image:
     if data is not None:
         data = data.astype(data.dtype.newbyteorder("="), copy=False)
     cards = tuple(
-        (card.keyword, card.value, card.comment) for card in unit.header.cards if card.keyword not in _STRUCTURE
+        (card.keyword, card.value, card.comment)
+        for card in unit.header.cards
+        if card.keyword not in _STRUCTURE
     )
     return Image(data, cards, unit.header.get("EXTNAME", ""))

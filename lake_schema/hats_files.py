@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,9 +23,10 @@ _MARGIN_ORDER = 13
 _SKYMAP_ORDER = 8
 # Above this many files the merged footers of `_metadata` outgrow their use.
 _MOST_FILES_IN_METADATA = 1000
-_CELL = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet")
 # The properties want a date; a clock's would make equal lakes differ.
 _DATE = "2000-01-01T00:00UTC"
+
+Cell = tuple[int, int]  # order, nested cell
 
 
 def write(version: Path, table: Table, parts: Sequence[tuple[str, int]]) -> None:
@@ -34,7 +34,7 @@ def write(version: Path, table: Table, parts: Sequence[tuple[str, int]]) -> None
 
     parts : (HATS path below dataset/, rows) of each cell
     """
-    cells = [cell_of_part(name) for name, _ in parts]
+    cells = [layout.cell_of_file(name) for name, _ in parts]
     root, margin = version / table.name, version / f"{table.name}_margin"
     files = {cell: root / "dataset" / name for cell, (name, _) in zip(cells, parts, strict=True)}
     margin_rows = _write_margin(margin, table, files)
@@ -43,30 +43,19 @@ def write(version: Path, table: Table, parts: Sequence[tuple[str, int]]) -> None
     _write_collection(version, table)
 
 
-def cell_of_part(name: str) -> tuple[int, int]:
-    """HATS path below dataset/ -> (order, cell)."""
-    match = _CELL.fullmatch(name)
-    if match is None:
-        raise ValueError(f"{name} is not a cell's path")
-    return int(match[1]), int(match[2])
-
-
-def _write_margin(folder: Path, table: Table, files: dict[tuple[int, int], Path]) -> int:
+def _write_margin(folder: Path, table: Table, files: dict[Cell, Path]) -> int:
+    orders = sorted({order for order, _ in files})
     total = 0
     for order, cell in files:
         rim = sky.margin_cells(order, cell, _MARGIN_ORDER)
-        pieces = [_rows_in(path, rim) for other, path in files.items() if _touch(other, rim)]
+        around = [(o, int(c)) for o in orders for c in np.unique(sky.parent(rim, _MARGIN_ORDER, o))]
+        pieces = [_rows_in(files[other], rim) for other in around if other in files]
         rows = pa.concat_tables([table.empty(), *pieces]).sort_by([("_healpix_29", "ascending"), ("id", "ascending")])
         target = folder / "dataset" / layout.cell_file(order, cell)
         target.parent.mkdir(parents=True, exist_ok=True)
         parquet.write(target, rows, table)
         total += rows.num_rows
     return total
-
-
-def _touch(cell: tuple[int, int], rim: sky.Int) -> bool:
-    order, index = cell
-    return bool((sky.parent(rim, _MARGIN_ORDER, order) == index).any())
 
 
 def _rows_in(path: Path, rim: sky.Int) -> pa.Table:
@@ -89,7 +78,7 @@ def _rows_in(path: Path, rim: sky.Int) -> pa.Table:
 
 
 def _write_catalogue(
-    root: Path, table: Table, cells: list[tuple[int, int]], rows: int, files: dict[tuple[int, int], Path] | None
+    root: Path, table: Table, cells: list[Cell], rows: int, files: dict[Cell, Path] | None
 ) -> None:
     from hats.catalog import TableProperties
     from hats.catalog.partition_info import PartitionInfo
@@ -121,7 +110,7 @@ def _write_catalogue(
     TableProperties(**facts, **about).to_properties_file(root)
 
 
-def _skymap(files: dict[tuple[int, int], Path]) -> sky.Int:
+def _skymap(files: dict[Cell, Path]) -> sky.Int:
     counts = np.zeros(12 << (2 * _SKYMAP_ORDER), np.int64)
     for path in files.values():
         index = pq.read_table(path, columns=["_healpix_29"], partitioning=None)["_healpix_29"].to_numpy()

@@ -17,6 +17,7 @@ from pathlib import Path
 from lake_schema.errors import BadInput
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
+_CELL = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet", re.ASCII)
 _REMOTE = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://")
 
 
@@ -62,6 +63,14 @@ def runs(root: Path) -> Path:
 def cell_file(order: int, cell: int) -> str:
     """Path of a cell's file below dataset/, as HATS wants it."""
     return f"Norder={order}/Dir={cell // 10_000 * 10_000}/Npix={cell}.parquet"
+
+
+def cell_of_file(part: str) -> tuple[int, int]:
+    """The order and cell of a path that `cell_file` made."""
+    match = _CELL.fullmatch(part)
+    if match is None or cell_file(int(match[1]), int(match[2])) != part:
+        raise BadInput(f"{part} is not the path of a cell")
+    return int(match[1]), int(match[2])
 
 
 def within(root: Path, path: Path) -> Path:

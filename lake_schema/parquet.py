@@ -1,11 +1,12 @@
 """Parquet files as the lake writes and reads them: declared encodings, sorted rows, page checksums on both ways.
 
 A changed byte goes through pyarrow's, Spark's, pandas', DuckDB's and lsdb's own readers as a wrong number; through `dataset`
-and `table` here it is an error that names the file.
+here, after its tail was compared with the manifest's, it is an error that names the file.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,3 +32,22 @@ def dataset(paths: Sequence[Path], schema: pa.Schema) -> ds.FileSystemDataset:
     """The files as one Arrow dataset, in the order given, every page checked as it is read."""
     names = [str(path) for path in paths]
     return ds.FileSystemDataset.from_paths(names, schema=schema, format=_FORMAT, filesystem=LocalFileSystem())
+
+
+def tail_start(path: Path) -> int:
+    """Where the pages of a file end, and the page index and the footer begin."""
+    about = pq.read_metadata(path)
+    ends = [4]  # the magic number
+    for group in range(about.num_row_groups):
+        for column in range(about.num_columns):
+            chunk = about.row_group(group).column(column)
+            first = chunk.dictionary_page_offset if chunk.has_dictionary_page else chunk.data_page_offset
+            ends.append(first + chunk.total_compressed_size)
+    return max(ends)
+
+
+def tail_sha256(path: Path, start: int) -> str:
+    """sha256 of a file from a byte on, hexadecimal."""
+    with path.open("rb") as stream:
+        stream.seek(start)
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -23,7 +23,7 @@ BOLTZMANN_ERG_K = 1.380649e-16
 # Oke & Gunn 1983: m_AB = -2.5 log10(f_nu / erg s-1 cm-2 Hz-1) - 48.6.
 AB_CGS = 48.6
 UJY_CGS = 1e-29
-# The same zero point for microjansky: 72.5 - 48.6; held as whole part and rest so that f_nu_of_mag loses no digits.
+# The same zero point for microjansky, 72.5 - 48.6. Whole part and rest apart, f_nu_of_mag loses no digits.
 AB_UJY = 23.9
 _AB_UJY_WHOLE, _AB_UJY_REST = 24.0, 0.1
 
@@ -43,14 +43,14 @@ def f_nu_of_mag(mag_ab: npt.ArrayLike) -> Float:
     bad = ~((mag >= MAG_LO) & (mag <= MAG_HI))
     if bad.any():
         raise OutOfRange("mag_ab", float(mag[bad].ravel()[0]), MAG_LO, MAG_HI)
-    # The whole decades come out first: what remains is small, so its rounding does not grow with the magnitude.
+    # The whole decades come out first: the rounding of what remains does not grow with the magnitude.
     decades = np.rint((_AB_UJY_WHOLE - mag) / 2.5)
     rest = (_AB_UJY_WHOLE - 2.5 * decades) - mag - _AB_UJY_REST
     return np.asarray(10.0**decades * 10.0 ** (rest / 2.5))
 
 
 def mag_of_f_nu(f_nu: npt.ArrayLike) -> Float:
-    """f_nu in microjansky -> AB magnitude; zero gives +inf.  Errors: OutOfRange for NaN and negative values."""
+    """f_nu in microjansky -> AB magnitude; 0 gives +inf.  Errors: OutOfRange for NaN and negatives"""
     flux = np.asarray(f_nu, float)
     bad = ~((flux >= 0.0) & (flux < np.inf))
     if bad.any():

@@ -3,21 +3,25 @@
     m_b = M_r + DM(z) - 2.5 log10(ratio)        (M_r = M(0.1r) - 5 log10 h, DM for H0 = 100)
 
 build       the table of ln(ratio) on redshift, law, template and E(B-V)
+load        the same, from the cache where it is there
 ln_ratio    read it for one component of an SED
 offset      m_b - M_r - DM(z) of two-component SEDs
 brightest   the smallest offset that any SED has, against redshift
 
-A small table for the catalogue's own needs: selection in one band, and the reference magnitude. Fluxes are not computed from it.
-Ref: Hogg et al. 2002, arXiv:astro-ph/0210394, eq. 8 and 13
+A small table for the catalogue's own needs: selection in one band, and the reference magnitude. Fluxes are
+not computed from it.
+Ref: Hogg et al. 2002, arXiv:astro-ph/0210394
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from jobs.cache import cached_arrays, content_key
 from jobs.fluxes import extinction, passbands
 from jobs.fluxes.templates import Library
 
@@ -25,14 +29,14 @@ Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 
 REFERENCE_BAND = "sdss_r01"
-# Uniform steps of ln(1 + z), and Chebyshev-Lobatto nodes of E(B-V): chosen so that the errors stated below hold.
+# Uniform steps of ln(1 + z), and Chebyshev-Lobatto nodes of E(B-V): the errors stated below hold with these.
 _STEP = 0.005
 _EBV_NODES = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Sed:
-    """Two-component spectra of n galaxies, the columns sed_k, frac_k, ext_law_k, ebv_k of table `galaxies`."""
+    """Two-component spectra of n galaxies: columns sed_k, frac_k, ext_law_k, ebv_k of table `galaxies`."""
 
     template_1: Int
     frac_1: Float
@@ -44,7 +48,12 @@ class Sed:
     def part(self, keep: npt.NDArray[np.bool_]) -> Sed:
         """The galaxies that are kept."""
         return Sed(
-            self.template_1[keep], self.frac_1[keep], self.template_2[keep], self.frac_2[keep], self.law[keep], self.ebv[keep]
+            self.template_1[keep],
+            self.frac_1[keep],
+            self.template_2[keep],
+            self.frac_2[keep],
+            self.law[keep],
+            self.ebv[keep],
         )
 
 
@@ -79,6 +88,23 @@ def build(library: Library, band: str, z_max: float, ebv_max: float) -> BandRati
     return BandRatios(band, ebv, np.ascontiguousarray(values, np.float32))
 
 
+def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatios:
+    """`build`, kept in the cache under everything that it depends on."""
+    curves = [passbands.load(name) for name in (band, REFERENCE_BAND)]
+    responses = [array for curve in curves for array in (curve.wavelength, curve.response)]
+    laws = extinction.laws(library.wavelength)
+    key = content_key(
+        Path(__file__).read_bytes(), z_max, ebv_max, library.wavelength, library.flux, laws, *responses
+    )
+
+    def arrays() -> dict[str, npt.NDArray[np.generic]]:
+        made = build(library, band, z_max, ebv_max)
+        return {"ebv": made.ebv, "values": made.values}
+
+    found = cached_arrays(f"band_ratios_{band}", key, arrays)
+    return BandRatios(band, found["ebv"], found["values"])
+
+
 def dusty(library: Library, ebv: Float) -> Float:
     """Transmission of laws 1 .. 4 at each E(B-V), [4, e, lambda] on the library's wavelengths."""
     k = extinction.laws(library.wavelength)[1:]
@@ -86,7 +112,10 @@ def dusty(library: Library, ebv: Float) -> Float:
 
 
 def band_weights(library: Library, band: str, z: float) -> Float:
-    """Weights[lambda] with which rest-frame f_lambda sums to the observed band-averaged f_nu: f_lambda(lambda / (1+z)) / (1+z)."""
+    """Weights[lambda] with which rest-frame f_lambda sums to the observed, band-averaged f_nu.
+
+    The observed spectrum is f_lambda(lambda / (1 + z)) / (1 + z).
+    """
     curve = passbands.load(band)
     weights = passbands.weights(curve) / (1.0 + z)
     at = curve.wavelength / (1.0 + z) - library.wavelength[0]

@@ -61,7 +61,7 @@ def embedded(seed: int, model: Cosecant) -> npt.NDArray[np.float32]:
     field = _gaussian_field(seed, model)
     sin_b = np.maximum(np.abs(np.sin(np.radians(b))), model.sin_b_min)
     ebv = model.ebv_pole / sin_b * np.exp(field - 0.5 * model.sigma**2)
-    return (model.r_v * np.minimum(ebv, model.ebv_max)).astype(np.float32)
+    return np.asarray((model.r_v * np.minimum(ebv, model.ebv_max)).astype(np.float32))
 
 
 def a_v(sky_map: npt.NDArray[np.float32], ra: Float, dec: Float) -> Float:
@@ -76,7 +76,7 @@ def a_v_at(to_infinity: Float, distance: Float, b: npt.ArrayLike, dust: Layer, s
     to_infinity : [n] mag; distance : [n] pc; b : Galactic latitude, deg; sin_b_min : as in the map
     """
     sin_b = np.maximum(np.abs(np.sin(np.radians(np.asarray(b, float)))), sin_b_min)
-    return -to_infinity * np.expm1(-distance * sin_b / dust.height)
+    return np.asarray(-to_infinity * np.expm1(-distance * sin_b / dust.height))
 
 
 def load(seed: int) -> npt.NDArray[np.float32]:

@@ -32,13 +32,13 @@ _Z_MAX_LIMIT = 6.0
 # Resolution of the tables: chosen so that the stated errors hold.
 _SMALLEST_A = 1e-5
 _A_NODES, _A_MARGIN = 128, 0.01
-_LN_X_RANGE, _X_NODES, _X_STEP = (-20.0, 6.4), 6001, 10
+_LN_X_RANGE, _X_NODES, _X_STEP = (-20.0, 6.4), 3001, 5
 _Z_NODES = 3000
 
 
 @dataclass(frozen=True, slots=True)
 class Schechter:
-    """A Schechter function whose three parameters vary with redshift (luminosity_function.toml, [schechter])."""
+    """A Schechter function whose parameters vary with redshift (luminosity_function.toml, [schechter])."""
 
     z_anchor: float
     m_star: float
@@ -61,7 +61,7 @@ class Schechter:
 
 @dataclass(frozen=True, slots=True)
 class Volume:
-    """The redshifts that galaxies fill, and the faintest luminosity drawn (luminosity_function.toml, [volume])."""
+    """The redshifts that are filled, and the faintest M_r drawn (luminosity_function.toml, [volume])."""
 
     z_min: float
     z_max: float
@@ -70,7 +70,10 @@ class Volume:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inverse:
-    """ln x of Gamma(a, x) = g on a grid of a = alpha + 1 (uniform) and ln g (ascending): the luminosity of a number density."""
+    """The luminosity of a number density: ln x of Gamma(a, x) = g, x = L/L*, a = alpha + 1.
+
+    a : [k], uniform; ln_g : [m], ascending; ln_x : [k, m]
+    """
 
     schechter: Schechter
     a: Float
@@ -100,7 +103,10 @@ def schechter() -> Schechter:
 
 
 def volume(z_max: float | None = None) -> Volume:
-    """The redshift range of the embedded universe, with another far end if asked; refuses z_max outside (z_min, 6]."""
+    """The redshift range of the embedded universe, or one with another far end.
+
+    Errors: OutOfRange for z_max outside (z_min, 6]
+    """
     numbers = parameters.section("luminosity_function.toml", "volume")
     if z_max is not None:
         if not numbers["z_min"] < z_max <= _Z_MAX_LIMIT:
@@ -110,7 +116,7 @@ def volume(z_max: float | None = None) -> Volume:
 
 
 def density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
-    """dn/dM at M, z, (Mpc/h)^-3 mag^-1.  Ref: Blanton et al. 2003, eq. 10."""
+    """dn/dM at M, z, (Mpc/h)^-3 mag^-1.  Ref: Schechter 1976"""
     m_star, phi_star, alpha = lf.at(z)
     ln_x = -_LN10_04 * (np.asarray(m, float) - m_star)
     return np.asarray(_LN10_04 * phi_star * np.exp((alpha + 1.0) * ln_x - np.exp(ln_x)))
@@ -126,7 +132,8 @@ def number_density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
 def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
     """Gamma(a, x) for a > -1 and x > 0; scipy's own needs a > 0.
 
-    Error: relative 1e-9 where |a| > 1e-2 and x < 300, 1e-4 where |a| < 1e-5 (tests/jobs/catalogue/test_luminosity_function)
+    Error: relative 1e-9 where |a| > 1e-2 and x < 300, 1e-4 where |a| < 1e-5
+           (tests/jobs/catalogue/test_luminosity_function)
     Ref: Abramowitz & Stegun 1972, 6.5.22: Gamma(a, x) = [Gamma(a + 1, x) - x^a e^-x] / a
     """
     order, at = np.asarray(a, float), np.asarray(x, float)

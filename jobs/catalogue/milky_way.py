@@ -1,13 +1,11 @@
-"""The Milky Way's stars: density laws, luminosity functions, and draws along a line of sight.
+"""The Milky Way's stars: density laws, and draws along a line of sight.
 
 density         of thin disc, thick disc and halo, relative to each one's at the Sun
-luminosity      stars pc^-3 per bin of M_H at the Sun, dwarfs and giants of the three components
 expected        stars of a cell in every (population, shell of distance, bin of M_H)
 draw            Poisson sample of it
 teff, log_g, metallicity   labels of the sample
 
-Ref: Juric et al. 2008 (density), Kroupa 2001 (masses), Pecaut & Mamajek 2013 (mass to luminosity); the numbers and their
-sources are in milky_way.toml. Types later than M9 are brown dwarfs, a population of their own.
+Ref: Juric et al. 2008; the numbers and their sources are in milky_way.toml.
 """
 
 from __future__ import annotations
@@ -16,10 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
 
 from jobs.catalogue import parameters
-from jobs.fluxes import stellar
+from jobs.catalogue.stellar_populations import Sequence, dwarf_sequence, giant_sequence, luminosity
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
@@ -55,42 +52,6 @@ class Halo:
     slope: float
     core: float
     share: float
-
-
-@dataclass(frozen=True, slots=True)
-class MassFunction:
-    """Broken power law of stellar systems (milky_way.toml, [mass_function])."""
-
-    lightest: float
-    reference: float
-    breaks: tuple[float, ...]
-    slopes: tuple[float, ...]
-    local: float
-    heaviest: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Giants:
-    """Luminosity function of giants (milky_way.toml, [giants])."""
-
-    local: float
-    relative: tuple[float, ...]
-    clump_fraction: float
-    clump_m_h: float
-    clump_scatter: float
-    slope: float
-    brightest: float
-    faintest: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sequence:
-    """Temperature (K), log gravity (cm s-2) and log mass (Msun; giants: 0) against M_H (ascending)."""
-
-    m_h: Float
-    teff: Float
-    log_g: Float
-    log_mass: Float
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +100,7 @@ def milky_way() -> MilkyWay:
     sampling = parameters.section(_FILE, "sampling")
     thin, thick = (Disc(**parameters.section(_FILE, name)) for name in ("thin", "thick"))
     halo = Halo(**parameters.section(_FILE, "halo"))
-    dwarfs, giants = dwarf_sequence(), _giant_sequence()
+    dwarfs, giants = dwarf_sequence(), giant_sequence()
     start = min(dwarfs.m_h[0], giants.m_h[0])
     stop = max(dwarfs.m_h[-1], giants.m_h[-1])
     m_h = start + sampling["bin_mag"] * np.arange(np.ceil((stop - start) / sampling["bin_mag"]) + 1)
@@ -151,71 +112,17 @@ def milky_way() -> MilkyWay:
     return MilkyWay(sun, thin, thick, halo, dwarfs, giants, metallicity, distance, m_h, functions)
 
 
-def dwarf_sequence() -> Sequence:
-    """The main sequence, bright to faint.  Ref: Pecaut & Mamajek 2013, Table 5 and its updates."""
-    types = stellar.types()
-    order = np.argsort(types.abs_mag_h)
-    log_mass = np.log10(types.mass[order])
-    # Types of nearly equal mass are not in order: half-way between the two monotone envelopes.
-    down = np.minimum.accumulate(log_mass)
-    up = np.maximum.accumulate(log_mass[::-1])[::-1]
-    return Sequence(types.abs_mag_h[order], types.teff[order], types.log_g[order], 0.5 * (down + up))
-
-
-def _giant_sequence() -> Sequence:
-    numbers = parameters.section(_FILE, "giant_sequence")
-    m_h, teff, log_g = (np.array(numbers[name]) for name in ("m_h", "teff", "log_g"))
-    return Sequence(m_h, teff, log_g, np.zeros(m_h.size))
-
-
-def luminosity(m_h: Float, dwarfs: Sequence, share: Float) -> Float:
-    """Stars pc^-3 at the Sun in each bin of M_H, [6, b]: dwarfs of the three components, then their giants.
-
-    m_h : [b + 1] edges; share : [3] of each component in the density at the Sun, summing to 1
-    """
-    masses = MassFunction(**parameters.section(_FILE, "mass_function"))
-    giants = Giants(**parameters.section(_FILE, "giants"))
-    mass = 10.0 ** np.interp(m_h, dwarfs.m_h, dwarfs.log_mass)
-    main = [part * -np.diff(mass_below(masses, np.minimum(mass, top))) for part, top in zip(share, masses.heaviest, strict=True)]
-    branch = np.diff(_giants_below(giants, m_h))
-    evolved = [part * times * branch for part, times in zip(share, giants.relative, strict=True)]
-    return np.stack([*main, *evolved])
-
-
-def mass_below(masses: MassFunction, m: npt.ArrayLike) -> Float:
-    """Systems pc^-3 at the Sun of mass between the lightest and m, all components together.  Ref: Kroupa 2001, eq. 2."""
-    return masses.local * _power_law(masses, np.asarray(m, float)) / _power_law(masses, np.asarray(masses.reference))
-
-
-def _power_law(masses: MassFunction, m: Float) -> Float:
-    edges = (masses.lightest, *masses.breaks, np.inf)
-    total, height = np.zeros(m.shape), 1.0
-    for i, slope in enumerate(masses.slopes):
-        low, rise = edges[i], slope + 1.0
-        top = np.clip(m, low, edges[i + 1])
-        total = total + height * low * np.expm1(rise * np.log(top / low)) / rise
-        height *= (edges[i + 1] / low) ** slope if np.isfinite(edges[i + 1]) else 1.0
-    return np.asarray(total)
-
-
-def _giants_below(giants: Giants, m_h: Float) -> Float:
-    """Giants pc^-3 at the Sun brighter than M_H, thin disc."""
-    clump = ndtr((m_h - giants.clump_m_h) / giants.clump_scatter)
-    inside = np.clip(m_h, giants.brightest, giants.faintest)
-    branch = 10.0 ** (giants.slope * (inside - giants.faintest)) - 10.0 ** (giants.slope * (giants.brightest - giants.faintest))
-    branch /= branch.max()
-    return giants.local * (giants.clump_fraction * clump + (1.0 - giants.clump_fraction) * branch)
-
-
 def density(galaxy: MilkyWay, component: int, radius: npt.ArrayLike, height: npt.ArrayLike) -> Float:
     """Density of a component (THIN, THICK, HALO) relative to its own at the Sun.
 
     radius, height : Galactocentric cylindrical R, z, pc
-    Ref: Juric et al. 2008, eq. 22-26
+    Ref: Juric et al. 2008
     """
     r, z = np.asarray(radius, float), np.asarray(height, float)
     if component == HALO:
-        return (_halo_distance2(galaxy.halo, r, z) / _halo_distance2(galaxy.halo, *_sun(galaxy))) ** (0.5 * galaxy.halo.slope)
+        return (_halo_distance2(galaxy.halo, r, z) / _halo_distance2(galaxy.halo, *_sun(galaxy))) ** (
+            0.5 * galaxy.halo.slope
+        )
     disc = galaxy.thin if component == THIN else galaxy.thick
     sun_r, sun_z = _sun(galaxy)
     return np.asarray(np.exp(-(r - sun_r) / disc.length - (np.abs(z) - np.abs(sun_z)) / disc.height))
@@ -238,7 +145,7 @@ def cylindrical(galaxy: MilkyWay, lon: float, lat: float, distance: Float) -> tu
 
 
 def expected(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float) -> Float:
-    """Stars of a cell in every (population, shell, bin), [6, s, b], that may be brighter than h_limit without extinction.
+    """Stars of a cell in every (population, shell, bin), [6, s, b]; 0 where all are fainter than h_limit.
 
     lon, lat : Galactic, of the cell's centre, deg; area : deg2
     """
@@ -258,7 +165,9 @@ def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> Sample:
     total = float(cumulative[-1]) if boxes.size else 0.0
     n = int(rng.poisson(total))
     # The product may round up to the total itself.
-    drawn = np.minimum(np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0))
+    drawn = np.minimum(
+        np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0)
+    )
     population, shell, m_bin = np.unravel_index(boxes[drawn], mean.shape)
     near3, far3 = galaxy.distance[shell] ** 3, galaxy.distance[shell + 1] ** 3
     distance = np.cbrt(near3 + (far3 - near3) * rng.random(n))
@@ -275,7 +184,9 @@ def metallicity(galaxy: MilkyWay, component: Int, rng: np.random.Generator) -> F
 
 def teff(galaxy: MilkyWay, stars: Sample, metals: Float) -> Float:
     """Effective temperature[n], K; metal-poor stars are hotter at their luminosity."""
-    return _of_sequence(galaxy, stars, "teff") + np.where(metals < galaxy.metallicity.poor, galaxy.metallicity.hotter, 0.0)
+    return _of_sequence(galaxy, stars, "teff") + np.where(
+        metals < galaxy.metallicity.poor, galaxy.metallicity.hotter, 0.0
+    )
 
 
 def log_g(galaxy: MilkyWay, stars: Sample) -> Float:
@@ -286,4 +197,4 @@ def log_g(galaxy: MilkyWay, stars: Sample) -> Float:
 def _of_sequence(galaxy: MilkyWay, stars: Sample, name: str) -> Float:
     dwarf = np.interp(stars.m_h, galaxy.dwarfs.m_h, getattr(galaxy.dwarfs, name))
     giant = np.interp(stars.m_h, galaxy.giants.m_h, getattr(galaxy.giants, name))
-    return np.where(stars.giant, giant, dwarf)
+    return np.asarray(np.where(stars.giant, giant, dwarf))

@@ -90,8 +90,8 @@ def shapes() -> Shapes:
     bulge = Bulge(**parameters.section("morphology.toml", "bulge"))
     e, cdf = _disc_distribution(**parameters.section("morphology.toml", "disc"))
     fraction = np.linspace(0.0, 1.0, _NODES)
-    ln_ratio = np.linspace(*np.log(bulge.ratio_limits), _NODES)
-    ln_sersic = np.linspace(*np.log(bulge.sersic_limits), _NODES)
+    ln_ratio = _log_nodes(bulge.ratio_limits)
+    ln_sersic = _log_nodes(bulge.sersic_limits)
     grid = np.meshgrid(fraction, np.exp(ln_ratio), np.exp(ln_sersic), indexing="ij")
     return Shapes(
         size=Size(**parameters.section("morphology.toml", "size")),
@@ -110,13 +110,17 @@ def shapes() -> Shapes:
 _NODES = 17
 
 
+def _log_nodes(limits: tuple[float, float]) -> Float:
+    return np.linspace(np.log(limits[0]), np.log(limits[1]), _NODES)
+
+
 def half_light_radius(
     size: Size, z: Float, log_stellar_mass: Float, red: Bool, kpc_per_arcsec: Float, rng: np.random.Generator
 ) -> Float:
     """Half-light semi-major axis[n] of the total light, arcsec.
 
     log_stellar_mass : [n] log10 Msun (h = 0.67); kpc_per_arcsec : [n] proper
-    Ref: van der Wel et al. 2014, eq. 1 and 2
+    Ref: van der Wel et al. 2014
     """
     log_mass = log_stellar_mass - np.log10(size.pivot)
     knee = np.log10(size.knee / size.pivot)
@@ -125,7 +129,7 @@ def half_light_radius(
     late = _at(size, size.late_norm, z) + _at(size, size.late_slope, z) * log_mass
     scatter = np.where(red, _at(size, size.early_scatter, z), _at(size, size.late_scatter, z))
     log_kpc = np.where(red, early, late) + scatter * rng.standard_normal(z.size)
-    return np.clip(10.0**log_kpc / kpc_per_arcsec, size.smallest, size.largest)
+    return np.asarray(np.clip(10.0**log_kpc / kpc_per_arcsec, size.smallest, size.largest))
 
 
 def _at(size: Size, values: tuple[float, ...], z: Float) -> Float:
@@ -134,7 +138,9 @@ def _at(size: Size, values: tuple[float, ...], z: Float) -> Float:
 
 def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: np.random.Generator) -> Float:
     """Flux of the bulge / total, [n] in [0, 1]."""
-    mean = np.clip(bulge.late_mean + bulge.late_rate * (log_stellar_mass - bulge.late_pivot), *bulge.late_limits)
+    mean = np.clip(
+        bulge.late_mean + bulge.late_rate * (log_stellar_mass - bulge.late_pivot), *bulge.late_limits
+    )
     a = np.where(red, bulge.early_a, bulge.late_concentration * mean)
     b = np.where(red, bulge.early_b, bulge.late_concentration * (1.0 - mean))
     return rng.beta(a, b)
@@ -143,17 +149,23 @@ def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: np.ran
 def sersic_index(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
     """Sersic index[n] of the bulge."""
     log_n = np.log10(np.where(red, bulge.early_sersic, bulge.late_sersic))
-    return np.clip(10.0 ** (log_n + bulge.sersic_scatter * rng.standard_normal(red.size)), *bulge.sersic_limits)
+    return np.clip(
+        10.0 ** (log_n + bulge.sersic_scatter * rng.standard_normal(red.size)), *bulge.sersic_limits
+    )
 
 
 def radius_ratio(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
     """Half-light radius of the bulge / that of the disc, [n]."""
     log_ratio = np.where(red, bulge.early_log_ratio, bulge.late_log_ratio)
-    return np.clip(10.0 ** (log_ratio + bulge.log_ratio_scatter * rng.standard_normal(red.size)), *bulge.ratio_limits)
+    return np.clip(
+        10.0 ** (log_ratio + bulge.log_ratio_scatter * rng.standard_normal(red.size)), *bulge.ratio_limits
+    )
 
 
-def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float, sersic: Float) -> tuple[Float, Float]:
-    """Half-light radii of bulge[n] and disc[n] whose summed light has the half-light radius `radius`[n] (same unit).
+def component_radii(
+    model: Shapes, radius: Float, fraction: Float, ratio: Float, sersic: Float
+) -> tuple[Float, Float]:
+    """Half-light radii of bulge[n] and disc[n] whose summed light has the half-light radius `radius`[n].
 
     fraction : bulge / total; ratio : bulge radius / disc radius; sersic : index of the bulge
     Error: the light within `radius` is 0.5 to 0.002 (tests/jobs/catalogue/test_morphology)
@@ -166,10 +178,12 @@ def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float,
 
 
 def light_within(r: npt.ArrayLike, half_light: npt.ArrayLike, sersic: npt.ArrayLike) -> Float:
-    """Fraction of a Sersic profile's light within r.  Ref: Graham & Driver 2005, PASA 22, 118, eq. 2."""
+    """Fraction of a Sersic profile's light within r.  Ref: Graham & Driver 2005, PASA 22, 118"""
     n = np.asarray(sersic, float)
     b = gammaincinv(2.0 * n, 0.5)
-    return np.asarray(gammainc(2.0 * n, b * (np.asarray(r, float) / np.asarray(half_light, float)) ** (1.0 / n)))
+    return np.asarray(
+        gammainc(2.0 * n, b * (np.asarray(r, float) / np.asarray(half_light, float)) ** (1.0 / n))
+    )
 
 
 def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
@@ -178,16 +192,18 @@ def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
     low, high = np.minimum(1.0, 1.0 / ratio), np.maximum(1.0, 1.0 / ratio)
     for _ in range(_BISECTIONS):
         middle = np.sqrt(low * high)
-        inside = fraction * light_within(1.0, ratio * middle, sersic) + (1.0 - fraction) * light_within(1.0, middle, 1.0)
+        inside = fraction * light_within(1.0, ratio * middle, sersic) + (1.0 - fraction) * light_within(
+            1.0, middle, 1.0
+        )
         low, high = np.where(inside > 0.5, middle, low), np.where(inside > 0.5, high, middle)
-    return np.sqrt(low * high)
+    return np.asarray(np.sqrt(low * high))
 
 
 _BISECTIONS = 30
 
 
 def disc_axis_ratio(model: Shapes, n: int, rng: np.random.Generator) -> Float:
-    """Apparent minor / major axis[n] of discs.  Ref: Miller et al. 2013, eq. 8."""
+    """Apparent minor / major axis[n] of discs.  Ref: Miller et al. 2013"""
     e = np.interp(rng.random(n), model.disc_cdf, model.disc_e)
     return (1.0 - e) / (1.0 + e)
 
@@ -197,13 +213,14 @@ def bulge_axis_ratio(bulge: Bulge, n: int, rng: np.random.Generator) -> Float:
     limits = (np.array(bulge.axis_ratio_limits) - bulge.axis_ratio_mean) / bulge.axis_ratio_scatter
     low, high = ndtr(limits)
     q = bulge.axis_ratio_mean + bulge.axis_ratio_scatter * ndtri(low + (high - low) * rng.random(n))
-    return np.clip(q, *bulge.axis_ratio_limits)
+    return np.asarray(np.clip(q, *bulge.axis_ratio_limits))
 
 
 def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
-    """Inclination[n] of discs, deg: sin^2 i = (1 - q^2) / (1 - h^2), and 90 where a disc looks thinner than it is.
+    """Inclination[n] of discs, deg: sin^2 i = (1 - q^2) / (1 - h^2); 90 where it looks thinner than it is.
 
-    The printed arcsine is not a number for q < h and loses half its digits near 90 deg; this form does neither.
+    The printed arcsine is not a number for q < h and loses half its digits near 90 deg; this form does
+    neither.
     Ref: Serrano et al. 2024, "Bulge and disc model"
     """
     q = np.asarray(axis_ratio, float)

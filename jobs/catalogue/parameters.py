@@ -1,4 +1,4 @@
-"""Numbers of the models, read from the data files beside the modules: every table of a file states its source."""
+"""Numbers of the models, read from the data files beside the modules; each of their tables has a source."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _HERE = Path(__file__).resolve().parent
 
 
 def section(file: str, name: str) -> dict[str, Any]:
-    """One table of a TOML file of this folder, without its `source`, ready to be the arguments of a dataclass.
+    """One table of a TOML file of this folder, without its `source`: the arguments of a dataclass.
 
     Errors: BadInput where the table is absent or has no source
     """

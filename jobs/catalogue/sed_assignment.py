@@ -2,7 +2,7 @@
 
 red_fraction, draw_colour   the red and blue sequences of 0.1(g - r) against luminosity and redshift
 draw_dust                   E(B-V) and extinction law
-invert                      the SED that has the colour: two neighbouring templates and their shares of the 0.1r flux
+invert                      the SED that has the colour: two neighbouring templates and their shares
 colours                     0.1(g - r) of an SED
 
 Ref: Skibba & Sheth 2009, Ilbert et al. 2009; the numbers and their sources are in sed_assignment.toml.
@@ -100,13 +100,21 @@ def colours_model() -> Colours:
 
 
 def red_fraction(law: RedFraction, m_r: Float, z: Float, kind: Int) -> Float:
-    """Share[n] of galaxies on the red sequence.  kind : [n] 0 central, 1 satellite.  Ref: Skibba & Sheth 2009, eq. 8"""
+    """Share[n] of galaxies on the red sequence.
+
+    kind : [n] 0 central, 1 satellite
+    Ref: Skibba & Sheth 2009
+    """
     bright = np.clip(1.0 - (law.blue + law.blue_rate * (m_r - _PIVOT)), *law.limits)
     evolved = bright * np.array(law.times)[kind] * np.clip(law.z_norm - law.z_rate * z, law.z_floor, 1.0)
-    return np.minimum(evolved * 10.0 ** (-law.dwarf_rate * np.maximum(m_r - law.dwarf, 0.0)), law.highest)
+    return np.asarray(
+        np.minimum(evolved * 10.0 ** (-law.dwarf_rate * np.maximum(m_r - law.dwarf, 0.0)), law.highest)
+    )
 
 
-def draw_colour(model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.Generator) -> tuple[Bool, Float]:
+def draw_colour(
+    model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.Generator
+) -> tuple[Bool, Float]:
     """(on the red sequence[n], 0.1(g - r)[n])."""
     law, x = model.sequence, m_r - _PIVOT
     red = rng.random(m_r.size) < red_fraction(model.fraction, m_r, z, kind)
@@ -119,8 +127,10 @@ def draw_colour(model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.
     return red, np.clip(mean + scatter * rng.standard_normal(m_r.size), *law.limits)
 
 
-def draw_dust(dust: Dust, m_r: Float, red: Bool, colour: Float, rng: np.random.Generator) -> tuple[Int, Float]:
-    """(extinction law[n], E(B-V)[n] mag); red galaxies have no dust.  Ref: Ilbert et al. 2009, section 3"""
+def draw_dust(
+    dust: Dust, m_r: Float, red: Bool, colour: Float, rng: np.random.Generator
+) -> tuple[Int, Float]:
+    """(extinction law[n], E(B-V)[n] mag); red galaxies have no dust.  Ref: Ilbert et al. 2009"""
     mean = np.clip(dust.mean + dust.mean_rate * (m_r - dust.pivot), *dust.mean_limits)
     ebv = np.minimum(mean / dust.shape * rng.standard_gamma(dust.shape, m_r.size), dust.highest)
     odds = np.cumsum(dust.calzetti_odds)
@@ -131,10 +141,10 @@ def draw_dust(dust: Dust, m_r: Float, red: Bool, colour: Float, rng: np.random.G
 
 
 def invert(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
-    """The spectra that have the wanted colours; the bluest or reddest template where dust leaves none that has.
+    """The spectra that have the wanted colours; the end of the library where dust leaves none that has.
 
-    table : of 0.1g at z = 0. Mixing templates i and i - 1 with shares 1 - f and f of the 0.1r flux mixes their 0.1g / 0.1r
-            ratios with the same shares, so the inversion is exact.
+    table : of 0.1g at z = 0. Mixing templates i and i - 1 with shares 1 - f and f of the 0.1r flux mixes
+            their 0.1g / 0.1r ratios with the same shares, so the inversion is exact.
     """
     weights = ebv_weights(table.ebv, np.where(law > 0, ebv, 0.0))
     by_law = table.values[0].astype(np.float64)[np.maximum(law, 1) - 1]

@@ -17,6 +17,7 @@ from jobs.catalogue.milky_way import MilkyWay, Sample
 from jobs.fluxes import stellar
 from jobs.rng import stream
 from lake_schema import ids, sky
+from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.tables.stars import STARS
 
@@ -24,6 +25,8 @@ Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 
 STAR = 5
+# What fits the running number of an id (22 bits): exceeded in the plane, within 30 deg of the Galactic centre.
+_MOST_STARS = 4e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,20 +61,20 @@ def draw(cell: int, seed: int, universe: StarModel, dust: npt.NDArray[np.float32
     """Table `stars` of one order-8 cell, sorted by _healpix_29.
 
     dust : map of the Milky Way's A(V) to infinity (jobs.catalogue.dust_map)
+    Errors: BadInput where a cell holds more stars than can be numbered
     Error: the density is that of the cell's centre: 2 % at its edges at |b| = 20 deg
     """
     galaxy = universe.galaxy
-    lon, lat = sky.galactic(*(np.array([angle]) for angle in sky.cell_centre(GENERATION_ORDER, cell)))
-    mean = milky_way.expected(galaxy, float(lon[0]), float(lat[0]), sky.cell_area(GENERATION_ORDER), universe.limit)
-    stars = milky_way.draw(galaxy, mean, stream(seed, "stars.luminosity", cell))
-    n = stars.m_h.size
-    index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, n, stream(seed, "stars.position", cell))
+    stars = _sample(cell, seed, universe)
+    index, ra, dec = sky.random_in_cell(
+        GENERATION_ORDER, cell, stars.m_h.size, stream(seed, "stars.position", cell)
+    )
     a_v = _extinction(universe, stars, dust, ra, dec)
     mag_h = stars.m_h + 5.0 * np.log10(stars.distance) - 5.0
     metals = milky_way.metallicity(galaxy, stars.component, stream(seed, "stars.metallicity", cell))
     teff = milky_way.teff(galaxy, stars, metals)
     columns = {
-        "id": ids.source_id(np.full(n, STAR), cell, np.arange(n)),
+        "id": ids.source_id(STAR, cell, np.arange(index.size)),
         "ra": ra,
         "dec": dec,
         "_healpix_29": index,
@@ -84,7 +87,7 @@ def draw(cell: int, seed: int, universe: StarModel, dust: npt.NDArray[np.float32
         "log_g": milky_way.log_g(galaxy, stars),
         "metallicity": metals,
         "a_v": a_v,
-        "density_boost": np.ones(n),
+        "density_boost": np.ones(index.size),
     }
     keep = mag_h + universe.h_over_v * a_v < universe.limit
     return STARS.build({name: values[keep] for name, values in columns.items()})
@@ -97,6 +100,23 @@ def nearest_template(library: Float, teff: Float) -> Int:
     return np.asarray(order[np.searchsorted(between, np.log(teff))], np.int64)
 
 
-def _extinction(universe: StarModel, stars: Sample, dust: npt.NDArray[np.float32], ra: Float, dec: Float) -> Float:
+def _sample(cell: int, seed: int, universe: StarModel) -> Sample:
+    """Stars of a cell that are brighter than the limit but for extinction."""
+    lon, lat = sky.galactic(*(np.array([angle]) for angle in sky.cell_centre(GENERATION_ORDER, cell)))
+    area = sky.cell_area(GENERATION_ORDER)
+    mean = milky_way.expected(universe.galaxy, float(lon[0]), float(lat[0]), area, universe.limit)
+    if mean.sum() > _MOST_STARS:
+        raise BadInput(
+            f"cell {cell} (l = {lon[0]:.1f}, b = {lat[0]:.1f}) holds {mean.sum():.3g} stars brighter than "
+            f"H = {universe.limit:g}, more than {_MOST_STARS:.3g}: ask for a brighter star_limit there"
+        )
+    return milky_way.draw(universe.galaxy, mean, stream(seed, "stars.luminosity", cell))
+
+
+def _extinction(
+    universe: StarModel, stars: Sample, dust: npt.NDArray[np.float32], ra: Float, dec: Float
+) -> Float:
     _, lat = sky.galactic(ra, dec)
-    return dust_map.a_v_at(dust_map.a_v(dust, ra, dec), stars.distance, lat, universe.layer, universe.sin_b_min)
+    return dust_map.a_v_at(
+        dust_map.a_v(dust, ra, dec), stars.distance, lat, universe.layer, universe.sin_b_min
+    )

@@ -3,7 +3,8 @@
 log_stellar_mass    from luminosity and colour
 light, log_sfr      from the template's ultraviolet light, internal dust undone
 
-Luminosities are physical here: M = M_r + 5 log10 h, h = 0.67.  Ref: Bell et al. 2003, Kennicutt 1998; numbers in stellar_mass.toml.
+Luminosities are physical here: M = M_r + 5 log10 h, h = 0.67.
+Ref: Bell et al. 2003, Kennicutt 1998; the numbers are in stellar_mass.toml.
 """
 
 from __future__ import annotations
@@ -82,25 +83,31 @@ def light(library: Library, ebv: Float) -> Light:
 
 
 def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float) -> Float:
-    """log10 of the stellar mass[n] / Msun.  m_r : M_r[n]; colour : 0.1(g - r)[n].  Ref: Bell et al. 2003, eq. 6"""
+    """log10 of the stellar mass[n] / Msun.
+
+    m_r : M_r[n]; colour : 0.1(g - r)[n]
+    Ref: Bell et al. 2003, appendix 2
+    """
     g_r = np.clip(colour - law.to_rest, *law.limits)
     return -0.4 * (_physical(m_r) - law.sun) + law.intercept + law.slope * g_r + law.initial_mass
 
 
 def log_sfr(table: Light, m_r: Float, sed: Sed) -> Float:
-    """log10 of the star formation rate[n] / (Msun/yr).  Ref: Kennicutt 1998, eq. 1"""
-    total = sed.frac_1 * _undimmed(table, sed.template_1, sed) + sed.frac_2 * _undimmed(table, sed.template_2, sed)
+    """log10 of the star formation rate[n] / (Msun/yr).  Ref: Kennicutt 1998"""
+    total = sed.frac_1 * _undimmed(table, sed.template_1, sed) + sed.frac_2 * _undimmed(
+        table, sed.template_2, sed
+    )
     area = 4.0 * np.pi * _TEN_PARSEC_CM**2
     log_l_nu = -0.4 * (_physical(m_r) + AB_CGS) + np.log10(area * total)
-    return np.log10(table.law.per_luminosity) + log_l_nu + table.law.calibration
+    return np.asarray(np.log10(table.law.per_luminosity) + log_l_nu + table.law.calibration)
 
 
 def _undimmed(table: Light, template: Int, sed: Sed) -> Float:
     """Dust-free ultraviolet f_nu for a unit flux in 0.1r that has passed the dust, [n]."""
     nodes = table.dimming[np.maximum(sed.law, 1) - 1, template]
     weights = band_ratios.ebv_weights(table.ebv, np.where(sed.law > 0, sed.ebv, 0.0))
-    return table.ultraviolet[template] * np.exp(-np.sum(nodes * weights, axis=1))
+    return np.asarray(table.ultraviolet[template] * np.exp(-np.sum(nodes * weights, axis=1)))
 
 
 def _physical(m_r: Float) -> Float:
-    return m_r + 5.0 * np.log10(HUBBLE)
+    return np.asarray(m_r + 5.0 * np.log10(HUBBLE))

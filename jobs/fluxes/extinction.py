@@ -4,8 +4,8 @@ laws        all five, one row a law code: 0 none, 1 Prevot, 2 Calzetti, 3 and 4 
 milky_way   O'Donnell 1994, R_V = 3.1
 transmitted 10^(-0.4 k E(B-V))
 
-Ref: Serrano et al. 2024, appendix B, eq. f_ext; Ilbert et al. 2009. The band averages are taken over the extinguished spectrum:
-Serrano et al. scale them linearly from E(B-V) = 0.2, which is wrong by up to 0.06 mag in broad bands.
+Ref: Serrano et al. 2024, appendix B, eq. f_ext; Ilbert et al. 2009. Bands are averaged after extinction:
+Serrano et al. scale a band's extinction linearly from E(B-V) = 0.2, which is wrong by up to 0.06 mag.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ MILKY_WAY_R_V = 3.1
 # Wavelengths over which O'Donnell 1994 is defined (0.3 .. 10 per micrometre).
 _MILKY_WAY_RANGE = (1000.0, 33333.0)
 
-# Prevot et al. 1984, table 2 (Small Magellanic Cloud; 3704 A as in LePhare), E(lambda - V) / E(B-V); R_V of Bouchet et al. 1985.
+# Prevot et al. 1984, table 2 (Small Magellanic Cloud; 3704 A as in LePhare): E(lambda - V) / E(B-V).
+# R_V of Bouchet et al. 1985.
 _PREVOT_TABLE = Path(__file__).with_name("prevot1984.csv")
 _PREVOT_R_V = 2.72
 _PREVOT_INFRARED = 1.6
@@ -38,7 +39,8 @@ _CALZETTI_RED = (-1.857, 1.040)
 _CALZETTI_SPLIT = 6300.0
 _CALZETTI_FIRST = 1200.0
 
-# Fitzpatrick & Massa 1986: Drude profile of the 2175 A bump; heights of the two laws, about a third and two thirds of the Milky Way's.
+# Fitzpatrick & Massa 1986: Drude profile of the 2175 A bump. The heights of the two laws are adopted: about a
+# third and two thirds of the Milky Way's.
 _BUMP_CENTRE, _BUMP_WIDTH = 2175.0, 350.0
 _BUMP_HEIGHTS = (1.26, 2.52)
 
@@ -48,7 +50,9 @@ def laws(wavelength: npt.ArrayLike) -> Float:
     lam = np.asarray(wavelength, float)
     calzetti = _calzetti(lam)
     bump = _bump(lam)
-    return np.stack([np.zeros_like(lam), _prevot(lam), calzetti, *(calzetti + height * bump for height in _BUMP_HEIGHTS)])
+    return np.stack(
+        [np.zeros_like(lam), _prevot(lam), calzetti, *(calzetti + height * bump for height in _BUMP_HEIGHTS)]
+    )
 
 
 def milky_way(wavelength: npt.ArrayLike) -> Float:
@@ -93,7 +97,9 @@ def _calzetti(lam: Float) -> Float:
     red = _CALZETTI_SLOPE * (np.array(_CALZETTI_RED) @ powers[:2]) + _CALZETTI_R_V
     # Below its first wavelength the law goes on along its tangent.
     x0 = 1e4 / _CALZETTI_FIRST
-    tangent = -_CALZETTI_SLOPE * np.polyval(np.polyder(np.array(_CALZETTI_BLUE[::-1])), x0) * x0 / _CALZETTI_FIRST
+    tangent = (
+        -_CALZETTI_SLOPE * np.polyval(np.polyder(np.array(_CALZETTI_BLUE[::-1])), x0) * x0 / _CALZETTI_FIRST
+    )
     k = np.where(lam < _CALZETTI_SPLIT, blue, red) + tangent * np.minimum(lam - _CALZETTI_FIRST, 0.0)
     return np.asarray(np.maximum(k, 0.0))
 

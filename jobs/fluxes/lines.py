@@ -5,7 +5,7 @@ velocity_dispersion  from the luminosity
 observed_wavelength  in vacuum, or in air
 Profiles, profiles   bins of the grid and the flux that falls into each
 
-A secondary line has a fixed fraction of its primary's flux; the catalogue holds the flux of the primary alone.
+A secondary line has a fixed fraction of its primary's flux; the catalogue holds the primary's flux alone.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Int = npt.NDArray[np.int64]
 
 _TABLE = Path(__file__).with_suffix(".csv")
 
-# Serrano et al. 2024, appendix B: log10 sigma = (A + B z) (M_r - C) + D z; the paper has the lower bound only, the upper one
-# is ours: the relation gives more than any galaxy has for M_r < -23.
+# Serrano et al. 2024, appendix B: log10 sigma = (A + B z) (M_r - C) + D z. The upper bound is adopted: below
+# M_r = -23 the relation gives more than any galaxy has.
 _SLOPE, _SLOPE_EVOLUTION, _MAGNITUDE_ZERO, _EVOLUTION = -0.10, 0.01, 3.0, -0.05
 SIGMA_MIN, SIGMA_MAX = 50.0, 400.0
 
@@ -92,7 +92,7 @@ def air_wavelength(vacuum: npt.ArrayLike) -> Float:
 
 
 def observed_wavelength(vacuum: npt.ArrayLike, z_obs: npt.ArrayLike, medium: str) -> Float:
-    """Where a line is seen, A.  The air's refraction is that at the observed wavelength, not at the emitted one."""
+    """Where a line is seen, A.  Air refracts as at the observed wavelength, not as at the emitted one."""
     redshifted = np.asarray(vacuum, float) * (1.0 + np.asarray(z_obs, float))
     if medium == "vacuum":
         return redshifted
@@ -101,13 +101,21 @@ def observed_wavelength(vacuum: npt.ArrayLike, z_obs: npt.ArrayLike, medium: str
     raise BadInput(f"medium {medium!r} is not air or vacuum")
 
 
-def profiles(fluxes: Float, z_obs: Float, sigma: Float, medium: str) -> Profiles:
-    """Profiles of every line with flux, integrated over each bin of 1 A.
+def profiles(
+    fluxes: Float,
+    z_obs: Float,
+    sigma: Float,
+    medium: str,
+    first_wanted: float = 0.0,
+    last_wanted: float = np.inf,
+) -> Profiles:
+    """Lines with flux that reach into [first_wanted, last_wanted] A, integrated over each bin of 1 A.
 
     fluxes : float64[n, 10] erg s-1 cm-2, observed, of each line of `line_list`; NaN or 0 where there is none
     sigma  : float64[n] km/s
-    In the observed frame a line is a Gaussian of centre lambda_i = mu_i (1 + z) and width sigma / c lambda_i that holds the
-    flux; Serrano et al. 2024 (appendix B, eq. f_el) print the un-redshifted centre and a stray 1 / (1 + z) in the exponent.
+    In the observed frame a line is a Gaussian of centre lambda_i = mu_i (1 + z) and width sigma / c lambda_i,
+    whose integral is the flux. Serrano et al. 2024 (appendix B, eq. f_el) print the un-redshifted centre and
+    a stray 1 / (1 + z) in the exponent.
     Error: 2e-8 of the flux
     """
     from scipy.special import erf
@@ -116,6 +124,9 @@ def profiles(fluxes: Float, z_obs: Float, sigma: Float, medium: str) -> Profiles
     row, which = np.nonzero(fluxes > 0.0)
     centre = observed_wavelength(vacuum[which], z_obs[row], medium)
     width = sigma[row] / LIGHT_KM_S * centre
+    reach = _REACH * width + 1.0
+    near = (centre + reach >= first_wanted) & (centre - reach <= last_wanted)
+    row, which, centre, width = row[near], which[near], centre[near], width[near]
     half = int(np.ceil(_REACH * width.max(initial=0.0))) + 1
     first = np.rint(centre).astype(np.int64) - half
     edges = first[:, None] - 0.5 + np.arange(2 * half + 2)

@@ -24,8 +24,8 @@ Float = npt.NDArray[np.float64]
 
 # Serrano et al. 2024, appendix B: every spectrum and response is homogenised to this range and step.
 GRID_FIRST, GRID_LAST = 600, 24000
-# Each end of a curve is cut where it would detect this fraction of the photons of a source of constant f_lambda: 1e-5 mag;
-# never inside, so that red leaks stay.
+# Each end of a curve is cut where this fraction of the photons of a source of constant f_lambda would be
+# detected outside: 1e-5 mag. Never inside, so that red leaks stay.
 END_PHOTONS = 1e-5
 # How far out a logistic edge is tabulated, in widths: exp(-20) is below any use.
 _LOGISTIC_REACH = 20.0
@@ -38,7 +38,7 @@ class Passband:
     """A photon response.
 
     wavelength : float64[n] A, whole numbers in steps of 1, inside the grid, in the band's own medium
-    response   : float64[n], detected per arriving photon (the absolute scale is arbitrary for some published curves)
+    response   : float64[n], detected per arriving photon (some published curves are on an arbitrary scale)
     medium     : "air" (from the ground) or "vacuum" (from space): decides where emission lines are seen
     """
 
@@ -77,7 +77,8 @@ def load(name: str) -> Passband:
 def weights(band: Passband) -> Float:
     """float64[n] such that f_nu = weights @ f_lambda(band.wavelength), erg s-1 cm-2 Hz-1 for f_lambda per A.
 
-    f_nu = (int f_lambda R lambda dlambda / c) / (int R dlambda / lambda).  Ref: Serrano et al. 2024, appendix B.
+    f_nu = (int f_lambda R lambda dlambda / c) / (int R dlambda / lambda).
+    Ref: Serrano et al. 2024, appendix B, eq. f_nu
     """
     photons = band.response * band.wavelength
     return photons / (LIGHT_ANGSTROM_S * float(np.sum(band.response / band.wavelength)))
@@ -89,7 +90,7 @@ def log_width(band: Passband) -> float:
 
 
 def pivot_wavelength(band: Passband) -> float:
-    """sqrt(int R lambda dlambda / int R dlambda / lambda), A: where f_nu = f_lambda lambda^2 / c holds exactly for the averages."""
+    """sqrt(int R lambda dlambda / int R dlambda / lambda), A: f_nu = f_lambda lambda^2 / c on average."""
     return float(np.sqrt(np.sum(band.response * band.wavelength) / np.sum(band.response / band.wavelength)))
 
 
@@ -114,7 +115,7 @@ def _rows() -> dict[str, dict[str, str]]:
 
 
 def _curve(source: str, shift: float) -> dict[str, Float]:
-    """The response on whole angstroms; `shift` > 1 moves it to the blue: R_shifted(lambda) = R(shift * lambda)."""
+    """The response on whole angstroms; `shift` above 1 is to the blue: R_new(lambda) = R(shift lambda)."""
     kind, _, detail = source.partition(":")
     wavelength, response = _published(detail) if kind == "speclite" else _logistic(detail)
     wavelength = wavelength / shift
@@ -138,6 +139,8 @@ def _published(name: str) -> tuple[Float, Float]:
 def _logistic(detail: str) -> tuple[Float, Float]:
     """A top hat with logistic edges: "blue edge:red edge:width of the edges:peak", A."""
     blue, red, width, peak = (float(part) for part in detail.split(":"))
-    wavelength = np.arange(np.floor(blue - _LOGISTIC_REACH * width), np.ceil(red + _LOGISTIC_REACH * width) + 1.0)
+    wavelength = np.arange(
+        np.floor(blue - _LOGISTIC_REACH * width), np.ceil(red + _LOGISTIC_REACH * width) + 1.0
+    )
     edges = 1.0 / ((1.0 + np.exp(-(wavelength - blue) / width)) * (1.0 + np.exp((wavelength - red) / width)))
     return wavelength, peak * edges

@@ -1,6 +1,6 @@
-"""Magnitudes of galaxies from M_r = M(0.1r) - 5 log10 h, by a table of what the redshift does to each template.
+"""Magnitudes of galaxies from M_r = M(0.1r) - 5 log10 h, by a table of what redshift does to each template.
 
-correction            m - M_r - DM of any band, tabulated in (z, template, law, E(B-V)); in the reference band: the K-correction
+correction            m - M_r - DM of any band on (z, template, law, E(B-V)); in 0.1r it is the K-correction
 apparent_magnitude    m = M_r + DM + correction
 reference_magnitude   the same in 0.1r: the column mag_r01
 ColorTable, rest_color_table   rest-frame 0.1(g - r), to be inverted for the template
@@ -36,7 +36,8 @@ COLOR_EBV = np.linspace(0.0, 0.6, 25)
 class Correction:
     """m - M_r - DM of a band for one template, as ln of the flux ratio.
 
-    log_ratio : float64[n_z, n_template, 5, n_ebv] ln(f_nu,band observed at z / f_nu,0.1r at rest), both after internal dust
+    log_ratio : float64[n_z, n_template, 5, n_ebv] ln(f_nu in the band seen at z / f_nu in 0.1r at rest), both
+                after internal dust
     """
 
     band: str
@@ -45,16 +46,17 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class ColorTable:
-    """ebv : float64[n_ebv];  color : float64[n_template, 5, n_ebv] rest-frame 0.1(g - r) after internal dust, AB."""
+    """ebv : float64[n_ebv];  color : float64[n_template, 5, n_ebv] rest-frame 0.1(g - r) after dust, AB."""
 
     ebv: Float
     color: Float
 
 
 def correction(library: Library, band: Passband) -> Correction:
-    """The table of a band for a library of galaxies, from the cache or made in about 2 s.
+    """The table of a band for a library of galaxies, from the cache or made in a second.
 
-    Error: 1e-4 mag for E(B-V) <= 0.6, 2e-3 for E(B-V) <= 3
+    Error: 1e-4 mag in 0.1r and 3e-4 mag in I_E for z <= 2.3 and E(B-V) <= 3; 0.03 mag towards z = 6, where
+    the Lyman edge is in the band
     """
     reference = passbands.load(REFERENCE_BAND)
     key = cache.content_key(
@@ -64,14 +66,19 @@ def correction(library: Library, band: Passband) -> Correction:
         np.asarray(library.flux),
         *(array for each in (band, reference) for array in (each.wavelength, each.response)),
     )
-    arrays = cache.cached_arrays(f"correction_{band.name}", key, lambda: {"log_ratio": _tabulate(library, band, reference)})
+    arrays = cache.cached_arrays(
+        f"correction_{band.name}", key, lambda: {"log_ratio": _tabulate(library, band, reference)}
+    )
     return Correction(band.name, arrays["log_ratio"])
 
 
-def apparent_magnitude(abs_mag_r01: npt.ArrayLike, z_true: npt.ArrayLike, mix: Mix, table: Correction) -> Float:
+def apparent_magnitude(
+    abs_mag_r01: npt.ArrayLike, z_true: npt.ArrayLike, mix: Mix, table: Correction
+) -> Float:
     """Apparent AB magnitude, before lines, magnification and the Milky Way: M_r + DM(z_true) + K.
 
-    abs_mag_r01 : [n] M(0.1r) - 5 log10 h, after internal dust;  z_true : [n] > 0;  mix.z_obs shifts the spectrum
+    abs_mag_r01 : [n] M(0.1r) - 5 log10 h, after internal dust
+    z_true      : [n] > 0, gives the distance; mix.z_obs shifts the spectrum
     The distance has H0 = 100, as the absolute magnitude: any h cancels.
     Ref: Serrano et al. 2024, appendix B, eq. K_Corr and m_r
     """
@@ -87,13 +94,17 @@ def apparent_magnitude(abs_mag_r01: npt.ArrayLike, z_true: npt.ArrayLike, mix: M
             log_ratio += z_weights[step] * np.einsum("ij,ij->i", nodes, ebv_weights)
         ratio += mix.frac[k] * np.exp(log_ratio)
     dimming = -2.5 * np.log10(ratio / mix.frac.sum(0))
-    return np.asarray(abs_mag_r01, float) + cosmology.distance_modulus(z_true) + dimming
+    return np.asarray(np.asarray(abs_mag_r01, float) + cosmology.distance_modulus(z_true) + dimming)
 
 
-def reference_magnitude(abs_mag_r01: npt.ArrayLike, z_true: npt.ArrayLike, mix: Mix, table: Correction) -> Float:
+def reference_magnitude(
+    abs_mag_r01: npt.ArrayLike, z_true: npt.ArrayLike, mix: Mix, table: Correction
+) -> Float:
     """The column mag_r01: `apparent_magnitude` in 0.1r, with K = 2.5 log10(f_rest / f_observed)."""
     if table.band != REFERENCE_BAND:
-        raise BadInput(f"the reference magnitude wants the correction of {REFERENCE_BAND}, not of {table.band}")
+        raise BadInput(
+            f"the reference magnitude wants the correction of {REFERENCE_BAND}, not of {table.band}"
+        )
     return apparent_magnitude(abs_mag_r01, z_true, mix, table)
 
 
@@ -110,7 +121,7 @@ def rest_color_table(library: Library) -> ColorTable:
 
 
 def _tabulate(library: Library, band: Passband, reference: Passband) -> Float:
-    """By the transposed problem: not the spectra are redshifted, but the weights of the band, once a node for all spectra."""
+    """By the transposed problem: at each node the weights of the band are shifted, once for all spectra."""
     dust, ebv = dust_of(library), _chebyshev_nodes()
     shape = (len(library), extinction.LAW_COUNT, len(ebv))
     sed, law, node = (axis.ravel() for axis in np.indices(shape))
@@ -125,7 +136,9 @@ def _tabulate(library: Library, band: Passband, reference: Passband) -> Float:
     total = float(weights.sum())
     rows = []
     for z in nodes:
-        low, moved = _moved(band.wavelength / (1.0 + z) - library.wavelength[first], weights / total / (1.0 + z))
+        low, moved = _moved(
+            band.wavelength / (1.0 + z) - library.wavelength[first], weights / total / (1.0 + z)
+        )
         rows.append(spectra[:, low : low + len(moved)] @ moved.astype(np.float32))
     observed = np.stack(rows).astype(float) * total
     # A template without flux that far in the ultraviolet: as faint as single precision goes.
@@ -139,7 +152,7 @@ def _moved(position: Float, weights: Float) -> tuple[int, Float]:
     part = position - index
     low = int(index[0])
     out = np.bincount(index - low, weights * (1.0 - part), minlength=int(index[-1]) - low + 2)
-    return low, out + np.bincount(index - low + 1, weights * part, minlength=len(out))
+    return low, np.asarray(out + np.bincount(index - low + 1, weights * part, minlength=len(out)), float)
 
 
 def _z_nodes() -> Float:
@@ -149,7 +162,7 @@ def _z_nodes() -> Float:
 
 
 def _cubic(u: Float) -> tuple[Int, tuple[Float, Float, Float, Float]]:
-    """First of four nodes in ln(1 + z), and Lagrange's weights of the four (one-sided in the first and last step)."""
+    """First of four nodes in ln(1 + z), and Lagrange's weights of the four (one-sided at the ends)."""
     position = (u - np.log1p(_Z_FIRST)) / _STEP
     row = np.clip(np.floor(position).astype(np.int64) - 1, 0, len(_z_nodes()) - 4)
     t = position - row - 1.0
@@ -170,5 +183,7 @@ def _chebyshev_nodes() -> Float:
 def _chebyshev_weights(ebv: Float) -> Float:
     """Lagrange's weights at the nodes, float64[n, n_ebv]."""
     to_x = 2.0 * np.sqrt(np.array(ebv, float) / EBV_MAX) - 1.0
-    at_nodes = np.polynomial.chebyshev.chebvander(2.0 * np.sqrt(_chebyshev_nodes() / EBV_MAX) - 1.0, _EBV_NODES - 1)
+    at_nodes = np.polynomial.chebyshev.chebvander(
+        2.0 * np.sqrt(_chebyshev_nodes() / EBV_MAX) - 1.0, _EBV_NODES - 1
+    )
     return np.polynomial.chebyshev.chebvander(to_x, _EBV_NODES - 1) @ np.linalg.inv(at_nodes)

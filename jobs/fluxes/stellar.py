@@ -1,7 +1,7 @@
 """Spectra of dwarf stars from what is published about their colours.
 
-types       the mean dwarf sequence O9V .. M9V of Pecaut & Mamajek 2013: temperature, mass, absolute magnitudes, colours
-spectra     a Planck spectrum a type, times absorption features, times a smooth curve that makes its colours the table's
+types       the mean dwarf sequence O9V .. M9V of Pecaut & Mamajek 2013: temperatures, magnitudes, colours
+spectra     a Planck spectrum a type, with absorption features, times a smooth curve that brings the colours
 planck      f_lambda of a black body
 normalised  mean f_lambda = 1 between 5450 and 5550 A
 
@@ -30,7 +30,16 @@ NORMALISED = (5450.0, 5550.0)
 
 _FIRST, _LAST = "O9V", "M9V"
 # Passbands of the table's colours; all are tied to V.
-_BANDS = ("bessell_u", "bessell_b", "bessell_v", "bessell_r", "bessell_i", "twomass_j", "twomass_h", "twomass_ks")
+_BANDS = (
+    "bessell_u",
+    "bessell_b",
+    "bessell_v",
+    "bessell_r",
+    "bessell_i",
+    "twomass_j",
+    "twomass_h",
+    "twomass_ks",
+)
 _V = _BANDS.index("bessell_v")
 # Colours are matched to this, mag; the late M dwarfs take the most passes (about 100).
 _COLOR_ERROR, _PASSES = 2e-7, 400
@@ -76,10 +85,18 @@ def types() -> StellarTypes:
     """The table of Pecaut & Mamajek 2013 (version 2022.04.16), O9V to M9V, as shipped by MeanStars."""
     lines = _table().decode().splitlines()
     titles = next(line for line in lines if line.startswith("SpT")).replace("#", " ").split()
-    rows = [line.split() for line in lines if line and not line.startswith(("#", "SpT")) and len(line.split()) == len(titles)]
+    rows = [
+        line.split()
+        for line in lines
+        if line and not line.startswith(("#", "SpT")) and len(line.split()) == len(titles)
+    ]
     names = [row[0] for row in rows]
     rows = rows[names.index(_FIRST) : names.index(_LAST) + 1]
-    column = {title: np.array([_number(row[k]) for row in rows]) for k, title in enumerate(titles) if k not in (0, len(titles) - 1)}
+    column = {
+        title: np.array([_number(row[k]) for row in rows])
+        for k, title in enumerate(titles)
+        if k not in (0, len(titles) - 1)
+    }
     bv, vk, hk = column["B-V"], column["V-Ks"], column["H-Ks"]
     h = hk - vk
     colors = [column["U-B"] + bv, bv, 0.0 * vk, -column["V-Rc"], -column["V-Ic"], column["J-H"] + h, h, -vk]
@@ -98,7 +115,9 @@ def types() -> StellarTypes:
 
 def fingerprint() -> str:
     """Key of everything the spectra depend on."""
-    responses = [array for name in _BANDS for array in (passbands.load(name).wavelength, passbands.load(name).response)]
+    responses = [
+        array for name in _BANDS for array in (passbands.load(name).wavelength, passbands.load(name).response)
+    ]
     return cache.content_key(Path(__file__).read_bytes(), _FEATURES.read_bytes(), _table(), *responses)
 
 
@@ -126,8 +145,10 @@ def planck(wavelength: Float, temperature: float) -> Float:
     middle = float(np.mean(NORMALISED))
     scale = PLANCK_ERG_S * LIGHT_ANGSTROM_S / (BOLTZMANN_ERG_K * temperature)
     at, reference = scale / wavelength, scale / middle
-    # exp(-x) / (1 - exp(-x)) instead of 1 / (exp(x) - 1): does not overflow in the far ultraviolet of cool stars.
-    return np.asarray((middle / wavelength) ** 5 * np.exp(reference - at) * np.expm1(-reference) / np.expm1(-at))
+    # exp(-x) / (1 - exp(-x)), not 1 / (exp(x) - 1), which overflows in the far ultraviolet of cool stars.
+    return np.asarray(
+        (middle / wavelength) ** 5 * np.exp(reference - at) * np.expm1(-reference) / np.expm1(-at)
+    )
 
 
 def normalised(wavelength: Float, flux: Float) -> Float:
@@ -137,7 +158,7 @@ def normalised(wavelength: Float, flux: Float) -> Float:
 
 
 def _matched(log_wavelength: Float, start: Float, response: Float, pivots: Float, colors: Float) -> Float:
-    """`start` times 10^(-0.4 c), c monotone-cubic through the pivots and constant outside, until its colours are `colors`."""
+    """`start` times 10^(-0.4 c) with the wanted colours; c is cubic between the pivots, constant outside."""
     from scipy.interpolate import PchipInterpolator
 
     known = np.isfinite(colors)
@@ -156,7 +177,7 @@ def _matched(log_wavelength: Float, start: Float, response: Float, pivots: Float
 
 
 def _absorbed(wavelength: Float, teff: float) -> Float:
-    """Transmission of the absorption features (stellar_features.csv) at a temperature: texture, the colours come after."""
+    """Transmission of the features (stellar_features.csv) at a temperature: texture, colours come after."""
     transmission = np.ones_like(wavelength)
     hydrogen = np.exp(-0.5 * (np.log(teff / _HYDROGEN_PEAK) / _HYDROGEN_WIDTH) ** 2)
     with _FEATURES.open(newline="", encoding="utf-8") as file:
@@ -172,7 +193,7 @@ def _absorbed(wavelength: Float, teff: float) -> Float:
 
 
 def _shape(kind: str, wavelength: Float, centre: float, width: float) -> Float:
-    """Optical-depth-like shape with peak 1: a line, a band shaded to the red, an edge, or a hydrogen series (centre = lower level)."""
+    """Shape with peak 1: line, band shaded to the red, edge, or hydrogen series (centre = lower level)."""
     if kind == "line":
         return np.asarray(np.exp(-0.5 * ((wavelength - centre) / width) ** 2))
     if kind == "band":

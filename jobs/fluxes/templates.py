@@ -34,9 +34,9 @@ _INFRARED_SLOPE = -3.2
 # The weak lines in the observed spectra are bridged by a straight line this far on both sides.
 _LINE_MASK = 40.0
 
-# The sequence: (first template, last template, earlier anchor, later anchor, offset, denominator, factor) with
-# x = factor (k - offset) / denominator, spectrum = (1 - x) earlier + x later. Adopted to span the colours of the 31
-# templates of Ilbert et al. 2009 (NUV - r from 5.7 to -0.7).
+# The sequence: first and last template k, earlier and later anchor, offset, denominator and factor of
+# x = factor (k - offset) / denominator, spectrum = (1 - x) earlier + x later. Adopted, to span the colours
+# of the 31 templates of Ilbert et al. 2009 (NUV - r from 5.7 to -0.7).
 _SEQUENCE = (
     (0, 7, "E", "Sbc", 0, 7, 0.72),
     (8, 13, "Sbc", "Scd", 8, 5, 1.0),
@@ -44,7 +44,7 @@ _SEQUENCE = (
     (20, 30, "Im", "young", 19, 11, 0.95),
 )
 GALAXY_LIBRARY_SIZE = 31
-# The young end: Planck spectra (K, share of f_lambda at 5500 A, factor below the Balmer edge), and the Lyman edge's factor.
+# The young end, adopted: Planck spectra (K, share of f_lambda at 5500 A, factor below the Balmer edge).
 _YOUNG = ((28000.0, 0.70, 1.0), (9500.0, 0.22, 0.45), (4200.0, 0.08, 1.0))
 _BALMER_EDGE, _LYMAN_EDGE, _BELOW_LYMAN = 3646.0, 912.0, 0.02
 
@@ -72,13 +72,21 @@ class Library:
 
 
 def galaxy_library() -> Library:
-    """The 31 galaxy templates, 0 the earliest (elliptical), 30 the latest (starburst), 80 .. 24500 A rest frame."""
+    """The 31 galaxy templates, from 0, elliptical, to 30, starburst; 80 .. 24500 A, rest frame."""
     key = cache.content_key(
-        Path(__file__).read_bytes(), emission_wavelengths(), *(_spectrum_file(f"CWW_{name}_ext.sed") for name in _ANCHORS)
+        Path(__file__).read_bytes(),
+        emission_wavelengths(),
+        *(_spectrum_file(f"CWW_{name}_ext.sed") for name in _ANCHORS),
     )
     wavelength = np.arange(_REST_FIRST, _REST_LAST + 1, dtype=float)
-    arrays = cache.cached_arrays("galaxy_library", key, lambda: {"flux": _galaxies(wavelength).astype(np.float32)})
-    names = tuple(name for first, last, early, late, *_ in _SEQUENCE for name in [f"{early}-{late}"] * (last - first + 1))
+    arrays = cache.cached_arrays(
+        "galaxy_library", key, lambda: {"flux": _galaxies(wavelength).astype(np.float32)}
+    )
+    names = tuple(
+        name
+        for first, last, early, late, *_ in _SEQUENCE
+        for name in [f"{early}-{late}"] * (last - first + 1)
+    )
     return Library(wavelength, arrays["flux"], tuple(f"{k:02d} {name}" for k, name in enumerate(names)))
 
 
@@ -86,12 +94,17 @@ def stellar_library() -> Library:
     """The dwarf sequence O9V .. M9V on the observed grid, hottest first, with its table of types."""
     types = stellar.types()
     key = cache.content_key(Path(__file__).read_bytes(), stellar.fingerprint(), _spectrum_file("vega.txt"))
-    arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": stellar.spectra(types, *vega()).astype(np.float32)})
+    arrays = cache.cached_arrays(
+        "stellar_library", key, lambda: {"flux": stellar.spectra(types, *vega()).astype(np.float32)}
+    )
     return Library(passbands.grid(), arrays["flux"], types.names, types)
 
 
 def vega() -> tuple[Float, Float]:
-    """Vega: wavelength A, f_lambda erg s-1 cm-2 A-1, 900 .. 24000 A.  Ref: CALSPEC alpha_lyr_mod_001, as shipped by GalSim"""
+    """Vega: wavelength A and f_lambda erg s-1 cm-2 A-1, 900 .. 24500 A.
+
+    Ref: CALSPEC alpha_lyr_mod_001, as shipped by GalSim
+    """
     table = np.loadtxt(_spectrum_file("vega.txt").decode().splitlines())
     # The file is in nm and per nm.
     wavelength, flux = table[:, 0] * 10.0, table[:, 1] / 10.0

@@ -1,7 +1,8 @@
 """Cameras: where detectors lie in the focal plane, and where their pixels look.
 
-Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, as the sky is seen from inside: with
-y to the north, x points west (east is left).  Pixel coordinates (column, row) are 0-based, a pixel's centre is whole.
+Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, as the sky is seen from
+inside: with y to the north, x points west (east is left).  Pixel coordinates (column, row) are 0-based, a pixel's
+centre is whole.
 
 detectors       the detectors of a camera, from the layout rules
 boresight_for   the pointing that puts a detector's centre on a target
@@ -12,6 +13,7 @@ corners, s_region, radius
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +29,8 @@ Float = npt.NDArray[np.float64]
 # Corner rafts of LSSTCam carry no science sensors (Rubin Observatory, obs_lsst camera description).
 _LSST_CORNERS = ("R00", "R04", "R40", "R44")
 _LSST_RAFTS, _LSST_SENSORS = 5, 3
-# VIS CCDs of the right half of the focal plane are mounted upside down (Euclid Data Product Description Document, LE1 VIS).
+# VIS CCDs of the right half of the focal plane are mounted upside down (Euclid Data Product Description
+# Document, LE1 VIS).
 _VIS_FIRST_ROTATED_COLUMN = 4
 _ARCSEC = np.pi / 180.0 / 3600.0
 
@@ -134,13 +137,15 @@ def _lsstcam(mission: MissionConfiguration) -> tuple[Detector, ...]:
 # ------------------------------------------------------------------------------------------------ pointing
 
 
-def boresight_for(detector: Detector, ra: float, dec: float, position_angle: float) -> tuple[float, float, float]:
+def boresight_for(
+    detector: Detector, ra: float, dec: float, position_angle: float
+) -> tuple[float, float, float]:
     """The pointing that puts a detector's centre on a target.
 
     ra, dec        : deg, target
     position_angle : deg, of the focal plane's y axis *at the target*, north through east
-    returns        : ra, dec, position angle of the boresight, deg; the angle differs from the one at the target because
-                     meridians converge; defined everywhere, poles included
+    returns        : ra, dec, position angle of the boresight, deg; the angle differs from the one at the
+                     target because meridians converge; defined everywhere, poles included
     """
     # Right-handed: (east-like = -x, y, outward).
     centre = np.array([-detector.x * _ARCSEC, detector.y * _ARCSEC, 1.0])
@@ -178,7 +183,7 @@ def _triad(direction: Float, along: Float) -> Float:
 
 
 def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS:
-    """The world coordinate system of a detector: ICRS, TAN about the boresight, no distortion; exact in its header.
+    """The world coordinate system of a detector: ICRS, TAN about the boresight, no distortion.
 
     ra, dec        : deg, boresight
     position_angle : deg, of the focal plane's y axis at the boresight, north through east
@@ -222,7 +227,10 @@ def jacobian(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> Float:
     east, north, _ = _basis(*sky_of_pixel(system, x, y))
     step_x = _direction(system, x + 0.5, y) - _direction(system, x - 0.5, y)
     step_y = _direction(system, x, y + 0.5) - _direction(system, x, y - 0.5)
-    rows = [[-np.sum(east * step, 0) for step in (step_x, step_y)], [np.sum(north * step, 0) for step in (step_x, step_y)]]
+    rows = [
+        [-np.sum(east * step, 0) for step in (step_x, step_y)],
+        [np.sum(north * step, 0) for step in (step_x, step_y)],
+    ]
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1)) / _ARCSEC
 
 
@@ -249,7 +257,7 @@ def s_region(detector: Detector, system: WCS) -> str:
 
 
 def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
-    """The world coordinate system as FITS cards, every digit kept."""
+    """The world coordinate system as FITS cards (a card holds 16 characters of a number: 1e-14)."""
     header = system.wcs
     return (
         ("WCSAXES", 2, "number of world coordinate axes"),
@@ -267,3 +275,20 @@ def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
         ("CD2_2", float(header.cd[1, 1]), "[deg/pix]"),
         ("RADESYS", "ICRS", "celestial reference system"),
     )
+
+
+def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
+    """The world coordinate system that `cards` wrote."""
+    values = {keyword: value for keyword, value, _ in header}
+    try:
+        system = WCS(naxis=2)
+        system.wcs.ctype = [values["CTYPE1"], values["CTYPE2"]]
+        system.wcs.cunit = [values["CUNIT1"], values["CUNIT2"]]
+        system.wcs.crval = [values["CRVAL1"], values["CRVAL2"]]
+        system.wcs.crpix = [values["CRPIX1"], values["CRPIX2"]]
+        system.wcs.cd = [[values["CD1_1"], values["CD1_2"]], [values["CD2_1"], values["CD2_2"]]]
+        system.wcs.radesys = values["RADESYS"]
+    except KeyError as error:
+        raise BadInput(f"the header has no card {error.args[0]}") from None
+    system.wcs.set()
+    return system

@@ -1,6 +1,7 @@
 """Catalogue rows -> galsim light profiles, lensed, on the sky.
 
-World frame of galsim: u to the west, v to the north, arcsec; an axis at position angle PA (north through east) lies at
+World frame of galsim: u to the west, v to the north, arcsec; an axis at position angle PA (north through
+                       east) lies at
 90 deg + PA from u.
 
 shapes        rows -> Shapes, checked arrays
@@ -21,15 +22,15 @@ from scipy.special import gammaincc, gammaln
 
 Float = npt.NDArray[np.float64]
 
-# Bulges take the nearest Sersic index of this step (Serrano et al. 2024), so that one table of each serves all.
+# Bulges take the nearest Sersic index of this step (Serrano et al. 2024), so that one table of each serves
+# all.
 SERSIC_STEP = 0.1
 # galsim.Sersic accepts [0.3, 6.2].
 _SERSIC_LO, _SERSIC_HI = 0.3, 6.2
 # Ratio of scale height to scale length (Serrano et al. 2024).
 SCALE_H_OVER_R = 0.1
-# Disc: half-light radius / scale length, root of (1 + x) exp(-x) = 1/2.
-_DISC_HALF_LIGHT = 1.6783469900166605
-# Reduced shear and inverse magnification near a critical line: beyond these a single source is not a lensed ellipse.
+# Reduced shear and inverse magnification near a critical line: beyond these a single source is not a lensed
+# ellipse.
 _MOST_SHEAR = 0.9
 _LEAST_DETERMINANT = 1e-3
 _SLIMMEST = 0.02
@@ -64,7 +65,8 @@ def shapes(galaxies: pa.Table, sersic_step: float = SERSIC_STEP) -> Shapes:
     """Rows of the table `galaxies` -> Shapes.
 
     sersic_step : bulges take the nearest multiple as their index
-    Lensing     : g = gamma / (1 - kappa), held below 0.9; mu = 1 / |(1 - kappa)^2 - gamma^2|, the determinant held above 1e-3
+    Lensing     : g = gamma / (1 - kappa), held below 0.9; mu = 1 / |(1 - kappa)^2 - gamma^2|, the determinant
+                  held above 1e-3
     """
     columns = {name: np.asarray(galaxies[name].to_numpy(), float) for name in _COLUMNS}
     stretch = 1.0 - columns["kappa"]
@@ -120,7 +122,8 @@ def profile(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
 
 
 def _bulge(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
-    # galsim's shear keeps the area, so the circle that it starts from has the geometric mean of the axes as its radius.
+    # galsim's shear keeps the area, so the circle that it starts from has the geometric mean of the axes as
+    # its radius.
     q = float(shape.bulge_axis_ratio[i])
     radius = float(shape.bulge_radius[i]) * np.sqrt(q)
     if radius < smallest:
@@ -171,7 +174,7 @@ def surface(shape: Shapes, radius: Float) -> Float:
 
 
 def outside(shape: Shapes, radius: Float) -> Float:
-    """Fraction of the flux beyond a radius, seen face-on: an upper bound.  radius : [m] arcsec;  returns [n, m]"""
+    """Fraction of the flux beyond a radius, seen face-on: an upper bound; radius [m] arcsec -> [n, m]."""
     stretch = _lensed_stretch(shape)
     bulge = _sersic_outside(radius, shape.bulge_radius * stretch, shape.sersic_index)
     disk = _sersic_outside(radius, shape.disk_radius * stretch, np.ones(len(shape)))
@@ -197,7 +200,7 @@ def _b(index: Float) -> Float:
 
 
 def _sersic_surface(radius: Float, half_light: Float, index: Float, stretch: Float) -> Float:
-    """[n, m] per arcsec2 of the unlensed circle scaled back by stretch^2; axis ratio and magnification are the caller's."""
+    """[n, m] per arcsec2 of the unlensed circle; axis ratio and magnification are the caller's."""
     r_e = np.maximum(half_light, 1e-6)[:, None]
     n, b = index[:, None], _b(index)[:, None]
     log_norm = np.log(2 * np.pi * n) - 2 * n * np.log(b) + gammaln(2 * n) + 2 * np.log(r_e / stretch[:, None])

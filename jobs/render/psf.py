@@ -1,6 +1,7 @@
 """Point-spread functions: the Euclid optics from their pupil, and a seeing disc for ground cameras.
 
-Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), in arcsec, without the pixel, centred on
+Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), in arcsec, without the
+       pixel, centred on
 the chief ray (coma moves the centroid by a few mas).  One PSF serves a whole detector.
 
 vis_psf, ground_psf   -> Psf
@@ -25,11 +26,13 @@ from lake_schema.mission.parameter import read_table
 
 Float = npt.NDArray[np.float64]
 
-# Monochromatic planes of equal photon number for a source of flat f_nu; 8 planes reproduce second moments to 2e-4.
+# Monochromatic planes of equal photon number for a source of flat f_nu; 8 planes reproduce second moments to
+# 2e-4.
 _PLANES = 8
 # Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide.
 _OVERSAMPLING = 3
-# Side of the plane, pixels; what lies outside (3e-4 of the flux for VIS) is lost.  No stamp of a point source is larger.
+# Side of the plane, pixels; what lies outside (3e-4 of the flux for VIS) is lost.  No stamp of a point source
+# is larger.
 SIDE = 512
 # Side of the optical transform, samples: light beyond its border (1e-3) wraps around.
 _TRANSFORM = 2048
@@ -40,7 +43,8 @@ _ARCSEC = np.pi / 180.0 / 3600.0
 class Psf:
     """A point-spread function with what the choice of a stamp's size needs.
 
-    profile     : galsim object, arcsec, detector axes, without the pixel; its flux is what the model keeps of 1
+    profile     : galsim object, arcsec, detector axes, without the pixel; its flux is what the model keeps of
+                  1
     pixel_scale : arcsec
     surface     : float64[SIDE / 2] fraction of the flux in a pixel at a distance of r pixels (azimuthal mean)
     outside     : float64[SIDE / 2] fraction of the flux beyond r pixels
@@ -55,9 +59,10 @@ class Psf:
 
 
 def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration) -> Psf:
-    """The Euclid PSF at a VIS detector's centre: optics, pointing jitter, charge diffusion; a source of flat f_nu.
+    """The Euclid PSF at a VIS detector's centre, for flat f_nu: optics, pointing jitter, charge diffusion.
 
-    Error : second moments 2e-4 from the number of planes; one position a detector (ellipticity varies by ~0.01 across it)
+    Error : second moments 2e-4 from the number of planes; one position a detector (ellipticity varies by
+            ~0.01 across it)
     Ref   : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
     """
     plane = _vis_plane(detector, band, mission)
@@ -77,7 +82,9 @@ def ground_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
 
 def _tabulated(profile: galsim.GSObject, pixel_scale: float) -> Psf:
     """With azimuthal means of the profile sampled on pixels."""
-    image = profile.drawImage(nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
+    image = profile.drawImage(
+        nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float
+    ).array
     grid = np.arange(SIDE + 1) - SIDE // 2
     ring = np.rint(np.hypot(*np.meshgrid(grid, grid))).astype(int)
     inside = ring < SIDE // 2
@@ -85,17 +92,21 @@ def _tabulated(profile: galsim.GSObject, pixel_scale: float) -> Psf:
     surface = np.maximum(total / np.bincount(ring[inside]), 0.0)
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
     core = galsim.Convolve(profile, galsim.Pixel(pixel_scale))
-    width = core.drawImage(nx=64, ny=64, scale=pixel_scale / 8, method="no_pixel", dtype=float).calculateFWHM()
+    width = core.drawImage(
+        nx=64, ny=64, scale=pixel_scale / 8, method="no_pixel", dtype=float
+    ).calculateFWHM()
     return Psf(profile, pixel_scale, surface, outside, width)
 
 
-# ------------------------------------------------------------------------------------------------ the Euclid optics
+# ------------------------------------------------------------------------------------------------ the Euclid
+# optics
 
 
 def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) -> Float:
     """Transmission of the entrance pupil: aperture stop, decentred central stop, three spider bars.
 
-    x, y     : [...] mm;  softness : width of the edges, mm (one sample: an edge then covers its pixels by area)
+    x, y     : [...] mm;  softness : width of the edges, mm (one sample: an edge then covers its pixels by
+               area)
     returns  : [...] 0 .. 1
     """
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
@@ -108,7 +119,9 @@ def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) ->
         angle = mission.value(f"plm.pupil.{bar}.angle", "rad")
         # Normal form: no singular angle.
         across = np.abs(-np.sin(angle) * (x - bar_x) + np.cos(angle) * (y - bar_y))
-        blocked = _step(width / 2 - across, softness) * _step(reach - np.hypot(x - bar_x, y - bar_y), softness)
+        blocked = _step(width / 2 - across, softness) * _step(
+            reach - np.hypot(x - bar_x, y - bar_y), softness
+        )
         clear = clear * (1.0 - blocked)
     return np.asarray(clear)
 
@@ -149,7 +162,9 @@ def _vis_plane(detector: Detector, band: Passband, mission: MissionConfiguration
         repr((sampling, *blur)),
     )
     arrays = cache.cached_arrays(
-        "vis_psf", key, lambda: {"plane": _polychromatic(nm, band, sampling, blur, mission).astype(np.float32)}
+        "vis_psf",
+        key,
+        lambda: {"plane": _polychromatic(nm, band, sampling, blur, mission).astype(np.float32)},
     )
     return arrays["plane"]
 
@@ -168,7 +183,9 @@ def _polychromatic(
     for wavelength in _equal_photon_wavelengths(band):
         total += _monochromatic(nm, wavelength, sampling, mission) / _PLANES
     k = 2 * np.pi * scipy.fft.fftfreq(_TRANSFORM, sampling)
-    transfer = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(-0.5 * blur[0] * k[None, : _TRANSFORM // 2 + 1] ** 2)
+    transfer = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(
+        -0.5 * blur[0] * k[None, : _TRANSFORM // 2 + 1] ** 2
+    )
     total = scipy.fft.irfft2(scipy.fft.rfft2(total) * transfer, s=total.shape)
     total = scipy.fft.fftshift(total)
     half = SIDE * _OVERSAMPLING // 2
@@ -179,12 +196,16 @@ def _polychromatic(
 def _equal_photon_wavelengths(band: Passband) -> list[float]:
     """Mean wavelengths, A, of _PLANES parts of the band that give equal photon numbers for flat f_nu."""
     photons = band.response / band.wavelength
-    part = np.minimum((np.cumsum(photons) - 0.5 * photons) / photons.sum() * _PLANES, _PLANES - 1e-9).astype(int)
+    rank = (np.cumsum(photons) - 0.5 * photons) / photons.sum()
+    part = np.minimum((rank * _PLANES).astype(int), _PLANES - 1)
     return [float(np.average(band.wavelength[part == i], weights=photons[part == i])) for i in range(_PLANES)]
 
 
 def _monochromatic(nm: Float, wavelength: float, sampling: float, mission: MissionConfiguration) -> Float:
-    """|FFT of the pupil|^2, sum 1, centred on [0, 0]; the pupil's sampling follows the wavelength so that the image's does not."""
+    """|FFT of the pupil|^2, sum 1, centred on [0, 0].
+
+    The pupil's sampling follows the wavelength, so that the image's does not.
+    """
     step = wavelength * 1e-7 / (_TRANSFORM * sampling * _ARCSEC)
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
     n = 2 * (int(np.ceil(radius / step)) + 1)

@@ -1,8 +1,8 @@
-"""Drawing sources: each on its own stamp, through one shared PSF, in Fourier space, summed onto a float64 frame.
+"""Drawing sources: each on its own stamp, through one shared PSF, in Fourier space, summed onto a frame.
 
-A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid.  Light that belongs
-outside a stamp comes in at its opposite edge: nothing is lost and nothing is rescaled.  A stamp is large enough that what
-wraps is below the noise at its edge and below the flux budget in the source's aperture (stamp_sizes).
+A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid.  Light that
+belongs outside a stamp comes in at its opposite edge: nothing is lost and nothing is rescaled.  A stamp is large
+enough that what wraps is below the noise at its edge, and below the flux budget in the source's aperture.
 
 Sources         what is drawn: galaxies (with a shape) and points
 stamp_sizes     pixels, from flux, shape, PSF, noise and accuracy
@@ -12,7 +12,7 @@ reference       one source by galsim's own drawImage: what `draw` is held agains
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import galsim
@@ -33,7 +33,8 @@ Complex = npt.NDArray[np.complex128]
 SIZES = np.array([32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048])
 # The aperture in which wrapped light is held to the flux budget: this many PSF widths plus half-light radii.
 _APERTURE_WIDTHS, _APERTURE_RADII = 2.0, 2.0
-# A component smaller than this many pixels is a point: it changes second moments by less than 1e-3 of the PSF's.
+# A component smaller than this many pixels is a point: it changes second moments by less than 1e-3 of the
+# PSF's.
 _POINT_RADIUS = 0.02
 # The k plane reaches twice the Nyquist frequency only where the PSF and pixel still pass more than this.
 _BAND_LIMIT = 1e-4
@@ -62,8 +63,15 @@ class Sources:
 
     def take(self, chosen: npt.NDArray[np.bool_] | Int) -> Sources:
         """Some of the sources."""
-        columns = (self.ids, self.column, self.row, self.jacobian, self.electrons, self.shape)
-        return Sources(*(column[chosen] for column in columns), shapes=self.shapes)
+        return Sources(
+            self.ids[chosen],
+            self.column[chosen],
+            self.row[chosen],
+            self.jacobian[chosen],
+            self.electrons[chosen],
+            self.shape[chosen],
+            self.shapes,
+        )
 
 
 def stamp_sizes(
@@ -72,8 +80,8 @@ def stamp_sizes(
     """Side of each source's stamp, pixels.
 
     noise    : of a pixel, electrons
-    accuracy : at the stamp's edge the surface brightness is below `background` of the noise, and of the light that wraps
-               less than `flux` of the source falls into its aperture
+    accuracy : at the stamp's edge the surface brightness is below `background` of the noise, and of the light
+               that wraps less than `flux` of the source falls into its aperture
     returns  : int64[n], one of SIZES
     """
     half = SIZES // 2
@@ -94,7 +102,7 @@ def stamp_sizes(
     enough[:, -1] = True
     # A point has no light beyond the PSF's plane.
     enough[~is_galaxy, int(np.searchsorted(SIZES, SIDE)) :] = True
-    return SIZES[np.argmax(enough, axis=1)]
+    return np.asarray(SIZES[np.argmax(enough, axis=1)])
 
 
 def draw(
@@ -146,7 +154,7 @@ def _plane(psf: Psf, size: int, oversampling: int) -> _Plane:
     bounds = galsim.BoundsI(0, half, -half, half - 1)
     scratch = galsim.ImageCD(bounds, scale=step)
     _k_image(psf.profile.dilate(1.0 / psf.pixel_scale), scratch)
-    kx, ky = np.arange(half + 1) * step, np.arange(-half, half) * step
+    kx, ky = np.arange(half + 1.0) * step, np.arange(-half, float(half)) * step
     pixel = np.sinc(ky / (2 * np.pi))[:, None] * np.sinc(kx / (2 * np.pi))[None, :]
     return _Plane(size, kx, ky, scratch.array * pixel, scratch)
 
@@ -185,12 +193,13 @@ def _on_pixels(profile: galsim.GSObject, jacobian: Float) -> galsim.GSObject:
 
 
 def _image(k_image: Complex, size: int) -> Float:
-    """Inverse transform of a half plane (rows ky ascending) after wrapping it onto the pixels' own Nyquist zone."""
+    """Inverse transform of a half plane (rows ky ascending), wrapped onto the pixels' own Nyquist zone."""
     half = size // 2
     if len(k_image) == size:
         zone = scipy.fft.ifftshift(k_image, axes=0)
     else:
-        # Rows ky and ky + 2 pi land on one; so do columns kx and kx - 2 pi, the latter known from its mirror image.
+        # Rows ky and ky + 2 pi land on one; so do columns kx and kx - 2 pi, the latter known from its mirror
+        # image.
         folded = k_image[:size] + k_image[size:]
         mirrored = np.conj(np.roll(folded[::-1], 1, axis=0)[:, size : half - 1 : -1])
         zone = folded[:, : half + 1] + mirrored
@@ -206,7 +215,7 @@ def _add(frame: Float, stamp: Float, x0: int, y0: int) -> None:
 
 
 def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4) -> Float:
-    """Source i by galsim.Convolve and drawImage, tight thresholds: slow, and independent of the stamps' own transforms.
+    """Source i by galsim.Convolve and drawImage, tight thresholds: slow, and independent of `draw`'s transforms.
 
     returns : float64[size, size], lower left pixel at round(position) - size / 2
     """
@@ -224,7 +233,3 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1
     whole.drawImage(image, center=centre, method="no_pixel")
     return np.asarray(image.array)
 
-
-def batches(n: int, size: int) -> Iterator[slice]:
-    """[0, n) in slices of at most `size`."""
-    return (slice(start, min(start + size, n)) for start in range(0, n, size))

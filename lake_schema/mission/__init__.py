@@ -1,1 +1,1 @@
-"""The mission database: every number of the telescopes, cameras and survey, with its status and its source."""
+"""The mission database: every number of the telescopes, cameras and survey, its status and its source."""

@@ -19,9 +19,11 @@ import astropy.units as u
 
 from lake_schema.errors import BadInput
 
-# As required, as designed, as built, current best estimate, as simulated (Serrano et al. 2024, the Mission Database).
+# As required, as designed, as built, current best estimate, as simulated (Serrano et al. 2024, the Mission
+# Database).
 STATUSES = ("REQ", "DES", "BLT", "CBE", "SIM")
-# What a value rests on: read in its source, quoted without the source at hand, computed from published values, chosen here.
+# What a value rests on: read in its source, quoted without the source at hand, computed from published
+# values, chosen here.
 CONFIDENCES = ("published", "quoted", "derived", "assumed")
 SECTIONS = ("environment", "spacecraft", "vis", "ext_lsstcam", "survey")
 _COLUMNS = ("key", "status", "value", "unit", "version", "valid_from", "confidence", "source")
@@ -50,7 +52,9 @@ class Parameter:
             raise BadInput(f"{where}: status is not one of {', '.join(STATUSES)}")
         if self.confidence not in CONFIDENCES:
             raise BadInput(f"{where}: confidence {self.confidence!r} is not one of {', '.join(CONFIDENCES)}")
-        if not math.isfinite(self.value) or (self.valid_from is not None and not math.isfinite(self.valid_from)):
+        if not math.isfinite(self.value) or (
+            self.valid_from is not None and not math.isfinite(self.valid_from)
+        ):
             raise BadInput(f"{where}: value = {self.value}, valid_from = {self.valid_from} must be finite")
         if not self.source:
             raise BadInput(f"{where}: has no source")
@@ -75,12 +79,14 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
     try:
         return float(parse_unit(unit, where).to(parse_unit(to, where), value))
     except u.UnitConversionError:
-        raise BadInput(f"{where}: {unit or 'a pure number'} does not convert to {to or 'a pure number'}") from None
+        raise BadInput(
+            f"{where}: {unit or 'a pure number'} does not convert to {to or 'a pure number'}"
+        ) from None
 
 
 def read(file: Traversable) -> tuple[Parameter, ...]:
-    """The records of a CSV file with the columns key, status, value, unit, version, valid_from, confidence, source."""
-    with file.open(encoding="utf-8", newline="") as stream:
+    """The records of a CSV file of exactly the columns _COLUMNS."""
+    with file.open(encoding="utf-8") as stream:
         rows = csv.DictReader(stream)
         if tuple(rows.fieldnames or ()) != _COLUMNS:
             raise BadInput(f"{file.name}: columns are not {', '.join(_COLUMNS)}")
@@ -94,7 +100,14 @@ def _record(row: dict[str, str], where: str) -> Parameter:
     except (ValueError, TypeError) as error:
         raise BadInput(f"{where}: {error}") from None
     return Parameter(
-        row["key"], row["status"], value, row["unit"], version, valid_from, row["confidence"], row["source"] or ""
+        row["key"],
+        row["status"],
+        value,
+        row["unit"],
+        version,
+        valid_from,
+        row["confidence"],
+        row["source"] or "",
     )
 
 

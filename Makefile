@@ -1,0 +1,79 @@
+# make demo | test | check | bench | clean -- each installs what it is missing into .venv, and nothing a second time.
+
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+.PHONY: help demo test check bench clean spark FORCE
+
+export OMP_NUM_THREADS := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# What is built from source (pyspark among others) is built by pinned tools, too.
+export PIP_CONSTRAINT := constraints.txt
+export PIP_BUILD_CONSTRAINT := constraints.txt
+unexport PYTHONHOME PYTHONPATH
+
+ifneq ($(words $(CURDIR)),1)
+$(error truesky: Spark cannot be started from a folder with a space in its name ($(CURDIR)): move the clone)
+endif
+
+RUN := . .venv/bin/activate &&
+INSTALL := .venv/bin/python -m pip install --editable
+
+help:
+	@echo 'make demo    simulate a field: five Spark jobs, a lake of tables and two images in out/demo'
+	@echo 'make test    all tests'
+	@echo 'make check   style, types, who may import whom'
+	@echo 'make bench   all benchmarks'
+	@echo 'make clean   remove what was computed (.venv and the cache stay)'
+
+demo: spark
+	@$(RUN) python -m jobs.demo
+
+test: .venv/installed-test spark
+	@$(RUN) python -m pytest
+
+check: .venv/installed-test
+	@$(RUN) ruff check . && ruff format --check . && mypy && lint-imports --no-cache
+
+bench: .venv/installed-bench spark
+	@$(RUN) for file in benchmarks/[a-z]*.py; do name=$${file##*/}; python -m "benchmarks.$${name%.py}"; done
+
+clean:
+	rm -rf out build dist *.egg-info spark-warehouse
+	rm -rf .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find benchmarks jobs lake_schema notebooks scripts tests -name __pycache__ -prune -exec rm -rf {} +
+
+# ---------------------------------------------------------------------------- the environment
+
+# Java is looked at every time (0.1 s): it may have come, gone or changed since.
+spark: .venv/installed
+	@.venv/bin/python scripts/prepare_spark.py
+
+.venv/installed: .venv/bin/python pyproject.toml constraints.txt
+	$(INSTALL) .
+	@touch $@
+
+.venv/installed-%: .venv/installed
+	$(INSTALL) '.[$*]'
+	@touch $@
+
+# The first Python that really runs, is neither too old nor too new, and can make an environment.
+PYTHONS := $(or $(PYTHON),python3.13 python3.12 python3.11 python3)
+SERVES := import sys, ensurepip, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+# An environment that does not run, or was made for another folder, is made anew.
+STALE := $(shell test "$$(cat .venv/.place 2>/dev/null || pwd)" = "$$(pwd)" && .venv/bin/python -c 'import pip' 2>/dev/null || echo FORCE)
+
+.venv/bin/python: $(STALE)
+	@for python in $(PYTHONS); do \
+	    if $$python -c '$(SERVES)' >/dev/null 2>&1; then \
+	        echo "$$($$python --version) makes .venv"; \
+	        $$python -m venv --clear .venv; \
+	        pwd > .venv/.place; \
+	        exit; \
+	    fi; \
+	done; \
+	echo 'truesky: no Python 3.11, 3.12 or 3.13 with venv among: $(PYTHONS);' \
+	    'install one (e.g. apt install python3 python3-venv) or name it: make PYTHON=/path/to/python' >&2; \
+	exit 2

@@ -1,0 +1,50 @@
+"""What brings a template to the magnitude that the catalogue gives it.
+
+continuum_scale   galaxies: apparent AB magnitude in the reference band
+star_scale        stars: Vega magnitude in 2MASS H
+vega_magnitude    AB magnitude of Vega
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs.fluxes import passbands
+from jobs.fluxes.passbands import Passband
+from jobs.fluxes.sources import Stars
+from jobs.fluxes.templates import Library, vega
+from lake_schema import units
+from lake_schema.errors import BadInput
+
+Float = npt.NDArray[np.float64]
+
+STAR_BAND = "twomass_h"
+
+
+def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
+    """Factor for a continuum that gives f_nu_observed (erg s-1 cm-2 Hz-1) in the reference band.
+
+    Errors: BadInput where dust has left nothing to scale
+    Ref: Serrano et al. 2024, appendix B, eq. f_continuum
+    """
+    if dark := int(np.sum(~(f_nu_observed > 0.0))):
+        raise BadInput(f"{dark} galaxies have no light in the reference band: mag_r01 cannot be met")
+    return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_r01)) / f_nu_observed)
+
+
+def star_scale(stars: Stars, library: Library) -> Float:
+    """Factor for each star's template, from its H magnitude before extinction.
+
+    The catalogue's H is Vega, 1.37 mag below AB; Serrano et al. 2024, appendix B, read it by the AB formula.
+    """
+    band = passbands.load(STAR_BAND)
+    seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
+    template = seen @ passbands.weights(band)
+    mag_ab = stars.mag_h + vega_magnitude(band)
+    return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_ab)) / template[stars.sed])
+
+
+def vega_magnitude(band: Passband) -> float:
+    """AB magnitude of Vega: m_AB = m_Vega + this (J 0.90, H 1.37, Ks 1.85)."""
+    return float(units.mag_of_f_nu(units.ujy_of_cgs(passbands.ab_flux(band, *vega()))))

@@ -1,0 +1,184 @@
+"""Rows of the catalogue tables as checked arrays: what the spectra are made from.
+
+Galaxies, galaxies_of
+Stars, stars_of
+magnification           of the gravitational lens
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from jobs.fluxes import lines
+from jobs.fluxes.continuum import COMPONENTS, Mix, mix_of, within
+from jobs.fluxes.templates import Library
+from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.stars import STARS
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+
+MAGNIFICATION_MAX = 100.0
+# Kinds whose templates are in the galaxy library: central, satellite, strong lens.
+_KINDS = (0, 1, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class Galaxies:
+    """n galaxies.
+
+    mag_r01, abs_mag_r01 : float64[n] apparent and absolute (- 5 log10 h) magnitude in the reference band
+    lines                : float64[n, 10] flux of each line of lines.line_list(), 0 where there is none
+    magnification, a_v   : float64[n]
+    """
+
+    mix: Mix
+    abs_mag_r01: Float
+    mag_r01: Float
+    lines: Float
+    magnification: Float
+    a_v: Float
+
+    def __len__(self) -> int:
+        return len(self.mix)
+
+    def rows(self, chosen: Int | slice) -> Galaxies:
+        return Galaxies(
+            self.mix.rows(chosen),
+            self.abs_mag_r01[chosen],
+            self.mag_r01[chosen],
+            self.lines[chosen],
+            self.magnification[chosen],
+            self.a_v[chosen],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Stars:
+    """n stars: sed int64[n]; mag_h (Vega, before extinction), a_v float64[n]."""
+
+    sed: Int
+    mag_h: Float
+    a_v: Float
+
+    def __len__(self) -> int:
+        return len(self.sed)
+
+
+def galaxies_of(table: pa.Table, library: Library) -> Galaxies:
+    """Rows of the table `galaxies`, checked.
+
+    Errors: BadInput names the column and the source of a missing value or NaN, OutOfRange the column
+    """
+    _refuse_other_kinds(table)
+    names = ["z_obs", *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS)]
+    columns = {name: _column(table, name) for name in names}
+    kappa, gamma1, gamma2, a_v = (_column(table, name) for name in ("kappa", "gamma1", "gamma2", "a_v"))
+    _declared("a_v", a_v)
+    return Galaxies(
+        mix_of(columns, library),
+        _declared("abs_mag_r01", _column(table, "abs_mag_r01")),
+        _declared("mag_r01", _column(table, "mag_r01")),
+        _line_fluxes(table),
+        magnification(kappa, gamma1, gamma2, _ids(table)),
+        a_v,
+    )
+
+
+def stars_of(table: pa.Table, library: Library) -> Stars:
+    """Rows of the table `stars`, checked; errors as `galaxies_of`."""
+    sed, mag_h, a_v = (_column(table, name) for name in ("sed", "mag_h", "a_v"))
+    within("sed", sed, 0, len(library) - 1)
+    for name, values in (("mag_h", mag_h), ("a_v", a_v)):
+        column = STARS.column(name)
+        within(name, values, _bound(column.lo), _bound(column.hi))
+    return Stars(sed.astype(np.int64), mag_h, a_v)
+
+
+def magnification(
+    kappa: npt.ArrayLike, gamma1: npt.ArrayLike, gamma2: npt.ArrayLike, ids: Sequence[int] | Int
+) -> Float:
+    """mu = 1 / ((1 - kappa)^2 - gamma^2), float64[n].
+
+    Errors: OutOfRange names the source where mu is not in (0, 100], at and inside the critical curve
+    Ref: Serrano et al. 2024, eq. magnification_factor
+    """
+    k, g1, g2 = (np.asarray(x, float) for x in (kappa, gamma1, gamma2))
+    shear = np.hypot(g1, g2)
+    # A product of differences keeps its digits where the difference of squares loses them.
+    determinant = (1.0 - k - shear) * (1.0 - k + shear)
+    with np.errstate(divide="ignore"):
+        mu = 1.0 / determinant
+    bad = ~((mu > 0.0) & (mu <= MAGNIFICATION_MAX))
+    if bad.any():
+        first = int(np.flatnonzero(bad)[0])
+        raise OutOfRange(
+            f"magnification of source {int(ids[first])}", float(mu[first]), 0.0, MAGNIFICATION_MAX
+        )
+    return np.asarray(mu)
+
+
+def _line_fluxes(table: pa.Table) -> Float:
+    """Fluxes of the ten lines; a missing column, null or NaN is a line that was not modelled."""
+    out = np.zeros((table.num_rows, len(lines.line_list())))
+    for k, line in enumerate(lines.line_list()):
+        if line.column not in table.column_names:
+            continue
+        flux = np.nan_to_num(_floats(table, line.column), nan=0.0, posinf=np.inf)
+        column = GALAXIES.column(line.column)
+        within(line.column, flux, _bound(column.lo), _bound(column.hi))
+        out[:, k] = flux * line.ratio
+    return out
+
+
+def _declared(name: str, values: Float) -> Float:
+    column = GALAXIES.column(name)
+    within(name, values, _bound(column.lo), _bound(column.hi))
+    return values
+
+
+def _bound(value: float | None) -> float:
+    if value is None:
+        raise BadInput("a column that is read for its spectrum has no bounds")
+    return value
+
+
+def _refuse_other_kinds(table: pa.Table) -> None:
+    if "kind" not in table.column_names:
+        return
+    kinds = _column(table, "kind")
+    other = ~np.isin(kinds, _KINDS)
+    if other.any():
+        first = int(np.flatnonzero(other)[0])
+        source = int(_ids(table)[first])
+        raise BadInput(f"galaxies: source {source} has kind {int(kinds[first])}: not in the galaxy library")
+
+
+def _ids(table: pa.Table) -> Int:
+    if "id" not in table.column_names:
+        return np.arange(table.num_rows, dtype=np.int64)
+    return np.asarray(table["id"].to_numpy(), np.int64)
+
+
+def _column(table: pa.Table, name: str) -> Float:
+    """A column as floats without gaps."""
+    values = _floats(table, name)
+    gap = np.isnan(values)
+    if gap.any():
+        first = int(np.flatnonzero(gap)[0])
+        raise BadInput(f"column {name} is missing in the row of source {int(_ids(table)[first])}")
+    return values
+
+
+def _floats(table: pa.Table, name: str) -> Float:
+    """A column as float64, null -> NaN."""
+    if name not in table.column_names:
+        raise BadInput(f"column {name} is missing")
+    return np.asarray(pc.cast(table[name], pa.float64()).to_numpy(), float)

@@ -1,0 +1,123 @@
+"""What an effect is, what it may know of an exposure, and the loop that applies a channel's effects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+
+Frame = npt.NDArray[np.float64]
+
+# An effect is needed where its largest contribution exceeds this part of a pixel's noise.
+NOTICEABLE = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What effects may know of an exposure of one detector.
+
+    section        : prefix of the detector's parameters, "vis" or "ext.lsstcam"
+    sky_rate       : electrons per second in a pixel
+    peak_electrons : brightest pixel of the expected image of the sources
+    """
+
+    mission: MissionConfiguration
+    section: str
+    exposure_time_s: float
+    sky_rate: float
+    peak_electrons: float
+
+    def value(self, key: str, unit: str) -> float:
+        """A parameter of the detector."""
+        return self.mission.value(f"{self.section}.{key}", unit)
+
+    @property
+    def sky_electrons(self) -> float:
+        return self.sky_rate * self.exposure_time_s
+
+    @property
+    def dark_electrons(self) -> float:
+        return self.value("dark_current", "electron / (s pix)") * self.exposure_time_s
+
+    @property
+    def pixel_noise(self) -> float:
+        """Electrons rms of a pixel without a source: sky, dark current, reading."""
+        read_noise = self.value("read_noise", "electron")
+        return float(np.sqrt(self.sky_electrons + self.dark_electrons + read_noise**2))
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One physical effect.
+
+    apply        : (frame, *parameters, rng) -> frame; never writes its argument
+    parameters   : scene -> the numbers that `apply` wants
+    contribution : scene -> its largest change of a pixel, electrons
+    optional     : False where the frame is no product without it
+    """
+
+    name: str
+    apply: Callable[..., Frame]
+    parameters: Callable[[Scene], tuple[float, ...]]
+    contribution: Callable[[Scene], float]
+    optional: bool = True
+
+    def margin(self, scene: Scene) -> float:
+        """Contribution over what would be noticed: above 1 the effect is needed."""
+        return float(self.contribution(scene)) / (NOTICEABLE * scene.pixel_noise)
+
+    def needed_if(self, scene: Scene) -> bool:
+        return not self.optional or self.margin(scene) > 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Whether an effect was applied, why, and by which margin."""
+
+    name: str
+    applied: bool
+    forced: bool
+    margin: float
+
+
+def decide(effects: Sequence[Effect], scene: Scene, forced: Mapping[str, bool]) -> tuple[Decision, ...]:
+    """What a scene needs, and what a request forces on or off (name -> bool)."""
+    unknown = sorted(set(forced) - {effect.name for effect in effects})
+    if unknown:
+        raise BadInput(f"effect {unknown[0]} is not one of {', '.join(effect.name for effect in effects)}")
+    for effect in effects:
+        if not effect.optional and not forced.get(effect.name, True):
+            raise BadInput(f"effect {effect.name} cannot be switched off")
+    return tuple(
+        Decision(
+            effect.name,
+            forced.get(effect.name, effect.needed_if(scene)),
+            effect.name in forced,
+            effect.margin(scene),
+        )
+        for effect in effects
+    )
+
+
+def apply_all(
+    frame: Frame,
+    effects: Sequence[Effect],
+    scene: Scene,
+    stream: Callable[[str], np.random.Generator],
+    forced: Mapping[str, bool] | None = None,
+) -> tuple[Frame, tuple[Decision, ...]]:
+    """Apply a channel's effects in their order.
+
+    stream : effect name -> its own generator, so that switching one effect off leaves the draws of the others
+             as they were
+    """
+    decisions = decide(effects, scene, forced or {})
+    for effect, decision in zip(effects, decisions, strict=True):
+        if decision.applied:
+            frame = effect.apply(frame, *effect.parameters(scene), rng=stream(effect.name))
+    return frame, decisions

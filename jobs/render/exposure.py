@@ -1,0 +1,207 @@
+"""One detector of one exposure: catalogue rows in, a raw image and its noise-free truth out.
+
+render          the whole of it
+sources_of      the rows that touch the detector, as what is drawn
+throughput      zero point and electron rates of a camera's band
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from astropy.wcs import WCS
+
+from jobs import rng
+from jobs.accuracy import Accuracy
+from jobs.fluxes import passbands
+from jobs.render import focal_plane, profiles, psf, selection, stamps
+from jobs.render.channels import ext, vis
+from jobs.render.effects.effect import Decision, Effect, Scene, apply_all
+from jobs.render.focal_plane import Detector
+from jobs.render.psf import Psf
+from jobs.render.stamps import Sources
+from lake_schema import units
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+
+Float = npt.NDArray[np.float64]
+Row = Mapping[str, Any]
+
+# What is read of the catalogues; fluxes are read besides.
+GALAXY_COLUMNS = (
+    "id",
+    "ra_lensed",
+    "dec_lensed",
+    "bulge_half_light_radius",
+    "disk_half_light_radius",
+    "bulge_fraction",
+    "bulge_sersic_index",
+    "bulge_axis_ratio",
+    "inclination",
+    "position_angle",
+    "kappa",
+    "gamma1",
+    "gamma2",
+)
+STAR_COLUMNS = ("id", "ra", "dec")
+EFFECTS: Mapping[str, tuple[Effect, ...]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
+
+
+@dataclass(frozen=True, slots=True)
+class Rendered:
+    """One detector's products before they are files.
+
+    science    : uint16[ny, nx] ADU
+    noise_free : float32[ny, nx] expected electrons of the sources alone
+    sources    : what was drawn, ascending id
+    zero_point : AB magnitude of one electron per second
+    """
+
+    exposure: Row
+    detector: Detector
+    wcs: WCS
+    psf: Psf
+    science: npt.NDArray[np.uint16]
+    noise_free: npt.NDArray[np.float32]
+    sources: Sources
+    zero_point: float
+    scene: Scene
+    decisions: tuple[Decision, ...]
+    accuracy: Accuracy
+    seed: int
+
+
+def render(
+    task: Row,
+    exposure: Row,
+    galaxies: pa.Table,
+    galaxy_fluxes: pa.Table,
+    stars: pa.Table,
+    star_fluxes: pa.Table,
+    mission: MissionConfiguration,
+    accuracy: Accuracy,
+    seed: int,
+    forced: Mapping[str, bool] | None = None,
+    detector: Detector | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Rendered:
+    """Render one detector.
+
+    task, exposure : rows of the tables `tasks` and `exposures`
+    galaxies ..    : rows that may touch the detector (GALAXY_COLUMNS, STAR_COLUMNS) and, row by row, their
+                     f_nu in the band
+    forced         : effect name -> on or off, instead of what the scene needs
+    detector       : another geometry than the mission's for task["detector"], e.g. a part of it
+    """
+    camera, band, channel = str(exposure["camera"]), str(exposure["band"]), str(exposure["channel"])
+    if channel not in EFFECTS:
+        raise BadInput(
+            f"exposure {exposure['exposure_id']}: channel {channel!r} is not one of {', '.join(EFFECTS)}"
+        )
+    if detector is None:
+        detector = focal_plane.detector(camera, str(task["detector"]), mission)
+    system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
+    spread = _psf(detector, band, float(exposure["seeing"]), mission)
+    exposure_time = float(exposure["exposure_time_s"])
+    zero_point, electrons_per_ujy = throughput(detector.section, band, mission)
+    scene = Scene(mission, detector.section, exposure_time, float(exposure["sky"]), 0.0)
+    flux = f"f_nu_{band}"
+    sources, sizes = sources_of(
+        (galaxies, _fluxes(galaxies, galaxy_fluxes, flux) * electrons_per_ujy * exposure_time),
+        (stars, _fluxes(stars, star_fluxes, flux) * electrons_per_ujy * exposure_time),
+        detector,
+        system,
+        spread,
+        scene.pixel_noise,
+        accuracy,
+    )
+    noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress)
+    scene = Scene(mission, detector.section, exposure_time, scene.sky_rate, float(noise_free.max()))
+    frame, decisions = apply_all(
+        noise_free,
+        EFFECTS[channel],
+        scene,
+        lambda name: rng.stream(seed, int(exposure["exposure_id"]), detector.name, name),
+        forced,
+    )
+    return Rendered(
+        exposure,
+        detector,
+        system,
+        spread,
+        frame.astype(np.uint16),
+        noise_free.astype(np.float32),
+        sources,
+        zero_point,
+        scene,
+        decisions,
+        accuracy,
+        seed,
+    )
+
+
+def throughput(section: str, band: str, mission: MissionConfiguration) -> tuple[float, float]:
+    """(AB magnitude of 1 e-/s, e-/s per microjansky), from the band's throughput and the collecting area."""
+    key = "plm.collecting_area" if section == "vis" else f"{section}.collecting_area"
+    area, width = mission.value(key, "cm2"), passbands.log_width(passbands.load(band))
+    return units.zero_point(area, width), float(units.electron_rate(1.0, area, width))
+
+
+def sources_of(
+    galaxies: tuple[pa.Table, Float],
+    stars: tuple[pa.Table, Float],
+    detector: Detector,
+    system: WCS,
+    spread: Psf,
+    noise: float,
+    accuracy: Accuracy,
+) -> tuple[Sources, stamps.Int]:
+    """Everything whose stamp touches the detector, ascending id, and the stamps' sides.
+
+    galaxies, stars : (rows, expected electrons [n])
+    """
+    catalogue, points = galaxies[0], stars[0]
+    ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy()]).astype(np.int64)
+    ra = np.concatenate([catalogue["ra_lensed"].to_numpy(), points["ra"].to_numpy()])
+    dec = np.concatenate([catalogue["dec_lensed"].to_numpy(), points["dec"].to_numpy()])
+    electrons = np.concatenate([galaxies[1], stars[1]])
+    shape = np.concatenate([np.arange(len(catalogue)), np.full(len(points), -1)]).astype(np.int64)
+    _check(ids, electrons)
+    reach = detector.half_diagonal + stamps.SIZES[-1] * detector.pixel_scale
+    seen = selection.near(ra, dec, focal_plane.centre(detector, system), reach / 3600.0) & (electrons > 0)
+    kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
+    form = profiles.shapes(catalogue)
+    column, row = focal_plane.pixel_of_sky(system, ra[kept], dec[kept])
+    sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, accuracy)
+    here = selection.touching(column, row, sizes, detector.nx, detector.ny)
+    kept, column, row = kept[here], column[here], row[here]
+    jacobian = focal_plane.jacobian(system, column, row)
+    return Sources(ids[kept], column, row, jacobian, electrons[kept], shape[kept], form), sizes[here]
+
+
+def _check(ids: npt.NDArray[np.int64], electrons: Float) -> None:
+    if len(np.unique(ids)) != len(ids):
+        raise BadInput("a source is given twice")
+    bad = ~(np.isfinite(electrons) & (electrons >= 0))
+    if bad.any():
+        raise BadInput(f"source {ids[np.argmax(bad)]}: {electrons[np.argmax(bad)]} electrons")
+
+
+def _fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
+    if column not in fluxes.column_names:
+        raise BadInput(f"the flux table has no column {column}")
+    if len(rows) != len(fluxes) or not np.array_equal(rows["id"].to_numpy(), fluxes["id"].to_numpy()):
+        raise BadInput("the flux table is not of the same rows as its catalogue")
+    return np.asarray(fluxes[column].to_numpy(), float)
+
+
+def _psf(detector: Detector, band: str, seeing: float, mission: MissionConfiguration) -> Psf:
+    if detector.section == "vis":
+        return psf.vis_psf(detector, passbands.load(band), mission)
+    beta = mission.value(f"{detector.section}.psf.moffat_beta")
+    return psf.ground_psf(seeing, beta, detector.pixel_scale)

@@ -1,0 +1,132 @@
+"""A rendered detector -> FITS files and rows of the table `products`.
+
+products   rows, and a writer for each file
+science_cards, noise_free_cards
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from jobs.render import focal_plane
+from jobs.render.exposure import Rendered
+from lake_schema import __version__, fits
+from lake_schema.fits import Card
+from lake_schema.tables.products import PRODUCTS
+
+Writer = Callable[[Path], None]
+
+
+def products(
+    rendered: Rendered, truth: Sequence[str] = ("noise_free",)
+) -> tuple[pa.Table, dict[str, Writer]]:
+    """Rows of `products` and, by path, what writes each file.
+
+    truth : truth maps that are wanted beside the science image
+    """
+    images: dict[str, tuple[npt.NDArray[Any], tuple[Card, ...]]] = {
+        "science": (rendered.science, science_cards(rendered))
+    }
+    if "noise_free" in truth:
+        images["noise_free"] = (rendered.noise_free, noise_free_cards(rendered))
+    exposure, detector = rendered.exposure, rendered.detector
+    stem = (
+        f"images/{int(exposure['exposure_id']):06d}/{exposure['channel']}_{exposure['band']}_{detector.name}"
+    )
+    paths = {content: f"{stem}_{content}.fits" for content in images}
+    ra, dec = focal_plane.centre(detector, rendered.wcs)
+    n = len(images)
+    rows = PRODUCTS.build(
+        {
+            "path": list(paths.values()),
+            "content": list(images),
+            "exposure_id": [int(exposure["exposure_id"])] * n,
+            "detector": [detector.name] * n,
+            "channel": [str(exposure["channel"])] * n,
+            "band": [str(exposure["band"])] * n,
+            "ra": [ra] * n,
+            "dec": [dec] * n,
+            "s_region": [focal_plane.s_region(detector, rendered.wcs)] * n,
+            "mission": [rendered.scene.mission.fingerprint] * n,
+            "sources": [len(rendered.sources)] * n,
+        }
+    )
+    writers: dict[str, Writer] = {
+        paths[content]: partial(_write, data, cards) for content, (data, cards) in images.items()
+    }
+    return rows, writers
+
+
+def _write(data: npt.NDArray[Any], cards: tuple[Card, ...], path: Path) -> None:
+    fits.write_images(path, [fits.Image(data, cards)])
+
+
+def science_cards(rendered: Rendered) -> tuple[Card, ...]:
+    """Header of the science image: what an astronomer needs to calibrate it, and what made it."""
+    scene = rendered.scene
+    gain = scene.value("gain", "electron / adu")
+    return (
+        *_common(rendered),
+        ("BUNIT", "adu", "unit of the pixels"),
+        ("GAIN", gain, "[electron/adu]"),
+        ("RDNOISE", scene.value("read_noise", "electron"), "[electron] rms"),
+        ("BIAS", scene.value("bias", "adu"), "[adu] added to every pixel"),
+        ("SATURATE", _saturation(rendered, gain), "[adu] largest value"),
+        ("SKYRATE", scene.sky_rate, "[electron/s/pix] expected sky"),
+        *_effect_cards(rendered),
+    )
+
+
+def noise_free_cards(rendered: Rendered) -> tuple[Card, ...]:
+    """Header of the truth image: expected electrons of the sources in the exposure, no sky, no detector."""
+    return (*_common(rendered), ("BUNIT", "electron", "unit of the pixels: expected, sources alone"))
+
+
+def _common(rendered: Rendered) -> tuple[Card, ...]:
+    exposure, scene, accuracy = rendered.exposure, rendered.scene, rendered.accuracy
+    return (
+        ("INSTRUME", str(exposure["camera"]), "camera"),
+        ("CHANNEL", str(exposure["channel"]), "channel"),
+        ("DETECTOR", rendered.detector.name, "detector"),
+        ("FILTER", str(exposure["band"]), "passband"),
+        ("IMAGETYP", str(exposure["image_type"]), "image type"),
+        ("EXPOSURE", int(exposure["exposure_id"]), "identifier of the exposure"),
+        ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
+        ("MJD-OBS", float(exposure["mjd"]), "[d] start of the exposure, MJD"),
+        ("TIMESYS", "UTC", "time scale of MJD-OBS"),
+        *focal_plane.cards(rendered.wcs),
+        ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] at the boresight"),
+        ("ZEROPNT", rendered.zero_point, "[mag] AB of 1 electron/s"),
+        ("PSFFWHM", rendered.psf.fwhm, "[arcsec] of a point source, pixel included"),
+        ("SEEING", float(exposure["seeing"]), "[arcsec] FWHM of the atmosphere"),
+        ("NSOURCES", len(rendered.sources), "number of sources drawn"),
+        ("SEED", str(rendered.seed), "of the random numbers"),
+        ("MISSION", rendered.scene.mission.fingerprint, ""),
+        ("TRUESKY", __version__, "version of the simulator"),
+        ("ACCFLUX", accuracy.flux, "allowed error: fraction of a source's flux"),
+        ("ACCBACK", accuracy.background, "allowed error: fraction of a pixel's noise"),
+    )
+
+
+def _saturation(rendered: Rendered, gain: float) -> float:
+    scene = rendered.scene
+    full_well = scene.value("full_well", "electron") / gain + scene.value("bias", "adu")
+    return float(np.floor(min(full_well, scene.value("adc_max", "adu"))))
+
+
+def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:
+    """EFFECTn = name, whether it was applied, and its contribution over what would be noticed (margin)."""
+    cards: list[Card] = []
+    for number, decision in enumerate(rendered.decisions, start=1):
+        state = ("on" if decision.applied else "off") + (" (forced)" if decision.forced else "")
+        cards.append(
+            (f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1")
+        )
+    return tuple(cards)

@@ -1,0 +1,330 @@
+"""Pictures of rendered images: asinh stretch, the brightest sources labelled, scale bar, compass, close-ups.
+
+picture     one image -> a PNG
+previews    every science image of a lake -> PNGs
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from astropy.wcs import WCS
+
+from jobs.render import focal_plane
+from lake_schema import fits, read, sky, units
+from lake_schema.fits import Card
+from lake_schema.ids import GENERATION_ORDER
+
+Float = npt.NDArray[np.float64]
+
+_INCHES, _DPI = (13.2, 9.6), 100
+# Largest side of the overview, pixels; close-ups are shown at full resolution.  Labels a kind.
+_OVERVIEW = 1000
+_LABELS, _CLOSE_UPS = 8, 3
+_CLOSE_UP_ARCSEC = 14.0
+# Black this many sigma below the sky; the stretch turns from linear to logarithmic at _KNEE sigma; white at
+# _WHITE.
+_BLACK, _KNEE, _WHITE = -1.5, 4.0, 400.0
+_INK, _PAPER, _GALAXY, _STAR = "#e8e6df", "#0b0d12", "#ffd27d", "#9fd3ff"
+_SCALE_BARS = np.array([1, 2, 5, 10, 20, 30, 60, 120, 300, 600])
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A source worth a name.
+
+    column, row : 0-based pixel position
+    kind        : "galaxy" or "star"
+    """
+
+    column: float
+    row: float
+    kind: str
+    mag: float
+    text: str
+
+
+def previews(root: Path, out: Path) -> list[Path]:
+    """A PNG beside each other in `out` for every science image of the lake; returns their paths."""
+    version = read.version(root, "products")
+    made = []
+    for row in version.rows().to_pylist():
+        if row["content"] == "science":
+            (image,) = fits.read_images(version.file(row["path"]))
+            path = out / f"{row['channel']}_{row['band']}_{row['detector']}_{row['exposure_id']}.png".lower()
+            picture(path, np.asarray(image.data), image.cards, labels(root, row, image))
+            made.append(path)
+    return made
+
+
+def labels(root: Path, product: dict[str, Any], image: fits.Image) -> list[Label]:
+    """The brightest sources of the lake's catalogues inside a product's frame, brightest first."""
+    system = focal_plane.from_cards(image.cards)
+    ny, nx = np.asarray(image.data).shape
+    column = f"f_nu_{product['band']}"
+    centre = (product["ra"], product["dec"])
+    corner = focal_plane.sky_of_pixel(system, [-0.5], [-0.5])
+    radius = float(sky.separation(*centre, *corner)[0])
+    cells = sky.cells_in_cone(*centre, radius, GENERATION_ORDER).tolist()
+    found: list[Label] = []
+    for kind, position in (("galaxy", ("ra_lensed", "dec_lensed")), ("star", ("ra", "dec"))):
+        table = "galaxies" if kind == "galaxy" else "stars"
+        columns = ["id", *position] + (["z_obs"] if kind == "galaxy" else [])
+        rows = read.version(root, table).in_cells(cells, GENERATION_ORDER, columns)
+        flux = read.version(root, f"{kind}_fluxes").in_cells(cells, GENERATION_ORDER, ["id", column])
+        found += _labels_of(kind, rows, flux[column].to_numpy(), position, system)
+    inside = [x for x in found if 0 <= x.column < nx and 0 <= x.row < ny]
+    return sorted(inside, key=lambda label: label.mag)
+
+
+def _labels_of(kind: str, rows: pa.Table, flux: Float, position: tuple[str, str], system: WCS) -> list[Label]:
+    brightest = np.argsort(-flux)[: 4 * _LABELS]
+    brightest = brightest[flux[brightest] > 0]
+    if not len(brightest):
+        return []
+    ra, dec = (rows[name].to_numpy()[brightest] for name in position)
+    column, row = focal_plane.pixel_of_sky(system, ra, dec)
+    mag = units.mag_of_f_nu(flux[brightest])
+    z = rows["z_obs"].to_numpy()[brightest] if kind == "galaxy" else np.full(len(mag), np.nan)
+    texts = [f"{m:.1f}" if np.isnan(zi) else f"{m:.1f}  z {zi:.2f}" for m, zi in zip(mag, z, strict=True)]
+    return [
+        Label(float(x), float(y), kind, float(m), t)
+        for x, y, m, t in zip(column, row, mag, texts, strict=True)
+    ]
+
+
+# ------------------------------------------------------------------------------------------------ drawing
+
+
+def picture(path: Path, image: npt.NDArray[Any], cards: Sequence[Card], names: Sequence[Label]) -> None:
+    """Draw one image.
+
+    image : [ny, nx] ADU;  cards : its header;  names : sources, brightest first
+    """
+    # A canvas of its own: no window system, and no state shared with a caller's figures.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    header: dict[str, Any] = {keyword: value for keyword, value, _ in cards}
+    system = focal_plane.from_cards(cards)
+    figure = Figure(figsize=_INCHES, dpi=_DPI, facecolor=_PAPER)
+    FigureCanvasAgg(figure)
+    upside_down = focal_plane.jacobian(system, [0.0], [0.0])[0, 1, 1] < 0
+    main = figure.add_axes((0.01, 0.01, 0.715, 0.93))
+    block = max(1, int(np.ceil(max(image.shape) / _OVERVIEW)))
+    _show(main, _shrunk(image, block), block, image.shape, upside_down)
+    for kind in ("galaxy", "star"):
+        chosen = _apart([label for label in names if label.kind == kind], min(image.shape) / 14)
+        _annotate(main, chosen[:_LABELS], image.shape, upside_down)
+    _scale_bar(main, header["PIXSCALE"], image.shape, image.shape[1] / 6)
+    _compass(main, system, image.shape)
+    for number, label in enumerate(_close_ups(names, image.shape, header["PIXSCALE"])):
+        axes = figure.add_axes(
+            (0.735, 0.01 + (0.93 + 0.008) / _CLOSE_UPS * (_CLOSE_UPS - 1 - number), 0.255, 0.305)
+        )
+        _close_up(axes, main, image, label, header["PIXSCALE"], upside_down, "abc"[number])
+    title = (
+        f"{header['INSTRUME'].upper()} {header['DETECTOR']}   {header['FILTER']}   {header['EXPTIME']:g} s"
+    )
+    figure.text(0.012, 0.958, title, color=_INK, fontsize=15, fontweight="bold")
+    figure.text(0.988, 0.958, _caption(header, system, image.shape), color=_INK, fontsize=10.5, ha="right")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, facecolor=_PAPER, metadata={"Software": None})
+
+
+def _caption(header: dict[str, Any], system: WCS, shape: tuple[int, ...]) -> str:
+    ra, dec = focal_plane.sky_of_pixel(system, [(shape[1] - 1) / 2], [(shape[0] - 1) / 2])
+    size = [n * header["PIXSCALE"] / 60.0 for n in shape[::-1]]
+    return (
+        f"RA {ra[0]:.4f}  Dec {dec[0]:+.4f}   {size[0]:.1f}' x {size[1]:.1f}'   PSF {header['PSFFWHM']:.2f}\""
+        f"   {header['NSOURCES']:,} sources   truesky {header['TRUESKY']}"
+    )
+
+
+def _shrunk(image: npt.NDArray[Any], block: int) -> Float:
+    ny, nx = (n // block for n in image.shape)
+    return np.asarray(
+        image[: ny * block, : nx * block].reshape(ny, block, nx, block).mean((1, 3), dtype=float)
+    )
+
+
+def _show(axes: Any, image: Float, block: int, shape: tuple[int, ...], upside_down: bool) -> None:
+    ny, nx = (n * block for n in image.shape)
+    extent = (-0.5, nx - 0.5, -0.5, ny - 0.5)
+    axes.imshow(
+        _stretched(image), origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="none"
+    )
+    _frame(axes, (-0.5, shape[1] - 0.5), (-0.5, shape[0] - 0.5), upside_down)
+
+
+def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], upside_down: bool) -> None:
+    """North up: a detector that is mounted upside down is shown turned by 180 deg."""
+    axes.set_xlim(x[::-1] if upside_down else x)
+    axes.set_ylim(y[::-1] if upside_down else y)
+    axes.set_anchor("W")
+    axes.set_facecolor(_PAPER)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for side in axes.spines.values():
+        side.set_edgecolor("#3a4150")
+
+
+def _stretched(image: Float) -> Float:
+    """ADU -> 0 .. 1 by asinh; sky and noise from the median and the pixels below it."""
+    sky_level = float(np.median(image))
+    below = image[image < sky_level]
+    noise = float(np.sqrt(np.mean((below - sky_level) ** 2))) if below.size else 1.0
+    signal = np.clip((image - sky_level) / max(noise, 1e-6), _BLACK, _WHITE)
+    lo, hi = np.arcsinh(_BLACK / _KNEE), np.arcsinh(_WHITE / _KNEE)
+    return np.asarray((np.arcsinh(signal / _KNEE) - lo) / (hi - lo))
+
+
+def _apart(names: Sequence[Label], distance: float) -> list[Label]:
+    """Labels that do not cover each other, brightest first."""
+    kept: list[Label] = []
+    for label in names:
+        if all(np.hypot(label.column - other.column, label.row - other.row) > distance for other in kept):
+            kept.append(label)
+    return kept
+
+
+def _close_ups(names: Sequence[Label], shape: tuple[int, ...], pixel_scale: float) -> list[Label]:
+    """The brightest galaxies that lie well inside the frame."""
+    half = _CLOSE_UP_ARCSEC / pixel_scale / 2
+    inside = [
+        x
+        for x in names
+        if x.kind == "galaxy" and half < x.column < shape[1] - half and half < x.row < shape[0] - half
+    ]
+    return _apart(inside, 3 * half)[:_CLOSE_UPS]
+
+
+def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_down: bool) -> None:
+    from matplotlib.patches import Circle
+
+    for label in names:
+        across, up = label.column / shape[1], label.row / shape[0]
+        if upside_down:
+            across, up = 1 - across, 1 - up
+        if up < 0.12 and not 0.25 < across < 0.85:
+            # Scale bar and compass stand there.
+            continue
+        colour = _GALAXY if label.kind == "galaxy" else _STAR
+        circle = Circle(
+            (label.column, label.row), shape[1] / 110, fill=False, edgecolor=colour, linewidth=0.9, alpha=0.9
+        )
+        axes.add_patch(circle)
+        text = axes.annotate(
+            f"{label.kind} {label.text}",
+            (label.column, label.row),
+            (-9 if across > 0.85 else 9, 5 if up < 0.96 else -12),
+            textcoords="offset points",
+            ha="right" if across > 0.85 else "left",
+            color=colour,
+            fontsize=8.5,
+        )
+        text.set_path_effects(_outline())
+
+
+def _outline() -> list[Any]:
+    """A dark edge, so that text is legible on a bright star."""
+    from matplotlib import patheffects
+
+    return [patheffects.withStroke(linewidth=2.0, foreground=_PAPER)]
+
+
+def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: float) -> None:
+    """In axes coordinates, lower left."""
+    arcsec = float(_SCALE_BARS[max(0, np.searchsorted(_SCALE_BARS, longest * pixel_scale, "right") - 1)])
+    width = arcsec / pixel_scale / shape[1]
+    axes.plot([0.03, 0.03 + width], [0.035, 0.035], color=_INK, linewidth=2.2, transform=axes.transAxes)
+    text = f'{arcsec:g}"' if arcsec < 60 else f"{arcsec / 60:g}'"
+    label = axes.text(
+        0.03 + width / 2, 0.045, text, color=_INK, fontsize=11, ha="center", transform=axes.transAxes
+    )
+    label.set_path_effects(_outline())
+
+
+def _compass(axes: Any, system: WCS, shape: tuple[int, ...]) -> None:
+    """North and east as they are at the centre, lower right."""
+    x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
+    inverse = np.linalg.inv(focal_plane.jacobian(system, [x], [y])[0])
+    flip = np.array([1 if lim[0] < lim[1] else -1 for lim in (axes.get_xlim(), axes.get_ylim())])
+    origin = np.array([0.93, 0.05])
+    # u points west.
+    for name, world in (("N", (0.0, 1.0)), ("E", (-1.0, 0.0))):
+        step = inverse @ np.array(world) * flip
+        step = step / np.hypot(*step) * 0.055
+        axes.annotate(
+            "",
+            origin + step,
+            origin,
+            xycoords="axes fraction",
+            arrowprops={"arrowstyle": "-|>", "color": _INK, "linewidth": 1.4, "shrinkA": 0, "shrinkB": 0},
+        )
+        axes.text(
+            *(origin + 1.3 * step),
+            name,
+            color=_INK,
+            fontsize=11,
+            ha="center",
+            va="center",
+            transform=axes.transAxes,
+        )
+
+
+def _close_up(
+    axes: Any,
+    main: Any,
+    image: npt.NDArray[Any],
+    label: Label,
+    pixel_scale: float,
+    upside_down: bool,
+    letter: str,
+) -> None:
+    from matplotlib.patches import Rectangle
+
+    half = int(_CLOSE_UP_ARCSEC / pixel_scale / 2)
+    x, y = round(label.column), round(label.row)
+    x0, x1, y0, y1 = (
+        max(x - half, 0),
+        min(x + half, image.shape[1]),
+        max(y - half, 0),
+        min(y + half, image.shape[0]),
+    )
+    cut = _close_up_stretch(image, image[y0:y1, x0:x1].astype(float))
+    axes.imshow(
+        cut, origin="lower", extent=(x0 - 0.5, x1 - 0.5, y0 - 0.5, y1 - 0.5), cmap="gray", vmin=0, vmax=1,
+        interpolation="nearest", aspect="auto",
+    )  # fmt: skip
+    _frame(axes, (x0 - 0.5, x1 - 0.5), (y0 - 0.5, y1 - 0.5), upside_down)
+    axes.text(
+        0.04,
+        0.92,
+        f"{letter}   {label.kind} {label.text}",
+        color=_GALAXY,
+        fontsize=10,
+        transform=axes.transAxes,
+    )
+    _scale_bar(axes, pixel_scale, (y1 - y0, x1 - x0), (x1 - x0) / 4)
+    main.add_patch(
+        Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=_INK, linewidth=0.8, alpha=0.8)
+    )
+    main.annotate(
+        letter, (x1 if not upside_down else x0, y0 if not upside_down else y1), (2, -2), textcoords="offset points",
+        color=_INK, fontsize=10, va="top",
+    )  # fmt: skip
+
+
+def _close_up_stretch(image: npt.NDArray[Any], cut: Float) -> Float:
+    """Sky and noise of a close-up from a strip of the whole image: the cut itself may be all galaxy."""
+    strip = image[:: max(1, image.shape[0] // 64)].astype(float)
+    return _stretched(np.vstack([np.resize(strip, (strip.size // cut.shape[1], cut.shape[1])), cut]))[
+        -cut.shape[0] :
+    ]

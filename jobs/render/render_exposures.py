@@ -1,0 +1,79 @@
+"""Render the planned exposures: spark-submit jobs/render/render_exposures.py --lake LAKE --request REQUEST."""
+
+import sys
+from pathlib import Path
+
+if __name__ == "__main__":
+    # spark-submit puts this folder first, where our modules would hide the standard library's.
+    sys.path[0] = str(Path(__file__).resolve().parents[2])
+
+import pyarrow.compute as pc
+
+from jobs.accuracy import Accuracy
+from jobs.render import exposure, fits_product
+from jobs.render.plan_exposures import mission_of
+from jobs.request import MissionChoice, Override, Request
+from jobs.shell import Job, Step, common_facts, main
+from lake_schema import read
+from lake_schema.errors import BadInput
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.publish import Json, Output, Part, Plan
+from lake_schema.tables.products import PRODUCTS
+
+INPUTS = ("exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
+
+
+def steps(lake: Path, request: Request) -> list[Step]:
+    """One part a detector of an exposure, the longest first."""
+    inputs = {name: read.version(lake, name) for name in INPUTS}
+    tasks = inputs["tasks"].rows().to_pylist()
+    for name in ("galaxies", "stars"):
+        _refuse_uncovered(inputs[name], {cell for task in tasks for cell in task["cells"]})
+    facts = {
+        **common_facts(request, "seed", "accuracy", "mission", "truth"),
+        "mission": mission_of(request.mission).fingerprint,
+        "inputs": {name: version.key for name, version in inputs.items()},
+    }
+    parts = tuple(
+        Part(f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet", {k: task[k] for k in ("exposure_id", "detector")})
+        for task in tasks
+    )
+    return [Step(Plan(PRODUCTS, facts, parts), work)]
+
+
+def _refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
+    """The detectors must lie where the catalogue was drawn."""
+    drawn = {cell for part in catalogue.manifest["parts"] for cell in part["facts"]["generation_cells"]}
+    if missing := sorted(cells - drawn):
+        some = ", ".join(map(str, missing[:3])) + (", ..." if len(missing) > 3 else "")
+        wanted = f"{len(missing)} order-{GENERATION_ORDER} cells that the detectors see ({some})"
+        raise BadInput(f"table {catalogue.table} lacks {wanted}: build it over a larger area first")
+
+
+def work(lake: Path, facts: Json) -> Output:
+    """One detector: its sources from its own cells, its image, its files."""
+    request = facts["request"]
+    inputs = {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
+    here = pc.field("exposure_id") == facts["exposure_id"]
+    (exposed,) = inputs["exposures"].rows(where=here).to_pylist()
+    (task,) = inputs["tasks"].rows(where=here & (pc.field("detector") == facts["detector"])).to_pylist()
+    flux = ["id", f"f_nu_{exposed['band']}"]
+    columns = {"galaxies": exposure.GALAXY_COLUMNS, "galaxy_fluxes": flux, "stars": exposure.STAR_COLUMNS, "star_fluxes": flux}
+    rows = {name: inputs[name].in_cells(task["cells"], GENERATION_ORDER, wanted) for name, wanted in columns.items()}
+    choice = request["mission"]
+    overrides = tuple((key, Override(**override)) for key, override in choice["overrides"])
+    rendered = exposure.render(
+        task,
+        exposed,
+        **rows,
+        mission=mission_of(MissionChoice(tuple(choice["ladder"]), overrides)),
+        accuracy=Accuracy(**request["accuracy"]),
+        seed=request["seed"],
+    )
+    return Output(*fits_product.products(rendered, request["truth"]))
+
+
+JOB = Job("render_exposures", "Render every planned detector to FITS.", steps)
+
+if __name__ == "__main__":
+    sys.exit(main(JOB))

@@ -1,0 +1,160 @@
+"""The diffuse sky: electrons per second in a pixel.
+
+sky_rate              of a camera and band, at a position and date
+zodiacal_intensity    W m-2 sr-1 um-1 at 500 nm
+zodiacal_rate         through a passband
+ecliptic, sun_longitude
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs.fluxes import passbands
+from jobs.fluxes.passbands import Passband
+from jobs.render.focal_plane import Detector
+from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.mission.parameter import read_table
+from lake_schema.units import LIGHT_ANGSTROM_S, PLANCK_ERG_S
+
+Float = npt.NDArray[np.float64]
+
+# IAU 1976 obliquity at J2000, deg.
+_OBLIQUITY = 23.4392911
+_MJD_J2000 = 51544.5
+# Mean longitude, mean anomaly (value at J2000, rate a day) and equation of the centre, deg: The Astronomical
+# Almanac, low-precision formula for the Sun (0.01 deg, 1950-2050); general precession a day turns "of date"
+# into J2000.
+_SUN_LONGITUDE = (280.460, 0.9856474)
+_SUN_ANOMALY = (357.528, 0.9856003)
+_SUN_CENTRE = (1.915, 0.020)
+_PRECESSION = 1.39697 / 36525.0
+# Unit of the table of Leinert et al. 1998.
+_TABLE_UNIT = 1e-8
+_ARCSEC = np.pi / 180.0 / 3600.0
+
+
+def sky_rate(
+    detector: Detector, band: str, ra: float, dec: float, mjd: float, mission: MissionConfiguration
+) -> float:
+    """Electrons per second in a pixel of a detector.
+
+    Euclid : zodiacal light and scattered starlight;  ground : the band's dark-sky rate of the mission
+             database
+    """
+    if detector.section == "vis":
+        area = mission.value("plm.collecting_area", "m2")
+        zodi = zodiacal_rate(ra, dec, mjd, passbands.load(band), area, detector.pixel_scale, mission)
+        return zodi + mission.value("vis.scattered_light", "electron / (s pix)")
+    return mission.value(f"{detector.section}.{band}.sky", "electron / (s pix)")
+
+
+def ecliptic(ra: float, dec: float) -> tuple[float, float]:
+    """ICRS -> ecliptic longitude [0, 360) and latitude, deg, J2000.  Error: 0.1 arcsec (frame bias)."""
+    lon, lat, tilt = np.radians([ra, dec, _OBLIQUITY])
+    x, y, z = np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)
+    across = np.cos(tilt) * y + np.sin(tilt) * z
+    up = np.cos(tilt) * z - np.sin(tilt) * y
+    return float(np.degrees(np.arctan2(across, x)) % 360.0), float(
+        np.degrees(np.arctan2(up, np.hypot(x, across)))
+    )
+
+
+def sun_longitude(mjd: float) -> float:
+    """Ecliptic longitude of the Sun from the Earth, deg, mean equinox J2000.  Error: 0.02 deg, 1950-2050."""
+    days = mjd - _MJD_J2000
+    longitude = _SUN_LONGITUDE[0] + (_SUN_LONGITUDE[1] - _PRECESSION) * days
+    anomaly = np.radians(_SUN_ANOMALY[0] + _SUN_ANOMALY[1] * days)
+    return float(
+        (longitude + _SUN_CENTRE[0] * np.sin(anomaly) + _SUN_CENTRE[1] * np.sin(2 * anomaly)) % 360.0
+    )
+
+
+def zodiacal_intensity(from_sun: float, latitude: float) -> float:
+    """Zodiacal light at 500 nm seen from the Earth, W m-2 sr-1 um-1.
+
+    from_sun : deg, ecliptic longitude minus the Sun's;  latitude : deg, ecliptic
+    Error    : 10 %; within 15 deg of the Sun, where the table is empty, its nearest value
+    Ref      : Leinert et al. 1998, Table 17, bilinear in the logarithm
+    """
+    if not abs(latitude) <= 90.0:
+        raise OutOfRange("ecliptic latitude", latitude, -90.0, 90.0)
+    distance, beta = abs((from_sun + 180.0) % 360.0 - 180.0), abs(latitude)
+    longitudes, values = _zodiacal_table()
+    i = int(np.clip(np.searchsorted(longitudes, distance, "right") - 1, 0, len(longitudes) - 2))
+    j = int(np.clip(np.searchsorted(_LATITUDES, beta, "right") - 1, 0, len(_LATITUDES) - 2))
+    s = (distance - longitudes[i]) / (longitudes[i + 1] - longitudes[i])
+    t = (beta - _LATITUDES[j]) / (_LATITUDES[j + 1] - _LATITUDES[j])
+    corner = np.log(values[i : i + 2, j : j + 2])
+    mean = np.array([1 - s, s]) @ corner @ np.array([1 - t, t])
+    return float(np.exp(mean)) * _TABLE_UNIT
+
+
+# Columns of the table.
+_LATITUDES = np.array([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 45.0, 60.0, 75.0, 90.0])
+
+
+def _zodiacal_table() -> tuple[Float, Float]:
+    """|longitude from the Sun| [19] deg, values [19, 11]; an empty entry takes the next away from the Sun."""
+    table = np.array(read_table("zodiacal_light_500nm"))
+    values = table[:, 1:]
+    for row in range(len(values) - 2, -1, -1):
+        empty = np.isnan(values[row])
+        values[row, empty] = values[row + 1, empty]
+    return table[:, 0], values
+
+
+def zodiacal_rate(
+    ra: float,
+    dec: float,
+    mjd: float,
+    band: Passband,
+    area: float,
+    pixel_scale: float,
+    mission: MissionConfiguration,
+) -> float:
+    """Electrons per second in a pixel from the zodiacal light.
+
+    area : m2, collecting;  pixel_scale : arcsec
+    Spectrum : the Sun's, reddened with the wavelength and the elongation
+    Ref      : Leinert et al. 1998, section 8
+    """
+    longitude, latitude = ecliptic(ra, dec)
+    from_sun = longitude - sun_longitude(mjd)
+    cosine = np.cos(np.radians(latitude)) * np.cos(np.radians(from_sun))
+    elongation = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    at_500 = zodiacal_intensity(from_sun, latitude)
+    wavelength = band.wavelength / 10.0
+    spectrum = _solar(wavelength) / _solar(np.array([mission.value("env.zodi.reference_wavelength", "nm")]))
+    intensity = at_500 * spectrum * _reddening(wavelength, elongation, mission)
+    energy = PLANCK_ERG_S * 1e-7 * LIGHT_ANGSTROM_S / band.wavelength
+    # W m-2 sr-1 um-1 over steps of 1 A = 1e-4 um.
+    photons = np.trapezoid(intensity * band.response / energy, band.wavelength) * 1e-4
+    return float(photons * area * (pixel_scale * _ARCSEC) ** 2)
+
+
+def _solar(wavelength: Float) -> Float:
+    """Solar spectral irradiance, W m-2 nm-1, 25 nm means; wavelength in nm.  Ref: Gueymard 2004."""
+    table = np.array(read_table("solar_spectrum"))
+    if wavelength.min() < table[0, 0] or wavelength.max() > table[-1, 0]:
+        raise BadInput(f"the solar spectrum covers {table[0, 0]:g}-{table[-1, 0]:g} nm, the band wants more")
+    return np.asarray(np.interp(wavelength, table[:, 0], table[:, 1]))
+
+
+def _reddening(wavelength: Float, elongation: float, mission: MissionConfiguration) -> Float:
+    """f_co of Leinert et al. 1998: 1 + k log10(lambda / 500 nm), k by side of 500 nm and by elongation."""
+    near, far = (mission.value(f"env.zodi.elongation_{end}", "deg") for end in ("near", "far"))
+    slopes = {
+        side: float(
+            np.interp(
+                elongation,
+                [near, far],
+                [mission.value(f"env.zodi.colour_{side}_{end}") for end in ("near", "far")],
+            )
+        )
+        for side in ("red", "blue")
+    }
+    decades = np.log10(wavelength / mission.value("env.zodi.reference_wavelength", "nm"))
+    return np.asarray(1.0 + np.where(decades > 0, slopes["red"], slopes["blue"]) * decades)

@@ -1,0 +1,144 @@
+"""The manifest of a version: its files with bytes and sha256, what they were made from, sealed by its own digest.
+
+write     put a manifest into a version's folder
+load      read one; refused where a byte of it has changed
+faults    is a version what its manifest says?
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lake_schema import layout, parquet, sky
+from lake_schema.errors import Damaged
+from lake_schema.plan import Json
+from lake_schema.provenance import canonical, digest, file_sha256
+
+MANIFEST = "manifest.json"
+
+
+def write(folder: Path, facts: Json) -> None:
+    """Seal the facts of a version and put them into its folder, synced."""
+    plain = json.loads(canonical(facts))
+    write_json(folder / MANIFEST, {**plain, "digest": digest(plain)})
+
+
+def load(folder: Path) -> dict[str, Any]:
+    """The manifest of a version's folder.  Errors: Damaged where it is missing, cut short or changed."""
+    path = folder / MANIFEST
+    try:
+        facts = json.loads(path.read_bytes())
+        seal = facts.pop("digest")
+    except (OSError, ValueError, KeyError, AttributeError, RecursionError) as error:
+        raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
+    if digest(facts) != seal:
+        raise Damaged(f"{path} is not what was written: its digest differs")
+    return dict(facts)
+
+
+def file_facts(path: Path, relative: str) -> dict[str, Any]:
+    """A file's entry in the manifest.
+
+    tail : of a Parquet file: where its pages end, and the sha256 from there on.  Pages carry checksums; what tells how to
+           read them does not, and a reader that checks both never takes a changed byte for a number
+    """
+    facts: dict[str, Any] = {"path": relative, "bytes": path.stat().st_size, "sha256": file_sha256(path)}
+    if relative.endswith(".parquet"):
+        start = parquet.tail_start(path)
+        facts["tail"] = [start, parquet.tail_sha256(path, start)]
+    return facts
+
+
+def checked(folder: Path, entry: Json) -> Path:
+    """A listed file, ready to be read.  Errors: Damaged where its size or its tail is not what the manifest says."""
+    path = folder / entry["path"]
+    if fault := _misfit(path, entry):
+        raise Damaged(fault)
+    return path
+
+
+def _misfit(path: Path, entry: Json) -> str:
+    if not path.is_file() or path.is_symlink():
+        return f"{path} is missing"
+    size = path.stat().st_size
+    if size != entry["bytes"]:
+        return f"{path} has {size} bytes, the manifest says {entry['bytes']}"
+    if "tail" in entry and parquet.tail_sha256(path, entry["tail"][0]) != entry["tail"][1]:
+        return f"{path} has another footer than the manifest says"
+    return ""
+
+
+def faults(folder: Path, facts: Json, deep: bool = False) -> list[str]:
+    """What is wrong with a version: a list of sentences, empty where all is well.
+
+    facts : its manifest
+    deep  : also the sha256 of every file, and that each cell holds only its own rows, sorted
+    """
+    listed = facts["files"]
+    names = {entry["path"] for entry in listed}
+    here = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()}
+    found = [f"{folder / extra} is not in the manifest" for extra in sorted(here - names - {MANIFEST})]
+    for entry in listed:
+        fault = _misfit(folder / entry["path"], entry)
+        found += [fault] if fault else _deep_faults(folder / entry["path"], entry) if deep else []
+    total = sum(entry.get("rows", 0) for entry in listed)
+    if total != facts["rows"]:
+        found.append(f"{folder / MANIFEST}: {facts['rows']} rows in all, {total} in the files")
+    return found
+
+
+def _deep_faults(path: Path, entry: Json) -> list[str]:
+    if file_sha256(path) != entry["sha256"]:
+        return [f"{path} has other contents than the manifest says"]
+    if "rows" not in entry:
+        return []
+    try:
+        return _row_faults(path, entry)
+    except (OSError, pa.ArrowInvalid) as error:
+        return [f"{path}: {error}"]
+
+
+def _row_faults(path: Path, entry: Json) -> list[str]:
+    with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        if file.metadata.num_rows != entry["rows"]:
+            return [f"{path} has {file.metadata.num_rows} rows, the manifest says {entry['rows']}"]
+        if "_healpix_29" not in file.schema_arrow.names or "Npix=" not in path.name:
+            return []
+        index = file.read(columns=["_healpix_29"])["_healpix_29"].to_numpy()
+    first, last = sky.cell_range(*layout.cell_of_file("/".join(path.parts[-3:])))
+    if index.size and (index.min() < first or index.max() >= last):
+        return [f"{path} holds rows of another cell"]
+    return [f"{path} is not sorted by _healpix_29"] if (index[1:] < index[:-1]).any() else []
+
+
+# ------------------------------------------------------------------------------------------------ files that last
+
+
+def write_json(path: Path, value: Json) -> None:
+    """Replace a JSON file in one rename, synced."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("w") as stream:
+            json.dump(value, stream, indent=1, sort_keys=True, allow_nan=False)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+        sync(path.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Make a file, or the names in a folder, survive a loss of power."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

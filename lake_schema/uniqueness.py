@@ -1,0 +1,71 @@
+"""No identifier twice in a table, whichever files its rows lie in."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow.parquet as pq
+
+from lake_schema.errors import BadInput
+from lake_schema.plan import Json, Plan, data_path
+from lake_schema.stage import BLOCK_BITS, is_numbered
+
+Int = npt.NDArray[np.int64]
+
+
+def refuse_duplicates(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
+    """Raise BadInput where a key stands in two parts; the rows of one part have been compared before they were written.
+
+    made : receipts.  Only parts that share a block of identifiers are read, so a catalogue costs little
+    """
+    table = plan.table
+    paths = [stage / data_path(table, receipt["part"]) for receipt in made]
+    if not is_numbered(table):
+        return _refuse_any(table.name, table.key, paths)
+
+    @lru_cache(maxsize=16)
+    def ids(path: Path) -> Int:
+        return np.sort(pq.read_table(path, columns=list(table.key), partitioning=None).column(0).to_numpy())
+
+    for block, sharers in _shared_blocks(made, paths).items():
+        _refuse_within(f"table {table.name}: {table.key[0]}", block, sharers, ids)
+
+
+def _shared_blocks(made: Sequence[Json], paths: Sequence[Path]) -> dict[int | None, list[Path]]:
+    """Block of identifiers -> the files that hold some of it, where there are two or more; None = all of them."""
+    if any(receipt["blocks"] is None for receipt in made):
+        return {None: list(paths)}
+    holders: dict[int | None, list[Path]] = defaultdict(list)
+    for receipt, path in zip(made, paths, strict=True):
+        for block in receipt["blocks"]:
+            holders[block].append(path)
+    return {block: files for block, files in holders.items() if len(files) > 1}
+
+
+def _refuse_within(what: str, block: int | None, files: Sequence[Path], ids: Callable[[Path], Int]) -> None:
+    pieces = [ids(path) for path in files]
+    if block is not None:
+        edges = np.array([block, block + 1]) << BLOCK_BITS
+        pieces = [piece[slice(*np.searchsorted(piece, edges))] for piece in pieces]
+    together = np.concatenate(pieces)
+    order = np.argsort(together, kind="stable")
+    same = np.flatnonzero(np.diff(together[order]) == 0)
+    if same.size:
+        source = np.repeat(np.arange(len(files)), [piece.size for piece in pieces])
+        first, second = (files[source[order[same[0] + i]]].name for i in (0, 1))
+        raise BadInput(f"{what} {together[order[same[0]]]} stands in {first} and in {second}")
+
+
+def _refuse_any(name: str, key: Sequence[str], paths: Sequence[Path]) -> None:
+    seen: dict[tuple[object, ...], str] = {}
+    for path in paths:
+        columns = pq.read_table(path, columns=list(key), partitioning=None)
+        for value in zip(*(columns[k].to_pylist() for k in key), strict=True):
+            if value in seen:
+                raise BadInput(f"table {name}: key {value} stands in {seen[value]} and in {path.name}")
+            seen[value] = path.name

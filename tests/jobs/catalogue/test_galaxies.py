@@ -1,0 +1,184 @@
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+
+from jobs.catalogue import galaxies, luminosity_function, morphology
+from jobs.fluxes import cosmology
+from lake_schema import ids, sky, validate
+from lake_schema.tables.galaxies import GALAXIES
+
+from .conftest import SEED
+
+ARCMIN2_PER_DEG2 = 3600.0
+CELL = 303_117
+
+
+@pytest.fixture(scope="module")
+def cell(universe, dust):
+    return galaxies.draw(CELL, SEED, universe, dust)
+
+
+def test_counts_to_the_limits_of_the_survey(drawn):
+    """Serrano et al. 2024: 922e6 galaxies with I_E < 26 are 102 an arcmin2; at least 30 with I_E < 24.5, median z > 0.8."""
+    vis = drawn.mags["euclid_vis"]
+    area = drawn.area * ARCMIN2_PER_DEG2
+    bright = vis < 24.5
+    assert np.sum(vis < 26) / area == pytest.approx(97.6, rel=0.15)
+    assert np.sum(vis < 26) / area == pytest.approx(102.0, rel=0.10)
+    assert np.sum(bright) / area == pytest.approx(31.0, rel=0.15)
+    assert np.sum(bright) / area >= 30
+    assert np.median(drawn.z[bright]) == pytest.approx(0.87, abs=0.05)
+
+
+@pytest.mark.parametrize(("limit", "observed"), [(21, 1.45), (22, 3.7), (23, 9.0), (24, 21.0), (25, 44.5)])
+def test_i_band_counts_are_the_observed_ones(drawn, limit, observed):
+    """Per arcmin2: GAMA (Driver et al. 2016), zCOSMOS, VVDS (Le Fevre et al. 2005), LSST Science Book 2009."""
+    found = np.sum(drawn.mags["lsst_i"] < limit) / (drawn.area * ARCMIN2_PER_DEG2)
+    assert found == pytest.approx(observed, rel=0.18)
+
+
+def test_slope_of_the_counts(drawn):
+    number = np.histogram(drawn.mags["euclid_vis"], np.arange(19.5, 24.0, 1.0))[0]
+    assert np.mean(np.diff(np.log10(number))) == pytest.approx(0.39, abs=0.03)
+
+
+@pytest.mark.parametrize("z", [0.1, 0.5, 1.0, 2.0])
+def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z):
+    half = 0.08 if z < 0.3 else 0.05
+    near, far = z - half, z + half
+    volume = drawn.area * np.radians(1.0) ** 2 * float(cosmology.comoving_volume(near, far))
+    # Complete for every spectrum: the reddest galaxy of this luminosity is still brighter than the limit.
+    faintest = 26.0 - float(cosmology.distance_modulus(far)) - {0.1: 0.2, 0.5: 0.3, 1.0: 1.2, 2.0: 3.7}[z]
+    faintest = min(faintest, -17.0)
+    inside = (drawn.z > near) & (drawn.z < far) & (drawn.m_r < faintest)
+    grid = np.linspace(near, far, 41)
+    density = luminosity_function.number_density(universe.inverse.schechter, faintest, grid)
+    shells = cosmology.comoving_volume(grid[:-1], grid[1:])
+    expected = np.sum(0.5 * (density[1:] + density[:-1]) * shells) * drawn.area * np.radians(1.0) ** 2
+    assert volume > 0
+    assert inside.sum() == pytest.approx(expected, rel=0.10)
+
+
+@pytest.mark.parametrize(
+    ("blue", "red", "median"),
+    [
+        ("lsst_g", "lsst_r", 0.44),
+        ("lsst_r", "lsst_i", 0.39),
+        ("lsst_i", "lsst_z", 0.26),
+        ("euclid_vis", "euclid_h", 1.33),
+    ],
+)
+def test_median_colours_of_the_wide_survey(drawn, blue, red, median):
+    """Observed medians of I_E < 24.5."""
+    bright = drawn.mags["euclid_vis"] < 24.5
+    assert np.median((drawn.mags[blue] - drawn.mags[red])[bright]) == pytest.approx(median, abs=0.08)
+
+
+@pytest.mark.parametrize(
+    ("bright", "faint", "median"),
+    [(19, 20, 1.18), (21, 22, 0.68), (22, 23, 0.52), (23, 24, 0.41), (24, 24.5, 0.34), (25, 26, 0.23)],
+)
+def test_median_sizes(drawn, bright, faint, median):
+    vis = drawn.mags["euclid_vis"]
+    inside = (vis >= bright) & (vis < faint)
+    names = ("bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index")
+    bulge, disc, fraction, sersic = (drawn.columns[name][inside].astype(float) for name in names)
+    low, high = np.minimum(bulge, disc), np.maximum(bulge, disc)
+    for _ in range(20):
+        middle = np.sqrt(low * high)
+        light = fraction * morphology.light_within(middle, bulge, sersic)
+        light += (1 - fraction) * morphology.light_within(middle, disc, 1.0)
+        low, high = np.where(light < 0.5, middle, low), np.where(light < 0.5, high, middle)
+    assert np.median(low) == pytest.approx(median, rel=0.10)
+
+
+@pytest.mark.parametrize("z", [0.3, 0.9, 1.5, 2.1])
+def test_cosmic_star_formation(drawn, z):
+    """Madau & Dickinson 2014, eq. 15; galaxies below the limit are missing."""
+    inside = np.abs(drawn.z - z) < 0.2
+    volume = drawn.area * np.radians(1.0) ** 2 * float(cosmology.comoving_volume(z - 0.2, z + 0.2)) / 0.67**3
+    found = np.log10(np.sum(10.0 ** drawn.columns["log_sfr"][inside].astype(float)) / volume)
+    assert found == pytest.approx(np.log10(0.015 * (1 + z) ** 2.7 / (1 + ((1 + z) / 2.9) ** 5.6)), abs=0.2)
+
+
+def test_rows_are_what_the_table_declares(drawn):
+    assert validate.violations(drawn.rows, GALAXIES) == []
+
+
+def test_rows_are_sorted_inside_their_cell(cell):
+    index = cell["_healpix_29"].to_numpy()
+    ra, dec = cell["ra"].to_numpy(), cell["dec"].to_numpy()
+    assert np.all(np.diff(index) >= 0)
+    assert np.all(np.diff(cell["id"].to_numpy()) > 0)
+    assert np.all(sky.cell_of(ra, dec, ids.GENERATION_ORDER) == CELL)
+    assert np.array_equal(sky.healpix_29(ra, dec), index)
+
+
+def test_every_galaxy_is_its_own_central_and_unlensed(cell):
+    assert np.array_equal(cell["halo_id"].to_numpy(), ids.halo_of(cell["id"].to_numpy()))
+    assert cell["ra_lensed"].equals(cell["ra"])
+    for name in ("kind", "kappa", "gamma1", "gamma2"):
+        assert not cell[name].to_numpy().any()
+
+
+def test_a_cell_is_the_same_alone_or_among_others(universe, dust, cell):
+    galaxies.draw(5, SEED, universe, dust)
+    again = galaxies.draw(CELL, SEED, pickle.loads(pickle.dumps(universe)), dust)
+    assert again.equals(cell)
+    # Null columns apart, the bytes themselves.
+    for name in cell.column_names:
+        if not cell[name].null_count:
+            assert again[name].to_numpy().tobytes() == cell[name].to_numpy().tobytes()
+
+
+def test_other_cells_and_seeds_have_other_galaxies(universe, dust, cell):
+    for other in (
+        galaxies.draw(CELL + 1, SEED, universe, dust),
+        galaxies.draw(CELL, SEED + 1, universe, dust),
+    ):
+        n = min(len(other), len(cell)) // 2
+        assert (
+            not np.isin(other["abs_mag_r01"].to_numpy()[:n], cell["abs_mag_r01"].to_numpy()[:n]).mean() > 0.01
+        )
+
+
+def test_a_step_leaves_the_numbers_of_the_others(universe, dust, cell):
+    size = dataclasses.replace(universe.shapes.size, pivot=1e10)
+    changed = dataclasses.replace(universe, shapes=dataclasses.replace(universe.shapes, size=size))
+    other = galaxies.draw(CELL, SEED, changed, dust)
+    differ = {name for name in cell.column_names if not cell[name].equals(other[name])}
+    assert differ == {"bulge_half_light_radius", "disk_half_light_radius"}
+
+
+def test_the_limit_is_the_limit(drawn, universe):
+    vis = drawn.mags["euclid_vis"]
+    # The columns are single precision: 1e-5 mag at redshift and luminosity.
+    assert vis.max() < 26.0 + 1e-3
+    assert np.sum(vis > 25.99) > 0
+    deeper = dataclasses.replace(universe.counts)
+    assert deeper.per_deg2 * drawn.area > 1.2 * vis.size
+
+
+def test_the_apparent_reference_magnitude_is_near_the_seen_ones(drawn):
+    """0.1r (5620 A) lies between LSST g and r for any smooth spectrum."""
+    m = drawn.columns["mag_r01"]
+    blue, red = drawn.mags["lsst_g"], drawn.mags["lsst_r"]
+    between = (m < np.maximum(blue, red) + 0.15) & (m > np.minimum(blue, red) - 0.15)
+    assert between.mean() > 0.99
+
+
+def test_an_empty_cell_is_an_empty_table(dust):
+    rows = galaxies.draw(0, SEED, galaxies.model(10.0), dust)
+    assert len(rows) < 5
+    assert rows.schema.equals(GALAXIES.arrow())
+    assert validate.violations(rows, GALAXIES) == []
+
+
+def test_the_deepest_and_widest_request(dust):
+    rows = galaxies.draw((12 << 16) - 1, SEED, galaxies.model(28.0, 3.0), dust)
+    assert validate.violations(rows, GALAXIES) == []
+    assert rows["z_true"].to_numpy().max() > 2.9
+    nearer = np.sum(rows["z_true"].to_numpy() < 2.3) / sky.cell_area(ids.GENERATION_ORDER)
+    assert nearer == pytest.approx(1.16e6, rel=0.15)

@@ -1,0 +1,131 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jobs.catalogue import milky_way as mw
+from jobs.fluxes import stellar
+
+GALAXY = mw.milky_way()
+COMPONENTS = st.sampled_from([mw.THIN, mw.THICK, mw.HALO])
+COUNTS = {
+    90: (898, 2248, 5119, 12869, 2149, 10947, 36451),
+    60: (1174, 2984, 6864, 17121, 2833, 14687, 47254),
+    45: (1708, 4439, 10413, 25723, 4154, 22374, 67569),
+    30: (3250, 8707, 21375, 52519, 7870, 46724, 124538),
+    20: (6699, 18113, 46740, 116048, 15669, 104824, 249659),
+}
+# I - H of K giants.
+GIANT_I_H = 1.68
+
+
+@given(COMPONENTS, st.floats(0.0, 1e5), st.floats(-1e5, 1e5))
+def test_density_is_positive_and_finite(component, radius, height):
+    value = float(mw.density(GALAXY, component, radius, height))
+    assert np.isfinite(value)
+    assert value >= 0.0
+    assert abs(height) > 5e4 or value > 0.0
+
+
+@given(COMPONENTS, st.floats(0.0, 3e4), st.floats(0.0, 3e4), st.floats(1.0, 3.0))
+def test_density_falls_outwards(component, radius, height, times):
+    here = mw.density(GALAXY, component, radius, height)
+    assert mw.density(GALAXY, component, radius * times, height) <= here
+    assert mw.density(GALAXY, component, radius, height * times) <= here
+
+
+@given(COMPONENTS)
+def test_density_is_one_at_the_sun(component):
+    assert mw.density(GALAXY, component, GALAXY.sun.radius, GALAXY.sun.height) == pytest.approx(1.0)
+
+
+def test_scale_heights_and_the_halo_s_slope():
+    thin = mw.density(GALAXY, mw.THIN, 8000.0, [500.0, 800.0])
+    assert thin[0] / thin[1] == pytest.approx(np.e)
+    halo = mw.density(GALAXY, mw.HALO, [20_000.0, 40_000.0], 0.0)
+    assert np.log2(halo[0] / halo[1]) == pytest.approx(2.77, abs=0.01)
+    flattened = mw.density(GALAXY, mw.HALO, [30_000.0, 0.0], [0.0, 30_000.0 * 0.64])
+    assert flattened[0] == pytest.approx(flattened[1])
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "place"),
+    [
+        (0, 0, (3000.0, 25.0)),
+        (180, 0, (13_000.0, 25.0)),
+        (90, 0, (np.hypot(8000, 5000), 25.0)),
+        (0, 90, (8000, 5025)),
+    ],
+)
+def test_places_along_the_line_of_sight(lon, lat, place):
+    radius, height = mw.cylindrical(GALAXY, lon, lat, np.array([5000.0]))
+    assert (radius[0], height[0]) == pytest.approx(place)
+
+
+def mean_counts(b):
+    """Stars deg^-2 at I < 18, 20, 22, 24.5 and H < 18, 22, 26 (Vega), mean over longitude, no dust."""
+    types = stellar.types()
+    order = np.argsort(types.abs_mag_h)
+    m_h = 0.5 * (GALAXY.m_h[1:] + GALAXY.m_h[:-1])
+    m_i = np.interp(m_h, types.abs_mag_h[order], (types.abs_mag_v - types.color_vi)[order])
+    modulus = 2.5 * np.log10(GALAXY.distance[1:] * GALAXY.distance[:-1]) - 5.0
+    mag_i = np.stack([m_i] * 3 + [m_h + GIANT_I_H] * 3)[:, None, :] + modulus[None, :, None]
+    mag_h = np.broadcast_to(m_h + modulus[:, None], mag_i.shape)
+    total = np.zeros(7)
+    longitudes = np.arange(0, 360, 30)
+    for lon in longitudes:
+        number = mw.expected(GALAXY, float(lon), float(b), 1.0, 40.0)
+        total += [number[mag_i < limit].sum() for limit in (18, 20, 22, 24.5)] + [
+            number[mag_h < limit].sum() for limit in (18, 22, 26)
+        ]
+    return total / len(longitudes)
+
+
+@pytest.mark.parametrize("b", COUNTS)
+def test_star_counts(b):
+    """Counts of the same laws summed once by a code of its own (2300 deg^-2 to V = 20 at the pole: Bahcall & Soneira 1980)."""
+    assert mean_counts(b) == pytest.approx(COUNTS[b], rel=0.05)
+
+
+def test_all_that_may_be_bright_enough_is_expected(rng):
+    everything = mw.expected(GALAXY, 40.0, 30.0, 0.05, 60.0)
+    bright = mw.expected(GALAXY, 40.0, 30.0, 0.05, 22.0)
+    assert np.all((bright == everything) | (bright == 0.0))
+    drawn = mw.draw(GALAXY, everything, rng)
+    apparent = drawn.m_h + 5 * np.log10(drawn.distance) - 5
+    wanted = np.sum(apparent < 22)
+    again = mw.draw(GALAXY, bright, rng)
+    found = np.sum(again.m_h + 5 * np.log10(again.distance) - 5 < 22)
+    assert found == pytest.approx(wanted, abs=6 * np.sqrt(wanted))
+
+
+def test_a_sample_has_the_expected_distribution(rng):
+    mean = mw.expected(GALAXY, 120.0, -50.0, 4.0, 26.0)
+    sample = mw.draw(GALAXY, mean, rng)
+    n = sample.m_h.size
+    assert n == pytest.approx(mean.sum(), abs=5 * np.sqrt(mean.sum()))
+    for population in range(6):
+        found = np.sum((sample.component == population % 3) & (sample.giant == (population >= 3)))
+        assert found == pytest.approx(mean[population].sum(), abs=5 * np.sqrt(mean[population].sum()) + 1)
+    shells = np.histogram(sample.distance, GALAXY.distance[::50])[0]
+    wanted = mean.sum((0, 2)).reshape(-1, 50).sum(1)
+    assert shells == pytest.approx(wanted, abs=5 * np.sqrt(wanted.max()))
+    bins = np.histogram(sample.m_h, GALAXY.m_h)[0]
+    assert bins == pytest.approx(mean.sum((0, 1)), abs=5 * np.sqrt(mean.sum((0, 1)).max()))
+
+
+def test_nothing_expected_nothing_drawn(rng):
+    sample = mw.draw(GALAXY, np.zeros((6, 500, GALAXY.m_h.size - 1)), rng)
+    assert sample.m_h.size == sample.distance.size == 0
+
+
+def test_labels(rng):
+    component = np.repeat([mw.THIN, mw.THICK, mw.HALO], 4000)
+    metals = mw.metallicity(GALAXY, component, rng)
+    means = [metals[component == code].mean() for code in (mw.THIN, mw.THICK, mw.HALO)]
+    # The halo: Ivezic et al. 2008.
+    assert means == pytest.approx([-0.05, -0.60, -1.46], abs=0.03)
+    sample = mw.Sample(component[:2], np.array([False, True]), np.ones(2), np.array([3.31, -1.5]))
+    assert mw.teff(GALAXY, sample, np.array([0.0, 0.0])) == pytest.approx([5770, 4750], abs=60)
+    assert mw.teff(GALAXY, sample, np.array([-1.5, -0.5])) == pytest.approx([5920, 4750], abs=60)
+    assert mw.log_g(GALAXY, sample) == pytest.approx([4.43, 2.5], abs=0.05)

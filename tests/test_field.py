@@ -1,0 +1,230 @@
+"""A whole field, from a request to two FITS images, measured as an astronomer would measure it.
+
+The five jobs run once, in the shared session, on the demo's request; everything else looks at what they published.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sep
+from astropy.io import fits
+from astropy.wcs import WCS
+from scipy.spatial import cKDTree
+
+from jobs import request, shell
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+from jobs.render import plan_exposures, render_exposures
+from lake_schema import layout, read, sky
+
+pytestmark = pytest.mark.spark
+
+DEMO = Path(__file__).parents[1] / "requests" / "demo.toml"
+JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.JOB, render_exposures.JOB)
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image with its truth: e-, sky subtracted; sources with 0-based pixel positions and expected e-."""
+
+    header: fits.Header
+    electrons: np.ndarray
+    noise_free: np.ndarray
+    variance: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    expected: np.ndarray
+    is_star: np.ndarray
+    pixel_scale: float
+    aperture: float
+    blend: float
+
+
+@pytest.fixture(scope="session")
+def field(spark, tmp_path_factory):
+    """The lake of the demo."""
+    root = layout.lake(tmp_path_factory.mktemp("field") / "lake")
+    wanted = request.parse(DEMO)
+    for job in JOBS:
+        shell.run(job, root, wanted)
+    return root
+
+
+def product(field, channel, content):
+    products = read.version(field, "products")
+    for row in products.rows().to_pylist():
+        if row["channel"] == channel and row["content"] == content:
+            return products.file(row["path"])
+    raise AssertionError(f"no {content} product of {channel}")
+
+
+@pytest.fixture(scope="session", params=["VIS", "EXT"])
+def image(request, field):
+    channel = request.param
+    with fits.open(product(field, channel, "science")) as science:
+        header, adu = science[0].header, science[0].data.astype(float)
+    noise_free = fits.getdata(product(field, channel, "noise_free")).astype(float)
+    diffuse = (header["SKYRATE"] + header["DARKRATE"]) * header["EXPTIME"]
+    electrons = (adu - header["BIAS"]) * header["GAIN"] - diffuse
+    variance = noise_free + diffuse + header["RDNOISE"] ** 2 + header["GAIN"] ** 2 / 12
+    x, y, expected, is_star = sources(field, header)
+    vis = channel == "VIS"
+    return Image(
+        header, electrons, noise_free, variance, x, y, expected, is_star,
+        pixel_scale=0.1 if vis else 0.2,
+        aperture=1.3 if vis else 2.0,
+        blend=2.0 if vis else 4.0,
+    )  # fmt: skip
+
+
+def sources(field, header):
+    """Positions and expected electrons of everything on the detector, from the catalogues and the flux tables alone."""
+    system = WCS(header)
+    found = []
+    for catalogue, fluxes, ra, dec in (
+        ("galaxies", "galaxy_fluxes", "ra_lensed", "dec_lensed"),
+        ("stars", "star_fluxes", "ra", "dec"),
+    ):
+        where = read.version(field, catalogue).rows([ra, dec])
+        flux = read.version(field, fluxes).rows([f"f_nu_{header['FILTER']}"])
+        x, y = system.all_world2pix(where[ra].to_numpy(), where[dec].to_numpy(), 0)
+        microjansky = flux.column(0).to_numpy().astype(float)
+        electrons = microjansky / 3631e6 * 10 ** (0.4 * header["ZEROPNT"]) * header["EXPTIME"]
+        inside = (x > -0.5) & (x < header["NAXIS1"] - 0.5) & (y > -0.5) & (y < header["NAXIS2"] - 0.5)
+        found.append((x[inside], y[inside], electrons[inside], np.full(inside.sum(), catalogue == "stars")))
+    return (np.concatenate(column) for column in zip(*found, strict=True))
+
+
+@pytest.fixture(scope="session")
+def photometry(image):
+    """Apertures of every unblended source away from the edge: (index, measured, noise-free, predicted noise)."""
+    radius = image.aperture / 2 / image.pixel_scale
+    points = np.stack([image.x, image.y], 1)
+    tree = cKDTree(points)
+    alone = np.ones(len(points), bool)
+    for i, j in tree.query_pairs(image.blend / image.pixel_scale):
+        # A neighbour spoils a source unless it is more than two magnitudes fainter.
+        alone[i] &= image.expected[j] < image.expected[i] * 10**-0.8
+        alone[j] &= image.expected[i] < image.expected[j] * 10**-0.8
+    ny, nx = image.electrons.shape
+    edge = 2 * radius
+    alone &= (image.x > edge) & (image.x < nx - edge) & (image.y > edge) & (image.y < ny - edge)
+    index = np.flatnonzero(alone)
+
+    def aperture(data):
+        return sep.sum_circle(np.ascontiguousarray(data), image.x[index], image.y[index], radius, subpix=0)[0]
+
+    noise = np.sqrt(aperture(image.variance))
+    return index, aperture(image.electrons), aperture(image.noise_free), noise
+
+
+def test_bright_unblended_sources_are_found(image, photometry):
+    index, _, truth, noise = photometry
+    bright = index[truth > 10 * noise]
+    assert len(bright) > 300
+    sigma = float(np.sqrt(np.median(image.variance)))
+    background = sep.Background(image.electrons, bw=128, bh=128).back()
+    objects = sep.extract(
+        image.electrons - background, 1.2, err=sigma, minarea=4, deblend_cont=0.001, deblend_nthresh=64
+    )
+    tree = cKDTree(np.stack([objects["x"], objects["y"]], 1))
+    distance, _ = tree.query(np.stack([image.x[bright], image.y[bright]], 1))
+    found = distance * image.pixel_scale < 0.25 * image.aperture
+    assert found.mean() >= 0.9
+    assert np.median(distance[found]) < 0.2
+
+
+def test_photometry_is_right_and_as_noisy_as_predicted(image, photometry):
+    _, measured, truth, noise = photometry
+    bright = truth > 10 * noise
+    # A saturated source has lost what the converter could not hold.
+    full = image.header["GAIN"] * 65000
+    peaks = image.noise_free[np.rint(image.y[photometry[0]]).astype(int), np.rint(image.x[photometry[0]]).astype(int)]
+    use = bright & (peaks < 0.5 * full)
+    dm = -2.5 * np.log10(measured[use] / truth[use])
+    assert abs(np.median(dm)) < 0.01
+    pull = (measured[use] - truth[use]) / noise[use]
+    spread = (np.percentile(pull, 84) - np.percentile(pull, 16)) / 2
+    assert 0.9 < spread < 1.3
+
+
+def test_positions_are_unbiased(image, photometry):
+    index, _, truth, noise = photometry
+    bright = index[truth > 50 * noise]
+    radius = 0.5 * image.aperture / image.pixel_scale
+    x, y, _ = sep.winpos(image.electrons, image.x[bright], image.y[bright], radius / 2.5)
+    offset = np.hypot(np.median(x - image.x[bright]), np.median(y - image.y[bright]))
+    assert offset < 0.2
+
+
+def test_the_frame_holds_the_light_of_its_sources(image):
+    """What lies on the detector, summed, within what wings carry over its edges."""
+    assert image.noise_free.sum() == pytest.approx(image.expected.sum(), rel=0.02)
+    assert image.noise_free.min() > -1e-3 * np.sqrt(np.median(image.variance))
+
+
+def test_the_background_is_the_predicted_one(image):
+    empty = image.noise_free < 0.05 * np.sqrt(image.variance)
+    assert empty.mean() > 0.2
+    pixels = (image.electrons - image.noise_free)[empty]
+    noise = np.sqrt(image.variance[empty].mean())
+    assert abs(pixels.mean()) < 5 * noise / np.sqrt(empty.sum())
+    assert pixels.std() == pytest.approx(noise, rel=0.005)
+
+
+@pytest.mark.parametrize("content", ["science", "noise_free"])
+@pytest.mark.parametrize("channel", ["VIS", "EXT"])
+def test_files_are_good_fits(field, channel, content):
+    path = product(field, channel, content)
+    with fits.open(path, checksum=True) as hdus:
+        hdus.verify("exception")
+        for hdu in hdus:
+            assert hdu.verify_checksum() == hdu.verify_datasum() == 1
+    header = fits.getheader(path)
+    for key in ("EXPTIME", "BUNIT", "SEED", "MISSION", "CTYPE1", "CD1_1", "MJD-OBS", "TRUESKY"):
+        assert key in header, key
+    if channel == "VIS":
+        assert (header["NAXIS1"], header["NAXIS2"]) == (4096, 4132)
+
+
+def test_other_tools_can_open_the_lake(field):
+    import lsdb
+
+    galaxies = read.version(field, "galaxies")
+    found = lsdb.open_catalog(str(layout.current(field, "galaxies"))).cone_search(53.117, -27.808, 60.0).compute()
+    everything = galaxies.rows(["ra", "dec"])
+    near = sky.separation(53.117, -27.808, everything["ra"].to_numpy(), everything["dec"].to_numpy()) < 60 / 3600
+    assert len(found) == near.sum() > 100
+
+
+def test_fluxes_lie_beside_their_catalogues(field):
+    for catalogue, fluxes in (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes")):
+        left, right = read.version(field, catalogue), read.version(field, fluxes)
+        assert left.parts == right.parts
+        assert left.rows(["id"]).equals(right.rows(["id"]))
+
+
+def test_every_table_is_sound(field):
+    for name in read.tables(field):
+        assert read.verify(read.version(field, name), deep=True) == []
+
+
+def test_the_demo_covers_only_what_its_detectors_touch(field):
+    tasks = read.version(field, "tasks").rows(["cells"])["cells"].to_pylist()
+    touched = sorted({cell for cells in tasks for cell in cells})
+    drawn = request.parse(DEMO).area.cells()
+    assert set(touched) <= set(drawn)
+    assert len(drawn) * sky.cell_area(8) <= 0.6
+
+
+def test_counts_are_those_of_the_sky(field):
+    """102 galaxies an arcmin2 with I_E < 26, as deep surveys and the Flagship mock have, within 15 %."""
+    area = len(request.parse(DEMO).area.cells()) * sky.cell_area(8) * 3600
+    galaxies = read.version(field, "galaxies")
+    assert galaxies.num_rows / area == pytest.approx(102, rel=0.15)
+    flux = read.version(field, "galaxy_fluxes").rows(["f_nu_euclid_vis"]).column(0).to_numpy()
+    a_v = galaxies.rows(["a_v"]).column(0).to_numpy()
+    unreddened = flux * 10 ** (0.4 * 2.27 / 3.1 * a_v)
+    assert (unreddened > 3631e6 * 10 ** (-0.4 * 24.5)).sum() / area == pytest.approx(31, rel=0.15)
