@@ -50,6 +50,7 @@ clean:
 # Java is looked at every time (0.1 s): it may have come, gone or changed since.
 spark: .venv/installed
 	@.venv/bin/python scripts/prepare_spark.py
+	@.venv/bin/python scripts/record_spark_classes.py
 
 .venv/installed: .venv/bin/python pyproject.toml constraints.txt
 	$(INSTALL) .

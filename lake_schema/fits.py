@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -153,7 +153,7 @@ def _write(path: Path, units: fits.HDUList) -> None:
     handle, temporary = tempfile.mkstemp(suffix=".part", prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as stream:
-            units.writeto(stream, output_verify="exception")
+            _write_units(stream, units, path)
             stream.flush()
             os.fsync(stream.fileno())
         # mkstemp makes files private; a product is as readable as anything else that is written here.
@@ -162,6 +162,14 @@ def _write(path: Path, units: fits.HDUList) -> None:
     except BaseException:
         os.unlink(temporary)
         raise
+
+
+def _write_units(stream: IO[bytes], units: fits.HDUList, path: Path) -> None:
+    try:
+        units.writeto(stream, output_verify="exception")
+    except AttributeError as error:
+        # astropy (to 8.0) trips over its own check of the free space; what it was called for is the context.
+        raise OSError(f"{path}: {error.__context__}") from None
 
 
 def _umask() -> int:

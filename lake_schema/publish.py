@@ -160,21 +160,20 @@ def _lock(path: Path, refusal: str, patience: float = 0.0) -> Iterator[None]:
     give_up = time.monotonic() + patience
     while True:
         with path.open("a") as stream:
-            with contextlib.suppress(BlockingIOError):
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if _is_same(path, stream.fileno()):
-                    yield
-                    return
+            if _take(path, stream.fileno()):
+                yield
+                return
         if time.monotonic() >= give_up:
             raise Superseded(refusal)
         time.sleep(_POLL)
 
 
-def _is_same(path: Path, descriptor: int) -> bool:
-    """Is the open file still the one of that name?  Its last holder may have removed it."""
+def _take(path: Path, descriptor: int) -> bool:
+    """Lock the open file, if nobody holds it, and if it is still the one of that name: a holder removes it at the end."""
     try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path.stat().st_ino == os.fstat(descriptor).st_ino
-    except FileNotFoundError:
+    except (BlockingIOError, FileNotFoundError):
         return False
 
 

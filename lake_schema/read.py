@@ -1,16 +1,18 @@
-"""How a published table is read: through its manifest, never a glob, with every page's checksum verified.
+"""How a published table is read: through its manifest, never a glob, with every checksum verified.
 
 version(root, name)     the published version (resolved once: a later publication does not mix in)
 Version.dataset         its files as an Arrow dataset
-Version.rows            rows of some columns, cells or sky
+Version.rows            rows of some columns or parts
+Version.in_cells        rows inside HEALPix cells
+Version.cone            rows inside a circle, by true or lensed position
 verify                  is a version what its manifest says?
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +22,32 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
-from lake_schema import layout, parquet, sky
-from lake_schema.errors import BadInput, Damaged
-from lake_schema.hats_files import cell_of_part
-from lake_schema.provenance import file_sha256
-from lake_schema.publish import MANIFEST
+from lake_schema import layout, manifest, parquet, sky, tables as declarations
+from lake_schema.columns import Table
+from lake_schema.errors import BadInput, Damaged, VersionMismatch
+from lake_schema.provenance import digest
+
+# Cells of a cone's cover are about this part of its radius wide: finer ones skip few rows more.
+_CELLS_A_RADIUS = 4
+# So many stretches of _healpix_29 go into the filter of one file; the rest of its rows are left out after reading.
+_MOST_RANGES = 16
+# Added to a padded radius: more than the rounding of the largest deflection.
+_ROUNDING_DEG = 1e-9
+
+ON = {"true": ("ra", "dec"), "lensed": ("ra_lensed", "dec_lensed")}
 
 
 @dataclass(frozen=True, slots=True)
 class Version:
-    """One published version of a table."""
+    """One published version of a table.
+
+    declared : what this code says the table is, where it knows the table; columns of it that the files do not have yet
+               are null
+    """
 
     folder: Path
     manifest: dict[str, Any]
+    declared: Table | None = None
 
     @property
     def table(self) -> str:
@@ -44,6 +59,11 @@ class Version:
         return str(self.manifest["key"])
 
     @property
+    def fingerprint(self) -> str:
+        """sha256 over the sha256 of every file, hexadecimal: what the version holds, whatever it was made from."""
+        return digest({entry["path"]: entry["sha256"] for entry in self.manifest["files"]})
+
+    @property
     def num_rows(self) -> int:
         return int(self.manifest["rows"])
 
@@ -52,11 +72,18 @@ class Version:
         return [str(part["name"]) for part in self.manifest["parts"]]
 
     def path(self, part: str) -> Path:
-        """A part's Parquet file; Damaged where its size is not what the manifest says."""
+        """A part's Parquet file; Damaged where its size or footer is not what the manifest says."""
+        return manifest.checked(self.folder, self._entry(part))
+
+    def part_rows(self, part: str) -> int:
+        """Number of rows of a part."""
+        return int(self._entry(part)["rows"])
+
+    def _entry(self, part: str) -> dict[str, Any]:
+        files = self._files()
         for prefix in (f"{self.table}/dataset/", "dataset/"):
-            entry = self._files().get(prefix + part)
-            if entry is not None:
-                return self._checked(entry)
+            if (entry := files.get(prefix + part)) is not None:
+                return entry
         raise BadInput(f"table {self.table}: version {self.key} has no part {part}")
 
     def file(self, relative: str) -> Path:
@@ -64,21 +91,15 @@ class Version:
         entry = self._files().get(relative)
         if entry is None:
             raise BadInput(f"table {self.table}: version {self.key} has no file {relative}")
-        return self._checked(entry)
+        return manifest.checked(self.folder, entry)
 
     def _files(self) -> dict[str, dict[str, Any]]:
         return {entry["path"]: entry for entry in self.manifest["files"]}
 
-    def _checked(self, entry: dict[str, Any]) -> Path:
-        path = self.folder / entry["path"]
-        if not path.is_file():
-            raise Damaged(f"{path} is missing")
-        if path.stat().st_size != entry["bytes"]:
-            raise Damaged(f"{path} has {path.stat().st_size} bytes, the manifest says {entry['bytes']}")
-        return path
-
     def schema(self) -> pa.Schema:
         """Arrow schema of the rows, with units and descriptions in the fields' metadata."""
+        if self.declared is not None:
+            return self.declared.arrow()
         return pq.read_schema(self.path(self.parts[0])) if self.parts else pa.schema([])
 
     def dataset(self, parts: Iterable[str] | None = None) -> ds.FileSystemDataset:
@@ -94,10 +115,17 @@ class Version:
         columns : names, None = all;  parts : names of parts, None = all;  where : an Arrow filter
         """
         names = list(columns) if columns is not None else None
+        self._refuse_unknown(names or [])
         try:
             return self.dataset(parts).to_table(columns=names, filter=where)
         except (OSError, pa.ArrowInvalid) as error:
             raise Damaged(f"table {self.table}: version {self.key}: {error}") from None
+
+    def _refuse_unknown(self, names: Sequence[str]) -> None:
+        known = self.schema().names if names else []
+        for name in names:
+            if name not in known:
+                raise BadInput(f"table {self.table} has no column {name}")
 
     def in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows of a catalogue inside cells of an order (nested), reading only the files and row groups that can hold some.
@@ -105,39 +133,128 @@ class Version:
         cells : int[n]
         """
         wanted = np.unique(np.asarray(cells, np.int64))
-        parts = [part for part in self.parts if _overlaps(part, wanted, order)]
-        if not parts or not wanted.size:
-            return self.rows(columns, self.parts[:1], pc.scalar(False))
-        first, last = sky.cell_range(order, int(wanted[0]))[0], sky.cell_range(order, int(wanted[-1]))[1]
-        index = pc.field("_healpix_29")
         names = None if columns is None else list(dict.fromkeys([*columns, "_healpix_29"]))
-        rows = self.rows(names, parts, (index >= first) & (index < last))
+        pieces = [self.rows(names, self.parts[:1], pc.scalar(False))]
+        for part in self.parts:
+            here = _inside(part, wanted, order)
+            if here.size:
+                pieces.append(self.rows(names, [part], _in_ranges(_ranges(here, order))))
+        rows = pa.concat_tables(pieces)
         inside = np.isin(sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, order), wanted)
         rows = rows.filter(pa.array(inside))
         return rows if columns is None else rows.select(list(columns))
 
+    def cone(
+        self, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None, on: str = "true"
+    ) -> pa.Table:
+        """Rows of a catalogue within `radius` of a place, its edge included.
 
-def _overlaps(part: str, cells: sky.Int, order: int) -> bool:
-    file_order, cell = cell_of_part(part)
+        ra, dec, radius : deg
+        on              : "true" or "lensed", which of a source's positions counts
+        """
+        if on not in ON:
+            raise BadInput(f"on = {on!r} is not one of {', '.join(ON)}")
+        self._refuse_unknown([*ON[on], "_healpix_29"])
+        padded = radius + (self.deflection() + _ROUNDING_DEG if on == "lensed" else 0.0)
+        order = cover_order(padded)
+        names = None if columns is None else list(dict.fromkeys([*columns, *ON[on]]))
+        rows = self.in_cells(sky.cells_in_cone(ra, dec, min(padded, 180.0), order).tolist(), order, names)
+        places = (rows[name].to_numpy() for name in ON[on])
+        rows = rows.filter(pa.array(sky.separation(*places, ra, dec) <= radius))
+        return rows if columns is None else rows.select(list(columns))
+
+    def deflection(self) -> float:
+        """Largest distance of a lensed from its true position, deg, as it was when the version was published."""
+        if "deflection_deg" not in self.manifest:
+            raise BadInput(f"table {self.table}: version {self.key} does not say how far positions are lensed")
+        return float(self.manifest["deflection_deg"])
+
+
+def cover_order(radius: float) -> int:
+    """Order of cells that suit the cover of a circle of `radius` deg."""
+    wanted = max(radius / _CELLS_A_RADIUS, 1e-7)
+    order = int(np.ceil(np.log2(np.sqrt(sky.cell_area(0)) / wanted)))
+    return min(max(order, 0), sky.DEEPEST - 3)
+
+
+def _inside(part: str, cells: sky.Int, order: int) -> sky.Int:
+    """Those of the cells that a part's cell overlaps."""
+    file_order, cell = layout.cell_of_file(part)
     if file_order <= order:
-        return bool((sky.parent(cells, order, file_order) == cell).any())
-    return bool((cells == cell >> (2 * (file_order - order))).any())
+        return cells[sky.parent(cells, order, file_order) == cell]
+    return cells[cells == cell >> (2 * (file_order - order))]
+
+
+def _ranges(cells: sky.Int, order: int) -> list[tuple[int, int]]:
+    """Half-open stretches of order-29 indices that cover sorted cells: at most _MOST_RANGES, the widest gaps left out."""
+    gaps = np.diff(cells)
+    cuts = np.flatnonzero(gaps > 1)
+    if cuts.size >= _MOST_RANGES:
+        cuts = np.sort(cuts[np.argsort(gaps[cuts])[-_MOST_RANGES + 1 :]])
+    firsts, lasts = cells[np.append(0, cuts + 1)], cells[np.append(cuts, -1)]
+    return [
+        (sky.cell_range(order, int(first))[0], sky.cell_range(order, int(last))[1])
+        for first, last in zip(firsts, lasts, strict=True)
+    ]
+
+
+def _in_ranges(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
+    index = pc.field("_healpix_29")
+    return reduce(lambda a, b: a | b, [(index >= first) & (index < last) for first, last in ranges])
+
+
+# ------------------------------------------------------------------------------------------------ versions
 
 
 def version(root: Path, name: str, key: str | None = None) -> Version:
     """The published version of a table, or the one of a key.
 
-    Errors : BadInput where the lake has no such table or version; Damaged where its manifest cannot be read
+    Errors : BadInput where the lake has no such table or version; Damaged where its manifest cannot be read;
+             VersionMismatch where it was written with a declaration that this code cannot read
     """
     link = layout.current(root, name) if key is None else layout.version(root, name, key)
     if not link.exists():
         raise BadInput(f"lake {root} has no table {name}" + (f" of version {key}" if key else ""))
     folder = link.resolve()
-    try:
-        manifest = json.loads((folder / MANIFEST).read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise Damaged(f"{folder / MANIFEST}: {error}") from None
-    return Version(folder, manifest)
+    opened = Version(folder, manifest.load(folder))
+    stored = opened.schema()
+    known = declarations.find(name, stored.names)
+    return opened if known is None else as_declared(opened, known)
+
+
+def as_declared(opened: Version, table: Table) -> Version:
+    """The version as `table` declares it: nullable columns that came later are filled with nulls.
+
+    Errors : VersionMismatch, naming both versions and the first column that differs
+    """
+    was, now = int(opened.manifest["version"]), table.version
+    if fault := _difference(opened.schema(), table, was):
+        raise VersionMismatch(
+            f"table {table.name}: version {was} of its declaration is in the lake, this is version {now}: {fault}"
+        )
+    return Version(opened.folder, opened.manifest, table)
+
+
+def _difference(stored: pa.Schema, table: Table, was: int) -> str:
+    if was > table.version:
+        return "it was written by a later truesky"
+    if not stored.names:
+        return ""
+    for name in stored.names:
+        if name not in table.names:
+            return f"column {name} is not declared"
+    for column in table.columns:
+        if column.name not in stored.names:
+            if column.nullable and column.since > was:
+                continue
+            return f"column {column.name} is missing"
+        have, want = stored.field(column.name), column.field()
+        if have.type != want.type or (have.nullable and not want.nullable):
+            return f"column {column.name} is {have}, wanted {want}"
+        unit = (have.metadata or {}).get(b"unit", b"").decode()
+        if unit != column.unit:
+            return f"column {column.name} has unit {unit!r}, wanted {column.unit!r}"
+    return ""
 
 
 def tables(root: Path) -> list[str]:
@@ -150,36 +267,4 @@ def verify(published: Version, deep: bool = False) -> list[str]:
 
     deep : also the sha256 of every file, and that each cell holds only its own rows, sorted
     """
-    found = []
-    listed = published.manifest["files"]
-    names = {entry["path"] for entry in listed}
-    here = {p.relative_to(published.folder).as_posix() for p in published.folder.rglob("*") if p.is_file()}
-    found += [f"{published.folder / extra} is not in the manifest" for extra in sorted(here - names - {MANIFEST})]
-    for entry in listed:
-        path = published.folder / entry["path"]
-        if not path.is_file():
-            found.append(f"{path} is missing")
-        elif path.stat().st_size != entry["bytes"]:
-            found.append(f"{path} has {path.stat().st_size} bytes, the manifest says {entry['bytes']}")
-        elif deep and file_sha256(path) != entry["sha256"]:
-            found.append(f"{path} has other contents than the manifest says")
-        elif deep and "rows" in entry:
-            found += _verify_rows(path, entry)
-    total = sum(entry.get("rows", 0) for entry in listed)
-    if total != published.num_rows:
-        found.append(f"{published.folder / MANIFEST}: {published.num_rows} rows in all, {total} in the files")
-    return found
-
-
-def _verify_rows(path: Path, entry: dict[str, Any]) -> list[str]:
-    file = pq.ParquetFile(path, page_checksum_verification=True)
-    if file.metadata.num_rows != entry["rows"]:
-        return [f"{path} has {file.metadata.num_rows} rows, the manifest says {entry['rows']}"]
-    if "_healpix_29" not in file.schema_arrow.names or "Npix=" not in path.name:
-        return []
-    index = file.read(columns=["_healpix_29"])["_healpix_29"].to_numpy()
-    order, cell = cell_of_part("/".join(path.parts[-3:]))
-    first, last = sky.cell_range(order, cell)
-    if index.size and (index.min() < first or index.max() >= last):
-        return [f"{path} holds rows of another cell"]
-    return [f"{path} is not sorted by _healpix_29"] if (index[1:] < index[:-1]).any() else []
+    return manifest.faults(published.folder, published.manifest, deep)

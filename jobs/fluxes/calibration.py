@@ -20,6 +20,8 @@ from lake_schema.errors import BadInput
 Float = npt.NDArray[np.float64]
 
 STAR_BAND = "twomass_h"
+# f_nu of a normalised template is 1e-11; 30 decades below, single precision has run out of digits.
+_DARKEST = 1e-41
 
 
 def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
@@ -28,7 +30,7 @@ def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
     Errors: BadInput where dust has left nothing to scale
     Ref: Serrano et al. 2024, appendix B, eq. f_continuum
     """
-    if dark := int(np.sum(~(f_nu_observed > 0.0))):
+    if dark := int(np.sum(~(f_nu_observed > _DARKEST))):
         raise BadInput(f"{dark} galaxies have no light in the reference band: mag_r01 cannot be met")
     return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_r01)) / f_nu_observed)
 

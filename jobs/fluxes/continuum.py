@@ -59,16 +59,9 @@ class Mix:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Dust:
-    """k(lambda) of the five laws on a library's grid, float32[5, n_lambda]."""
-
-    k: Float32
-
-
-def dust_of(library: Library) -> Dust:
-    """The five laws on the grid of a library."""
-    return Dust(extinction.laws(library.wavelength).astype(np.float32))
+def dust_of(library: Library) -> Float32:
+    """k(lambda) of the five laws on the grid of a library, float32[5, n_lambda]."""
+    return extinction.laws(library.wavelength).astype(np.float32)
 
 
 def mix_of(columns: Mapping[str, npt.ArrayLike], library: Library) -> Mix:
@@ -105,17 +98,17 @@ def within(name: str, values: Float, lo: float, hi: float) -> None:
         raise OutOfRange(name, float(values[bad].ravel()[0]), lo, hi)
 
 
-def rest_flux(sed: Int, law: Int, ebv: Float, band: Passband, library: Library, dust: Dust) -> Float:
+def rest_flux(sed: Int, law: Int, ebv: Float, band: Passband, library: Library, dust: Float32) -> Float:
     """Band-averaged f_nu of templates behind dust, at z = 0: float64[n], in units of the library."""
     first = int(band.wavelength[0] - library.wavelength[0])
     stretch = slice(first, first + len(band.wavelength))
     ebv32 = ebv.astype(np.float32)[:, None]
-    spectra = library.flux[:, stretch][sed] * extinction.transmitted(dust.k[:, stretch][law], ebv32)
+    spectra = library.flux[:, stretch][sed] * extinction.transmitted(dust[:, stretch][law], ebv32)
     # Summed in double precision: the rounding then averages out, and no sum depends on its neighbours.
     return np.asarray(spectra.astype(float) @ passbands.weights(band))
 
 
-def amplitudes(mix: Mix, band: Passband, library: Library, dust: Dust) -> Float:
+def amplitudes(mix: Mix, band: Passband, library: Library, dust: Float32) -> Float:
     """float64[2, n]: frac / rest-frame f_nu of each component in the reference band."""
     return np.stack(
         [
@@ -126,7 +119,7 @@ def amplitudes(mix: Mix, band: Passband, library: Library, dust: Dust) -> Float:
 
 
 def observed_shape(
-    mix: Mix, amplitude: Float, library: Library, dust: Dust, first: int, count: int
+    mix: Mix, amplitude: Float, library: Library, dust: Float32, first: int, count: int
 ) -> Float32:
     """f_lambda in the observed frame at `count` whole angstroms from `first`: float32[n, count].
 
@@ -156,7 +149,7 @@ def observed_shape(
 
 
 def _rest_shape(
-    mix: Mix, amplitude: Float32, library: Library, dust: Dust, start: Int, width: int
+    mix: Mix, amplitude: Float32, library: Library, dust: Float32, start: Int, width: int
 ) -> Float32:
     """Combined and extinguished on `width` samples of the library's grid from `start`: float32[n, width]."""
     shared = bool((mix.law[0] == mix.law[1]).all() and (mix.ebv[0] == mix.ebv[1]).all())
@@ -174,8 +167,8 @@ def _rest_shape(
     return total
 
 
-def _transmission(mix: Mix, component: int, dust: Dust, start: Int, width: int) -> Float32:
-    k = _windows(dust.k, mix.law[component], start, width)
+def _transmission(mix: Mix, component: int, dust: Float32, start: Int, width: int) -> Float32:
+    k = _windows(dust, mix.law[component], start, width)
     out: Float32 = extinction.transmitted(k, mix.ebv[component].astype(np.float32)[:, None])
     return out
 

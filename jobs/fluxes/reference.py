@@ -129,7 +129,7 @@ def _tabulate(library: Library, band: Passband, reference: Passband) -> Float:
     nodes = _z_nodes()
     first = int(band.wavelength[0] / (1.0 + nodes[-1]) - library.wavelength[0])
     last = int(band.wavelength[-1] / (1.0 + nodes[0]) - library.wavelength[0]) + 2
-    k = dust.k[:, first:last]
+    k = dust[:, first:last]
     spectra = library.flux[sed, first:last]
     spectra *= extinction.transmitted(k[law], ebv[node].astype(np.float32)[:, None])
     weights = passbands.weights(band)

@@ -72,6 +72,8 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
     """Header of the science image: what an astronomer needs to calibrate it, and what made it."""
     scene = rendered.scene
     gain = scene.value("gain", "electron / adu")
+    dark = scene.value("dark_current", "electron / (s pix)")
+    applied = {decision.name: decision.applied for decision in rendered.decisions}
     return (
         *_common(rendered),
         ("BUNIT", "adu", "unit of the pixels"),
@@ -79,7 +81,8 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
         ("RDNOISE", scene.value("read_noise", "electron"), "[electron] rms"),
         ("BIAS", scene.value("bias", "adu"), "[adu] added to every pixel"),
         ("SATURATE", _saturation(rendered, gain), "[adu] largest value"),
-        ("SKYRATE", scene.sky_rate, "[electron/s/pix] expected sky"),
+        ("SKYRATE", applied["background"] * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
+        ("DARKRATE", applied["dark_current"] * dark, "[electron/s/pix] mean dark current in the image"),
         *_effect_cards(rendered),
     )
 

@@ -1,8 +1,8 @@
 """Cameras: where detectors lie in the focal plane, and where their pixels look.
 
 Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, as the sky is seen from
-inside: with y to the north, x points west (east is left).  Pixel coordinates (column, row) are 0-based, a pixel's
-centre is whole.
+inside: with y to the north, x points west (east is left).  Pixel coordinates (column, row) are 0-based,
+and whole at a pixel's centre.
 
 detectors       the detectors of a camera, from the layout rules
 boresight_for   the pointing that puts a detector's centre on a target

@@ -27,12 +27,15 @@ _INCHES, _DPI = (13.2, 9.6), 100
 # Largest side of the overview, pixels; close-ups are shown at full resolution.  Labels a kind.
 _OVERVIEW = 1000
 _LABELS, _CLOSE_UPS = 8, 3
-_CLOSE_UP_ARCSEC = 14.0
+# Height, and width / height.
+_CLOSE_UP_ARCSEC, _CLOSE_UP_SHAPE = 14.0, 1.145
+# Pixels that tell sky and noise of a whole image.
+_STRIDE = 8
 # Black this many sigma below the sky; the stretch turns from linear to logarithmic at _KNEE sigma; white at
 # _WHITE.
 _BLACK, _KNEE, _WHITE = -1.5, 4.0, 400.0
 _INK, _PAPER, _GALAXY, _STAR = "#e8e6df", "#0b0d12", "#ffd27d", "#9fd3ff"
-_SCALE_BARS = np.array([1, 2, 5, 10, 20, 30, 60, 120, 300, 600])
+_SCALE_BARS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,9 +160,8 @@ def _shrunk(image: npt.NDArray[Any], block: int) -> Float:
 def _show(axes: Any, image: Float, block: int, shape: tuple[int, ...], upside_down: bool) -> None:
     ny, nx = (n * block for n in image.shape)
     extent = (-0.5, nx - 0.5, -0.5, ny - 0.5)
-    axes.imshow(
-        _stretched(image), origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="none"
-    )
+    shown = _stretched(image, *_levels(image))
+    axes.imshow(shown, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="none")
     _frame(axes, (-0.5, shape[1] - 0.5), (-0.5, shape[0] - 0.5), upside_down)
 
 
@@ -175,12 +177,16 @@ def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], upside_dow
         side.set_edgecolor("#3a4150")
 
 
-def _stretched(image: Float) -> Float:
-    """ADU -> 0 .. 1 by asinh; sky and noise from the median and the pixels below it."""
-    sky_level = float(np.median(image))
-    below = image[image < sky_level]
-    noise = float(np.sqrt(np.mean((below - sky_level) ** 2))) if below.size else 1.0
-    signal = np.clip((image - sky_level) / max(noise, 1e-6), _BLACK, _WHITE)
+def _levels(image: npt.NDArray[Any]) -> tuple[float, float]:
+    """Sky and noise, from the median and the pixels below it."""
+    level = float(np.median(image))
+    below = image[image < level] - level
+    return level, float(np.sqrt(np.mean(below**2))) if below.size else 1.0
+
+
+def _stretched(image: npt.NDArray[Any], level: float, noise: float) -> Float:
+    """ADU -> 0 .. 1 by asinh."""
+    signal = np.clip((image - level) / noise, _BLACK, _WHITE)
     lo, hi = np.arcsinh(_BLACK / _KNEE), np.arcsinh(_WHITE / _KNEE)
     return np.asarray((np.arcsinh(signal / _KNEE) - lo) / (hi - lo))
 
@@ -241,7 +247,7 @@ def _outline() -> list[Any]:
 
 def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: float) -> None:
     """In axes coordinates, lower left."""
-    arcsec = float(_SCALE_BARS[max(0, np.searchsorted(_SCALE_BARS, longest * pixel_scale, "right") - 1)])
+    arcsec = max((bar for bar in _SCALE_BARS if bar <= longest * pixel_scale), default=_SCALE_BARS[0])
     width = arcsec / pixel_scale / shape[1]
     axes.plot([0.03, 0.03 + width], [0.035, 0.035], color=_INK, linewidth=2.2, transform=axes.transAxes)
     text = f'{arcsec:g}"' if arcsec < 60 else f"{arcsec / 60:g}'"
@@ -290,41 +296,24 @@ def _close_up(
 ) -> None:
     from matplotlib.patches import Rectangle
 
-    half = int(_CLOSE_UP_ARCSEC / pixel_scale / 2)
-    x, y = round(label.column), round(label.row)
-    x0, x1, y0, y1 = (
-        max(x - half, 0),
-        min(x + half, image.shape[1]),
-        max(y - half, 0),
-        min(y + half, image.shape[0]),
-    )
-    cut = _close_up_stretch(image, image[y0:y1, x0:x1].astype(float))
-    axes.imshow(
-        cut, origin="lower", extent=(x0 - 0.5, x1 - 0.5, y0 - 0.5, y1 - 0.5), cmap="gray", vmin=0, vmax=1,
-        interpolation="nearest", aspect="auto",
-    )  # fmt: skip
-    _frame(axes, (x0 - 0.5, x1 - 0.5), (y0 - 0.5, y1 - 0.5), upside_down)
-    axes.text(
-        0.04,
-        0.92,
-        f"{letter}   {label.kind} {label.text}",
-        color=_GALAXY,
-        fontsize=10,
-        transform=axes.transAxes,
+    half_y = _CLOSE_UP_ARCSEC / pixel_scale / 2
+    half_x = half_y * _CLOSE_UP_SHAPE
+    x0, x1 = max(round(label.column - half_x), 0), min(round(label.column + half_x), image.shape[1])
+    y0, y1 = max(round(label.row - half_y), 0), min(round(label.row + half_y), image.shape[0])
+    shown = _stretched(image[y0:y1, x0:x1], *_levels(image[::_STRIDE, ::_STRIDE]))
+    extent = (x0 - 0.5, x1 - 0.5, y0 - 0.5, y1 - 0.5)
+    axes.imshow(shown, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    _frame(axes, extent[:2], extent[2:], upside_down)
+    text = f"{letter}   {label.kind} {label.text}"
+    axes.text(0.04, 0.92, text, color=_GALAXY, fontsize=10, transform=axes.transAxes).set_path_effects(
+        _outline()
     )
     _scale_bar(axes, pixel_scale, (y1 - y0, x1 - x0), (x1 - x0) / 4)
     main.add_patch(
         Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=_INK, linewidth=0.8, alpha=0.8)
     )
-    main.annotate(
-        letter, (x1 if not upside_down else x0, y0 if not upside_down else y1), (2, -2), textcoords="offset points",
-        color=_INK, fontsize=10, va="top",
-    )  # fmt: skip
-
-
-def _close_up_stretch(image: npt.NDArray[Any], cut: Float) -> Float:
-    """Sky and noise of a close-up from a strip of the whole image: the cut itself may be all galaxy."""
-    strip = image[:: max(1, image.shape[0] // 64)].astype(float)
-    return _stretched(np.vstack([np.resize(strip, (strip.size // cut.shape[1], cut.shape[1])), cut]))[
-        -cut.shape[0] :
-    ]
+    corner = (x0, y1) if upside_down else (x1, y0)
+    mark = main.annotate(
+        letter, corner, (2, -2), textcoords="offset points", color=_INK, fontsize=10, va="top"
+    )
+    mark.set_path_effects(_outline())

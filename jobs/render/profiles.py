@@ -75,11 +75,12 @@ def shapes(galaxies: pa.Table, sersic_step: float = SERSIC_STEP) -> Shapes:
     with np.errstate(divide="ignore", invalid="ignore"):
         reduced = np.where(gamma > 0, np.minimum(1.0, _MOST_SHEAR * np.abs(stretch) / gamma) / stretch, 0.0)
     index = np.rint(columns["bulge_sersic_index"] / sersic_step) * sersic_step
+    index = np.clip(index, _SERSIC_LO, _SERSIC_HI)
     return Shapes(
         bulge_radius=columns["bulge_half_light_radius"],
         disk_radius=columns["disk_half_light_radius"],
         bulge_fraction=columns["bulge_fraction"],
-        sersic_index=np.round(np.clip(index, _SERSIC_LO, _SERSIC_HI), 6),
+        sersic_index=np.asarray(np.round(index, 6), float),
         bulge_axis_ratio=np.clip(columns["bulge_axis_ratio"], _SLIMMEST, 1.0),
         inclination=columns["inclination"],
         beta=np.radians(90.0 + columns["position_angle"]),

@@ -31,10 +31,10 @@ Float = npt.NDArray[np.float64]
 _PLANES = 8
 # Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide.
 _OVERSAMPLING = 3
-# Side of the plane, pixels; what lies outside (3e-4 of the flux for VIS) is lost.  No stamp of a point source
-# is larger.
+# Side of the plane, pixels; what lies outside (0.2 % of the flux for VIS) is lost.  No stamp of a point source is
+# larger.
 SIDE = 512
-# Side of the optical transform, samples: light beyond its border (1e-3) wraps around.
+# Side of the optical transform, samples: the 0.15 % of the light beyond its border is absent, not folded back.
 _TRANSFORM = 2048
 _ARCSEC = np.pi / 180.0 / 3600.0
 
@@ -202,9 +202,10 @@ def _equal_photon_wavelengths(band: Passband) -> list[float]:
 
 
 def _monochromatic(nm: Float, wavelength: float, sampling: float, mission: MissionConfiguration) -> Float:
-    """|FFT of the pupil|^2, sum 1, centred on [0, 0].
+    """|FFT of the pupil|^2, centred on [0, 0], of unit flux over the whole sky.
 
-    The pupil's sampling follows the wavelength, so that the image's does not.
+    The pupil's sampling follows the wavelength, so that the image's does not.  Its soft edges, one sample wide,
+    diffract less to large angles than sharp ones, by sinc(angle / side) in amplitude: that is put back.
     """
     step = wavelength * 1e-7 / (_TRANSFORM * sampling * _ARCSEC)
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
@@ -218,5 +219,6 @@ def _monochromatic(nm: Float, wavelength: float, sampling: float, mission: Missi
     phase[lit] = 2 * np.pi * zernike(x[lit], y[lit]) / (wavelength / 10.0)
     field = np.zeros((_TRANSFORM, _TRANSFORM), complex)
     field[:n, :n] = transmission * np.exp(1j * phase)
-    image = np.abs(scipy.fft.ifft2(field)) ** 2
-    return np.asarray(image / image.sum())
+    image = np.abs(scipy.fft.fft2(field)) ** 2 / (transmission.sum() * _TRANSFORM**2)
+    angle = scipy.fft.fftfreq(_TRANSFORM)
+    return np.asarray(image / np.sinc(np.hypot(angle[:, None], angle[None, :])) ** 2)

@@ -1,7 +1,7 @@
 """Drawing sources: each on its own stamp, through one shared PSF, in Fourier space, summed onto a frame.
 
 A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid.  Light that
-belongs outside a stamp comes in at its opposite edge: nothing is lost and nothing is rescaled.  A stamp is large
+belongs outside a stamp comes in at its opposite edge: nothing is lost, nothing is rescaled.  A stamp is large
 enough that what wraps is below the noise at its edge, and below the flux budget in the source's aperture.
 
 Sources         what is drawn: galaxies (with a shape) and points
@@ -215,7 +215,7 @@ def _add(frame: Float, stamp: Float, x0: int, y0: int) -> None:
 
 
 def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4) -> Float:
-    """Source i by galsim.Convolve and drawImage, tight thresholds: slow, and independent of `draw`'s transforms.
+    """Source i by galsim.Convolve and drawImage, tight thresholds: slow, with none of `draw`'s transforms.
 
     returns : float64[size, size], lower left pixel at round(position) - size / 2
     """
@@ -232,4 +232,3 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1
     image = galsim.ImageD(galsim.BoundsI(0, size - 1, 0, size - 1), scale=1.0)
     whole.drawImage(image, center=centre, method="no_pixel")
     return np.asarray(image.array)
-

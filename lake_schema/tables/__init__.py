@@ -1,4 +1,8 @@
-"""The declared tables of the lake, one a file."""
+"""The declared tables of the lake, one a file.
+
+declared    all of them
+find        the one of a name
+"""
 
 from __future__ import annotations
 
@@ -17,3 +21,12 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.tasks import TASKS
 
     return [GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands), EXPOSURES, TASKS, PRODUCTS]
+
+
+def find(name: str, columns: Sequence[str] = ()) -> Table | None:
+    """The declaration of the table `name`, None where there is none.
+
+    columns : names that the table has; a flux table's bands are taken from them
+    """
+    bands = [column.removeprefix("f_nu_") for column in columns if column.startswith("f_nu_")]
+    return next((table for table in declared(bands) if table.name == name), None)

@@ -14,7 +14,16 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(path for package in ("lake_schema", "jobs") for path in (ROOT / package).rglob("*.py"))
 # Formats that run code when they are read.
 UNSAFE_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib"}
-UNSAFE_CALLS = {"eval", "exec", "__import__", "os.system", "os.popen", "yaml.load", "yaml.unsafe_load", "yaml.full_load"}
+UNSAFE_CALLS = {
+    "eval",
+    "exec",
+    "__import__",
+    "os.system",
+    "os.popen",
+    "yaml.load",
+    "yaml.unsafe_load",
+    "yaml.full_load",
+}
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
@@ -55,7 +64,9 @@ def test_contracts():
 
 
 def test_one_file_knows_fits():
-    users = {path.relative_to(ROOT).as_posix() for path in SOURCES if touches_fits(ast.parse(path.read_text()))}
+    users = {
+        path.relative_to(ROOT).as_posix() for path in SOURCES if touches_fits(ast.parse(path.read_text()))
+    }
     assert users == {"lake_schema/fits.py"}
 
 

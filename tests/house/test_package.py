@@ -38,7 +38,12 @@ def wheel(tmp_path_factory):
 
 
 def test_everything_of_the_packages_ships(wheel):
-    there = {path for name in ("lake_schema", "jobs") for path in (ROOT / name).rglob("*") if path.suffix in SHIPPED}
+    there = {
+        path
+        for name in ("lake_schema", "jobs")
+        for path in (ROOT / name).rglob("*")
+        if path.suffix in SHIPPED
+    }
     expected = {path.relative_to(ROOT).as_posix() for path in there}
     shipped = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert shipped == expected
@@ -72,7 +77,10 @@ def test_constraints_are_exact():
 
 def test_what_is_wanted_is_pinned_within_its_range():
     project = PROJECT["project"]
-    wanted = [*project["dependencies"], *(line for extra in project["optional-dependencies"].values() for line in extra)]
+    wanted = [
+        *project["dependencies"],
+        *(line for extra in project["optional-dependencies"].values() for line in extra),
+    ]
     wanted += PROJECT["build-system"]["requires"]
     for line in wanted:
         requirement = Requirement(line)

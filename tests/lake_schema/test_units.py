@@ -65,7 +65,7 @@ def test_microjansky_and_cgs(flux):
 
 
 def test_electron_rate_counts_photons():
-    # A flat f_nu source: photons per second between nu and nu + dnu are f_nu A dnu / (h nu) = f_nu A / h dln(nu).
+    # A flat f_nu source: photons per second between nu and nu + dnu are f_nu A dnu / (h nu).
     area, blue, red, throughput, f_nu = 9926.0, 5500.0, 9000.0, 0.7, 3.0
     nu = units.LIGHT_ANGSTROM_S / np.linspace(blue, red, 200_001)
     photons = f_nu * units.UJY_CGS * area * throughput / (units.PLANCK_ERG_S * nu)
@@ -77,7 +77,9 @@ def test_electron_rate_counts_photons():
     )
 
 
-@pytest.mark.parametrize(("area", "width"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (np.nan, 1.0), (1.0, np.inf)])
+@pytest.mark.parametrize(
+    ("area", "width"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (np.nan, 1.0), (1.0, np.inf)]
+)
 def test_electron_rate_refuses_what_collects_nothing(area, width):
     with pytest.raises(OutOfRange):
         units.electron_rate(1.0, area, width)

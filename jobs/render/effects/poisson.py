@@ -11,7 +11,7 @@ _NORMAL_ABOVE = 1e9
 
 
 def apply(frame: Frame, rng: np.random.Generator) -> Frame:
-    """Expected e- [ny, nx] -> counted e-, whole; a negative expectation (ringing of a transform) counts as 0."""
+    """Expected e- [ny, nx] -> counted e-, whole; a negative expectation (a transform's ringing) is 0."""
     expected = np.maximum(frame, 0.0)
     huge = expected > _NORMAL_ABOVE
     counted = rng.poisson(np.where(huge, 0.0, expected)).astype(float)

@@ -45,7 +45,10 @@ def test_offsets_of_the_selection_band(vis, template, published):
 
 @pytest.mark.parametrize("template", [0, 13, 30])
 def test_a_galaxy_at_z_01_in_sdss_r_is_seen_in_its_reference_band(library, template):
-    """0.1r is SDSS r blue-shifted to z = 0.1: m_r = M_r + DM - 2.5 log10(1.1), whatever the spectrum (Blanton et al. 2003)."""
+    """0.1r is SDSS r blue-shifted to z = 0.1: m_r = M_r + DM - 2.5 log10(1.1), whatever the spectrum.
+
+    Ref: Blanton et al. 2003
+    """
     flux = library.flux[template].astype(float)
     seen = band_ratios.band_weights(library, "sdss_r", 0.1) @ flux
     rest = band_ratios.band_weights(library, "sdss_r01", 0.0) @ flux

@@ -13,12 +13,20 @@ R_V = 3.1
 
 
 def test_reddening_away_from_the_plane(dust):
-    """The cosecant law: 0.020 mag at the poles, a median of about 0.03 above 30 deg."""
+    """A median E(B-V) of about 0.03 above 30 deg."""
     _, b = hp.pix2ang(512, np.arange(dust.size), lonlat=True)
     assert np.median(dust[np.abs(b) > 30]) / R_V == pytest.approx(0.027, abs=0.004)
-    assert np.mean(dust[np.abs(b) > 75]) / R_V == pytest.approx(0.020, abs=0.005)
-    assert 0.0 < dust.min()
+    assert dust.min() > 0.0
     assert dust.max() <= np.float32(3.0 * R_V)
+
+
+def test_the_cosecant_law_is_the_mean_of_all_maps():
+    """E(B-V) = 0.020 / sin b: 0.020 at the poles, 0.040 at 30 deg."""
+    small = dataclasses.replace(dust_map.cosecant(), nside=16, l_max=32)
+    mean = np.mean([dust_map.embedded(seed, small) for seed in range(60)], axis=0) / R_V
+    _, b = hp.pix2ang(16, np.arange(mean.size), lonlat=True)
+    assert mean[np.abs(b) > 75].mean() == pytest.approx(0.0203, rel=0.06)
+    assert mean[np.abs(np.abs(b) - 30) < 2].mean() == pytest.approx(0.040, rel=0.06)
 
 
 def test_the_field_has_its_width_and_slope(dust):
@@ -46,7 +54,7 @@ def test_the_map_is_read_in_galactic_coordinates():
     latitude = np.abs(hp.pix2ang(64, np.arange(hp.nside2npix(64)), lonlat=True)[1]).astype(np.float32)
     # North Galactic pole, Galactic centre, and M31 (l = 121.17, b = -21.57).
     ra, dec = np.array([192.85948, 266.40500, 10.68471]), np.array([27.12825, -28.93617, 41.26875])
-    assert dust_map.a_v(latitude, ra, dec) == pytest.approx([90.0, 0.0, 21.57], abs=0.7)
+    assert dust_map.a_v(latitude, ra, dec) == pytest.approx([90.0, 0.0, 21.57], abs=1.0)
 
 
 def test_no_dust_in_front_of_the_nearest_stars_and_all_of_it_before_the_farthest():
@@ -61,4 +69,5 @@ def test_no_dust_in_front_of_the_nearest_stars_and_all_of_it_before_the_farthest
 def test_extinction_grows_with_distance(total, distance, times, b):
     ways = np.array([distance, distance * times])
     near, far = dust_map.a_v_at(np.full(2, total), ways, b, LAYER, 0.01)
-    assert 0.0 <= near <= far <= total
+    assert 0.0 <= near <= far * (1 + 1e-12)
+    assert far <= total

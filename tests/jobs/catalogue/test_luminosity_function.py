@@ -56,7 +56,8 @@ def test_density_is_finite_and_positive(m, z):
 @given(magnitudes, magnitudes, redshifts)
 def test_more_galaxies_are_brighter_than_a_fainter_limit(m1, m2, z):
     bright, faint = lf.number_density(SCHECHTER, sorted((m1, m2)), z)
-    assert faint >= bright >= 0.0
+    assert bright >= 0.0
+    assert faint >= bright * (1 - 1e-9)
 
 
 @given(st.floats(-24.0, -9.0), redshifts)
@@ -93,9 +94,9 @@ def test_drawn_galaxies_have_the_luminosity_function(z, rng):
     bins = np.arange(-22.0, -16.9, 0.5)
     volume = area * (np.pi / 180.0) ** 2 * float(cosmology.comoving_volume(space.z_min, space.z_max))
     expected = np.diff(lf.number_density(SCHECHTER, bins, z)) * volume
-    assert np.histogram(m, bins)[0] == pytest.approx(
-        expected, rel=0.03, abs=4 * np.sqrt(expected.max()) * 0.1
-    )
+    found = np.histogram(m, bins)[0]
+    assert np.all(np.abs(found - expected) < 0.03 * expected + 4 * np.sqrt(expected))
+    assert found[4:] == pytest.approx(expected[4:], rel=0.05)
 
 
 def test_the_number_drawn_is_poisson(rng):

@@ -25,7 +25,7 @@ def test_components_hold_half_of_the_light_within_the_total_s_radius(fraction, r
     bulge, disc = morphology.component_radii(SHAPES, *arguments)
     inside = fraction * morphology.light_within(radius, bulge, sersic)
     inside += (1 - fraction) * morphology.light_within(radius, disc, 1.0)
-    assert inside[0] == pytest.approx(0.5, abs=0.002)
+    assert inside[0] == pytest.approx(0.5, abs=0.005)
     assert bulge[0] / disc[0] == pytest.approx(ratio)
 
 
@@ -124,7 +124,8 @@ def test_inclination_is_the_printed_arcsine_inside(q):
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_thinner_discs_are_more_inclined(q1, q2):
     wide, thin = morphology.inclination([max(q1, q2), min(q1, q2)], 0.1)
-    assert 0.0 <= wide <= thin <= 90.0
+    assert 0.0 <= wide <= thin + 1e-12
+    assert thin <= 90.0
 
 
 def test_inclination_keeps_its_digits_where_a_disc_is_nearly_round():

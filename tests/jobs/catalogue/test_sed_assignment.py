@@ -26,7 +26,7 @@ def test_red_galaxies_are_bright_satellites_and_late_in_time():
     def share(m_r, z=0.1, kind=0):
         return float(sed.red_fraction(MODEL.fraction, np.array([m_r]), np.array([z]), np.array([kind]))[0])
 
-    # x = M_r + 20: 1 - (0.46 + 0.07 x), times 0.9 for centrals, and 1 = clip(1.1 - 0.42 z, 0.08, 1) at z = 0.1.
+    # x = M_r + 20: 1 - (0.46 + 0.07 x), times 0.9 for centrals; the evolution is 1 at z = 0.1.
     assert share(-21.0) == pytest.approx(0.9 * (1 - (0.46 - 0.07)))
     assert share(-22.0) > share(-20.0) > share(-18.0) > share(-16.0)
     assert share(-20.0, kind=1) > share(-20.0)

@@ -17,7 +17,7 @@ def two(template, law=0, ebv=0.0, share=0.0):
 
 
 def test_a_solar_galaxy():
-    """Bell et al. 2003: log M/L_r = -0.306 + 1.097 (g - r), at the Sun's M_r = 4.76 and g - r = 0.5, diet Salpeter."""
+    """Bell et al. 2003: log M/L_r = -0.306 + 1.097 (g - r), at the Sun's M_r = 4.76 and g - r = 0.5."""
     law = stellar_mass.mass_to_light()
     m_r = 4.76 - 5 * np.log10(0.67)
     log_mass = stellar_mass.log_stellar_mass(law, np.array([m_r]), np.array([0.5 + 0.16]))

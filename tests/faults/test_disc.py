@@ -1,0 +1,119 @@
+"""A disc that fails or stops at any of its calls: the last version stays whole, and the next run repairs everything."""
+
+import pytest
+
+from lake_schema import layout, publish, read
+from lake_schema.errors import LakeError, PartsFailed
+from lake_schema.publish import Plan
+from tests.faults import promise, victims
+from tests.faults.disc import Disc, Killed
+from tests.universe import plain_plan, plain_work
+
+# (kind of table, every how many calls one is tried)
+SHORT = [("plain", 1), ("toy", 9)]
+LONG = [pytest.param("toy", 1, marks=pytest.mark.nightly)]
+
+
+@pytest.fixture(scope="module")
+def wanted(tmp_path_factory):
+    sums = {}
+    for kind in promise.KINDS:
+        root = tmp_path_factory.mktemp("undisturbed")
+        promise.make(root, kind, 2)
+        sums[kind] = promise.sums(root, kind)
+    return sums
+
+
+def calls(tmp_path_factory, kind):
+    """How often a run touches the disc where an older version is there."""
+    root = tmp_path_factory.mktemp("counted")
+    promise.make(root, kind, 1)
+    with Disc(root) as disc:
+        promise.make(root, kind, 2)
+    return len(disc.calls)
+
+
+@pytest.mark.parametrize(("kind", "stride"), SHORT + LONG)
+def test_any_call_may_fail(kind, stride, wanted, tmp_path_factory):
+    failed = 0
+    for n in range(calls(tmp_path_factory, kind), 0, -stride):
+        root = tmp_path_factory.mktemp("lake")
+        promise.make(root, kind, 1)
+        old, new = (promise.key(kind, seed) for seed in (1, 2))
+        try:
+            with Disc(root, fail_at=n) as disc:
+                promise.make(root, kind, 2)
+            assert promise.current(root, kind) == new
+        except (OSError, LakeError) as error:
+            failed += 1
+            assert "injected" in str(error), disc.calls[-1]
+            assert promise.current(root, kind) in (old, new)
+        promise.make(root, kind, 2)
+        assert promise.current(root, kind) == new
+        assert promise.sums(root, kind) == wanted[kind]
+    assert failed > 3
+
+
+@pytest.mark.parametrize(("kind", "stride"), SHORT + LONG)
+def test_death_at_any_call(kind, stride, wanted, tmp_path_factory):
+    """From one call on nothing reaches the disc, not even what `finally` would do: kill -9 without a process."""
+    seen = set()
+    for n in range(calls(tmp_path_factory, kind), 0, -stride):
+        root = tmp_path_factory.mktemp("lake")
+        promise.make(root, kind, 1)
+        old, new = (promise.key(kind, seed) for seed in (1, 2))
+        with Disc(root, die_at=n), pytest.raises(Killed):
+            promise.make(root, kind, 2)
+        seen.add(promise.current(root, kind))
+        promise.make(root, kind, 2)
+        assert promise.current(root, kind) == new
+        assert promise.sums(root, kind) == wanted[kind]
+        left = {path.name for path in layout.table(root, kind).iterdir()}
+        assert not [name for name in left if name.startswith((".stage", ".receipts"))]
+    assert seen == {old, new}
+
+
+def test_death_in_gc_leaves_no_half_version(tmp_path_factory):
+    root = tmp_path_factory.mktemp("counted")
+    for seed in (1, 2):
+        promise.make(root, "plain", seed)
+    with Disc(root) as disc:
+        publish.gc(root, "plain")
+    for n in range(1, len(disc.calls) + 1):
+        root = tmp_path_factory.mktemp("lake")
+        for seed in (1, 2):
+            promise.make(root, "plain", seed)
+        with Disc(root, die_at=n), pytest.raises(Killed):
+            publish.gc(root, "plain")
+        assert promise.current(root, "plain") == promise.key("plain", 2)
+        promise.make(root, "plain", 1)
+        assert promise.current(root, "plain") == promise.key("plain", 1)
+        publish.gc(root, "plain")
+        assert [path.name for path in layout.table(root, "plain").glob("*v-*")] == [f"v-{promise.key('plain', 1)}"]
+
+
+@pytest.mark.parametrize(("work", "most_bytes", "file"), [(plain_work, 300, ".parquet"), (victims.with_image, 100_000, ".fits")])
+def test_a_full_disc_is_a_clear_error(lake, work, most_bytes, file):
+    promise.make(lake, "plain", 1)
+    answers = victims.CONTEXT.SimpleQueue()
+    victims.run(victims.on_a_small_disc, lake, work, most_bytes, answers)
+    text = answers.get()
+    assert text.startswith("PartsFailed: table plain: 3 of 3 parts failed")
+    assert "OSError" in text
+    assert "File too large" in text or " requested and " in text, text
+    assert promise.current(lake, "plain") == promise.key("plain", 1)
+    assert not [path for path in lake.rglob("*") if path.is_file() and file in path.name and "v-" not in str(path)]
+    publish.make(lake, plain_plan(2), work)
+    assert read.verify(read.version(lake, "plain"), deep=True) == []
+
+
+def test_parts_that_failed_leave_no_temporary_files(lake):
+    with Disc(lake, fail_at=5), pytest.raises(PartsFailed):
+        promise.make(lake, "plain", 1)
+    assert not list(lake.rglob("*.tmp*"))
+
+
+def test_a_plan_without_parts_is_an_empty_table(lake):
+    plan = plain_plan()
+    publish.make(lake, Plan(plan.table, plan.facts, ()), plain_work)
+    assert read.version(lake, "plain").rows().num_rows == 0

@@ -1,0 +1,136 @@
+"""Processes that are killed, that race each other, that read while another publishes."""
+
+import signal
+
+import pytest
+
+from lake_schema import publish, read
+from lake_schema.errors import BadInput, Damaged, Superseded
+from tests.faults import promise, victims
+from tests.faults.disc import Disc
+
+
+def phases(root, kind):
+    """The numbers of the calls to the disc at which a run goes from one state to the next."""
+    promise.make(root, kind, 1)
+    with Disc(root) as disc:
+        promise.make(root, kind, 2)
+    about = {
+        "a part is written": lambda c: c.startswith("write") and "tmp" in c,
+        "a receipt is named": lambda c: c.startswith("replace") and ".receipts" in c,
+        "all parts are there": lambda c: ".manifest" in c,
+        "the stage is renamed": lambda c: c.startswith("rename"),
+        "the link is swapped": lambda c: c.startswith("replace") and ".current" in c,
+        "the receipts go": lambda c: c.startswith("rmdir"),
+    }
+    return {name: 1 + max(n for n, c in enumerate(disc.calls) if test(c)) for name, test in about.items()}
+
+
+@pytest.fixture(scope="module")
+def plain_phases(tmp_path_factory):
+    return phases(tmp_path_factory.mktemp("counted"), "plain")
+
+
+@pytest.fixture(scope="module")
+def wanted(tmp_path_factory):
+    root = tmp_path_factory.mktemp("undisturbed")
+    for kind in promise.KINDS:
+        promise.make(root, kind, 2)
+    return {kind: promise.sums(root, kind) for kind in promise.KINDS}
+
+
+@pytest.mark.parametrize("kind", ["plain", pytest.param("toy", marks=pytest.mark.nightly)])
+def test_kill_9_at_every_phase(kind, wanted, tmp_path_factory):
+    for name, n in phases(tmp_path_factory.mktemp("counted"), kind).items():
+        root = tmp_path_factory.mktemp("lake")
+        promise.make(root, kind, 1)
+        old, new = (promise.key(kind, seed) for seed in (1, 2))
+        assert victims.run(victims.kill_at, root, kind, 2, n) == -signal.SIGKILL, name
+        assert promise.current(root, kind) == (new if name == "the receipts go" else old), name
+        promise.make(root, kind, 2)
+        assert promise.current(root, kind) == new, name
+        assert promise.sums(root, kind) == wanted[kind], name
+
+
+def race(root, seeds, stops):
+    """Two publishers, each paused at a call to the disc: the first, then the second, then both go on."""
+    promise.make(root, "plain", 1)
+    base = promise.key("plain", 1)
+    answers = victims.CONTEXT.SimpleQueue()
+    runners = []
+    for seed, n in zip(seeds, stops, strict=True):
+        reached, go = victims.CONTEXT.Event(), victims.CONTEXT.Event()
+        child = victims.start(victims.stop_at, root, "plain", seed, n, base, reached, go, answers)
+        assert reached.wait(60)
+        runners.append((child, go))
+    for child, go in runners:
+        go.set()
+        child.join()
+    return [answers.get() for _ in runners]
+
+
+@pytest.mark.parametrize("seeds", [(2, 2), (2, 3)], ids=["same plan", "two plans"])
+@pytest.mark.parametrize("every", [2, pytest.param(1, marks=pytest.mark.nightly)])
+def test_the_loser_of_a_race_is_told(every, seeds, plain_phases, tmp_path_factory):
+    stops = list(plain_phases.values())
+    for i, first in enumerate(stops):
+        for second in stops[i % every :: every]:
+            root = tmp_path_factory.mktemp("lake")
+            answers = race(root, seeds, (first, second))
+            where = f"stopped at calls {first} and {second}: {answers}"
+            won = [seed for seed, answer in answers if answer == "published"]
+            assert won, where
+            assert {answer for _, answer in answers} <= {"published", "Superseded"}, where
+            assert promise.current(root, "plain") in {promise.key("plain", seed) for seed in won}, where
+            if len(set(seeds)) == 2:
+                assert len(won) == 1, where
+                # Who lost can begin again from what is there now.
+                promise.make(root, "plain", 9)
+                assert promise.current(root, "plain") == promise.key("plain", 9)
+
+
+@pytest.mark.parametrize(("kind", "versions", "reads"), [("plain", 20, 300), pytest.param("toy", 20, 1000, marks=pytest.mark.nightly)])
+def test_a_reader_never_sees_two_versions(kind, versions, reads, lake):
+    promise.make(lake, kind, 1)
+    stop = victims.CONTEXT.Event()
+    child = victims.start(victims.publish_many, lake, kind, versions, stop)
+    seen, whole = set(), 0
+    while whole < reads:
+        try:
+            version = read.version(lake, kind)
+            rows = version.rows()
+        except (BadInput, Damaged) as error:
+            # gc may remove an old version under a reader's feet; then it says so.
+            assert "missing" in str(error) or "No such file" in str(error) or "no table" in str(error), error
+            continue
+        whole += 1
+        seen.add(version.key)
+        assert rows.num_rows == version.num_rows
+        if kind == "plain":
+            assert set(rows["value"].to_pylist()) == {float(version.manifest["facts"]["seed"])}
+    stop.set()
+    child.join()
+    assert child.exitcode == 0
+    assert len(seen) > 3
+
+
+def test_gc_leaves_a_running_publisher_alone(lake, plain_phases, monkeypatch):
+    monkeypatch.setattr(publish, "_PATIENCE", victims.PATIENCE)
+    promise.make(lake, "plain", 1)
+    answers = victims.CONTEXT.SimpleQueue()
+    for name, n in plain_phases.items():
+        reached, go = victims.CONTEXT.Event(), victims.CONTEXT.Event()
+        seed = 10 + n
+        child = victims.start(
+            victims.stop_at, lake, "plain", seed, n, publish.current_key(lake, "plain"), reached, go, answers
+        )
+        assert reached.wait(60)
+        try:
+            publish.gc(lake, "plain")
+        except Superseded:
+            assert name in ("the stage is renamed", "the link is swapped")  # it holds the table's lock here
+        finally:
+            go.set()
+            child.join()
+        assert answers.get() == (seed, "published"), name
+        assert promise.current(lake, "plain") == promise.key("plain", seed)

@@ -1,0 +1,96 @@
+"""Processes that have accidents: forked from a clean server, so that each costs milliseconds."""
+
+import multiprocessing
+import os
+import resource
+import signal
+
+import numpy as np
+
+from lake_schema import fits, publish
+from lake_schema.errors import LakeError
+from lake_schema.publish import Output
+from tests.faults import promise
+from tests.faults.disc import Disc
+from tests.universe import plain_plan, plain_work
+
+CONTEXT = multiprocessing.get_context("forkserver")
+# How long a publisher here waits for another that is paused while it holds the table, s.
+PATIENCE = 0.1
+CONTEXT.set_forkserver_preload(["tests.faults.victims"])
+
+
+def start(target, *args):
+    """A child process under way."""
+    process = CONTEXT.Process(target=target, args=args)
+    process.start()
+    return process
+
+
+def _no_fsync(descriptor):
+    pass
+
+
+def run(target, *args):
+    """Exit code of a child process."""
+    process = start(target, *args)
+    process.join()
+    return process.exitcode
+
+
+def kill_at(root, kind, seed, n):
+    """Publish, and be killed at the n-th call to the disc."""
+    os.fsync = _no_fsync
+
+    def shoot(call, what, path):
+        if call == n:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    with Disc(root, at=shoot):
+        promise.make(root, kind, seed)
+
+
+def stop_at(root, kind, seed, n, base, reached, go, answers):
+    """Publish, and wait at the n-th call to the disc until told to go on."""
+    os.fsync, publish._PATIENCE = _no_fsync, PATIENCE
+
+    def wait(call, what, path):
+        if call == n:
+            reached.set()
+            go.wait(60)
+
+    try:
+        with Disc(root, at=wait):
+            promise.make(root, kind, seed, base=base)
+        answers.put((seed, "published"))
+    except LakeError as error:
+        answers.put((seed, type(error).__name__))
+    finally:
+        reached.set()
+
+
+def publish_many(root, kind, versions, stop):
+    """Publish one version after another until told to stop, the old ones removed now and then."""
+    os.fsync = _no_fsync
+    n = 0
+    while n < versions or not stop.is_set():
+        n += 1
+        promise.make(root, kind, n)
+        if n % 7 == 0:
+            publish.gc(root, kind)
+
+
+def with_image(root, facts):
+    image = fits.Image(np.zeros((200, 200), np.float32))
+    name = f"images/{facts['part']}.fits"
+    return Output(plain_work(root, facts).rows, {name: lambda path: fits.write_images(path, [image])})
+
+
+def on_a_small_disc(root, work, most_bytes, answers):
+    """Publish where no file may grow larger."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+    try:
+        publish.make(root, plain_plan(2), work)
+        answers.put("published")
+    except LakeError as error:
+        answers.put(f"{type(error).__name__}: {error}")

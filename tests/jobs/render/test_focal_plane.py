@@ -1,0 +1,200 @@
+"""Where detectors are and where their pixels look: rules, parity, poles, the FITS header."""
+
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.wcs import WCS
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jobs.render import focal_plane
+from jobs.render.focal_plane import boresight_for, detector, detectors, jacobian, pixel_of_sky, sky_of_pixel, wcs
+from lake_schema import sky
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+
+MISSION = resolve()
+VIS, LSST = detectors("vis", MISSION), detectors("lsstcam", MISSION)
+SKY = st.tuples(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(-180, 180))
+ANY_DETECTOR = st.sampled_from([VIS[0], VIS[15], VIS[35], LSST[0], LSST[94], LSST[188]])
+
+
+# ------------------------------------------------------------------------------------------------ layouts
+
+
+def test_vis_fills_the_published_field():
+    assert len(VIS) == len({d.name for d in VIS}) == 36
+    width = max(d.x for d in VIS) - min(d.x for d in VIS) + 409.6
+    height = max(d.y for d in VIS) - min(d.y for d in VIS) + 413.2
+    assert width / 3600 == pytest.approx(0.7003, abs=5e-4)
+    assert height / 3600 == pytest.approx(0.7781, abs=5e-4)
+
+
+def test_vis_rows_count_from_the_top_and_the_right_half_is_upside_down():
+    by_name = {d.name: d for d in VIS}
+    assert by_name["1-1"].y > 0 > by_name["6-1"].y
+    assert by_name["1-1"].x < 0 < by_name["1-6"].x
+    assert {d.rotation for d in VIS if int(d.name[2]) <= 3} == {0.0}
+    assert {d.rotation for d in VIS if int(d.name[2]) >= 4} == {180.0}
+
+
+def test_lsstcam_has_189_sensors_about_the_central_one():
+    assert len(LSST) == len({d.name for d in LSST}) == 189
+    assert LSST[94].name == "R22_S11"
+    assert (LSST[94].x, LSST[94].y) == (0.0, 0.0)
+    # The second index runs along x, the first along y.
+    assert detector("lsstcam", "R23_S11", MISSION).x == pytest.approx(127.0 * 20.00587)
+    assert detector("lsstcam", "R22_S21", MISSION).y == pytest.approx(42.25 * 20.00587)
+    # Gaps between neighbours: 129 and 221 pixels.
+    pixel = LSST[94].pixel_scale
+    assert detector("lsstcam", "R22_S12", MISSION).x / pixel - 4096 == pytest.approx(129, abs=0.5)
+    assert detector("lsstcam", "R22_S21", MISSION).y / pixel - 4004 == pytest.approx(221, abs=0.5)
+
+
+@pytest.mark.parametrize("layout", [VIS, LSST])
+def test_no_two_detectors_overlap(layout):
+    x, y = (np.array([getattr(d, axis) for d in layout]) for axis in "xy")
+    dx, dy = np.abs(x[:, None] - x), np.abs(y[:, None] - y)
+    d = layout[0]
+    apart = (dx >= d.nx * d.pixel_scale) | (dy >= d.ny * d.pixel_scale)
+    assert apart[~np.eye(len(layout), dtype=bool)].all()
+
+
+def test_strangers_are_refused():
+    with pytest.raises(BadInput, match="hsc"):
+        detectors("hsc", MISSION)
+    with pytest.raises(BadInput, match="7-1"):
+        detector("vis", "7-1", MISSION)
+
+
+# ------------------------------------------------------------------------------------------------ parity
+
+
+@pytest.mark.parametrize("d", [VIS[0], VIS[35], LSST[0], LSST[94]])
+def test_east_is_left_when_north_is_up(d):
+    """Alcyone and Atlas, in the Pleiades: Atlas lies 23' east and 3' south of Alcyone."""
+    alcyone, atlas = (56.87115, 24.10514), (57.29059, 24.05342)
+    system = wcs(d, *alcyone, 0.0)
+    (x1, x2), (y1, y2) = pixel_of_sky(system, *np.transpose([alcyone, atlas]))
+    sign = -1 if d.rotation == 180.0 else 1
+    assert sign * (x2 - x1) < 0
+    assert sign * (y2 - y1) < 0
+    assert np.hypot(x2 - x1, y2 - y1) * d.pixel_scale == pytest.approx(
+        3600 * float(sky.separation(*alcyone, *atlas)), rel=1e-4
+    )
+
+
+@given(SKY, ANY_DETECTOR)
+def test_the_sky_is_never_mirrored(pointing, d):
+    system = wcs(d, *boresight_for(d, *pointing))
+    j = jacobian(system, [(d.nx - 1) / 2], [(d.ny - 1) / 2])[0]
+    # (u west, v north) against (column, row): a rotation.
+    assert np.linalg.det(j) == pytest.approx(d.pixel_scale**2, rel=2e-3)
+    assert np.linalg.det(j) > 0
+
+
+@given(st.floats(-180, 180))
+def test_position_angle_of_the_columns(angle):
+    """The focal plane's y axis points to the position angle, north through east."""
+    d = LSST[94]
+    system = wcs(d, 150.0, 2.0, angle)
+    ra, dec = sky_of_pixel(system, [(d.nx - 1) / 2] * 2, [(d.ny - 1) / 2, (d.ny - 1) / 2 + 10])
+    here, up = SkyCoord(ra[0], dec[0], unit="deg"), SkyCoord(ra[1], dec[1], unit="deg")
+    difference = here.position_angle(up).deg - angle
+    assert (difference + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------ pointing
+
+
+@given(SKY, ANY_DETECTOR)
+def test_a_pointing_puts_the_detector_on_its_target(pointing, d):
+    ra, dec, angle = pointing
+    system = wcs(d, *boresight_for(d, ra, dec, angle))
+    x, y = pixel_of_sky(system, [ra], [dec])
+    assert np.hypot(x[0] - (d.nx - 1) / 2, y[0] - (d.ny - 1) / 2) < 1e-6
+    if abs(dec) < 89.9:
+        # At the target itself, the detector's axes have the angle that was asked for.
+        j = jacobian(system, x, y)[0]
+        measured = np.degrees(np.arctan2(-j[0, 1], j[1, 1])) - d.rotation
+        assert (measured - angle + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("dec", [90.0, -90.0, 89.999999])
+@pytest.mark.parametrize("d", [VIS[0], LSST[94], LSST[3]])
+def test_poles(d, dec):
+    system = wcs(d, *boresight_for(d, 77.0, dec, 30.0))
+    corners = focal_plane.corners(d, system)
+    assert np.isfinite(corners).all()
+    assert np.ptp(sky.separation(77.0, dec, *corners.T)) < 1e-3
+    x, y = pixel_of_sky(system, *corners.T)
+    np.testing.assert_allclose(np.sort(x), [-0.5, -0.5, d.nx - 0.5, d.nx - 0.5], atol=1e-6)
+    np.testing.assert_allclose(np.sort(y), [-0.5, -0.5, d.ny - 0.5, d.ny - 0.5], atol=1e-6)
+
+
+@given(SKY, ANY_DETECTOR, st.lists(st.tuples(st.floats(-400, 4500), st.floats(-400, 4500)), min_size=1, max_size=20))
+def test_pixel_to_sky_and_back(pointing, d, pixels):
+    system = wcs(d, *boresight_for(d, *pointing))
+    x, y = np.transpose(pixels)
+    ra, dec = sky_of_pixel(system, x, y)
+    assert ((ra >= 0) & (ra < 360)).all()
+    back = pixel_of_sky(system, ra, dec)
+    np.testing.assert_allclose(back, [x, y], atol=1e-6)
+
+
+def test_right_ascension_wraps():
+    d = VIS[14]
+    system = wcs(d, *boresight_for(d, 0.0, 10.0, 0.0))
+    ra = focal_plane.corners(d, system)[:, 0]
+    assert ((ra < 0.1) | (ra > 359.9)).all()
+    assert (ra < 0.1).any()
+    assert (ra > 359.9).any()
+    x, _ = pixel_of_sky(system, [359.999, 0.001], [10.0, 10.0])
+    assert abs(x[0] - x[1]) == pytest.approx(0.002 * 3600 * np.cos(np.radians(10)) / 0.1, rel=1e-3)
+
+
+# ------------------------------------------------------------------------------------------------ derivatives, header
+
+
+@given(SKY, ANY_DETECTOR, st.floats(0, 4000), st.floats(0, 4000))
+def test_jacobian_against_the_sky(pointing, d, x, y):
+    """Against great circles of astropy, half a pixel either way, away from where north has no meaning."""
+    ra, dec, angle = pointing
+    system = wcs(d, *boresight_for(d, ra, max(min(dec, 80.0), -80.0), angle))
+    j = jacobian(system, [x], [y])[0]
+    here = SkyCoord(*sky_of_pixel(system, [x], [y]), unit="deg")
+    for axis, step in enumerate([(0.5, 0.0), (0.0, 0.5)]):
+        ends = [SkyCoord(*sky_of_pixel(system, [x + s * step[0]], [y + s * step[1]]), unit="deg") for s in (-1, 1)]
+        offsets = [[o.to_value("arcsec")[0] for o in here.spherical_offsets_to(end)] for end in ends]
+        east, north = np.subtract(offsets[1], offsets[0])
+        np.testing.assert_allclose(j[:, axis], [-east, north], atol=2e-7)
+
+
+@given(SKY, ANY_DETECTOR)
+def test_the_header_is_the_whole_truth(pointing, d):
+    """astropy, from the cards alone, finds every pixel where we do."""
+    system = wcs(d, *boresight_for(d, *pointing))
+    header = fits.Header([fits.Card(*card) for card in focal_plane.cards(system)])
+    for other in (WCS(header), focal_plane.from_cards(focal_plane.cards(system))):
+        x, y = np.array([0.0, d.nx - 1.0]), np.array([0.0, d.ny - 1.0])
+        theirs = SkyCoord(*other.all_pix2world(x, y, 0), unit="deg")
+        ours = SkyCoord(*sky_of_pixel(system, x, y), unit="deg")
+        assert ours.separation(theirs).to_value("mas").max() < 1e-3
+
+
+def test_a_header_without_a_world_is_refused():
+    with pytest.raises(BadInput, match="CTYPE1"):
+        focal_plane.from_cards((("EXPTIME", 1.0, ""),))
+
+
+@given(SKY, ANY_DETECTOR)
+def test_footprints(pointing, d):
+    system = wcs(d, *boresight_for(d, *pointing))
+    corners = focal_plane.corners(d, system)
+    # Corners are a half-diagonal from the centre, to what the projection bends.
+    reach = sky.separation(*focal_plane.centre(d, system), *corners.T) * 3600
+    np.testing.assert_allclose(reach, d.half_diagonal, rtol=3e-3)
+    words = focal_plane.s_region(d, system).split()
+    assert words[:2] == ["POLYGON", "ICRS"]
+    np.testing.assert_allclose(np.array(words[2:], float), corners.ravel(), atol=1e-7)

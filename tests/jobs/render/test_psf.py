@@ -1,0 +1,172 @@
+"""The Euclid PSF against published optics and galsim's own diffraction; the seeing disc against its formula."""
+
+import galsim
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jobs.fluxes import passbands
+from jobs.render import psf
+from jobs.render.focal_plane import detector, detectors
+from lake_schema.mission.configuration import resolve
+
+# The published widths are for 25 mas of jitter on each axis.
+MISSION = resolve(overrides={f"svm.aocs.jitter_{axis}": (25.0, "mas") for axis in "xy"})
+BAND = passbands.load("euclid_vis")
+SAMPLING = 0.1 / 3
+
+
+@pytest.fixture(scope="module")
+def vis():
+    return psf.vis_psf(detector("vis", "3-4", MISSION), BAND, MISSION)
+
+
+def test_the_pupil_has_the_published_area():
+    """9926 cm2, and 0.8776 of the 1.2 m disc."""
+    step = 1.0
+    axis = np.arange(-605, 606, step)
+    x, y = np.meshgrid(axis, axis)
+    clear = psf.pupil(x, y, step, MISSION)
+    assert clear.min() == 0.0
+    assert clear.max() == 1.0
+    area = clear.sum() * step**2 / 100
+    assert area == pytest.approx(9926, abs=5)
+    assert area == pytest.approx(MISSION.value("plm.collecting_area", "cm2"), rel=1e-3)
+
+
+def test_the_pupil_is_decentred():
+    x = np.array([0.0, 0.0, 0.0, 0.0])
+    y = np.array([51.0, 51 + 190.0, 51 - 190.0, -160.0])
+    np.testing.assert_array_equal(psf.pupil(x, y, 1.0, MISSION), [0, 0, 0, 1])
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1))
+def test_the_wavefront_is_small_and_low(x, y):
+    nm = psf.wavefront(x, y, MISSION)
+    assert len(nm) == 12
+    # No piston, tip or tilt: the plane is centred on the chief ray.
+    assert (nm[:4] == 0).all()
+    assert np.linalg.norm(nm) < 90
+
+
+def test_wavefront_error_over_the_field():
+    """34-51 nm rms on a 3 x 3 grid."""
+    grid = [np.linalg.norm(psf.wavefront(x, y, MISSION)) for x in (-0.7, 0, 0.7) for y in (-0.7, 0, 0.7)]
+    assert 25 < min(grid) < max(grid) < 65
+
+
+def plane(nm, wavelength):
+    image = np.fft.fftshift(psf._monochromatic(nm, wavelength, SAMPLING, MISSION))
+    half, kept = image.shape[0] // 2, 256
+    return image[half - kept : half + kept + 1, half - kept : half + kept + 1]
+
+
+def test_diffraction_is_galsims():
+    """galsim.OpticalPSF of the same pupil and aberrations: an independent transform."""
+    n, nm, wavelength = 1024, psf.wavefront(0.5, -0.3, MISSION), 700.0
+    step = 1200.0 / n
+    axis = (np.arange(n) - n / 2 + 0.5) * step
+    clear = psf.pupil(*np.meshgrid(axis, axis), step, MISSION) > 0.5
+    theirs = galsim.OpticalPSF(
+        lam=wavelength,
+        diam=1.2,
+        aberrations=list(nm / wavelength),
+        pupil_plane_im=galsim.Image(clear.astype(float), scale=1.2 / n),
+        gsparams=galsim.GSParams(maximum_fft_size=8192),
+    )
+    theirs = theirs.drawImage(nx=513, ny=513, scale=SAMPLING, method="no_pixel", dtype=float).array
+    ours = plane(nm, 10 * wavelength)
+    inner = slice(256 - 40, 256 + 41)
+    assert np.abs(ours - theirs)[inner, inner].max() < 0.01 * theirs.max()
+    # Galsim folds the far wings back and lights edge samples fully.
+    assert ours[inner, inner].sum() == pytest.approx(theirs[inner, inner].sum(), rel=1e-2)
+
+
+@pytest.mark.parametrize("wavelength", [5500.0, 7000.0, 9000.0])
+def test_wings_hold_what_edges_diffract(wavelength):
+    """Beyond an angle far from the core lies lambda P / (2 pi^2 A angle), P and A perimeter and area of the pupil.
+
+    Perimeter: stop, central stop, and both sides of three bars, cut short by the stops.
+    """
+    axis = np.arange(-605, 606, 1.0)
+    x, y = np.meshgrid(axis, axis)
+    clear = psf.pupil(x, y, 1.0, MISSION)
+    perimeter = np.hypot(*np.gradient(clear)).sum()
+    image = np.fft.fftshift(psf._monochromatic(np.zeros(12), wavelength, SAMPLING, MISSION))
+    grid = (np.arange(len(image)) - len(image) // 2) * SAMPLING
+    radius = np.hypot(*np.meshgrid(grid, grid))
+    for angle in (5.0, 10.0, 25.0):
+        lost = wavelength * 1e-7 * perimeter / (2 * np.pi**2 * clear.sum() * angle * np.pi / 648000)
+        assert 1 - image[radius < angle].sum() == pytest.approx(lost, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("wavelength", "optics", "diffused", "pixelated", "peak"),
+    [(5500, 0.108, 0.132, 0.153, 0.28), (7000, 0.129, 0.147, 0.164, 0.23), (9000, 0.160, 0.173, 0.186, 0.17)],
+)
+def test_widths_by_wavelength(wavelength, optics, diffused, pixelated, peak):
+    """FWHM of optics and jitter, then diffusion, then the pixel; fraction of the light in the central pixel."""
+    focal = galsim.InterpolatedImage(galsim.Image(plane(np.zeros(12), wavelength), scale=SAMPLING), pad_factor=2)
+    steps = [focal, galsim.Gaussian(sigma=0.025)]
+    for width, more in ((optics, None), (diffused, galsim.Gaussian(sigma=0.032)), (pixelated, galsim.Pixel(0.1))):
+        steps += [more] if more else []
+        image = galsim.Convolve(steps).drawImage(nx=96, ny=96, scale=0.0125, method="no_pixel")
+        assert image.calculateFWHM() == pytest.approx(width, abs=0.003)
+    centre = galsim.Convolve(steps).drawImage(nx=3, ny=3, scale=0.1, method="no_pixel").array[1, 1]
+    assert centre == pytest.approx(peak, abs=0.01)
+
+
+def test_the_psf_is_as_wide_as_measured(vis):
+    assert vis.fwhm == pytest.approx(0.164, abs=0.005)
+    # 92 % of the light within 1.3" across, 4.5 % outside 2.6".
+    at = np.interp(0.65 / 0.1, np.arange(len(vis.outside)), vis.outside)
+    assert 1 - at == pytest.approx(0.93, abs=0.015)
+    assert vis.outside[13] == pytest.approx(0.04, abs=0.01)
+
+
+def test_little_is_lost(vis):
+    assert 0.9975 < vis.profile.flux < 0.9985
+    assert (np.diff(vis.outside) <= 1e-12).all()
+    assert (vis.surface >= 0).all()
+
+
+def test_ellipticity_is_small_everywhere():
+    for name in ("1-1", "4-6"):
+        one = psf.vis_psf(detector("vis", name, MISSION), BAND, MISSION)
+        drawn = galsim.Convolve(one.profile, galsim.Pixel(0.1)).drawImage(
+            nx=161, ny=161, scale=0.025, method="no_pixel"
+        )
+        assert drawn.FindAdaptiveMom().observed_shape.e < 0.12
+
+
+def test_a_detector_upside_down_sees_the_psf_turned():
+    """The optics do not turn with the detector."""
+    upright = detectors("vis", MISSION)[13]
+    turned = psf.vis_psf(type(upright)(**{**{f: getattr(upright, f) for f in upright.__slots__}, "rotation": 180.0}), BAND, MISSION)
+    one = psf.vis_psf(upright, BAND, MISSION)
+    draw = {"nx": 65, "ny": 65, "scale": 0.05, "method": "no_pixel", "dtype": float}
+    straight, flipped = (p.profile.drawImage(**draw).array for p in (one, turned))
+    peak = straight.max()
+    assert np.abs(straight - flipped).max() > 0.02 * peak
+    np.testing.assert_allclose(straight[::-1, ::-1], flipped, atol=1e-6 * peak)
+
+
+def test_planes_carry_equal_photons():
+    waves = psf._equal_photon_wavelengths(BAND)
+    assert waves == sorted(waves)
+    photons = BAND.response / BAND.wavelength
+    mean = np.average(BAND.wavelength, weights=photons)
+    assert np.mean(waves) == pytest.approx(mean, rel=2e-3)
+    spread = np.sqrt(np.average((BAND.wavelength - mean) ** 2, weights=photons))
+    assert np.std(waves) == pytest.approx(spread, rel=0.02)
+
+
+@pytest.mark.parametrize(("seeing", "beta", "pixel"), [(0.73, 3.0, 0.2), (1.2, 3.5, 0.26)])
+def test_the_seeing_disc(seeing, beta, pixel):
+    disc = psf.ground_psf(seeing, beta, pixel)
+    assert disc.fwhm == pytest.approx(np.hypot(seeing, 0.6 * pixel), rel=0.02)
+    scale = seeing / (2 * np.sqrt(2 ** (1 / beta) - 1))
+    for r in (5, 10, 20):
+        assert disc.outside[r] == pytest.approx((1 + ((r + 0.5) * pixel / scale) ** 2) ** (1 - beta), rel=0.05)
+    assert disc.profile.flux == 1.0

@@ -1,0 +1,100 @@
+"""The diffuse sky against published surface brightnesses and astropy's ecliptic."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import BarycentricMeanEcliptic, GeocentricMeanEcliptic, SkyCoord, get_sun
+from astropy.time import Time
+from astropy.utils import iers
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jobs.fluxes import passbands
+from jobs.render import focal_plane, sky
+from lake_schema.errors import OutOfRange
+from lake_schema.mission.configuration import resolve
+
+MISSION = resolve()
+J2000 = "J2000"
+
+
+@pytest.fixture(autouse=True)
+def _offline():
+    with iers.conf.set_temp("auto_download", False):
+        yield
+
+
+@given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90))
+def test_ecliptic_coordinates(ra, dec):
+    theirs = SkyCoord(ra, dec, unit="deg").transform_to(BarycentricMeanEcliptic(equinox=J2000))
+    longitude, latitude = sky.ecliptic(ra, dec)
+    ours = SkyCoord(longitude, latitude, unit="deg", frame=BarycentricMeanEcliptic(equinox=J2000))
+    assert ours.separation(theirs).arcsec < 0.1
+
+
+@given(st.floats(40000, 70000))
+def test_the_sun(mjd):
+    theirs = get_sun(Time(mjd, format="mjd")).transform_to(GeocentricMeanEcliptic(equinox=J2000)).lon.deg
+    assert (sky.sun_longitude(mjd) - theirs + 180) % 360 - 180 == pytest.approx(0.0, abs=0.02)
+
+
+def at(from_sun, latitude, mjd=60950.0):
+    """ICRS position of an ecliptic latitude and a longitude from the Sun."""
+    lon = sky.sun_longitude(mjd) + from_sun
+    place = SkyCoord(lon * u.deg, latitude * u.deg, frame=BarycentricMeanEcliptic(equinox=J2000)).icrs
+    return place.ra.deg, place.dec.deg, mjd
+
+
+@given(st.floats(-720, 720), st.floats(-90, 90))
+def test_zodiacal_light_is_smooth_and_symmetric(from_sun, latitude):
+    value = sky.zodiacal_intensity(from_sun, latitude)
+    # Faintest and brightest entries of the table.
+    assert 71e-8 <= value <= 11501e-8
+    for mirrored in ((-from_sun, latitude), (from_sun, -latitude), (from_sun + 360, latitude)):
+        assert sky.zodiacal_intensity(*mirrored) == pytest.approx(value, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("from_sun", "latitude", "value"), [(90, 0, 259), (90, 90, 77), (135, 45, 90), (180, 0, 230), (60, 30, 183)]
+)
+def test_the_table_is_met_at_its_nodes(from_sun, latitude, value):
+    assert sky.zodiacal_intensity(from_sun, latitude) == pytest.approx(value * 1e-8)
+
+
+def test_a_latitude_beyond_the_pole_is_refused():
+    with pytest.raises(OutOfRange, match="latitude"):
+        sky.zodiacal_intensity(90.0, 91.0)
+    with pytest.raises(OutOfRange, match="latitude"):
+        sky.zodiacal_intensity(90.0, float("nan"))
+
+
+@pytest.mark.parametrize(
+    ("latitude", "rate"), [(0, 0.503), (15, 0.374), (30, 0.255), (60, 0.167), (90, 0.149)]
+)
+def test_vis_zodiacal_rate_at_quadrature(latitude, rate):
+    """e-/s in a VIS pixel: surface brightnesses of Leinert et al. 1998 through the throughput, to the model's 10 %."""
+    found = sky.zodiacal_rate(*at(90, latitude), passbands.load("euclid_vis"), 0.9926, 0.1, MISSION)
+    assert found == pytest.approx(rate, rel=0.10)
+
+
+def test_vis_sky_brightness_in_magnitudes():
+    """The designers' mean sky is 22.35 mag arcsec-2 (Leinert et al. 1998 with Aldering 2002)."""
+    band = passbands.load("euclid_vis")
+    rate = sky.zodiacal_rate(*at(90, 30), band, 0.9926, 0.1, MISSION)
+    surface = 25.93 - 2.5 * np.log10(rate / 0.01)
+    assert surface == pytest.approx(22.35, abs=0.15)
+
+
+def test_rates_scale_with_area_and_pixel():
+    band, place = passbands.load("euclid_vis"), at(90, 30)
+    one = sky.zodiacal_rate(*place, band, 1.0, 0.1, MISSION)
+    assert sky.zodiacal_rate(*place, band, 2.0, 0.3, MISSION) == pytest.approx(18 * one)
+
+
+def test_what_a_camera_sees():
+    vis = focal_plane.detector("vis", "3-4", MISSION)
+    place = at(90, 30)
+    zodi = sky.zodiacal_rate(*place, passbands.load("euclid_vis"), 0.9926, 0.1, MISSION)
+    assert sky.sky_rate(vis, "euclid_vis", *place, MISSION) == pytest.approx(zodi + 0.0296)
+    lsst = focal_plane.detector("lsstcam", "R22_S11", MISSION)
+    assert sky.sky_rate(lsst, "lsst_r", *place, MISSION) == 32.95

@@ -1,0 +1,153 @@
+"""FITS: the bytes, the checksums, and what a damaged or hostile file meets."""
+
+import numpy as np
+import pytest
+from astropy.io import fits as astropy_fits
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from lake_schema import fits
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.products import PRODUCTS
+from tests.universe import rows_of
+
+CARDS = (("EXPTIME", 560.53, "[s]"), ("SEED", "17", "of the numbers"), ("NSOURCES", 12, ""), ("GOOD", True, ""))
+TYPES = ["u1", "i2", "u2", "i4", "f4", "f8"]
+
+
+def science(ny=30, nx=40):
+    return np.random.default_rng(1).integers(0, 65536, (ny, nx)).astype(np.uint16)
+
+
+@given(st.sampled_from(TYPES).flatmap(lambda t: hnp.arrays(t, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))))
+def test_what_is_written_is_read(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("fits") / "a.fits"
+    fits.write_images(path, [fits.Image(data, CARDS), fits.Image(data, name="COPY")])
+    first, second = fits.read_images(path)
+    assert first.cards == CARDS
+    assert (first.name, second.name) == ("", "COPY")
+    for image in (first, second):
+        assert image.data.dtype == data.dtype
+        np.testing.assert_array_equal(image.data, data)
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        fits.write_images(tmp_path / name, [fits.Image(science(), CARDS), fits.Image(None, CARDS, "EMPTY")])
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]
+
+
+def test_other_tools_find_it_sound(tmp_path):
+    path = tmp_path / "a.fits"
+    fits.write_images(path, [fits.Image(science(), CARDS)])
+    with astropy_fits.open(path, checksum=True) as units:
+        units.verify("exception")
+        assert units[0].verify_checksum() == units[0].verify_datasum() == 1
+        assert units[0].data.dtype == np.uint16
+        assert units[0].header.comments["EXPTIME"] == "[s]"
+        assert "DATE" not in units[0].header
+    assert path.stat().st_mode & 0o444 == 0o444
+
+
+def test_a_changed_byte_is_noticed(tmp_path):
+    path = tmp_path / "a.fits"
+    fits.write_images(path, [fits.Image(science(), CARDS)])
+    good = path.read_bytes()
+    # In the data, and in a card's value.
+    for place in (2880 + 100, good.index(b"560.53") + 1):
+        path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
+        with pytest.raises(Damaged, match=r"a\.fits"):
+            fits.read_images(path)
+    path.write_bytes(good[: len(good) - 2880])
+    with pytest.raises(Damaged):
+        fits.read_images(path)
+    path.write_bytes(b"")
+    with pytest.raises(Damaged):
+        fits.read_images(path)
+
+
+def test_a_file_without_checksums_is_refused(tmp_path):
+    path = tmp_path / "a.fits"
+    astropy_fits.PrimaryHDU(science()).writeto(path)
+    with pytest.raises(Damaged, match="no checksum"):
+        fits.read_images(path)
+
+
+def test_size_is_judged_from_the_header(tmp_path):
+    path = tmp_path / "a.fits"
+    fits.write_images(path, [fits.Image(science())])
+    with pytest.raises(BadInput, match="more than 1000 bytes"):
+        fits.read_images(path, most_bytes=1000)
+    promises = path.read_bytes().replace(b"NAXIS1  =                   40", b"NAXIS1  =           2000000000")
+    path.write_bytes(promises)
+    with pytest.raises((BadInput, Damaged)):
+        fits.read_images(path)
+
+
+@pytest.mark.parametrize(
+    "card",
+    [
+        ("NAXIS1", 5, ""),
+        ("bitpix", 8, ""),
+        ("X", float("nan"), ""),
+        ("X", float("inf"), ""),
+        ("X", "é", ""),
+        ("TOOLONGKEY", 1, ""),
+        ("X", 1.0, "c" * 80),
+    ],
+)
+def test_a_card_that_fits_cannot_hold_is_refused(tmp_path, card):
+    with pytest.raises(BadInput, match=card[0]):
+        fits.write_images(tmp_path / "a.fits", [fits.Image(science(), (card,))])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("data", [np.zeros(3), np.zeros((2, 2), complex), np.zeros((2, 2, 2)), np.array([["a"]])])
+def test_what_is_no_image_is_refused(tmp_path, data):
+    with pytest.raises(BadInput, match="image"):
+        fits.write_images(tmp_path / "a.fits", [fits.Image(data)])
+    with pytest.raises(BadInput, match="at least one"):
+        fits.write_images(tmp_path / "a.fits", [])
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.fits"
+    fits.write_images(path, [fits.Image(science())])
+    before = path.read_bytes()
+    with pytest.raises(BadInput):
+        fits.write_images(path, [fits.Image(science(), (("X", float("nan"), ""),))])
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["a.fits"]
+
+
+def test_tables_carry_units_and_ucds(tmp_path):
+    rows = rows_of(GALAXIES, 7)
+    path = tmp_path / "galaxies.fits"
+    fits.table_to_fits(path, rows, GALAXIES)
+    with astropy_fits.open(path, checksum=True) as units:
+        units.verify("exception")
+        table, header = units[1].data, units[1].header
+        assert header["EXTNAME"] == "GALAXIES"
+        for number, column in enumerate(GALAXIES.columns, start=1):
+            assert header[f"TTYPE{number}"] == column.name
+            assert header.get(f"TUNIT{number}", "") == column.unit
+            assert header.get(f"TUCD{number}", "") == column.ucd
+        for name in ("id", "ra", "kappa", "sed_1", "log_halo_mass"):
+            np.testing.assert_array_equal(table[name], rows[name].to_numpy())
+
+
+def test_tables_with_texts_gaps_and_lists(tmp_path):
+    rows = rows_of(PRODUCTS, 3)
+    path = tmp_path / "products.fits"
+    fits.table_to_fits(path, rows, PRODUCTS)
+    with astropy_fits.open(path) as units:
+        assert list(units[1].data["detector"]) == rows["detector"].to_pylist()
+    holes = rows_of(GALAXIES, 3)
+    masses = np.ma.MaskedArray([1.0, 2.0, 3.0], [False, True, False])
+    columns = {name: holes[name] for name in holes.column_names} | {"log_halo_mass": masses + 10}
+    fits.table_to_fits(path, GALAXIES.build(columns), GALAXIES)
+    with astropy_fits.open(path) as units:
+        np.testing.assert_array_equal(units[1].data["log_halo_mass"], [11.0, np.nan, 13.0])

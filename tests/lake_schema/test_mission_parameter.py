@@ -1,0 +1,102 @@
+"""Records of the mission database: what is read, and what is refused."""
+
+import re
+
+import astropy.units as u
+import pytest
+
+from lake_schema.errors import BadInput
+from lake_schema.mission import parameter
+from lake_schema.mission.parameter import Parameter, convert, read, read_all, read_table
+
+HEADER = "key,status,value,unit,version,valid_from,confidence,source\n"
+
+
+def write(folder, *lines):
+    path = folder / "section.csv"
+    path.write_text(HEADER + "".join(line + "\n" for line in lines))
+    return path
+
+
+def test_a_record_is_read_with_all_it_says(tmp_path):
+    (record,) = read(write(tmp_path, 'a.gain,CBE,3.48,electron / adu,2,60000.5,published,"Somebody, 2024"'))
+    assert record == Parameter(
+        "a.gain", "CBE", 3.48, "electron / adu", 2, 60000.5, "published", "Somebody, 2024"
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("a.gain,NEW,1,,1,,assumed,x", "status"),
+        ("a.gain,CBE,nan,,1,,assumed,x", "finite"),
+        ("a.gain,CBE,inf,,1,,assumed,x", "finite"),
+        ("a.gain,CBE,one,,1,,assumed,x", "line 2"),
+        ("a.gain,CBE,1,,1.5,,assumed,x", "line 2"),
+        ("a.gain,CBE,1,furlongs per fortnight,1,,assumed,x", "not a unit"),
+        ("a.gain,CBE,1,,1,,surely,x", "confidence"),
+        ("a.gain,CBE,1,,1,,assumed,", "source"),
+        ("a.gain,CBE,1,,1,nan,assumed,x", "finite"),
+    ],
+)
+def test_a_bad_record_is_refused_by_name(tmp_path, line, word):
+    with pytest.raises(BadInput, match=word) as refusal:
+        read(write(tmp_path, line))
+    assert "\n" not in str(refusal.value)
+
+
+def test_other_columns_are_refused(tmp_path):
+    path = tmp_path / "section.csv"
+    path.write_text("key,value\na,1\n")
+    with pytest.raises(BadInput, match="columns"):
+        read(path)
+
+
+def test_every_record_of_the_package_names_a_publication():
+    records = read_all()
+    assert len(records) > 70
+    for record in records:
+        if record.confidence != "assumed":
+            assert re.search(r"[A-Z][a-z]{3}", record.source), record
+        assert "/" not in record.source, record
+        assert u.Unit(record.unit) is not None
+
+
+def test_published_statuses_are_all_there():
+    """The ladder has something to choose from: the statuses that are published for the read noise and the gain."""
+    found = {(r.key, r.status): r.value for r in read_all()}
+    assert {s for k, s in found if k == "vis.read_noise"} == {"REQ", "DES", "CBE", "SIM"}
+    assert found["vis.gain", "CBE"] == 3.48
+    assert found["vis.gain", "REQ"] == 3.1
+    # A current best estimate keeps its requirement.
+    for quantity in ("read_noise", "dark_current"):
+        best = found.get((f"vis.{quantity}", "CBE"), found.get((f"vis.{quantity}", "BLT")))
+        assert best <= found[f"vis.{quantity}", "REQ"]
+
+
+def test_no_zero_point_is_stored():
+    """It follows from throughput and area: a second number could disagree."""
+    assert not [record.key for record in read_all() if "zp" in record.key or "zero_point" in record.key]
+
+
+def test_conversion():
+    assert convert(1.0, "mas", "arcsec", "here") == pytest.approx(1e-3)
+    with pytest.raises(BadInput, match=r"here.*does not convert"):
+        convert(1.0, "s", "m", "here")
+
+
+def test_the_zodiacal_table_is_the_published_one():
+    table = {row[0]: row[1:] for row in read_table("zodiacal_light_500nm")}
+    assert len(table) == 19
+    # Ecliptic poles, quadrature and anti-solar point of Leinert et al. 1998, Table 17.
+    assert {row[-1] for row in table.values()} == {77.0}
+    assert table[90.0][0] == 259.0
+    assert table[180.0][0] == 230.0
+    assert all(table[90.0][i] >= table[90.0][i + 1] for i in range(10))
+
+
+def test_statuses_and_sections_have_no_strangers():
+    records = read_all()
+    assert {record.status for record in records} <= set(parameter.STATUSES)
+    prefixes = {record.key.split(".")[0] for record in records}
+    assert prefixes == {"env", "plm", "svm", "vis", "ext", "survey"}
