@@ -201,7 +201,7 @@ def _refusing(path: Path) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyUserWarning)
             yield
-    except (OSError, AstropyUserWarning, fits.VerifyError, TypeError, IndexError) as error:
+    except (OSError, AstropyUserWarning, fits.VerifyError, TypeError, ValueError, LookupError) as error:
         raise Damaged(f"{path}: {' '.join(str(error).split())}") from None
 
 

@@ -16,6 +16,8 @@ FILE_ORDER = 5
 _SUB_BITS = 2 * (GENERATION_ORDER - FILE_ORDER)
 _NUMBER_BITS = 22
 _MEMBER_BITS = 18
+# Identifiers that differ above these bits stand for another kind or another file cell.
+BLOCK_BITS = _MEMBER_BITS + _NUMBER_BITS + _SUB_BITS
 
 Int64 = npt.NDArray[np.int64]
 
@@ -34,7 +36,7 @@ def source_id(kind: npt.ArrayLike, cell: int, number: npt.ArrayLike, member: npt
         raise BadInput(f"source id: {cell} is not a cell of order {GENERATION_ORDER}")
     file_cell, sub = cell >> _SUB_BITS, cell & ((1 << _SUB_BITS) - 1)
     index = np.int64(sub) << _NUMBER_BITS | numbers
-    return kinds << 60 | np.int64(file_cell) << 46 | index << _MEMBER_BITS | members
+    return kinds << 60 | np.int64(file_cell) << BLOCK_BITS | index << _MEMBER_BITS | members
 
 
 def halo_of(ids: Int64) -> Int64:

@@ -18,11 +18,10 @@ import pyarrow as pa
 from lake_schema import layout, manifest, parquet, sky
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.ids import BLOCK_BITS, kind_of
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
 from lake_schema.validate import check
 
-# Identifiers that differ above this bit stand for another kind or another file cell (lake_schema.ids).
-BLOCK_BITS = 46
 # A table whose identifiers spread over more blocks than this has none worth noting.
 _MOST_BLOCKS = 1000
 
@@ -77,6 +76,10 @@ def _check_sky(rows: pa.Table, table: Table, part: Part) -> None:
     wrong = index != sky.healpix_29(rows["ra"].to_numpy(), rows["dec"].to_numpy())
     if wrong.any():
         raise BadInput(f"{where}: _healpix_29 of row {wrong.argmax()} is not that of its ra, dec")
+    if "kind" in table.names:
+        wrong = kind_of(rows["id"].to_numpy()) != rows["kind"].to_numpy()
+        if wrong.any():
+            raise BadInput(f"{where}: kind of row {wrong.argmax()} is not that of its id")
 
 
 def _row_facts(rows: pa.Table, table: Table) -> dict[str, Any]:

@@ -12,8 +12,9 @@ import numpy.typing as npt
 import pyarrow.parquet as pq
 
 from lake_schema.errors import BadInput
+from lake_schema.ids import BLOCK_BITS
 from lake_schema.plan import Json, Plan, data_path
-from lake_schema.stage import BLOCK_BITS, is_numbered
+from lake_schema.stage import is_numbered
 
 Int = npt.NDArray[np.int64]
 

@@ -99,8 +99,8 @@ def _packaged(install: bool) -> Java | None:
 def wrapper(java: Java, environment: Path) -> str:
     """The `java` that Spark calls: the chosen one, without the arguments that it cannot digest.
 
-    With an archive of classes (record_spark_classes.py) it starts in half the time.  Such an archive admits no
-    folder on the class path; all that Java looks for in ours is how to log.
+    With an archive of classes (record_spark_classes.py) it starts in half the time.  Such an archive admits
+    no folder on the class path; all that Java looks for in ours is how to log.
     """
     conf, store = environment / "spark-conf", environment / "java"
     dropped = "|".join(argument for since, argument in NOT_PASSED.items() if java.major >= since)
@@ -115,12 +115,14 @@ for argument in "$@"; do
   [ $first = 1 ] && set -- && first=0
   case $argument in
     {dropped}) ;;
-    "$conf/:"*) set -- "$@" "${{argument#"$conf/:"}}" "-Dlog4j2.configurationFile=$conf/log4j2.properties" ;;
+    "$conf/:"*)
+      set -- "$@" "${{argument#"$conf/:"}}" "-Dlog4j2.configurationFile=$conf/log4j2.properties" ;;
     *) set -- "$@" "$argument" ;;
   esac
 done
-if [ -s "$store/spark.jsa" ]; then
-  set -- "-XX:SharedArchiveFile=$store/java.jsa:$store/spark.jsa" -Xshare:auto -Xlog:disable -Xlog:all=off "$@"
+spark="$store/spark.jsa"
+if [ -s "$spark" ]; then
+  set -- "-XX:SharedArchiveFile=$store/java.jsa:$spark" -Xshare:auto -Xlog:disable -Xlog:all=off "$@"
 fi
 exec "$java" "$@"
 """
@@ -142,6 +144,7 @@ exec {shlex.quote(str(environment / "bin" / "python"))} "$@"
 def spark_env(environment: Path) -> str:
     """spark-env.sh: bash, read by every start script of Spark; what it sets is exported."""
     return f"""# Written by scripts/prepare_spark.py.
+SPARK_CONF_DIR={shlex.quote(str(environment / "spark-conf"))}
 JAVA_HOME={shlex.quote(str(environment / "java"))}
 PYSPARK_PYTHON={shlex.quote(str(environment / "bin" / "python"))}
 PYSPARK_DRIVER_PYTHON={shlex.quote(str(environment / "spark-conf" / "driver-python"))}
@@ -207,7 +210,7 @@ _HEAD = re.compile(r"^deactivate *\(\) *\{\n", re.MULTILINE)
 
 
 def activate(text: str, spark_home: Path, conf: Path) -> str:
-    """bin/activate with our lines at the head of `deactivate` and at the end, in place of an earlier run's."""
+    """bin/activate with our lines heading `deactivate` and at the end, instead of an earlier run's."""
     text = _OURS.sub("", text)
     text = _HEAD.sub(lambda head: head[0] + _DEACTIVATE, text, count=1)
     ours = _ACTIVATE.replace("@SPARK_HOME@", shlex.quote(str(spark_home)))

@@ -2,9 +2,9 @@
 
     python scripts/record_spark_classes.py [--environment .venv]
 
-A job with nothing to do runs once, and Java writes what it loaded to .venv/java/spark.jsa (class data sharing,
-150 MB).  Java itself passes over an archive that does not fit; for another Java or another Spark a new one is
-made.  Where none can be made, Spark starts as slowly as it did.  prepare_spark.py has to have run before.
+A job with nothing to do runs once, and Java writes what it loaded to .venv/java/spark.jsa (class data
+sharing, 150 MB).  Java passes over an archive that does not fit; for another Java or another Spark a new one
+is made.  Where none can be made, Spark starts as slowly as it did.  prepare_spark.py has to have run before.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -49,22 +50,36 @@ def record(environment: Path, java: Java) -> bool:
     store = environment / "java"
     (store / "spark.jsa").unlink(missing_ok=True)
     with tempfile.TemporaryDirectory(dir=store) as folder:
-        base, top, job = (Path(folder) / name for name in ("java.jsa", "spark.jsa", "job.py"))
+        names = ("java.jsa", "spark.jsa", "job.py", "nothing.py")
+        base, top, job, nothing = (Path(folder) / name for name in names)
         job.write_text(JOB)
-        dump = [java.home / "bin" / "java", "-Xshare:dump", *OPTIONS.split(), f"-XX:SharedArchiveFile={base}"]
-        if not (_runs(dump) and base.is_file()):
+        nothing.touch()
+        dump = ["-Xshare:dump", *OPTIONS.split(), f"-XX:SharedArchiveFile={base}"]
+        if not (_runs([java.home / "bin" / "java", *dump]) and base.is_file()):
             return False
         # The archive on top remembers where the one below lies.
         base = base.replace(store / base.name)
-        options = f"{OPTIONS} -XX:SharedArchiveFile={base} -XX:ArchiveClassesAtExit={top}"
-        submit = [environment / "bin" / "spark-submit", "--conf", f"spark.driver.extraJavaOptions={options}", job]
-        if not (_runs(submit, SPARK_CONF_DIR=str(environment / "spark-conf")) and top.is_file()):
+        if not _submits(environment, job, f"-XX:SharedArchiveFile={base} -XX:ArchiveClassesAtExit={top}"):
             return False
+        # Made to use both or fail, Java uses them.
+        forced = f"-XX:SharedArchiveFile={base}:{top} -Xshare:on"
+        if not (top.is_file() and _submits(environment, nothing, forced)):
+            return False
+        # Java trusts what an archive says: none may be there that a crash of the machine cut short.
+        for archive in (base, top):
+            with archive.open("rb") as stream:
+                os.fsync(stream.fileno())
         top.replace(store / top.name)
     return True
 
 
-def _runs(command: list[str | Path], **variables: str) -> bool:
+def _submits(environment: Path, script: Path, options: str) -> bool:
+    options = f"spark.driver.extraJavaOptions={OPTIONS} {options}"
+    command = [environment / "bin" / "spark-submit", "--conf", options, script]
+    return _runs(command, SPARK_CONF_DIR=str(environment / "spark-conf"))
+
+
+def _runs(command: Sequence[str | Path], **variables: str) -> bool:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     environ = {**os.environ, "PATH": path, **variables}
     environ.pop("SPARK_HOME", None)

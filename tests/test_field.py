@@ -3,6 +3,7 @@
 The five jobs run once, in the shared session, on the demo's request; everything else looks at what they published.
 """
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import sep
 from astropy.io import fits
-from astropy.wcs import WCS
+from astropy.wcs import WCS, FITSFixedWarning
 from scipy.spatial import cKDTree
 
 from jobs import request, shell
@@ -81,7 +82,9 @@ def image(request, field):
 
 def sources(field, header):
     """Positions and expected electrons of everything on the detector, from the catalogues and the flux tables alone."""
-    system = WCS(header)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)  # astropy adds DATE-OBS to its own copy
+        system = WCS(header)
     found = []
     for catalogue, fluxes, ra, dec in (
         ("galaxies", "galaxy_fluxes", "ra_lensed", "dec_lensed"),
@@ -126,14 +129,17 @@ def test_bright_unblended_sources_are_found(image, photometry):
     assert len(bright) > 300
     sigma = float(np.sqrt(np.median(image.variance)))
     background = sep.Background(image.electrons, bw=128, bh=128).back()
-    objects = sep.extract(
-        image.electrons - background, 1.2, err=sigma, minarea=4, deblend_cont=0.001, deblend_nthresh=64
-    )
-    tree = cKDTree(np.stack([objects["x"], objects["y"]], 1))
-    distance, _ = tree.query(np.stack([image.x[bright], image.y[bright]], 1))
+    data = image.electrons - background
+    objects = sep.extract(data, 1.5, err=sigma, minarea=5, deblend_cont=0.001, deblend_nthresh=64)
+    # Windowed positions, as SExtractor's XWIN_IMAGE: the barycentre of a noisy isophote is a third worse.
+    width = 1.5 * image.header["PSFFWHM"] / 2.355 / image.pixel_scale
+    x, y, _ = sep.winpos(data, objects["x"], objects["y"], width)
+    distance, which = cKDTree(np.stack([x, y], 1)).query(np.stack([image.x[bright], image.y[bright]], 1))
     found = distance * image.pixel_scale < 0.25 * image.aperture
     assert found.mean() >= 0.9
     assert np.median(distance[found]) < 0.2
+    assert abs(np.median((x[which] - image.x[bright])[found])) < 0.15
+    assert abs(np.median((y[which] - image.y[bright])[found])) < 0.15
 
 
 def test_photometry_is_right_and_as_noisy_as_predicted(image, photometry):
@@ -148,15 +154,6 @@ def test_photometry_is_right_and_as_noisy_as_predicted(image, photometry):
     pull = (measured[use] - truth[use]) / noise[use]
     spread = (np.percentile(pull, 84) - np.percentile(pull, 16)) / 2
     assert 0.9 < spread < 1.3
-
-
-def test_positions_are_unbiased(image, photometry):
-    index, _, truth, noise = photometry
-    bright = index[truth > 50 * noise]
-    radius = 0.5 * image.aperture / image.pixel_scale
-    x, y, _ = sep.winpos(image.electrons, image.x[bright], image.y[bright], radius / 2.5)
-    offset = np.hypot(np.median(x - image.x[bright]), np.median(y - image.y[bright]))
-    assert offset < 0.2
 
 
 def test_the_frame_holds_the_light_of_its_sources(image):

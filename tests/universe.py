@@ -58,7 +58,8 @@ def rows_of(table, n, seed=0):
     if table.is_catalogue:
         index, ra, dec = sky.random_in_cell(5, 1607, n, rng)
         columns |= {"_healpix_29": index, "ra": ra, "dec": dec}
-        columns["id"] = ids.source_id(0, 1607 << 6, np.arange(n))
+        kind = columns.get("kind", (table.column("id").lo or 0) >> 60)
+        columns["id"] = ids.source_id(kind, 1607 << 6, np.arange(n))
     return table.build(columns)
 
 

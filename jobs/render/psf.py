@@ -17,6 +17,7 @@ import galsim
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
+from scipy.ndimage import uniform_filter
 
 from jobs import cache
 from jobs.fluxes.passbands import Passband
@@ -36,6 +37,8 @@ _OVERSAMPLING = 3
 SIDE = 512
 # Side of the optical transform, samples: the 0.15 % of the light beyond its border is absent, not folded back.
 _TRANSFORM = 2048
+# Side and samples a pixel of the drawing that tells the width.
+_CORE, _FINE = 243, 9
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
@@ -67,8 +70,14 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration) -
     """
     plane = _vis_plane(detector, band, mission)
     image = galsim.Image(plane.astype(float), scale=detector.pixel_scale / _OVERSAMPLING)
-    # A plane that is empty at its border needs little padding.
-    focal = galsim.InterpolatedImage(image, pad_factor=2.0, flux=float(plane.sum(dtype=float)))
+    # A plane that is empty at its border needs little padding; its extent in real and Fourier space is known.
+    focal = galsim.InterpolatedImage(
+        image,
+        pad_factor=2.0,
+        flux=float(plane.sum(dtype=float)),
+        _force_stepk=2 * np.pi / (len(plane) * image.scale),
+        _force_maxk=np.pi / image.scale,
+    )
     return _tabulated(focal.rotate(-detector.rotation * galsim.degrees), detector.pixel_scale)
 
 
@@ -91,15 +100,12 @@ def _tabulated(profile: galsim.GSObject, pixel_scale: float) -> Psf:
     total = np.bincount(ring[inside], image[inside])
     surface = np.maximum(total / np.bincount(ring[inside]), 0.0)
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
-    core = galsim.Convolve(profile, galsim.Pixel(pixel_scale))
-    width = core.drawImage(
-        nx=64, ny=64, scale=pixel_scale / 8, method="no_pixel", dtype=float
-    ).calculateFWHM()
-    return Psf(profile, pixel_scale, surface, outside, width)
+    core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / _FINE, method="no_pixel", dtype=float)
+    with_pixel = galsim.Image(uniform_filter(core.array, _FINE), scale=pixel_scale / _FINE)
+    return Psf(profile, pixel_scale, surface, outside, float(with_pixel.calculateFWHM()))
 
 
-# ------------------------------------------------------------------------------------------------ the Euclid
-# optics
+# ------------------------------------------------------------------------------------------------ the optics
 
 
 def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) -> Float:
@@ -182,6 +188,7 @@ def _polychromatic(
     total = np.zeros((_TRANSFORM, _TRANSFORM))
     for wavelength in _equal_photon_wavelengths(band):
         total += _monochromatic(nm, wavelength, sampling, mission) / _PLANES
+    total /= _edge_loss()
     k = 2 * np.pi * scipy.fft.fftfreq(_TRANSFORM, sampling)
     transfer = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(
         -0.5 * blur[0] * k[None, : _TRANSFORM // 2 + 1] ** 2
@@ -204,8 +211,7 @@ def _equal_photon_wavelengths(band: Passband) -> list[float]:
 def _monochromatic(nm: Float, wavelength: float, sampling: float, mission: MissionConfiguration) -> Float:
     """|FFT of the pupil|^2, centred on [0, 0], of unit flux over the whole sky.
 
-    The pupil's sampling follows the wavelength, so that the image's does not.  Its soft edges, one sample wide,
-    diffract less to large angles than sharp ones, by sinc(angle / side) in amplitude: that is put back.
+    The pupil's sampling follows the wavelength, so that the image's does not; its edges are one sample wide.
     """
     step = wavelength * 1e-7 / (_TRANSFORM * sampling * _ARCSEC)
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
@@ -219,6 +225,11 @@ def _monochromatic(nm: Float, wavelength: float, sampling: float, mission: Missi
     phase[lit] = 2 * np.pi * zernike(x[lit], y[lit]) / (wavelength / 10.0)
     field = np.zeros((_TRANSFORM, _TRANSFORM), complex)
     field[:n, :n] = transmission * np.exp(1j * phase)
-    image = np.abs(scipy.fft.fft2(field)) ** 2 / (transmission.sum() * _TRANSFORM**2)
+    amplitude = scipy.fft.ifft2(field, overwrite_x=True)
+    return np.asarray((amplitude.real**2 + amplitude.imag**2) * (_TRANSFORM**2 / transmission.sum()))
+
+
+def _edge_loss() -> Float:
+    """What the soft edges of `pupil` leave of the diffracted light, by angle: sinc^2(angle / side)."""
     angle = scipy.fft.fftfreq(_TRANSFORM)
-    return np.asarray(image / np.sinc(np.hypot(angle[:, None], angle[None, :])) ** 2)
+    return np.asarray(np.sinc(np.hypot(angle[:, None], angle)) ** 2)

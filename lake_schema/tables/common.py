@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from lake_schema.columns import Column
 
 KINDS = (
@@ -26,3 +28,9 @@ HEALPIX_29 = Column(
     "_healpix_29", "int64", ucd="pos.healpix", doc="HEALPix index of (ra, dec), order 29, nested: the sort key", lo=0
 )
 SKY = (ID, RA, DEC, HEALPIX_29)
+
+
+def id_of_kinds(first: int, last: int) -> Column:
+    """The column `id` of a table that holds these kinds only, so that no two tables can share an identifier."""
+    return replace(ID, lo=first << 60, hi=(last + 1 << 60) - 1)
+

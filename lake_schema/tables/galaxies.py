@@ -7,7 +7,7 @@ case of equal laws and E(B-V).
 from __future__ import annotations
 
 from lake_schema.columns import Column, Table
-from lake_schema.tables.common import DEC, HEALPIX_29, ID, KINDS, RA
+from lake_schema.tables.common import DEC, HEALPIX_29, KINDS, RA, id_of_kinds
 
 LAWS = ((0, "none"), (1, "Prevot"), (2, "Calzetti"), (3, "Calzetti + 2175 A bump"), (4, "Calzetti + double bump"))
 
@@ -43,7 +43,7 @@ GALAXIES = Table(
     1,
     (
         # 1 identity
-        ID,
+        id_of_kinds(0, 4),
         Column("halo_id", "int64", ucd="meta.id.parent", doc="parent halo: the id with its kind and member bits cleared", lo=0),
         # 2 positions
         RA,

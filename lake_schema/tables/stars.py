@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lake_schema.columns import Column, Table
-from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
+from lake_schema.tables.common import DEC, HEALPIX_29, RA, id_of_kinds
 
 COMPONENTS = (
     (0, "thin disc"),
@@ -17,7 +17,7 @@ STARS = Table(
     "stars",
     1,
     (
-        ID,
+        id_of_kinds(5, 5),
         RA,
         DEC,
         HEALPIX_29,

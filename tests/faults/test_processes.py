@@ -89,7 +89,7 @@ def test_the_loser_of_a_race_is_told(every, seeds, plain_phases, tmp_path_factor
                 assert promise.current(root, "plain") == promise.key("plain", 9)
 
 
-@pytest.mark.parametrize(("kind", "versions", "reads"), [("plain", 20, 300), pytest.param("toy", 20, 1000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("kind", "versions", "reads"), [("plain", 20, 1000), pytest.param("toy", 20, 1000, marks=pytest.mark.nightly)])
 def test_a_reader_never_sees_two_versions(kind, versions, reads, lake):
     promise.make(lake, kind, 1)
     stop = victims.CONTEXT.Event()

@@ -62,13 +62,13 @@ def environment(tmp_path):
 def program(path: Path, body: str) -> Path:
     """A small program of the shell."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f"#!/bin/sh\n{body}\n")
+    path.write_text(body if body.startswith("#!") else f"#!/bin/sh\n{body}\n")
     path.chmod(0o755)
     return path
 
 
 def fake_java(home: Path, version: str) -> Path:
-    """A folder with a `java` that says it is of some version and else repeats its arguments; returns the folder."""
+    """A folder with a `java` that says it is of some version, and else repeats its arguments."""
     told = f"    java.home = {home}\\n    java.specification.version = {version}\\n"
     program(
         home / "bin" / "java", f'case $1 in -Xshow*) printf "{told}" >&2 ;; *) printf "%s\\n" "$@" ;; esac'
@@ -136,26 +136,47 @@ def test_without_any_java_one_line_says_what_to_install(tmp_path):
     assert not (tmp_path / "environment").exists()
 
 
+def wrapped(prepare, tmp_path, major):
+    """The wrapper around a fake Java, in a folder with a blank and a quote in its name."""
+    environment, home = tmp_path / "an environment", fake_java(tmp_path / "a java's home", str(major))
+    return environment, program(
+        environment / "java" / "bin" / "java", prepare.wrapper(prepare.Java(home, major, "PATH"), environment)
+    )
+
+
+def said(*command):
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\n")[:-1]
+
+
 @pytest.mark.parametrize("major", [17, 25])
 def test_wrapper_passes_all_but_what_java_cannot_digest(prepare, tmp_path, major):
-    java = prepare.Java(fake_java(tmp_path / "a java's home", str(major)), major, "PATH")
-    wrapper = tmp_path / "java"
-    wrapper.write_text(prepare.wrapper(java))
-    wrapper.chmod(0o755)
-    removed = "--add-opens=java.base/sun.security.action=ALL-UNNAMED"
-    arguments = ["-cp", "a b:*", "--add-modules=jdk.incubator.vector", removed, "", "$x", "--", "*"]
-    done = subprocess.run([wrapper, *arguments], capture_output=True, text=True, check=True)
-    assert done.stdout.split("\n")[:-1] == [
-        "-cp",
-        "a b:*",
-        *([removed] if major == 17 else []),
-        "",
-        "$x",
-        "--",
-        "*",
-    ]
-    shutil.rmtree(java.home)
-    done = subprocess.run([wrapper], capture_output=True, text=True)
+    _, java = wrapped(prepare, tmp_path, major)
+    package = "--add-opens=java.base/sun.security.action=ALL-UNNAMED"
+    arguments = ["-cp", "a b:*", "--add-modules=jdk.incubator.vector", package, "", "$x", "--", "*"]
+    kept = [package] if major == 17 else []
+    assert said(java, *arguments) == ["-cp", "a b:*", *kept, "", "$x", "--", "*"]
+
+
+def test_wrapper_uses_an_archive_of_classes_where_there_is_one(prepare, tmp_path):
+    environment, java = wrapped(prepare, tmp_path, 17)
+    arguments = ["-cp", f"{environment}/spark-conf/:/jars/*", "Main"]
+    logging = f"-Dlog4j2.configurationFile={environment}/spark-conf/log4j2.properties"
+    without = ["-cp", "/jars/*", logging, "Main"]
+    assert said(java, *arguments) == without
+    archive = environment / "java" / "spark.jsa"
+    archive.touch()
+    assert said(java, *arguments) == without
+    archive.write_text("classes")
+    sharing, *rest = said(java, *arguments)
+    assert sharing == f"-XX:SharedArchiveFile={environment}/java/java.jsa:{archive}"
+    assert rest[-len(without) :] == without
+    assert "-Xshare:auto" in rest
+
+
+def test_wrapper_of_a_java_that_is_gone(prepare, tmp_path):
+    _, java = wrapped(prepare, tmp_path, 17)
+    shutil.rmtree(tmp_path / "a java's home")
+    done = subprocess.run([java], capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr.endswith("is gone: run make again\n")
 
@@ -247,9 +268,9 @@ def test_make_says_which_python_it_wants(tmp_path):
     old = program(tmp_path / "python-of-old", "exit 1")
     done = make(tmp_path / "clone", ".venv/bin/python", f"PYTHON={old} no-such-python")
     assert done.returncode == 2
-    said = [line for line in done.stderr.splitlines() if not line.startswith("make")]
-    assert len(said) == 1
-    assert "Python 3.11, 3.12 or 3.13 with venv" in said[0]
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("make")]
+    assert len(lines) == 1
+    assert "Python 3.11, 3.12 or 3.13 with venv" in lines[0]
     assert not (tmp_path / "clone" / ".venv").exists()
 
 

@@ -93,7 +93,7 @@ def test_unsafe_is_recognised(text):
 
 
 def test_safe_is_let_through():
-    text = "import numpy as np, subprocess, re\nnp.load('x', allow_pickle=False)\nsubprocess.run(['ls'])\nre.compile('x')"
+    text = "import numpy as np, subprocess\nnp.load('x', allow_pickle=False)\nsubprocess.run(['ls'])"
     assert unsafe(ast.parse(text)) == []
 
 

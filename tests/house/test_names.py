@@ -1,4 +1,4 @@
-"""Names: no module hides one of the standard library's, and nothing in the tree depends on where it was written."""
+"""Names: no module hides one of the standard library's, and nothing depends on where the tree was written."""
 
 from __future__ import annotations
 

@@ -154,7 +154,7 @@ def test_right_ascension_wraps():
     assert abs(x[0] - x[1]) == pytest.approx(0.002 * 3600 * np.cos(np.radians(10)) / 0.1, rel=1e-3)
 
 
-# ------------------------------------------------------------------------------------------------ derivatives, header
+# ------------------------------------------------------------------------------------------------ header
 
 
 @given(SKY, ANY_DETECTOR, st.floats(0, 4000), st.floats(0, 4000))

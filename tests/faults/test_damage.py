@@ -1,0 +1,198 @@
+"""Published files that are harmed afterwards: no reader of ours takes a changed byte for a number, verify names the file."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema import fits, publish, read
+from lake_schema.errors import Damaged
+from lake_schema.plan import Output
+from tests.faults import promise
+from tests.universe import plain_plan, plain_work, toy_plan, toy_rows, toy_work
+
+FLIPS = [pytest.param(60, id="short"), pytest.param(2000, id="long", marks=pytest.mark.nightly)]
+
+
+@pytest.fixture
+def toy(lake):
+    publish.make(lake, toy_plan(), toy_work)
+    return read.version(lake, "toy")
+
+
+def image(part):
+    rng = np.random.default_rng(part)
+    return fits.Image(rng.integers(0, 60_000, (80, 50)).astype(np.uint16), (("EXPTIME", 560.5, "s"),))
+
+
+@pytest.fixture
+def images(lake):
+    def work(root, facts):
+        part = facts["part"]
+        files = {f"images/{part}.fits": lambda path: fits.write_images(path, [image(part)])}
+        return Output(plain_work(root, facts).rows, files)
+
+    publish.make(lake, plain_plan(), work)
+    return read.version(lake, "plain")
+
+
+def flipped(path, bit):
+    data = bytearray(path.read_bytes())
+    data[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("flips", FLIPS)
+def test_a_flipped_bit_of_a_table_is_never_a_wrong_number(toy, flips):
+    part = toy.parts[0]
+    path, good = toy.path(part), toy.rows(parts=[toy.parts[0]])
+    whole = path.read_bytes()
+    rng = np.random.default_rng(3)
+    refused = 0
+    for bit in rng.choice(8 * len(whole), flips, replace=False):
+        flipped(path, bit)
+        assert read.verify(toy, deep=True) == [f"{path} has other contents than the manifest says"] or read.verify(
+            toy
+        ) == [f"{path} has another footer than the manifest says"]
+        try:
+            # A bit that means nothing to the reader (a statistic of a page) may change; the numbers may not.
+            assert toy.rows(parts=[part]).equals(good), f"bit {bit}"
+        except Damaged as error:
+            refused += 1
+            assert part in str(error) or toy.table in str(error)
+        path.write_bytes(whole)
+    assert refused >= 0.9 * flips
+
+
+@pytest.mark.parametrize("flips", FLIPS)
+def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
+    path = images.file("images/0.fits")
+    whole = path.read_bytes()
+    (good,) = fits.read_images(path)
+    rng = np.random.default_rng(4)
+    refused = 0
+    for bit in rng.choice(8 * len(whole), flips, replace=False):
+        flipped(path, bit)
+        assert len(read.verify(images, deep=True)) == 1
+        try:
+            # The blanks after a header's end may change.
+            (found,) = fits.read_images(images.file("images/0.fits"))
+            assert np.array_equal(found.data, good.data), f"bit {bit}"
+            assert found.cards == good.cards, f"bit {bit}"
+        except Damaged:
+            refused += 1
+        path.write_bytes(whole)
+    assert refused > 0.6 * flips
+
+
+@pytest.mark.parametrize("kind", ["rows", "image"])
+def test_a_truncated_file_is_refused_before_use(toy, images, kind):
+    version = toy if kind == "rows" else images
+    path = version.path(version.parts[0]) if kind == "rows" else version.file("images/0.fits")
+    whole = path.read_bytes()
+    for size in {*range(0, len(whole), 4096), *range(len(whole) - 16, len(whole))}:
+        os.truncate(path, size)
+        with pytest.raises(Damaged, match="bytes"):
+            version.rows() if kind == "rows" else version.file("images/0.fits")
+        assert path.name in read.verify(version)[0]
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("kind", ["rows", "image"])
+@pytest.mark.parametrize("harm", ["delete", "add", "rename", "link", "swap parts", "swap versions"])
+def test_a_folder_that_was_edited_is_named(lake, toy, images, kind, harm):
+    version = toy if kind == "rows" else images
+    first, second = (
+        (version.path(p) for p in version.parts[:2])
+        if kind == "rows"
+        else (version.file(f"images/{i}.fits") for i in (0, 1))
+    )
+    other = first.with_name(f"x{first.name}")
+    if harm == "delete":
+        first.unlink()
+    if harm == "add":
+        shutil.copy(first, other)
+    if harm == "rename":
+        first.rename(other)
+    if harm == "link":
+        first.rename(lake / first.name)
+        first.symlink_to(lake / first.name)
+    if harm == "swap parts":
+        first.rename(other)
+        second.rename(first)
+        other.rename(second)
+    if harm == "swap versions":
+        later = publish.make(lake, toy_plan(2), toy_work) if kind == "rows" else publish.make(lake, plain_plan(2), plain_work)
+        found = later / first.relative_to(version.folder)
+        found.parent.mkdir(parents=True, exist_ok=True)
+        first.write_bytes(found.read_bytes() if kind == "rows" else first.read_bytes()[:-1] + b"x")
+    found = read.verify(version, deep=True)
+    assert found
+    assert all(first.name in line or second.name in line for line in found)
+    if kind == "rows" and harm != "add":
+        with pytest.raises(Damaged):
+            version.rows()
+
+
+def test_a_damaged_version_is_not_published_again(toy, lake):
+    publish.make(lake, toy_plan(2), toy_work)
+    toy.path(toy.parts[0]).unlink()
+    with pytest.raises(Damaged, match="made again"):
+        publish.make(lake, toy_plan(1), toy_work)
+    shutil.rmtree(toy.folder)
+    publish.make(lake, toy_plan(1), toy_work)
+    assert read.verify(read.version(lake, "toy"), deep=True) == []
+
+
+@given(st.data())
+def test_verify_finds_any_one_change(tmp_path_factory, data):
+    root = tmp_path_factory.mktemp("lake")
+    folder = promise.make(root, "plain", data.draw(st.integers(1, 5)))
+    assert read.verify(read.version(root, "plain"), deep=True) == []
+    path = data.draw(st.sampled_from(sorted(p for p in folder.rglob("*") if p.is_file())))
+    whole = path.read_bytes()
+    change = data.draw(st.sampled_from(["flip", "cut", "append", "delete"]))
+    if change == "flip":
+        flipped(path, data.draw(st.integers(0, 8 * len(whole) - 1)))
+    elif change == "cut":
+        os.truncate(path, data.draw(st.integers(0, len(whole) - 1)))
+    elif change == "append":
+        path.write_bytes(whole + data.draw(st.binary(min_size=1)))
+    else:
+        path.unlink()
+    try:
+        found = read.verify(read.version(root, "plain"), deep=True)
+    except Damaged as error:
+        found = [str(error)]
+    # White space in a manifest says nothing.
+    assert (found and path.name in found[0]) or path.name == "manifest.json"
+    if path.name == "manifest.json" and not found:
+        assert change in ("flip", "append")
+
+
+def test_rows_of_another_cell_are_found_by_verify(lake):
+    """A hand that rewrites a file and its manifest is still found out by the rows themselves."""
+    from lake_schema import manifest, parquet
+
+    folder = publish.make(lake, toy_plan(), toy_work)
+    version = read.version(lake, "toy")
+    path = version.path(version.parts[0])
+    for rows, words in (
+        (toy_rows(1608, 300), "another cell"),
+        (toy_rows(1607, 300).take(list(range(299, -1, -1))), "not sorted"),
+        (toy_rows(1607, 299), "299 rows"),
+    ):
+        parquet.write(path, rows, toy_plan().table)
+        facts = {k: v for k, v in version.manifest.items() if k != "files"}
+        relative = path.relative_to(folder).as_posix()
+        files = [
+            {**entry, **(manifest.file_facts(path, relative) if entry["path"] == relative else {})}
+            for entry in version.manifest["files"]
+        ]
+        manifest.write(folder, {**facts, "files": files})
+        (found,) = read.verify(read.version(lake, "toy"), deep=True)
+        assert words in found
+        assert path.name in found

@@ -1,0 +1,209 @@
+"""Drawing: galsim's own drawImage is the reference; angles, fluxes and positions are measured on frames."""
+
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jobs.accuracy import DRAFT, REFERENCE, SURVEY
+from jobs.render import focal_plane, profiles, stamps
+from jobs.render.focal_plane import boresight_for, sky_of_pixel, wcs
+from tests.jobs.render.fields import galaxies, moments, one_source, small, spread
+
+NOISE = 12.0
+KINDS = {
+    "point": {},
+    "disc": {"inclination": 60.0, "position_angle": 30.0, "gamma1": 0.05, "kappa": 0.02},
+    "edge-on": {"inclination": 90.0, "position_angle": 100.0},
+    "bulge": {"bulge_fraction": 1.0, "bulge_sersic_index": 4.0, "bulge_axis_ratio": 0.6, "gamma2": 0.1},
+    "both": {"bulge_fraction": 0.4, "inclination": 30.0, "position_angle": 170.0},
+    "tiny": {"disk_half_light_radius": 0.01},
+}
+
+
+def scene(camera, name, angle=20.0, n=160):
+    detector = small(camera, name, n)
+    return detector, wcs(detector, *boresight_for(detector, 10.0, 20.0, angle)), spread(camera, name)
+
+
+def drawn(sources, psf, n=160, accuracy=SURVEY):
+    sizes = stamps.stamp_sizes(sources.electrons, sources.shape, sources.shapes, psf, NOISE, accuracy)
+    return stamps.draw(sources, sizes, psf, n, n)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("camera", "name"), [("vis", "3-4"), ("lsstcam", "R22_S11")])
+def test_a_stamp_is_what_galsim_draws(camera, name, kind):
+    detector, system, psf = scene(camera, name)
+    source = one_source(detector, system, 2e4, 80.3, 77.6, **KINDS[kind])
+    image = drawn(source, psf)
+    theirs = stamps.reference(source, 0, psf, 160)
+    # The reference's lower left pixel is at round(position) - 80.
+    theirs = np.roll(theirs, (78 - 80, 80 - 80), (0, 1))[8:-8, 8:-8]
+    ours = image[8:-8, 8:-8]
+    assert np.abs(ours - theirs).max() < max(SURVEY.background * NOISE, 1e-4 * theirs.max())
+    y, x = np.mgrid[8:152, 8:152]
+    size = 1.0 if kind in ("point", "tiny") else 1.6
+    aperture = np.hypot(x - 80.3, y - 77.6) * detector.pixel_scale < size
+    assert ours[aperture].sum() == pytest.approx(theirs[aperture].sum(), rel=SURVEY.flux)
+
+
+@pytest.mark.parametrize(("camera", "name"), [("vis", "2-3"), ("vis", "2-4"), ("lsstcam", "R01_S20")])
+@pytest.mark.parametrize("angle", [10.0, 60.0, 125.0])
+def test_position_angle_from_end_to_end(camera, name, angle):
+    """A slim galaxy's axis, measured on the frame and put on the sky by the header alone."""
+    detector, system, psf = scene(camera, name, angle=-35.0)
+    source = one_source(detector, system, 1e6, inclination=80.0, position_angle=angle, disk_half_light_radius=0.7)
+    image = drawn(source, psf, accuracy=REFERENCE)
+    centre, second = moments(image)
+    along = np.linalg.eigh(second)[1][:, 1] * 5
+    ends = SkyCoord(*sky_of_pixel(system, *np.transpose([centre - along, centre + along])), unit="deg")
+    measured = ends[0].position_angle(ends[1]).deg
+    assert (measured - angle + 90) % 180 - 90 == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("camera", "name"), [("vis", "2-3"), ("vis", "2-4"), ("lsstcam", "R22_S11")])
+def test_shear_from_end_to_end(camera, name):
+    """A round galaxy behind a mass to its north-east lies along north-west."""
+    detector, system, psf = scene(camera, name, angle=110.0)
+    image = drawn(one_source(detector, system, 1e6, gamma2=-0.1, disk_half_light_radius=0.5), psf, accuracy=REFERENCE)
+    centre, second = moments(image)
+    along = np.linalg.eigh(second)[1][:, 1] * 5
+    ends = SkyCoord(*sky_of_pixel(system, *np.transpose([centre - along, centre + along])), unit="deg")
+    assert ends[0].position_angle(ends[1]).deg % 180 == pytest.approx(135.0, abs=0.3)
+
+
+def test_neighbouring_orientations_show_the_same_sky():
+    """Two VIS detectors, one upside down: the same galaxy on each, one picture turned by 180 deg."""
+    images = []
+    for name in ("2-3", "2-4"):
+        detector = small("vis", name)
+        system = wcs(detector, *boresight_for(detector, 10.0, 0.0, 0.0))
+        images.append(drawn(one_source(detector, system, 1e5, **KINDS["both"]), spread("vis"), accuracy=REFERENCE))
+    np.testing.assert_allclose(images[0], images[1][::-1, ::-1], atol=2e-3 * images[0].max())
+
+
+@given(
+    st.sampled_from(sorted(KINDS)), st.floats(70, 90), st.floats(70, 90), st.floats(1, 1e5), st.sampled_from([DRAFT, SURVEY])
+)
+def test_no_light_is_lost(kind, x, y, electrons, accuracy):
+    detector, system, psf = scene("lsstcam", "R22_S11")
+    image = drawn(one_source(detector, system, electrons, x, y, **KINDS[kind]), psf, accuracy=accuracy)
+    assert image.sum() == pytest.approx(electrons, rel=1e-5)
+    assert image.min() > -1e-4 * image.max()
+
+
+@given(st.floats(75, 85), st.floats(75, 85))
+def test_a_source_is_where_it_should_be(x, y):
+    detector, system, psf = scene("vis", "2-3")
+    image = drawn(one_source(detector, system, 1e5, x, y, inclination=40.0), psf, accuracy=REFERENCE)
+    iy, ix = np.mgrid[:160, :160]
+    window = np.exp(-0.5 * ((ix - x) ** 2 + (iy - y) ** 2) / 5**2) * image
+    assert (window * (ix - x)).sum() / window.sum() == pytest.approx(0.0, abs=1e-3)
+    assert (window * (iy - y)).sum() / window.sum() == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(("x", "y"), [(-3.0, 50.0), (170.0, 170.0), (80.0, -20.0), (-500.0, 80.0)])
+def test_the_part_on_the_frame_is_the_whole_stamp_cut(x, y):
+    detector, system, psf = scene("vis", "2-3")
+    source = one_source(detector, system, 1e5, x, y, inclination=40.0)
+    sizes = np.array([96])
+    cut = stamps.draw(source, sizes, psf, 160, 160)
+    moved = one_source(detector, system, 1e5, x + 600, y + 600, inclination=40.0)
+    moved = stamps.Sources(moved.ids, moved.column, moved.row, source.jacobian, moved.electrons, moved.shape, moved.shapes)
+    whole = stamps.draw(moved, sizes, psf, 1400, 1400)
+    np.testing.assert_allclose(cut, whole[600:760, 600:760], atol=1e-9 * max(whole.max(), 1))
+
+
+def many(n, seed=5):
+    rng = np.random.default_rng(seed)
+    form = profiles.shapes(
+        galaxies(
+            rng.random(n), rng.random(n), bulge_fraction=rng.random(n), bulge_sersic_index=rng.choice([1.0, 2.0], n),
+            inclination=90 * rng.random(n), position_angle=180 * rng.random(n),
+        )
+    )  # fmt: skip
+    jacobian = np.tile(np.array([[0.2, 0.01], [-0.01, 0.2]]), (n, 1, 1))
+    shape = np.where(np.arange(n) % 4 == 0, -1, np.arange(n))
+    return stamps.Sources(
+        np.arange(n), 160 * rng.random(n), 160 * rng.random(n), jacobian, 10 ** rng.uniform(1, 5, n), shape, form
+    )
+
+
+def test_a_frame_is_the_sum_of_its_sources_and_the_same_every_time():
+    sources, psf = many(40), spread("lsstcam")
+    whole = drawn(sources, psf)
+    np.testing.assert_array_equal(whole, drawn(sources, psf))
+    parts = sum(drawn(sources.take(np.arange(40) % 2 == i), psf) for i in (0, 1))
+    np.testing.assert_allclose(whole, parts, atol=1e-9 * whole.max())
+
+
+def test_progress_is_told():
+    told = []
+    sources = many(3)
+    stamps.draw(sources, np.full(3, 32), spread("lsstcam"), 160, 160, told.append)
+    assert told == [0]
+
+
+def test_sizes_follow_flux_noise_and_accuracy():
+    sources, psf = many(200), spread("lsstcam")
+
+    def sizes(factor=1.0, noise=NOISE, accuracy=SURVEY):
+        return stamps.stamp_sizes(
+            factor * sources.electrons, sources.shape, sources.shapes, psf, noise, accuracy
+        )
+
+    base = sizes()
+    assert set(base) <= set(stamps.SIZES)
+    assert (sizes(100.0) >= base).all()
+    assert (sizes(100.0) > base).any()
+    assert (sizes(noise=100 * NOISE) <= base).all()
+    assert (sizes(accuracy=REFERENCE) >= base).all()
+    assert (sizes(accuracy=DRAFT) <= base).all()
+    # A point never needs more than the PSF's own plane.
+    assert (sizes(1e12)[sources.shape < 0] <= stamps.SIDE).all()
+    assert (sizes(1e12) <= stamps.SIZES[-1]).all()
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"disk_half_light_radius": 1e-8},
+        {"disk_half_light_radius": 0.0},
+        {"disk_half_light_radius": 15.0, "inclination": 90.0},
+        {"bulge_fraction": 1.0, "bulge_half_light_radius": 10.0, "bulge_sersic_index": 6.0},
+        {"bulge_fraction": 1.0, "bulge_sersic_index": 0.3, "bulge_axis_ratio": 0.02},
+        {"kappa": 0.999, "gamma1": 0.001},
+        {"gamma1": 0.9, "gamma2": 0.9},
+    ],
+)
+@pytest.mark.parametrize("electrons", [1e-6, 1e6])
+def test_extremes_stay_finite(shape, electrons):
+    detector, system, psf = scene("lsstcam", "R22_S11")
+    source = one_source(detector, system, electrons, **shape)
+    image = drawn(source, psf)
+    assert np.isfinite(image).all()
+    assert image.min() > -1e-3 * image.max()
+    assert image.sum() <= electrons * (1 + 1e-4)
+
+
+def test_the_jacobian_of_the_place_is_used():
+    """A source drawn with a stretched Jacobian is stretched the other way in pixels; the PSF is not."""
+    detector, system, psf = scene("vis", "2-3")
+    source = one_source(detector, system, 1e6, disk_half_light_radius=0.6)
+    jacobian = np.array([[[0.1, 0.0], [0.0, 0.05]]])
+    source = stamps.Sources(source.ids, source.column, source.row, jacobian, source.electrons, source.shape, source.shapes)
+    point = one_source(detector, system, 1e6)
+    _, second = moments(drawn(source, psf, accuracy=REFERENCE))
+    _, spread_out = moments(drawn(point, psf, accuracy=REFERENCE))
+    body = second - spread_out
+    assert np.sqrt(body[1, 1] / body[0, 0]) == pytest.approx(2.0, rel=0.05)
+
+
+def test_focal_plane_jacobian_has_the_sign_that_stamps_want():
+    """On an upright detector with north up, u (west) grows with the column and v (north) with the row."""
+    detector = small("lsstcam", "R22_S11")
+    system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 0.0))
+    j = focal_plane.jacobian(system, [80.0], [80.0])[0]
+    np.testing.assert_allclose(j, np.eye(2) * detector.pixel_scale, atol=1e-5)

@@ -1,0 +1,104 @@
+"""The submitted jobs as their users meet them: help, bad requests, and the same bytes under any master."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jobs import shell
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+from jobs.render import plan_exposures, render_exposures
+from lake_schema import layout, read
+
+ROOT = Path(__file__).parents[1]
+JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.JOB, render_exposures.JOB)
+# Four order-5 cells meet here, so that there is something to share out.
+SMALL = """
+name = "small"
+seed = 5
+[area]
+cone = { ra = 53.4375, dec = -27.279613, radius = 0.01 }
+[universe]
+galaxy_limit = 21.0
+"""
+BAD = [
+    ('name = "x"\nseed = 1\ncolour = 3\n[area]\ncone = {ra = 0, dec = 0, radius = 1}', "colour"),
+    ('name = "x"\nseed = 1\n[area]\ncone = {ra = 0, dec = 95, radius = 1}', "area.cone.dec"),
+    ('name = "x"\nseed = 1\n[area]\ncone = {ra = 0, dec = 0, radius = -1}', "area.cone.radius"),
+    ('name = "x"\nseed = 1\n[area]\nbox = {ra = [0, 1], dec = [1, 0]}', "area.box.dec"),
+    ('name = "x"\nseed = 1\n[area]\ncone = {ra = nan, dec = 0, radius = 1}', "area.cone.ra"),
+    ('name = "x"\n[area]\ncone = {ra = 0, dec = 0, radius = 1}', "seed"),
+]
+
+
+def submit(*arguments):
+    command = shutil.which("spark-submit", path=f"{Path(sys.executable).parent}") or "spark-submit"
+    return subprocess.run([command, *map(str, arguments)], capture_output=True, text=True, cwd="/", timeout=300)
+
+
+@pytest.mark.parametrize(("text", "key"), BAD)
+@pytest.mark.parametrize("job", JOBS, ids=lambda job: job.name)
+def test_a_bad_request_ends_with_one_line_and_nothing_written(job, text, key, tmp_path, capsys):
+    request = tmp_path / "bad.toml"
+    request.write_text(text)
+    lake = tmp_path / "lake"
+    assert shell.main(job, ["--lake", str(lake), "--request", str(request)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert len(err.strip().splitlines()) == 1
+    assert err.startswith(f"{job.name}: ")
+    assert key in err
+    assert not lake.exists()
+
+
+@pytest.mark.parametrize("job", JOBS[2:], ids=lambda job: job.name)
+def test_what_must_be_built_first_is_named(job, tmp_path, capsys):
+    request = tmp_path / "r.toml"
+    request.write_text(SMALL)
+    assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(request)]) == 2
+    err = capsys.readouterr().err
+    assert "no table" in err or "pointing is missing" in err
+
+
+@pytest.mark.spark
+def test_the_same_request_gives_the_same_bytes_under_any_master(tmp_path):
+    request = tmp_path / "r.toml"
+    request.write_text(SMALL)
+    script = ROOT / "jobs" / "catalogue" / "build_galaxies.py"
+    manifests = []
+    for master in ("local[1]", "local[2,4]"):
+        lake = tmp_path / master
+        done = submit("--master", master, script, "--lake", lake, "--request", request)
+        assert done.returncode == 0, done.stderr
+        version = read.version(layout.lake(lake), "galaxies")
+        assert len(version.parts) == 4
+        assert version.num_rows > 100
+        assert read.verify(version, deep=True) == []
+        manifests.append((version.folder / "manifest.json").read_bytes())
+    assert manifests[0] == manifests[1]
+
+
+@pytest.mark.spark
+def test_spark_submit_passes_on_the_line_and_the_status(tmp_path):
+    request = tmp_path / "bad.toml"
+    request.write_text(BAD[1][0])
+    script = ROOT / "jobs" / "catalogue" / "build_galaxies.py"
+    done = submit(script, "--lake", tmp_path / "lake", "--request", request)
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines() == [f"build_galaxies: request {request}: area.cone.dec = 95 is outside [-90.0, 90.0]"]
+    assert not (tmp_path / "lake").exists()
+
+
+def test_a_generation_cell_is_the_same_in_every_request():
+    """Whatever else is asked for, a cell's rows are the same bytes."""
+    facts = {"seed": 5, "galaxy_limit": 21.0, "z_max": 2.3, "star_limit": 22.0}
+    for work in (build_galaxies.work, build_stars.work):
+        alone = work(Path(), {**facts, "generation_cells": [574971]}).rows
+        among = work(Path(), {**facts, "generation_cells": [574970, 574972, 574971]}).rows
+        ids = alone["id"].to_pylist()
+        kept = among.filter([i in set(ids) for i in among["id"].to_pylist()])
+        assert alone.num_rows > 10
+        assert kept.equals(alone)
