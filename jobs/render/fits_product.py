@@ -7,6 +7,7 @@ science_cards, noise_free_cards
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from jobs.render.exposure import Rendered
 from lake_schema import __version__, fits
 from lake_schema.fits import Card
 from lake_schema.tables.products import PRODUCTS
+
+_MJD_ZERO = datetime(1858, 11, 17)
 
 Writer = Callable[[Path], None]
 
@@ -78,7 +81,11 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
         *_common(rendered),
         ("BUNIT", "adu", "unit of the pixels"),
         ("GAIN", gain, "[electron/adu]"),
-        ("RDNOISE", scene.value("read_noise", "electron"), "[electron] rms"),
+        (
+            "RDNOISE",
+            applied["read_noise"] * scene.value("read_noise", "electron"),
+            "[electron] rms in the image",
+        ),
         ("BIAS", scene.value("bias", "adu"), "[adu] added to every pixel"),
         ("SATURATE", _saturation(rendered, gain), "[adu] largest value"),
         ("SKYRATE", applied["background"] * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
@@ -102,8 +109,9 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("IMAGETYP", str(exposure["image_type"]), "image type"),
         ("EXPOSURE", int(exposure["exposure_id"]), "identifier of the exposure"),
         ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
-        ("MJD-OBS", float(exposure["mjd"]), "[d] start of the exposure, MJD"),
-        ("TIMESYS", "UTC", "time scale of MJD-OBS"),
+        ("DATE-OBS", _date(float(exposure["mjd"])), "start of the exposure"),
+        ("MJD-OBS", float(exposure["mjd"]), "[d] start of the exposure"),
+        ("TIMESYS", "UTC", "time scale of DATE-OBS and MJD-OBS"),
         *focal_plane.cards(rendered.wcs),
         ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] at the boresight"),
         ("ZEROPNT", rendered.zero_point, "[mag] AB of 1 electron/s"),
@@ -116,6 +124,11 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("ACCFLUX", accuracy.flux, "allowed error: fraction of a source's flux"),
         ("ACCBACK", accuracy.background, "allowed error: fraction of a pixel's noise"),
     )
+
+
+def _date(mjd: float) -> str:
+    """ISO 8601, milliseconds."""
+    return (_MJD_ZERO + timedelta(days=mjd)).isoformat(timespec="milliseconds")
 
 
 def _saturation(rendered: Rendered, gain: float) -> float:

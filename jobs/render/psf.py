@@ -27,15 +27,13 @@ from lake_schema.mission.parameter import read_table
 
 Float = npt.NDArray[np.float64]
 
-# Monochromatic planes of equal photon number for a source of flat f_nu; 8 planes reproduce second moments to
-# 2e-4.
+# Monochromatic planes of equal photon number for flat f_nu; eight reproduce second moments to 2e-4.
 _PLANES = 8
 # Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide.
 _OVERSAMPLING = 3
-# Side of the plane, pixels; what lies outside (0.2 % of the flux for VIS) is lost.  No stamp of a point source is
-# larger.
+# Side of the plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is lost.
 SIDE = 512
-# Side of the optical transform, samples: the 0.15 % of the light beyond its border is absent, not folded back.
+# Side of the optical transform, samples; the 0.15 % of the light beyond its border is absent.
 _TRANSFORM = 2048
 # Side and samples a pixel of the drawing that tells the width.
 _CORE, _FINE = 243, 9

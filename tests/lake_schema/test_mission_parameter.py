@@ -63,7 +63,7 @@ def test_every_record_of_the_package_names_a_publication():
 
 
 def test_published_statuses_are_all_there():
-    """The ladder has something to choose from: the statuses that are published for the read noise and the gain."""
+    """The ladder has something to choose from."""
     found = {(r.key, r.status): r.value for r in read_all()}
     assert {s for k, s in found if k == "vis.read_noise"} == {"REQ", "DES", "CBE", "SIM"}
     assert found["vis.gain", "CBE"] == 3.48

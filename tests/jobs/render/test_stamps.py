@@ -54,7 +54,9 @@ def test_a_stamp_is_what_galsim_draws(camera, name, kind):
 def test_position_angle_from_end_to_end(camera, name, angle):
     """A slim galaxy's axis, measured on the frame and put on the sky by the header alone."""
     detector, system, psf = scene(camera, name, angle=-35.0)
-    source = one_source(detector, system, 1e6, inclination=80.0, position_angle=angle, disk_half_light_radius=0.7)
+    source = one_source(
+        detector, system, 1e6, inclination=80.0, position_angle=angle, disk_half_light_radius=0.7
+    )
     image = drawn(source, psf, accuracy=REFERENCE)
     centre, second = moments(image)
     along = np.linalg.eigh(second)[1][:, 1] * 5
@@ -67,7 +69,9 @@ def test_position_angle_from_end_to_end(camera, name, angle):
 def test_shear_from_end_to_end(camera, name):
     """A round galaxy behind a mass to its north-east lies along north-west."""
     detector, system, psf = scene(camera, name, angle=110.0)
-    image = drawn(one_source(detector, system, 1e6, gamma2=-0.1, disk_half_light_radius=0.5), psf, accuracy=REFERENCE)
+    image = drawn(
+        one_source(detector, system, 1e6, gamma2=-0.1, disk_half_light_radius=0.5), psf, accuracy=REFERENCE
+    )
     centre, second = moments(image)
     along = np.linalg.eigh(second)[1][:, 1] * 5
     ends = SkyCoord(*sky_of_pixel(system, *np.transpose([centre - along, centre + along])), unit="deg")
@@ -80,12 +84,18 @@ def test_neighbouring_orientations_show_the_same_sky():
     for name in ("2-3", "2-4"):
         detector = small("vis", name)
         system = wcs(detector, *boresight_for(detector, 10.0, 0.0, 0.0))
-        images.append(drawn(one_source(detector, system, 1e5, **KINDS["both"]), spread("vis"), accuracy=REFERENCE))
+        images.append(
+            drawn(one_source(detector, system, 1e5, **KINDS["both"]), spread("vis"), accuracy=REFERENCE)
+        )
     np.testing.assert_allclose(images[0], images[1][::-1, ::-1], atol=2e-3 * images[0].max())
 
 
 @given(
-    st.sampled_from(sorted(KINDS)), st.floats(70, 90), st.floats(70, 90), st.floats(1, 1e5), st.sampled_from([DRAFT, SURVEY])
+    st.sampled_from(sorted(KINDS)),
+    st.floats(70, 90),
+    st.floats(70, 90),
+    st.floats(1, 1e5),
+    st.sampled_from([DRAFT, SURVEY]),
 )
 def test_no_light_is_lost(kind, x, y, electrons, accuracy):
     detector, system, psf = scene("lsstcam", "R22_S11")
@@ -111,7 +121,9 @@ def test_the_part_on_the_frame_is_the_whole_stamp_cut(x, y):
     sizes = np.array([96])
     cut = stamps.draw(source, sizes, psf, 160, 160)
     moved = one_source(detector, system, 1e5, x + 600, y + 600, inclination=40.0)
-    moved = stamps.Sources(moved.ids, moved.column, moved.row, source.jacobian, moved.electrons, moved.shape, moved.shapes)
+    moved = stamps.Sources(
+        moved.ids, moved.column, moved.row, source.jacobian, moved.electrons, moved.shape, moved.shapes
+    )
     whole = stamps.draw(moved, sizes, psf, 1400, 1400)
     np.testing.assert_allclose(cut, whole[600:760, 600:760], atol=1e-9 * max(whole.max(), 1))
 
@@ -120,14 +132,21 @@ def many(n, seed=5):
     rng = np.random.default_rng(seed)
     form = profiles.shapes(
         galaxies(
-            rng.random(n), rng.random(n), bulge_fraction=rng.random(n), bulge_sersic_index=rng.choice([1.0, 2.0], n),
+            rng.random(n), rng.random(n),
+            bulge_fraction=rng.random(n), bulge_sersic_index=rng.choice([1.0, 2.0], n),
             inclination=90 * rng.random(n), position_angle=180 * rng.random(n),
         )
     )  # fmt: skip
     jacobian = np.tile(np.array([[0.2, 0.01], [-0.01, 0.2]]), (n, 1, 1))
     shape = np.where(np.arange(n) % 4 == 0, -1, np.arange(n))
     return stamps.Sources(
-        np.arange(n), 160 * rng.random(n), 160 * rng.random(n), jacobian, 10 ** rng.uniform(1, 5, n), shape, form
+        np.arange(n),
+        160 * rng.random(n),
+        160 * rng.random(n),
+        jacobian,
+        10 ** rng.uniform(1, 5, n),
+        shape,
+        form,
     )
 
 
@@ -193,7 +212,9 @@ def test_the_jacobian_of_the_place_is_used():
     detector, system, psf = scene("vis", "2-3")
     source = one_source(detector, system, 1e6, disk_half_light_radius=0.6)
     jacobian = np.array([[[0.1, 0.0], [0.0, 0.05]]])
-    source = stamps.Sources(source.ids, source.column, source.row, jacobian, source.electrons, source.shape, source.shapes)
+    source = stamps.Sources(
+        source.ids, source.column, source.row, jacobian, source.electrons, source.shape, source.shapes
+    )
     point = one_source(detector, system, 1e6)
     _, second = moments(drawn(source, psf, accuracy=REFERENCE))
     _, spread_out = moments(drawn(point, psf, accuracy=REFERENCE))
