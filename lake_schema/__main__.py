@@ -54,7 +54,7 @@ def _gc(root: Path, name: str, deep: bool) -> bool:
 
 def _describe(root: Path, name: str, deep: bool) -> bool:
     version = read.version(root, name)
-    schema = version.schema()
+    schema = version.schema
     print(f"{name}: {(schema.metadata or {}).get(b'description', b'').decode()}")
     print(f"  version {version.key}, {version.num_rows:,} rows in {len(version.parts)} files")
     width = max(len(field.name) for field in schema)

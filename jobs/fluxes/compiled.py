@@ -101,22 +101,26 @@ def line_centres(
 
     ciddor : float64[2, 2] (strength, resonance) of the refractivity of air
     curve  : A(lambda) / A(V) in steps of 1 A from `first`; lines beyond it are in no band
-    centre : float64[2, n, n_line];  flux : float64[n, n_line]
+    centre, flux : float64[2, n, n_line]
     """
     for i in range(len(z_obs)):
         for j in range(len(vacuum)):
-            flux[i, j] = 0.0
+            flux[0, i, j] = flux[1, i, j] = 0.0
             lam = vacuum[j] * (1.0 + z_obs[i])
             position = lam - first
             if fluxes[i, j] == 0.0 or position < 0.0 or position >= len(curve) - 1:
                 continue
             square = (1e4 / lam) ** 2
             refractivity = ciddor[0, 0] / (ciddor[0, 1] - square) + ciddor[1, 0] / (ciddor[1, 1] - square)
+            shift = np.log1p(1e-8 * refractivity)
             centre[0, i, j] = np.log(lam)
-            centre[1, i, j] = centre[0, i, j] - np.log1p(1e-8 * refractivity)
+            centre[1, i, j] = centre[0, i, j] - shift
             low = int(position)
-            k = curve[low] + (position - low) * (curve[low + 1] - curve[low])
-            flux[i, j] = fluxes[i, j] * np.exp(-0.4 * np.log(10.0) * k * a_v[i])
+            slope = curve[low + 1] - curve[low]
+            depth = 0.4 * np.log(10.0) * a_v[i]
+            flux[0, i, j] = fluxes[i, j] * np.exp(-depth * (curve[low] + (position - low) * slope))
+            # The extinction at the wavelength in air, to first order in a shift of 3e-4.
+            flux[1, i, j] = flux[0, i, j] * (1.0 + depth * slope * lam * shift)
 
 
 @_jit
@@ -132,20 +136,22 @@ def line_sums(
     first        : float64[n_band] ln(lambda) of a band's first row
     cells        : int64[n_cell + 1]: members[cells[c] : cells[c + 1]] are the bands that see wavelength cell c
     """
-    for i in range(flux.shape[0]):
+    per_row, per_cell = 1.0 / step, 1.0 / cell_step
+    for i in range(flux.shape[1]):
         w, s = width[i], share[i]
-        for j in range(flux.shape[1]):
-            if flux[i, j] == 0.0:
+        for j in range(flux.shape[2]):
+            if flux[0, i, j] == 0.0:
                 continue
-            cell = int((centre[0, i, j] - cell_first) / cell_step)
+            cell = int((centre[0, i, j] - cell_first) * per_cell)
             for m in range(cells[cell], cells[cell + 1]):
                 b = members[m]
-                position = (centre[place[b, 2], i, j] - first[b]) / step
+                medium = place[b, 2]
+                position = (centre[medium, i, j] - first[b]) * per_row
                 if position < 0.0 or position >= place[b, 1] - 1:
                     continue
                 low = int(position)
                 part = position - low
-                low += place[b, 0]
-                narrow = tables[low, w] + part * (tables[low + 1, w] - tables[low, w])
-                wide = tables[low, w + 1] + part * (tables[low + 1, w + 1] - tables[low, w + 1])
-                out[b, i] += flux[i, j] * (narrow + s * (wide - narrow))
+                blue, red = tables[place[b, 0] + low], tables[place[b, 0] + low + 1]
+                narrow = blue[w] + part * (red[w] - blue[w])
+                wide = blue[w + 1] + part * (red[w + 1] - blue[w + 1])
+                out[b, i] += flux[medium, i, j] * (narrow + s * (wide - narrow))

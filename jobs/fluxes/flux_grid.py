@@ -2,6 +2,7 @@
 
 Grid, open_grid   the tables of some bands, made where the cache has them not
 galaxies, stars   f_nu of checked rows
+warm              compile what computes galaxies
 covered           which galaxies the tables cover; covered_stars
 
 A band's flux is linear in a galaxy's two components and additive in its lines. The logarithm of one template's, behind one
@@ -86,18 +87,28 @@ def galaxies(rows: Galaxies, grid: Grid) -> Float:
     """
     # Neighbours in redshift read the same part of a table.
     order = np.argsort(rows.mix.z_obs, kind="stable")
-    near = rows.rows(order)
-    seen, observed = np.empty((len(grid.tables), len(near))), np.empty((1, len(near)))
-    for start in range(0, len(near), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        block = near.rows(part)
-        _continua(block.mix, np.zeros(len(block)), (REFERENCE_SETTING,), (grid.reference,), observed[:, part])
-        _continua(block.mix, block.a_v, grid.settings, grid.tables, seen[:, part])
-        seen[:, part] *= continuum_scale(block.mag_r01, observed[0, part])
-        _add_lines(block, grid, seen[:, part])
-    out = np.empty_like(seen)
-    out[:, order] = units.ujy_of_cgs(seen) * near.magnification
+    out = np.empty((len(grid.tables), len(rows)))
+    for start in range(0, len(rows), _CHUNK):
+        part = order[start : start + _CHUNK]
+        out[:, part] = _chunk(rows.rows(part), grid)
     return out.T
+
+
+def _chunk(rows: Galaxies, grid: Grid) -> Float:
+    observed, seen = np.empty((1, len(rows))), np.empty((len(grid.tables), len(rows)))
+    _continua(rows.mix, np.zeros(len(rows)), (REFERENCE_SETTING,), (grid.reference,), observed)
+    _continua(rows.mix, rows.a_v, grid.settings, grid.tables, seen)
+    seen *= continuum_scale(rows.mag_r01, observed[0])
+    _add_lines(rows, grid, seen)
+    seen *= units.ujy_of_cgs(rows.magnification)
+    return seen
+
+
+def warm(grid: Grid) -> None:
+    """Compile, by computing one galaxy."""
+    one, two = np.ones(1), np.zeros((2, 1))
+    mix = Mix(one, two.astype(np.int64), two.astype(np.int64), two + 0.5, two)
+    galaxies(Galaxies(mix, -20.0 * one, 20.0 * one, np.full((1, len(lines.line_list())), 1e-17), one, one), grid)
 
 
 def stars(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
@@ -166,7 +177,7 @@ def _add_lines(rows: Galaxies, grid: Grid, out: Float) -> None:
     width = np.clip(np.searchsorted(LINE_SIGMA, sigma, "right") - 1, 0, len(LINE_SIGMA) - 2)
     low, high = LINE_SIGMA[width] ** 2, LINE_SIGMA[width + 1] ** 2
     vacuum = np.array([line.vacuum for line in lines.line_list()])
-    centre, flux = np.empty((2, *rows.lines.shape)), np.empty(rows.lines.shape)
+    centre, flux = np.empty((2, *rows.lines.shape)), np.empty((2, *rows.lines.shape))
     compiled.line_centres(
         rows.lines, rows.mix.z_obs, rows.a_v, vacuum, lines.refractivity_terms(), grid.milky_way,
         float(passbands.GRID_FIRST), centre, flux,

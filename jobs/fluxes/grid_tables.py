@@ -32,7 +32,7 @@ STAR_A_V_LAST = 5.0
 STAR_COEFFICIENTS = 12
 
 # Widths of lines that are tabulated, km/s: linear in sigma^2 in between.
-LINE_SIGMA = lines.SIGMA_MIN * 2.0 ** (np.arange(7) / 2.0)
+LINE_SIGMA = lines.SIGMA_MIN * 2.0 ** (np.arange(13) / 4.0)
 LINE_STEP = 25.0 / LIGHT_KM_S
 _LINE_REACH = 6.0
 

@@ -51,9 +51,12 @@ def test_cells_hold_everything_that_a_detector_sees(ra, dec, angle):
     detector = focal_plane.detector("vis", "1-6", MISSION)
     system = focal_plane.wcs(detector, *(exposed[k] for k in ("ra", "dec", "position_angle")))
     rng = np.random.default_rng(1)
-    margin = 500
+    # The margin of a minute of arc, on either axis of the frame.
+    margin = 400
     x, y = rng.uniform(-margin, detector.nx + margin, 200), rng.uniform(-margin, detector.ny + margin, 200)
-    cells = sky.cell_of(*focal_plane.sky_of_pixel(system, x, y), 8)
+    seen = focal_plane.sky_of_pixel(system, x, y)
+    assert (sky.separation(task["ra"], task["dec"], *seen) <= task["radius"]).all()
+    cells = sky.cell_of(*seen, 8)
     assert set(cells) <= set(task["cells"])
 
 
