@@ -100,7 +100,10 @@ def common_facts(request: requests.Request, *parts: str) -> dict[str, Any]:
 
 def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
-        prog=job.name, description=job.doc, epilog=f"truesky {__version__}", formatter_class=argparse.RawTextHelpFormatter
+        prog=job.name,
+        description=job.doc,
+        epilog=f"truesky {__version__}",
+        formatter_class=argparse.RawTextHelpFormatter,
     )
     parser.add_argument("--lake", required=True, type=Path, help="folder of the lake (made where it is not there)")
     parser.add_argument("--request", required=True, type=Path, help="simulation request, a TOML file")
@@ -210,7 +213,9 @@ def _bar(root: Path, plan: Plan) -> Iterator[None]:
         return sum(1 for path in folder.glob("*.json") if not path.name.startswith("."))
 
     quiet = not sys.stderr.isatty() and "TRUESKY_PROGRESS" not in os.environ
-    with tqdm(total=len(plan.parts), initial=count(), desc=plan.table.name, unit="part", disable=quiet, leave=False) as bar:
+    with tqdm(
+        total=len(plan.parts), initial=count(), desc=plan.table.name, unit="part", disable=quiet, leave=False
+    ) as bar:
         done = threading.Event()
 
         def follow() -> None:

@@ -143,18 +143,12 @@ def _light(cell: int, seed: int, universe: GalaxyModel) -> tuple[Float, Float, B
         universe.inverse, universe.counts, area, stream(seed, "galaxies.luminosity", cell)
     )
     kind = np.full(z.size, CENTRAL)
-    red, colour = sed_assignment.draw_colour(
-        universe.colours, m_r, z, kind, stream(seed, "galaxies.colour", cell)
-    )
-    law, ebv = sed_assignment.draw_dust(
-        universe.colours.dust, m_r, red, colour, stream(seed, "galaxies.dust", cell)
-    )
+    red, colour = sed_assignment.draw_colour(universe.colours, m_r, z, kind, stream(seed, "galaxies.colour", cell))
+    law, ebv = sed_assignment.draw_dust(universe.colours.dust, m_r, red, colour, stream(seed, "galaxies.dust", cell))
     return z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
 
 
-def _places(
-    cell: int, seed: int, z: Float, dust: npt.NDArray[np.float32]
-) -> dict[str, npt.NDArray[np.generic]]:
+def _places(cell: int, seed: int, z: Float, dust: npt.NDArray[np.float32]) -> dict[str, npt.NDArray[np.generic]]:
     n = z.size
     index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, n, stream(seed, "galaxies.position", cell))
     kind, zeros = np.full(n, CENTRAL), np.zeros(n)

@@ -100,9 +100,7 @@ def render(
     """
     camera, band, channel = str(exposure["camera"]), str(exposure["band"]), str(exposure["channel"])
     if channel not in EFFECTS:
-        raise BadInput(
-            f"exposure {exposure['exposure_id']}: channel {channel!r} is not one of {', '.join(EFFECTS)}"
-        )
+        raise BadInput(f"exposure {exposure['exposure_id']}: channel {channel!r} is not one of {', '.join(EFFECTS)}")
     if detector is None:
         detector = focal_plane.detector(camera, str(task["detector"]), mission)
     system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])

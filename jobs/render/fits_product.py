@@ -27,9 +27,7 @@ _MJD_ZERO = datetime(1858, 11, 17)
 Writer = Callable[[Path], None]
 
 
-def products(
-    rendered: Rendered, truth: Sequence[str] = ("noise_free",)
-) -> tuple[pa.Table, dict[str, Writer]]:
+def products(rendered: Rendered, truth: Sequence[str] = ("noise_free",)) -> tuple[pa.Table, dict[str, Writer]]:
     """Rows of `products` and, by path, what writes each file.
 
     truth : truth maps that are wanted beside the science image
@@ -40,9 +38,7 @@ def products(
     if "noise_free" in truth:
         images["noise_free"] = (rendered.noise_free, noise_free_cards(rendered))
     exposure, detector = rendered.exposure, rendered.detector
-    stem = (
-        f"images/{int(exposure['exposure_id']):06d}/{exposure['channel']}_{exposure['band']}_{detector.name}"
-    )
+    stem = f"images/{int(exposure['exposure_id']):06d}/{exposure['channel']}_{exposure['band']}_{detector.name}"
     paths = {content: f"{stem}_{content}.fits" for content in images}
     ra, dec = focal_plane.centre(detector, rendered.wcs)
     n = len(images)
@@ -142,7 +138,5 @@ def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:
     cards: list[Card] = []
     for number, decision in enumerate(rendered.decisions, start=1):
         state = ("on" if decision.applied else "off") + (" (forced)" if decision.forced else "")
-        cards.append(
-            (f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1")
-        )
+        cards.append((f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1"))
     return tuple(cards)

@@ -89,9 +89,7 @@ def ground_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
 
 def _tabulated(profile: galsim.GSObject, pixel_scale: float) -> Psf:
     """With azimuthal means of the profile sampled on pixels."""
-    image = profile.drawImage(
-        nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float
-    ).array
+    image = profile.drawImage(nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
     grid = np.arange(SIDE + 1) - SIDE // 2
     ring = np.rint(np.hypot(*np.meshgrid(grid, grid))).astype(int)
     inside = ring < SIDE // 2
@@ -123,9 +121,7 @@ def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) ->
         angle = mission.value(f"plm.pupil.{bar}.angle", "rad")
         # Normal form: no singular angle.
         across = np.abs(-np.sin(angle) * (x - bar_x) + np.cos(angle) * (y - bar_y))
-        blocked = _step(width / 2 - across, softness) * _step(
-            reach - np.hypot(x - bar_x, y - bar_y), softness
-        )
+        blocked = _step(width / 2 - across, softness) * _step(reach - np.hypot(x - bar_x, y - bar_y), softness)
         clear = clear * (1.0 - blocked)
     return np.asarray(clear)
 
@@ -188,9 +184,7 @@ def _polychromatic(
         total += _monochromatic(nm, wavelength, sampling, mission) / _PLANES
     total /= _edge_loss()
     k = 2 * np.pi * scipy.fft.fftfreq(_TRANSFORM, sampling)
-    transfer = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(
-        -0.5 * blur[0] * k[None, : _TRANSFORM // 2 + 1] ** 2
-    )
+    transfer = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(-0.5 * blur[0] * k[None, : _TRANSFORM // 2 + 1] ** 2)
     total = scipy.fft.irfft2(scipy.fft.rfft2(total) * transfer, s=total.shape)
     total = scipy.fft.fftshift(total)
     half = SIDE * _OVERSAMPLING // 2

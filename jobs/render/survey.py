@@ -41,9 +41,7 @@ def plan(
     for number, pointing in enumerate(pointings, start=1):
         exposure = _exposure(number, pointing, mission)
         exposures.append(exposure)
-        tasks.extend(
-            _task(exposure, detector, mission, deflection) for detector in _wanted(pointing, mission)
-        )
+        tasks.extend(_task(exposure, detector, mission, deflection) for detector in _wanted(pointing, mission))
     tasks.sort(key=lambda task: (-task["seconds"], task["exposure_id"], task["detector"]))
     return _build(EXPOSURES, exposures), _build(TASKS, tasks)
 
@@ -72,9 +70,7 @@ def _exposure(number: int, pointing: Pointing, mission: MissionConfiguration) ->
     exposure_time = pointing.exposure_time_s
     if exposure_time is None:
         exposure_time = mission.value(f"{first.section}.exposure_time", "s")
-    seeing = (
-        0.0 if first.section == "vis" else mission.value(f"{first.section}.{pointing.band}.seeing", "arcsec")
-    )
+    seeing = 0.0 if first.section == "vis" else mission.value(f"{first.section}.{pointing.band}.seeing", "arcsec")
     return {
         "exposure_id": number,
         "channel": pointing.channel,
@@ -96,9 +92,7 @@ def _task(
 ) -> dict[str, Any]:
     system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
     ra, dec = focal_plane.centre(detector, system)
-    radius = (
-        detector.half_diagonal + mission.value("survey.selection_margin", "arcsec")
-    ) / 3600.0 + deflection
+    radius = (detector.half_diagonal + mission.value("survey.selection_margin", "arcsec")) / 3600.0 + deflection
     pixels = detector.nx * detector.ny
     area = pixels * (detector.pixel_scale / 60.0) ** 2
     density = sum(mission.value(f"survey.{kind}_density", "arcmin-2") for kind in ("galaxy", "star"))

@@ -26,11 +26,7 @@ def science(ny=30, nx=40):
     return np.random.default_rng(1).integers(0, 65536, (ny, nx)).astype(np.uint16)
 
 
-@given(
-    st.sampled_from(TYPES).flatmap(
-        lambda t: hnp.arrays(t, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))
-    )
-)
+@given(st.sampled_from(TYPES).flatmap(lambda t: hnp.arrays(t, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))))
 def test_what_is_written_is_read(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("fits") / "a.fits"
     fits.write_images(path, [fits.Image(data, CARDS), fits.Image(data, name="COPY")])
@@ -114,9 +110,7 @@ def test_a_card_that_fits_cannot_hold_is_refused(tmp_path, card):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "data", [np.zeros(3), np.zeros((2, 2), complex), np.zeros((2, 2, 2)), np.array([["a"]])]
-)
+@pytest.mark.parametrize("data", [np.zeros(3), np.zeros((2, 2), complex), np.zeros((2, 2, 2)), np.array([["a"]])])
 def test_what_is_no_image_is_refused(tmp_path, data):
     with pytest.raises(BadInput, match="image"):
         fits.write_images(tmp_path / "a.fits", [fits.Image(data)])

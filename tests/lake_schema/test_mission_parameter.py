@@ -20,9 +20,7 @@ def write(folder, *lines):
 
 def test_a_record_is_read_with_all_it_says(tmp_path):
     (record,) = read(write(tmp_path, 'a.gain,CBE,3.48,electron / adu,2,60000.5,published,"Somebody, 2024"'))
-    assert record == Parameter(
-        "a.gain", "CBE", 3.48, "electron / adu", 2, 60000.5, "published", "Somebody, 2024"
-    )
+    assert record == Parameter("a.gain", "CBE", 3.48, "electron / adu", 2, 60000.5, "published", "Somebody, 2024")
 
 
 @pytest.mark.parametrize(

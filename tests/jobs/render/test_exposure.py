@@ -67,9 +67,7 @@ def test_published_saturation_magnitude():
     """A fifth of the light in the central pixel fills the well at I_E = 17.8 in VIS's nominal exposure."""
     zero_point, _ = exposure.throughput("vis", "euclid_vis", MISSION)
     t = MISSION.value("vis.exposure_time", "s")
-    assert zero_point + 2.5 * np.log10(t * 0.20 / MISSION.value("vis.full_well")) == pytest.approx(
-        17.80, abs=0.03
-    )
+    assert zero_point + 2.5 * np.log10(t * 0.20 / MISSION.value("vis.full_well")) == pytest.approx(17.80, abs=0.03)
 
 
 @pytest.mark.parametrize("channel", CASES)
@@ -85,10 +83,7 @@ def test_noise_free_totals_are_the_table_s(channel):
             exposed["dec"],
             exposed["position_angle"],
         ),
-        *(
-            np.concatenate([body[f"{axis}_lensed"].to_numpy(), points[axis].to_numpy()])
-            for axis in ("ra", "dec")
-        ),
+        *(np.concatenate([body[f"{axis}_lensed"].to_numpy(), points[axis].to_numpy()]) for axis in ("ra", "dec")),
     )
     central = np.flatnonzero((np.abs(np.array(inside) - SIDE / 2) < 60).all(0))[::2]
     assert {i < len(body) for i in central} == {True, False}

@@ -177,9 +177,7 @@ def test_jacobian_against_the_sky(pointing, d, x, y):
     j = jacobian(system, [x], [y])[0]
     here = SkyCoord(*sky_of_pixel(system, [x], [y]), unit="deg")
     for axis, step in enumerate([(0.5, 0.0), (0.0, 0.5)]):
-        ends = [
-            SkyCoord(*sky_of_pixel(system, [x + s * step[0]], [y + s * step[1]]), unit="deg") for s in (-1, 1)
-        ]
+        ends = [SkyCoord(*sky_of_pixel(system, [x + s * step[0]], [y + s * step[1]]), unit="deg") for s in (-1, 1)]
         offsets = [[o.to_value("arcsec")[0] for o in here.spherical_offsets_to(end)] for end in ends]
         east, north = np.subtract(offsets[1], offsets[0])
         np.testing.assert_allclose(j[:, axis], [-east, north], atol=2e-7)

@@ -45,9 +45,7 @@ def test_bulge_radius_is_the_half_light_semi_major_axis():
     """Half the light lies inside the ellipse of that semi-major axis, whatever the axis ratio."""
     for q in (1.0, 0.6, 0.3):
         bulge = profiles.profile(
-            shape(
-                bulge_fraction=1.0, bulge_sersic_index=1.0, bulge_half_light_radius=0.6, bulge_axis_ratio=q
-            ),
+            shape(bulge_fraction=1.0, bulge_sersic_index=1.0, bulge_half_light_radius=0.6, bulge_axis_ratio=q),
             0,
             1e-3,
         )
@@ -89,9 +87,7 @@ def test_flux_is_one_whatever_the_lens(fraction, index, q, inclination, gamma, k
 
 
 def test_sersic_index_is_rounded_to_its_step():
-    found = profiles.shapes(
-        galaxies([1, 2, 3, 4], 0.0 * np.arange(4), bulge_sersic_index=[2.04, 2.06, 0.1, 7.0])
-    )
+    found = profiles.shapes(galaxies([1, 2, 3, 4], 0.0 * np.arange(4), bulge_sersic_index=[2.04, 2.06, 0.1, 7.0]))
     np.testing.assert_allclose(found.sersic_index, [2.0, 2.1, 0.3, 6.2])
     coarse = profiles.shapes(galaxies(1, 0, bulge_sersic_index=2.26), sersic_step=0.5)
     assert coarse.sersic_index[0] == 2.5

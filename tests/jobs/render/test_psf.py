@@ -96,9 +96,7 @@ def test_wings_hold_what_edges_diffract(wavelength):
     x, y = np.meshgrid(axis, axis)
     clear = psf.pupil(x, y, 1.0, MISSION)
     perimeter = np.hypot(*np.gradient(clear)).sum()
-    image = np.fft.fftshift(
-        psf._monochromatic(np.zeros(12), wavelength, SAMPLING, MISSION) / psf._edge_loss()
-    )
+    image = np.fft.fftshift(psf._monochromatic(np.zeros(12), wavelength, SAMPLING, MISSION) / psf._edge_loss())
     grid = (np.arange(len(image)) - len(image) // 2) * SAMPLING
     radius = np.hypot(*np.meshgrid(grid, grid))
     for angle in (5.0, 10.0, 25.0):
@@ -175,7 +173,5 @@ def test_the_seeing_disc(seeing, beta, pixel):
     assert disc.fwhm == pytest.approx(np.hypot(seeing, 0.6 * pixel), rel=0.02)
     scale = seeing / (2 * np.sqrt(2 ** (1 / beta) - 1))
     for r in (5, 10, 20):
-        assert disc.outside[r] == pytest.approx(
-            (1 + ((r + 0.5) * pixel / scale) ** 2) ** (1 - beta), rel=0.05
-        )
+        assert disc.outside[r] == pytest.approx((1 + ((r + 0.5) * pixel / scale) ** 2) ** (1 - beta), rel=0.05)
     assert disc.profile.flux == 1.0

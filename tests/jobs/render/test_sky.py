@@ -69,9 +69,7 @@ def test_a_latitude_beyond_the_pole_is_refused():
         sky.zodiacal_intensity(90.0, float("nan"))
 
 
-@pytest.mark.parametrize(
-    ("latitude", "rate"), [(0, 0.503), (15, 0.374), (30, 0.255), (60, 0.167), (90, 0.149)]
-)
+@pytest.mark.parametrize(("latitude", "rate"), [(0, 0.503), (15, 0.374), (30, 0.255), (60, 0.167), (90, 0.149)])
 def test_vis_zodiacal_rate_at_quadrature(latitude, rate):
     """e-/s in a VIS pixel: Leinert et al. 1998 through the throughput, to the model's 10 %."""
     found = sky.zodiacal_rate(*at(90, latitude), passbands.load("euclid_vis"), 0.9926, 0.1, MISSION)

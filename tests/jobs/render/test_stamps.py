@@ -54,9 +54,7 @@ def test_a_stamp_is_what_galsim_draws(camera, name, kind):
 def test_position_angle_from_end_to_end(camera, name, angle):
     """A slim galaxy's axis, measured on the frame and put on the sky by the header alone."""
     detector, system, psf = scene(camera, name, angle=-35.0)
-    source = one_source(
-        detector, system, 1e6, inclination=80.0, position_angle=angle, disk_half_light_radius=0.7
-    )
+    source = one_source(detector, system, 1e6, inclination=80.0, position_angle=angle, disk_half_light_radius=0.7)
     image = drawn(source, psf, accuracy=REFERENCE)
     centre, second = moments(image)
     along = np.linalg.eigh(second)[1][:, 1] * 5
@@ -69,9 +67,7 @@ def test_position_angle_from_end_to_end(camera, name, angle):
 def test_shear_from_end_to_end(camera, name):
     """A round galaxy behind a mass to its north-east lies along north-west."""
     detector, system, psf = scene(camera, name, angle=110.0)
-    image = drawn(
-        one_source(detector, system, 1e6, gamma2=-0.1, disk_half_light_radius=0.5), psf, accuracy=REFERENCE
-    )
+    image = drawn(one_source(detector, system, 1e6, gamma2=-0.1, disk_half_light_radius=0.5), psf, accuracy=REFERENCE)
     centre, second = moments(image)
     along = np.linalg.eigh(second)[1][:, 1] * 5
     ends = SkyCoord(*sky_of_pixel(system, *np.transpose([centre - along, centre + along])), unit="deg")
@@ -84,9 +80,7 @@ def test_neighbouring_orientations_show_the_same_sky():
     for name in ("2-3", "2-4"):
         detector = small("vis", name)
         system = wcs(detector, *boresight_for(detector, 10.0, 0.0, 0.0))
-        images.append(
-            drawn(one_source(detector, system, 1e5, **KINDS["both"]), spread("vis"), accuracy=REFERENCE)
-        )
+        images.append(drawn(one_source(detector, system, 1e5, **KINDS["both"]), spread("vis"), accuracy=REFERENCE))
     np.testing.assert_allclose(images[0], images[1][::-1, ::-1], atol=2e-3 * images[0].max())
 
 
@@ -169,9 +163,7 @@ def test_sizes_follow_flux_noise_and_accuracy():
     sources, psf = many(200), spread("lsstcam")
 
     def sizes(factor=1.0, noise=NOISE, accuracy=SURVEY):
-        return stamps.stamp_sizes(
-            factor * sources.electrons, sources.shape, sources.shapes, psf, noise, accuracy
-        )
+        return stamps.stamp_sizes(factor * sources.electrons, sources.shape, sources.shapes, psf, noise, accuracy)
 
     base = sizes()
     assert set(base) <= set(stamps.SIZES)
