@@ -1,7 +1,7 @@
 """What makes a folder of cells a HATS collection: metadata, the 10 arcsec margin, the properties.
 
 <version>/collection.properties
-<version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,_common_metadata,...}
+<version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,...}
 <version>/<table>_margin/   the same for the rows just outside each cell, so that a cross-match loses no pair at an edge
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -77,19 +78,17 @@ def _rows_in(path: Path, rim: sky.Int) -> pa.Table:
     return rows.filter(pa.array(np.isin(fine, rim)))
 
 
-def _write_catalogue(
-    root: Path, table: Table, cells: list[Cell], rows: int, files: dict[Cell, Path] | None
-) -> None:
-    from hats.catalog import TableProperties
+def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, files: dict[Cell, Path] | None) -> None:
+    from hats.catalog.dataset.table_properties import TableProperties
     from hats.catalog.partition_info import PartitionInfo
-    from hats.io.file_io import write_fits_image
+    from hats.io.file_io.file_io import write_fits_image
     from hats.io.parquet_metadata import write_parquet_metadata
     from hats.io.paths import get_skymap_file_pointer
-    from hats.pixel_math import HealpixPixel
+    from hats.pixel_math.healpix_pixel import HealpixPixel
 
     write_parquet_metadata(root, create_metadata=len(cells) <= _MOST_FILES_IN_METADATA)
     PartitionInfo([HealpixPixel(order, cell) for order, cell in cells]).write_to_file(catalog_path=root)
-    facts: dict[str, object] = {
+    facts: dict[str, Any] = {
         "total_rows": rows,
         "ra_column": "ra",
         "dec_column": "dec",
@@ -122,8 +121,11 @@ def _write_collection(version: Path, table: Table) -> None:
     from hats.catalog.dataset.collection_properties import CollectionProperties
 
     margin = f"{table.name}_margin"
-    about = {"hats_builder": "truesky", "hats_creation_date": _DATE}
+    about: dict[str, Any] = {"hats_builder": "truesky", "hats_creation_date": _DATE}
     CollectionProperties(
-        name=table.name, hats_primary_table_url=table.name, all_margins=[margin], default_margin=margin, **about
+        obs_collection=table.name,
+        hats_primary_table_url=table.name,
+        all_margins=[margin],
+        default_margin=margin,
+        **about,
     ).to_properties_file(version)
-

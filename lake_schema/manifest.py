@@ -45,8 +45,8 @@ def load(folder: Path) -> dict[str, Any]:
 def file_facts(path: Path, relative: str) -> dict[str, Any]:
     """A file's entry in the manifest.
 
-    tail : of a Parquet file: where its pages end, and the sha256 from there on.  Pages carry checksums; what tells how to
-           read them does not, and a reader that checks both never takes a changed byte for a number
+    tail : of a Parquet file: where its pages end, and the sha256 from there on.  Pages carry checksums; what tells how
+           to read them does not, and a reader that checks both never takes a changed byte for a number
     """
     facts: dict[str, Any] = {"path": relative, "bytes": path.stat().st_size, "sha256": file_sha256(path)}
     if relative.endswith(".parquet"):
@@ -57,7 +57,7 @@ def file_facts(path: Path, relative: str) -> dict[str, Any]:
 
 def checked(folder: Path, entry: Json) -> Path:
     """A listed file, ready to be read.  Errors: Damaged where its size or its tail is not what the manifest says."""
-    path = folder / entry["path"]
+    path: Path = folder / entry["path"]
     if fault := _misfit(path, entry):
         raise Damaged(fault)
     return path

@@ -1,9 +1,9 @@
 """How a table gets into the lake: never half, and never mistaken for another.
 
 plan      what is to be made: table, everything that goes into it, its parts.  Its hash names the version.
-stage     LAKE/<table>/.stage-<key>; a part's file is written under a temporary name, synced, hashed, renamed; its receipt
-          last, in the same way.
-publish   all parts there -> HATS metadata -> manifest -> one rename of the folder -> `current` is swapped by one rename.
+stage     LAKE/<table>/.stage-<key>; a part's file is written under a temporary name, synced, hashed, renamed; its
+          receipt last, in the same way.
+publish   all parts there -> HATS metadata -> manifest -> one rename of the folder -> `current` swapped by one rename.
 
 State after a death at any point             what a reader sees        what the next run does
 before the first receipt                     the last version          everything
@@ -48,8 +48,8 @@ def make(root: Path, plan: Plan, work: Work, mapper: Mapper = map, base: str | N
     work   : (lake, facts of the plan and the part) -> its Output; runs wherever `mapper` runs it
     mapper : like map: (function, parts) -> results in any order.  Results are only reported on; the receipts decide
     base   : key of the version that this one replaces, "" = whatever is current when the call begins
-    Errors : PartsFailed lists the parts that could not be made (the others are kept); Superseded where another run holds
-             the same plan, or has published another version since; Damaged where the version is there and not whole
+    Errors : PartsFailed lists the parts that could not be made (the others are kept); Superseded where another run
+             holds the same plan, or has published another version since; Damaged where it is there and not whole
     """
     name, key = plan.table.name, plan.key
     base = current_key(root, name) if base == "" else base
@@ -107,7 +107,9 @@ def _finish(stage: Path, plan: Plan) -> None:
         sync(path)
     if listed:
         raise Damaged(f"{stage / min(listed)} is missing")
-    deflections = {"deflection_deg": max(r["deflection_deg"] for r in made)} if made and "deflection_deg" in made[0] else {}
+    deflections = (
+        {"deflection_deg": max(r["deflection_deg"] for r in made)} if made and "deflection_deg" in made[0] else {}
+    )
     manifest.write(
         stage,
         {
@@ -170,7 +172,7 @@ def _lock(path: Path, refusal: str, patience: float = 0.0) -> Iterator[None]:
 
 
 def _take(path: Path, descriptor: int) -> bool:
-    """Lock the open file, if nobody holds it, and if it is still the one of that name: a holder removes it at the end."""
+    """Lock the open file, if nobody holds it, and if it is still the one of that name: holders remove it."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path.stat().st_ino == os.fstat(descriptor).st_ino

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import selectors
 import subprocess
 import sys
@@ -94,11 +95,11 @@ class Explorer:
     def sql(self, text: str, /, into: str = "pandas", **parameters: object) -> Any:
         """The result of one SELECT over the lake's tables.
 
-        text       : DuckDB's SQL, with separation(ra1, dec1, ra2, dec2) in deg and mag_ab(f_nu) of microjansky beside its
-                     own functions; $name stands for a parameter
+        text       : DuckDB's SQL, with separation(ra1, dec1, ra2, dec2) in deg and mag_ab(f_nu) of microjansky beside
+                     its own functions; $name stands for a parameter
         into       : "pandas", "astropy" (a Table with units) or "arrow"
         parameters : numbers, texts, booleans or lists of them
-        Errors     : BadInput for text that is no SELECT of ours, or that takes too long or too much; Damaged for a changed byte
+        Errors     : BadInput for what is no SELECT of ours, or takes too long or too much; Damaged for a changed byte
         """
         try:
             line = json.dumps({"sql": text, "parameters": parameters}, allow_nan=False)
@@ -173,7 +174,9 @@ class Explorer:
         return found["cell"].to_numpy(), found["n"].to_numpy()
 
     def _span(self, table: str, x: str, where: str) -> Range:
-        text = f"SELECT min(x)::DOUBLE AS lo, max(x)::DOUBLE AS hi FROM (SELECT ({x}) AS x FROM {table} WHERE ({where}))"
+        text = (
+            f"SELECT min(x)::DOUBLE AS lo, max(x)::DOUBLE AS hi FROM (SELECT ({x}) AS x FROM {table} WHERE ({where}))"
+        )
         found = self.sql(text, into="arrow")
         lo, hi = found["lo"][0].as_py(), found["hi"][0].as_py()
         if lo is None or not np.isfinite([lo, hi]).all():
@@ -185,7 +188,8 @@ class Explorer:
     def _ask(self, line: str) -> pa.Table:
         deadline = time.monotonic() + self.timeout
         worker = self._running()
-        assert worker.stdin is not None and worker.stdout is not None
+        assert worker.stdin is not None
+        assert worker.stdout is not None
         whole = False
         try:
             worker.stdin.write(line.encode() + b"\n")
@@ -214,7 +218,9 @@ class Explorer:
             versions = [f"{name}={version.key}" for name, version in self.versions.items()]
             command = [sys.executable, "-m", "jobs.explore.worker", str(self.root), str(self.memory), *versions]
             pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-            self._worker = subprocess.Popen(command, cwd=_ROOT, **pipes)
+            # Arrow's other allocators reserve a gigabyte at the start, which would count against the limit.
+            environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
+            self._worker = subprocess.Popen(command, cwd=_ROOT, env=environment, **pipes)
         return self._worker
 
 
