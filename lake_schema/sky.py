@@ -71,6 +71,12 @@ def cell_centre(order: int, cell: int) -> tuple[float, float]:
     return float(ra), float(dec)
 
 
+def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
+    """Corners of cells, [n, 4, 2] ra, dec deg, in order around each."""
+    corners = np.moveaxis(_hp().boundaries(1 << order, np.atleast_1d(np.asarray(cells, np.int64)), nest=True), 1, 2)
+    return np.stack(_hp().vec2ang(corners.reshape(-1, 3), lonlat=True), -1).reshape(-1, 4, 2)
+
+
 def cell_range(order: int, cell: int) -> tuple[int, int]:
     """The half-open range of order-29 indices inside a cell."""
     shift = 2 * (DEEPEST - order)

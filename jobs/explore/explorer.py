@@ -135,10 +135,10 @@ class Explorer:
     ) -> tuple[Float, Float]:
         """Counts of an expression in equal bins.
 
+        table            : name, or what may follow FROM, such as "galaxies JOIN galaxy_fluxes USING (id)"
         x, where, weight : SQL of the table's columns;  span : lowest and highest value, None = all
         returns          : counts[bins], edges[bins + 1]
         """
-        self._version(table)
         lo, hi = span or self._span(table, x, where)
         text = f"""
             SELECT {_bin("x", "x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x})::DOUBLE AS x, {_weight(weight)}
@@ -156,7 +156,6 @@ class Explorer:
 
         returns : counts[y bins, x bins], edges of x, edges of y
         """
-        self._version(table)
         (x_lo, x_hi), (y_lo, y_hi) = span or (self._span(table, x, where), self._span(table, y, where))
         text = f"""
             SELECT {_bin("x", "x")} AS i, {_bin("y", "y")} AS j, {_counted(weight)} AS n
@@ -170,7 +169,6 @@ class Explorer:
 
     def skymap(self, table: str, order: int = 8, where: str = "true", weight: str | None = None) -> tuple[Int, Float]:
         """Counts in HEALPix cells (nested) of an order: the cells that hold any, ascending, and their counts."""
-        self._version(table)
         if not 0 <= order <= sky.DEEPEST:
             raise BadInput(f"order = {order} is outside [0, {sky.DEEPEST}]")
         text = f"""

@@ -157,3 +157,14 @@ def test_a_box_takes_few_cells_too_many():
     """380 deg2, and no more than a cell's width along its 96 deg of border."""
     area = len(sky.cells_in_box(0, 90, 60, 70, 7)) * sky.cell_area(7)
     assert 380 < area < 380 + 96 * np.sqrt(sky.cell_area(7)) * 1.1
+
+
+@pytest.mark.parametrize("order", [0, 5, 12])
+def test_corners_lie_about_the_centre(order):
+    cells = np.arange(0, 12 * 4**order, max(1, 12 * 4**order // 20))
+    corners = sky.cell_corners(order, cells)
+    assert corners.shape == (len(cells), 4, 2)
+    for cell, around in zip(cells, corners, strict=True):
+        apart = sky.separation(*sky.cell_centre(order, int(cell)), around[:, 0], around[:, 1])
+        assert (apart <= sky.cell_radius(order) * (1 + 1e-9)).all()
+        assert (apart > 0.5 * np.sqrt(sky.cell_area(order) / 2)).all()

@@ -145,6 +145,12 @@ def test_hist_is_numpys(explorer, galaxies):
     assert np.allclose(counts, wanted)
 
 
+def test_hist_of_two_tables(explorer, galaxies):
+    joined = "galaxies g JOIN galaxy_fluxes f USING (id)"
+    counts, _ = explorer.hist(joined, "f_nu_euclid_vis - bulge_fraction", 1, (-0.5, 0.5), "g.kind = 0")
+    assert counts[0] == sum(kind == 0 for kind in galaxies["kind"].to_pylist())
+
+
 def test_heatmap_is_numpys(explorer, galaxies):
     x, y = (galaxies[name].to_numpy().astype(float) for name in ("z_obs", "abs_mag_r01"))
     counts, x_edges, y_edges = explorer.heatmap("galaxies", "z_obs", "abs_mag_r01", (8, 5))
@@ -167,7 +173,7 @@ def test_skymap_counts_cells(explorer, galaxies):
     ("call", "words"),
     [
         (lambda e: e.hist("galaxies", "speed"), "speed"),
-        (lambda e: e.hist("stars", "ra"), "no table stars"),
+        (lambda e: e.hist("stars", "ra"), "'stars' is not a table of the lake"),
         (lambda e: e.hist("galaxies", "1) FROM plain; DROP VIEW plain --"), "SQL"),
         (lambda e: e.hist("galaxies", "ra) AS x FROM read_text('/etc/passwd') --"), "read_text"),
         (lambda e: e.hist("galaxies", "log_sfr", where="ra < 0"), "no finite"),

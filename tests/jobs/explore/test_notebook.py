@@ -1,0 +1,55 @@
+"""The notebook runs on a small field made by the real jobs, and shows what it says."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from astropy.table import Table
+from nbclient import NotebookClient
+
+from jobs import request as requests
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+from lake_schema import layout, publish
+
+NOTEBOOK = Path(__file__).resolve().parents[3] / "notebooks" / "01_explore_catalogue.ipynb"
+SMALL = """
+name = "small"
+seed = 5
+[area]
+cone = { ra = 53.117, dec = -27.808, radius = 0.02 }
+[universe]
+galaxy_limit = 23.5
+star_limit = 20.0
+[fluxes]
+bands = ["euclid_vis", "lsst_r"]
+"""
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory):
+    """Galaxies, stars and fluxes, made without Spark."""
+    folder = tmp_path_factory.mktemp("field")
+    (folder / "r.toml").write_text(SMALL)
+    request, root = requests.parse(folder / "r.toml"), layout.lake(folder / "lake")
+    root.mkdir()
+    for job in (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB):
+        for step in job.steps(root, request):
+            publish.make(root, step.plan, step.work)
+    return root
+
+
+def test_every_cell_runs(field, tmp_path, monkeypatch):
+    monkeypatch.setenv("TRUESKY_LAKE", str(field))
+    monkeypatch.setenv("TRUESKY_DOWNLOADS", str(tmp_path))
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    monkeypatch.setenv("PYTHONPATH", str(NOTEBOOK.parents[1]))
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(NOTEBOOK.parent)}}).execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert [output for output in outputs if output.output_type in ("error", "stream")] == []
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 4
+    taken = Table.read(tmp_path / "redshift_one.fits")
+    assert len(taken) > 100
+    assert taken["ra"].unit == "deg"
+    assert 0.9 <= taken["z_obs"].min() <= taken["z_obs"].max() <= 1.1
