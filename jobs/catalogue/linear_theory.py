@@ -24,6 +24,8 @@ Float = npt.NDArray[np.float64]
 
 MASS_DEFINITION = "200m"
 _POWER, _MASS_FUNCTION, _BIAS, _CONCENTRATION = "eisenstein98", "tinker08", "tinker10", "diemer19"
+# Concentrations are slow to make (0.1 s a redshift and mass): at fewer redshifts, and every so many masses.
+_Z_COARSE, _COARSE = 7, 20
 
 
 def power(k: Float) -> Float:
@@ -31,19 +33,19 @@ def power(k: Float) -> Float:
     return np.asarray(_universe().matterPowerSpectrum(k, 0.0, model=_POWER), float)
 
 
-def halo_tables(log_mass: Float, z: Float, z_coarse: Float) -> dict[str, Float]:
+def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
     """Tables of halos of M_200m, log_mass[m] log10 Msun/h.
 
     density       : [len(z), m] dn/dlog10 M, comoving (Mpc/h)^-3
     bias          : [len(z), m]
-    concentration : [len(z_coarse), m] c_200m (slower to make: fewer redshifts)
+    concentration : [_Z_COARSE, m] c_200m, at redshifts uniform in ln(1 + z) over the same range
     """
     numbers = (cosmology.OMEGA_M, cosmology.OMEGA_B, cosmology.HUBBLE, cosmology.SIGMA_8)
-    key = content_key(Path(__file__).read_bytes(), *numbers, cosmology.SPECTRAL_INDEX, log_mass, z, z_coarse)
-    return cached_arrays("halo_tables", key, lambda: _halo_tables(log_mass, z, z_coarse))
+    key = content_key(Path(__file__).read_bytes(), *numbers, cosmology.SPECTRAL_INDEX, log_mass, z)
+    return cached_arrays("halo_tables", key, lambda: _halo_tables(log_mass, z))
 
 
-def _halo_tables(log_mass: Float, z: Float, z_coarse: Float) -> dict[str, Float]:
+def _halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
     _universe()
     from colossus.halo import concentration
     from colossus.lss import bias, mass_function
@@ -51,8 +53,10 @@ def _halo_tables(log_mass: Float, z: Float, z_coarse: Float) -> dict[str, Float]
     mass, args = 10.0**log_mass, {"mdef": MASS_DEFINITION}
     rows = [mass_function.massFunction(mass, at, model=_MASS_FUNCTION, q_out="dndlnM", **args) for at in z]
     biases = [bias.haloBias(mass, at, model=_BIAS, **args) for at in z]
-    c = [concentration.concentration(mass, MASS_DEFINITION, at, model=_CONCENTRATION) for at in z_coarse]
-    return {"density": np.log(10.0) * np.array(rows), "bias": np.array(biases), "concentration": np.array(c)}
+    few, coarse = log_mass[::_COARSE], np.expm1(np.linspace(np.log1p(z[0]), np.log1p(z[-1]), _Z_COARSE))
+    c = [concentration.concentration(10.0**few, MASS_DEFINITION, at, model=_CONCENTRATION) for at in coarse]
+    fine = np.array([np.exp(np.interp(log_mass, few, np.log(row))) for row in c])
+    return {"density": np.log(10.0) * np.array(rows), "bias": np.array(biases), "concentration": fine}
 
 
 def _universe() -> Any:
