@@ -22,7 +22,7 @@ from jobs.fluxes import cosmology
 Float = npt.NDArray[np.float64]
 
 # Tables reach redshift 3, uniform in ln(1 + z), and 0.02 dex.
-_Z_LAST, _Z_NODES = 3.0, 49
+Z_LAST, _Z_NODES = 3.0, 49
 _LOG_MASS = np.linspace(8.0, 16.4, 421)
 
 
@@ -106,7 +106,7 @@ class Matching:
 
 def masses() -> Masses:
     """The halos of the embedded universe, 0 <= z <= 3."""
-    z = np.expm1(np.linspace(0.0, np.log1p(_Z_LAST), _Z_NODES))
+    z = np.expm1(np.linspace(0.0, np.log1p(Z_LAST), _Z_NODES))
     tables = linear_theory.halo_tables(_LOG_MASS, z)
     shape = HaloShape(**parameters.section("halos.toml", "halo"))
     density = np.log(np.maximum(tables["density"], 1e-300))
@@ -148,7 +148,7 @@ def satellites_above(log_mass: Float, occupation: Occupation) -> Float:
 
 
 def _place(z: Float, nodes: int) -> tuple[npt.NDArray[np.int64], Float]:
-    step = np.log1p(np.asarray(z, float)) * ((nodes - 1) / np.log1p(_Z_LAST))
+    step = np.log1p(np.asarray(z, float)) * ((nodes - 1) / np.log1p(Z_LAST))
     row = np.clip(step.astype(np.int64), 0, nodes - 2)
     return row, step - row
 

@@ -16,11 +16,12 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.exposures import EXPOSURES
     from lake_schema.tables.fluxes import fluxes
     from lake_schema.tables.galaxies import GALAXIES
+    from lake_schema.tables.halos import HALOS
     from lake_schema.tables.products import PRODUCTS
     from lake_schema.tables.stars import STARS
     from lake_schema.tables.tasks import TASKS
 
-    return [GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands), EXPOSURES, TASKS, PRODUCTS]
+    return [HALOS, GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands), EXPOSURES, TASKS, PRODUCTS]
 
 
 def find(name: str, columns: Sequence[str] = ()) -> Table | None:
