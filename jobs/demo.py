@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from jobs import request as requests
@@ -31,7 +32,9 @@ JOBS = (
 
 def main(argv: list[str] | None = None) -> int:
     """Run the jobs; the exit status is 0, or that of the first job that fails."""
-    parser = argparse.ArgumentParser(prog="python -m jobs.demo", description="Simulate a field: five jobs, a table, pictures.")
+    parser = argparse.ArgumentParser(
+        prog="python -m jobs.demo", description="Simulate a field: five jobs, a table, pictures."
+    )
     parser.add_argument("--request", type=Path, default=_ROOT / "requests" / "demo.toml", help="simulation request")
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the lake and the pictures")
     options = parser.parse_args(argv)
@@ -51,12 +54,12 @@ def _run_all(root: Path, request: Path) -> int:
     submit = shutil.which("spark-submit", path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
     if submit is None:
         raise LakeError("no spark-submit on PATH: activate the environment that `make` made (. .venv/bin/activate)")
-    environment = {**os.environ, "TRUESKY_PROGRESS": "1"}
     rows, start = [], time.perf_counter()
     for script, tables in JOBS:
         began = time.perf_counter()
+        print(f"{Path(script).stem} ...", flush=True)
         command = [submit, str(_ROOT / script), "--lake", str(root), "--request", str(request)]
-        done = subprocess.run(command, env=environment, stdout=subprocess.DEVNULL)
+        done = subprocess.run(command)
         if done.returncode:
             return done.returncode
         rows.append((Path(script).stem, tables, time.perf_counter() - began))
@@ -64,14 +67,14 @@ def _run_all(root: Path, request: Path) -> int:
     return 0
 
 
-def _table(root: Path, stages: list[tuple[str, tuple[str, ...], float]], total: float) -> None:
+def _table(root: Path, stages: Sequence[tuple[str, Sequence[str], float]], total: float) -> None:
     print(f"\n{'stage':18} {'table':14} {'rows':>10} {'rows/s':>10} {'MB':>8} {'seconds':>8}")
     for stage, tables, seconds in stages:
         versions = [read.version(root, name) for name in tables]
         rows = sum(version.num_rows for version in versions)
         for i, version in enumerate(versions):
             size = sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6
-            pace = f"{rows / seconds:10,.0f} {size:8.1f} {seconds:8.1f}" if i == 0 else f"{'':10} {size:8.1f}"
+            pace = f"{rows / seconds:10,.1f} {size:8.1f} {seconds:8.1f}" if i == 0 else f"{'':10} {size:8.1f}"
             print(f"{stage if i == 0 else '':18} {version.table:14} {version.num_rows:10,} {pace}")
     print(f"{'all':18} {'':14} {'':10} {'':10} {'':8} {total:8.1f}\n")
 

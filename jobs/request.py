@@ -1,7 +1,7 @@
 """The simulation request: a TOML file of at most a screen, read into frozen records; every number has bounds.
 
-    name = "demo"                       seed = 2024                    accuracy = "survey" | "draft" | "reference" | {flux = ..}
-    [area]       polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}     deg
+    name = "demo"      seed = 2024      accuracy = "survey" | "draft" | "reference" | {flux = .., shape = .., ..}
+    [area]       polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
     [universe]   galaxy_limit (I_E), star_limit (H, Vega), z_max, box_cells, lensing_nside
     [mission]    ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
     [fluxes]     bands = [..]           default: the bands of the pointings
@@ -49,8 +49,8 @@ class Area:
     def cells(self, order: int = GENERATION_ORDER) -> list[int]:
         """Nested cells of `order` that the area touches, ascending."""
         if self.vertices:
-            return sky.cells_in_polygon(self.vertices, order).tolist()
-        return sky.cells_in_cone(self.ra, self.dec, self.radius, order).tolist()
+            return [int(cell) for cell in sky.cells_in_polygon(self.vertices, order)]
+        return [int(cell) for cell in sky.cells_in_cone(self.ra, self.dec, self.radius, order)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """Random numbers keyed by what is drawn, never by where or when it runs.
 
 A stream's identity (seed, stage, cell, source, detector, effect ...) is hashed into the key of a counter-based Philox
-generator: equal identities give equal numbers on any core, in any order, after any retry; a new stage takes a new name and
-leaves the numbers of the others as they were.
+generator: equal identities give equal numbers on any core, in any order, after any retry; a new stage takes a new name
+and leaves the numbers of the others as they were.
 """
 
 from __future__ import annotations

@@ -6,10 +6,13 @@ spark-defaults.conf.  Where the master is not local, no path of this machine goe
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import warnings
 from pathlib import Path
 
+from py4j.protocol import Py4JError
 from pyspark import SparkConf, SparkContext
 from pyspark.sql import SparkSession
 
@@ -25,4 +28,17 @@ def session(name: str) -> SparkSession:
         builder = builder.config("spark.executorEnv.PYTHONPATH", str(Path(__file__).resolve().parents[1]))
         if not conf.contains("spark.pyspark.python"):
             builder = builder.config("spark.pyspark.python", sys.executable)
-    return builder.getOrCreate()
+    before = signal.getsignal(signal.SIGINT)
+    running = builder.getOrCreate()
+    if threading.current_thread() is threading.main_thread():
+        # PySpark's own handler calls Java from wherever the interrupt finds it, and fails.
+        signal.signal(signal.SIGINT, before)
+    return running
+
+
+def is_alive(spark: SparkSession) -> bool:
+    """Does the session's Java still answer?"""
+    try:
+        return not spark.sparkContext._jsc.sc().isStopped()
+    except (Py4JError, OSError, LookupError):
+        return False

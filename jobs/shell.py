@@ -7,7 +7,9 @@ of it.  Spark carries the parts' numbers out and their receipts back; rows go fr
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import logging
 import os
 import re
 import resource
@@ -69,20 +71,19 @@ _RESULT = pa.schema(
 )
 
 
+_AGAIN = "a second run continues where this one ended"
+
+
 def main(job: Job, argv: Sequence[str] | None = None) -> int:
     """Run a job from its command line; returns the exit status: 0, 1 a part failed, 2 bad input, 130/143 stopped."""
     options = _options(job, argv)
-    signal.signal(signal.SIGTERM, _stop)
     try:
-        run(job, layout.lake(options.lake), requests.parse(options.request), options.verbose)
+        with _stoppable(job):
+            run(job, layout.lake(options.lake), requests.parse(options.request), options.verbose)
     except BadInput as error:
         return _say(job, error, 2)
     except LakeError as error:
         return _say(job, error, 1)
-    except KeyboardInterrupt:
-        return _say(job, "stopped; a second run continues where this one ended", 130)
-    except SystemExit as stopped:
-        return int(stopped.code or 0)
     return 0
 
 
@@ -99,7 +100,10 @@ def common_facts(request: requests.Request, *parts: str) -> dict[str, Any]:
 
 def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
-        prog=job.name, description=job.doc, epilog=f"truesky {__version__}", formatter_class=argparse.RawTextHelpFormatter
+        prog=job.name,
+        description=job.doc,
+        epilog=f"truesky {__version__}",
+        formatter_class=argparse.RawTextHelpFormatter,
     )
     parser.add_argument("--lake", required=True, type=Path, help="folder of the lake (made where it is not there)")
     parser.add_argument("--request", required=True, type=Path, help="simulation request, a TOML file")
@@ -108,12 +112,23 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _say(job: Job, error: object, status: int) -> int:
-    print(f"{job.name}: {error}", file=sys.stderr)
+    print(f"{job.name}: {error}", file=sys.stderr, flush=True)
     return status
 
 
-def _stop(signum: int, frame: FrameType | None) -> None:
-    raise SystemExit(128 + signum)
+@contextmanager
+def _stoppable(job: Job) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the process at once: whatever it was doing, the lake is whole and the next run goes on."""
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        os._exit(_say(job, f"stopped; {_AGAIN}", 128 + signum))
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 # ------------------------------------------------------------------------------------------------ one step
@@ -198,7 +213,9 @@ def _bar(root: Path, plan: Plan) -> Iterator[None]:
         return sum(1 for path in folder.glob("*.json") if not path.name.startswith("."))
 
     quiet = not sys.stderr.isatty() and "TRUESKY_PROGRESS" not in os.environ
-    with tqdm(total=len(plan.parts), initial=count(), desc=plan.table.name, unit="part", disable=quiet, leave=False) as bar:
+    with tqdm(
+        total=len(plan.parts), initial=count(), desc=plan.table.name, unit="part", disable=quiet, leave=False
+    ) as bar:
         done = threading.Event()
 
         def follow() -> None:
@@ -224,21 +241,35 @@ def _spark_map(function: Callable[[Part], Json], parts: Sequence[Part], name: st
     from py4j.protocol import Py4JError
     from pyspark.errors import PySparkException
 
-    from jobs.session import session
+    from jobs.session import is_alive, session
 
     spark = session(name)
     if not verbose:
         # Whatever fails is reported by us, in one line.
         spark.sparkContext.setLogLevel("OFF")
     try:
-        return _collect(spark, function, parts)
-    except (Py4JError, PySparkException):
+        with contextlib.nullcontext() if verbose else _hushed():
+            return _collect(spark, function, parts)
+    except (Py4JError, PySparkException, OSError):
+        if not is_alive(spark):
+            raise LakeError(f"Spark has ended; {_AGAIN}") from None
         if len(parts) == 1:
             return [{"part": parts[0].name, "error": "its worker died"}]
     results: list[Json] = []
     for part in parts:
         results += _spark_map(function, [part], name, verbose)
     return results
+
+
+@contextmanager
+def _hushed() -> Iterator[None]:
+    """No log lines of libraries: the bridge to Java writes a traceback for every call that is interrupted."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def _collect(spark: SparkSession, function: Callable[[Part], Json], parts: Sequence[Part]) -> list[Json]:

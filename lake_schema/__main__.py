@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from lake_schema import __version__, layout, publish, read
@@ -24,15 +24,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         names = [options.table] if options.table else read.tables(root)
         if not names:
             raise BadInput(f"lake {root} holds no table")
-        actions = {"verify": _verify, "gc": _gc, "describe": _describe}
-        wrong = [actions[options.command](root, name, options.deep) for name in names]
     except BadInput as error:
-        print(error, file=sys.stderr)
-        return 2
+        return _say(error, 2)
+    actions = {"verify": _verify, "gc": _gc, "describe": _describe}
+    return max(_status(actions[options.command], root, name, options.deep) for name in names)
+
+
+def _status(action: Callable[[Path, str, bool], bool], root: Path, name: str, deep: bool) -> int:
+    try:
+        return int(action(root, name, deep))
+    except BadInput as error:
+        return _say(error, 2)
     except LakeError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return int(any(wrong))
+        return _say(error, 1)
+
+
+def _say(error: LakeError, status: int) -> int:
+    print(error, file=sys.stderr)
+    return status
 
 
 def _verify(root: Path, name: str, deep: bool) -> bool:
@@ -54,7 +63,7 @@ def _gc(root: Path, name: str, deep: bool) -> bool:
 
 def _describe(root: Path, name: str, deep: bool) -> bool:
     version = read.version(root, name)
-    schema = version.schema()
+    schema = version.schema
     print(f"{name}: {(schema.metadata or {}).get(b'description', b'').decode()}")
     print(f"  version {version.key}, {version.num_rows:,} rows in {len(version.parts)} files")
     width = max(len(field.name) for field in schema)

@@ -227,8 +227,6 @@ def _image(unit: Any) -> Image:
     if data is not None:
         data = data.astype(data.dtype.newbyteorder("="), copy=False)
     cards = tuple(
-        (card.keyword, card.value, card.comment)
-        for card in unit.header.cards
-        if card.keyword not in _STRUCTURE
+        (card.keyword, card.value, card.comment) for card in unit.header.cards if card.keyword not in _STRUCTURE
     )
     return Image(data, cards, unit.header.get("EXTNAME", ""))

@@ -29,7 +29,11 @@ def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, m
     returns int64[n].  Errors: BadInput where a number needs more bits than it has
     """
     kinds, numbers, members = (np.asarray(x, np.int64) for x in (kind, number, member))
-    for name, values, bits in (("kind", kinds, 3), ("number", numbers, _NUMBER_BITS), ("member", members, _MEMBER_BITS)):
+    for name, values, bits in (
+        ("kind", kinds, 3),
+        ("number", numbers, _NUMBER_BITS),
+        ("member", members, _MEMBER_BITS),
+    ):
         if values.size and (values.min() < 0 or values.max() >= 1 << bits):
             raise BadInput(f"source id: {name} needs {bits} bits, got {values.min()} .. {values.max()}")
     cells = np.asarray(cell, np.int64)

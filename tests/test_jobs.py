@@ -88,7 +88,9 @@ def test_spark_submit_passes_on_the_line_and_the_status(tmp_path):
     script = ROOT / "jobs" / "catalogue" / "build_galaxies.py"
     done = submit(script, "--lake", tmp_path / "lake", "--request", request)
     assert done.returncode == 2
-    assert done.stderr.strip().splitlines() == [f"build_galaxies: request {request}: area.cone.dec = 95 is outside [-90.0, 90.0]"]
+    assert done.stderr.strip().splitlines() == [
+        f"build_galaxies: request {request}: area.cone.dec = 95 is outside [-90.0, 90.0]"
+    ]
     assert not (tmp_path / "lake").exists()
 
 

@@ -93,9 +93,7 @@ def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatio
     curves = [passbands.load(name) for name in (band, REFERENCE_BAND)]
     responses = [array for curve in curves for array in (curve.wavelength, curve.response)]
     laws = extinction.laws(library.wavelength)
-    key = content_key(
-        Path(__file__).read_bytes(), z_max, ebv_max, library.wavelength, library.flux, laws, *responses
-    )
+    key = content_key(Path(__file__).read_bytes(), z_max, ebv_max, library.wavelength, library.flux, laws, *responses)
 
     def arrays() -> dict[str, npt.NDArray[np.generic]]:
         made = build(library, band, z_max, ebv_max)

@@ -22,7 +22,9 @@ def parts(area: Area) -> tuple[Part, ...]:
     touched: dict[int, list[int]] = defaultdict(list)
     for cell in area.cells(GENERATION_ORDER):
         touched[cell >> 2 * (GENERATION_ORDER - FILE_ORDER)].append(cell)
-    return tuple(Part(layout.cell_file(FILE_ORDER, file), {"generation_cells": own}) for file, own in sorted(touched.items()))
+    return tuple(
+        Part(layout.cell_file(FILE_ORDER, file), {"generation_cells": own}) for file, own in sorted(touched.items())
+    )
 
 
 def rows(facts: Json, table: Table, draw: Callable[[int], pa.Table]) -> pa.Table:

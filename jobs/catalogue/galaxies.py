@@ -187,9 +187,7 @@ def _light(cell: int, seed: int, universe: GalaxyModel, people: Members) -> tupl
     red, colour = sed_assignment.draw_colour(
         universe.colours, m_r, people.z, people.kind, stream(seed, "galaxies.colour", cell)
     )
-    law, ebv = sed_assignment.draw_dust(
-        universe.colours.dust, m_r, red, colour, stream(seed, "galaxies.dust", cell)
-    )
+    law, ebv = sed_assignment.draw_dust(universe.colours.dust, m_r, red, colour, stream(seed, "galaxies.dust", cell))
     return people.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
 
 

@@ -177,9 +177,7 @@ def _blocks(step: Int) -> list[slice]:
     return [slice(first, last) for first, last in zip(edges, edges[1:], strict=False) if last > first]
 
 
-def _block(
-    halos: HaloModel, used: Bool, space: Voxels, rng: np.random.Generator, rows: slice
-) -> tuple[Int, Int]:
+def _block(halos: HaloModel, used: Bool, space: Voxels, rng: np.random.Generator, rows: slice) -> tuple[Int, Int]:
     """Halos of some voxels: a Poisson number, spread over voxels and bins by their means."""
     first, last = int(space.step[rows].min()), int(space.step[rows].max()) + 1
     columns = np.flatnonzero(used[first:last].any(0))

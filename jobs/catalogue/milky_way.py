@@ -165,9 +165,7 @@ def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> Sample:
     total = float(cumulative[-1]) if boxes.size else 0.0
     n = int(rng.poisson(total))
     # The product may round up to the total itself.
-    drawn = np.minimum(
-        np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0)
-    )
+    drawn = np.minimum(np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0))
     population, shell, m_bin = np.unravel_index(boxes[drawn], mean.shape)
     near3, far3 = galaxy.distance[shell] ** 3, galaxy.distance[shell + 1] ** 3
     distance = np.cbrt(near3 + (far3 - near3) * rng.random(n))

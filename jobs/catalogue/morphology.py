@@ -139,9 +139,7 @@ def _at(size: Size, values: tuple[float, ...], z: Float) -> Float:
 
 def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: np.random.Generator) -> Float:
     """Flux of the bulge / total, [n] in [0, 1]."""
-    mean = np.clip(
-        bulge.late_mean + bulge.late_rate * (log_stellar_mass - bulge.late_pivot), *bulge.late_limits
-    )
+    mean = np.clip(bulge.late_mean + bulge.late_rate * (log_stellar_mass - bulge.late_pivot), *bulge.late_limits)
     a = np.where(red, bulge.early_a, bulge.late_concentration * mean)
     b = np.where(red, bulge.early_b, bulge.late_concentration * (1.0 - mean))
     return rng.beta(a, b)
@@ -150,22 +148,16 @@ def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: np.ran
 def sersic_index(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
     """Sersic index[n] of the bulge."""
     log_n = np.log10(np.where(red, bulge.early_sersic, bulge.late_sersic))
-    return np.clip(
-        10.0 ** (log_n + bulge.sersic_scatter * rng.standard_normal(red.size)), *bulge.sersic_limits
-    )
+    return np.clip(10.0 ** (log_n + bulge.sersic_scatter * rng.standard_normal(red.size)), *bulge.sersic_limits)
 
 
 def radius_ratio(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
     """Half-light radius of the bulge / that of the disc, [n]."""
     log_ratio = np.where(red, bulge.early_log_ratio, bulge.late_log_ratio)
-    return np.clip(
-        10.0 ** (log_ratio + bulge.log_ratio_scatter * rng.standard_normal(red.size)), *bulge.ratio_limits
-    )
+    return np.clip(10.0 ** (log_ratio + bulge.log_ratio_scatter * rng.standard_normal(red.size)), *bulge.ratio_limits)
 
 
-def component_radii(
-    model: Shapes, radius: Float, fraction: Float, ratio: Float, sersic: Float
-) -> tuple[Float, Float]:
+def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float, sersic: Float) -> tuple[Float, Float]:
     """Half-light radii of bulge[n] and disc[n] whose summed light has the half-light radius `radius`[n].
 
     fraction : bulge / total; ratio : bulge radius / disc radius; sersic : index of the bulge

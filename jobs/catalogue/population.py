@@ -127,9 +127,7 @@ def members(cells: Cells, cell: int) -> Members:
     source, halo_id, index, ra, dec, chi, velocity, proxy, mass = (column[order] for column in columns)
     z = cells.population.halos.distances.redshift(chi)
     z_obs = (1.0 + z) * (1.0 + velocity / LIGHT_KM_S) - 1.0
-    return Members(
-        own, own_ids, source, halo_id, ids.kind_of(source), index, ra, dec, chi, z, z_obs, proxy, mass
-    )
+    return Members(own, own_ids, source, halo_id, ids.kind_of(source), index, ra, dec, chi, z, z_obs, proxy, mass)
 
 
 def _around(order: int, cell: int) -> list[int]:

@@ -107,14 +107,10 @@ def red_fraction(law: RedFraction, m_r: Float, z: Float, kind: Int) -> Float:
     """
     bright = np.clip(1.0 - (law.blue + law.blue_rate * (m_r - _PIVOT)), *law.limits)
     evolved = bright * np.array(law.times)[kind] * np.clip(law.z_norm - law.z_rate * z, law.z_floor, 1.0)
-    return np.asarray(
-        np.minimum(evolved * 10.0 ** (-law.dwarf_rate * np.maximum(m_r - law.dwarf, 0.0)), law.highest)
-    )
+    return np.asarray(np.minimum(evolved * 10.0 ** (-law.dwarf_rate * np.maximum(m_r - law.dwarf, 0.0)), law.highest))
 
 
-def draw_colour(
-    model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.Generator
-) -> tuple[Bool, Float]:
+def draw_colour(model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.Generator) -> tuple[Bool, Float]:
     """(on the red sequence[n], 0.1(g - r)[n])."""
     law, x = model.sequence, m_r - _PIVOT
     red = rng.random(m_r.size) < red_fraction(model.fraction, m_r, z, kind)
@@ -127,9 +123,7 @@ def draw_colour(
     return red, np.clip(mean + scatter * rng.standard_normal(m_r.size), *law.limits)
 
 
-def draw_dust(
-    dust: Dust, m_r: Float, red: Bool, colour: Float, rng: np.random.Generator
-) -> tuple[Int, Float]:
+def draw_dust(dust: Dust, m_r: Float, red: Bool, colour: Float, rng: np.random.Generator) -> tuple[Int, Float]:
     """(extinction law[n], E(B-V)[n] mag); red galaxies have no dust.  Ref: Ilbert et al. 2009"""
     mean = np.clip(dust.mean + dust.mean_rate * (m_r - dust.pivot), *dust.mean_limits)
     ebv = np.minimum(mean / dust.shape * rng.standard_gamma(dust.shape, m_r.size), dust.highest)

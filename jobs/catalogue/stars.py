@@ -66,9 +66,7 @@ def draw(cell: int, seed: int, universe: StarModel, dust: npt.NDArray[np.float32
     """
     galaxy = universe.galaxy
     stars = _sample(cell, seed, universe)
-    index, ra, dec = sky.random_in_cell(
-        GENERATION_ORDER, cell, stars.m_h.size, stream(seed, "stars.position", cell)
-    )
+    index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, stars.m_h.size, stream(seed, "stars.position", cell))
     a_v = _extinction(universe, stars, dust, ra, dec)
     mag_h = stars.m_h + 5.0 * np.log10(stars.distance) - 5.0
     metals = milky_way.metallicity(galaxy, stars.component, stream(seed, "stars.metallicity", cell))
@@ -113,10 +111,6 @@ def _sample(cell: int, seed: int, universe: StarModel) -> Sample:
     return milky_way.draw(universe.galaxy, mean, stream(seed, "stars.luminosity", cell))
 
 
-def _extinction(
-    universe: StarModel, stars: Sample, dust: npt.NDArray[np.float32], ra: Float, dec: Float
-) -> Float:
+def _extinction(universe: StarModel, stars: Sample, dust: npt.NDArray[np.float32], ra: Float, dec: Float) -> Float:
     _, lat = sky.galactic(ra, dec)
-    return dust_map.a_v_at(
-        dust_map.a_v(dust, ra, dec), stars.distance, lat, universe.layer, universe.sin_b_min
-    )
+    return dust_map.a_v_at(dust_map.a_v(dust, ra, dec), stars.distance, lat, universe.layer, universe.sin_b_min)

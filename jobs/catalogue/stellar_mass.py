@@ -94,9 +94,7 @@ def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float) -> Float:
 
 def log_sfr(table: Light, m_r: Float, sed: Sed) -> Float:
     """log10 of the star formation rate[n] / (Msun/yr).  Ref: Kennicutt 1998"""
-    total = sed.frac_1 * _undimmed(table, sed.template_1, sed) + sed.frac_2 * _undimmed(
-        table, sed.template_2, sed
-    )
+    total = sed.frac_1 * _undimmed(table, sed.template_1, sed) + sed.frac_2 * _undimmed(table, sed.template_2, sed)
     area = 4.0 * np.pi * _TEN_PARSEC_CM**2
     log_l_nu = -0.4 * (_physical(m_r) + AB_CGS) + np.log10(area * total)
     return np.asarray(np.log10(table.law.per_luminosity) + log_l_nu + table.law.calibration)

@@ -95,11 +95,7 @@ def luminosity(m_h: Float, dwarfs: Sequence, share: Float) -> Float:
 
 def mass_below(masses: MassFunction, m: npt.ArrayLike) -> Float:
     """Systems pc^-3 at the Sun lighter than m, all components together.  Ref: Kroupa 2001"""
-    return (
-        masses.local
-        * _power_law(masses, np.asarray(m, float))
-        / _power_law(masses, np.asarray(masses.reference))
-    )
+    return masses.local * _power_law(masses, np.asarray(m, float)) / _power_law(masses, np.asarray(masses.reference))
 
 
 def _power_law(masses: MassFunction, m: Float) -> Float:

@@ -1,107 +1,157 @@
-"""The inner loops of the flux grid, compiled by numba; its machine code lies in the project's cache.
+"""The inner loops of the flux grid, compiled by numba; the machine code lies in the project's cache.
 
-continuum     sum over the two components of what the grid gives in one band
-line_centres  where lines are seen and what the Milky Way leaves of them
+prepare       what galaxies have to do with every table of one setting
+continuum     what the two components of galaxies give in one band
+line_centres  where lines are seen, and what the Milky Way leaves of them
 line_sums     what lines give through one band
 
-Plain loops over rows, each row by itself: a source does not depend on its neighbours, to the bit.
+Plain loops over rows: no source depends on its neighbours, not in the last bit.
 """
 
 from __future__ import annotations
 
-import numba
+import os
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
 from jobs import cache
 
+# Compiled once a machine, not once a process. numba reads this when it is imported.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(cache.cache_dir() / "numba"))
+
+import numba  # noqa: E402
+
 Float = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int64]
 
-# Compiled once a machine, not once a process: numba asks for the folder when the functions below are defined.
-if not numba.config.CACHE_DIR:
-    numba.config.CACHE_DIR = str(cache.cache_dir() / "numba")
+# Sums may be taken in any order, which makes them twice as fast; NaN and infinity keep their meaning.
+_jit: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 
 
-@numba.njit(cache=True, error_model="numpy")
+@_jit
+def prepare(
+    log_z: Float, law: Int, ebv: Float, a_v: Float, log_first: float, step: float, z_count: int, ebv_last: float,
+    a_v_last: float, n_ebv: int, n_av: int, row: Int, z_weights: Float32, basis: Float32,
+) -> None:  # fmt: skip
+    """Fills row, z_weights (Lagrange's, of four nodes from `row`) and basis (products of Chebyshev polynomials).
+
+    log_z : float64[n] ln(1 + z);  law, ebv : [2, n];  a_v : float64[n]
+    row : int64[n];  z_weights : float32[n, 4];  basis : float32[2, n, n_ebv * n_av]
+    """
+    in_ebv, in_av = np.empty(n_ebv), np.empty(n_av)
+    for i in range(len(log_z)):
+        position = (log_z[i] - log_first) / step
+        # One-sided at the ends.
+        first = min(max(int(np.floor(position)) - 1, 0), z_count - 4)
+        t = position - first - 1.0
+        row[i] = first
+        z_weights[i, 0] = -t * (t - 1.0) * (t - 2.0) / 6.0
+        z_weights[i, 1] = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0
+        z_weights[i, 2] = -(t + 1.0) * t * (t - 2.0) / 2.0
+        z_weights[i, 3] = (t + 1.0) * t * (t - 1.0) / 6.0
+        _chebyshev(2.0 * a_v[i] / a_v_last - 1.0, in_av)
+        for k in range(2):
+            _chebyshev(2.0 * (ebv[k, i] if law[k, i] > 0 else 0.0) / ebv_last - 1.0, in_ebv)
+            for p in range(n_ebv):
+                for q in range(n_av):
+                    basis[k, i, p * n_av + q] = in_ebv[p] * in_av[q]
+
+
+@_jit
+def _chebyshev(x: float, out: Float) -> None:
+    before, now = x, 1.0
+    for k in range(len(out)):
+        out[k] = now
+        before, now = now, 2.0 * x * now - before
+
+
+@_jit
 def continuum(
     table: Float32, row: Int, z_weights: Float32, sed: Int, law: Int, basis: Float32, frac: Float, out: Float
 ) -> None:
-    """out[i] = sum_k frac[k, i] exp(ln ratio of component k).
+    """Fills out[i] = sum_k frac[k, i] exp(ln of the ratio of component k).
 
-    table     : float32[n_template, n_law, n_z, n_coefficient];  row : int64[n] first of four nodes in z
-    z_weights : float32[n, 4];  basis : float32[2, n, n_coefficient];  out : float64[n]
+    table : float32[n_template, 4, n_z, n_coefficient], laws 1 .. 4; without a law E(B-V) is 0 in any of them
     """
     count = table.shape[3]
-    mixed = np.empty(count, np.float32)
     for i in range(len(row)):
         total = 0.0
+        w0, w1, w2, w3 = z_weights[i, 0], z_weights[i, 1], z_weights[i, 2], z_weights[i, 3]
         for k in range(2):
             if frac[k, i] == 0.0:
                 continue
-            nodes = table[sed[k, i], law[k, i], row[i] : row[i] + 4]
-            w0, w1, w2, w3 = z_weights[i, 0], z_weights[i, 1], z_weights[i, 2], z_weights[i, 3]
+            nodes = table[sed[k, i], max(law[k, i] - 1, 0), row[i] : row[i] + 4]
             at = basis[k, i]
+            log_ratio = np.float32(0.0)
             for c in range(count):
-                mixed[c] = (w0 * nodes[0, c] + w1 * nodes[1, c] + w2 * nodes[2, c] + w3 * nodes[3, c]) * at[c]
-            log_ratio = 0.0
-            for c in range(count):
-                log_ratio += mixed[c]
-            total += frac[k, i] * np.exp(log_ratio)
+                log_ratio += (w0 * nodes[0, c] + w1 * nodes[1, c] + w2 * nodes[2, c] + w3 * nodes[3, c]) * at[c]
+            total += frac[k, i] * np.exp(np.float64(log_ratio))
         out[i] = total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@_jit
 def line_centres(
     fluxes: Float, z_obs: Float, a_v: Float, vacuum: Float, ciddor: Float, curve: Float, first: float,
     centre: Float, flux: Float,
 ) -> None:  # fmt: skip
-    """Logarithms of the observed wavelengths, and fluxes behind the Milky Way: fills centre, flux, float64[n, n_line].
+    """Fills centre, ln of the observed wavelength in A in a vacuum and in air, and flux, behind the Milky Way.
 
-    ciddor : float64[2, 2] strengths and resonances of the refractivity of air; strengths 0 in vacuum
-    curve  : float64[n_lambda] A(lambda) / A(V) from `first` in steps of 1 A
+    ciddor : float64[2, 2] (strength, resonance) of the refractivity of air
+    curve  : A(lambda) / A(V) in steps of 1 A from `first`; lines beyond it are in no band
+    centre, flux : float64[2, n, n_line]
     """
     for i in range(len(z_obs)):
         for j in range(len(vacuum)):
-            flux[i, j] = 0.0
-            if fluxes[i, j] == 0.0:
-                continue
+            flux[0, i, j] = flux[1, i, j] = 0.0
             lam = vacuum[j] * (1.0 + z_obs[i])
-            square = (1e4 / lam) ** 2
-            lam /= 1.0 + 1e-8 * (ciddor[0, 0] / (ciddor[0, 1] - square) + ciddor[1, 0] / (ciddor[1, 1] - square))
-            centre[i, j] = np.log(lam)
             position = lam - first
-            if position < 0.0 or position >= len(curve) - 1:
-                # Beyond every band.
+            if fluxes[i, j] == 0.0 or position < 0.0 or position >= len(curve) - 1:
                 continue
+            square = (1e4 / lam) ** 2
+            refractivity = ciddor[0, 0] / (ciddor[0, 1] - square) + ciddor[1, 0] / (ciddor[1, 1] - square)
+            shift = np.log1p(1e-8 * refractivity)
+            centre[0, i, j] = np.log(lam)
+            centre[1, i, j] = centre[0, i, j] - shift
             low = int(position)
-            part = position - low
-            k = curve[low] + part * (curve[low + 1] - curve[low])
-            flux[i, j] = fluxes[i, j] * 10.0 ** (-0.4 * k * a_v[i])
+            slope = curve[low + 1] - curve[low]
+            depth = 0.4 * np.log(10.0) * a_v[i]
+            flux[0, i, j] = fluxes[i, j] * np.exp(-depth * (curve[low] + (position - low) * slope))
+            # The extinction at the wavelength in air, to first order in a shift of 3e-4.
+            flux[1, i, j] = flux[0, i, j] * (1.0 + depth * slope * lam * shift)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@_jit
 def line_sums(
-    centre: Float, flux: Float, smooth: Int, share: Float, table: Float32, first: float, step: float, out: Float
-) -> None:
-    """out[i] = sum over lines of flux times the response seen by a line of that width; table as LineGrid.response.
+    centre: Float, flux: Float, width: Int, share: Float, tables: Float32, place: Int, first: Float, step: float,
+    cells: Int, members: Int, cell_first: float, cell_step: float, out: Float,
+) -> None:  # fmt: skip
+    """Adds to out[b, i] the flux of each line times what band b makes of a line of that width there.
 
-    smooth, share : int64[n], float64[n] node below a galaxy's width, and how far to the next (0 .. 1)
+    width, share : [n] node of the width below the galaxy's, and how far towards the next, 0 .. 1
+    tables       : float32[sum of n_lambda, n_width] of all bands, uniform in ln(lambda) by `step`
+    place        : int64[n_band, 3] first row and number of rows of a band in `tables`, and its medium, 1 for air
+    first        : float64[n_band] ln(lambda) of a band's first row
+    cells        : int64[n_cell + 1]: members[cells[c] : cells[c + 1]] are the bands that see wavelength cell c
     """
-    count = table.shape[0]
-    for i in range(centre.shape[0]):
-        total = 0.0
-        low_width, part_width = smooth[i], share[i]
-        for j in range(centre.shape[1]):
-            if flux[i, j] == 0.0:
+    per_row, per_cell = 1.0 / step, 1.0 / cell_step
+    for i in range(flux.shape[1]):
+        w, s = width[i], share[i]
+        for j in range(flux.shape[2]):
+            if flux[0, i, j] == 0.0:
                 continue
-            position = (centre[i, j] - first) / step
-            if position < 0.0 or position >= count - 1:
-                continue
-            low = int(position)
-            part = position - low
-            narrow = table[low, low_width] + part * (table[low + 1, low_width] - table[low, low_width])
-            wide = table[low, low_width + 1] + part * (table[low + 1, low_width + 1] - table[low, low_width + 1])
-            total += flux[i, j] * (narrow + part_width * (wide - narrow))
-        out[i] = total
+            cell = int((centre[0, i, j] - cell_first) * per_cell)
+            for m in range(cells[cell], cells[cell + 1]):
+                b = members[m]
+                medium = place[b, 2]
+                position = (centre[medium, i, j] - first[b]) * per_row
+                if position < 0.0 or position >= place[b, 1] - 1:
+                    continue
+                low = int(position)
+                part = position - low
+                blue, red = tables[place[b, 0] + low], tables[place[b, 0] + low + 1]
+                narrow = blue[w] + part * (red[w] - blue[w])
+                wide = blue[w + 1] + part * (red[w + 1] - blue[w + 1])
+                out[b, i] += flux[medium, i, j] * (narrow + s * (wide - narrow))

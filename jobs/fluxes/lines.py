@@ -101,6 +101,11 @@ def observed_wavelength(vacuum: npt.ArrayLike, z_obs: npt.ArrayLike, medium: str
     raise BadInput(f"medium {medium!r} is not air or vacuum")
 
 
+def refractivity_terms() -> Float:
+    """(strength, resonance) of the two terms of `air_wavelength`, float64[2, 2]."""
+    return np.array(_CIDDOR)
+
+
 def profiles(
     fluxes: Float,
     z_obs: Float,

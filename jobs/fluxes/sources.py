@@ -2,7 +2,8 @@
 
 Galaxies, galaxies_of
 Stars, stars_of
-magnification           of the gravitational lens
+magnification, magnification_of   of the gravitational lens
+column, ids_of          a column without gaps, the identifiers
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ Int = npt.NDArray[np.int64]
 
 MAGNIFICATION_MAX = 100.0
 # Kinds whose templates are in the galaxy library: central, satellite, strong lens.
-_KINDS = (0, 1, 4)
+GALAXY_KINDS = (0, 1, 4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,9 @@ class Stars:
     def __len__(self) -> int:
         return len(self.sed)
 
+    def rows(self, chosen: Int | slice) -> Stars:
+        return Stars(self.sed[chosen], self.mag_h[chosen], self.a_v[chosen])
+
 
 def galaxies_of(table: pa.Table, library: Library) -> Galaxies:
     """Rows of the table `galaxies`, checked.
@@ -79,26 +83,26 @@ def galaxies_of(table: pa.Table, library: Library) -> Galaxies:
     """
     _refuse_other_kinds(table)
     names = ["z_obs", *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS)]
-    columns = {name: _column(table, name) for name in names}
-    kappa, gamma1, gamma2, a_v = (_column(table, name) for name in ("kappa", "gamma1", "gamma2", "a_v"))
+    columns = {name: column(table, name) for name in names}
+    a_v = column(table, "a_v")
     _declared("a_v", a_v)
     return Galaxies(
         mix_of(columns, library),
-        _declared("abs_mag_r01", _column(table, "abs_mag_r01")),
-        _declared("mag_r01", _column(table, "mag_r01")),
+        _declared("abs_mag_r01", column(table, "abs_mag_r01")),
+        _declared("mag_r01", column(table, "mag_r01")),
         _line_fluxes(table),
-        magnification(kappa, gamma1, gamma2, _ids(table)),
+        magnification_of(table),
         a_v,
     )
 
 
 def stars_of(table: pa.Table, library: Library) -> Stars:
     """Rows of the table `stars`, checked; errors as `galaxies_of`."""
-    sed, mag_h, a_v = (_column(table, name) for name in ("sed", "mag_h", "a_v"))
+    sed, mag_h, a_v = (column(table, name) for name in ("sed", "mag_h", "a_v"))
     within("sed", sed, 0, len(library) - 1)
     for name, values in (("mag_h", mag_h), ("a_v", a_v)):
-        column = STARS.column(name)
-        within(name, values, _bound(column.lo), _bound(column.hi))
+        declared = STARS.column(name)
+        within(name, values, _bound(declared.lo), _bound(declared.hi))
     return Stars(sed.astype(np.int64), mag_h, a_v)
 
 
@@ -125,6 +129,11 @@ def magnification(
     return np.asarray(mu)
 
 
+def magnification_of(table: pa.Table) -> Float:
+    """`magnification` of the rows of the table `galaxies`."""
+    return magnification(*(column(table, name) for name in ("kappa", "gamma1", "gamma2")), ids_of(table))
+
+
 def _line_fluxes(table: pa.Table) -> Float:
     """Fluxes of the ten lines; a missing column, null or NaN is a line that was not modelled."""
     out = np.zeros((table.num_rows, len(lines.line_list())))
@@ -132,15 +141,15 @@ def _line_fluxes(table: pa.Table) -> Float:
         if line.column not in table.column_names:
             continue
         flux = np.nan_to_num(_floats(table, line.column), nan=0.0, posinf=np.inf)
-        column = GALAXIES.column(line.column)
-        within(line.column, flux, _bound(column.lo), _bound(column.hi))
+        declared = GALAXIES.column(line.column)
+        within(line.column, flux, _bound(declared.lo), _bound(declared.hi))
         out[:, k] = flux * line.ratio
     return out
 
 
 def _declared(name: str, values: Float) -> Float:
-    column = GALAXIES.column(name)
-    within(name, values, _bound(column.lo), _bound(column.hi))
+    declared = GALAXIES.column(name)
+    within(name, values, _bound(declared.lo), _bound(declared.hi))
     return values
 
 
@@ -153,27 +162,27 @@ def _bound(value: float | None) -> float:
 def _refuse_other_kinds(table: pa.Table) -> None:
     if "kind" not in table.column_names:
         return
-    kinds = _column(table, "kind")
-    other = ~np.isin(kinds, _KINDS)
+    kinds = column(table, "kind")
+    other = ~np.isin(kinds, GALAXY_KINDS)
     if other.any():
         first = int(np.flatnonzero(other)[0])
-        source = int(_ids(table)[first])
+        source = int(ids_of(table)[first])
         raise BadInput(f"galaxies: source {source} has kind {int(kinds[first])}: not in the galaxy library")
 
 
-def _ids(table: pa.Table) -> Int:
+def ids_of(table: pa.Table) -> Int:
     if "id" not in table.column_names:
         return np.arange(table.num_rows, dtype=np.int64)
     return np.asarray(table["id"].to_numpy(), np.int64)
 
 
-def _column(table: pa.Table, name: str) -> Float:
+def column(table: pa.Table, name: str) -> Float:
     """A column as floats without gaps."""
     values = _floats(table, name)
     gap = np.isnan(values)
     if gap.any():
         first = int(np.flatnonzero(gap)[0])
-        raise BadInput(f"column {name} is missing in the row of source {int(_ids(table)[first])}")
+        raise BadInput(f"column {name} is missing in the row of source {int(ids_of(table)[first])}")
     return values
 
 

@@ -5,9 +5,10 @@ star_spectra     scaled to H, behind the dust on the way
 band_fluxes      f_nu of any of them
 galaxy_fluxes    table `galaxies` -> table `galaxy_fluxes`
 star_fluxes      table `stars` -> table `star_fluxes`
+prepare          make the tables that the two need, and compile
 
-Spectra are on the grid of passbands.grid(), 600 .. 24000 A by 1 A. The flux tables are the same sums, over
-the wavelengths of the wanted bands only (jobs/fluxes/integration.py).
+Spectra are on the grid of passbands.grid(), 600 .. 24000 A by 1 A. The flux tables are the same sums, interpolated in
+tables (flux_grid.py) where the accuracy allows it, else over the wavelengths of the wanted bands (integration.py).
 Ref: Serrano et al. 2024, appendix B, in its order
 """
 
@@ -19,11 +20,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from jobs.fluxes import extinction, integration, lines, passbands
+from jobs.accuracy import REFERENCE, Accuracy
+from jobs.fluxes import extinction, flux_grid, grid_settings, high_redshift, integration, lines, passbands
 from jobs.fluxes.calibration import continuum_scale, star_scale
 from jobs.fluxes.continuum import REFERENCE_BAND, amplitudes, dust_of, observed_shape
 from jobs.fluxes.passbands import Passband
-from jobs.fluxes.sources import galaxies_of, stars_of
+from jobs.fluxes.sources import GALAXY_KINDS, Galaxies, Stars, galaxies_of, stars_of
 from jobs.fluxes.templates import Library
 from lake_schema import units
 from lake_schema.errors import BadInput
@@ -31,8 +33,8 @@ from lake_schema.tables.fluxes import fluxes
 
 Float = npt.NDArray[np.float64]
 
-# Rows turned into arrays at a time: some 20 MB of them.
-_SLICE = 50_000
+# Rows turned into arrays at a time: some 80 MB of them. The more, the more often a part of a table is used.
+_SLICE = 200_000
 
 
 def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum") -> Float:
@@ -76,24 +78,87 @@ def band_fluxes(spectra: Float, bands: Sequence[Passband]) -> Float:
     return units.ujy_of_cgs(out)
 
 
-def galaxy_fluxes(galaxies: pa.Table, bands: Sequence[str], library: Library) -> pa.Table:
+def galaxy_fluxes(
+    galaxies: pa.Table, bands: Sequence[str], library: Library, accuracy: Accuracy = REFERENCE
+) -> pa.Table:
     """f_nu of galaxies through bands: internal dust, lines, magnification and the Milky Way's dust included.
 
-    galaxies : rows of the table `galaxies`;  bands : names of passbands
+    galaxies : rows of the table `galaxies`, of any kind;  bands : names of passbands
+    library  : of the kinds central, satellite and strong lens
     returns  : rows of the table `galaxy_fluxes` in the same order, microjansky
-    Error    : 1e-6 relative to band_fluxes of galaxy_spectra
+    Error    : |df/f| <= accuracy.flux against band_fluxes of galaxy_spectra (benchmarks/fluxes); 1e-6 at best
     Errors   : BadInput names the column and source of a missing value, OutOfRange what is out of bounds
     """
-    curves = [passbands.load(name) for name in bands]
-    f_nu = [integration.galaxies(galaxies_of(part, library), curves, library) for part in _slices(galaxies)]
-    return _table("galaxy", galaxies, bands, np.concatenate(f_nu))
+    curves = _curves(bands)
+    choices = grid_settings.choose(bands, accuracy)
+    tabulated = [k for k, choice in enumerate(choices) if choice.setting is not None]
+    grid = None
+    f_nu = np.zeros((len(bands), galaxies.num_rows))
+    for start, part in _slices(galaxies):
+        out = f_nu[:, start : start + part.num_rows]
+        kinds = _kinds(part)
+        usual = np.isin(kinds, GALAXY_KINDS)
+        if not usual.all():
+            out[:, ~usual] = high_redshift.fluxes(part.filter(pa.array(~usual)), curves).T
+            part = part.filter(pa.array(usual))
+        rows = galaxies_of(part, library)
+        if tabulated and grid is None and len(rows):
+            settings = [setting for choice in choices if (setting := choice.setting) is not None]
+            grid = flux_grid.open_grid([curves[k] for k in tabulated], settings, library)
+        out[:, usual] = _galaxies(rows, curves, tabulated, grid, library)
+    return _table("galaxy", galaxies, bands, f_nu)
 
 
-def star_fluxes(stars: pa.Table, bands: Sequence[str], library: Library) -> pa.Table:
+def star_fluxes(stars: pa.Table, bands: Sequence[str], library: Library, accuracy: Accuracy = REFERENCE) -> pa.Table:
     """f_nu of stars through bands, with the dust on the way to each; as `galaxy_fluxes`."""
-    curves = [passbands.load(name) for name in bands]
-    f_nu = [integration.stars(stars_of(part, library), curves, library) for part in _slices(stars)]
-    return _table("star", stars, bands, np.concatenate(f_nu))
+    curves = _curves(bands)
+    tabulated = grid_settings.stars_tabulated(accuracy)
+    f_nu = np.zeros((len(bands), stars.num_rows))
+    for start, part in _slices(stars):
+        f_nu[:, start : start + part.num_rows] = _stars(stars_of(part, library), curves, tabulated, library)
+    return _table("star", stars, bands, f_nu)
+
+
+def prepare(bands: Sequence[str], accuracy: Accuracy) -> None:
+    """Make what the cache lacks for these bands, tables and machine code, so that workers find it there."""
+    from jobs.fluxes import templates
+
+    library = templates.galaxy_library()
+    if chosen := [(band, c.setting) for band, c in zip(bands, grid_settings.choose(bands, accuracy), strict=True) if c.setting]:
+        curves = [passbands.load(band) for band, _ in chosen]
+        grid = flux_grid.open_grid(curves, [setting for _, setting in chosen], library)
+        flux_grid.warm(grid)
+    stars = templates.stellar_library()
+    if grid_settings.stars_tabulated(accuracy):
+        flux_grid.stars(Stars(np.zeros(1, np.int64), np.zeros(1), np.zeros(1)), _curves(bands), stars)
+
+
+def _galaxies(
+    rows: Galaxies, curves: Sequence[Passband], tabulated: Sequence[int], grid: flux_grid.Grid | None, library: Library
+) -> Float:
+    """float64[n_band, n]: from tables where there are any, the rest integrated."""
+    out = np.zeros((len(curves), len(rows)))
+    inside = flux_grid.covered(rows) if grid is not None else np.zeros(len(rows), bool)
+    if grid is not None:
+        near = np.flatnonzero(inside)
+        out[np.ix_(tabulated, near)] = flux_grid.galaxies(rows if inside.all() else rows.rows(near), grid).T
+        others = [k for k in range(len(curves)) if k not in tabulated]
+        if others and len(near):
+            out[np.ix_(others, near)] = integration.galaxies(rows.rows(near), [curves[k] for k in others], library).T
+    if len(far := np.flatnonzero(~inside)):
+        out[:, far] = integration.galaxies(rows.rows(far), curves, library).T
+    return out
+
+
+def _stars(rows: Stars, curves: Sequence[Passband], tabulated: bool, library: Library) -> Float:
+    inside = flux_grid.covered_stars(rows) & tabulated
+    out = np.zeros((len(curves), len(rows)))
+    near, far = np.flatnonzero(inside), np.flatnonzero(~inside)
+    if len(near):
+        out[:, near] = flux_grid.stars(rows.rows(near), curves, library).T
+    if len(far):
+        out[:, far] = integration.stars(rows.rows(far), curves, library).T
+    return out
 
 
 def milky_way_transmission(wavelength: npt.ArrayLike, a_v: Float) -> Float:
@@ -101,8 +166,20 @@ def milky_way_transmission(wavelength: npt.ArrayLike, a_v: Float) -> Float:
     return np.asarray(extinction.transmitted(extinction.milky_way(wavelength), a_v[:, None]))
 
 
-def _slices(table: pa.Table) -> list[pa.Table]:
-    return [table.slice(start, _SLICE) for start in range(0, max(table.num_rows, 1), _SLICE)]
+def _curves(bands: Sequence[str]) -> list[Passband]:
+    if not bands:
+        raise BadInput("no passband is asked for")
+    return [passbands.load(name) for name in bands]
+
+
+def _kinds(table: pa.Table) -> npt.NDArray[np.int64]:
+    if "kind" not in table.column_names:
+        return np.zeros(table.num_rows, np.int64)
+    return np.asarray(table["kind"].to_numpy(), np.int64)
+
+
+def _slices(table: pa.Table) -> list[tuple[int, pa.Table]]:
+    return [(start, table.slice(start, _SLICE)) for start in range(0, table.num_rows, _SLICE)]
 
 
 def _table(kind: str, source: pa.Table, bands: Sequence[str], f_nu: Float) -> pa.Table:
@@ -110,5 +187,5 @@ def _table(kind: str, source: pa.Table, bands: Sequence[str], f_nu: Float) -> pa
     if absent := [name for name in names if name not in source.column_names]:
         raise BadInput(f"{kind} catalogue: column {', '.join(absent)} is missing")
     positions = {name: source[name] for name in names}
-    columns = {f"f_nu_{band}": f_nu[:, k].astype(np.float32) for k, band in enumerate(bands)}
+    columns = {f"f_nu_{band}": f_nu[k].astype(np.float32) for k, band in enumerate(bands)}
     return fluxes(kind, bands).build(positions | columns)

@@ -100,20 +100,21 @@ def render(
     """
     camera, band, channel = str(exposure["camera"]), str(exposure["band"]), str(exposure["channel"])
     if channel not in EFFECTS:
-        raise BadInput(
-            f"exposure {exposure['exposure_id']}: channel {channel!r} is not one of {', '.join(EFFECTS)}"
-        )
+        raise BadInput(f"exposure {exposure['exposure_id']}: channel {channel!r} is not one of {', '.join(EFFECTS)}")
     if detector is None:
         detector = focal_plane.detector(camera, str(task["detector"]), mission)
     system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
-    spread = _psf(detector, band, float(exposure["seeing"]), mission)
     exposure_time = float(exposure["exposure_time_s"])
     zero_point, electrons_per_ujy = throughput(detector.section, band, mission)
     scene = Scene(mission, detector.section, exposure_time, float(exposure["sky"]), 0.0)
-    flux = f"f_nu_{band}"
+    electrons = [
+        _fluxes(rows, fluxes, f"f_nu_{band}") * electrons_per_ujy * exposure_time
+        for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
+    ]
+    spread = _psf(detector, band, float(exposure["seeing"]), mission)
     sources, sizes = sources_of(
-        (galaxies, _fluxes(galaxies, galaxy_fluxes, flux) * electrons_per_ujy * exposure_time),
-        (stars, _fluxes(stars, star_fluxes, flux) * electrons_per_ujy * exposure_time),
+        (galaxies, electrons[0]),
+        (stars, electrons[1]),
         detector,
         system,
         spread,

@@ -7,6 +7,7 @@ science_cards, noise_free_cards
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,12 @@ from lake_schema import __version__, fits
 from lake_schema.fits import Card
 from lake_schema.tables.products import PRODUCTS
 
+_MJD_ZERO = datetime(1858, 11, 17)
+
 Writer = Callable[[Path], None]
 
 
-def products(
-    rendered: Rendered, truth: Sequence[str] = ("noise_free",)
-) -> tuple[pa.Table, dict[str, Writer]]:
+def products(rendered: Rendered, truth: Sequence[str] = ("noise_free",)) -> tuple[pa.Table, dict[str, Writer]]:
     """Rows of `products` and, by path, what writes each file.
 
     truth : truth maps that are wanted beside the science image
@@ -37,9 +38,7 @@ def products(
     if "noise_free" in truth:
         images["noise_free"] = (rendered.noise_free, noise_free_cards(rendered))
     exposure, detector = rendered.exposure, rendered.detector
-    stem = (
-        f"images/{int(exposure['exposure_id']):06d}/{exposure['channel']}_{exposure['band']}_{detector.name}"
-    )
+    stem = f"images/{int(exposure['exposure_id']):06d}/{exposure['channel']}_{exposure['band']}_{detector.name}"
     paths = {content: f"{stem}_{content}.fits" for content in images}
     ra, dec = focal_plane.centre(detector, rendered.wcs)
     n = len(images)
@@ -78,7 +77,11 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
         *_common(rendered),
         ("BUNIT", "adu", "unit of the pixels"),
         ("GAIN", gain, "[electron/adu]"),
-        ("RDNOISE", scene.value("read_noise", "electron"), "[electron] rms"),
+        (
+            "RDNOISE",
+            applied["read_noise"] * scene.value("read_noise", "electron"),
+            "[electron] rms in the image",
+        ),
         ("BIAS", scene.value("bias", "adu"), "[adu] added to every pixel"),
         ("SATURATE", _saturation(rendered, gain), "[adu] largest value"),
         ("SKYRATE", applied["background"] * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
@@ -102,8 +105,9 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("IMAGETYP", str(exposure["image_type"]), "image type"),
         ("EXPOSURE", int(exposure["exposure_id"]), "identifier of the exposure"),
         ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
-        ("MJD-OBS", float(exposure["mjd"]), "[d] start of the exposure, MJD"),
-        ("TIMESYS", "UTC", "time scale of MJD-OBS"),
+        ("DATE-OBS", _date(float(exposure["mjd"])), "start of the exposure"),
+        ("MJD-OBS", float(exposure["mjd"]), "[d] start of the exposure"),
+        ("TIMESYS", "UTC", "time scale of DATE-OBS and MJD-OBS"),
         *focal_plane.cards(rendered.wcs),
         ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] at the boresight"),
         ("ZEROPNT", rendered.zero_point, "[mag] AB of 1 electron/s"),
@@ -118,6 +122,11 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
     )
 
 
+def _date(mjd: float) -> str:
+    """ISO 8601, milliseconds."""
+    return (_MJD_ZERO + timedelta(days=mjd)).isoformat(timespec="milliseconds")
+
+
 def _saturation(rendered: Rendered, gain: float) -> float:
     scene = rendered.scene
     full_well = scene.value("full_well", "electron") / gain + scene.value("bias", "adu")
@@ -129,7 +138,5 @@ def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:
     cards: list[Card] = []
     for number, decision in enumerate(rendered.decisions, start=1):
         state = ("on" if decision.applied else "off") + (" (forced)" if decision.forced else "")
-        cards.append(
-            (f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1")
-        )
+        cards.append((f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1"))
     return tuple(cards)

@@ -137,9 +137,7 @@ def _lsstcam(mission: MissionConfiguration) -> tuple[Detector, ...]:
 # ------------------------------------------------------------------------------------------------ pointing
 
 
-def boresight_for(
-    detector: Detector, ra: float, dec: float, position_angle: float
-) -> tuple[float, float, float]:
+def boresight_for(detector: Detector, ra: float, dec: float, position_angle: float) -> tuple[float, float, float]:
     """The pointing that puts a detector's centre on a target.
 
     ra, dec        : deg, target

@@ -96,10 +96,7 @@ def _labels_of(kind: str, rows: pa.Table, flux: Float, position: tuple[str, str]
     mag = units.mag_of_f_nu(flux[brightest])
     z = rows["z_obs"].to_numpy()[brightest] if kind == "galaxy" else np.full(len(mag), np.nan)
     texts = [f"{m:.1f}" if np.isnan(zi) else f"{m:.1f}  z {zi:.2f}" for m, zi in zip(mag, z, strict=True)]
-    return [
-        Label(float(x), float(y), kind, float(m), t)
-        for x, y, m, t in zip(column, row, mag, texts, strict=True)
-    ]
+    return [Label(float(x), float(y), kind, float(m), t) for x, y, m, t in zip(column, row, mag, texts, strict=True)]
 
 
 # ------------------------------------------------------------------------------------------------ drawing
@@ -128,13 +125,9 @@ def picture(path: Path, image: npt.NDArray[Any], cards: Sequence[Card], names: S
     _scale_bar(main, header["PIXSCALE"], image.shape, image.shape[1] / 6)
     _compass(main, system, image.shape)
     for number, label in enumerate(_close_ups(names, image.shape, header["PIXSCALE"])):
-        axes = figure.add_axes(
-            (0.735, 0.01 + (0.93 + 0.008) / _CLOSE_UPS * (_CLOSE_UPS - 1 - number), 0.255, 0.305)
-        )
+        axes = figure.add_axes((0.735, 0.01 + (0.93 + 0.008) / _CLOSE_UPS * (_CLOSE_UPS - 1 - number), 0.255, 0.305))
         _close_up(axes, main, image, label, header["PIXSCALE"], upside_down, "abc"[number])
-    title = (
-        f"{header['INSTRUME'].upper()} {header['DETECTOR']}   {header['FILTER']}   {header['EXPTIME']:g} s"
-    )
+    title = f"{header['INSTRUME'].upper()} {header['DETECTOR']}   {header['FILTER']}   {header['EXPTIME']:g} s"
     figure.text(0.012, 0.958, title, color=_INK, fontsize=15, fontweight="bold")
     figure.text(0.988, 0.958, _caption(header, system, image.shape), color=_INK, fontsize=10.5, ha="right")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -152,9 +145,7 @@ def _caption(header: dict[str, Any], system: WCS, shape: tuple[int, ...]) -> str
 
 def _shrunk(image: npt.NDArray[Any], block: int) -> Float:
     ny, nx = (n // block for n in image.shape)
-    return np.asarray(
-        image[: ny * block, : nx * block].reshape(ny, block, nx, block).mean((1, 3), dtype=float)
-    )
+    return np.asarray(image[: ny * block, : nx * block].reshape(ny, block, nx, block).mean((1, 3), dtype=float))
 
 
 def _show(axes: Any, image: Float, block: int, shape: tuple[int, ...], upside_down: bool) -> None:
@@ -204,9 +195,7 @@ def _close_ups(names: Sequence[Label], shape: tuple[int, ...], pixel_scale: floa
     """The brightest galaxies that lie well inside the frame."""
     half = _CLOSE_UP_ARCSEC / pixel_scale / 2
     inside = [
-        x
-        for x in names
-        if x.kind == "galaxy" and half < x.column < shape[1] - half and half < x.row < shape[0] - half
+        x for x in names if x.kind == "galaxy" and half < x.column < shape[1] - half and half < x.row < shape[0] - half
     ]
     return _apart(inside, 3 * half)[:_CLOSE_UPS]
 
@@ -251,9 +240,7 @@ def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: f
     width = arcsec / pixel_scale / shape[1]
     axes.plot([0.03, 0.03 + width], [0.035, 0.035], color=_INK, linewidth=2.2, transform=axes.transAxes)
     text = f'{arcsec:g}"' if arcsec < 60 else f"{arcsec / 60:g}'"
-    label = axes.text(
-        0.03 + width / 2, 0.045, text, color=_INK, fontsize=11, ha="center", transform=axes.transAxes
-    )
+    label = axes.text(0.03 + width / 2, 0.045, text, color=_INK, fontsize=11, ha="center", transform=axes.transAxes)
     label.set_path_effects(_outline())
 
 
@@ -305,15 +292,9 @@ def _close_up(
     axes.imshow(shown, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     _frame(axes, extent[:2], extent[2:], upside_down)
     text = f"{letter}   {label.kind} {label.text}"
-    axes.text(0.04, 0.92, text, color=_GALAXY, fontsize=10, transform=axes.transAxes).set_path_effects(
-        _outline()
-    )
+    axes.text(0.04, 0.92, text, color=_GALAXY, fontsize=10, transform=axes.transAxes).set_path_effects(_outline())
     _scale_bar(axes, pixel_scale, (y1 - y0, x1 - x0), (x1 - x0) / 4)
-    main.add_patch(
-        Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=_INK, linewidth=0.8, alpha=0.8)
-    )
+    main.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=_INK, linewidth=0.8, alpha=0.8))
     corner = (x0, y1) if upside_down else (x1, y0)
-    mark = main.annotate(
-        letter, corner, (2, -2), textcoords="offset points", color=_INK, fontsize=10, va="top"
-    )
+    mark = main.annotate(letter, corner, (2, -2), textcoords="offset points", color=_INK, fontsize=10, va="top")
     mark.set_path_effects(_outline())

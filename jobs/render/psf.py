@@ -27,15 +27,13 @@ from lake_schema.mission.parameter import read_table
 
 Float = npt.NDArray[np.float64]
 
-# Monochromatic planes of equal photon number for a source of flat f_nu; 8 planes reproduce second moments to
-# 2e-4.
+# Monochromatic planes of equal photon number for flat f_nu; eight reproduce second moments to 2e-4.
 _PLANES = 8
 # Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide.
 _OVERSAMPLING = 3
-# Side of the plane, pixels; what lies outside (0.2 % of the flux for VIS) is lost.  No stamp of a point source is
-# larger.
+# Side of the plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is lost.
 SIDE = 512
-# Side of the optical transform, samples: the 0.15 % of the light beyond its border is absent, not folded back.
+# Side of the optical transform, samples; the 0.15 % of the light beyond its border is absent.
 _TRANSFORM = 2048
 # Side and samples a pixel of the drawing that tells the width.
 _CORE, _FINE = 243, 9
@@ -91,9 +89,7 @@ def ground_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
 
 def _tabulated(profile: galsim.GSObject, pixel_scale: float) -> Psf:
     """With azimuthal means of the profile sampled on pixels."""
-    image = profile.drawImage(
-        nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float
-    ).array
+    image = profile.drawImage(nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
     grid = np.arange(SIDE + 1) - SIDE // 2
     ring = np.rint(np.hypot(*np.meshgrid(grid, grid))).astype(int)
     inside = ring < SIDE // 2
@@ -125,9 +121,7 @@ def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) ->
         angle = mission.value(f"plm.pupil.{bar}.angle", "rad")
         # Normal form: no singular angle.
         across = np.abs(-np.sin(angle) * (x - bar_x) + np.cos(angle) * (y - bar_y))
-        blocked = _step(width / 2 - across, softness) * _step(
-            reach - np.hypot(x - bar_x, y - bar_y), softness
-        )
+        blocked = _step(width / 2 - across, softness) * _step(reach - np.hypot(x - bar_x, y - bar_y), softness)
         clear = clear * (1.0 - blocked)
     return np.asarray(clear)
 
@@ -190,9 +184,7 @@ def _polychromatic(
         total += _monochromatic(nm, wavelength, sampling, mission) / _PLANES
     total /= _edge_loss()
     k = 2 * np.pi * scipy.fft.fftfreq(_TRANSFORM, sampling)
-    transfer = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(
-        -0.5 * blur[0] * k[None, : _TRANSFORM // 2 + 1] ** 2
-    )
+    transfer = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(-0.5 * blur[0] * k[None, : _TRANSFORM // 2 + 1] ** 2)
     total = scipy.fft.irfft2(scipy.fft.rfft2(total) * transfer, s=total.shape)
     total = scipy.fft.fftshift(total)
     half = SIDE * _OVERSAMPLING // 2

@@ -35,7 +35,10 @@ def steps(lake: Path, request: Request) -> list[Step]:
         "inputs": {name: version.key for name, version in inputs.items()},
     }
     parts = tuple(
-        Part(f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet", {k: task[k] for k in ("exposure_id", "detector")})
+        Part(
+            f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet",
+            {k: task[k] for k in ("exposure_id", "detector")},
+        )
         for task in tasks
     )
     return [Step(Plan(PRODUCTS, facts, parts), work)]
@@ -58,7 +61,12 @@ def work(lake: Path, facts: Json) -> Output:
     (exposed,) = inputs["exposures"].rows(where=here).to_pylist()
     (task,) = inputs["tasks"].rows(where=here & (pc.field("detector") == facts["detector"])).to_pylist()
     flux = ["id", f"f_nu_{exposed['band']}"]
-    columns = {"galaxies": exposure.GALAXY_COLUMNS, "galaxy_fluxes": flux, "stars": exposure.STAR_COLUMNS, "star_fluxes": flux}
+    columns = {
+        "galaxies": exposure.GALAXY_COLUMNS,
+        "galaxy_fluxes": flux,
+        "stars": exposure.STAR_COLUMNS,
+        "star_fluxes": flux,
+    }
     rows = {name: inputs[name].in_cells(task["cells"], GENERATION_ORDER, wanted) for name, wanted in columns.items()}
     choice = request["mission"]
     overrides = tuple((key, Override(**override)) for key, override in choice["overrides"])

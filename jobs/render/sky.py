@@ -36,9 +36,7 @@ _TABLE_UNIT = 1e-8
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
-def sky_rate(
-    detector: Detector, band: str, ra: float, dec: float, mjd: float, mission: MissionConfiguration
-) -> float:
+def sky_rate(detector: Detector, band: str, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
     """Electrons per second in a pixel of a detector.
 
     Euclid : zodiacal light and scattered starlight;  ground : the band's dark-sky rate of the mission
@@ -57,9 +55,7 @@ def ecliptic(ra: float, dec: float) -> tuple[float, float]:
     x, y, z = np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)
     across = np.cos(tilt) * y + np.sin(tilt) * z
     up = np.cos(tilt) * z - np.sin(tilt) * y
-    return float(np.degrees(np.arctan2(across, x)) % 360.0), float(
-        np.degrees(np.arctan2(up, np.hypot(x, across)))
-    )
+    return float(np.degrees(np.arctan2(across, x)) % 360.0), float(np.degrees(np.arctan2(up, np.hypot(x, across))))
 
 
 def sun_longitude(mjd: float) -> float:
@@ -67,9 +63,7 @@ def sun_longitude(mjd: float) -> float:
     days = mjd - _MJD_J2000
     longitude = _SUN_LONGITUDE[0] + (_SUN_LONGITUDE[1] - _PRECESSION) * days
     anomaly = np.radians(_SUN_ANOMALY[0] + _SUN_ANOMALY[1] * days)
-    return float(
-        (longitude + _SUN_CENTRE[0] * np.sin(anomaly) + _SUN_CENTRE[1] * np.sin(2 * anomaly)) % 360.0
-    )
+    return float((longitude + _SUN_CENTRE[0] * np.sin(anomaly) + _SUN_CENTRE[1] * np.sin(2 * anomaly)) % 360.0)
 
 
 def zodiacal_intensity(from_sun: float, latitude: float) -> float:

@@ -74,9 +74,7 @@ class Sources:
         )
 
 
-def stamp_sizes(
-    electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: float, accuracy: Accuracy
-) -> Int:
+def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: float, accuracy: Accuracy) -> Int:
     """Side of each source's stamp, pixels.
 
     noise    : of a pixel, electrons

@@ -90,9 +90,7 @@ def _group(records: Iterable[Parameter]) -> dict[str, list[Parameter]]:
     seen = set()
     for record in records:
         if record.identity in seen:
-            raise BadInput(
-                f"mission parameter {record.key} ({record.status}, version {record.version}) is given twice"
-            )
+            raise BadInput(f"mission parameter {record.key} ({record.status}, version {record.version}) is given twice")
         seen.add(record.identity)
         group = groups.setdefault(record.key, [])
         if group:
@@ -105,9 +103,7 @@ def _group(records: Iterable[Parameter]) -> dict[str, list[Parameter]]:
 def _choose(key: str, group: Sequence[Parameter], ladder: Sequence[str], mjd: float | None) -> Parameter:
     for status in ladder:
         valid = [
-            p
-            for p in group
-            if p.status == status and (mjd is None or p.valid_from is None or p.valid_from <= mjd)
+            p for p in group if p.status == status and (mjd is None or p.valid_from is None or p.valid_from <= mjd)
         ]
         if valid:
             return max(valid, key=lambda p: (-math.inf if p.valid_from is None else p.valid_from, p.version))
@@ -133,9 +129,7 @@ def _overridden(chosen: Mapping[str, Parameter], key: str, value: float, unit: s
 @cache
 def _bounds() -> tuple[tuple[str, float, float, str], ...]:
     with (files("lake_schema.mission") / "bounds.csv").open(encoding="utf-8") as stream:
-        return tuple(
-            (r["pattern"], float(r["lo"]), float(r["hi"]), r["unit"]) for r in csv.DictReader(stream)
-        )
+        return tuple((r["pattern"], float(r["lo"]), float(r["hi"]), r["unit"]) for r in csv.DictReader(stream))
 
 
 def _check_bounds(parameter: Parameter) -> None:

@@ -52,9 +52,7 @@ class Parameter:
             raise BadInput(f"{where}: status is not one of {', '.join(STATUSES)}")
         if self.confidence not in CONFIDENCES:
             raise BadInput(f"{where}: confidence {self.confidence!r} is not one of {', '.join(CONFIDENCES)}")
-        if not math.isfinite(self.value) or (
-            self.valid_from is not None and not math.isfinite(self.valid_from)
-        ):
+        if not math.isfinite(self.value) or (self.valid_from is not None and not math.isfinite(self.valid_from)):
             raise BadInput(f"{where}: value = {self.value}, valid_from = {self.valid_from} must be finite")
         if not self.source:
             raise BadInput(f"{where}: has no source")
@@ -79,9 +77,7 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
     try:
         return float(parse_unit(unit, where).to(parse_unit(to, where), value))
     except u.UnitConversionError:
-        raise BadInput(
-            f"{where}: {unit or 'a pure number'} does not convert to {to or 'a pure number'}"
-        ) from None
+        raise BadInput(f"{where}: {unit or 'a pure number'} does not convert to {to or 'a pure number'}") from None
 
 
 def read(file: Traversable) -> tuple[Parameter, ...]:

@@ -16,7 +16,9 @@ HALOS = Table(
         Column("z_true", "float32", "", "src.redshift", "cosmological redshift", 0.0, 15.0),
         Column("z_obs", "float32", "", "src.redshift", "observed redshift, with the peculiar velocity", -0.02, 15.0),
         Column("log_mass", "float32", "", "phys.mass", "log10 of M_200m / (Msun/h)", 5.0, 17.0),
-        Column("concentration", "float32", "", "src.morph.param", "R_200m / scale radius of the NFW profile", 0.5, 100.0),
+        Column(
+            "concentration", "float32", "", "src.morph.param", "R_200m / scale radius of the NFW profile", 0.5, 100.0
+        ),
         Column(
             "complete",
             "bool",

@@ -64,9 +64,7 @@ def test_contracts():
 
 
 def test_one_file_knows_fits():
-    users = {
-        path.relative_to(ROOT).as_posix() for path in SOURCES if touches_fits(ast.parse(path.read_text()))
-    }
+    users = {path.relative_to(ROOT).as_posix() for path in SOURCES if touches_fits(ast.parse(path.read_text()))}
     assert users == {"lake_schema/fits.py"}
 
 

@@ -12,9 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 # spark-submit puts the folder of the submitted file first in sys.path.
 FOLDERS = ("lake_schema", "jobs", "benchmarks", "scripts")
-MODULES = sorted(
-    path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path.stem[:2] != "__"
-)
+MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path.stem[:2] != "__")
 ELSEWHERE = re.compile(r"(?<![\w.~])/(?:home|root|Users|work)/\w|\.\./shared|\bissues? #?\d", re.IGNORECASE)
 MAX_BYTES = 1_000_000
 
@@ -49,9 +47,7 @@ def test_elsewhere_is_recognised(text):
     assert ELSEWHERE.search(text)
 
 
-@pytest.mark.parametrize(
-    "text", ["the home/work balance", "/path/to/python", "issue of 2024", "framework/work"]
-)
+@pytest.mark.parametrize("text", ["the home/work balance", "/path/to/python", "issue of 2024", "framework/work"])
 def test_here_is_let_through(text):
     assert not ELSEWHERE.search(text)
 

@@ -38,12 +38,7 @@ def wheel(tmp_path_factory):
 
 
 def test_everything_of_the_packages_ships(wheel):
-    there = {
-        path
-        for name in ("lake_schema", "jobs")
-        for path in (ROOT / name).rglob("*")
-        if path.suffix in SHIPPED
-    }
+    there = {path for name in ("lake_schema", "jobs") for path in (ROOT / name).rglob("*") if path.suffix in SHIPPED}
     expected = {path.relative_to(ROOT).as_posix() for path in there}
     shipped = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert shipped == expected

@@ -13,7 +13,12 @@ from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
 from tests.universe import rows_of
 
-CARDS = (("EXPTIME", 560.53, "[s]"), ("SEED", "17", "of the numbers"), ("NSOURCES", 12, ""), ("GOOD", True, ""))
+CARDS = (
+    ("EXPTIME", 560.53, "[s]"),
+    ("SEED", "17", "of the numbers"),
+    ("NSOURCES", 12, ""),
+    ("GOOD", True, ""),
+)
 TYPES = ["u1", "i2", "u2", "i4", "f4", "f8"]
 
 

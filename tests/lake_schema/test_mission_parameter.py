@@ -20,9 +20,7 @@ def write(folder, *lines):
 
 def test_a_record_is_read_with_all_it_says(tmp_path):
     (record,) = read(write(tmp_path, 'a.gain,CBE,3.48,electron / adu,2,60000.5,published,"Somebody, 2024"'))
-    assert record == Parameter(
-        "a.gain", "CBE", 3.48, "electron / adu", 2, 60000.5, "published", "Somebody, 2024"
-    )
+    assert record == Parameter("a.gain", "CBE", 3.48, "electron / adu", 2, 60000.5, "published", "Somebody, 2024")
 
 
 @pytest.mark.parametrize(
@@ -63,7 +61,7 @@ def test_every_record_of_the_package_names_a_publication():
 
 
 def test_published_statuses_are_all_there():
-    """The ladder has something to choose from: the statuses that are published for the read noise and the gain."""
+    """The ladder has something to choose from."""
     found = {(r.key, r.status): r.value for r in read_all()}
     assert {s for k, s in found if k == "vis.read_noise"} == {"REQ", "DES", "CBE", "SIM"}
     assert found["vis.gain", "CBE"] == 3.48

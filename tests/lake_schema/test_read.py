@@ -40,7 +40,7 @@ def test_filters_and_columns(toy):
 
 
 def test_units_come_back_with_the_rows(toy):
-    assert toy.schema().field("flux").metadata[b"unit"] == b"uJy"
+    assert toy.schema.field("flux").metadata[b"unit"] == b"uJy"
 
 
 def test_a_table_that_is_not_there(lake):

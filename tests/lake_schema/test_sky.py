@@ -26,6 +26,27 @@ def test_a_cone_never_misses_a_cell(ra, dec, radius, order, seed):
     assert (np.diff(cells) > 0).all()
 
 
+@pytest.mark.parametrize("cones", [1000, pytest.param(100_000, marks=pytest.mark.nightly)])
+def test_no_cell_of_any_cone_is_missed(cones):
+    """Random cones, many at the poles, on RA = 0, on corners and edges of cells; places inside by the closed form."""
+    rng = np.random.default_rng(11)
+    ra, dec = rng.uniform(0, 360, cones), np.degrees(np.arcsin(rng.uniform(-1, 1, cones)))
+    special = rng.integers(0, 5, cones)
+    dec = np.where(special == 0, np.sign(dec) * (90 - 10.0 ** rng.uniform(-9, 0, cones)), dec)
+    ra = np.where(special == 1, 10.0 ** rng.uniform(-9, 0, cones) * rng.choice([-1, 1], cones), ra)
+    corner = hp.vec2ang(hp.boundaries(32, rng.integers(0, 12288, cones), nest=True)[:, :, 0], lonlat=True)
+    ra, dec = np.where(special == 2, corner[0], ra), np.where(special == 2, corner[1], dec)
+    radius, order = 10.0 ** rng.uniform(-6, 0.5, cones), rng.integers(3, 10, cones)
+    for i in range(cones):
+        r = np.radians(radius[i]) * np.sqrt(np.append(rng.random(20), [1.0, 0.0]))
+        bearing, lat = rng.uniform(0, 2 * np.pi, r.size), np.radians(dec[i])
+        inside = np.arcsin(np.clip(np.sin(lat) * np.cos(r) + np.cos(lat) * np.sin(r) * np.cos(bearing), -1, 1))
+        east = np.arctan2(np.sin(bearing) * np.sin(r) * np.cos(lat), np.cos(r) - np.sin(lat) * np.sin(inside))
+        cells = sky.cell_of(ra[i] + np.degrees(east), np.degrees(inside), order[i])
+        found = sky.cells_in_cone(ra[i], dec[i], radius[i], order[i])
+        assert np.isin(cells, found).all(), (ra[i], dec[i], radius[i], order[i])
+
+
 def test_a_cone_takes_few_cells_too_many():
     cells = sky.cells_in_cone(53.1, -27.8, 0.5, 8)
     centres = np.array([sky.cell_centre(8, c) for c in cells])

@@ -3,8 +3,10 @@
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from lake_schema import validate
+from lake_schema import parquet, validate
 from lake_schema.errors import BadInput
 from lake_schema.tables import declared
 from tests.universe import TOY, rows_of, toy_rows
@@ -86,11 +88,11 @@ def test_a_missing_value_only_where_declared(table, column):
         refused(holed, table, column.name, "row 1")
 
 
-def changed(rows, column, value):
+def changed(rows, column, value, row=1):
     place = rows.column_names.index(column.name)
     field = rows.schema.field(place)
     values = rows.column(place).to_pylist()
-    values[1] = [value] if column.type.startswith("list") else value
+    values[row] = [value] if column.type.startswith("list") and value is not None else value
     return rows.set_column(place, field, pa.array(values, field.type))
 
 
@@ -110,3 +112,65 @@ def test_a_compound_key():
     tasks = next(t for t in TABLES if t.name == "tasks")
     rows = rows_of(tasks, 3)
     refused(pa.concat_tables([rows, rows]), tasks, "rows 0 and 3")
+
+
+# Numbers that are strange and legal: kept to the bit where the bounds admit them, refused where they do not.
+ODD = {"minus zero": -0.0, "denormal": 5e-324, "small denormal32": 1e-45, "1e308": 1e308, "-1e308": -1e308, "minus one": -1.0}
+
+
+ODD_COLUMNS = [
+    pytest.param(*p.values, number, id=f"{p.id}-{name}")
+    for p in FLOATS
+    for name, number in ODD.items()
+    if abs(number) < 1e300 or p.values[1].type == "float64"  # 1e308 is no float32
+]
+
+
+@pytest.mark.parametrize(("table", "column", "number"), ODD_COLUMNS)
+def test_an_odd_number_is_kept_or_refused_but_never_changed(table, column, number, tmp_path):
+    value = np.dtype(column.type).type(number)
+    rows = changed(rows_of(table, 3), column, float(value))
+    lo = -np.inf if column.lo is None else column.lo
+    hi = np.inf if column.hi is None else column.hi
+    if not lo <= value <= hi:
+        refused(rows, table, column.name, "row 1")
+        return
+    assert validate.violations(rows, table) == []
+    parquet.write(tmp_path / "x.parquet", rows, table)
+    back = parquet.dataset([tmp_path / "x.parquet"], table.arrow()).to_table()[column.name].to_numpy()
+    assert back[1].tobytes() == value.tobytes()
+
+
+@st.composite
+def tables_and_rows(draw):
+    """Any declared table with rows drawn from the bounds of its columns, the bounds themselves among them."""
+    table = draw(st.sampled_from([t for t in TABLES if not t.is_catalogue] + [TOY, TABLES[0], TABLES[1]]))
+    rows = rows_of(table, draw(st.integers(1, 20)), draw(st.integers(0, 2**32 - 1)))
+    for column in table.columns:
+        if column.is_float and column.name not in (*table.key, "ra", "dec") and draw(st.booleans()):
+            width = int(column.type.removeprefix("float"))
+            lo, hi = (b if b is None else float(np.dtype(column.type).type(b)) for b in (column.lo, column.hi))
+            number = draw(st.floats(lo, hi, width=width, allow_nan=False, allow_infinity=False))
+            rows = changed(rows, column, number, draw(st.integers(0, rows.num_rows - 1)))
+    return table, rows
+
+
+def mutations(table, rows, column):
+    """Every single way to spoil a column."""
+    yield rows.drop_columns([column.name])
+    yield rows.rename_columns([f"{n}_" if n == column.name else n for n in rows.column_names])
+    place = rows.column_names.index(column.name)
+    yield rows.set_column(place, rows.schema.field(place).with_nullable(not column.nullable), rows.column(place))
+    if column.is_float:
+        yield from (changed(rows, column, bad, 0) for bad in (float("nan"), float("inf"), float("-inf")))
+    if not column.nullable:
+        yield changed(rows, column, None, rows.num_rows - 1)
+
+
+@given(tables_and_rows(), st.data())
+def test_what_is_declared_passes_and_any_one_mutation_is_refused(example, data):
+    table, rows = example
+    assert validate.violations(rows, table) == []
+    column = data.draw(st.sampled_from(table.columns))
+    for spoiled in mutations(table, rows, column):
+        refused(spoiled, table, column.name)

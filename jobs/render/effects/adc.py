@@ -8,9 +8,7 @@ from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
 
-def apply(
-    frame: Frame, gain: float, bias: float, largest: float, rng: np.random.Generator | None = None
-) -> Frame:
+def apply(frame: Frame, gain: float, bias: float, largest: float, rng: np.random.Generator | None = None) -> Frame:
     """Electrons [ny, nx] -> ADU, whole numbers in [0, largest].
 
     gain : electrons per ADU;  bias : ADU

@@ -15,6 +15,4 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     return frame + rng.poisson(electrons, frame.shape)
 
 
-EFFECT = Effect(
-    "dark_current", apply, lambda scene: (scene.dark_electrons,), lambda scene: scene.dark_electrons
-)
+EFFECT = Effect("dark_current", apply, lambda scene: (scene.dark_electrons,), lambda scene: scene.dark_electrons)

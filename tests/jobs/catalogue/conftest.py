@@ -37,9 +37,7 @@ def drawn(universe, dust, library):
     columns = {name: rows[name].to_numpy() for name in rows.column_names if not rows[name].null_count}
     z = columns["z_true"].astype(float)
     m_r = columns["abs_mag_r01"].astype(float)
-    sed = band_ratios.Sed(
-        *(columns[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1"))
-    )
+    sed = band_ratios.Sed(*(columns[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
 
     def mag(band):
         table = band_ratios.load(library, band, 2.3, 0.5)

@@ -30,9 +30,7 @@ def clean(table, template, z):
 )
 def test_k_corrections_of_the_reference_band(reference, template, published):
     """Calculated once from the same four spectra with a code of its own, lines left in."""
-    assert [clean(reference, template, z) for z in (0.1, 0.5, 1.0, 2.0)] == pytest.approx(
-        published, abs=0.025
-    )
+    assert [clean(reference, template, z) for z in (0.1, 0.5, 1.0, 2.0)] == pytest.approx(published, abs=0.025)
 
 
 @pytest.mark.parametrize(

@@ -155,9 +155,7 @@ def test_other_cells_and_seeds_have_other_galaxies(universe, dust, cell):
         galaxies.draw(CELL, SEED + 1, universe, dust),
     ):
         n = min(len(other), len(cell)) // 2
-        assert (
-            not np.isin(other["abs_mag_r01"].to_numpy()[:n], cell["abs_mag_r01"].to_numpy()[:n]).mean() > 0.01
-        )
+        assert not np.isin(other["abs_mag_r01"].to_numpy()[:n], cell["abs_mag_r01"].to_numpy()[:n]).mean() > 0.01
 
 
 def test_a_step_leaves_the_numbers_of_the_others(universe, dust, cell):

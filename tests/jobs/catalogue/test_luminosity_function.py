@@ -17,9 +17,7 @@ magnitudes, redshifts = st.floats(-26.0, -8.0), st.floats(0.0, 3.0)
 @pytest.mark.parametrize("x", [1e-6, 1e-2, 1.0, 30.0, 300.0])
 def test_incomplete_gamma_is_its_integral(a, x):
     # In t = x + s: a smooth integrand, and e^-x taken out.
-    tail = quad(
-        lambda s: np.exp(a * np.log(x * np.exp(s)) - x * np.expm1(s)), 0.0, np.log1p(60.0 / x), epsrel=1e-12
-    )[0]
+    tail = quad(lambda s: np.exp(a * np.log(x * np.exp(s)) - x * np.expm1(s)), 0.0, np.log1p(60.0 / x), epsrel=1e-12)[0]
     assert lf.upper_gamma(a, x) == pytest.approx(tail * np.exp(-x), rel=1e-9)
 
 
@@ -74,9 +72,7 @@ def test_counts_are_the_integral_over_the_volume():
     def shell(z):
         limit = min(24.0 - float(cosmology.distance_modulus(z)), space.m_faintest)
         depth = cosmology.HUBBLE_DISTANCE / float(cosmology.expansion_rate(z))
-        return (
-            float(lf.number_density(SCHECHTER, limit, z)) * float(cosmology.comoving_distance(z)) ** 2 * depth
-        )
+        return float(lf.number_density(SCHECHTER, limit, z)) * float(cosmology.comoving_distance(z)) ** 2 * depth
 
     exact = quad(shell, space.z_min, space.z_max, epsrel=1e-8, limit=200)[0] * (np.pi / 180.0) ** 2
     assert counts.per_deg2 == pytest.approx(exact, rel=1e-4)

@@ -130,6 +130,4 @@ def test_thinner_discs_are_more_inclined(q1, q2):
 
 def test_inclination_keeps_its_digits_where_a_disc_is_nearly_round():
     """i = sqrt(2 (1 - q) / 0.99) for 1 - q << 1."""
-    assert np.radians(morphology.inclination(1 - 1e-12, 0.1)) == pytest.approx(
-        np.sqrt(2e-12 / 0.99), rel=1e-3
-    )
+    assert np.radians(morphology.inclination(1 - 1e-12, 0.1)) == pytest.approx(np.sqrt(2e-12 / 0.99), rel=1e-3)

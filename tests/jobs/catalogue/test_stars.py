@@ -30,9 +30,7 @@ def galactic_cell(lon, lat):
     return int(sky.cell_of([at.ra.deg], [at.dec.deg], ids.GENERATION_ORDER)[0])
 
 
-@pytest.mark.parametrize(
-    ("b", "published"), [(90, 36451), (60, 47254), (45, 67569), (30, 124538), (20, 249659)]
-)
+@pytest.mark.parametrize(("b", "published"), [(90, 36451), (60, 47254), (45, 67569), (30, 124538), (20, 249659)])
 def test_counts_with_dust(dust, b, published):
     """Stars deg^-2 with H < 26 (Vega), mean over longitude; the dust takes a few per cent."""
     numbers = [len(stars.draw(galactic_cell(lon, b), SEED, UNIVERSE, dust)) for lon in range(0, 360, 45)]
@@ -59,12 +57,8 @@ def test_a_cell_is_the_same_alone_or_among_others(dust, cell):
 
 
 def test_magnitudes_distances_and_the_limit_agree(cell):
-    columns = {
-        name: cell[name].to_numpy().astype(float) for name in ("mag_h", "abs_mag_h", "distance", "a_v")
-    }
-    assert columns["mag_h"] == pytest.approx(
-        columns["abs_mag_h"] + 5 * np.log10(columns["distance"] / 10), abs=1e-4
-    )
+    columns = {name: cell[name].to_numpy().astype(float) for name in ("mag_h", "abs_mag_h", "distance", "a_v")}
+    assert columns["mag_h"] == pytest.approx(columns["abs_mag_h"] + 5 * np.log10(columns["distance"] / 10), abs=1e-4)
     seen = columns["mag_h"] + 0.178 * columns["a_v"]
     assert 25.9 < seen.max() <= 26.0 + 1e-4
 
@@ -109,17 +103,13 @@ def test_a_cell_in_the_plane(dust):
 
 
 def test_more_stars_than_can_be_numbered_are_refused(dust):
-    with pytest.raises(
-        BadInput, match=r"cell \d+ \(l = .*\) holds .* stars .* ask for a brighter star_limit"
-    ):
+    with pytest.raises(BadInput, match=r"cell \d+ \(l = .*\) holds .* stars .* ask for a brighter star_limit"):
         stars.draw(galactic_cell(0.0, 0.5), SEED, UNIVERSE, dust)
 
 
 def test_labels_leave_the_numbers_of_the_others(dust, cell):
     metallicity = dataclasses.replace(UNIVERSE.galaxy.metallicity, mean=(0.1, -0.2, -0.5))
-    changed = dataclasses.replace(
-        UNIVERSE, galaxy=dataclasses.replace(UNIVERSE.galaxy, metallicity=metallicity)
-    )
+    changed = dataclasses.replace(UNIVERSE, galaxy=dataclasses.replace(UNIVERSE.galaxy, metallicity=metallicity))
     other = stars.draw(CELL, SEED, changed, dust)
     differ = {name for name in cell.column_names if not cell[name].equals(other[name])}
     assert differ == {"metallicity", "teff", "sed"}

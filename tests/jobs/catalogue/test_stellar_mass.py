@@ -50,8 +50,7 @@ def test_internal_dust_is_undone(library, law):
     spectrum = library.flux[template].astype(float)
     dusty = spectrum * 10.0 ** (-0.4 * extinction.laws(library.wavelength)[law] * ebv)
     dimmed = -2.5 * np.log10(
-        passbands.ab_flux(rest, library.wavelength, dusty)
-        / passbands.ab_flux(rest, library.wavelength, spectrum)
+        passbands.ab_flux(rest, library.wavelength, dusty) / passbands.ab_flux(rest, library.wavelength, spectrum)
     )
     bare = stellar_mass.log_sfr(light, np.array([-20.0]), two(template))
     behind = stellar_mass.log_sfr(light, np.array([-20.0 + dimmed]), two(template, law, ebv))

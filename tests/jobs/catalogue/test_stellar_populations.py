@@ -25,9 +25,7 @@ def test_masses_follow_the_broken_power_law():
     norm = 0.075 / quad(law, 0.075, 1.0, points=[0.5])[0]
     for low, high in ((0.1, 0.3), (0.3, 0.8), (0.8, 2.0), (2.0, 9.0)):
         below = populations.mass_below(MASSES, [low, high])
-        assert below[1] - below[0] == pytest.approx(
-            norm * quad(law, low, high, points=[0.5, 1.0])[0], rel=1e-6
-        )
+        assert below[1] - below[0] == pytest.approx(norm * quad(law, low, high, points=[0.5, 1.0])[0], rel=1e-6)
 
 
 @given(st.floats(0.01, 100.0), st.floats(0.01, 100.0))

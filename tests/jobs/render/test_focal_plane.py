@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.render import focal_plane
-from jobs.render.focal_plane import boresight_for, detector, detectors, jacobian, pixel_of_sky, sky_of_pixel, wcs
+from jobs.render.focal_plane import (
+    boresight_for,
+    detector,
+    detectors,
+    jacobian,
+    pixel_of_sky,
+    sky_of_pixel,
+    wcs,
+)
 from lake_schema import sky
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
@@ -133,7 +141,11 @@ def test_poles(d, dec):
     np.testing.assert_allclose(np.sort(y), [-0.5, -0.5, d.ny - 0.5, d.ny - 0.5], atol=1e-6)
 
 
-@given(SKY, ANY_DETECTOR, st.lists(st.tuples(st.floats(-400, 4500), st.floats(-400, 4500)), min_size=1, max_size=20))
+@given(
+    SKY,
+    ANY_DETECTOR,
+    st.lists(st.tuples(st.floats(-400, 4500), st.floats(-400, 4500)), min_size=1, max_size=20),
+)
 def test_pixel_to_sky_and_back(pointing, d, pixels):
     system = wcs(d, *boresight_for(d, *pointing))
     x, y = np.transpose(pixels)

@@ -45,7 +45,9 @@ def test_bulge_radius_is_the_half_light_semi_major_axis():
     """Half the light lies inside the ellipse of that semi-major axis, whatever the axis ratio."""
     for q in (1.0, 0.6, 0.3):
         bulge = profiles.profile(
-            shape(bulge_fraction=1.0, bulge_sersic_index=1.0, bulge_half_light_radius=0.6, bulge_axis_ratio=q), 0, 1e-3
+            shape(bulge_fraction=1.0, bulge_sersic_index=1.0, bulge_half_light_radius=0.6, bulge_axis_ratio=q),
+            0,
+            1e-3,
         )
         image = bulge.drawImage(nx=801, ny=801, scale=0.02, method="no_pixel", dtype=float).array
         y, x = (np.mgrid[:801, :801] - 400) * 0.02
@@ -65,7 +67,12 @@ def test_disc_radius_is_seen_face_on():
 
 
 @given(
-    st.floats(0, 1), st.floats(0.3, 6.2), st.floats(0.02, 1), st.floats(0, 90), st.floats(-0.3, 0.3), st.floats(-0.4, 0.4)
+    st.floats(0, 1),
+    st.floats(0.3, 6.2),
+    st.floats(0.02, 1),
+    st.floats(0, 90),
+    st.floats(-0.3, 0.3),
+    st.floats(-0.4, 0.4),
 )
 def test_flux_is_one_whatever_the_lens(fraction, index, q, inclination, gamma, kappa):
     body = profiles.profile(
@@ -102,7 +109,10 @@ def test_images_lie_tangentially_about_a_mass(bearing):
 def test_reduced_shear_and_size():
     """kappa = 0.1, gamma = 0.05: stretched by 1 / (1 - kappa -+ gamma), the flux left to the catalogue."""
     v, u = (np.mgrid[:401, :401] - 200) * 0.02
-    plain, lensed = drawn(disk_half_light_radius=0.4), drawn(disk_half_light_radius=0.4, kappa=0.1, gamma1=0.05)
+    plain, lensed = (
+        drawn(disk_half_light_radius=0.4),
+        drawn(disk_half_light_radius=0.4, kappa=0.1, gamma1=0.05),
+    )
     width = [[np.sqrt((i * a * a).sum() / i.sum() - 0.04**2) for a in (u, v)] for i in (plain, lensed)]
     assert width[1][0] / width[0][0] == pytest.approx(1 / (1 - 0.1 - 0.05), rel=0.01)
     assert width[1][1] / width[0][1] == pytest.approx(1 / (1 - 0.1 + 0.05), rel=0.01)
@@ -110,7 +120,8 @@ def test_reduced_shear_and_size():
 
 
 @pytest.mark.parametrize(
-    ("kappa", "gamma1", "gamma2"), [(1.0, 0.1, 0.0), (1.0, 0.0, 0.0), (0.5, 0.5, 0.0), (0.2, -0.9, 0.9), (2.0, 1.0, 1.0)]
+    ("kappa", "gamma1", "gamma2"),
+    [(1.0, 0.1, 0.0), (1.0, 0.0, 0.0), (0.5, 0.5, 0.0), (0.2, -0.9, 0.9), (2.0, 1.0, 1.0)],
 )
 def test_critical_lines_do_no_harm(kappa, gamma1, gamma2):
     found = shape(kappa=kappa, gamma1=gamma1, gamma2=gamma2)
@@ -126,7 +137,10 @@ def test_critical_lines_do_no_harm(kappa, gamma1, gamma2):
 def test_light_outside_a_radius_is_bounded(index, radius, fraction):
     """A round galaxy: exactly what lies outside, by the incomplete gamma function's inverse."""
     found = shape(
-        bulge_fraction=fraction, bulge_sersic_index=index, bulge_half_light_radius=radius, disk_half_light_radius=radius
+        bulge_fraction=fraction,
+        bulge_sersic_index=index,
+        bulge_half_light_radius=radius,
+        disk_half_light_radius=radius,
     )
     at = profiles.outside(found, np.array([radius, 3 * radius]))[0]
     assert at[0] == pytest.approx(0.5, abs=2e-3)

@@ -1,13 +1,13 @@
-"""The Euclid PSF against published optics and galsim's own diffraction; the seeing disc against its formula."""
+"""The Euclid PSF against published optics and galsim's diffraction; the seeing disc against its formula."""
 
 from dataclasses import replace
 
 import galsim
 import numpy as np
 import pytest
-from scipy.ndimage import uniform_filter
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import uniform_filter
 
 from jobs.fluxes import passbands
 from jobs.render import psf
@@ -88,7 +88,7 @@ def test_diffraction_is_galsims():
 
 @pytest.mark.parametrize("wavelength", [5500.0, 7000.0, 9000.0])
 def test_wings_hold_what_edges_diffract(wavelength):
-    """Beyond an angle far from the core lies lambda P / (2 pi^2 A angle), P and A perimeter and area of the pupil.
+    """Beyond a large angle lies lambda P / (2 pi^2 A angle), P and A perimeter and area of the pupil.
 
     Perimeter: stop, central stop, and both sides of three bars, cut short by the stops.
     """
@@ -109,11 +109,15 @@ def test_wings_hold_what_edges_diffract(wavelength):
     [(5500, 0.108, 0.132, 0.153, 0.28), (7000, 0.129, 0.147, 0.164, 0.23), (9000, 0.160, 0.173, 0.186, 0.17)],
 )
 def test_widths_by_wavelength(wavelength, optics, diffused, pixelated, peak):
-    """FWHM of optics and jitter, then diffusion, then the pixel; fraction of the light in the central pixel."""
+    """FWHM of optics and jitter, then diffusion, then the pixel; fraction of light in the central pixel."""
     image = galsim.Image(plane(np.zeros(12), wavelength), scale=SAMPLING)
     focal = galsim.InterpolatedImage(image, pad_factor=2)
     steps = [focal, galsim.Gaussian(sigma=0.025)]
-    for width, more in ((optics, None), (diffused, galsim.Gaussian(sigma=0.032)), (pixelated, galsim.Pixel(0.1))):
+    for width, more in (
+        (optics, None),
+        (diffused, galsim.Gaussian(sigma=0.032)),
+        (pixelated, galsim.Pixel(0.1)),
+    ):
         steps += [more] if more else []
         image = galsim.Convolve(steps).drawImage(nx=96, ny=96, scale=0.0125, method="no_pixel")
         assert image.calculateFWHM() == pytest.approx(width, abs=0.003)

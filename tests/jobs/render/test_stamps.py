@@ -85,7 +85,11 @@ def test_neighbouring_orientations_show_the_same_sky():
 
 
 @given(
-    st.sampled_from(sorted(KINDS)), st.floats(70, 90), st.floats(70, 90), st.floats(1, 1e5), st.sampled_from([DRAFT, SURVEY])
+    st.sampled_from(sorted(KINDS)),
+    st.floats(70, 90),
+    st.floats(70, 90),
+    st.floats(1, 1e5),
+    st.sampled_from([DRAFT, SURVEY]),
 )
 def test_no_light_is_lost(kind, x, y, electrons, accuracy):
     detector, system, psf = scene("lsstcam", "R22_S11")
@@ -111,7 +115,9 @@ def test_the_part_on_the_frame_is_the_whole_stamp_cut(x, y):
     sizes = np.array([96])
     cut = stamps.draw(source, sizes, psf, 160, 160)
     moved = one_source(detector, system, 1e5, x + 600, y + 600, inclination=40.0)
-    moved = stamps.Sources(moved.ids, moved.column, moved.row, source.jacobian, moved.electrons, moved.shape, moved.shapes)
+    moved = stamps.Sources(
+        moved.ids, moved.column, moved.row, source.jacobian, moved.electrons, moved.shape, moved.shapes
+    )
     whole = stamps.draw(moved, sizes, psf, 1400, 1400)
     np.testing.assert_allclose(cut, whole[600:760, 600:760], atol=1e-9 * max(whole.max(), 1))
 
@@ -120,14 +126,21 @@ def many(n, seed=5):
     rng = np.random.default_rng(seed)
     form = profiles.shapes(
         galaxies(
-            rng.random(n), rng.random(n), bulge_fraction=rng.random(n), bulge_sersic_index=rng.choice([1.0, 2.0], n),
+            rng.random(n), rng.random(n),
+            bulge_fraction=rng.random(n), bulge_sersic_index=rng.choice([1.0, 2.0], n),
             inclination=90 * rng.random(n), position_angle=180 * rng.random(n),
         )
     )  # fmt: skip
     jacobian = np.tile(np.array([[0.2, 0.01], [-0.01, 0.2]]), (n, 1, 1))
     shape = np.where(np.arange(n) % 4 == 0, -1, np.arange(n))
     return stamps.Sources(
-        np.arange(n), 160 * rng.random(n), 160 * rng.random(n), jacobian, 10 ** rng.uniform(1, 5, n), shape, form
+        np.arange(n),
+        160 * rng.random(n),
+        160 * rng.random(n),
+        jacobian,
+        10 ** rng.uniform(1, 5, n),
+        shape,
+        form,
     )
 
 
@@ -150,9 +163,7 @@ def test_sizes_follow_flux_noise_and_accuracy():
     sources, psf = many(200), spread("lsstcam")
 
     def sizes(factor=1.0, noise=NOISE, accuracy=SURVEY):
-        return stamps.stamp_sizes(
-            factor * sources.electrons, sources.shape, sources.shapes, psf, noise, accuracy
-        )
+        return stamps.stamp_sizes(factor * sources.electrons, sources.shape, sources.shapes, psf, noise, accuracy)
 
     base = sizes()
     assert set(base) <= set(stamps.SIZES)
@@ -193,7 +204,9 @@ def test_the_jacobian_of_the_place_is_used():
     detector, system, psf = scene("vis", "2-3")
     source = one_source(detector, system, 1e6, disk_half_light_radius=0.6)
     jacobian = np.array([[[0.1, 0.0], [0.0, 0.05]]])
-    source = stamps.Sources(source.ids, source.column, source.row, jacobian, source.electrons, source.shape, source.shapes)
+    source = stamps.Sources(
+        source.ids, source.column, source.row, jacobian, source.electrons, source.shape, source.shapes
+    )
     point = one_source(detector, system, 1e6)
     _, second = moments(drawn(source, psf, accuracy=REFERENCE))
     _, spread_out = moments(drawn(point, psf, accuracy=REFERENCE))

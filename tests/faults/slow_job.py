@@ -1,0 +1,30 @@
+"""A job for spark-submit whose parts take a while, so that it can be interrupted: --lake LAKE --request SEED_FILE."""
+
+import sys
+import time
+from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path[0] = str(Path(__file__).resolve().parents[2])
+
+from jobs.shell import Job, Step, main
+from tests.universe import plain_plan, plain_work
+
+# Parts, and s a part: the last driver to be stopped must still be at work.
+PARTS, SLOW = 24, 1.5
+
+
+def steps(lake, request):
+    return [Step(plain_plan(request.seed, parts=PARTS), work)]
+
+
+def work(root, facts):
+    if (root / "slow").exists():
+        time.sleep(SLOW)
+    return plain_work(root, facts)
+
+
+JOB = Job("slow_job", "Toy rows, slowly.", steps)
+
+if __name__ == "__main__":
+    sys.exit(main(JOB))

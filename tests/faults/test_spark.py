@@ -1,0 +1,158 @@
+"""Accidents under Spark: kernels that raise, workers that die, drivers that are stopped or killed."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from jobs import shell
+from jobs.shell import Job, Step
+from lake_schema import layout
+from tests.faults import promise, slow_job
+from tests.universe import plain_plan, plain_work
+
+pytestmark = pytest.mark.spark
+
+SLOW_JOB = Path(slow_job.__file__)
+
+
+def poisoned(root, facts):
+    """Toy rows, with what the files `raise-N`, `die-N` and `die-once-N` in the lake ask of part N."""
+    part = facts["part"]
+    if (root / f"raise-{part}").exists():
+        raise ValueError("row 17: no such template")
+    if (root / f"die-{part}").exists():
+        os._exit(137)
+    if (root / f"die-once-{part}").exists():
+        (root / f"die-once-{part}").unlink()
+        os._exit(137)
+    return plain_work(root, facts)
+
+
+JOB = Job("poisoned", "Toy rows.", lambda root, request: [Step(plain_plan(request.seed), poisoned)])
+
+
+@pytest.fixture(scope="module")
+def request_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("request") / "r.toml"
+    path.write_text('name = "x"\nseed = 2\n[area]\ncone = {ra = 0, dec = 0, radius = 1}\n')
+    return path
+
+
+@pytest.fixture
+def run(spark, lake, request_file, capfd):
+    promise.make(lake, "plain", 1)
+
+    def run_job():
+        status = shell.main(JOB, ["--lake", str(lake), "--request", str(request_file)])
+        return status, capfd.readouterr().err.strip().splitlines()
+
+    return run_job
+
+
+@pytest.fixture(scope="module")
+def wanted(tmp_path_factory):
+    root = tmp_path_factory.mktemp("undisturbed")
+    promise.make(root, "plain", 2)
+    return promise.sums(root, "plain")
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"), [("raise-1", "1.parquet: ValueError: row 17: no such template"), ("die-1", "1.parquet: its worker died")]
+)
+def test_a_part_that_fails_is_named_and_the_rest_is_kept(run, lake, wanted, harm, words):
+    (lake / harm).touch()
+    status, lines = run()
+    assert (status, len(lines)) == (1, 1)
+    assert lines[0] == f"poisoned: table plain: 1 of 3 parts failed: {words}"
+    assert promise.current(lake, "plain") == promise.key("plain", 1)
+    log = [json.loads(line) for line in max(layout.runs(lake).glob("*.jsonl")).read_text().splitlines()]
+    (failed,) = [line for line in log if "error" in line]
+    assert failed["part"] == "1.parquet"
+    (lake / harm).unlink()
+    assert run() == (0, [])
+    assert promise.sums(lake, "plain") == wanted
+    log = [json.loads(line) for line in max(layout.runs(lake).glob("*.jsonl")).read_text().splitlines()]
+    assert [line["part"] for line in log if "part" in line] == ["1.parquet"]
+
+
+def test_a_worker_that_dies_once_is_replaced(run, lake, wanted):
+    (lake / "die-once-2").touch()
+    assert run() == (0, [])
+    assert not (lake / "die-once-2").exists()
+    assert promise.sums(lake, "plain") == wanted
+
+
+def children(pid):
+    """Process ids below `pid`."""
+    found = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout.split()
+    below, parents = {pid}, dict(zip(map(int, found[::2]), map(int, found[1::2]), strict=True))
+    for _ in range(5):
+        below |= {child for child, parent in parents.items() if parent in below}
+    return below - {pid}
+
+
+def started(lake, request_file):
+    """A spark-submit of the slow job, in a process group of its own."""
+    (lake / "slow").touch()
+    submit = shutil.which("spark-submit", path=str(Path(sys.executable).parent))
+    command = [submit, str(SLOW_JOB), "--lake", str(lake), "--request", str(request_file)]
+    return subprocess.Popen(command, cwd="/", start_new_session=True, stderr=subprocess.PIPE, text=True)
+
+
+def past_first_receipt(lake, driver):
+    deadline = time.monotonic() + 120
+    while not list(lake.glob("plain/.receipts-*/*.json")):
+        assert driver.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+# Ctrl-C reaches the whole group of a terminal, `kill` the process that was started, and kill -9 here everyone.
+ENDS = [(signal.SIGINT, "group", 130), (signal.SIGTERM, "driver", 143), (signal.SIGKILL, "group", -signal.SIGKILL)]
+
+
+@pytest.fixture(scope="module")
+def drivers(tmp_path_factory, request_file):
+    """One for each end, all started at once."""
+    lakes = [layout.lake(tmp_path_factory.mktemp("lake")) for _ in ENDS]
+    for lake in lakes:
+        promise.make(lake, "plain", 1)
+    running = [(lake, started(lake, request_file)) for lake in lakes]
+    yield dict(zip(ENDS, running, strict=True))
+    for _, driver in running:
+        if driver.poll() is None:
+            os.killpg(driver.pid, signal.SIGKILL)
+        driver.stderr.close()
+
+
+@pytest.mark.parametrize("end", ENDS, ids=lambda end: f"{end[0].name} to the {end[1]}")
+def test_a_driver_that_is_stopped(drivers, spark, request_file, end):
+    number, whom, status = end
+    lake, driver = drivers[end]
+    past_first_receipt(lake, driver)
+    below = children(driver.pid)
+    assert len(below) >= 3
+    stopped = time.monotonic()
+    os.killpg(driver.pid, number) if whom == "group" else driver.send_signal(number)
+    assert driver.wait(10) == status
+    lines = driver.stderr.read().strip().splitlines()
+    assert len(lines) == (0 if number == signal.SIGKILL else 1), lines
+    assert all("a second run continues where this one ended" in line for line in lines)
+    while any(Path(f"/proc/{pid}").exists() for pid in below):
+        assert time.monotonic() - stopped < 10, "a worker was left behind"
+        time.sleep(0.1)
+    assert promise.current(lake, "plain") == promise.key("plain", 1)
+    (lake / "slow").unlink()
+    before = len(list(lake.glob("plain/.receipts-*/*.json")))
+    assert shell.main(slow_job.JOB, ["--lake", str(lake), "--request", str(request_file)]) == 0
+    assert promise.current(lake, "plain") == plain_plan(2, parts=slow_job.PARTS).key
+    last = max(layout.runs(lake).glob("*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
+    log = [json.loads(line) for line in last.read_text().splitlines()]
+    assert sum("part" in line for line in log) == slow_job.PARTS - before

@@ -1,0 +1,115 @@
+"""The loop over effects: what a scene needs, what a request forces, and who draws which numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jobs.render.channels import ext, vis
+from jobs.render.effects.effect import Scene, apply_all, decide
+from jobs.rng import stream
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+
+SCENE = Scene(resolve(), "vis", 560.0, 0.25, 1e4)
+NAMES = ["background", "poisson", "dark_current", "full_well", "read_noise", "adc"]
+
+
+def run(effects, frame, scene=SCENE, forced=None, seed=1):
+    return apply_all(frame, effects, scene, lambda name: stream(seed, 7, "3-4", name), forced)
+
+
+def test_the_order_of_physics():
+    assert [effect.name for effect in vis.EFFECTS] == NAMES
+    assert [effect.name for effect in ext.EFFECTS] == NAMES
+
+
+def test_pixel_noise_is_sky_dark_and_reading():
+    mission = SCENE.mission
+    dark, read = mission.value("vis.dark_current"), mission.value("vis.read_noise")
+    assert SCENE.pixel_noise == pytest.approx(np.sqrt(0.25 * 560 + dark * 560 + read**2))
+
+
+def test_a_frame_becomes_adu():
+    frame = np.full((300, 300), 50.0)
+    image, decisions = run(vis.EFFECTS, frame)
+    assert [d.name for d in decisions] == NAMES
+    assert (frame == 50.0).all()
+    assert (image == np.rint(image)).all()
+    expected = (50.0 + 140.0) / 3.48 + 1000
+    assert image.mean() == pytest.approx(expected, abs=0.1)
+    noise = np.sqrt(190.0 + 4.4**2) / 3.48
+    assert image.std() == pytest.approx(np.hypot(noise, 12**-0.5), rel=0.02)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_numbers_are_the_effects_own(seed):
+    """Switching the dark current on leaves the shot noise and the read noise as they were."""
+    frame = np.full((50, 50), 100.0)
+    without, _ = run(vis.EFFECTS[:5], frame, forced={"dark_current": False}, seed=seed)
+    with_dark, _ = run(vis.EFFECTS[:5], frame, forced={"dark_current": True}, seed=seed)
+    extra = with_dark - without
+    np.testing.assert_allclose(extra, np.rint(extra), atol=1e-9)
+    assert 0 < extra.mean() < 1
+    again, _ = run(vis.EFFECTS[:5], frame, forced={"dark_current": False}, seed=seed)
+    np.testing.assert_array_equal(without, again)
+    other, _ = run(vis.EFFECTS[:5], frame, forced={"dark_current": False}, seed=seed + 10)
+    assert (other != without).any()
+
+
+def test_what_a_request_forces_is_recorded():
+    decisions = {d.name: d for d in decide(vis.EFFECTS, SCENE, {"poisson": False, "dark_current": True})}
+    assert not decisions["poisson"].applied
+    assert decisions["poisson"].forced
+    assert decisions["dark_current"].applied
+    assert decisions["read_noise"].applied
+    assert not decisions["read_noise"].forced
+
+
+def test_strange_or_impossible_wishes_are_refused():
+    with pytest.raises(BadInput, match="ghosts"):
+        decide(vis.EFFECTS, SCENE, {"ghosts": True})
+    with pytest.raises(BadInput, match="adc"):
+        decide(vis.EFFECTS, SCENE, {"adc": False})
+
+
+@pytest.mark.parametrize("name", ["background", "dark_current", "read_noise", "full_well"])
+def test_what_is_left_out_is_not_noticed(name):
+    """On either side of its threshold: what is below it changes a pixel by < 0.1 of the noise."""
+    (effect,) = (e for e in vis.EFFECTS if e.name == name)
+    mission, found = SCENE.mission, set()
+    # Scenes in which each contribution is small, then large.
+    for scale in (1e-6, 1e-3, 1e-2, 0.1, 1.0, 30.0):
+        changed = resolve(
+            overrides={
+                "vis.dark_current": (scale * 0.02, "electron / (s pix)"),
+                "vis.read_noise": (scale * 50, "electron"),
+            }
+        )
+        scene = Scene(
+            changed,
+            "vis",
+            560.0,
+            scale * 2.0 if name == "background" else 0.25,
+            1.9e5 * max(scale, 1e-3) + 1e4,
+        )
+        frame = np.full((200, 200), 100.0)
+        frame[0, 0] = scene.peak_electrons + scene.sky_electrons
+        after = effect.apply(frame, *effect.parameters(scene), rng=np.random.default_rng(1))
+        change = np.sqrt(np.mean((after - frame)[0, 0] ** 2 if name == "full_well" else (after - frame) ** 2))
+        found.add(effect.needed_if(scene))
+        if not effect.needed_if(scene) and name != "dark_current":
+            assert change <= 0.1 * scene.pixel_noise * 1.05
+        if not effect.needed_if(scene) and name == "dark_current":
+            # Its mean; its own shot noise adds in quadrature to what is there.
+            assert (after - frame).mean() <= 0.1 * scene.pixel_noise * 1.05
+    assert found == {True, False}
+    assert mission.fingerprint == SCENE.mission.fingerprint
+
+
+def test_margins_tell_the_ratio():
+    (dark,) = (e for e in vis.EFFECTS if e.name == "dark_current")
+    assert dark.margin(SCENE) == pytest.approx(SCENE.dark_electrons / (0.1 * SCENE.pixel_noise))
+    longer = replace(SCENE, exposure_time_s=1e5, sky_rate=0.0)
+    assert dark.needed_if(longer)
+    assert not dark.needed_if(SCENE)

@@ -1,0 +1,194 @@
+"""One detector from tables to images: fluxes, places, noise, and that neighbours change nothing."""
+
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from jobs.accuracy import DRAFT, SURVEY
+from jobs.fluxes import passbands
+from jobs.render import exposure, focal_plane
+from jobs.render.focal_plane import boresight_for
+from lake_schema import units
+from lake_schema.errors import BadInput
+from lake_schema.ids import kind_of
+from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
+
+SIDE = 256
+CASES = {"VIS": ("vis", "3-4", "euclid_vis", 0.24, 0.0), "EXT": ("lsstcam", "R22_S11", "lsst_r", 33.0, 0.73)}
+
+
+@cache
+def field(channel, n=30):
+    """(task, exposure, galaxies, stars) of a small detector with sources laid on a grid of pixels."""
+    camera, name, band, sky, seeing = CASES[channel]
+    detector = small(camera, name, SIDE)
+    ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
+    exposed = {
+        "exposure_id": 3, "channel": channel, "camera": camera, "band": band, "image_type": "science",
+        "ra": ra, "dec": dec, "position_angle": angle, "mjd": 60950.0, "exposure_time_s": 100.0,
+        "sky": sky, "seeing": seeing,
+    }  # fmt: skip
+    rng = np.random.default_rng(2)
+    system = focal_plane.wcs(detector, ra, dec, angle)
+    x, y = rng.uniform(-40, SIDE + 40, (2, 2 * n))
+    where = focal_plane.sky_of_pixel(system, x, y)
+    body = galaxies(
+        where[0][:n], where[1][:n], bulge_fraction=rng.random(n), inclination=80 * rng.random(n),
+        position_angle=180 * rng.random(n), disk_half_light_radius=0.4, bulge_sersic_index=1.5,
+    )  # fmt: skip
+    return {"detector": name}, exposed, body, stars(where[0][n:], where[1][n:])
+
+
+def render(channel, body=None, points=None, flux=3.0, seed=1, accuracy=SURVEY, **options):
+    task, exposed, all_bodies, all_points = field(channel)
+    body = all_bodies if body is None else body
+    points = all_points if points is None else points
+    camera, name, band = CASES[channel][:3]
+    return exposure.render(
+        task, exposed, body, fluxes(body, band, flux), points, fluxes(points, band, flux), MISSION, accuracy,
+        seed, detector=options.pop("detector", small(camera, name, SIDE)), **options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("section", "band", "zero_point"),
+    [("vis", "euclid_vis", 25.93), ("ext.lsstcam", "lsst_r", 28.34), ("ext.lsstcam", "lsst_i", 28.16)],
+)
+def test_zero_points_follow_from_throughput_and_area(section, band, zero_point):
+    found, rate = exposure.throughput(section, band, MISSION)
+    assert found == pytest.approx(zero_point, abs=0.01)
+    assert rate == pytest.approx(10 ** (0.4 * (found - 23.9)), rel=1e-9)
+    assert units.mag_of_f_nu(1 / rate) == pytest.approx(found)
+
+
+def test_published_saturation_magnitude():
+    """A fifth of the light in the central pixel fills the well at I_E = 17.8 in VIS's nominal exposure."""
+    zero_point, _ = exposure.throughput("vis", "euclid_vis", MISSION)
+    t = MISSION.value("vis.exposure_time", "s")
+    assert zero_point + 2.5 * np.log10(t * 0.20 / MISSION.value("vis.full_well")) == pytest.approx(17.80, abs=0.03)
+
+
+@pytest.mark.parametrize("channel", CASES)
+def test_noise_free_totals_are_the_table_s(channel):
+    """Each source alone: galaxies to 1 %, stars to 0.5 %."""
+    _, exposed, body, points = field(channel)
+    band = CASES[channel][2]
+    _, rate = exposure.throughput("vis" if channel == "VIS" else "ext.lsstcam", band, MISSION)
+    inside = focal_plane.pixel_of_sky(
+        focal_plane.wcs(
+            small(CASES[channel][0], CASES[channel][1], SIDE),
+            exposed["ra"],
+            exposed["dec"],
+            exposed["position_angle"],
+        ),
+        *(np.concatenate([body[f"{axis}_lensed"].to_numpy(), points[axis].to_numpy()]) for axis in ("ra", "dec")),
+    )
+    central = np.flatnonzero((np.abs(np.array(inside) - SIDE / 2) < 60).all(0))[::2]
+    assert {i < len(body) for i in central} == {True, False}
+    for i in central:
+        flux = 0.05 if i % 2 else 5.0
+        n = len(body)
+        one = render(
+            channel,
+            body.slice(i, 1) if i < n else body.slice(0, 0),
+            points.slice(i - n, 1) if i >= n else points.slice(0, 0),
+            flux,
+        )
+        assert len(one.sources) == 1
+        total = float(one.noise_free.sum(dtype=float))
+        assert total == pytest.approx(flux * rate * 100.0, rel=0.01 if i < n else 0.005)
+
+
+@pytest.mark.parametrize("channel", CASES)
+def test_the_image_is_the_truth_with_the_predicted_noise(channel):
+    one = render(channel)
+    scene = one.scene
+    gain, bias = scene.value("gain", "electron / adu"), scene.value("bias", "adu")
+    applied = {d.name: d.applied for d in one.decisions}
+    assert one.science.dtype == np.uint16
+    # In 100 s the ground's sky drowns the reading.
+    left_out = {"VIS": set(), "EXT": {"read_noise"}}[channel]
+    assert {name for name, on in applied.items() if not on} == left_out | {"dark_current", "full_well"}
+    dark = scene.dark_electrons * applied["dark_current"]
+    read_noise = scene.value("read_noise", "electron") * applied["read_noise"]
+    expected = one.noise_free + scene.sky_electrons + dark
+    electrons = (one.science.astype(float) - bias) * gain
+    pull = (electrons - expected) / np.sqrt(expected + read_noise**2 + gain**2 / 12)
+    assert pull.mean() == pytest.approx(0.0, abs=5 / SIDE)
+    assert pull.std() == pytest.approx(1.0, abs=5 / SIDE)
+
+
+def test_sources_are_drawn_in_order_of_id():
+    """The order of the rows, and rows beyond the margin, change no bit."""
+    _, _, body, points = field("VIS")
+    base = render("VIS")
+    assert (np.diff(base.sources.ids) > 0).all()
+    shuffled = render(
+        "VIS",
+        body.take(np.random.default_rng(1).permutation(len(body))),
+        points.take(np.arange(len(points))[::-1]),
+    )
+    np.testing.assert_array_equal(base.science, shuffled.science)
+    np.testing.assert_array_equal(base.noise_free, shuffled.noise_free)
+    far = stars([53.1, 233.1, 53.1, 0.0], [-26.0, 27.8, -27.9, 90.0])
+    far = far.set_column(0, "id", pa.array(far["id"].to_numpy() + (1 << 30)))
+    crowd = render("VIS", points=pa.concat_tables([points, far]))
+    np.testing.assert_array_equal(base.science, crowd.science)
+    assert len(crowd.sources) == len(base.sources)
+
+
+def test_the_seed_changes_the_noise_alone():
+    base, other = render("VIS"), render("VIS", seed=2)
+    np.testing.assert_array_equal(base.noise_free, other.noise_free)
+    assert (base.science != other.science).mean() > 0.5
+
+
+def test_a_source_just_outside_still_shines_in():
+    one = render("VIS", flux=3000.0)
+    kinds = kind_of(one.sources.ids)
+    outside = (one.sources.column < -0.5) | (one.sources.column > SIDE - 0.5)
+    assert (outside & (kinds == 5)).any()
+    alone = exposure.stamps.draw(one.sources.take(outside), np.full(outside.sum(), 256), one.psf, SIDE, SIDE)
+    assert alone.sum() > 0
+
+
+def test_sources_of_no_flux_are_left_out():
+    assert len(render("VIS", flux=0.0).sources) == 0
+    empty = render("EXT", field("EXT")[2].slice(0, 0), field("EXT")[3].slice(0, 0))
+    assert empty.noise_free.max() == 0.0
+    assert empty.science.std() > 0
+
+
+def test_draft_is_close_to_survey():
+    fine, coarse = render("VIS"), render("VIS", accuracy=DRAFT)
+    assert np.abs(fine.noise_free - coarse.noise_free).max() < DRAFT.background * fine.scene.pixel_noise * 2
+
+
+def test_bad_tables_are_refused():
+    task, exposed, body, points = field("VIS")
+    good = (body, fluxes(body, "euclid_vis", 1.0), points, fluxes(points, "euclid_vis", 1.0))
+
+    def attempt(*tables, exposed=exposed):
+        return exposure.render(task, exposed, *tables, MISSION, SURVEY, 1, detector=small("vis", "3-4", 32))
+
+    with pytest.raises(BadInput, match="not of the same rows"):
+        attempt(body, good[1].slice(1), points, good[3])
+    with pytest.raises(BadInput, match="f_nu_euclid_vis"):
+        attempt(body, fluxes(body, "lsst_r", 1.0), points, good[3])
+    with pytest.raises(BadInput, match="electrons"):
+        attempt(body, fluxes(body, "euclid_vis", float("nan")), points, good[3])
+    with pytest.raises(BadInput, match="twice"):
+        attempt(*(pa.concat_tables([t, t]) for t in good))
+    with pytest.raises(BadInput, match="NISP"):
+        attempt(*good, exposed={**exposed, "channel": "NISP"})
+    with pytest.raises(BadInput, match="euclid"):
+        attempt(*good, exposed={**exposed, "band": "euclid"})
+
+
+def test_the_passband_is_the_one_of_the_fluxes():
+    """One curve a band: the zero point uses what the flux tables were integrated over."""
+    width = passbands.log_width(passbands.load("euclid_vis"))
+    found, _ = exposure.throughput("vis", "euclid_vis", MISSION)
+    assert found == pytest.approx(units.zero_point(9926.0, width))

@@ -1,0 +1,92 @@
+"""Products: files that stand alone, and rows that say what they are."""
+
+import numpy as np
+import pytest
+from astropy.io import fits as astropy_fits
+from astropy.wcs import WCS
+
+from jobs.render import fits_product, focal_plane
+from lake_schema import fits, validate
+from lake_schema.tables.products import PRODUCTS
+from tests.jobs.render.test_exposure import render
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    return render("VIS")
+
+
+@pytest.fixture(scope="module")
+def written(rendered, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("products")
+    rows, writers = fits_product.products(rendered)
+    for path, writer in writers.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        writer(folder / path)
+    return folder, rows
+
+
+def test_rows_are_as_declared(rendered, written):
+    folder, rows = written
+    assert validate.violations(rows, PRODUCTS) == []
+    assert rows["content"].to_pylist() == ["science", "noise_free"]
+    for row in rows.to_pylist():
+        assert (folder / row["path"]).is_file()
+        assert row["sources"] == len(rendered.sources) > 10
+        assert row["mission"] == rendered.scene.mission.fingerprint
+
+
+def test_truth_is_written_where_it_is_wanted(rendered):
+    rows, writers = fits_product.products(rendered, truth=())
+    assert rows["content"].to_pylist() == ["science"]
+    assert list(writers) == rows["path"].to_pylist()
+
+
+def test_files_read_back(rendered, written):
+    folder, rows = written
+    science, noise_free = (fits.read_images(folder / path)[0].data for path in rows["path"].to_pylist())
+    np.testing.assert_array_equal(science, rendered.science)
+    np.testing.assert_array_equal(noise_free, rendered.noise_free)
+    assert science.dtype == np.uint16
+    assert noise_free.dtype == np.float32
+
+
+def test_the_header_calibrates_the_image(rendered, written):
+    folder, rows = written
+    header = astropy_fits.getheader(folder / rows["path"][0].as_py())
+    data = astropy_fits.getdata(folder / rows["path"][0].as_py()).astype(float)
+    electrons = (data - header["BIAS"]) * header["GAIN"]
+    diffuse = (header["SKYRATE"] + header["DARKRATE"]) * header["EXPTIME"]
+    assert electrons.mean() - diffuse == pytest.approx(rendered.noise_free.mean(), abs=0.3)
+    for key, value in (
+        ("BUNIT", "adu"),
+        ("FILTER", "euclid_vis"),
+        ("SEED", "1"),
+        ("DATE-OBS", "2025-10-02T00:00:00.000"),
+    ):
+        assert header[key] == value
+    assert header["ZEROPNT"] == pytest.approx(25.93, abs=0.01)
+    assert header["SATURATE"] == 58471
+    assert header["MISSION"] == rendered.scene.mission.fingerprint
+    assert [header[f"EFFECT{i}"].split(":")[0] for i in range(1, 7)] == [d.name for d in rendered.decisions]
+    assert header["DARKRATE"] == 0.0
+    assert "dark_current: off" in header["EFFECT3"]
+
+
+def test_astropy_finds_the_sources_where_they_were_drawn(rendered, written):
+    folder, rows = written
+    for path in rows["path"].to_pylist():
+        system = WCS(astropy_fits.getheader(folder / path))
+        s = rendered.sources
+        ra, dec = system.all_pix2world(s.column, s.row, 0)
+        again = focal_plane.pixel_of_sky(rendered.wcs, ra, dec)
+        np.testing.assert_allclose(again, [s.column, s.row], atol=1e-6)
+
+
+def test_the_same_exposure_gives_the_same_bytes(written, tmp_path):
+    folder, rows = written
+    _, writers = fits_product.products(render("VIS"))
+    for path, writer in writers.items():
+        writer(tmp_path / "again.fits")
+        assert (tmp_path / "again.fits").read_bytes() == (folder / path).read_bytes()
+    assert len(rows) == 2

@@ -1,0 +1,149 @@
+"""Selections on the sky: by true and by lensed position, across the edges of cells of one or several orders."""
+
+import healpy as hp
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema import layout, publish, read, sky
+from lake_schema.columns import Column, Table
+from lake_schema.errors import BadInput
+from lake_schema.publish import Output, Part, Plan
+from tests.universe import TOY, toy_plan, toy_work
+
+LENSED = Table(
+    "lensed",
+    1,
+    (*TOY.columns, *(Column(f"{name}_lensed", "float64", "deg", doc="observed") for name in ("ra", "dec"))),
+    "A toy catalogue with lensed positions.",
+    order=5,
+)
+# Where the cells 1607, 1610 and their neighbours meet, and a corner at a pole, and one on RA = 0.
+CORNERS = [hp.vec2ang(hp.boundaries(32, cell, nest=True)[:, 0], lonlat=True) for cell in (1607, 1023, 5461)]
+N, SPREAD, DEFLECTION = 4000, 0.05, 8 / 3600
+
+
+def sources(corner, seed=1):
+    """Random sources about a corner of cells, each moved by up to 8 arcsec."""
+    rng = np.random.default_rng(seed)
+    centre = hp.ang2vec(*corner, lonlat=True).reshape(3)
+    true = centre + np.radians(SPREAD) * rng.normal(size=(N, 3))
+    seen = true / np.linalg.norm(true, axis=1)[:, None] + np.radians(DEFLECTION) / 2 * rng.uniform(-1, 1, (N, 3))
+    (ra, dec), (ra_lensed, dec_lensed) = (hp.vec2ang(v, lonlat=True) for v in (true, seen))
+    columns = {"ra": ra, "dec": dec, "_healpix_29": sky.healpix_29(ra, dec), "ra_lensed": ra_lensed, "dec_lensed": dec_lensed}
+    order = np.argsort(columns["_healpix_29"])
+    columns = {name: values[order] for name, values in columns.items()}
+    return LENSED.build({**columns, "id": np.arange(N), "flux": rng.random(N)})
+
+
+def published(root, rows, orders=(5,)):
+    """The rows as a catalogue, one file a cell; with several orders, every cell of order 5 takes the next of them."""
+    index = rows["_healpix_29"].to_numpy()
+    parts = []
+    for n, cell in enumerate(np.unique(index >> 48).tolist()):
+        order = orders[n % len(orders)]
+        cells = np.unique(index[index >> 48 == cell] >> (2 * (29 - order))).tolist()
+        parts += [Part(layout.cell_file(order, c), {"order": order, "cell": c}) for c in cells]
+
+    def work(lake, facts):
+        return Output(rows.filter(index >> (2 * (29 - facts["order"])) == facts["cell"]))
+
+    publish.make(root, Plan(LENSED, {"orders": list(orders)}, tuple(parts)), work)
+    return read.version(root, "lensed")
+
+
+@pytest.fixture(scope="module", params=[(5,), (5, 7, 6)], ids=["one order", "mixed orders"])
+def catalogues(request, tmp_path_factory):
+    made = []
+    for corner in CORNERS:
+        rows = sources(corner)
+        made.append((corner, rows, published(tmp_path_factory.mktemp("lake"), rows, request.param)))
+    return made
+
+
+def test_corners_are_corners(catalogues):
+    for _, _, version in catalogues:
+        assert len(version.parts) >= 3
+
+
+@given(data=st.data(), on=st.sampled_from(["true", "lensed"]))
+def test_no_source_is_lost_at_an_edge(catalogues, data, on):
+    (ra, dec), rows, version = data.draw(st.sampled_from(catalogues))
+    ra, dec = float(ra[0]), float(dec[0])
+    towards = st.floats(-SPREAD, SPREAD)
+    centre = (ra + data.draw(towards)) % 360, np.clip(dec + data.draw(towards), -90, 90)
+    radius = data.draw(st.floats(1e-4, 2 * SPREAD))
+    places = (rows[name].to_numpy() for name in read.ON[on])
+    wanted = rows["id"].to_numpy()[sky.separation(*places, *centre) <= radius]
+    found = version.cone(*centre, radius, ["id"], on)
+    assert found.column_names == ["id"]
+    assert sorted(found["id"].to_pylist()) == sorted(wanted.tolist())
+
+
+def test_lensing_moves_sources_over_the_edge(catalogues):
+    """The padding matters: without it, sources whose true cell is not touched would be lost."""
+    lost = 0
+    for _, rows, version in catalogues:
+        assert 0.3 * DEFLECTION < version.deflection() <= DEFLECTION
+        radius = 5 / 3600
+        for row in range(0, N, 160):
+            ra, dec = (float(rows[name][row].as_py()) for name in ("ra_lensed", "dec_lensed"))
+            found = set(version.cone(ra, dec, radius, ["id"], "lensed")["id"].to_pylist())
+            unpadded = version.in_cells(sky.cells_in_cone(ra, dec, radius, 16), 16, ["id"])["id"].to_pylist()
+            lost += len(found - set(unpadded))
+            assert row in found or rows["id"][row].as_py() in found
+    assert lost > 3
+
+
+def test_all_columns_and_the_whole_sky(catalogues):
+    _, rows, version = catalogues[0]
+    assert version.cone(10.0, 20.0, 180.0).num_rows == N
+    assert version.cone(10.0, 20.0, 180.0, on="lensed").column_names == LENSED.names
+    assert version.cone(float(CORNERS[0][0][0]), -float(CORNERS[0][1][0]), 0.001).num_rows == 0
+
+
+def test_what_a_cone_refuses(lake, catalogues):
+    _, _, version = catalogues[0]
+    for arguments, words in (
+        ((0.0, 91.0, 1.0), "dec"),
+        ((0.0, 0.0, -1.0), "radius"),
+        ((float("nan"), 0.0, 1.0), "ra"),
+        ((0.0, 0.0, 1.0, ["id"], "seen"), "on = 'seen'"),
+        ((0.0, 0.0, 1.0, ["speed"]), "no column speed"),
+    ):
+        with pytest.raises(BadInput, match=words):
+            version.cone(*arguments)
+    publish.make(lake, toy_plan(), toy_work)
+    with pytest.raises(BadInput, match="table toy has no column ra_lensed"):
+        read.version(lake, "toy").cone(0.0, 0.0, 1.0, on="lensed")
+
+
+def test_a_version_that_does_not_know_its_deflection(catalogues):
+    _, _, version = catalogues[0]
+    facts = {k: v for k, v in version.manifest.items() if k != "deflection_deg"}
+    with pytest.raises(BadInput, match="how far positions are lensed"):
+        read.Version(version.folder, facts, version.schema).cone(0.0, 0.0, 1.0, on="lensed")
+
+
+def test_other_readers_open_mixed_orders(catalogues):
+    import lsdb
+    from hats.io.validation import is_valid_catalog
+
+    corner, rows, version = catalogues[0]
+    assert is_valid_catalog(str(version.folder), strict=True)
+    found = lsdb.open_catalog(str(version.folder)).cone_search(float(corner[0][0]), float(corner[1][0]), 60.0).compute()
+    assert sorted(found["id"]) == sorted(version.cone(float(corner[0][0]), float(corner[1][0]), 1 / 60, ["id"])["id"].to_pylist())
+    assert len(found) > 20
+
+
+def test_the_margin_of_each_cell_is_what_lies_about_it(catalogues):
+    for _, rows, version in catalogues:
+        fine = rows["_healpix_29"].to_numpy() >> 32
+        for part in version.parts:
+            order, cell = layout.cell_of_file(part)
+            margin = pq.read_table(version.folder / "lensed_margin" / "dataset" / part, partitioning=None)
+            wanted = rows.filter(np.isin(fine, sky.margin_cells(order, cell, 13)))
+            assert margin["id"].to_pylist() == wanted["id"].to_pylist()
+            assert margin.num_rows > 10

@@ -1,0 +1,89 @@
+"""The commands that look after a lake: what they print and how they end."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from lake_schema import __version__, layout, publish, read
+from lake_schema.__main__ import main
+from tests.universe import plain_plan, plain_work, toy_plan, toy_work
+
+
+@pytest.fixture
+def filled(lake):
+    publish.make(lake, plain_plan(1), plain_work)
+    publish.make(lake, plain_plan(2), plain_work)
+    publish.make(lake, toy_plan(), toy_work)
+    return lake
+
+
+def flip(path, byte):
+    data = bytearray(path.read_bytes())
+    data[byte] ^= 1
+    path.write_bytes(data)
+
+
+def test_verify_says_sound_and_ends_with_0(filled, capsys):
+    assert main(["verify", str(filled)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["plain", "toy"]
+    assert all(line.endswith("sound") for line in lines)
+    assert " 550 rows " in lines[1]
+
+
+def test_verify_finds_what_it_is_told_to_look_for(filled, capsys):
+    version = read.version(filled, "toy")
+    flip(version.path(version.parts[0]), 100)
+    assert main(["verify", str(filled), "toy"]) == 0
+    capsys.readouterr()
+    assert main(["verify", str(filled), "--deep"]) == 1
+    out = capsys.readouterr().out
+    assert "Npix=1607.parquet has other contents" in out
+    assert "1 faults" in out
+    assert "plain" in out
+
+
+def test_verify_goes_on_after_a_broken_manifest(filled, capsys):
+    flip(layout.current(filled, "plain") / "manifest.json", 30)
+    assert main(["verify", str(filled)]) == 1
+    out, err = capsys.readouterr()
+    assert "manifest.json" in err
+    assert "toy" in out
+
+
+def test_gc_removes_what_is_old_and_says_so(filled, capsys):
+    old = layout.version(filled, "plain", plain_plan(1).key)
+    assert main(["gc", str(filled)]) == 0
+    assert capsys.readouterr().out == f"removed {old}\n"
+    assert not old.exists()
+    assert main(["verify", str(filled), "--deep"]) == 0
+    capsys.readouterr()
+    assert main(["gc", str(filled)]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_describe_names_every_column_with_its_unit(filled, capsys):
+    assert main(["describe", str(filled), "toy"]) == 0
+    out = capsys.readouterr().out
+    assert "550 rows in 4 files" in out
+    assert all(name in out for name in toy_plan().table.names)
+    assert "uJy" in out
+
+
+@pytest.mark.parametrize("command", ["verify", "gc", "describe"])
+def test_what_is_not_there_is_a_wrong_call(lake, capsys, command):
+    assert main([command, str(lake)]) == 2
+    assert main([command, str(lake), "galaxies"]) == 2
+    assert main([command, str(lake), "../galaxies"]) == 2
+    assert main([command, "s3://lake"]) == 2
+    err = capsys.readouterr().err.splitlines()
+    assert len(err) == 4
+    assert "holds no table" in err[0]
+
+
+def test_help_tells_the_version(tmp_path):
+    command = [sys.executable, "-m", "lake_schema", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "200"})
+    assert f"truesky {__version__}" in done.stdout

@@ -1,0 +1,82 @@
+"""A lake that was written by an earlier truesky: read where that is safe, refused by name where it is not."""
+
+from dataclasses import replace
+
+import pytest
+
+from lake_schema import publish, read
+from lake_schema.columns import Column
+from lake_schema.errors import VersionMismatch
+from lake_schema.tables.galaxies import GALAXIES
+from tests.make_old_lake import OLD_LAKE
+from tests.universe import PLAIN, plain_plan, plain_work, rows_of
+
+LATER = Column("colour", "float32", doc="colour", nullable=True, since=2)
+
+
+@pytest.fixture
+def old():
+    return read.version(OLD_LAKE, "plain")
+
+
+def later(*columns, version=2):
+    return replace(PLAIN, version=version, columns=columns)
+
+
+def test_the_old_lake_is_whole():
+    for name in read.tables(OLD_LAKE):
+        assert read.verify(read.version(OLD_LAKE, name), deep=True) == []
+
+
+def test_galaxies_of_an_old_lake():
+    """Fails where GALAXIES changed so that written lakes cannot be read: give it a version, and the column `since`."""
+    rows = read.version(OLD_LAKE, "galaxies").rows()
+    assert rows.schema.equals(GALAXIES.arrow())
+    written = rows_of(GALAXIES, 12)
+    for name in ("id", "ra", "z_true", "sed_1"):
+        assert rows[name].equals(written[name])
+
+
+def test_a_later_nullable_column_is_null(old):
+    table = later(*PLAIN.columns, LATER)
+    version = read.as_declared(old, table)
+    assert version.schema.equals(table.arrow(), check_metadata=True)
+    assert version.rows()["colour"].null_count == version.num_rows == 60
+    assert version.rows(["id", "colour"]).drop_columns("colour").equals(old.rows(["id"]))
+    assert version.rows(where=read.pc.field("colour") > 0).num_rows == 0
+
+
+BAD = {
+    "a later column that must be there": (later(*PLAIN.columns, replace(LATER, nullable=False)), "column colour is missing"),
+    "a nullable column that was always there": (later(*PLAIN.columns, replace(LATER, since=1)), "column colour is missing"),
+    "another type": (later(PLAIN.columns[0], replace(PLAIN.columns[1], type="float32")), "column value is"),
+    "another unit": (later(PLAIN.columns[0], replace(PLAIN.columns[1], unit="deg")), "has unit '', wanted 'deg'"),
+    "a column that went": (later(PLAIN.columns[0]), "column value is not declared"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_any_other_difference_is_refused_naming_both_versions(old, name):
+    table, words = BAD[name]
+    with pytest.raises(VersionMismatch, match=r"table plain: version 1 .* version 2: ") as caught:
+        read.as_declared(old, table)
+    assert words in str(caught.value)
+
+
+def test_a_table_from_the_future_is_refused(lake):
+    plan = plain_plan()
+    publish.make(lake, replace(plan, table=replace(PLAIN, version=3)), plain_work)
+    with pytest.raises(VersionMismatch, match="version 3 .* version 1: it was written by a later truesky"):
+        read.as_declared(read.version(lake, "plain"), PLAIN)
+
+
+def test_a_lake_is_read_as_declared_without_being_asked(lake, monkeypatch):
+    """`read.version` itself looks the table up."""
+    wider = replace(GALAXIES, version=2, columns=(*GALAXIES.columns, LATER))
+    monkeypatch.setattr("lake_schema.tables.galaxies.GALAXIES", wider)
+    rows = read.version(OLD_LAKE, "galaxies").rows(["id", "colour"])
+    assert rows["colour"].null_count == 12
+    narrower = replace(GALAXIES, version=2, columns=GALAXIES.columns[:-1])
+    monkeypatch.setattr("lake_schema.tables.galaxies.GALAXIES", narrower)
+    with pytest.raises(VersionMismatch, match="table galaxies: version 1"):
+        read.version(OLD_LAKE, "galaxies")
