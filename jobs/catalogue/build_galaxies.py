@@ -1,4 +1,4 @@
-"""Build the tables `halos` and `galaxies`: spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQUEST."""
+"""Build tables `halos` and `galaxies`: spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQUEST."""
 
 import sys
 from pathlib import Path

@@ -70,7 +70,7 @@ class GalaxyModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """Galaxies after selection: rows of the members, z[n], M_r[n], on the red sequence[n], realised 0.1(g - r)[n], spectra."""
+    """Galaxies after selection: rows of the members, z, M_r, on the red sequence, realised 0.1(g - r), spectra; [n]."""
 
     row: Int
     z: Float

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
-from jobs.catalogue import density_box, lightcone, linear_theory, parameters
+from jobs.catalogue import density_box, lightcone, parameters
 from jobs.catalogue.density_box import Box
 from jobs.catalogue.lightcone import Distances, Replicas, Steps, Voxels
 from jobs.catalogue.matching import Masses, Matching
@@ -174,7 +175,7 @@ def _blocks(step: Int) -> list[slice]:
     """Rows of voxels, which are sorted by step within an order, in stretches of neighbouring steps."""
     change = np.flatnonzero(np.diff(step // _STEPS_A_BLOCK)) + 1
     edges = [0, *change.tolist(), step.size]
-    return [slice(first, last) for first, last in zip(edges, edges[1:], strict=False) if last > first]
+    return [slice(first, last) for first, last in pairwise(edges) if last > first]
 
 
 def _block(halos: HaloModel, used: Bool, space: Voxels, rng: np.random.Generator, rows: slice) -> tuple[Int, Int]:

@@ -32,6 +32,7 @@ Float32 = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int64]
 
 KAPPA, GAMMA_1, GAMMA_2, EAST, NORTH = range(5)
+_GAIN_NODES = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,18 +100,21 @@ def convergence(box: Box, nside: int, chi: Float, chosen: Settings) -> Float32:
     done, at = 0, 0.0
     averaged: tuple[int, int, Float32] | None = None
     pixel = hp.nside2resol(nside)
+    nodes = np.linspace(float(density_box.growth(table.z[-1])), 1.0, _GAIN_NODES)
+    gain = density_box.matter_gain(box.model, nodes)
     while done < chi.size:
         factor = _coarse(pixel * at / box.model.cell, chosen.coarsest)
         width = factor * box.model.cell
         middle = at + 0.5 * width
         stretch = int(middle // chosen.stretch)
+        growth = float(density_box.growth(table.redshift((stretch + 0.5) * chosen.stretch)))
         if averaged is None or averaged[:2] != (stretch, factor):
-            growth = float(density_box.growth(table.redshift((stretch + 0.5) * chosen.stretch)))
             averaged = (stretch, factor, _averaged(box, growth, factor))
         delta = averaged[2].ravel()[_places(box, turned, direction, middle, factor)]
         z = float(table.redshift(middle))
-        growth = float(density_box.growth(z) / density_box.growth(table.redshift((stretch + 0.5) * chosen.stretch)))
-        weight = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * width * middle * (1.0 + z) * growth
+        now = float(density_box.growth(z))
+        weight = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * width * middle * (1.0 + z)
+        weight *= now / growth * float(np.interp(now, nodes, gain))
         while done < chi.size and chi[done] <= middle:
             planes[done] = first - second / np.float32(chi[done])
             done += 1

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from jobs.catalogue import density_box, halos, luminosity_function, matching, satellites
+from jobs.catalogue import density_box, halos, matching, satellites
 from jobs.catalogue.halos import LEVELS, HaloModel, Halos
 from jobs.catalogue.luminosity_function import Inverse, Volume
 from jobs.catalogue.matching import Masses
