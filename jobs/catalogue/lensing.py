@@ -6,8 +6,8 @@ displaced   true positions -> observed ones
 
 gamma1, gamma2 are in the frame (x, y) = (east, north): east or west of a mass gamma1 < 0, north-east of it
 gamma2 < 0.  Deflections point away from a mass.
-Error: Born approximation, no power above l_max = 1.5 nside; the convergence has the power of linear theory
-       within 10 % up to a multipole that tests/jobs/catalogue/test_lensing states
+Error: Born approximation; the convergence has the power of linear theory within 10 % up to l = nside (tests), none
+       above 1.5 nside
 Ref: Bartelmann & Schneider 2001, Phys. Rep. 340, 291; Hu 2000, PhRvD 62, 043007
 """
 
