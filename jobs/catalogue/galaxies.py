@@ -18,6 +18,7 @@ import pyarrow as pa
 from jobs.catalogue import (
     band_ratios,
     dust_map,
+    emission_lines,
     lensing,
     luminosity_function,
     matching,
@@ -27,6 +28,7 @@ from jobs.catalogue import (
     stellar_mass,
 )
 from jobs.catalogue.band_ratios import BandRatios, Sed
+from jobs.catalogue.emission_lines import LineModel
 from jobs.catalogue.lensing import Planes
 from jobs.catalogue.luminosity_function import Schechter
 from jobs.catalogue.morphology import Shapes
@@ -66,6 +68,7 @@ class GalaxyModel:
     shapes: Shapes
     masses: stellar_mass.MassToLight
     light: stellar_mass.Light
+    lines: LineModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +106,7 @@ def model(
         shapes=morphology.shapes(),
         masses=stellar_mass.mass_to_light(),
         light=stellar_mass.light(library, selection.ebv),
+        lines=emission_lines.model(),
     )
 
 
@@ -133,14 +137,17 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.fl
     drawn = select(universe, *_light(cell, seed, universe, people))
     distance_modulus = cosmology.distance_modulus(drawn.z)
     log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, drawn.colour)
+    log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
+    rng = stream(seed, "galaxies.lines", cell)
     columns = {
         **_places(universe.planes, people, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
         "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
         "color_gr_01": drawn.colour,
         "log_stellar_mass": log_mass,
-        "log_sfr": stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed),
+        "log_sfr": log_sfr,
         **_sed_columns(drawn.sed),
+        **emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, drawn.red, drawn.sed.ebv, rng),
         **_shape_columns(cell, seed, universe.shapes, drawn, log_mass),
     }
     return GALAXIES.build(columns)

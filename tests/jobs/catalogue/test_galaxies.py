@@ -55,7 +55,9 @@ def expected_number(lf, near, far, faintest, area):
     return float(np.sum(0.5 * (density[1:] + density[:-1]) * shells) * area * np.radians(1.0) ** 2)
 
 
-@pytest.mark.parametrize(("z", "half", "reddest", "within"), [(0.1, 0.08, 0.2, 0.25), (0.5, 0.05, 0.3, 0.15), (1.0, 0.1, 1.5, 0.10)])
+@pytest.mark.parametrize(
+    ("z", "half", "reddest", "within"), [(0.1, 0.08, 0.2, 0.25), (0.5, 0.05, 0.3, 0.15), (1.0, 0.1, 1.5, 0.10)]
+)
 def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, half, reddest, within):
     """Counted where the reddest spectrum (I_E - M_r - DM) is still brighter than the limit; structure moves nearby counts."""
     near, far = z - half, z + half

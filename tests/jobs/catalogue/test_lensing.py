@@ -111,9 +111,7 @@ def test_tangential_shear_about_massive_halos(universe, drawn):
     shear = []
     for angle in np.arange(8) * np.pi / 4:
         east, north = 1.0 * np.sin(angle), 1.0 * np.cos(angle)
-        found = lensing.at(
-            universe.planes, ra + east / np.cos(np.radians(dec)), dec + north, np.full(ra.size, 2600.0)
-        )
+        found = lensing.at(universe.planes, ra + east / np.cos(np.radians(dec)), dec + north, np.full(ra.size, 2600.0))
         # Position angle from north to east; gamma1 > 0 is north-south.
         shear.append(found[1] * np.cos(2 * angle) - found[2] * np.sin(2 * angle))
     assert ra.size > 20
