@@ -60,6 +60,7 @@ class Universe:
     galaxy_limit, star_limit : I_E (AB, before Milky Way dust), H (Vega, as observed);  z_max : highest redshift
     box_cells                : cells of 4 Mpc/h a side of the box of matter
     lensing_nside            : HEALPix resolution of the lensing maps
+    high_redshift_boost, quasar_boost : how many times denser than in nature these kinds are drawn, 0 = not at all
     """
 
     galaxy_limit: float = 26.0
@@ -67,6 +68,8 @@ class Universe:
     z_max: float = 2.3
     box_cells: int = 256
     lensing_nside: int = 512
+    high_redshift_boost: float = 1.0
+    quasar_boost: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +227,8 @@ def _universe(table: Toml) -> Universe:
         star_limit=_number(table, "universe.star_limit", 0.0, 30.0, default.star_limit),
         z_max=_number(table, "universe.z_max", 0.01, 3.0, default.z_max),
         box_cells=_choice(table, "universe.box_cells", BOX_CELLS, default.box_cells),
+        high_redshift_boost=_number(table, "universe.high_redshift_boost", 0.0, 1e5, default.high_redshift_boost),
+        quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),
         lensing_nside=_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
     )
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
 def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
     """What is to be added to log L, [z bin, node]."""
     rows = []
-    for near, far in zip(EDGES[:-1], EDGES[1:], strict=True):
+    for near, far in pairwise(EDGES):
         middle = 0.5 * (near + far)
         here = np.sort(raw[(z > near) & (z < far)])
         distance = float(cosmology.luminosity_distance(middle)) / cosmology.HUBBLE * CM_PER_MPC

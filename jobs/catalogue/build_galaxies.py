@@ -17,6 +17,8 @@ from lake_schema.publish import Json, Output, Plan
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
 
+_HALO_FACTS = ("galaxy_limit", "z_max", "box_cells")
+
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """Two tables of one part an order-5 cell each, made of the generation cells that the request's area touches."""
@@ -24,7 +26,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     del universe["star_limit"]
     facts = {"seed": request.seed, **universe, "code": code_version()}
     parts = cells.parts(request.area)
-    halos = Plan(HALOS, {key: value for key, value in facts.items() if key != "lensing_nside"}, parts)
+    halos = Plan(HALOS, {key: facts[key] for key in ("seed", *_HALO_FACTS, "code")}, parts)
     # Up to this multipole the lensing has the power of linear theory within 10 %.
     plan = Plan(GALAXIES, {**facts, "lensing_l_max": facts["lensing_nside"]}, parts)
     if not layout.version(lake, GALAXIES.name, plan.key).exists():
@@ -35,7 +37,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 def halo_work(lake: Path, facts: Json) -> Output:
     """The halos of one order-5 cell."""
-    people = galaxies.people(facts["seed"], facts["galaxy_limit"], facts["z_max"], facts["box_cells"])
+    people = galaxies.people(facts["seed"], *(facts[name] for name in _HALO_FACTS))
     drawn = population.Cells(people)
     return Output(cells.rows(facts, HALOS, lambda cell: galaxies.halo_table(cell, people, drawn)))
 
@@ -49,7 +51,7 @@ def work(lake: Path, facts: Json) -> Output:
 
 
 def _universe(facts: Json) -> GalaxyModel:
-    names = ("seed", "galaxy_limit", "z_max", "box_cells", "lensing_nside")
+    names = ("seed", "galaxy_limit", "z_max", "box_cells", "lensing_nside", "high_redshift_boost", "quasar_boost")
     return galaxies.model(*(facts[name] for name in names))
 
 

@@ -19,6 +19,7 @@ from jobs.catalogue import (
     band_ratios,
     dust_map,
     emission_lines,
+    high_redshift,
     lensing,
     luminosity_function,
     matching,
@@ -29,6 +30,7 @@ from jobs.catalogue import (
 )
 from jobs.catalogue.band_ratios import BandRatios, Sed
 from jobs.catalogue.emission_lines import LineModel
+from jobs.catalogue.high_redshift import Kind
 from jobs.catalogue.lensing import Planes
 from jobs.catalogue.luminosity_function import Schechter
 from jobs.catalogue.morphology import Shapes
@@ -69,6 +71,7 @@ class GalaxyModel:
     masses: stellar_mass.MassToLight
     light: stellar_mass.Light
     lines: LineModel
+    distant: tuple[Kind, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +87,13 @@ class Drawn:
 
 
 def model(
-    seed: int, limit: float = 26.0, z_max: float = 2.3, box_cells: int = 256, lensing_nside: int = 512
+    seed: int,
+    limit: float = 26.0,
+    z_max: float = 2.3,
+    box_cells: int = 256,
+    lensing_nside: int = 512,
+    high_redshift_boost: float = 1.0,
+    quasar_boost: float = 1.0,
 ) -> GalaxyModel:
     """The embedded universe of a seed: its galaxies with I_E < limit and z < z_max.
 
@@ -94,10 +103,11 @@ def model(
     selection = _selection(z_max)
     population_of = people(seed, limit, z_max, box_cells)
     dustiest = colours.dust.highest
+    distant = high_redshift.model(high_redshift_boost, quasar_boost)
     return GalaxyModel(
         limit=limit,
         population=population_of,
-        planes=lensing.load(population_of.halos.box, lensing_nside),
+        planes=lensing.load(population_of.halos.box, lensing_nside, far=bool(distant)),
         luminosities=luminosity_function.schechter(),
         colours=colours,
         selection=selection,
@@ -107,6 +117,7 @@ def model(
         masses=stellar_mass.mass_to_light(),
         light=stellar_mass.light(library, selection.ebv),
         lines=emission_lines.model(),
+        distant=distant,
     )
 
 
@@ -150,7 +161,10 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.fl
         **emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, drawn.red, drawn.sed.ebv, rng),
         **_shape_columns(cell, seed, universe.shapes, drawn, log_mass),
     }
-    return GALAXIES.build(columns)
+    rows = [GALAXIES.build(columns)]
+    rows += [high_redshift.draw(cell, seed, kind, universe.planes, dust) for kind in universe.distant]
+    together = pa.concat_tables(rows)
+    return together.take(np.lexsort((together["id"].to_numpy(), together["_healpix_29"].to_numpy())))
 
 
 def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
