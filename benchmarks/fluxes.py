@@ -1,6 +1,6 @@
-"""How fast and how right the band fluxes are: python -m benchmarks.fluxes [--quick] [--json FILE] [--measure].
+"""How fast and how right the band fluxes are: python -m benchmarks.fluxes [--quick] [--json FILE] [--measure FILE].
 
---measure  writes jobs/fluxes/flux_errors.csv, from which the job chooses its tables
+--measure  writes the errors of all settings in all bands, jobs/fluxes/flux_errors.csv, from which the job chooses
 
 Galaxies in two components with their lines, over the whole of the parameter space that the tables cover, in the 22 bands of
 Serrano et al. 2024; the truth is direct integration in steps of 1 A, in the same run. CPU seconds of one core.
@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 import os
+import platform
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +30,7 @@ from jobs.accuracy import DRAFT, SURVEY, Accuracy
 from jobs.fluxes import flux_grid, grid_settings, grid_tables, integration, lines, passbands, spectra, templates
 from jobs.fluxes.sources import Galaxies, galaxies_of
 from jobs.fluxes.templates import Library
+from lake_schema.provenance import git_commit
 
 Float = npt.NDArray[np.float64]
 
@@ -40,6 +44,8 @@ _SEED_CHOICE, _SEED_TEST, _SEED_SPEED = 1, 2, 3
 _SAMPLE, _SPEED_SAMPLE = 20_000, 200_000
 _QUICK = 1_000
 _MAG = 2.5 / np.log(10.0)
+# speclite's maggies are relative to 3631 Jy.
+_AB_UJY = 3631e6
 
 
 def sample(n: int, seed: int) -> pa.Table:
@@ -90,3 +96,183 @@ def measure(file: Path, n: int = _SAMPLE, bands: Sequence[str] = ()) -> None:
                 writer.writerow((name, setting.step, setting.n_ebv, setting.n_av, f"{rms:.2e}", f"{largest:.2e}"))
             stream.flush()
             print(name)
+
+
+def accuracy_of(rows: Galaxies, truth: Float, library: Library, accuracy: Accuracy) -> Float:
+    """Errors, mag, float64[n, 22], of what the job chooses for an accuracy."""
+    f_nu, _ = _interpolated(rows, library, accuracy)
+    return np.asarray(-_MAG * np.log(f_nu / truth))
+
+
+def _interpolated(rows: Galaxies, library: Library, accuracy: Accuracy) -> tuple[Float, flux_grid.Grid]:
+    curves = [passbands.load(name) for name in BANDS]
+    settings = [choice.setting for choice in grid_settings.choose(BANDS, accuracy)]
+    if missing := [name for name, setting in zip(BANDS, settings, strict=True) if setting is None]:
+        raise SystemExit(f"no table is fine enough for {', '.join(missing)}")
+    grid = flux_grid.open_grid(curves, [setting for setting in settings if setting], library)
+    return flux_grid.galaxies(rows, grid), grid
+
+
+def oracle(n: int, library: Library) -> float:
+    """Largest difference, mag, between our photometry and speclite's of the same spectra."""
+    import astropy.units as u
+    from speclite.filters import load_filter
+
+    table = sample(n, _SEED_TEST)
+    table = table.set_column(table.column_names.index("mag_r01"), "mag_r01", pa.array(np.full(n, 20.0)))
+    worst, grid = 0.0, passbands.grid()
+    with (Path(passbands.__file__).with_suffix(".csv")).open(newline="", encoding="utf-8") as stream:
+        published = {row["name"]: row["source"] for row in csv.DictReader(stream)}
+    made = {medium: spectra.galaxy_spectra(table, library, medium) for medium in ("air", "vacuum")}
+    for name in BANDS:
+        kind, _, source = published[name].partition(":")
+        if kind != "speclite":
+            continue
+        band = passbands.load(name)
+        seen = made[band.medium]
+        unit = u.erg / u.s / u.cm**2 / u.AA
+        wanted = np.array(load_filter(source).get_ab_maggies(seen * unit, grid * u.AA), float) * _AB_UJY
+        ours = spectra.band_fluxes(seen, [band])[:, 0]
+        worst = max(worst, float(np.abs(_MAG * np.log(ours / wanted)).max()))
+    return worst
+
+
+def job(n: int) -> float:
+    """Galaxies a second of a core, from Parquet to published Parquet, 22 bands, without Spark."""
+    from jobs import request
+    from jobs.fluxes import compute_fluxes
+    from lake_schema import ids, layout, publish, sky
+    from lake_schema.tables.galaxies import GALAXIES
+
+    drawn = sample(n, _SEED_SPEED)
+    index, ra, dec = sky.random_in_cell(5, 1607, n, np.random.default_rng(_SEED_SPEED))
+    columns: dict[str, Any] = {c.name: np.full(n, c.lo or 0.0) for c in GALAXIES.columns if not c.nullable}
+    columns |= {name: drawn[name].to_numpy() for name in drawn.column_names}
+    columns |= {"ra": ra, "dec": dec, "ra_lensed": ra, "dec_lensed": dec, "_healpix_29": index}
+    columns |= {"id": ids.source_id(0, 1607 << 6, np.arange(n)), "density_boost": np.ones(n)}
+    fitting = {c.name: np.asarray(columns[c.name]).astype(c.type) for c in GALAXIES.columns if c.name in columns}
+    rows = GALAXIES.build(fitting)
+    part = publish.Part(layout.cell_file(5, 1607), {})
+    with tempfile.TemporaryDirectory() as folder:
+        lake = layout.lake(Path(folder) / "lake")
+        lake.mkdir()
+        publish.make(lake, publish.Plan(GALAXIES, {}, (part,)), lambda root, facts: publish.Output(rows))
+        wanted = request.from_table(
+            {"name": "bench", "seed": 1, "area": {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}}, "fluxes": {"bands": list(BANDS)}}
+        )
+        step = compute_fluxes.galaxy_step(lake, wanted)
+        seconds = _cpu(lambda: publish.make(lake, step.plan, step.work), 1)
+    return n / seconds
+
+
+def stars(n: int) -> dict[str, float]:
+    """Speed and error of the stars."""
+    from jobs.fluxes.sources import Stars
+
+    library = templates.stellar_library()
+    rng = np.random.default_rng(_SEED_TEST)
+    rows = Stars(rng.integers(0, len(library), n), rng.uniform(5.0, 26.0, n), rng.uniform(0.0, grid_tables.STAR_A_V_LAST, n))
+    curves = [passbands.load(name) for name in BANDS]
+    found, truth = flux_grid.stars(rows, curves, library), integration.stars(rows, curves, library)
+    seconds = _cpu(lambda: flux_grid.stars(rows, curves, library), 3)
+    return {"stars_max_mag": float(np.abs(_MAG * np.log(found / truth)).max()), "stars_per_s_core": n / seconds}
+
+
+def curve(rows: Galaxies, truth: Float, library: Library) -> dict[str, list[float]]:
+    """Error against time of each setting, all bands alike: what the notebook draws."""
+    curves = [passbands.load(name) for name in BANDS]
+    out: dict[str, list[float]] = {name: [] for name in ("curve_us", "curve_rms_mag", "curve_max_mag", "curve_mb")}
+    for setting in grid_settings.CANDIDATES:
+        grid = flux_grid.open_grid(curves, [setting] * len(curves), library)
+        error = -_MAG * np.log(flux_grid.galaxies(rows, grid) / truth)
+        out["curve_us"].append(1e6 * _cpu(lambda grid=grid: flux_grid.galaxies(rows, grid), 3) / len(rows))  # type: ignore[misc]
+        out["curve_rms_mag"].append(_rms(error))
+        out["curve_max_mag"].append(float(np.abs(error).max()))
+        out["curve_mb"].append(grid.tables[0].nbytes / 1e6)
+    return out
+
+
+def run(quick: bool) -> dict[str, Any]:
+    """All figures."""
+    library = templates.galaxy_library()
+    n = _QUICK if quick else _SAMPLE
+    curves = [passbands.load(name) for name in BANDS]
+    rows = galaxies_of(sample(n, _SEED_TEST), library)
+    integrated: list[Float] = []
+    integration_s = _cpu(lambda: integrated.append(integration.galaxies(rows, curves, library)), 1)
+    truth = integrated[0]
+    survey, draft = (accuracy_of(rows, truth, library, accuracy) for accuracy in (SURVEY, DRAFT))
+    many = rows if quick else galaxies_of(sample(_SPEED_SAMPLE, _SEED_SPEED), library)
+    _, grid = _interpolated(many, library, SURVEY)
+    speed = len(many) / _cpu(lambda: flux_grid.galaxies(many, grid), 1 if quick else 5)
+    figures: dict[str, Any] = {
+        "objects": n,
+        "rms_mag_all": _rms(survey),
+        "rms_mag_worst_band": max(_rms(error) for error in survey.T),
+        "max_mag": float(np.abs(survey).max()),
+        "draft_rms_mag_all": _rms(draft),
+        "draft_max_mag": float(np.abs(draft).max()),
+        "galaxies_per_s_core": speed,
+        "integration_galaxies_per_s_core": n / integration_s,
+        "speedup_vs_integration": speed * integration_s / n,
+        "job_galaxies_per_s_core": job(n if quick else _SPEED_SAMPLE),
+        "table_mb": max(table.nbytes for table in grid.tables) / 1e6,
+        "table_mb_mean": float(np.mean([table.nbytes for table in grid.tables])) / 1e6,
+        "build_s": _build_seconds(library, quick),
+        "oracle_mag_max": oracle(20 if quick else 200, library),
+        **stars(n),
+    }
+    figures |= {f"rms_mag_{name}": _rms(error) for name, error in zip(BANDS, survey.T, strict=True)}
+    return figures if quick else figures | curve(rows, truth, library)
+
+
+def _build_seconds(library: Library, quick: bool) -> float:
+    """Making the tables of the 22 bands (two, if in haste), in an empty cache."""
+    bands = BANDS[:2] if quick else BANDS
+    curves = [passbands.load(name) for name in bands]
+    settings = [setting for choice in grid_settings.choose(bands, SURVEY) if (setting := choice.setting) is not None]
+    before = os.environ.get("TRUESKY_CACHE")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["TRUESKY_CACHE"] = folder
+        try:
+            return _cpu(lambda: flux_grid.open_grid(curves, settings, library), 1)
+        finally:
+            os.environ.pop("TRUESKY_CACHE")
+            if before is not None:
+                os.environ["TRUESKY_CACHE"] = before
+
+
+def _rms(error: Float) -> float:
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def _cpu(work: Callable[[], object], repeats: int) -> float:
+    """Least CPU seconds of a few repeats."""
+    best = np.inf
+    for _ in range(repeats):
+        started = time.process_time()
+        work()
+        best = min(best, time.process_time() - started)
+    return float(best)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="benchmarks.fluxes", description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="few objects, for tests")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--measure", type=Path, metavar="FILE")
+    options = parser.parse_args(argv)
+    if options.measure:
+        measure(options.measure, _QUICK if options.quick else _SAMPLE)
+        return 0
+    figures = run(options.quick)
+    for name, value in figures.items():
+        print(f"{name:34} {', '.join(f'{v:.3g}' for v in value) if isinstance(value, list) else f'{value:,.4g}'}")
+    if options.json:
+        about = {"name": "fluxes", "commit": git_commit(), "machine": platform.processor() or platform.machine()}
+        options.json.write_text(json.dumps({**about, "repeats": 1 if options.quick else 5, **figures}, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -105,7 +105,7 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
         epilog=f"truesky {__version__}",
         formatter_class=argparse.RawTextHelpFormatter,
     )
-    parser.add_argument("--lake", required=True, type=Path, help="folder of the lake (made where it is not there)")
+    parser.add_argument("--lake", required=True, help="folder of the lake (made where it is not there)")
     parser.add_argument("--request", required=True, type=Path, help="simulation request, a TOML file")
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and Spark's own messages")
     return parser.parse_args(argv)

@@ -15,19 +15,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: 0 all well, 1 something is wrong with the lake, 2 the call is wrong."""
     parser = argparse.ArgumentParser(prog="python -m lake_schema", description=__doc__, epilog=f"truesky {__version__}")
     parser.add_argument("command", choices=("verify", "gc", "describe"))
-    parser.add_argument("lake", type=Path)
+    parser.add_argument("lake", help="folder of the lake")
     parser.add_argument("table", nargs="?", help="one table (default: all of them)")
     parser.add_argument("--deep", action="store_true", help="verify: read every byte and compare its sha256")
     options = parser.parse_args(argv)
     try:
         root = layout.lake(options.lake)
-        names = [options.table] if options.table else read.tables(root)
+        names = [options.table] if options.table else _names(root, options.command)
         if not names:
             raise BadInput(f"lake {root} holds no table")
     except BadInput as error:
         return _say(error, 2)
     actions = {"verify": _verify, "gc": _gc, "describe": _describe}
     return max(_status(actions[options.command], root, name, options.deep) for name in names)
+
+
+def _names(root: Path, command: str) -> list[str]:
+    """The published tables; gc also looks where nothing has been published yet."""
+    if command != "gc":
+        return read.tables(root)
+    return sorted({path.parent.name for path in root.glob("*/.lock*")})
 
 
 def _status(action: Callable[[Path, str, bool], bool], root: Path, name: str, deep: bool) -> int:

@@ -18,7 +18,7 @@ from lake_schema.errors import BadInput
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
 _CELL = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet", re.ASCII)
-_REMOTE = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://")
+_REMOTE = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+:/")
 
 
 def name(text: str) -> str:

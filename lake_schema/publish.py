@@ -25,7 +25,7 @@ from functools import partial
 from pathlib import Path
 
 from lake_schema import __version__, layout, manifest
-from lake_schema.errors import Damaged, PartsFailed, Superseded
+from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
 from lake_schema.manifest import sync
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
 from lake_schema.stage import attempt, is_done, missing, receipt_of, receipts, write_part
@@ -192,6 +192,8 @@ def gc(root: Path, name: str) -> list[Path]:
     A folder is renamed before it is emptied, so that a death in between leaves no half version that looks whole.
     """
     folder = layout.table(root, name)
+    if not folder.is_dir():
+        raise BadInput(f"lake {root} has no table {name}")
     removed: list[Path] = []
     _empty(folder)
     with _lock(folder / ".lock", f"table {name}: another run is publishing", _PATIENCE):

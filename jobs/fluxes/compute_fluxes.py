@@ -41,6 +41,11 @@ def steps(lake: Path, request: Request) -> list[Step]:
     return made
 
 
+def galaxy_step(lake: Path, request: Request) -> Step:
+    """The step of the galaxies alone."""
+    return _step(read.version(lake, "galaxies"), "galaxy", request)
+
+
 def _step(catalogue: read.Version, kind: str, request: Request) -> Step:
     inputs = {"catalogue": catalogue.table, "input": catalogue.key}
     facts = {**inputs, **_how(kind, request), "code": code_version()}

@@ -25,8 +25,8 @@ Float = npt.NDArray[np.float64]
 # Serrano et al. 2024, appendix B: every spectrum and response is homogenised to this range and step.
 GRID_FIRST, GRID_LAST = 600, 24000
 # Each end of a curve is cut where this fraction of the photons of a source of constant f_lambda would be
-# detected outside: 1e-5 mag. Never inside, so that red leaks stay.
-END_PHOTONS = 1e-5
+# detected outside. Never inside: behind dust, a red leak is most of what ultraviolet bands see.
+END_PHOTONS = 1e-7
 # How far out a logistic edge is tabulated, in widths: exp(-20) is below any use.
 _LOGISTIC_REACH = 20.0
 

@@ -8,6 +8,7 @@ import pytest
 
 from lake_schema import __version__, layout, publish, read
 from lake_schema.__main__ import main
+from lake_schema.errors import PartsFailed
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
 
 
@@ -62,6 +63,14 @@ def test_gc_removes_what_is_old_and_says_so(filled, capsys):
     capsys.readouterr()
     assert main(["gc", str(filled)]) == 0
     assert capsys.readouterr().out == ""
+
+
+def test_gc_removes_the_stage_of_a_run_that_was_given_up(lake, capsys):
+    with pytest.raises(PartsFailed):
+        publish.make(lake, plain_plan(1), lambda root, facts: None)
+    assert main(["gc", str(lake)]) == 0
+    assert "removed" in capsys.readouterr().out
+    assert [path.name for path in (lake / "plain").iterdir()] == [".lock"]
 
 
 def test_describe_names_every_column_with_its_unit(filled, capsys):

@@ -1,0 +1,58 @@
+"""Ask a lake: python -m jobs.explore "SELECT ..." --lake LAKE [--out FILE.csv|FILE.parquet|FILE.fits]."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jobs.explore import results
+from jobs.explore.explorer import Explorer
+from lake_schema import __version__
+from lake_schema.errors import BadInput, LakeError
+
+_GIGABYTE = 1e9
+_MOST_ROWS_SHOWN = 40
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit status: 0, 1 the lake is damaged, 2 the call or the query is wrong."""
+    options = _options(argv)
+    try:
+        with Explorer(options.lake, int(options.memory * _GIGABYTE), options.timeout) as lake:
+            if options.sql is None:
+                print(lake.tables().to_string())
+                return 0
+            rows = lake.sql(options.sql, into="arrow")
+        if options.out is None:
+            print(rows.to_pandas().to_string(max_rows=_MOST_ROWS_SHOWN, index=False))
+            print(f"{rows.num_rows:,} rows")
+        else:
+            results.write(rows, options.out)
+            print(f"{options.out}: {rows.num_rows:,} rows, {options.out.stat().st_size / 1e6:.1f} MB")
+    except (BadInput, OSError) as error:
+        print(f"explore: {error}", file=sys.stderr)
+        return 2
+    except LakeError as error:
+        print(f"explore: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _options(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m jobs.explore",
+        description="Run one SELECT over the tables of a lake; without one, list the tables.",
+        epilog=f"truesky {__version__}",
+    )
+    parser.add_argument("sql", nargs="?", help="a SELECT, in DuckDB's SQL")
+    parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser.add_argument("--out", type=Path, help="write to this .csv, .parquet or .fits file")
+    parser.add_argument("--memory", type=float, default=4.0, help="GB that the query may take (default 4)")
+    parser.add_argument("--timeout", type=float, default=300.0, help="s that it may take (default 300)")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,230 @@
+"""A lake, opened for looking: its tables as they were at that moment, whatever is published meanwhile."""
+
+from __future__ import annotations
+
+import json
+import selectors
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pyarrow as pa
+
+from jobs.explore import results
+from lake_schema import layout, read, sky
+from lake_schema.errors import BadInput, Damaged, LakeError
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+Range = tuple[float, float]
+
+_ROOT = Path(__file__).resolve().parents[2]
+_ERRORS = {"BadInput": BadInput, "Damaged": Damaged}
+
+
+class Explorer:
+    """Tables of a lake, and the process that answers questions about them; ends with `close` or a `with` block.
+
+    memory  : bytes that a query and its result may take together
+    timeout : s after which a query is stopped
+    """
+
+    def __init__(self, lake: str | Path, memory: int = 4 << 30, timeout: float = 60.0) -> None:
+        self.root = layout.lake(lake)
+        self.versions = {name: read.version(self.root, name) for name in read.tables(self.root)}
+        if not self.versions:
+            raise BadInput(f"lake {self.root} holds no table")
+        self.memory, self.timeout = memory, timeout
+        self._worker: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Explorer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process; a later query starts another."""
+        if self._worker is not None:
+            self._worker.kill()
+            self._worker.communicate()
+            self._worker = None
+
+    # ------------------------------------------------------------------------------------------------ what there is
+
+    def tables(self) -> pd.DataFrame:
+        """The tables: rows, megabytes, files, version and meaning."""
+        rows = [
+            {
+                "table": name,
+                "rows": version.num_rows,
+                "MB": sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6,
+                "files": len(version.parts),
+                "version": version.key,
+                "meaning": (version.schema.metadata or {}).get(b"description", b"").decode(),
+            }
+            for name, version in self.versions.items()
+        ]
+        return pd.DataFrame(rows).set_index("table")
+
+    def describe(self, table: str) -> pd.DataFrame:
+        """The columns of a table: type, unit, range, UCD, meaning."""
+        rows = []
+        for field in self._version(table).schema:
+            facts = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+            span = f"{facts.get('min', '')} .. {facts.get('max', '')}" if {"min", "max"} & facts.keys() else ""
+            meaning = facts.get("description", "") + (f" ({facts['codes']})" if "codes" in facts else "")
+            about = {"type": str(field.type), "unit": facts.get("unit", ""), "range": span, "null": field.nullable}
+            rows.append({"column": field.name, **about, "ucd": facts.get("ucd", ""), "meaning": meaning})
+        return pd.DataFrame(rows).set_index("column")
+
+    def _version(self, table: str) -> read.Version:
+        if table not in self.versions:
+            raise BadInput(f"lake {self.root} has no table {table}; it has {', '.join(self.versions)}")
+        return self.versions[table]
+
+    # ------------------------------------------------------------------------------------------------ rows
+
+    def sql(self, text: str, /, into: str = "pandas", **parameters: object) -> Any:
+        """The result of one SELECT over the lake's tables.
+
+        text       : DuckDB's SQL, with separation(ra1, dec1, ra2, dec2) in deg and mag_ab(f_nu) of microjansky beside its
+                     own functions; $name stands for a parameter
+        into       : "pandas", "astropy" (a Table with units) or "arrow"
+        parameters : numbers, texts, booleans or lists of them
+        Errors     : BadInput for text that is no SELECT of ours, or that takes too long or too much; Damaged for a changed byte
+        """
+        try:
+            line = json.dumps({"sql": text, "parameters": parameters}, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise BadInput(f"SQL: a parameter is not a number, text, boolean or list of them: {error}") from None
+        return results.converted(self._ask(line), into)
+
+    def cone(
+        self, table: str, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None,
+        on: str = "true", into: str = "pandas",
+    ) -> Any:  # fmt: skip
+        """Rows of a catalogue within a circle.
+
+        ra, dec, radius : deg;  on : "true" or "lensed" positions
+        """
+        return results.converted(self._version(table).cone(ra, dec, radius, columns, on), into)
+
+    def export(self, text: str, path: str | Path, /, **parameters: object) -> Path:
+        """Write the result of a SELECT to a .csv, .parquet or .fits file; returns its path."""
+        results.write(self.sql(text, into="arrow", **parameters), Path(path))
+        return Path(path)
+
+    # ------------------------------------------------------------------------------------------------ distributions
+
+    def hist(
+        self, table: str, x: str, bins: int = 100, span: Range | None = None, where: str = "true", weight: str = "1"
+    ) -> tuple[Float, Float]:
+        """Counts of an expression in equal bins.
+
+        x, where, weight : SQL of the table's columns;  span : lowest and highest value, None = all
+        returns          : counts[bins], edges[bins + 1]
+        """
+        self._version(table)
+        lo, hi = span or self._span(table, x, where)
+        text = f"""
+            SELECT {_bin("x", "x")} AS i, sum(w)::DOUBLE AS n FROM (SELECT ({x})::DOUBLE AS x, ({weight})::DOUBLE AS w
+            FROM {table} WHERE ({where})) WHERE x BETWEEN $x_lo AND $x_hi GROUP BY i"""
+        found = self.sql(text, into="arrow", x_lo=lo, x_hi=hi, x_bins=bins)
+        counts = np.zeros(bins)
+        counts[found["i"].to_numpy()] = found["n"].to_numpy()
+        return counts, np.linspace(lo, hi, bins + 1)
+
+    def heatmap(
+        self, table: str, x: str, y: str, bins: tuple[int, int] = (100, 100),
+        span: tuple[Range, Range] | None = None, where: str = "true", weight: str = "1",
+    ) -> tuple[Float, Float, Float]:  # fmt: skip
+        """Counts of two expressions in a grid of equal bins.
+
+        returns : counts[y bins, x bins], edges of x, edges of y
+        """
+        self._version(table)
+        (x_lo, x_hi), (y_lo, y_hi) = span or (self._span(table, x, where), self._span(table, y, where))
+        text = f"""
+            SELECT {_bin("x", "x")} AS i, {_bin("y", "y")} AS j, sum(w)::DOUBLE AS n
+            FROM (SELECT ({x})::DOUBLE AS x, ({y})::DOUBLE AS y, ({weight})::DOUBLE AS w FROM {table} WHERE ({where}))
+            WHERE x BETWEEN $x_lo AND $x_hi AND y BETWEEN $y_lo AND $y_hi GROUP BY i, j"""
+        limits = {"x_lo": x_lo, "x_hi": x_hi, "x_bins": bins[0], "y_lo": y_lo, "y_hi": y_hi, "y_bins": bins[1]}
+        found = self.sql(text, into="arrow", **limits)
+        counts = np.zeros((bins[1], bins[0]))
+        counts[found["j"].to_numpy(), found["i"].to_numpy()] = found["n"].to_numpy()
+        return counts, np.linspace(x_lo, x_hi, bins[0] + 1), np.linspace(y_lo, y_hi, bins[1] + 1)
+
+    def skymap(self, table: str, order: int = 8, where: str = "true", weight: str = "1") -> tuple[Int, Float]:
+        """Counts in HEALPix cells (nested) of an order: the cells that hold any, ascending, and their counts."""
+        self._version(table)
+        if not 0 <= order <= sky.DEEPEST:
+            raise BadInput(f"order = {order} is outside [0, {sky.DEEPEST}]")
+        text = f"""
+            SELECT _healpix_29 >> $shift::INT AS cell, sum(({weight})::DOUBLE)::DOUBLE AS n FROM {table} WHERE ({where})
+            GROUP BY cell ORDER BY cell"""
+        found = self.sql(text, into="arrow", shift=2 * (sky.DEEPEST - order))
+        return found["cell"].to_numpy(), found["n"].to_numpy()
+
+    def _span(self, table: str, x: str, where: str) -> Range:
+        text = f"SELECT min(x)::DOUBLE AS lo, max(x)::DOUBLE AS hi FROM (SELECT ({x}) AS x FROM {table} WHERE ({where}))"
+        found = self.sql(text, into="arrow")
+        lo, hi = found["lo"][0].as_py(), found["hi"][0].as_py()
+        if lo is None or not np.isfinite([lo, hi]).all():
+            raise BadInput(f"table {table}: {x} has no finite values here")
+        return (lo, hi) if hi > lo else (lo - 0.5, hi + 0.5)
+
+    # ------------------------------------------------------------------------------------------------ the process
+
+    def _ask(self, line: str) -> pa.Table:
+        deadline = time.monotonic() + self.timeout
+        worker = self._running()
+        assert worker.stdin is not None and worker.stdout is not None
+        whole = False
+        try:
+            worker.stdin.write(line.encode() + b"\n")
+            worker.stdin.flush()
+            if not _readable(worker, deadline):
+                raise BadInput(f"SQL: stopped after {self.timeout:g} s")
+            head = worker.stdout.readline()
+            if not head:
+                raise BadInput("SQL: the query needs more memory than it may have, or brought its process down")
+            answer = json.loads(head)
+            if not answer:
+                with pa.ipc.open_stream(worker.stdout) as stream:
+                    found = stream.read_all()
+            whole = True
+        except BrokenPipeError:
+            raise BadInput("SQL: the process that answers queries has ended; ask again") from None
+        finally:
+            if not whole:
+                self.close()
+        if answer:
+            raise _ERRORS.get(answer["kind"], LakeError)(answer["error"])
+        return found
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        if self._worker is None or self._worker.poll() is not None:
+            versions = [f"{name}={version.key}" for name, version in self.versions.items()]
+            command = [sys.executable, "-m", "jobs.explore.worker", str(self.root), str(self.memory), *versions]
+            pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+            self._worker = subprocess.Popen(command, cwd=_ROOT, **pipes)
+        return self._worker
+
+
+def _bin(x: str, axis: str) -> str:
+    return f"least(floor(({x} - ${axis}_lo) / (${axis}_hi - ${axis}_lo) * ${axis}_bins), ${axis}_bins - 1)::INT"
+
+
+def _readable(worker: subprocess.Popen[bytes], deadline: float) -> bool:
+    """Has the process said anything, or ended, before the deadline?"""
+    assert worker.stdout is not None
+    with selectors.DefaultSelector() as selector:
+        selector.register(worker.stdout, selectors.EVENT_READ)
+        return bool(selector.select(max(deadline - time.monotonic(), 0.0)))

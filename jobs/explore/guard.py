@@ -1,0 +1,146 @@
+"""What a query may be: one SELECT over the lake's tables and its own subqueries, with no function that reaches outside.
+
+The text is parsed by DuckDB itself, into the tree that it would run; nothing is guessed from the text.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import duckdb
+
+from lake_schema.errors import BadInput
+
+_MOST_CHARACTERS = 100_000
+_QUERIES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
+_SOURCES = {"BASE_TABLE", "JOIN", "SUBQUERY", "EMPTY", "EXPRESSION_LIST", "TABLE_FUNCTION"}
+_TABLE_FUNCTIONS = {"range", "generate_series", "unnest"}
+# Of the scalar functions those that read or change the session, wait, or run other text.
+_FUNCTIONS = {
+    "current_query", "current_setting", "currval", "getenv", "getvariable", "json_deserialize_sql", "json_serialize_sql",
+    "nextval", "query", "query_table", "setseed", "setval", "sleep_ms", "write_log",
+}  # fmt: skip
+_FUNCTION_PREFIXES = ("pg_", "duckdb_", "read_", "json_execute")
+
+Tree = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """A query that may run.
+
+    tables  : those of the lake that it names
+    columns : names of the result that are columns of these tables, as they are; None = every name of a table's column
+    """
+
+    text: str
+    tables: tuple[str, ...]
+    columns: frozenset[str] | None
+
+
+def checked(text: str, known: Collection[str]) -> Query:
+    """The query, if it is harmless.  Errors: BadInput says what it may not do.
+
+    known : names of the lake's tables
+    """
+    if len(text) > _MOST_CHARACTERS or "\0" in text:
+        raise BadInput(f"SQL: a query has at most {_MOST_CHARACTERS} characters and no NUL")
+    tree = _parsed(text)
+    named = {str(entry["key"]).lower() for node in _nodes(tree) if "cte_map" in node for entry in node["cte_map"]["map"]}
+    used = set()
+    for node in _nodes(tree):
+        if "cte_map" in node and node.get("type") not in _QUERIES:
+            raise BadInput(f"SQL: only SELECT is possible, not {_words(node)}")
+        if {"type", "alias", "sample"} <= node.keys():
+            used |= _source(node, known, named)
+        if node.get("class") == "FUNCTION":
+            _refuse_function(str(node["function_name"]).lower())
+    return Query(text, tuple(sorted(used)), _plain_columns(tree, used))
+
+
+def _parsed(text: str) -> Tree:
+    with duckdb.connect(":memory:", config={"threads": 1}) as parser:
+        try:
+            kinds = [statement.type for statement in parser.extract_statements(text)]
+            if kinds != [duckdb.StatementType.SELECT]:
+                names = ", ".join(str(kind).rpartition(".")[2] for kind in kinds) or "nothing"
+                raise BadInput(f"SQL: exactly one SELECT is possible, got {names[:100]}")
+            row = parser.execute("SELECT json_serialize_sql($text::VARCHAR)", {"text": text}).fetchone()
+        except (duckdb.Error, UnicodeError) as error:
+            raise BadInput(f"SQL: {one_line(error)}") from None
+    try:
+        answer: Tree = json.loads(row[0]) if row else {"error": True}
+    except RecursionError:
+        raise BadInput("SQL: nested too deeply") from None
+    if answer.get("error") or len(answer["statements"]) != 1:
+        raise BadInput(f"SQL: {answer.get('error_message', 'cannot be parsed')}")
+    return answer["statements"][0]["node"]  # type: ignore[no-any-return]
+
+
+def one_line(error: BaseException) -> str:
+    """An error's text without its line breaks and pointers."""
+    return " ".join(str(error).split())[:500]
+
+
+def _nodes(tree: Any) -> Iterator[Tree]:
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, dict):
+            yield node
+            waiting += node.values()
+        elif isinstance(node, list):
+            waiting += node
+
+
+def _words(node: Tree) -> str:
+    return str(node.get("type")).removesuffix("_NODE").removesuffix("_QUERY").replace("_", " ")
+
+
+def _source(node: Tree, known: Collection[str], named: Collection[str]) -> set[str]:
+    """The lake's table that a FROM entry stands for, if any."""
+    kind = node["type"]
+    if kind not in _SOURCES:
+        raise BadInput(f"SQL: {_words(node)} is not possible here")
+    if kind == "TABLE_FUNCTION" and node["function"].get("function_name", "").lower() not in _TABLE_FUNCTIONS:
+        name = node["function"].get("function_name", "this")
+        raise BadInput(f"SQL: {name}() is not a table of the lake ({', '.join(sorted(known))})")
+    if kind != "BASE_TABLE":
+        return set()
+    name, qualified = str(node["table_name"]).lower(), node.get("schema_name") or node.get("catalog_name")
+    if not qualified and name in known:
+        return {name}
+    if not qualified and name in named:
+        return set()
+    raise BadInput(f"SQL: {node['table_name']!r} is not a table of the lake ({', '.join(sorted(known))})")
+
+
+def _refuse_function(name: str) -> None:
+    if name in _FUNCTIONS or name.startswith(_FUNCTION_PREFIXES):
+        raise BadInput(f"SQL: the function {name} is not possible here")
+
+
+def _plain_columns(tree: Tree, tables: Collection[str]) -> frozenset[str] | None:
+    """Names of result columns that are columns of the tables, so that their units still hold."""
+    if tree.get("type") != "SELECT_NODE" or not _only_tables(tree["from_table"], tables):
+        return frozenset()
+    plain, renamed, everything = set(), set(), False
+    for entry in tree["select_list"]:
+        if entry["class"] == "STAR" and not (entry.get("replace_list") or entry.get("rename_list") or entry.get("columns")):
+            everything = True
+        elif entry["class"] == "COLUMN_REF" and not entry["alias"]:
+            plain.add(str(entry["column_names"][-1]))
+        else:
+            renamed.add(str(entry["alias"]))
+    if everything and not renamed:
+        return None
+    return frozenset(plain - renamed)
+
+
+def _only_tables(source: Tree, tables: Collection[str]) -> bool:
+    if source["type"] == "JOIN":
+        return _only_tables(source["left"], tables) and _only_tables(source["right"], tables)
+    return source["type"] == "BASE_TABLE" and str(source["table_name"]).lower() in tables and not source["column_name_alias"]

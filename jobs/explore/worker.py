@@ -1,0 +1,133 @@
+"""The process that runs queries: python -m jobs.explore.worker LAKE TABLE=KEY ... , queries on stdin, answers on stdout.
+
+DuckDB counts neither the memory of every function nor its result, and some functions do not stop when told to; a process has
+a limit of memory that holds, and can be killed.  A query is a line of JSON; an answer a line of JSON, then, if it is a
+result, an Arrow stream.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import duckdb
+import pyarrow as pa
+
+from jobs.explore.guard import Query, checked, one_line
+from lake_schema import layout, read
+from lake_schema.errors import BadInput, Damaged, LakeError
+
+_MACROS = (
+    # Great-circle distance by the haversine, deg.
+    """CREATE MACRO separation(ra1, dec1, ra2, dec2) AS degrees(2 * asin(least(1.0, sqrt(
+       pow(sin(radians(dec2 - dec1) / 2), 2) + cos(radians(dec1)) * cos(radians(dec2)) * pow(sin(radians(ra2 - ra1) / 2), 2)))))""",
+    # AB magnitude of f_nu in microjansky, NULL where there is no flux.
+    "CREATE MACRO mag_ab(f_nu) AS 23.9 - 2.5 * log10(CASE WHEN f_nu > 0 THEN f_nu END)",
+)
+# From here on the session can reach nothing but what was registered, and can change nothing of this.
+_LOCKS = (
+    "SET python_enable_replacements = false",
+    "SET autoload_known_extensions = false",
+    "SET autoinstall_known_extensions = false",
+    "SET allow_community_extensions = false",
+    "SET enable_external_access = false",
+    "SET lock_configuration = true",
+)
+_ROWS_A_BATCH = 65_536
+# What Python and the libraries take before any query, and the part of the rest that DuckDB may fill.
+_BASE_BYTES, _SHARE = 1 << 30, 0.5
+
+
+def main(argv: Sequence[str]) -> int:
+    """Answer queries until stdin ends.
+
+    argv : lake, most bytes of memory, TABLE=KEY of each table
+    """
+    root, memory = layout.lake(argv[0]), int(argv[1])
+    resource.setrlimit(resource.RLIMIT_DATA, (memory + _BASE_BYTES, memory + _BASE_BYTES))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    versions = dict(entry.split("=", 1) for entry in argv[2:])
+    # Whatever a library prints must not get between the answers.
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        _answer(out, root, versions, memory, json.loads(line))
+    return 0
+
+
+def _answer(out: IO[bytes], root: Path, versions: dict[str, str], memory: int, question: dict[str, Any]) -> None:
+    try:
+        query = checked(question["sql"], versions)
+        opened = {name: read.version(root, name, versions[name]) for name in query.tables}
+        found = _with_units(_run(query, opened, memory, question["parameters"]), query, opened)
+    except LakeError as error:
+        kind = "Damaged" if isinstance(error, Damaged) else "BadInput"
+        out.write(json.dumps({"error": str(error), "kind": kind}).encode() + b"\n")
+    except MemoryError:
+        out.write(json.dumps({"error": _TOO_LARGE, "kind": "BadInput"}).encode() + b"\n")
+    else:
+        out.write(b"{}\n")
+        with pa.ipc.new_stream(out, found.schema) as stream:
+            stream.write_table(found)
+    out.flush()
+
+
+_TOO_LARGE = "SQL: the query or its result needs more memory than it may have: ask for less"
+
+
+def _run(query: Query, opened: dict[str, read.Version], memory: int, parameters: dict[str, Any]) -> pa.Table:
+    most = int(memory * _SHARE)
+    config = {"memory_limit": f"{most // 1_000_000}MB", "temp_directory": "", "threads": os.cpu_count() or 1}
+    with duckdb.connect(":memory:", config=config) as session:
+        for name, version in opened.items():
+            session.register(name, version.dataset())
+        for command in (*_MACROS, *_LOCKS):
+            session.execute(command)
+        try:
+            relation = session.sql(query.text, params=parameters or None)
+            if relation is None:
+                raise BadInput("SQL: gives no rows")
+            return _collected(pa.RecordBatchReader.from_stream(relation), most)
+        except duckdb.OutOfMemoryException:
+            raise BadInput(_TOO_LARGE) from None
+        except (duckdb.Error, OSError, pa.ArrowException) as error:
+            text = one_line(error)
+            if "CRC" in text or isinstance(error, OSError):
+                raise Damaged(f"table {', '.join(opened)}: {text}") from None
+            raise BadInput(f"SQL: {text}") from None
+
+
+def _collected(batches: pa.RecordBatchReader, most: int) -> pa.Table:
+    kept, size = [], 0
+    for batch in batches:
+        size += batch.nbytes
+        if size > most:
+            raise BadInput(_TOO_LARGE)
+        kept.append(batch)
+    table = pa.Table.from_batches(kept, batches.schema)
+    fields = [_exportable(field) for field in table.schema]
+    return table.cast(pa.schema(fields))
+
+
+def _exportable(field: pa.Field) -> pa.Field:
+    """Sums of integers come as 128-bit decimals, which no file format of astronomy has."""
+    return field.with_type(pa.float64()) if pa.types.is_decimal(field.type) else field
+
+
+def _with_units(found: pa.Table, query: Query, opened: dict[str, read.Version]) -> pa.Table:
+    """Give the columns that came unchanged from a table its unit and description."""
+    fields = []
+    for field in found.schema:
+        sources = [v.schema.field(field.name) for v in opened.values() if field.name in v.schema.names]
+        same = [s for s in sources if s.type == field.type and (query.columns is None or field.name in query.columns)]
+        fields.append(field.with_metadata(same[0].metadata) if same else field)
+    return pa.Table.from_arrays(found.columns, schema=pa.schema(fields))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

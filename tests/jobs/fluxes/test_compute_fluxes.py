@@ -1,0 +1,98 @@
+"""The job: cell by cell, row by row, with its accuracy in the manifest."""
+
+import numpy as np
+import pytest
+
+from jobs import request
+from jobs.accuracy import REFERENCE
+from jobs.fluxes import compute_fluxes, spectra
+from lake_schema import ids, layout, publish, read, sky
+from lake_schema.errors import BadInput
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.stars import STARS
+from tests.universe import rows_of
+
+CELLS = (1607, 1608)
+BANDS = ["euclid_vis", "euclid_h"]
+
+
+def wanted(**keys):
+    area = {"cone": {"ra": 10.0, "dec": 10.0, "radius": 1.0}}
+    return request.from_table({"name": "test", "seed": 1, "area": area, "fluxes": {"bands": BANDS}} | keys)
+
+
+def catalogue(lake, declared, columns):
+    """A small catalogue of two cells."""
+
+    def work(root, facts):
+        cell, n = facts["cell"], 40
+        index, ra, dec = sky.random_in_cell(5, cell, n, np.random.default_rng(cell))
+        kind = 5 if declared is STARS else 0
+        place = {"_healpix_29": index, "ra": ra, "dec": dec, "id": ids.source_id(kind, cell << 6, np.arange(n))}
+        rows = rows_of(declared, n, cell)
+        given = {name: np.full(n, value).astype(declared.column(name).type) for name, value in columns.items()}
+        if declared is GALAXIES:
+            place |= {"ra_lensed": ra, "dec_lensed": dec}
+        return publish.Output(declared.build({name: rows[name] for name in declared.names} | place | given))
+
+    parts = tuple(publish.Part(layout.cell_file(5, cell), {"cell": cell}) for cell in CELLS)
+    publish.make(lake, publish.Plan(declared, {"columns": sorted(columns)}, parts), work)
+
+
+@pytest.fixture
+def filled(lake):
+    galaxy = {"kind": 0, "kappa": 0.1, "gamma1": 0.0, "gamma2": 0.0, "z_obs": 0.7, "sed_1": 3, "sed_2": 2, "mag_r01": 21.0}
+    catalogue(lake, GALAXIES, galaxy | {"frac_1": 0.3, "frac_2": 0.7, "a_v": 0.2, "ebv_1": 0.1, "ebv_2": 0.1})
+    catalogue(lake, STARS, {"sed": 20, "a_v": 0.3, "mag_h": 18.0})
+    return lake
+
+
+def run(lake, asked):
+    for step in compute_fluxes.steps(lake, asked):
+        publish.make(lake, step.plan, step.work)
+
+
+def test_every_source_has_its_fluxes_beside_it(filled):
+    run(filled, wanted())
+    for kind, name in compute_fluxes.CATALOGUES:
+        source, made = read.version(filled, name), read.version(filled, f"{kind}_fluxes")
+        assert made.num_rows == source.num_rows == 80
+        assert made.parts == source.parts
+        assert made.rows()["id"].equals(source.rows()["id"])
+        assert all((made.rows()[f"f_nu_{band}"].to_numpy() > 0.0).all() for band in BANDS)
+
+
+def test_the_manifest_says_how_exact_it_is(filled):
+    run(filled, wanted())
+    facts = read.version(filled, "galaxy_fluxes").manifest["facts"]
+    assert facts["accuracy"]["flux"] == 1e-3
+    assert set(facts["errors"]) == set(BANDS)
+    assert all(0.0 < error["largest"] <= 1e-3 and len(error["setting"]) == 3 for error in facts["errors"].values())
+    assert facts["covered"]["ebv"] == [0.0, 0.6]
+    assert read.version(filled, "star_fluxes").manifest["facts"]["errors"]["euclid_h"]["largest"] <= 1e-5
+
+
+def test_the_accuracy_of_the_request_rules(filled, library):
+    run(filled, wanted(accuracy="draft"))
+    draft = read.version(filled, "galaxy_fluxes")
+    run(filled, wanted(accuracy="reference"))
+    exact = read.version(filled, "galaxy_fluxes")
+    assert draft.key != exact.key
+    assert all(error["setting"] is None for error in exact.manifest["facts"]["errors"].values())
+    truth = spectra.galaxy_fluxes(read.version(filled, "galaxies").rows(), BANDS, library, REFERENCE)
+    for band in BANDS:
+        slow, fast = (version.rows()[f"f_nu_{band}"].to_numpy() for version in (exact, draft))
+        np.testing.assert_array_equal(slow, truth[f"f_nu_{band}"].to_numpy())
+        np.testing.assert_allclose(fast, slow, rtol=5e-3)
+        assert (fast != slow).any()
+
+
+def test_what_is_there_is_not_prepared_again(filled, monkeypatch):
+    run(filled, wanted())
+    monkeypatch.setattr(spectra, "prepare", None)
+    run(filled, wanted())
+
+
+def test_an_unknown_band_is_refused_before_anything_is_made(filled):
+    with pytest.raises(BadInput, match=r"fluxes\.bands: 'nonsense' is not one of euclid_vis"):
+        compute_fluxes.steps(filled, wanted(fluxes={"bands": ["nonsense"]}))

@@ -1,0 +1,166 @@
+"""The shell of a job, without Spark: statuses, lines, the log of a run."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from jobs import shell
+from jobs.shell import Job, Step
+from lake_schema import __version__, layout, read
+from lake_schema.publish import Plan
+from tests.universe import PLAIN, plain_plan, plain_work
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def job_of(work, on_driver=True):
+    return Job("toy_job", "Toy rows.", lambda lake, request: [Step(plain_plan(request.seed), work, on_driver)])
+
+
+@pytest.fixture
+def request_file(tmp_path):
+    path = tmp_path / "r.toml"
+    path.write_text('name = "small"\nseed = 2\n[area]\ncone = {ra = 0, dec = 0, radius = 1}\n')
+    return path
+
+
+@pytest.fixture
+def run(lake, request_file):
+    def run_job(work, *options):
+        return shell.main(job_of(work), ["--lake", str(lake), "--request", str(request_file), *options])
+
+    return run_job
+
+
+def logs(lake):
+    return [
+        [json.loads(line) for line in path.read_text().splitlines()] for path in sorted(layout.runs(lake).glob("*.jsonl"))
+    ]
+
+
+def test_a_run_is_logged(run, lake):
+    assert run(plain_work) == 0
+    ((first, *parts, last),) = logs(lake)
+    assert first["truesky"] == __version__
+    assert (first["job"], first["table"], first["request"], first["parts"]) == ("toy_job", "plain", "small", 3)
+    assert first["key"] == read.version(lake, "plain").key
+    assert {len(first["commit"]), len("unknown")} & {40, 7}
+    assert [line["part"] for line in parts] == ["0.parquet", "1.parquet", "2.parquet"]
+    for line in parts:
+        assert line["rows"] == 20
+        assert 0 <= line["seconds"] < 60
+        assert 0.01 < line["peak_gb"] < 100
+    assert last["seconds"] >= sum(line["seconds"] for line in parts)
+
+
+def test_the_summary_says_what_was_made(run, capsys):
+    assert run(plain_work) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.split()[:2] == ["plain", "60"]
+    assert "3 of 3 parts made" in line
+    assert run(None) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "already there, 0 of 3 parts made" in line
+
+
+def raising(root, facts):
+    if facts["part"] == 1:
+        raise ValueError("row 17")
+    return plain_work(root, facts)
+
+
+def test_a_failure_is_one_line_and_its_traceback_is_in_the_log(run, lake, capsys):
+    assert run(raising) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == "toy_job: table plain: 1 of 3 parts failed: 1.parquet: ValueError: row 17\n"
+    (log,) = logs(lake)
+    (failed,) = [line for line in log if "error" in line]
+    assert failed["part"] == "1.parquet"
+    assert 'raise ValueError("row 17")' in failed["traceback"]
+    assert log[-1]["ended"]
+    assert run(plain_work) == 0
+    assert [line["part"] for line in logs(lake)[1] if "part" in line] == ["1.parquet"]
+
+
+def test_verbose_shows_the_traceback(run, capsys):
+    assert run(raising, "-v") == 1
+    assert 'raise ValueError("row 17")' in capsys.readouterr().err
+
+
+def test_help_tells_what_the_job_does_and_the_version(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        shell.main(job_of(plain_work), ["--help"])
+    out = capsys.readouterr().out
+    assert "Toy rows." in out
+    assert f"truesky {__version__}" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [(["--request", "none.toml"], "no such file"), (["--lake", "s3://bucket"], "POSIX")],
+)
+def test_a_wrong_call_ends_with_2(lake, request_file, capsys, options, words):
+    arguments = ["--lake", str(lake), "--request", str(request_file), *options]
+    assert shell.main(job_of(plain_work), arguments) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_another_run_of_the_same_plan_is_refused(run, lake, request_file, capsys):
+    def work(root, facts):
+        assert run(plain_work) == 1
+        return plain_work(root, facts)
+
+    assert run(work) == 0
+    assert capsys.readouterr().err.splitlines() == [
+        f"toy_job: table plain: another run is making version {plain_plan(2).key}"
+    ] * 3
+
+
+def test_the_bar_counts_receipts(run, monkeypatch, capsys):
+    monkeypatch.setenv("TRUESKY_PROGRESS", "1")
+    assert run(plain_work) == 0
+    assert "plain" in capsys.readouterr().err
+
+
+def test_two_steps_and_an_empty_table(lake, request_file):
+    def steps(root, request):
+        return [Step(Plan(PLAIN, {}, ()), plain_work, True), Step(plain_plan(3), plain_work, True)]
+
+    assert shell.main(Job("two", "Two.", steps), ["--lake", str(lake), "--request", str(request_file)]) == 0
+    assert read.version(lake, "plain").num_rows == 60
+    assert len(logs(lake)) == 2
+
+
+_STOPPED = """
+import sys, time
+from jobs.shell import Job, Step, main
+from tests.universe import plain_plan, plain_work
+def work(root, facts):
+    if facts["part"] == 1:
+        print("started", flush=True)
+        time.sleep(60)
+    return plain_work(root, facts)
+sys.exit(main(Job("slow", "Slow.", lambda lake, request: [Step(plain_plan(2), work, True)])))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_says_so_and_the_next_continues(run, lake, request_file, number):
+    command = [sys.executable, "-c", _STOPPED, "--lake", str(lake), "--request", str(request_file)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, env=dict(os.environ), **pipes) as driver:
+        assert driver.stdout.readline() == "started\n"
+        stopped = time.monotonic()
+        driver.send_signal(number)
+        assert driver.wait(10) == 128 + number
+        assert time.monotonic() - stopped < 10
+        assert driver.stderr.read() == "slow: stopped; a second run continues where this one ended\n"
+    assert run(plain_work) == 0
+    assert [line["part"] for line in logs(lake)[-1] if "part" in line] == ["1.parquet", "2.parquet"]
