@@ -100,7 +100,7 @@ def load(seed: int, n: int) -> Box:
     ]
     velocity = tuple(stored(f"box_u{axis}", partial(_displacement, g, model.cell, axis)) for axis in range(3))
     variance = stored("box_variance", lambda: np.array([field.var(dtype=float) for field in smooth]))
-    return Box(model, n, seed, tuple(smooth), variance, velocity)
+    return Box(model, n, seed, tuple(smooth), np.asarray(variance, float), velocity)
 
 
 def growth(z: npt.ArrayLike) -> Float:
@@ -160,7 +160,7 @@ def _growing(a: Float) -> Float:
 
 
 def _stored(key: str, name: str, make: Callable[[], npt.NDArray[np.generic]]) -> npt.NDArray[np.float32]:
-    return cached_arrays(name, key, lambda: {"field": make()})["field"]
+    return np.asarray(cached_arrays(name, key, lambda: {"field": make()})["field"])
 
 
 def _gaussian(seed: int, n: int, cell: float) -> Float32:
@@ -181,7 +181,7 @@ def _log_power(n: int, cell: float) -> Float32:
     correlation = fft.irfftn(power, (n, n, n), overwrite_x=True) / np.float32(cell**3)
     transformed = fft.rfftn(np.log1p(correlation), overwrite_x=True).real * np.float32(cell**3)
     transformed[0, 0, 0] = 0.0
-    return np.maximum(transformed, np.float32(0.0))
+    return np.asarray(np.maximum(transformed, np.float32(0.0)))
 
 
 def _on_modes(n: int, cell: float) -> Float32:

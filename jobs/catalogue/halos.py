@@ -152,9 +152,9 @@ def draw(halos: HaloModel, seed: int, order: int, cell: int) -> Halos:
     index = (space.cell[voxel] << shift) | offset
     factor = density_box.velocity_factor(halos.box.model, halos.line.z)
     velocity = factor[step] * space.velocity[voxel]
-    drawn = Halos(index, chi, log_mass, proxy, velocity, np.zeros(step.size, np.int64))
-    ordered = drawn.part(np.lexsort((chi, index)))
-    return Halos(*(getattr(ordered, name) for name in Halos.__slots__[:-1]), FIRST_NUMBER[order] + np.arange(step.size))
+    order_of = np.lexsort((chi, index))
+    drawn = (column[order_of] for column in (index, chi, log_mass, proxy, velocity))
+    return Halos(*drawn, number=FIRST_NUMBER[order] + np.arange(step.size))
 
 
 def _levels(wide: Float) -> Int:

@@ -203,7 +203,7 @@ def _averaged(box: Box, growth: float, factor: int) -> Float32:
     return mean
 
 
-def _places(box: Box, turned: lightcone.Replicas, direction: Float32, chi: float, factor: int) -> Int:
+def _places(box: Box, turned: lightcone.Replicas, direction: Float32, chi: float, factor: int) -> npt.NDArray[np.int32]:
     """Cubes of factor^3 cells that all directions meet at chi: flat indices [n]."""
     shell = int(chi // box.length)
     width, n = box.model.cell * factor, box.n // factor

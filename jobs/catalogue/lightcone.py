@@ -84,7 +84,7 @@ class Distances:
     z: Float
 
     def redshift(self, chi: npt.ArrayLike) -> Float:
-        return np.asarray(np.interp(chi, self.chi, self.z))
+        return np.asarray(np.interp(np.asarray(chi, float), self.chi, self.z))
 
 
 def distances(z_max: float) -> Distances:

@@ -59,7 +59,7 @@ def expected_number(lf, near, far, faintest, area):
     ("z", "half", "reddest", "within"), [(0.1, 0.08, 0.2, 0.25), (0.5, 0.05, 0.3, 0.15), (1.0, 0.1, 1.5, 0.10)]
 )
 def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, half, reddest, within):
-    """Counted where the reddest spectrum (I_E - M_r - DM) is brighter than the limit (structure moves the near ones)."""
+    """Counted where the reddest spectrum (I_E - M_r - DM) beats the limit (structure moves the near ones)."""
     near, far = z - half, z + half
     faintest = min(26.0 - float(cosmology.distance_modulus(far)) - reddest, -16.0)
     found = np.sum((drawn.z > near) & (drawn.z < far) & (drawn.m_r < faintest))
