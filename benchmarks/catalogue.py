@@ -1,8 +1,8 @@
 """How fast the universe is drawn: python -m benchmarks.catalogue [--quick] [--json FILE].
 
-One order-5 cell (3.4 deg2) to I_E < 26, halos and galaxies, as the job makes it: drawn, checked, written as Parquet. CPU
-seconds of one core; the box and its lensing are in the cache.  The peer is SkyPy's draw of a Schechter function to the same
-magnitude limit (redshifts and luminosities only), beside ours of halos, satellites, redshifts and luminosities.
+One order-5 cell (3.4 deg2) to I_E < 26, halos and galaxies, as the job makes it: drawn and written as Parquet. CPU
+seconds of one core; the box and its lensing are in the cache.  The peer is SkyPy's draw of a Schechter function to the
+same magnitude limit (redshifts and luminosities only), beside ours of halos, satellites, redshifts and luminosities.
 """
 
 from __future__ import annotations

@@ -158,7 +158,12 @@ def job(n: int) -> float:
         lake.mkdir()
         publish.make(lake, publish.Plan(GALAXIES, {}, (part,)), lambda root, facts: publish.Output(rows))
         wanted = request.from_table(
-            {"name": "bench", "seed": 1, "area": {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}}, "fluxes": {"bands": list(BANDS)}}
+            {
+                "name": "bench",
+                "seed": 1,
+                "area": {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}},
+                "fluxes": {"bands": list(BANDS)},
+            }
         )
         step = compute_fluxes.galaxy_step(lake, wanted)
         seconds = _cpu(lambda: publish.make(lake, step.plan, step.work), 1)
@@ -171,7 +176,9 @@ def stars(n: int) -> dict[str, float]:
 
     library = templates.stellar_library()
     rng = np.random.default_rng(_SEED_TEST)
-    rows = Stars(rng.integers(0, len(library), n), rng.uniform(5.0, 26.0, n), rng.uniform(0.0, grid_tables.STAR_A_V_LAST, n))
+    rows = Stars(
+        rng.integers(0, len(library), n), rng.uniform(5.0, 26.0, n), rng.uniform(0.0, grid_tables.STAR_A_V_LAST, n)
+    )
     curves = [passbands.load(name) for name in BANDS]
     found, truth = flux_grid.stars(rows, curves, library), integration.stars(rows, curves, library)
     seconds = _cpu(lambda: flux_grid.stars(rows, curves, library), 3)

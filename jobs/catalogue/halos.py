@@ -152,9 +152,9 @@ def draw(halos: HaloModel, seed: int, order: int, cell: int) -> Halos:
     index = (space.cell[voxel] << shift) | offset
     factor = density_box.velocity_factor(halos.box.model, halos.line.z)
     velocity = factor[step] * space.velocity[voxel]
-    order_of = np.lexsort((chi, index))
-    drawn = (column[order_of] for column in (index, chi, log_mass, proxy, velocity))
-    return Halos(*drawn, number=FIRST_NUMBER[order] + np.arange(step.size))
+    row = np.lexsort((chi, index))
+    number = FIRST_NUMBER[order] + np.arange(row.size)
+    return Halos(index[row], chi[row], log_mass[row], proxy[row], velocity[row], number)
 
 
 def _levels(wide: Float) -> Int:
