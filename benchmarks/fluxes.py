@@ -12,7 +12,6 @@ import argparse
 import csv
 import json
 import os
-import platform
 import sys
 import tempfile
 import time
@@ -26,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from benchmarks.report import best, machine
 from jobs.accuracy import DRAFT, SURVEY, Accuracy
 from jobs.fluxes import flux_grid, grid_settings, grid_tables, integration, lines, passbands, spectra, templates
 from jobs.fluxes.sources import Galaxies, galaxies_of
@@ -275,12 +275,7 @@ def _rms(error: Float) -> float:
 
 def _cpu(work: Callable[[], object], repeats: int) -> float:
     """Least CPU seconds of a few repeats."""
-    best = np.inf
-    for _ in range(repeats):
-        started = time.process_time()
-        work()
-        best = min(best, time.process_time() - started)
-    return float(best)
+    return best(work, repeats, time.process_time)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -296,7 +291,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, value in figures.items():
         print(f"{name:34} {', '.join(f'{v:.3g}' for v in value) if isinstance(value, list) else f'{value:,.4g}'}")
     if options.json:
-        about = {"name": "fluxes", "commit": git_commit(), "machine": platform.processor() or platform.machine()}
+        about = {"name": "fluxes", "commit": git_commit(), "machine": machine()}
         options.json.write_text(json.dumps({**about, "repeats": 1 if options.quick else 5, **figures}, indent=1) + "\n")
     return 0
 

@@ -24,11 +24,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from lake_schema import __version__, layout, manifest
+from lake_schema import __version__, hats_files, layout, manifest
 from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
 from lake_schema.manifest import sync
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
-from lake_schema.stage import attempt, is_done, missing, receipt_of, receipts, write_part
+from lake_schema.stage import attempt, border_path, is_done, missing, receipt_of, receipts, write_part
 from lake_schema.uniqueness import refuse_duplicates
 
 __all__ = [
@@ -89,14 +89,13 @@ def _make_parts(root: Path, plan: Plan, work: Work, mapper: Mapper) -> None:
 
 def _finish(stage: Path, plan: Plan) -> None:
     """Metadata and manifest: after this the stage is the version, all but its name."""
-    from lake_schema import hats_files
-
     made = [receipt for part in plan.parts if (receipt := receipt_of(stage, part.name)) is not None]
     refuse_duplicates(stage, plan, made)
     listed = {f["path"]: f for receipt in made for f in receipt["files"]}
     _sweep(stage, set(listed))
     if plan.table.is_catalogue:
-        hats_files.write(stage, plan.table, [(r["part"], r["rows"]) for r in made])
+        borders = [border_path(stage, receipt["part"]) for receipt in made]
+        hats_files.write(stage, plan.table, [(r["part"], r["rows"]) for r in made], borders)
     rows = {data_path(plan.table, r["part"]): r["rows"] for r in made}
     files = []
     for path in sorted(stage.rglob("*")):

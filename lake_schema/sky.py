@@ -186,13 +186,17 @@ _TO_GALACTIC = np.array(
 )
 
 
-def margin_cells(order: int, cell: int, fine: int) -> Int:
-    """Cells of the finer order outside `cell` that touch its border (8 neighbours), sorted: a rim about the cell."""
+def border_cells(order: int, cell: int, fine: int) -> Int:
+    """Cells of the finer order inside `cell` that touch its border, sorted."""
     side = 1 << (fine - order)
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     rim = (x == 0) | (y == 0) | (x == side - 1) | (y == side - 1)
-    inside = (np.int64(cell) << (2 * (fine - order))) + _interleave(x[rim]) + 2 * _interleave(y[rim])
-    around = _hp().get_all_neighbours(1 << fine, inside, nest=True).ravel()
+    return np.sort((np.int64(cell) << (2 * (fine - order))) + _interleave(x[rim]) + 2 * _interleave(y[rim]))
+
+
+def margin_cells(order: int, cell: int, fine: int) -> Int:
+    """Cells of the finer order outside `cell` that touch its border (8 neighbours), sorted: a rim about the cell."""
+    around = _hp().get_all_neighbours(1 << fine, border_cells(order, cell, fine), nest=True).ravel()
     around = np.unique(around[around >= 0]).astype(np.int64)
     outside: Int = around[parent(around, fine, order) != cell]
     return outside

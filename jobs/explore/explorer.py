@@ -125,7 +125,13 @@ class Explorer:
     # ------------------------------------------------------------------------------------------------ distributions
 
     def hist(
-        self, table: str, x: str, bins: int = 100, span: Range | None = None, where: str = "true", weight: str = "1"
+        self,
+        table: str,
+        x: str,
+        bins: int = 100,
+        span: Range | None = None,
+        where: str = "true",
+        weight: str | None = None,
     ) -> tuple[Float, Float]:
         """Counts of an expression in equal bins.
 
@@ -135,7 +141,7 @@ class Explorer:
         self._version(table)
         lo, hi = span or self._span(table, x, where)
         text = f"""
-            SELECT {_bin("x", "x")} AS i, sum(w)::DOUBLE AS n FROM (SELECT ({x})::DOUBLE AS x, ({weight})::DOUBLE AS w
+            SELECT {_bin("x", "x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x})::DOUBLE AS x, {_weight(weight)}
             FROM {table} WHERE ({where})) WHERE x BETWEEN $x_lo AND $x_hi GROUP BY i"""
         found = self.sql(text, into="arrow", x_lo=lo, x_hi=hi, x_bins=bins)
         counts = np.zeros(bins)
@@ -144,7 +150,7 @@ class Explorer:
 
     def heatmap(
         self, table: str, x: str, y: str, bins: tuple[int, int] = (100, 100),
-        span: tuple[Range, Range] | None = None, where: str = "true", weight: str = "1",
+        span: tuple[Range, Range] | None = None, where: str = "true", weight: str | None = None,
     ) -> tuple[Float, Float, Float]:  # fmt: skip
         """Counts of two expressions in a grid of equal bins.
 
@@ -153,8 +159,8 @@ class Explorer:
         self._version(table)
         (x_lo, x_hi), (y_lo, y_hi) = span or (self._span(table, x, where), self._span(table, y, where))
         text = f"""
-            SELECT {_bin("x", "x")} AS i, {_bin("y", "y")} AS j, sum(w)::DOUBLE AS n
-            FROM (SELECT ({x})::DOUBLE AS x, ({y})::DOUBLE AS y, ({weight})::DOUBLE AS w FROM {table} WHERE ({where}))
+            SELECT {_bin("x", "x")} AS i, {_bin("y", "y")} AS j, {_counted(weight)} AS n
+            FROM (SELECT ({x})::DOUBLE AS x, ({y})::DOUBLE AS y, {_weight(weight)} FROM {table} WHERE ({where}))
             WHERE x BETWEEN $x_lo AND $x_hi AND y BETWEEN $y_lo AND $y_hi GROUP BY i, j"""
         limits = {"x_lo": x_lo, "x_hi": x_hi, "x_bins": bins[0], "y_lo": y_lo, "y_hi": y_hi, "y_bins": bins[1]}
         found = self.sql(text, into="arrow", **limits)
@@ -162,16 +168,16 @@ class Explorer:
         counts[found["j"].to_numpy(), found["i"].to_numpy()] = found["n"].to_numpy()
         return counts, np.linspace(x_lo, x_hi, bins[0] + 1), np.linspace(y_lo, y_hi, bins[1] + 1)
 
-    def skymap(self, table: str, order: int = 8, where: str = "true", weight: str = "1") -> tuple[Int, Float]:
+    def skymap(self, table: str, order: int = 8, where: str = "true", weight: str | None = None) -> tuple[Int, Float]:
         """Counts in HEALPix cells (nested) of an order: the cells that hold any, ascending, and their counts."""
         self._version(table)
         if not 0 <= order <= sky.DEEPEST:
             raise BadInput(f"order = {order} is outside [0, {sky.DEEPEST}]")
         text = f"""
-            SELECT _healpix_29 >> $shift::INT AS cell, sum(({weight})::DOUBLE)::DOUBLE AS n FROM {table} WHERE ({where})
-            GROUP BY cell ORDER BY cell"""
+            SELECT cell, {_counted(weight)} AS n FROM (SELECT _healpix_29 >> $shift::INT AS cell, {_weight(weight)}
+            FROM {table} WHERE ({where})) GROUP BY cell ORDER BY cell"""
         found = self.sql(text, into="arrow", shift=2 * (sky.DEEPEST - order))
-        return found["cell"].to_numpy(), found["n"].to_numpy()
+        return found["cell"].to_numpy(), found["n"].to_numpy().astype(float)
 
     def _span(self, table: str, x: str, where: str) -> Range:
         text = (
@@ -226,6 +232,14 @@ class Explorer:
 
 def _bin(x: str, axis: str) -> str:
     return f"least(floor(({x} - ${axis}_lo) / (${axis}_hi - ${axis}_lo) * ${axis}_bins), ${axis}_bins - 1)::INT"
+
+
+def _weight(weight: str | None) -> str:
+    return "1 AS w" if weight is None else f"({weight})::DOUBLE AS w"
+
+
+def _counted(weight: str | None) -> str:
+    return "count(*)" if weight is None else "sum(w)"
 
 
 def _readable(worker: subprocess.Popen[bytes], deadline: float) -> bool:
