@@ -1,7 +1,7 @@
-"""Is the universe what it should be: python -m benchmarks.validate_universe [--quick] [--cells N] [--json FILE] [--figures FOLDER].
+"""Is the universe what it should be: python -m benchmarks.validate_universe [--quick] [--json FILE] [--figures FOLDER].
 
-Blocks of generation cells spread over the sky are drawn and counted: against the mass function, the luminosity function, the
-published counts, H alpha, and the angular correlation of Limber's approximation; the lensing maps against linear theory.
+Blocks of generation cells spread over the sky are drawn and counted: against the mass and luminosity functions,
+the published counts, H alpha, and the angular correlation of Limber's approximation; the lensing maps are measured.
 """
 
 from __future__ import annotations
