@@ -19,7 +19,7 @@ from astropy.wcs import WCS
 from jobs import rng
 from jobs.accuracy import Accuracy
 from jobs.fluxes import passbands
-from jobs.render import focal_plane, profiles, psf, selection, stamps
+from jobs.render import chromatic, focal_plane, profiles, psf, selection, stamps
 from jobs.render.channels import ext, vis
 from jobs.render.effects.effect import Decision, Effect, Scene, apply_all
 from jobs.render.focal_plane import Detector
@@ -33,22 +33,27 @@ Float = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
 
 # What is read of the catalogues; fluxes are read besides.
-GALAXY_COLUMNS = (
-    "id",
-    "ra_lensed",
-    "dec_lensed",
-    "bulge_half_light_radius",
-    "disk_half_light_radius",
-    "bulge_fraction",
-    "bulge_sersic_index",
-    "bulge_axis_ratio",
-    "inclination",
-    "position_angle",
-    "kappa",
-    "gamma1",
-    "gamma2",
+GALAXY_COLUMNS = tuple(
+    dict.fromkeys(
+        (
+            "id",
+            "ra_lensed",
+            "dec_lensed",
+            "bulge_half_light_radius",
+            "disk_half_light_radius",
+            "bulge_fraction",
+            "bulge_sersic_index",
+            "bulge_axis_ratio",
+            "inclination",
+            "position_angle",
+            "kappa",
+            "gamma1",
+            "gamma2",
+            *chromatic.GALAXY_COLUMNS,
+        )
+    )
 )
-STAR_COLUMNS = ("id", "ra", "dec")
+STAR_COLUMNS = ("id", "ra", "dec", *chromatic.STAR_COLUMNS)
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
 
 
@@ -120,6 +125,7 @@ def render(
         spread,
         scene.pixel_noise,
         accuracy,
+        band,
     )
     noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress)
     scene = Scene(mission, detector.section, exposure_time, scene.sky_rate, float(noise_free.max()))
@@ -161,6 +167,7 @@ def sources_of(
     spread: Psf,
     noise: float,
     accuracy: Accuracy,
+    band: str,
 ) -> tuple[Sources, stamps.Int]:
     """Everything whose stamp touches the detector, ascending id, and the stamps' sides.
 
@@ -182,7 +189,17 @@ def sources_of(
     here = selection.touching(column, row, sizes, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
-    return Sources(ids[kept], column, row, jacobian, electrons[kept], shape[kept], form), sizes[here]
+    photons = _colours(kept, catalogue, points, band) if spread.planes is not None else None
+    return Sources(ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons), sizes[here]
+
+
+def _colours(kept: npt.NDArray[np.int64], galaxies: pa.Table, stars: pa.Table, band: str) -> Float:
+    """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
+    curve, of_galaxy = passbands.load(band), kept < len(galaxies)
+    out = np.empty((len(kept), chromatic.PARTS))
+    out[of_galaxy] = chromatic.galaxies(galaxies.take(kept[of_galaxy]), curve)
+    out[~of_galaxy] = chromatic.stars(stars.take(kept[~of_galaxy] - len(galaxies)), curve)
+    return out
 
 
 def _check(ids: npt.NDArray[np.int64], electrons: Float) -> None:

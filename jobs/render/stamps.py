@@ -1,4 +1,4 @@
-"""Drawing sources: each on its own stamp, through one shared PSF, in Fourier space, summed onto a frame.
+"""Drawing sources: each on its own stamp, through its own PSF, in Fourier space, summed onto a frame.
 
 A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid.  Light that
 belongs outside a stamp comes in at its opposite edge: nothing is lost, nothing is rescaled.  A stamp is large
@@ -12,8 +12,9 @@ reference       one source by galsim's own drawImage: what `draw` is held agains
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import galsim
 import numpy as np
@@ -21,23 +22,25 @@ import numpy.typing as npt
 import scipy.fft
 
 from jobs.accuracy import Accuracy
-from jobs.render import profiles
+from jobs.render import kernel, profiles, sersic
+from jobs.render import psf as psfs
 from jobs.render.profiles import Shapes
-from jobs.render.psf import SIDE, Psf
+from jobs.render.psf import SIDE, Psf, Transfer
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
-Complex = npt.NDArray[np.complex128]
+Array = npt.NDArray[Any]
 
 # Sides whose transforms are fast; the last bounds memory (its k plane has 134 MB).
 SIZES = np.array([32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048])
 # The aperture in which wrapped light is held to the flux budget: this many PSF widths plus half-light radii.
 _APERTURE_WIDTHS, _APERTURE_RADII = 2.0, 2.0
-# A component smaller than this many pixels is a point: it changes second moments by less than 1e-3 of the
-# PSF's.
-_POINT_RADIUS = 0.02
-# The k plane reaches twice the Nyquist frequency only where the PSF and pixel still pass more than this.
-_BAND_LIMIT = 1e-4
+# Above this many electrons the rounding of single precision would show.
+_BRIGHT = 1e7
+# Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
+_SHARED = 256
+# What galsim takes for a point in the reference, arcsec.
+_POINT = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,7 @@ class Sources:
     jacobian    : float64[n, 2, 2] d(u, v) / d(column, row), arcsec
     electrons   : float64[n] expected
     shape       : row of `shapes`, -1 = a point
+    photons     : float64[n, w] fraction of its photons in each sub-band of the PSF; None: flat f_nu
     """
 
     ids: Int
@@ -57,6 +61,7 @@ class Sources:
     electrons: Float
     shape: Int
     shapes: Shapes
+    photons: Float | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -71,6 +76,7 @@ class Sources:
             self.electrons[chosen],
             self.shape[chosen],
             self.shapes,
+            None if self.photons is None else self.photons[chosen],
         )
 
 
@@ -110,106 +116,70 @@ def draw(
     nx: int,
     ny: int,
     progress: Callable[[int], None] | None = None,
+    floors: Float | None = None,
 ) -> Float:
     """Expected electrons of the sources alone.
 
-    sizes    : int[n] from stamp_sizes
+    sizes    : int[n] from stamp_sizes;  floors : float[n] from `floors`, None: nothing is left out
     progress : called now and then with the number of sources drawn
-    returns  : float64[ny, nx]
+    returns  : float64[ny, nx], to 5e-7 electrons a source; the same, bit by bit, in any order of the sources
     """
-    frame = np.zeros((ny, nx))
-    planes: dict[int, _Plane] = {}
-    oversampling = _oversampling(psf)
-    for i in range(len(sources)):
+    frame = np.zeros((ny, nx), np.int64)
+    weights = psfs.basis_weights(psf, sources.photons, sources.column, sources.row)
+    bodies = _bodies(sources)
+    left_out = np.zeros(len(sources)) if floors is None else floors
+    shared: dict[int, Transfer] = {}
+    # Stamps of one size follow each other, so that one size's planes are in memory.
+    for count, i in enumerate(np.argsort(sizes, kind="stable")):
         size = int(sizes[i])
-        if size not in planes:
-            planes[size] = _plane(psf, size, oversampling)
-        _draw_one(frame, sources, i, planes[size], psf.pixel_scale)
-        if progress is not None and i % 100 == 0:
-            progress(i)
-    return frame
+        bright = sources.electrons[i] > _BRIGHT
+        dtype = np.float64 if bright else np.float32
+        if bright or (size > _SHARED and psf.planes is not None):
+            passed, share = psfs.collapsed(psf, weights[i], size, dtype), np.ones(1, dtype)
+        else:
+            if size not in shared:
+                shared = {size: psfs.transfer(psf, size)}
+            passed, share = shared[size], weights[i].astype(np.float32)
+        x0, y0 = (int(np.rint(position[i])) - size // 2 for position in (sources.column, sources.row))
+        zone = np.empty((size, size // 2 + 1), np.complex128 if bright else np.complex64)
+        kernel.nyquist_zone(
+            passed.planes, share, passed.low, passed.high, passed.envelope, psfs.ENVELOPE_STEP,
+            *(part[i] for part in bodies), float(left_out[i]),
+            sources.column[i] - x0, sources.row[i] - y0, float(sources.electrons[i]), zone,
+        )  # fmt: skip
+        kernel.accumulate(frame, scipy.fft.irfft2(zone, s=(size, size), overwrite_x=True), x0, y0)
+        if progress is not None and count % 100 == 0:
+            progress(count)
+    return frame / kernel.FIXED_POINT
 
 
-@dataclass(frozen=True, slots=True)
-class _Plane:
-    """The k grid of a stamp size and what PSF and pixel pass on it.
+class _Bodies(NamedTuple):
+    """The kernel's arguments of each source's profile, arrays [n]."""
 
-    kx, ky   : radian / pixel, [m / 2 + 1], [m], m = size * oversampling
-    transfer : complex[m, m / 2 + 1]
-    scratch  : a galsim image of the same grid
-    """
-
-    size: int
-    kx: Float
-    ky: Float
-    transfer: Complex
-    scratch: galsim.Image
+    body: Array
+    fraction: Float
+    bulge: Float
+    disk: Float
+    thick: Float
+    sersic: Sequence[Array]
+    row: Int
+    row_weights: Float
 
 
-def _plane(psf: Psf, size: int, oversampling: int) -> _Plane:
-    half = size * oversampling // 2
-    step = 2 * np.pi / size
-    bounds = galsim.BoundsI(0, half, -half, half - 1)
-    scratch = galsim.ImageCD(bounds, scale=step)
-    _k_image(psf.profile.dilate(1.0 / psf.pixel_scale), scratch)
-    kx, ky = np.arange(half + 1.0) * step, np.arange(-half, float(half)) * step
-    pixel = np.sinc(ky / (2 * np.pi))[:, None] * np.sinc(kx / (2 * np.pi))[None, :]
-    return _Plane(size, kx, ky, scratch.array * pixel, scratch)
-
-
-def _k_image(profile: galsim.GSObject, image: galsim.Image) -> None:
-    # The half plane is all that a real image needs; galsim's public call draws both halves.
-    profile._drawKImage(image)
-
-
-def _oversampling(psf: Psf) -> int:
-    """1 where nothing passes beyond the Nyquist frequency, else 2."""
-    profile = psf.profile.dilate(1.0 / psf.pixel_scale)
-    beyond = max(abs(profile.kValue(k, 0.0)) for k in np.linspace(np.pi, 1.25 * np.pi, 4))
-    beyond = max(beyond, max(abs(profile.kValue(0.0, k)) for k in np.linspace(np.pi, 1.25 * np.pi, 4)))
-    return 2 if beyond > _BAND_LIMIT else 1
-
-
-def _draw_one(frame: Float, sources: Sources, i: int, plane: _Plane, pixel_scale: float) -> None:
-    x0 = int(np.rint(sources.column[i])) - plane.size // 2
-    y0 = int(np.rint(sources.row[i])) - plane.size // 2
-    phase_x = np.exp(-1j * plane.kx * (sources.column[i] - x0))
-    phase_y = np.exp(-1j * plane.ky * (sources.row[i] - y0)) * sources.electrons[i]
-    k_image = plane.transfer * phase_y[:, None]
-    k_image *= phase_x
-    if sources.shape[i] >= 0:
-        smallest = _POINT_RADIUS * pixel_scale
-        profile = profiles.profile(sources.shapes, int(sources.shape[i]), smallest)
-        _k_image(_on_pixels(profile, sources.jacobian[i]), plane.scratch)
-        k_image *= plane.scratch.array
-    _add(frame, _image(k_image, plane.size), x0, y0)
-
-
-def _on_pixels(profile: galsim.GSObject, jacobian: Float) -> galsim.GSObject:
-    """World frame, arcsec -> pixels, the flux kept."""
-    return galsim.JacobianWCS(*jacobian.ravel()).toImage(profile)
-
-
-def _image(k_image: Complex, size: int) -> Float:
-    """Inverse transform of a half plane (rows ky ascending), wrapped onto the pixels' own Nyquist zone."""
-    half = size // 2
-    if len(k_image) == size:
-        zone = scipy.fft.ifftshift(k_image, axes=0)
-    else:
-        # Rows ky and ky + 2 pi land on one; so do columns kx and kx - 2 pi, the latter known from its mirror
-        # image.
-        folded = k_image[:size] + k_image[size:]
-        mirrored = np.conj(np.roll(folded[::-1], 1, axis=0)[:, size : half - 1 : -1])
-        zone = folded[:, : half + 1] + mirrored
-    return np.asarray(scipy.fft.irfft2(zone, s=(size, size), overwrite_x=True))
-
-
-def _add(frame: Float, stamp: Float, x0: int, y0: int) -> None:
-    ny, nx = frame.shape
-    left, right = max(x0, 0), min(x0 + stamp.shape[1], nx)
-    bottom, top = max(y0, 0), min(y0 + stamp.shape[0], ny)
-    if left < right and bottom < top:
-        frame[bottom:top, left:right] += stamp[bottom - y0 : top - y0, left - x0 : right - x0]
+def _bodies(sources: Sources) -> _Bodies:
+    n, table = len(sources), sersic.table()
+    body = sources.shape >= 0
+    out = _Bodies(
+        body, np.zeros(n), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2)), [table] * n,
+        np.zeros(n, np.int64), np.zeros((n, 4)),
+    )  # fmt: skip
+    if body.any():
+        shapes = sources.shapes.take(sources.shape[body])
+        form = profiles.forms(shapes, sources.jacobian[body])
+        out.fraction[body] = shapes.bulge_fraction
+        out.bulge[body], out.disk[body], out.thick[body] = form.bulge, form.disk, form.thick
+        out.row[body], out.row_weights[body] = sersic.row_of(shapes.sersic_index)
+    return out
 
 
 def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4) -> Float:
@@ -220,10 +190,12 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1
     settings = galsim.GSParams(
         folding_threshold=accuracy, maxk_threshold=accuracy, kvalue_accuracy=1e-7, maximum_fft_size=16384
     )
-    parts = [psf.profile.dilate(1.0 / psf.pixel_scale), galsim.Pixel(1.0)]
+    weights = psfs.basis_weights(psf, sources.photons, sources.column, sources.row)[i]
+    parts = [psfs.profile_of(psf, weights).dilate(1.0 / psf.pixel_scale), galsim.Pixel(1.0)]
     if sources.shape[i] >= 0:
-        profile = profiles.profile(sources.shapes, int(sources.shape[i]), _POINT_RADIUS * psf.pixel_scale)
-        parts.append(_on_pixels(profile, sources.jacobian[i]))
+        profile = profiles.profile(sources.shapes, int(sources.shape[i]), _POINT)
+        # World frame, arcsec -> pixels, the flux kept.
+        parts.append(galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(profile))
     whole = galsim.Convolve(parts, gsparams=settings) * float(sources.electrons[i])
     x0, y0 = (int(np.rint(position[i])) - size // 2 for position in (sources.column, sources.row))
     centre = galsim.PositionD(sources.column[i] - x0, sources.row[i] - y0)
