@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 from jobs import cache
 
@@ -12,5 +13,13 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(cache.cache_dir() / "numba"))
 
 import numba
 
-# Sums may be taken in any order, which makes them twice as fast; NaN and infinity keep their meaning.
-jit: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def jit(function: Function) -> Function:
+    """The function, compiled when it is first called."""
+    # Sums may be taken in any order, which makes them twice as fast; NaN and infinity keep their meaning.
+    fast = {"reassoc", "contract", "nsz"}
+    decorate: Any = numba.njit(cache=True, error_model="numpy", fastmath=fast)
+    compiled: Function = decorate(function)
+    return compiled

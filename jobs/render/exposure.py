@@ -24,7 +24,7 @@ from jobs.render.channels import ext, vis
 from jobs.render.effects.effect import Decision, Effect, Scene, apply_all
 from jobs.render.focal_plane import Detector
 from jobs.render.psf import Psf
-from jobs.render.stamps import Sources
+from jobs.render.stamps import Settings, Sources
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -116,7 +116,8 @@ def render(
         _fluxes(rows, fluxes, f"f_nu_{band}") * electrons_per_ujy * exposure_time
         for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
     ]
-    spread = _psf(detector, band, float(exposure["seeing"]), mission)
+    settings = stamps.settings_for(accuracy)
+    spread = _psf(detector, band, float(exposure["seeing"]), mission, settings.positions)
     sources, sizes = sources_of(
         (galaxies, electrons[0]),
         (stars, electrons[1]),
@@ -124,10 +125,11 @@ def render(
         system,
         spread,
         scene.pixel_noise,
-        accuracy,
+        settings,
         band,
     )
-    noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress)
+    floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
+    noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors)
     scene = Scene(mission, detector.section, exposure_time, scene.sky_rate, float(noise_free.max()))
     frame, decisions = apply_all(
         noise_free,
@@ -166,7 +168,7 @@ def sources_of(
     system: WCS,
     spread: Psf,
     noise: float,
-    accuracy: Accuracy,
+    settings: Settings,
     band: str,
 ) -> tuple[Sources, stamps.Int]:
     """Everything whose stamp touches the detector, ascending id, and the stamps' sides.
@@ -185,7 +187,7 @@ def sources_of(
     kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
     form = profiles.shapes(catalogue)
     column, row = focal_plane.pixel_of_sky(system, ra[kept], dec[kept])
-    sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, accuracy)
+    sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings)
     here = selection.touching(column, row, sizes, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
@@ -218,8 +220,8 @@ def _fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
     return np.asarray(fluxes[column].to_numpy(), float)
 
 
-def _psf(detector: Detector, band: str, seeing: float, mission: MissionConfiguration) -> Psf:
+def _psf(detector: Detector, band: str, seeing: float, mission: MissionConfiguration, positions: int) -> Psf:
     if detector.section == "vis":
-        return psf.vis_psf(detector, passbands.load(band), mission)
+        return psf.vis_psf(detector, passbands.load(band), mission, positions)
     beta = mission.value(f"{detector.section}.psf.moffat_beta")
     return psf.ground_psf(seeing, beta, detector.pixel_scale)

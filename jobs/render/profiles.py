@@ -6,7 +6,7 @@ lies at 90 deg + PA from u.
 shapes        rows -> Shapes, checked arrays
 forms         what the kernel draws them from, in pixels
 profile       one galaxy by galsim, for the reference
-surface, outside   its light beyond a radius, for the choice of a stamp's size
+surface       its light at a radius, for the choice of a stamp's size
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import galsim
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from scipy.special import gammaincc, gammaln
+from scipy.special import gammaln
 
 from jobs.render import sersic
 
@@ -188,15 +188,6 @@ def _disk(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
 # ------------------------------------------------------------------------------------------------ extent
 
 
-def half_light_radius(shape: Shapes) -> Float:
-    """[n] arcsec: an upper bound, the larger component's semi-major axis, lensed."""
-    larger = np.maximum(
-        np.where(shape.bulge_fraction > 0, shape.bulge_radius, 0.0),
-        np.where(shape.bulge_fraction < 1, shape.disk_radius, 0.0),
-    )
-    return larger * _lensed_stretch(shape)
-
-
 def surface(shape: Shapes, radius: Float) -> Float:
     """Fraction of the flux per arcsec2 along the major axis, an upper bound for every other direction.
 
@@ -210,15 +201,6 @@ def surface(shape: Shapes, radius: Float) -> Float:
         bulge[:, None] * _sersic_surface(radius, shape.bulge_radius * stretch, shape.sersic_index, stretch)
         + disk[:, None] * _sersic_surface(radius, shape.disk_radius * stretch, np.ones(len(shape)), stretch)
     )
-
-
-def outside(shape: Shapes, radius: Float) -> Float:
-    """Fraction of the flux beyond a radius, seen face-on: an upper bound; radius [m] arcsec -> [n, m]."""
-    stretch = _lensed_stretch(shape)
-    bulge = _sersic_outside(radius, shape.bulge_radius * stretch, shape.sersic_index)
-    disk = _sersic_outside(radius, shape.disk_radius * stretch, np.ones(len(shape)))
-    fraction = shape.bulge_fraction[:, None]
-    return np.asarray(fraction * bulge + (1 - fraction) * disk)
 
 
 def _lensed_stretch(shape: Shapes) -> Float:
@@ -244,9 +226,3 @@ def _sersic_surface(radius: Float, half_light: Float, index: Float, stretch: Flo
     n, b = index[:, None], _b(index)[:, None]
     log_norm = np.log(2 * np.pi * n) - 2 * n * np.log(b) + gammaln(2 * n) + 2 * np.log(r_e / stretch[:, None])
     return np.asarray(np.exp(-b * (radius[None, :] / r_e) ** (1 / n) - log_norm))
-
-
-def _sersic_outside(radius: Float, half_light: Float, index: Float) -> Float:
-    r_e = np.maximum(half_light, 1e-6)[:, None]
-    n, b = index[:, None], _b(index)[:, None]
-    return np.asarray(gammaincc(2 * n, b * (radius[None, :] / r_e) ** (1 / n)))

@@ -20,7 +20,7 @@ import galsim
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import maximum, uniform_filter
 
 from jobs import cache
 from jobs.fluxes.passbands import Passband
@@ -50,6 +50,8 @@ _CORE, _FINE = 243, 9
 _BAND_LIMIT = 1e-4
 # Of the planes in single precision: what is less is nothing.
 _NOTHING = 1e-7
+# Larger stamps are few: looking for what is nothing takes longer than drawing it.
+_SHARED = 256
 # radian / pixel between the samples of an envelope: those of the smallest stamp.
 ENVELOPE_STEP = 2 * np.pi / 32
 _ARCSEC = np.pi / 180.0 / 3600.0
@@ -168,7 +170,7 @@ def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) ->
 class Transfer:
     """PSF times pixel on the Fourier grid of a stamp of N pixels, with its neighbouring zones.
 
-    planes    : float[b, aliases, N, 2, N / 2 + 1] real and imaginary parts: see kernel.nyquist_zone
+    planes    : float[aliases, N, b, 2, N / 2 + 1] real and imaginary parts: see kernel.nyquist_zones
     low, high : int64[aliases, N] columns between which any of it is not nothing
     envelope  : float64[m] largest modulus at k = i ENVELOPE_STEP, radian / pixel
     """
@@ -246,25 +248,29 @@ def _galsim_spectrum(psf: Psf, size: int) -> Array:
 def _transfer(spectra: Sequence[Array], size: int, dtype: type[Any]) -> Transfer:
     aliases = 1 if len(spectra[0]) == size else 4
     columns, rows = np.arange(size // 2 + 1), np.fft.ifftshift(np.arange(-size // 2, size // 2))
-    planes = np.empty((len(spectra), aliases, size, 2, len(columns)), dtype)
-    low, high = np.zeros((aliases, size), np.int64), np.zeros((aliases, size), np.int64)
-    envelope = np.zeros(int(2 * np.sqrt(2) * np.pi / ENVELOPE_STEP) + 2)
+    planes = np.empty((aliases, size, len(spectra), 2, len(columns)), dtype)
+    low, high = np.zeros((aliases, size), np.int64), np.full((aliases, size), len(columns))
+    envelope = np.ones(int(2 * np.sqrt(2) * np.pi / ENVELOPE_STEP) + 2)
+    rings = np.zeros(len(envelope))
     for alias in range(aliases):
         kx = columns - size * (alias % 2)
         ky = rows if alias < 2 else rows - np.where(rows >= 0, size, -size)
         pixel = np.sinc(ky / size)[:, None] * np.sinc(kx / size)
         for b, spectrum in enumerate(spectra):
             # What lies to the left of kx = 0 is the mirror image's conjugate.
-            found = spectrum[ky][:, kx] if alias % 2 == 0 else np.conj(spectrum[-ky][:, -kx])
-            planes[b, alias, :, 0], planes[b, alias, :, 1] = found.real * pixel, found.imag * pixel
-        modulus = np.sqrt((planes[:, alias] ** 2).sum(axis=2).max(axis=0))
-        k = 2 * np.pi / size * np.hypot(ky[:, None], kx)
-        np.maximum.at(envelope, (k / ENVELOPE_STEP).astype(int).ravel(), modulus.ravel())
+            found = spectrum[ky, : len(columns)] if alias % 2 == 0 else np.conj(spectrum[-ky][:, -kx])
+            np.multiply(found.real, pixel, out=planes[alias, :, b, 0])
+            np.multiply(found.imag, pixel, out=planes[alias, :, b, 1])
+        if size > _SHARED:
+            continue
+        modulus = np.hypot(planes[alias, :, :, 0], planes[alias, :, :, 1]).max(axis=1)
+        ring = (2 * np.pi / size / ENVELOPE_STEP * np.hypot(ky[:, None], kx)).astype(int)
+        rings = np.maximum(rings, maximum(modulus, ring, np.arange(len(rings))))
         something = modulus > (_NOTHING if dtype is np.float32 else 0.0)
         seen = something.any(axis=1)
         low[alias] = np.where(seen, something.argmax(axis=1), 0)
         high[alias] = np.where(seen, len(columns) - something[:, ::-1].argmax(axis=1), 0)
-    return Transfer(planes, low, high, envelope)
+    return Transfer(planes, low, high, envelope if size > _SHARED else rings)
 
 
 # ------------------------------------------------------------------------------------------------ the optics

@@ -5,16 +5,19 @@ belongs outside a stamp comes in at its opposite edge: nothing is lost, nothing 
 enough that what wraps is below the noise at its edge, and below the flux budget in the source's aperture.
 
 Sources         what is drawn: galaxies (with a shape) and points
-stamp_sizes     pixels, from flux, shape, PSF, noise and accuracy
+settings_for    what an accuracy takes, from the measured table
+stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 draw            sources -> frame
 reference       one source by galsim's own drawImage: what `draw` is held against
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
 
 import galsim
 import numpy as np
@@ -31,14 +34,19 @@ Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 Array = npt.NDArray[Any]
 
-# Sides whose transforms are fast; the last bounds memory (its k plane has 134 MB).
-SIZES = np.array([32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048])
-# The aperture in which wrapped light is held to the flux budget: this many PSF widths plus half-light radii.
-_APERTURE_WIDTHS, _APERTURE_RADII = 2.0, 2.0
+# Sides whose transforms are fast; the last bounds memory (its planes have 134 MB).
+SIZES = np.array([32, 40, 48, 64, 80, 96, 128, 160, 192, 256, 320, 384, 512, 640, 768, 1024, 1280, 1536, 2048])
+# Light that wraps is counted in this aperture about the source: radius, arcsec.
+_APERTURE = 1.0
+# A source's light a stamp's side away, times this, is what all its periodic images bring to its middle: the sum of
+# r^-3 over the square lattice (the PSF's wings), and of the flattest wings of galaxies.
+_LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
 # Above this many electrons the rounding of single precision would show.
 _BRIGHT = 1e7
 # Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
 _SHARED = 256
+# Pixels of stamps that are transformed together.
+_BATCH = 1 << 17
 # What galsim takes for a point in the reference, arcsec.
 _POINT = 1e-6
 
@@ -80,33 +88,66 @@ class Sources:
         )
 
 
-def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: float, accuracy: Accuracy) -> Int:
-    """Side of each source's stamp, pixels.
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What decides how much of a source is drawn.
 
-    noise    : of a pixel, electrons
-    accuracy : at the stamp's edge the surface brightness is below `background` of the noise, and of the light
-               that wraps less than `flux` of the source falls into its aperture
-    returns  : int64[n], one of SIZES
+    edge  : largest surface brightness at a stamp's edge, of a pixel's noise
+    ghost : largest part of a source's flux that wraps into its own aperture
+    floor : Fourier samples of less than this are left out, 1 at k = 0
+    positions : of the PSF on a detector
     """
-    half = SIZES // 2
-    radius = half * psf.pixel_scale
-    inside = np.minimum(half, SIDE // 2 - 1)
-    edge = np.where(half < SIDE // 2, psf.surface[inside], 0.0)
-    beyond = psf.outside[inside]
-    surface, lost = np.tile(edge, (len(shape), 1)), np.tile(beyond, (len(shape), 1))
-    aperture = np.full(len(shape), _APERTURE_WIDTHS * psf.fwhm)
-    is_galaxy = shape >= 0
-    if is_galaxy.any():
-        which = shape[is_galaxy]
-        surface[is_galaxy] += profiles.surface(shapes, radius)[which] * psf.pixel_scale**2
-        lost[is_galaxy] += profiles.outside(shapes, radius)[which]
-        aperture[is_galaxy] += _APERTURE_RADII * profiles.half_light_radius(shapes)[which]
-    covered = np.minimum(np.pi * aperture[:, None] ** 2 / (2 * radius) ** 2, 1.0)
-    enough = (electrons[:, None] * surface < accuracy.background * noise) & (lost * covered < accuracy.flux)
+
+    edge: float
+    ghost: float
+    floor: float
+    positions: int
+
+
+def settings_for(accuracy: Accuracy) -> Settings:
+    """The cheapest settings whose measured errors are within an accuracy (settings.csv), or the most accurate."""
+    with Path(__file__).with_name("settings.csv").open(newline="", encoding="utf-8") as file:
+        rows = [
+            {name: float(value) for name, value in row.items()}
+            for row in csv.DictReader(line for line in file if not line.startswith("#"))
+        ]
+    good = [row for row in rows if all(row[f"{f.name}_error"] <= getattr(accuracy, f.name) for f in fields(accuracy))]
+    row = min(good, key=lambda row: row["seconds"]) if good else max(rows, key=lambda row: row["seconds"])
+    return Settings(row["edge"], row["ghost"], row["floor"], int(row["positions"]))
+
+
+def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: float, settings: Settings) -> Int:
+    """Side of each source's stamp, pixels: int64[n], one of SIZES.
+
+    noise : of a pixel, electrons. A cut by noise alone biases faint sources, for what wraps is coherent: the second
+            condition holds it to a part of the flux, from the wings of the PSF and of high-n bulges alike
+    """
+    at = np.concatenate([SIZES // 2, SIZES])
+    psf_light = _beyond_the_table(psf, at)
+    galaxy_light = np.zeros((len(shape), len(at)))
+    body = shape >= 0
+    if body.any():
+        galaxy_light[body] = profiles.surface(shapes, at * psf.pixel_scale)[shape[body]] * psf.pixel_scale**2
+    edge = psf_light[: len(SIZES)] + galaxy_light[:, : len(SIZES)]
+    wrapped = _LATTICE_PSF * psf_light[len(SIZES) :] + _LATTICE_GALAXY * galaxy_light[:, len(SIZES) :]
+    aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
+    enough = (electrons[:, None] * edge < settings.edge * noise) & (wrapped * aperture < settings.ghost)
     enough[:, -1] = True
     # A point has no light beyond the PSF's plane.
-    enough[~is_galaxy, int(np.searchsorted(SIZES, SIDE)) :] = True
+    enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
     return np.asarray(SIZES[np.argmax(enough, axis=1)])
+
+
+def _beyond_the_table(psf: Psf, radius: Int) -> Float:
+    """psf.surface at any radius, pixels: wings of r^-3 beyond the table, nothing beyond the plane."""
+    last = len(psf.surface) - 1
+    wing = psf.surface[np.minimum(radius, last)] * (np.minimum(radius, last) / radius) ** 3
+    return np.where(radius < SIDE, wing, 0.0)
+
+
+def floors(electrons: Float, noise: float, settings: Settings) -> Float:
+    """Per source, the Fourier samples that `draw` may leave out: of its flux, and in the noise."""
+    return np.minimum(settings.floor, settings.edge * noise / np.maximum(electrons, 1e-30))
 
 
 def draw(
@@ -126,60 +167,55 @@ def draw(
     """
     frame = np.zeros((ny, nx), np.int64)
     weights = psfs.basis_weights(psf, sources.photons, sources.column, sources.row)
-    bodies = _bodies(sources)
     left_out = np.zeros(len(sources)) if floors is None else floors
-    shared: dict[int, Transfer] = {}
-    # Stamps of one size follow each other, so that one size's planes are in memory.
-    for count, i in enumerate(np.argsort(sizes, kind="stable")):
-        size = int(sizes[i])
-        bright = sources.electrons[i] > _BRIGHT
-        dtype = np.float64 if bright else np.float32
-        if bright or (size > _SHARED and psf.planes is not None):
-            passed, share = psfs.collapsed(psf, weights[i], size, dtype), np.ones(1, dtype)
-        else:
-            if size not in shared:
-                shared = {size: psfs.transfer(psf, size)}
-            passed, share = shared[size], weights[i].astype(np.float32)
-        x0, y0 = (int(np.rint(position[i])) - size // 2 for position in (sources.column, sources.row))
-        zone = np.empty((size, size // 2 + 1), np.complex128 if bright else np.complex64)
-        kernel.nyquist_zone(
-            passed.planes, share, passed.low, passed.high, passed.envelope, psfs.ENVELOPE_STEP,
-            *(part[i] for part in bodies), float(left_out[i]),
-            sources.column[i] - x0, sources.row[i] - y0, float(sources.electrons[i]), zone,
-        )  # fmt: skip
-        kernel.accumulate(frame, scipy.fft.irfft2(zone, s=(size, size), overwrite_x=True), x0, y0)
-        if progress is not None and count % 100 == 0:
-            progress(count)
+    bodies, table = (*_bodies(sources), left_out), sersic.table()
+    done = 0
+    for size in np.unique(sizes):
+        alone = (sizes == size) & ((sources.electrons > _BRIGHT) | ((size > _SHARED) & (psf.planes is not None)))
+        together = np.flatnonzero((sizes == size) & ~alone)
+        shared = psfs.transfer(psf, int(size)) if len(together) else None
+        batch = max(_BATCH // int(size) ** 2, 1)
+        groups = [together[i : i + batch] for i in range(0, len(together), batch)]
+        for chosen in [*groups, *np.flatnonzero(alone)[:, None]]:
+            if alone[chosen[0]]:
+                dtype = np.float64 if sources.electrons[chosen[0]] > _BRIGHT else np.float32
+                passed, share = psfs.collapsed(psf, weights[chosen[0]], int(size), dtype), np.ones((1, 1), dtype)
+            elif shared is not None:
+                passed, share = shared, weights[chosen].astype(np.float32)
+            _draw_some(frame, sources, chosen, passed, share, bodies, table)
+            done += len(chosen)
+            if progress is not None:
+                progress(done)
     return frame / kernel.FIXED_POINT
 
 
-class _Bodies(NamedTuple):
-    """The kernel's arguments of each source's profile, arrays [n]."""
+def _draw_some(
+    frame: Int, sources: Sources, chosen: Int, passed: Transfer, weights: Array, bodies: tuple[Array, ...], table: Array
+) -> None:
+    """Stamps of one size through one set of planes, onto the frame."""
+    size = passed.planes.shape[1]
+    column, row = sources.column[chosen], sources.row[chosen]
+    x0, y0 = (np.rint(position).astype(np.int64) - size // 2 for position in (column, row))
+    kind = np.complex128 if passed.planes.dtype == np.float64 else np.complex64
+    zones = np.empty((len(chosen), size, size // 2 + 1), kind)
+    electrons, some = sources.electrons[chosen], [part[chosen] for part in bodies]
+    grid = (passed.planes, passed.low, passed.high, passed.envelope, psfs.ENVELOPE_STEP)
+    kernel.nyquist_zones(zones, *grid, weights, column - x0, row - y0, electrons, table, *some)
+    kernel.accumulate(frame, scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True), x0, y0)
 
-    body: Array
-    fraction: Float
-    bulge: Float
-    disk: Float
-    thick: Float
-    sersic: Sequence[Array]
-    row: Int
-    row_weights: Float
 
-
-def _bodies(sources: Sources) -> _Bodies:
-    n, table = len(sources), sersic.table()
-    body = sources.shape >= 0
-    out = _Bodies(
-        body, np.zeros(n), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2)), [table] * n,
-        np.zeros(n, np.int64), np.zeros((n, 4)),
-    )  # fmt: skip
+def _bodies(sources: Sources) -> tuple[Array, ...]:
+    """The kernel's arguments of each source's profile: body, fraction, bulge, disk, thick, row, row_weights."""
+    n, body = len(sources), sources.shape >= 0
+    fraction, row, row_weights = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 4))
+    bulge, disk, thick = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2))
     if body.any():
         shapes = sources.shapes.take(sources.shape[body])
         form = profiles.forms(shapes, sources.jacobian[body])
-        out.fraction[body] = shapes.bulge_fraction
-        out.bulge[body], out.disk[body], out.thick[body] = form.bulge, form.disk, form.thick
-        out.row[body], out.row_weights[body] = sersic.row_of(shapes.sersic_index)
-    return out
+        fraction[body] = shapes.bulge_fraction
+        bulge[body], disk[body], thick[body] = form.bulge, form.disk, form.thick
+        row[body], row_weights[body] = sersic.row_of(shapes.sersic_index)
+    return body, fraction, bulge, disk, thick, row, row_weights
 
 
 def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4) -> Float:
