@@ -2,6 +2,7 @@
 
 nyquist_zones profile x PSF x pixel x phase on the half plane, wrapped onto the pixels' Nyquist zone
 accumulate    stamps onto the frame, in fixed point
+add_blocks    a smooth layer onto the frame
 
 The half plane is held as its aliases: sample (row, column) of the zone and the same place in the neighbouring zones,
 which all fall on it. Precision is that of the planes: single, but double for sources so bright that it would show.
@@ -250,3 +251,19 @@ def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> None:
         for r in range(max(0, -y0[i]), min(stamps.shape[1], ny - y0[i])):
             for c in range(max(0, -x0[i]), min(stamps.shape[2], nx - x0[i])):
                 frame[y0[i] + r, x0[i] + c] += np.int64(np.rint(np.float64(stamps[i, r, c]) * FIXED_POINT))
+
+
+@jit
+def add_blocks(frame: Float, blocks: Float, side: int, margin: int) -> None:
+    """Adds blocks of `side` pixels, `margin` of them before the frame's first, interpolated linearly."""
+    ny, nx = frame.shape
+    middle = 0.5 * (side - 1)
+    for r in range(ny):
+        y = (r - middle) / side + margin
+        low = int(np.floor(y))
+        part = y - low
+        line = (1.0 - part) * blocks[low] + part * blocks[low + 1]
+        for c in range(nx):
+            x = (c - middle) / side + margin
+            left = int(np.floor(x))
+            frame[r, c] += line[left] + (x - left) * (line[left + 1] - line[left])

@@ -35,7 +35,7 @@ Int = npt.NDArray[np.int64]
 Array = npt.NDArray[Any]
 
 # Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide.
-_OVERSAMPLING = 3
+SAMPLES = 3
 # Side of the plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is lost.
 SIDE = 512
 # Side of the optical transform, samples; the 0.15 % of the light beyond its border is absent.
@@ -59,7 +59,7 @@ _ARCSEC = np.pi / 180.0 / 3600.0
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """A PSF by wavelength and place, in samples of 1 / _OVERSAMPLING pixel, centred on the middle sample.
+    """A PSF by wavelength and place, in samples of 1 / SAMPLES pixel, centred on the middle sample.
 
     PSF(source) = sum_w photons_w images_w + sum_j polynomial_j(place) drift_j: the change across the detector of the
     mean PSF to second order (x, y, x^2, x y, y^2), and of its slope with wavelength to first (x, y).
@@ -110,7 +110,7 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
 
 def galsim_profile(image: Float, pixel_scale: float) -> galsim.GSObject:
     """A plane as a galsim object, arcsec."""
-    sampled = galsim.Image(np.asarray(image, float), scale=pixel_scale / _OVERSAMPLING)
+    sampled = galsim.Image(np.asarray(image, float), scale=pixel_scale / SAMPLES)
     # A plane that is empty at its border needs little padding; its extent in real and Fourier space is known.
     return galsim.InterpolatedImage(
         sampled,
@@ -196,31 +196,42 @@ def collapsed(psf: Psf, weights: Float, size: int, dtype: type[Any]) -> Transfer
     """
     if psf.planes is None:
         return _transfer([_galsim_spectrum(psf, size)], size, dtype)
-    return _transfer([_spectrum(_image(psf.planes, weights, dtype), size)], size, dtype)
+    image = _image(psf.planes, weights, SAMPLES * size).astype(dtype)
+    return _transfer([_spectrum(image, size)], size, dtype)
 
 
 def profile_of(psf: Psf, weights: Float) -> galsim.GSObject:
     """A source's own PSF as a galsim object, arcsec."""
-    return (
-        psf.profile if psf.planes is None else galsim_profile(_image(psf.planes, weights, np.float64), psf.pixel_scale)
-    )
+    if psf.planes is None:
+        return psf.profile
+    return galsim_profile(_image(psf.planes, weights, psf.planes.images.shape[1]), psf.pixel_scale)
 
 
-def _image(planes: Planes, weights: Float, dtype: type[Any]) -> Array:
-    count = len(planes.images)
-    image = np.zeros(planes.images.shape[1:], dtype)
-    for weight, plane in zip(weights[:count], planes.images, strict=True):
-        image += dtype(weight) * plane
-    if len(planes.drift):
-        margin = (image.shape[0] - planes.drift.shape[1]) // 2
-        inner = slice(margin, margin + planes.drift.shape[1])
-        image[inner, inner] += np.tensordot(weights[count:].astype(dtype), planes.drift.astype(dtype), 1)
-    return image
+def _image(planes: Planes, weights: Float, side: int) -> Float32:
+    """The planes' sum, cut to `side` samples or one more."""
+    images, drift = _middle(planes.images, side), _middle(planes.drift, side)
+    share = weights.astype(np.float32)
+    image = np.tensordot(share[: len(images)], images, 1)
+    if len(drift):
+        margin = (image.shape[0] - drift.shape[1]) // 2
+        inner = slice(margin, margin + drift.shape[1])
+        image[inner, inner] += np.tensordot(share[len(images) :], drift, 1)
+    return np.asarray(image)
+
+
+def _middle(images: Float32, side: int) -> Float32:
+    """The middle of square planes [b, s, s], `side` samples or one more."""
+    margin = max((images.shape[1] - side) // 2, 0)
+    return images[:, margin : images.shape[1] - margin, margin : images.shape[2] - margin]
 
 
 def _spectrum(image: Array, size: int) -> Array:
-    """Fourier transform of a plane on the grid of a periodic stamp: complex[m, m / 2 + 1], m = _OVERSAMPLING size."""
-    period = _OVERSAMPLING * size
+    """Fourier transform of a plane on the grid of a stamp: complex[m, m / 2 + 1], m = SAMPLES size.
+
+    A plane is cut to the stamp: its wings beyond would otherwise come in at the opposite edge.
+    """
+    period = SAMPLES * size
+    image = _middle(image[None], period)[0]
     folded = _folded(_folded(image, period).T, period).T
     return np.asarray(scipy.fft.rfft2(folded))
 
@@ -320,7 +331,7 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
     waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
     places = [_field(detector, x, y, mission) for x, y in (_NODES if positions > 1 else _NODES[:0])]
     coefficients = [wavefront(*_field(detector, 0.0, 0.0, mission), mission), *(wavefront(*p, mission) for p in places)]
-    sampling = detector.pixel_scale / _OVERSAMPLING
+    sampling = detector.pixel_scale / SAMPLES
     blur = _blur_variances(detector, mission)
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
     key = cache.content_key(
@@ -368,7 +379,7 @@ def _drift(
     nodes: Sequence[Float], waves: Float, sampling: float, blur: tuple[float, float], mission: MissionConfiguration
 ) -> Float:
     """Planes of Planes.drift, [7, t, t] or [0, t, t], in the focal plane's axes, by least squares over the nodes."""
-    side = _CORE_SIDE * _OVERSAMPLING + 1
+    side = _CORE_SIDE * SAMPLES + 1
     if not nodes:
         return np.zeros((0, side, side))
     mean, slope = np.zeros((2, len(nodes), side, side))
@@ -390,12 +401,12 @@ def _plane(
     nm: Float, wavelength: float, transform: int, side: int, sampling: float, blur: tuple[float, float],
     mission: MissionConfiguration,
 ) -> Float:  # fmt: skip
-    """One wavelength's PSF: [side * _OVERSAMPLING + 1] square, in the focal plane's axes."""
+    """One wavelength's PSF: [side * SAMPLES + 1] square, in the focal plane's axes."""
     image = _monochromatic(nm, wavelength, sampling, mission, transform) / _edge_loss(transform)
     k = 2 * np.pi * scipy.fft.fftfreq(transform, sampling)
     blurred = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(-0.5 * blur[0] * k[None, : transform // 2 + 1] ** 2)
     image = scipy.fft.fftshift(scipy.fft.irfft2(scipy.fft.rfft2(image) * blurred, s=image.shape))
-    half = side * _OVERSAMPLING // 2
+    half = side * SAMPLES // 2
     kept = slice(transform // 2 - half, transform // 2 + half + 1)
     return np.asarray(image[kept, kept])
 

@@ -1,8 +1,9 @@
 """Drawing sources: each on its own stamp, through its own PSF, in Fourier space, summed onto a frame.
 
-A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid.  Light that
-belongs outside a stamp comes in at its opposite edge: nothing is lost, nothing is rescaled.  A stamp is large
-enough that what wraps is below the noise at its edge, and below the flux budget in the source's aperture.
+A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid. A galaxy's light
+that belongs outside its stamp comes in at the opposite edge; a stamp is large enough that this is below the noise at
+its edge, and below the flux budget in the source's aperture. The PSF's wings beyond the stamp are drawn on their own
+(wings.py). Nothing is lost, nothing is rescaled.
 
 Sources         what is drawn: galaxies (with a shape) and points
 settings_for    what an accuracy takes, from the measured table
@@ -25,7 +26,7 @@ import numpy.typing as npt
 import scipy.fft
 
 from jobs.accuracy import Accuracy
-from jobs.render import kernel, profiles, sersic
+from jobs.render import kernel, profiles, sersic, wings
 from jobs.render import psf as psfs
 from jobs.render.profiles import Shapes
 from jobs.render.psf import SIDE, Psf, Transfer
@@ -95,12 +96,14 @@ class Settings:
     edge  : largest surface brightness at a stamp's edge, of a pixel's noise
     ghost : largest part of a source's flux that wraps into its own aperture
     floor : Fourier samples of less than this are left out, 1 at k = 0
+    least : smallest side of a stamp, arcsec: what of the PSF a source keeps
     positions : of the PSF on a detector
     """
 
     edge: float
     ghost: float
     floor: float
+    least: float
     positions: int
 
 
@@ -113,7 +116,7 @@ def settings_for(accuracy: Accuracy) -> Settings:
         ]
     good = [row for row in rows if all(row[f"{f.name}_error"] <= getattr(accuracy, f.name) for f in fields(accuracy))]
     row = min(good, key=lambda row: row["seconds"]) if good else max(rows, key=lambda row: row["seconds"])
-    return Settings(row["edge"], row["ghost"], row["floor"], int(row["positions"]))
+    return Settings(row["edge"], row["ghost"], row["floor"], row["least"], int(row["positions"]))
 
 
 def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: float, settings: Settings) -> Int:
@@ -129,9 +132,12 @@ def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: f
     if body.any():
         galaxy_light[body] = profiles.surface(shapes, at * psf.pixel_scale)[shape[body]] * psf.pixel_scale**2
     edge = psf_light[: len(SIZES)] + galaxy_light[:, : len(SIZES)]
-    wrapped = _LATTICE_PSF * psf_light[len(SIZES) :] + _LATTICE_GALAXY * galaxy_light[:, len(SIZES) :]
+    # A PSF in planes is cut to the stamp and does not wrap.
+    wings = _LATTICE_PSF * psf_light[len(SIZES) :] * (psf.planes is None)
+    wrapped = wings + _LATTICE_GALAXY * galaxy_light[:, len(SIZES) :]
     aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
     enough = (electrons[:, None] * edge < settings.edge * noise) & (wrapped * aperture < settings.ghost)
+    enough &= SIZES * psf.pixel_scale >= settings.least
     enough[:, -1] = True
     # A point has no light beyond the PSF's plane.
     enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
@@ -186,7 +192,9 @@ def draw(
             done += len(chosen)
             if progress is not None:
                 progress(done)
-    return frame / kernel.FIXED_POINT
+    beyond = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
+    beyond += frame / kernel.FIXED_POINT
+    return beyond
 
 
 def _draw_some(
