@@ -20,12 +20,14 @@ JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.
 SMALL = """
 name = "small"
 accuracy = "draft"
-seed = 5
+seed = 7
 [area]
 cone = { ra = 53.4375, dec = -27.279613, radius = 0.01 }
 [universe]
 galaxy_limit = 21.0
 star_limit = 20.0
+box_cells = 192
+lensing_nside = 64
 [fluxes]
 bands = ["euclid_vis"]
 """
