@@ -2,7 +2,7 @@
 
     name = "demo"      seed = 2024      accuracy = "survey" | "draft" | "reference" | {flux = .., shape = .., ..}
     [area]       polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
-    [universe]   galaxy_limit (I_E), star_limit (H, Vega), z_max
+    [universe]   galaxy_limit (I_E), star_limit (H, Vega), z_max, box_cells, lensing_nside
     [mission]    ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
     [fluxes]     bands = [..]           default: the bands of the pointings
     [[pointing]] channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
@@ -33,6 +33,8 @@ STATUSES = ("REQ", "DES", "BLT", "CBE", "SIM")
 LADDER = ("CBE", "BLT", "DES", "REQ", "SIM")
 CHANNELS = ("VIS", "EXT")
 TRUTH = ("noise_free",)
+BOX_CELLS = (192, 256, 384)
+LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +58,21 @@ class Area:
 
 @dataclass(frozen=True, slots=True)
 class Universe:
-    """How deep: I_E of galaxies (AB, before Milky Way dust), H of stars (Vega, as observed), highest redshift."""
+    """How deep and how fine.
+
+    galaxy_limit, star_limit : I_E (AB, before Milky Way dust), H (Vega, as observed);  z_max : highest redshift
+    box_cells                : cells of 4 Mpc/h a side of the box of matter
+    lensing_nside            : HEALPix resolution of the lensing maps
+    high_redshift_boost, quasar_boost : how many times denser than in nature these kinds are drawn, 0 = not at all
+    """
 
     galaxy_limit: float = 26.0
     star_limit: float = 26.0
     z_max: float = 2.3
+    box_cells: int = 256
+    lensing_nside: int = 512
+    high_redshift_boost: float = 1.0
+    quasar_boost: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +166,7 @@ def from_table(table: Toml) -> Request:
         seed=_integer(table, "seed", 0, 2**63 - 1),
         accuracy=_accuracy(table.get("accuracy")),
         area=_area(_section(table, "area", {"polygon", "cone", "box"})),
-        universe=_universe(_section(table, "universe", {"galaxy_limit", "star_limit", "z_max"})),
+        universe=_universe(_section(table, "universe", set(Universe.__slots__))),
         mission=_mission(_section(table, "mission", {"ladder", "overrides"})),
         bands=bands or tuple(dict.fromkeys(p.band for p in pointings)),
         pointings=pointings,
@@ -217,6 +229,10 @@ def _universe(table: Toml) -> Universe:
         galaxy_limit=_number(table, "universe.galaxy_limit", 10.0, 30.0, default.galaxy_limit),
         star_limit=_number(table, "universe.star_limit", 0.0, 30.0, default.star_limit),
         z_max=_number(table, "universe.z_max", 0.01, 3.0, default.z_max),
+        box_cells=_choice(table, "universe.box_cells", BOX_CELLS, default.box_cells),
+        high_redshift_boost=_number(table, "universe.high_redshift_boost", 0.0, 1e5, default.high_redshift_boost),
+        quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),
+        lensing_nside=_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
     )
 
 
@@ -332,6 +348,15 @@ def _integer(table: Toml, path: str, lo: int, hi: int) -> int:
         raise BadInput(f"{path} wants a whole number, got {_shown(value)}")
     if not lo <= value <= hi:
         raise OutOfRange(path, value, lo, hi)
+    return value
+
+
+def _choice(table: Toml, path: str, legal: Sequence[int], default: int) -> int:
+    if path.rpartition(".")[2] not in table:
+        return default
+    value = _integer(table, path, min(legal), max(legal))
+    if value not in legal:
+        raise BadInput(f"{path} = {value} is not one of {', '.join(map(str, legal))}")
     return value
 
 

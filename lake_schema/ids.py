@@ -22,10 +22,10 @@ BLOCK_BITS = _MEMBER_BITS + _NUMBER_BITS + _SUB_BITS
 Int64 = npt.NDArray[np.int64]
 
 
-def source_id(kind: npt.ArrayLike, cell: int, number: npt.ArrayLike, member: npt.ArrayLike = 0) -> Int64:
-    """Identifiers of sources drawn in one generation cell.
+def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, member: npt.ArrayLike = 0) -> Int64:
+    """Identifiers of sources.
 
-    kind : int[n]; cell : order-8 nested cell; number : int[n] running number of the halo in the cell; member : int[n]
+    kind : int[n]; cell : int or int[n], order-8 nested cell that the halo lies in; number : int[n] running number of the halo in the cell; member : int[n]
     returns int64[n].  Errors: BadInput where a number needs more bits than it has
     """
     kinds, numbers, members = (np.asarray(x, np.int64) for x in (kind, number, member))
@@ -36,11 +36,13 @@ def source_id(kind: npt.ArrayLike, cell: int, number: npt.ArrayLike, member: npt
     ):
         if values.size and (values.min() < 0 or values.max() >= 1 << bits):
             raise BadInput(f"source id: {name} needs {bits} bits, got {values.min()} .. {values.max()}")
-    if not 0 <= cell < 12 << (2 * GENERATION_ORDER):
-        raise BadInput(f"source id: {cell} is not a cell of order {GENERATION_ORDER}")
-    file_cell, sub = cell >> _SUB_BITS, cell & ((1 << _SUB_BITS) - 1)
-    index = np.int64(sub) << _NUMBER_BITS | numbers
-    return kinds << 60 | np.int64(file_cell) << BLOCK_BITS | index << _MEMBER_BITS | members
+    cells = np.asarray(cell, np.int64)
+    beyond = (cells < 0) | (cells >= 12 << (2 * GENERATION_ORDER))
+    if beyond.any():
+        raise BadInput(f"source id: {cells[beyond].ravel()[0]} is not a cell of order {GENERATION_ORDER}")
+    file_cells, sub = cells >> _SUB_BITS, cells & ((1 << _SUB_BITS) - 1)
+    index = sub << _NUMBER_BITS | numbers
+    return np.asarray(kinds << 60 | file_cells << BLOCK_BITS | index << _MEMBER_BITS | members)
 
 
 def halo_of(ids: Int64) -> Int64:

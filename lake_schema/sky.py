@@ -169,6 +169,12 @@ def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> t
     return index, ra, dec
 
 
+def positions(index: npt.ArrayLike) -> tuple[Float, Float]:
+    """Order-29 indices [n] -> ra, dec [n] deg of their centres."""
+    ra, dec = _hp().pix2ang(1 << DEEPEST, np.asarray(index, np.int64), nest=True, lonlat=True)
+    return np.asarray(ra, float), np.asarray(dec, float)
+
+
 def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     """ICRS ra, dec [n] deg -> Galactic l, b [n] deg (matrix of the Hipparcos catalogue, ESA 1997, eq. 1.5.11)."""
     ra_rad, dec_rad = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))

@@ -45,7 +45,7 @@ class Sed:
     law: Int
     ebv: Float
 
-    def part(self, keep: npt.NDArray[np.bool_]) -> Sed:
+    def part(self, keep: npt.NDArray[np.generic]) -> Sed:
         """The galaxies that are kept."""
         return Sed(
             self.template_1[keep],

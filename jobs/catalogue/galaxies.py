@@ -1,10 +1,10 @@
-"""Galaxies of one generation cell: table `galaxies`, a pure function of (seed, cell, model).
+"""Galaxies of one generation cell: table `galaxies`, a pure function of (seed, cell, model); and its halos.
 
-model   every table that the draws need, made once
-draw    luminosities -> colours, dust, spectra -> selection -> masses, shapes, positions
+model        every table that the draws need, made once
+draw         members of halos -> colours, dust, spectra -> selection -> masses, shapes, lensing
+halo_table   table `halos` of the same cell
 
-Each step draws from a stream of its own, so that a new column leaves the others' numbers as they are. So far
-every galaxy is the central of its own halo and lies at a random place of the cell, unlensed.
+Each step draws from a stream of its own, so that a new column leaves the others' numbers as they are.
 """
 
 from __future__ import annotations
@@ -18,25 +18,34 @@ import pyarrow as pa
 from jobs.catalogue import (
     band_ratios,
     dust_map,
+    emission_lines,
+    high_redshift,
+    lensing,
     luminosity_function,
+    matching,
     morphology,
+    population,
     sed_assignment,
     stellar_mass,
 )
 from jobs.catalogue.band_ratios import BandRatios, Sed
-from jobs.catalogue.luminosity_function import Counts, Inverse
+from jobs.catalogue.emission_lines import LineModel
+from jobs.catalogue.high_redshift import Kind
+from jobs.catalogue.lensing import Planes
+from jobs.catalogue.luminosity_function import Schechter
 from jobs.catalogue.morphology import Shapes
+from jobs.catalogue.population import Cells, Members, Population
 from jobs.fluxes import cosmology, templates
 from jobs.rng import stream
-from lake_schema import ids, sky
-from lake_schema.ids import GENERATION_ORDER
+from lake_schema import sky
 from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.halos import HALOS
+from lake_schema.units import LIGHT_KM_S
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-CENTRAL = 0
 SELECTION_BAND = "euclid_vis"
 # Candidates are drawn this much deeper than the brightest SED needs, mag: more than the tables' errors.
 _MARGIN = 0.02
@@ -51,8 +60,9 @@ class GalaxyModel:
     """
 
     limit: float
-    inverse: Inverse
-    counts: Counts
+    population: Population
+    planes: Planes
+    luminosities: Schechter
     colours: sed_assignment.Colours
     selection: BandRatios
     reference: BandRatios
@@ -60,12 +70,15 @@ class GalaxyModel:
     shapes: Shapes
     masses: stellar_mass.MassToLight
     light: stellar_mass.Light
+    lines: LineModel
+    distant: tuple[Kind, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """Galaxies after selection: z[n], M_r[n], on the red sequence[n], realised 0.1(g - r)[n], spectra."""
+    """Galaxies after selection: rows of the members, z, M_r, on the red sequence, realised 0.1(g - r), spectra; [n]."""
 
+    row: Int
     z: Float
     m_r: Float
     red: Bool
@@ -73,23 +86,29 @@ class Drawn:
     sed: Sed
 
 
-def model(limit: float = 26.0, z_max: float = 2.3) -> GalaxyModel:
-    """The embedded universe's galaxies with I_E < limit and z < z_max (1 s, 3 s with an empty cache)."""
-    library = templates.galaxy_library()
-    colours = sed_assignment.colours_model()
-    space = luminosity_function.volume(z_max)
+def model(
+    seed: int,
+    limit: float = 26.0,
+    z_max: float = 2.3,
+    box_cells: int = 256,
+    lensing_nside: int = 512,
+    high_redshift_boost: float = 1.0,
+    quasar_boost: float = 1.0,
+) -> GalaxyModel:
+    """The embedded universe of a seed: its galaxies with I_E < limit and z < z_max.
+
+    1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
+    """
+    library, colours = templates.galaxy_library(), sed_assignment.colours_model()
+    selection = _selection(z_max)
+    population_of = people(seed, limit, z_max, box_cells)
     dustiest = colours.dust.highest
-    selection = band_ratios.load(library, SELECTION_BAND, z_max, dustiest)
-    nodes, brightest = band_ratios.brightest(selection)
-
-    def faintest(z: Float) -> Float:
-        return limit + _MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
-
-    lf = luminosity_function.schechter()
+    distant = high_redshift.model(high_redshift_boost, quasar_boost)
     return GalaxyModel(
         limit=limit,
-        inverse=luminosity_function.inverse(lf, z_max),
-        counts=luminosity_function.counts(lf, space, faintest),
+        population=population_of,
+        planes=lensing.load(population_of.halos.box, lensing_nside, far=bool(distant)),
+        luminosities=luminosity_function.schechter(),
         colours=colours,
         selection=selection,
         reference=band_ratios.load(library, band_ratios.REFERENCE_BAND, z_max, dustiest),
@@ -97,35 +116,82 @@ def model(limit: float = 26.0, z_max: float = 2.3) -> GalaxyModel:
         shapes=morphology.shapes(),
         masses=stellar_mass.mass_to_light(),
         light=stellar_mass.light(library, selection.ebv),
+        lines=emission_lines.model(),
+        distant=distant,
     )
 
 
-def draw(cell: int, seed: int, universe: GalaxyModel, dust: npt.NDArray[np.float32]) -> pa.Table:
+def people(seed: int, limit: float, z_max: float, box_cells: int) -> Population:
+    """The halos and galaxies that an I_E < limit can be asked of, before they have colours."""
+    nodes, brightest = band_ratios.brightest(_selection(z_max))
+
+    def faintest(z: Float) -> Float:
+        return limit + _MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
+
+    inverse = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
+    return population.model(seed, box_cells, luminosity_function.volume(z_max), inverse, faintest)
+
+
+def _selection(z_max: float) -> BandRatios:
+    dustiest = sed_assignment.colours_model().dust.highest
+    return band_ratios.load(templates.galaxy_library(), SELECTION_BAND, z_max, dustiest)
+
+
+def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.float32]) -> pa.Table:
     """Table `galaxies` of one order-8 cell, sorted by _healpix_29.
 
-    dust : map of the Milky Way's A(V) (jobs.catalogue.dust_map)
+    cells : what has been drawn of the universe's population
+    dust  : map of the Milky Way's A(V) (jobs.catalogue.dust_map)
     """
-    drawn = select(universe, *_light(cell, seed, universe))
+    seed = universe.population.seed
+    people = population.members(cells, cell)
+    drawn = select(universe, *_light(cell, seed, universe, people))
     distance_modulus = cosmology.distance_modulus(drawn.z)
     log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, drawn.colour)
+    log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
+    rng = stream(seed, "galaxies.lines", cell)
     columns = {
-        **_places(cell, seed, drawn.z, dust),
+        **_places(universe.planes, people, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
         "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
         "color_gr_01": drawn.colour,
         "log_stellar_mass": log_mass,
-        "log_sfr": stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed),
+        "log_sfr": log_sfr,
         **_sed_columns(drawn.sed),
+        **emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, drawn.red, drawn.sed.ebv, rng),
         **_shape_columns(cell, seed, universe.shapes, drawn, log_mass),
     }
-    return GALAXIES.build(columns)
+    rows = [GALAXIES.build(columns)]
+    rows += [high_redshift.draw(cell, seed, kind, universe.planes, dust) for kind in universe.distant]
+    together = pa.concat_tables(rows)
+    return together.take(np.lexsort((together["id"].to_numpy(), together["_healpix_29"].to_numpy())))
+
+
+def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
+    """Table `halos` of one order-8 cell, sorted by _healpix_29."""
+    hosts, own_ids = population.halos_of(cells, cell)
+    ra, dec = sky.positions(hosts.index)
+    z = universe.halos.distances.redshift(hosts.chi)
+    return HALOS.build(
+        {
+            "id": own_ids,
+            "ra": ra,
+            "dec": dec,
+            "_healpix_29": hosts.index,
+            "z_true": z,
+            "z_obs": (1.0 + z) * (1.0 + hosts.velocity / LIGHT_KM_S) - 1.0,
+            "log_mass": hosts.log_mass,
+            "concentration": universe.masses.at(universe.masses.concentration, z, hosts.log_mass),
+            "complete": hosts.log_mass >= universe.halos.mass_limit(hosts.chi),
+        }
+    )
 
 
 def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed) -> Drawn:
     """The galaxies brighter than the limit, with their realised colours."""
-    keep = apparent(universe, z, m_r, sed) < universe.limit
-    kept = sed.part(keep)
-    return Drawn(z[keep], m_r[keep], red[keep], sed_assignment.colours(universe.colour, kept), kept)
+    row = np.flatnonzero(apparent(universe, z, m_r, sed) < universe.limit)
+    kept = sed.part(row)
+    return Drawn(row, z[row], m_r[row], red[row], sed_assignment.colours(universe.colour, kept), kept)
 
 
 def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
@@ -136,38 +202,38 @@ def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
     return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
 
 
-def _light(cell: int, seed: int, universe: GalaxyModel) -> tuple[Float, Float, Bool, Sed]:
+def _light(cell: int, seed: int, universe: GalaxyModel, people: Members) -> tuple[Float, Float, Bool, Sed]:
     """Candidates of a cell: z, M_r, on the red sequence, spectra."""
-    area = sky.cell_area(GENERATION_ORDER)
-    z, m_r = luminosity_function.draw(
-        universe.inverse, universe.counts, area, stream(seed, "galaxies.luminosity", cell)
+    m_r = universe.population.halos.matching.magnitude(people.z, people.proxy)
+    red, colour = sed_assignment.draw_colour(
+        universe.colours, m_r, people.z, people.kind, stream(seed, "galaxies.colour", cell)
     )
-    kind = np.full(z.size, CENTRAL)
-    red, colour = sed_assignment.draw_colour(universe.colours, m_r, z, kind, stream(seed, "galaxies.colour", cell))
     law, ebv = sed_assignment.draw_dust(universe.colours.dust, m_r, red, colour, stream(seed, "galaxies.dust", cell))
-    return z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
+    return people.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
 
 
-def _places(cell: int, seed: int, z: Float, dust: npt.NDArray[np.float32]) -> dict[str, npt.NDArray[np.generic]]:
-    n = z.size
-    index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, n, stream(seed, "galaxies.position", cell))
-    kind, zeros = np.full(n, CENTRAL), np.zeros(n)
-    source = ids.source_id(kind, cell, np.arange(n))
+def _places(
+    planes: Planes, people: Members, row: Int, dust: npt.NDArray[np.float32]
+) -> dict[str, npt.NDArray[np.generic]]:
+    ra, dec = people.ra[row], people.dec[row]
+    kappa, gamma1, gamma2, east, north = lensing.at(planes, ra, dec, people.chi[row])
+    ra_lensed, dec_lensed = lensing.displaced(ra, dec, east, north)
     return {
-        "id": source,
-        "halo_id": ids.halo_of(source),
+        "id": people.id[row],
+        "halo_id": people.halo_id[row],
         "ra": ra,
         "dec": dec,
-        "_healpix_29": index,
-        "ra_lensed": ra,
-        "dec_lensed": dec,
-        "kind": kind,
-        "density_boost": np.ones(n),
-        "z_true": z,
-        "z_obs": z,
-        "kappa": zeros,
-        "gamma1": zeros,
-        "gamma2": zeros,
+        "_healpix_29": people.index[row],
+        "ra_lensed": ra_lensed,
+        "dec_lensed": dec_lensed,
+        "kind": people.kind[row],
+        "density_boost": np.ones(row.size),
+        "z_true": people.z[row],
+        "z_obs": people.z_obs[row],
+        "log_halo_mass": people.host_mass[row],
+        "kappa": kappa,
+        "gamma1": gamma1,
+        "gamma2": gamma2,
         "a_v": dust_map.a_v(dust, ra, dec),
     }
 

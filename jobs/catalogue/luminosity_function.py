@@ -1,9 +1,7 @@
-"""The evolving luminosity function of galaxies, and draws of (redshift, luminosity) from it.
+"""The evolving luminosity function of galaxies, and its inverse.
 
 number_density      n(< M, z), closed form
 inverse, magnitude  the table that turns n(< M, z) back into M
-counts              galaxies per deg2 along the line of sight, brighter than a limit that varies with redshift
-draw                Poisson sample of (z, M) of an area
 
 Absolute magnitudes are M_r = M(0.1r) - 5 log10 h, volumes comoving (Mpc/h)^3.
 Ref: Schechter 1976, ApJ 203, 297; the numbers and their sources are in luminosity_function.toml.
@@ -11,7 +9,6 @@ Ref: Schechter 1976, ApJ 203, 297; the numbers and their sources are in luminosi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,13 +16,11 @@ import numpy.typing as npt
 from scipy.special import gamma, gammaincc
 
 from jobs.catalogue import parameters
-from jobs.fluxes import cosmology
 from lake_schema.errors import OutOfRange
 
 Float = npt.NDArray[np.float64]
 
 _LN10_04 = 0.4 * np.log(10.0)
-_SR_PER_DEG2 = np.radians(1.0) ** 2
 # Beyond this redshift the universe has a population of its own (Serrano et al. 2024, "Galaxy catalogues").
 _Z_MAX_LIMIT = 6.0
 
@@ -33,7 +28,6 @@ _Z_MAX_LIMIT = 6.0
 _SMALLEST_A = 1e-5
 _A_NODES, _A_MARGIN = 128, 0.01
 _LN_X_RANGE, _X_NODES, _X_STEP = (-20.0, 6.4), 3001, 5
-_Z_NODES = 3000
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,22 +73,6 @@ class Inverse:
     a: Float
     ln_g: Float
     ln_x: Float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Counts:
-    """Galaxies per deg2 nearer than each redshift and brighter than the limit there.
-
-    z : [n]; cumulative : [n] deg-2; density : [n] (Mpc/h)^-3, n(< limit, z)
-    """
-
-    z: Float
-    cumulative: Float
-    density: Float
-
-    @property
-    def per_deg2(self) -> float:
-        return float(self.cumulative[-1])
 
 
 def schechter() -> Schechter:
@@ -169,31 +147,6 @@ def magnitude(table: Inverse, number: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     low = table.ln_x[row, col] * (1.0 - above_col) + table.ln_x[row, col + 1] * above_col
     high = table.ln_x[row + 1, col] * (1.0 - above_col) + table.ln_x[row + 1, col + 1] * above_col
     return np.asarray(m_star - (low * (1.0 - above_row) + high * above_row) / _LN10_04)
-
-
-def counts(lf: Schechter, space: Volume, m_limit: Callable[[Float], Float]) -> Counts:
-    """Galaxies per deg2 along the line of sight.
-
-    m_limit : z[n] -> faintest M_r[n] that is kept there
-    Error: < 1e-4 in the total (tests/jobs/catalogue/test_luminosity_function)
-    """
-    z = np.geomspace(space.z_min, space.z_max, _Z_NODES)
-    faintest = np.minimum(m_limit(z), space.m_faintest)
-    number = number_density(lf, faintest, z)
-    per_shell = 0.5 * (number[1:] + number[:-1]) * _SR_PER_DEG2 * cosmology.comoving_volume(z[:-1], z[1:])
-    return Counts(z, np.concatenate([[0.0], np.cumsum(per_shell)]), number)
-
-
-def draw(table: Inverse, line_of_sight: Counts, area: float, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Poisson sample of an area: (z[n], M_r[n]), independent galaxies, M brighter than the limit at z.
-
-    area : deg2
-    """
-    n = int(rng.poisson(area * line_of_sight.per_deg2))
-    z = np.interp(rng.random(n) * line_of_sight.per_deg2, line_of_sight.cumulative, line_of_sight.z)
-    # 1 - u lies in (0, 1]: no galaxy of infinite luminosity.
-    number = (1.0 - rng.random(n)) * np.interp(z, line_of_sight.z, line_of_sight.density)
-    return z, magnitude(table, number, z)
 
 
 def _bracket(nodes: Float, values: Float) -> tuple[npt.NDArray[np.int64], Float]:

@@ -19,12 +19,12 @@ from astropy.wcs import WCS
 from jobs import rng
 from jobs.accuracy import Accuracy
 from jobs.fluxes import passbands
-from jobs.render import focal_plane, profiles, psf, selection, stamps
+from jobs.render import chromatic, focal_plane, profiles, psf, selection, stamps
 from jobs.render.channels import ext, vis
 from jobs.render.effects.effect import Decision, Effect, Scene, apply_all
 from jobs.render.focal_plane import Detector
 from jobs.render.psf import Psf
-from jobs.render.stamps import Sources
+from jobs.render.stamps import Settings, Sources
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -33,22 +33,27 @@ Float = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
 
 # What is read of the catalogues; fluxes are read besides.
-GALAXY_COLUMNS = (
-    "id",
-    "ra_lensed",
-    "dec_lensed",
-    "bulge_half_light_radius",
-    "disk_half_light_radius",
-    "bulge_fraction",
-    "bulge_sersic_index",
-    "bulge_axis_ratio",
-    "inclination",
-    "position_angle",
-    "kappa",
-    "gamma1",
-    "gamma2",
+GALAXY_COLUMNS = tuple(
+    dict.fromkeys(
+        (
+            "id",
+            "ra_lensed",
+            "dec_lensed",
+            "bulge_half_light_radius",
+            "disk_half_light_radius",
+            "bulge_fraction",
+            "bulge_sersic_index",
+            "bulge_axis_ratio",
+            "inclination",
+            "position_angle",
+            "kappa",
+            "gamma1",
+            "gamma2",
+            *chromatic.GALAXY_COLUMNS,
+        )
+    )
 )
-STAR_COLUMNS = ("id", "ra", "dec")
+STAR_COLUMNS = ("id", "ra", "dec", *chromatic.STAR_COLUMNS)
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
 
 
@@ -111,7 +116,8 @@ def render(
         _fluxes(rows, fluxes, f"f_nu_{band}") * electrons_per_ujy * exposure_time
         for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
     ]
-    spread = _psf(detector, band, float(exposure["seeing"]), mission)
+    settings = stamps.settings_for(accuracy)
+    spread = _psf(detector, band, float(exposure["seeing"]), mission, settings.positions)
     sources, sizes = sources_of(
         (galaxies, electrons[0]),
         (stars, electrons[1]),
@@ -119,9 +125,11 @@ def render(
         system,
         spread,
         scene.pixel_noise,
-        accuracy,
+        settings,
+        band,
     )
-    noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress)
+    floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
+    noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors)
     scene = Scene(mission, detector.section, exposure_time, scene.sky_rate, float(noise_free.max()))
     frame, decisions = apply_all(
         noise_free,
@@ -160,7 +168,8 @@ def sources_of(
     system: WCS,
     spread: Psf,
     noise: float,
-    accuracy: Accuracy,
+    settings: Settings,
+    band: str,
 ) -> tuple[Sources, stamps.Int]:
     """Everything whose stamp touches the detector, ascending id, and the stamps' sides.
 
@@ -178,11 +187,21 @@ def sources_of(
     kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
     form = profiles.shapes(catalogue)
     column, row = focal_plane.pixel_of_sky(system, ra[kept], dec[kept])
-    sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, accuracy)
+    sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings)
     here = selection.touching(column, row, sizes, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
-    return Sources(ids[kept], column, row, jacobian, electrons[kept], shape[kept], form), sizes[here]
+    photons = _colours(kept, catalogue, points, band) if spread.planes is not None else None
+    return Sources(ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons), sizes[here]
+
+
+def _colours(kept: npt.NDArray[np.int64], galaxies: pa.Table, stars: pa.Table, band: str) -> Float:
+    """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
+    curve, of_galaxy = passbands.load(band), kept < len(galaxies)
+    out = np.empty((len(kept), chromatic.PARTS))
+    out[of_galaxy] = chromatic.galaxies(galaxies.take(kept[of_galaxy]), curve)
+    out[~of_galaxy] = chromatic.stars(stars.take(kept[~of_galaxy] - len(galaxies)), curve)
+    return out
 
 
 def _check(ids: npt.NDArray[np.int64], electrons: Float) -> None:
@@ -201,8 +220,8 @@ def _fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
     return np.asarray(fluxes[column].to_numpy(), float)
 
 
-def _psf(detector: Detector, band: str, seeing: float, mission: MissionConfiguration) -> Psf:
+def _psf(detector: Detector, band: str, seeing: float, mission: MissionConfiguration, positions: int) -> Psf:
     if detector.section == "vis":
-        return psf.vis_psf(detector, passbands.load(band), mission)
+        return psf.vis_psf(detector, passbands.load(band), mission, positions)
     beta = mission.value(f"{detector.section}.psf.moffat_beta")
     return psf.ground_psf(seeing, beta, detector.pixel_scale)

@@ -1,32 +1,31 @@
-"""Catalogue rows -> galsim light profiles, lensed, on the sky.
+"""Catalogue rows -> light profiles, lensed, on the sky.
 
-World frame of galsim: u to the west, v to the north, arcsec; an axis at position angle PA (north through
-                       east) lies at
-90 deg + PA from u.
+World frame of galsim: u to the west, v to the north, arcsec; an axis at position angle PA (north through east)
+lies at 90 deg + PA from u.
 
 shapes        rows -> Shapes, checked arrays
-profile       one galaxy of unit flux in the world frame
-surface, outside   its light beyond a radius, for the choice of a stamp's size
+forms         what the kernel draws them from, in pixels
+profile       one galaxy by galsim, for the reference
+surface       its light at a radius, for the choice of a stamp's size
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import galsim
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from scipy.special import gammaincc, gammaln
+from scipy.special import gammaln
+
+from jobs.render import sersic
 
 Float = npt.NDArray[np.float64]
 
-# Bulges take the nearest Sersic index of this step (Serrano et al. 2024), so that one table of each serves
-# all.
-SERSIC_STEP = 0.1
-# galsim.Sersic accepts [0.3, 6.2].
-_SERSIC_LO, _SERSIC_HI = 0.3, 6.2
+# Half-light radius of a face-on exponential disc in scale lengths: (1 + x) exp(-x) = 1/2.
+EXPONENTIAL_RADIUS = 1.6783469900166605
 # Ratio of scale height to scale length (Serrano et al. 2024).
 SCALE_H_OVER_R = 0.1
 # Reduced shear and inverse magnification near a critical line: beyond these a single source is not a lensed
@@ -60,11 +59,14 @@ class Shapes:
     def __len__(self) -> int:
         return len(self.beta)
 
+    def take(self, chosen: npt.NDArray[np.int64]) -> Shapes:
+        """Some of the galaxies."""
+        return Shapes(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
-def shapes(galaxies: pa.Table, sersic_step: float = SERSIC_STEP) -> Shapes:
+
+def shapes(galaxies: pa.Table) -> Shapes:
     """Rows of the table `galaxies` -> Shapes.
 
-    sersic_step : bulges take the nearest multiple as their index
     Lensing     : g = gamma / (1 - kappa), held below 0.9; mu = 1 / |(1 - kappa)^2 - gamma^2|, the determinant
                   held above 1e-3
     """
@@ -74,13 +76,11 @@ def shapes(galaxies: pa.Table, sersic_step: float = SERSIC_STEP) -> Shapes:
     determinant = np.maximum(np.abs((stretch - gamma) * (stretch + gamma)), _LEAST_DETERMINANT)
     with np.errstate(divide="ignore", invalid="ignore"):
         reduced = np.where(gamma > 0, np.minimum(1.0, _MOST_SHEAR * np.abs(stretch) / gamma) / stretch, 0.0)
-    index = np.rint(columns["bulge_sersic_index"] / sersic_step) * sersic_step
-    index = np.clip(index, _SERSIC_LO, _SERSIC_HI)
     return Shapes(
         bulge_radius=columns["bulge_half_light_radius"],
         disk_radius=columns["disk_half_light_radius"],
         bulge_fraction=columns["bulge_fraction"],
-        sersic_index=np.asarray(np.round(index, 6), float),
+        sersic_index=np.clip(columns["bulge_sersic_index"], sersic.INDEX_LO, sersic.INDEX_HI),
         bulge_axis_ratio=np.clip(columns["bulge_axis_ratio"], _SLIMMEST, 1.0),
         inclination=columns["inclination"],
         beta=np.radians(90.0 + columns["position_angle"]),
@@ -103,6 +103,44 @@ _COLUMNS = (
     "gamma1",
     "gamma2",
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Forms:
+    """Sizes and orientations of n galaxies in Fourier space, k in radian / pixel.
+
+    bulge, disk : float64[n, 2, 2] k @ matrix is k along and across the major axis times the radius: half-light of
+                  the bulge, scale length of the disc, both foreshortened across
+    thick       : float64[n, 2] k @ vector is (pi / 2) (h / r) sin(inclination) times k r across, r the scale length
+    """
+
+    bulge: Float
+    disk: Float
+    thick: Float
+
+
+def forms(shape: Shapes, jacobian: Float) -> Forms:
+    """What the kernel needs of shapes [n] at places of a Jacobian [n, 2, 2] (arcsec by pixels).
+
+    An inclined disc of scale height h, sech^2 across, has (1 + k_p^2)^-3/2 q / sinh q for its transform.
+    Ref : van der Kruit & Searle 1981 (the disc); galsim.InclinedExponential
+    """
+    cos_beta, sin_beta = np.cos(shape.beta), np.sin(shape.beta)
+    turn = _matrices(cos_beta, -sin_beta, sin_beta, cos_beta)
+    scale = np.sqrt(shape.magnification / ((1 - shape.g1) * (1 + shape.g1) - shape.g2**2))
+    lens = _matrices(1 + shape.g1, shape.g2, shape.g2, 1 - shape.g1) * scale[:, None, None]
+    to_pixels = np.linalg.inv(jacobian) @ lens @ turn
+    one = np.ones(len(shape))
+    bulge = to_pixels * (shape.bulge_radius[:, None] * np.stack([one, shape.bulge_axis_ratio], 1))[:, None]
+    disk = to_pixels * (shape.disk_radius / EXPONENTIAL_RADIUS)[:, None, None]
+    inclination = np.radians(shape.inclination)
+    seen = disk * np.stack([one, np.cos(inclination)], 1)[:, None]
+    thick = disk[:, :, 1] * (0.5 * np.pi * SCALE_H_OVER_R * np.sin(inclination))[:, None]
+    return Forms(bulge, seen, thick)
+
+
+def _matrices(a: Float, b: Float, c: Float, d: Float) -> Float:
+    return np.stack([np.stack([a, b], -1), np.stack([c, d], -1)], -2)
 
 
 def profile(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
@@ -150,15 +188,6 @@ def _disk(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
 # ------------------------------------------------------------------------------------------------ extent
 
 
-def half_light_radius(shape: Shapes) -> Float:
-    """[n] arcsec: an upper bound, the larger component's semi-major axis, lensed."""
-    larger = np.maximum(
-        np.where(shape.bulge_fraction > 0, shape.bulge_radius, 0.0),
-        np.where(shape.bulge_fraction < 1, shape.disk_radius, 0.0),
-    )
-    return larger * _lensed_stretch(shape)
-
-
 def surface(shape: Shapes, radius: Float) -> Float:
     """Fraction of the flux per arcsec2 along the major axis, an upper bound for every other direction.
 
@@ -172,15 +201,6 @@ def surface(shape: Shapes, radius: Float) -> Float:
         bulge[:, None] * _sersic_surface(radius, shape.bulge_radius * stretch, shape.sersic_index, stretch)
         + disk[:, None] * _sersic_surface(radius, shape.disk_radius * stretch, np.ones(len(shape)), stretch)
     )
-
-
-def outside(shape: Shapes, radius: Float) -> Float:
-    """Fraction of the flux beyond a radius, seen face-on: an upper bound; radius [m] arcsec -> [n, m]."""
-    stretch = _lensed_stretch(shape)
-    bulge = _sersic_outside(radius, shape.bulge_radius * stretch, shape.sersic_index)
-    disk = _sersic_outside(radius, shape.disk_radius * stretch, np.ones(len(shape)))
-    fraction = shape.bulge_fraction[:, None]
-    return np.asarray(fraction * bulge + (1 - fraction) * disk)
 
 
 def _lensed_stretch(shape: Shapes) -> Float:
@@ -206,9 +226,3 @@ def _sersic_surface(radius: Float, half_light: Float, index: Float, stretch: Flo
     n, b = index[:, None], _b(index)[:, None]
     log_norm = np.log(2 * np.pi * n) - 2 * n * np.log(b) + gammaln(2 * n) + 2 * np.log(r_e / stretch[:, None])
     return np.asarray(np.exp(-b * (radius[None, :] / r_e) ** (1 / n) - log_norm))
-
-
-def _sersic_outside(radius: Float, half_light: Float, index: Float) -> Float:
-    r_e = np.maximum(half_light, 1e-6)[:, None]
-    n, b = index[:, None], _b(index)[:, None]
-    return np.asarray(gammaincc(2 * n, b * (radius[None, :] / r_e) ** (1 / n)))

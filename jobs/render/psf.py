@@ -1,55 +1,91 @@
 """Point-spread functions: the Euclid optics from their pupil, and a seeing disc for ground cameras.
 
-Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), in arcsec, without the
-       pixel, centred on
-the chief ray (coma moves the centroid by a few mas).  One PSF serves a whole detector.
+Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), without the pixel, centred on the
+chief ray (coma moves the centroid by a few mas).
 
 vis_psf, ground_psf   -> Psf
+basis_weights         what each source takes of the PSF's planes: its colour, its place on the detector
+transfer, collapsed   PSF times pixel on a stamp's Fourier grid, as the kernel wants it
 pupil, wavefront      the parts of the Euclid model
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import galsim
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import maximum, uniform_filter
 
 from jobs import cache
 from jobs.fluxes.passbands import Passband
+from jobs.render.chromatic import sub_bands
 from jobs.render.focal_plane import Detector, detectors
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import read_table
 
 Float = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Int = npt.NDArray[np.int64]
+Array = npt.NDArray[Any]
 
-# Monochromatic planes of equal photon number for flat f_nu; eight reproduce second moments to 2e-4.
-_PLANES = 8
 # Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide.
-_OVERSAMPLING = 3
+SAMPLES = 3
 # Side of the plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is lost.
 SIDE = 512
 # Side of the optical transform, samples; the 0.15 % of the light beyond its border is absent.
 _TRANSFORM = 2048
+# The same for what changes across a detector: the core alone.
+_CORE_TRANSFORM, _CORE_SIDE = 768, 160
+# Where the PSF is computed across a detector, in half sides from its centre.
+_NODES = tuple((x, y) for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0))
 # Side and samples a pixel of the drawing that tells the width.
 _CORE, _FINE = 243, 9
+# The k plane reaches twice the Nyquist frequency only where the PSF still passes more than this.
+_BAND_LIMIT = 1e-4
+# Of the planes in single precision: what is less is nothing.
+_NOTHING = 1e-7
+# Larger stamps are few: looking for what is nothing takes longer than drawing it.
+_SHARED = 256
+# radian / pixel between the samples of an envelope: those of the smallest stamp.
+ENVELOPE_STEP = 2 * np.pi / 32
 _ARCSEC = np.pi / 180.0 / 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Planes:
+    """A PSF by wavelength and place, in samples of 1 / SAMPLES pixel, centred on the middle sample.
+
+    PSF(source) = sum_w photons_w images_w + sum_j polynomial_j(place) drift_j: the change across the detector of the
+    mean PSF to second order (x, y, x^2, x y, y^2), and of its slope with wavelength to first (x, y).
+
+    wavelength : float64[w] A;  images : float32[w, s, s] of unit flux over the whole sky, at the detector's centre
+    drift      : float32[7, t, t], or [0, t, t] for one PSF a detector
+    half       : (columns, rows) half the detector: the unit of x and y
+    """
+
+    wavelength: Float
+    images: Float32
+    drift: Float32
+    half: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Psf:
     """A point-spread function with what the choice of a stamp's size needs.
 
-    profile     : galsim object, arcsec, detector axes, without the pixel; its flux is what the model keeps of
-                  1
+    profile     : galsim object, arcsec, detector axes, without the pixel, for flat f_nu at the detector's centre; its
+                  flux is what the model keeps of 1
     pixel_scale : arcsec
     surface     : float64[SIDE / 2] fraction of the flux in a pixel at a distance of r pixels (azimuthal mean)
     outside     : float64[SIDE / 2] fraction of the flux beyond r pixels
     fwhm        : arcsec, pixel included
+    planes      : by wavelength and place; None where `profile` is all
     """
 
     profile: galsim.GSObject
@@ -57,26 +93,32 @@ class Psf:
     surface: Float
     outside: Float
     fwhm: float
+    planes: Planes | None = None
 
 
-def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration) -> Psf:
-    """The Euclid PSF at a VIS detector's centre, for flat f_nu: optics, pointing jitter, charge diffusion.
+def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = len(_NODES)) -> Psf:
+    """The Euclid PSF of a VIS detector: optics, pointing jitter, charge diffusion.
 
-    Error : second moments 2e-4 from the number of planes; one position a detector (ellipticity varies by
-            ~0.01 across it)
-    Ref   : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
+    positions : 1, or 9 for one that changes across the detector
+    Error     : second moments 2e-4 from the number of wavelengths; across the detector as measured (settings.csv)
+    Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
     """
-    plane = _vis_plane(detector, band, mission)
-    image = galsim.Image(plane.astype(float), scale=detector.pixel_scale / _OVERSAMPLING)
+    planes = _vis_planes(detector, band, mission, positions)
+    mean = planes.images.mean(axis=0, dtype=float)
+    return _tabulated(galsim_profile(mean, detector.pixel_scale), detector.pixel_scale, planes)
+
+
+def galsim_profile(image: Float, pixel_scale: float) -> galsim.GSObject:
+    """A plane as a galsim object, arcsec."""
+    sampled = galsim.Image(np.asarray(image, float), scale=pixel_scale / SAMPLES)
     # A plane that is empty at its border needs little padding; its extent in real and Fourier space is known.
-    focal = galsim.InterpolatedImage(
-        image,
+    return galsim.InterpolatedImage(
+        sampled,
         pad_factor=2.0,
-        flux=float(plane.sum(dtype=float)),
-        _force_stepk=2 * np.pi / (len(plane) * image.scale),
-        _force_maxk=np.pi / image.scale,
+        flux=float(image.sum(dtype=float)),
+        _force_stepk=2 * np.pi / (len(image) * sampled.scale),
+        _force_maxk=np.pi / sampled.scale,
     )
-    return _tabulated(focal.rotate(-detector.rotation * galsim.degrees), detector.pixel_scale)
 
 
 def ground_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
@@ -87,7 +129,7 @@ def ground_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
     return _tabulated(galsim.Moffat(beta=beta, fwhm=seeing), pixel_scale)
 
 
-def _tabulated(profile: galsim.GSObject, pixel_scale: float) -> Psf:
+def _tabulated(profile: galsim.GSObject, pixel_scale: float, planes: Planes | None = None) -> Psf:
     """With azimuthal means of the profile sampled on pixels."""
     image = profile.drawImage(nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
     grid = np.arange(SIDE + 1) - SIDE // 2
@@ -98,7 +140,148 @@ def _tabulated(profile: galsim.GSObject, pixel_scale: float) -> Psf:
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
     core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / _FINE, method="no_pixel", dtype=float)
     with_pixel = galsim.Image(uniform_filter(core.array, _FINE), scale=pixel_scale / _FINE)
-    return Psf(profile, pixel_scale, surface, outside, float(with_pixel.calculateFWHM()))
+    return Psf(profile, pixel_scale, surface, outside, float(with_pixel.calculateFWHM()), planes)
+
+
+# ------------------------------------------------------------------------------------------------ in Fourier space
+
+
+def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) -> Float:
+    """float64[n, planes]: the share of each plane of `transfer` in each source's PSF.
+
+    photons     : [n, w] fraction of its photons in each sub-band; None: flat f_nu
+    column, row : [n] pixels
+    """
+    planes, n = psf.planes, len(column)
+    if planes is None:
+        return np.ones((n, 1))
+    if photons is None:
+        photons = np.full((n, len(planes.wavelength)), 1.0 / len(planes.wavelength))
+    if not len(planes.drift):
+        return photons
+    # Beyond the border the polynomial is held.
+    x = np.clip((column - planes.half[0]) / (planes.half[0] + 0.5), -1.0, 1.0)
+    y = np.clip((row - planes.half[1]) / (planes.half[1] + 0.5), -1.0, 1.0)
+    redder = photons @ planes.wavelength - planes.wavelength.mean()
+    return np.column_stack([photons, x, y, x * x, x * y, y * y, redder * x, redder * y])
+
+
+@dataclass(frozen=True, slots=True)
+class Transfer:
+    """PSF times pixel on the Fourier grid of a stamp of N pixels, with its neighbouring zones.
+
+    planes    : float[aliases, N, b, 2, N / 2 + 1] real and imaginary parts: see kernel.nyquist_zones
+    low, high : int64[aliases, N] columns between which any of it is not nothing
+    envelope  : float64[m] largest modulus at k = i ENVELOPE_STEP, radian / pixel
+    """
+
+    planes: Array
+    low: Int
+    high: Int
+    envelope: Float
+
+
+def transfer(psf: Psf, size: int) -> Transfer:
+    """All planes of a PSF for stamps of `size` pixels, single precision."""
+    if psf.planes is None:
+        return _transfer([_galsim_spectrum(psf, size)], size, np.float32)
+    images = [*psf.planes.images, *psf.planes.drift]
+    return _transfer([_spectrum(image, size) for image in images], size, np.float32)
+
+
+def collapsed(psf: Psf, weights: Float, size: int, dtype: type[Any]) -> Transfer:
+    """One plane: a source's own PSF, for large stamps or in double precision (float64).
+
+    weights : [planes] from basis_weights
+    """
+    if psf.planes is None:
+        return _transfer([_galsim_spectrum(psf, size)], size, dtype)
+    image = _image(psf.planes, weights, SAMPLES * size).astype(dtype)
+    return _transfer([_spectrum(image, size)], size, dtype)
+
+
+def profile_of(psf: Psf, weights: Float) -> galsim.GSObject:
+    """A source's own PSF as a galsim object, arcsec."""
+    if psf.planes is None:
+        return psf.profile
+    return galsim_profile(_image(psf.planes, weights, psf.planes.images.shape[1]), psf.pixel_scale)
+
+
+def _image(planes: Planes, weights: Float, side: int) -> Float32:
+    """The planes' sum, cut to `side` samples or one more."""
+    images, drift = _middle(planes.images, side), _middle(planes.drift, side)
+    share = weights.astype(np.float32)
+    image = np.tensordot(share[: len(images)], images, 1)
+    if len(drift):
+        margin = (image.shape[0] - drift.shape[1]) // 2
+        inner = slice(margin, margin + drift.shape[1])
+        image[inner, inner] += np.tensordot(share[len(images) :], drift, 1)
+    return np.asarray(image)
+
+
+def _middle(images: Float32, side: int) -> Float32:
+    """The middle of square planes [b, s, s], `side` samples or one more."""
+    margin = max((images.shape[1] - side) // 2, 0)
+    return images[:, margin : images.shape[1] - margin, margin : images.shape[2] - margin]
+
+
+def _spectrum(image: Array, size: int) -> Array:
+    """Fourier transform of a plane on the grid of a stamp: complex[m, m / 2 + 1], m = SAMPLES size.
+
+    A plane is cut to the stamp: its wings beyond would otherwise come in at the opposite edge.
+    """
+    period = SAMPLES * size
+    image = _middle(image[None], period)[0]
+    folded = _folded(_folded(image, period).T, period).T
+    return np.asarray(scipy.fft.rfft2(folded))
+
+
+def _folded(image: Array, period: int) -> Array:
+    """Rows summed modulo the period, the middle one on row 0."""
+    before = -(len(image) // 2) % period
+    after = -(before + len(image)) % period
+    padded = np.pad(image, ((before, after), (0, 0)))
+    return np.asarray(padded.reshape(-1, period, image.shape[1]).sum(axis=0))
+
+
+def _galsim_spectrum(psf: Psf, size: int) -> Array:
+    """The same from a galsim object: to the Nyquist frequency where nothing passes beyond it, else to twice."""
+    profile = psf.profile.dilate(1.0 / psf.pixel_scale)
+    beyond = np.linspace(np.pi, 1.25 * np.pi, 4)
+    passed = max(max(abs(profile.kValue(k, 0.0)), abs(profile.kValue(0.0, k))) for k in beyond)
+    half = size if passed > _BAND_LIMIT else size // 2
+    image = galsim.ImageCD(galsim.BoundsI(0, half, -half, half - 1), scale=2 * np.pi / size)
+    # The half plane is all that a real image needs; galsim's public call draws both halves.
+    profile._drawKImage(image)
+    return np.fft.ifftshift(image.array, axes=0)
+
+
+def _transfer(spectra: Sequence[Array], size: int, dtype: type[Any]) -> Transfer:
+    aliases = 1 if len(spectra[0]) == size else 4
+    columns, rows = np.arange(size // 2 + 1), np.fft.ifftshift(np.arange(-size // 2, size // 2))
+    planes = np.empty((aliases, size, len(spectra), 2, len(columns)), dtype)
+    low, high = np.zeros((aliases, size), np.int64), np.full((aliases, size), len(columns))
+    envelope = np.ones(int(2 * np.sqrt(2) * np.pi / ENVELOPE_STEP) + 2)
+    rings = np.zeros(len(envelope))
+    for alias in range(aliases):
+        kx = columns - size * (alias % 2)
+        ky = rows if alias < 2 else rows - np.where(rows >= 0, size, -size)
+        pixel = np.sinc(ky / size)[:, None] * np.sinc(kx / size)
+        for b, spectrum in enumerate(spectra):
+            # What lies to the left of kx = 0 is the mirror image's conjugate.
+            found = spectrum[ky, : len(columns)] if alias % 2 == 0 else np.conj(spectrum[-ky][:, -kx])
+            np.multiply(found.real, pixel, out=planes[alias, :, b, 0])
+            np.multiply(found.imag, pixel, out=planes[alias, :, b, 1])
+        if size > _SHARED:
+            continue
+        modulus = np.hypot(planes[alias, :, :, 0], planes[alias, :, :, 1]).max(axis=1)
+        ring = (2 * np.pi / size / ENVELOPE_STEP * np.hypot(ky[:, None], kx)).astype(int)
+        rings = np.maximum(rings, maximum(modulus, ring, np.arange(len(rings))))
+        something = modulus > (_NOTHING if dtype is np.float32 else 0.0)
+        seen = something.any(axis=1)
+        low[alias] = np.where(seen, something.argmax(axis=1), 0)
+        high[alias] = np.where(seen, len(columns) - something[:, ::-1].argmax(axis=1), 0)
+    return Transfer(planes, low, high, envelope if size > _SHARED else rings)
 
 
 # ------------------------------------------------------------------------------------------------ the optics
@@ -142,31 +325,47 @@ def wavefront(x: float, y: float, mission: MissionConfiguration) -> Float:
     return nm * mission.value("vis.psf.wavefront_scale")
 
 
-def _vis_plane(detector: Detector, band: Passband, mission: MissionConfiguration) -> npt.NDArray[np.float32]:
-    """Focal-plane axes, _OVERSAMPLING samples a pixel, odd side, float32."""
-    everything = detectors("vis", mission)
-    reach_x, reach_y = (max(abs(getattr(d, axis)) for d in everything) for axis in ("x", "y"))
-    # The model's field coordinates run over the outer edges of the focal plane.
-    field_x = detector.x / (reach_x + detector.nx * detector.pixel_scale / 2)
-    field_y = detector.y / (reach_y + detector.ny * detector.pixel_scale / 2)
-    sampling = detector.pixel_scale / _OVERSAMPLING
+def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Planes:
+    parts = sub_bands(band)
+    # Second moments of diffraction go with the square of the wavelength.
+    waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
+    places = [_field(detector, x, y, mission) for x, y in (_NODES if positions > 1 else _NODES[:0])]
+    coefficients = [wavefront(*_field(detector, 0.0, 0.0, mission), mission), *(wavefront(*p, mission) for p in places)]
+    sampling = detector.pixel_scale / SAMPLES
     blur = _blur_variances(detector, mission)
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
-    nm = wavefront(field_x, field_y, mission)
     key = cache.content_key(
         Path(__file__).read_bytes(),
-        nm,
-        band.wavelength,
-        band.response,
+        np.array(coefficients),
+        waves,
         repr([(p.key, p.value, p.unit) for p in optics]),
         repr((sampling, *blur)),
     )
-    arrays = cache.cached_arrays(
-        "vis_psf",
-        key,
-        lambda: {"plane": _polychromatic(nm, band, sampling, blur, mission).astype(np.float32)},
-    )
-    return arrays["plane"]
+
+    def make() -> dict[str, Array]:
+        centre = [_plane(coefficients[0], w, _TRANSFORM, SIDE, sampling, blur, mission) for w in waves]
+        return {
+            "images": np.stack(centre).astype(np.float32),
+            "drift": _drift(coefficients[1:], waves, sampling, blur, mission).astype(np.float32),
+        }
+
+    arrays = cache.cached_arrays("vis_psf", key, make)
+    turned = slice(None, None, -1 if detector.rotation == 180.0 else 1)
+    # Upside down, both the planes and the places that the drift is written in are turned.
+    sign = np.array([-1, -1, 1, 1, 1, -1, -1], np.float32)[: len(arrays["drift"]), None, None]
+    drift = arrays["drift"][:, turned, turned] * (sign if detector.rotation == 180.0 else np.float32(1.0))
+    half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
+    return Planes(waves, arrays["images"][:, turned, turned], drift, half)
+
+
+def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> tuple[float, float]:
+    """Field coordinates, -1 .. 1 over the focal plane's outer edges, of a place in half sides from the centre."""
+    everything = detectors("vis", mission)
+    half_x, half_y = (n * detector.pixel_scale / 2 for n in (detector.nx, detector.ny))
+    reach_x, reach_y = (max(abs(getattr(d, axis)) for d in everything) for axis in ("x", "y"))
+    whole = everything[0]
+    reach_x, reach_y = reach_x + whole.nx * whole.pixel_scale / 2, reach_y + whole.ny * whole.pixel_scale / 2
+    return (detector.x + x * half_x) / reach_x, (detector.y + y * half_y) / reach_y
 
 
 def _blur_variances(detector: Detector, mission: MissionConfiguration) -> tuple[float, float]:
@@ -176,36 +375,50 @@ def _blur_variances(detector: Detector, mission: MissionConfiguration) -> tuple[
     return jitter_x**2 + diffusion**2, jitter_y**2 + diffusion**2
 
 
-def _polychromatic(
-    nm: Float, band: Passband, sampling: float, blur: tuple[float, float], mission: MissionConfiguration
+def _drift(
+    nodes: Sequence[Float], waves: Float, sampling: float, blur: tuple[float, float], mission: MissionConfiguration
 ) -> Float:
-    total = np.zeros((_TRANSFORM, _TRANSFORM))
-    for wavelength in _equal_photon_wavelengths(band):
-        total += _monochromatic(nm, wavelength, sampling, mission) / _PLANES
-    total /= _edge_loss()
-    k = 2 * np.pi * scipy.fft.fftfreq(_TRANSFORM, sampling)
-    transfer = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(-0.5 * blur[0] * k[None, : _TRANSFORM // 2 + 1] ** 2)
-    total = scipy.fft.irfft2(scipy.fft.rfft2(total) * transfer, s=total.shape)
-    total = scipy.fft.fftshift(total)
-    half = SIDE * _OVERSAMPLING // 2
-    kept = slice(_TRANSFORM // 2 - half, _TRANSFORM // 2 + half + 1)
-    return np.asarray(total[kept, kept])
+    """Planes of Planes.drift, [7, t, t] or [0, t, t], in the focal plane's axes, by least squares over the nodes."""
+    side = _CORE_SIDE * SAMPLES + 1
+    if not nodes:
+        return np.zeros((0, side, side))
+    mean, slope = np.zeros((2, len(nodes), side, side))
+    redder = (waves - waves.mean()) / np.sum((waves - waves.mean()) ** 2)
+    for i, nm in enumerate(nodes):
+        for wavelength, tilt in zip(waves, redder, strict=True):
+            plane = _plane(nm, float(wavelength), _CORE_TRANSFORM, _CORE_SIDE, sampling, blur, mission)
+            mean[i] += plane / len(waves)
+            slope[i] += plane * tilt
+    x, y = np.array(_NODES).T
+    middle = _NODES.index((0.0, 0.0))
+    second = np.linalg.pinv(np.stack([x, y, x * x, x * y, y * y], axis=1))
+    first = np.linalg.pinv(np.stack([x, y], axis=1))
+    changes = np.tensordot(second, mean - mean[middle], 1), np.tensordot(first, slope - slope[middle], 1)
+    return np.concatenate(changes)
 
 
-def _equal_photon_wavelengths(band: Passband) -> list[float]:
-    """Mean wavelengths, A, of _PLANES parts of the band that give equal photon numbers for flat f_nu."""
-    photons = band.response / band.wavelength
-    rank = (np.cumsum(photons) - 0.5 * photons) / photons.sum()
-    part = np.minimum((rank * _PLANES).astype(int), _PLANES - 1)
-    return [float(np.average(band.wavelength[part == i], weights=photons[part == i])) for i in range(_PLANES)]
+def _plane(
+    nm: Float, wavelength: float, transform: int, side: int, sampling: float, blur: tuple[float, float],
+    mission: MissionConfiguration,
+) -> Float:  # fmt: skip
+    """One wavelength's PSF: [side * SAMPLES + 1] square, in the focal plane's axes."""
+    image = _monochromatic(nm, wavelength, sampling, mission, transform) / _edge_loss(transform)
+    k = 2 * np.pi * scipy.fft.fftfreq(transform, sampling)
+    blurred = np.exp(-0.5 * blur[1] * k[:, None] ** 2) * np.exp(-0.5 * blur[0] * k[None, : transform // 2 + 1] ** 2)
+    image = scipy.fft.fftshift(scipy.fft.irfft2(scipy.fft.rfft2(image) * blurred, s=image.shape))
+    half = side * SAMPLES // 2
+    kept = slice(transform // 2 - half, transform // 2 + half + 1)
+    return np.asarray(image[kept, kept])
 
 
-def _monochromatic(nm: Float, wavelength: float, sampling: float, mission: MissionConfiguration) -> Float:
+def _monochromatic(
+    nm: Float, wavelength: float, sampling: float, mission: MissionConfiguration, transform: int = _TRANSFORM
+) -> Float:
     """|FFT of the pupil|^2, centred on [0, 0], of unit flux over the whole sky.
 
     The pupil's sampling follows the wavelength, so that the image's does not; its edges are one sample wide.
     """
-    step = wavelength * 1e-7 / (_TRANSFORM * sampling * _ARCSEC)
+    step = wavelength * 1e-7 / (transform * sampling * _ARCSEC)
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
     n = 2 * (int(np.ceil(radius / step)) + 1)
     axis = (np.arange(n) - n // 2) * step
@@ -215,13 +428,13 @@ def _monochromatic(nm: Float, wavelength: float, sampling: float, mission: Missi
     phase = np.zeros_like(x)
     zernike = galsim.zernike.Zernike(nm, R_outer=radius)
     phase[lit] = 2 * np.pi * zernike(x[lit], y[lit]) / (wavelength / 10.0)
-    field = np.zeros((_TRANSFORM, _TRANSFORM), complex)
+    field = np.zeros((transform, transform), complex)
     field[:n, :n] = transmission * np.exp(1j * phase)
     amplitude = scipy.fft.ifft2(field, overwrite_x=True)
-    return np.asarray((amplitude.real**2 + amplitude.imag**2) * (_TRANSFORM**2 / transmission.sum()))
+    return np.asarray((amplitude.real**2 + amplitude.imag**2) * (transform**2 / transmission.sum()))
 
 
-def _edge_loss() -> Float:
+def _edge_loss(transform: int = _TRANSFORM) -> Float:
     """What the soft edges of `pupil` leave of the diffracted light, by angle: sinc^2(angle / side)."""
-    angle = scipy.fft.fftfreq(_TRANSFORM)
+    angle = scipy.fft.fftfreq(transform)
     return np.asarray(np.sinc(np.hypot(angle[:, None], angle)) ** 2)

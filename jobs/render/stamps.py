@@ -1,19 +1,24 @@
-"""Drawing sources: each on its own stamp, through one shared PSF, in Fourier space, summed onto a frame.
+"""Drawing sources: each on its own stamp, through its own PSF, in Fourier space, summed onto a frame.
 
-A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid.  Light that
-belongs outside a stamp comes in at its opposite edge: nothing is lost, nothing is rescaled.  A stamp is large
-enough that what wraps is below the noise at its edge, and below the flux budget in the source's aperture.
+A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid. A galaxy's light
+that belongs outside its stamp comes in at the opposite edge; a stamp is large enough that this is below the noise at
+its edge, and below the flux budget in the source's aperture. The PSF's wings beyond the stamp are drawn on their own
+(wings.py). Nothing is lost, nothing is rescaled.
 
 Sources         what is drawn: galaxies (with a shape) and points
-stamp_sizes     pixels, from flux, shape, PSF, noise and accuracy
+settings_for    what an accuracy takes, from the measured table
+stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 draw            sources -> frame
 reference       one source by galsim's own drawImage: what `draw` is held against
 """
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
 
 import galsim
 import numpy as np
@@ -21,23 +26,30 @@ import numpy.typing as npt
 import scipy.fft
 
 from jobs.accuracy import Accuracy
-from jobs.render import profiles
+from jobs.render import kernel, profiles, sersic, wings
+from jobs.render import psf as psfs
 from jobs.render.profiles import Shapes
-from jobs.render.psf import SIDE, Psf
+from jobs.render.psf import SIDE, Psf, Transfer
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
-Complex = npt.NDArray[np.complex128]
+Array = npt.NDArray[Any]
 
-# Sides whose transforms are fast; the last bounds memory (its k plane has 134 MB).
-SIZES = np.array([32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048])
-# The aperture in which wrapped light is held to the flux budget: this many PSF widths plus half-light radii.
-_APERTURE_WIDTHS, _APERTURE_RADII = 2.0, 2.0
-# A component smaller than this many pixels is a point: it changes second moments by less than 1e-3 of the
-# PSF's.
-_POINT_RADIUS = 0.02
-# The k plane reaches twice the Nyquist frequency only where the PSF and pixel still pass more than this.
-_BAND_LIMIT = 1e-4
+# Sides whose transforms are fast; the last bounds memory (its planes have 134 MB).
+SIZES = np.array([32, 40, 48, 64, 80, 96, 128, 160, 192, 256, 320, 384, 512, 640, 768, 1024, 1280, 1536, 2048])
+# Light that wraps is counted in this aperture about the source: radius, arcsec.
+_APERTURE = 1.0
+# A source's light a stamp's side away, times this, is what all its periodic images bring to its middle: the sum of
+# r^-3 over the square lattice (the PSF's wings), and of the flattest wings of galaxies.
+_LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
+# Above this many electrons the rounding of single precision would show.
+_BRIGHT = 1e7
+# Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
+_SHARED = 256
+# Pixels of stamps that are transformed together.
+_BATCH = 1 << 17
+# What galsim takes for a point in the reference, arcsec.
+_POINT = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +60,7 @@ class Sources:
     jacobian    : float64[n, 2, 2] d(u, v) / d(column, row), arcsec
     electrons   : float64[n] expected
     shape       : row of `shapes`, -1 = a point
+    photons     : float64[n, w] fraction of its photons in each sub-band of the PSF; None: flat f_nu
     """
 
     ids: Int
@@ -57,6 +70,7 @@ class Sources:
     electrons: Float
     shape: Int
     shapes: Shapes
+    photons: Float | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -71,36 +85,75 @@ class Sources:
             self.electrons[chosen],
             self.shape[chosen],
             self.shapes,
+            None if self.photons is None else self.photons[chosen],
         )
 
 
-def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: float, accuracy: Accuracy) -> Int:
-    """Side of each source's stamp, pixels.
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What decides how much of a source is drawn.
 
-    noise    : of a pixel, electrons
-    accuracy : at the stamp's edge the surface brightness is below `background` of the noise, and of the light
-               that wraps less than `flux` of the source falls into its aperture
-    returns  : int64[n], one of SIZES
+    edge  : largest surface brightness at a stamp's edge, of a pixel's noise
+    ghost : largest part of a source's flux that wraps into its own aperture
+    floor : Fourier samples of less than this are left out, 1 at k = 0
+    least : smallest side of a stamp, arcsec: what of the PSF a source keeps
+    positions : of the PSF on a detector
     """
-    half = SIZES // 2
-    radius = half * psf.pixel_scale
-    inside = np.minimum(half, SIDE // 2 - 1)
-    edge = np.where(half < SIDE // 2, psf.surface[inside], 0.0)
-    beyond = psf.outside[inside]
-    surface, lost = np.tile(edge, (len(shape), 1)), np.tile(beyond, (len(shape), 1))
-    aperture = np.full(len(shape), _APERTURE_WIDTHS * psf.fwhm)
-    is_galaxy = shape >= 0
-    if is_galaxy.any():
-        which = shape[is_galaxy]
-        surface[is_galaxy] += profiles.surface(shapes, radius)[which] * psf.pixel_scale**2
-        lost[is_galaxy] += profiles.outside(shapes, radius)[which]
-        aperture[is_galaxy] += _APERTURE_RADII * profiles.half_light_radius(shapes)[which]
-    covered = np.minimum(np.pi * aperture[:, None] ** 2 / (2 * radius) ** 2, 1.0)
-    enough = (electrons[:, None] * surface < accuracy.background * noise) & (lost * covered < accuracy.flux)
+
+    edge: float
+    ghost: float
+    floor: float
+    least: float
+    positions: int
+
+
+def settings_for(accuracy: Accuracy) -> Settings:
+    """The cheapest settings whose measured errors are within an accuracy (settings.csv), or the most accurate."""
+    with Path(__file__).with_name("settings.csv").open(newline="", encoding="utf-8") as file:
+        rows = [
+            {name: float(value) for name, value in row.items()}
+            for row in csv.DictReader(line for line in file if not line.startswith("#"))
+        ]
+    good = [row for row in rows if all(row[f"{f.name}_error"] <= getattr(accuracy, f.name) for f in fields(accuracy))]
+    row = min(good, key=lambda row: row["seconds"]) if good else max(rows, key=lambda row: row["seconds"])
+    return Settings(row["edge"], row["ghost"], row["floor"], row["least"], int(row["positions"]))
+
+
+def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: float, settings: Settings) -> Int:
+    """Side of each source's stamp, pixels: int64[n], one of SIZES.
+
+    noise : of a pixel, electrons. A cut by noise alone biases faint sources, for what wraps is coherent: the second
+            condition holds it to a part of the flux, from the wings of the PSF and of high-n bulges alike
+    """
+    at = np.concatenate([SIZES // 2, SIZES])
+    psf_light = _beyond_the_table(psf, at)
+    galaxy_light = np.zeros((len(shape), len(at)))
+    body = shape >= 0
+    if body.any():
+        galaxy_light[body] = profiles.surface(shapes, at * psf.pixel_scale)[shape[body]] * psf.pixel_scale**2
+    edge = psf_light[: len(SIZES)] + galaxy_light[:, : len(SIZES)]
+    # A PSF in planes is cut to the stamp and does not wrap.
+    wings = _LATTICE_PSF * psf_light[len(SIZES) :] * (psf.planes is None)
+    wrapped = wings + _LATTICE_GALAXY * galaxy_light[:, len(SIZES) :]
+    aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
+    enough = (electrons[:, None] * edge < settings.edge * noise) & (wrapped * aperture < settings.ghost)
+    enough &= SIZES * psf.pixel_scale >= settings.least
     enough[:, -1] = True
     # A point has no light beyond the PSF's plane.
-    enough[~is_galaxy, int(np.searchsorted(SIZES, SIDE)) :] = True
+    enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
     return np.asarray(SIZES[np.argmax(enough, axis=1)])
+
+
+def _beyond_the_table(psf: Psf, radius: Int) -> Float:
+    """psf.surface at any radius, pixels: wings of r^-3 beyond the table, nothing beyond the plane."""
+    last = len(psf.surface) - 1
+    wing = psf.surface[np.minimum(radius, last)] * (np.minimum(radius, last) / radius) ** 3
+    return np.where(radius < SIDE, wing, 0.0)
+
+
+def floors(electrons: Float, noise: float, settings: Settings) -> Float:
+    """Per source, the Fourier samples that `draw` may leave out: of its flux, and in the noise."""
+    return np.minimum(settings.floor, settings.edge * noise / np.maximum(electrons, 1e-30))
 
 
 def draw(
@@ -110,106 +163,67 @@ def draw(
     nx: int,
     ny: int,
     progress: Callable[[int], None] | None = None,
+    floors: Float | None = None,
 ) -> Float:
     """Expected electrons of the sources alone.
 
-    sizes    : int[n] from stamp_sizes
+    sizes    : int[n] from stamp_sizes;  floors : float[n] from `floors`, None: nothing is left out
     progress : called now and then with the number of sources drawn
-    returns  : float64[ny, nx]
+    returns  : float64[ny, nx], to 5e-7 electrons a source; the same, bit by bit, in any order of the sources
     """
-    frame = np.zeros((ny, nx))
-    planes: dict[int, _Plane] = {}
-    oversampling = _oversampling(psf)
-    for i in range(len(sources)):
-        size = int(sizes[i])
-        if size not in planes:
-            planes[size] = _plane(psf, size, oversampling)
-        _draw_one(frame, sources, i, planes[size], psf.pixel_scale)
-        if progress is not None and i % 100 == 0:
-            progress(i)
-    return frame
+    frame = np.zeros((ny, nx), np.int64)
+    weights = psfs.basis_weights(psf, sources.photons, sources.column, sources.row)
+    left_out = np.zeros(len(sources)) if floors is None else floors
+    bodies, table = (*_bodies(sources), left_out), sersic.table()
+    done = 0
+    for size in np.unique(sizes):
+        alone = (sizes == size) & ((sources.electrons > _BRIGHT) | ((size > _SHARED) & (psf.planes is not None)))
+        together = np.flatnonzero((sizes == size) & ~alone)
+        shared = psfs.transfer(psf, int(size)) if len(together) else None
+        batch = max(_BATCH // int(size) ** 2, 1)
+        groups = [together[i : i + batch] for i in range(0, len(together), batch)]
+        for chosen in [*groups, *np.flatnonzero(alone)[:, None]]:
+            if alone[chosen[0]]:
+                dtype = np.float64 if sources.electrons[chosen[0]] > _BRIGHT else np.float32
+                passed, share = psfs.collapsed(psf, weights[chosen[0]], int(size), dtype), np.ones((1, 1), dtype)
+            elif shared is not None:
+                passed, share = shared, weights[chosen].astype(np.float32)
+            _draw_some(frame, sources, chosen, passed, share, bodies, table)
+            done += len(chosen)
+            if progress is not None:
+                progress(done)
+    beyond = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
+    beyond += frame / kernel.FIXED_POINT
+    return beyond
 
 
-@dataclass(frozen=True, slots=True)
-class _Plane:
-    """The k grid of a stamp size and what PSF and pixel pass on it.
-
-    kx, ky   : radian / pixel, [m / 2 + 1], [m], m = size * oversampling
-    transfer : complex[m, m / 2 + 1]
-    scratch  : a galsim image of the same grid
-    """
-
-    size: int
-    kx: Float
-    ky: Float
-    transfer: Complex
-    scratch: galsim.Image
-
-
-def _plane(psf: Psf, size: int, oversampling: int) -> _Plane:
-    half = size * oversampling // 2
-    step = 2 * np.pi / size
-    bounds = galsim.BoundsI(0, half, -half, half - 1)
-    scratch = galsim.ImageCD(bounds, scale=step)
-    _k_image(psf.profile.dilate(1.0 / psf.pixel_scale), scratch)
-    kx, ky = np.arange(half + 1.0) * step, np.arange(-half, float(half)) * step
-    pixel = np.sinc(ky / (2 * np.pi))[:, None] * np.sinc(kx / (2 * np.pi))[None, :]
-    return _Plane(size, kx, ky, scratch.array * pixel, scratch)
+def _draw_some(
+    frame: Int, sources: Sources, chosen: Int, passed: Transfer, weights: Array, bodies: tuple[Array, ...], table: Array
+) -> None:
+    """Stamps of one size through one set of planes, onto the frame."""
+    size = passed.planes.shape[1]
+    column, row = sources.column[chosen], sources.row[chosen]
+    x0, y0 = (np.rint(position).astype(np.int64) - size // 2 for position in (column, row))
+    kind = np.complex128 if passed.planes.dtype == np.float64 else np.complex64
+    zones = np.empty((len(chosen), size, size // 2 + 1), kind)
+    electrons, some = sources.electrons[chosen], [part[chosen] for part in bodies]
+    grid = (passed.planes, passed.low, passed.high, passed.envelope, psfs.ENVELOPE_STEP)
+    kernel.nyquist_zones(zones, *grid, weights, column - x0, row - y0, electrons, table, *some)
+    kernel.accumulate(frame, scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True), x0, y0)
 
 
-def _k_image(profile: galsim.GSObject, image: galsim.Image) -> None:
-    # The half plane is all that a real image needs; galsim's public call draws both halves.
-    profile._drawKImage(image)
-
-
-def _oversampling(psf: Psf) -> int:
-    """1 where nothing passes beyond the Nyquist frequency, else 2."""
-    profile = psf.profile.dilate(1.0 / psf.pixel_scale)
-    beyond = max(abs(profile.kValue(k, 0.0)) for k in np.linspace(np.pi, 1.25 * np.pi, 4))
-    beyond = max(beyond, max(abs(profile.kValue(0.0, k)) for k in np.linspace(np.pi, 1.25 * np.pi, 4)))
-    return 2 if beyond > _BAND_LIMIT else 1
-
-
-def _draw_one(frame: Float, sources: Sources, i: int, plane: _Plane, pixel_scale: float) -> None:
-    x0 = int(np.rint(sources.column[i])) - plane.size // 2
-    y0 = int(np.rint(sources.row[i])) - plane.size // 2
-    phase_x = np.exp(-1j * plane.kx * (sources.column[i] - x0))
-    phase_y = np.exp(-1j * plane.ky * (sources.row[i] - y0)) * sources.electrons[i]
-    k_image = plane.transfer * phase_y[:, None]
-    k_image *= phase_x
-    if sources.shape[i] >= 0:
-        smallest = _POINT_RADIUS * pixel_scale
-        profile = profiles.profile(sources.shapes, int(sources.shape[i]), smallest)
-        _k_image(_on_pixels(profile, sources.jacobian[i]), plane.scratch)
-        k_image *= plane.scratch.array
-    _add(frame, _image(k_image, plane.size), x0, y0)
-
-
-def _on_pixels(profile: galsim.GSObject, jacobian: Float) -> galsim.GSObject:
-    """World frame, arcsec -> pixels, the flux kept."""
-    return galsim.JacobianWCS(*jacobian.ravel()).toImage(profile)
-
-
-def _image(k_image: Complex, size: int) -> Float:
-    """Inverse transform of a half plane (rows ky ascending), wrapped onto the pixels' own Nyquist zone."""
-    half = size // 2
-    if len(k_image) == size:
-        zone = scipy.fft.ifftshift(k_image, axes=0)
-    else:
-        # Rows ky and ky + 2 pi land on one; so do columns kx and kx - 2 pi, the latter known from its mirror
-        # image.
-        folded = k_image[:size] + k_image[size:]
-        mirrored = np.conj(np.roll(folded[::-1], 1, axis=0)[:, size : half - 1 : -1])
-        zone = folded[:, : half + 1] + mirrored
-    return np.asarray(scipy.fft.irfft2(zone, s=(size, size), overwrite_x=True))
-
-
-def _add(frame: Float, stamp: Float, x0: int, y0: int) -> None:
-    ny, nx = frame.shape
-    left, right = max(x0, 0), min(x0 + stamp.shape[1], nx)
-    bottom, top = max(y0, 0), min(y0 + stamp.shape[0], ny)
-    if left < right and bottom < top:
-        frame[bottom:top, left:right] += stamp[bottom - y0 : top - y0, left - x0 : right - x0]
+def _bodies(sources: Sources) -> tuple[Array, ...]:
+    """The kernel's arguments of each source's profile: body, fraction, bulge, disk, thick, row, row_weights."""
+    n, body = len(sources), sources.shape >= 0
+    fraction, row, row_weights = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 4))
+    bulge, disk, thick = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2))
+    if body.any():
+        shapes = sources.shapes.take(sources.shape[body])
+        form = profiles.forms(shapes, sources.jacobian[body])
+        fraction[body] = shapes.bulge_fraction
+        bulge[body], disk[body], thick[body] = form.bulge, form.disk, form.thick
+        row[body], row_weights[body] = sersic.row_of(shapes.sersic_index)
+    return body, fraction, bulge, disk, thick, row, row_weights
 
 
 def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4) -> Float:
@@ -220,10 +234,12 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1
     settings = galsim.GSParams(
         folding_threshold=accuracy, maxk_threshold=accuracy, kvalue_accuracy=1e-7, maximum_fft_size=16384
     )
-    parts = [psf.profile.dilate(1.0 / psf.pixel_scale), galsim.Pixel(1.0)]
+    weights = psfs.basis_weights(psf, sources.photons, sources.column, sources.row)[i]
+    parts = [psfs.profile_of(psf, weights).dilate(1.0 / psf.pixel_scale), galsim.Pixel(1.0)]
     if sources.shape[i] >= 0:
-        profile = profiles.profile(sources.shapes, int(sources.shape[i]), _POINT_RADIUS * psf.pixel_scale)
-        parts.append(_on_pixels(profile, sources.jacobian[i]))
+        profile = profiles.profile(sources.shapes, int(sources.shape[i]), _POINT)
+        # World frame, arcsec -> pixels, the flux kept.
+        parts.append(galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(profile))
     whole = galsim.Convolve(parts, gsparams=settings) * float(sources.electrons[i])
     x0, y0 = (int(np.rint(position[i])) - size // 2 for position in (sources.column, sources.row))
     centre = galsim.PositionD(sources.column[i] - x0, sources.row[i] - y0)

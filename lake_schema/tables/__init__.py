@@ -17,6 +17,7 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.exposures import EXPOSURES
     from lake_schema.tables.fluxes import fluxes
     from lake_schema.tables.galaxies import GALAXIES
+    from lake_schema.tables.halos import HALOS
     from lake_schema.tables.mission import MISSION
     from lake_schema.tables.passbands import PASSBANDS
     from lake_schema.tables.products import PRODUCTS
@@ -24,7 +25,7 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.tasks import TASKS
     from lake_schema.tables.templates import TEMPLATES
 
-    catalogues = [GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands)]
+    catalogues = [HALOS, GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands)]
     return [*catalogues, TEMPLATES, PASSBANDS, MISSION, EXPOSURES, TASKS, PRODUCTS]
 
 

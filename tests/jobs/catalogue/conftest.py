@@ -6,12 +6,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from jobs.catalogue import band_ratios, dust_map, galaxies
+from jobs.catalogue import band_ratios, density_box, dust_map, galaxies, population
 from jobs.fluxes import cosmology, templates
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 
 SEED = 7
+BOX_CELLS = 192
+NSIDE = 64
 
 
 @pytest.fixture(scope="session")
@@ -26,14 +28,28 @@ def dust():
 
 @pytest.fixture(scope="session")
 def universe():
-    return galaxies.model()
+    return galaxies.model(SEED, box_cells=BOX_CELLS, lensing_nside=NSIDE)
 
 
 @pytest.fixture(scope="session")
-def drawn(universe, dust, library):
-    """Twenty cells spread over the sky (1.05 deg2): the rows, columns by name, and magnitudes by band."""
-    cells = range(100, 12 << 16, (12 << 16) // 20)
-    rows = pa.concat_tables([galaxies.draw(cell, SEED, universe, dust) for cell in cells])
+def box():
+    return density_box.load(SEED, BOX_CELLS)
+
+
+@pytest.fixture(scope="session")
+def cells(universe):
+    """What has been drawn of the universe in this run of tests."""
+    return population.Cells(universe.population)
+
+
+@pytest.fixture(scope="session")
+def drawn(universe, cells, dust, library):
+    """Five blocks of four cells spread over the sky (1.05 deg2): rows, columns by name, and magnitudes by band."""
+    places = [4 * block + i for block in range(25, 3 << 16, (3 << 16) // 5) for i in range(4)]
+    rows = pa.concat_tables([galaxies.draw(cell, universe, cells, dust) for cell in places])
+    halos = pa.concat_tables([galaxies.halo_table(cell, universe.population, cells) for cell in places])
+    # Galaxies of the light-cone; those beyond redshift 6 have tests of their own.
+    every, rows = rows, rows.filter(pa.array(rows["kind"].to_numpy() < 2))
     columns = {name: rows[name].to_numpy() for name in rows.column_names if not rows[name].null_count}
     z = columns["z_true"].astype(float)
     m_r = columns["abs_mag_r01"].astype(float)
@@ -43,10 +59,12 @@ def drawn(universe, dust, library):
         table = band_ratios.load(library, band, 2.3, 0.5)
         return m_r + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed)
 
-    area = len(cells) * sky.cell_area(GENERATION_ORDER)
+    area = len(places) * sky.cell_area(GENERATION_ORDER)
     bands = ("euclid_vis", "euclid_y", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")
     mags = {band: mag(band) for band in bands}
-    return SimpleNamespace(rows=rows, columns=columns, z=z, m_r=m_r, sed=sed, mags=mags, area=area)
+    return SimpleNamespace(
+        every=every, rows=rows, halos=halos, columns=columns, z=z, m_r=m_r, sed=sed, mags=mags, area=area
+    )
 
 
 @pytest.fixture

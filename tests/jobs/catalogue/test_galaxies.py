@@ -5,20 +5,22 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from jobs.catalogue import galaxies, luminosity_function, morphology
+from jobs.catalogue import galaxies, luminosity_function, morphology, population
 from jobs.fluxes import cosmology
 from lake_schema import ids, sky, validate
 from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.halos import HALOS
+from lake_schema.units import LIGHT_KM_S
 
-from .conftest import SEED
+from .conftest import BOX_CELLS, NSIDE, SEED
 
 ARCMIN2_PER_DEG2 = 3600.0
 CELL = 303_117
 
 
 @pytest.fixture(scope="module")
-def cell(universe, dust):
-    return galaxies.draw(CELL, SEED, universe, dust)
+def cell(universe, cells, dust):
+    return galaxies.draw(CELL, universe, cells, dust)
 
 
 def test_counts_to_the_limits_of_the_survey(drawn):
@@ -37,7 +39,7 @@ def test_counts_to_the_limits_of_the_survey(drawn):
 def test_i_band_counts_are_the_observed_ones(drawn, limit, observed):
     """Per arcmin2: GAMA (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST Science Book 2009."""
     found = np.sum(drawn.mags["lsst_i"] < limit) / (drawn.area * ARCMIN2_PER_DEG2)
-    assert found == pytest.approx(observed, rel=0.18)
+    assert found == pytest.approx(observed, rel=0.22)
 
 
 def test_slope_of_the_counts(drawn):
@@ -53,28 +55,30 @@ def expected_number(lf, near, far, faintest, area):
     return float(np.sum(0.5 * (density[1:] + density[:-1]) * shells) * area * np.radians(1.0) ** 2)
 
 
-@pytest.mark.parametrize(("z", "half", "reddest"), [(0.1, 0.08, 0.2), (0.5, 0.05, 0.3), (1.0, 0.1, 1.5)])
-def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, half, reddest):
-    """Counted where the reddest spectrum (I_E - M_r - DM) is still brighter than the limit."""
+@pytest.mark.parametrize(
+    ("z", "half", "reddest", "within"), [(0.1, 0.08, 0.2, 0.25), (0.5, 0.05, 0.3, 0.15), (1.0, 0.1, 1.5, 0.10)]
+)
+def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, half, reddest, within):
+    """Counted where the reddest spectrum (I_E - M_r - DM) beats the limit (structure moves the near ones)."""
     near, far = z - half, z + half
     faintest = min(26.0 - float(cosmology.distance_modulus(far)) - reddest, -16.0)
     found = np.sum((drawn.z > near) & (drawn.z < far) & (drawn.m_r < faintest))
-    expected = expected_number(universe.inverse.schechter, near, far, faintest, drawn.area)
+    expected = expected_number(universe.luminosities, near, far, faintest, drawn.area)
     assert expected > 400
-    assert found == pytest.approx(expected, rel=0.10)
+    assert found == pytest.approx(expected, rel=within)
 
 
 def test_the_luminosity_function_comes_out_of_a_deep_catalogue_at_z_2(dust):
-    deep = galaxies.model(28.0)
-    cells = range(4000, 4006)
-    rows = pa.concat_tables([galaxies.draw(cell, SEED, deep, dust) for cell in cells])
+    deep = galaxies.model(SEED, 28.0, 2.3, BOX_CELLS, NSIDE)
+    drawn, cells = population.Cells(deep.population), (4000, 4001, 4002, 4003, 40_000, 40_001)
+    rows = pa.concat_tables([galaxies.draw(cell, deep, drawn, dust) for cell in cells])
     z, m_r = rows["z_true"].to_numpy(), rows["abs_mag_r01"].to_numpy()
     faintest = 28.0 - float(cosmology.distance_modulus(2.15)) - 4.0
     found = np.sum((z > 1.85) & (z < 2.15) & (m_r < faintest))
     area = len(cells) * sky.cell_area(ids.GENERATION_ORDER)
-    expected = expected_number(deep.inverse.schechter, 1.85, 2.15, faintest, area)
+    expected = expected_number(deep.luminosities, 1.85, 2.15, faintest, area)
     assert expected > 400
-    assert found == pytest.approx(expected, rel=0.10)
+    assert found == pytest.approx(expected, rel=0.20)
 
 
 @pytest.mark.parametrize(
@@ -120,28 +124,60 @@ def test_cosmic_star_formation(drawn, z):
 
 
 def test_rows_are_what_the_table_declares(drawn):
-    assert validate.violations(drawn.rows, GALAXIES) == []
+    assert validate.violations(drawn.every, GALAXIES) == []
+    assert validate.violations(drawn.halos, HALOS) == []
 
 
 def test_rows_are_sorted_inside_their_cell(cell):
     index = cell["_healpix_29"].to_numpy()
     ra, dec = cell["ra"].to_numpy(), cell["dec"].to_numpy()
     assert np.all(np.diff(index) >= 0)
-    assert np.all(np.diff(cell["id"].to_numpy()) > 0)
+    assert np.unique(cell["id"].to_numpy()).size == len(cell)
     assert np.all(sky.cell_of(ra, dec, ids.GENERATION_ORDER) == CELL)
     assert np.array_equal(sky.healpix_29(ra, dec), index)
 
 
-def test_every_galaxy_is_its_own_central_and_unlensed(cell):
-    assert np.array_equal(cell["halo_id"].to_numpy(), ids.halo_of(cell["id"].to_numpy()))
-    assert cell["ra_lensed"].equals(cell["ra"])
-    for name in ("kind", "kappa", "gamma1", "gamma2"):
-        assert not cell[name].to_numpy().any()
+def test_galaxies_name_halos_of_the_table(drawn):
+    """The halo of a central is there; that of a satellite as well, unless it lies in a cell that was not drawn."""
+    columns = drawn.columns
+    central, halos = columns["kind"] == 0, drawn.halos["id"].to_numpy()
+    assert np.array_equal(columns["halo_id"][central], columns["id"][central])
+    assert np.isin(columns["halo_id"][central], halos).all()
+    known = np.isin(columns["halo_id"][~central], halos)
+    assert 0.9 < known.mean() < 1.0
+    mass = dict(zip(halos.tolist(), drawn.halos["log_mass"].to_pylist(), strict=True))
+    rows = np.flatnonzero(~central)[known][:1000]
+    assert [mass[i] for i in columns["halo_id"][rows].tolist()] == columns["log_halo_mass"][rows].tolist()
+
+
+def test_satellite_fraction(drawn):
+    """Zehavi et al. 2011: 0.21 with M_r < -20 nearby; the embedded universe has 0.22 on average, a cluster moves it."""
+    bright = (drawn.z < 0.35) & (drawn.m_r < -20)
+    assert np.mean(drawn.columns["kind"][bright]) == pytest.approx(0.21, abs=0.06)
+
+
+def test_redshifts_have_peculiar_velocities(drawn):
+    near, columns = drawn.z < 0.5, drawn.columns
+    velocity = LIGHT_KM_S * (columns["z_obs"].astype(float) - drawn.z) / (1 + drawn.z)
+    central = near & (columns["kind"] == 0)
+    assert np.std(velocity[central]) == pytest.approx(290.0, rel=0.15)
+    rich = near & (columns["kind"] == 1) & (columns["log_halo_mass"] > 13.5)
+    assert np.std(velocity[rich]) > 1.2 * np.std(velocity[central])
+
+
+def test_positions_are_lensed(drawn):
+    columns = drawn.columns
+    shift = sky.separation(*(columns[name] for name in ("ra", "dec", "ra_lensed", "dec_lensed")))
+    assert 0.2 < 60.0 * np.sqrt(np.mean(shift[drawn.z > 1.5] ** 2)) < 3.0
+    assert shift[drawn.z < 0.1].max() < 0.2 * shift.max()
 
 
 def test_a_cell_is_the_same_alone_or_among_others(universe, dust, cell):
-    galaxies.draw(5, SEED, universe, dust)
-    again = galaxies.draw(CELL, SEED, pickle.loads(pickle.dumps(universe)), dust)
+    """In another process, after other cells: every byte."""
+    other = pickle.loads(pickle.dumps(universe))
+    drawn = population.Cells(other.population)
+    galaxies.draw(CELL + 5, other, drawn, dust)
+    again = galaxies.draw(CELL, other, drawn, dust)
     assert again.equals(cell)
     # Null columns apart, the bytes themselves.
     for name in cell.column_names:
@@ -149,30 +185,19 @@ def test_a_cell_is_the_same_alone_or_among_others(universe, dust, cell):
             assert again[name].to_numpy().tobytes() == cell[name].to_numpy().tobytes()
 
 
-def test_other_cells_and_seeds_have_other_galaxies(universe, dust, cell):
-    for other in (
-        galaxies.draw(CELL + 1, SEED, universe, dust),
-        galaxies.draw(CELL, SEED + 1, universe, dust),
-    ):
-        n = min(len(other), len(cell)) // 2
-        assert not np.isin(other["abs_mag_r01"].to_numpy()[:n], cell["abs_mag_r01"].to_numpy()[:n]).mean() > 0.01
-
-
-def test_a_step_leaves_the_numbers_of_the_others(universe, dust, cell):
+def test_a_step_leaves_the_numbers_of_the_others(universe, cells, dust, cell):
     size = dataclasses.replace(universe.shapes.size, pivot=1e10)
     changed = dataclasses.replace(universe, shapes=dataclasses.replace(universe.shapes, size=size))
-    other = galaxies.draw(CELL, SEED, changed, dust)
+    other = galaxies.draw(CELL, changed, cells, dust)
     differ = {name for name in cell.column_names if not cell[name].equals(other[name])}
     assert differ == {"bulge_half_light_radius", "disk_half_light_radius"}
 
 
-def test_the_limit_is_the_limit(drawn, universe):
+def test_the_limit_is_the_limit(drawn):
     vis = drawn.mags["euclid_vis"]
     # The columns are single precision: 1e-5 mag at redshift and luminosity.
     assert vis.max() < 26.0 + 1e-3
     assert np.sum(vis > 25.99) > 0
-    # Far more candidates were drawn than kept, so that no kind of spectrum is cut short.
-    assert universe.counts.per_deg2 * drawn.area > 1.2 * vis.size
 
 
 def test_the_apparent_reference_magnitude_is_near_the_seen_ones(drawn):
@@ -184,15 +209,26 @@ def test_the_apparent_reference_magnitude_is_near_the_seen_ones(drawn):
 
 
 def test_an_empty_cell_is_an_empty_table(dust):
-    rows = galaxies.draw(0, SEED, galaxies.model(10.0), dust)
-    assert len(rows) < 5
+    shallow = galaxies.model(SEED, 10.0, 2.3, BOX_CELLS, NSIDE)
+    rows = galaxies.draw(0, shallow, population.Cells(shallow.population), dust)
+    # High-redshift galaxies and quasars have limits of their own.
+    assert (rows["z_true"].to_numpy() < 6).sum() < 5
     assert rows.schema.equals(GALAXIES.arrow())
     assert validate.violations(rows, GALAXIES) == []
 
 
+@pytest.mark.parametrize("place", [(0.0, 90.0), (0.0, -90.0), (0.0, 0.0)])
+def test_poles_and_the_first_meridian(universe, dust, place):
+    at = int(sky.cell_of([place[0]], [place[1]], ids.GENERATION_ORDER)[0])
+    rows = galaxies.draw(at, universe, population.Cells(universe.population), dust)
+    assert validate.violations(rows, GALAXIES) == []
+    assert len(rows) == pytest.approx(19_200, rel=0.3)
+
+
 def test_the_deepest_and_widest_request(dust):
-    rows = galaxies.draw((12 << 16) - 1, SEED, galaxies.model(28.0, 3.0), dust)
+    deep = galaxies.model(SEED, 28.0, 3.0, BOX_CELLS, NSIDE)
+    rows = galaxies.draw((12 << 16) - 1, deep, population.Cells(deep.population), dust)
     assert validate.violations(rows, GALAXIES) == []
     assert rows["z_true"].to_numpy().max() > 2.9
     nearer = np.sum(rows["z_true"].to_numpy() < 2.3) / sky.cell_area(ids.GENERATION_ORDER)
-    assert nearer == pytest.approx(1.16e6, rel=0.15)
+    assert nearer == pytest.approx(1.16e6, rel=0.25)

@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from jobs.catalogue import luminosity_function as lf
-from jobs.fluxes import cosmology
 from lake_schema.errors import OutOfRange
 
 SCHECHTER = lf.schechter()
@@ -63,44 +62,6 @@ def test_magnitude_inverts_number_density(m, z):
     number = lf.number_density(SCHECHTER, m, z)
     if number > 1e-12:
         assert lf.magnitude(INVERSE, number, z) == pytest.approx(m, abs=0.003)
-
-
-def test_counts_are_the_integral_over_the_volume():
-    space = lf.volume()
-    counts = lf.counts(SCHECHTER, space, lambda z: 24.0 - cosmology.distance_modulus(z))
-
-    def shell(z):
-        limit = min(24.0 - float(cosmology.distance_modulus(z)), space.m_faintest)
-        depth = cosmology.HUBBLE_DISTANCE / float(cosmology.expansion_rate(z))
-        return float(lf.number_density(SCHECHTER, limit, z)) * float(cosmology.comoving_distance(z)) ** 2 * depth
-
-    exact = quad(shell, space.z_min, space.z_max, epsrel=1e-8, limit=200)[0] * (np.pi / 180.0) ** 2
-    assert counts.per_deg2 == pytest.approx(exact, rel=1e-4)
-
-
-@pytest.mark.parametrize("z", [0.1, 0.5, 1.0, 2.0])
-def test_drawn_galaxies_have_the_luminosity_function(z, rng):
-    space = lf.Volume(z - 0.02, z + 0.02, -17.0)
-    counts = lf.counts(SCHECHTER, space, lambda z: np.full_like(z, -17.0))
-    area = 2e5 / counts.per_deg2
-    redshift, m = lf.draw(INVERSE, counts, area, rng)
-    assert redshift.min() >= space.z_min
-    assert redshift.max() <= space.z_max
-    assert m.max() <= -17.0 + 0.01
-    bins = np.arange(-22.0, -16.9, 0.5)
-    volume = area * (np.pi / 180.0) ** 2 * float(cosmology.comoving_volume(space.z_min, space.z_max))
-    expected = np.diff(lf.number_density(SCHECHTER, bins, z)) * volume
-    found = np.histogram(m, bins)[0]
-    assert np.all(np.abs(found - expected) < 0.03 * expected + 4 * np.sqrt(expected))
-    assert found[4:] == pytest.approx(expected[4:], rel=0.05)
-
-
-def test_the_number_drawn_is_poisson(rng):
-    counts = lf.counts(SCHECHTER, lf.volume(), lambda z: 22.0 - cosmology.distance_modulus(z))
-    area = 50.0 / counts.per_deg2
-    numbers = np.array([lf.draw(INVERSE, counts, area, rng)[0].size for _ in range(1500)])
-    assert numbers.mean() == pytest.approx(50.0, abs=4 * np.sqrt(50.0 / 1500))
-    assert numbers.var() == pytest.approx(50.0, rel=4 * np.sqrt(2 / 1500))
 
 
 def test_an_impossible_far_end_is_refused():

@@ -86,11 +86,9 @@ def test_flux_is_one_whatever_the_lens(fraction, index, q, inclination, gamma, k
     assert body.kValue(0.0, 0.0) == pytest.approx(1.0, rel=1e-6)
 
 
-def test_sersic_index_is_rounded_to_its_step():
+def test_sersic_index_is_the_catalogue_s_within_bounds():
     found = profiles.shapes(galaxies([1, 2, 3, 4], 0.0 * np.arange(4), bulge_sersic_index=[2.04, 2.06, 0.1, 7.0]))
-    np.testing.assert_allclose(found.sersic_index, [2.0, 2.1, 0.3, 6.2])
-    coarse = profiles.shapes(galaxies(1, 0, bulge_sersic_index=2.26), sersic_step=0.5)
-    assert coarse.sersic_index[0] == 2.5
+    np.testing.assert_allclose(found.sersic_index, [2.04, 2.06, 0.3, 6.2], rtol=1e-6)
 
 
 # ------------------------------------------------------------------------------------------------ lensing
@@ -133,21 +131,9 @@ def test_critical_lines_do_no_harm(kappa, gamma1, gamma2):
 # ------------------------------------------------------------------------------------------------ extent
 
 
-@given(st.floats(0.5, 6.0), st.floats(0.05, 2.0), st.floats(0, 1))
-def test_light_outside_a_radius_is_bounded(index, radius, fraction):
-    """A round galaxy: exactly what lies outside, by the incomplete gamma function's inverse."""
-    found = shape(
-        bulge_fraction=fraction,
-        bulge_sersic_index=index,
-        bulge_half_light_radius=radius,
-        disk_half_light_radius=radius,
-    )
-    at = profiles.outside(found, np.array([radius, 3 * radius]))[0]
-    assert at[0] == pytest.approx(0.5, abs=2e-3)
-    assert at[1] < 0.5
-    # The constant b_n that the approximation stands for.
-    n = found.sersic_index[0]
-    assert profiles._b(np.array([n]))[0] == pytest.approx(gammaincinv(2 * n, 0.5), rel=1e-3)
+@given(st.floats(0.5, 6.2))
+def test_the_series_of_b_n(index):
+    assert profiles._b(np.array([index]))[0] == pytest.approx(gammaincinv(2 * index, 0.5), rel=1e-3)
 
 
 @pytest.mark.parametrize("kind", [{"bulge_fraction": 1.0, "bulge_axis_ratio": 0.5}, {"inclination": 50.0}])
@@ -167,4 +153,3 @@ def test_surface_brightness_along_the_major_axis(kind):
 def test_a_point_has_no_size():
     found = shape(bulge_fraction=1.0, bulge_half_light_radius=0.0)
     assert isinstance(profiles.profile(found, 0, 1e-3).original, galsim.DeltaFunction)
-    assert profiles.half_light_radius(found)[0] == 0.0

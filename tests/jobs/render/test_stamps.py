@@ -28,8 +28,9 @@ def scene(camera, name, angle=20.0, n=160):
 
 
 def drawn(sources, psf, n=160, accuracy=SURVEY):
-    sizes = stamps.stamp_sizes(sources.electrons, sources.shape, sources.shapes, psf, NOISE, accuracy)
-    return stamps.draw(sources, sizes, psf, n, n)
+    settings = stamps.settings_for(accuracy)
+    sizes = stamps.stamp_sizes(sources.electrons, sources.shape, sources.shapes, psf, NOISE, settings)
+    return stamps.draw(sources, sizes, psf, n, n, floors=stamps.floors(sources.electrons, NOISE, settings))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -94,8 +95,9 @@ def test_neighbouring_orientations_show_the_same_sky():
 def test_no_light_is_lost(kind, x, y, electrons, accuracy):
     detector, system, psf = scene("lsstcam", "R22_S11")
     image = drawn(one_source(detector, system, electrons, x, y, **KINDS[kind]), psf, accuracy=accuracy)
-    assert image.sum() == pytest.approx(electrons, rel=1e-5)
-    assert image.min() > -1e-4 * image.max()
+    # Each pixel is rounded to 2^-20 electrons.
+    assert image.sum() == pytest.approx(electrons, rel=1e-5, abs=1e-4)
+    assert image.min() > -1e-3 * image.max()
 
 
 @given(st.floats(75, 85), st.floats(75, 85))
@@ -149,21 +151,22 @@ def test_a_frame_is_the_sum_of_its_sources_and_the_same_every_time():
     whole = drawn(sources, psf)
     np.testing.assert_array_equal(whole, drawn(sources, psf))
     parts = sum(drawn(sources.take(np.arange(40) % 2 == i), psf) for i in (0, 1))
-    np.testing.assert_allclose(whole, parts, atol=1e-9 * whole.max())
+    np.testing.assert_array_equal(whole, parts)
 
 
 def test_progress_is_told():
     told = []
     sources = many(3)
     stamps.draw(sources, np.full(3, 32), spread("lsstcam"), 160, 160, told.append)
-    assert told == [0]
+    assert told[-1] == 3
 
 
 def test_sizes_follow_flux_noise_and_accuracy():
     sources, psf = many(200), spread("lsstcam")
 
     def sizes(factor=1.0, noise=NOISE, accuracy=SURVEY):
-        return stamps.stamp_sizes(factor * sources.electrons, sources.shape, sources.shapes, psf, noise, accuracy)
+        settings = stamps.settings_for(accuracy)
+        return stamps.stamp_sizes(factor * sources.electrons, sources.shape, sources.shapes, psf, noise, settings)
 
     base = sizes()
     assert set(base) <= set(stamps.SIZES)
@@ -195,7 +198,7 @@ def test_extremes_stay_finite(shape, electrons):
     source = one_source(detector, system, electrons, **shape)
     image = drawn(source, psf)
     assert np.isfinite(image).all()
-    assert image.min() > -1e-3 * image.max()
+    assert image.min() >= -1e-3 * image.max()
     assert image.sum() <= electrons * (1 + 1e-4)
 
 

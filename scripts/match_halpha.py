@@ -1,0 +1,94 @@
+"""Make jobs/catalogue/halpha_matching.csv: which H alpha luminosity a star formation rate's stands for.
+
+    python scripts/match_halpha.py [--cells 120]
+
+A sample without structure (every halo where the mean says) is drawn once; per redshift, its cumulative counts of raw
+luminosities are matched to those of Pozzetti et al. 2016, model 3.  The table is monotone and the same for every seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from jobs.catalogue import emission_lines, galaxies, halos, population, satellites, sed_assignment, stellar_mass
+from jobs.fluxes import cosmology
+from jobs.rng import stream
+from lake_schema import sky
+from lake_schema.ids import GENERATION_ORDER
+
+SEED, LIMIT, Z_MAX, BOX_CELLS = 2016, 26.0, 3.0, 192
+EDGES = np.concatenate([[0.03, 0.2], np.arange(0.3, 3.01, 0.1)])
+LOG_L = np.linspace(39.0, 43.6, 47)
+# A luminosity that fewer have takes the shift of the last that enough have.
+ENOUGH = 15
+CM_PER_MPC = 3.0856775814913673e24
+
+
+def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """(z, raw log L) of galaxies with I_E < LIMIT in so many cells' area."""
+    universe = galaxies.model(SEED, LIMIT, Z_MAX, BOX_CELLS, 64)
+    flat = replace(universe.population.halos, x=np.zeros_like(universe.population.halos.x))
+    lines = emission_lines.unmatched(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
+    found = []
+    for cell in range(0, cells * 5000, 5000):
+        hosts = halos.draw(flat, SEED, GENERATION_ORDER, cell)
+        own = satellites.draw(flat, universe.population.masses, hosts, stream(SEED, "satellites", cell))
+        chi, proxy = np.concatenate([hosts.chi, own.chi]), np.concatenate([hosts.proxy, own.proxy])
+        kind = np.repeat([population.CENTRAL, population.SATELLITE], [hosts.chi.size, own.chi.size])
+        z = flat.distances.redshift(chi)
+        m_r = flat.matching.magnitude(z, proxy)
+        red, colour = sed_assignment.draw_colour(universe.colours, m_r, z, kind, stream(SEED, "colour", cell))
+        law, ebv = sed_assignment.draw_dust(universe.colours.dust, m_r, red, colour, stream(SEED, "dust", cell))
+        drawn = galaxies.select(universe, z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv))
+        log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
+        raw = emission_lines.raw_halpha(
+            lines.halpha, lines.dust["halpha"], log_sfr, drawn.sed.ebv, stream(SEED, "lines", cell)
+        )
+        shines = ~(drawn.red & (log_sfr < np.log10(lines.halpha.red_sfr)))
+        found.append((drawn.z[shines], raw[shines]))
+    return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+
+
+def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
+    """What is to be added to log L, [z bin, node]."""
+    rows = []
+    for near, far in pairwise(EDGES):
+        middle = 0.5 * (near + far)
+        here = np.sort(raw[(z > near) & (z < far)])
+        distance = float(cosmology.luminosity_distance(middle)) / cosmology.HUBBLE * CM_PER_MPC
+        wanted = np.linspace(38.0, 45.0, 281)
+        counts = emission_lines.expected_counts(10.0**wanted / (4 * np.pi * distance**2), near, far) * area
+        above = here.size - np.searchsorted(here, LOG_L)
+        # Counts fall with luminosity: interpolate their logarithms backwards.
+        to = np.interp(-np.log(np.maximum(above, 1)), -np.log(np.maximum(counts, 1e-9)), wanted)
+        shift = to - LOG_L
+        last = int(np.flatnonzero(above >= ENOUGH)[-1])
+        first = int(np.flatnonzero(above < 0.98 * here.size)[0])
+        shift[last:] = shift[last]
+        shift[:first] = shift[first]
+        rows.append(np.maximum.accumulate(LOG_L + shift) - LOG_L)
+    return np.array(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cells", type=int, default=120, help="generation cells to draw (0.052 deg2 each)")
+    cells = parser.parse_args().cells
+    z, raw = sample(cells)
+    table = shifts(z, raw, cells * sky.cell_area(GENERATION_ORDER))
+    middle = 0.5 * (EDGES[1:] + EDGES[:-1])
+    whole = np.vstack([np.concatenate([[0.0], LOG_L]), np.column_stack([middle, table])])
+    note = "rows: redshift, then the shift of log10 L(H alpha) in dex; first row: raw log10 L; scripts/match_halpha.py"
+    np.savetxt(emission_lines.MATCHING, whole, "%.4f", ",", header=note)
+
+
+if __name__ == "__main__":
+    main()
