@@ -1,4 +1,4 @@
-"""The one knob: how wrong a user allows a product to be.  What that buys in speed is looked up, never chosen by name."""
+"""The one knob: how wrong a user allows a product to be.  What it buys in speed is looked up, never chosen by name."""
 
 from __future__ import annotations
 

@@ -58,6 +58,12 @@ class Column:
     mantissa_bits: int | None = None
     since: int = 1
 
+    def __post_init__(self) -> None:
+        if self.type not in _TYPES:
+            raise BadInput(f"column {self.name}: {self.type} is not one of {', '.join(_TYPES)}")
+        if self.mantissa_bits is not None and not (self.type == "float32" and 1 <= self.mantissa_bits <= 23):
+            raise BadInput(f"column {self.name}: only float32 can be rounded, to 1 .. 23 bits")
+
     @property
     def arrow_type(self) -> pa.DataType:
         return _TYPES[self.type]

@@ -25,7 +25,8 @@ Int64 = npt.NDArray[np.int64]
 def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, member: npt.ArrayLike = 0) -> Int64:
     """Identifiers of sources.
 
-    kind : int[n]; cell : int or int[n], order-8 nested cell that the halo lies in; number : int[n] running number of the halo in the cell; member : int[n]
+    kind : int[n]; cell : int or int[n], order-8 nested cell that the halo lies in
+    number : int[n] running number of the halo in the cell; member : int[n]
     returns int64[n].  Errors: BadInput where a number needs more bits than it has
     """
     kinds, numbers, members = (np.asarray(x, np.int64) for x in (kind, number, member))

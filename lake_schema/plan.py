@@ -44,6 +44,8 @@ class Plan:
     def __post_init__(self) -> None:
         if len({part.name for part in self.parts}) != len(self.parts):
             raise BadInput(f"table {self.table.name}: the plan names a part twice")
+        if self.table.is_catalogue and not self.parts:
+            raise BadInput(f"table {self.table.name}: the plan has no cells")
 
     @property
     def key(self) -> str:

@@ -57,7 +57,8 @@ def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> 
             raise BadInput(f"table {name} was planned for another request: run plan_exposures first")
     for name in ("galaxies", "stars"):
         if facts[name].get("seed") != request.seed:
-            raise BadInput(f"table {name} has seed {facts[name].get('seed')}, the request {request.seed}: build it first")
+            seeds = f"seed {facts[name].get('seed')}, the request {request.seed}"
+            raise BadInput(f"table {name} has {seeds}: build it first")
     for fluxes, catalogue in (("galaxy_fluxes", "galaxies"), ("star_fluxes", "stars")):
         if facts[fluxes].get("input") != inputs[catalogue].key:
             raise BadInput(f"table {fluxes} was computed from another version of {catalogue}: run compute_fluxes first")

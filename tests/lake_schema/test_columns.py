@@ -93,6 +93,21 @@ def test_rounding_keeps_its_relative_error(values, bits):
     assert np.array_equal(round_mantissa(rounded, bits)[normal], rounded[normal])
 
 
+@pytest.mark.parametrize(
+    ("kind", "bits"), [("float64", 12), ("int64", 12), ("float32", 0), ("float32", 24), ("float16", None)]
+)
+def test_only_float32_may_be_rounded(kind, bits):
+    with pytest.raises(BadInput, match="column x"):
+        Column("x", kind, mantissa_bits=bits)
+
+
+def test_a_rounded_column_is_rounded_when_it_is_built_and_says_so():
+    table = Table("t", 1, (Column("id", "int64"), Column("x", "float32", mantissa_bits=8)), "t")
+    rows = table.build({"id": [1], "x": np.array([np.pi])})
+    assert rows["x"][0].as_py() == round_mantissa(np.array([np.pi], np.float32), 8)[0] != np.float32(np.pi)
+    assert rows.schema.field("x").metadata[b"mantissa_bits"] == b"8"
+
+
 def test_rounding_leaves_infinities():
     values = np.array([np.inf, -np.inf, np.nan], np.float32)
     assert np.array_equal(round_mantissa(values, 5), values, equal_nan=True)

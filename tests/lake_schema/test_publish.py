@@ -102,6 +102,15 @@ def test_a_plan_names_a_part_once():
         Plan(TOY, {}, (Part("a", {}), Part("a", {})))
 
 
+def test_a_catalogue_has_cells_though_they_may_be_empty(lake):
+    with pytest.raises(BadInput, match="no cells"):
+        Plan(TOY, {}, ())
+    publish.make(lake, toy_plan(cells=((8000, 0), (1607, 0))), toy_work)
+    version = read.version(lake, "toy")
+    assert version.rows().num_rows == version.cone(10.0, 10.0, 5.0).num_rows == 0
+    assert read.verify(version, deep=True) == []
+
+
 def test_versions_follow_each_other_and_gc_keeps_the_last(lake):
     first = publish.make(lake, toy_plan(1), toy_work)
     second = publish.make(lake, toy_plan(2), toy_work)

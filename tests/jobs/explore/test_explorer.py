@@ -229,10 +229,13 @@ def test_a_killed_process_is_replaced(explorer):
 
 
 def test_results_in_files(explorer, galaxies, tmp_path):
+    from astropy.io.fits import getheader
     from astropy.table import Table
 
     text = "SELECT id, ra, kind, flux_halpha, z_obs > 1 AS far, 'x' || kind AS name FROM galaxies ORDER BY _healpix_29"
     fits = Table.read(explorer.export(text, tmp_path / "a.fits"))
+    header = getheader(tmp_path / "a.fits", 1)
+    assert (header["TUNIT2"], header["TUCD2"]) == ("deg", GALAXIES.column("ra").ucd)
     csv = pd.read_csv(explorer.export(text, tmp_path / "a.csv"))
     parquet = pa.parquet.read_table(explorer.export(text, tmp_path / "a.parquet"))
     assert fits["ra"].unit == "deg"
