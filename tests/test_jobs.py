@@ -18,11 +18,13 @@ JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.
 # Four order-5 cells meet here, so that there is something to share out.
 SMALL = """
 name = "small"
-seed = 5
+seed = 7
 [area]
 cone = { ra = 53.4375, dec = -27.279613, radius = 0.01 }
 [universe]
 galaxy_limit = 21.0
+box_cells = 192
+lensing_nside = 64
 """
 BAD = [
     ('name = "x"\nseed = 1\ncolour = 3\n[area]\ncone = {ra = 0, dec = 0, radius = 1}', "colour"),
@@ -96,7 +98,8 @@ def test_spark_submit_passes_on_the_line_and_the_status(tmp_path):
 
 def test_a_generation_cell_is_the_same_in_every_request():
     """Whatever else is asked for, a cell's rows are the same bytes."""
-    facts = {"seed": 5, "galaxy_limit": 21.0, "z_max": 2.3, "star_limit": 22.0}
+    facts = {"seed": 7, "galaxy_limit": 21.0, "z_max": 2.3, "star_limit": 22.0, "box_cells": 192, "lensing_nside": 64}
+    facts |= {"high_redshift_boost": 1.0, "quasar_boost": 1.0}
     for work in (build_galaxies.work, build_stars.work):
         alone = work(Path(), {**facts, "generation_cells": [574971]}).rows
         among = work(Path(), {**facts, "generation_cells": [574970, 574972, 574971]}).rows

@@ -24,9 +24,9 @@ HALOS = Table(
             "bool",
             "",
             "meta.code",
-            "above the mass limit of its redshift: there all halos are listed, below it only those whose central may be bright enough",
+            "above the mass limit of its redshift, where all are listed; below it, those whose central may be bright",
         ),
     ),
-    "Halos of the True Universe; a galaxy's halo_id is the id of a row here, which is also the id of its central galaxy.",
+    "Halos of the True Universe; a halo has the id of its central galaxy, which is the halo_id of all its galaxies.",
     order=5,
 )
