@@ -43,7 +43,7 @@ bench: .venv/installed-bench spark
 clean:
 	rm -rf out build dist *.egg-info spark-warehouse
 	rm -rf .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
-	find benchmarks jobs lake_schema notebooks scripts tests -name __pycache__ -prune -exec rm -rf {} +
+	find . -path ./.venv -prune -o -name __pycache__ -prune -exec rm -rf {} +
 
 # ---------------------------------------------------------------------------- the environment
 

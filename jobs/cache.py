@@ -23,6 +23,8 @@ from lake_schema.errors import BadInput
 
 Array = npt.NDArray[Any]
 
+# Lists a folder's arrays, so that one that went missing is noticed.
+_NAMES = "arrays.txt"
 _KEY_LENGTH = 32
 
 
@@ -77,9 +79,9 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) 
 
 
 def _load(folder: Path) -> dict[str, Array] | None:
-    files = sorted(folder.glob("*.npy"))
     try:
-        return {file.stem: _map(file) for file in files} or None
+        names = (folder / _NAMES).read_text(encoding="utf-8").split()
+        return {name: _map(folder / f"{name}.npy") for name in names}
     except (ValueError, EOFError, OSError):
         # Cut short by a crash of the machine: make it again.
         shutil.rmtree(folder, ignore_errors=True)
@@ -99,6 +101,7 @@ def _publish(arrays: Mapping[str, Array], folder: Path) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     staged = Path(tempfile.mkdtemp(prefix=".making-", dir=folder.parent))
     try:
+        (staged / _NAMES).write_text("\n".join(arrays), encoding="utf-8")
         for stem, array in arrays.items():
             np.save(staged / f"{layout.name(stem)}.npy", np.ascontiguousarray(array), allow_pickle=False)
         staged.chmod(0o755)

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jobs import request as requests
+from jobs.render import plan_exposures, preview
 from lake_schema import layout, read
 from lake_schema.errors import LakeError
 
@@ -39,14 +40,18 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the lake and the pictures")
     options = parser.parse_args(argv)
     try:
-        requests.parse(options.request)
+        # Whatever is wrong with the pointings is said before the first job runs.
+        plan_exposures.steps(options.out, requests.parse(options.request))
         root = layout.lake(options.out / "lake")
         status = _run_all(root, options.request)
+        if status == 0:
+            _show(root, options.out)
     except LakeError as error:
         print(f"demo: {error}", file=sys.stderr)
         return 2
-    if status == 0:
-        _show(root, options.out)
+    except KeyboardInterrupt:
+        print("demo: stopped; a second run continues where this one ended", file=sys.stderr)
+        return 130
     return status
 
 
@@ -80,8 +85,6 @@ def _table(root: Path, stages: Sequence[tuple[str, Sequence[str], float]], total
 
 
 def _show(root: Path, out: Path) -> None:
-    from jobs.render import preview
-
     for picture in preview.previews(root, out):
         print(picture)
 

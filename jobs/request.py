@@ -39,15 +39,18 @@ LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """A convex spherical polygon (vertices) or a circle (ra, dec, radius), deg."""
+    """A convex spherical polygon (vertices), a box (west, east, south, north) or a circle (ra, dec, radius), deg."""
 
     vertices: tuple[tuple[float, float], ...] = ()
+    box: tuple[float, float, float, float] | None = None
     ra: float = 0.0
     dec: float = 0.0
     radius: float = 0.0
 
     def cells(self, order: int = GENERATION_ORDER) -> list[int]:
         """Nested cells of `order` that the area touches, ascending."""
+        if self.box is not None:
+            return [int(cell) for cell in sky.cells_in_box(*self.box, order)]
         if self.vertices:
             return [int(cell) for cell in sky.cells_in_polygon(self.vertices, order)]
         return [int(cell) for cell in sky.cells_in_cone(self.ra, self.dec, self.radius, order)]
@@ -201,7 +204,7 @@ def _area(table: Toml) -> Area:
         raise BadInput(f"area.box.ra = [{west}, {east}]: the second must be larger, by less than 180")
     if not north > south:
         raise BadInput(f"area.box.dec = [{south}, {north}]: the second must be larger")
-    return _polygon([[west, south], [east, south], [east, north], [west, north]], "area.box")
+    return Area(box=(west % 360.0, east % 360.0, south, north))
 
 
 def _polygon(value: object, path: str) -> Area:
@@ -333,8 +336,9 @@ def _number(table: Toml, path: str, lo: float, hi: float, default: float | None 
 def _checked_number(value: object, path: str, lo: float, hi: float) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise BadInput(f"{path} wants a number, got {_shown(value)}")
-    if not math.isfinite(value) or not lo <= value <= hi:
-        raise OutOfRange(path, value, lo, hi)
+    # Whole numbers are compared before they become floats: TOML's have no largest one.
+    if not lo <= value <= hi or not math.isfinite(value):
+        raise OutOfRange(path, _shown(value), lo, hi)
     return float(value)
 
 

@@ -1,7 +1,7 @@
 """From a command line to published tables: the only file, with session.py, that knows Spark.
 
-A job is a function (lake, request) -> steps; a step is a plan (what to make of what) and the function that makes one part
-of it.  Spark carries the parts' numbers out and their receipts back; rows go from the kernel straight to their file.
+A job is a function (lake, request) -> steps; a step is a plan (what to make of what) and the function that makes one
+part of it.  Spark carries the parts' numbers out and their receipts back; rows go straight from the kernel to a file.
 """
 
 from __future__ import annotations
@@ -296,7 +296,7 @@ def _collect(spark: SparkSession, function: Callable[[Part], Json], parts: Seque
 
 def _tries(spark: SparkSession) -> int:
     """How often Spark runs a failing task: F of local[N,F], 1 of local[N], spark.task.maxFailures of a cluster."""
-    master = spark.sparkContext.master
+    master = str(spark.sparkContext.master)
     local = re.fullmatch(r"local(?:\[[^,\]]+(?:,\s*(\d+))?\])?", master)
     if local:
         return int(local[1] or 1)

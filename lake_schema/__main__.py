@@ -1,4 +1,4 @@
-"""Look after a lake: python -m lake_schema verify|gc|describe LAKE [TABLE]."""
+"""Look after a lake: python -m lake_schema verify|gc|describe LAKE [TABLE]; `tables` prints the reference page."""
 
 from __future__ import annotations
 
@@ -7,18 +7,23 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from lake_schema import __version__, layout, publish, read
+from lake_schema import __version__, layout, publish, read, tables
 from lake_schema.errors import BadInput, LakeError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: 0 all well, 1 something is wrong with the lake, 2 the call is wrong."""
     parser = argparse.ArgumentParser(prog="python -m lake_schema", description=__doc__, epilog=f"truesky {__version__}")
-    parser.add_argument("command", choices=("verify", "gc", "describe"))
-    parser.add_argument("lake", help="folder of the lake")
+    parser.add_argument("command", choices=("verify", "gc", "describe", "tables"))
+    parser.add_argument("lake", nargs="?", help="folder of the lake")
     parser.add_argument("table", nargs="?", help="one table (default: all of them)")
     parser.add_argument("--deep", action="store_true", help="verify: read every byte and compare its sha256")
     options = parser.parse_args(argv)
+    if options.command == "tables":
+        print(tables.markdown(), end="")
+        return 0
+    if options.lake is None:
+        parser.error("the folder of the lake is missing")
     try:
         root = layout.lake(options.lake)
         names = [options.table] if options.table else _names(root, options.command)

@@ -27,6 +27,7 @@ _TYPES: dict[str, pa.DataType] = {
     "float32": pa.float32(),
     "bool": pa.bool_(),
     "string": pa.string(),
+    "list<float32>": pa.list_(pa.field("element", pa.float32(), nullable=False)),
     "list<float64>": pa.list_(pa.field("element", pa.float64(), nullable=False)),
     "list<int64>": pa.list_(pa.field("element", pa.int64(), nullable=False)),
 }
@@ -175,13 +176,19 @@ class Table:
             lines += [f"Key `{', '.join(self.key)}`.", ""]
         lines += ["| column | type | unit | range | null | UCD | meaning |", "|---|---|---|---|---|---|---|"]
         for c in self.columns:
-            lo, hi = ("" if bound is None else f"{bound:g}" for bound in (c.lo, c.hi))
+            lo, hi = (_shown(bound) for bound in (c.lo, c.hi))
             bounds = f"{lo} .. {hi}" if lo or hi else ""
             codes = "; ".join(f"{code} {meaning}" for code, meaning in c.codes)
             meaning = c.doc + (f" ({codes})" if codes else "")
             null = "yes" if c.nullable else ""
             lines.append(f"| `{c.name}` | {c.type} | {c.unit} | {bounds} | {null} | {c.ucd} | {meaning} |")
         return "\n".join(lines) + "\n"
+
+
+def _shown(bound: float | None) -> str:
+    if bound is None:
+        return ""
+    return str(bound) if isinstance(bound, int) else f"{bound:g}"
 
 
 def _array(table: str, column: Column, values: Any, rows: int) -> pa.Array:

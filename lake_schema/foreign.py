@@ -2,8 +2,8 @@
 
 batches     the rows of some flat columns, a bounded piece at a time
 
-A file can be made so that its reader crashes, so it is read by a process of its own, which has little memory and time and
-hands over plain Arrow batches: python -m lake_schema.foreign FILE COLUMN ... >stream
+A file can be made so that its reader crashes, so it is read by a process of its own, which has little memory and time
+and hands over plain Arrow batches: python -m lake_schema.foreign FILE COLUMN ... >stream
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ import pyarrow.parquet as pq
 from lake_schema.errors import BadInput
 
 _MAGIC = b"PAR1"
-# A footer larger than this describes no table of ours; columns and row groups are bounded by the length of any list in it,
-# and with them how deep columns can nest.
+# A footer larger than this describes no table of ours; columns and row groups are bounded by the length of any list in
+# it, and with them how deep columns can nest.
 _MOST_FOOTER_BYTES = 32 << 20
 _MOST_ENTRIES = 5000
 # What one row group may hold, uncompressed; the largest that is written here is a tenth of it.
@@ -84,7 +84,7 @@ def _refuse_large_footer(path: Path) -> None:
         raise BadInput(f"{path}: its footer says {length} bytes, of {size} and at most {_MOST_FOOTER_BYTES}")
 
 
-# ------------------------------------------------------------------------------------------------ in a process of its own
+# ----------------------------------------------------------------------------------------- in a process of its own
 
 
 def main(argv: Sequence[str]) -> int:

@@ -1,7 +1,7 @@
 """What makes a folder of cells a HATS collection: metadata, the 10 arcsec margin, the properties.
 
 <version>/collection.properties
-<version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,_common_metadata,...}
+<version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,...}
 <version>/<table>_margin/   the same for the rows just outside each cell, so that a cross-match loses no pair at an edge
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -29,27 +30,34 @@ _DATE = "2000-01-01T00:00UTC"
 Cell = tuple[int, int]  # order, nested cell
 
 
-def write(version: Path, table: Table, parts: Sequence[tuple[str, int]]) -> None:
+def border(rows: pa.Table, part: str) -> pa.Table:
+    """Those rows of a cell that another cell's margin may want: kept beside the receipts until the margins are made."""
+    order, cell = layout.cell_of_file(part)
+    fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, _MARGIN_ORDER)
+    return rows.filter(pa.array(np.isin(fine, sky.border_cells(order, cell, _MARGIN_ORDER))))
+
+
+def write(version: Path, table: Table, parts: Sequence[tuple[str, int]], borders: Sequence[Path]) -> None:
     """Write the metadata of a catalogue whose cells lie in `version`/<table>/dataset.
 
-    parts : (HATS path below dataset/, rows) of each cell
+    parts : (HATS path below dataset/, rows) of each cell;  borders : files of their border rows
     """
     cells = [layout.cell_of_file(name) for name, _ in parts]
     root, margin = version / table.name, version / f"{table.name}_margin"
-    files = {cell: root / "dataset" / name for cell, (name, _) in zip(cells, parts, strict=True)}
-    margin_rows = _write_margin(margin, table, files)
+    margin_rows = _write_margin(margin, table, dict(zip(cells, borders, strict=True)))
+    files = [root / "dataset" / name for name, _ in parts]
     _write_catalogue(root, table, cells, sum(rows for _, rows in parts), files)
     _write_catalogue(margin, table, cells, margin_rows, None)
     _write_collection(version, table)
 
 
-def _write_margin(folder: Path, table: Table, files: dict[Cell, Path]) -> int:
-    orders = sorted({order for order, _ in files})
+def _write_margin(folder: Path, table: Table, borders: dict[Cell, Path]) -> int:
+    orders = sorted({order for order, _ in borders})
     total = 0
-    for order, cell in files:
+    for order, cell in borders:
         rim = sky.margin_cells(order, cell, _MARGIN_ORDER)
         around = [(o, int(c)) for o in orders for c in np.unique(sky.parent(rim, _MARGIN_ORDER, o))]
-        pieces = [_rows_in(files[other], rim) for other in around if other in files]
+        pieces = [_rows_in(borders[other], rim) for other in around if other in borders]
         rows = pa.concat_tables([table.empty(), *pieces]).sort_by([("_healpix_29", "ascending"), ("id", "ascending")])
         target = folder / "dataset" / layout.cell_file(order, cell)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -59,37 +67,22 @@ def _write_margin(folder: Path, table: Table, files: dict[Cell, Path]) -> int:
 
 
 def _rows_in(path: Path, rim: sky.Int) -> pa.Table:
-    """Rows of a cell's file that lie in the rim, reading only the row groups that can hold some."""
-    file = pq.ParquetFile(path, page_checksum_verification=True)
-    column = file.schema_arrow.get_field_index("_healpix_29")
-    keep = []
-    for group in range(file.metadata.num_row_groups):
-        facts = file.metadata.row_group(group).column(column).statistics
-        if facts is None:  # a group of no rows has none
-            continue
-        first, last = (sky.parent([x], sky.DEEPEST, _MARGIN_ORDER)[0] for x in (facts.min, facts.max))
-        if np.searchsorted(rim, last, "right") > np.searchsorted(rim, first, "left"):
-            keep.append(group)
-    if not keep:
-        return file.schema_arrow.empty_table()
-    rows = file.read_row_groups(keep)
+    rows = pq.read_table(path, partitioning=None, page_checksum_verification=True)
     fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, _MARGIN_ORDER)
     return rows.filter(pa.array(np.isin(fine, rim)))
 
 
-def _write_catalogue(
-    root: Path, table: Table, cells: list[Cell], rows: int, files: dict[Cell, Path] | None
-) -> None:
-    from hats.catalog import TableProperties
+def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, files: list[Path] | None) -> None:
+    from hats.catalog.dataset.table_properties import TableProperties
     from hats.catalog.partition_info import PartitionInfo
-    from hats.io.file_io import write_fits_image
+    from hats.io.file_io.file_io import write_fits_image
     from hats.io.parquet_metadata import write_parquet_metadata
     from hats.io.paths import get_skymap_file_pointer
-    from hats.pixel_math import HealpixPixel
+    from hats.pixel_math.healpix_pixel import HealpixPixel
 
     write_parquet_metadata(root, create_metadata=len(cells) <= _MOST_FILES_IN_METADATA)
     PartitionInfo([HealpixPixel(order, cell) for order, cell in cells]).write_to_file(catalog_path=root)
-    facts: dict[str, object] = {
+    facts: dict[str, Any] = {
         "total_rows": rows,
         "ra_column": "ra",
         "dec_column": "dec",
@@ -110,9 +103,9 @@ def _write_catalogue(
     TableProperties(**facts, **about).to_properties_file(root)
 
 
-def _skymap(files: dict[Cell, Path]) -> sky.Int:
+def _skymap(files: list[Path]) -> sky.Int:
     counts = np.zeros(12 << (2 * _SKYMAP_ORDER), np.int64)
-    for path in files.values():
+    for path in files:
         index = pq.read_table(path, columns=["_healpix_29"], partitioning=None)["_healpix_29"].to_numpy()
         counts += np.bincount(sky.parent(index, sky.DEEPEST, _SKYMAP_ORDER), minlength=counts.size)
     return counts
@@ -122,8 +115,11 @@ def _write_collection(version: Path, table: Table) -> None:
     from hats.catalog.dataset.collection_properties import CollectionProperties
 
     margin = f"{table.name}_margin"
-    about = {"hats_builder": "truesky", "hats_creation_date": _DATE}
+    about: dict[str, Any] = {"hats_builder": "truesky", "hats_creation_date": _DATE}
     CollectionProperties(
-        name=table.name, hats_primary_table_url=table.name, all_margins=[margin], default_margin=margin, **about
+        obs_collection=table.name,
+        hats_primary_table_url=table.name,
+        all_margins=[margin],
+        default_margin=margin,
+        **about,
     ).to_properties_file(version)
-

@@ -1,7 +1,7 @@
 """Parquet files as the lake writes and reads them: declared encodings, sorted rows, page checksums on both ways.
 
-A changed byte goes through pyarrow's, Spark's, pandas', DuckDB's and lsdb's own readers as a wrong number; through `dataset`
-here, after its tail was compared with the manifest's, it is an error that names the file.
+A changed byte goes through pyarrow's, Spark's, pandas', DuckDB's and lsdb's own readers as a wrong number; through
+`dataset` here, after its tail was compared with the manifest's, it is an error that names the file.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from pyarrow.fs import LocalFileSystem
 
 from lake_schema.columns import Table
 
-# Sorted by position, 65,536 rows a group is where small cones are fast and the footer is still small (measured 4k to 262k).
+# Sorted by position, 65,536 rows a group is where small cones are fast and the footer still small (tried: 4k to 262k).
 ROWS_A_GROUP = 65_536
 
-_FORMAT = ds.ParquetFileFormat(default_fragment_scan_options=ds.ParquetFragmentScanOptions(page_checksum_verification=True))
+_FORMAT = ds.ParquetFileFormat(
+    default_fragment_scan_options=ds.ParquetFragmentScanOptions(page_checksum_verification=True)
+)
 
 
 def write(path: Path, rows: pa.Table, table: Table) -> None:

@@ -15,7 +15,19 @@ _ROOT = Path(__file__).resolve().parents[1]
 _PACKAGES = ("lake_schema", "jobs")
 _DATA = {".py", ".csv", ".toml"}
 # Libraries whose version can change a byte of a product.
-_LIBRARIES = ("numpy", "pyarrow", "numba", "scipy", "astropy", "galsim")
+_LIBRARIES = (
+    "astropy",
+    "colossus",
+    "dust_extinction",
+    "galsim",
+    "hats",
+    "healpy",
+    "numba",
+    "numpy",
+    "pyarrow",
+    "scipy",
+    "speclite",
+)
 
 
 def canonical(value: Any) -> bytes:
@@ -35,7 +47,7 @@ def file_sha256(path: Path) -> str:
 
 
 def code_version(root: Path = _ROOT) -> str:
-    """Fingerprint of the code: every source and data file of lake_schema and jobs, and the versions of the libraries."""
+    """Fingerprint of the code: every source and data file of lake_schema and jobs, and the libraries' versions."""
     files = sorted(
         path
         for package in _PACKAGES

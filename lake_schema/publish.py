@@ -1,9 +1,9 @@
 """How a table gets into the lake: never half, and never mistaken for another.
 
 plan      what is to be made: table, everything that goes into it, its parts.  Its hash names the version.
-stage     LAKE/<table>/.stage-<key>; a part's file is written under a temporary name, synced, hashed, renamed; its receipt
-          last, in the same way.
-publish   all parts there -> HATS metadata -> manifest -> one rename of the folder -> `current` is swapped by one rename.
+stage     LAKE/<table>/.stage-<key>; a part's file is written under a temporary name, synced, hashed, renamed; its
+          receipt last, in the same way.
+publish   all parts there -> HATS metadata -> manifest -> one rename of the folder -> `current` swapped by one rename.
 
 State after a death at any point             what a reader sees        what the next run does
 before the first receipt                     the last version          everything
@@ -24,11 +24,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from lake_schema import __version__, layout, manifest
+from lake_schema import __version__, hats_files, layout, manifest
 from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
 from lake_schema.manifest import sync
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
-from lake_schema.stage import attempt, is_done, missing, receipt_of, receipts, write_part
+from lake_schema.stage import attempt, border_path, is_done, missing, receipt_of, receipts, write_part
 from lake_schema.uniqueness import refuse_duplicates
 
 __all__ = [
@@ -48,8 +48,8 @@ def make(root: Path, plan: Plan, work: Work, mapper: Mapper = map, base: str | N
     work   : (lake, facts of the plan and the part) -> its Output; runs wherever `mapper` runs it
     mapper : like map: (function, parts) -> results in any order.  Results are only reported on; the receipts decide
     base   : key of the version that this one replaces, "" = whatever is current when the call begins
-    Errors : PartsFailed lists the parts that could not be made (the others are kept); Superseded where another run holds
-             the same plan, or has published another version since; Damaged where the version is there and not whole
+    Errors : PartsFailed lists the parts that could not be made (the others are kept); Superseded where another run
+             holds the same plan, or has published another version since; Damaged where it is there and not whole
     """
     name, key = plan.table.name, plan.key
     base = current_key(root, name) if base == "" else base
@@ -89,14 +89,13 @@ def _make_parts(root: Path, plan: Plan, work: Work, mapper: Mapper) -> None:
 
 def _finish(stage: Path, plan: Plan) -> None:
     """Metadata and manifest: after this the stage is the version, all but its name."""
-    from lake_schema import hats_files
-
     made = [receipt for part in plan.parts if (receipt := receipt_of(stage, part.name)) is not None]
     refuse_duplicates(stage, plan, made)
     listed = {f["path"]: f for receipt in made for f in receipt["files"]}
     _sweep(stage, set(listed))
     if plan.table.is_catalogue:
-        hats_files.write(stage, plan.table, [(r["part"], r["rows"]) for r in made])
+        borders = [border_path(stage, receipt["part"]) for receipt in made]
+        hats_files.write(stage, plan.table, [(r["part"], r["rows"]) for r in made], borders)
     rows = {data_path(plan.table, r["part"]): r["rows"] for r in made}
     files = []
     for path in sorted(stage.rglob("*")):
@@ -107,7 +106,9 @@ def _finish(stage: Path, plan: Plan) -> None:
         sync(path)
     if listed:
         raise Damaged(f"{stage / min(listed)} is missing")
-    deflections = {"deflection_deg": max(r["deflection_deg"] for r in made)} if made and "deflection_deg" in made[0] else {}
+    deflections = (
+        {"deflection_deg": max(r["deflection_deg"] for r in made)} if made and "deflection_deg" in made[0] else {}
+    )
     manifest.write(
         stage,
         {
@@ -170,7 +171,7 @@ def _lock(path: Path, refusal: str, patience: float = 0.0) -> Iterator[None]:
 
 
 def _take(path: Path, descriptor: int) -> bool:
-    """Lock the open file, if nobody holds it, and if it is still the one of that name: a holder removes it at the end."""
+    """Lock the open file, if nobody holds it, and if it is still the one of that name: holders remove it."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path.stat().st_ino == os.fstat(descriptor).st_ino

@@ -22,7 +22,8 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
-from lake_schema import layout, manifest, parquet, sky, tables as declarations
+from lake_schema import layout, manifest, parquet, sky
+from lake_schema import tables as declarations
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput, Damaged, VersionMismatch
 from lake_schema.provenance import digest
@@ -41,7 +42,7 @@ ON = {"true": ("ra", "dec"), "lensed": ("ra_lensed", "dec_lensed")}
 class Version:
     """One published version of a table.
 
-    schema : of its rows, with units and descriptions in the fields' metadata; a column that the files do not have is null
+    schema : of its rows, with units and descriptions in the fields' metadata; a column that the files lack is null
     """
 
     folder: Path
@@ -101,7 +102,10 @@ class Version:
         return parquet.dataset([self.path(name) for name in names], self.schema)
 
     def rows(
-        self, columns: Sequence[str] | None = None, parts: Iterable[str] | None = None, where: ds.Expression | None = None
+        self,
+        columns: Sequence[str] | None = None,
+        parts: Iterable[str] | None = None,
+        where: ds.Expression | None = None,
     ) -> pa.Table:
         """Rows in file order.
 
@@ -120,7 +124,7 @@ class Version:
                 raise BadInput(f"table {self.table} has no column {name}")
 
     def in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
-        """Rows of a catalogue inside cells of an order (nested), reading only the files and row groups that can hold some.
+        """Rows of a catalogue inside cells of an order (nested), reading only files and row groups that can hold some.
 
         cells : int[n]
         """
@@ -153,8 +157,8 @@ class Version:
         order = cover_order(padded)
         names = None if columns is None else list(dict.fromkeys([*columns, *ON[on]]))
         rows = self.in_cells(sky.cells_in_cone(ra, dec, min(padded, 180.0), order).tolist(), order, names)
-        places = (rows[name].to_numpy() for name in ON[on])
-        rows = rows.filter(pa.array(sky.separation(*places, ra, dec) <= radius))
+        lon, lat = (rows[name].to_numpy() for name in ON[on])
+        rows = rows.filter(pa.array(sky.separation(lon, lat, ra, dec) <= radius))
         return rows if columns is None else rows.select(list(columns))
 
     def deflection(self) -> float:
@@ -175,12 +179,14 @@ def _inside(part: str, cells: sky.Int, order: int) -> sky.Int:
     """Those of the cells that a part's cell overlaps."""
     file_order, cell = layout.cell_of_file(part)
     if file_order <= order:
-        return cells[sky.parent(cells, order, file_order) == cell]
-    return cells[cells == cell >> (2 * (file_order - order))]
+        inside: sky.Int = cells[sky.parent(cells, order, file_order) == cell]
+    else:
+        inside = cells[cells == cell >> (2 * (file_order - order))]
+    return inside
 
 
 def _ranges(cells: sky.Int, order: int) -> list[tuple[int, int]]:
-    """Half-open stretches of order-29 indices that cover sorted cells: at most _MOST_RANGES, the widest gaps left out."""
+    """Half-open stretches of order-29 indices that cover sorted cells: at most _MOST_RANGES, widest gaps left out."""
     gaps = np.diff(cells)
     cuts = np.flatnonzero(gaps > 1)
     if cuts.size >= _MOST_RANGES:

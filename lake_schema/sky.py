@@ -4,12 +4,15 @@ healpix_29          sky -> order-29 index
 cell_of             sky -> cell of an order
 cells_in_cone       cells that a circle touches (never misses one)
 cells_in_polygon    cells that a spherical polygon touches
+cells_in_box        cells between two meridians and two parallels
 random_in_cell      uniform positions inside one cell, sorted
 """
 
 from __future__ import annotations
 
-import healpy as hp
+from functools import cache
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -19,6 +22,14 @@ Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 
 DEEPEST = 29
+
+
+@cache
+def _hp() -> Any:
+    # Its import takes longer than most of what a process does with a lake.
+    import healpy
+
+    return healpy
 
 
 def checked(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
@@ -46,17 +57,17 @@ def healpix_29(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
 def cell_of(ra: npt.ArrayLike, dec: npt.ArrayLike, order: int) -> Int:
     """ra, dec [n] deg -> int64[n], the nested cell of `order` that holds each position."""
     ra_deg, dec_deg = checked(ra, dec)
-    return np.asarray(hp.ang2pix(1 << order, ra_deg, dec_deg, nest=True, lonlat=True), np.int64)
+    return np.asarray(_hp().ang2pix(1 << order, ra_deg, dec_deg, nest=True, lonlat=True), np.int64)
 
 
 def cell_area(order: int) -> float:
     """Area of a cell of `order`, deg2."""
-    return float(hp.nside2pixarea(1 << order, degrees=True))
+    return float(np.degrees(np.sqrt(np.pi / 3)) ** 2 / 4**order)
 
 
 def cell_centre(order: int, cell: int) -> tuple[float, float]:
     """ra, dec of a cell's centre, deg."""
-    ra, dec = hp.pix2ang(1 << order, cell, nest=True, lonlat=True)
+    ra, dec = _hp().pix2ang(1 << order, cell, nest=True, lonlat=True)
     return float(ra), float(dec)
 
 
@@ -73,7 +84,7 @@ def parent(cells: npt.ArrayLike, order: int, coarser: int) -> Int:
 
 def cell_radius(order: int) -> float:
     """Largest distance of a point of any cell of `order` from the cell's centre, deg."""
-    return float(np.degrees(hp.max_pixrad(1 << order)))
+    return float(np.degrees(_hp().max_pixrad(1 << order)))
 
 
 def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
@@ -85,9 +96,9 @@ def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
     (ra_deg,), (dec_deg,) = checked([ra], [dec])
     if not 0.0 <= radius <= 180.0:
         raise OutOfRange("radius", radius, 0.0, 180.0)
-    centre = hp.ang2vec(ra_deg, dec_deg, lonlat=True)
+    centre = _hp().ang2vec(ra_deg, dec_deg, lonlat=True)
     fine = min(order + 3, DEEPEST)
-    found = hp.query_disc(1 << fine, centre, np.radians(min(radius + cell_radius(fine), 180.0)), nest=True)
+    found = _hp().query_disc(1 << fine, centre, np.radians(min(radius + cell_radius(fine), 180.0)), nest=True)
     own = cell_of([ra], [dec], order)
     return np.unique(np.concatenate([parent(found, fine, order), own]))
 
@@ -102,13 +113,36 @@ def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
         raise BadInput(f"a polygon wants at least 3 vertices (ra, dec), got shape {corners.shape}")
     ra, dec = checked(corners[:, 0], corners[:, 1])
-    vectors = hp.ang2vec(ra, dec, lonlat=True)
+    vectors = _hp().ang2vec(ra, dec, lonlat=True)
     sides = np.einsum("ij,ij->i", np.cross(vectors, np.roll(vectors, -1, 0)), np.roll(vectors, -2, 0))
     if not ((sides > 0).all() or (sides < 0).all()):
         raise BadInput("a polygon must be convex, with no repeated vertex and no angle of 180 deg")
     fine = min(order + 3, DEEPEST)
-    inside = hp.query_polygon(1 << fine, vectors, inclusive=True, fact=4, nest=True)
+    inside = _hp().query_polygon(1 << fine, vectors, inclusive=True, fact=4, nest=True)
     return np.unique(parent(inside, fine, order))
+
+
+def cells_in_box(west: float, east: float, south: float, north: float, order: int) -> Int:
+    """Cells of `order` that a box between two meridians and two parallels touches, sorted.
+
+    west, east, south, north : deg; the box runs eastward from west to east (across RA 0 where east < west)
+    returns                  : int64[m]; holds every touched cell, and may hold a neighbour whose edge is just outside
+    """
+    ra, dec = checked([west, east], [south, north])
+    fine = min(order + 3, DEEPEST)
+    reach = cell_radius(fine)
+    low, high = max(dec[0] - reach, -90.0), min(dec[1] + reach, 90.0)
+    # The southernmost cells of the strip have the largest colatitude.
+    strip = _hp().query_strip(1 << fine, np.radians(90.0 - high), np.radians(90.0 - low), inclusive=True)
+    found = _hp().ring2nest(1 << fine, strip)
+    lon, lat = _hp().pix2ang(1 << fine, found, nest=True, lonlat=True)
+    # A cell's half-width in right ascension; near a pole it may reach any meridian.
+    widest = np.cos(np.radians(np.minimum(np.abs(lat) + reach, 90.0)))
+    margin = np.where(widest > np.radians(reach), reach / np.maximum(widest, 1e-9), 360.0)
+    eastward = (lon - ra[0] + margin) % 360.0
+    span = (ra[1] - ra[0]) % 360.0
+    kept = (eastward <= span + 2 * margin) | (2 * margin + span >= 360.0)
+    return np.unique(parent(found[kept], fine, order))
 
 
 def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2: npt.ArrayLike) -> Float:
@@ -125,7 +159,7 @@ def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> t
     """n positions uniform in a cell: (int64[n] order-29 index, ascending; ra[n], dec[n] deg)."""
     first, _ = cell_range(order, cell)
     index = np.sort(rng.integers(0, 1 << (2 * (DEEPEST - order)), n, dtype=np.int64)) | np.int64(first)
-    ra, dec = hp.pix2ang(1 << DEEPEST, index, nest=True, lonlat=True)
+    ra, dec = _hp().pix2ang(1 << DEEPEST, index, nest=True, lonlat=True)
     return index, ra, dec
 
 
@@ -136,7 +170,7 @@ def positions(index: npt.ArrayLike) -> tuple[Float, Float]:
 
 
 def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
-    """ICRS ra, dec [n] deg -> Galactic l, b [n] deg (rotation matrix of the Hipparcos catalogue, ESA 1997, eq. 1.5.11)."""
+    """ICRS ra, dec [n] deg -> Galactic l, b [n] deg (matrix of the Hipparcos catalogue, ESA 1997, eq. 1.5.11)."""
     ra_rad, dec_rad = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     vector = np.stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)])
     x, y, z = np.tensordot(_TO_GALACTIC, vector, 1)
@@ -152,15 +186,20 @@ _TO_GALACTIC = np.array(
 )
 
 
-def margin_cells(order: int, cell: int, fine: int) -> Int:
-    """Cells of the finer order that lie outside `cell` and touch its border (8 neighbours), sorted: a rim about the cell."""
+def border_cells(order: int, cell: int, fine: int) -> Int:
+    """Cells of the finer order inside `cell` that touch its border, sorted."""
     side = 1 << (fine - order)
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     rim = (x == 0) | (y == 0) | (x == side - 1) | (y == side - 1)
-    inside = (np.int64(cell) << (2 * (fine - order))) + _interleave(x[rim]) + 2 * _interleave(y[rim])
-    around = hp.get_all_neighbours(1 << fine, inside, nest=True).ravel()
+    return np.sort((np.int64(cell) << (2 * (fine - order))) + _interleave(x[rim]) + 2 * _interleave(y[rim]))
+
+
+def margin_cells(order: int, cell: int, fine: int) -> Int:
+    """Cells of the finer order outside `cell` that touch its border (8 neighbours), sorted: a rim about the cell."""
+    around = _hp().get_all_neighbours(1 << fine, border_cells(order, cell, fine), nest=True).ravel()
     around = np.unique(around[around >= 0]).astype(np.int64)
-    return around[parent(around, fine, order) != cell]
+    outside: Int = around[parent(around, fine, order) != cell]
+    return outside
 
 
 def _interleave(values: npt.NDArray[np.int64]) -> Int:

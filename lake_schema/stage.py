@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from lake_schema import layout, manifest, parquet, sky
+from lake_schema import hats_files, layout, manifest, parquet, sky
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.ids import BLOCK_BITS, kind_of
@@ -58,7 +58,12 @@ def write_part(stage: Path, table: Table, part: Part, output: Output) -> Json:
     path = data_path(table, part.name)
     writers = {path: lambda target: parquet.write(target, rows, table), **output.files}
     files = [_write_file(stage, relative, writer) for relative, writer in writers.items()]
-    receipt = {"part": part.name, "rows": rows.num_rows, "files": files, **_row_facts(rows, table)}
+    receipt: dict[str, Any] = {"part": part.name, "rows": rows.num_rows, "files": files, **_row_facts(rows, table)}
+    if table.is_catalogue:
+        kept = hats_files.border(rows, part.name)
+        receipt["border"] = _write_file(
+            receipts(stage), _flat(part.name), lambda target: parquet.write(target, kept, table)
+        )
     manifest.write_json(_receipt_path(stage, part.name), receipt)
     return receipt
 
@@ -99,8 +104,8 @@ def is_numbered(table: Table) -> bool:
     return len(table.key) == 1 and table.column(table.key[0]).type == "int64"
 
 
-def _write_file(stage: Path, relative: str, writer: Callable[[Path], None]) -> Json:
-    target = layout.within(stage, stage / relative)
+def _write_file(folder: Path, relative: str, writer: Callable[[Path], None]) -> Json:
+    target = layout.within(folder, folder / relative)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{os.getpid()}.tmp.{target.name}")
     try:
@@ -123,7 +128,16 @@ def receipts(stage: Path) -> Path:
 
 
 def _receipt_path(stage: Path, part: str) -> Path:
-    return receipts(stage) / (part.replace("/", "+") + ".json")
+    return receipts(stage) / f"{_flat(part)}.json"
+
+
+def border_path(stage: Path, part: str) -> Path:
+    """A cell's rows along its border, kept until the margins are made."""
+    return receipts(stage) / _flat(part)
+
+
+def _flat(part: str) -> str:
+    return part.replace("/", "+")
 
 
 def receipt_of(stage: Path, part: str) -> dict[str, Any] | None:
@@ -140,7 +154,9 @@ def is_done(stage: Path, part: Part) -> bool:
     receipt = receipt_of(stage, part.name)
     if receipt is None:
         return False
-    sizes = ((stage / f["path"], f["bytes"]) for f in receipt["files"])
+    sizes = [(stage / f["path"], f["bytes"]) for f in receipt["files"]]
+    if "border" in receipt:
+        sizes.append((receipts(stage) / receipt["border"]["path"], receipt["border"]["bytes"]))
     return all(path.is_file() and path.stat().st_size == size for path, size in sizes)
 
 

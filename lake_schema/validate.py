@@ -6,6 +6,8 @@ check(rows, table)          raises BadInput with the first of them
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -53,7 +55,7 @@ def _schema_violations(schema: pa.Schema, table: Table) -> list[str]:
 
 
 def _unit(field: pa.Field) -> str:
-    return (field.metadata or {}).get(b"unit", b"").decode()
+    return str((field.metadata or {}).get(b"unit", b"").decode())
 
 
 def _content_violations(values: pa.ChunkedArray, column: Column, table: str) -> list[str]:
@@ -62,15 +64,20 @@ def _content_violations(values: pa.ChunkedArray, column: Column, table: str) -> 
         return [f"{where} has {values.null_count} missing values, the first in row {_first(pc.is_null(values))}"]
     if column.type == "string":
         return _code_violations(values, column, where)
-    if column.type.startswith("list"):
-        values = pc.list_flatten(values)
     if column.type == "bool":
         return []
+    if column.type.startswith("list"):
+        owners = pc.list_parent_indices(values)
+        return _number_violations(pc.list_flatten(values), column, where, lambda place: int(owners[place].as_py()))
+    return _number_violations(values, column, where, int)
+
+
+def _number_violations(values: pa.ChunkedArray, column: Column, where: str, row_of: Callable[[int], int]) -> list[str]:
     if pa.types.is_floating(values.type):
         strange = pc.invert(pc.is_finite(values))
         if pc.any(strange).as_py():
-            row = _first(strange)
-            return [f"{where} is {values[row].as_py()} in row {row}, wanted a finite number"]
+            place = _first(strange)
+            return [f"{where} is {values[place].as_py()} in row {row_of(place)}, wanted a finite number"]
     found = []
     for bound, outside in ((column.lo, pc.less), (column.hi, pc.greater)):
         if bound is None or len(values) == 0:
@@ -79,8 +86,9 @@ def _content_violations(values: pa.ChunkedArray, column: Column, table: str) -> 
         scalar = pa.scalar(np.dtype(values.type.to_pandas_dtype()).type(bound), values.type)
         beyond = outside(values, scalar)
         if pc.any(beyond).as_py():
-            row = _first(beyond)
-            found.append(f"{where} is {values[row].as_py()} in row {row}, outside [{column.lo}, {column.hi}]")
+            place = _first(beyond)
+            bounds = f"[{column.lo}, {column.hi}]"
+            found.append(f"{where} is {values[place].as_py()} in row {row_of(place)}, outside {bounds}")
     return found + ([] if found else _code_violations(values, column, where))
 
 

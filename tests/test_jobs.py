@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from jobs import shell
+from jobs import demo, shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
@@ -18,6 +18,7 @@ JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.
 # Four order-5 cells meet here, so that there is something to share out.
 SMALL = """
 name = "small"
+accuracy = "draft"
 seed = 7
 [area]
 cone = { ra = 53.4375, dec = -27.279613, radius = 0.01 }
@@ -25,6 +26,9 @@ cone = { ra = 53.4375, dec = -27.279613, radius = 0.01 }
 galaxy_limit = 21.0
 box_cells = 192
 lensing_nside = 64
+star_limit = 20.0
+[fluxes]
+bands = ["euclid_vis"]
 """
 BAD = [
     ('name = "x"\nseed = 1\ncolour = 3\n[area]\ncone = {ra = 0, dec = 0, radius = 1}', "colour"),
@@ -33,6 +37,26 @@ BAD = [
     ('name = "x"\nseed = 1\n[area]\nbox = {ra = [0, 1], dec = [1, 0]}', "area.box.dec"),
     ('name = "x"\nseed = 1\n[area]\ncone = {ra = nan, dec = 0, radius = 1}', "area.cone.ra"),
     ('name = "x"\n[area]\ncone = {ra = 0, dec = 0, radius = 1}', "seed"),
+]
+POINTING = """
+name = "x"
+seed = 1
+[area]
+cone = {{ra = 0, dec = 0, radius = 1}}
+[[pointing]]
+channel = "{channel}"
+camera = "{camera}"
+band = "{band}"
+ra = 0
+dec = 0
+mjd = 60000
+detectors = ["{detector}"]
+"""
+BAD_POINTINGS = [
+    (("VIS", "vis", "lsst_r", "3-4"), "pointing[0].band"),
+    (("VIS", "lsstcam", "euclid_vis", "3-4"), "pointing[0].camera"),
+    (("EXT", "lsstcam", "euclid_vis", "R22_S11"), "pointing[0].band"),
+    (("VIS", "vis", "euclid_vis", "7-7"), "7-7"),
 ]
 
 
@@ -56,30 +80,51 @@ def test_a_bad_request_ends_with_one_line_and_nothing_written(job, text, key, tm
     assert not lake.exists()
 
 
+@pytest.mark.parametrize(("words", "key"), BAD_POINTINGS)
+def test_a_bad_pointing_is_refused_before_the_first_job_runs(words, key, tmp_path, capsys):
+    request = tmp_path / "bad.toml"
+    request.write_text(POINTING.format(**dict(zip(("channel", "camera", "band", "detector"), words, strict=True))))
+    assert demo.main(["--request", str(request), "--out", str(tmp_path / "out")]) == 2
+    err = capsys.readouterr().err
+    assert key in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("job", JOBS[2:], ids=lambda job: job.name)
 def test_what_must_be_built_first_is_named(job, tmp_path, capsys):
     request = tmp_path / "r.toml"
     request.write_text(SMALL)
     assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(request)]) == 2
-    err = capsys.readouterr().err
-    assert "no table" in err or "pointing is missing" in err
+    missing = {"compute_fluxes": "no table galaxies", "plan_exposures": "pointing is missing"}
+    assert missing.get(job.name, "no table exposures") in capsys.readouterr().err
 
 
 @pytest.mark.spark
 def test_the_same_request_gives_the_same_bytes_under_any_master(tmp_path):
     request = tmp_path / "r.toml"
     request.write_text(SMALL)
-    script = ROOT / "jobs" / "catalogue" / "build_galaxies.py"
+    # The three catalogue jobs in one session.
+    script = tmp_path / "catalogues.py"
+    script.write_text(f"""
+import sys
+sys.path[0] = {str(ROOT)!r}
+from jobs import demo, shell
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+sys.exit(max(shell.main(m.JOB, sys.argv[1:]) for m in (build_galaxies, build_stars, compute_fluxes)))
+""")
     manifests = []
     for master in ("local[1]", "local[2,4]"):
         lake = tmp_path / master
         done = submit("--master", master, script, "--lake", lake, "--request", request)
         assert done.returncode == 0, done.stderr
-        version = read.version(layout.lake(lake), "galaxies")
-        assert len(version.parts) == 4
-        assert version.num_rows > 100
-        assert read.verify(version, deep=True) == []
-        manifests.append((version.folder / "manifest.json").read_bytes())
+        root = layout.lake(lake)
+        versions = {name: read.version(root, name) for name in ("galaxies", "stars", "galaxy_fluxes", "star_fluxes")}
+        assert len(versions["galaxies"].parts) == 4
+        assert versions["galaxies"].num_rows > 100
+        assert all(read.verify(version, deep=True) == [] for version in versions.values())
+        manifests.append({name: (v.folder / "manifest.json").read_bytes() for name, v in versions.items()})
     assert manifests[0] == manifests[1]
 
 

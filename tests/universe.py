@@ -38,7 +38,9 @@ def toy_plan(seed=1, cells=CELLS):
     return Plan(TOY, {"seed": seed}, parts)
 
 
-PLAIN = Table("plain", 1, (TOY.columns[0], Column("value", "float64", doc="value")), "A toy table that is not on the sky.")
+PLAIN = Table(
+    "plain", 1, (TOY.columns[0], Column("value", "float64", doc="value")), "A toy table that is not on the sky."
+)
 
 
 def plain_work(root, facts):
@@ -70,9 +72,13 @@ def _values(column, n, rng):
         return picked if column.type == "string" else np.array(picked)
     if column.type == "string":
         return [f"{column.name}-{i}" for i in range(n)]
-    if column.type.startswith("list"):
+    if column.type == "list<int64>":
         return [rng.integers(0, 100, 3).tolist() for _ in range(n)]
-    if column.name in ("id", "exposure_id"):
+    if column.type.startswith("list"):
+        return [rng.random(3).astype(np.float32).tolist() for _ in range(n)]
+    if column.type == "bool":
+        return rng.random(n) < 0.5
+    if column.name in ("id", "exposure_id", "sed"):
         return np.arange(n)
     lo = column.lo if column.lo is not None else -100.0
     hi = column.hi if column.hi is not None else lo + 100.0

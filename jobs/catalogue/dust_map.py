@@ -10,6 +10,8 @@ Maps are HEALPix, RING, Galactic.  Ref: the numbers and their sources are in dus
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
+from importlib.metadata import version
+from pathlib import Path
 
 import healpy as hp
 import numpy as np
@@ -82,7 +84,7 @@ def a_v_at(to_infinity: Float, distance: Float, b: npt.ArrayLike, dust: Layer, s
 def load(seed: int) -> npt.NDArray[np.float32]:
     """The embedded map of a seed, from the cache or made now (1 s)."""
     model = cosecant()
-    key = content_key("dust_map 1", seed, *astuple(model))
+    key = content_key(Path(__file__).read_bytes(), version("healpy"), seed, *astuple(model))
     return cached_arrays("dust_map", key, lambda: {"a_v": embedded(seed, model)})["a_v"]
 
 

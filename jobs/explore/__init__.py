@@ -1,10 +1,10 @@
 """Look at a lake: SQL, cones, histograms, maps and downloads, for notebooks and the command line.
 
-    from jobs.explore.explorer import Explorer
+from jobs.explore.explorer import Explorer
 
-    with Explorer("out/demo/lake") as lake:
-        lake.tables()
-        lake.sql("SELECT z_obs, mag_r01 FROM galaxies WHERE z_obs < $most", most=0.5)
+with Explorer("out/demo/lake") as lake:
+    lake.tables()
+    lake.sql("SELECT z_obs, mag_r01 FROM galaxies WHERE z_obs < $most", most=0.5)
 
-    python -m jobs.explore "SELECT count(*) FROM galaxies" --lake out/demo/lake [--out FILE.csv|.parquet|.fits]
+python -m jobs.explore "SELECT count(*) FROM galaxies" --lake out/demo/lake [--out FILE.csv|.parquet|.fits]
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import selectors
 import subprocess
 import sys
@@ -94,11 +95,11 @@ class Explorer:
     def sql(self, text: str, /, into: str = "pandas", **parameters: object) -> Any:
         """The result of one SELECT over the lake's tables.
 
-        text       : DuckDB's SQL, with separation(ra1, dec1, ra2, dec2) in deg and mag_ab(f_nu) of microjansky beside its
-                     own functions; $name stands for a parameter
+        text       : DuckDB's SQL, with separation(ra1, dec1, ra2, dec2) in deg and mag_ab(f_nu) of microjansky beside
+                     its own functions; $name stands for a parameter
         into       : "pandas", "astropy" (a Table with units) or "arrow"
         parameters : numbers, texts, booleans or lists of them
-        Errors     : BadInput for text that is no SELECT of ours, or that takes too long or too much; Damaged for a changed byte
+        Errors     : BadInput for what is no SELECT of ours, or takes too long or too much; Damaged for a changed byte
         """
         try:
             line = json.dumps({"sql": text, "parameters": parameters}, allow_nan=False)
@@ -124,7 +125,13 @@ class Explorer:
     # ------------------------------------------------------------------------------------------------ distributions
 
     def hist(
-        self, table: str, x: str, bins: int = 100, span: Range | None = None, where: str = "true", weight: str = "1"
+        self,
+        table: str,
+        x: str,
+        bins: int = 100,
+        span: Range | None = None,
+        where: str = "true",
+        weight: str | None = None,
     ) -> tuple[Float, Float]:
         """Counts of an expression in equal bins.
 
@@ -134,7 +141,7 @@ class Explorer:
         self._version(table)
         lo, hi = span or self._span(table, x, where)
         text = f"""
-            SELECT {_bin("x", "x")} AS i, sum(w)::DOUBLE AS n FROM (SELECT ({x})::DOUBLE AS x, ({weight})::DOUBLE AS w
+            SELECT {_bin("x", "x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x})::DOUBLE AS x, {_weight(weight)}
             FROM {table} WHERE ({where})) WHERE x BETWEEN $x_lo AND $x_hi GROUP BY i"""
         found = self.sql(text, into="arrow", x_lo=lo, x_hi=hi, x_bins=bins)
         counts = np.zeros(bins)
@@ -143,7 +150,7 @@ class Explorer:
 
     def heatmap(
         self, table: str, x: str, y: str, bins: tuple[int, int] = (100, 100),
-        span: tuple[Range, Range] | None = None, where: str = "true", weight: str = "1",
+        span: tuple[Range, Range] | None = None, where: str = "true", weight: str | None = None,
     ) -> tuple[Float, Float, Float]:  # fmt: skip
         """Counts of two expressions in a grid of equal bins.
 
@@ -152,8 +159,8 @@ class Explorer:
         self._version(table)
         (x_lo, x_hi), (y_lo, y_hi) = span or (self._span(table, x, where), self._span(table, y, where))
         text = f"""
-            SELECT {_bin("x", "x")} AS i, {_bin("y", "y")} AS j, sum(w)::DOUBLE AS n
-            FROM (SELECT ({x})::DOUBLE AS x, ({y})::DOUBLE AS y, ({weight})::DOUBLE AS w FROM {table} WHERE ({where}))
+            SELECT {_bin("x", "x")} AS i, {_bin("y", "y")} AS j, {_counted(weight)} AS n
+            FROM (SELECT ({x})::DOUBLE AS x, ({y})::DOUBLE AS y, {_weight(weight)} FROM {table} WHERE ({where}))
             WHERE x BETWEEN $x_lo AND $x_hi AND y BETWEEN $y_lo AND $y_hi GROUP BY i, j"""
         limits = {"x_lo": x_lo, "x_hi": x_hi, "x_bins": bins[0], "y_lo": y_lo, "y_hi": y_hi, "y_bins": bins[1]}
         found = self.sql(text, into="arrow", **limits)
@@ -161,19 +168,21 @@ class Explorer:
         counts[found["j"].to_numpy(), found["i"].to_numpy()] = found["n"].to_numpy()
         return counts, np.linspace(x_lo, x_hi, bins[0] + 1), np.linspace(y_lo, y_hi, bins[1] + 1)
 
-    def skymap(self, table: str, order: int = 8, where: str = "true", weight: str = "1") -> tuple[Int, Float]:
+    def skymap(self, table: str, order: int = 8, where: str = "true", weight: str | None = None) -> tuple[Int, Float]:
         """Counts in HEALPix cells (nested) of an order: the cells that hold any, ascending, and their counts."""
         self._version(table)
         if not 0 <= order <= sky.DEEPEST:
             raise BadInput(f"order = {order} is outside [0, {sky.DEEPEST}]")
         text = f"""
-            SELECT _healpix_29 >> $shift::INT AS cell, sum(({weight})::DOUBLE)::DOUBLE AS n FROM {table} WHERE ({where})
-            GROUP BY cell ORDER BY cell"""
+            SELECT cell, {_counted(weight)} AS n FROM (SELECT _healpix_29 >> $shift::INT AS cell, {_weight(weight)}
+            FROM {table} WHERE ({where})) GROUP BY cell ORDER BY cell"""
         found = self.sql(text, into="arrow", shift=2 * (sky.DEEPEST - order))
-        return found["cell"].to_numpy(), found["n"].to_numpy()
+        return found["cell"].to_numpy(), found["n"].to_numpy().astype(float)
 
     def _span(self, table: str, x: str, where: str) -> Range:
-        text = f"SELECT min(x)::DOUBLE AS lo, max(x)::DOUBLE AS hi FROM (SELECT ({x}) AS x FROM {table} WHERE ({where}))"
+        text = (
+            f"SELECT min(x)::DOUBLE AS lo, max(x)::DOUBLE AS hi FROM (SELECT ({x}) AS x FROM {table} WHERE ({where}))"
+        )
         found = self.sql(text, into="arrow")
         lo, hi = found["lo"][0].as_py(), found["hi"][0].as_py()
         if lo is None or not np.isfinite([lo, hi]).all():
@@ -185,7 +194,8 @@ class Explorer:
     def _ask(self, line: str) -> pa.Table:
         deadline = time.monotonic() + self.timeout
         worker = self._running()
-        assert worker.stdin is not None and worker.stdout is not None
+        assert worker.stdin is not None
+        assert worker.stdout is not None
         whole = False
         try:
             worker.stdin.write(line.encode() + b"\n")
@@ -214,12 +224,22 @@ class Explorer:
             versions = [f"{name}={version.key}" for name, version in self.versions.items()]
             command = [sys.executable, "-m", "jobs.explore.worker", str(self.root), str(self.memory), *versions]
             pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-            self._worker = subprocess.Popen(command, cwd=_ROOT, **pipes)
+            # Arrow's other allocators reserve a gigabyte at the start, which would count against the limit.
+            environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
+            self._worker = subprocess.Popen(command, cwd=_ROOT, env=environment, **pipes)
         return self._worker
 
 
 def _bin(x: str, axis: str) -> str:
     return f"least(floor(({x} - ${axis}_lo) / (${axis}_hi - ${axis}_lo) * ${axis}_bins), ${axis}_bins - 1)::INT"
+
+
+def _weight(weight: str | None) -> str:
+    return "1 AS w" if weight is None else f"({weight})::DOUBLE AS w"
+
+
+def _counted(weight: str | None) -> str:
+    return "count(*)" if weight is None else "sum(w)"
 
 
 def _readable(worker: subprocess.Popen[bytes], deadline: float) -> bool:

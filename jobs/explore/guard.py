@@ -20,8 +20,8 @@ _SOURCES = {"BASE_TABLE", "JOIN", "SUBQUERY", "EMPTY", "EXPRESSION_LIST", "TABLE
 _TABLE_FUNCTIONS = {"range", "generate_series", "unnest"}
 # Of the scalar functions those that read or change the session, wait, or run other text.
 _FUNCTIONS = {
-    "current_query", "current_setting", "currval", "getenv", "getvariable", "json_deserialize_sql", "json_serialize_sql",
-    "nextval", "query", "query_table", "setseed", "setval", "sleep_ms", "write_log",
+    "current_query", "current_setting", "currval", "getenv", "getvariable", "json_deserialize_sql",
+    "json_serialize_sql", "nextval", "query", "query_table", "setseed", "setval", "sleep_ms", "write_log",
 }  # fmt: skip
 _FUNCTION_PREFIXES = ("pg_", "duckdb_", "read_", "json_execute")
 
@@ -49,7 +49,9 @@ def checked(text: str, known: Collection[str]) -> Query:
     if len(text) > _MOST_CHARACTERS or "\0" in text:
         raise BadInput(f"SQL: a query has at most {_MOST_CHARACTERS} characters and no NUL")
     tree = _parsed(text)
-    named = {str(entry["key"]).lower() for node in _nodes(tree) if "cte_map" in node for entry in node["cte_map"]["map"]}
+    named = {
+        str(entry["key"]).lower() for node in _nodes(tree) if "cte_map" in node for entry in node["cte_map"]["map"]
+    }
     used = set()
     for node in _nodes(tree):
         if "cte_map" in node and node.get("type") not in _QUERIES:
@@ -58,7 +60,7 @@ def checked(text: str, known: Collection[str]) -> Query:
             used |= _source(node, known, named)
         if node.get("class") == "FUNCTION":
             _refuse_function(str(node["function_name"]).lower())
-    return Query(text, tuple(sorted(used)), _plain_columns(tree, used))
+    return Query(text, tuple(sorted(used)), _plain_columns(tree, used - named))
 
 
 def _parsed(text: str) -> Tree:
@@ -129,7 +131,9 @@ def _plain_columns(tree: Tree, tables: Collection[str]) -> frozenset[str] | None
         return frozenset()
     plain, renamed, everything = set(), set(), False
     for entry in tree["select_list"]:
-        if entry["class"] == "STAR" and not (entry.get("replace_list") or entry.get("rename_list") or entry.get("columns")):
+        if entry["class"] == "STAR" and not (
+            entry.get("replace_list") or entry.get("rename_list") or entry.get("columns")
+        ):
             everything = True
         elif entry["class"] == "COLUMN_REF" and not entry["alias"]:
             plain.add(str(entry["column_names"][-1]))
@@ -143,4 +147,8 @@ def _plain_columns(tree: Tree, tables: Collection[str]) -> frozenset[str] | None
 def _only_tables(source: Tree, tables: Collection[str]) -> bool:
     if source["type"] == "JOIN":
         return _only_tables(source["left"], tables) and _only_tables(source["right"], tables)
-    return source["type"] == "BASE_TABLE" and str(source["table_name"]).lower() in tables and not source["column_name_alias"]
+    return (
+        source["type"] == "BASE_TABLE"
+        and str(source["table_name"]).lower() in tables
+        and not source["column_name_alias"]
+    )

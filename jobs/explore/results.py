@@ -31,16 +31,18 @@ def converted(rows: pa.Table, into: str) -> Any:
 
 def _astropy(rows: pa.Table) -> Any:
     from astropy.table import Column as AstropyColumn
-    from astropy.table import MaskedColumn, QTable  # noqa: F401
+    from astropy.table import MaskedColumn
     from astropy.table import Table as AstropyTable
 
     table = AstropyTable()
-    for field, column in zip(rows.schema, rows.columns, strict=True):
+    for field, values in zip(rows.schema, rows.columns, strict=True):
         facts = _facts(field)
-        make = MaskedColumn if column.null_count else AstropyColumn
-        mask = {"mask": column.is_null().to_numpy()} if column.null_count else {}
-        values = column.fill_null(0 if pa.types.is_integer(field.type) else None).to_numpy() if column.null_count else column.to_numpy()
-        table[field.name] = make(values, unit=facts.get("unit") or None, description=facts.get("description"), **mask)
+        about = {"unit": facts.get("unit") or None, "description": facts.get("description")}
+        if values.null_count:
+            filled = values.fill_null(0) if pa.types.is_integer(field.type) else values
+            table[field.name] = MaskedColumn(filled.to_numpy(), mask=values.is_null().to_numpy(), **about)
+        else:
+            table[field.name] = AstropyColumn(values.to_numpy(), **about)
     return table
 
 
@@ -94,7 +96,9 @@ def _column(field: pa.Field) -> Column:
         kind = {"float": "float32", "double": "float64"}[kind]
     elif not pa.types.is_boolean(field.type):
         kind = "string"
-    return Column(field.name, kind, facts.get("unit", ""), facts.get("ucd", ""), facts.get("description", ""), nullable=True)
+    return Column(
+        field.name, kind, facts.get("unit", ""), facts.get("ucd", ""), facts.get("description", ""), nullable=True
+    )
 
 
 _WRITERS: dict[str, Callable[[pa.Table, Path], None]] = {".csv": _csv, ".parquet": _parquet, ".fits": _fits}

@@ -1,8 +1,8 @@
-"""The process that runs queries: python -m jobs.explore.worker LAKE TABLE=KEY ... , queries on stdin, answers on stdout.
+"""The process that runs queries: python -m jobs.explore.worker LAKE MEMORY TABLE=KEY ...; answers on stdout.
 
-DuckDB counts neither the memory of every function nor its result, and some functions do not stop when told to; a process has
-a limit of memory that holds, and can be killed.  A query is a line of JSON; an answer a line of JSON, then, if it is a
-result, an Arrow stream.
+DuckDB counts neither the memory of every function nor its result, and some functions do not stop when told to; a
+process has a limit of memory that holds, and can be killed.  A query is a line of JSON on stdin; an answer is a line of
+JSON, then, if it is a result, an Arrow stream.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from lake_schema.errors import BadInput, Damaged, LakeError
 _MACROS = (
     # Great-circle distance by the haversine, deg.
     """CREATE MACRO separation(ra1, dec1, ra2, dec2) AS degrees(2 * asin(least(1.0, sqrt(
-       pow(sin(radians(dec2 - dec1) / 2), 2) + cos(radians(dec1)) * cos(radians(dec2)) * pow(sin(radians(ra2 - ra1) / 2), 2)))))""",
+       pow(sin(radians(dec2 - dec1) / 2), 2)
+       + cos(radians(dec1)) * cos(radians(dec2)) * pow(sin(radians(ra2 - ra1) / 2), 2)))))""",
     # AB magnitude of f_nu in microjansky, NULL where there is no flux.
     "CREATE MACRO mag_ab(f_nu) AS 23.9 - 2.5 * log10(CASE WHEN f_nu > 0 THEN f_nu END)",
 )
@@ -82,7 +83,11 @@ _TOO_LARGE = "SQL: the query or its result needs more memory than it may have: a
 
 def _run(query: Query, opened: dict[str, read.Version], memory: int, parameters: dict[str, Any]) -> pa.Table:
     most = int(memory * _SHARE)
-    config = {"memory_limit": f"{most // 1_000_000}MB", "temp_directory": "", "threads": os.cpu_count() or 1}
+    config: dict[str, str | bool | int | float | list[str]] = {
+        "memory_limit": f"{most // 1_000_000}MB",
+        "temp_directory": "",
+        "threads": os.cpu_count() or 1,
+    }
     with duckdb.connect(":memory:", config=config) as session:
         for name, version in opened.items():
             session.register(name, version.dataset())

@@ -1,6 +1,7 @@
 """The inner loops of the flux grid, compiled by numba; the machine code lies in the project's cache.
 
-prepare       what galaxies have to do with every table of one setting
+place         where galaxies lie between the nodes in redshift
+products      their polynomials in E(B-V) and A_V
 continuum     what the two components of galaxies give in one band
 line_centres  where lines are seen, and what the Milky Way leaves of them
 line_sums     what lines give through one band
@@ -11,7 +12,8 @@ Plain loops over rows: no source depends on its neighbours, not in the last bit.
 from __future__ import annotations
 
 import os
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,27 +23,24 @@ from jobs import cache
 # Compiled once a machine, not once a process. numba reads this when it is imported.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(cache.cache_dir() / "numba"))
 
-import numba  # noqa: E402
+import numba
 
 Float = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int64]
 
-# Sums may be taken in any order, which makes them twice as fast; NaN and infinity keep their meaning.
-_jit: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+_Loop = TypeVar("_Loop", bound=Callable[..., None])
+
+
+def _jit(loop: _Loop) -> _Loop:
+    # Sums may be taken in any order, which makes them twice as fast; NaN and infinity keep their meaning.
+    compiled: Any = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})(loop)
+    return cast(_Loop, compiled)
 
 
 @_jit
-def prepare(
-    log_z: Float, law: Int, ebv: Float, a_v: Float, log_first: float, step: float, z_count: int, ebv_last: float,
-    a_v_last: float, n_ebv: int, n_av: int, row: Int, z_weights: Float32, basis: Float32,
-) -> None:  # fmt: skip
-    """Fills row, z_weights (Lagrange's, of four nodes from `row`) and basis (products of Chebyshev polynomials).
-
-    log_z : float64[n] ln(1 + z);  law, ebv : [2, n];  a_v : float64[n]
-    row : int64[n];  z_weights : float32[n, 4];  basis : float32[2, n, n_ebv * n_av]
-    """
-    in_ebv, in_av = np.empty(n_ebv), np.empty(n_av)
+def place(log_z: Float, log_first: float, step: float, z_count: int, row: Int, z_weights: Float32) -> None:
+    """Fills row, int64[n], and z_weights, float32[n, 4]: Lagrange's, of four nodes from `row`; log_z = ln(1 + z)."""
     for i in range(len(log_z)):
         position = (log_z[i] - log_first) / step
         # One-sided at the ends.
@@ -52,6 +51,15 @@ def prepare(
         z_weights[i, 1] = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0
         z_weights[i, 2] = -(t + 1.0) * t * (t - 2.0) / 2.0
         z_weights[i, 3] = (t + 1.0) * t * (t - 1.0) / 6.0
+
+
+@_jit
+def products(
+    law: Int, ebv: Float, a_v: Float, ebv_last: float, a_v_last: float, n_ebv: int, n_av: int, basis: Float32
+) -> None:
+    """Fills basis, float32[2, n, n_ebv * n_av]: products of Chebyshev polynomials in E(B-V), [2, n], and A_V, [n]."""
+    in_ebv, in_av = np.empty(n_ebv), np.empty(n_av)
+    for i in range(len(a_v)):
         _chebyshev(2.0 * a_v[i] / a_v_last - 1.0, in_av)
         for k in range(2):
             _chebyshev(2.0 * (ebv[k, i] if law[k, i] > 0 else 0.0) / ebv_last - 1.0, in_ebv)
@@ -76,18 +84,22 @@ def continuum(
 
     table : float32[n_template, 4, n_z, n_coefficient], laws 1 .. 4; without a law E(B-V) is 0 in any of them
     """
-    count = table.shape[3]
-    for i in range(len(row)):
+    # Flat arrays and unsigned positions: nothing is looked up from the end.
+    flat, n_law, n_z, count = table.ravel(), table.shape[1], table.shape[2], np.uint64(table.shape[3])
+    polynomials, n = basis.ravel(), len(row)
+    for i in range(n):
         total = 0.0
         w0, w1, w2, w3 = z_weights[i, 0], z_weights[i, 1], z_weights[i, 2], z_weights[i, 3]
         for k in range(2):
             if frac[k, i] == 0.0:
                 continue
-            nodes = table[sed[k, i], max(law[k, i] - 1, 0), row[i] : row[i] + 4]
-            at = basis[k, i]
+            node0 = np.uint64((sed[k, i] * n_law + max(law[k, i] - 1, 0)) * n_z + row[i]) * count
+            node1, node2, node3 = node0 + count, node0 + count + count, node0 + count + count + count
+            at = np.uint64(k * n + i) * count
             log_ratio = np.float32(0.0)
             for c in range(count):
-                log_ratio += (w0 * nodes[0, c] + w1 * nodes[1, c] + w2 * nodes[2, c] + w3 * nodes[3, c]) * at[c]
+                mixed = w0 * flat[node0 + c] + w1 * flat[node1 + c] + w2 * flat[node2 + c] + w3 * flat[node3 + c]
+                log_ratio += mixed * polynomials[at + c]
             total += frac[k, i] * np.exp(np.float64(log_ratio))
         out[i] = total
 
@@ -137,8 +149,10 @@ def line_sums(
     cells        : int64[n_cell + 1]: members[cells[c] : cells[c + 1]] are the bands that see wavelength cell c
     """
     per_row, per_cell = 1.0 / step, 1.0 / cell_step
+    # One flat array and unsigned positions: nothing is looked up from the end.
+    flat, widths = tables.ravel(), np.uint64(tables.shape[1])
     for i in range(flux.shape[1]):
-        w, s = width[i], share[i]
+        w, s = np.uint64(width[i]), share[i]
         for j in range(flux.shape[2]):
             if flux[0, i, j] == 0.0:
                 continue
@@ -151,7 +165,8 @@ def line_sums(
                     continue
                 low = int(position)
                 part = position - low
-                blue, red = tables[place[b, 0] + low], tables[place[b, 0] + low + 1]
-                narrow = blue[w] + part * (red[w] - blue[w])
-                wide = blue[w + 1] + part * (red[w + 1] - blue[w + 1])
+                blue = np.uint64(place[b, 0] + low) * widths + w
+                red = blue + widths
+                narrow = flat[blue] + part * (flat[red] - flat[blue])
+                wide = flat[blue + np.uint64(1)] + part * (flat[red + np.uint64(1)] - flat[blue + np.uint64(1)])
                 out[b, i] += flux[medium, i, j] * (narrow + s * (wide - narrow))

@@ -2,8 +2,8 @@
 
 spark-submit jobs/fluxes/compute_fluxes.py --lake LAKE --request REQUEST
 
-The tables' manifests say how: facts.accuracy what was asked for, facts.errors the setting and the measured error of each
-band (fractions of the flux), facts.covered where tables were used; what lies beyond was integrated.
+The tables' manifests say how: facts.accuracy what was asked for, facts.errors the setting and the measured error of
+each band (fractions of the flux), facts.covered where tables were used; what lies beyond was integrated.
 """
 
 import sys

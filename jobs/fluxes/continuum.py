@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -51,12 +52,20 @@ class Mix:
 
     def rows(self, chosen: npt.NDArray[np.int64] | slice) -> Mix:
         return Mix(
-            self.z_obs[chosen],
-            self.sed[:, chosen],
-            self.law[:, chosen],
-            self.frac[:, chosen],
-            self.ebv[:, chosen],
+            picked(self.z_obs, chosen),
+            picked(self.sed, chosen),
+            picked(self.law, chosen),
+            picked(self.frac, chosen),
+            picked(self.ebv, chosen),
         )
+
+
+_Array = TypeVar("_Array", Float, Int)
+
+
+def picked(values: _Array, chosen: Int | slice) -> _Array:
+    """values[..., chosen]; by `take`, which is twice as fast as indexing."""
+    return values[..., chosen] if isinstance(chosen, slice) else np.take(values, chosen, -1)
 
 
 def dust_of(library: Library) -> Float32:
@@ -118,9 +127,7 @@ def amplitudes(mix: Mix, band: Passband, library: Library, dust: Float32) -> Flo
     )
 
 
-def observed_shape(
-    mix: Mix, amplitude: Float, library: Library, dust: Float32, first: int, count: int
-) -> Float32:
+def observed_shape(mix: Mix, amplitude: Float, library: Library, dust: Float32, first: int, count: int) -> Float32:
     """f_lambda in the observed frame at `count` whole angstroms from `first`: float32[n, count].
 
     amplitude : float64[2, n] factor of each component
@@ -148,9 +155,7 @@ def observed_shape(
     return shape
 
 
-def _rest_shape(
-    mix: Mix, amplitude: Float32, library: Library, dust: Float32, start: Int, width: int
-) -> Float32:
+def _rest_shape(mix: Mix, amplitude: Float32, library: Library, dust: Float32, start: Int, width: int) -> Float32:
     """Combined and extinguished on `width` samples of the library's grid from `start`: float32[n, width]."""
     shared = bool((mix.law[0] == mix.law[1]).all() and (mix.ebv[0] == mix.ebv[1]).all())
     total = _windows(library.flux, mix.sed[0], start, width)

@@ -97,9 +97,7 @@ def _calzetti(lam: Float) -> Float:
     red = _CALZETTI_SLOPE * (np.array(_CALZETTI_RED) @ powers[:2]) + _CALZETTI_R_V
     # Below its first wavelength the law goes on along its tangent.
     x0 = 1e4 / _CALZETTI_FIRST
-    tangent = (
-        -_CALZETTI_SLOPE * np.polyval(np.polyder(np.array(_CALZETTI_BLUE[::-1])), x0) * x0 / _CALZETTI_FIRST
-    )
+    tangent = -_CALZETTI_SLOPE * np.polyval(np.polyder(np.array(_CALZETTI_BLUE[::-1])), x0) * x0 / _CALZETTI_FIRST
     k = np.where(lam < _CALZETTI_SPLIT, blue, red) + tangent * np.minimum(lam - _CALZETTI_FIRST, 0.0)
     return np.asarray(np.maximum(k, 0.0))
 

@@ -27,8 +27,8 @@ CANDIDATES = tuple(
         (
             Setting(step, n_ebv, n_av)
             for step, n_ebv, n_av in (
-                (0.02, 3, 2), (0.02, 4, 3), (0.014, 3, 2), (0.014, 4, 3), (0.01, 3, 2), (0.01, 4, 3), (0.01, 6, 3),
-                (0.007, 4, 3), (0.007, 6, 3), (0.005, 4, 3), (0.005, 6, 3), (0.007, 10, 4), (0.005, 10, 4),
+                (0.02, 3, 2), (0.02, 4, 3), (0.01, 3, 2), (0.01, 4, 3), (0.007, 4, 3), (0.007, 6, 3), (0.005, 4, 3),
+                (0.005, 6, 3), (0.007, 11, 4), (0.005, 11, 4),
             )
         ),
         key=lambda setting: setting.size,
@@ -36,7 +36,7 @@ CANDIDATES = tuple(
 )  # fmt: skip
 
 # The measured largest error times this is taken for the largest of all galaxies.
-MARGIN = 1.25
+MARGIN = 1.5
 # From here on nothing is interpolated: what the tables are measured against is not measured against itself.
 _INTEGRATED = 1e-4
 # Of integration, against the whole spectrum in double precision (the templates are in single precision).
@@ -60,7 +60,7 @@ class Choice:
 
 
 def choose(bands: Sequence[str], accuracy: Accuracy) -> tuple[Choice, ...]:
-    """For each band the smallest setting with 1.25 x largest error <= accuracy.flux; without one it is integrated.
+    """For each band the smallest setting with 1.5 x largest error <= accuracy.flux; without one it is integrated.
 
     A band that was not measured (a user's) takes a setting that is fine enough for every band that was.
     """

@@ -155,6 +155,8 @@ def _stars(library: Library, band: Passband) -> Float32:
     inside = slice(band.first, band.first + len(band.wavelength))
     dimmed = passbands.weights(band) * extinction.transmitted(extinction.milky_way(band.wavelength), a_v[:, None])
     f_nu = library.flux[:, inside].astype(float) @ dimmed.T
+    # Cool stars have nothing left in the ultraviolet.
+    f_nu = np.maximum(f_nu, np.finfo(float).tiny)
     return np.asarray(np.log(f_nu) @ _to_coefficients(STAR_COEFFICIENTS).T, np.float32)
 
 
@@ -195,4 +197,4 @@ def _moved(position: Float, weights: Float) -> tuple[int, Float]:
 
 def _to_coefficients(count: int) -> Float:
     """Matrix from values at the nodes to coefficients."""
-    return np.linalg.inv(chebyshev(nodes(count, 1.0), 1.0, count))
+    return np.asarray(np.linalg.inv(chebyshev(nodes(count, 1.0), 1.0, count)), float)

@@ -6,7 +6,7 @@ fluxes               f_nu of rows of `galaxies` of these two kinds
 spectra              their f_lambda
 ultraviolet_magnitude  M_UV -> apparent magnitude, the column mag_r01 of these kinds
 
-A row of these kinds has one template, sed_1, without internal dust; its lines are in the template. Its magnitude mag_r01 is
+A row of these kinds has one template, sed_1, without internal dust; its lines are in the template. Its mag_r01 is
 AB, monochromatic, at 1450 A (quasars) or 1500 A (galaxies) in the rest frame: Serrano et al. 2024, appendix B.
 """
 
@@ -153,4 +153,4 @@ def _star_forming(wavelength: Float, slope: float, width: float) -> Float:
     flux = np.where(wavelength < _LYMAN_ALPHA, 0.0, (wavelength / MAGNITUDE_AT[HIGH_REDSHIFT]) ** slope)
     edges = np.append(wavelength, wavelength[-1] + 1.0) - 0.5
     profile = np.diff(erf(np.maximum(edges - _LYMAN_ALPHA, 0.0) / (np.sqrt(2.0) * _LYMAN_ALPHA_SIGMA)))
-    return flux + width * (_LYMAN_ALPHA / MAGNITUDE_AT[HIGH_REDSHIFT]) ** slope * profile
+    return np.asarray(flux + width * (_LYMAN_ALPHA / MAGNITUDE_AT[HIGH_REDSHIFT]) ** slope * profile)

@@ -123,9 +123,7 @@ def _line_block(found: lines.Profiles, rows: Galaxies, table: Float) -> Float:
     np.clip(index, 0, len(table) - 1, out=index)
     dust = extinction.transmitted(table[:, -1][index], rows.a_v[found.row][:, None])
     each = np.einsum("ij,ijk->ik", found.f_lambda * dust, table[:, :-1][index])
-    return np.stack(
-        [np.bincount(found.row, each[:, k], minlength=len(rows)) for k in range(each.shape[1])], 1
-    )
+    return np.stack([np.bincount(found.row, each[:, k], minlength=len(rows)) for k in range(each.shape[1])], 1)
 
 
 def _full_weights(bands: Sequence[Passband]) -> Float:
@@ -160,9 +158,7 @@ def _stretch(first: int, last: int, bands: Sequence[Passband], reference: Passba
         if (place := _place(band, first, last)) is not None:
             weights[slice(*place), k] = passbands.weights(band)
     milky_way = extinction.milky_way(np.arange(first, last + 1.0)).astype(np.float32)
-    return Stretch(
-        first, weights, milky_way, _place(reference, first, last) if reference is not None else None
-    )
+    return Stretch(first, weights, milky_way, _place(reference, first, last) if reference is not None else None)
 
 
 def _place(band: Passband, first: int, last: int) -> tuple[int, int] | None:

@@ -118,13 +118,20 @@ def _curve(source: str, shift: float) -> dict[str, Float]:
     """The response on whole angstroms; `shift` above 1 is to the blue: R_new(lambda) = R(shift lambda)."""
     kind, _, detail = source.partition(":")
     wavelength, response = _published(detail) if kind == "speclite" else _logistic(detail)
-    wavelength = wavelength / shift
+    whole, resampled_response = resampled(wavelength / shift, response)
+    return {"wavelength": whole, "response": resampled_response}
+
+
+def resampled(wavelength: Float, response: Float) -> tuple[Float, Float]:
+    """A curve on the whole angstroms of the grid, linearly, without its ends; empty where it lies outside."""
     whole = np.arange(np.ceil(wavelength[0]), np.floor(wavelength[-1]) + 1.0)
     whole = whole[(whole >= GRID_FIRST) & (whole <= GRID_LAST)]
-    resampled = np.interp(whole, wavelength, response)
-    photons = np.cumsum(resampled * whole)
+    if not len(whole):
+        return whole, whole
+    at_whole = np.interp(whole, wavelength, response)
+    photons = np.cumsum(at_whole * whole)
     first, last = np.searchsorted(photons, np.array([END_PHOTONS, 1.0 - END_PHOTONS]) * photons[-1])
-    return {"wavelength": whole[first : last + 1], "response": resampled[first : last + 1]}
+    return whole[first : last + 1], at_whole[first : last + 1]
 
 
 def _published(name: str) -> tuple[Float, Float]:
@@ -139,8 +146,6 @@ def _published(name: str) -> tuple[Float, Float]:
 def _logistic(detail: str) -> tuple[Float, Float]:
     """A top hat with logistic edges: "blue edge:red edge:width of the edges:peak", A."""
     blue, red, width, peak = (float(part) for part in detail.split(":"))
-    wavelength = np.arange(
-        np.floor(blue - _LOGISTIC_REACH * width), np.ceil(red + _LOGISTIC_REACH * width) + 1.0
-    )
+    wavelength = np.arange(np.floor(blue - _LOGISTIC_REACH * width), np.ceil(red + _LOGISTIC_REACH * width) + 1.0)
     edges = 1.0 / ((1.0 + np.exp(-(wavelength - blue) / width)) * (1.0 + np.exp((wavelength - red) / width)))
     return wavelength, peak * edges

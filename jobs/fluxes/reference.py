@@ -72,9 +72,7 @@ def correction(library: Library, band: Passband) -> Correction:
     return Correction(band.name, arrays["log_ratio"])
 
 
-def apparent_magnitude(
-    abs_mag_r01: npt.ArrayLike, z_true: npt.ArrayLike, mix: Mix, table: Correction
-) -> Float:
+def apparent_magnitude(abs_mag_r01: npt.ArrayLike, z_true: npt.ArrayLike, mix: Mix, table: Correction) -> Float:
     """Apparent AB magnitude, before lines, magnification and the Milky Way: M_r + DM(z_true) + K.
 
     abs_mag_r01 : [n] M(0.1r) - 5 log10 h, after internal dust
@@ -97,14 +95,10 @@ def apparent_magnitude(
     return np.asarray(np.asarray(abs_mag_r01, float) + cosmology.distance_modulus(z_true) + dimming)
 
 
-def reference_magnitude(
-    abs_mag_r01: npt.ArrayLike, z_true: npt.ArrayLike, mix: Mix, table: Correction
-) -> Float:
+def reference_magnitude(abs_mag_r01: npt.ArrayLike, z_true: npt.ArrayLike, mix: Mix, table: Correction) -> Float:
     """The column mag_r01: `apparent_magnitude` in 0.1r, with K = 2.5 log10(f_rest / f_observed)."""
     if table.band != REFERENCE_BAND:
-        raise BadInput(
-            f"the reference magnitude wants the correction of {REFERENCE_BAND}, not of {table.band}"
-        )
+        raise BadInput(f"the reference magnitude wants the correction of {REFERENCE_BAND}, not of {table.band}")
     return apparent_magnitude(abs_mag_r01, z_true, mix, table)
 
 
@@ -136,9 +130,7 @@ def _tabulate(library: Library, band: Passband, reference: Passband) -> Float:
     total = float(weights.sum())
     rows = []
     for z in nodes:
-        low, moved = _moved(
-            band.wavelength / (1.0 + z) - library.wavelength[first], weights / total / (1.0 + z)
-        )
+        low, moved = _moved(band.wavelength / (1.0 + z) - library.wavelength[first], weights / total / (1.0 + z))
         rows.append(spectra[:, low : low + len(moved)] @ moved.astype(np.float32))
     observed = np.stack(rows).astype(float) * total
     # A template without flux that far in the ultraviolet: as faint as single precision goes.
@@ -183,7 +175,5 @@ def _chebyshev_nodes() -> Float:
 def _chebyshev_weights(ebv: Float) -> Float:
     """Lagrange's weights at the nodes, float64[n, n_ebv]."""
     to_x = 2.0 * np.sqrt(np.array(ebv, float) / EBV_MAX) - 1.0
-    at_nodes = np.polynomial.chebyshev.chebvander(
-        2.0 * np.sqrt(_chebyshev_nodes() / EBV_MAX) - 1.0, _EBV_NODES - 1
-    )
+    at_nodes = np.polynomial.chebyshev.chebvander(2.0 * np.sqrt(_chebyshev_nodes() / EBV_MAX) - 1.0, _EBV_NODES - 1)
     return np.polynomial.chebyshev.chebvander(to_x, _EBV_NODES - 1) @ np.linalg.inv(at_nodes)

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs.fluxes import lines
-from jobs.fluxes.continuum import COMPONENTS, Mix, mix_of, within
+from jobs.fluxes.continuum import COMPONENTS, Mix, mix_of, picked, within
 from jobs.fluxes.templates import Library
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.tables.galaxies import GALAXIES
@@ -53,11 +53,11 @@ class Galaxies:
     def rows(self, chosen: Int | slice) -> Galaxies:
         return Galaxies(
             self.mix.rows(chosen),
-            self.abs_mag_r01[chosen],
-            self.mag_r01[chosen],
-            self.lines[chosen],
-            self.magnification[chosen],
-            self.a_v[chosen],
+            picked(self.abs_mag_r01, chosen),
+            picked(self.mag_r01, chosen),
+            self.lines[chosen] if isinstance(chosen, slice) else np.take(self.lines, chosen, 0),
+            picked(self.magnification, chosen),
+            picked(self.a_v, chosen),
         )
 
 
@@ -123,15 +123,14 @@ def magnification(
     bad = ~((mu > 0.0) & (mu <= MAGNIFICATION_MAX))
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
-        raise OutOfRange(
-            f"magnification of source {int(ids[first])}", float(mu[first]), 0.0, MAGNIFICATION_MAX
-        )
+        raise OutOfRange(f"magnification of source {int(ids[first])}", float(mu[first]), 0.0, MAGNIFICATION_MAX)
     return np.asarray(mu)
 
 
 def magnification_of(table: pa.Table) -> Float:
     """`magnification` of the rows of the table `galaxies`."""
-    return magnification(*(column(table, name) for name in ("kappa", "gamma1", "gamma2")), ids_of(table))
+    kappa, gamma1, gamma2 = (column(table, name) for name in ("kappa", "gamma1", "gamma2"))
+    return magnification(kappa, gamma1, gamma2, ids_of(table))
 
 
 def _line_fluxes(table: pa.Table) -> Float:

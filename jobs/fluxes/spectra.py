@@ -79,18 +79,18 @@ def band_fluxes(spectra: Float, bands: Sequence[Passband]) -> Float:
 
 
 def galaxy_fluxes(
-    galaxies: pa.Table, bands: Sequence[str], library: Library, accuracy: Accuracy = REFERENCE
+    galaxies: pa.Table, bands: Sequence[str | Passband], library: Library, accuracy: Accuracy = REFERENCE
 ) -> pa.Table:
     """f_nu of galaxies through bands: internal dust, lines, magnification and the Milky Way's dust included.
 
-    galaxies : rows of the table `galaxies`, of any kind;  bands : names of passbands
+    galaxies : rows of the table `galaxies`, of any kind;  bands : names of passbands, or a user's own
     library  : of the kinds central, satellite and strong lens
     returns  : rows of the table `galaxy_fluxes` in the same order, microjansky
     Error    : |df/f| <= accuracy.flux against band_fluxes of galaxy_spectra (benchmarks/fluxes); 1e-6 at best
     Errors   : BadInput names the column and source of a missing value, OutOfRange what is out of bounds
     """
     curves = _curves(bands)
-    choices = grid_settings.choose(bands, accuracy)
+    choices = grid_settings.choose([curve.name for curve in curves], accuracy)
     tabulated = [k for k, choice in enumerate(choices) if choice.setting is not None]
     grid = None
     f_nu = np.zeros((len(bands), galaxies.num_rows))
@@ -106,17 +106,19 @@ def galaxy_fluxes(
             settings = [setting for choice in choices if (setting := choice.setting) is not None]
             grid = flux_grid.open_grid([curves[k] for k in tabulated], settings, library)
         out[:, usual] = _galaxies(rows, curves, tabulated, grid, library)
-    return _table("galaxy", galaxies, bands, f_nu)
+    return _table("galaxy", galaxies, [curve.name for curve in curves], f_nu)
 
 
-def star_fluxes(stars: pa.Table, bands: Sequence[str], library: Library, accuracy: Accuracy = REFERENCE) -> pa.Table:
+def star_fluxes(
+    stars: pa.Table, bands: Sequence[str | Passband], library: Library, accuracy: Accuracy = REFERENCE
+) -> pa.Table:
     """f_nu of stars through bands, with the dust on the way to each; as `galaxy_fluxes`."""
     curves = _curves(bands)
     tabulated = grid_settings.stars_tabulated(accuracy)
     f_nu = np.zeros((len(bands), stars.num_rows))
     for start, part in _slices(stars):
         f_nu[:, start : start + part.num_rows] = _stars(stars_of(part, library), curves, tabulated, library)
-    return _table("star", stars, bands, f_nu)
+    return _table("star", stars, [curve.name for curve in curves], f_nu)
 
 
 def prepare(bands: Sequence[str], accuracy: Accuracy) -> None:
@@ -124,7 +126,9 @@ def prepare(bands: Sequence[str], accuracy: Accuracy) -> None:
     from jobs.fluxes import templates
 
     library = templates.galaxy_library()
-    if chosen := [(band, c.setting) for band, c in zip(bands, grid_settings.choose(bands, accuracy), strict=True) if c.setting]:
+    if chosen := [
+        (band, c.setting) for band, c in zip(bands, grid_settings.choose(bands, accuracy), strict=True) if c.setting
+    ]:
         curves = [passbands.load(band) for band, _ in chosen]
         grid = flux_grid.open_grid(curves, [setting for _, setting in chosen], library)
         flux_grid.warm(grid)
@@ -141,10 +145,12 @@ def _galaxies(
     inside = flux_grid.covered(rows) if grid is not None else np.zeros(len(rows), bool)
     if grid is not None:
         near = np.flatnonzero(inside)
-        out[np.ix_(tabulated, near)] = flux_grid.galaxies(rows if inside.all() else rows.rows(near), grid).T
+        out[np.ix_(np.array(tabulated), near)] = flux_grid.galaxies(rows if inside.all() else rows.rows(near), grid).T
         others = [k for k in range(len(curves)) if k not in tabulated]
         if others and len(near):
-            out[np.ix_(others, near)] = integration.galaxies(rows.rows(near), [curves[k] for k in others], library).T
+            out[np.ix_(np.array(others), near)] = integration.galaxies(
+                rows.rows(near), [curves[k] for k in others], library
+            ).T
     if len(far := np.flatnonzero(~inside)):
         out[:, far] = integration.galaxies(rows.rows(far), curves, library).T
     return out
@@ -166,10 +172,10 @@ def milky_way_transmission(wavelength: npt.ArrayLike, a_v: Float) -> Float:
     return np.asarray(extinction.transmitted(extinction.milky_way(wavelength), a_v[:, None]))
 
 
-def _curves(bands: Sequence[str]) -> list[Passband]:
+def _curves(bands: Sequence[str | Passband]) -> list[Passband]:
     if not bands:
         raise BadInput("no passband is asked for")
-    return [passbands.load(name) for name in bands]
+    return [band if isinstance(band, Passband) else passbands.load(band) for band in bands]
 
 
 def _kinds(table: pa.Table) -> npt.NDArray[np.int64]:

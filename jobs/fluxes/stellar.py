@@ -4,6 +4,7 @@ types       the mean dwarf sequence O9V .. M9V of Pecaut & Mamajek 2013: tempera
 spectra     a Planck spectrum a type, with absorption features, times a smooth curve that brings the colours
 planck      f_lambda of a black body
 normalised  mean f_lambda = 1 between 5450 and 5550 A
+table       the published table;  matching, corrected, shape: the steps, for other kinds of stars
 
 Metal-poor stars and giants take the spectrum of the dwarf of their temperature.
 """
@@ -83,25 +84,12 @@ class StellarTypes:
 
 def types() -> StellarTypes:
     """The table of Pecaut & Mamajek 2013 (version 2022.04.16), O9V to M9V, as shipped by MeanStars."""
-    lines = _table().decode().splitlines()
-    titles = next(line for line in lines if line.startswith("SpT")).replace("#", " ").split()
-    rows = [
-        line.split()
-        for line in lines
-        if line and not line.startswith(("#", "SpT")) and len(line.split()) == len(titles)
-    ]
-    names = [row[0] for row in rows]
-    rows = rows[names.index(_FIRST) : names.index(_LAST) + 1]
-    column = {
-        title: np.array([_number(row[k]) for row in rows])
-        for k, title in enumerate(titles)
-        if k not in (0, len(titles) - 1)
-    }
+    names, column = table(_FIRST, _LAST)
     bv, vk, hk = column["B-V"], column["V-Ks"], column["H-Ks"]
     h = hk - vk
     colors = [column["U-B"] + bv, bv, 0.0 * vk, -column["V-Rc"], -column["V-Ic"], column["J-H"] + h, h, -vk]
     return StellarTypes(
-        tuple(row[0] for row in rows),
+        names,
         column["Teff"],
         _LOG_G_SUN + np.log10(column["Msun"]) - 2.0 * np.log10(column["R_Rsun"]),
         column["Msun"],
@@ -113,11 +101,28 @@ def types() -> StellarTypes:
     )
 
 
+def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
+    """Spectral types from `first` to `last`, and the columns of the table of dwarfs by title, NaN where unknown."""
+    lines = _table().decode().splitlines()
+    titles = next(line for line in lines if line.startswith("SpT")).replace("#", " ").split()
+    rows = [
+        line.split()
+        for line in lines
+        if line and not line.startswith(("#", "SpT")) and len(line.split()) == len(titles)
+    ]
+    names = [row[0] for row in rows]
+    rows = rows[names.index(first) : names.index(last) + 1]
+    columns = {
+        title: np.array([_number(row[k]) for row in rows])
+        for k, title in enumerate(titles)
+        if k not in (0, len(titles) - 1)
+    }
+    return tuple(row[0] for row in rows), columns
+
+
 def fingerprint() -> str:
     """Key of everything the spectra depend on."""
-    responses = [
-        array for name in _BANDS for array in (passbands.load(name).wavelength, passbands.load(name).response)
-    ]
+    responses = [array for name in _BANDS for array in (passbands.load(name).wavelength, passbands.load(name).response)]
     return cache.content_key(Path(__file__).read_bytes(), _FEATURES.read_bytes(), _table(), *responses)
 
 
@@ -146,9 +151,7 @@ def planck(wavelength: Float, temperature: float) -> Float:
     scale = PLANCK_ERG_S * LIGHT_ANGSTROM_S / (BOLTZMANN_ERG_K * temperature)
     at, reference = scale / wavelength, scale / middle
     # exp(-x) / (1 - exp(-x)), not 1 / (exp(x) - 1), which overflows in the far ultraviolet of cool stars.
-    return np.asarray(
-        (middle / wavelength) ** 5 * np.exp(reference - at) * np.expm1(-reference) / np.expm1(-at)
-    )
+    return np.asarray((middle / wavelength) ** 5 * np.exp(reference - at) * np.expm1(-reference) / np.expm1(-at))
 
 
 def normalised(wavelength: Float, flux: Float) -> Float:
@@ -159,21 +162,43 @@ def normalised(wavelength: Float, flux: Float) -> Float:
 
 def _matched(log_wavelength: Float, start: Float, response: Float, pivots: Float, colors: Float) -> Float:
     """`start` times 10^(-0.4 c) with the wanted colours; c is cubic between the pivots, constant outside."""
-    from scipy.interpolate import PchipInterpolator
-
     known = np.isfinite(colors)
-    at, wanted, seen = pivots[known], colors[known], response[:, known]
-    v = int(np.sum(known[:_V]))
-    correction = np.zeros(len(at))
-    inside = np.clip(log_wavelength, at[0], at[-1])
-    for _ in range(_PASSES):
-        flux = start * 10.0 ** (-0.4 * PchipInterpolator(at, correction)(inside))
-        mags = -2.5 * np.log10(flux @ seen)
-        missing = wanted - (mags - mags[v])
-        if np.abs(missing).max() < _COLOR_ERROR:
+    at, v = pivots[known], int(np.sum(known[:_V]))
+    found = matching(log_wavelength, start, response[:, known], at, colors[known], v, _COLOR_ERROR, _PASSES)
+    return corrected(log_wavelength, start, at, found)
+
+
+def matching(
+    log_wavelength: Float,
+    start: Float,
+    response: Float,
+    pivots: Float,
+    colors: Float,
+    tied: int,
+    error: float,
+    passes: int,
+    first: Float | None = None,
+) -> Float:
+    """The correction at the pivots, mag, that brings the colours m_band - m_(band `tied`); see `corrected`.
+
+    response : float64[n_lambda, n_band] f_nu = f_lambda @ response;  first : where to begin
+    """
+    correction = np.zeros(len(pivots)) if first is None else first
+    for _ in range(passes):
+        mags = -2.5 * np.log10(corrected(log_wavelength, start, pivots, correction) @ response)
+        missing = colors - (mags - mags[tied])
+        if np.abs(missing).max() < error:
             break
         correction = correction + missing
-    return np.asarray(flux)
+    return correction
+
+
+def corrected(log_wavelength: Float, start: Float, pivots: Float, correction: Float) -> Float:
+    """`start` times 10^(-0.4 c): c is the correction, cubic between the pivots, constant outside."""
+    from scipy.interpolate import PchipInterpolator
+
+    inside = np.clip(log_wavelength, pivots[0], pivots[-1])
+    return np.asarray(start * 10.0 ** (-0.4 * PchipInterpolator(pivots, correction)(inside)))
 
 
 def _absorbed(wavelength: Float, teff: float) -> Float:
@@ -188,11 +213,11 @@ def _absorbed(wavelength: Float, teff: float) -> Float:
                 strength = float(np.clip((hot - teff) / (hot - cool), 0.0, 1.0))
             else:
                 strength = float(hydrogen)
-            transmission *= 1.0 - strength * depth * _shape(row["kind"], wavelength, centre, width)
+            transmission *= 1.0 - strength * depth * shape(row["kind"], wavelength, centre, width)
     return transmission
 
 
-def _shape(kind: str, wavelength: Float, centre: float, width: float) -> Float:
+def shape(kind: str, wavelength: Float, centre: float, width: float) -> Float:
     """Shape with peak 1: line, band shaded to the red, edge, or hydrogen series (centre = lower level)."""
     if kind == "line":
         return np.asarray(np.exp(-0.5 * ((wavelength - centre) / width) ** 2))

@@ -1,9 +1,9 @@
-"""The embedded libraries of spectra: 31 galaxies and the dwarf stars.
+"""The embedded libraries of spectra: 31 galaxies, and the stars.
 
 galaxy_library     early to late, mixed from the four spectra of Coleman, Wu & Weedman 1980 and a young burst
-stellar_library    O9 to M9, shaped until their colours are those of Pecaut & Mamajek 2013
+stellar_library    O9 to T8, shaped until their colours are those of Pecaut & Mamajek 2013, and standards
 vega               the spectrum of Vega, for magnitudes that are not AB
-GALAXY_LIBRARY_SIZE, emission_wavelengths
+GALAXY_LIBRARY_SIZE, rest_grid, emission_wavelengths
 
 Both are made once (seconds), kept in the cache, and afterwards mapped from disc.
 """
@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs import cache
-from jobs.fluxes import passbands, stellar
+from jobs.fluxes import brown_dwarfs, passbands, standards, stellar
 from jobs.fluxes.stellar import normalised, planck
 from lake_schema.errors import BadInput
 
@@ -59,7 +59,7 @@ class Library:
     wavelength : float64[n_lambda] A, whole numbers in steps of 1
     flux       : float32[n, n_lambda] f_lambda, mean 1 between 5450 and 5550 A
     names      : n labels
-    types      : what is known of the n stars, None for galaxies
+    types      : what is known of the first stars, the dwarf sequence; None for galaxies
     """
 
     wavelength: Float
@@ -78,26 +78,36 @@ def galaxy_library() -> Library:
         emission_wavelengths(),
         *(_spectrum_file(f"CWW_{name}_ext.sed") for name in _ANCHORS),
     )
-    wavelength = np.arange(_REST_FIRST, _REST_LAST + 1, dtype=float)
-    arrays = cache.cached_arrays(
-        "galaxy_library", key, lambda: {"flux": _galaxies(wavelength).astype(np.float32)}
-    )
+    wavelength = rest_grid()
+    arrays = cache.cached_arrays("galaxy_library", key, lambda: {"flux": _galaxies(wavelength).astype(np.float32)})
     names = tuple(
-        name
-        for first, last, early, late, *_ in _SEQUENCE
-        for name in [f"{early}-{late}"] * (last - first + 1)
+        name for first, last, early, late, *_ in _SEQUENCE for name in [f"{early}-{late}"] * (last - first + 1)
     )
     return Library(wavelength, arrays["flux"], tuple(f"{k:02d} {name}" for k, name in enumerate(names)))
 
 
+def rest_grid() -> Float:
+    """Wavelengths of galaxy templates, rest frame: 80 .. 24500 A in steps of 1 A."""
+    return np.arange(_REST_FIRST, _REST_LAST + 1, dtype=float)
+
+
 def stellar_library() -> Library:
-    """The dwarf sequence O9V .. M9V on the observed grid, hottest first, with its table of types."""
+    """On the observed grid: 0 .. 75 the dwarfs O9V .. M9V, hottest first (with their table of types), 76 .. 440 the L
+    and T dwarfs, 441 .. 443 Vega, a white dwarf, a planetary nebula.
+    """
     types = stellar.types()
-    key = cache.content_key(Path(__file__).read_bytes(), stellar.fingerprint(), _spectrum_file("vega.txt"))
-    arrays = cache.cached_arrays(
-        "stellar_library", key, lambda: {"flux": stellar.spectra(types, *vega()).astype(np.float32)}
-    )
-    return Library(passbands.grid(), arrays["flux"], types.names, types)
+    names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES)
+    sources = [
+        Path(file).read_bytes() for file in (__file__, brown_dwarfs.__file__, standards.__file__, standards.NEBULA)
+    ]
+    key = cache.content_key(*sources, stellar.fingerprint(), _spectrum_file("vega.txt"))
+    arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": _stars(types)})
+    return Library(passbands.grid(), arrays["flux"], names, types)
+
+
+def _stars(types: stellar.StellarTypes) -> Float32:
+    parts = [stellar.spectra(types, *vega()), brown_dwarfs.spectra(), standards.spectra(*vega())]
+    return np.concatenate(parts).astype(np.float32)
 
 
 def vega() -> tuple[Float, Float]:

@@ -7,6 +7,8 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
+from collections.abc import Mapping
+
 import pyarrow.compute as pc
 
 from jobs.accuracy import Accuracy
@@ -17,6 +19,7 @@ from jobs.shell import Job, Step, common_facts, main
 from lake_schema import read
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
+from lake_schema.provenance import canonical
 from lake_schema.publish import Json, Output, Part, Plan
 from lake_schema.tables.products import PRODUCTS
 
@@ -26,6 +29,7 @@ INPUTS = ("exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_flux
 def steps(lake: Path, request: Request) -> list[Step]:
     """One part a detector of an exposure, the longest first."""
     inputs = {name: read.version(lake, name) for name in INPUTS}
+    _refuse_other_plan(inputs, request)
     tasks = inputs["tasks"].rows().to_pylist()
     for name in ("galaxies", "stars"):
         _refuse_uncovered(inputs[name], {cell for task in tasks for cell in task["cells"]})
@@ -42,6 +46,21 @@ def steps(lake: Path, request: Request) -> list[Step]:
         for task in tasks
     )
     return [Step(Plan(PRODUCTS, facts, parts), work)]
+
+
+def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> None:
+    """What lies in the lake must have been made for this request, and the tables from one another."""
+    facts = {name: version.manifest["facts"] for name, version in inputs.items()}
+    wanted = {"request": request.facts("pointings"), "mission": mission_of(request.mission).fingerprint}
+    for name in ("exposures", "tasks"):
+        if canonical({key: facts[name].get(key) for key in wanted}) != canonical(wanted):
+            raise BadInput(f"table {name} was planned for another request: run plan_exposures first")
+    for name in ("galaxies", "stars"):
+        if facts[name].get("seed") != request.seed:
+            raise BadInput(f"table {name} has seed {facts[name].get('seed')}, the request {request.seed}: build it first")
+    for fluxes, catalogue in (("galaxy_fluxes", "galaxies"), ("star_fluxes", "stars")):
+        if facts[fluxes].get("input") != inputs[catalogue].key:
+            raise BadInput(f"table {fluxes} was computed from another version of {catalogue}: run compute_fluxes first")
 
 
 def _refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:

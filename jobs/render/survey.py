@@ -19,7 +19,9 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.tasks import TASKS
 
+# Cameras of a channel, and the passbands of a camera.
 _CAMERAS = {"VIS": ("vis",), "EXT": ("lsstcam",)}
+_BANDS = {"vis": ("euclid_vis",), "lsstcam": tuple(f"lsst_{letter}" for letter in "ugrizy")}
 # Measured on one core of an AMD EPYC: a detector's PSF, sky, noise and files; each source, by channel.
 _SECONDS_DETECTOR, _SECONDS_SOURCE = 8.0, {"VIS": 2.0e-3, "EXT": 0.8e-3}
 # Peak memory: interpreter, PSF and tables; bytes held a pixel (frames in double precision, noise, files).
@@ -61,7 +63,10 @@ def _wanted(pointing: Pointing, mission: MissionConfiguration) -> tuple[Detector
 
 def _exposure(number: int, pointing: Pointing, mission: MissionConfiguration) -> dict[str, Any]:
     if pointing.camera not in _CAMERAS.get(pointing.channel, ()):
-        raise BadInput(f"pointing {number}: channel {pointing.channel} has no camera {pointing.camera!r}")
+        raise BadInput(f"pointing[{number - 1}].camera: channel {pointing.channel} has no camera {pointing.camera!r}")
+    if pointing.band not in _BANDS[pointing.camera]:
+        known = ", ".join(_BANDS[pointing.camera])
+        raise BadInput(f"pointing[{number - 1}].band: camera {pointing.camera} has no band {pointing.band!r} ({known})")
     ra, dec, angle = pointing.ra % 360.0, pointing.dec, pointing.position_angle
     if pointing.centre_on is not None:
         target = focal_plane.detector(pointing.camera, pointing.centre_on, mission)

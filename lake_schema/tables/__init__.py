@@ -2,6 +2,7 @@
 
 declared    all of them
 find        the one of a name
+markdown    the reference page
 """
 
 from __future__ import annotations
@@ -17,11 +18,21 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.fluxes import fluxes
     from lake_schema.tables.galaxies import GALAXIES
     from lake_schema.tables.halos import HALOS
+    from lake_schema.tables.mission import MISSION
+    from lake_schema.tables.passbands import PASSBANDS
     from lake_schema.tables.products import PRODUCTS
     from lake_schema.tables.stars import STARS
     from lake_schema.tables.tasks import TASKS
+    from lake_schema.tables.templates import TEMPLATES
 
-    return [HALOS, GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands), EXPOSURES, TASKS, PRODUCTS]
+    catalogues = [HALOS, GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands)]
+    return [*catalogues, TEMPLATES, PASSBANDS, MISSION, EXPOSURES, TASKS, PRODUCTS]
+
+
+def markdown() -> str:
+    """The reference page of all tables."""
+    head = "# Tables of the lake\n\nWritten by `python -m lake_schema tables`; do not edit.\n"
+    return "\n".join([head, *(table.markdown() for table in declared(["<band>"]))])
 
 
 def find(name: str, columns: Sequence[str] = ()) -> Table | None:

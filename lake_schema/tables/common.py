@@ -33,4 +33,3 @@ SKY = (ID, RA, DEC, HEALPIX_29)
 def id_of_kinds(first: int, last: int) -> Column:
     """The column `id` of a table that holds these kinds only, so that no two tables can share an identifier."""
     return replace(ID, lo=first << 60, hi=(last + 1 << 60) - 1)
-

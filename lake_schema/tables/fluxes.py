@@ -16,7 +16,15 @@ _CONTENT = {
 def fluxes(kind: str, bands: Sequence[str]) -> Table:
     """The flux table of `kind` ("galaxy" or "star") with one column a band: f_nu_<band>, microjansky."""
     columns = [
-        Column(f"f_nu_{band}", "float32", "uJy", "phot.flux.density", f"band-averaged f_nu in {band}, {_CONTENT[kind]}", 0.0, 1e15)
+        Column(
+            f"f_nu_{band}",
+            "float32",
+            "uJy",
+            "phot.flux.density",
+            f"band-averaged f_nu in {band}, {_CONTENT[kind]}",
+            0.0,
+            1e15,
+        )
         for band in bands
     ]
     return Table(

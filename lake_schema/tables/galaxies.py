@@ -1,7 +1,7 @@
 """Table `galaxies`: the True Universe's galaxies, the ten groups of columns of Serrano et al. 2024, section 4.1.
 
-The SED is held in the two-component form (Flagship 2); one mixed template with one law and one E(B-V) (Flagship 1) is the
-case of equal laws and E(B-V).
+The SED is held in the two-component form (Flagship 2); one mixed template with one law and one E(B-V) (Flagship 1) is
+the case of equal laws and E(B-V).
 """
 
 from __future__ import annotations
@@ -44,13 +44,29 @@ GALAXIES = Table(
     (
         # 1 identity
         id_of_kinds(0, 4),
-        Column("halo_id", "int64", ucd="meta.id.parent", doc="parent halo: the id with its kind and member bits cleared", lo=0),
+        Column(
+            "halo_id",
+            "int64",
+            ucd="meta.id.parent",
+            doc="parent halo: the id with its kind and member bits cleared",
+            lo=0,
+        ),
         # 2 positions
         RA,
         DEC,
         HEALPIX_29,
-        Column("ra_lensed", "float64", "deg", "pos.eq.ra", "observed (lensed) right ascension, what is rendered", 0.0, 360.0),
-        Column("dec_lensed", "float64", "deg", "pos.eq.dec", "observed (lensed) declination, what is rendered", -90.0, 90.0),
+        Column(
+            "ra_lensed",
+            "float64",
+            "deg",
+            "pos.eq.ra",
+            "observed (lensed) right ascension, what is rendered",
+            0.0,
+            360.0,
+        ),
+        Column(
+            "dec_lensed", "float64", "deg", "pos.eq.dec", "observed (lensed) declination, what is rendered", -90.0, 90.0
+        ),
         # 3 kind
         Column("kind", "int8", ucd="src.class", doc="kind of source", codes=KINDS[:5], lo=0, hi=4),
         Column(
@@ -79,14 +95,36 @@ GALAXIES = Table(
             "float32",
             "mag",
             "phot.mag;em.opt.R",
-            "apparent AB magnitude in the same reference passband (K-corrected), before magnification and the Milky Way",
+            "apparent AB magnitude in the same reference passband (K-corrected), before magnification and Milky Way",
             -5.0,
             60.0,
         ),
-        Column("color_gr_01", "float32", "mag", "phot.color;em.opt.B;em.opt.R", "rest-frame colour 0.1(g - r)", -2.0, 4.0),
-        Column("log_halo_mass", "float32", "", "phys.mass", "log10 of M_200m / (Msun/h) of the host halo", 5.0, 17.0, True),
-        Column("log_stellar_mass", "float32", "", "phys.mass", "log10 of the stellar mass / Msun (h = 0.67)", 0.0, 14.0, True),
-        Column("log_sfr", "float32", "", "phys.SFR", "log10 of the star formation rate / (Msun/yr), Salpeter", -10.0, 5.0, True),
+        Column(
+            "color_gr_01", "float32", "mag", "phot.color;em.opt.B;em.opt.R", "rest-frame colour 0.1(g - r)", -2.0, 4.0
+        ),
+        Column(
+            "log_halo_mass", "float32", "", "phys.mass", "log10 of M_200m / (Msun/h) of the host halo", 5.0, 17.0, True
+        ),
+        Column(
+            "log_stellar_mass",
+            "float32",
+            "",
+            "phys.mass",
+            "log10 of the stellar mass / Msun (h = 0.67)",
+            0.0,
+            14.0,
+            True,
+        ),
+        Column(
+            "log_sfr",
+            "float32",
+            "",
+            "phys.SFR",
+            "log10 of the star formation rate / (Msun/yr), Salpeter",
+            -10.0,
+            5.0,
+            True,
+        ),
         # 6 SED
         *_component(1),
         *_component(2),
@@ -99,23 +137,72 @@ GALAXIES = Table(
         _line("sii", "[S II] 6718.3 (the doublet's other line has the same flux)"),
         # 8 morphology
         Column(
-            "bulge_half_light_radius", "float32", "arcsec", "phys.angSize.smajAxis", "bulge: half-light semi-major axis", 0.0, 120.0
+            "bulge_half_light_radius",
+            "float32",
+            "arcsec",
+            "phys.angSize.smajAxis",
+            "bulge: half-light semi-major axis",
+            0.0,
+            120.0,
         ),
         Column(
-            "disk_half_light_radius", "float32", "arcsec", "phys.angSize.smajAxis", "disc: half-light semi-major axis", 0.0, 120.0
+            "disk_half_light_radius",
+            "float32",
+            "arcsec",
+            "phys.angSize.smajAxis",
+            "disc: half-light semi-major axis",
+            0.0,
+            120.0,
         ),
-        Column("bulge_fraction", "float32", ucd="phot.flux;arith.ratio", doc="flux of the bulge / total", lo=0.0, hi=1.0),
-        Column("bulge_sersic_index", "float32", ucd="src.morph.scLength", doc="Sersic index of the bulge", lo=0.3, hi=6.2),
-        Column("bulge_axis_ratio", "float32", ucd="phys.size.axisRatio", doc="bulge: minor / major axis", lo=0.02, hi=1.0),
-        Column("disk_axis_ratio", "float32", ucd="phys.size.axisRatio", doc="disc: apparent minor / major axis", lo=0.02, hi=1.0),
-        Column("inclination", "float32", "deg", "src.orbital.inclination", "disc inclination, 0 face-on, 90 edge-on", 0.0, 90.0),
+        Column(
+            "bulge_fraction", "float32", ucd="phot.flux;arith.ratio", doc="flux of the bulge / total", lo=0.0, hi=1.0
+        ),
+        Column(
+            "bulge_sersic_index", "float32", ucd="src.morph.scLength", doc="Sersic index of the bulge", lo=0.3, hi=6.2
+        ),
+        Column(
+            "bulge_axis_ratio", "float32", ucd="phys.size.axisRatio", doc="bulge: minor / major axis", lo=0.02, hi=1.0
+        ),
+        Column(
+            "disk_axis_ratio",
+            "float32",
+            ucd="phys.size.axisRatio",
+            doc="disc: apparent minor / major axis",
+            lo=0.02,
+            hi=1.0,
+        ),
+        Column(
+            "inclination",
+            "float32",
+            "deg",
+            "src.orbital.inclination",
+            "disc inclination, 0 face-on, 90 edge-on",
+            0.0,
+            90.0,
+        ),
         Column("position_angle", "float32", "deg", "pos.posAng", "of the major axis, north through east", 0.0, 180.0),
         # 9 lensing
         Column("kappa", "float32", ucd="arith.factor", doc="convergence", lo=-1.0, hi=2.0),
-        Column("gamma1", "float32", ucd="arith.factor", doc="shear along east-west (negative east and west of a mass)", lo=-1.0, hi=1.0),
-        Column("gamma2", "float32", ucd="arith.factor", doc="shear along north-east (negative north-east of a mass)", lo=-1.0, hi=1.0),
+        Column(
+            "gamma1",
+            "float32",
+            ucd="arith.factor",
+            doc="shear along east-west (negative east and west of a mass)",
+            lo=-1.0,
+            hi=1.0,
+        ),
+        Column(
+            "gamma2",
+            "float32",
+            ucd="arith.factor",
+            doc="shear along north-east (negative north-east of a mass)",
+            lo=-1.0,
+            hi=1.0,
+        ),
         # 10 Milky Way
-        Column("a_v", "float32", "mag", "phys.absorption.gal", "extinction A(V) of the Milky Way, R_V = 3.1", 0.0, 40.0),
+        Column(
+            "a_v", "float32", "mag", "phys.absorption.gal", "extinction A(V) of the Milky Way, R_V = 3.1", 0.0, 40.0
+        ),
     ),
     "Galaxies of the True Universe: central, satellite, QSO, high-redshift and strongly lensed.",
     order=5,

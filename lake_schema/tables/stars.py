@@ -23,8 +23,18 @@ STARS = Table(
         HEALPIX_29,
         Column("component", "int8", ucd="src.class", doc="population", codes=COMPONENTS, lo=0, hi=4),
         Column("sed", "int16", ucd="meta.code", doc="template index in the stellar library", lo=0),
-        Column("mag_h", "float32", "mag", "phot.mag;em.IR.H", "apparent 2MASS H, Vega, before Galactic extinction", -10.0, 40.0),
-        Column("abs_mag_h", "float32", "mag", "phot.mag;phys.magAbs;em.IR.H", "absolute 2MASS H, Vega", -15.0, 30.0, True),
+        Column(
+            "mag_h",
+            "float32",
+            "mag",
+            "phot.mag;em.IR.H",
+            "apparent 2MASS H, Vega, before Galactic extinction",
+            -10.0,
+            40.0,
+        ),
+        Column(
+            "abs_mag_h", "float32", "mag", "phot.mag;phys.magAbs;em.IR.H", "absolute 2MASS H, Vega", -15.0, 30.0, True
+        ),
         Column("distance", "float64", "pc", "pos.distance", "heliocentric distance", 0.0, 1e6, True),
         Column("teff", "float32", "K", "phys.temperature.effective", "effective temperature", 300.0, 1e5, True),
         Column("log_g", "float32", "", "phys.gravity", "log10 of the surface gravity / (cm s-2)", -1.0, 10.0, True),

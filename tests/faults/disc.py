@@ -1,8 +1,8 @@
 """A disc that fails: every call that changes it is counted, and the n-th can raise, stop the world, or wait.
 
-    with Disc(lake, fail_at=7): ...          the 7th call raises OSError
-    with Disc(lake, die_at=7): ...           from the 7th call on nothing reaches the disc, as after kill -9
-    with Disc(lake, at=hook): ...            hook(n, what, path) before each call
+with Disc(lake, fail_at=7): ...          the 7th call raises OSError
+with Disc(lake, die_at=7): ...           from the 7th call on nothing reaches the disc, as after kill -9
+with Disc(lake, at=hook): ...            hook(n, what, path) before each call
 """
 
 import builtins
@@ -20,7 +20,7 @@ class Killed(BaseException):
 
 
 class Disc:
-    """Counts `mkdir`, `open` for writing, `flush`, `fsync`, `rename`, `symlink`, `unlink`, `rmdir` and Parquet writes."""
+    """Counts `mkdir`, `open` for writing, `flush`, `fsync`, `rename`, `symlink`, `unlink`, `rmdir`, Parquet writes."""
 
     def __init__(self, root, fail_at=0, die_at=0, at=None):
         self.root, self.fail_at, self.die_at, self.at = str(Path(root).resolve()), fail_at, die_at, at

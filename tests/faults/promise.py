@@ -1,4 +1,4 @@
-"""What must hold after any accident: a reader sees a whole version or none, and a second run ends as if nothing had been."""
+"""What must hold after any accident: a reader sees a whole version or none, a second run repairs it."""
 
 from functools import partial
 
@@ -37,4 +37,3 @@ def sums(root, kind, version_key=None):
     """sha256 of every file of a version, the manifest included in its digest."""
     manifest = read.version(root, kind, version_key).manifest
     return {entry["path"]: entry["sha256"] for entry in manifest["files"]}
-

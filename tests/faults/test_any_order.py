@@ -93,7 +93,8 @@ class Lake(RuleBasedStateMachine):
 
 
 @pytest.mark.parametrize(
-    ("sequences", "steps"), [pytest.param(25, 12, id="short"), pytest.param(200, 20, id="long", marks=pytest.mark.nightly)]
+    ("sequences", "steps"),
+    [pytest.param(25, 12, id="short"), pytest.param(200, 20, id="long", marks=pytest.mark.nightly)],
 )
 def test_the_promise_in_any_order(sequences, steps):
     profile = settings(max_examples=sequences, stateful_step_count=steps, deadline=None)

@@ -46,7 +46,11 @@ def retried(function, parts):
     return [function(part) for part in [*parts, *parts]]
 
 
-HOW = {f"order {seed}": shuffled(seed) for seed in range(3)} | {f"{n} threads": threads(n) for n in (2, 4)} | {"twice": retried}
+HOW = (
+    {f"order {seed}": shuffled(seed) for seed in range(3)}
+    | {f"{n} threads": threads(n) for n in (2, 4)}
+    | {"twice": retried}
+)
 
 
 def test_the_same_bytes_however_they_were_made(tmp_path):
@@ -143,7 +147,12 @@ def test_a_byte_of_code_or_data_is_another_code(tmp_path):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     before = code_version(tmp_path)
     assert before == code_version(ROOT)
-    for name in ("jobs/fluxes/passbands.csv", "lake_schema/mission/vis.csv", "jobs/rng.py", "jobs/catalogue/milky_way.toml"):
+    for name in (
+        "jobs/fluxes/passbands.csv",
+        "lake_schema/mission/vis.csv",
+        "jobs/rng.py",
+        "jobs/catalogue/milky_way.toml",
+    ):
         path = tmp_path / name
         whole = path.read_bytes()
         path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
@@ -154,7 +163,7 @@ def test_a_byte_of_code_or_data_is_another_code(tmp_path):
     assert len(before) == len(hashlib.sha256().hexdigest())
 
 
-# ------------------------------------------------------------------------------------------------ rows that do not add up
+# ---------------------------------------------------------------------------------------------- rows that do not add up
 
 
 def silent(root, facts):

@@ -64,7 +64,8 @@ def wanted(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("harm", "words"), [("raise-1", "1.parquet: ValueError: row 17: no such template"), ("die-1", "1.parquet: its worker died")]
+    ("harm", "words"),
+    [("raise-1", "1.parquet: ValueError: row 17: no such template"), ("die-1", "1.parquet: its worker died")],
 )
 def test_a_part_that_fails_is_named_and_the_rest_is_kept(run, lake, wanted, harm, words):
     (lake / harm).touch()

@@ -40,7 +40,8 @@ def run(lake, request_file):
 
 def logs(lake):
     return [
-        [json.loads(line) for line in path.read_text().splitlines()] for path in sorted(layout.runs(lake).glob("*.jsonl"))
+        [json.loads(line) for line in path.read_text().splitlines()]
+        for path in sorted(layout.runs(lake).glob("*.jsonl"))
     ]
 
 
@@ -118,9 +119,10 @@ def test_another_run_of_the_same_plan_is_refused(run, lake, request_file, capsys
         return plain_work(root, facts)
 
     assert run(work) == 0
-    assert capsys.readouterr().err.splitlines() == [
-        f"toy_job: table plain: another run is making version {plain_plan(2).key}"
-    ] * 3
+    assert (
+        capsys.readouterr().err.splitlines()
+        == [f"toy_job: table plain: another run is making version {plain_plan(2).key}"] * 3
+    )
 
 
 def test_the_bar_counts_receipts(run, monkeypatch, capsys):

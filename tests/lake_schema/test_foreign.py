@@ -59,7 +59,13 @@ def many_texts(path):
 
 
 def zeros(path):
-    write(path, pa.table({"ra": np.zeros(40_000_000)}), compression="zstd", use_dictionary=False, row_group_size=40_000_000)
+    write(
+        path,
+        pa.table({"ra": np.zeros(40_000_000)}),
+        compression="zstd",
+        use_dictionary=False,
+        row_group_size=40_000_000,
+    )
 
 
 def footer(change):
@@ -162,7 +168,7 @@ def test_changed_bytes_end_in_rows_or_in_one_line(trials, tmp_path):
     write(path, GOOD)
     whole = np.frombuffer(path.read_bytes(), np.uint8)
     rng = np.random.default_rng(5)
-    refused = 0
+    refused = []
     for _ in range(trials):
         data = whole.copy()
         places = rng.integers(0, data.size, rng.integers(1, 6))
@@ -171,6 +177,6 @@ def test_changed_bytes_end_in_rows_or_in_one_line(trials, tmp_path):
         try:
             read(path, ("ra", "name"))
         except BadInput as error:
-            refused += 1
-            assert len(str(error).splitlines()) == 1
-    assert refused > trials / 20
+            refused.append(str(error))
+    assert len(refused) > trials / 20
+    assert [text for text in refused if len(text.splitlines()) != 1] == []

@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 from lake_schema import ids
 from lake_schema.errors import BadInput
 
-PARTS = st.tuples(st.integers(0, 7), st.integers(0, 12 * 4**8 - 1), st.integers(0, 2**22 - 1), st.integers(0, 2**18 - 1))
+PARTS = st.tuples(
+    st.integers(0, 7), st.integers(0, 12 * 4**8 - 1), st.integers(0, 2**22 - 1), st.integers(0, 2**18 - 1)
+)
 
 
 @given(PARTS, PARTS)

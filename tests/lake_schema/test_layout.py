@@ -8,10 +8,11 @@ from lake_schema import layout
 from lake_schema.errors import BadInput
 
 BAD = [
-    "", ".", "..", "../x", "/etc/x", "a/b", "a\\b", "a\0b", "a\nb", "a b", "A", "Galaxies", "-x", "_x", "x" * 65, "x" * 300,
-    "hpx=3", "%2e%2e", "a%2fb", "\u2024\u2024", "\uff0e\uff0e", "\u0430bc", "ga\u0142axy", "a\u200bb", "~", "~root", "$HOME",
-    "`ls`", "$(ls)", "a;b", "a|b", "a&b", "a>b", "a*b", "a?b", "a[b]", "a{b}", "a'b", 'a"b', "a,b", "a:b", "a@b", "a#b", "a!b",
-    "a+b", "a^b", "a=b", "a.b", "x.parquet", "con.", "a\tb", "a\rb", "a\x7fb", " a", "a ", "\ufeffa", "\u202ea", "s3://x", "file:x",
+    "", ".", "..", "../x", "/etc/x", "a/b", "a\\b", "a\0b", "a\nb", "a b", "A", "Galaxies", "-x", "_x",
+    "x" * 65, "x" * 300, "hpx=3", "%2e%2e", "a%2fb", "\u2024\u2024", "\uff0e\uff0e", "\u0430bc", "ga\u0142axy",
+    "a\u200bb", "~", "~root", "$HOME", "`ls`", "$(ls)", "a;b", "a|b", "a&b", "a>b", "a*b", "a?b", "a[b]",
+    "a{b}", "a'b", 'a"b', "a,b", "a:b", "a@b", "a#b", "a!b", "a+b", "a^b", "a=b", "a.b", "x.parquet", "con.",
+    "a\tb", "a\rb", "a\x7fb", " a", "a ", "\ufeffa", "\u202ea", "s3://x", "file:x",
 ]  # fmt: skip
 
 

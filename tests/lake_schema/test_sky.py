@@ -139,3 +139,21 @@ def test_the_margin_holds_all_within_ten_arcsec(cell):
     outside = sky.cell_of(near.ra.deg, near.dec.deg, 5) != cell
     assert outside.sum() > 500
     assert np.isin(sky.cell_of(near.ra.deg[outside], near.dec.deg[outside], 13), rim).all()
+
+
+@given(RA, st.floats(0.01, 179), DEC, st.floats(0.01, 60), st.integers(0, 6), st.integers(0, 2**32 - 1))
+def test_a_box_never_misses_a_cell(west, span, south, height, order, seed):
+    north = min(south + height, 90.0)
+    rng = np.random.default_rng(seed)
+    ra, dec = west + span * rng.random(200), south + (north - south) * rng.random(200)
+    # Its four edges, where a polygon of great circles would go astray.
+    dec[:40], dec[40:80], ra[80:120], ra[120:160] = south, north, west, west + span
+    cells = sky.cells_in_box(west % 360, (west + span) % 360, south, north, order)
+    assert np.isin(sky.cell_of(ra, dec, order), cells).all()
+    assert (np.diff(cells) > 0).all()
+
+
+def test_a_box_takes_few_cells_too_many():
+    """380 deg2, and no more than a cell's width along its 96 deg of border."""
+    area = len(sky.cells_in_box(0, 90, 60, 70, 7)) * sky.cell_area(7)
+    assert 380 < area < 380 + 96 * np.sqrt(sky.cell_area(7)) * 1.1

@@ -47,8 +47,14 @@ def test_a_later_nullable_column_is_null(old):
 
 
 BAD = {
-    "a later column that must be there": (later(*PLAIN.columns, replace(LATER, nullable=False)), "column colour is missing"),
-    "a nullable column that was always there": (later(*PLAIN.columns, replace(LATER, since=1)), "column colour is missing"),
+    "a later column that must be there": (
+        later(*PLAIN.columns, replace(LATER, nullable=False)),
+        "column colour is missing",
+    ),
+    "a nullable column that was always there": (
+        later(*PLAIN.columns, replace(LATER, since=1)),
+        "column colour is missing",
+    ),
     "another type": (later(PLAIN.columns[0], replace(PLAIN.columns[1], type="float32")), "column value is"),
     "another unit": (later(PLAIN.columns[0], replace(PLAIN.columns[1], unit="deg")), "has unit '', wanted 'deg'"),
     "a column that went": (later(PLAIN.columns[0]), "column value is not declared"),
@@ -66,7 +72,7 @@ def test_any_other_difference_is_refused_naming_both_versions(old, name):
 def test_a_table_from_the_future_is_refused(lake):
     plan = plain_plan()
     publish.make(lake, replace(plan, table=replace(PLAIN, version=3)), plain_work)
-    with pytest.raises(VersionMismatch, match="version 3 .* version 1: it was written by a later truesky"):
+    with pytest.raises(VersionMismatch, match=r"version 3 .* version 1: it was written by a later truesky"):
         read.as_declared(read.version(lake, "plain"), PLAIN)
 
 

@@ -41,7 +41,16 @@ def catalogue(lake, declared, columns):
 
 @pytest.fixture
 def filled(lake):
-    galaxy = {"kind": 0, "kappa": 0.1, "gamma1": 0.0, "gamma2": 0.0, "z_obs": 0.7, "sed_1": 3, "sed_2": 2, "mag_r01": 21.0}
+    galaxy = {
+        "kind": 0,
+        "kappa": 0.1,
+        "gamma1": 0.0,
+        "gamma2": 0.0,
+        "z_obs": 0.7,
+        "sed_1": 3,
+        "sed_2": 2,
+        "mag_r01": 21.0,
+    }
     catalogue(lake, GALAXIES, galaxy | {"frac_1": 0.3, "frac_2": 0.7, "a_v": 0.2, "ebv_1": 0.1, "ebv_2": 0.1})
     catalogue(lake, STARS, {"sed": 20, "a_v": 0.3, "mag_h": 18.0})
     return lake

@@ -16,9 +16,7 @@ Z = np.geomspace(1e-3, 20.0, 40)
 
 def test_distances_are_astropys():
     np.testing.assert_allclose(cosmology.comoving_distance(Z), ORACLE.comoving_distance(Z).value, rtol=1e-10)
-    np.testing.assert_allclose(
-        cosmology.luminosity_distance(Z), ORACLE.luminosity_distance(Z).value, rtol=1e-10
-    )
+    np.testing.assert_allclose(cosmology.luminosity_distance(Z), ORACLE.luminosity_distance(Z).value, rtol=1e-10)
     np.testing.assert_allclose(cosmology.distance_modulus(Z), ORACLE.distmod(Z).value, atol=1e-9)
     np.testing.assert_allclose(cosmology.expansion_rate(Z), ORACLE.efunc(Z), rtol=1e-13)
     volume = ORACLE.comoving_volume(Z).value / (4.0 * np.pi)
@@ -40,9 +38,7 @@ def test_flagship_numbers():
 @given(st.floats(0.0, np.log(21.0)))
 def test_quadrature_is_exact(log_a):
     z = float(np.expm1(log_a))
-    wanted, _ = quad(
-        lambda y: np.exp(y) / np.sqrt(0.319 * np.exp(3 * y) + 0.681), 0.0, np.log1p(z), epsrel=1e-13
-    )
+    wanted, _ = quad(lambda y: np.exp(y) / np.sqrt(0.319 * np.exp(3 * y) + 0.681), 0.0, np.log1p(z), epsrel=1e-13)
     assert float(cosmology.comoving_distance(z)) == pytest.approx(2997.92458 * wanted, rel=1e-12, abs=1e-300)
 
 

@@ -126,7 +126,9 @@ def test_without_a_law_there_is_no_dust(grid):
     assert flux_grid.covered(beyond).all()
 
 
-@pytest.mark.parametrize(("column", "value"), [("ebv_1", 0.61), ("ebv_2", 2.5), ("a_v", 1.56), ("a_v", 30.0), ("z_obs", 3.1)])
+@pytest.mark.parametrize(
+    ("column", "value"), [("ebv_1", 0.61), ("ebv_2", 2.5), ("a_v", 1.56), ("a_v", 30.0), ("z_obs", 3.1)]
+)
 def test_what_lies_beyond_the_tables_is_integrated_not_extrapolated(galaxies, library, column, value):
     values = galaxies()[column].to_numpy().copy()
     values[[3, 11]] = value
@@ -143,7 +145,11 @@ def test_what_lies_beyond_the_tables_is_integrated_not_extrapolated(galaxies, li
 def test_stars_fast_are_slow(stars_library):
     rng = np.random.default_rng(4)
     n = 2000
-    rows = Stars(rng.integers(0, len(stars_library), n), rng.uniform(5.0, 26.0, n), rng.uniform(0.0, grid_tables.STAR_A_V_LAST, n))
+    rows = Stars(
+        rng.integers(0, len(stars_library), n),
+        rng.uniform(5.0, 26.0, n),
+        rng.uniform(0.0, grid_tables.STAR_A_V_LAST, n),
+    )
     curves = [*CURVES, passbands.load("gaia_g")]
     fast, slow = flux_grid.stars(rows, curves, stars_library), integration.stars(rows, curves, stars_library)
     np.testing.assert_allclose(fast, slow, rtol=5e-6)
@@ -170,7 +176,9 @@ def test_another_library_has_other_tables(library, tmp_path, monkeypatch):
     setting = grid_settings.Setting(0.2, 2, 2)
     few = Library(library.wavelength, np.asarray(library.flux[:2]), library.names[:2])
     other = dataclasses.replace(few, flux=1.5 * few.flux * np.linspace(1.0, 2.0, few.flux.shape[1], dtype=np.float32))
-    tables = [grid_tables.galaxy_table(CURVES[0], each, setting, grid_tables.library_key(each)) for each in (few, other)]
+    tables = [
+        grid_tables.galaxy_table(CURVES[0], each, setting, grid_tables.library_key(each)) for each in (few, other)
+    ]
     assert np.abs(tables[0] - tables[1]).max() > 0.01
 
 
@@ -183,7 +191,10 @@ def test_hundreds_of_times_faster(library, grid):
     rows = drawn(20_000)
     flux_grid.galaxies(rows.rows(slice(0, 10)), grid)
     times = []
-    for work in (lambda: flux_grid.galaxies(rows, grid), lambda: integration.galaxies(rows.rows(slice(0, 200)), CURVES, library)):
+    for work in (
+        lambda: flux_grid.galaxies(rows, grid),
+        lambda: integration.galaxies(rows.rows(slice(0, 200)), CURVES, library),
+    ):
         best = np.inf
         for _ in range(2):
             started = time.process_time()

@@ -14,8 +14,9 @@ from jobs.fluxes.grid_settings import CANDIDATES, MARGIN, choose
 
 # Those of Serrano et al. 2024.
 BANDS = (
-    "euclid_vis", "euclid_y", "euclid_j", "euclid_h", "gaia_g", "gaia_bp", "gaia_rp", "des_g", "des_r", "des_i", "des_z",
-    "lsst_u", "lsst_g", "lsst_r", "lsst_i", "lsst_z", "lsst_y", "cfis_u", "cfis_r", "jedis_g", "ps1_i", "hsc_z",
+    "euclid_vis", "euclid_y", "euclid_j", "euclid_h", "gaia_g", "gaia_bp", "gaia_rp", "des_g", "des_r", "des_i",
+    "des_z", "lsst_u", "lsst_g", "lsst_r", "lsst_i", "lsst_z", "lsst_y", "cfis_u", "cfis_r", "jedis_g", "ps1_i",
+    "hsc_z",
 )  # fmt: skip
 
 

@@ -97,10 +97,14 @@ def test_lens_and_milky_way(distant):
 
 
 def test_all_kinds_in_one_table(distant, galaxies, library):
-    table = pa.concat_tables([galaxies(5), distant(4, 2), galaxies(3, seed=9), distant(6, 3)], promote_options="permissive")
+    table = pa.concat_tables(
+        [galaxies(5), distant(4, 2), galaxies(3, seed=9), distant(6, 3)], promote_options="permissive"
+    )
     bands = ["euclid_h", "lsst_r"]
     whole = spectra.galaxy_fluxes(table, bands, library, SURVEY)
-    parts = [spectra.galaxy_fluxes(table.slice(i, n), bands, library, SURVEY) for i, n in ((0, 5), (5, 4), (9, 3), (12, 6))]
+    parts = [
+        spectra.galaxy_fluxes(table.slice(i, n), bands, library, SURVEY) for i, n in ((0, 5), (5, 4), (9, 3), (12, 6))
+    ]
     assert whole.equals(pa.concat_tables(parts))
     alone = high_redshift.fluxes(table.slice(12, 6), [H])[:, 0]
     np.testing.assert_allclose(whole["f_nu_euclid_h"].to_numpy()[12:], alone, rtol=1e-6)

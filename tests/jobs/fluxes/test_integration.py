@@ -42,9 +42,7 @@ def test_the_reference_band_may_lie_elsewhere(galaxies, library, band):
 
 def test_lines_alone_are_their_spectra(galaxies, library):
     table = galaxies(30, mag_r01=45.0)
-    np.testing.assert_allclose(
-        columns(spectra.galaxy_fluxes(table, BANDS, library)), whole(table, library), rtol=1e-6
-    )
+    np.testing.assert_allclose(columns(spectra.galaxy_fluxes(table, BANDS, library)), whole(table, library), rtol=1e-6)
 
 
 def test_a_source_does_not_depend_on_its_neighbours(galaxies, library, monkeypatch):

@@ -92,9 +92,7 @@ def test_doublets():
 
 
 def test_lines_that_share_a_bin_add_up():
-    fluxes = np.array(
-        [[1.0, 0, 0, 0, 0, 0, 2.0, 4.0, 0, 0], np.zeros(10), [np.nan, 0, 0, 0, 0, 0, 0, 0, 8.0, 0]]
-    )
+    fluxes = np.array([[1.0, 0, 0, 0, 0, 0, 2.0, 4.0, 0, 0], np.zeros(10), [np.nan, 0, 0, 0, 0, 0, 0, 0, 8.0, 0]])
     found = lines.profiles(fluxes, np.array([0.1, 0.1, 0.3]), np.array([400.0, 400.0, 100.0]), "vacuum")
     assert found.row.tolist() == [0, 0, 0, 2]
     spectra = lines.add(np.zeros((3, 4000)), 6000, found)

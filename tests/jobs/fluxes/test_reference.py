@@ -41,12 +41,8 @@ def plain(library, z, template, **columns):
 def test_k_corrections_of_the_templates(library, table, vis, template, k, m_ie):
     mix = plain(library, Z, template)
     modulus = cosmology.distance_modulus(Z)
-    np.testing.assert_allclose(
-        reference.reference_magnitude(-20.0, Z, mix, table) + 20.0 - modulus, k, atol=0.02
-    )
-    np.testing.assert_allclose(
-        reference.apparent_magnitude(-20.0, Z, mix, vis) + 20.0 - modulus, m_ie, atol=0.011
-    )
+    np.testing.assert_allclose(reference.reference_magnitude(-20.0, Z, mix, table) + 20.0 - modulus, k, atol=0.02)
+    np.testing.assert_allclose(reference.apparent_magnitude(-20.0, Z, mix, vis) + 20.0 - modulus, m_ie, atol=0.011)
 
 
 def test_a_galaxy_at_a_tenth_seen_in_sdss_r_is_its_rest_frame_seen_in_the_reference_band(library):
@@ -100,9 +96,7 @@ def test_the_table_is_the_integral(library, table, vis, band, worst):
 def test_any_h_cancels_but_the_distance_is_the_true_one(library, table):
     mix = plain(library, np.array([0.5]), 10)
     near, far = (float(reference.reference_magnitude(-20.0, [z], mix, table)[0]) for z in (0.5, 0.51))
-    assert far - near == pytest.approx(
-        float(cosmology.distance_modulus(0.51) - cosmology.distance_modulus(0.5))
-    )
+    assert far - near == pytest.approx(float(cosmology.distance_modulus(0.51) - cosmology.distance_modulus(0.5)))
 
 
 def test_rest_colours(library):

@@ -129,9 +129,5 @@ def test_no_rows(galaxies, stars, library, stars_library):
 
 def test_a_null_line_is_no_line(bare, library):
     table = bare(2, z_obs=0.3)
-    null = table.set_column(
-        table.column_names.index("flux_oii"), "flux_oii", pa.array([None, np.nan], pa.float32())
-    )
-    np.testing.assert_array_equal(
-        spectra.galaxy_spectra(null, library), spectra.galaxy_spectra(table, library)
-    )
+    null = table.set_column(table.column_names.index("flux_oii"), "flux_oii", pa.array([None, np.nan], pa.float32()))
+    np.testing.assert_array_equal(spectra.galaxy_spectra(null, library), spectra.galaxy_spectra(table, library))

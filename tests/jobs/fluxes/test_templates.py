@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jobs import cache
-from jobs.fluxes import passbands, stellar, templates
+from jobs.fluxes import brown_dwarfs, passbands, stellar, templates
 from lake_schema import units
 
 
@@ -96,7 +96,8 @@ def test_planck_is_plancks_law():
 def test_stars_are_the_dwarf_sequence(stars_library):
     types = stars_library.types
     assert stars_library.names[0] == "O9V"
-    assert stars_library.names[-1] == "M9V"
+    assert stars_library.names[: len(types.names)] == types.names
+    assert types.names[-1] == "M9V"
     assert (np.diff(types.teff) < 0.0).all()
     for values in (
         types.log_g,
@@ -130,9 +131,7 @@ def test_stars_have_the_tables_colours(stars_library):
         "twomass_ks",
     )
     vega = np.array([magnitudes(name, *templates.vega()) for name in names])
-    mags = (
-        np.stack([magnitudes(name, stars_library.wavelength, stars_library.flux) for name in names], 1) - vega
-    )
+    mags = np.stack([magnitudes(name, stars_library.wavelength, stars_library.flux[:76]) for name in names], 1) - vega
     error = mags - mags[:, 2:3] - stars_library.types.colors
     assert np.nanmax(np.abs(error)) < 1e-6
     assert np.isfinite(error).sum() > 590
@@ -167,3 +166,43 @@ def test_vega_reaches_over_ks():
     assert (np.diff(wavelength) > 0.0).all()
     # Bohlin & Gilliland 2004: 3.44e-9 erg s-1 cm-2 A-1 at 5556 A.
     assert np.interp(5556.0, wavelength, flux) == pytest.approx(3.44e-9, rel=0.01)
+
+
+def test_brown_dwarfs_have_their_colours(stars_library):
+    types = brown_dwarfs.subtypes()
+    assert types.names == tuple(f"L{k}" for k in range(10)) + tuple(f"T{k}" for k in range(9))
+    names = np.array(stars_library.names)
+    found = np.array([name.partition("-")[0] in types.names for name in names])
+    assert np.flatnonzero(found).tolist() == list(range(76, 441))
+    flux, which = stars_library.flux[found], [types.names.index(name.partition("-")[0]) for name in names[found]]
+    mean = np.array([name.endswith("-00") for name in names[found]])
+    for blue, red, zero, column in (("sdss_i", "sdss_z", 0.0, "i-z"), ("twomass_j", "twomass_h", 0.47, "J-H")):
+        published = np.array([v for n, v in zip(*_published(column), strict=True) if "." not in n])[which]
+        got = color(blue, red, stars_library.wavelength, flux) + zero
+        np.testing.assert_allclose(got[mean], published[mean], atol=0.02)
+        if column == "J-H":
+            scatter = (got - published)[~mean]
+            assert scatter.std() == pytest.approx(0.07, rel=0.15)
+            assert scatter.mean() == pytest.approx(0.0, abs=0.02)
+
+
+def _published(column):
+    names, columns = stellar.table("L0V", "T8V")
+    return names, columns[column]
+
+
+def test_standards(stars_library):
+    names = stars_library.names
+    assert names[441:] == ("Vega", "white dwarf DA", "planetary nebula")
+    vega, dwarf, nebula = stars_library.flux[441:].astype(float)
+    wavelength = stars_library.wavelength
+    for band, zero in (("twomass_j", 0.90), ("twomass_h", 1.37)):
+        # V is almost AB.
+        assert float(color(band, "bessell_v", wavelength, vega)) == pytest.approx(zero, abs=0.06)
+    # Hotter than any star of the sequence but the first, with Balmer lines.
+    assert float(color("sdss_u", "sdss_r", wavelength, dwarf)) < -0.7
+    assert dwarf[6563 - 600] < 0.7 * dwarf[6500 - 600]
+    # [O III] 5008 : 4960 : H beta = 10 : 3.35 : 1 over the continuum.
+    level = nebula[6200 - 600]
+    sums = [np.sum(nebula[at - 610 : at - 590] - level) for at in (5008, 4960, 4863)]
+    np.testing.assert_allclose(sums / sums[2], [10.0, 3.35, 1.0], rtol=1e-3)

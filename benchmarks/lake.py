@@ -1,0 +1,249 @@
+"""How fast the lake is, each figure with its peer beside it: python -m benchmarks.lake [--quick] [--json FILE].
+
+A catalogue of 50 random columns in 20 cells of 250,000 rows; the peers are Spark's and pyarrow's own Parquet writers,
+lsdb, a scan of everything, and the same query on files that nobody verifies.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+
+from benchmarks import report
+from jobs.explore.explorer import Explorer
+from lake_schema import layout, parquet, publish, read, sky
+from lake_schema.columns import Column, Table
+from lake_schema.publish import Json, Output, Part, Plan
+from lake_schema.stage import write_part
+from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
+
+# Nested neighbours of order 5: about the Chandra Deep Field South.
+FIRST_CELL, CELLS, ROWS = 8976, 20, 250_000
+QUICK_CELLS, QUICK_ROWS = 3, 20_000
+CONE_ARCSEC, CONE_COLUMNS = 60.0, ("id", "ra", "dec", "x_0", "x_1")
+
+KINDS = tuple((code, f"kind {code}") for code in range(5))
+TRIAL = Table(
+    "trial",
+    1,
+    (
+        ID,
+        RA,
+        DEC,
+        HEALPIX_29,
+        Column("halo_id", "int64", doc="identifier", lo=0),
+        *(
+            Column(f"{name}_lensed", "float64", "deg", doc="a place nearby", lo=-90.0, hi=360.0)
+            for name in ("ra", "dec")
+        ),
+        *(Column(f"kind_{i}", "int32", codes=KINDS, doc="random code", lo=0, hi=4) for i in range(3)),
+        *(Column(f"x_{i}", "float32", doc="random number", lo=0.0, hi=1.0) for i in range(40)),
+    ),
+    "50 columns of random values, 228 bytes a row as they are, which compress worse than anything real.",
+    order=5,
+)
+
+NOTES = {
+    "write_rows_per_s_core": "rows validated, written, hashed, synced, with the receipt",
+    "write_parquet_rows_per_s": "the Parquet file alone",
+    "write_vs_spark_writer": "times the rows/s of Spark's own writer, one core, from memory",
+    "write_vs_pyarrow_defaults": "times the rows/s of pyarrow's default settings",
+    "bytes_per_row": "in the file",
+    "bytes_per_row_defaults": "pyarrow's default settings",
+    "finish_s": "metadata, margin, skymap, manifest and rename of the whole catalogue",
+    "cone_ms": '60" cone, 5 columns, warm, as lake_schema.read gives it',
+    "cone_cold_ms": "the same, a version just opened",
+    "cone_vs_lsdb": "times faster than lsdb's cone_search",
+    "cone_vs_scan": "times faster than a scan of all positions",
+    "heatmap_s": "100 x 100 bins of two columns of all rows, by the explorer",
+    "heatmap_vs_unverified": "its time / DuckDB's own read_parquet, which verifies nothing",
+    "verify_mb_per_s": "sha256 of every file, order of every cell",
+    "read_mb_per_s": "all columns of a cell into memory, checksums verified (bytes of the file)",
+    "read_vs_unverified": "its time / pyarrow's without checksums",
+    "session_start_s": "a Spark session in a new process",
+}
+
+
+def rows_of(cell: int, n: int) -> pa.Table:
+    """Random rows of a cell."""
+    rng = np.random.default_rng([1, cell])
+    index, ra, dec = sky.random_in_cell(5, cell, n, rng)
+    ids = np.int64(cell) << 46 | np.arange(n)
+    columns = {"id": ids, "ra": ra, "dec": dec, "_healpix_29": index, "halo_id": ids & ~np.int64(1023)}
+    columns |= {"ra_lensed": ra + rng.normal(0, 1e-3, n), "dec_lensed": dec + rng.normal(0, 1e-3, n)}
+    for column in TRIAL.columns[7:]:
+        columns[column.name] = rng.integers(0, 5, n) if column.codes else rng.random(n)
+    return TRIAL.build(columns)
+
+
+def work(root: Path, facts: Json) -> Output:
+    """One cell."""
+    return Output(rows_of(facts["cell"], facts["rows"]))
+
+
+def plan(cells: int, rows: int) -> Plan:
+    """The catalogue."""
+    numbers = range(FIRST_CELL, FIRST_CELL + cells)
+    return Plan(
+        TRIAL, {}, tuple(Part(layout.cell_file(5, cell), {"cell": cell, "rows": rows}, rows) for cell in numbers)
+    )
+
+
+def writing(folder: Path, rows: pa.Table, repeats: int) -> dict[str, float]:
+    """One cell written by us and by others, one core each."""
+    part = Part(layout.cell_file(5, FIRST_CELL), {})
+    ours, plain = folder / "ours.parquet", folder / "plain.parquet"
+    pa.set_cpu_count(1)
+    whole = report.best(lambda: write_part(folder / ".stage-x", TRIAL, part, Output(rows)), repeats)
+    file = report.best(lambda: parquet.write(ours, rows, TRIAL), repeats)
+    default = report.best(lambda: pq.write_table(rows, plain), repeats)
+    spark = _spark_writer(folder, ours, repeats)
+    n = rows.num_rows
+    return {
+        "write_rows_per_s_core": n / whole,
+        "write_parquet_rows_per_s": n / file,
+        "write_vs_spark_writer": spark / file,
+        "write_vs_pyarrow_defaults": default / file,
+        "bytes_per_row": ours.stat().st_size / n,
+        "bytes_per_row_defaults": plain.stat().st_size / n,
+    }
+
+
+def _spark_writer(folder: Path, file: Path, repeats: int) -> float:
+    """s of Spark's own writer on the same rows, held in its memory, in one task."""
+    from jobs.session import session
+
+    frame = session("benchmarks.lake").read.parquet(str(file)).coalesce(1).cache()
+    frame.count()
+    return report.best(lambda: frame.write.mode("overwrite").parquet(str(folder / "spark")), repeats + 1)
+
+
+def cones(version: read.Version, repeats: int) -> dict[str, float]:
+    """Small circles at random places of the catalogue."""
+    import lsdb
+
+    centres = np.random.default_rng(2).permutation(version.rows(["ra", "dec"], version.parts[:2]).to_pandas())[:repeats]
+    radius, columns = CONE_ARCSEC / 3600, list(CONE_COLUMNS)
+    started = time.perf_counter()
+    opened = read.version(version.folder.parents[1], TRIAL.name)
+    opened.cone(*centres[0], radius, columns)
+    cold = time.perf_counter() - started
+    theirs = lsdb.open_catalog(str(version.folder), columns=columns)
+    ours_s, theirs_s, scan_s = [], [], []
+    for ra, dec in centres:
+        found = _timed(ours_s, lambda ra=ra, dec=dec: opened.cone(ra, dec, radius, columns))
+        same = _timed(theirs_s, lambda ra=ra, dec=dec: theirs.cone_search(ra, dec, CONE_ARCSEC).compute())
+        scan = _timed(scan_s, lambda ra=ra, dec=dec: _scan(version, ra, dec, radius, columns))
+        if not found.num_rows == len(same) == scan.num_rows:
+            raise SystemExit(f"cones differ: {found.num_rows}, {len(same)}, {scan.num_rows} rows")
+    best = min(ours_s)
+    return {
+        "cone_ms": 1e3 * best,
+        "cone_cold_ms": 1e3 * cold,
+        "cone_vs_lsdb": min(theirs_s) / best,
+        "cone_vs_scan": min(scan_s) / best,
+    }
+
+
+def _timed(seconds: list[float], work):  # type: ignore[no-untyped-def]
+    started = time.perf_counter()
+    found = work()
+    seconds.append(time.perf_counter() - started)
+    return found
+
+
+def _scan(version: read.Version, ra: float, dec: float, radius: float, columns: list[str]) -> pa.Table:
+    rows = version.rows(columns)
+    return rows.filter(pa.array(sky.separation(rows["ra"].to_numpy(), rows["dec"].to_numpy(), ra, dec) <= radius))
+
+
+def exploring(version: read.Version, repeats: int) -> dict[str, float]:
+    """A heat map of all rows."""
+    import duckdb
+
+    files = [str(version.path(part)) for part in version.parts]
+    text = """SELECT floor(x_0 * 100)::INT AS i, floor(x_1 * 100)::INT AS j, count(*) AS n
+        FROM read_parquet($files) WHERE x_0 BETWEEN 0 AND 1 AND x_1 BETWEEN 0 AND 1 GROUP BY i, j"""
+    with Explorer(version.folder.parents[1]) as lake, duckdb.connect(":memory:") as plain:
+
+        def ours() -> None:
+            lake.heatmap("trial", "x_0", "x_1", span=((0.0, 1.0), (0.0, 1.0)))
+
+        ours()
+        seconds = report.best(ours, repeats)
+        unverified = report.best(lambda: plain.execute(text, {"files": files}).fetchall(), repeats + 1)
+    return {"heatmap_s": seconds, "heatmap_vs_unverified": seconds / unverified}
+
+
+def verifying(version: read.Version, repeats: int) -> dict[str, float]:
+    """Bytes a second through the checks."""
+    size = sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6
+    deep = report.best(lambda: read.verify(version, deep=True), repeats)
+    part = version.parts[0]
+    checked = report.best(lambda: version.rows(parts=[part]), repeats)
+    plain = report.best(lambda: ds.dataset(str(version.path(part))).to_table(), repeats)
+    return {
+        "verify_mb_per_s": size / deep,
+        "read_mb_per_s": version.path(part).stat().st_size / 1e6 / checked,
+        "read_vs_unverified": checked / plain,
+    }
+
+
+_SESSION = "import time; t = time.time(); from jobs.session import session; session('x'); print(time.time() - t)"
+
+
+def starting(repeats: int) -> dict[str, float]:
+    """The first seconds of a job."""
+    command = [sys.executable, "-c", _SESSION]
+    done = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(min(repeats, 3))]
+    return {"session_start_s": min(float(text) for text in done)}
+
+
+def run(quick: bool, folder: Path) -> tuple[int, dict[str, float]]:
+    """All figures."""
+    cells, rows, repeats = (QUICK_CELLS, QUICK_ROWS, 1) if quick else (CELLS, ROWS, 5)
+    figures = writing(folder, rows_of(FIRST_CELL, rows), repeats)
+    pa.set_cpu_count(os.cpu_count() or 1)
+    root = folder / "lake"
+    root.mkdir()
+    ends: list[float] = []
+
+    def mapper(function, parts):  # type: ignore[no-untyped-def]
+        yield from map(function, parts)
+        ends.append(time.perf_counter())
+
+    publish.make(root, plan(cells, rows), work, mapper)
+    figures["finish_s"] = time.perf_counter() - ends[0]
+    version = read.version(root, TRIAL.name)
+    figures |= cones(version, 3 if quick else 20) | exploring(version, repeats) | verifying(version, repeats)
+    return repeats, figures | starting(repeats)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the table; exit status 0."""
+    chosen = report.options("lake", __doc__ or "", argv)
+    folder = Path(tempfile.mkdtemp(prefix="truesky-benchmark-"))
+    try:
+        repeats, figures = run(chosen.quick, folder)
+    finally:
+        shutil.rmtree(folder)
+    report.finish("lake", repeats, figures, NOTES, chosen.json)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,61 @@
+"""Table `passbands`: the photon responses through which fluxes were computed, one row a band."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from lake_schema.columns import Column, Table
+
+MEDIA = (("air", "from the ground"), ("vacuum", "from space"))
+
+PASSBANDS = Table(
+    "passbands",
+    1,
+    (
+        Column("name", "string", ucd="meta.id;instr.bandpass", doc="name, the <band> of f_nu_<band>"),
+        Column("medium", "string", ucd="meta.code", doc="in which the wavelengths are measured", codes=MEDIA),
+        Column("pivot_wavelength", "float64", "Angstrom", "em.wl.central", "pivot wavelength", 100.0, 1e6),
+        Column("log_width", "float64", "", "instr.bandwidth", "integral of the response over ln(wavelength)", 0.0, 1e3),
+        Column("first_wavelength", "float64", "Angstrom", "em.wl;stat.min", "of the first sample", 100.0, 1e6),
+        Column("wavelength_step", "float64", "Angstrom", "em.wl;spect.binSize", "between samples", 1e-3, 1e3),
+        Column("response", "list<float64>", "", "phys.transmission", "detected per photon that arrives", 0.0, 1e9),
+    ),
+    "Passbands.",
+    key=("name",),
+)
+
+
+class Passband(Protocol):
+    """A response on a grid of equal steps: wavelength[m] A, response[m]."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def medium(self) -> str: ...
+    @property
+    def wavelength(self) -> npt.NDArray[np.float64]: ...
+    @property
+    def response(self) -> npt.NDArray[np.float64]: ...
+
+
+def rows(bands: Sequence[Passband], pivot_wavelengths: npt.ArrayLike, log_widths: npt.ArrayLike) -> pa.Table:
+    """Table `passbands`.
+
+    pivot_wavelengths : [n] A;  log_widths : [n]
+    """
+    return PASSBANDS.build(
+        {
+            "name": [band.name for band in bands],
+            "medium": [band.medium for band in bands],
+            "pivot_wavelength": np.asarray(pivot_wavelengths, float),
+            "log_width": np.asarray(log_widths, float),
+            "first_wavelength": np.array([band.wavelength[0] for band in bands], float),
+            "wavelength_step": np.array([band.wavelength[1] - band.wavelength[0] for band in bands], float),
+            "response": [np.asarray(band.response) for band in bands],
+        }
+    )

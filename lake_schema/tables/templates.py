@@ -1,0 +1,84 @@
+"""Table `templates`: the spectra that sources are made of, one row a template."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from lake_schema.columns import Column, Table
+
+LIBRARIES = (("galaxy", "rest frame"), ("star", "as observed"))
+
+TEMPLATES = Table(
+    "templates",
+    1,
+    (
+        Column("library", "string", ucd="meta.code.class", doc="which sources it is for", codes=LIBRARIES),
+        Column("sed", "int16", ucd="meta.code", doc="index, the sed or sed_k of those sources", lo=0),
+        Column("name", "string", ucd="meta.title", doc="label"),
+        Column("first_wavelength", "float64", "Angstrom", "em.wl;stat.min", "of the first sample, vacuum", 1.0, 1e6),
+        Column("wavelength_step", "float64", "Angstrom", "em.wl;spect.binSize", "between samples", 1e-3, 1e3),
+        Column(
+            "flux", "list<float32>", "", "phot.flux.density;arith.ratio", "f_lambda, mean 1 in 5450-5550 A", 0.0, 1e6
+        ),
+        Column("teff", "float32", "K", "phys.temperature.effective", "effective temperature", 300.0, 1e6, True),
+        Column("log_g", "float32", "", "phys.gravity", "log10 of the surface gravity / (cm s-2)", -1.0, 10.0, True),
+    ),
+    "Template spectra of galaxies and stars.",
+    key=("library", "sed"),
+)
+
+
+class Types(Protocol):
+    """What is known of the first stars of a library: float64[n] each."""
+
+    @property
+    def teff(self) -> npt.NDArray[np.float64]: ...
+    @property
+    def log_g(self) -> npt.NDArray[np.float64]: ...
+
+
+class Library(Protocol):
+    """Spectra on one grid of equal steps: wavelength[m] A, flux[n, m], n names."""
+
+    @property
+    def wavelength(self) -> npt.NDArray[np.float64]: ...
+    @property
+    def flux(self) -> npt.NDArray[np.float32]: ...
+    @property
+    def names(self) -> Sequence[str]: ...
+    @property
+    def types(self) -> Types | None: ...
+
+
+def rows(libraries: Mapping[str, Library]) -> pa.Table:
+    """Table `templates` of the libraries, by name ("galaxy", "star")."""
+    return pa.concat_tables([TEMPLATES.empty(), *(_rows(name, library) for name, library in libraries.items())])
+
+
+def _rows(name: str, library: Library) -> pa.Table:
+    n, wavelength = len(library.names), library.wavelength
+    known: dict[str, Any] = {}
+    if library.types is not None:
+        known = {"teff": _first(library.types.teff, n), "log_g": _first(library.types.log_g, n)}
+    return TEMPLATES.build(
+        {
+            "library": [name] * n,
+            "sed": np.arange(n),
+            "name": list(library.names),
+            "first_wavelength": np.full(n, wavelength[0]),
+            "wavelength_step": np.full(n, wavelength[1] - wavelength[0]),
+            "flux": [np.asarray(spectrum) for spectrum in library.flux],
+            **known,
+        }
+    )
+
+
+def _first(values: npt.NDArray[np.float64], n: int) -> Any:
+    """Values of the first rows of n, the others missing."""
+    missing = np.arange(n) >= len(values)
+    return np.ma.masked_array(np.concatenate([values[:n], np.zeros(max(n - len(values), 0))]), missing)

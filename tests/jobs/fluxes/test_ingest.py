@@ -1,0 +1,257 @@
+"""Files of others, all synthetic: made here in the published forms, with numbers that nobody measured."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.table import QTable, Table
+
+from jobs.accuracy import SURVEY
+from jobs.fluxes import flux_grid, ingest, passbands, spectra
+from lake_schema.errors import BadInput
+
+WAVELENGTH = np.arange(900.0, 26_000.0, 20.0)
+FLUX = 1.0 + 0.5 * np.sin(WAVELENGTH / 800.0)
+BAND = np.arange(5000.0, 7001.0, 10.0)
+RESPONSE = np.exp(-0.5 * ((BAND - 6000.0) / 300.0) ** 2)
+
+VOTABLE = """<?xml version="1.0"?>
+<VOTABLE version="1.1" xmlns="http://www.ivoa.net/xml/VOTable/v1.1">
+ <INFO name="SYNTHETIC" value="YES"/>
+ <RESOURCE><TABLE utype="photDM:PhotometryFilter.transmissionCurve.spectrum">
+  <FIELD name="Wavelength" ucd="em.wl" unit="AA" datatype="float"/>
+  <FIELD name="Transmission" ucd="phys.transmission" datatype="float"/>
+  <DATA><TABLEDATA>{rows}</TABLEDATA></DATA>
+ </TABLE></RESOURCE>
+</VOTABLE>
+"""
+
+
+def ascii_file(path, wavelength=WAVELENGTH, value=FLUX):
+    rows = "\n".join(f"{a:.6g} {b:.6g}" for a, b in zip(wavelength, value, strict=True))
+    path.write_text("# SYNTHETIC\n" + rows + "\n")
+    return path
+
+
+def votable(path, wavelength=BAND, value=RESPONSE):
+    rows = "".join(f"<TR><TD>{a}</TD><TD>{b}</TD></TR>" for a, b in zip(wavelength, value, strict=True))
+    path.write_text(VOTABLE.format(rows=rows))
+    return path
+
+
+def basel_file(path, models=((5750, 4.5, -0.5), (3500, 1.0, 0.2)), value=1e-5):
+    lines = []
+    nm = 9.1 + (160_000.0 - 9.1) * np.expm1(0.0075 * np.arange(1221)) / np.expm1(0.0075 * 1220)
+    for start in range(0, 1221, 8):
+        lines.append("".join(f"{x:10.1f}" for x in nm[start : start + 8]))
+    for k, (teff, log_g, metallicity) in enumerate(models):
+        lines.append(f"{k + 1:6d}{teff:6d}{log_g:6.2f}{metallicity:6.2f}{2.0:6.2f}{0.7:6.2f}")
+        h_nu = np.full(1221, value * (k + 1))
+        for start in range(0, 1221, 7):
+            lines.append("".join(f"{x:11.4E}" for x in h_nu[start : start + 7]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_every_format_names_its_source_and_reader():
+    for name, form in ingest.formats().items():
+        assert form["source"], name
+        assert form["reader"] in ("ascii", "csv", "ecsv", "fits", "votable")
+        assert {"wavelength", "value", "unit", "largest_gap", "bounds"} <= set(form)
+
+
+@pytest.mark.parametrize("form", ["cosmos", "extinction", "irtf", "spectrum_csv", "spectrum_ecsv", "spectrum_fits"])
+def test_every_form_gives_the_same_spectrum(tmp_path, form):
+    path = tmp_path / "synthetic"
+    wavelength = np.arange(8000.0, 24_001.0, 20.0) if form == "irtf" else WAVELENGTH
+    flux = np.interp(wavelength, WAVELENGTH, FLUX)
+    if form in ("cosmos", "extinction"):
+        ascii_file(path)
+    elif form == "irtf":
+        np.savetxt(path, np.stack([wavelength / 1e4, flux, 0.01 * flux], 1), header="SYNTHETIC IRTF")
+    elif form == "spectrum_csv":
+        Table({"wavelength": wavelength, "flux": flux}).write(path, format="ascii.csv")
+    elif form == "spectrum_ecsv":
+        QTable({"wavelength": wavelength / 10 * u.nm, "flux": flux}).write(path, format="ascii.ecsv")
+    else:
+        Table({"WAVELENGTH": wavelength, "FLUX": flux}).write(path, format="fits")
+    curve = ingest.read(path, form)
+    np.testing.assert_allclose(curve.wavelength, wavelength, rtol=1e-5)
+    np.testing.assert_allclose(curve.value, flux, rtol=1e-5)
+
+
+def broken(name):
+    """A filter file that is wrong in one way."""
+    wavelength, value = BAND.copy(), RESPONSE.copy()
+    match name:
+        case "one row":
+            wavelength, value = wavelength[:1], value[:1]
+        case "unsorted":
+            wavelength[[40, 41]] = wavelength[[41, 40]]
+        case "repeated":
+            wavelength[41] = wavelength[40]
+        case "descending":
+            wavelength, value = wavelength[::-1], value[::-1]
+        case "negative":
+            value[7] = -0.1
+        case "zero":
+            value[:] = 0.0
+        case "nan":
+            value[3] = np.nan
+        case "infinite":
+            value[3] = np.inf
+        case "nm":
+            wavelength /= 10.0
+        case "um":
+            wavelength /= 1e4
+        case "m":
+            wavelength *= 1e10
+        case "gap":
+            keep = (wavelength < 5200.0) | (wavelength > 6900.0)
+            wavelength, value = wavelength[keep], value[keep]
+    return wavelength, value
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("one row", "1 rows are no curve"),
+        ("unsorted", "row 42 goes back in wavelength"),
+        ("repeated", "row 42 repeats the wavelength"),
+        ("descending", "row 2 goes back"),
+        ("negative", "row 8 is negative"),
+        ("zero", "all values are 0"),
+        ("nan", "row 4 is not a number"),
+        ("infinite", "row 4 is not a number"),
+        ("nm", "is the unit right"),
+        ("um", "is the unit right"),
+        ("m", "is the unit right"),
+        ("gap", "row 21 follows a gap"),
+    ],
+)
+@pytest.mark.parametrize("form", ["passband_ascii", "passband_svo"])
+def test_wrong_filters_are_refused_with_file_and_row(tmp_path, name, message, form):
+    path = tmp_path / "filter.dat"
+    (ascii_file if form == "passband_ascii" else votable)(path, *broken(name))
+    with pytest.raises(BadInput, match=rf"filter\.dat: .*{message}"):
+        ingest.passband(path, "mine", "air", form)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1e-4])
+def test_a_spectrum_in_another_unit_is_refused(tmp_path, scale):
+    with pytest.raises(BadInput, match="is the unit right"):
+        ingest.read(ascii_file(tmp_path / "sed", WAVELENGTH * scale), "cosmos")
+
+
+def test_what_is_not_a_table_is_refused(tmp_path):
+    path = tmp_path / "nothing"
+    for form in ingest.formats():
+        with pytest.raises(BadInput, match=f"nothing: cannot be read as {form}"):
+            ingest.read(path, form)
+    path.write_bytes(b"\x00\xff\xfe garbage\n1 2 3 <")
+    for form in ingest.formats():
+        with pytest.raises(BadInput, match="nothing"):
+            ingest.read(path, form)
+    with pytest.raises(BadInput, match="'guess' is not one of cosmos"):
+        ingest.read(path, "guess")
+
+
+def test_a_votable_declares_no_entities(tmp_path):
+    path = votable(tmp_path / "bomb.xml")
+    path.write_text(path.read_text().replace("<VOTABLE", '<!DOCTYPE x [<!ENTITY a "b">]>\n<VOTABLE', 1))
+    with pytest.raises(BadInput, match="DOCTYPE"):
+        ingest.read(path, "passband_svo")
+
+
+def test_large_files_are_not_opened(tmp_path, monkeypatch):
+    monkeypatch.setattr(ingest, "_MOST_BYTES", 100)
+    with pytest.raises(BadInput, match="bytes are too many"):
+        ingest.read(ascii_file(tmp_path / "sed"), "cosmos")
+
+
+@pytest.mark.parametrize("form", ["passband_ascii", "passband_ecsv", "passband_svo"])
+def test_a_users_filter_is_used_like_any_other(tmp_path, galaxies, library, form):
+    path = tmp_path / "filter"
+    if form == "passband_ascii":
+        ascii_file(path, BAND, RESPONSE)
+    elif form == "passband_svo":
+        votable(path)
+    else:
+        QTable({"wavelength": BAND / 1e4 * u.um, "throughput": RESPONSE}).write(path, format="ascii.ecsv")
+    mine = ingest.passband(path, "mine", "vacuum", form)
+    assert mine.medium == "vacuum"
+    assert passbands.pivot_wavelength(mine) == pytest.approx(5985.0, abs=20.0)
+    table = galaxies(5)
+    got = spectra.galaxy_fluxes(table, [mine], library)["f_nu_mine"].to_numpy()
+    wanted = spectra.band_fluxes(spectra.galaxy_spectra(table, library), [mine])[:, 0]
+    np.testing.assert_allclose(got, wanted, rtol=1e-6)
+
+
+def test_a_filter_outside_the_grid_or_without_medium_is_refused(tmp_path):
+    path = ascii_file(tmp_path / "mid", BAND + 30_000.0, RESPONSE)
+    with pytest.raises(BadInput, match=r"mid: lies outside 600 \.\. 24000 A"):
+        ingest.passband(path, "mine", "air")
+    with pytest.raises(BadInput, match="medium 'water'"):
+        ingest.passband(path, "mine", "water")
+
+
+def test_a_library_keeps_the_flux_of_its_files(tmp_path):
+    # Sampled every 0.5 A, with a line that is narrower than the grid.
+    fine = np.arange(900.0, 9500.0, 0.5)
+    flux = 1.0 + 50.0 * np.exp(-0.5 * ((fine - 6000.3) / 0.6) ** 2)
+    files = [ascii_file(tmp_path / "Ell1", fine, flux), ascii_file(tmp_path / "SB0")]
+    library = ingest.library(files)
+    assert library.names == ("Ell1", "SB0")
+    near = np.abs(library.wavelength - 6000.0) <= 20.0
+    assert library.flux[0, near].sum() - 41.0 == pytest.approx(50.0 * 0.6 * np.sqrt(2.0 * np.pi), rel=1e-3)
+    red = library.flux[0, np.isin(library.wavelength, (10_000.0, 20_000.0))]
+    assert np.log2(red[1] / red[0]) == pytest.approx(-3.2, abs=1e-3)
+    assert not library.flux[0, library.wavelength < 899.0].any()
+    grid = flux_grid.open_grid([passbands.load("euclid_h")], [flux_grid.Setting(0.1, 2, 2)], library)
+    assert np.isfinite(grid.tables[0]).all()
+    assert SURVEY.flux < 1.0
+
+
+def test_basel(tmp_path):
+    models = ingest.basel(basel_file(tmp_path / "lcbm05.cor"))
+    assert models.teff.tolist() == [5750.0, 3500.0]
+    assert models.log_g.tolist() == [4.5, 1.0]
+    assert models.metallicity.tolist() == [-0.5, 0.2]
+    assert models.wavelength[[0, -1]].tolist() == [91.0, 1.6e6]
+    # ReadMe: f_lambda = 0.4 H_nu c / lambda^2 with c = 2.997925e17 nm/s and lambda in nm, per A.
+    nm = models.wavelength / 10.0
+    np.testing.assert_allclose(models.flux[0], 0.4 * 1e-5 * 2.997925e17 / nm**2, rtol=1e-5)
+    np.testing.assert_allclose(models.flux[1], 2.0 * models.flux[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("damage", ["cut", "header", "negative", "empty", "absent"])
+def test_damaged_basel_files_are_refused(tmp_path, damage):
+    path = basel_file(tmp_path / "lcb.cor", value=-1e-5 if damage == "negative" else 1e-5)
+    lines = path.read_text().splitlines()
+    if damage == "cut":
+        path.write_text("\n".join(lines[:-10]))
+    elif damage == "header":
+        path.write_text("\n".join([*lines[:153], "no model at all", *lines[154:]]))
+    elif damage == "empty":
+        path.write_text("\n".join(lines[:153]))
+    elif damage == "absent":
+        path.unlink()
+    with pytest.raises(BadInput, match=r"lcb\.cor"):
+        ingest.basel(path)
+
+
+def test_infrared_stars_are_spliced_by_colour():
+    grid = passbands.grid()
+    slopes = (-1.0, -2.0, -3.0)
+    wiggle = 1.0 + 0.05 * np.sin(grid / 30.0)
+    irtf = [ingest.Curve(grid[grid > 8000.0], ((grid / 1e4) ** s * wiggle)[grid > 8000.0]) for s in slopes]
+    low = np.stack([7.0 * (grid / 1e4) ** s for s in (-2.9, -1.05)])
+    out = ingest.splice(grid, low, irtf)
+    outside = grid < 8200.0
+    np.testing.assert_array_equal(out[:, outside], low[:, outside])
+    middle = (grid > 8300.0) & (grid < 23_900.0)
+    # The structure is the star's, the shape and the level are the low resolution's.
+    ratio = out[:, middle] / low[:, middle]
+    assert np.abs(ratio - 1.0).max() < 0.12
+    for row, slope in ((0, -3.0), (1, -1.0)):
+        detail = out[row, middle] / (grid[middle] / 1e4) ** slope / wiggle[middle]
+        assert np.abs(np.diff(np.log(detail))).max() < 1e-5

@@ -1,0 +1,116 @@
+"""The reference page, the declarations by name, and the tables of what the rest was made with."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jobs.fluxes import passbands as responses
+from lake_schema import __main__, publish, read, tables
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+from lake_schema.mission.parameter import CONFIDENCES, STATUSES, read_all
+from lake_schema.publish import Output, Part, Plan
+from lake_schema.tables import mission, passbands, templates
+from lake_schema.validate import check
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "tables.md"
+
+
+def test_the_reference_page_is_up_to_date(capsys):
+    """If not: python -m lake_schema tables > docs/tables.md"""
+    assert __main__.main(["tables"]) == 0
+    assert PAGE.read_text() == capsys.readouterr().out
+
+
+def test_tables_are_found_by_name():
+    for table in tables.declared(["euclid_vis", "lsst_r"]):
+        assert tables.find(table.name, table.names) == table
+    assert tables.find("nothing") is None
+
+
+@dataclass
+class Types:
+    teff: np.ndarray
+    log_g: np.ndarray
+
+
+@dataclass
+class Library:
+    wavelength: np.ndarray
+    flux: np.ndarray
+    names: tuple
+    types: Types | None = None
+
+
+def libraries():
+    rng = np.random.default_rng(1)
+    wavelength = np.arange(600.0, 700.0)
+    spectra = rng.random((3, 100)).astype(np.float32)
+    known = Types(np.array([40_000.0, 5_000.0]), np.array([4.0, 4.5]))
+    return {
+        "galaxy": Library(wavelength, spectra[:2], ("E", "Im")),
+        "star": Library(wavelength, spectra, ("O9V", "G2V", "T5"), known),
+    }
+
+
+def test_templates_come_back_as_spectra():
+    rows = templates.rows(libraries())
+    check(rows, templates.TEMPLATES)
+    assert rows["sed"].to_pylist() == [0, 1, 0, 1, 2]
+    assert rows["teff"].to_pylist() == [None, None, 40_000.0, 5_000.0, None]
+    assert rows["log_g"].to_pylist() == [None, None, 4.0, 4.5, None]
+    for library in libraries().values():
+        for i, name in enumerate(library.names):
+            row = next(row for row in rows.to_pylist() if row["name"] == name)
+            assert row["sed"] == i
+            assert np.array_equal(np.array(row["flux"], np.float32), library.flux[i])
+            assert np.array_equal(row["first_wavelength"] + row["wavelength_step"] * np.arange(100), library.wavelength)
+
+
+def test_passbands_come_back_as_responses():
+    bands = [responses.load(name) for name in ("euclid_vis", "lsst_r")]
+    pivots, widths = [responses.pivot_wavelength(b) for b in bands], [responses.log_width(b) for b in bands]
+    rows = passbands.rows(bands, pivots, widths)
+    check(rows, passbands.PASSBANDS)
+    for band, row in zip(bands, rows.to_pylist(), strict=True):
+        assert row["name"] == band.name
+        assert row["medium"] == band.medium
+        assert np.array_equal(row["response"], band.response)
+        assert row["first_wavelength"] + row["wavelength_step"] * (len(row["response"]) - 1) == band.wavelength[-1]
+        assert 4000 < row["pivot_wavelength"] < 10_000
+    with pytest.raises(BadInput, match="medium"):
+        check(passbands.rows([Other()], [5000.0], [0.1]), passbands.PASSBANDS)
+
+
+class Other:
+    name, medium, wavelength, response = "x", "water", np.arange(10.0) + 100, np.ones(10)
+
+
+def test_the_mission_with_what_a_run_chose():
+    name = next(p.key for p in read_all() if p.unit == "electron")
+    plain, changed = resolve(), resolve(overrides={name: (7.5, "electron")})
+    for chosen, given in ((plain, 0), (changed, 1)):
+        rows = mission.rows(read_all(), chosen.parameters, chosen.overridden)
+        check(rows, mission.MISSION)
+        assert rows.num_rows == len(read_all()) + given
+        used = [row for row in rows.to_pylist() if row["chosen"]]
+        assert sorted(row["name"] for row in used) == [p.key for p in chosen.parameters]
+        values = {row["name"]: (row["value"], row["unit"]) for row in used}
+        assert values == {p.key: (p.value, p.unit) for p in chosen.parameters}
+        assert [row["value"] for row in used if row["overridden"]] == [7.5] * given
+
+
+def test_the_codes_are_the_databases_own():
+    assert tuple(code for code, _ in mission.STATUSES) == STATUSES
+    assert tuple(code for code, _ in mission.CONFIDENCES) == CONFIDENCES
+
+
+def test_they_can_be_published_and_asked(lake):
+    for table, rows in (
+        (templates.TEMPLATES, templates.rows(libraries())),
+        (mission.MISSION, mission.rows(read_all(), resolve().parameters)),
+    ):
+        publish.make(lake, Plan(table, {}, (Part("0.parquet", {}),)), lambda root, facts, rows=rows: Output(rows))
+        assert read.version(lake, table.name).rows().equals(rows)
