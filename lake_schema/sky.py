@@ -165,7 +165,7 @@ def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> t
 
 def positions(index: npt.ArrayLike) -> tuple[Float, Float]:
     """Order-29 indices [n] -> ra, dec [n] deg of their centres."""
-    ra, dec = hp.pix2ang(1 << DEEPEST, np.asarray(index, np.int64), nest=True, lonlat=True)
+    ra, dec = _hp().pix2ang(1 << DEEPEST, np.asarray(index, np.int64), nest=True, lonlat=True)
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
