@@ -209,7 +209,7 @@ def test_the_apparent_reference_magnitude_is_near_the_seen_ones(drawn):
 
 
 def test_an_empty_cell_is_an_empty_table(dust):
-    shallow = galaxies.model(SEED, 10.0, 2.3, BOX_CELLS, NSIDE)
+    shallow = galaxies.model(SEED, 10.0, 2.3, BOX_CELLS, NSIDE, 0.0, 0.0)
     rows = galaxies.draw(0, shallow, population.Cells(shallow.population), dust)
     # High-redshift galaxies and quasars have limits of their own.
     assert (rows["z_true"].to_numpy() < 6).sum() < 5
