@@ -233,6 +233,28 @@ def against_galsim(scene: Scene, settings: Settings, seed: int, n: int) -> tuple
     return np.array(out), spent / max(len(out), 1)
 
 
+def shear_response(scene: Scene, settings: Settings, seed: int, n: int, g: float = 0.02) -> tuple[float, float]:
+    """(worst |m|, worst |c|) of 90-degree pairs under +-g, against stamps of COMPARED pixels, noise-free."""
+    some, full = sample(scene, seed, n), spread(scene, 9)
+    weights = psf.basis_weights(full, some.photons, some.column, some.row)
+    bias, offset = [], []
+    for i in range(len(some)):
+        found = np.zeros((2, 2))
+        for turn in (0.0, np.pi / 2):
+            for k, shear in enumerate((-g, g)):
+                one = moved(some, i, COMPARED)
+                shapes = replace(one.shapes.take(one.shape), g1=np.array([shear]), g2=np.zeros(1))
+                one = replace(one, shapes=replace(shapes, beta=shapes.beta + turn), shape=np.zeros(1, np.int64))
+                sizes, floors = sizes_of(one, full, scene, settings)
+                at = float(one.column[0]), float(one.row[0])
+                for j, (size, floor) in enumerate(((min(int(sizes[0]), COMPARED), floors[0]), (COMPARED, 0.0))):
+                    image = alone(one, weights[i], full, size, floor, COMPARED)
+                    found[j, k] += 0.5 * measured(image, scene.scale, *at)[4]
+        bias.append(abs((found[0, 1] - found[0, 0]) / (found[1, 1] - found[1, 0]) - 1))
+        offset.append(abs((found[0] - found[1]).mean()))
+    return max(bias), max(offset)
+
+
 def show(title: str, found: np.ndarray) -> dict[str, float]:
     rms, worst = np.sqrt((found**2).mean(axis=0)), found.max(axis=0)
     print(f"{title:34}" + "".join(f" {name} {a:.1e}/{b:.1e}" for name, a, b in zip(NAMES, rms, worst, strict=True)))
@@ -265,6 +287,10 @@ def main(argv: list[str] | None = None) -> int:
             figures |= {
                 f"{scene.name}_{name}_{key}": value for key, value in show(f"{scene.name} {name}", found).items()
             }
+        for name in ("draft", "survey"):
+            m, c = shear_response(scene, tiers[name], 14, 12 if options.quick else 30)
+            print(f"{scene.name} {name}: shear |m| <= {m:.1e}, |c| <= {c:.1e}")
+            figures |= {f"{scene.name}_{name}_shear_m_worst": m, f"{scene.name}_{name}_shear_c_worst": c}
         found, each = against_galsim(scene, tiers["survey"], 13, 12 if options.quick else 24)
         figures |= {f"{scene.name}_galsim_{key}": value for key, value in show(f"{scene.name} galsim", found).items()}
         figures[f"{scene.name}_galsim_s_each"] = each

@@ -108,7 +108,7 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
     return _tabulated(galsim_profile(mean, detector.pixel_scale), detector.pixel_scale, planes)
 
 
-def galsim_profile(image: Float | Float32, pixel_scale: float) -> galsim.GSObject:
+def galsim_profile(image: Array, pixel_scale: float) -> galsim.GSObject:
     """A plane as a galsim object, arcsec."""
     sampled = galsim.Image(np.asarray(image, float), scale=pixel_scale / SAMPLES)
     # A plane that is empty at its border needs little padding; its extent in real and Fourier space is known.
