@@ -1,4 +1,4 @@
-"""The lake's benchmark in haste: the figures are there, and bytes, which no other load can spoil, are as few as they should."""
+"""The benchmark of the lake in haste: the figures are there, and its files are as small as they should be."""
 
 import json
 

@@ -24,7 +24,7 @@ HALOS = Table(
             "bool",
             "",
             "meta.code",
-            "above the mass limit of its redshift: there all halos are listed, below it only those whose central may be seen",
+            "above the mass limit of its redshift: all are listed there, below it only what may be seen",
         ),
     ),
     "Halos of the True Universe; a galaxy's halo_id is the id of a row here, also the id of its central galaxy.",
