@@ -6,6 +6,9 @@ LAKE/<table>/v-<key>/<table>/dataset/...      a catalogue: HATS, beside <table>_
 LAKE/<table>/v-<key>/dataset/<part>.parquet   any other table
 LAKE/<table>/v-<key>/images/...               files that belong to rows
 LAKE/<table>/.stage-<key>/                    a version in the making
+LAKE/<table>/.receipts-<key>/                 what is done of it, and the rows along the borders of its cells
+LAKE/<table>/.lock, .lock-<key>               held while publishing, while making a version
+LAKE/<table>/.gone*                           on its way out
 LAKE/runs/<id>.jsonl                          what each run did
 """
 

@@ -138,7 +138,9 @@ def _publish(root: Path, plan: Plan, base: str | None) -> None:
     with _lock(folder / ".lock", f"table {name}: another run is publishing", _PATIENCE):
         now = current_key(root, name)
         if now not in (base, key):
-            raise Superseded(f"table {name}: version {now} was published since this run began from {base}")
+            raise Superseded(
+                f"table {name}: version {now} was published since this run began from {base}; run again to replace it"
+            )
         stage, target = layout.stage(root, name, key), layout.version(root, name, key)
         if not target.exists():
             os.rename(stage, target)

@@ -1,4 +1,4 @@
-"""The benchmark of the lake in haste: the figures are there, and its files are as small as they should be."""
+"""The benchmark of the lake in haste: the figures are there, and the bytes, which no load can spoil, are few."""
 
 import json
 
