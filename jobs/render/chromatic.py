@@ -9,18 +9,19 @@ Whose spectrum the table does not hold has flat f_nu.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from jobs.fluxes import flux_grid, integration, passbands, templates
+from jobs.fluxes import flux_grid, high_redshift, integration, passbands, templates
 from jobs.fluxes.continuum import COMPONENTS
 from jobs.fluxes.grid_tables import Setting
 from jobs.fluxes.lines import line_list
 from jobs.fluxes.passbands import Passband
-from jobs.fluxes.sources import Stars, galaxies_of, stars_of
+from jobs.fluxes.sources import GALAXY_KINDS, Stars, galaxies_of, stars_of
 
 Float = npt.NDArray[np.float64]
 
@@ -55,7 +56,18 @@ def galaxies(rows: pa.Table, band: Passband) -> Float:
     """
     if not len(rows) or not set(GALAXY_COLUMNS) <= set(rows.column_names):
         return _flat(len(rows))
-    library, parts = templates.galaxy_library(), sub_bands(band)
+    parts = sub_bands(band)
+    f_nu = np.empty((len(rows), len(parts)))
+    usual = np.isin(rows["kind"].to_numpy(), GALAXY_KINDS) if "kind" in rows.column_names else np.ones(len(rows), bool)
+    if not usual.all():
+        f_nu[~usual] = high_redshift.fluxes(rows.filter(pa.array(~usual)), parts)
+    f_nu[usual] = _usual(rows.filter(pa.array(usual)), parts)
+    return _shares(f_nu, parts)
+
+
+def _usual(rows: pa.Table, parts: Sequence[Passband]) -> Float:
+    """f_nu of galaxies whose spectra are in the galaxy library."""
+    library = templates.galaxy_library()
     found = galaxies_of(rows, library)
     tabulated = flux_grid.covered(found)
     f_nu = np.empty((len(found), len(parts)))
@@ -64,7 +76,7 @@ def galaxies(rows: pa.Table, band: Passband) -> Float:
         f_nu[tabulated] = flux_grid.galaxies(found.rows(np.flatnonzero(tabulated)), grid)
     if not tabulated.all():
         f_nu[~tabulated] = integration.galaxies(found.rows(np.flatnonzero(~tabulated)), parts, library)
-    return _shares(f_nu, parts)
+    return f_nu
 
 
 def stars(rows: pa.Table, band: Passband) -> Float:

@@ -37,6 +37,7 @@ GALAXY_COLUMNS = tuple(
     dict.fromkeys(
         (
             "id",
+            "kind",
             "ra_lensed",
             "dec_lensed",
             "bulge_half_light_radius",
