@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pyarrow as pa
 from py4j.protocol import Py4JError
-from pyspark import SparkConf, SparkContext
+from pyspark import SparkConf, SparkContext, accumulators
 from pyspark.sql import SparkSession
 from pyspark.sql.pandas.types import from_arrow_type
 from pyspark.sql.types import StructField, StructType
@@ -27,6 +27,10 @@ def session(name: str) -> SparkSession:
     """The running session, or a new one under `name`."""
     # PySpark 4 warns of pandas 3 once; no row of ours passes through pandas.
     warnings.filterwarnings("ignore", "PySpark does not yet fully support pandas", FutureWarning)
+    # Where Java is stopped in mid-sentence, its listener in this process would print a traceback; that it ended, and
+    # what to do, is said in one line by the shell.
+    for listener in (accumulators.AccumulatorTCPServer, accumulators.AccumulatorUnixServer):
+        listener.handle_error = _say_nothing  # type: ignore[assignment]
     SparkContext._ensure_initialized()
     conf = SparkConf()
     builder = SparkSession.builder.appName(name)
@@ -40,6 +44,10 @@ def session(name: str) -> SparkSession:
         # PySpark's own handler calls Java from wherever the interrupt finds it, and fails.
         signal.signal(signal.SIGINT, before)
     return running
+
+
+def _say_nothing(listener: object, request: object, client_address: object) -> None:
+    """In place of socketserver's traceback."""
 
 
 def is_alive(spark: SparkSession) -> bool:
