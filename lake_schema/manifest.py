@@ -65,6 +65,14 @@ def checked(folder: Path, entry: Json) -> Path:
 
 
 def _misfit(path: Path, entry: Json) -> str:
+    try:
+        return _difference(path, entry)
+    except FileNotFoundError:
+        # Removed since, with its whole version.
+        return f"{path} is missing"
+
+
+def _difference(path: Path, entry: Json) -> str:
     if not path.is_file() or path.is_symlink():
         return f"{path} is missing"
     size = path.stat().st_size

@@ -219,7 +219,11 @@ def version(root: Path, name: str, key: str | None = None) -> Version:
     about = manifest.load(folder)
     opened = Version(folder, about, pa.schema([]))
     if opened.parts:
-        opened = replace(opened, schema=pq.read_schema(opened.path(opened.parts[0])))
+        first = opened.path(opened.parts[0])
+        try:
+            opened = replace(opened, schema=pq.read_schema(first))
+        except (OSError, pa.ArrowInvalid) as error:
+            raise Damaged(f"{first}: {error}") from None
     known = declarations.find(name, opened.schema.names)
     return opened if known is None else as_declared(opened, known)
 

@@ -1,11 +1,14 @@
 """Processes that are killed, that race each other, that read while another publishes."""
 
+import io
+import os
 import re
 import signal
 
+import pyarrow.parquet as pq
 import pytest
 
-from lake_schema import publish, read
+from lake_schema import parquet, publish, read
 from lake_schema.errors import BadInput, Damaged, Superseded
 from tests.faults import promise, victims
 from tests.faults.disc import Disc
@@ -138,3 +141,36 @@ def test_gc_leaves_a_running_publisher_alone(lake, plain_phases, monkeypatch):
             child.join()
         assert answers.get() == (seed, "published"), name
         assert promise.current(lake, "plain") == promise.key("plain", seed)
+
+
+def test_a_version_that_is_removed_while_it_is_read_is_said_to_be_missing(lake, tmp_path_factory):
+    """Each call of a reader to the disc, with the version gone just before it."""
+    promise.make(lake, "plain", 1)
+    calls = _reads(lake, 0)
+    assert calls > 5
+    for n in range(1, calls + 1):
+        root = tmp_path_factory.mktemp("lake")
+        promise.make(root, "plain", 1)
+        with pytest.raises((BadInput, Damaged), match=r"missing|No such file|no table"):
+            _reads(root, n)
+
+
+def _reads(root, n):
+    """Read a table, its folder being renamed before the n-th time that a file is looked at; returns how often one was."""
+    seen = []
+
+    def looked(real):
+        def call(path, *args, **kwargs):
+            if str(root) in str(path):
+                seen.append(path)
+                if len(seen) == n:
+                    (root / "plain").rename(root / "gone")
+            return real(path, *args, **kwargs)
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module, name in ((os, "stat"), (io, "open"), (pq, "read_schema"), (parquet, "dataset")):
+            patch.setattr(module, name, looked(getattr(module, name)))
+        read.version(root, "plain").rows()
+    return len(seen)

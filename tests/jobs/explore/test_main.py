@@ -24,13 +24,19 @@ def test_a_query_into_a_file(explored, tmp_path, capsys):
     assert len(pd.read_csv(tmp_path / "x.csv")) == 60
 
 
+LONG = "SELECT count(*) FROM range(1000000) a(x), range(1000000) b(y) WHERE x * y < 0"
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["DROP VIEW plain"], "SELECT"),
         (["SELECT 1", "--out", "x.doc"], "ending"),
         (["SELECT 1 AS a", "--out", "/no/such/folder/x.csv"], "no/such"),
-        (["SELECT count(*) FROM range(1000000) a(x), range(1000000) b(y) WHERE x * y < 0", "--timeout", "3"], "stopped after 3 s"),
+        (
+            ["SELECT count(*) FROM range(1000000) a(x), range(1000000) b(y) WHERE x * y < 0", "--timeout", "3"],
+            "stopped after 3 s",
+        ),
     ],
 )
 def test_what_is_wrong_is_one_line(explored, capsys, arguments, words):
