@@ -156,7 +156,7 @@ def test_a_version_that_is_removed_while_it_is_read_is_said_to_be_missing(lake, 
 
 
 def _reads(root, n):
-    """Read a table, its folder being renamed before the n-th time that a file is looked at; returns how often one was."""
+    """Read a table whose folder is renamed before the n-th look at a file; returns how often it looked."""
     seen = []
 
     def looked(real):
