@@ -3,6 +3,7 @@
     name = "demo"      seed = 2024      accuracy = "survey" | "draft" | "reference" | {flux = .., shape = .., ..}
     [area]       polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
     [universe]   galaxy_limit (I_E), star_limit (H, Vega), z_max, box_cells, lensing_nside
+    [stars]      plane_limit, rows_a_file
     [mission]    ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
     [fluxes]     bands = [..]           default: the bands of the pointings
     [[pointing]] channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
@@ -76,6 +77,18 @@ class Universe:
 
 
 @dataclass(frozen=True, slots=True)
+class Stars:
+    """How the Milky Way's stars are drawn.
+
+    plane_limit : faintest H (Vega, as observed) within 5 deg of the Galactic plane; None = an area there is refused
+    rows_a_file : above so many expected rows a cell's file is split into those of the next HEALPix order
+    """
+
+    plane_limit: float | None = None
+    rows_a_file: int = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
 class Override:
     """A value that replaces what the mission's ladder would choose."""
 
@@ -122,6 +135,7 @@ class Request:
     accuracy: Accuracy
     area: Area
     universe: Universe
+    stars: Stars
     mission: MissionChoice
     bands: tuple[str, ...]
     pointings: tuple[Pointing, ...]
@@ -158,7 +172,8 @@ def _one_line(error: Exception) -> str:
 
 def from_table(table: Toml) -> Request:
     """A parsed TOML table -> Request; BadInput names the key."""
-    _known(table, "", {"name", "seed", "accuracy", "area", "universe", "mission", "fluxes", "pointing", "products"})
+    sections = {"area", "universe", "stars", "mission", "fluxes", "pointing", "products"}
+    _known(table, "", {"name", "seed", "accuracy", *sections})
     pointings = _pointings(table)
     bands = _strings(_section(table, "fluxes", {"bands"}), "fluxes.bands")
     return Request(
@@ -167,6 +182,7 @@ def from_table(table: Toml) -> Request:
         accuracy=_accuracy(table.get("accuracy")),
         area=_area(_section(table, "area", {"polygon", "cone", "box"})),
         universe=_universe(_section(table, "universe", set(Universe.__slots__))),
+        stars=_stars(_section(table, "stars", set(Stars.__slots__))),
         mission=_mission(_section(table, "mission", {"ladder", "overrides"})),
         bands=bands or tuple(dict.fromkeys(p.band for p in pointings)),
         pointings=pointings,
@@ -234,6 +250,12 @@ def _universe(table: Toml) -> Universe:
         quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),
         lensing_nside=_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
     )
+
+
+def _stars(table: Toml) -> Stars:
+    plane_limit = _number(table, "stars.plane_limit", 0.0, 30.0, math.nan)
+    rows = _integer(table, "stars.rows_a_file", 1, 3_000_000) if "rows_a_file" in table else Stars().rows_a_file
+    return Stars(None if math.isnan(plane_limit) else plane_limit, rows)
 
 
 def _mission(table: Toml) -> MissionChoice:

@@ -95,6 +95,7 @@ class Table:
 
     key   : columns that together identify a row
     order : HEALPix order of its files (nested), None for a table that is not on the sky
+    finest : the highest order of its files, where they differ in order so as to hold about as many rows
     """
 
     name: str
@@ -103,6 +104,7 @@ class Table:
     doc: str
     key: tuple[str, ...] = ("id",)
     order: int | None = None
+    finest: int | None = None
 
     def __post_init__(self) -> None:
         names = [column.name for column in self.columns]
@@ -177,7 +179,8 @@ class Table:
         """The reference page of the table, in Markdown."""
         lines = [f"## {self.name} (version {self.version})", "", self.doc, ""]
         if self.is_catalogue:
-            lines += [f"HATS catalogue, HEALPix order {self.order} files, key `{', '.join(self.key)}`.", ""]
+            orders = f"{self.order} to {self.finest}" if self.finest else str(self.order)
+            lines += [f"HATS catalogue, HEALPix order {orders} files, key `{', '.join(self.key)}`.", ""]
         else:
             lines += [f"Key `{', '.join(self.key)}`.", ""]
         lines += ["| column | type | unit | range | null | UCD | meaning |", "|---|---|---|---|---|---|---|"]

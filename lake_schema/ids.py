@@ -16,8 +16,9 @@ FILE_ORDER = 5
 _SUB_BITS = 2 * (GENERATION_ORDER - FILE_ORDER)
 _NUMBER_BITS = 22
 _MEMBER_BITS = 18
-# Identifiers that differ above these bits stand for another kind or another file cell.
-BLOCK_BITS = _MEMBER_BITS + _NUMBER_BITS + _SUB_BITS
+_FILE_BITS = _MEMBER_BITS + _NUMBER_BITS + _SUB_BITS
+# Identifiers that differ above these bits stand for another kind or another generation cell.
+BLOCK_BITS = _MEMBER_BITS + _NUMBER_BITS
 
 Int64 = npt.NDArray[np.int64]
 
@@ -43,7 +44,7 @@ def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, m
         raise BadInput(f"source id: {cells[beyond].ravel()[0]} is not a cell of order {GENERATION_ORDER}")
     file_cells, sub = cells >> _SUB_BITS, cells & ((1 << _SUB_BITS) - 1)
     index = sub << _NUMBER_BITS | numbers
-    return np.asarray(kinds << 60 | file_cells << BLOCK_BITS | index << _MEMBER_BITS | members)
+    return np.asarray(kinds << 60 | file_cells << _FILE_BITS | index << _MEMBER_BITS | members)
 
 
 def halo_of(ids: Int64) -> Int64:

@@ -71,6 +71,12 @@ def cell_centre(order: int, cell: int) -> tuple[float, float]:
     return float(ra), float(dec)
 
 
+def cell_centres(order: int, cells: npt.ArrayLike) -> tuple[Float, Float]:
+    """ra[n], dec[n] of the centres of cells, deg."""
+    ra, dec = _hp().pix2ang(1 << order, np.asarray(cells, np.int64), nest=True, lonlat=True)
+    return np.asarray(ra, float), np.asarray(dec, float)
+
+
 def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
     """Corners of cells, [n, 4, 2] ra, dec deg, in order around each."""
     corners = np.moveaxis(_hp().boundaries(1 << order, np.atleast_1d(np.asarray(cells, np.int64)), nest=True), 1, 2)

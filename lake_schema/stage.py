@@ -22,8 +22,8 @@ from lake_schema.ids import BLOCK_BITS, kind_of
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
 from lake_schema.validate import check
 
-# A table whose identifiers spread over more blocks than this has none worth noting.
-_MOST_BLOCKS = 1000
+# A part whose identifiers spread over more blocks than this has none worth noting (order 3 has 1024 of a kind).
+_MOST_BLOCKS = 4096
 
 
 def attempt(root: Path, key: str, table: Table, facts: Json, work: Work, part: Part) -> Json:

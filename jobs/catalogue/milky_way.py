@@ -1,6 +1,7 @@
 """The Milky Way's stars: density laws, and draws along a line of sight.
 
 density         of thin disc, thick disc and halo, relative to each one's at the Sun
+numbers         stars of many cells
 expected        stars of a cell in every (population, shell of distance, bin of M_H)
 draw            Poisson sample of it
 teff, log_g, metallicity   labels of the sample
@@ -25,6 +26,8 @@ THIN, THICK, HALO = 0, 1, 2
 COMPONENTS = 3
 _FILE = "milky_way.toml"
 _SR_PER_DEG2 = np.radians(1.0) ** 2
+# So that the shells of all of them take 20 MB.
+_CELLS_AT_A_TIME = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,12 +139,29 @@ def _halo_distance2(halo: Halo, r: Float, z: Float) -> Float:
     return np.asarray(r**2 + (z / halo.flattening) ** 2 + halo.core**2)
 
 
-def cylindrical(galaxy: MilkyWay, lon: float, lat: float, distance: Float) -> tuple[Float, Float]:
-    """Galactocentric R[n], z[n] pc at heliocentric distances[n] along Galactic (l, b) deg."""
+def cylindrical(galaxy: MilkyWay, lon: npt.ArrayLike, lat: npt.ArrayLike, distance: Float) -> tuple[Float, Float]:
+    """Galactocentric R, z pc at heliocentric distances along Galactic (l, b) deg, all of them broadcast."""
     l_rad, b_rad = np.radians(lon), np.radians(lat)
     across = distance * np.cos(b_rad)
     r = np.hypot(galaxy.sun.radius - across * np.cos(l_rad), across * np.sin(l_rad))
     return r, galaxy.sun.height + distance * np.sin(b_rad)
+
+
+def numbers(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float) -> Float:
+    """Stars[n] of cells before their dust: the sum of `expected` of each.
+
+    lon, lat : [n] Galactic, of the cells' centres, deg; area : of one of them, deg2; h_limit : [n]
+    """
+    total = np.zeros(lon.size)
+    for limit in np.unique(h_limit):
+        chosen = np.flatnonzero(h_limit == limit)
+        per_shell = _seen(galaxy, float(limit)) @ galaxy.local.T * _volumes(galaxy, area)[:, None]
+        per_component = per_shell.reshape(per_shell.shape[0], -1, COMPONENTS).sum(1)
+        for some in np.array_split(chosen, -(-chosen.size // _CELLS_AT_A_TIME)):
+            r, z = cylindrical(galaxy, lon[some, None], lat[some, None], _middles(galaxy))
+            for component in range(COMPONENTS):
+                total[some] += density(galaxy, component, r, z) @ per_component[:, component]
+    return total
 
 
 def expected(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float) -> Float:
@@ -149,13 +169,26 @@ def expected(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: flo
 
     lon, lat : Galactic, of the cell's centre, deg; area : deg2
     """
-    near, far = galaxy.distance[:-1], galaxy.distance[1:]
-    r, z = cylindrical(galaxy, lon, lat, np.sqrt(near * far))
+    r, z = cylindrical(galaxy, lon, lat, _middles(galaxy))
     relative = np.stack([density(galaxy, component, r, z) for component in (THIN, THICK, HALO)])
-    volume = area * _SR_PER_DEG2 * (far - near) * (far**2 + far * near + near**2) / 3.0
-    brightest = galaxy.m_h[None, :-1] + 5.0 * np.log10(near[:, None]) - 5.0
-    per_shell = np.concatenate([relative, relative]) * volume
-    return np.where(brightest < h_limit, per_shell[:, :, None] * galaxy.local[:, None, :], 0.0)
+    per_shell = np.concatenate([relative, relative]) * _volumes(galaxy, area)
+    return np.where(_seen(galaxy, h_limit), per_shell[:, :, None] * galaxy.local[:, None, :], 0.0)
+
+
+def _middles(galaxy: MilkyWay) -> Float:
+    """Where in a shell its density is taken, [s] pc."""
+    return np.asarray(np.sqrt(galaxy.distance[:-1] * galaxy.distance[1:]))
+
+
+def _volumes(galaxy: MilkyWay, area: float) -> Float:
+    """Of the shells within an area, deg2, [s] pc^3."""
+    near, far = galaxy.distance[:-1], galaxy.distance[1:]
+    return np.asarray(area * _SR_PER_DEG2 * (far - near) * (far**2 + far * near + near**2) / 3.0)
+
+
+def _seen(galaxy: MilkyWay, h_limit: float) -> npt.NDArray[np.bool_]:
+    """[s, b] whether a star of the bin may be brighter than the limit in the shell."""
+    return np.asarray(galaxy.m_h[None, :-1] + 5.0 * np.log10(galaxy.distance[:-1, None]) - 5.0 < h_limit)
 
 
 def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> Sample:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.stars import STARS
 
 _CONTENT = {
     "galaxy": "with internal dust, emission lines, magnification and the Milky Way's dust",
@@ -27,10 +29,12 @@ def fluxes(kind: str, bands: Sequence[str]) -> Table:
         )
         for band in bands
     ]
+    catalogue = GALAXIES if kind == "galaxy" else STARS
     return Table(
         f"{kind}_fluxes",
         1,
         (ID, RA, DEC, HEALPIX_29, *columns),
-        f"Band fluxes of the table {'galaxies' if kind == 'galaxy' else 'stars'}, in the same cells and row order.",
-        order=5,
+        f"Band fluxes of the table {catalogue.name}, in the same cells and row order.",
+        order=catalogue.order,
+        finest=catalogue.finest,
     )

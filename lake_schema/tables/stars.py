@@ -50,5 +50,6 @@ STARS = Table(
         ),
     ),
     "Stars of the True Universe.",
-    order=5,
+    order=3,
+    finest=8,
 )

@@ -155,3 +155,27 @@ def test_the_margin_of_each_cell_is_what_lies_about_it(catalogues):
             wanted = rows.filter(np.isin(fine, sky.margin_cells(order, cell, 13)))
             assert margin["id"].to_pylist() == wanted["id"].to_pylist()
             assert margin.num_rows > 10
+
+
+def test_a_cross_match_loses_no_pair_across_cells_of_other_orders(catalogues, tmp_path):
+    """Every source has a twin 0.5" to the north, in files cut in another way."""
+    import lsdb
+
+    _, rows, version = catalogues[0]
+    columns = {name: rows[name].to_numpy() for name in rows.column_names}
+    columns["dec"] = columns["dec"] + 0.5 / 3600
+    columns["_healpix_29"] = sky.healpix_29(columns["ra"], columns["dec"])
+    order = np.argsort(columns["_healpix_29"])
+    twins = published(tmp_path, LENSED.build({name: values[order] for name, values in columns.items()}), (8, 5, 6))
+    file_of = {
+        int(cell): part
+        for one in (version, twins)
+        for part in one.parts
+        for cell in one.rows(["_healpix_29"], [part])["_healpix_29"].to_numpy()
+    }
+    moved = dict(zip(columns["id"].tolist(), columns["_healpix_29"].tolist(), strict=True))
+    stayed = dict(zip(rows["id"].to_pylist(), rows["_healpix_29"].to_pylist(), strict=True))
+    assert sum(file_of[moved[i]] != file_of[stayed[i]] for i in stayed) > 100
+    left, right = (lsdb.open_catalog(str(one.folder), columns=["id", "ra", "dec"]) for one in (version, twins))
+    pairs = left.crossmatch(right, radius_arcsec=0.6, n_neighbors=4, suffixes=("_a", "_b")).compute()
+    assert set(pairs["id_a"][pairs["id_a"] == pairs["id_b"]]) == set(range(N))

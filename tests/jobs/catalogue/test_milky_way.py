@@ -90,6 +90,20 @@ def test_star_counts(b):
     assert mean_counts(b) == pytest.approx(COUNTS[b], rel=0.05)
 
 
+@given(st.floats(0.0, 360.0), st.floats(-90.0, 90.0), st.floats(0.0, 30.0))
+def test_numbers_are_the_sum_of_what_is_expected(lon, lat, limit):
+    found = mw.numbers(GALAXY, np.array([lon, lon]), np.array([lat, -lat]), 0.05, np.array([limit, 12.0]))
+    assert found[0] == pytest.approx(mw.expected(GALAXY, lon, lat, 0.05, limit).sum(), rel=1e-9)
+    assert found[1] == pytest.approx(mw.expected(GALAXY, lon, -lat, 0.05, 12.0).sum(), rel=1e-9)
+
+
+@given(st.floats(0.0, 360.0), st.floats(20.0, 60.0), st.floats(0.1, 10.0), st.floats(5.0, 30.0))
+def test_there_are_fewer_stars_away_from_the_plane(lon, lat, step, limit):
+    """Not so about the poles, which are nearer to the Galactic centre than the anticentre's side of them."""
+    near, far = mw.numbers(GALAXY, np.array([lon] * 2), np.array([lat, lat + step]), 1.0, np.array([limit] * 2))
+    assert 0.0 < far < near < np.inf
+
+
 def test_all_that_may_be_bright_enough_is_expected(rng):
     everything = mw.expected(GALAXY, 40.0, 30.0, 0.05, 60.0)
     bright = mw.expected(GALAXY, 40.0, 30.0, 0.05, 22.0)

@@ -97,14 +97,30 @@ def test_stars_are_as_hot_as_their_template(cell):
 
 def test_a_cell_in_the_plane(dust):
     """H < 20 towards the Galactic centre: many stars behind 9 mag of dust, all inside their bounds."""
-    rows = stars.draw(galactic_cell(0.0, 0.5), SEED, stars.model(20.0), dust)
+    rows = stars.draw(galactic_cell(0.0, 0.5), SEED, stars.model(26.0, plane_limit=20.0), dust)
     assert len(rows) > 20_000
     assert validate.violations(rows, STARS) == []
 
 
-def test_more_stars_than_can_be_numbered_are_refused(dust):
-    with pytest.raises(BadInput, match=r"cell \d+ \(l = .*\) holds .* stars .* ask for a brighter star_limit"):
-        stars.draw(galactic_cell(0.0, 0.5), SEED, UNIVERSE, dust)
+def test_numbers_are_those_that_are_drawn(dust):
+    cells = np.arange(CELL, CELL + 4)
+    found = stars.numbers(cells, UNIVERSE)
+    drawn = [len(stars.draw(int(cell), SEED, UNIVERSE, 0 * dust)) for cell in cells]
+    assert found == pytest.approx(drawn, rel=0.01, abs=5 * np.sqrt(found.max()))
+    assert np.all(stars.numbers(cells, stars.model(18.0)) < 0.1 * found)
+    assert stars.numbers([], UNIVERSE).size == 0
+
+
+def test_the_plane_is_refused_or_has_its_own_limit():
+    high, low = galactic_cell(0.0, 6.0), galactic_cell(0.0, 0.5)
+    with pytest.raises(BadInput, match=r"1 of the area's cells lie within 5 deg .* stars\.plane_limit"):
+        stars.numbers([high, low], UNIVERSE)
+    with pytest.raises(BadInput, match=r"1 of the area's cells hold more than .* brighter stars\.plane_limit"):
+        stars.numbers([high, low], stars.model(26.0, plane_limit=26.0))
+    high_alone = stars.numbers([high], UNIVERSE)
+    both = stars.numbers([high, low], stars.model(26.0, plane_limit=18.0))
+    assert both[0] == high_alone[0]
+    assert both[1] == stars.numbers([low], stars.model(18.0, plane_limit=18.0))[0]
 
 
 def test_labels_leave_the_numbers_of_the_others(dust, cell):
