@@ -1,29 +1,49 @@
-"""The Milky Way's stars: density laws, and draws along a line of sight.
+"""The Milky Way's stars: how many there are along a line of sight, and draws of them.
 
-density         of thin disc, thick disc and halo, relative to each one's at the Sun
+milky_way       the components, by one of the models MODELS, and the luminosity functions
 numbers         stars of many cells
 expected        stars of a cell in every (population, shell of distance, bin of M_H)
 draw            Poisson sample of it
 teff, log_g, metallicity   labels of the sample
 
-Ref: Juric et al. 2008; the numbers and their sources are in milky_way.toml.
+A population is a component's dwarfs, giants or white dwarfs.  The numbers and their sources are in milky_way.toml.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from jobs.catalogue import parameters
-from jobs.catalogue.stellar_populations import Sequence, dwarf_sequence, giant_sequence, luminosity
+from jobs.catalogue.density_laws import (
+    Aged,
+    CoredPowerLaw,
+    Exponential,
+    Law,
+    Parabolic,
+    PowerLaw,
+    Sun,
+    Young,
+    density,
+)
+from jobs.catalogue.stellar_populations import (
+    Sequence,
+    dwarf_sequence,
+    giant_sequence,
+    luminosity,
+    white_dwarf_sequence,
+)
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 
+MODELS = ("juric", "besancon")
 THIN, THICK, HALO = 0, 1, 2
-COMPONENTS = 3
+DWARF, GIANT, WHITE_DWARF = 0, 1, 2
+_STAGES = 3
 _FILE = "milky_way.toml"
 _SR_PER_DEG2 = np.radians(1.0) ** 2
 # So that the shells of all of them take 20 MB.
@@ -31,30 +51,12 @@ _CELLS_AT_A_TIME = 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Sun:
-    """The Sun's distance from the centre and height above the plane, pc."""
+class Component:
+    """A law of density, its share in the density of stars at the Sun, and THIN, THICK or HALO."""
 
-    radius: float
-    height: float
-
-
-@dataclass(frozen=True, slots=True)
-class Disc:
-    """Double-exponential disc: lengths in pc, density share against the thin disc at the Sun."""
-
-    length: float
-    height: float
+    law: Law
     share: float
-
-
-@dataclass(frozen=True, slots=True)
-class Halo:
-    """Flattened power-law halo, core in pc."""
-
-    flattening: float
-    slope: float
-    core: float
-    share: float
+    code: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,16 +74,14 @@ class Metallicity:
 class MilkyWay:
     """Everything that stars are drawn from, made once by `milky_way`.
 
-    distance : [s + 1] pc, edges of the shells; m_h : [b + 1] mag, edges of the bins
-    local    : [6, b] pc^-3 at the Sun: dwarfs of thin disc, thick disc, halo, then giants of the three
+    sequences : of DWARF, GIANT, WHITE_DWARF
+    distance  : [s + 1] pc, edges of the shells; m_h : [b + 1] mag, edges of the bins
+    local     : [p, b] pc^-3 at the Sun: dwarfs of every component, then their giants, then their white dwarfs
     """
 
     sun: Sun
-    thin: Disc
-    thick: Disc
-    halo: Halo
-    dwarfs: Sequence
-    giants: Sequence
+    components: tuple[Component, ...]
+    sequences: tuple[Sequence, Sequence, Sequence]
     metallicity: Metallicity
     distance: Float
     m_h: Float
@@ -90,53 +90,54 @@ class MilkyWay:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """Stars: component code[n], whether a giant[n], distance[n] pc, M_H[n] mag (Vega)."""
+    """Stars: component THIN, THICK, HALO [n], stage DWARF, .. [n], distance[n] pc, M_H[n] mag (Vega)."""
 
     component: Int
-    giant: npt.NDArray[np.bool_]
+    stage: Int
     distance: Float
     m_h: Float
 
 
-def milky_way() -> MilkyWay:
+def milky_way(model: str = "juric") -> MilkyWay:
     """The Milky Way of the embedded universe: numbers read, tables made (a few ms)."""
     sampling = parameters.section(_FILE, "sampling")
-    thin, thick = (Disc(**parameters.section(_FILE, name)) for name in ("thin", "thick"))
-    halo = Halo(**parameters.section(_FILE, "halo"))
-    dwarfs, giants = dwarf_sequence(), giant_sequence()
-    start = min(dwarfs.m_h[0], giants.m_h[0])
-    stop = max(dwarfs.m_h[-1], giants.m_h[-1])
+    sun, components = _juric() if model == "juric" else _besancon()
+    sequences = dwarf_sequence(), giant_sequence(), white_dwarf_sequence()
+    start = min(sequence.m_h[0] for sequence in sequences)
+    stop = max(sequence.m_h[-1] for sequence in sequences)
     m_h = start + sampling["bin_mag"] * np.arange(np.ceil((stop - start) / sampling["bin_mag"]) + 1)
-    shares = np.array([thin.share, thick.share, halo.share])
-    functions = luminosity(m_h, dwarfs, shares / shares.sum())
+    share = np.array([component.share for component in components])
+    functions = luminosity(m_h, sequences[DWARF], share / share.sum(), np.array([c.code for c in components]))
     distance = np.geomspace(sampling["nearest"], sampling["farthest"], sampling["shells"] + 1)
     metallicity = Metallicity(**parameters.section(_FILE, "metallicity"))
-    sun = Sun(**parameters.section(_FILE, "sun"))
-    return MilkyWay(sun, thin, thick, halo, dwarfs, giants, metallicity, distance, m_h, functions)
+    return MilkyWay(sun, components, sequences, metallicity, distance, m_h, functions)
 
 
-def density(galaxy: MilkyWay, component: int, radius: npt.ArrayLike, height: npt.ArrayLike) -> Float:
-    """Density of a component (THIN, THICK, HALO) relative to its own at the Sun.
-
-    radius, height : Galactocentric cylindrical R, z, pc
-    Ref: Juric et al. 2008
-    """
-    r, z = np.asarray(radius, float), np.asarray(height, float)
-    if component == HALO:
-        return (_halo_distance2(galaxy.halo, r, z) / _halo_distance2(galaxy.halo, *_sun(galaxy))) ** (
-            0.5 * galaxy.halo.slope
-        )
-    disc = galaxy.thin if component == THIN else galaxy.thick
-    sun_r, sun_z = _sun(galaxy)
-    return np.asarray(np.exp(-(r - sun_r) / disc.length - (np.abs(z) - np.abs(sun_z)) / disc.height))
+def _juric() -> tuple[Sun, tuple[Component, ...]]:
+    """Ref: Juric et al. 2008"""
+    number: dict[str, Any] = parameters.section(_FILE, "juric")
+    thin = Exponential(number["thin_length"], number["thin_height"])
+    thick = Exponential(number["thick_length"], number["thick_height"])
+    halo = PowerLaw(number["halo_flattening"], number["halo_slope"], number["halo_core"])
+    components = (
+        Component(thin, 1.0, THIN),
+        Component(thick, number["thick_share"], THICK),
+        Component(halo, number["halo_share"], HALO),
+    )
+    return Sun(number["sun_radius"], number["sun_height"]), components
 
 
-def _sun(galaxy: MilkyWay) -> tuple[Float, Float]:
-    return np.asarray(galaxy.sun.radius), np.asarray(galaxy.sun.height)
-
-
-def _halo_distance2(halo: Halo, r: Float, z: Float) -> Float:
-    return np.asarray(r**2 + (z / halo.flattening) ** 2 + halo.core**2)
+def _besancon() -> tuple[Sun, tuple[Component, ...]]:
+    """Ref: Robin et al. 2003"""
+    number: dict[str, Any] = parameters.section(_FILE, "besancon")
+    flattening = number["thin_flattening"]
+    thin: list[Law] = [Aged(value, number["outer"], number["inner"]) for value in flattening]
+    thin[0] = Young(flattening[0], number["young_outer"], number["young_inner"])
+    thick = Parabolic(number["thick_length"], number["thick_height"], number["thick_joint"])
+    halo = CoredPowerLaw(number["halo_flattening"], number["halo_slope"], number["halo_core"])
+    components = [Component(law, local, THIN) for law, local in zip(thin, number["thin_local"], strict=True)]
+    components += [Component(thick, number["thick_local"], THICK), Component(halo, number["halo_local"], HALO)]
+    return Sun(number["sun_radius"], number["sun_height"]), tuple(components)
 
 
 def cylindrical(galaxy: MilkyWay, lon: npt.ArrayLike, lat: npt.ArrayLike, distance: Float) -> tuple[Float, Float]:
@@ -156,22 +157,22 @@ def numbers(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Floa
     for limit in np.unique(h_limit):
         chosen = np.flatnonzero(h_limit == limit)
         per_shell = _seen(galaxy, float(limit)) @ galaxy.local.T * _volumes(galaxy, area)[:, None]
-        per_component = per_shell.reshape(per_shell.shape[0], -1, COMPONENTS).sum(1)
+        weight = per_shell.reshape(per_shell.shape[0], _STAGES, -1).sum(1)
         for some in np.array_split(chosen, -(-chosen.size // _CELLS_AT_A_TIME)):
             r, z = cylindrical(galaxy, lon[some, None], lat[some, None], _middles(galaxy))
-            for component in range(COMPONENTS):
-                total[some] += density(galaxy, component, r, z) @ per_component[:, component]
+            for component, weights in zip(galaxy.components, weight.T, strict=True):
+                total[some] += density(component.law, galaxy.sun, r, z) @ weights
     return total
 
 
 def expected(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float) -> Float:
-    """Stars of a cell in every (population, shell, bin), [6, s, b]; 0 where all are fainter than h_limit.
+    """Stars of a cell in every (population, shell, bin), [p, s, b]; 0 where all are fainter than h_limit.
 
     lon, lat : Galactic, of the cell's centre, deg; area : deg2
     """
     r, z = cylindrical(galaxy, lon, lat, _middles(galaxy))
-    relative = np.stack([density(galaxy, component, r, z) for component in (THIN, THICK, HALO)])
-    per_shell = np.concatenate([relative, relative]) * _volumes(galaxy, area)
+    relative = np.stack([density(component.law, galaxy.sun, r, z) for component in galaxy.components])
+    per_shell = np.tile(relative * _volumes(galaxy, area), (_STAGES, 1))
     return np.where(_seen(galaxy, h_limit), per_shell[:, :, None] * galaxy.local[:, None, :], 0.0)
 
 
@@ -203,7 +204,9 @@ def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> Sample:
     near3, far3 = galaxy.distance[shell] ** 3, galaxy.distance[shell + 1] ** 3
     distance = np.cbrt(near3 + (far3 - near3) * rng.random(n))
     m_h = galaxy.m_h[m_bin] + (galaxy.m_h[m_bin + 1] - galaxy.m_h[m_bin]) * rng.random(n)
-    return Sample(population % COMPONENTS, population >= COMPONENTS, distance, m_h)
+    stage, component = np.divmod(population, len(galaxy.components))
+    codes = np.array([component.code for component in galaxy.components])
+    return Sample(codes[component], stage, distance, m_h)
 
 
 def metallicity(galaxy: MilkyWay, component: Int, rng: np.random.Generator) -> Float:
@@ -215,9 +218,8 @@ def metallicity(galaxy: MilkyWay, component: Int, rng: np.random.Generator) -> F
 
 def teff(galaxy: MilkyWay, stars: Sample, metals: Float) -> Float:
     """Effective temperature[n], K; metal-poor stars are hotter at their luminosity."""
-    return _of_sequence(galaxy, stars, "teff") + np.where(
-        metals < galaxy.metallicity.poor, galaxy.metallicity.hotter, 0.0
-    )
+    poor = (metals < galaxy.metallicity.poor) & (stars.stage != WHITE_DWARF)
+    return _of_sequence(galaxy, stars, "teff") + np.where(poor, galaxy.metallicity.hotter, 0.0)
 
 
 def log_g(galaxy: MilkyWay, stars: Sample) -> Float:
@@ -226,6 +228,5 @@ def log_g(galaxy: MilkyWay, stars: Sample) -> Float:
 
 
 def _of_sequence(galaxy: MilkyWay, stars: Sample, name: str) -> Float:
-    dwarf = np.interp(stars.m_h, galaxy.dwarfs.m_h, getattr(galaxy.dwarfs, name))
-    giant = np.interp(stars.m_h, galaxy.giants.m_h, getattr(galaxy.giants, name))
-    return np.asarray(np.where(stars.giant, giant, dwarf))
+    values = [np.interp(stars.m_h, sequence.m_h, getattr(sequence, name)) for sequence in galaxy.sequences]
+    return np.choose(stars.stage, values)

@@ -60,6 +60,7 @@ class StellarTypes:
     """The mean dwarf sequence, hottest first; all arrays float64[n], magnitudes Vega.
 
     teff K, log_g of cm s-2, mass Msun, abs_mag_v (Johnson), abs_mag_j, abs_mag_h, abs_mag_ks (2MASS)
+    bolometric_h : M_bol - M_H
     colors : m_band - m_V of each of the bands U B V R I J H Ks, float64[n, 8], NaN where unknown
     """
 
@@ -71,6 +72,7 @@ class StellarTypes:
     abs_mag_j: Float
     abs_mag_h: Float
     abs_mag_ks: Float
+    bolometric_h: Float
     colors: Float
 
     @property
@@ -97,6 +99,7 @@ def types() -> StellarTypes:
         column["M_J"],
         column["M_Ks"] + hk,
         column["M_Ks"],
+        column["BCv"] - h,
         np.stack(colors, 1),
     )
 

@@ -55,8 +55,8 @@ def test_the_main_sequence_is_in_order():
 
 def test_old_components_have_lost_their_massive_stars():
     m_h = np.arange(-7.0, 12.0, 0.1)
-    local = populations.luminosity(m_h, DWARFS, np.array([0.8, 0.15, 0.05]))
-    assert local.shape == (6, m_h.size - 1)
+    local = populations.luminosity(m_h, DWARFS, np.array([0.8, 0.15, 0.05]), np.arange(3))
+    assert local.shape == (9, m_h.size - 1)
     assert local.min() >= 0.0
     bright = m_h[1:] < 2.0
     assert local[0, bright].sum() > 0.0
