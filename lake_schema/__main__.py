@@ -1,4 +1,6 @@
-"""Look after a lake: python -m lake_schema verify|gc|describe LAKE [TABLE]; `tables` prints the reference page."""
+"""Look after a lake: python -m lake_schema verify|gc|describe LAKE [TABLE]; `tables` prints the reference page;
+`mission diff A B` compares two mission configurations, each a ladder (CBE,DES,SIM), a request or a LAKE[@KEY].
+"""
 
 from __future__ import annotations
 
@@ -13,12 +15,15 @@ from lake_schema.errors import BadInput, LakeError
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: 0 all well, 1 something is wrong with the lake, 2 the call is wrong."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["mission"]:
+        return _mission(arguments[1:])
     parser = argparse.ArgumentParser(prog="python -m lake_schema", description=__doc__, epilog=f"truesky {__version__}")
     parser.add_argument("command", choices=("verify", "gc", "describe", "tables"))
     parser.add_argument("lake", nargs="?", help="folder of the lake")
     parser.add_argument("table", nargs="?", help="one table (default: all of them)")
     parser.add_argument("--deep", action="store_true", help="verify: read every byte and compare its sha256")
-    options = parser.parse_args(argv)
+    options = parser.parse_args(arguments)
     if options.command == "tables":
         print(tables.markdown(), end="")
         return 0
@@ -33,6 +38,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _say(error, 2)
     actions = {"verify": _verify, "gc": _gc, "describe": _describe}
     return max(_status(actions[options.command], root, name, options.deep) for name in names)
+
+
+def _mission(argv: Sequence[str]) -> int:
+    """Exit status as of diff: 0 the same, 1 different, 2 the call is wrong."""
+    from lake_schema.mission.compare import compare
+
+    parser = argparse.ArgumentParser(prog="python -m lake_schema mission", description="Compare mission configurations")
+    parser.add_argument("command", choices=("diff",))
+    about = "a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of its table mission"
+    parser.add_argument("first", help=about)
+    parser.add_argument("second", help="the same")
+    options = parser.parse_args(argv)
+    try:
+        lines = compare(options.first, options.second)
+    except LakeError as error:
+        return _say(error, 2)
+    for line in lines:
+        print(line)
+    return int(bool(lines))
 
 
 def _names(root: Path, command: str) -> list[str]:

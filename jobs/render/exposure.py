@@ -156,9 +156,14 @@ def render(
 
 
 def throughput(section: str, band: str, mission: MissionConfiguration) -> tuple[float, float]:
-    """(AB magnitude of 1 e-/s, e-/s per microjansky), from the band's throughput and the collecting area."""
-    key = "plm.collecting_area" if section == "vis" else f"{section}.collecting_area"
-    area, width = mission.value(key, "cm2"), passbands.log_width(passbands.load(band))
+    """(AB magnitude of 1 e-/s, e-/s per microjansky).
+
+    Euclid : from the band's throughput and the collecting area;  ground : the mission database's zero point
+    """
+    if f"{section}.{band}.zero_point" in mission:
+        zero_point = mission.value(f"{section}.{band}.zero_point", "mag")
+        return zero_point, float(10.0 ** (0.4 * (zero_point - units.AB_UJY)))
+    area, width = mission.value("plm.collecting_area", "cm2"), passbands.log_width(passbands.load(band))
     return units.zero_point(area, width), float(units.electron_rate(1.0, area, width))
 
 

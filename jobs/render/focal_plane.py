@@ -13,7 +13,7 @@ corners, s_region, radius
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,15 +23,15 @@ from astropy.wcs import WCS
 
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.mission.parameter import CAMERAS
 
 Float = npt.NDArray[np.float64]
 
-# Corner rafts of LSSTCam carry no science sensors (Rubin Observatory, obs_lsst camera description).
-_LSST_CORNERS = ("R00", "R04", "R40", "R44")
-_LSST_RAFTS, _LSST_SENSORS = 5, 3
 # VIS CCDs of the right half of the focal plane are mounted upside down (Euclid Data Product Description
 # Document, LE1 VIS).
 _VIS_FIRST_ROTATED_COLUMN = 4
+# NISP detectors of the lower half likewise (Euclid Data Product Description Document, LE1 NISP).
+_NISP_FIRST_ROTATED_ROW = 3
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
@@ -39,7 +39,7 @@ _ARCSEC = np.pi / 180.0 / 3600.0
 class Detector:
     """One detector of a camera.
 
-    section     : prefix of its parameters in the mission database, "vis" or "ext.lsstcam"
+    section     : prefix of its parameters in the mission database, "vis", "nisp" or "ext.lsstcam"
     nx, ny      : columns and rows of its image
     x, y        : arcsec, its centre in the focal plane
     rotation    : deg, of its columns-rows axes against the focal plane's, from x to y
@@ -62,15 +62,19 @@ class Detector:
 
 
 def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
-    """The detectors of "vis" (36) or "lsstcam" (189), in the order of the layout rule.
+    """The detectors of a camera, in the order of its layout: "vis", "nisp" or a ground camera.
 
-    Ref : VIS, Scaramella et al. 2022, Table 1 (gaps); LSSTCam, Rubin Observatory, obs_lsst camera description
+    Ref : VIS and NISP, Scaramella et al. 2022, Table 1 (gaps); ground cameras, the mission database's layouts
     """
     if camera == "vis":
-        return _vis(mission)
-    if camera == "lsstcam":
-        return _lsstcam(mission)
-    raise BadInput(f"camera {camera!r} is not one of vis, lsstcam")
+        return tuple(
+            _grid(mission, "vis", lambda row, column: (f"{row}-{column}", column >= _VIS_FIRST_ROTATED_COLUMN))
+        )
+    if camera == "nisp":
+        return tuple(_grid(mission, "nisp", lambda row, column: (f"DET{row}{column}", row >= _NISP_FIRST_ROTATED_ROW)))
+    if camera in CAMERAS:
+        return _listed(f"ext.{camera}", mission)
+    raise BadInput(f"camera {camera!r} is not one of vis, nisp, {', '.join(CAMERAS)}")
 
 
 def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
@@ -81,56 +85,45 @@ def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
     raise BadInput(f"camera {camera} has no detector {name!r}")
 
 
-def _vis(mission: MissionConfiguration) -> tuple[Detector, ...]:
-    """6 x 6, named row-column: rows from the top, columns from the left."""
-    scale = mission.value("vis.fpa.pixel_scale", "arcsec / pix")
-    nx, ny, rows, columns = (int(mission.value(f"vis.fpa.{key}")) for key in ("nx", "ny", "rows", "columns"))
-    pitch_x = nx * scale + mission.value("vis.fpa.gap_x", "arcsec")
-    pitch_y = ny * scale + mission.value("vis.fpa.gap_y", "arcsec")
-    return tuple(
-        Detector(
-            name=f"{row}-{column}",
-            section="vis",
-            nx=nx,
-            ny=ny,
-            x=(column - (columns + 1) / 2) * pitch_x,
-            y=((rows + 1) / 2 - row) * pitch_y,
-            rotation=180.0 if column >= _VIS_FIRST_ROTATED_COLUMN else 0.0,
-            pixel_scale=scale,
-        )
-        for row in range(1, rows + 1)
-        for column in range(1, columns + 1)
-    )
+def _grid(
+    mission: MissionConfiguration, section: str, label: Callable[[int, int], tuple[str, bool]]
+) -> Iterator[Detector]:
+    """Rows from the top, columns from the left; `label` gives the name, and whether it is mounted upside down."""
+    scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
+    nx, ny, rows, columns = (int(mission.value(f"{section}.fpa.{key}")) for key in ("nx", "ny", "rows", "columns"))
+    pitch_x = nx * scale + mission.value(f"{section}.fpa.gap_x", "arcsec")
+    pitch_y = ny * scale + mission.value(f"{section}.fpa.gap_y", "arcsec")
+    for row in range(1, rows + 1):
+        for column in range(1, columns + 1):
+            name, turned = label(row, column)
+            yield Detector(
+                name=name,
+                section=section,
+                nx=nx,
+                ny=ny,
+                x=(column - (columns + 1) / 2) * pitch_x,
+                y=((rows + 1) / 2 - row) * pitch_y,
+                rotation=180.0 if turned else 0.0,
+                pixel_scale=scale,
+            )
 
 
-def _lsstcam(mission: MissionConfiguration) -> tuple[Detector, ...]:
-    """21 rafts of 3 x 3, named R<row><column>_S<row><column>, all of one make (as in Serrano et al. 2024)."""
-    prefix = "ext.lsstcam.fpa"
-    plate_scale = mission.value(f"{prefix}.plate_scale", "arcsec / mm")
-    raft_pitch = mission.value(f"{prefix}.raft_pitch", "mm") * plate_scale
-    sensor_pitch = mission.value(f"{prefix}.sensor_pitch", "mm") * plate_scale
-    scale = mission.value(f"{prefix}.pixel_size", "mm / pix") * plate_scale
-    nx, ny = (int(mission.value(f"{prefix}.{key}")) for key in ("nx", "ny"))
-    places = [
-        (f"R{i}{j}", i, j, k, m)
-        for i in range(_LSST_RAFTS)
-        for j in range(_LSST_RAFTS)
-        for k in range(_LSST_SENSORS)
-        for m in range(_LSST_SENSORS)
-    ]
+def _listed(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
+    """Detectors of a layout in millimetres."""
+    scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
+    plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")
     return tuple(
         Detector(
-            name=f"{raft}_S{k}{m}",
-            section="ext.lsstcam",
-            nx=nx,
-            ny=ny,
-            x=raft_pitch * (j - _LSST_RAFTS // 2) + sensor_pitch * (m - _LSST_SENSORS // 2),
-            y=raft_pitch * (i - _LSST_RAFTS // 2) + sensor_pitch * (k - _LSST_SENSORS // 2),
-            rotation=0.0,
+            name=row["detector"],
+            section=section,
+            nx=int(row["nx"]),
+            ny=int(row["ny"]),
+            x=float(row["x_mm"]) * plate_scale,
+            y=float(row["y_mm"]) * plate_scale,
+            rotation=float(row["rotation_deg"]),
             pixel_scale=scale,
         )
-        for raft, i, j, k, m in places
-        if raft not in _LSST_CORNERS
+        for row in mission.rows(f"{section}.layout")
     )
 
 

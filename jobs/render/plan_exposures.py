@@ -7,17 +7,19 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
-import pyarrow as pa
-
 from jobs.render import survey
 from jobs.request import MissionChoice, Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput
-from lake_schema.mission import configuration
+from lake_schema.mission import checks, configuration, published
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.mission.model import read_models
+from lake_schema.mission.parameter import read_all
+from lake_schema.provenance import digest
 from lake_schema.publish import Json, Output, Part, Plan
 from lake_schema.tables.exposures import EXPOSURES
+from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
 
 
@@ -28,17 +30,27 @@ def mission_of(choice: MissionChoice) -> MissionConfiguration:
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """The exposures, and a task for each of their detectors."""
+    """The mission configuration, the exposures, and a task for each of their detectors."""
     if not request.pointings:
         raise BadInput(f"request {request.name}: pointing is missing: there is nothing to plan")
     mission = mission_of(request.mission)
+    checks.check(mission)
     exposures, tasks = survey.plan(request.pointings, mission)
     facts = {**common_facts(request, "pointings"), "mission": mission.fingerprint}
-    return [_step(EXPOSURES, exposures, facts), _step(TASKS, tasks, facts)]
+    about = {
+        "mission": mission.fingerprint,
+        "ladder": list(mission.ladder),
+        "records": digest([repr(r) for r in (*read_all(), *read_models())]),
+    }
+    return [
+        _step(MISSION, published.output(mission), about),
+        _step(EXPOSURES, Output(exposures), facts),
+        _step(TASKS, Output(tasks), facts),
+    ]
 
 
-def _step(table: Table, rows: pa.Table, facts: Json) -> Step:
-    return Step(Plan(table, facts, (Part("all.parquet", {}),)), lambda lake, part: Output(rows), on_driver=True)
+def _step(table: Table, output: Output, facts: Json) -> Step:
+    return Step(Plan(table, facts, (Part("all.parquet", {}),)), lambda lake, part: output, on_driver=True)
 
 
 JOB = Job("plan_exposures", "Plan which detectors are rendered, with which sky and which sources.", steps)

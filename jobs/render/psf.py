@@ -27,7 +27,6 @@ from jobs.fluxes.passbands import Passband
 from jobs.render.chromatic import sub_bands
 from jobs.render.focal_plane import Detector, detectors
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.mission.parameter import read_table
 
 Float = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -318,7 +317,7 @@ def wavefront(x: float, y: float, mission: MissionConfiguration) -> Float:
 
     x, y : -1 .. 1 across the focal plane
     """
-    terms = read_table("vis_wavefront")
+    terms = mission.numbers("vis.psf.wavefront")
     nm = np.zeros(1 + int(max(term[0] for term in terms)))
     for noll, x_power, y_power, coefficient in terms:
         nm[int(noll)] += coefficient * x**x_power * y**y_power

@@ -14,16 +14,17 @@ import pyarrow.compute as pc
 from jobs.accuracy import Accuracy
 from jobs.render import exposure, fits_product
 from jobs.render.plan_exposures import mission_of
-from jobs.request import MissionChoice, Override, Request
+from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema import read
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
+from lake_schema.mission.published import read_back
 from lake_schema.provenance import canonical
 from lake_schema.publish import Json, Output, Part, Plan
 from lake_schema.tables.products import PRODUCTS
 
-INPUTS = ("exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
+INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
@@ -55,6 +56,8 @@ def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> 
     for name in ("exposures", "tasks"):
         if canonical({key: facts[name].get(key) for key in wanted}) != canonical(wanted):
             raise BadInput(f"table {name} was planned for another request: run plan_exposures first")
+    if facts["mission"].get("mission") != wanted["mission"]:
+        raise BadInput("table mission was planned for another request: run plan_exposures first")
     for name in ("galaxies", "stars"):
         if facts[name].get("seed") != request.seed:
             seeds = f"seed {facts[name].get('seed')}, the request {request.seed}"
@@ -88,13 +91,11 @@ def work(lake: Path, facts: Json) -> Output:
         "star_fluxes": flux,
     }
     rows = {name: inputs[name].in_cells(task["cells"], GENERATION_ORDER, wanted) for name, wanted in columns.items()}
-    choice = request["mission"]
-    overrides = tuple((key, Override(**override)) for key, override in choice["overrides"])
     rendered = exposure.render(
         task,
         exposed,
         **rows,
-        mission=mission_of(MissionChoice(tuple(choice["ladder"]), overrides)),
+        mission=read_back(inputs["mission"]),
         accuracy=Accuracy(**request["accuracy"]),
         seed=request["seed"],
     )

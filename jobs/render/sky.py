@@ -16,7 +16,6 @@ from jobs.fluxes.passbands import Passband
 from jobs.render.focal_plane import Detector
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.mission.parameter import read_table
 from lake_schema.units import LIGHT_ANGSTROM_S, PLANCK_ERG_S
 
 Float = npt.NDArray[np.float64]
@@ -40,13 +39,20 @@ def sky_rate(detector: Detector, band: str, ra: float, dec: float, mjd: float, m
     """Electrons per second in a pixel of a detector.
 
     Euclid : zodiacal light and scattered starlight;  ground : the band's dark-sky rate of the mission
-             database
+             database, or what follows from its surface brightness and zero point
     """
-    if detector.section == "vis":
+    section = detector.section
+    if section in ("vis", "nisp"):
         area = mission.value("plm.collecting_area", "m2")
-        zodi = zodiacal_rate(ra, dec, mjd, passbands.load(band), area, detector.pixel_scale, mission)
-        return zodi + mission.value("vis.scattered_light", "electron / (s pix)")
-    return mission.value(f"{detector.section}.{band}.sky", "electron / (s pix)")
+        rate = zodiacal_rate(ra, dec, mjd, passbands.load(band), area, detector.pixel_scale, mission)
+        extra = f"{section}.scattered_light" if section == "vis" else f"{section}.{band}.thermal"
+        return rate + mission.value(extra, "electron / (s pix)")
+    if f"{section}.{band}.sky" in mission:
+        return mission.value(f"{section}.{band}.sky", "electron / (s pix)")
+    contrast = mission.value(f"{section}.{band}.zero_point", "mag") - mission.value(
+        f"{section}.{band}.sky_brightness", "mag / arcsec2"
+    )
+    return float(10.0 ** (0.4 * contrast) * detector.pixel_scale**2)
 
 
 def ecliptic(ra: float, dec: float) -> tuple[float, float]:
@@ -66,7 +72,7 @@ def sun_longitude(mjd: float) -> float:
     return float((longitude + _SUN_CENTRE[0] * np.sin(anomaly) + _SUN_CENTRE[1] * np.sin(2 * anomaly)) % 360.0)
 
 
-def zodiacal_intensity(from_sun: float, latitude: float) -> float:
+def zodiacal_intensity(from_sun: float, latitude: float, mission: MissionConfiguration) -> float:
     """Zodiacal light at 500 nm seen from the Earth, W m-2 sr-1 um-1.
 
     from_sun : deg, ecliptic longitude minus the Sun's;  latitude : deg, ecliptic
@@ -76,7 +82,7 @@ def zodiacal_intensity(from_sun: float, latitude: float) -> float:
     if not abs(latitude) <= 90.0:
         raise OutOfRange("ecliptic latitude", latitude, -90.0, 90.0)
     distance, beta = abs((from_sun + 180.0) % 360.0 - 180.0), abs(latitude)
-    longitudes, values = _zodiacal_table()
+    longitudes, values = _zodiacal_table(mission)
     i = int(np.clip(np.searchsorted(longitudes, distance, "right") - 1, 0, len(longitudes) - 2))
     j = int(np.clip(np.searchsorted(_LATITUDES, beta, "right") - 1, 0, len(_LATITUDES) - 2))
     s = (distance - longitudes[i]) / (longitudes[i + 1] - longitudes[i])
@@ -90,9 +96,9 @@ def zodiacal_intensity(from_sun: float, latitude: float) -> float:
 _LATITUDES = np.array([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 45.0, 60.0, 75.0, 90.0])
 
 
-def _zodiacal_table() -> tuple[Float, Float]:
+def _zodiacal_table(mission: MissionConfiguration) -> tuple[Float, Float]:
     """|longitude from the Sun| [19] deg, values [19, 11]; an empty entry takes the next away from the Sun."""
-    table = np.array(read_table("zodiacal_light_500nm"))
+    table = np.array(mission.numbers("env.zodi.map"))
     values = table[:, 1:]
     for row in range(len(values) - 2, -1, -1):
         empty = np.isnan(values[row])
@@ -119,9 +125,10 @@ def zodiacal_rate(
     from_sun = longitude - sun_longitude(mjd)
     cosine = np.cos(np.radians(latitude)) * np.cos(np.radians(from_sun))
     elongation = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    at_500 = zodiacal_intensity(from_sun, latitude)
+    at_500 = zodiacal_intensity(from_sun, latitude, mission)
     wavelength = band.wavelength / 10.0
-    spectrum = _solar(wavelength) / _solar(np.array([mission.value("env.zodi.reference_wavelength", "nm")]))
+    reference = np.array([mission.value("env.zodi.reference_wavelength", "nm")])
+    spectrum = _solar(wavelength, mission) / _solar(reference, mission)
     intensity = at_500 * spectrum * _reddening(wavelength, elongation, mission)
     energy = PLANCK_ERG_S * 1e-7 * LIGHT_ANGSTROM_S / band.wavelength
     # W m-2 sr-1 um-1 over steps of 1 A = 1e-4 um.
@@ -129,9 +136,9 @@ def zodiacal_rate(
     return float(photons * area * (pixel_scale * _ARCSEC) ** 2)
 
 
-def _solar(wavelength: Float) -> Float:
+def _solar(wavelength: Float, mission: MissionConfiguration) -> Float:
     """Solar spectral irradiance, W m-2 nm-1, 25 nm means; wavelength in nm.  Ref: Gueymard 2004."""
-    table = np.array(read_table("solar_spectrum"))
+    table = np.array(mission.numbers("env.sun.spectrum"))
     if wavelength.min() < table[0, 0] or wavelength.max() > table[-1, 0]:
         raise BadInput(f"the solar spectrum covers {table[0, 0]:g}-{table[-1, 0]:g} nm, the band wants more")
     return np.asarray(np.interp(wavelength, table[:, 0], table[:, 1]))

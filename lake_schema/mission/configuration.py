@@ -1,7 +1,8 @@
-"""A mission configuration: exactly one value for every name, chosen by a ladder of statuses.
+"""A mission configuration: exactly one value and one model for every name, chosen by a ladder of statuses.
 
 resolve                 records + ladder + overrides -> MissionConfiguration
-MissionConfiguration    .value(key, unit), .fingerprint
+MissionConfiguration    .value(key, unit), .numbers(key), .rows(key), .fingerprint
+difference              what two configurations do not have in common
 """
 
 from __future__ import annotations
@@ -9,17 +10,24 @@ from __future__ import annotations
 import csv
 import hashlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
+from fnmatch import translate
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
+from typing import TypeVar
 
 from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.mission import model
+from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import STATUSES, Parameter, convert, read_all
+from lake_schema.tables.mission import LADDER
 
-# Best knowledge first; as simulated only where nothing better exists.
-LADDER = ("CBE", "BLT", "DES", "REQ", "SIM")
+__all__ = ["LADDER", "MissionConfiguration", "difference", "resolve"]
+
+Chosen = TypeVar("Chosen", Parameter, Model)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,21 +35,35 @@ class MissionConfiguration:
     """One record a name, sorted by name.
 
     overridden : names whose value a request replaced
+    folder     : where the files of its models lie, if they are not the package's
     """
 
     parameters: tuple[Parameter, ...]
     ladder: tuple[str, ...] = LADDER
     overridden: tuple[str, ...] = ()
+    models: tuple[Model, ...] = ()
+    folder: Path | None = None
     _index: dict[str, Parameter] = field(init=False, repr=False, compare=False)
+    _files: dict[str, Model] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_index", {p.key: p for p in self.parameters})
+        object.__setattr__(self, "_files", {m.key: m for m in self.models})
 
     def parameter(self, key: str) -> Parameter:
         """The record chosen for a name; BadInput for an unknown one."""
         if key not in self._index:
             raise BadInput(f"the mission database has no parameter {key}")
         return self._index[key]
+
+    def model(self, key: str) -> Model:
+        """The model chosen for a name; BadInput for an unknown one."""
+        if key not in self._files:
+            raise BadInput(f"the mission database has no model {key}")
+        return self._files[key]
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._index or key in self._files
 
     def value(self, key: str, unit: str | None = None) -> float:
         """The value of a name, in `unit` where one is given, else in its record's own."""
@@ -50,10 +72,19 @@ class MissionConfiguration:
             return record.value
         return convert(record.value, record.unit, unit, f"mission parameter {key}")
 
+    def numbers(self, key: str) -> tuple[tuple[float, ...], ...]:
+        """A model that is a table of numbers: its rows."""
+        return model.numbers(model.content(self.model(key), self.folder))
+
+    def rows(self, key: str) -> tuple[dict[str, str], ...]:
+        """A model that is a table of texts: its rows by column name."""
+        return model.rows(model.content(self.model(key), self.folder))
+
     @property
     def fingerprint(self) -> str:
-        """sha256 of every name, value and unit, hexadecimal: equal for configurations that act alike."""
-        lines = (f"{p.key}={p.value.hex()} {p.unit}\n" for p in self.parameters)
+        """sha256 of every name, value, unit and file, hexadecimal: equal for configurations that act alike."""
+        lines = [f"{p.key}={p.value.hex()} {p.unit}\n" for p in self.parameters]
+        lines += [f"{m.key}={m.sha256}\n" for m in self.models]
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
@@ -62,6 +93,7 @@ def resolve(
     ladder: Sequence[str] = LADDER,
     overrides: Mapping[str, tuple[float, str]] | None = None,
     mjd: float | None = None,
+    models: Iterable[Model] | None = None,
 ) -> MissionConfiguration:
     """Choose one value a name.
 
@@ -69,38 +101,47 @@ def resolve(
     ladder    : statuses, the preferred first; statuses that it does not name are never chosen
     overrides : name -> (value, unit), replaces what the ladder would choose
     mjd       : date at which the records must hold; None = the latest
+    models    : in any order; None = the package's where the records are, else none
     returns   : configuration.  Errors: BadInput / OutOfRange name the parameter
     """
     unknown = [status for status in ladder if status not in STATUSES]
     if unknown or not ladder or len(set(ladder)) != len(ladder):
         raise BadInput(f"mission ladder {list(ladder)} must name some of {', '.join(STATUSES)}, each once")
-    by_key = _group(read_all() if records is None else records)
-    chosen = {key: _choose(key, group, ladder, mjd) for key, group in by_key.items()}
+    if models is None:
+        models = read_models() if records is None else ()
+    parameters = _grouped(read_all() if records is None else records)
+    for key, group in parameters.items():
+        for record in group[1:]:
+            # Records of one quantity may differ in unit, never in kind.
+            convert(1.0, record.unit, group[0].unit, f"mission parameter {key} ({record.status})")
+    chosen = {key: _choose(key, group, ladder, mjd) for key, group in parameters.items()}
+    files_ = {key: _choose(key, group, ladder, mjd) for key, group in _grouped(models).items()}
+    if twice := sorted(set(chosen) & set(files_)):
+        raise BadInput(f"mission parameter {twice[0]} is a value and a model")
     for key, (value, unit) in (overrides or {}).items():
         chosen[key] = _overridden(chosen, key, value, unit)
     for parameter in chosen.values():
         _check_bounds(parameter)
     return MissionConfiguration(
-        tuple(chosen[key] for key in sorted(chosen)), tuple(ladder), tuple(sorted(overrides or {}))
+        tuple(chosen[key] for key in sorted(chosen)),
+        tuple(ladder),
+        tuple(sorted(overrides or {})),
+        tuple(files_[key] for key in sorted(files_)),
     )
 
 
-def _group(records: Iterable[Parameter]) -> dict[str, list[Parameter]]:
-    groups: dict[str, list[Parameter]] = {}
+def _grouped(records: Iterable[Chosen]) -> dict[str, list[Chosen]]:
+    groups: dict[str, list[Chosen]] = {}
     seen = set()
     for record in records:
         if record.identity in seen:
             raise BadInput(f"mission parameter {record.key} ({record.status}, version {record.version}) is given twice")
         seen.add(record.identity)
-        group = groups.setdefault(record.key, [])
-        if group:
-            # Records of one quantity may differ in unit, never in kind.
-            convert(1.0, record.unit, group[0].unit, f"mission parameter {record.key} ({record.status})")
-        group.append(record)
+        groups.setdefault(record.key, []).append(record)
     return groups
 
 
-def _choose(key: str, group: Sequence[Parameter], ladder: Sequence[str], mjd: float | None) -> Parameter:
+def _choose(key: str, group: Sequence[Chosen], ladder: Sequence[str], mjd: float | None) -> Chosen:
     for status in ladder:
         valid = [
             p for p in group if p.status == status and (mjd is None or p.valid_from is None or p.valid_from <= mjd)
@@ -127,14 +168,52 @@ def _overridden(chosen: Mapping[str, Parameter], key: str, value: float, unit: s
 
 
 @cache
-def _bounds() -> tuple[tuple[str, float, float, str], ...]:
+def _bounds() -> tuple[tuple[re.Pattern[str], float, float, str], ...]:
     with (files("lake_schema.mission") / "bounds.csv").open(encoding="utf-8") as stream:
-        return tuple((r["pattern"], float(r["lo"]), float(r["hi"]), r["unit"]) for r in csv.DictReader(stream))
+        return tuple(
+            (re.compile(translate(r["pattern"])), float(r["lo"]), float(r["hi"]), r["unit"])
+            for r in csv.DictReader(stream)
+        )
+
+
+@cache
+def bounds_of(key: str) -> tuple[tuple[float, float, str], ...]:
+    """(lowest, highest, unit) of every bound that a parameter must keep."""
+    return tuple((lo, hi, unit) for pattern, lo, hi, unit in _bounds() if pattern.fullmatch(key))
 
 
 def _check_bounds(parameter: Parameter) -> None:
-    for pattern, lo, hi, unit in _bounds():
-        if fnmatchcase(parameter.key, pattern):
-            value = convert(parameter.value, parameter.unit, unit, f"mission parameter {parameter.key}")
-            if not lo <= value <= hi:
-                raise OutOfRange(f"mission parameter {parameter.key} [{unit}]", value, lo, hi)
+    for lo, hi, unit in bounds_of(parameter.key):
+        value = convert(parameter.value, parameter.unit, unit, f"mission parameter {parameter.key}")
+        if not lo <= value <= hi:
+            raise OutOfRange(f"mission parameter {parameter.key} [{unit}]", value, lo, hi)
+
+
+def difference(first: MissionConfiguration, second: MissionConfiguration) -> Iterator[str]:
+    """A line for each name whose value, unit or file differs, or that only one of them has."""
+    left, right = _by_key(first), _by_key(second)
+    for key in sorted(set(left) | set(right)):
+        a, b = left.get(key), right.get(key)
+        if _shown(a).acts != _shown(b).acts:
+            yield f"{key}: {_shown(a).text} -> {_shown(b).text}"
+
+
+def _by_key(configuration: MissionConfiguration) -> dict[str, Parameter | Model]:
+    return {p.key: p for p in configuration.parameters} | {m.key: m for m in configuration.models}
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """What a record does, and how it is written."""
+
+    acts: str
+    text: str
+
+
+def _shown(record: Parameter | Model | None) -> _Shown:
+    if record is None:
+        return _Shown("", "absent")
+    if isinstance(record, Model):
+        return _Shown(record.sha256, f"{record.file} ({record.sha256[:12]}, {record.status})")
+    value = f"{record.value!r} {record.unit}".strip()
+    return _Shown(f"{record.value.hex()} {record.unit}", f"{value} ({record.status})")

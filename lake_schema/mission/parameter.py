@@ -3,30 +3,53 @@
 Parameter     a value with its status, unit, version, validity and source
 read          one CSV file -> records
 read_all      every section of the package
-read_table    a table of numbers that stands beside the records (zodiacal light, wavefront, solar spectrum)
 """
 
 from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from typing import Protocol, TypeVar
 
 import astropy.units as u
 
 from lake_schema.errors import BadInput
+from lake_schema.tables import mission as table
 
 # As required, as designed, as built, current best estimate, as simulated (Serrano et al. 2024, the Mission
 # Database).
-STATUSES = ("REQ", "DES", "BLT", "CBE", "SIM")
+STATUSES = tuple(code for code, _ in table.STATUSES)
 # What a value rests on: read in its source, quoted without the source at hand, computed from published
 # values, chosen here.
-CONFIDENCES = ("published", "quoted", "derived", "assumed")
-SECTIONS = ("environment", "spacecraft", "vis", "ext_lsstcam", "survey")
+CONFIDENCES = tuple(code for code, _ in table.CONFIDENCES)
+CAMERAS = ("decam", "lsstcam", "megacam", "jpcam", "gpc1", "hsc")
+SECTIONS = ("environment", "spacecraft", "vis", "nisp", *(f"ext_{camera}" for camera in CAMERAS), "survey")
 _COLUMNS = ("key", "status", "value", "unit", "version", "valid_from", "confidence", "source")
+
+Identity = tuple[str, str, int, float]
+Record = TypeVar("Record")
+
+
+class Dated(Protocol):
+    """What records of values and of files have in common."""
+
+    @property
+    def key(self) -> str: ...
+    @property
+    def status(self) -> str: ...
+    @property
+    def version(self) -> int: ...
+    @property
+    def valid_from(self) -> float | None: ...
+    @property
+    def confidence(self) -> str: ...
+    @property
+    def source(self) -> str: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,23 +71,36 @@ class Parameter:
 
     def __post_init__(self) -> None:
         where = f"mission parameter {self.key} ({self.status})"
-        if self.status not in STATUSES:
-            raise BadInput(f"{where}: status is not one of {', '.join(STATUSES)}")
-        if self.confidence not in CONFIDENCES:
-            raise BadInput(f"{where}: confidence {self.confidence!r} is not one of {', '.join(CONFIDENCES)}")
-        if not math.isfinite(self.value) or (self.valid_from is not None and not math.isfinite(self.valid_from)):
-            raise BadInput(f"{where}: value = {self.value}, valid_from = {self.valid_from} must be finite")
-        if not self.source:
-            raise BadInput(f"{where}: has no source")
+        check_record(self, where)
+        if not math.isfinite(self.value):
+            raise BadInput(f"{where}: value = {self.value} must be finite")
         parse_unit(self.unit, where)
 
     @property
-    def identity(self) -> tuple[str, str, int, float]:
+    def identity(self) -> Identity:
         """What no two records may share."""
-        return self.key, self.status, self.version, -math.inf if self.valid_from is None else self.valid_from
+        return identity_of(self)
 
 
-def parse_unit(text: str, where: str) -> u.UnitBase:
+def check_record(record: Dated, where: str) -> None:
+    """Refuse a status, confidence, date or source that a record may not have."""
+    if record.status not in STATUSES:
+        raise BadInput(f"{where}: status is not one of {', '.join(STATUSES)}")
+    if record.confidence not in CONFIDENCES:
+        raise BadInput(f"{where}: confidence {record.confidence!r} is not one of {', '.join(CONFIDENCES)}")
+    if record.valid_from is not None and not math.isfinite(record.valid_from):
+        raise BadInput(f"{where}: valid_from = {record.valid_from} must be finite")
+    if not record.source:
+        raise BadInput(f"{where}: has no source")
+
+
+def identity_of(record: Dated) -> Identity:
+    """Key, status, version and date of a record."""
+    return record.key, record.status, record.version, -math.inf if record.valid_from is None else record.valid_from
+
+
+@cache
+def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
     """A unit string -> astropy unit; BadInput names where it stands."""
     try:
         return u.Unit(text)
@@ -72,39 +108,53 @@ def parse_unit(text: str, where: str) -> u.UnitBase:
         raise BadInput(f"{where}: {text!r} is not a unit") from None
 
 
+@cache
+def _factor(unit: str, to: str) -> float | None:
+    """What a value in `unit` is multiplied with to be in `to`, None where they do not fit."""
+    try:
+        return float(parse_unit(unit).to(parse_unit(to)))
+    except u.UnitConversionError:
+        return None
+
+
 def convert(value: float, unit: str, to: str, where: str) -> float:
     """A value in one unit -> in another; BadInput names where they do not fit."""
-    try:
-        return float(parse_unit(unit, where).to(parse_unit(to, where), value))
-    except u.UnitConversionError:
-        raise BadInput(f"{where}: {unit or 'a pure number'} does not convert to {to or 'a pure number'}") from None
+    parse_unit(unit, where)
+    parse_unit(to, where)
+    factor = _factor(unit, to)
+    if factor is None:
+        raise BadInput(f"{where}: {unit or 'a pure number'} does not convert to {to or 'a pure number'}")
+    return value * factor
 
 
 def read(file: Traversable) -> tuple[Parameter, ...]:
     """The records of a CSV file of exactly the columns _COLUMNS."""
+
+    def record(row: Mapping[str, str], version: int, valid_from: float | None) -> Parameter:
+        value = float(row["value"])
+        return Parameter(
+            row["key"], row["status"], value, row["unit"], version, valid_from, row["confidence"], row["source"] or ""
+        )
+
+    return tuple(read_rows(file, _COLUMNS, record))
+
+
+def read_rows(
+    file: Traversable,
+    columns: Sequence[str],
+    record: Callable[[Mapping[str, str], int, float | None], Record],
+) -> Iterator[Record]:
+    """Records of a CSV file of exactly these columns: record(row, version, valid_from) of each line."""
     with file.open(encoding="utf-8") as stream:
-        rows = csv.DictReader(stream)
-        if tuple(rows.fieldnames or ()) != _COLUMNS:
-            raise BadInput(f"{file.name}: columns are not {', '.join(_COLUMNS)}")
-        return tuple(_record(row, f"{file.name} line {rows.line_num}") for row in rows)
-
-
-def _record(row: dict[str, str], where: str) -> Parameter:
-    try:
-        valid_from = float(row["valid_from"]) if row["valid_from"] else None
-        value, version = float(row["value"]), int(row["version"])
-    except (ValueError, TypeError) as error:
-        raise BadInput(f"{where}: {error}") from None
-    return Parameter(
-        row["key"],
-        row["status"],
-        value,
-        row["unit"],
-        version,
-        valid_from,
-        row["confidence"],
-        row["source"] or "",
-    )
+        lines = csv.DictReader(stream)
+        if tuple(lines.fieldnames or ()) != tuple(columns):
+            raise BadInput(f"{file.name}: columns are not {', '.join(columns)}")
+        for row in lines:
+            try:
+                valid_from = float(row["valid_from"]) if row["valid_from"] else None
+                yield record(row, int(row["version"]), valid_from)
+            except (ValueError, TypeError) as error:
+                raise BadInput(f"{file.name} line {lines.line_num}: {error}") from None
 
 
 @cache
@@ -112,11 +162,3 @@ def read_all() -> tuple[Parameter, ...]:
     """Every record of the package."""
     folder = files("lake_schema.mission")
     return tuple(record for section in SECTIONS for record in read(folder / f"{section}.csv"))
-
-
-@cache
-def read_table(name: str) -> tuple[tuple[float, ...], ...]:
-    """A table of numbers of the package, header dropped, '#' lines are comments, a blank entry is NaN."""
-    text = (files("lake_schema.mission") / f"{name}.csv").read_text(encoding="utf-8")
-    rows = list(csv.reader(line for line in text.splitlines() if not line.startswith("#")))
-    return tuple(tuple(float(entry) if entry else math.nan for entry in row) for row in rows[1:])

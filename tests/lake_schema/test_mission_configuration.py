@@ -36,10 +36,14 @@ def test_as_simulated_is_the_last_resort():
     assert all(p.status != "SIM" for p in everything.parameters if p.key in with_other)
 
 
-@given(st.permutations(read_all()), st.permutations(STATUSES))
-def test_the_order_of_the_records_does_not_matter(records, ladder):
-    assert resolve(records, ladder) == resolve(read_all(), ladder)
-    assert resolve(records, ladder).fingerprint == resolve(read_all(), ladder).fingerprint
+@given(st.randoms(use_true_random=False), st.permutations(STATUSES))
+def test_the_order_of_the_records_does_not_matter(random, ladder):
+    # Some of the records of each kind: every name of a camera, a few statuses of each.
+    records = [record for record in read_all() if record.key.startswith(("vis.", "svm."))]
+    expected = resolve(records, ladder)
+    random.shuffle(records)
+    assert resolve(records, ladder) == expected
+    assert resolve(records, ladder).fingerprint == expected.fingerprint
 
 
 @given(st.permutations(STATUSES))

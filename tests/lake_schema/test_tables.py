@@ -9,8 +9,10 @@ import pytest
 from jobs.fluxes import passbands as responses
 from lake_schema import __main__, publish, read, tables
 from lake_schema.errors import BadInput
+from lake_schema.mission import published
 from lake_schema.mission.configuration import resolve
-from lake_schema.mission.parameter import CONFIDENCES, STATUSES, read_all
+from lake_schema.mission.model import read_models
+from lake_schema.mission.parameter import read_all
 from lake_schema.publish import Output, Part, Plan
 from lake_schema.tables import mission, passbands, templates
 from lake_schema.validate import check
@@ -92,25 +94,22 @@ def test_the_mission_with_what_a_run_chose():
     name = next(p.key for p in read_all() if p.unit == "electron")
     plain, changed = resolve(), resolve(overrides={name: (7.5, "electron")})
     for chosen, given in ((plain, 0), (changed, 1)):
-        rows = mission.rows(read_all(), chosen.parameters, chosen.overridden)
+        rows = published.table(chosen)
         check(rows, mission.MISSION)
-        assert rows.num_rows == len(read_all()) + given
+        assert rows.num_rows == len(read_all()) + len(read_models()) + given
         used = [row for row in rows.to_pylist() if row["chosen"]]
-        assert sorted(row["name"] for row in used) == [p.key for p in chosen.parameters]
-        values = {row["name"]: (row["value"], row["unit"]) for row in used}
+        assert sorted(row["name"] for row in used) == sorted(r.key for r in (*chosen.parameters, *chosen.models))
+        values = {row["name"]: (row["value"], row["unit"]) for row in used if row["file"] is None}
         assert values == {p.key: (p.value, p.unit) for p in chosen.parameters}
+        files = {row["name"]: row["sha256"] for row in used if row["value"] is None}
+        assert files == {m.key: m.sha256 for m in chosen.models}
         assert [row["value"] for row in used if row["overridden"]] == [7.5] * given
-
-
-def test_the_codes_are_the_databases_own():
-    assert tuple(code for code, _ in mission.STATUSES) == STATUSES
-    assert tuple(code for code, _ in mission.CONFIDENCES) == CONFIDENCES
 
 
 def test_they_can_be_published_and_asked(lake):
     for table, rows in (
         (templates.TEMPLATES, templates.rows(libraries())),
-        (mission.MISSION, mission.rows(read_all(), resolve().parameters)),
+        (mission.MISSION, published.table(resolve())),
     ):
         publish.make(lake, Plan(table, {}, (Part("0.parquet", {}),)), lambda root, facts, rows=rows: Output(rows))
         assert read.version(lake, table.name).rows().equals(rows)

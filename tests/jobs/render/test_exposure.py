@@ -1,6 +1,8 @@
 """One detector from tables to images: fluxes, places, noise, and that neighbours change nothing."""
 
+import csv
 from functools import cache
+from importlib.resources import files
 
 import numpy as np
 import pyarrow as pa
@@ -54,13 +56,63 @@ def render(channel, body=None, points=None, flux=3.0, seed=1, accuracy=SURVEY, *
 
 @pytest.mark.parametrize(
     ("section", "band", "zero_point"),
-    [("vis", "euclid_vis", 25.93), ("ext.lsstcam", "lsst_r", 28.34), ("ext.lsstcam", "lsst_i", 28.16)],
+    [
+        ("vis", "euclid_vis", 25.93),
+        ("nisp", "euclid_y", 25.00),
+        ("nisp", "euclid_j", 25.18),
+        ("nisp", "euclid_h", 25.11),
+        ("ext.lsstcam", "lsst_r", 28.36),
+        ("ext.decam", "des_g", 26.93),
+    ],
 )
-def test_zero_points_follow_from_throughput_and_area(section, band, zero_point):
+def test_zero_points(section, band, zero_point):
     found, rate = exposure.throughput(section, band, MISSION)
     assert found == pytest.approx(zero_point, abs=0.01)
     assert rate == pytest.approx(10 ** (0.4 * (found - 23.9)), rel=1e-9)
     assert units.mag_of_f_nu(1 / rate) == pytest.approx(found)
+
+
+@pytest.mark.parametrize(
+    ("section", "band", "tolerance"),
+    [
+        *(("ext.lsstcam", f"lsst_{b}", 0.1) for b in "ugrizy"),
+        *(("ext.decam", f"des_{b}", 0.25) for b in "griz"),
+        *(("ext.megacam", f"cfis_{b}", 0.1) for b in "ur"),
+        ("ext.jpcam", "jedis_g", 0.75),
+        ("ext.gpc1", "ps1_i", 0.15),
+        ("ext.hsc", "hsc_z", 0.35),
+    ],
+)
+def test_published_zero_points_are_those_of_throughput_and_area(section, band, tolerance):
+    """Within what calibrations and telescopes differ by; JPCam's curve leaves out the telescope and the sky."""
+    width = passbands.log_width(passbands.load(band))
+    derived = units.zero_point(MISSION.value(f"{section}.collecting_area", "cm2"), width)
+    assert MISSION.value(f"{section}.{band}.zero_point") == pytest.approx(derived, abs=tolerance)
+
+
+def test_every_throughput_is_the_one_of_the_fluxes():
+    """One curve a band: the model that the database names is what the flux tables are integrated over."""
+    with (files("jobs.fluxes") / "passbands.csv").open() as stream:
+        used = {row["name"]: row["source"] for row in csv.DictReader(stream)}
+    named = {m.key.split(".")[-2]: m.file for m in MISSION.models if m.key.endswith(".throughput")}
+    assert set(named) >= {
+        "euclid_vis",
+        "euclid_y",
+        "euclid_j",
+        "euclid_h",
+        "lsst_u",
+        "des_z",
+        "cfis_u",
+        "ps1_i",
+        "hsc_z",
+    }
+    for band, file in named.items():
+        assert used[band] == "speclite:" + file.rpartition("/")[2].removesuffix(".ecsv")
+    for grism, curve in (("rgs000", "nisp_red"), ("bgs000", "nisp_blue")):
+        band = passbands.load(curve)
+        half = band.wavelength[band.response > 0.5 * band.response.max()]
+        for end, found in (("low", half[0]), ("high", half[-1])):
+            assert MISSION.value(f"nisp.{grism}.{end}", "Angstrom") == pytest.approx(found, rel=2e-3)
 
 
 def test_published_saturation_magnitude():

@@ -23,7 +23,7 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 
 MISSION = resolve()
-VIS, LSST = detectors("vis", MISSION), detectors("lsstcam", MISSION)
+VIS, LSST, NISP = (detectors(camera, MISSION) for camera in ("vis", "lsstcam", "nisp"))
 SKY = st.tuples(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(-180, 180))
 ANY_DETECTOR = st.sampled_from([VIS[0], VIS[15], VIS[35], LSST[0], LSST[94], LSST[188]])
 
@@ -53,6 +53,8 @@ def test_lsstcam_has_189_sensors_about_the_central_one():
     assert (LSST[94].x, LSST[94].y) == (0.0, 0.0)
     # The second index runs along x, the first along y.
     assert detector("lsstcam", "R23_S11", MISSION).x == pytest.approx(127.0 * 20.00587)
+    # Rafts of the two makers differ in size.
+    assert {(d.nx, d.ny) for d in LSST} == {(4096, 4004), (4072, 4000)}
     assert detector("lsstcam", "R22_S21", MISSION).y == pytest.approx(42.25 * 20.00587)
     # Gaps between neighbours: 129 and 221 pixels.
     pixel = LSST[94].pixel_scale
@@ -60,7 +62,36 @@ def test_lsstcam_has_189_sensors_about_the_central_one():
     assert detector("lsstcam", "R22_S21", MISSION).y / pixel - 4004 == pytest.approx(221, abs=0.5)
 
 
-@pytest.mark.parametrize("layout", [VIS, LSST])
+def test_nisp_fills_the_published_field():
+    assert [d.name for d in NISP][:5] == ["DET11", "DET12", "DET13", "DET14", "DET21"]
+    assert len(NISP) == 16
+    width, height = (max(getattr(d, axis) for d in NISP) - min(getattr(d, axis) for d in NISP) + 612 for axis in "xy")
+    assert width / 3600 == pytest.approx(0.7222, abs=1e-4)
+    assert height / 3600 == pytest.approx(0.7645, abs=1e-4)
+    assert {d.rotation for d in NISP if d.y > 0} == {0.0}
+    assert {d.rotation for d in NISP if d.y < 0} == {180.0}
+
+
+@pytest.mark.parametrize(
+    ("camera", "count", "diameter"),
+    [("decam", 62, 2.2), ("megacam", 40, 1.4), ("jpcam", 14, 3.1), ("gpc1", 60, 3.3), ("hsc", 103, 1.8)],
+)
+def test_ground_cameras_fill_their_fields(camera, count, diameter):
+    found = detectors(camera, MISSION)
+    assert len(found) == len({d.name for d in found}) == count
+    corner = max(np.hypot(d.x, d.y) + d.half_diagonal for d in found)
+    assert 2 * corner / 3600 == pytest.approx(diameter, rel=0.12)
+
+
+def test_decam_s_long_axis_runs_east_west():
+    d = detector("decam", "N4", MISSION)
+    system = wcs(d, 30.0, 0.0, 0.0)
+    ra, dec = sky_of_pixel(system, [1023.5, 1023.5], [0.0, 4095.0])
+    assert abs(ra[1] - ra[0]) == pytest.approx(4095 * 0.2637 / 3600, rel=1e-3)
+    assert abs(dec[1] - dec[0]) < 1e-3
+
+
+@pytest.mark.parametrize("layout", [VIS, LSST, NISP])
 def test_no_two_detectors_overlap(layout):
     x, y = (np.array([getattr(d, axis) for d in layout]) for axis in "xy")
     dx, dy = np.abs(x[:, None] - x), np.abs(y[:, None] - y)
@@ -70,8 +101,8 @@ def test_no_two_detectors_overlap(layout):
 
 
 def test_strangers_are_refused():
-    with pytest.raises(BadInput, match="hsc"):
-        detectors("hsc", MISSION)
+    with pytest.raises(BadInput, match="wfc"):
+        detectors("wfc", MISSION)
     with pytest.raises(BadInput, match="7-1"):
         detector("vis", "7-1", MISSION)
 

@@ -1,0 +1,118 @@
+"""What the records of a mission configuration must keep between one another.
+
+check    raise BadInput with the first fault of a configuration
+faults   all of them, a sentence each
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.mission.parameter import CAMERAS, convert, read_all
+
+# Quantities of which no chosen value may be worse than what is required, and which way worse is.
+_LOWER = ("*.read_noise", "*.dark_current", "*.prnu", "*.crosstalk", "*.jitter_?", "*.psf.fwhm", "*.ellipticity",
+          "*.bad_pixels", "*.readout_time", "*.ee50", "*.ee80")  # fmt: skip
+_HIGHER = ("*.full_well", "*.quantum_efficiency", "*.resolving_power", "*.depth")
+# Throughputs of Pan-STARRS are capture cross sections, m2 (Tonry et al. 2012).
+_CROSS_SECTIONS = ("ext.gpc1.*",)
+
+
+def check(configuration: MissionConfiguration) -> None:
+    """Raise BadInput where the configuration has a fault."""
+    for fault in faults(configuration):
+        raise BadInput(fault)
+
+
+def faults(configuration: MissionConfiguration) -> Iterator[str]:
+    """Sentences, each naming a parameter or model; none where all is well."""
+    yield from _worse_than_required(configuration)
+    for camera in CAMERAS:
+        yield from _layout(f"ext.{camera}", configuration)
+        yield from _amplifiers(f"ext.{camera}.amplifiers", configuration)
+    yield from _amplifiers("vis.amplifiers", configuration)
+    yield from _pitch("vis", configuration)
+    yield from _pitch("nisp", configuration)
+    for m in configuration.models:
+        if m.key.endswith(".throughput"):
+            yield from _throughput(m.key, configuration)
+    yield from _quantiles("env.cosmic_rays.vis_tracks", configuration)
+
+
+def _worse_than_required(configuration: MissionConfiguration) -> Iterator[str]:
+    required = {record.key: record for record in read_all() if record.status == "REQ"}
+    for chosen in configuration.parameters:
+        limit = required.get(chosen.key)
+        if limit is None or chosen.status in ("REQ", "SIM"):
+            continue
+        bound = convert(limit.value, limit.unit, chosen.unit, chosen.key)
+        sign = 1 if _like(chosen.key, _LOWER) else -1 if _like(chosen.key, _HIGHER) else 0
+        if sign * (chosen.value - bound) > 0:
+            value = f"{chosen.key} ({chosen.status}) = {chosen.value:g}"
+            yield f"mission parameter {value} is worse than required: {bound:g}"
+
+
+def _like(key: str, patterns: tuple[str, ...]) -> bool:
+    return any(fnmatchcase(key, pattern) for pattern in patterns)
+
+
+def _layout(section: str, configuration: MissionConfiguration) -> Iterator[str]:
+    """No two detectors nearer than their size, as rectangles along the focal plane's axes."""
+    key = f"{section}.layout"
+    rows = configuration.rows(key)
+    pixel = configuration.value(f"{section}.fpa.pixel_size", "mm / pix")
+    place = np.array([[float(row["x_mm"]), float(row["y_mm"])] for row in rows])
+    size = np.array([[int(row["nx"]), int(row["ny"])] for row in rows]) * pixel
+    turned = np.array([round(float(row["rotation_deg"]) / 90.0) % 2 == 1 for row in rows])
+    size[turned] = size[turned, ::-1]
+    apart = np.abs(place[:, None] - place[None, :]) >= 0.5 * (size[:, None] + size[None, :])
+    overlap = np.triu(~apart.any(axis=2), 1)
+    for first, second in np.argwhere(overlap):
+        yield f"mission model {key}: detectors {rows[first]['detector']} and {rows[second]['detector']} overlap"
+    if len({row["detector"] for row in rows}) != len(rows):
+        yield f"mission model {key}: a detector is given twice"
+
+
+def _pitch(section: str, configuration: MissionConfiguration) -> Iterator[str]:
+    for axis in ("x", "y"):
+        if configuration.value(f"{section}.fpa.gap_{axis}", "arcsec") < 0:
+            yield f"mission parameter {section}.fpa.gap_{axis}: detectors overlap"
+
+
+def _amplifiers(key: str, configuration: MissionConfiguration) -> Iterator[str]:
+    for row in configuration.rows(key):
+        name = f"mission model {key}: amplifier {row['amplifier']} of {row['type']}"
+        if not float(row["gain"]) > 0:
+            yield f"{name}: gain = {row['gain']} is not positive"
+        if not (float(row["read_noise"]) >= 0 and float(row["full_well"]) > 0):
+            yield f"{name}: read noise and full well must be positive"
+
+
+def _throughput(key: str, configuration: MissionConfiguration) -> Iterator[str]:
+    curve = _curve(key, configuration)
+    if not (np.diff(curve[:, 0]) > 0).all():
+        yield f"mission model {key}: wavelengths do not ascend"
+    highest = np.inf if _like(key, _CROSS_SECTIONS) else 1.0
+    if not ((curve[:, 1] >= 0) & (curve[:, 1] <= highest)).all():
+        yield f"mission model {key}: throughput outside 0 to {highest:g}"
+
+
+def _curve(key: str, configuration: MissionConfiguration) -> np.ndarray:
+    """[n, 2] wavelength and throughput of a file of ours or of speclite's (blank-separated, header line)."""
+    rows = configuration.rows(key)
+    if next(iter(rows[0])) == "wavelength_nm":
+        return np.array([[float(value) for value in row.values()] for row in rows])
+    return np.array([[float(value) for value in next(iter(row.values())).split()[:2]] for row in rows])
+
+
+def _quantiles(key: str, configuration: MissionConfiguration) -> Iterator[str]:
+    table = np.array(configuration.numbers(key))
+    if table[0, 0] != 0.0 or table[-1, 0] != 1.0:
+        yield f"mission model {key}: quantiles do not go from 0 to 1"
+    if not (np.diff(table, axis=0) > 0).all():
+        yield f"mission model {key}: quantiles do not ascend"

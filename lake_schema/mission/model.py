@@ -1,0 +1,128 @@
+"""Larger models of the mission database: files named with their sha256.
+
+Model          one record: which file a name stands for, with its status, version, validity and source
+read_models    the records of the package
+content        the bytes of a model's file, refused where they are not those that the record names
+numbers, rows  a model that is a table (CSV): of numbers, or of texts by column
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.mission.parameter import Identity, check_record, identity_of, read_rows
+
+_COLUMNS = ("key", "status", "file", "sha256", "version", "valid_from", "confidence", "source")
+_FOLDER = "models"
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_FILE = re.compile(r"\w[\w.-]*|[a-z_]+(\.[a-z_]+)*:\w[\w./-]*", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A model that is a file.
+
+    file       : name in the package's folder of models, or `package:path` of a library's own data
+    sha256     : of its bytes, hexadecimal
+    valid_from : MJD from which the record holds, None = always
+    """
+
+    key: str
+    status: str
+    file: str
+    sha256: str
+    version: int = 1
+    valid_from: float | None = None
+    confidence: str = "assumed"
+    source: str = "assumed"
+
+    def __post_init__(self) -> None:
+        where = f"mission model {self.key} ({self.status})"
+        check_record(self, where)
+        if _SHA256.fullmatch(self.sha256) is None:
+            raise BadInput(f"{where}: sha256 = {self.sha256!r} is not 64 hexadecimal digits")
+        if _FILE.fullmatch(self.file) is None or ".." in self.file:
+            raise BadInput(f"{where}: file {self.file!r} is neither a name nor package:path")
+
+    @property
+    def identity(self) -> Identity:
+        """What no two records may share."""
+        return identity_of(self)
+
+
+def read(file: Traversable) -> tuple[Model, ...]:
+    """The records of a CSV file of exactly the columns _COLUMNS."""
+
+    def record(row: Mapping[str, str], version: int, valid_from: float | None) -> Model:
+        return Model(
+            row["key"],
+            row["status"],
+            row["file"],
+            row["sha256"],
+            version,
+            valid_from,
+            row["confidence"],
+            row["source"] or "",
+        )
+
+    return tuple(read_rows(file, _COLUMNS, record))
+
+
+@cache
+def read_models() -> tuple[Model, ...]:
+    """Every model of the package."""
+    return read(files("lake_schema.mission") / "models.csv")
+
+
+def content(model: Model, folder: Path | None = None) -> bytes:
+    """The bytes of a model's file.
+
+    folder : where the files of a published configuration lie, each named by its sha256; looked at where the
+             installed file is another one
+    Errors : Damaged names the model and the sha256 that its file has
+    """
+    data = _installed(model.file)
+    if data is not None and hashlib.sha256(data).hexdigest() == model.sha256:
+        return data
+    kept = folder / model.sha256 if folder is not None else None
+    if kept is not None and kept.is_file():
+        old = kept.read_bytes()
+        if hashlib.sha256(old).hexdigest() == model.sha256:
+            return old
+    found = "is missing" if data is None else f"has sha256 {hashlib.sha256(data).hexdigest()}, not {model.sha256}"
+    raise Damaged(f"mission model {model.key} ({model.status}): file {model.file} {found}")
+
+
+@cache
+def _installed(file: str) -> bytes | None:
+    package, _, path = file.rpartition(":")
+    try:
+        where = files(package).joinpath(path) if package else files("lake_schema.mission") / _FOLDER / path
+        return where.read_bytes()
+    except (OSError, ModuleNotFoundError):
+        return None
+
+
+def numbers(data: bytes) -> tuple[tuple[float, ...], ...]:
+    """A table of numbers: header dropped, lines that begin with '#' are comments, a blank entry is NaN."""
+    table = list(csv.reader(_lines(data)))
+    return tuple(tuple(float(entry) if entry else math.nan for entry in row) for row in table[1:])
+
+
+def rows(data: bytes) -> tuple[dict[str, str], ...]:
+    """A table of texts by column name; lines that begin with '#' are comments."""
+    return tuple(csv.DictReader(_lines(data)))
+
+
+def _lines(data: bytes) -> list[str]:
+    return [line for line in data.decode("utf-8").splitlines() if not line.startswith("#")]

@@ -1,0 +1,99 @@
+"""A mission configuration as a lake table, with the files of its models, and back.
+
+output       configuration -> rows of the table `mission` and the files
+read_back    a published version -> the configuration that it holds
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema.errors import Damaged
+from lake_schema.mission import model
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.mission.model import Model, read_models
+from lake_schema.mission.parameter import Parameter, read_all
+from lake_schema.plan import Output
+from lake_schema.read import Version
+from lake_schema.tables.mission import MISSION
+
+# Beside the table's dataset/, each file under its sha256: an old product can be rendered with what it was made from.
+_FOLDER = "models"
+
+
+def output(configuration: MissionConfiguration) -> Output:
+    """Every record of the database, which of them are chosen, the overridden ones in rows of their own; the files."""
+    contents = {m.sha256: model.content(m, configuration.folder) for m in configuration.models}
+    return Output(
+        table(configuration),
+        {f"{_FOLDER}/{sha256}": partial(_write, data) for sha256, data in contents.items()},
+    )
+
+
+def _write(data: bytes, path: Path) -> None:
+    path.write_bytes(data)
+
+
+def table(configuration: MissionConfiguration) -> pa.Table:
+    """Rows of the table `mission`."""
+    chosen: list[Parameter | Model] = [*configuration.parameters, *configuration.models]
+    own = [record for record in chosen if record.key in configuration.overridden]
+    known: list[Parameter | Model] = [*read_all(), *read_models()]
+    # A configuration that was read back may hold records that the package no longer has.
+    strangers = [record for record in chosen if record not in known and record not in own]
+    every = [*known, *strangers, *own]
+    wanted = set(chosen)
+    dates = [math.nan if record.valid_from is None else record.valid_from for record in every]
+    values = [record.value if isinstance(record, Parameter) else math.nan for record in every]
+    return MISSION.build(
+        {
+            "name": [record.key for record in every],
+            "value": np.ma.masked_invalid(values),
+            "unit": [record.unit if isinstance(record, Parameter) else "" for record in every],
+            "status": [record.status for record in every],
+            "version": np.array([record.version for record in every], np.int64),
+            "valid_from": np.ma.masked_invalid(dates),
+            "confidence": [record.confidence for record in every],
+            "source": [record.source for record in every],
+            "chosen": np.array([record in wanted for record in every], bool),
+            "overridden": np.arange(len(every)) >= len(every) - len(own),
+            "file": [record.file if isinstance(record, Model) else None for record in every],
+            "sha256": [record.sha256 if isinstance(record, Model) else None for record in every],
+        }
+    )
+
+
+def read_back(version: Version) -> MissionConfiguration:
+    """The configuration of a published version of the table `mission`.
+
+    Errors : Damaged where it is not the one that the manifest names
+    """
+    parameters: list[Parameter] = []
+    models: list[Model] = []
+    overridden = []
+    for row in version.rows().to_pylist():
+        if not row["chosen"]:
+            continue
+        rest = (row["version"], row["valid_from"], row["confidence"], row["source"])
+        if row["file"] is None:
+            parameters.append(Parameter(row["name"], row["status"], row["value"], row["unit"], *rest))
+        else:
+            models.append(Model(row["name"], row["status"], row["file"], row["sha256"], *rest))
+        if row["overridden"]:
+            overridden.append(row["name"])
+    facts = version.manifest["facts"]
+    configuration = MissionConfiguration(
+        tuple(sorted(parameters, key=lambda p: p.key)),
+        tuple(facts["ladder"]),
+        tuple(sorted(overridden)),
+        tuple(sorted(models, key=lambda m: m.key)),
+        version.folder / _FOLDER,
+    )
+    if configuration.fingerprint != facts["mission"]:
+        raise Damaged(f"table mission: version {version.key} is not the configuration {facts['mission']}")
+    return configuration

@@ -1,0 +1,125 @@
+"""A configuration goes into the lake and comes back; two of them are told apart."""
+
+import hashlib
+import json
+
+import pytest
+
+from lake_schema import __main__, publish, read
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.mission import compare, published
+from lake_schema.mission.configuration import LADDER, MissionConfiguration, difference, resolve
+from lake_schema.mission.model import Model
+from lake_schema.mission.parameter import Parameter
+from lake_schema.publish import Part, Plan
+from lake_schema.tables.mission import MISSION
+
+CHANGED = resolve(ladder=("SIM", *LADDER[:-1]), overrides={"vis.gain": (3.3, "electron / adu")})
+
+
+def put(lake, configuration, **facts):
+    about = {"mission": configuration.fingerprint, "ladder": list(configuration.ladder), **facts}
+    plan = Plan(MISSION, about, (Part("all.parquet", {}),))
+    publish.make(lake, plan, lambda root, facts: published.output(configuration))
+    return read.version(lake, "mission")
+
+
+@pytest.mark.parametrize("configuration", [resolve(), CHANGED])
+def test_it_comes_back_as_it_went(tmp_path, configuration):
+    version = put(tmp_path, configuration)
+    back = published.read_back(version)
+    assert back == MissionConfiguration(
+        configuration.parameters, configuration.ladder, configuration.overridden, configuration.models, back.folder
+    )
+    assert back.fingerprint == configuration.fingerprint
+    assert list(difference(back, configuration)) == []
+    assert read.verify(version, deep=True) == []
+    # Its own copies of the files serve where the package's have changed.
+    for m in configuration.models:
+        assert (back.folder / m.sha256).is_file()
+    # What was read back can be published again, to the same rows.
+    assert published.table(back).equals(published.table(configuration))
+
+
+def test_records_that_the_package_no_longer_has_come_back_too(tmp_path):
+    content = b"a,b\n1,2\n"
+    (tmp_path / "old").mkdir()
+    sha256 = hashlib.sha256(content).hexdigest()
+    (tmp_path / "old" / sha256).write_bytes(content)
+    old = MissionConfiguration(
+        (Parameter("vis.gone", "CBE", 3.0, "s", source="x"),),
+        LADDER,
+        (),
+        (Model("vis.old", "CBE", "old.csv", sha256, source="x"),),
+        tmp_path / "old",
+    )
+    back = published.read_back(put(tmp_path / "lake", old))
+    assert back.value("vis.gone") == 3.0
+    assert back.numbers("vis.old") == ((1.0, 2.0),)
+    assert back.fingerprint == old.fingerprint
+
+
+def test_one_that_is_not_what_its_manifest_says_is_refused(tmp_path):
+    with pytest.raises(Damaged, match="is not the configuration 0000"):
+        published.read_back(put(tmp_path, resolve(), mission="0" * 64))
+
+
+# ------------------------------------------------------------------------------------------------ diff
+
+
+def test_differences_are_named_with_both_values(tmp_path, capsys):
+    request = tmp_path / "r.toml"
+    request.write_text('[mission]\nladder = ["CBE", "BLT", "DES", "REQ", "SIM"]\n'
+                       'overrides = {"vis.read_noise" = {value = 5, unit = "electron"}}\n')  # fmt: skip
+    put(tmp_path / "lake", CHANGED)
+    assert __main__.main(["mission", "diff", ",".join(LADDER), str(request)]) == 1
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line == "vis.read_noise: 4.4 electron (CBE) -> 5.0 electron (SIM)"
+    assert __main__.main(["mission", "diff", ",".join(LADDER), ",".join(LADDER)]) == 0
+    assert capsys.readouterr().out == ""
+    assert __main__.main(["mission", "diff", "CBE,SIM,BLT,DES,REQ", str(tmp_path / "lake")]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert "vis.gain: 3.48 electron / adu (CBE) -> 3.3 electron / adu (SIM)" in lines
+    key = read.version(tmp_path / "lake", "mission").key
+    assert __main__.main(["mission", "diff", f"{tmp_path}/lake@{key}", f"{tmp_path}/lake"]) == 0
+
+
+def test_names_that_only_one_has():
+    some = MissionConfiguration((Parameter("a.b", "CBE", 1.0, "s", source="x"),))
+    assert list(difference(some, MissionConfiguration(()))) == ["a.b: 1.0 s (CBE) -> absent"]
+    assert list(difference(MissionConfiguration(()), some)) == ["a.b: absent -> 1.0 s (CBE)"]
+    # Another source or status of the same value acts alike.
+    other = MissionConfiguration((Parameter("a.b", "BLT", 1.0, "s", source="y"),))
+    assert list(difference(some, other)) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[mission]\nladder = ['NEW']", "ladder"),
+        ("[mission]\noverrides = {'vis.gain' = {value = 3, unit = 's'}}", "does not convert"),
+        ("[mission]\noverrides = {'vis.gain' = 3}", "request"),
+        ("mission = 3", "request"),
+        ("[mission", "request"),
+    ],
+)
+def test_what_is_no_configuration_is_refused(tmp_path, capsys, text, words):
+    path = tmp_path / "r.toml"
+    path.write_text(text)
+    assert __main__.main(["mission", "diff", "CBE,SIM,BLT,DES,REQ", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+    with pytest.raises(BadInput, match="neither"):
+        compare.configuration(str(tmp_path / "nothing"))
+    with pytest.raises(BadInput, match="neither"):
+        compare.configuration("CBE,BEST")
+
+
+def test_a_lake_without_the_table(tmp_path):
+    with pytest.raises(BadInput, match="no table mission"):
+        compare.configuration(str(tmp_path))
+    (tmp_path / "mission").mkdir()
+    (tmp_path / "mission" / "manifest.json").write_text(json.dumps({}))
+    with pytest.raises(BadInput, match="no table mission"):
+        compare.configuration(str(tmp_path))
