@@ -21,7 +21,7 @@ import numpy as np
 
 from jobs import accuracy
 from jobs.fluxes import passbands
-from jobs.render import chromatic, focal_plane, psf, stamps
+from jobs.render import chromatic, focal_plane, psf, stamps, transfer
 from jobs.render.profiles import Shapes
 from jobs.render.stamps import Settings, Sources
 from lake_schema.mission.configuration import resolve
@@ -119,7 +119,7 @@ def seconds(scene: Scene, settings: Settings, repeats: int = 1) -> tuple[float, 
     shared = [int(size) for size in np.unique(sizes) if size <= 256]
     start = time.process_time()
     for size in shared:
-        psf.transfer(spread_, size)
+        transfer.transfer(spread_, size, 6.5)
     return best, time.process_time() - start
 
 
@@ -197,7 +197,7 @@ def sample(scene: Scene, seed: int, n: int) -> Sources:
 def convergence(scene: Scene, trials: dict[str, Settings], seed: int, n: int) -> dict[str, np.ndarray]:
     """Errors [n, 5] of each trial against stamps of COMPARED pixels, nothing left out."""
     some, full = sample(scene, seed, n), spread(scene, 9)
-    weights = psf.basis_weights(full, some.photons, some.column, some.row)
+    weights = transfer.basis_weights(full, some.photons, some.column, some.row)
     out: dict[str, list[np.ndarray]] = {name: [] for name in trials}
     for i in range(len(some)):
         one = moved(some, i, COMPARED)
@@ -215,12 +215,12 @@ def convergence(scene: Scene, trials: dict[str, Settings], seed: int, n: int) ->
 def against_galsim(scene: Scene, settings: Settings, seed: int, n: int) -> tuple[np.ndarray, float]:
     """Errors against galsim's tightest, and its CPU seconds a source."""
     some, full = sample(scene, seed, n), spread(scene, 9)
-    weights = psf.basis_weights(full, some.photons, some.column, some.row)
+    weights = transfer.basis_weights(full, some.photons, some.column, some.row)
     out, spent = [], 0.0
     for i in range(len(some)):
         one = moved(some, i, COMPARED)
         sizes, floors = sizes_of(one, full, scene, settings)
-        own = replace(full, profile=psf.profile_of(full, weights[i]), planes=None)
+        own = replace(full, profile=transfer.profile_of(full, weights[i]), planes=None)
         start = time.process_time()
         try:
             truth = stamps.reference(one, 0, own, COMPARED)
@@ -236,7 +236,7 @@ def against_galsim(scene: Scene, settings: Settings, seed: int, n: int) -> tuple
 def shear_response(scene: Scene, settings: Settings, seed: int, n: int, g: float = 0.02) -> tuple[float, float]:
     """(worst |m|, worst |c|) of 90-degree pairs under +-g, against stamps of COMPARED pixels, noise-free."""
     some, full = sample(scene, seed, n), spread(scene, 9)
-    weights = psf.basis_weights(full, some.photons, some.column, some.row)
+    weights = transfer.basis_weights(full, some.photons, some.column, some.row)
     bias, offset = [], []
     for i in range(len(some)):
         found = np.zeros((2, 2))

@@ -2,10 +2,11 @@
 
 nyquist_zones profile x PSF x pixel x phase on the half plane, wrapped onto the pixels' Nyquist zone
 accumulate    stamps onto the frame, in fixed point
-add_blocks    a smooth layer onto the frame
+take          the samples of a stamp's grid from a transform
+electrons_of  the frame with a smooth layer on top
+reaches       how far in Fourier space a source must be followed
 
-The half plane is held as its aliases: sample (row, column) of the zone and the same place in the neighbouring zones,
-which all fall on it. Precision is that of the planes: single, but double for sources so bright that it would show.
+Precision is that of the planes: single, but double for sources so bright that it would show.
 """
 
 from __future__ import annotations
@@ -31,130 +32,116 @@ _FIRST = int(FIRST_BITS)
 
 @jit
 def nyquist_zones(
-    zones: npt.NDArray[Any], planes: npt.NDArray[Any], low: Int, high: Int, envelope: Float, envelope_step: float,
+    zones: npt.NDArray[Any], planes: npt.NDArray[Any], kx: Float32, ky: Float32, runs: Int, pieces: Int, inner: Float,
     weights: npt.NDArray[Any], x: Float, y: Float, electrons: Float, sersic: Float32, body: Bool, fraction: Float,
-    bulge: Float, disk: Float, thick: Float, row: Int, row_weights: Float, floor: Float,
+    bulge: Float, disk: Float, thick: Float, row: Int, row_weights: Float, cut: Float,
 ) -> None:  # fmt: skip
     """Fills zones, complex[m, N, N / 2 + 1]: what irfft2 turns into the stamps of m sources.
 
-    planes      : [aliases, N, b, 2, N / 2 + 1] real and imaginary part of PSF x pixel; weights [m, b] sum them
-    low, high   : [aliases, N] columns beyond which the planes hold nothing
-    envelope    : largest modulus of the planes at k = i * envelope_step, radian / pixel
+    planes, kx .. inner : of transfer.Transfer and transfer.Grid; weights [m, b] sum the planes
     body        : [m] False for a point
     fraction    : [m] of the light in the bulge
     bulge, disk, thick : [m, 2, 2], [m, 2, 2], [m, 2] of profiles.Forms
     sersic      : table of sersic.py; row, row_weights : [m], [m, 4] from sersic.row_of
-    floor       : [m] samples of less than this (1 at k = 0) are left out
+    cut         : [m] pieces from this |k| on, radian / pixel, are left out
     x, y        : [m] position in the stamp, pixels, 0 = centre of the first;  electrons : [m]
     """
-    for i in range(len(zones)):
-        _zone(
-            zones[i], planes, low, high, envelope, envelope_step, weights[i], x[i], y[i], electrons[i], sersic, body[i],
-            fraction[i], bulge[i], disk[i], thick[i], row[i], row_weights[i], floor[i],
-        )  # fmt: skip
-
-
-@jit
-def _zone(
-    zone: npt.NDArray[Any], planes: npt.NDArray[Any], low: Int, high: Int, envelope: Float, envelope_step: float,
-    weights: npt.NDArray[Any], x: float, y: float, electrons: float, sersic: Float32, body: bool, fraction: float,
-    bulge: Float, disk: Float, thick: Float, row: int, row_weights: Float, floor: float,
-) -> None:  # fmt: skip
-    aliases, n, columns = planes.shape[0], planes.shape[1], planes.shape[4]
+    m, n, columns = zones.shape
+    most, low, high, far = 0, 0, 0, 0
+    for p in range(len(inner)):
+        most = max(most, runs[pieces[p + 1], 0] - runs[pieces[p], 0])
+    for j in range(len(runs) - 1):
+        low, high = min(low, runs[j, 1]), max(high, runs[j, 1] + runs[j + 1, 0] - runs[j, 0])
+        far = max(far, abs(runs[j, 2]))
+    # Phase by column and by row; the electrons enter with the rows.
+    of_column, of_row = np.empty((m, 2, high - low), planes.dtype), np.empty((m, 2, 2 * far + 1), planes.dtype)
+    tables = np.empty((m, sersic.shape[1]), np.float32)
+    sums = np.zeros((m, 2, n, columns), planes.dtype)
     step = _TWO_PI / n
-    table = np.empty(sersic.shape[1] if body and fraction > 0.0 else 1, np.float32)
-    cut = len(envelope) * envelope_step
-    if body:
-        cut = _reach(envelope, envelope_step, fraction, bulge, disk, sersic, row, floor)
-        if fraction > 0.0:
-            # Rows of samples end up to a step beyond the cut.
-            most = 1.01 * (cut + 2.0 * step) ** 2 * np.sum(bulge**2)
-            least = 0.99 * step**2 * _smaller(bulge)
-            _interpolate(sersic, row, row_weights, least, most, table)
-    re, im = np.empty(columns, planes.dtype), np.empty(columns, planes.dtype)
-    sum_re, sum_im = np.empty(columns, planes.dtype), np.empty(columns, planes.dtype)
-    profile, square = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    for i in range(m):
+        for c in range(low, high):
+            of_column[i, 0, c - low], of_column[i, 1, c - low] = np.cos(step * c * x[i]), -np.sin(step * c * x[i])
+        for r in range(-far, far + 1):
+            of_row[i, 0, r + far] = electrons[i] * np.cos(step * r * y[i])
+            of_row[i, 1, r + far] = -electrons[i] * np.sin(step * r * y[i])
+        if body[i] and fraction[i] > 0.0:
+            farthest = 1.01 * (min(cut[i], step * np.hypot(far, max(-low, high))) + 2.0 * step) ** 2
+            table = farthest * np.sum(bulge[i] ** 2), 0.99 * step**2 * _smaller(bulge[i])
+            _interpolate(sersic, row[i], row_weights[i], table[1], table[0], tables[i])
+    re, im = np.empty(most, planes.dtype), np.empty(most, planes.dtype)
+    profile, square = np.empty(most, np.float32), np.empty(most, np.float32)
     bits = square.view(np.int32)
-    turned, cos_x, sin_x = np.empty(2, planes.dtype), np.empty(columns), np.empty(columns)
-    ramp = np.empty(columns, np.float32)
-    for c in range(columns):
-        ramp[c] = step * c
-        cos_x[c], sin_x[c] = np.cos(step * c * x), np.sin(step * c * x)
-    for r in range(n):
-        sum_re[:] = 0
-        sum_im[:] = 0
-        upper = r < (n + 1) // 2
-        ky_zone = step * (r if upper else r - n)
-        for a in range(aliases):
-            right, up = a % 2, a // 2
-            ky = ky_zone - up * (_TWO_PI if upper else -_TWO_PI)
-            if abs(ky) >= cut:
+    for p in range(len(inner)):
+        first, last = runs[pieces[p], 0], runs[pieces[p + 1], 0]
+        # From 0 over a slice: only so does the compiler use whole vectors.
+        some_re, some_im, some = re[: last - first], im[: last - first], profile[: last - first]
+        for i in range(m):
+            if inner[p] >= cut[i]:
                 continue
-            widest = int(np.sqrt((cut - ky) * (cut + ky)) / step) + 1
-            first = max(low[a, r], n - widest) if right else low[a, r]
-            last = high[a, r] if right else min(high[a, r], widest)
-            if first >= last:
-                continue
-            # From 0 over a slice: only so does the compiler use whole vectors.
-            some_re, some_im = re[first:last], im[first:last]
-            _collapse(planes[a, r], weights, first, last, some_re, some_im)
-            if body:
-                some = profile[first:last]
-                start = step * first - (_TWO_PI if right else 0.0)
-                _profile(fraction, bulge, disk, thick, table, start, ramp, ky, square, bits, some)
+            _collapse(planes, weights[i], first, last, some_re, some_im)
+            if body[i]:
+                _profile(
+                    fraction[i], bulge[i], disk[i], thick[i], tables[i], kx[first:last], ky[first:last], square, bits,
+                    some,
+                )  # fmt: skip
                 for c in range(len(some)):
                     some_re[c] *= some[c]
                     some_im[c] *= some[c]
-            turn = _TWO_PI * ((x if right else 0.0) + (0.0 if not up else (y if upper else -y)))
-            turned[0], turned[1] = np.cos(turn), np.sin(turn)
-            _add_turned(turned[0], turned[1], some_re, some_im, sum_re[first:last], sum_im[first:last])
-        cos_y, sin_y = electrons * np.cos(ky_zone * y), electrons * np.sin(ky_zone * y)
-        for c in range(columns):
-            turn_re = cos_x[c] * cos_y - sin_x[c] * sin_y
-            turn_im = -(sin_x[c] * cos_y + cos_x[c] * sin_y)
-            zone[r, c] = complex(sum_re[c] * turn_re - sum_im[c] * turn_im, sum_re[c] * turn_im + sum_im[c] * turn_re)
+            for j in range(pieces[p], pieces[p + 1]):
+                start, ix, iy = runs[j]
+                length, left, up = runs[j + 1, 0] - start, ix % n, iy % n
+                _add_turned(
+                    of_column[i, :, ix - low : ix - low + length], of_row[i, 0, iy + far], of_row[i, 1, iy + far],
+                    re[start - first : start - first + length], im[start - first : start - first + length],
+                    sums[i, 0, up, left : left + length], sums[i, 1, up, left : left + length],
+                )  # fmt: skip
+    for i in range(m):
+        for r in range(n):
+            for c in range(columns):
+                zones[i, r, c] = complex(sums[i, 0, r, c], sums[i, 1, r, c])
 
 
 @jit
 def _collapse(planes: Any, weights: Any, first: int, last: int, re: Any, im: Any) -> None:
-    """Fills re, im with the sum of the columns first .. last of the planes [b, 2, columns]."""
+    """Fills re, im with the sum of the samples first .. last of the planes [b, 2, s]."""
     for part, out in ((0, re), (1, im)):
         triples = len(weights) // 3 * 3
         for c in range(len(out)):
             out[c] = 0
         for b in range(0, triples, 3):
             w0, w1, w2 = weights[b], weights[b + 1], weights[b + 2]
-            p0, p1, p2 = planes[b, part][first:last], planes[b + 1, part][first:last], planes[b + 2, part][first:last]
+            p0, p1, p2 = planes[b, part, first:last], planes[b + 1, part, first:last], planes[b + 2, part, first:last]
             for c in range(len(out)):
                 out[c] += w0 * p0[c] + w1 * p1[c] + w2 * p2[c]
         for b in range(triples, len(weights)):
-            w, p = weights[b], planes[b, part][first:last]
+            w, p = weights[b], planes[b, part, first:last]
             for c in range(len(out)):
                 out[c] += w * p[c]
 
 
 @jit
-def _add_turned(cosine: Any, sine: Any, re: Any, im: Any, sum_re: Any, sum_im: Any) -> None:
+def _add_turned(column: Any, cosine: Any, sine: Any, re: Any, im: Any, sum_re: Any, sum_im: Any) -> None:
+    cosines, sines = column[0], column[1]
     for c in range(len(re)):
-        sum_re[c] += cosine * re[c] - sine * im[c]
-        sum_im[c] += cosine * im[c] + sine * re[c]
+        turn_re = cosines[c] * cosine - sines[c] * sine
+        turn_im = cosines[c] * sine + sines[c] * cosine
+        sum_re[c] += turn_re * re[c] - turn_im * im[c]
+        sum_im[c] += turn_re * im[c] + turn_im * re[c]
 
 
 @jit
 def _profile(
-    fraction: float, bulge: Float, disk: Float, thick: Float, table: Float32, start: float, ramp: Float32, ky: float,
+    fraction: float, bulge: Float, disk: Float, thick: Float, table: Float32, kx: Float32, ky: Float32,
     square: Float32, bits: Any, out: Float32,
 ) -> None:  # fmt: skip
-    """Fills `out` with the profile's transform at kx = start + ramp; square and its bits are scratch."""
-    first = np.float32(start)
+    """Fills `out` with the profile's transform at (kx, ky); square and its bits are scratch."""
     one, share = np.float32(1.0), np.float32(1.0 - fraction)
     if fraction < 1.0:
-        u0, u1 = np.float32(disk[0, 0]), np.float32(disk[1, 0] * ky)
-        v0, v1 = np.float32(disk[0, 1]), np.float32(disk[1, 1] * ky)
-        t0, t1 = np.float32(thick[0]), np.float32(thick[1] * ky)
+        u0, u1 = np.float32(disk[0, 0]), np.float32(disk[1, 0])
+        v0, v1 = np.float32(disk[0, 1]), np.float32(disk[1, 1])
+        t0, t1 = np.float32(thick[0]), np.float32(thick[1])
         for c in range(len(out)):
-            kx = first + ramp[c]
-            u, v, q = u1 + u0 * kx, v1 + v0 * kx, t1 + t0 * kx
+            u, v, q = u0 * kx[c] + u1 * ky[c], v0 * kx[c] + v1 * ky[c], t0 * kx[c] + t1 * ky[c]
             s = one + (u * u + v * v)
             out[c] = share / (s * np.sqrt(s) * _sinh_over(q * q))
     else:
@@ -162,11 +149,10 @@ def _profile(
             out[c] = np.float32(0.0)
     if fraction > 0.0:
         share = np.float32(fraction)
-        u0, u1 = np.float32(bulge[0, 0]), np.float32(bulge[1, 0] * ky)
-        v0, v1 = np.float32(bulge[0, 1]), np.float32(bulge[1, 1] * ky)
+        u0, u1 = np.float32(bulge[0, 0]), np.float32(bulge[1, 0])
+        v0, v1 = np.float32(bulge[0, 1]), np.float32(bulge[1, 1])
         for c in range(len(out)):
-            kx = first + ramp[c]
-            u, v = u1 + u0 * kx, v1 + v0 * kx
+            u, v = u0 * kx[c] + u1 * ky[c], v0 * kx[c] + v1 * ky[c]
             square[c] = u * u + v * v
         end = np.int32(len(table) - 2)
         for c in range(len(out)):
@@ -201,26 +187,32 @@ def _smaller(form: Float) -> Any:
 
 
 @jit
-def _reach(
-    envelope: Float, envelope_step: float, fraction: float, bulge: Float, disk: Float, sersic: Float32, row: int,
-    floor: float,
-) -> float:  # fmt: skip
-    """The k beyond which profile times PSF is below `floor` in every direction."""
-    slim_disk, slim_bulge = _smaller(disk), _smaller(bulge)
+def reaches(
+    passing: Float, step: float, body: Bool, fraction: Float, bulge: Float, disk: Float, sersic: Float32, row: Int,
+    floor: Float,
+) -> Float:  # fmt: skip
+    """[m] the |k|, radian / pixel, beyond which profile times PSF is below `floor` [m] in every direction.
+
+    passing : [i] the most that the PSF passes at |k| = i step
+    """
+    out = np.full(len(body), step * len(passing))
     square = np.empty(1, np.float32)
     bits = square.view(np.int32)
-    for i in range(len(envelope) - 1, 0, -1):
-        k2 = (envelope_step * (i - 1)) ** 2
-        most = 0.0
-        if fraction < 1.0:
-            most += (1.0 - fraction) * (1.0 + slim_disk * k2) ** -1.5
-        if fraction > 0.0:
-            square[0] = slim_bulge * k2
-            column = min(max((bits[0] >> 16) - np.int32(_FIRST), np.int32(0)), np.int32(sersic.shape[1] - 1))
-            most += fraction * max(abs(sersic[row + 1, column]), abs(sersic[row + 2, column]))
-        if most * envelope[i] > floor:
-            return envelope_step * (i + 1)
-    return envelope_step
+    for j in range(len(body)):
+        slim_disk, slim_bulge = _smaller(disk[j]), _smaller(bulge[j])
+        for i in range(len(passing) - 1, -1, -1):
+            out[j] = step * (i + 1)
+            k2 = (step * i) ** 2
+            most = 0.0 if body[j] else 1.0
+            if body[j] and fraction[j] < 1.0:
+                most += (1.0 - fraction[j]) * (1.0 + slim_disk * k2) ** -1.5
+            if body[j] and fraction[j] > 0.0:
+                square[0] = slim_bulge * k2
+                column = min(max((bits[0] >> 16) - np.int32(_FIRST), np.int32(0)), np.int32(sersic.shape[1] - 1))
+                most += fraction[j] * max(abs(sersic[row[j] + 1, column]), abs(sersic[row[j] + 2, column]))
+            if most * passing[i] > floor[j]:
+                break
+    return out
 
 
 @jit
@@ -241,6 +233,23 @@ def _interpolate(sersic: Float32, row: int, row_weights: Float, least: float, mo
 
 
 @jit
+def take(spectrum: npt.NDArray[Any], runs: Int, pixel: Float, out: npt.NDArray[Any]) -> None:
+    """Fills out [2, s] with the samples of transfer.Grid.runs: real and imaginary part of spectrum times pixel.
+
+    spectrum : complex[iy, ix], ix >= 0 of a real image;  pixel : [k] its transform along an axis
+    """
+    for j in range(len(runs) - 1):
+        start, left, iy = runs[j]
+        for c in range(runs[j + 1, 0] - start):
+            ix = left + c
+            through = pixel[abs(ix)] * pixel[abs(iy)]
+            # What lies to the left of kx = 0 is the mirror image's conjugate.
+            sample = spectrum[iy, ix] if ix >= 0 else spectrum[-iy, -ix]
+            out[0, start + c] = through * sample.real
+            out[1, start + c] = through * (sample.imag if ix >= 0 else -sample.imag)
+
+
+@jit
 def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> None:
     """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, in units of 1 / FIXED_POINT.
 
@@ -248,22 +257,33 @@ def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> None:
     """
     ny, nx = frame.shape
     for i in range(len(stamps)):
+        left, right = max(0, -x0[i]), min(stamps.shape[2], nx - x0[i])
         for r in range(max(0, -y0[i]), min(stamps.shape[1], ny - y0[i])):
-            for c in range(max(0, -x0[i]), min(stamps.shape[2], nx - x0[i])):
-                frame[y0[i] + r, x0[i] + c] += np.int64(np.rint(np.float64(stamps[i, r, c]) * FIXED_POINT))
+            if left < right:
+                some, out = stamps[i, r, left:right], frame[y0[i] + r, x0[i] + left : x0[i] + right]
+                for c in range(len(some)):
+                    out[c] += np.int64(np.rint(np.float64(some[c]) * FIXED_POINT))
 
 
 @jit
-def add_blocks(frame: Float, blocks: Float, side: int, margin: int) -> None:
-    """Adds blocks of `side` pixels, `margin` of them before the frame's first, interpolated linearly."""
+def electrons_of(frame: Int, blocks: Float, side: int, margin: int) -> Float:
+    """The frame's electrons, with those of blocks of `side` pixels, `margin` of them before the frame's first.
+
+    blocks : electrons a pixel, interpolated linearly between the blocks' centres;  returns float64[ny, nx]
+    """
     ny, nx = frame.shape
+    out = np.empty((ny, nx))
     middle = 0.5 * (side - 1)
+    left, part = np.empty(nx, np.int64), np.empty(nx)
+    for c in range(nx):
+        x = (c - middle) / side + margin
+        left[c] = int(np.floor(x))
+        part[c] = x - left[c]
     for r in range(ny):
         y = (r - middle) / side + margin
         low = int(np.floor(y))
-        part = y - low
-        line = (1.0 - part) * blocks[low] + part * blocks[low + 1]
+        up = y - low
+        line = (1.0 - up) * blocks[low] + up * blocks[low + 1]
         for c in range(nx):
-            x = (c - middle) / side + margin
-            left = int(np.floor(x))
-            frame[r, c] += line[left] + (x - left) * (line[left + 1] - line[left])
+            out[r, c] = frame[r, c] / FIXED_POINT + line[left[c]] + part[c] * (line[left[c] + 1] - line[left[c]])
+    return out

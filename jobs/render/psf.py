@@ -4,8 +4,7 @@ Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows
 chief ray (coma moves the centroid by a few mas).
 
 vis_psf, ground_psf   -> Psf
-basis_weights         what each source takes of the PSF's planes: its colour, its place on the detector
-transfer, collapsed   PSF times pixel on a stamp's Fourier grid, as the kernel wants it
+spectrum_of           the Fourier transform of a PSF without planes
 pupil, wavefront      the parts of the Euclid model
 """
 
@@ -20,7 +19,7 @@ import galsim
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-from scipy.ndimage import maximum, uniform_filter
+from scipy.ndimage import uniform_filter
 
 from jobs import cache
 from jobs.fluxes.passbands import Passband
@@ -43,16 +42,10 @@ _TRANSFORM = 2048
 _CORE_TRANSFORM, _CORE_SIDE = 768, 160
 # Where the PSF is computed across a detector, in half sides from its centre.
 _NODES = tuple((x, y) for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0))
+# Of the drift: the mean PSF to second order in place, its slope with wavelength to first.
+_POWERS = ((1, 0, 0), (0, 1, 0), (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1))
 # Side and samples a pixel of the drawing that tells the width.
 _CORE, _FINE = 243, 9
-# The k plane reaches twice the Nyquist frequency only where the PSF still passes more than this.
-_BAND_LIMIT = 1e-4
-# Of the planes in single precision: what is less is nothing.
-_NOTHING = 1e-7
-# Larger stamps are few: looking for what is nothing takes longer than drawing it.
-_SHARED = 256
-# radian / pixel between the samples of an envelope: those of the smallest stamp.
-ENVELOPE_STEP = 2 * np.pi / 32
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
@@ -60,11 +53,12 @@ _ARCSEC = np.pi / 180.0 / 3600.0
 class Planes:
     """A PSF by wavelength and place, in samples of 1 / SAMPLES pixel, centred on the middle sample.
 
-    PSF(source) = sum_w photons_w images_w + sum_j polynomial_j(place) drift_j: the change across the detector of the
-    mean PSF to second order (x, y, x^2, x y, y^2), and of its slope with wavelength to first (x, y).
+    PSF(source) = sum_w photons_w images_w + sum_j x^a_j y^b_j redder^c_j drift_j, (a, b, c) = powers, redder the mean
+    wavelength of its photons above that of the planes, A.
 
     wavelength : float64[w] A;  images : float32[w, s, s] of unit flux over the whole sky, at the detector's centre
-    drift      : float32[7, t, t], or [0, t, t] for one PSF a detector
+    drift      : float32[d, t, t]; d = 0 for one PSF a detector
+    powers     : [d] of x, y and redder
     half       : (columns, rows) half the detector: the unit of x and y
     """
 
@@ -72,6 +66,7 @@ class Planes:
     images: Float32
     drift: Float32
     half: tuple[float, float]
+    powers: tuple[tuple[int, int, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,145 +137,16 @@ def _tabulated(profile: galsim.GSObject, pixel_scale: float, planes: Planes | No
     return Psf(profile, pixel_scale, surface, outside, float(with_pixel.calculateFWHM()), planes)
 
 
-# ------------------------------------------------------------------------------------------------ in Fourier space
+def spectrum_of(psf: Psf, size: int, reach: int) -> Array:
+    """Fourier transform of `profile` on the grid of a stamp of `size` pixels, without the pixel.
 
-
-def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) -> Float:
-    """float64[n, planes]: the share of each plane of `transfer` in each source's PSF.
-
-    photons     : [n, w] fraction of its photons in each sub-band; None: flat f_nu
-    column, row : [n] pixels
+    returns : complex[2 reach + 1, reach + 1], [iy, ix] at (ix, iy) times 2 pi / size radian / pixel
     """
-    planes, n = psf.planes, len(column)
-    if planes is None:
-        return np.ones((n, 1))
-    if photons is None:
-        photons = np.full((n, len(planes.wavelength)), 1.0 / len(planes.wavelength))
-    if not len(planes.drift):
-        return photons
-    # Beyond the border the polynomial is held.
-    x = np.clip((column - planes.half[0]) / (planes.half[0] + 0.5), -1.0, 1.0)
-    y = np.clip((row - planes.half[1]) / (planes.half[1] + 0.5), -1.0, 1.0)
-    redder = photons @ planes.wavelength - planes.wavelength.mean()
-    return np.column_stack([photons, x, y, x * x, x * y, y * y, redder * x, redder * y])
-
-
-@dataclass(frozen=True, slots=True)
-class Transfer:
-    """PSF times pixel on the Fourier grid of a stamp of N pixels, with its neighbouring zones.
-
-    planes    : float[aliases, N, b, 2, N / 2 + 1] real and imaginary parts: see kernel.nyquist_zones
-    low, high : int64[aliases, N] columns between which any of it is not nothing
-    envelope  : float64[m] largest modulus at k = i ENVELOPE_STEP, radian / pixel
-    """
-
-    planes: Array
-    low: Int
-    high: Int
-    envelope: Float
-
-
-def transfer(psf: Psf, size: int) -> Transfer:
-    """All planes of a PSF for stamps of `size` pixels, single precision."""
-    if psf.planes is None:
-        return _transfer([_galsim_spectrum(psf, size)], size, np.float32)
-    images = [*psf.planes.images, *psf.planes.drift]
-    return _transfer([_spectrum(image, size) for image in images], size, np.float32)
-
-
-def collapsed(psf: Psf, weights: Float, size: int, dtype: type[Any]) -> Transfer:
-    """One plane: a source's own PSF, for large stamps or in double precision (float64).
-
-    weights : [planes] from basis_weights
-    """
-    if psf.planes is None:
-        return _transfer([_galsim_spectrum(psf, size)], size, dtype)
-    image = _image(psf.planes, weights, SAMPLES * size).astype(dtype)
-    return _transfer([_spectrum(image, size)], size, dtype)
-
-
-def profile_of(psf: Psf, weights: Float) -> galsim.GSObject:
-    """A source's own PSF as a galsim object, arcsec."""
-    if psf.planes is None:
-        return psf.profile
-    return galsim_profile(_image(psf.planes, weights, psf.planes.images.shape[1]), psf.pixel_scale)
-
-
-def _image(planes: Planes, weights: Float, side: int) -> Float32:
-    """The planes' sum, cut to `side` samples or one more."""
-    images, drift = _middle(planes.images, side), _middle(planes.drift, side)
-    share = weights.astype(np.float32)
-    image = np.tensordot(share[: len(images)], images, 1)
-    if len(drift):
-        margin = (image.shape[0] - drift.shape[1]) // 2
-        inner = slice(margin, margin + drift.shape[1])
-        image[inner, inner] += np.tensordot(share[len(images) :], drift, 1)
-    return np.asarray(image)
-
-
-def _middle(images: Float32, side: int) -> Float32:
-    """The middle of square planes [b, s, s], `side` samples or one more."""
-    margin = max((images.shape[1] - side) // 2, 0)
-    return images[:, margin : images.shape[1] - margin, margin : images.shape[2] - margin]
-
-
-def _spectrum(image: Array, size: int) -> Array:
-    """Fourier transform of a plane on the grid of a stamp: complex[m, m / 2 + 1], m = SAMPLES size.
-
-    A plane is cut to the stamp: its wings beyond would otherwise come in at the opposite edge.
-    """
-    period = SAMPLES * size
-    image = _middle(image[None], period)[0]
-    folded = _folded(_folded(image, period).T, period).T
-    return np.asarray(scipy.fft.rfft2(folded))
-
-
-def _folded(image: Array, period: int) -> Array:
-    """Rows summed modulo the period, the middle one on row 0."""
-    before = -(len(image) // 2) % period
-    after = -(before + len(image)) % period
-    padded = np.pad(image, ((before, after), (0, 0)))
-    return np.asarray(padded.reshape(-1, period, image.shape[1]).sum(axis=0))
-
-
-def _galsim_spectrum(psf: Psf, size: int) -> Array:
-    """The same from a galsim object: to the Nyquist frequency where nothing passes beyond it, else to twice."""
     profile = psf.profile.dilate(1.0 / psf.pixel_scale)
-    beyond = np.linspace(np.pi, 1.25 * np.pi, 4)
-    passed = max(max(abs(profile.kValue(k, 0.0)), abs(profile.kValue(0.0, k))) for k in beyond)
-    half = size if passed > _BAND_LIMIT else size // 2
-    image = galsim.ImageCD(galsim.BoundsI(0, half, -half, half - 1), scale=2 * np.pi / size)
+    image = galsim.ImageCD(galsim.BoundsI(0, reach, -reach, reach), scale=2 * np.pi / size)
     # The half plane is all that a real image needs; galsim's public call draws both halves.
     profile._drawKImage(image)
-    return np.fft.ifftshift(image.array, axes=0)
-
-
-def _transfer(spectra: Sequence[Array], size: int, dtype: type[Any]) -> Transfer:
-    aliases = 1 if len(spectra[0]) == size else 4
-    columns, rows = np.arange(size // 2 + 1), np.fft.ifftshift(np.arange(-size // 2, size // 2))
-    planes = np.empty((aliases, size, len(spectra), 2, len(columns)), dtype)
-    low, high = np.zeros((aliases, size), np.int64), np.full((aliases, size), len(columns))
-    envelope = np.ones(int(2 * np.sqrt(2) * np.pi / ENVELOPE_STEP) + 2)
-    rings = np.zeros(len(envelope))
-    for alias in range(aliases):
-        kx = columns - size * (alias % 2)
-        ky = rows if alias < 2 else rows - np.where(rows >= 0, size, -size)
-        pixel = np.sinc(ky / size)[:, None] * np.sinc(kx / size)
-        for b, spectrum in enumerate(spectra):
-            # What lies to the left of kx = 0 is the mirror image's conjugate.
-            found = spectrum[ky, : len(columns)] if alias % 2 == 0 else np.conj(spectrum[-ky][:, -kx])
-            np.multiply(found.real, pixel, out=planes[alias, :, b, 0])
-            np.multiply(found.imag, pixel, out=planes[alias, :, b, 1])
-        if size > _SHARED:
-            continue
-        modulus = np.hypot(planes[alias, :, :, 0], planes[alias, :, :, 1]).max(axis=1)
-        ring = (2 * np.pi / size / ENVELOPE_STEP * np.hypot(ky[:, None], kx)).astype(int)
-        rings = np.maximum(rings, maximum(modulus, ring, np.arange(len(rings))))
-        something = modulus > (_NOTHING if dtype is np.float32 else 0.0)
-        seen = something.any(axis=1)
-        low[alias] = np.where(seen, something.argmax(axis=1), 0)
-        high[alias] = np.where(seen, len(columns) - something[:, ::-1].argmax(axis=1), 0)
-    return Transfer(planes, low, high, envelope if size > _SHARED else rings)
+    return np.asarray(np.roll(image.array, -reach, axis=0))
 
 
 # ------------------------------------------------------------------------------------------------ the optics
@@ -351,10 +217,11 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
     arrays = cache.cached_arrays("vis_psf", key, make)
     turned = slice(None, None, -1 if detector.rotation == 180.0 else 1)
     # Upside down, both the planes and the places that the drift is written in are turned.
-    sign = np.array([-1, -1, 1, 1, 1, -1, -1], np.float32)[: len(arrays["drift"]), None, None]
+    powers = _POWERS[: len(arrays["drift"])]
+    sign = np.array([(-1) ** (i + j) for i, j, _ in powers], np.float32)[:, None, None]
     drift = arrays["drift"][:, turned, turned] * (sign if detector.rotation == 180.0 else np.float32(1.0))
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
-    return Planes(waves, arrays["images"][:, turned, turned], drift, half)
+    return Planes(waves, arrays["images"][:, turned, turned], drift, half, powers)
 
 
 def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> tuple[float, float]:
@@ -390,8 +257,10 @@ def _drift(
             slope[i] += plane * tilt
     x, y = np.array(_NODES).T
     middle = _NODES.index((0.0, 0.0))
-    second = np.linalg.pinv(np.stack([x, y, x * x, x * y, y * y], axis=1))
-    first = np.linalg.pinv(np.stack([x, y], axis=1))
+    second, first = (
+        np.linalg.pinv(np.stack([x**i * y**j for i, j, colour in _POWERS if colour == order], axis=1))
+        for order in (0, 1)
+    )
     changes = np.tensordot(second, mean - mean[middle], 1), np.tensordot(first, slope - slope[middle], 1)
     return np.concatenate(changes)
 

@@ -26,10 +26,10 @@ import numpy.typing as npt
 import scipy.fft
 
 from jobs.accuracy import Accuracy
-from jobs.render import kernel, profiles, sersic, wings
-from jobs.render import psf as psfs
+from jobs.render import kernel, profiles, sersic, transfer, wings
 from jobs.render.profiles import Shapes
-from jobs.render.psf import SIDE, Psf, Transfer
+from jobs.render.psf import SIDE, Psf
+from jobs.render.transfer import Transfer
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
@@ -45,7 +45,7 @@ _LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
 # Above this many electrons the rounding of single precision would show.
 _BRIGHT = 1e7
 # Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
-_SHARED = 256
+_SHARED = 512
 # Pixels of stamps that are transformed together.
 _BATCH = 1 << 17
 # What galsim takes for a point in the reference, arcsec.
@@ -172,43 +172,53 @@ def draw(
     returns  : float64[ny, nx], to 5e-7 electrons a source; the same, bit by bit, in any order of the sources
     """
     frame = np.zeros((ny, nx), np.int64)
-    weights = psfs.basis_weights(psf, sources.photons, sources.column, sources.row)
+    weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
+    bodies, table, passing = _bodies(sources), sersic.table(), transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
-    bodies, table = (*_bodies(sources), left_out), sersic.table()
-    done = 0
+    body, fraction, bulge, disk, _, row, _ = bodies
+    cut = kernel.reaches(passing, transfer.STEP, body, fraction, bulge, disk, table, row, left_out)
+    reach, done = transfer.STEP * len(passing), 0
     for size in np.unique(sizes):
         alone = (sizes == size) & ((sources.electrons > _BRIGHT) | ((size > _SHARED) & (psf.planes is not None)))
         together = np.flatnonzero((sizes == size) & ~alone)
-        shared = psfs.transfer(psf, int(size)) if len(together) else None
-        batch = max(_BATCH // int(size) ** 2, 1)
+        shared = transfer.transfer(psf, int(size), reach) if len(together) else None
+        batch = max(_BATCH // int(size) ** 2, 2)
         groups = [together[i : i + batch] for i in range(0, len(together), batch)]
         for chosen in [*groups, *np.flatnonzero(alone)[:, None]]:
             if alone[chosen[0]]:
                 dtype = np.float64 if sources.electrons[chosen[0]] > _BRIGHT else np.float32
-                passed, share = psfs.collapsed(psf, weights[chosen[0]], int(size), dtype), np.ones((1, 1), dtype)
+                far = cut[chosen[0]] if size > _SHARED else reach
+                passed = transfer.collapsed(psf, weights[chosen[0]], int(size), far, dtype)
+                share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
-            _draw_some(frame, sources, chosen, passed, share, bodies, table)
+            _draw_some(frame, sources, chosen, passed, share, bodies, table, cut)
             done += len(chosen)
             if progress is not None:
                 progress(done)
     beyond = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
-    beyond += frame / kernel.FIXED_POINT
-    return beyond
+    return np.asarray(kernel.electrons_of(frame, beyond, wings.BLOCK, wings.MARGIN))
 
 
 def _draw_some(
-    frame: Int, sources: Sources, chosen: Int, passed: Transfer, weights: Array, bodies: tuple[Array, ...], table: Array
+    frame: Int,
+    sources: Sources,
+    chosen: Int,
+    passed: Transfer,
+    weights: Array,
+    bodies: tuple[Array, ...],
+    table: Array,
+    cut: Float,
 ) -> None:
     """Stamps of one size through one set of planes, onto the frame."""
-    size = passed.planes.shape[1]
+    size = passed.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
     x0, y0 = (np.rint(position).astype(np.int64) - size // 2 for position in (column, row))
     kind = np.complex128 if passed.planes.dtype == np.float64 else np.complex64
     zones = np.empty((len(chosen), size, size // 2 + 1), kind)
     electrons, some = sources.electrons[chosen], [part[chosen] for part in bodies]
-    grid = (passed.planes, passed.low, passed.high, passed.envelope, psfs.ENVELOPE_STEP)
-    kernel.nyquist_zones(zones, *grid, weights, column - x0, row - y0, electrons, table, *some)
+    grid = (passed.planes, passed.grid.kx, passed.grid.ky, passed.grid.runs, passed.grid.pieces, passed.grid.inner)
+    kernel.nyquist_zones(zones, *grid, weights, column - x0, row - y0, electrons, table, *some, cut[chosen])
     kernel.accumulate(frame, scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True), x0, y0)
 
 
@@ -234,8 +244,8 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1
     settings = galsim.GSParams(
         folding_threshold=accuracy, maxk_threshold=accuracy, kvalue_accuracy=1e-7, maximum_fft_size=16384
     )
-    weights = psfs.basis_weights(psf, sources.photons, sources.column, sources.row)[i]
-    parts = [psfs.profile_of(psf, weights).dilate(1.0 / psf.pixel_scale), galsim.Pixel(1.0)]
+    weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)[i]
+    parts = [transfer.profile_of(psf, weights).dilate(1.0 / psf.pixel_scale), galsim.Pixel(1.0)]
     if sources.shape[i] >= 0:
         profile = profiles.profile(sources.shapes, int(sources.shape[i]), _POINT)
         # World frame, arcsec -> pixels, the flux kept.

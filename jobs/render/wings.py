@@ -7,45 +7,50 @@ drawn here on blocks of pixels, through the mean PSF.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import fftconvolve
+import scipy.fft
 
 from jobs.render import kernel
 from jobs.render.psf import SAMPLES, SIDE, Psf
 
 Float = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int64]
 
 # Side of a block, pixels; all stamps are whole numbers of them.
 BLOCK = 8
 # Blocks beyond the frame: a source there sends its wings in.
-_MARGIN = SIDE // 2 // BLOCK + 1
+MARGIN = SIDE // 2 // BLOCK + 1
 
 
 def wings(column: Float, row: Float, electrons: Float, sizes: Int, psf: Psf, nx: int, ny: int) -> Float:
-    """Electrons of sources [n] beyond stamps of `sizes`: float64[ny, nx]; the same in any order of the sources.
+    """Electrons a pixel of sources [n] beyond stamps of `sizes`, on blocks, MARGIN of them before the frame's first.
 
-    Error : the PSF of mean colour at the detector's centre, on blocks: a few per cent of what is beyond the stamp
+    returns : float64[blocks, blocks], the same in any order of the sources
+    Error   : the PSF of mean colour at the detector's centre, on blocks: a few per cent of what is beyond the stamp
     """
-    frame = np.zeros((ny, nx))
+    shape = -(-ny // BLOCK) + 2 * MARGIN, -(-nx // BLOCK) + 2 * MARGIN
     if psf.planes is None:
-        return frame
-    shape = -(-ny // BLOCK) + 2 * _MARGIN, -(-nx // BLOCK) + 2 * _MARGIN
-    mean = psf.planes.images.mean(axis=0, dtype=float)
-    total = np.zeros(shape)
+        return np.zeros(shape)
+    cells = _cells(psf.planes.images.mean(axis=0))
+    # Wide enough that nothing comes round: the margin is as wide as the wings.
+    period = [scipy.fft.next_fast_len(side, real=True) for side in shape]
+    total = np.zeros((period[0], period[1] // 2 + 1), complex)
     for size in np.unique(sizes[sizes < SIDE]):
         chosen = sizes == size
         light = _on_blocks(column[chosen], row[chosen], electrons[chosen], shape)
-        total += fftconvolve(light, _beyond(mean, int(size)), mode="same")
-    kernel.add_blocks(frame, np.maximum(total, 0.0) / BLOCK**2, BLOCK, _MARGIN)
-    return frame
+        total += scipy.fft.rfft2(light, period) * scipy.fft.rfft2(_beyond(cells, int(size), period))
+    found = scipy.fft.irfft2(total, period)[: shape[0], : shape[1]]
+    return np.maximum(found, 0.0) / BLOCK**2
 
 
 def _on_blocks(column: Float, row: Float, electrons: Float, shape: tuple[int, int]) -> Float:
     """Electrons shared among the four nearest blocks, summed in fixed point: the same in any order."""
     out = np.zeros(shape, np.int64)
-    x, y = ((at - (BLOCK - 1) / 2) / BLOCK + _MARGIN for at in (column, row))
+    x, y = ((at - (BLOCK - 1) / 2) / BLOCK + MARGIN for at in (column, row))
     x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     for right in (0, 1):
         for up in (0, 1):
@@ -56,12 +61,21 @@ def _on_blocks(column: Float, row: Float, electrons: Float, shape: tuple[int, in
     return out / kernel.FIXED_POINT
 
 
-def _beyond(plane: Float, size: int) -> Float:
-    """A plane outside a square of `size` pixels, summed on blocks about its middle."""
-    middle, half, step = len(plane) // 2, SAMPLES * size // 2, SAMPLES * BLOCK
-    hollow = plane.copy()
-    hollow[middle - half : middle + half + 1, middle - half : middle + half + 1] = 0.0
-    count = (middle - step // 2) // step
-    first = middle - step // 2 - count * step
-    kept = hollow[first : first + (2 * count + 1) * step, first : first + (2 * count + 1) * step]
-    return np.asarray(kept.reshape(2 * count + 1, step, 2 * count + 1, step).sum(axis=(1, 3)))
+def _cells(plane: Float32) -> Float:
+    """A plane summed on squares of half a block, an even number of them about its middle."""
+    middle, step = len(plane) // 2, SAMPLES * BLOCK // 2
+    count = (SIDE // 2 - BLOCK // 2) // BLOCK * 2 + 1
+    kept = slice(middle - count * step, middle + count * step)
+    whole = plane[kept, kept].reshape(2 * count, step, 2 * count, step)
+    return np.asarray(whole.sum(axis=(1, 3), dtype=float))
+
+
+def _beyond(cells: Float, size: int, period: Sequence[int]) -> Float:
+    """What lies outside a square of `size` pixels, on blocks, the middle one first: [period]."""
+    middle, half = len(cells) // 2, size // BLOCK
+    hollow = cells.copy()
+    hollow[middle - half : middle + half, middle - half : middle + half] = 0.0
+    count = len(cells) // 4
+    out = np.zeros(period)
+    out[: 2 * count + 1, : 2 * count + 1] = hollow.reshape(2 * count + 1, 2, 2 * count + 1, 2).sum(axis=(1, 3))
+    return np.roll(out, (-count, -count), (0, 1))

@@ -1,0 +1,222 @@
+"""What passes a PSF and the pixels: transfer functions on the Fourier grids of stamps.
+
+basis_weights what each source takes of the PSF's planes: its colour, its place on the detector
+passing       how much passes at most, by frequency
+grid          the samples of a stamp's half plane inside a disc, in the order in which the kernel takes them
+transfer      all planes of a PSF on such a grid
+collapsed     the one of a single source
+profile_of    the same as a galsim object, for the reference
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+from scipy.ndimage import maximum
+
+from jobs.render import kernel
+from jobs.render.psf import SAMPLES, SIDE, Planes, Psf, galsim_profile, spectrum_of
+
+Float = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Int = npt.NDArray[np.int64]
+Array = npt.NDArray[Any]
+
+# radian / pixel between the samples of `passing`: those of a stamp of 32 pixels.
+STEP = 2 * np.pi / 32
+# What passes less than this in single precision passes nothing.
+_NOTHING = 1e-7
+# Frequencies beyond this are not looked at: twice the Nyquist frequency and a half (a plane has three times).
+_FARTHEST = 2.5 * np.pi
+# Samples that the kernel takes together: their planes stay in the cache.
+_TOGETHER = 1024
+# Stamp that `passing` is measured on, pixels.
+_PROBE = 64
+
+
+def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) -> Float:
+    """float64[n, planes]: the share of each plane of `transfer` in each source's PSF.
+
+    photons     : [n, w] fraction of its photons in each sub-band; None: flat f_nu
+    column, row : [n] pixels
+    """
+    planes, n = psf.planes, len(column)
+    if planes is None:
+        return np.ones((n, 1))
+    waves = planes.wavelength
+    if photons is None:
+        photons = np.full((n, len(waves)), 1.0 / len(waves))
+    # Beyond the border the polynomial is held.
+    x = np.clip((column - planes.half[0]) / (planes.half[0] + 0.5), -1.0, 1.0)
+    y = np.clip((row - planes.half[1]) / (planes.half[1] + 0.5), -1.0, 1.0)
+    redder = photons @ waves - waves.mean()
+    drift = [x**i * y**j * redder**colour for i, j, colour in planes.powers]
+    return np.column_stack([photons, *drift])
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """The samples of a stamp's Fourier half plane inside a disc, and of its aliases: s samples, in pieces of runs.
+
+    A sample lies at (ix, iy) times 2 pi / size radian / pixel and adds to the half plane's place (iy, ix) modulo
+    size. Runs are of samples with one iy and consecutive ix; pieces are whole runs of about one |k|, which a source
+    that reaches less far leaves out.
+
+    kx, ky : float32[s] radian / pixel
+    runs   : int64[r + 1, 3] first sample, its ix, its iy; the last is s
+    pieces : int64[p + 1] first run
+    inner  : float64[p] smallest |k|, radian / pixel
+    """
+
+    size: int
+    kx: Float32
+    ky: Float32
+    runs: Int
+    pieces: Int
+    inner: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Transfer:
+    """PSF times pixel on a grid: planes float[b, 2, s], real and imaginary parts."""
+
+    grid: Grid
+    planes: Array
+
+
+@lru_cache(maxsize=32)
+def grid(size: int, reach: float) -> Grid:
+    """Samples at |k| < reach, radian / pixel."""
+    return _grid(size, reach)
+
+
+def _grid(size: int, reach: float) -> Grid:
+    step = 2 * np.pi / size
+    most = int(np.ceil(reach / step))
+    ix, iy = np.arange(-most, most + 1), np.arange(-most, most + 1)
+    # A real image needs half of the plane, but all aliases of that half.
+    ix = ix[ix % size <= size // 2]
+    k = step * np.hypot(iy[:, None], ix)
+    rows, columns = np.nonzero(k < reach)
+    shells = max(size // 16, 4)
+    shell = np.minimum((k[rows, columns] * (shells / reach)).astype(np.int64), shells - 1)
+    order = np.argsort(shell, kind="stable")
+    shell, ix, iy = shell[order], ix[columns[order]], iy[rows[order]]
+    # ix of one residue class modulo size are consecutive only up to its middle.
+    new = (np.diff(shell) != 0) | (np.diff(iy) != 0) | (np.diff(ix) != 1)
+    first = np.concatenate([[0], np.flatnonzero(new) + 1])
+    # A piece is full after so many samples, or at the end of its shell.
+    start = np.searchsorted(shell, shell[first])
+    part = (first - start) // _TOGETHER + shell[first] * (len(shell) // _TOGETHER + 1)
+    pieces = np.concatenate([[0], np.flatnonzero(np.diff(part)) + 1])
+    inner = shell[first[pieces]] * (reach / shells)
+    runs = np.column_stack([first, ix[first], iy[first]])
+    runs = np.concatenate([runs, [[len(ix), 0, 0]]]).astype(np.int64)
+    pieces = np.append(pieces, len(first)).astype(np.int64)
+    return Grid(size, (step * ix).astype(np.float32), (step * iy).astype(np.float32), runs, pieces, inner)
+
+
+def passing(psf: Psf) -> Float:
+    """float64[m]: the largest modulus of PSF times pixel at k = i STEP radian / pixel; nothing beyond."""
+    probe = grid(_PROBE, _FARTHEST)
+    planes = _planes(psf, probe, np.float32)
+    modulus = np.hypot(planes[:, 0], planes[:, 1]).max(axis=0)
+    ring = (np.hypot(probe.kx, probe.ky) / STEP).astype(int)
+    rings = np.asarray(maximum(modulus, ring, np.arange(ring.max() + 1)), float)
+    something = np.flatnonzero(rings > _NOTHING)
+    return rings[: something[-1] + 1]
+
+
+def transfer(psf: Psf, size: int, reach: float) -> Transfer:
+    """All planes of a PSF for stamps of `size` pixels, single precision, up to |k| = reach."""
+    some = grid(size, reach)
+    return Transfer(some, _planes(psf, some, np.float32))
+
+
+def collapsed(psf: Psf, weights: Float, size: int, reach: float, dtype: type[Any]) -> Transfer:
+    """One plane: a source's own PSF, for large stamps or in double precision (float64).
+
+    weights : [planes] from basis_weights
+    """
+    some = _grid(size, reach) if size > SIDE else grid(size, reach)
+    if psf.planes is None:
+        return Transfer(some, _planes(psf, some, dtype))
+    image = _image(psf.planes, weights, SAMPLES * size).astype(dtype)
+    return Transfer(some, _on_grid([image], some, dtype))
+
+
+def profile_of(psf: Psf, weights: Float) -> Any:
+    """A source's own PSF as a galsim object, arcsec."""
+    if psf.planes is None:
+        return psf.profile
+    return galsim_profile(_image(psf.planes, weights, psf.planes.images.shape[1]), psf.pixel_scale)
+
+
+def _planes(psf: Psf, some: Grid, dtype: type[Any]) -> Array:
+    if psf.planes is None:
+        step = 2 * np.pi / some.size
+        reach = int(np.rint(max(some.kx.max(), -some.kx.min(), some.ky.max()) / step))
+        out = np.empty((1, 2, len(some.kx)), dtype)
+        _take(spectrum_of(psf, some.size, reach), some, out[0])
+        return out
+    return _on_grid([*psf.planes.images, *psf.planes.drift], some, dtype)
+
+
+def _on_grid(images: list[Array], some: Grid, dtype: type[Any]) -> Array:
+    out = np.empty((len(images), 2, len(some.kx)), dtype)
+    columns = int(np.rint(np.abs(some.kx).max() * some.size / (2 * np.pi))) + 1
+    for image, plane in zip(images, out, strict=True):
+        _take(_spectrum(image, some.size, columns), some, plane)
+    return out
+
+
+def _take(spectrum: Array, some: Grid, out: Array) -> None:
+    """Fills out [2, s] with spectrum x pixel."""
+    pixel = np.sinc(np.arange(spectrum.shape[1] + len(spectrum)) / some.size)
+    kernel.take(spectrum, some.runs, pixel, out)
+
+
+def _image(planes: Planes, weights: Float, side: int) -> Float32:
+    """The planes' sum, cut to `side` samples or one more."""
+    images, drift = _middle(planes.images, side), _middle(planes.drift, side)
+    share = weights.astype(np.float32)
+    image = share[0] * images[0]
+    for weight, plane in zip(share[1 : len(images)], images[1:], strict=True):
+        image += weight * plane
+    margin = (image.shape[0] - drift.shape[1]) // 2
+    inner = image[margin : margin + drift.shape[1], margin : margin + drift.shape[1]]
+    for weight, plane in zip(share[len(images) :], drift, strict=True):
+        inner += weight * plane
+    return np.asarray(image)
+
+
+def _middle(images: Float32, side: int) -> Float32:
+    """The middle of square planes [b, s, s], `side` samples or one more."""
+    margin = max((images.shape[1] - side) // 2, 0)
+    return images[:, margin : images.shape[1] - margin, margin : images.shape[2] - margin]
+
+
+def _spectrum(image: Array, size: int, columns: int) -> Array:
+    """Fourier transform of a plane on the grid of a stamp: complex[SAMPLES size, columns], its first columns.
+
+    A plane is cut to the stamp: its wings beyond would otherwise come in at the opposite edge. Rows and columns that
+    are empty, or not asked for, are not transformed.
+    """
+    period = SAMPLES * size
+    image = _middle(image[None], period)[0]
+    lines = scipy.fft.rfft(_from_middle(image.T, period), axis=0)[:columns].T
+    return np.asarray(scipy.fft.fft(_from_middle(lines, period), axis=0, overwrite_x=True))
+
+
+def _from_middle(image: Array, period: int) -> Array:
+    """Rows filled up to the period, the middle one on row 0; of one too many the last is added to the first."""
+    out = np.zeros((period, image.shape[1]), image.dtype)
+    half = len(image) // 2
+    out[: len(image) - half] = image[half:] if len(image) - half <= period else image[half : half + period]
+    out[period - half :] += image[:half]
+    return out
