@@ -141,7 +141,7 @@ def alone(one: Sources, weights: np.ndarray, spread_: psf.Psf, size: int, floor:
     )
     bodies = (*stamps._bodies(one), np.array([floor]))
     table = stamps.sersic.table()
-    stamps._draw_some(frame, one, np.array([0]), passed, np.ones((1, 1), np.float32), bodies, table)
+    stamps._draw_some(frame, one, np.array([0]), passed, np.ones((1, 1), np.float32), bodies, table, cut)
     return frame / stamps.kernel.FIXED_POINT
 
 

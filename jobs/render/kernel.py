@@ -2,7 +2,9 @@
 
 nyquist_zones profile x PSF x pixel x phase on the half plane, wrapped onto the pixels' Nyquist zone
 accumulate    stamps onto the frame, in fixed point
+runs          which samples of a stamp's grid are taken, in what order
 take          the samples of a stamp's grid from a transform
+add_planes    planes of a PSF, weighted, summed
 electrons_of  the frame with a smooth layer on top
 reaches       how far in Fourier space a source must be followed
 
@@ -247,6 +249,53 @@ def take(spectrum: npt.NDArray[Any], runs: Int, pixel: Float, out: npt.NDArray[A
             sample = spectrum[iy, ix] if ix >= 0 else spectrum[-iy, -ix]
             out[0, start + c] = through * sample.real
             out[1, start + c] = through * (sample.imag if ix >= 0 else -sample.imag)
+
+
+@jit
+def runs(size: int, reach: float, shells: int, out: Int) -> tuple[int, int]:
+    """Runs of samples of a stamp's Fourier grid: see transfer.Grid.
+
+    reach   : largest |(ix, iy)|;  shells : rings of equal width that the runs are sorted by, then by iy
+    out     : filled with first sample, ix, iy, shell, as far as it has rows
+    returns : number of runs, number of samples
+    """
+    count, samples = 0, 0
+    for shell in range(shells):
+        inside, outside = reach * shell / shells, reach * (shell + 1) / shells
+        for iy in range(-int(reach), int(reach) + 1):
+            last = _half_chord(outside, iy)
+            gap = _half_chord(inside, iy) if shell > 0 else -1
+            # Two arcs, left and right of the inner shells; or, on top of them, one.
+            for arc in range(2 if gap >= 0 else 1):
+                low = gap + 1 if arc == 1 else -last
+                high = last if arc == 1 or gap < 0 else -gap - 1
+                # Half of a real image's plane is enough, with all that falls onto that half.
+                for alias in range(low // size, high // size + 1):
+                    start, end = max(low, alias * size), min(high, alias * size + size // 2)
+                    if start <= end:
+                        if count < len(out):
+                            out[count, 0], out[count, 1], out[count, 2], out[count, 3] = samples, start, iy, shell
+                        count += 1
+                        samples += end - start + 1
+    return count, samples
+
+
+@jit
+def _half_chord(radius: float, y: int) -> int:
+    """Largest x >= 0 with (x, y) inside a circle, else -1."""
+    square = radius * radius - y * y
+    return int(np.sqrt(square)) if square >= 0.0 else -1
+
+
+@jit
+def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> None:
+    """Adds the weighted sum of planes [b, s, s] to the image inside a margin."""
+    for r in range(planes.shape[1]):
+        out = image[margin + r, margin : margin + planes.shape[2]]
+        for b in range(len(planes)):
+            weight, line = np.float32(weights[b]), planes[b, r]
+            for c in range(len(out)):
+                out[c] += weight * line[c]
 
 
 @jit

@@ -46,6 +46,8 @@ _LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
 _BRIGHT = 1e7
 # Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
 _SHARED = 512
+# For so few the planes are not worth their transforms.
+_FEW = 8
 # Pixels of stamps that are transformed together.
 _BATCH = 1 << 17
 # What galsim takes for a point in the reference, arcsec.
@@ -179,16 +181,18 @@ def draw(
     cut = kernel.reaches(passing, transfer.STEP, body, fraction, bulge, disk, table, row, left_out)
     reach, done = transfer.STEP * len(passing), 0
     for size in np.unique(sizes):
-        alone = (sizes == size) & ((sources.electrons > _BRIGHT) | ((size > _SHARED) & (psf.planes is not None)))
-        together = np.flatnonzero((sizes == size) & ~alone)
+        of_size = sizes == size
+        few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW)
+        alone = of_size & (few | (sources.electrons > _BRIGHT))
+        together = np.flatnonzero(of_size & ~alone)
         shared = transfer.transfer(psf, int(size), reach) if len(together) else None
+        own = transfer.grid(int(size), float(cut[alone].max()) if size > SIDE else reach) if alone.any() else None
         batch = max(_BATCH // int(size) ** 2, 2)
         groups = [together[i : i + batch] for i in range(0, len(together), batch)]
         for chosen in [*groups, *np.flatnonzero(alone)[:, None]]:
-            if alone[chosen[0]]:
+            if own is not None and alone[chosen[0]]:
                 dtype = np.float64 if sources.electrons[chosen[0]] > _BRIGHT else np.float32
-                far = cut[chosen[0]] if size > _SHARED else reach
-                passed = transfer.collapsed(psf, weights[chosen[0]], int(size), far, dtype)
+                passed = transfer.collapsed(psf, weights[chosen[0]], own, dtype)
                 share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
+import scipy.signal
 from scipy.ndimage import maximum
 
 from jobs.render import kernel
@@ -89,42 +90,45 @@ class Transfer:
     planes: Array
 
 
-@lru_cache(maxsize=32)
 def grid(size: int, reach: float) -> Grid:
-    """Samples at |k| < reach, radian / pixel."""
+    """Samples of a stamp of `size` pixels at |k| <= reach, radian / pixel."""
+    return _kept(size, reach) if size <= SIDE else _grid(size, reach)
+
+
+@lru_cache(maxsize=32)
+def _kept(size: int, reach: float) -> Grid:
     return _grid(size, reach)
 
 
 def _grid(size: int, reach: float) -> Grid:
     step = 2 * np.pi / size
-    most = int(np.ceil(reach / step))
-    ix, iy = np.arange(-most, most + 1), np.arange(-most, most + 1)
-    # A real image needs half of the plane, but all aliases of that half.
-    ix = ix[ix % size <= size // 2]
-    k = step * np.hypot(iy[:, None], ix)
-    rows, columns = np.nonzero(k < reach)
     shells = max(size // 16, 4)
-    shell = np.minimum((k[rows, columns] * (shells / reach)).astype(np.int64), shells - 1)
-    order = np.argsort(shell, kind="stable")
-    shell, ix, iy = shell[order], ix[columns[order]], iy[rows[order]]
-    # ix of one residue class modulo size are consecutive only up to its middle.
-    new = (np.diff(shell) != 0) | (np.diff(iy) != 0) | (np.diff(ix) != 1)
-    first = np.concatenate([[0], np.flatnonzero(new) + 1])
+    count, samples = kernel.runs(size, reach / step, shells, np.zeros((0, 4), np.int64))
+    runs = np.zeros((count + 1, 4), np.int64)
+    kernel.runs(size, reach / step, shells, runs)
+    runs[-1] = samples, 0, 0, shells
+    first, ix, iy, shell = runs.T
     # A piece is full after so many samples, or at the end of its shell.
-    start = np.searchsorted(shell, shell[first])
-    part = (first - start) // _TOGETHER + shell[first] * (len(shell) // _TOGETHER + 1)
-    pieces = np.concatenate([[0], np.flatnonzero(np.diff(part)) + 1])
-    inner = shell[first[pieces]] * (reach / shells)
-    runs = np.column_stack([first, ix[first], iy[first]])
-    runs = np.concatenate([runs, [[len(ix), 0, 0]]]).astype(np.int64)
-    pieces = np.append(pieces, len(first)).astype(np.int64)
-    return Grid(size, (step * ix).astype(np.float32), (step * iy).astype(np.float32), runs, pieces, inner)
+    start = first[np.searchsorted(shell, shell)]
+    part = (first - start) // _TOGETHER + shell * (samples // _TOGETHER + 1)
+    pieces = np.concatenate([[0], np.flatnonzero(np.diff(part)) + 1]).astype(np.int64)
+    length = np.diff(first)
+    along = np.arange(samples) - np.repeat(first[:-1] - ix[:-1], length)
+    kx, ky = (step * along).astype(np.float32), np.repeat((step * iy[:-1]).astype(np.float32), length)
+    inner = shell[pieces[:-1]] * (reach / shells)
+    return Grid(size, kx, ky, np.ascontiguousarray(runs[:, :3]), pieces, inner)
 
 
 def passing(psf: Psf) -> Float:
     """float64[m]: the largest modulus of PSF times pixel at k = i STEP radian / pixel; nothing beyond."""
     probe = grid(_PROBE, _FARTHEST)
-    planes = _planes(psf, probe, np.float32)
+    if psf.planes is None:
+        planes = _planes(psf, probe, np.float32)
+    else:
+        # A smooth edge: a sharp one passes some of every frequency.
+        window = scipy.signal.windows.hann(SAMPLES * _PROBE + 1).astype(np.float32)
+        middle = _middle(psf.planes.images, SAMPLES * _PROBE)
+        planes = _on_grid(list(middle * window[:, None] * window), probe, np.float32)
     modulus = np.hypot(planes[:, 0], planes[:, 1]).max(axis=0)
     ring = (np.hypot(probe.kx, probe.ky) / STEP).astype(int)
     rings = np.asarray(maximum(modulus, ring, np.arange(ring.max() + 1)), float)
@@ -138,15 +142,14 @@ def transfer(psf: Psf, size: int, reach: float) -> Transfer:
     return Transfer(some, _planes(psf, some, np.float32))
 
 
-def collapsed(psf: Psf, weights: Float, size: int, reach: float, dtype: type[Any]) -> Transfer:
+def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any]) -> Transfer:
     """One plane: a source's own PSF, for large stamps or in double precision (float64).
 
     weights : [planes] from basis_weights
     """
-    some = _grid(size, reach) if size > SIDE else grid(size, reach)
     if psf.planes is None:
         return Transfer(some, _planes(psf, some, dtype))
-    image = _image(psf.planes, weights, SAMPLES * size).astype(dtype)
+    image = _image(psf.planes, weights, SAMPLES * some.size).astype(dtype)
     return Transfer(some, _on_grid([image], some, dtype))
 
 
@@ -184,15 +187,11 @@ def _take(spectrum: Array, some: Grid, out: Array) -> None:
 def _image(planes: Planes, weights: Float, side: int) -> Float32:
     """The planes' sum, cut to `side` samples or one more."""
     images, drift = _middle(planes.images, side), _middle(planes.drift, side)
-    share = weights.astype(np.float32)
-    image = share[0] * images[0]
-    for weight, plane in zip(share[1 : len(images)], images[1:], strict=True):
-        image += weight * plane
-    margin = (image.shape[0] - drift.shape[1]) // 2
-    inner = image[margin : margin + drift.shape[1], margin : margin + drift.shape[1]]
-    for weight, plane in zip(share[len(images) :], drift, strict=True):
-        inner += weight * plane
-    return np.asarray(image)
+    image = np.zeros(images.shape[1:], np.float32)
+    margin = (len(image) - drift.shape[1]) // 2
+    kernel.add_planes(image, images, weights[: len(images)], 0)
+    kernel.add_planes(image, drift, weights[len(images) :], margin)
+    return image
 
 
 def _middle(images: Float32, side: int) -> Float32:
@@ -209,14 +208,20 @@ def _spectrum(image: Array, size: int, columns: int) -> Array:
     """
     period = SAMPLES * size
     image = _middle(image[None], period)[0]
-    lines = scipy.fft.rfft(_from_middle(image.T, period), axis=0)[:columns].T
-    return np.asarray(scipy.fft.fft(_from_middle(lines, period), axis=0, overwrite_x=True))
+    lines = scipy.fft.rfft(_from_middle(image, period, 1), axis=1)[:, :columns]
+    return np.asarray(scipy.fft.fft(_from_middle(lines, period, 0), axis=0, overwrite_x=True))
 
 
-def _from_middle(image: Array, period: int) -> Array:
-    """Rows filled up to the period, the middle one on row 0; of one too many the last is added to the first."""
-    out = np.zeros((period, image.shape[1]), image.dtype)
-    half = len(image) // 2
-    out[: len(image) - half] = image[half:] if len(image) - half <= period else image[half : half + period]
-    out[period - half :] += image[:half]
+def _from_middle(image: Array, period: int, axis: int) -> Array:
+    """Filled up to the period along an axis, the middle first; of one too many the last is added to the first."""
+    shape = list(image.shape)
+    shape[axis] = period
+    out = np.zeros(shape, image.dtype)
+    half = image.shape[axis] // 2
+    if axis == 0:
+        out[: len(image) - half] = image[half:]
+        out[period - half :] += image[:half]
+    else:
+        out[:, : image.shape[1] - half] = image[:, half:]
+        out[:, period - half :] += image[:, :half]
     return out
