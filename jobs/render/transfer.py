@@ -5,6 +5,7 @@ passing       how much passes at most, by frequency
 grid          the samples of a stamp's half plane inside a disc, in the order in which the kernel takes them
 transfer      all planes of a PSF on such a grid
 collapsed     the one of a single source
+image_of      its image
 profile_of    the same as a galsim object, for the reference
 """
 
@@ -155,9 +156,12 @@ def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any]) -> Transfe
 
 def profile_of(psf: Psf, weights: Float) -> Any:
     """A source's own PSF as a galsim object, arcsec."""
-    if psf.planes is None:
-        return psf.profile
-    return galsim_profile(_image(psf.planes, weights, psf.planes.images.shape[1]), psf.pixel_scale)
+    return psf.profile if psf.planes is None else galsim_profile(image_of(psf.planes, weights), psf.pixel_scale)
+
+
+def image_of(planes: Planes, weights: Float) -> Float32:
+    """A source's own PSF in samples of 1 / SAMPLES pixel."""
+    return _image(planes, weights, planes.images.shape[1])
 
 
 def _planes(psf: Psf, some: Grid, dtype: type[Any]) -> Array:

@@ -1,0 +1,140 @@
+"""Errors of drawn galaxies: against galsim at its tightest, and of their response to shear."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks import _scenes as scenes
+from benchmarks._scenes import BINS, Scene
+from jobs.render import psf, stamps
+from jobs.render.stamps import Settings, Sources
+
+Float = npt.NDArray[np.float64]
+Found = TypeVar("Found")
+# galsim asks for more than any machine has where a bulge is steep: bytes of address space.
+MEMORY = 6 << 30
+# Of the weight under which moments are taken, arcsec; radius of the aperture, arcsec.
+WEIGHT, APERTURE = 0.75, 1.0
+# Side of the frames that are compared, pixels.
+COMPARED = 256
+NAMES = ("aperture_mag", "centroid_mas", "r2", "ellipticity", "pixel_sigma")
+# No approximation but the stamp, and that the largest.
+FULL = Settings(edge=1e-7, ghost=1e-9, floor=0.0, least=51.2, positions=9)
+
+
+def capped(work: Callable[..., Found], *args: Any) -> Found:
+    """work(*args) in a process of its own whose memory is limited."""
+    with ProcessPoolExecutor(1, get_context("spawn"), _cap) as pool:
+        return pool.submit(work, *args).result()
+
+
+def _cap() -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+
+
+def measured(image: Float, scale: float, x: float, y: float) -> Float:
+    """Aperture flux; centroid in arcsec; R2 in arcsec2; e1, e2, under a Gaussian weight about the true place."""
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
+    dx, dy = (columns - x) * scale, (rows - y) * scale
+    r2 = dx**2 + dy**2
+    weighted = image * np.exp(-0.5 * r2 / WEIGHT**2)
+    total = weighted.sum()
+    xx, yy, xy = ((weighted * a).sum() / total for a in (dx * dx, dy * dy, dx * dy))
+    aperture = image[r2 < APERTURE**2].sum()
+    centroid = (weighted * dx).sum() / total, (weighted * dy).sum() / total
+    return np.array([aperture, *centroid, xx + yy, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
+
+
+def errors(image: Float, truth: Float, scene: Scene, one: Sources) -> Float:
+    """NAMES: aperture mag, centroid mas, dR2 / R2, ellipticity, largest pixel in sigma."""
+    at = float(one.column[0]), float(one.row[0])
+    ours, theirs = measured(image, scene.scale, *at), measured(truth, scene.scale, *at)
+    return np.array(
+        [
+            abs(2.5 * np.log10(ours[0] / theirs[0])),
+            1e3 * np.hypot(*(ours - theirs)[1:3]),
+            abs(ours[3] / theirs[3] - 1),
+            np.hypot(*(ours - theirs)[4:6]),
+            np.abs(image - truth).max() / scene.noise,
+        ]
+    )
+
+
+def against_galsim(
+    scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int
+) -> tuple[dict[str, Float], npt.NDArray[np.int64], int]:
+    """(errors [m, 5] of each of the settings, magnitude bins [m], galaxies that galsim refused)."""
+    some, full = scenes.sample(scene, seed, n), scenes.spread(scene)
+    out: dict[str, list[Float]] = {name: [] for name in tiers}
+    bins, refused = [], 0
+    for i, b in enumerate(scenes.bins_of(some, scene)):
+        one, mine = scenes.moved(some, i, COMPARED), scenes.own(full, some, i)
+        try:
+            truth = stamps.reference(one, 0, mine, COMPARED)
+        except (MemoryError, RuntimeError):
+            refused += 1
+            continue
+        bins.append(b)
+        for name, settings in tiers.items():
+            image = scenes.draw(one, scenes.own(full, some, i, settings), scene, settings, COMPARED)
+            out[name].append(errors(image, truth, scene, one))
+    return {name: np.array(rows) for name, rows in out.items()}, np.array(bins), refused
+
+
+def shear_response(
+    scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int, g: float = 0.02
+) -> tuple[dict[str, Float], Sources]:
+    """Errors (m, c) [n, 2] of each of the settings and the galaxies: 90-degree pairs under +-g, noise-free.
+
+    The truth is the same galaxy through the same PSF on the largest stamp (FULL); |m| <= 1e-5 of galsim's.
+    """
+    some, full = scenes.sample(scene, seed, n), scenes.spread(scene)
+    out: dict[str, list[tuple[float, float]]] = {name: [] for name in tiers}
+    for i in range(len(some)):
+        mine, one = scenes.own(full, some, i), scenes.moved(some, i, 2 * COMPARED)
+        truth = _response(one, mine, scene, FULL, g)
+        for name, settings in tiers.items():
+            less = scenes.own(full, some, i, settings) if settings.positions == 1 else mine
+            found = _response(one, less, scene, settings, g)
+            out[name].append((float(found[0] / truth[0] - 1), float(found[1] - truth[1])))
+    return {name: np.array(rows) for name, rows in out.items()}, some
+
+
+def _response(one: Sources, spread: psf.Psf, scene: Scene, settings: Settings, g: float) -> tuple[float, float]:
+    """(de / dg, mean e) of a galaxy and the same turned by 90 degrees."""
+    found = np.zeros(2)
+    for turn in (0.0, np.pi / 2):
+        for k, shear in enumerate((-g, g)):
+            shapes = one.shapes.take(one.shape)
+            shapes = replace(shapes, g1=np.array([shear]), g2=np.zeros(1), beta=shapes.beta + turn)
+            image = scenes.draw(
+                replace(one, shapes=shapes, shape=np.zeros(1, np.int64)), spread, scene, settings, 2 * COMPARED
+            )
+            found[k] += 0.5 * measured(image, scene.scale, float(one.column[0]), float(one.row[0]))[4]
+    return float(found[1] - found[0]) / (2 * g), float(found.mean())
+
+
+def figures(found: Float) -> dict[str, float]:
+    """rms and worst of errors [n, 5]."""
+    rms, worst = np.sqrt((found**2).mean(axis=0)), found.max(axis=0)
+    named = zip(NAMES, rms, worst, strict=True)
+    return {key: float(value) for name, a, b in named for key, value in ((f"{name}_rms", a), (f"{name}_worst", b))}
+
+
+def table(title: str, found: Float, bins: npt.NDArray[np.int64]) -> None:
+    """Prints rms / worst of errors by magnitude bin."""
+    print(f"{title:24}" + "".join(f"{name:>20}" for name in NAMES))
+    rows = [(f"m {BINS[b]:.0f}-{BINS[b + 1]:.0f}", found[bins == b]) for b in range(len(BINS) - 1)]
+    for label, some in [*rows, ("all", found)]:
+        if len(some):
+            rms, worst = np.sqrt((some**2).mean(axis=0)), some.max(axis=0)
+            cells = "".join(f"{a:>10.1e}/{b:<9.1e}" for a, b in zip(rms, worst, strict=True))
+            print(f"  {label:12}{len(some):>6}    {cells}")

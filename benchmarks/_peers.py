@@ -1,0 +1,101 @@
+"""What others take for the same galaxies: galsim, object by object, and UFig's photons."""
+
+from __future__ import annotations
+
+import time
+
+import galsim
+import numpy as np
+
+from benchmarks import _scenes as scenes
+from benchmarks._scenes import BINS, Scene
+from jobs.render import profiles, psf, transfer
+from jobs.render.stamps import Sources
+
+# Side of a PSF's image for galsim, samples: 10".
+_SIDE = 301
+
+
+def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float]:
+    """CPU s of a detector's galaxies, from `each` galaxies a magnitude bin, at galsim's default parameters.
+
+    returns : with a PSF of its own for each galaxy (its image summed to its colour and place); with one PSF for all,
+              the index rounded to 0.1, and every index drawn once before
+    """
+    some, full = scenes.sample(scene, seed, each * (len(BINS) - 1)), scenes.spread(scene)
+    bins = scenes.bins_of(some, scene)
+    everything = scenes.sources(scene, 1, stars=0)
+    counts = np.bincount(scenes.bins_of(everything, scene), minlength=len(BINS) - 1)
+    weights = transfer.basis_weights(full, some.photons, some.column, some.row)
+    shared = _image(full, weights.mean(axis=0))
+    shared.drawKImage()
+    default, cached = np.zeros(len(some)), np.zeros(len(some))
+    for i in range(len(some)):
+        start = time.process_time()
+        _draw(some, i, _image(full, weights[i]), some.shapes.sersic_index[some.shape[i]])
+        default[i] = time.process_time() - start
+        index = np.round(some.shapes.sersic_index[some.shape[i]], 1)
+        _draw(some, i, shared, index)
+        start = time.process_time()
+        _draw(some, i, shared, index)
+        cached[i] = time.process_time() - start
+    return tuple(  # type: ignore[return-value]
+        float(sum(counts[b] * spent[bins == b].mean() for b in range(len(counts)) if (bins == b).any()))
+        for spent in (default, cached)
+    )
+
+
+def _image(full: psf.Psf, weights: scenes.Float) -> galsim.GSObject:
+    """The PSF in pixels."""
+    if full.planes is None:
+        return galsim.Moffat(beta=scenes.BETA, fwhm=scenes.SEEING / full.pixel_scale)
+    whole = transfer.image_of(full.planes, weights)
+    middle = slice((len(whole) - _SIDE) // 2, (len(whole) + _SIDE) // 2)
+    return galsim.InterpolatedImage(galsim.Image(whole[middle, middle], scale=1.0 / psf.SAMPLES))
+
+
+def _draw(some: Sources, i: int, spread: galsim.GSObject, index: float) -> None:
+    shape = some.shapes.take(some.shape[i : i + 1])
+    shape.sersic_index[0] = index
+    body = galsim.JacobianWCS(*some.jacobian[i].ravel()).toImage(profiles.profile(shape, 0, 1e-6))
+    whole = galsim.Convolve([body.withFlux(some.electrons[i]), spread])
+    whole.drawImage(scale=1.0, offset=(some.column[i] % 1, some.row[i] % 1))
+
+
+def ufig_seconds(scene: Scene) -> float:
+    """CPU s of UFig's photons of all galaxies (bulge and disc an entry each, a grey Moffat); NaN if not installed."""
+    try:
+        from ufig import rendering_util
+        from ufig.plugins.gamma_interpolation_table import load_intrinsicTable
+        from ufig.plugins.render_galaxies_flexion import integrate_image
+    except ImportError:
+        print("UFig is not installed (pip install ufig): not compared")
+        return float("nan")
+    some = scenes.sources(scene, 1, stars=0)
+    shape, n = some.shapes, len(some)
+    fraction = np.concatenate([shape.bulge_fraction, 1 - shape.bulge_fraction])
+    photons = np.rint(np.tile(some.electrons, 2) * fraction).astype(np.int64)
+    radius = np.concatenate([shape.bulge_radius, shape.disk_radius]) / scene.scale
+    index = np.concatenate([shape.sersic_index, np.ones(n)])
+    cosine = np.concatenate([shape.bulge_axis_ratio, np.cos(np.radians(shape.inclination))])
+    slim = (1 - cosine**2) / (1 + cosine**2)
+    ellipticity = [slim * turn(2 * np.tile(shape.beta, 2)) for turn in (np.cos, np.sin)]
+    kept = photons > 0
+    m = int(kept.sum())
+    fwhm, beta = (0.16 / scene.scale, 3.5) if scene.name == "vis" else (scenes.SEEING / scene.scale, scenes.BETA)
+    nothing, one = np.zeros((m, 1)), np.ones((m, 1))
+    np.random.seed(1)  # noqa: NPY002  (UFig draws from it)
+    arguments = [
+        13, 4, 9, load_intrinsicTable(9, 13, 4), np.zeros((scene.ny, scene.nx)),
+        np.tile(some.column, 2)[kept], np.tile(some.row, 2)[kept], photons[kept, None], index[kept],
+        rendering_util.compute_ellip_matrices(radius[kept], *(e[kept] for e in ellipticity)),
+        beta * one, rendering_util.compute_ellip_matrices(np.full(m, fwhm), np.full(m, 0.01), np.zeros(m)),
+        np.zeros((m, 2, 2, 2)), nothing, nothing, nothing, -9.0, False,
+    ]  # fmt: skip
+    best = np.inf
+    for few in (True, False, False):
+        arguments[7] = np.minimum(photons[kept, None], 10) if few else photons[kept, None]
+        start = time.process_time()
+        integrate_image(rendering_util.rng_buffer(), *arguments)
+        best = best if few else min(best, time.process_time() - start)
+    return best

@@ -1,0 +1,140 @@
+"""Scenes that drawing is measured on: galaxies and stars of a VIS and of an LSST detector.
+
+4,701 galaxies (m 17 - 26, dN/dm ~ 10^0.3m) and 300 stars on a VIS detector, each with its own colour and place;
+18,223 galaxies and 1,160 stars on an LSST detector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs.fluxes import passbands
+from jobs.render import chromatic, focal_plane, psf, stamps, transfer
+from jobs.render.profiles import Shapes
+from jobs.render.stamps import Settings, Sources
+from lake_schema.mission.configuration import resolve
+
+Float = npt.NDArray[np.float64]
+# Edges of the magnitude bins that errors are told by.
+BINS = (17.0, 20.0, 22.0, 23.0, 24.0, 25.0, 26.0)
+# The seeing disc of the LSST scene: FWHM in arcsec, exponent.
+SEEING, BETA = 0.7, 3.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """nx, ny, pixel scale in arcsec, exposure in s, magnitude of 1 e-/s, noise in e-, numbers of galaxies and stars."""
+
+    name: str
+    nx: int
+    ny: int
+    scale: float
+    exposure: float
+    zero_point: float
+    noise: float
+    galaxies: int
+    stars: int
+
+
+VIS = Scene("vis", 4096, 4132, 0.1, 565.0, 25.7, 12.45, 4701, 300)
+LSST = Scene("lsst", 4096, 4004, 0.2, 30.0, 28.17, 38.3, 18223, 1160)
+
+
+def spread(scene: Scene, positions: int = 9) -> psf.Psf:
+    """The scene's PSF."""
+    if scene.name == "lsst":
+        return psf.ground_psf(SEEING, BETA, scene.scale)
+    mission = resolve()
+    return psf.vis_psf(focal_plane.detector("vis", "3-4", mission), passbands.load("euclid_vis"), mission, positions)
+
+
+def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | None = None) -> Sources:
+    """Galaxies, then stars, drawn from the scene's counts."""
+    rng = np.random.default_rng(seed)
+    n, m = galaxies if galaxies is not None else scene.galaxies, stars if stars is not None else scene.stars
+    mag = np.concatenate([_magnitudes(rng, 17.0, 26.0, 0.3, n), _magnitudes(rng, 14.0, 25.5, 0.15, m)])
+    total = n + m
+    fraction = np.where(rng.random(n) < 0.3, 0.0, np.where(rng.random(n) < 0.14, 1.0, 0.6 * rng.random(n)))
+    half_light = 0.32 * 10 ** (-0.14 * (mag[:n] - 24.5) + 0.18 * rng.normal(size=n))
+    g = 0.03 * rng.normal(size=(2, n))
+    shapes = Shapes(
+        bulge_radius=half_light * np.where(fraction < 1, 0.5, 1.0),
+        disk_radius=half_light * 1.1,
+        bulge_fraction=fraction,
+        sersic_index=np.clip(2.2 * np.exp(0.45 * rng.normal(size=n)), 0.5, 6.0),
+        bulge_axis_ratio=rng.uniform(0.5, 1.0, n),
+        inclination=np.degrees(np.arccos(rng.random(n))),
+        beta=np.pi * rng.random(n),
+        g1=g[0],
+        g2=g[1],
+        magnification=1 + 0.04 * rng.normal(size=n),
+    )
+    jacobian = scene.scale * np.array([[1.001, 0.002], [-0.003, 0.998]])
+    # Power laws in wavelength, of photons.
+    waves = np.linspace(-0.25, 0.25, chromatic.PARTS)
+    photons = np.exp(np.outer(rng.normal(0.5, 1.5, total), waves))
+    return Sources(
+        np.arange(total),
+        rng.uniform(0, scene.nx - 1, total),
+        rng.uniform(0, scene.ny - 1, total),
+        np.tile(jacobian, (total, 1, 1)),
+        scene.exposure * 10 ** (0.4 * (scene.zero_point - mag)),
+        np.where(np.arange(total) < n, np.arange(total), -1),
+        shapes,
+        photons / photons.sum(axis=1, keepdims=True),
+    )
+
+
+def _magnitudes(rng: np.random.Generator, bright: float, faint: float, slope: float, n: int) -> Float:
+    low, high = 10 ** (slope * bright), 10 ** (slope * faint)
+    return np.asarray(np.log10(low + (high - low) * rng.random(n)) / slope)
+
+
+def magnitudes(some: Sources, scene: Scene) -> Float:
+    """AB magnitudes of the sources."""
+    return np.asarray(scene.zero_point - 2.5 * np.log10(some.electrons / scene.exposure))
+
+
+def bins_of(some: Sources, scene: Scene) -> npt.NDArray[np.int64]:
+    """Magnitude bin of each source."""
+    return np.clip(np.searchsorted(BINS, magnitudes(some, scene)) - 1, 0, len(BINS) - 2)
+
+
+def sample(scene: Scene, seed: int, n: int) -> Sources:
+    """n galaxies, as many in every magnitude bin."""
+    some = sources(scene, seed, galaxies=max(60 * n, 3000), stars=0)
+    bins, rng = bins_of(some, scene), np.random.default_rng(seed)
+    each = -(-n // (len(BINS) - 1))
+    chosen = [rng.permutation(np.flatnonzero(bins == b))[:each] for b in range(len(BINS) - 1)]
+    return some.take(np.sort(np.concatenate(chosen)))
+
+
+def draw(some: Sources, spread_: psf.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
+    """The whole of drawing, as for an exposure; `side`: on a small frame instead of the scene's."""
+    sizes = stamps.stamp_sizes(some.electrons, some.shape, some.shapes, spread_, scene.noise, settings)
+    floors = stamps.floors(some.electrons, scene.noise, settings)
+    nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
+    return stamps.draw(some, sizes, spread_, nx, ny, None, floors)
+
+
+def own(spread_: psf.Psf, some: Sources, i: int, settings: Settings | None = None) -> psf.Psf:
+    """The PSF of source i everywhere on a frame; with settings, as they have it (one position: without drift)."""
+    planes = spread_.planes
+    if planes is None:
+        return spread_
+    weights = transfer.basis_weights(spread_, some.photons, some.column, some.row)[i]
+    if settings is not None and settings.positions == 1:
+        weights[len(planes.wavelength) :] = 0.0
+    image = transfer.image_of(planes, weights)
+    alone = psf.Planes(planes.wavelength[:1], image[None], planes.drift[:0], planes.half)
+    return replace(spread_, profile=psf.galsim_profile(image, spread_.pixel_scale), planes=alone)
+
+
+def moved(some: Sources, i: int, side: int) -> Sources:
+    """Source i alone, its middle pixel on the middle of a frame; of `own`'s PSF."""
+    one = some.take(np.array([i]))
+    shift = [side // 2 - np.rint(position) for position in (one.column, one.row)]
+    return replace(one, column=one.column + shift[0], row=one.row + shift[1], photons=None)
