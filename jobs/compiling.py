@@ -23,3 +23,13 @@ def jit(function: Function) -> Function:
     decorate: Any = numba.njit(cache=True, error_model="numpy", fastmath=fast)
     compiled: Function = decorate(function)
     return compiled
+
+
+def exact_jit(function: Function) -> Function:
+    """The function, compiled with every operation rounded as it is written: the same bits on any processor.
+
+    It lets other threads run beside it.
+    """
+    decorate: Any = numba.njit(cache=True, error_model="numpy", nogil=True)
+    compiled: Function = decorate(function)
+    return compiled

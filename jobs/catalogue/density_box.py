@@ -16,6 +16,7 @@ Ref: Coles & Jones 1991, MNRAS 248, 1; Eisenstein & Hu 1998, ApJ 496, 605
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
@@ -42,6 +43,8 @@ _FILE = "density_box.toml"
 _K_NODES = 2000
 # The gain is the same for all boxes; a small one is enough: 0.5 %.
 _GAIN_CELLS = 96
+# More threads do not make the transforms of a box any faster.
+_MOST_WORKERS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +96,13 @@ def load(seed: int, n: int) -> Box:
     numbers = [value for field in fields(model) for value in np.atleast_1d(getattr(model, field.name))]
     key = content_key(*code, seed, n, *map(float, numbers))
     stored = partial(_stored, key)
-    g = stored("box_g", lambda: _gaussian(seed, n, model.cell))
-    smooth = [
-        stored(f"box_g{round(radius)}", partial(_smoothed, g, model.cell, radius)) if radius > 0.0 else g
-        for radius in model.smoothing
-    ]
-    velocity = tuple(stored(f"box_u{axis}", partial(_displacement, g, model.cell, axis)) for axis in range(3))
+    with fft.set_workers(min(os.cpu_count() or 1, _MOST_WORKERS)):
+        g = stored("box_g", lambda: _gaussian(seed, n, model.cell))
+        smooth = [
+            stored(f"box_g{round(radius)}", partial(_smoothed, g, model.cell, radius)) if radius > 0.0 else g
+            for radius in model.smoothing
+        ]
+        velocity = tuple(stored(f"box_u{axis}", partial(_displacement, g, model.cell, axis)) for axis in range(3))
     variance = stored("box_variance", lambda: np.array([field.var(dtype=float) for field in smooth]))
     return Box(model, n, seed, tuple(smooth), np.asarray(variance, float), velocity)
 

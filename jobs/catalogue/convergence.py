@@ -1,0 +1,184 @@
+"""The convergence of the box's matter on source planes: sums along straight lines of sight.
+
+convergence    kappa of sources at several distances
+
+Error: Born approximation; matter is taken at one point a cell of the box's, or averaged over as many cells as a pixel
+       is wide
+Ref: Bartelmann & Schneider 2001, Phys. Rep. 340, 291, eq. 6.16 ff.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from itertools import groupby
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs.catalogue import density_box, lightcone
+from jobs.catalogue.density_box import Box
+from jobs.compiling import exact_jit
+from jobs.fluxes import cosmology
+
+Float = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+
+_GAIN_NODES = 9
+# Pixels whose sums are taken together: few enough that the cells of the box they share stay in the processor's cache.
+_PATCH = 1024
+# Patches that a thread takes at a time.
+_PATCHES = 48
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layers:
+    """Layers of matter, near to far; arrays [s].
+
+    middle, factor : Mpc/h, and cells of the box a side that matter is averaged over
+    stretch        : number of the stretch of one growth;  growth : D that its matter is averaged at
+    weight         : of delta in the convergence, without the distances of the sources
+    """
+
+    middle: Float
+    factor: npt.NDArray[np.int64]
+    stretch: npt.NDArray[np.int64]
+    growth: Float
+    weight: Float
+
+    def part(self, cut: slice) -> Layers:
+        return Layers(*(getattr(self, field.name)[cut] for field in fields(self)))
+
+
+def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest: int, stretch: float) -> Float32:
+    """kappa[p, n] of sources at chi[p] Mpc/h, ascending, in n directions.
+
+    kappa = 3/2 Om (H0 / c)^2 int dchi' chi' (chi - chi') / chi (1 + z') delta
+    direction : float32[3, n] unit vectors, neighbours close to each other, n a multiple of 1024
+    width     : of a pixel, rad
+    coarsest  : most cells a side that matter is averaged over;  stretch : Mpc/h in which its growth is linear
+    """
+    direction = np.ascontiguousarray(direction.reshape(3, -1, _PATCH).swapaxes(0, 1))
+    turned = lightcone.replicas(box, float(chi[-1]))
+    slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
+    # kappa(chi) = first - second / chi: two sums serve every plane.
+    sums = np.zeros((len(direction), 2, _PATCH), np.float32)
+    planes = np.empty((chi.size, len(direction), _PATCH), np.float32)
+    done = 0
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
+        for cut in _together(slabs, np.searchsorted(chi, slabs.middle)):
+            while done < chi.size and chi[done] <= slabs.middle[cut.start]:
+                planes[done] = sums[:, 0] - sums[:, 1] / np.float32(chi[done])
+                done += 1
+            _add(box, turned, slabs.part(cut), direction, sums, pool)
+    planes[done:] = sums[:, 0] - sums[:, 1] / chi[done:, None, None].astype(np.float32)
+    return planes.reshape(chi.size, -1)
+
+
+def layers(box: Box, width: float, far: float, coarsest: int, stretch: float) -> Layers:
+    """Layers out to `far` Mpc/h, as thick as the cells that a pixel of `width` rad is averaged over."""
+    middle, factor, at = [], [], 0.0
+    while at < far:
+        cells = min(1 << max(int(np.log2(max(width * at / box.model.cell, 1.0))), 0), coarsest)
+        middle.append(at + 0.5 * cells * box.model.cell)
+        factor.append(cells)
+        at += cells * box.model.cell
+    chi, thick = np.array(middle), np.array(factor)
+    table = lightcone.distances(float(cosmology.redshift(far)) + 0.01)
+    number = (chi / stretch).astype(np.int64)
+    growth = density_box.growth(table.redshift((number + 0.5) * stretch))
+    z = table.redshift(chi)
+    now = density_box.growth(z)
+    nodes = np.linspace(float(density_box.growth(table.z[-1])), 1.0, _GAIN_NODES)
+    gain = np.interp(now, nodes, density_box.matter_gain(box.model, nodes))
+    weight = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * thick * box.model.cell * chi * (1.0 + z)
+    return Layers(chi, thick, number, growth, weight * now / growth * gain)
+
+
+def averaged(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> Float32:
+    """Matter overdensity at a growth, in cubes of factor^3 cells: float32[(n / factor)^3]."""
+    n = box.n // factor
+    mean = np.empty((n, n, n), np.float32)
+    offset = np.float32(0.5 * growth**2 * box.variance[0])
+
+    def slab(x: int) -> None:
+        delta = np.expm1(np.float32(growth) * box.smoothed[0][x * factor : (x + 1) * factor] - offset)
+        # Adding whole rows is faster than numpy's mean over several axes.
+        rows = delta.sum(0) if factor > 1 else delta[0]
+        rows = sum((rows[y::factor] for y in range(1, factor)), rows[::factor])
+        mean[x] = sum((rows[:, z::factor] for z in range(1, factor)), rows[:, ::factor]) / np.float32(factor**3)
+
+    list(pool.map(slab, range(n)))
+    return mean
+
+
+def _together(slabs: Layers, plane: npt.NDArray[np.int64]) -> Iterator[slice]:
+    """Stretches of layers that share their matter and the planes behind them."""
+    same = zip(slabs.stretch.tolist(), slabs.factor.tolist(), plane.tolist(), strict=True)
+    at = 0
+    for _, group in groupby(same):
+        size = sum(1 for _ in group)
+        yield slice(at, at + size)
+        at += size
+
+
+def _add(
+    box: Box, turned: lightcone.Replicas, slabs: Layers, direction: Float32, sums: Float32, pool: ThreadPoolExecutor
+) -> None:
+    """Add layers of one growth and factor to both sums."""
+    factor = int(slabs.factor[0])
+    delta = averaged(box, float(slabs.growth[0]), factor, pool).ravel()
+    shell = (slabs.middle // box.length).astype(np.int64)
+    scale = (turned.sign[shell] * (slabs.middle / box.length)[:, None]).astype(np.float32)
+    shift = (turned.shift[shell] / box.length).astype(np.float32)
+    axes = turned.axes[shell]
+    weights = np.stack([slabs.weight, slabs.weight * slabs.middle]).astype(np.float32)
+
+    def part(first: int) -> None:
+        cut = slice(first, first + _PATCHES)
+        add_layers(direction[cut], delta, box.n // factor, axes, scale, shift, weights, sums[cut])
+
+    list(pool.map(part, range(0, len(direction), _PATCHES)))
+
+
+@exact_jit
+def add_layers(
+    direction: Float32,
+    delta: Float32,
+    n: int,
+    axes: npt.NDArray[np.int64],
+    scale: Float32,
+    shift: Float32,
+    weights: Float32,
+    sums: Float32,
+) -> None:
+    """sums[:, k, p] += sum over layers s of weights[k, s] delta(cell that direction[:, :, p] meets in layer s).
+
+    direction : [patch, 3, p];  sums : [patch, 2, p];  delta : [n^3], periodic
+    axes, scale, shift : [s, 3], place in units of the box = direction[axes] scale + shift
+    """
+    pixels = direction.shape[2]
+    index = np.empty(pixels, np.int64)
+    for patch in range(direction.shape[0]):
+        first, second = sums[patch, 0], sums[patch, 1]
+        for s in range(weights.shape[1]):
+            along_x, along_y, along_z = (
+                direction[patch, axes[s, 0]],
+                direction[patch, axes[s, 1]],
+                direction[patch, axes[s, 2]],
+            )
+            scale_x, scale_y, scale_z = scale[s]
+            shift_x, shift_y, shift_z = shift[s]
+            for p in range(pixels):
+                x = along_x[p] * scale_x + shift_x
+                y = along_y[p] * scale_y + shift_y
+                z = along_z[p] * scale_z + shift_z
+                x, y, z = x - np.floor(x), y - np.floor(y), z - np.floor(z)
+                index[p] = (int(x * n) * n + int(y * n)) * n + int(z * n)
+            one, other = weights[0, s], weights[1, s]
+            for p in range(pixels):
+                found = delta[index[p]]
+                first[p] += one * found
+                second[p] += other * found
