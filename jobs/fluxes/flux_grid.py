@@ -36,21 +36,24 @@ Bool = npt.NDArray[np.bool_]
 
 # Of the reference band: its error is everybody's.
 REFERENCE_SETTING = Setting(0.005, 6, 1)
-# Rows that are interpolated together: what is known of them stays in the processor's cache.
-_CHUNK = 2048
+# Rows that are interpolated together: what is known of them stays in the processor's cache (a power of two would
+# use but a part of it).
+_CHUNK = 2000
 # Which bands see a line is looked up on this grid of ln(lambda); air moves lines by 3e-4.
 _CELL, _AIR = 0.01, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class LineGrid:
-    """The line tables of all bands in one, see compiled.line_sums; wavelengths of the lines."""
+    """The line tables of all bands in one, see compiled.add_up; wavelengths of the lines."""
 
     tables: Float32
-    place: Int
+    start: npt.NDArray[np.uint32]
+    last: npt.NDArray[np.int32]
+    medium: npt.NDArray[np.uint32]
     first: Float
     cells: Int
-    members: Int
+    members: npt.NDArray[np.uint32]
     cell_first: float
     vacuum: Float
 
@@ -91,21 +94,33 @@ def galaxies(rows: Galaxies, grid: Grid) -> Float:
     # 16 bits of it are enough, and sorted ten times faster.
     span = 65_535.0 / np.log1p(Z_LAST - Z_FIRST)
     order = np.argsort((np.log1p(np.maximum(rows.mix.z_obs - Z_FIRST, 0.0)) * span).astype(np.uint16), kind="stable")
-    out = np.empty((len(grid.tables), len(rows)))
+    out = np.empty((len(rows), len(grid.tables)))
     for start in range(0, len(rows), _CHUNK):
         part = order[start : start + _CHUNK]
-        out[:, part] = _chunk(rows.rows(part), grid)
-    return out.T
+        _chunk(rows.rows(part), grid, part, out)
+    return out
 
 
-def _chunk(rows: Galaxies, grid: Grid) -> Float:
-    observed, seen = np.empty((1, len(rows))), np.empty((len(grid.tables), len(rows)))
-    _continua(rows.mix, np.zeros(len(rows)), (REFERENCE_SETTING,), (grid.reference,), observed)
-    _continua(rows.mix, rows.a_v, grid.settings, grid.tables, seen)
-    seen *= continuum_scale(rows.mag_r01, observed[0])
-    _add_lines(rows, grid, seen)
-    seen *= units.ujy_of_cgs(rows.magnification)
-    return seen
+def _chunk(rows: Galaxies, grid: Grid, part: Int, out: Float) -> None:
+    """Fills out[part]."""
+    log_z = np.log1p(rows.mix.z_obs)
+    observed = _ratios(rows.mix, log_z, np.zeros(len(rows)), (REFERENCE_SETTING,), (grid.reference,))[0]
+    ratios = _ratios(rows.mix, log_z, rows.a_v, grid.settings, grid.tables)
+    scale = continuum_scale(rows.mag_r01, (rows.mix.frac * observed).sum(0))
+    sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
+    width = np.clip(np.searchsorted(LINE_SIGMA, sigma, "right") - 1, 0, len(LINE_SIGMA) - 2)
+    low, high = LINE_SIGMA[width] ** 2, LINE_SIGMA[width + 1] ** 2
+    drawn = grid.lines
+    centre, flux = np.empty((*rows.lines.shape, 2)), np.empty((*rows.lines.shape, 2))
+    compiled.line_centres(
+        rows.lines, log_z, rows.a_v, drawn.vacuum, lines.refractivity_terms(), grid.milky_way,
+        float(passbands.GRID_FIRST), centre, flux,
+    )  # fmt: skip
+    compiled.add_up(
+        ratios, rows.mix.frac, scale, centre, flux, width, (sigma**2 - low) / (high - low), drawn.tables, drawn.start,
+        drawn.last, drawn.medium, drawn.first, LINE_STEP, drawn.cells, drawn.members, drawn.cell_first, _CELL,
+        units.ujy_of_cgs(rows.magnification), part, out,
+    )  # fmt: skip
 
 
 def warm(grid: Grid) -> None:
@@ -140,25 +155,25 @@ def covered_stars(rows: Stars) -> Bool:
     return np.asarray(rows.a_v <= STAR_A_V_LAST)
 
 
-def _continua(mix: Mix, a_v: Float, settings: Sequence[Setting], tables: Sequence[Float32], out: Float) -> None:
-    """Fills out[k] with f_nu in band k relative to the reference band at rest."""
-    log_z = np.log1p(mix.z_obs)
+def _ratios(mix: Mix, log_z: Float, a_v: Float, settings: Sequence[Setting], tables: Sequence[Float32]) -> Float32:
+    """f_nu of each component in each band relative to the reference band at rest: float32[n_band, 2, n]."""
     # Most bands share their nodes, or their polynomials, with another.
     distinct = set(settings)
     steps = {s.step: s for s in distinct}
-    places = {step: _place(setting, log_z) for step, setting in steps.items()}
+    places = {step: _place(setting, mix, log_z) for step, setting in steps.items()}
     orders = {(s.n_ebv, s.n_av): s for s in distinct}
     products = {order: _products(setting, mix, a_v) for order, setting in orders.items()}
+    out = np.empty((len(tables), 2, len(mix)), np.float32)
     for k, (setting, table) in enumerate(zip(settings, tables, strict=True)):
-        row, z_weights = places[setting.step]
-        basis = products[setting.n_ebv, setting.n_av]
-        compiled.continuum(table, row, z_weights, mix.sed, mix.law, basis, mix.frac, out[k])
+        compiled.log_ratios(table, *places[setting.step], products[setting.n_ebv, setting.n_av], out[k])
+    return np.exp(out, out=out)
 
 
-def _place(setting: Setting, log_z: Float) -> tuple[Int, Float32]:
-    row, z_weights = np.empty(len(log_z), np.int64), np.empty((len(log_z), 4), np.float32)
-    compiled.place(log_z, setting.log_z(0), setting.step, setting.z_count, row, z_weights)
-    return row, z_weights
+def _place(setting: Setting, mix: Mix, log_z: Float) -> tuple[Int, Float32]:
+    first, z_weights = np.empty((2, len(mix)), np.int64), np.empty((len(mix), 4), np.float32)
+    n_law = extinction.LAW_COUNT - 1
+    compiled.place(log_z, mix.sed, mix.law, n_law, setting.log_z(0), setting.step, setting.z_count, first, z_weights)
+    return first, z_weights
 
 
 def _products(setting: Setting, mix: Mix, a_v: Float) -> Float32:
@@ -170,7 +185,7 @@ def _products(setting: Setting, mix: Mix, a_v: Float) -> Float32:
 def _line_grid(bands: Sequence[Passband]) -> LineGrid:
     firsts, tables = zip(*(grid_tables.line_table(band) for band in bands), strict=True)
     rows = np.array([len(table) for table in tables])
-    place = np.stack([np.cumsum(rows) - rows, rows, np.array([band.medium == "air" for band in bands], int)], 1)
+    medium = np.array([band.medium == "air" for band in bands], np.uint32)
     first = np.array(firsts)
     cell_first = float(np.log(passbands.GRID_FIRST)) - _AIR
     count = int((np.log(passbands.GRID_LAST + 1.0) - cell_first) / _CELL) + 1
@@ -178,21 +193,7 @@ def _line_grid(bands: Sequence[Passband]) -> LineGrid:
     cell, member = np.nonzero((blue <= first + LINE_STEP * rows) & (blue + _CELL + 2.0 * _AIR >= first))
     cells = np.searchsorted(cell, np.arange(count + 1))
     vacuum = np.array([line.vacuum for line in lines.line_list()])
-    return LineGrid(np.concatenate(tables), place, first, cells, member, cell_first, vacuum)
-
-
-def _add_lines(rows: Galaxies, grid: Grid, out: Float) -> None:
-    """Adds to out[k] what the lines give in band k, erg s-1 cm-2 Hz-1, before magnification."""
-    sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
-    width = np.clip(np.searchsorted(LINE_SIGMA, sigma, "right") - 1, 0, len(LINE_SIGMA) - 2)
-    low, high = LINE_SIGMA[width] ** 2, LINE_SIGMA[width + 1] ** 2
-    drawn = grid.lines
-    centre, flux = np.empty((2, *rows.lines.shape)), np.empty((2, *rows.lines.shape))
-    compiled.line_centres(
-        rows.lines, rows.mix.z_obs, rows.a_v, drawn.vacuum, lines.refractivity_terms(), grid.milky_way,
-        float(passbands.GRID_FIRST), centre, flux,
-    )  # fmt: skip
-    compiled.line_sums(
-        centre, flux, width, (sigma**2 - low) / (high - low), drawn.tables, drawn.place, drawn.first, LINE_STEP,
-        drawn.cells, drawn.members, drawn.cell_first, _CELL, out,
-    )  # fmt: skip
+    start, last = (np.cumsum(rows) - rows).astype(np.uint32), (rows - 1).astype(np.int32)
+    return LineGrid(
+        np.concatenate(tables), start, last, medium, first, cells, member.astype(np.uint32), cell_first, vacuum
+    )

@@ -126,6 +126,15 @@ def test_without_a_law_there_is_no_dust(grid):
     assert flux_grid.covered(beyond).all()
 
 
+def test_a_component_without_flux_may_have_any_dust(grid):
+    rows = drawn(50)
+    single = dataclasses.replace(rows.mix, frac=np.stack([np.ones(50), np.zeros(50)]))
+    ebv = np.stack([rows.mix.ebv[0], np.full(50, 3.0)])
+    both = [dataclasses.replace(rows, mix=mix) for mix in (single, dataclasses.replace(single, ebv=ebv))]
+    assert flux_grid.covered(both[1]).all()
+    np.testing.assert_array_equal(*(flux_grid.galaxies(each, grid) for each in both))
+
+
 @pytest.mark.parametrize(
     ("column", "value"), [("ebv_1", 0.61), ("ebv_2", 2.5), ("a_v", 1.56), ("a_v", 30.0), ("z_obs", 3.1)]
 )
