@@ -142,7 +142,8 @@ def _galaxies(wavelength: Float) -> Float:
 def _anchor(name: str, wavelength: Float) -> Float:
     table = np.loadtxt(_spectrum_file(f"CWW_{name}_ext.sed").decode().splitlines())
     at, flux = table[:, 0], table[:, 1]
-    sampled = np.interp(wavelength, at, flux, left=0.0)
+    # In the logarithm: the ultraviolet is sampled every 100 A, over which an elliptical fades by half.
+    sampled = np.exp(np.interp(wavelength, at, np.log(flux), left=-np.inf))
     sampled = np.where(wavelength > at[-1], flux[-1] * (wavelength / at[-1]) ** _INFRARED_SLOPE, sampled)
     away = (np.abs(wavelength[:, None] - emission_wavelengths()) > _LINE_MASK).all(1)
     return normalised(wavelength, np.interp(wavelength, wavelength[away], sampled[away]))
