@@ -3,7 +3,7 @@
     name = "demo"      seed = 2024      accuracy = "survey" | "draft" | "reference" | {flux = .., shape = .., ..}
     [area]       polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
     [universe]   galaxy_limit (I_E), star_limit (H, Vega), z_max, box_cells, lensing_nside
-    [stars]      plane_limit, rows_a_file
+    [stars]      density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
     [mission]    ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
     [fluxes]     bands = [..]           default: the bands of the pointings
     [[pointing]] channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
@@ -34,6 +34,7 @@ STATUSES = ("REQ", "DES", "BLT", "CBE", "SIM")
 LADDER = ("CBE", "BLT", "DES", "REQ", "SIM")
 CHANNELS = ("VIS", "EXT")
 TRUTH = ("noise_free",)
+DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
 
@@ -80,10 +81,19 @@ class Universe:
 class Stars:
     """How the Milky Way's stars are drawn.
 
-    plane_limit : faintest H (Vega, as observed) within 5 deg of the Galactic plane; None = an area there is refused
-    rows_a_file : above so many expected rows a cell's file is split into those of the next HEALPix order
+    density           : whose laws of density
+    brown_dwarf_boost : how many times denser than in nature L and T dwarfs are drawn, 0 = not at all
+    tycho2            : files of Tycho-2, which replace the model brighter than V = 11
+    catalogue         : file of other stars to be taken instead of the model's, "" = none; columns: (ours, theirs)
+    plane_limit       : faintest H (Vega, as observed) within 5 deg of the plane; None = an area there is refused
+    rows_a_file       : above so many expected rows a cell's file is split into those of the next HEALPix order
     """
 
+    density: str = "juric"
+    brown_dwarf_boost: float = 1.0
+    tycho2: tuple[str, ...] = ()
+    catalogue: str = ""
+    columns: tuple[tuple[str, str], ...] = ()
     plane_limit: float | None = None
     rows_a_file: int = 1_000_000
 
@@ -182,7 +192,7 @@ def from_table(table: Toml) -> Request:
         accuracy=_accuracy(table.get("accuracy")),
         area=_area(_section(table, "area", {"polygon", "cone", "box"})),
         universe=_universe(_section(table, "universe", set(Universe.__slots__))),
-        stars=_stars(_section(table, "stars", set(Stars.__slots__))),
+        stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"})),
         mission=_mission(_section(table, "mission", {"ladder", "overrides"})),
         bands=bands or tuple(dict.fromkeys(p.band for p in pointings)),
         pointings=pointings,
@@ -253,9 +263,20 @@ def _universe(table: Toml) -> Universe:
 
 
 def _stars(table: Toml) -> Stars:
+    default = Stars()
+    rows = _integer(table, "stars.rows_a_file", 1, 3_000_000) if "rows_a_file" in table else default.rows_a_file
     plane_limit = _number(table, "stars.plane_limit", 0.0, 30.0, math.nan)
-    rows = _integer(table, "stars.rows_a_file", 1, 3_000_000) if "rows_a_file" in table else Stars().rows_a_file
-    return Stars(None if math.isnan(plane_limit) else plane_limit, rows)
+    given = _table(table.get("catalogue", {}), "stars.catalogue", {"file", "columns"})
+    columns = _table(given.get("columns", {}), "stars.catalogue.columns", None)
+    return Stars(
+        density=_string(table, "stars.density", DENSITIES) if "density" in table else default.density,
+        brown_dwarf_boost=_number(table, "stars.brown_dwarf_boost", 0.0, 1e4, default.brown_dwarf_boost),
+        tycho2=_strings(table, "stars.tycho2"),
+        catalogue=_string(given, "stars.catalogue.file") if given else "",
+        columns=tuple((key, _string(columns, f"stars.catalogue.columns.{key}")) for key in sorted(columns)),
+        plane_limit=None if math.isnan(plane_limit) else plane_limit,
+        rows_a_file=rows,
+    )
 
 
 def _mission(table: Toml) -> MissionChoice:

@@ -3,6 +3,7 @@
 Image           an image with its header cards
 write_images    images -> one file: checksums, the same bytes for the same input
 read_images     a file -> images; checksums are demanded and verified, sizes checked before data
+read_numbers    somebody's binary table -> its columns of numbers
 table_to_fits   an Arrow table -> a binary table, units and UCDs from the table's declaration
 """
 
@@ -90,6 +91,33 @@ def read_images(path: Path, most_bytes: int = MOST_BYTES) -> list[Image]:
             if missing:
                 raise Damaged(f"{path}: no checksum in {', '.join(missing)}")
             return [_image(unit) for unit in units]
+
+
+def read_numbers(path: Path) -> dict[str, npt.NDArray[np.float64]]:
+    """Columns of numbers of a file's first table, title -> float64[n]; NaN where TNULL says that there is none.
+
+    Errors : Damaged for a file that is cut short or is none; BadInput where there is no table
+    """
+    with _refusing(path), fits.open(path, memmap=True) as units:
+        # Titles such as "RA(ICRS)" are usual.
+        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
+        for unit in units:
+            if isinstance(unit, fits.BinTableHDU):
+                return _numbers_of(unit)
+    raise BadInput(f"{path}: holds no table")
+
+
+def _numbers_of(unit: Any) -> dict[str, npt.NDArray[np.float64]]:
+    found = {}
+    for column in unit.columns:
+        values = np.asarray(unit.data[column.name])
+        if values.dtype.kind not in "fiu" or values.ndim != 1:
+            continue
+        numbers = values.astype(np.float64)
+        if values.dtype.kind in "iu" and column.null is not None:
+            numbers[values == column.null] = np.nan
+        found[str(column.name)] = numbers
+    return found
 
 
 def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:

@@ -189,6 +189,14 @@ def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
+def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
+    """Galactic l, b [n] deg -> ICRS ra, dec [n] deg; the inverse of `galactic`."""
+    l_rad, b_rad = np.radians(np.asarray(lon, float)), np.radians(np.asarray(lat, float))
+    vector = np.stack([np.cos(b_rad) * np.cos(l_rad), np.cos(b_rad) * np.sin(l_rad), np.sin(b_rad)])
+    x, y, z = np.tensordot(_TO_GALACTIC.T, vector, 1)
+    return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+
+
 _TO_GALACTIC = np.array(
     [
         [-0.0548755604162154, -0.8734370902348850, -0.4838350155487132],

@@ -7,10 +7,14 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
-from jobs.catalogue import cells, dust_map, stars
-from jobs.request import Request
+from functools import partial
+from typing import Any
+
+from jobs.catalogue import bright_stars, cells, dust_map, star_catalogue, stars
+from jobs.request import Request, Stars
 from jobs.shell import Job, Step, main
-from lake_schema.provenance import code_version
+from lake_schema.errors import BadInput
+from lake_schema.provenance import code_version, file_sha256
 from lake_schema.publish import Json, Output, Plan
 from lake_schema.tables.stars import STARS
 
@@ -20,26 +24,60 @@ _LARGEST = 3
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """Files of about as many rows, made of the generation cells that the request's area touches."""
+    choice = request.stars
     facts = {
         "seed": request.seed,
         "star_limit": request.universe.star_limit,
-        "plane_limit": request.stars.plane_limit,
+        "plane_limit": choice.plane_limit,
+        "density": choice.density,
+        "brown_dwarf_boost": choice.brown_dwarf_boost,
+        **_files(choice),
         "code": code_version(),
     }
     drawn = request.area.cells()
-    numbers = stars.numbers(drawn, _model(facts))
-    return [Step(Plan(STARS, facts, cells.by_number(drawn, numbers, request.stars.rows_a_file, _LARGEST)), work)]
+    numbers = stars.numbers(drawn, _model(facts, choice))
+    parts = cells.by_number(drawn, numbers, choice.rows_a_file, _LARGEST)
+    return [Step(Plan(STARS, facts, parts), partial(work, choice=choice))]
 
 
-def work(lake: Path, facts: Json) -> Output:
+def _files(choice: Stars) -> dict[str, Any]:
+    """What the user's files hold, wherever they lie."""
+    facts: dict[str, Any] = {}
+    if choice.tycho2:
+        sums = bright_stars.sha256(_paths(choice.tycho2))
+        read = bright_stars.load(_paths(choice.tycho2), sums)
+        counts = {"records": read.read, "without_color": read.without_color, "left_out": read.without_magnitude}
+        facts["tycho2"] = {"sha256": sums, "brighter": read.ra.size, **counts}
+    if choice.catalogue:
+        columns = dict(choice.columns)
+        star_catalogue.checked_columns(columns)
+        (file,) = _paths((choice.catalogue,))
+        if not file.is_file():
+            raise BadInput(f"stars.catalogue.file: {file}: no such file")
+        facts["catalogue"] = {"sha256": file_sha256(file), "columns": columns}
+    return facts
+
+
+def _paths(names: tuple[str, ...]) -> tuple[Path, ...]:
+    return tuple(Path(name).expanduser().resolve() for name in names)
+
+
+def work(lake: Path, facts: Json, choice: Stars) -> Output:
     """The stars of one file's cell."""
-    model = _model(facts)
+    model = _model(facts, choice)
     dust = dust_map.load(facts["seed"])
     return Output(cells.rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
 
 
-def _model(facts: Json) -> stars.StarModel:
-    return stars.model(facts["star_limit"], facts["plane_limit"])
+def _model(facts: Json, choice: Stars) -> stars.StarModel:
+    catalogue = bright = None
+    if choice.catalogue:
+        given = facts["catalogue"]
+        catalogue = star_catalogue.load(_paths((choice.catalogue,))[0], given["sha256"], given["columns"])
+    if choice.tycho2:
+        bright = bright_stars.load(_paths(choice.tycho2), facts["tycho2"]["sha256"])
+    limits = facts["star_limit"], facts["plane_limit"]
+    return stars.model(*limits, facts["density"], facts["brown_dwarf_boost"], catalogue, bright)
 
 
 JOB = Job("build_stars", "Draw the Milky Way's stars of a sky area.", steps)

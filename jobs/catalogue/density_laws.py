@@ -120,5 +120,5 @@ def _log_difference(near: Float, far: Float) -> Float:
 
 def _log_parabolic(law: Parabolic, z: Float) -> Float:
     x = law.joint / law.height
-    inside = np.log1p(-np.minimum(z, law.joint) ** 2 / (law.height * law.joint * (2.0 + x)))
+    inside = np.log1p(-(np.minimum(z, law.joint) ** 2) / (law.height * law.joint * (2.0 + x)))
     return np.asarray(inside - np.maximum(z - law.joint, 0.0) / law.height)

@@ -156,10 +156,10 @@ def numbers(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Floa
     total = np.zeros(lon.size)
     for limit in np.unique(h_limit):
         chosen = np.flatnonzero(h_limit == limit)
-        per_shell = _seen(galaxy, float(limit)) @ galaxy.local.T * _volumes(galaxy, area)[:, None]
+        per_shell = _seen(galaxy, float(limit)) @ galaxy.local.T * volumes(galaxy, area)[:, None]
         weight = per_shell.reshape(per_shell.shape[0], _STAGES, -1).sum(1)
         for some in np.array_split(chosen, -(-chosen.size // _CELLS_AT_A_TIME)):
-            r, z = cylindrical(galaxy, lon[some, None], lat[some, None], _middles(galaxy))
+            r, z = cylindrical(galaxy, lon[some, None], lat[some, None], middles(galaxy))
             for component, weights in zip(galaxy.components, weight.T, strict=True):
                 total[some] += density(component.law, galaxy.sun, r, z) @ weights
     return total
@@ -170,18 +170,18 @@ def expected(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: flo
 
     lon, lat : Galactic, of the cell's centre, deg; area : deg2
     """
-    r, z = cylindrical(galaxy, lon, lat, _middles(galaxy))
+    r, z = cylindrical(galaxy, lon, lat, middles(galaxy))
     relative = np.stack([density(component.law, galaxy.sun, r, z) for component in galaxy.components])
-    per_shell = np.tile(relative * _volumes(galaxy, area), (_STAGES, 1))
+    per_shell = np.tile(relative * volumes(galaxy, area), (_STAGES, 1))
     return np.where(_seen(galaxy, h_limit), per_shell[:, :, None] * galaxy.local[:, None, :], 0.0)
 
 
-def _middles(galaxy: MilkyWay) -> Float:
+def middles(galaxy: MilkyWay) -> Float:
     """Where in a shell its density is taken, [s] pc."""
     return np.asarray(np.sqrt(galaxy.distance[:-1] * galaxy.distance[1:]))
 
 
-def _volumes(galaxy: MilkyWay, area: float) -> Float:
+def volumes(galaxy: MilkyWay, area: float) -> Float:
     """Of the shells within an area, deg2, [s] pc^3."""
     near, far = galaxy.distance[:-1], galaxy.distance[1:]
     return np.asarray(area * _SR_PER_DEG2 * (far - near) * (far**2 + far * near + near**2) / 3.0)
@@ -194,19 +194,34 @@ def _seen(galaxy: MilkyWay, h_limit: float) -> npt.NDArray[np.bool_]:
 
 def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> Sample:
     """Poisson sample of `expected` numbers; uniform in volume within a shell and in M_H within a bin."""
+    drawn = _boxes(mean, rng)
+    population, shell, m_bin = np.unravel_index(drawn, mean.shape)
+    distance = _distance(galaxy, shell, rng)
+    m_h = galaxy.m_h[m_bin] + (galaxy.m_h[m_bin + 1] - galaxy.m_h[m_bin]) * rng.random(drawn.size)
+    stage, component = np.divmod(population, len(galaxy.components))
+    codes = np.array([component.code for component in galaxy.components])
+    return Sample(codes[component], stage, distance, m_h)
+
+
+def in_shells(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> tuple[Int, Float]:
+    """Poisson sample of expected numbers [k, s] of k kinds: kind[n], distance[n] pc, uniform in volume in a shell."""
+    kind, shell = np.unravel_index(_boxes(mean, rng), mean.shape)
+    return np.asarray(kind), _distance(galaxy, shell, rng)
+
+
+def _boxes(mean: Float, rng: np.random.Generator) -> Int:
+    """Flat index[n] of the box that each of a Poisson number of draws falls into."""
     boxes = np.flatnonzero(mean)
     cumulative = np.cumsum(mean.ravel()[boxes])
     total = float(cumulative[-1]) if boxes.size else 0.0
     n = int(rng.poisson(total))
     # The product may round up to the total itself.
-    drawn = np.minimum(np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0))
-    population, shell, m_bin = np.unravel_index(boxes[drawn], mean.shape)
+    return boxes[np.minimum(np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0))]
+
+
+def _distance(galaxy: MilkyWay, shell: Int, rng: np.random.Generator) -> Float:
     near3, far3 = galaxy.distance[shell] ** 3, galaxy.distance[shell + 1] ** 3
-    distance = np.cbrt(near3 + (far3 - near3) * rng.random(n))
-    m_h = galaxy.m_h[m_bin] + (galaxy.m_h[m_bin + 1] - galaxy.m_h[m_bin]) * rng.random(n)
-    stage, component = np.divmod(population, len(galaxy.components))
-    codes = np.array([component.code for component in galaxy.components])
-    return Sample(codes[component], stage, distance, m_h)
+    return np.asarray(np.cbrt(near3 + (far3 - near3) * rng.random(shell.size)))
 
 
 def metallicity(galaxy: MilkyWay, component: Int, rng: np.random.Generator) -> Float:

@@ -2,6 +2,7 @@
 
 subtypes        L0 .. T8 with their temperatures, magnitudes and colours
 template_names  which subtype each template is
+templates       their temperatures and magnitudes
 spectra         f_lambda of all templates
 
 The mean colours are those of Pecaut & Mamajek 2013: i - z (AB) and J - H, H - Ks (Vega); z - J from z - Y, with Y - J
@@ -62,6 +63,28 @@ def template_names() -> tuple[str, ...]:
     names = subtypes().names
     counts = [COUNT // len(names) + (k < COUNT % len(names)) for k in range(len(names))]
     return tuple(f"{name}-{m:02d}" for name, count in zip(names, counts, strict=True) for m in range(count))
+
+
+@dataclass(frozen=True, slots=True)
+class Templates:
+    """The 365 templates: number[365] of the subtype, teff K, abs_mag_j, abs_mag_h (Vega)."""
+
+    subtype: npt.NDArray[np.int64]
+    teff: Float
+    abs_mag_j: Float
+    abs_mag_h: Float
+
+
+def templates() -> Templates:
+    """What is known of the templates; realisations of a subtype have its M_J."""
+    types = subtypes()
+    labels = [name.partition("-")[::2] for name in template_names()]
+    subtype = np.array([types.names.index(name) for name, _ in labels])
+    jh = -types.colors[subtype] - np.stack([_scatter(name, int(number)) for name, number in labels])
+    abs_mag_j = types.abs_mag_j[subtype]
+    return Templates(
+        subtype, types.teff[subtype], abs_mag_j, abs_mag_j - jh[:, _J + 1] + _vega("twomass_j") - _vega("twomass_h")
+    )
 
 
 def spectra() -> Float:

@@ -80,6 +80,10 @@ class StellarTypes:
         return self.colors[:, 1]
 
     @property
+    def v_minus_h(self) -> Float:
+        return -self.colors[:, 6]
+
+    @property
     def color_vi(self) -> Float:
         return -self.colors[:, 4]
 

@@ -11,17 +11,19 @@ COMPONENTS = (
     (2, "halo"),
     (3, "catalogued bright star"),
     (4, "brown dwarf"),
+    (5, "bulge"),
 )
+STAGES = ((0, "main sequence"), (1, "giant"), (2, "white dwarf"), (3, "brown dwarf"))
 
 STARS = Table(
     "stars",
-    1,
+    2,
     (
         id_of_kinds(5, 5),
         RA,
         DEC,
         HEALPIX_29,
-        Column("component", "int8", ucd="src.class", doc="population", codes=COMPONENTS, lo=0, hi=4),
+        Column("component", "int8", ucd="src.class", doc="population", codes=COMPONENTS, lo=0, hi=5),
         Column("sed", "int16", ucd="meta.code", doc="template index in the stellar library", lo=0),
         Column(
             "mag_h",
@@ -48,6 +50,7 @@ STARS = Table(
             lo=1e-3,
             hi=1e6,
         ),
+        Column("stage", "int8", "", "src.class", "stage of evolution", 0, 3, nullable=True, codes=STAGES, since=2),
     ),
     "Stars of the True Universe.",
     order=3,
