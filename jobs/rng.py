@@ -3,6 +3,9 @@
 A stream's identity (seed, stage, cell, source, detector, effect ...) is hashed into the key of a counter-based Philox
 generator: equal identities give equal numbers on any core, in any order, after any retry; a new stage takes a new name
 and leaves the numbers of the others as they were.
+
+stream     a generator of one identity
+uniforms   a few numbers for each of many sources, whichever others they are drawn with
 """
 
 from __future__ import annotations
@@ -10,8 +13,11 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
+import numpy.typing as npt
 
 from lake_schema.errors import BadInput
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
 def stream(*identity: int | str) -> np.random.Generator:
@@ -19,9 +25,34 @@ def stream(*identity: int | str) -> np.random.Generator:
 
     identity : integers and strings; 1 and "1" are different, and so are ("a", "b") and ("ab",)
     """
+    return np.random.Generator(np.random.Philox(key=_key(identity)))
+
+
+def uniforms(ids: npt.NDArray[np.int64], count: int, *identity: int | str) -> npt.NDArray[np.float64]:
+    """Random numbers in (0, 1), [count, n], each a function of the identity, the source and its place alone.
+
+    ids : int64[n]
+    Ref : Steele, Lea & Flood 2014 (SplitMix64: a counter through a mixer that changes half of the bits)
+    """
+    first, second = _key(identity)
+    own = _mixed(ids.astype(np.uint64) ^ first)
+    # Arithmetic is modulo 2^64.
+    counters = (np.arange(count, dtype=np.uint64) + np.uint64(1)) * _GOLDEN
+    bits = _mixed((own[None, :] ^ second) + counters[:, None])
+    # 52 bits and a half: neither 0 nor, rounded, 1.
+    return np.asarray(((bits >> np.uint64(12)) + 0.5) * 2.0**-52)
+
+
+def _mixed(words: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.asarray(words ^ (words >> np.uint64(31)), np.uint64)
+
+
+def _key(identity: tuple[int | str, ...]) -> npt.NDArray[np.uint64]:
     for part in identity:
         if isinstance(part, bool) or not isinstance(part, (int, str, np.integer)):
             raise BadInput(f"a random stream is identified by integers and strings, not {part!r}")
     canonical = tuple(part if isinstance(part, str) else int(part) for part in identity)
     digest = hashlib.blake2b(repr(canonical).encode(), digest_size=16).digest()
-    return np.random.Generator(np.random.Philox(key=np.frombuffer(digest, "<u8").copy()))
+    return np.frombuffer(digest, "<u8").copy()

@@ -3,6 +3,7 @@
 version(root, name)     the published version (resolved once: a later publication does not mix in)
 Version.dataset         its files as an Arrow dataset
 Version.rows            rows of some columns or parts
+Version.margin          rows just outside a part's cell
 Version.in_cells        rows inside HEALPix cells
 Version.cone            rows inside a circle, by true or lensed position
 verify                  is a version what its manifest says?
@@ -115,6 +116,15 @@ class Version:
         self._refuse_unknown(names or [])
         try:
             return self.dataset(parts).to_table(columns=names, filter=where)
+        except (OSError, pa.ArrowInvalid) as error:
+            raise Damaged(f"table {self.table}: version {self.key}: {error}") from None
+
+    def margin(self, part: str, columns: Sequence[str] | None = None) -> pa.Table:
+        """Rows of a catalogue beside a part's cell, within 10" of it and a little farther."""
+        self._refuse_unknown(list(columns or []))
+        path = self.file(f"{self.table}_margin/dataset/{part}")
+        try:
+            return parquet.dataset([path], self.schema).to_table(columns=None if columns is None else list(columns))
         except (OSError, pa.ArrowInvalid) as error:
             raise Damaged(f"table {self.table}: version {self.key}: {error}") from None
 

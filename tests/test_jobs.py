@@ -9,13 +9,15 @@ from pathlib import Path
 import pytest
 
 from jobs import demo, request, shell
-from jobs.catalogue import build_galaxies, build_stars
+from jobs.catalogue import build_gaia, build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
 from lake_schema import layout, read
 
 ROOT = Path(__file__).parents[1]
-JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.JOB, render_exposures.JOB)
+FIRST = (build_galaxies.JOB, build_stars.JOB)
+LATER = (compute_fluxes.JOB, build_gaia.JOB, plan_exposures.JOB, render_exposures.JOB)
+JOBS = FIRST + LATER
 # Four order-5 cells meet here, so that there is something to share out.
 SMALL = """
 name = "small"
@@ -92,12 +94,16 @@ def test_a_bad_pointing_is_refused_before_the_first_job_runs(words, key, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("job", JOBS[2:], ids=lambda job: job.name)
+@pytest.mark.parametrize("job", LATER, ids=lambda job: job.name)
 def test_what_must_be_built_first_is_named(job, tmp_path, capsys):
     path = tmp_path / "r.toml"
     path.write_text(SMALL)
     assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 2
-    missing = {"compute_fluxes": "no table galaxies", "plan_exposures": "pointing is missing"}
+    missing = {
+        "compute_fluxes": "no table galaxies",
+        "build_gaia": "no table stars",
+        "plan_exposures": "pointing is missing",
+    }
     assert missing.get(job.name, "no table exposures") in capsys.readouterr().err
 
 

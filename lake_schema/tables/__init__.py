@@ -16,6 +16,7 @@ def declared(bands: Sequence[str]) -> list[Table]:
     """Every table of the lake, the flux tables with these bands."""
     from lake_schema.tables.exposures import EXPOSURES
     from lake_schema.tables.fluxes import fluxes
+    from lake_schema.tables.gaia import GAIA
     from lake_schema.tables.galaxies import GALAXIES
     from lake_schema.tables.halos import HALOS
     from lake_schema.tables.mission import MISSION
@@ -25,7 +26,7 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.tasks import TASKS
     from lake_schema.tables.templates import TEMPLATES
 
-    catalogues = [HALOS, GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands)]
+    catalogues = [HALOS, GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands), GAIA]
     return [*catalogues, TEMPLATES, PASSBANDS, MISSION, EXPOSURES, TASKS, PRODUCTS]
 
 
