@@ -46,6 +46,11 @@ def galaxy_step(lake: Path, request: Request) -> Step:
     return _step(read.version(lake, "galaxies"), "galaxy", request)
 
 
+def star_step(lake: Path, request: Request) -> Step:
+    """The step of the stars alone."""
+    return _step(read.version(lake, "stars"), "star", request)
+
+
 def _step(catalogue: read.Version, kind: str, request: Request) -> Step:
     inputs = {"catalogue": catalogue.table, "input": catalogue.key}
     facts = {**inputs, **_how(kind, request), "code": code_version()}

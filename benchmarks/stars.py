@@ -1,0 +1,257 @@
+"""How fast the Milky Way is drawn, and is it the right one: python -m benchmarks.stars [--quick] [--json FILE].
+
+stars_per_s_core   from the plan to the published table, CPU seconds of one core; with fluxes: in ten bands as well
+cell_peak_gb       the most crowded cell that is drawn to H < 26, at |b| = 5 deg, in a process of its own
+counts_*           the largest difference of star counts from those of the same laws, summed once by other code
+against_*          the real sky: published counts in the same band
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from benchmarks import report
+from jobs import request
+from jobs.catalogue import brown_dwarfs, build_stars, dust_map, gaia, milky_way, stars
+from jobs.fluxes import brown_dwarfs as spectra_of_dwarfs
+from jobs.fluxes import compute_fluxes, passbands, spectra, templates
+from jobs.fluxes.calibration import vega_magnitude
+from jobs.rng import stream
+from lake_schema import layout, publish, read, sky, units
+from lake_schema.ids import GENERATION_ORDER
+
+Float = npt.NDArray[np.float64]
+
+SEED = 7
+AREA = sky.cell_area(GENERATION_ORDER)
+BANDS = [f"euclid_{b}" for b in ("vis", "y", "j", "h")] + [f"lsst_{b}" for b in "ugrizy"]
+# Latitude -> stars deg-2 to I = 18, 20, 22, 24.5 and H = 18, 22, 26 (Vega), mean over longitude, without dust.
+COUNTS = {
+    90: (898, 2248, 5119, 12869, 2149, 10947, 36451),
+    60: (1174, 2984, 6864, 17121, 2833, 14687, 47254),
+    45: (1708, 4439, 10413, 25723, 4154, 22374, 67569),
+    30: (3250, 8707, 21375, 52519, 7870, 46724, 124538),
+    20: (6699, 18113, 46740, 116048, 15669, 104824, 249659),
+}
+LIMITS = {"I": (18.0, 20.0, 22.0, 24.5), "H": (18.0, 22.0, 26.0)}
+# L, then T dwarfs deg-2 to J = 22, 24, 26 (Vega).
+DWARFS = {30: (62, 267, 458, 6, 60, 330), 60: (32, 81, 105, 5, 35, 116), 90: (25, 57, 69, 5, 29, 83)}
+# Stars to H < 26 at |b| > 20 deg by the same laws.
+SKY_20 = 2.65e9
+# mas at G = 15, 17, 20: the law of PyGaia scaled to DR2, which publishes 0.04, 0.1, 0.7.
+PARALLAX = {15.0: 0.037, 17.0: 0.098, 20.0: 0.765}
+
+
+def pole_counts(v: float) -> float:
+    """Published stars deg-2 at the Galactic pole brighter than V.
+
+    Error: 15 % (its authors); a factor of 2 low at V = 11.  Ref: Bahcall & Soneira 1980, eq. B1
+    """
+    disc = 925.0 * 10.0 ** (0.035 * (v - 15.75)) / (1.0 + 10.0 ** (-0.132 * (v - 15.75))) ** 3
+    spheroid = 1050.0 * 10.0 ** (0.087 * (v - 17.5)) / (1.0 + 10.0 ** (-0.18 * (v - 17.5))) ** 2.5
+    return float(disc + spheroid)
+
+
+def around(b: float, cells: int) -> list[int]:
+    """Generation cells at Galactic latitudes b and -b, evenly in longitude."""
+    lon = np.arange(cells) * 360.0 / cells
+    # At a pole the parallel is too short for them.
+    lat = np.where(np.arange(cells) % 2, -1.0, 1.0) * np.minimum(b, 89.9 - 0.1 * np.arange(cells))
+    return sorted({int(cell) for cell in sky.cell_of(*sky.equatorial(lon, lat), GENERATION_ORDER)})
+
+
+def counts(b: float, cells: int, universe: stars.StarModel, dust: npt.NDArray[np.float32]) -> Float:
+    """Stars drawn deg-2 at a latitude, as in COUNTS."""
+    types, drawn = universe.types, around(b, cells)
+    total = np.zeros(sum(map(len, LIMITS.values())))
+    for cell in drawn:
+        rows = stars.draw(cell, SEED, universe, dust)
+        rows = rows.filter(pa.array(rows["component"].to_numpy() != stars.BROWN))
+        h = rows["mag_h"].to_numpy().astype(float)
+        mags = {"H": h, "I": h + (types.v_minus_h - types.color_vi)[rows["sed"].to_numpy()]}
+        total += [np.sum(mags[band] < limit) for band, limits in LIMITS.items() for limit in limits]
+    return np.asarray(total / (len(drawn) * AREA))
+
+
+def dwarf_counts(b: float, area: float) -> Float:
+    """L and T dwarfs drawn deg-2 at a latitude, as in DWARFS: one draw over so many deg2, without dust."""
+    galaxy, dwarfs, types = milky_way.milky_way(), brown_dwarfs.brown_dwarfs(1.0), spectra_of_dwarfs.templates()
+    found = brown_dwarfs.draw(dwarfs, galaxy, 90.0, b, area, 28.0, stream(SEED, "benchmark", int(b)))
+    j = types.abs_mag_j[found.template] + 5.0 * np.log10(found.distance) - 5.0
+    is_t = types.subtype[found.template] >= 10
+    total = [np.sum(~is_t & (j < m)) for m in (22, 24, 26)] + [np.sum(is_t & (j < m)) for m in (22, 24, 26)]
+    return np.array(total) / area
+
+
+def far_from_the_plane(step: int) -> float:
+    """Stars to expect to H < 26 at |b| > 20 deg, from every step-th cell."""
+    cells = np.arange(0, 12 << 2 * GENERATION_ORDER, step)
+    _, b = sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
+    return float(stars.numbers(cells[np.abs(b) > 20.0], stars.model()).sum() * step)
+
+
+def brighter_than_11(step: int, dust: npt.NDArray[np.float32]) -> float:
+    """Stars of the whole sky to expect with V < 11, behind the dust, from every step-th cell of order 4."""
+    universe, order = stars.model(), 4
+    galaxy, types = universe.galaxy, universe.types
+    by_teff, m_h = np.argsort(types.teff), 0.5 * (galaxy.m_h[1:] + galaxy.m_h[:-1])
+    distance = milky_way.middles(galaxy)
+    color = np.stack(
+        [
+            np.interp(np.interp(m_h, sequence.m_h, sequence.teff), types.teff[by_teff], types.v_minus_h[by_teff])
+            for sequence in galaxy.sequences
+            for _ in galaxy.components
+        ]
+    )
+    v = (m_h + color)[:, None, :] + 5.0 * np.log10(distance)[:, None] - 5.0
+    total = 0.0
+    cells = np.arange(step // 2, 12 << 2 * order, step)
+    for ra, dec in zip(*sky.cell_centres(order, cells), strict=True):
+        lon, lat = sky.galactic([ra], [dec])
+        far = dust_map.a_v(dust, np.array([ra]), np.array([dec]))
+        a_v = dust_map.a_v_at(far, distance, lat, universe.layer, universe.sin_b_min)
+        number = milky_way.expected(galaxy, float(lon[0]), float(lat[0]), sky.cell_area(order), 30.0)
+        total += float(number[v + a_v[:, None] < 11.0].sum())
+    return total * (12 << 2 * order) / cells.size
+
+
+def pole(cells: int, dust: npt.NDArray[np.float32]) -> dict[str, float]:
+    """Stars deg-2 at the pole to V = 20 and G = 20 from the flux table, against published counts in the same band."""
+    universe, library = stars.model(24.0), templates.stellar_library()
+    zero = {"bessell_v": vega_magnitude(passbands.load("bessell_v")), "gaia_g": gaia.ab_minus_vega()[0]}
+    drawn = around(90.0, cells)
+    found = {band: [] for band in zero}
+    for cell in drawn:
+        rows = stars.draw(cell, SEED, universe, dust)
+        fluxes = spectra.star_fluxes(rows, list(zero), library)
+        for band, offset in zero.items():
+            found[band].append(units.mag_of_f_nu(fluxes[f"f_nu_{band}"].to_numpy().astype(float)) - offset)
+    v, g = (np.concatenate(found[band]) for band in zero)
+    area = len(drawn) * AREA
+    # The published counts in G: in bins of V, the part of our stars that is brighter than G = 20.
+    edges = np.arange(8.0, 24.1, 0.5)
+    inside, _ = np.histogram(v[g < 20.0], edges)
+    every, _ = np.histogram(v, edges)
+    published = np.diff([pole_counts(edge) for edge in edges]) @ (inside / np.maximum(every, 1))
+    return {
+        "pole_v20_per_deg2": np.sum(v < 20.0) / area,
+        "against_pole_v20": np.sum(v < 20.0) / area / pole_counts(20.0),
+        "pole_g20_per_deg2": np.sum(g < 20.0) / area,
+        "against_pole_g20": np.sum(g < 20.0) / area / float(published),
+    }
+
+
+def speed(radius: float) -> dict[str, float]:
+    """CPU seconds of the two jobs at b = 30 deg, without Spark."""
+    ra, dec = (float(x) for x in sky.equatorial(90.0, 30.0))
+    table = {"name": "benchmark", "seed": SEED, "area": {"cone": {"ra": ra, "dec": dec, "radius": radius}}}
+    wanted = request.from_table({**table, "fluxes": {"bands": BANDS}})
+    # Libraries and machine code are made once, whatever is asked for.
+    spectra.prepare(BANDS, wanted.accuracy)
+    dust_map.load(SEED)
+    with tempfile.TemporaryDirectory() as folder:
+        lake = layout.lake(folder)
+        started = time.process_time()
+        (step,) = build_stars.steps(lake, wanted)
+        publish.make(lake, step.plan, step.work)
+        drawn = time.process_time()
+        step = compute_fluxes.star_step(lake, wanted)
+        publish.make(lake, step.plan, step.work)
+        ended = time.process_time()
+        version = read.version(lake, "stars")
+        size = sum(path.stat().st_size for path in version.folder.rglob("Npix=*"))
+    rows = version.num_rows
+    return {
+        "rows": rows,
+        "stars_per_s_core": rows / (drawn - started),
+        "with_fluxes_per_s_core": rows / (ended - started),
+        "bytes_per_row": size / rows,
+    }
+
+
+_CROWDED = """
+import resource, sys
+from pathlib import Path
+from benchmarks.stars import crowded
+rows = crowded(float(sys.argv[1]))
+print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
+"""
+
+
+def crowded(limit: float) -> int:
+    """Draw and publish the most crowded cell at |b| > 5 deg; returns its rows."""
+    cells = np.arange(12 << 2 * GENERATION_ORDER)
+    _, lat = sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
+    near = cells[(np.abs(lat) >= stars.PLANE) & (np.abs(lat) < stars.PLANE + 0.3)]
+    (ra,), (dec,) = sky.cell_centres(GENERATION_ORDER, near[[stars.numbers(near, stars.model()).argmax()]])
+    area = {"cone": {"ra": float(ra), "dec": float(dec), "radius": 0.0}}
+    wanted = request.from_table({"name": "x", "seed": SEED, "area": area, "universe": {"star_limit": limit}})
+    with tempfile.TemporaryDirectory() as folder:
+        lake = layout.lake(folder)
+        (step,) = build_stars.steps(lake, wanted)
+        publish.make(lake, step.plan, step.work)
+        return read.version(lake, "stars").num_rows
+
+
+def peak(limit: float) -> tuple[float, float]:
+    """Rows and peak memory, GB, of `crowded` in a process of its own."""
+    root = Path(__file__).resolve().parents[1]
+    done = subprocess.run(
+        [sys.executable, "-c", _CROWDED, str(limit)], capture_output=True, text=True, check=True, cwd=root
+    )
+    rows, gigabytes = map(float, done.stdout.split())
+    return rows, gigabytes
+
+
+def run(quick: bool) -> dict[str, float]:
+    """All figures."""
+    dust = dust_map.load(SEED)
+    figures = speed(0.1 if quick else 1.0)
+    figures["cell_rows"], figures["cell_peak_gb"] = peak(16.0 if quick else 26.0)
+    cells, universe = (4, stars.model(22.0)) if quick else (24, stars.model())
+    for b in (60,) if quick else COUNTS:
+        found = counts(b, cells, universe, dust) / np.array(COUNTS[b])
+        kept = found[:-1] if quick else found
+        figures[f"counts_b{b}_off"] = float(kept[np.abs(kept - 1.0).argmax()] - 1.0)
+    for b in (60,) if quick else DWARFS:
+        found = dwarf_counts(b, 100.0 if quick else 1000.0) / np.array(DWARFS[b])
+        figures[f"lt_b{b}_off"] = float(found[np.abs(found - 1.0).argmax()] - 1.0)
+    figures["sky_b20_off"] = far_from_the_plane(4096 if quick else 64) / SKY_20 - 1.0
+    figures["sky_v11"] = brighter_than_11(64 if quick else 4, dust)
+    figures |= pole(4 if quick else 24, dust)
+    for g, published in PARALLAX.items():
+        figures[f"gaia_parallax_g{g:g}_off"] = float(gaia.astrometric_errors(g)[2] / published - 1.0)
+    return figures
+
+
+NOTES = {
+    "stars_per_s_core": "drawn and published; CPU seconds",
+    "with_fluxes_per_s_core": "and their fluxes in ten bands",
+    "cell_peak_gb": "the most crowded cell at |b| > 5 deg",
+    "sky_b20_off": "stars to H < 26 at |b| > 20 deg, against 2.65e9",
+    "sky_v11": "V < 11 on the whole sky; in reality 1e6",
+    "against_pole_v20": "against Bahcall & Soneira 1980, good to 15 %",
+    "against_pole_g20": "the same in G",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    options = report.options("stars", __doc__ or "", argv)
+    report.finish("stars", 1, run(options.quick), NOTES, options.json)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
