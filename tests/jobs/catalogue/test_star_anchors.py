@@ -1,0 +1,39 @@
+"""The numbers that the Milky Way must meet, at a few cells; benchmarks/stars.py has the fuller table."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import stars as benchmark
+from jobs.catalogue import stars
+
+KEYS = ("stars_per_s_core", "cell_peak_gb")
+
+
+@pytest.mark.parametrize("b", [60, 20])
+def test_counts_of_drawn_stars(b, dust):
+    """Mean over 12 cells to I = 18 .. 24.5 and H = 18 .. 26, each within 15 % and its Poisson error."""
+    found = benchmark.counts(b, 12, stars.model(), dust)
+    published = np.array(benchmark.COUNTS[b], float)
+    error = 3 * np.sqrt(published / (12 * benchmark.AREA))
+    assert np.all(np.abs(found - published) < 0.15 * published + error)
+
+
+def test_stars_far_from_the_plane():
+    assert benchmark.far_from_the_plane(1024) == pytest.approx(benchmark.SKY_20, rel=0.15)
+
+
+def test_bright_stars_of_the_whole_sky(dust):
+    """Brighter than V = 11: 1.05e6 in Tycho-2."""
+    assert 0.85e6 < benchmark.brighter_than_11(61, dust) < 1.15e6
+
+
+@pytest.mark.nightly
+def test_the_benchmark(tmp_path):
+    file = tmp_path / "stars.json"
+    assert benchmark.main(["--quick", "--json", str(file)]) == 0
+    figures = json.loads(file.read_text())
+    assert set(KEYS) <= set(figures)
+    assert {"name", "commit", "machine", "repeats"} <= set(figures)
+    assert figures["cell_peak_gb"] < 1.5
