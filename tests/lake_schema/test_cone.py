@@ -154,6 +154,8 @@ def test_the_margin_of_each_cell_is_what_lies_about_it(catalogues):
             margin = pq.read_table(version.folder / "lensed_margin" / "dataset" / part, partitioning=None)
             wanted = rows.filter(np.isin(fine, sky.margin_cells(order, cell, 13)))
             assert margin["id"].to_pylist() == wanted["id"].to_pylist()
+            assert version.margin(part).equals(wanted)
+            assert version.margin(part, ["id"]).column_names == ["id"]
             assert margin.num_rows > 10
 
 

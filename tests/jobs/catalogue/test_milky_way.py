@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jobs import request
 from jobs.catalogue import milky_way as mw
 from jobs.fluxes import stellar
 
@@ -137,3 +138,7 @@ def test_the_besancon_model_has_the_same_stars_at_the_sun():
     assert BESANCON.local[:9, faint].sum(0) == pytest.approx(GALAXY.local[:3, faint].sum(0))
     near = [mw.expected(galaxy, 200.0, 80.0, 1.0, 12.0).sum() for galaxy in (GALAXY, BESANCON)]
     assert near[1] == pytest.approx(near[0], rel=0.5)
+
+
+def test_a_request_can_choose_every_model():
+    assert request.DENSITIES == mw.MODELS
