@@ -67,9 +67,12 @@ def nyquist_zones(
             of_row[i, 0, r + far] = electrons[i] * np.cos(step * r * y[i])
             of_row[i, 1, r + far] = -electrons[i] * np.sin(step * r * y[i])
         if body[i] and fraction[i] > 0.0:
-            farthest = 1.01 * (min(cut[i], step * np.hypot(far, max(-low, high))) + 2.0 * step) ** 2
-            table = farthest * np.sum(bulge[i] ** 2), 0.99 * step**2 * _smaller(bulge[i])
-            _interpolate(sersic, row[i], row_weights[i], table[1], table[0], tables[i])
+            # Pieces are taken whole: to the inner edge of the first that is not.
+            outer = step * np.hypot(far, max(-low, high))
+            for p in range(len(inner) - 1, -1, -1):
+                outer = inner[p] if inner[p] >= cut[i] else outer
+            most_square = 1.01 * (outer + 2.0 * step) ** 2 * np.sum(bulge[i] ** 2)
+            _interpolate(sersic, row[i], row_weights[i], 0.99 * step**2 * _smaller(bulge[i]), most_square, tables[i])
     re, im = np.empty(most, planes.dtype), np.empty(most, planes.dtype)
     profile, square = np.empty(most, np.float32), np.empty(most, np.float32)
     bits = square.view(np.int32)

@@ -203,6 +203,12 @@ def surface(shape: Shapes, radius: Float) -> Float:
     )
 
 
+def half_light(shape: Shapes) -> Float:
+    """Half-light radius along the major axis, lensed, arcsec: the mean of the components'."""
+    fraction = shape.bulge_fraction
+    return _lensed_stretch(shape) * (fraction * shape.bulge_radius + (1 - fraction) * shape.disk_radius)
+
+
 def _lensed_stretch(shape: Shapes) -> Float:
     """Largest linear stretch by lensing."""
     g = np.hypot(shape.g1, shape.g2)

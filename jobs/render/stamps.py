@@ -36,12 +36,16 @@ Int = npt.NDArray[np.int64]
 Array = npt.NDArray[Any]
 
 # Sides whose transforms are fast; the last bounds memory (its planes have 134 MB).
-SIZES = np.array([32, 40, 48, 64, 80, 96, 128, 160, 192, 256, 320, 384, 512, 640, 768, 1024, 1280, 1536, 2048])
+SIZES = np.array(
+    [32, 40, 48, 56, 64, 72, 80, 96, 112, 128, 160, 192, 256, 320, 384, 512, 640, 768, 1024, 1280, 1536, 2048]
+)
 # Light that wraps is counted in this aperture about the source: radius, arcsec.
 _APERTURE = 1.0
 # A source's light a stamp's side away, times this, is what all its periodic images bring to its middle: the sum of
 # r^-3 over the square lattice (the PSF's wings), and of the flattest wings of galaxies.
 _LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
+# Of a galaxy's half-light radius, that its stamp is wider than a point's.
+_EXTENT = 4.0
 # Above this many electrons the rounding of single precision would show.
 _BRIGHT = 1e7
 # Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
@@ -139,7 +143,10 @@ def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: f
     wrapped = wings + _LATTICE_GALAXY * galaxy_light[:, len(SIZES) :]
     aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
     enough = (electrons[:, None] * edge < settings.edge * noise) & (wrapped * aperture < settings.ghost)
-    enough &= SIZES * psf.pixel_scale >= settings.least
+    # The PSF's wings beyond a stamp are those of a point: the larger a galaxy, the farther out that may begin.
+    least = np.full(len(shape), settings.least)
+    least[body] += _EXTENT * profiles.half_light(shapes)[shape[body]]
+    enough &= SIZES * psf.pixel_scale >= least[:, None]
     enough[:, -1] = True
     # A point has no light beyond the PSF's plane.
     enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
