@@ -20,7 +20,7 @@ from benchmarks import _scenes as scenes
 from benchmarks import report
 from benchmarks._scenes import LSST, VIS, Scene
 from jobs import accuracy
-from jobs.render import psf, stamps
+from jobs.render import stamps
 from jobs.render.stamps import Settings
 
 # Galaxies whose errors are quoted, by a seed of their own; pairs of the shear response; galsim's, a magnitude bin.
@@ -87,7 +87,10 @@ def times(quick: bool) -> dict[str, float]:
         out[f"{scene.name}_galaxies_s"] = galaxies
         default, cached = peers.galsim_seconds(scene, 1 if quick else PEERS)
         out |= {f"{scene.name}_galsim_default_s": default, f"{scene.name}_galsim_cached_s": cached}
-        out |= {f"{scene.name}_vs_galsim_default": default / galaxies, f"{scene.name}_vs_galsim_cached": cached / galaxies}
+        out |= {
+            f"{scene.name}_vs_galsim_default": default / galaxies,
+            f"{scene.name}_vs_galsim_cached": cached / galaxies,
+        }
         if scene is VIS:
             shared = seconds(scene, tiers["survey"], repeats, stars=False, shared=True)
             out |= {"vis_shared_s": shared, "vis_shared_vs_galsim_cached": cached / shared}

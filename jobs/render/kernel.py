@@ -35,8 +35,8 @@ _FIRST = int(FIRST_BITS)
 @jit
 def nyquist_zones(
     zones: npt.NDArray[Any], planes: npt.NDArray[Any], kx: Float32, ky: Float32, runs: Int, pieces: Int, inner: Float,
-    weights: npt.NDArray[Any], x: Float, y: Float, electrons: Float, sersic: Float32, body: Bool, fraction: Float,
-    bulge: Float, disk: Float, thick: Float, row: Int, row_weights: Float, cut: Float,
+    weights: npt.NDArray[Any], x: Float, y: Float, electrons: Float, cut: Float, sersic: Float32, body: Bool,
+    fraction: Float, bulge: Float, disk: Float, thick: Float, row: Int, row_weights: Float,
 ) -> None:  # fmt: skip
     """Fills zones, complex[m, N, N / 2 + 1]: what irfft2 turns into the stamps of m sources.
 

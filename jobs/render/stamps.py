@@ -227,9 +227,11 @@ def _draw_some(
     x0, y0 = (np.rint(position).astype(np.int64) - size // 2 for position in (column, row))
     kind = np.complex128 if passed.planes.dtype == np.float64 else np.complex64
     zones = np.empty((len(chosen), size, size // 2 + 1), kind)
-    electrons, some = sources.electrons[chosen], [part[chosen] for part in bodies]
-    grid = (passed.planes, passed.grid.kx, passed.grid.ky, passed.grid.runs, passed.grid.pieces, passed.grid.inner)
-    kernel.nyquist_zones(zones, *grid, weights, column - x0, row - y0, electrons, table, *some, cut[chosen])
+    some = passed.grid
+    kernel.nyquist_zones(
+        zones, passed.planes, some.kx, some.ky, some.runs, some.pieces, some.inner, weights, column - x0, row - y0,
+        sources.electrons[chosen], cut[chosen], table, *(part[chosen] for part in bodies),
+    )  # fmt: skip
     kernel.accumulate(frame, scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True), x0, y0)
 
 

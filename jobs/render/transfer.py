@@ -116,7 +116,7 @@ def _grid(size: int, reach: float) -> Grid:
     length = np.diff(first)
     along = np.arange(samples) - np.repeat(first[:-1] - ix[:-1], length)
     kx, ky = (step * along).astype(np.float32), np.repeat((step * iy[:-1]).astype(np.float32), length)
-    inner = shell[pieces[:-1]] * (reach / shells)
+    inner = np.asarray(shell[pieces[:-1]] * (reach / shells), float)
     return Grid(size, kx, ky, np.ascontiguousarray(runs[:, :3]), pieces, inner)
 
 

@@ -44,7 +44,7 @@ def wings(column: Float, row: Float, electrons: Float, sizes: Int, psf: Psf, nx:
         light = _on_blocks(column[chosen], row[chosen], electrons[chosen], shape)
         total += scipy.fft.rfft2(light, period) * scipy.fft.rfft2(_beyond(cells, int(size), period))
     found = scipy.fft.irfft2(total, period)[: shape[0], : shape[1]]
-    return np.maximum(found, 0.0) / BLOCK**2
+    return np.asarray(np.maximum(found, 0.0) / BLOCK**2)
 
 
 def _on_blocks(column: Float, row: Float, electrons: Float, shape: tuple[int, int]) -> Float:
@@ -64,7 +64,7 @@ def _on_blocks(column: Float, row: Float, electrons: Float, shape: tuple[int, in
 def _cells(plane: Float32) -> Float:
     """A plane summed on squares of half a block, an even number of them about its middle."""
     middle, step = len(plane) // 2, SAMPLES * BLOCK // 2
-    count = (SIDE // 2 - BLOCK // 2) // BLOCK * 2 + 1
+    count = (middle // step - 1) // 2 * 2 + 1
     kept = slice(middle - count * step, middle + count * step)
     whole = plane[kept, kept].reshape(2 * count, step, 2 * count, step)
     return np.asarray(whole.sum(axis=(1, 3), dtype=float))
@@ -72,7 +72,7 @@ def _cells(plane: Float32) -> Float:
 
 def _beyond(cells: Float, size: int, period: Sequence[int]) -> Float:
     """What lies outside a square of `size` pixels, on blocks, the middle one first: [period]."""
-    middle, half = len(cells) // 2, size // BLOCK
+    middle, half = len(cells) // 2, min(size // BLOCK, len(cells) // 2)
     hollow = cells.copy()
     hollow[middle - half : middle + half, middle - half : middle + half] = 0.0
     count = len(cells) // 4
