@@ -19,6 +19,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import gammainc, gammaincinv, ndtr, ndtri
 
 from jobs.catalogue import parameters
+from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 
 Float = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
@@ -96,7 +97,7 @@ def shapes() -> Shapes:
     return Shapes(
         size=Size(**parameters.section("morphology.toml", "size")),
         bulge=bulge,
-        scale_height=float(parameters.section("morphology.toml", "thickness")["scale_height"]),
+        scale_height=DISK_SCALE_HEIGHT,
         disc_e=e,
         disc_cdf=cdf,
         fraction=fraction,

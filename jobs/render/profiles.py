@@ -21,13 +21,12 @@ import pyarrow as pa
 from scipy.special import gammaln
 
 from jobs.render import sersic
+from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 
 Float = npt.NDArray[np.float64]
 
 # Half-light radius of a face-on exponential disc in scale lengths: (1 + x) exp(-x) = 1/2.
 EXPONENTIAL_RADIUS = 1.6783469900166605
-# Ratio of scale height to scale length (Serrano et al. 2024).
-SCALE_H_OVER_R = 0.1
 # Reduced shear and inverse magnification near a critical line: beyond these a single source is not a lensed
 # ellipse.
 _MOST_SHEAR = 0.9
@@ -135,7 +134,7 @@ def forms(shape: Shapes, jacobian: Float) -> Forms:
     disk = to_pixels * (shape.disk_radius / EXPONENTIAL_RADIUS)[:, None, None]
     inclination = np.radians(shape.inclination)
     seen = disk * np.stack([one, np.cos(inclination)], 1)[:, None]
-    thick = disk[:, :, 1] * (0.5 * np.pi * SCALE_H_OVER_R * np.sin(inclination))[:, None]
+    thick = disk[:, :, 1] * (0.5 * np.pi * DISK_SCALE_HEIGHT * np.sin(inclination))[:, None]
     return Forms(bulge, seen, thick)
 
 
@@ -181,7 +180,7 @@ def _disk(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
     if radius < smallest:
         return galsim.DeltaFunction()
     return galsim.InclinedExponential(
-        float(shape.inclination[i]) * galsim.degrees, half_light_radius=radius, scale_h_over_r=SCALE_H_OVER_R
+        float(shape.inclination[i]) * galsim.degrees, half_light_radius=radius, scale_h_over_r=DISK_SCALE_HEIGHT
     )
 
 
@@ -217,7 +216,7 @@ def _lensed_stretch(shape: Shapes) -> Float:
 
 def _apparent_axis_ratio(shape: Shapes) -> Float:
     cosine = np.cos(np.radians(shape.inclination))
-    return np.asarray(np.hypot(cosine, SCALE_H_OVER_R))
+    return np.asarray(np.hypot(cosine, DISK_SCALE_HEIGHT))
 
 
 def _b(index: Float) -> Float:

@@ -11,6 +11,10 @@ from lake_schema.tables.common import DEC, HEALPIX_29, KINDS, RA, id_of_kinds
 
 LAWS = ((0, "none"), (1, "Prevot"), (2, "Calzetti"), (3, "Calzetti + 2175 A bump"), (4, "Calzetti + double bump"))
 
+# Scale height of every disc in scale lengths: what `inclination` makes of an axis ratio, and how a disc is drawn
+# (Serrano et al. 2024, "Bulge and disc model").
+DISK_SCALE_HEIGHT = 0.1
+
 _LINE = (
     "observed flux of the primary component, dimmed by the galaxy's own dust, before magnification and the Milky Way; "
     "missing where it was not modelled"
