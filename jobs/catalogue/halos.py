@@ -49,7 +49,7 @@ class HaloModel:
 
     line    : radial steps;  log_mass : [bins + 1] edges
     number  : [s, bins] comoving (Mpc/h)^-3 in a bin;  ratio : [s, bins] ln of the density at its edges, low / high
-    x       : [s, bins] bias times growth;  field : int[s, bins] which smoothed field
+    x       : [s, bins] bias times growth;  field, amplitude : int[s, bins] which smoothed field, and how much of it
     level   : int[s, bins] order of the cells that a halo of this bin is drawn by, -1 = not drawn
     limit   : [s] log10 of the proxy mass of the faintest galaxy;  depth, scatter : dex
     """
@@ -63,6 +63,7 @@ class HaloModel:
     ratio: Float
     x: Float
     field: Int
+    amplitude: Float
     level: Int
     limit: Float
     matching: Matching
@@ -110,6 +111,7 @@ def model(
     depth = matching.occupation.depth
     x = masses.interpolate(masses.bias, line.z, edge[:-1] + 0.5 * low["bin"])
     x = x * density_box.growth(line.z)[:, None]
+    field, amplitude = density_box.biased(box.model, x)
     wide = masses.radius(edge[1:])[None, :] / line.edge[:-1, None]
     level = _levels(wide)
     level[edge[None, 1:] < limit[:, None] - depth] = -1
@@ -122,7 +124,8 @@ def model(
         number=number,
         ratio=ratio,
         x=x,
-        field=np.searchsorted(np.array(box.model.bias_edges), x),
+        field=field,
+        amplitude=amplitude,
         level=level,
         limit=limit,
         matching=matching,
@@ -183,13 +186,13 @@ def _block(halos: HaloModel, used: Bool, space: Voxels, rng: np.random.Generator
     first, last = int(space.step[rows].min()), int(space.step[rows].max()) + 1
     columns = np.flatnonzero(used[first:last].any(0))
     cut = (slice(first, last), slice(columns[0], columns[-1] + 1))
-    x, field = halos.x[cut].astype(np.float32), halos.field[cut]
+    amplitude, field = halos.amplitude[cut].astype(np.float32), halos.field[cut]
     with np.errstate(divide="ignore"):
-        ln_number = np.log(np.where(used[cut], halos.number[cut], 0.0)) - 0.5 * x**2 * halos.box.variance[field]
+        ln_number = np.log(np.where(used[cut], halos.number[cut], 0.0)) - 0.5 * amplitude**2 * halos.box.variance[field]
     ln_number += np.log(np.pi / 3.0 * halos.line.volume[first:last])[:, None]
     step, box = space.step[rows] - first, space.box[rows]
     g = np.stack([smooth.ravel()[box] for smooth in halos.box.smoothed], 1)
-    exponent = x[step] * np.take_along_axis(g, field[step], 1)
+    exponent = amplitude[step] * np.take_along_axis(g, field[step], 1)
     exponent += ln_number.astype(np.float32)[step]
     exponent -= (np.log(4.0) * space.order[rows]).astype(np.float32)[:, None]
     total = np.cumsum(np.exp(exponent), dtype=float)

@@ -6,8 +6,8 @@ displaced   true positions -> observed ones
 
 gamma1, gamma2 are in the frame (x, y) = (east, north): east or west of a mass gamma1 < 0, north-east of it
 gamma2 < 0.  Deflections point away from a mass.
-Error: Born approximation; the convergence has the power of linear theory within 10 % up to l = nside (tests), none
-       above 1.5 nside
+Error: Born approximation; the convergence has the power of linear theory within 10 % up to l = nside for sources at
+       z > 0.4 (tests), none above 1.5 nside
 Ref: Bartelmann & Schneider 2001, Phys. Rep. 340, 291; Hu 2000, PhRvD 62, 043007
 """
 
@@ -74,14 +74,15 @@ def load(box: Box, nside: int, far: bool = False) -> Planes:
     chosen = settings()
     z = np.array(chosen.planes + (chosen.far_planes if far else ()))
     modules = ("density_box.py", "lightcone.py", "convergence.py", "lensing.py")
-    code = [(Path(__file__).parent / name).read_bytes() for name in modules]
+    code = [(Path(__file__).parent / module).read_bytes() for module in modules]
     about = [np.atleast_1d(value).astype(float) for value in astuple(chosen)]
     key = content_key(*code, box.seed, box.n, *map(float, np.concatenate(about)), nside, int(far))
     chi = cosmology.comoving_distance(z)
     name = f"lensing_{nside}"
-    kappa = cached_arrays(f"{name}_kappa", key, lambda: _convergence(box, nside, chi, chosen))["field"]
+    summed = cached_arrays(f"{name}_kappa", key, lambda: _summed(box, nside, chi, chosen))
     planes = [
-        cached_arrays(f"{name}_{i}", key, _plane_of(kappa[i], nside, chosen.l_max))["field"] for i in range(z.size)
+        cached_arrays(f"{name}_{i}", key, _plane_of(summed["kappa"][i], nside, summed["transfer"][i]))["field"]
+        for i in range(z.size)
     ]
     return Planes(nside, chi, tuple(planes))
 
@@ -126,17 +127,17 @@ def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> 
     return np.asarray(((1.0 - kappa) ** 2 - gamma1**2 - gamma2**2 < caustic) | (kappa >= 1.0))
 
 
-def transform(kappa: Float32, nside: int, l_max: float) -> Float32:
-    """Shear and deflection of a convergence map: float32[12 nside^2, 5] nested; kappa without power above l_max.
+def transform(kappa: Float32, nside: int, gain: Float) -> Float32:
+    """Convergence, shear and deflection, float32[12 nside^2, 5] nested, of a map whose kappa_lm are gain[l] as large.
 
     Ref: Hu 2000, eqs. 35 and 36
     """
-    top = int(l_max * nside)
+    top = gain.size - 1
     ring_of = hp.nest2ring(nside, np.arange(kappa.size))
     ring = np.empty(kappa.size)
     ring[ring_of] = kappa
     # Without iterations the quadrature is wrong by 5e-4, a hundredth of what the pixels of the map smooth away.
-    alm = hp.map2alm(ring, lmax=top, iter=0)
+    alm = hp.almxfl(hp.map2alm(ring, lmax=top, iter=0), gain)
     ell = np.arange(top + 1)
     inner = np.maximum(ell * (ell + 1.0), 1.0)
     shear = hp.almxfl(alm, -np.sqrt(np.maximum((ell + 2.0) * (ell - 1.0), 0.0) / inner))
@@ -148,13 +149,17 @@ def transform(kappa: Float32, nside: int, l_max: float) -> Float32:
     return np.stack([field.astype(np.float32)[ring_of] for field in fields], 1)
 
 
-def _convergence(box: Box, nside: int, chi: Float, chosen: Settings) -> dict[str, npt.NDArray[np.generic]]:
+def _summed(box: Box, nside: int, chi: Float, chosen: Settings) -> dict[str, npt.NDArray[np.generic]]:
     # Its compiler takes a second to import, and is not needed where the planes are in the cache.
-    from jobs.catalogue.convergence import convergence
+    from jobs.catalogue import convergence
 
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)
-    return {"field": convergence(box, direction, hp.nside2resol(nside), chi, chosen.coarsest, chosen.stretch)}
+    width, how = hp.nside2resol(nside), (chosen.coarsest, chosen.stretch)
+    return {
+        "kappa": convergence.convergence(box, direction, width, chi, *how),
+        "transfer": convergence.transfer(box, width, chi, int(chosen.l_max * nside), *how),
+    }
 
 
-def _plane_of(kappa: Float32, nside: int, l_max: float) -> Callable[[], dict[str, npt.NDArray[np.generic]]]:
-    return lambda: {"field": transform(kappa, nside, l_max)}
+def _plane_of(kappa: Float32, nside: int, gain: Float) -> Callable[[], dict[str, npt.NDArray[np.generic]]]:
+    return lambda: {"field": transform(kappa, nside, gain)}

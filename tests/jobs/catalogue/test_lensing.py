@@ -19,7 +19,7 @@ def bump():
     ra, dec = hp.pix2ang(BUMP_NSIDE, np.arange(12 * BUMP_NSIDE**2), nest=True, lonlat=True)
     angle = np.radians(sky.separation(ra, dec, RA, DEC))
     kappa = 0.1 * np.exp(-0.5 * (angle / WIDTH) ** 2)
-    fields = lensing.transform(kappa.astype(np.float32), BUMP_NSIDE, 2.0)
+    fields = lensing.transform(kappa.astype(np.float32), BUMP_NSIDE, np.ones(2 * BUMP_NSIDE + 1))
     return lensing.Planes(BUMP_NSIDE, np.array([1000.0]), (fields,))
 
 
