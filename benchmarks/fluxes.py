@@ -166,7 +166,7 @@ def job(n: int) -> float:
                 "fluxes": {"bands": list(BANDS)},
             }
         )
-        step = compute_fluxes.galaxy_step(lake, wanted)
+        step = compute_fluxes.step_of("galaxy", lake, wanted)
         seconds = _cpu(lambda: publish.make(lake, step.plan, step.work), 1)
     return n / seconds
 

@@ -167,7 +167,7 @@ def speed(radius: float) -> dict[str, float]:
         (step,) = build_stars.steps(lake, wanted)
         publish.make(lake, step.plan, step.work)
         drawn = time.process_time()
-        step = compute_fluxes.star_step(lake, wanted)
+        step = compute_fluxes.step_of("star", lake, wanted)
         publish.make(lake, step.plan, step.work)
         ended = time.process_time()
         version = read.version(lake, "stars")

@@ -6,9 +6,13 @@
     [stars]      density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
     [mission]    ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
     [fluxes]     bands = [..]           default: the bands of the pointings
+    [fluxes.passbands.NAME]             your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
+    [fluxes.templates]                  your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
+    [fluxes.extinction.CODE]            your own law in place of law 1 .. 4: file, format
     [[pointing]] channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
     [products]   truth = ["noise_free"]
 
+Files are found from the folder of the request; their formats are in jobs/fluxes/spectrum_formats.toml.
 A key that is not here, a wrong type or a number out of bounds is refused with the key's full path.
 """
 
@@ -84,15 +88,15 @@ class Stars:
     density           : whose laws of density
     brown_dwarf_boost : how many times denser than in nature L and T dwarfs are drawn, 0 = not at all
     tycho2            : files of Tycho-2, which replace the model brighter than V = 11
-    catalogue         : file of other stars to be taken instead of the model's, "" = none; columns: (ours, theirs)
+    catalogue         : file of other stars to be taken instead of the model's; columns: (ours, theirs)
     plane_limit       : faintest H (Vega, as observed) within 5 deg of the plane; None = an area there is refused
     rows_a_file       : above so many expected rows a cell's file is split into those of the next HEALPix order
     """
 
     density: str = "juric"
     brown_dwarf_boost: float = 1.0
-    tycho2: tuple[str, ...] = ()
-    catalogue: str = ""
+    tycho2: tuple[Path, ...] = ()
+    catalogue: Path | None = None
     columns: tuple[tuple[str, str], ...] = ()
     plane_limit: float | None = None
     rows_a_file: int = 1_000_000
@@ -137,6 +141,24 @@ class Pointing:
 
 
 @dataclass(frozen=True, slots=True)
+class Curves:
+    """Files of spectra, of a filter or of an extinction law; medium : of a filter's wavelengths, "air" or "vacuum"."""
+
+    files: tuple[Path, ...]
+    format: str
+    medium: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnCurves:
+    """What stands beside the embedded passbands, and in place of the embedded galaxies and extinction laws."""
+
+    passbands: tuple[tuple[str, Curves], ...] = ()
+    templates: Curves | None = None
+    extinction: tuple[tuple[int, Curves], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Request:
     """A simulation request, checked."""
 
@@ -150,6 +172,7 @@ class Request:
     bands: tuple[str, ...]
     pointings: tuple[Pointing, ...]
     truth: tuple[str, ...]
+    curves: OwnCurves = OwnCurves()
 
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""
@@ -171,7 +194,7 @@ def parse(path: Path) -> Request:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, BadInput) as error:
         raise BadInput(f"request {path}: {_one_line(error)}") from None
     try:
-        return from_table(table)
+        return from_table(table, path.resolve().parent)
     except BadInput as error:
         raise BadInput(f"request {path}: {error}") from None
 
@@ -180,23 +203,26 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def from_table(table: Toml) -> Request:
-    """A parsed TOML table -> Request; BadInput names the key."""
+def from_table(table: Toml, folder: Path = Path()) -> Request:
+    """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
     sections = {"area", "universe", "stars", "mission", "fluxes", "pointing", "products"}
     _known(table, "", {"name", "seed", "accuracy", *sections})
     pointings = _pointings(table)
-    bands = _strings(_section(table, "fluxes", {"bands"}), "fluxes.bands")
+    fluxes = _section(table, "fluxes", {"bands", "passbands", "templates", "extinction"})
+    curves = _own_curves(fluxes, folder)
+    bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in pointings)
     return Request(
         name=layout.name(_string(table, "name")),
         seed=_integer(table, "seed", 0, 2**63 - 1),
         accuracy=_accuracy(table.get("accuracy")),
         area=_area(_section(table, "area", {"polygon", "cone", "box"})),
         universe=_universe(_section(table, "universe", set(Universe.__slots__))),
-        stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"})),
+        stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder),
         mission=_mission(_section(table, "mission", {"ladder", "overrides"})),
-        bands=bands or tuple(dict.fromkeys(p.band for p in pointings)),
+        bands=tuple(dict.fromkeys((*bands, *(name for name, _ in curves.passbands)))),
         pointings=pointings,
         truth=_truth(_section(table, "products", {"truth"})),
+        curves=curves,
     )
 
 
@@ -262,7 +288,7 @@ def _universe(table: Toml) -> Universe:
     )
 
 
-def _stars(table: Toml) -> Stars:
+def _stars(table: Toml, folder: Path) -> Stars:
     default = Stars()
     rows = _integer(table, "stars.rows_a_file", 1, 3_000_000) if "rows_a_file" in table else default.rows_a_file
     plane_limit = _number(table, "stars.plane_limit", 0.0, 30.0, math.nan)
@@ -271,12 +297,16 @@ def _stars(table: Toml) -> Stars:
     return Stars(
         density=_string(table, "stars.density", DENSITIES) if "density" in table else default.density,
         brown_dwarf_boost=_number(table, "stars.brown_dwarf_boost", 0.0, 1e4, default.brown_dwarf_boost),
-        tycho2=_strings(table, "stars.tycho2"),
-        catalogue=_string(given, "stars.catalogue.file") if given else "",
+        tycho2=tuple(_file(folder, name) for name in _strings(table, "stars.tycho2")),
+        catalogue=_file(folder, _string(given, "stars.catalogue.file")) if given else None,
         columns=tuple((key, _string(columns, f"stars.catalogue.columns.{key}")) for key in sorted(columns)),
         plane_limit=None if math.isnan(plane_limit) else plane_limit,
         rows_a_file=rows,
     )
+
+
+def _file(folder: Path, name: str) -> Path:
+    return folder / Path(name).expanduser()
 
 
 def _mission(table: Toml) -> MissionChoice:
@@ -316,6 +346,30 @@ def _pointing(value: object, path: str) -> Pointing:
         centre_on=_string(table, f"{path}.centre_on") if "centre_on" in table else None,
         exposure_time_s=None if math.isnan(exposure) else exposure,
     )
+
+
+def _own_curves(table: Toml, folder: Path) -> OwnCurves:
+    filters = _table(table.get("passbands", {}), "fluxes.passbands", None)
+    laws = _table(table.get("extinction", {}), "fluxes.extinction", set("1234"))
+    passbands = [_curves(value, f"fluxes.passbands.{layout.name(key)}", folder, True) for key, value in filters.items()]
+    extinction = [_curves(value, f"fluxes.extinction.{key}", folder) for key, value in laws.items()]
+    templates = None
+    if "templates" in table:
+        path = "fluxes.templates"
+        given = _table(table["templates"], path, {"files", "format"})
+        files = _strings(given, f"{path}.files")
+        if not files:
+            raise BadInput(f"{path}.files is missing")
+        templates = Curves(tuple(_file(folder, file) for file in files), _string(given, f"{path}.format"))
+    return OwnCurves(
+        tuple(zip(filters, passbands, strict=True)), templates, tuple(zip(map(int, laws), extinction, strict=True))
+    )
+
+
+def _curves(value: object, path: str, folder: Path, has_medium: bool = False) -> Curves:
+    table = _table(value, path, {"file", "format", *(["medium"] if has_medium else [])})
+    medium = _string(table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
+    return Curves((_file(folder, _string(table, f"{path}.file")),), _string(table, f"{path}.format"), medium)
 
 
 def _truth(table: Toml) -> tuple[str, ...]:

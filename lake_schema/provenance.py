@@ -16,6 +16,7 @@ _PACKAGES = ("lake_schema", "jobs")
 _DATA = {".py", ".csv", ".toml"}
 # Libraries whose version can change a byte of a product.
 _LIBRARIES = (
+    "MeanStars",
     "astropy",
     "colossus",
     "dust_extinction",

@@ -78,7 +78,7 @@ def _values(column, n, rng):
         return [rng.random(3).astype(np.float32).tolist() for _ in range(n)]
     if column.type == "bool":
         return rng.random(n) < 0.5
-    if column.name in ("id", "exposure_id", "sed"):
+    if column.name in ("id", "exposure_id", "sed", "law"):
         return np.arange(n)
     lo = column.lo if column.lo is not None else -100.0
     hi = column.hi if column.hi is not None else lo + 100.0

@@ -44,22 +44,17 @@ def _files(choice: Stars) -> dict[str, Any]:
     """What the user's files hold, wherever they lie."""
     facts: dict[str, Any] = {}
     if choice.tycho2:
-        sums = bright_stars.sha256(_paths(choice.tycho2))
-        read = bright_stars.load(_paths(choice.tycho2), sums)
+        sums = bright_stars.sha256(choice.tycho2)
+        read = bright_stars.load(choice.tycho2, sums)
         counts = {"records": read.read, "without_color": read.without_color, "left_out": read.without_magnitude}
         facts["tycho2"] = {"sha256": sums, "brighter": read.ra.size, **counts}
     if choice.catalogue:
         columns = dict(choice.columns)
         star_catalogue.checked_columns(columns)
-        (file,) = _paths((choice.catalogue,))
-        if not file.is_file():
-            raise BadInput(f"stars.catalogue.file: {file}: no such file")
-        facts["catalogue"] = {"sha256": file_sha256(file), "columns": columns}
+        if not choice.catalogue.is_file():
+            raise BadInput(f"stars.catalogue.file: {choice.catalogue}: no such file")
+        facts["catalogue"] = {"sha256": file_sha256(choice.catalogue), "columns": columns}
     return facts
-
-
-def _paths(names: tuple[str, ...]) -> tuple[Path, ...]:
-    return tuple(Path(name).expanduser().resolve() for name in names)
 
 
 def work(lake: Path, facts: Json, choice: Stars) -> Output:
@@ -73,9 +68,9 @@ def _model(facts: Json, choice: Stars) -> stars.StarModel:
     catalogue = bright = None
     if choice.catalogue:
         given = facts["catalogue"]
-        catalogue = star_catalogue.load(_paths((choice.catalogue,))[0], given["sha256"], given["columns"])
+        catalogue = star_catalogue.load(choice.catalogue, given["sha256"], given["columns"])
     if choice.tycho2:
-        bright = bright_stars.load(_paths(choice.tycho2), facts["tycho2"]["sha256"])
+        bright = bright_stars.load(choice.tycho2, facts["tycho2"]["sha256"])
     limits = facts["star_limit"], facts["plane_limit"]
     return stars.model(*limits, facts["density"], facts["brown_dwarf_boost"], catalogue, bright)
 

@@ -1,9 +1,10 @@
-"""Band fluxes of every source of a lake.
+"""Band fluxes of every source of a lake, and the tables of what they were made with.
 
 spark-submit jobs/fluxes/compute_fluxes.py --lake LAKE --request REQUEST
 
 The tables' manifests say how: facts.accuracy what was asked for, facts.errors the setting and the measured error of
-each band (fractions of the flux), facts.covered where tables were used; what lies beyond was integrated.
+each band (fractions of the flux), facts.covered where tables were used; what lies beyond was integrated, which the
+column `integrated` says of every source. facts.files holds the sha256 of each file that the request named.
 """
 
 import sys
@@ -13,68 +14,114 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import pyarrow as pa
+
 from jobs.accuracy import Accuracy
-from jobs.fluxes import grid_settings, passbands, spectra, templates
+from jobs.fluxes import grid_errors, grid_settings, inputs, passbands, spectra, templates
+from jobs.fluxes.grid_settings import Choice
+from jobs.fluxes.grid_tables import Setting
+from jobs.fluxes.inputs import Own
+from jobs.fluxes.passbands import Passband
+from jobs.fluxes.templates import Library
 from jobs.request import Request
 from jobs.shell import Job, Step, main
 from lake_schema import layout, read
-from lake_schema.errors import BadInput
+from lake_schema.columns import Table
 from lake_schema.provenance import code_version
 from lake_schema.publish import Json, Output, Part, Plan
+from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
 from lake_schema.tables.fluxes import fluxes
+from lake_schema.tables.passbands import PASSBANDS
+from lake_schema.tables.templates import TEMPLATES
 
 CATALOGUES = (("galaxy", "galaxies"), ("star", "stars"))
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """One part a cell of the catalogue, row by row beside it."""
-    for band in request.bands:
-        if band not in passbands.names():
-            raise BadInput(f"fluxes.bands: {band!r} is not one of {', '.join(passbands.names())}")
-    made = [_step(read.version(lake, catalogue), kind, request) for kind, catalogue in CATALOGUES]
+    """What fluxes are made with; then one part a cell of each catalogue, row by row beside it."""
+    own = inputs.read(request.curves)
+    curves = inputs.curves(request.bands, own.passbands)
+    catalogues = [(kind, read.version(lake, name)) for kind, name in CATALOGUES]
+    sources = source_steps(own)
+    chosen = grid_errors.choose(curves, request.accuracy, own.library)
+    made = [_step(catalogue, kind, request, own, chosen, sources) for kind, catalogue in catalogues]
     if not all(layout.version(lake, step.plan.table.name, step.plan.key).exists() for step in made):
         # Here once, and not in every worker at the same time.
-        spectra.prepare(request.bands, request.accuracy)
-    return made
+        spectra.prepare(curves, [choice.setting for choice in chosen], own.library, request.accuracy)
+    return [*sources, *made]
 
 
-def galaxy_step(lake: Path, request: Request) -> Step:
-    """The step of the galaxies alone."""
-    return _step(read.version(lake, "galaxies"), "galaxy", request)
+def step_of(kind: str, lake: Path, request: Request) -> Step:
+    """The step of the galaxies or of the stars alone."""
+    own = inputs.read(request.curves)
+    chosen = grid_errors.choose(inputs.curves(request.bands, own.passbands), request.accuracy, own.library)
+    return _step(read.version(lake, dict(CATALOGUES)[kind]), kind, request, own, chosen, source_steps(own))
 
 
-def star_step(lake: Path, request: Request) -> Step:
-    """The step of the stars alone."""
-    return _step(read.version(lake, "stars"), "star", request)
+def source_steps(own: Own) -> list[Step]:
+    """The tables `templates`, `extinction_laws` and `passbands`."""
+
+    def step(table: Table, rows: Callable[[Own], pa.Table]) -> Step:
+        plan = Plan(table, {"files": own.sha256(), "code": code_version()}, (Part("all.parquet", {}),))
+        return Step(plan, lambda lake, facts: Output(rows(own)), on_driver=True)
+
+    tables = ((TEMPLATES, inputs.template_rows), (EXTINCTION_LAWS, inputs.law_rows), (PASSBANDS, inputs.passband_rows))
+    return [step(table, rows) for table, rows in tables]
 
 
-def _step(catalogue: read.Version, kind: str, request: Request) -> Step:
-    inputs = {"catalogue": catalogue.table, "input": catalogue.key}
-    facts = {**inputs, **_how(kind, request), "code": code_version()}
+def _step(
+    catalogue: read.Version, kind: str, request: Request, own: Own, chosen: Sequence[Choice], sources: Sequence[Step]
+) -> Step:
+    facts = {
+        "catalogue": catalogue.table,
+        "input": catalogue.key,
+        "bands": list(request.bands),
+        "accuracy": asdict(request.accuracy),
+        **_errors(kind, request, chosen),
+        "files": own.sha256(),
+        "sources": {step.plan.table.name: step.plan.key for step in sources},
+        "code": code_version(),
+    }
     parts = tuple(Part(name, {"part": name}) for name in catalogue.parts)
     return Step(Plan(fluxes(kind, request.bands), facts, parts), work)
 
 
-def _how(kind: str, request: Request) -> dict[str, Any]:
-    accuracy = asdict(request.accuracy)
+def _errors(kind: str, request: Request, chosen: Sequence[Choice]) -> dict[str, Any]:
     if kind == "star":
-        errors: dict[str, Any] = {band: grid_settings.of_stars(request.accuracy) for band in request.bands}
-        return {"bands": list(request.bands), "accuracy": accuracy, "errors": errors}
-    chosen = grid_settings.choose(request.bands, request.accuracy)
+        return {"errors": {band: grid_settings.of_stars(request.accuracy) for band in request.bands}}
     errors = {band: choice.facts() for band, choice in zip(request.bands, chosen, strict=True)}
-    return {"bands": list(request.bands), "accuracy": accuracy, "errors": errors, "covered": grid_settings.COVERED}
+    return {"errors": errors, "covered": grid_settings.COVERED}
 
 
 def work(lake: Path, facts: Json) -> Output:
     """The fluxes of one cell, in the order of its rows."""
     rows = read.version(lake, facts["catalogue"], facts["input"]).rows(parts=[facts["part"]])
-    accuracy = Accuracy(**facts["accuracy"])
+    curves = _curves(lake, facts)
     if facts["catalogue"] == "galaxies":
-        return Output(spectra.galaxy_fluxes(rows, facts["bands"], templates.galaxy_library(), accuracy))
-    return Output(spectra.star_fluxes(rows, facts["bands"], templates.stellar_library(), accuracy))
+        chosen = [facts["errors"][band]["setting"] for band in facts["bands"]]
+        settings = [Setting(*numbers) if numbers else None for numbers in chosen]
+        return Output(spectra.galaxy_fluxes_by(rows, curves, settings, _library(lake, facts)))
+    return Output(spectra.star_fluxes(rows, curves, templates.stellar_library(), Accuracy(**facts["accuracy"])))
+
+
+def _library(lake: Path, facts: Json) -> Library:
+    if not any(key.startswith(("fluxes.templates.", "fluxes.extinction.")) for key in facts["files"]):
+        return templates.galaxy_library()
+    return inputs.published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
+
+
+def _curves(lake: Path, facts: Json) -> list[Passband]:
+    key = facts["sources"]["passbands"]
+    return [
+        inputs.published_passband(lake, key, band)
+        if f"fluxes.passbands.{band}" in facts["files"]
+        else passbands.load(band)
+        for band in facts["bands"]
+    ]
 
 
 JOB = Job("compute_fluxes", "Compute the band fluxes of galaxies and stars.", steps)

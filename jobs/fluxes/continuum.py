@@ -70,7 +70,7 @@ def picked(values: _Array, chosen: Int | slice) -> _Array:
 
 def dust_of(library: Library) -> Float32:
     """k(lambda) of the five laws on the grid of a library, float32[5, n_lambda]."""
-    return extinction.laws(library.wavelength).astype(np.float32)
+    return extinction.laws(library.wavelength).astype(np.float32) if library.dust is None else library.dust
 
 
 def mix_of(columns: Mapping[str, npt.ArrayLike], library: Library) -> Mix:

@@ -27,7 +27,7 @@ _MILKY_WAY_RANGE = (1000.0, 33333.0)
 
 # Prevot et al. 1984, table 2 (Small Magellanic Cloud; 3704 A as in LePhare): E(lambda - V) / E(B-V).
 # R_V of Bouchet et al. 1985.
-_PREVOT_TABLE = Path(__file__).with_name("prevot1984.csv")
+PREVOT_TABLE = Path(__file__).with_name("prevot1984.csv")
 _PREVOT_R_V = 2.72
 _PREVOT_INFRARED = 1.6
 
@@ -80,7 +80,7 @@ _LN_PER_MAG = float(-0.4 * np.log(10.0))
 
 
 def _prevot(lam: Float) -> Float:
-    with _PREVOT_TABLE.open(newline="", encoding="utf-8") as file:
+    with PREVOT_TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     at = np.array([float(row["wavelength"]) for row in rows])
     k = np.array([float(row["excess_ratio"]) for row in rows]) + _PREVOT_R_V

@@ -3,6 +3,8 @@
 CANDIDATES      settings that were measured, smallest first
 Choice, choose  setting and error of each band, for galaxies
 stars_tabulated, of_stars   the same for stars
+known           bands that were measured
+INTEGRATED      the choice of no table
 COVERED         what the tables cover, as JSON values
 
 The errors (flux_errors.csv) are those of 20,000 random galaxies, lines included, against direct integration:
@@ -59,6 +61,9 @@ class Choice:
         return {"setting": setting, "rms": self.rms, "largest": self.largest}
 
 
+INTEGRATED = Choice(None, _INTEGRATION_ERROR, _INTEGRATION_ERROR)
+
+
 def choose(bands: Sequence[str], accuracy: Accuracy) -> tuple[Choice, ...]:
     """For each band the smallest setting with 1.5 x largest error <= accuracy.flux; without one it is integrated.
 
@@ -66,6 +71,11 @@ def choose(bands: Sequence[str], accuracy: Accuracy) -> tuple[Choice, ...]:
     """
     measured = _measured()
     return tuple(_smallest(measured, band, accuracy.flux) for band in bands)
+
+
+def known() -> frozenset[str]:
+    """Names of the bands that were measured."""
+    return frozenset(name for of_bands in _measured().values() for name in of_bands)
 
 
 def stars_tabulated(accuracy: Accuracy) -> bool:
@@ -86,7 +96,7 @@ def _smallest(measured: dict[Setting, dict[str, Choice]], band: str, allowed: fl
             choice = of_bands.get(band) or _worst(setting, of_bands)
             if choice is not None and MARGIN * choice.largest <= allowed:
                 return choice
-    return Choice(None, _INTEGRATION_ERROR, _INTEGRATION_ERROR)
+    return INTEGRATED
 
 
 def _worst(setting: Setting, of_bands: dict[str, Choice]) -> Choice | None:

@@ -61,7 +61,7 @@ class Setting:
 
 def library_key(library: Library) -> str:
     """Key of a library's spectra and of the dust in front of them."""
-    return cache.content_key(library.wavelength, np.asarray(library.flux), extinction.laws(library.wavelength[::50]))
+    return cache.content_key(library.wavelength, np.asarray(library.flux), dust_of(library))
 
 
 def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -> Float32:

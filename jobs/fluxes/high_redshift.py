@@ -44,7 +44,7 @@ _LYMAN_ALPHA = 1215.67
 # Vanden Berk et al. 2001: slopes of f_lambda below and above 5000 A; the 3 x 3 of Barnett et al. 2019.
 _QUASAR_SLOPE, _QUASAR_RED_SLOPE, _QUASAR_BREAK = -1.56, 0.45, 5000.0
 QUASAR_OFFSETS, QUASAR_STRENGTHS = (-0.3, 0.0, 0.3), (0.5, 1.0, 2.0)
-_QUASAR_LINES = Path(__file__).with_name("quasar_lines.csv")
+QUASAR_LINES = Path(__file__).with_name("quasar_lines.csv")
 
 # Slopes around the mean of Bouwens et al. 2014; equivalent widths of Lyman alpha, A; its width redwards, A (adopted).
 HIGH_REDSHIFT_SLOPES, LYMAN_ALPHA_WIDTHS, _LYMAN_ALPHA_SIGMA = (-2.6, -2.3, -2.0, -1.7, -1.4), (0.0, 25.0, 50.0), 1.0
@@ -138,7 +138,7 @@ def _quasar(wavelength: Float, slope: float, strength: float) -> Float:
     ratio = wavelength / _QUASAR_BREAK
     continuum = np.where(ratio < 1.0, ratio**slope, ratio**_QUASAR_RED_SLOPE)
     flux = continuum.copy()
-    with _QUASAR_LINES.open(newline="", encoding="utf-8") as file:
+    with QUASAR_LINES.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             centre, width, sigma = (float(row[name]) for name in ("wavelength", "equivalent_width", "sigma"))
             profile = np.exp(-0.5 * ((wavelength - centre) / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)

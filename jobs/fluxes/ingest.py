@@ -3,6 +3,7 @@
 formats         what can be read (spectrum_formats.toml)
 read            wavelengths and values of one file
 library         galaxy templates on our grid, from files in the order of a list
+law             an extinction law on the wavelengths of a library
 passband        a user's filter
 basel           stellar spectra of Lejeune, Cuisinier & Buser 1997 (.cor)
 splice          IRTF spectra of stars onto those of low resolution, by their Y - H colour
@@ -41,6 +42,9 @@ _RED_SLOPE = -3.2
 # header "2I6,4F6.2" and 1221 values of H_nu, 7 of 11 characters a line; f_lambda = 4 pi H_nu c / lambda^2 / pi.
 _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH, _BASEL_FLUX_WIDTH = 1221, 10, 11
 _BASEL_HEADER = (0, 6, 12, 18, 24)
+
+# k of the steepest law, at 912 A, is some 25.
+_MOST_EXTINCTION = 100.0
 
 # The colour by which stars are compared, and the stretch of IRTF spectra that is used, A.
 SPLICE_BANDS = ("euclid_y", "euclid_h")
@@ -99,7 +103,15 @@ def library(files: Sequence[Path], name: str = "cosmos") -> Library:
 
     grid = rest_grid()
     flux = np.stack([_resampled(grid, read(path, name)) for path in files])
-    return Library(grid, normalised(grid, flux).astype(np.float32), tuple(path.stem for path in files))
+    names = tuple(path.stem for path in files)
+    return Library(grid, normalised(grid, flux).astype(np.float32), names, own=True)
+
+
+def law(path: Path, name: str, wavelength: Float) -> Float:
+    """k(lambda) = A / E(B-V) of an extinction law, linear between the file's wavelengths, constant beyond them."""
+    curve = read(path, name)
+    _refuse(path, curve.value > _MOST_EXTINCTION, f"is more than k = {_MOST_EXTINCTION:g}: is it A / E(B-V)?")
+    return np.interp(wavelength, curve.wavelength, curve.value)
 
 
 def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -> Passband:

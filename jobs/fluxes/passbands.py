@@ -2,6 +2,7 @@
 
 grid            the observed-frame grid of all spectra: 600 .. 24000 A in steps of 1 A
 names, load     what there is (passbands.csv), and one of them
+published       where it is from
 weights         f_nu = weights @ f_lambda
 log_width, pivot_wavelength, ab_flux
 """
@@ -30,7 +31,7 @@ END_PHOTONS = 1e-7
 # How far out a logistic edge is tabulated, in widths: exp(-20) is below any use.
 _LOGISTIC_REACH = 20.0
 
-_TABLE = Path(__file__).with_suffix(".csv")
+TABLE = Path(__file__).with_suffix(".csv")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,12 @@ def load(name: str) -> Passband:
     return Passband(name, arrays["wavelength"], arrays["response"], row["medium"])
 
 
+def published(name: str) -> tuple[str, str]:
+    """Where a passband is from: its source as passbands.csv has it, and a note."""
+    row = _rows()[name]
+    return row["source"], row["note"]
+
+
 def weights(band: Passband) -> Float:
     """float64[n] such that f_nu = weights @ f_lambda(band.wavelength), erg s-1 cm-2 Hz-1 for f_lambda per A.
 
@@ -110,7 +117,7 @@ def ab_flux(band: Passband, wavelength: npt.ArrayLike, f_lambda: npt.ArrayLike) 
 
 
 def _rows() -> dict[str, dict[str, str]]:
-    with _TABLE.open(newline="", encoding="utf-8") as file:
+    with TABLE.open(newline="", encoding="utf-8") as file:
         return {row["name"]: row for row in csv.DictReader(file)}
 
 

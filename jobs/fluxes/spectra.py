@@ -5,6 +5,7 @@ star_spectra     scaled to H, behind the dust on the way
 band_fluxes      f_nu of any of them
 galaxy_fluxes    table `galaxies` -> table `galaxy_fluxes`
 star_fluxes      table `stars` -> table `star_fluxes`
+galaxy_fluxes_by the same with chosen settings of the tables
 prepare          make the tables that the two need, and compile
 
 Spectra are on the grid of passbands.grid(), 600 .. 24000 A by 1 A. The flux tables are the same sums, interpolated in
@@ -21,9 +22,10 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.accuracy import REFERENCE, Accuracy
-from jobs.fluxes import extinction, flux_grid, grid_settings, high_redshift, integration, lines, passbands
+from jobs.fluxes import extinction, flux_grid, grid_errors, grid_settings, high_redshift, integration, lines, passbands
 from jobs.fluxes.calibration import continuum_scale, star_scale
 from jobs.fluxes.continuum import REFERENCE_BAND, amplitudes, dust_of, observed_shape
+from jobs.fluxes.grid_tables import Setting
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.sources import GALAXY_KINDS, Galaxies, Stars, galaxies_of, stars_of
 from jobs.fluxes.templates import Library
@@ -32,6 +34,7 @@ from lake_schema.errors import BadInput
 from lake_schema.tables.fluxes import fluxes
 
 Float = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
 
 # Rows turned into arrays at a time: some 80 MB of them. The more, the more often a part of a table is used.
 _SLICE = 200_000
@@ -90,23 +93,29 @@ def galaxy_fluxes(
     Errors   : BadInput names the column and source of a missing value, OutOfRange what is out of bounds
     """
     curves = _curves(bands)
-    choices = grid_settings.choose([curve.name for curve in curves], accuracy)
-    tabulated = [k for k, choice in enumerate(choices) if choice.setting is not None]
+    settings = [choice.setting for choice in grid_errors.choose(curves, accuracy, library)]
+    return galaxy_fluxes_by(galaxies, curves, settings, library)
+
+
+def galaxy_fluxes_by(
+    galaxies: pa.Table, curves: Sequence[Passband], settings: Sequence[Setting | None], library: Library
+) -> pa.Table:
+    """`galaxy_fluxes` from the tables of these settings; bands without one are integrated."""
+    tabulated = [k for k, setting in enumerate(settings) if setting is not None]
     grid = None
-    f_nu = np.zeros((len(bands), galaxies.num_rows))
+    f_nu, integrated = np.zeros((galaxies.num_rows, len(curves))), np.ones(galaxies.num_rows, bool)
     for start, part in _slices(galaxies):
-        out = f_nu[:, start : start + part.num_rows]
-        kinds = _kinds(part)
-        usual = np.isin(kinds, GALAXY_KINDS)
+        out, exact = (array[start : start + part.num_rows] for array in (f_nu, integrated))
+        usual = np.isin(_kinds(part), GALAXY_KINDS)
         if not usual.all():
-            out[:, ~usual] = high_redshift.fluxes(part.filter(pa.array(~usual)), curves).T
+            out[~usual] = high_redshift.fluxes(part.filter(pa.array(~usual)), curves)
             part = part.filter(pa.array(usual))
         rows = galaxies_of(part, library)
         if tabulated and grid is None and len(rows):
-            settings = [setting for choice in choices if (setting := choice.setting) is not None]
-            grid = flux_grid.open_grid([curves[k] for k in tabulated], settings, library)
-        out[:, usual] = _galaxies(rows, curves, tabulated, grid, library)
-    return _table("galaxy", galaxies, [curve.name for curve in curves], f_nu)
+            chosen = [setting for setting in settings if setting is not None]
+            grid = flux_grid.open_grid([curves[k] for k in tabulated], chosen, library)
+        out[usual], exact[usual] = _galaxies(rows, curves, tabulated, grid, library)
+    return _table("galaxy", galaxies, [curve.name for curve in curves], f_nu, integrated)
 
 
 def star_fluxes(
@@ -115,56 +124,58 @@ def star_fluxes(
     """f_nu of stars through bands, with the dust on the way to each; as `galaxy_fluxes`."""
     curves = _curves(bands)
     tabulated = grid_settings.stars_tabulated(accuracy)
-    f_nu = np.zeros((len(bands), stars.num_rows))
+    f_nu, integrated = np.zeros((stars.num_rows, len(curves))), np.ones(stars.num_rows, bool)
     for start, part in _slices(stars):
-        f_nu[:, start : start + part.num_rows] = _stars(stars_of(part, library), curves, tabulated, library)
-    return _table("star", stars, [curve.name for curve in curves], f_nu)
+        here = slice(start, start + part.num_rows)
+        f_nu[here], integrated[here] = _stars(stars_of(part, library), curves, tabulated, library)
+    return _table("star", stars, [curve.name for curve in curves], f_nu, integrated)
 
 
-def prepare(bands: Sequence[str], accuracy: Accuracy) -> None:
+def prepare(
+    curves: Sequence[Passband], settings: Sequence[Setting | None], library: Library, accuracy: Accuracy
+) -> None:
     """Make what the cache lacks for these bands, tables and machine code, so that workers find it there."""
     from jobs.fluxes import templates
 
-    library = templates.galaxy_library()
-    if chosen := [
-        (band, c.setting) for band, c in zip(bands, grid_settings.choose(bands, accuracy), strict=True) if c.setting
-    ]:
-        curves = [passbands.load(band) for band, _ in chosen]
-        grid = flux_grid.open_grid(curves, [setting for _, setting in chosen], library)
+    chosen = [(curve, setting) for curve, setting in zip(curves, settings, strict=True) if setting is not None]
+    if chosen:
+        grid = flux_grid.open_grid([curve for curve, _ in chosen], [setting for _, setting in chosen], library)
         flux_grid.warm(grid)
     stars = templates.stellar_library()
     if grid_settings.stars_tabulated(accuracy):
-        flux_grid.stars(Stars(np.zeros(1, np.int64), np.zeros(1), np.zeros(1)), _curves(bands), stars)
+        flux_grid.stars(Stars(np.zeros(1, np.int64), np.zeros(1), np.zeros(1)), curves, stars)
 
 
 def _galaxies(
     rows: Galaxies, curves: Sequence[Passband], tabulated: Sequence[int], grid: flux_grid.Grid | None, library: Library
-) -> Float:
-    """float64[n_band, n]: from tables where there are any, the rest integrated."""
-    out = np.zeros((len(curves), len(rows)))
-    inside = flux_grid.covered(rows) if grid is not None else np.zeros(len(rows), bool)
-    if grid is not None:
-        near = np.flatnonzero(inside)
-        out[np.ix_(np.array(tabulated), near)] = flux_grid.galaxies(rows if inside.all() else rows.rows(near), grid).T
-        others = [k for k in range(len(curves)) if k not in tabulated]
-        if others and len(near):
-            out[np.ix_(np.array(others), near)] = integration.galaxies(
-                rows.rows(near), [curves[k] for k in others], library
-            ).T
-    if len(far := np.flatnonzero(~inside)):
-        out[:, far] = integration.galaxies(rows.rows(far), curves, library).T
-    return out
+) -> tuple[Float, Bool]:
+    """float64[n, n_band]: from tables where there are any, the rest integrated; bool[n] in no table."""
+    if grid is None:
+        return integration.galaxies(rows, curves, library), np.ones(len(rows), bool)
+    inside = flux_grid.covered(rows)
+    if inside.all() and len(tabulated) == len(curves):
+        return flux_grid.galaxies(rows, grid), ~inside
+    out = np.zeros((len(rows), len(curves)))
+    near, far = np.flatnonzero(inside), np.flatnonzero(~inside)
+    covered = rows.rows(near)
+    out[np.ix_(near, np.array(tabulated))] = flux_grid.galaxies(covered, grid)
+    others = [k for k in range(len(curves)) if k not in tabulated]
+    if others and len(near):
+        out[np.ix_(near, np.array(others))] = integration.galaxies(covered, [curves[k] for k in others], library)
+    if len(far):
+        out[far] = integration.galaxies(rows.rows(far), curves, library)
+    return out, ~inside
 
 
-def _stars(rows: Stars, curves: Sequence[Passband], tabulated: bool, library: Library) -> Float:
+def _stars(rows: Stars, curves: Sequence[Passband], tabulated: bool, library: Library) -> tuple[Float, Bool]:
     inside = flux_grid.covered_stars(rows) & tabulated
-    out = np.zeros((len(curves), len(rows)))
+    out = np.zeros((len(rows), len(curves)))
     near, far = np.flatnonzero(inside), np.flatnonzero(~inside)
     if len(near):
-        out[:, near] = flux_grid.stars(rows.rows(near), curves, library).T
+        out[near] = flux_grid.stars(rows.rows(near), curves, library)
     if len(far):
-        out[:, far] = integration.stars(rows.rows(far), curves, library).T
-    return out
+        out[far] = integration.stars(rows.rows(far), curves, library)
+    return out, ~inside
 
 
 def milky_way_transmission(wavelength: npt.ArrayLike, a_v: Float) -> Float:
@@ -188,10 +199,10 @@ def _slices(table: pa.Table) -> list[tuple[int, pa.Table]]:
     return [(start, table.slice(start, _SLICE)) for start in range(0, table.num_rows, _SLICE)]
 
 
-def _table(kind: str, source: pa.Table, bands: Sequence[str], f_nu: Float) -> pa.Table:
+def _table(kind: str, source: pa.Table, bands: Sequence[str], f_nu: Float, integrated: Bool) -> pa.Table:
     names = ("id", "ra", "dec", "_healpix_29")
     if absent := [name for name in names if name not in source.column_names]:
         raise BadInput(f"{kind} catalogue: column {', '.join(absent)} is missing")
-    positions = {name: source[name] for name in names}
-    columns = {f"f_nu_{band}": f_nu[k].astype(np.float32) for k, band in enumerate(bands)}
-    return fluxes(kind, bands).build(positions | columns)
+    columns = {name: source[name] for name in names}
+    columns |= {f"f_nu_{band}": f_nu[:, k].astype(np.float32) for k, band in enumerate(bands)}
+    return fluxes(kind, bands).build(columns | {"integrated": integrated})

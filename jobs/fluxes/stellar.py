@@ -110,7 +110,7 @@ def types() -> StellarTypes:
 
 def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
     """Spectral types from `first` to `last`, and the columns of the table of dwarfs by title, NaN where unknown."""
-    lines = _table().decode().splitlines()
+    lines = table_file().read_text().splitlines()
     titles = next(line for line in lines if line.startswith("SpT")).replace("#", " ").split()
     rows = [
         line.split()
@@ -130,7 +130,7 @@ def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
 def fingerprint() -> str:
     """Key of everything the spectra depend on."""
     responses = [array for name in _BANDS for array in (passbands.load(name).wavelength, passbands.load(name).response)]
-    return cache.content_key(Path(__file__).read_bytes(), _FEATURES.read_bytes(), _table(), *responses)
+    return cache.content_key(Path(__file__).read_bytes(), _FEATURES.read_bytes(), table_file().read_bytes(), *responses)
 
 
 def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Float:
@@ -247,9 +247,9 @@ def _number(text: str) -> float:
         return np.nan
 
 
-def _table() -> bytes:
-    """The table's text; MeanStars itself, slow to import, is not loaded."""
+def table_file() -> Path:
+    """The published table; MeanStars itself, slow to import, is not loaded."""
     spec = importlib.util.find_spec("MeanStars")
     if spec is None or not spec.submodule_search_locations:
         raise BadInput("MeanStars is not installed: its table of dwarf stars is needed")
-    return (Path(spec.submodule_search_locations[0]) / "EEM_dwarf_UBVIJHK_colors_Teff.txt").read_bytes()
+    return Path(spec.submodule_search_locations[0]) / "EEM_dwarf_UBVIJHK_colors_Teff.txt"

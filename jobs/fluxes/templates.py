@@ -4,6 +4,7 @@ galaxy_library     early to late, mixed from the four spectra of Coleman, Wu & W
 stellar_library    O9 to T8, shaped until their colours are those of Pecaut & Mamajek 2013, and standards
 vega               the spectrum of Vega, for magnitudes that are not AB
 GALAXY_LIBRARY_SIZE, rest_grid, emission_wavelengths
+anchors_of, spectrum_file   what they are made of
 
 Both are made once (seconds), kept in the cache, and afterwards mapped from disc.
 """
@@ -37,11 +38,12 @@ _LINE_MASK = 40.0
 # The sequence: first and last template k, earlier and later anchor, offset, denominator and factor of
 # x = factor (k - offset) / denominator, spectrum = (1 - x) earlier + x later. Adopted, to span the colours
 # of the 31 templates of Ilbert et al. 2009 (NUV - r from 5.7 to -0.7).
+YOUNG = "young"
 _SEQUENCE = (
     (0, 7, "E", "Sbc", 0, 7, 0.72),
     (8, 13, "Sbc", "Scd", 8, 5, 1.0),
     (14, 19, "Scd", "Im", 13, 6, 1.0),
-    (20, 30, "Im", "young", 19, 11, 0.95),
+    (20, 30, "Im", YOUNG, 19, 11, 0.95),
 )
 GALAXY_LIBRARY_SIZE = 31
 # The young end, adopted: Planck spectra (K, share of f_lambda at 5500 A, factor below the Balmer edge).
@@ -60,12 +62,16 @@ class Library:
     flux       : float32[n, n_lambda] f_lambda, mean 1 between 5450 and 5550 A
     names      : n labels
     types      : what is known of the first stars, the dwarf sequence; None for galaxies
+    dust       : float32[5, n_lambda] k(lambda) of the laws in front of galaxies, None = those of extinction.laws
+    own        : read from files of others: what was measured of the embedded one says nothing about it
     """
 
     wavelength: Float
     flux: Float32
     names: tuple[str, ...]
     types: stellar.StellarTypes | None = None
+    dust: Float32 | None = None
+    own: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
@@ -76,7 +82,7 @@ def galaxy_library() -> Library:
     key = cache.content_key(
         Path(__file__).read_bytes(),
         emission_wavelengths(),
-        *(_spectrum_file(f"CWW_{name}_ext.sed") for name in _ANCHORS),
+        *(spectrum_file(f"CWW_{name}_ext.sed").read_bytes() for name in _ANCHORS),
     )
     wavelength = rest_grid()
     arrays = cache.cached_arrays("galaxy_library", key, lambda: {"flux": _galaxies(wavelength).astype(np.float32)})
@@ -84,6 +90,12 @@ def galaxy_library() -> Library:
         name for first, last, early, late, *_ in _SEQUENCE for name in [f"{early}-{late}"] * (last - first + 1)
     )
     return Library(wavelength, arrays["flux"], tuple(f"{k:02d} {name}" for k, name in enumerate(names)))
+
+
+def anchors_of(template: int) -> tuple[str, str]:
+    """Names of the two spectra that a galaxy template is mixed of."""
+    row = next(row for row in _SEQUENCE if row[0] <= template <= row[1])
+    return row[2], row[3]
 
 
 def rest_grid() -> Float:
@@ -100,7 +112,7 @@ def stellar_library() -> Library:
     sources = [
         Path(file).read_bytes() for file in (__file__, brown_dwarfs.__file__, standards.__file__, standards.NEBULA)
     ]
-    key = cache.content_key(*sources, stellar.fingerprint(), _spectrum_file("vega.txt"))
+    key = cache.content_key(*sources, stellar.fingerprint(), spectrum_file("vega.txt").read_bytes())
     arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": _stars(types)})
     return Library(passbands.grid(), arrays["flux"], names, types)
 
@@ -115,7 +127,7 @@ def vega() -> tuple[Float, Float]:
 
     Ref: CALSPEC alpha_lyr_mod_001, as shipped by GalSim
     """
-    table = np.loadtxt(_spectrum_file("vega.txt").decode().splitlines())
+    table = np.loadtxt(spectrum_file("vega.txt").read_text().splitlines())
     # The file is in nm and per nm.
     wavelength, flux = table[:, 0] * 10.0, table[:, 1] / 10.0
     tail = np.arange(np.ceil(wavelength[-1]), _REST_LAST + 1.0)[1:]
@@ -130,7 +142,7 @@ def emission_wavelengths() -> Float:
 
 def _galaxies(wavelength: Float) -> Float:
     anchors = {name: _anchor(name, wavelength) for name in _ANCHORS}
-    anchors["young"] = _young(wavelength)
+    anchors[YOUNG] = _young(wavelength)
     spectra = []
     for first, last, early, late, offset, denominator, factor in _SEQUENCE:
         for k in range(first, last + 1):
@@ -140,7 +152,7 @@ def _galaxies(wavelength: Float) -> Float:
 
 
 def _anchor(name: str, wavelength: Float) -> Float:
-    table = np.loadtxt(_spectrum_file(f"CWW_{name}_ext.sed").decode().splitlines())
+    table = np.loadtxt(spectrum_file(f"CWW_{name}_ext.sed").read_text().splitlines())
     at, flux = table[:, 0], table[:, 1]
     # In the logarithm: the ultraviolet is sampled every 100 A, over which an elliptical fades by half.
     sampled = np.exp(np.interp(wavelength, at, np.log(flux), left=-np.inf))
@@ -157,9 +169,9 @@ def _young(wavelength: Float) -> Float:
     return normalised(wavelength, np.sum(parts, 0) * np.where(wavelength < _LYMAN_EDGE, _BELOW_LYMAN, 1.0))
 
 
-def _spectrum_file(name: str) -> bytes:
-    """Content of a spectrum that GalSim ships; GalSim itself, slow to import, is not loaded."""
+def spectrum_file(name: str) -> Path:
+    """A spectrum that GalSim ships; GalSim itself, slow to import, is not loaded."""
     spec = importlib.util.find_spec("galsim")
     if spec is None or not spec.submodule_search_locations:
         raise BadInput("GalSim is not installed: its spectra of galaxies and Vega are needed")
-    return (Path(spec.submodule_search_locations[0]) / "share" / "SEDs" / name).read_bytes()
+    return Path(spec.submodule_search_locations[0]) / "share" / "SEDs" / name

@@ -15,6 +15,7 @@ from lake_schema.columns import Table
 def declared(bands: Sequence[str]) -> list[Table]:
     """Every table of the lake, the flux tables with these bands."""
     from lake_schema.tables.exposures import EXPOSURES
+    from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
     from lake_schema.tables.fluxes import fluxes
     from lake_schema.tables.gaia import GAIA
     from lake_schema.tables.galaxies import GALAXIES
@@ -27,7 +28,7 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.templates import TEMPLATES
 
     catalogues = [HALOS, GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands), GAIA]
-    return [*catalogues, TEMPLATES, PASSBANDS, MISSION, EXPOSURES, TASKS, PRODUCTS]
+    return [*catalogues, TEMPLATES, EXTINCTION_LAWS, PASSBANDS, MISSION, EXPOSURES, TASKS, PRODUCTS]
 
 
 def markdown() -> str:

@@ -1,8 +1,8 @@
-"""Columns that several tables share: identifiers and positions."""
+"""What several tables share: identifiers, positions, origins."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from lake_schema.columns import Column
 
@@ -28,6 +28,14 @@ HEALPIX_29 = Column(
     "_healpix_29", "int64", ucd="pos.healpix", doc="HEALPix index of (ra, dec), order 29, nested: the sort key", lo=0
 )
 SKY = (ID, RA, DEC, HEALPIX_29)
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where a spectrum or a curve is from: names of files with their reference, and their sha256, hexadecimal."""
+
+    source: str
+    sha256: str
 
 
 def id_of_kinds(first: int, last: int) -> Column:

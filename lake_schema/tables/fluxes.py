@@ -15,6 +15,15 @@ _CONTENT = {
 }
 
 
+INTEGRATED = Column(
+    "integrated",
+    "bool",
+    ucd="meta.code.qual",
+    doc="true where no table was used in any band: the source lies outside what the tables cover (facts.covered of the "
+    "manifest), is a QSO or a high-redshift galaxy, or the accuracy asked for is finer than any table's",
+)
+
+
 def fluxes(kind: str, bands: Sequence[str]) -> Table:
     """The flux table of `kind` ("galaxy" or "star") with one column a band: f_nu_<band>, microjansky."""
     columns = [
@@ -33,7 +42,7 @@ def fluxes(kind: str, bands: Sequence[str]) -> Table:
     return Table(
         f"{kind}_fluxes",
         1,
-        (ID, RA, DEC, HEALPIX_29, *columns),
+        (ID, RA, DEC, HEALPIX_29, *columns, INTEGRATED),
         f"Band fluxes of the table {catalogue.name}, in the same cells and row order.",
         order=catalogue.order,
         finest=catalogue.finest,

@@ -99,7 +99,8 @@ GALAXIES = Table(
             "float32",
             "mag",
             "phot.mag;em.opt.R",
-            "apparent AB magnitude in the same reference passband (K-corrected), before magnification and Milky Way",
+            "apparent AB magnitude in the same reference passband (K-corrected), before magnification and Milky Way; "
+            "for kinds 2 (QSO) and 3 (high redshift) at 1450 and 1500 Angstrom in the rest frame instead",
             -5.0,
             60.0,
         ),

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from lake_schema.columns import Column, Table
+from lake_schema.tables.common import Origin
 
 MEDIA = (("air", "from the ground"), ("vacuum", "from space"))
 
@@ -24,6 +25,8 @@ PASSBANDS = Table(
         Column("first_wavelength", "float64", "Angstrom", "em.wl;stat.min", "of the first sample", 100.0, 1e6),
         Column("wavelength_step", "float64", "Angstrom", "em.wl;spect.binSize", "between samples", 1e-3, 1e3),
         Column("response", "list<float64>", "", "phys.transmission", "detected per photon that arrives", 0.0, 1e9),
+        Column("source", "string", ucd="meta.ref", doc="file that it was made from, and its reference"),
+        Column("sha256", "string", ucd="meta.checksum", doc="of that file, hexadecimal"),
     ),
     "Passbands.",
     key=("name",),
@@ -43,10 +46,12 @@ class Passband(Protocol):
     def response(self) -> npt.NDArray[np.float64]: ...
 
 
-def rows(bands: Sequence[Passband], pivot_wavelengths: npt.ArrayLike, log_widths: npt.ArrayLike) -> pa.Table:
+def rows(
+    bands: Sequence[Passband], pivot_wavelengths: npt.ArrayLike, log_widths: npt.ArrayLike, origins: Sequence[Origin]
+) -> pa.Table:
     """Table `passbands`.
 
-    pivot_wavelengths : [n] A;  log_widths : [n]
+    pivot_wavelengths : [n] A;  log_widths : [n];  origins : where each is from
     """
     return PASSBANDS.build(
         {
@@ -57,5 +62,7 @@ def rows(bands: Sequence[Passband], pivot_wavelengths: npt.ArrayLike, log_widths
             "first_wavelength": np.array([band.wavelength[0] for band in bands], float),
             "wavelength_step": np.array([band.wavelength[1] - band.wavelength[0] for band in bands], float),
             "response": [np.asarray(band.response) for band in bands],
+            "source": [origin.source for origin in origins],
+            "sha256": [origin.sha256 for origin in origins],
         }
     )

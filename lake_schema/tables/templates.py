@@ -10,8 +10,14 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from lake_schema.columns import Column, Table
+from lake_schema.tables.common import Origin
 
-LIBRARIES = (("galaxy", "rest frame"), ("star", "as observed"))
+LIBRARIES = (
+    ("galaxy", "rest frame"),
+    ("qso", "rest frame"),
+    ("high_redshift", "rest frame"),
+    ("star", "as observed"),
+)
 
 TEMPLATES = Table(
     "templates",
@@ -23,10 +29,18 @@ TEMPLATES = Table(
         Column("first_wavelength", "float64", "Angstrom", "em.wl;stat.min", "of the first sample, vacuum", 1.0, 1e6),
         Column("wavelength_step", "float64", "Angstrom", "em.wl;spect.binSize", "between samples", 1e-3, 1e3),
         Column(
-            "flux", "list<float32>", "", "phot.flux.density;arith.ratio", "f_lambda, mean 1 in 5450-5550 A", 0.0, 1e6
+            "flux",
+            "list<float32>",
+            "",
+            "phot.flux.density;arith.ratio",
+            "f_lambda, mean 1 in 5450-5550 A; of high_redshift 1 at 1500 A, of qso the continuum 1 at 5000 A",
+            0.0,
+            1e7,
         ),
         Column("teff", "float32", "K", "phys.temperature.effective", "effective temperature", 300.0, 1e6, True),
         Column("log_g", "float32", "", "phys.gravity", "log10 of the surface gravity / (cm s-2)", -1.0, 10.0, True),
+        Column("source", "string", ucd="meta.ref", doc="files that it was made from, and their reference"),
+        Column("sha256", "string", ucd="meta.checksum", doc="of those files, one after another, hexadecimal"),
     ),
     "Template spectra of galaxies and stars.",
     key=("library", "sed"),
@@ -55,12 +69,13 @@ class Library(Protocol):
     def types(self) -> Types | None: ...
 
 
-def rows(libraries: Mapping[str, Library]) -> pa.Table:
-    """Table `templates` of the libraries, by name ("galaxy", "star")."""
-    return pa.concat_tables([TEMPLATES.empty(), *(_rows(name, library) for name, library in libraries.items())])
+def rows(libraries: Mapping[str, Library], origins: Mapping[str, Sequence[Origin]]) -> pa.Table:
+    """Table `templates` of the libraries, by name ("galaxy", "star"), and where each of their spectra is from."""
+    made = (_rows(name, library, origins[name]) for name, library in libraries.items())
+    return pa.concat_tables([TEMPLATES.empty(), *made])
 
 
-def _rows(name: str, library: Library) -> pa.Table:
+def _rows(name: str, library: Library, origins: Sequence[Origin]) -> pa.Table:
     n, wavelength = len(library.names), library.wavelength
     known: dict[str, Any] = {}
     if library.types is not None:
@@ -73,6 +88,8 @@ def _rows(name: str, library: Library) -> pa.Table:
             "first_wavelength": np.full(n, wavelength[0]),
             "wavelength_step": np.full(n, wavelength[1] - wavelength[0]),
             "flux": [np.asarray(spectrum) for spectrum in library.flux],
+            "source": [origin.source for origin in origins],
+            "sha256": [origin.sha256 for origin in origins],
             **known,
         }
     )

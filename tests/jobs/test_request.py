@@ -61,6 +61,16 @@ BAD = [
     ("mission", {"overrides": {"vis.gain": {"value": 3.0}}}, "mission.overrides.vis.gain.unit"),
     ("mission", {"overrides": {"vis.gain": {"value": float("inf"), "unit": ""}}}, "vis.gain.value"),
     ("fluxes", {"bands": "r"}, "fluxes.bands"),
+    ("fluxes", {"filters": {}}, "fluxes.filters is not a key"),
+    ("fluxes", {"passbands": {"a b": {}}}, "name 'a b'"),
+    ("fluxes", {"passbands": {"mine": "file.dat"}}, "fluxes.passbands.mine wants a table"),
+    ("fluxes", {"passbands": {"mine": {"format": "passband_ascii", "medium": "air"}}}, "mine.file is missing"),
+    ("fluxes", {"passbands": {"mine": {"file": "x", "medium": "air"}}}, "mine.format is missing"),
+    ("fluxes", {"passbands": {"mine": {"file": "x", "format": "y", "medium": "sea"}}}, "mine.medium = 'sea'"),
+    ("fluxes", {"templates": {"format": "cosmos"}}, "fluxes.templates.files is missing"),
+    ("fluxes", {"templates": {"files": ["x"]}}, "fluxes.templates.format is missing"),
+    ("fluxes", {"extinction": {"5": {"file": "x", "format": "extinction"}}}, "fluxes.extinction.5 is not a key"),
+    ("fluxes", {"extinction": {"2": {"file": 3, "format": "extinction"}}}, "fluxes.extinction.2.file wants text"),
     ("products", {"truth": ["everything"]}, "products.truth"),
     ("pointing", {}, "pointing wants a list"),
     ("pointing", [3], r"pointing\[0\]"),
@@ -142,3 +152,26 @@ def test_areas_are_the_same_sky_in_any_form():
 def test_numbers_of_any_size_are_numbers():
     with pytest.raises(BadInput, match=r"area\.cone\.ra"):
         request.from_table(with_("area", {"cone": {"ra": 10**400, "dec": 0, "radius": 1}}))
+
+
+def test_own_curves_lie_beside_the_request_and_their_bands_are_added(tmp_path):
+    fluxes = """
+[fluxes.passbands.mine]
+file = "filters/mine.dat"
+format = "passband_ascii"
+medium = "air"
+[fluxes.templates]
+files = ["a.sed", "/b.sed"]
+format = "cosmos"
+[fluxes.extinction.3]
+file = "bump.dat"
+format = "extinction"
+"""
+    (tmp_path / "r.toml").write_text(DEMO.read_text() + fluxes)
+    asked = request.parse(tmp_path / "r.toml")
+    assert asked.bands == ("euclid_vis", "lsst_r", "mine")
+    ((name, mine),) = asked.curves.passbands
+    assert (name, mine.medium, mine.files) == ("mine", "air", (tmp_path / "filters" / "mine.dat",))
+    assert asked.curves.templates.files == (tmp_path / "a.sed", Path("/b.sed"))
+    assert [code for code, _ in asked.curves.extinction] == [3]
+    assert request.parse(DEMO).curves == request.OwnCurves()

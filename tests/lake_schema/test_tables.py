@@ -15,6 +15,7 @@ from lake_schema.mission.model import read_models
 from lake_schema.mission.parameter import read_all
 from lake_schema.publish import Output, Part, Plan
 from lake_schema.tables import mission, passbands, templates
+from lake_schema.tables.common import Origin
 from lake_schema.validate import check
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tables.md"
@@ -57,8 +58,15 @@ def libraries():
     }
 
 
+def origins():
+    return {
+        name: [Origin(f"{name}{k}.sed", "0" * 64) for k in range(len(library.names))]
+        for name, library in libraries().items()
+    }
+
+
 def test_templates_come_back_as_spectra():
-    rows = templates.rows(libraries())
+    rows = templates.rows(libraries(), origins())
     check(rows, templates.TEMPLATES)
     assert rows["sed"].to_pylist() == [0, 1, 0, 1, 2]
     assert rows["teff"].to_pylist() == [None, None, 40_000.0, 5_000.0, None]
@@ -67,6 +75,7 @@ def test_templates_come_back_as_spectra():
         for i, name in enumerate(library.names):
             row = next(row for row in rows.to_pylist() if row["name"] == name)
             assert row["sed"] == i
+            assert row["source"].endswith(f"{i}.sed")
             assert np.array_equal(np.array(row["flux"], np.float32), library.flux[i])
             assert np.array_equal(row["first_wavelength"] + row["wavelength_step"] * np.arange(100), library.wavelength)
 
@@ -74,8 +83,9 @@ def test_templates_come_back_as_spectra():
 def test_passbands_come_back_as_responses():
     bands = [responses.load(name) for name in ("euclid_vis", "lsst_r")]
     pivots, widths = [responses.pivot_wavelength(b) for b in bands], [responses.log_width(b) for b in bands]
-    rows = passbands.rows(bands, pivots, widths)
+    rows = passbands.rows(bands, pivots, widths, [Origin(b.name, "0" * 64) for b in bands])
     check(rows, passbands.PASSBANDS)
+    assert rows["source"].to_pylist() == ["euclid_vis", "lsst_r"]
     for band, row in zip(bands, rows.to_pylist(), strict=True):
         assert row["name"] == band.name
         assert row["medium"] == band.medium
@@ -83,7 +93,7 @@ def test_passbands_come_back_as_responses():
         assert row["first_wavelength"] + row["wavelength_step"] * (len(row["response"]) - 1) == band.wavelength[-1]
         assert 4000 < row["pivot_wavelength"] < 10_000
     with pytest.raises(BadInput, match="medium"):
-        check(passbands.rows([Other()], [5000.0], [0.1]), passbands.PASSBANDS)
+        check(passbands.rows([Other()], [5000.0], [0.1], [Origin("x", "")]), passbands.PASSBANDS)
 
 
 class Other:
@@ -108,7 +118,7 @@ def test_the_mission_with_what_a_run_chose():
 
 def test_they_can_be_published_and_asked(lake):
     for table, rows in (
-        (templates.TEMPLATES, templates.rows(libraries())),
+        (templates.TEMPLATES, templates.rows(libraries(), origins())),
         (mission.MISSION, published.table(resolve())),
     ):
         publish.make(lake, Plan(table, {}, (Part("0.parquet", {}),)), lambda root, facts, rows=rows: Output(rows))

@@ -24,8 +24,8 @@ def clean(table, template, z):
     return MAG * float(band_ratios.ln_ratio(table, *at)[0])
 
 
-# K-corrections and m_IE - M_r - DM at z = 0.1, 0.5, 1, 2: calculated once with a code of its own, from the four observed
-# spectra with the lines left in.
+# K-corrections and m_IE - M_r - DM at z = 0.1, 0.5, 1, 2: calculated once with a code of its own, from the four
+# observed spectra with the lines left in.
 K_CORRECTIONS = {
     "sdss_r01": {0: (0.16, 1.60, 3.29, 5.06), 13: (0.005, 0.54, 1.17, 1.12), 25: (-0.14, -0.42, -0.75, -1.31)},
     "euclid_vis": {0: (-0.43, 0.07, 1.15, 3.63), 13: (-0.27, -0.17, 0.29, 0.91), 25: (-0.15, -0.46, -0.73, -1.25)},

@@ -73,7 +73,7 @@ def test_fluxes_lie_beside_their_stars(versions):
     """In the same files and the same order, so that reading both needs no join."""
     mixed = versions[1]
     lake = mixed.folder.parents[1]
-    step = compute_fluxes.star_step(lake, wanted())
+    step = compute_fluxes.step_of("star", lake, wanted())
     publish.make(lake, step.plan, step.work)
     fluxes = read.version(lake, "star_fluxes")
     assert fluxes.parts == mixed.parts

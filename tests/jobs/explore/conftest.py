@@ -21,7 +21,7 @@ def explored(tmp_path_factory):
     part = Part(layout.cell_file(5, 1607), {})
     galaxies = rows_of(GALAXIES, ROWS, seed=3)
     shared = {name: galaxies[name] for name in ("id", "ra", "dec", "_healpix_29")}
-    flux = FLUXES.build({**shared, "f_nu_euclid_vis": galaxies["bulge_fraction"]})
+    flux = FLUXES.build({**shared, "f_nu_euclid_vis": galaxies["bulge_fraction"], "integrated": [False] * ROWS})
     for table, rows in ((GALAXIES, galaxies), (FLUXES, flux)):
         publish.make(root, Plan(table, {}, (part,)), lambda lake, facts, rows=rows: Output(rows))
     publish.make(root, plain_plan(), plain_work)

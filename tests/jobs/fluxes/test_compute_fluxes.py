@@ -1,15 +1,18 @@
 """The job: cell by cell, row by row, with its accuracy in the manifest."""
 
+import hashlib
+
 import numpy as np
 import pytest
 
 from jobs import request
 from jobs.accuracy import REFERENCE
-from jobs.fluxes import compute_fluxes, spectra
+from jobs.fluxes import compute_fluxes, inputs, lines, spectra
 from lake_schema import ids, layout, publish, read, sky
 from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
+from tests.jobs.fluxes.test_ingest import BAND, RESPONSE, WAVELENGTH, ascii_file
 from tests.universe import rows_of
 
 CELLS = (1607, 1608)
@@ -51,6 +54,7 @@ def filled(lake):
         "sed_2": 2,
         "mag_r01": 21.0,
     }
+    galaxy |= dict.fromkeys(lines.columns(), 1e-17)
     catalogue(lake, GALAXIES, galaxy | {"frac_1": 0.3, "frac_2": 0.7, "a_v": 0.2, "ebv_1": 0.1, "ebv_2": 0.1})
     catalogue(lake, STARS, {"sed": 20, "a_v": 0.3, "mag_h": 18.0})
     return lake
@@ -94,6 +98,64 @@ def test_the_accuracy_of_the_request_rules(filled, library):
         np.testing.assert_array_equal(slow, truth[f"f_nu_{band}"].to_numpy())
         np.testing.assert_allclose(fast, slow, rtol=5e-3)
         assert (fast != slow).any()
+
+
+def test_what_they_were_made_with_is_published_with_them(filled):
+    run(filled, wanted())
+    made = read.version(filled, "galaxy_fluxes").manifest["facts"]["sources"]
+    for name in ("templates", "extinction_laws", "passbands"):
+        version = read.version(filled, name)
+        assert version.key == made[name]
+        assert all(len(row["sha256"]) == 64 and row["source"] for row in version.rows(["source", "sha256"]).to_pylist())
+
+
+def test_files_of_the_user_make_the_fluxes(filled, tmp_path, library):
+    """A filter, two galaxies and a law of the request's own: through the lake, the tables and the workers."""
+    slope = WAVELENGTH / 5500.0
+    for name, values in (("early", slope), ("late", 1.0 / slope)):
+        ascii_file(tmp_path / f"{name}.sed", value=values)
+    ascii_file(tmp_path / "mine.dat", BAND, RESPONSE)
+    ascii_file(tmp_path / "law.dat", value=4.05 / slope)
+    text = f"""
+name = "own"
+seed = 1
+area = {{ cone = {{ ra = 10, dec = 10, radius = 1 }} }}
+[fluxes]
+bands = {BANDS}
+[fluxes.passbands.mine]
+file = "mine.dat"
+format = "passband_ascii"
+medium = "vacuum"
+[fluxes.templates]
+files = ["early.sed", "late.sed", "late.sed", "early.sed"]
+format = "cosmos"
+[fluxes.extinction.2]
+file = "law.dat"
+format = "extinction"
+"""
+    (tmp_path / "own.toml").write_text(text)
+    asked = request.parse(tmp_path / "own.toml")
+    run(filled, asked)
+    made = read.version(filled, "galaxy_fluxes")
+    assert [name for name in made.rows().column_names if name.startswith("f_nu")] == [
+        *(f"f_nu_{band}" for band in BANDS), "f_nu_mine",
+    ]  # fmt: skip
+    facts = made.manifest["facts"]
+    assert facts["files"]["fluxes.passbands.mine"] == hashlib.sha256((tmp_path / "mine.dat").read_bytes()).hexdigest()
+    assert all(0.0 < error["largest"] <= 1e-3 / 1.5 for error in facts["errors"].values())
+    own = inputs.read(asked.curves)
+    truth = spectra.galaxy_fluxes(
+        read.version(filled, "galaxies").rows(), [*BANDS, own.passbands["mine"]], own.library, REFERENCE
+    )
+    embedded = spectra.galaxy_fluxes(read.version(filled, "galaxies").rows(), BANDS, library, REFERENCE)
+    for band in (*BANDS, "mine"):
+        column = f"f_nu_{band}"
+        np.testing.assert_allclose(made.rows()[column], truth[column], rtol=1e-3)
+    assert np.abs(np.log(np.asarray(truth["f_nu_euclid_h"]) / np.asarray(embedded["f_nu_euclid_h"]))).min() > 0.1
+    assert (read.version(filled, "star_fluxes").rows()["f_nu_mine"].to_numpy() > 0.0).all()
+    # Another content of the same file is another table.
+    ascii_file(tmp_path / "mine.dat", BAND, RESPONSE**2)
+    assert compute_fluxes.step_of("galaxy", filled, request.parse(tmp_path / "own.toml")).plan.key != made.key
 
 
 def test_what_is_there_is_not_prepared_again(filled, monkeypatch):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jobs.accuracy import DRAFT, SURVEY
-from jobs.fluxes import flux_grid, grid_settings, grid_tables, integration, passbands, spectra, templates
+from jobs.fluxes import flux_grid, grid_errors, grid_settings, grid_tables, integration, passbands, spectra, templates
 from jobs.fluxes.continuum import Mix
 from jobs.fluxes.sources import Galaxies, Stars
 from jobs.fluxes.templates import Library
@@ -31,22 +31,7 @@ def grid(library):
 def drawn(n, seed=5):
     """Galaxies uniform over all that the tables cover."""
     rng = np.random.default_rng(seed)
-    frac = rng.uniform(0.0, 1.0, n)
-    mix = Mix(
-        rng.uniform(grid_tables.Z_FIRST, grid_tables.Z_LAST, n),
-        rng.integers(0, 31, (2, n)),
-        rng.integers(0, 5, (2, n)),
-        np.stack([frac, 1.0 - frac]),
-        rng.uniform(0.0, grid_tables.EBV_LAST, (2, n)),
-    )
-    return Galaxies(
-        mix,
-        rng.uniform(-23.0, -16.0, n),
-        rng.uniform(18.0, 26.0, n),
-        10.0 ** rng.uniform(-18.0, -15.5, (n, 10)),
-        rng.uniform(0.5, 3.0, n),
-        rng.uniform(0.0, grid_tables.A_V_LAST, n),
-    )
+    return dataclasses.replace(grid_errors.drawn(n, 31, rng), magnification=rng.uniform(0.5, 3.0, n))
 
 
 @pytest.mark.parametrize("accuracy", [DRAFT, SURVEY])
@@ -145,6 +130,8 @@ def test_what_lies_beyond_the_tables_is_integrated_not_extrapolated(galaxies, li
     rows = spectra.galaxies_of(table, library)
     assert list(np.flatnonzero(~flux_grid.covered(rows))) == [3, 11]
     survey, reference = (spectra.galaxy_fluxes(table, BANDS, library, a) for a in (SURVEY, spectra.REFERENCE))
+    assert list(np.flatnonzero(survey["integrated"])) == [3, 11]
+    assert all(reference["integrated"].to_pylist())
     for band in BANDS:
         fast, slow = (np.asarray(t[f"f_nu_{band}"]) for t in (survey, reference))
         np.testing.assert_array_equal(fast[[3, 11]], slow[[3, 11]])
@@ -167,6 +154,7 @@ def test_stars_fast_are_slow(stars_library):
 def test_stars_behind_too_much_dust_are_integrated(stars, stars_library):
     table = stars(6, a_v=np.array([0.0, 5.0, 5.1, 30.0, 2.0, 0.1]))
     survey, reference = (spectra.star_fluxes(table, BANDS, stars_library, a) for a in (SURVEY, spectra.REFERENCE))
+    assert list(np.flatnonzero(survey["integrated"])) == [2, 3]
     for band in BANDS:
         fast, slow = (np.asarray(t[f"f_nu_{band}"]) for t in (survey, reference))
         np.testing.assert_array_equal(fast[[2, 3]], slow[[2, 3]])
@@ -219,8 +207,9 @@ def test_the_example_compiles(grid):
 
 
 def test_prepare_leaves_nothing_to_make(monkeypatch):
-    spectra.prepare(BANDS, SURVEY)
+    wanted = (CURVES, chosen(SURVEY), templates.galaxy_library(), SURVEY)
+    spectra.prepare(*wanted)
     monkeypatch.setattr(grid_tables, "_galaxies", None)
     monkeypatch.setattr(grid_tables, "_stars", None)
-    spectra.prepare(BANDS, SURVEY)
+    spectra.prepare(*wanted)
     assert templates.GALAXY_LIBRARY_SIZE == 31

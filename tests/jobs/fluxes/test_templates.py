@@ -45,7 +45,7 @@ def test_colours_run_from_early_to_late(library):
 def test_anchors_are_in_the_sequence(library):
     # 13 is Scd and 19 is Im, as published, away from their masked lines.
     for k, name in ((13, "Scd"), (19, "Im")):
-        at, flux = np.loadtxt(templates._spectrum_file(f"CWW_{name}_ext.sed").decode().splitlines()).T
+        at, flux = np.loadtxt(templates.spectrum_file(f"CWW_{name}_ext.sed").read_text().splitlines()).T
         clean = (at > 200.0) & (np.abs(at[:, None] - templates.emission_wavelengths()) > 100.0).all(1)
         seen = library.flux[k][(at[clean] - library.wavelength[0]).astype(int)]
         np.testing.assert_allclose(seen / flux[clean], np.median(seen / flux[clean]), rtol=0.05)

@@ -1,0 +1,200 @@
+"""What fluxes are made with: the embedded spectra, laws and passbands, and a request's own; all of it as lake tables.
+
+Own, read             the files that a request names, checked
+curves                passbands by name
+template_rows, law_rows, passband_rows   tables `templates`, `extinction_laws`, `passbands`
+published_library, published_passband    the request's own, back from these tables, wherever a worker runs
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from jobs import cache
+from jobs.fluxes import brown_dwarfs, extinction, high_redshift, ingest, passbands, standards, stellar, templates
+from jobs.fluxes.continuum import dust_of
+from jobs.fluxes.passbands import Passband
+from jobs.fluxes.templates import Library
+from jobs.request import Curves, OwnCurves
+from lake_schema import read as lake_read
+from lake_schema.errors import BadInput
+from lake_schema.provenance import file_sha256
+from lake_schema.tables import extinction_laws
+from lake_schema.tables import passbands as passband_table
+from lake_schema.tables import templates as template_table
+from lake_schema.tables.common import Origin
+
+
+@dataclass(frozen=True, slots=True)
+class Own:
+    """passbands : by name;  library : galaxies with their laws;  origins : by the key in the request."""
+
+    passbands: Mapping[str, Passband]
+    library: Library
+    origins: Mapping[str, Origin]
+
+    def sha256(self) -> dict[str, str]:
+        """What names the files' contents in a plan."""
+        return {key: origin.sha256 for key, origin in self.origins.items()}
+
+
+def read(given: OwnCurves) -> Own:
+    """The embedded library with whatever the request puts in its place, and its passbands.
+
+    Errors: BadInput names the key of the request, the file, and the row where there is one
+    """
+    filters, origins = {}, {}
+    for name, curves in given.passbands:
+        key = f"fluxes.passbands.{name}"
+        if name in passbands.names():
+            raise BadInput(f"{key}: there is a passband of this name: choose another")
+        with _named(key):
+            filters[name] = ingest.passband(curves.files[0], name, curves.medium, curves.format)
+            origins[key] = _origin_of(curves)
+    library = templates.galaxy_library()
+    if given.templates is not None:
+        with _named("fluxes.templates"):
+            library = ingest.library(given.templates.files, given.templates.format)
+            each = (replace(given.templates, files=(file,)) for file in given.templates.files)
+            origins |= {f"fluxes.templates.{k}": _origin_of(curves) for k, curves in enumerate(each)}
+    if given.extinction:
+        dust = dust_of(library).copy()
+        for code, curves in given.extinction:
+            key = f"fluxes.extinction.{code}"
+            with _named(key):
+                dust[code] = ingest.law(curves.files[0], curves.format, library.wavelength)
+                origins[key] = _origin_of(curves)
+        library = replace(library, dust=dust, own=True)
+    return Own(filters, library, origins)
+
+
+def curves(names: Sequence[str], own: Mapping[str, Passband]) -> list[Passband]:
+    """Passbands by name.  Errors: BadInput for one that is not there"""
+    known = (*passbands.names(), *own)
+    for name in names:
+        if name not in known:
+            raise BadInput(f"fluxes.bands: {name!r} is not one of {', '.join(known)}")
+    return [own[name] if name in own else passbands.load(name) for name in names]
+
+
+def template_rows(own: Own) -> pa.Table:
+    """Table `templates`: galaxies (the request's own where it has them), quasars, high-redshift galaxies, stars."""
+    libraries = {
+        "galaxy": own.library,
+        "qso": high_redshift.quasar_library(),
+        "high_redshift": high_redshift.high_redshift_library(),
+        "star": templates.stellar_library(),
+    }
+    given = [origin for key, origin in own.origins.items() if key.startswith("fluxes.templates.")]
+    quasars = _origin("Vanden Berk et al. 2001", high_redshift.QUASAR_LINES)
+    origins = {
+        "galaxy": given or [_galaxy_origin(k) for k in range(len(own.library))],
+        "qso": [quasars] * len(libraries["qso"]),
+        "high_redshift": [_origin("power laws", Path(high_redshift.__file__))] * len(libraries["high_redshift"]),
+        "star": _star_origins(),
+    }
+    return template_table.rows(libraries, origins)
+
+
+def law_rows(own: Own) -> pa.Table:
+    """Table `extinction_laws`, on the wavelengths of the galaxies."""
+    code = Path(extinction.__file__)
+    embedded = (
+        _origin("no dust", code),
+        _origin("Prevot et al. 1984, Bouchet et al. 1985", extinction.PREVOT_TABLE),
+        _origin("Calzetti et al. 2000", code),
+        *(_origin("Calzetti et al. 2000 with the bump of Fitzpatrick & Massa 1986", code) for _ in range(2)),
+    )
+    origins = [own.origins.get(f"fluxes.extinction.{law}", origin) for law, origin in enumerate(embedded)]
+    return extinction_laws.rows(own.library.wavelength, dust_of(own.library), origins)
+
+
+def passband_rows(own: Own) -> pa.Table:
+    """Table `passbands`: the embedded ones, and the request's own."""
+    bands = [*(passbands.load(name) for name in passbands.names()), *own.passbands.values()]
+    origins = [_passband_origin(name) for name in passbands.names()]
+    origins += [own.origins[f"fluxes.passbands.{name}"] for name in own.passbands]
+    pivots, widths = [passbands.pivot_wavelength(b) for b in bands], [passbands.log_width(b) for b in bands]
+    return passband_table.rows(bands, pivots, widths, origins)
+
+
+def published_library(lake: Path, templates_key: str, laws_key: str) -> Library:
+    """The galaxies of published versions of `templates` and `extinction_laws`, kept in the cache and mapped."""
+
+    def read_rows() -> dict[str, cache.Array]:
+        rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "galaxy")
+        rows = rows.sort_by("sed")
+        laws = lake_read.version(lake, "extinction_laws", laws_key).rows().sort_by("law")
+        flux, dust = (np.stack(column.to_numpy()).astype(np.float32) for column in (rows["flux"], laws["k"]))
+        first, step = (float(rows[name][0].as_py()) for name in ("first_wavelength", "wavelength_step"))
+        return {"wavelength": first + step * np.arange(flux.shape[1]), "flux": flux, "dust": dust}
+
+    key = cache.content_key(templates_key, laws_key, Path(__file__).read_bytes())
+    arrays = cache.cached_arrays("published_library", key, read_rows)
+    names = tuple(str(k) for k in range(len(arrays["flux"])))
+    return Library(arrays["wavelength"], arrays["flux"], names, dust=arrays["dust"], own=True)
+
+
+def published_passband(lake: Path, key: str, name: str) -> Passband:
+    """A passband of a published version of `passbands`."""
+    row = lake_read.version(lake, "passbands", key).rows(where=pc.field("name") == name).to_pylist()[0]
+    response = np.array(row["response"])
+    wavelength = row["first_wavelength"] + row["wavelength_step"] * np.arange(len(response))
+    return Passband(name, wavelength, response, row["medium"])
+
+
+@contextmanager
+def _named(key: str) -> Iterator[None]:
+    """Whatever is refused is refused with the key of the request."""
+    try:
+        yield
+    except (BadInput, OSError, ValueError) as error:
+        raise BadInput(f"{key}: {' '.join(str(error).split())}") from None
+
+
+def _origin_of(curves: Curves) -> Origin:
+    (file,) = curves.files
+    return Origin(f"{file.name}, read as {curves.format}", file_sha256(file))
+
+
+def _origin(reference: str, *files: Path) -> Origin:
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    return Origin(f"{', '.join(file.name for file in files)}: {reference}", digest)
+
+
+def _galaxy_origin(template: int) -> Origin:
+    code, young = Path(templates.__file__), templates.YOUNG
+    files = [
+        code if name == young else templates.spectrum_file(f"CWW_{name}_ext.sed")
+        for name in templates.anchors_of(template)
+    ]
+    return _origin("Coleman, Wu & Weedman 1980, as GalSim has them" + ", and a burst" * (code in files), *files)
+
+
+def _star_origins() -> list[Origin]:
+    dwarfs = _origin("Pecaut & Mamajek 2013, as MeanStars has them", stellar.table_file())
+    count = len(stellar.types().names) + len(brown_dwarfs.template_names())
+    vega = _origin("CALSPEC, as GalSim has it", templates.spectrum_file("vega.txt"))
+    white_dwarf = _origin("Bohlin, Hubeny & Rauch 2020", Path(standards.__file__))
+    return [dwarfs] * count + [vega, white_dwarf, _origin("the references in the file", standards.NEBULA)]
+
+
+def _passband_origin(name: str) -> Origin:
+    source, note = passbands.published(name)
+    kind, _, detail = source.partition(":")
+    if kind != "speclite":
+        return _origin(f"{source}, {note}", passbands.TABLE)
+    spec = importlib.util.find_spec("speclite")
+    if spec is None or not spec.submodule_search_locations:
+        raise BadInput("speclite is not installed: its passbands are needed")
+    folder = Path(spec.submodule_search_locations[0]) / "data" / "filters"
+    return _origin(f"{note}, as speclite has it", folder / f"{detail}.ecsv")

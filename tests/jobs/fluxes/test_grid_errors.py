@@ -1,0 +1,54 @@
+"""The errors of tables for what was not measured in advance."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jobs.accuracy import DRAFT, REFERENCE, SURVEY
+from jobs.fluxes import flux_grid, grid_errors, grid_settings, integration, passbands
+
+
+@pytest.fixture
+def mine():
+    """A filter of intermediate width."""
+    return filter_of(1000)
+
+
+def filter_of(width):
+    wavelength = np.arange(5000.0, 5000.0 + width)
+    return passbands.Passband("mine", wavelength, np.hanning(width + 2)[1:-1], "air")
+
+
+def test_what_was_measured_is_looked_up(library):
+    bands = [passbands.load(name) for name in ("euclid_vis", "lsst_u")]
+    for accuracy in (DRAFT, SURVEY, REFERENCE):
+        wanted = grid_settings.choose(["euclid_vis", "lsst_u"], accuracy)
+        assert grid_errors.choose(bands, accuracy, library) == wanted
+
+
+@pytest.mark.parametrize("accuracy", [DRAFT, SURVEY])
+def test_a_filter_of_others_is_measured(library, mine, accuracy):
+    (choice,) = grid_errors.choose([mine], accuracy, library)
+    rows = grid_errors.drawn(1000, len(library), np.random.default_rng(77))
+    fast = flux_grid.galaxies(rows, flux_grid.open_grid([mine], [choice.setting], library))
+    error = np.abs(fast / integration.galaxies(rows, [mine], library) - 1.0)
+    assert error.max() <= accuracy.flux
+    assert 0.0 < choice.rms < choice.largest <= accuracy.flux / 1.5
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(choice.rms, rel=0.5)
+
+
+def test_a_filter_too_narrow_for_any_table_is_integrated(library):
+    assert grid_errors.choose([filter_of(30)], SURVEY, library) == (grid_settings.INTEGRATED,)
+
+
+def test_no_table_for_the_reference(library, mine):
+    assert grid_errors.choose([mine], REFERENCE, library) == (grid_settings.INTEGRATED,)
+
+
+def test_spectra_of_others_are_measured_although_the_band_is_known(library, monkeypatch):
+    monkeypatch.setattr(grid_errors, "measured", lambda *_: grid_settings.Choice(None, 1.0, 1.0))
+    band = passbands.load("euclid_h")
+    assert grid_errors.choose([band], SURVEY, library)[0].setting is not None
+    # No table is fine enough for them.
+    assert grid_errors.choose([band], SURVEY, dataclasses.replace(library, own=True)) == (grid_settings.INTEGRATED,)

@@ -1,0 +1,119 @@
+"""What fluxes are made with, as tables: rows that say where they are from, and a request's own files among them."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from jobs.fluxes import continuum, inputs, passbands, templates
+from jobs.request import Curves, OwnCurves
+from lake_schema.errors import BadInput
+from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
+from lake_schema.tables.passbands import PASSBANDS
+from lake_schema.tables.templates import TEMPLATES
+from lake_schema.validate import check
+from tests.jobs.fluxes.test_ingest import BAND, FLUX, RESPONSE, WAVELENGTH, ascii_file, votable
+
+
+@pytest.fixture(scope="module")
+def embedded():
+    return inputs.read(OwnCurves())
+
+
+def own(tmp_path, **changes):
+    """Two galaxies, a filter and a law, all synthetic."""
+    slope = (WAVELENGTH / 5500.0) ** -1.0
+    files = tuple(ascii_file(tmp_path / f"{name}.sed", value=flux) for name, flux in (("early", FLUX), ("late", slope)))
+    mine = ascii_file(tmp_path / "mine.dat", BAND, RESPONSE)
+    law = ascii_file(tmp_path / "law.dat", value=4.05 * 5500.0 / WAVELENGTH)
+    wanted = {
+        "passbands": (("mine", Curves((mine,), "passband_ascii", "air")),),
+        "templates": Curves(files, "cosmos"),
+        "extinction": ((3, Curves((law,), "extinction")),),
+    }
+    return OwnCurves(**(wanted | changes))
+
+
+def test_embedded_templates_say_where_they_are_from(embedded):
+    rows = inputs.template_rows(embedded)
+    check(rows, TEMPLATES)
+    assert rows.num_rows == 31 + 9 + 15 + 444
+    vega = next(row for row in rows.select(["name", "source", "sha256"]).to_pylist() if row["name"] == "Vega")
+    assert vega["source"].startswith("vega.txt")
+    assert vega["sha256"] == hashlib.sha256(templates.spectrum_file("vega.txt").read_bytes()).hexdigest()
+    galaxies = rows.filter(np.array([name == "galaxy" for name in rows["library"].to_pylist()]))
+    assert [galaxies["source"][k].as_py().partition(":")[0] for k in (0, 13, 30)] == [
+        "CWW_E_ext.sed, CWW_Sbc_ext.sed", "CWW_Sbc_ext.sed, CWW_Scd_ext.sed", "CWW_Im_ext.sed, templates.py",
+    ]  # fmt: skip
+    np.testing.assert_array_equal(np.array(galaxies["flux"][7].as_py(), np.float32), embedded.library.flux[7])
+
+
+def test_embedded_passbands_and_laws_say_where_they_are_from(embedded):
+    rows = inputs.passband_rows(embedded)
+    check(rows, PASSBANDS)
+    assert rows["name"].to_pylist() == list(passbands.names())
+    by_name = {row["name"]: row for row in rows.to_pylist()}
+    assert by_name["euclid_vis"]["source"].startswith("Euclid-VIS.ecsv")
+    assert by_name["jedis_g"]["source"].startswith("passbands.csv: logistic:")
+    assert len({row["sha256"] for row in by_name.values()}) > 30
+    laws = inputs.law_rows(embedded)
+    check(laws, EXTINCTION_LAWS)
+    np.testing.assert_array_equal(np.stack(laws["k"].to_numpy()), continuum.dust_of(embedded.library))
+
+
+def test_own_files_take_their_places(tmp_path, embedded):
+    mine = inputs.read(own(tmp_path))
+    assert set(mine.sha256()) == {
+        "fluxes.passbands.mine", "fluxes.templates.0", "fluxes.templates.1", "fluxes.extinction.3",
+    }  # fmt: skip
+    assert mine.sha256()["fluxes.extinction.3"] == hashlib.sha256((tmp_path / "law.dat").read_bytes()).hexdigest()
+    assert mine.library.names == ("early", "late")
+    changed = (continuum.dust_of(mine.library) != continuum.dust_of(embedded.library)).any(1)
+    assert changed.tolist() == [False, False, False, True, False]
+    assert inputs.template_rows(mine)["source"][1].as_py() == "late.sed, read as cosmos"
+    assert inputs.law_rows(mine)["source"].to_pylist()[3] == "law.dat, read as extinction"
+    rows = inputs.passband_rows(mine).to_pylist()
+    assert rows[-1]["name"] == "mine"
+    assert rows[-1]["sha256"] == mine.sha256()["fluxes.passbands.mine"]
+
+
+def test_a_law_alone_stands_before_the_embedded_galaxies(tmp_path, embedded):
+    mine = inputs.read(own(tmp_path, templates=None, passbands=()))
+    np.testing.assert_array_equal(mine.library.flux, embedded.library.flux)
+    k = continuum.dust_of(mine.library)[3]
+    assert k[mine.library.wavelength == 5500.0] == pytest.approx(4.05, rel=1e-4)
+    # Beyond the file its ends go on.
+    assert k[0] == k[mine.library.wavelength == 899.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"passbands": (("euclid_vis", 0),)}, r"fluxes\.passbands\.euclid_vis: there is a passband of this name"),
+        ({"passbands": (("x", ("absent.dat", "passband_ascii", "air")),)}, r"fluxes\.passbands\.x: .*absent\.dat"),
+        ({"passbands": (("x", ("mine.dat", "nonsense", "air")),)}, r"fluxes\.passbands\.x: format 'nonsense' is not"),
+        ({"passbands": (("x", ("mine.dat", "passband_svo", "air")),)}, r"fluxes\.passbands\.x: .*cannot be read as"),
+        ({"templates": (("mine.dat",), "cosmos")}, r"fluxes\.templates: .*mine\.dat: covers 5000 \.\. 7000 A"),
+        ({"extinction": ((2, ("steep.dat", "extinction")),)}, r"fluxes\.extinction\.2: .*row 1 is more than k = 100"),
+    ],
+)
+def test_what_is_wrong_is_refused_with_its_key(tmp_path, changes, message):
+    own(tmp_path)
+    ascii_file(tmp_path / "steep.dat", value=1e4 * FLUX)
+
+    def made(value):
+        files, *rest = value if value else (("mine.dat",), "passband_ascii", "air")
+        return Curves(tuple(tmp_path / file for file in ([files] if isinstance(files, str) else files)), *rest)
+
+    given = {
+        name: made(value) if name == "templates" else tuple((key, made(curves)) for key, curves in value)
+        for name, value in changes.items()
+    }
+    with pytest.raises(BadInput, match=message):
+        inputs.read(OwnCurves(**given))
+
+
+def test_a_votable_without_its_own_unit_is_in_angstrom(tmp_path):
+    path = votable(tmp_path / "filter.xml")
+    mine = inputs.read(OwnCurves(passbands=(("svo", Curves((path,), "passband_svo", "vacuum")),)))
+    assert passbands.pivot_wavelength(mine.passbands["svo"]) == pytest.approx(5985.0, abs=20.0)
