@@ -51,6 +51,14 @@ def test_lines_lie_on_the_sequence_of_star_forming_galaxies(drawn):
     assert decrement[clean] == pytest.approx(np.full(clean.sum(), 2.86), rel=1e-5)
 
 
+def test_every_emitter_has_its_sulphur(drawn):
+    halpha, sii = (drawn.columns[f"flux_{name}"].astype(float) for name in ("halpha", "sii"))
+    emits = halpha > 0
+    assert (sii[emits] > 0).all()
+    # Both together some third of H alpha, the column holding one of the two.
+    assert 0.05 < np.median(sii[emits] / halpha[emits]) < 0.3
+
+
 def test_red_galaxies_that_form_no_stars_have_no_lines(drawn):
     quiet = drawn.columns["flux_halpha"] == 0
     assert 0.005 < quiet.mean() < 0.3

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from jobs.fluxes import lines
 from lake_schema.errors import BadInput
+from lake_schema.tables.galaxies import GALAXIES
 
 LINES = lines.line_list()
 HALPHA = [line.name for line in LINES].index("halpha")
@@ -86,6 +87,13 @@ def test_doublets():
     assert ratios["oii_2"] == ratios["sii_2"] == 1.0
     assert ratios["oiii_2"] == ratios["nii_2"] == pytest.approx(1.0 / 3.0)
     assert len(lines.columns()) == 6
+    # A column holds the primary alone: were it the total, as the text may be read, a doublet would sum to 1.
+    totals = {column: sum(line.ratio for line in LINES if line.column == column) for column in lines.columns()}
+    assert totals == pytest.approx(
+        {"flux_halpha": 1, "flux_hbeta": 1, "flux_oii": 2, "flux_oiii": 4 / 3, "flux_nii": 4 / 3, "flux_sii": 2}
+    )
+    # The paper's table of lines has [S II], its catalogue does not.
+    assert set(totals) <= set(GALAXIES.names)
     primaries = {line.column: line.vacuum for line in LINES[::-1]}
     assert primaries["flux_oii"] == 3727.09
     assert primaries["flux_oiii"] == 5008.239

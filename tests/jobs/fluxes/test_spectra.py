@@ -4,6 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from jobs.accuracy import SURVEY
 from jobs.fluxes import extinction, lines, passbands, spectra, templates
 from lake_schema import units
 from lake_schema.errors import OutOfRange
@@ -115,11 +116,34 @@ def test_synthetic_photometry_is_speclites(galaxies, library):
         "lsst_r": "lsst2023-r",
         "gaia_g": "gaiadr2-G",
     }
-    got = units.mag_of_f_nu(spectra.band_fluxes(f_lambda, [passbands.load(name) for name in pairs]))
+    got = spectra.band_fluxes(f_lambda, [passbands.load(name) for name in pairs])
     for k, published in enumerate(pairs.values()):
-        wanted = load_filter(published).get_ab_magnitude(f_lambda * u.erg / u.s / u.cm**2 / u.AA, GRID * u.AA)
-        # 3631 Jy against 48.6: 7e-5 mag.
-        np.testing.assert_allclose(got[:, k], wanted, atol=2e-4)
+        maggies = load_filter(published).get_ab_maggies(f_lambda * u.erg / u.s / u.cm**2 / u.AA, GRID * u.AA)
+        # speclite's are relative to 3631 Jy; 1e-4 mag.
+        np.testing.assert_allclose(got[:, k], 3631e6 * np.asarray(maggies), rtol=0.9e-4)
+
+
+def test_dust_is_applied_at_every_wavelength_not_to_the_band(bare, library):
+    """A band's extinction at E(B-V) = 0.2, rescaled to 0.5 as printed, is wrong in wide and in steep bands."""
+
+    def dimming(band, **dust):
+        clear, dim = (np.asarray(t[f"f_nu_{band}"], float)[0] for t in (flux(), flux(**dust)))
+        return -2.5 * np.log10(dim / clear)
+
+    def flux(**dust):
+        table = bare(sed_1=8, sed_2=8, z_obs=0.4, mag_r01=20.0, **dust)
+        return spectra.galaxy_fluxes(table, list(worst), library, SURVEY)
+
+    worst = {"euclid_vis": 0.01, "gaia_g": 0.02, "lsst_u": 0.01}
+    for band, error in worst.items():
+        scaled = 2.5 * dimming(band, a_v=3.1 * 0.2)
+        assert abs(dimming(band, a_v=3.1 * 0.5) - scaled) > error
+    # Inside the galaxy: behind its own dust, at its E(B-V), against the sum over wavelengths.
+    rest, band = library.wavelength, passbands.load("lsst_u")
+    dusty = library.flux[8] * extinction.transmitted(extinction.laws(rest)[2], 0.5)
+    ratio = passbands.ab_flux(band, rest * 1.4, dusty) / passbands.ab_flux(R01, rest * 1.4, dusty)
+    got = flux(ext_law_1=2, ebv_1=0.5)["f_nu_lsst_u"][0].as_py() / float(units.f_nu_of_mag(20.0))
+    assert got == pytest.approx(float(ratio), rel=1e-3)
 
 
 def test_no_rows(galaxies, stars, library, stars_library):
