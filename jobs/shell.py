@@ -19,7 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
@@ -52,11 +52,15 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A job: its name, what it does (the text of --help), and its steps for a lake and a request."""
+    """A job: its name, what it does (the text of --help), and its steps for a lake and a request.
+
+    options : lists of the request, such as bands, that its command line may give instead, each with its text of help
+    """
 
     name: str
     doc: str
     steps: Callable[[Path, requests.Request], Sequence[Step]]
+    options: tuple[tuple[str, str], ...] = ()
 
 
 _RESULT = pa.schema(
@@ -79,7 +83,7 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
     options = _options(job, argv)
     try:
         with _stoppable(job):
-            run(job, layout.lake(options.lake), requests.parse(options.request), options.verbose)
+            run(job, layout.lake(options.lake), _request(job, options), options.verbose)
     except BadInput as error:
         return _say(job, error, 2)
     except LakeError as error:
@@ -107,8 +111,16 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--lake", required=True, help="folder of the lake (made where it is not there)")
     parser.add_argument("--request", required=True, type=Path, help="simulation request, a TOML file")
+    for name, text in job.options:
+        parser.add_argument(f"--{name}", nargs="+", help=text)
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and Spark's own messages")
     return parser.parse_args(argv)
+
+
+def _request(job: Job, options: argparse.Namespace) -> requests.Request:
+    given = {name: getattr(options, name) for name, _ in job.options}
+    lists: dict[str, Any] = {name: tuple(dict.fromkeys(value)) for name, value in given.items() if value is not None}
+    return replace(requests.parse(options.request), **lists)
 
 
 def _say(job: Job, error: object, status: int) -> int:

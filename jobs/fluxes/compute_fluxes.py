@@ -1,6 +1,6 @@
 """Band fluxes of every source of a lake, and the tables of what they were made with.
 
-spark-submit jobs/fluxes/compute_fluxes.py --lake LAKE --request REQUEST
+spark-submit jobs/fluxes/compute_fluxes.py --lake LAKE --request REQUEST [--bands BAND ...]
 
 The tables' manifests say how: facts.accuracy what was asked for, facts.errors the setting and the measured error of
 each band (fractions of the flux), facts.covered where tables were used; what lies beyond was integrated, which the
@@ -124,7 +124,12 @@ def _curves(lake: Path, facts: Json) -> list[Passband]:
     ]
 
 
-JOB = Job("compute_fluxes", "Compute the band fluxes of galaxies and stars.", steps)
+JOB = Job(
+    "compute_fluxes",
+    "Compute the band fluxes of galaxies and stars.",
+    steps,
+    options=(("bands", "passbands, instead of those of the request"),),
+)
 
 if __name__ == "__main__":
     sys.exit(main(JOB))

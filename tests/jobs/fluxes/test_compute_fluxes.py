@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from jobs import request
+from jobs import request, shell
 from jobs.accuracy import REFERENCE
 from jobs.fluxes import compute_fluxes, inputs, lines, spectra
 from lake_schema import ids, layout, publish, read, sky
@@ -164,6 +164,17 @@ def test_what_is_there_is_not_prepared_again(filled, monkeypatch):
     run(filled, wanted())
     monkeypatch.setattr(spectra, "prepare", None)
     run(filled, wanted())
+
+
+def test_bands_may_be_named_on_the_command_line(filled, tmp_path, monkeypatch, capsys):
+    (tmp_path / "r.toml").write_text('name = "test"\nseed = 1\narea = { cone = { ra = 10, dec = 10, radius = 1 } }\n')
+    asked = []
+    monkeypatch.setattr(shell, "_run", lambda job, step, *_: asked.append(step.plan.table))
+    line = ["--lake", str(filled), "--request", str(tmp_path / "r.toml"), "--bands"]
+    assert shell.main(compute_fluxes.JOB, [*line, "lsst_r", "euclid_h"]) == 0
+    assert asked[-1].names[-3:] == ["f_nu_lsst_r", "f_nu_euclid_h", "integrated"]
+    assert shell.main(compute_fluxes.JOB, [*line, "lsst_q"]) == 2
+    assert "fluxes.bands: 'lsst_q' is not one of" in capsys.readouterr().err
 
 
 def test_an_unknown_band_is_refused_before_anything_is_made(filled):
