@@ -12,6 +12,7 @@ from lake_schema.errors import BadInput
 WAVELENGTH = np.arange(900.0, 26_000.0, 20.0)
 FLUX = 1.0 + 0.5 * np.sin(WAVELENGTH / 800.0)
 BAND = np.arange(5000.0, 7001.0, 10.0)
+SYNTHETIC = {"ORIGIN": "SYNTHETIC"}
 RESPONSE = np.exp(-0.5 * ((BAND - 6000.0) / 300.0) ** 2)
 
 VOTABLE = """<?xml version="1.0"?>
@@ -69,11 +70,13 @@ def test_every_form_gives_the_same_spectrum(tmp_path, form):
     elif form == "irtf":
         np.savetxt(path, np.stack([wavelength / 1e4, flux, 0.01 * flux], 1), header="SYNTHETIC IRTF")
     elif form == "spectrum_csv":
-        Table({"wavelength": wavelength, "flux": flux}).write(path, format="ascii.csv")
+        Table({"wavelength": wavelength, "flux": flux, "note": ["SYNTHETIC"] * len(flux)}).write(
+            path, format="ascii.csv"
+        )
     elif form == "spectrum_ecsv":
-        QTable({"wavelength": wavelength / 10 * u.nm, "flux": flux}).write(path, format="ascii.ecsv")
+        QTable({"wavelength": wavelength / 10 * u.nm, "flux": flux}, meta=SYNTHETIC).write(path, format="ascii.ecsv")
     else:
-        Table({"WAVELENGTH": wavelength, "FLUX": flux}).write(path, format="fits")
+        Table({"WAVELENGTH": wavelength, "FLUX": flux}, meta=SYNTHETIC).write(path, format="fits")
     curve = ingest.read(path, form)
     np.testing.assert_allclose(curve.wavelength, wavelength, rtol=1e-5)
     np.testing.assert_allclose(curve.value, flux, rtol=1e-5)
@@ -176,7 +179,9 @@ def test_a_users_filter_is_used_like_any_other(tmp_path, galaxies, library, form
     elif form == "passband_svo":
         votable(path)
     else:
-        QTable({"wavelength": BAND / 1e4 * u.um, "throughput": RESPONSE}).write(path, format="ascii.ecsv")
+        QTable({"wavelength": BAND / 1e4 * u.um, "throughput": RESPONSE}, meta=SYNTHETIC).write(
+            path, format="ascii.ecsv"
+        )
     mine = ingest.passband(path, "mine", "vacuum", form)
     assert mine.medium == "vacuum"
     assert passbands.pivot_wavelength(mine) == pytest.approx(5985.0, abs=20.0)
@@ -212,7 +217,7 @@ def test_a_library_keeps_the_flux_of_its_files(tmp_path):
 
 
 def test_basel(tmp_path):
-    models = ingest.basel(basel_file(tmp_path / "lcbm05.cor"))
+    models = ingest.basel(basel_file(tmp_path / "synthetic_lcbm05.cor"))
     assert models.teff.tolist() == [5750.0, 3500.0]
     assert models.log_g.tolist() == [4.5, 1.0]
     assert models.metallicity.tolist() == [-0.5, 0.2]
@@ -225,7 +230,7 @@ def test_basel(tmp_path):
 
 @pytest.mark.parametrize("damage", ["cut", "header", "negative", "empty", "absent"])
 def test_damaged_basel_files_are_refused(tmp_path, damage):
-    path = basel_file(tmp_path / "lcb.cor", value=-1e-5 if damage == "negative" else 1e-5)
+    path = basel_file(tmp_path / "synthetic_lcb.cor", value=-1e-5 if damage == "negative" else 1e-5)
     lines = path.read_text().splitlines()
     if damage == "cut":
         path.write_text("\n".join(lines[:-10]))
