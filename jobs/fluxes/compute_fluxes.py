@@ -26,7 +26,6 @@ from jobs.fluxes.grid_settings import Choice
 from jobs.fluxes.grid_tables import Setting
 from jobs.fluxes.inputs import Own
 from jobs.fluxes.passbands import Passband
-from jobs.fluxes.templates import Library
 from jobs.request import Request
 from jobs.shell import Job, Step, main
 from lake_schema import layout, read
@@ -104,14 +103,8 @@ def work(lake: Path, facts: Json) -> Output:
     if facts["catalogue"] == "galaxies":
         chosen = [facts["errors"][band]["setting"] for band in facts["bands"]]
         settings = [Setting(*numbers) if numbers else None for numbers in chosen]
-        return Output(spectra.galaxy_fluxes_by(rows, curves, settings, _library(lake, facts)))
+        return Output(spectra.galaxy_fluxes_by(rows, curves, settings, inputs.library_of(lake, facts)))
     return Output(spectra.star_fluxes(rows, curves, templates.stellar_library(), Accuracy(**facts["accuracy"])))
-
-
-def _library(lake: Path, facts: Json) -> Library:
-    if not any(key.startswith(("fluxes.templates.", "fluxes.extinction.")) for key in facts["files"]):
-        return templates.galaxy_library()
-    return inputs.published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
 
 
 def _curves(lake: Path, facts: Json) -> list[Passband]:

@@ -3,7 +3,7 @@
 Own, read             the files that a request names, checked
 curves                passbands by name
 template_rows, law_rows, passband_rows   tables `templates`, `extinction_laws`, `passbands`
-published_library, published_passband    the request's own, back from these tables, wherever a worker runs
+library_of, published_library, published_passband    back from these tables, wherever a worker runs
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -125,6 +126,13 @@ def passband_rows(own: Own) -> pa.Table:
     origins += [own.origins[f"fluxes.passbands.{name}"] for name in own.passbands]
     pivots, widths = [passbands.pivot_wavelength(b) for b in bands], [passbands.log_width(b) for b in bands]
     return passband_table.rows(bands, pivots, widths, origins)
+
+
+def library_of(lake: Path, facts: Mapping[str, Any]) -> Library:
+    """The galaxies that a table of fluxes was, or is to be, made with; facts : of its plan."""
+    if not any(key.startswith(("fluxes.templates.", "fluxes.extinction.")) for key in facts.get("files", ())):
+        return templates.galaxy_library()
+    return published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
 
 
 def published_library(lake: Path, templates_key: str, laws_key: str) -> Library:

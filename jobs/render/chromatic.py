@@ -22,6 +22,7 @@ from jobs.fluxes.grid_tables import Setting
 from jobs.fluxes.lines import line_list
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.sources import GALAXY_KINDS, Stars, galaxies_of, stars_of
+from jobs.fluxes.templates import Library
 
 Float = npt.NDArray[np.float64]
 
@@ -49,9 +50,10 @@ def sub_bands(band: Passband, parts: int = PARTS) -> tuple[Passband, ...]:
     )
 
 
-def galaxies(rows: pa.Table, band: Passband) -> Float:
+def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
     """float64[n, PARTS] fractions of the detected photons of rows of the table `galaxies`.
 
+    library : what sed_1 and sed_2 count, None = the embedded galaxies
     Error : 1e-3 rms (the coarse tables); 1e-5 of second moments
     """
     if not len(rows) or not set(GALAXY_COLUMNS) <= set(rows.column_names):
@@ -61,13 +63,12 @@ def galaxies(rows: pa.Table, band: Passband) -> Float:
     usual = np.isin(rows["kind"].to_numpy(), GALAXY_KINDS) if "kind" in rows.column_names else np.ones(len(rows), bool)
     if not usual.all():
         f_nu[~usual] = high_redshift.fluxes(rows.filter(pa.array(~usual)), parts)
-    f_nu[usual] = _usual(rows.filter(pa.array(usual)), parts)
+    f_nu[usual] = _usual(rows.filter(pa.array(usual)), parts, library or templates.galaxy_library())
     return _shares(f_nu, parts)
 
 
-def _usual(rows: pa.Table, parts: Sequence[Passband]) -> Float:
+def _usual(rows: pa.Table, parts: Sequence[Passband], library: Library) -> Float:
     """f_nu of galaxies whose spectra are in the galaxy library."""
-    library = templates.galaxy_library()
     found = galaxies_of(rows, library)
     tabulated = flux_grid.covered(found)
     f_nu = np.empty((len(found), len(parts)))

@@ -19,6 +19,7 @@ from astropy.wcs import WCS
 from jobs import rng
 from jobs.accuracy import Accuracy
 from jobs.fluxes import passbands
+from jobs.fluxes.templates import Library
 from jobs.render import chromatic, focal_plane, profiles, psf, selection, stamps
 from jobs.render.channels import ext, vis
 from jobs.render.effects.effect import Decision, Effect, Scene, apply_all
@@ -95,6 +96,7 @@ def render(
     forced: Mapping[str, bool] | None = None,
     detector: Detector | None = None,
     progress: Callable[[int], None] | None = None,
+    library: Library | None = None,
 ) -> Rendered:
     """Render one detector.
 
@@ -102,6 +104,7 @@ def render(
     galaxies ..    : rows that may touch the detector (GALAXY_COLUMNS, STAR_COLUMNS) and, row by row, their
                      f_nu in the band
     forced         : effect name -> on or off, instead of what the scene needs
+    library        : what the galaxies' sed_1 and sed_2 count, None = the embedded one
     detector       : another geometry than the mission's for task["detector"], e.g. a part of it
     """
     camera, band, channel = str(exposure["camera"]), str(exposure["band"]), str(exposure["channel"])
@@ -128,6 +131,7 @@ def render(
         scene.pixel_noise,
         settings,
         band,
+        library,
     )
     floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
     noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors)
@@ -176,6 +180,7 @@ def sources_of(
     noise: float,
     settings: Settings,
     band: str,
+    library: Library | None = None,
 ) -> tuple[Sources, stamps.Int]:
     """Everything whose stamp touches the detector, ascending id, and the stamps' sides.
 
@@ -197,15 +202,17 @@ def sources_of(
     here = selection.touching(column, row, sizes, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
-    photons = _colours(kept, catalogue, points, band) if spread.planes is not None else None
+    photons = _colours(kept, catalogue, points, band, library) if spread.planes is not None else None
     return Sources(ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons), sizes[here]
 
 
-def _colours(kept: npt.NDArray[np.int64], galaxies: pa.Table, stars: pa.Table, band: str) -> Float:
+def _colours(
+    kept: npt.NDArray[np.int64], galaxies: pa.Table, stars: pa.Table, band: str, library: Library | None
+) -> Float:
     """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
     curve, of_galaxy = passbands.load(band), kept < len(galaxies)
     out = np.empty((len(kept), chromatic.PARTS))
-    out[of_galaxy] = chromatic.galaxies(galaxies.take(kept[of_galaxy]), curve)
+    out[of_galaxy] = chromatic.galaxies(galaxies.take(kept[of_galaxy]), curve, library)
     out[~of_galaxy] = chromatic.stars(stars.take(kept[~of_galaxy] - len(galaxies)), curve)
     return out
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import pyarrow.compute as pc
 
 from jobs.accuracy import Accuracy
+from jobs.fluxes.inputs import library_of
 from jobs.render import exposure, fits_product
 from jobs.render.plan_exposures import mission_of
 from jobs.request import Request
@@ -98,6 +99,7 @@ def work(lake: Path, facts: Json) -> Output:
         mission=read_back(inputs["mission"]),
         accuracy=Accuracy(**request["accuracy"]),
         seed=request["seed"],
+        library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
     )
     return Output(*fits_product.products(rendered, request["truth"]))
 

@@ -155,6 +155,8 @@ format = "extinction"
         np.testing.assert_allclose(made.rows()[column], truth[column], rtol=1e-3)
     assert np.abs(np.log(np.asarray(truth["f_nu_euclid_h"]) / np.asarray(embedded["f_nu_euclid_h"]))).min() > 0.1
     assert (read.version(filled, "star_fluxes").rows()["f_nu_mine"].to_numpy() > 0.0).all()
+    # What draws the galaxies finds their spectra, too.
+    np.testing.assert_array_equal(inputs.library_of(filled, facts).flux, own.library.flux)
     # Another content of the same file is another table.
     ascii_file(tmp_path / "mine.dat", BAND, RESPONSE**2)
     assert compute_fluxes.step_of("galaxy", filled, request.parse(tmp_path / "own.toml")).plan.key != made.key

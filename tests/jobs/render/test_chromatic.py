@@ -1,9 +1,11 @@
 """Colours: parts of a band, and the photons of each source in them, against direct integration."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow as pa
 
-from jobs.fluxes import passbands
+from jobs.fluxes import passbands, templates
 from jobs.render import chromatic
 
 BAND = passbands.load("euclid_vis")
@@ -20,3 +22,17 @@ def test_without_a_spectrum_the_colour_is_flat():
     rows = pa.table({"id": [1, 2]})
     for found in (chromatic.galaxies(rows, BAND), chromatic.stars(rows, BAND)):
         np.testing.assert_array_equal(found, np.full((2, chromatic.PARTS), 1 / chromatic.PARTS))
+
+
+def galaxy(sed):
+    columns = {name: [0.0] for name in chromatic.GALAXY_COLUMNS}
+    columns |= {"id": [1], "z_obs": [0.5], "abs_mag_r01": [-20.0], "mag_r01": [22.0], "frac_1": [1.0], "sed_1": [sed]}
+    return pa.table(columns)
+
+
+def test_galaxies_have_the_colours_of_the_library_that_is_given():
+    embedded = templates.galaxy_library()
+    turned = replace(embedded, flux=embedded.flux[::-1], own=True)
+    one, other = (chromatic.galaxies(galaxy(sed), BAND, library) for sed, library in ((3, None), (27, turned)))
+    np.testing.assert_allclose(one, other, rtol=1e-5)
+    assert np.abs(chromatic.galaxies(galaxy(3), BAND, turned) - one).max() > 0.01
