@@ -15,7 +15,7 @@ EXTINCTION_LAWS = Table(
     "extinction_laws",
     1,
     (
-        Column("law", "int8", ucd="meta.code", doc="code, the ext_law_k of galaxies", lo=0),
+        Column("law", "int16", ucd="meta.code", doc="code, the ext_law_k of galaxies", lo=0),
         Column("first_wavelength", "float64", "Angstrom", "em.wl;stat.min", "of the first sample, vacuum", 1.0, 1e6),
         Column("wavelength_step", "float64", "Angstrom", "em.wl;spect.binSize", "between samples", 1e-3, 1e3),
         Column("k", "list<float32>", "", "phys.absorption", "A(lambda) / E(B-V), rest frame", 0.0, 1e3),
