@@ -1,65 +1,94 @@
 """The simulation request: a TOML file of at most a screen, read into frozen records; every number has bounds.
 
     name = "demo"      seed = 2024      accuracy = "survey" | "draft" | "reference" | {flux = .., shape = .., ..}
-    [area]       polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
-    [universe]   galaxy_limit (I_E), star_limit (H, Vega), z_max, box_cells, lensing_nside
-    [stars]      density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
-    [mission]    ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
-    [fluxes]     bands = [..]           default: the bands of the pointings
-    [fluxes.passbands.NAME]             your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
-    [fluxes.templates]                  your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
-    [fluxes.extinction.CODE]            your own law in place of law 1 .. 4: file, format
-    [[pointing]] channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
-    [products]   truth = ["noise_free"]
+    [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
+                   tile = number | patches = [[ra, dec, radius], ..] | wide = true
+    [universe]     galaxy_limit (I_E), star_limit (H, Vega), z_max, box_cells, lensing_nside
+    [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
+    [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
+    [fluxes]       bands = [..]           default: the bands of the pointings and observations
+    [fluxes.passbands.NAME]        your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
+    [fluxes.templates]             your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
+    [fluxes.extinction.CODE]       your own law in place of law 1 .. 4: file, format
+    [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
+    [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
+    [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
+    [[observation]]
+        channels = ["VIS", "NISP-P", "NISP-S"] | ["EXT"]
+        image_type = "science" | "deep" | "bias" | "dark" | "flat" | "self_calibration" | "standard_star"
+                     | "planetary_nebula"
+        survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
+        pointings = "file.csv"     a table of pointings instead of a survey's pattern
+        dither = "S" | "J" | "none"   fields, visits, exposures, short, flat, blue, bands, detectors, mjd,
+        exposure_time_s
+    [products]     truth = ["noise_free"]
 
 Files are found from the folder of the request; their formats are in jobs/fluxes/spectrum_formats.toml.
-A key that is not here, a wrong type or a number out of bounds is refused with the key's full path.
+A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
+
+    python -m jobs.request check FILE
 """
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
+from jobs import area as areas
 from jobs.accuracy import SURVEY, Accuracy, preset
-from lake_schema import layout, sky
-from lake_schema.errors import BadInput, OutOfRange
-from lake_schema.ids import GENERATION_ORDER
+from jobs.area import Area
+from jobs.toml_values import Toml
+from jobs.toml_values import boolean as _boolean
+from jobs.toml_values import checked_number as _checked_number
+from jobs.toml_values import choice as _choice
+from jobs.toml_values import has as _has
+from jobs.toml_values import integer as _integer
+from jobs.toml_values import known as _known
+from jobs.toml_values import number as _number
+from jobs.toml_values import optional as _optional
+from jobs.toml_values import section as _section
+from jobs.toml_values import shown as _shown
+from jobs.toml_values import string as _string
+from jobs.toml_values import strings as _strings
+from jobs.toml_values import table_of as _table
+from jobs.toml_values import tables as _tables
+from jobs.toml_values import value as _value
+from lake_schema import layout
+from lake_schema.errors import BadInput, LakeError
+from lake_schema.tables import exposures as declared
+from lake_schema.tables import mission as database
+from lake_schema.tables import products
 
-Toml = Mapping[str, Any]
+__all__ = ["Area", "Override", "Request", "parse"]
 
 _MOST_BYTES = 1 << 20
-_MOST_POINTINGS = 100_000
-STATUSES = ("REQ", "DES", "BLT", "CBE", "SIM")
-LADDER = ("CBE", "BLT", "DES", "REQ", "SIM")
-CHANNELS = ("VIS", "EXT")
-TRUTH = ("noise_free",)
+_MOST_POINTINGS, _MOST_OBSERVATIONS, _MOST_VARIANTS = 100_000, 1000, 10_000
+STATUSES = tuple(code for code, _ in database.STATUSES)
+LADDER = database.LADDER
+CHANNELS = tuple(code for code, _ in declared.CHANNELS)
+IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
+TRUTH = tuple(code for code, _ in products.CONTENTS if code != "science")
 DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
-
-
-@dataclass(frozen=True, slots=True)
-class Area:
-    """A convex spherical polygon (vertices), a box (west, east, south, north) or a circle (ra, dec, radius), deg."""
-
-    vertices: tuple[tuple[float, float], ...] = ()
-    box: tuple[float, float, float, float] | None = None
-    ra: float = 0.0
-    dec: float = 0.0
-    radius: float = 0.0
-
-    def cells(self, order: int = GENERATION_ORDER) -> list[int]:
-        """Nested cells of `order` that the area touches, ascending."""
-        if self.box is not None:
-            return [int(cell) for cell in sky.cells_in_box(*self.box, order)]
-        if self.vertices:
-            return [int(cell) for cell in sky.cells_in_polygon(self.vertices, order)]
-        return [int(cell) for cell in sky.cells_in_cone(self.ra, self.dec, self.radius, order)]
+DITHERS = ("S", "J", "none")
+EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
+GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes")
+# What each channel can be asked for.
+_CALIBRATIONS = {
+    "VIS": ("bias", "dark", "flat", "self_calibration"),
+    "NISP-P": ("dark", "flat", "self_calibration", "standard_star"),
+    "NISP-S": ("dark", "flat", "standard_star", "planetary_nebula"),
+    "EXT": ("bias", "dark", "flat"),
+}
+_SKY_TYPES = ("science", "deep")
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +170,46 @@ class Pointing:
 
 
 @dataclass(frozen=True, slots=True)
+class Observation:
+    """A block of exposures that the planner lays out.
+
+    survey    : whose pattern;  pointings : a table of pointings (path) instead
+    area      : where, None = the request's
+    fields    : how many fields at most, those deepest in the area, 0 = all
+    visits    : how often each field is observed, 0 = the survey's
+    exposures : of a ground survey, in all bands together of which the positions are its own; of calibrations, frames
+    dither    : pattern within a field;  short, flat : with the short VIS exposure, the closing flat
+    blue      : with the blue grism besides the red ones
+    mjd       : the earliest date, None = the mission's launch
+    """
+
+    channels: tuple[str, ...]
+    image_type: str = "science"
+    survey: str = "wide"
+    pointings: str = ""
+    area: Area | None = None
+    fields: int = 0
+    visits: int = 0
+    exposures: int = 0
+    dither: str = "S"
+    short: bool = True
+    flat: bool = True
+    blue: bool = False
+    bands: tuple[str, ...] = ()
+    detectors: tuple[str, ...] = ()
+    mjd: float | None = None
+    exposure_time_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Effects:
+    """Effects that are forced on or off, whatever a scene needs."""
+
+    on: tuple[str, ...] = ()
+    off: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Curves:
     """Files of spectra, of a filter or of an extinction law; medium : of a filter's wavelengths, "air" or "vacuum"."""
 
@@ -160,7 +229,10 @@ class OwnCurves:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A simulation request, checked."""
+    """A simulation request, checked.
+
+    explore : parameter -> the values (JSON) that it takes in turn
+    """
 
     name: str
     seed: int
@@ -173,11 +245,20 @@ class Request:
     pointings: tuple[Pointing, ...]
     truth: tuple[str, ...]
     curves: OwnCurves = OwnCurves()
+    observations: tuple[Observation, ...] = ()
+    effects: Effects = Effects()
+    explore: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""
         everything = asdict(self)
         return {part: everything[part] for part in parts}
+
+    def variants(self) -> Iterator[dict[str, Any]]:
+        """The product of what is explored: parameter -> value; one empty variant where nothing is."""
+        names = [name for name, _ in self.explore]
+        for values in product(*(choices for _, choices in self.explore)):
+            yield {name: json.loads(value) for name, value in zip(names, values, strict=True)}
 
 
 def parse(path: Path) -> Request:
@@ -194,7 +275,7 @@ def parse(path: Path) -> Request:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, BadInput) as error:
         raise BadInput(f"request {path}: {_one_line(error)}") from None
     try:
-        return from_table(table, path.resolve().parent)
+        return _with_files_beside(from_table(table, path.resolve().parent), path.parent)
     except BadInput as error:
         raise BadInput(f"request {path}: {error}") from None
 
@@ -205,74 +286,43 @@ def _one_line(error: Exception) -> str:
 
 def from_table(table: Toml, folder: Path = Path()) -> Request:
     """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
-    sections = {"area", "universe", "stars", "mission", "fluxes", "pointing", "products"}
-    _known(table, "", {"name", "seed", "accuracy", *sections})
-    pointings = _pointings(table)
+    sections = {"area", "universe", "stars", "mission", "fluxes", "effects", "explore", "products"}
+    _known(table, "", {"name", "seed", "accuracy", "pointing", "observation", *sections})
+    pointings, observations = _pointings(table), _observations(table)
     fluxes = _section(table, "fluxes", {"bands", "passbands", "templates", "extinction"})
     curves = _own_curves(fluxes, folder)
     bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in pointings)
-    return Request(
+    mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
+    request = Request(
         name=layout.name(_string(table, "name")),
         seed=_integer(table, "seed", 0, 2**63 - 1),
-        accuracy=_accuracy(table.get("accuracy")),
-        area=_area(_section(table, "area", {"polygon", "cone", "box"})),
+        accuracy=_accuracy(table.get("accuracy"), "accuracy"),
+        area=areas.parse(_section(table, "area", None)),
         universe=_universe(_section(table, "universe", set(Universe.__slots__))),
         stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder),
-        mission=_mission(_section(table, "mission", {"ladder", "overrides"})),
+        mission=mission,
         bands=tuple(dict.fromkeys((*bands, *(name for name, _ in curves.passbands)))),
         pointings=pointings,
         truth=_truth(_section(table, "products", {"truth"})),
         curves=curves,
+        observations=observations,
+        effects=_effects(_section(table, "effects", {"on", "off"})),
+        explore=_explore(_section(table, "explore", None)),
     )
+    _check_mission(request)
+    return request
 
 
 # ------------------------------------------------------------------------------------------------ sections
 
 
-def _accuracy(value: object) -> Accuracy:
+def _accuracy(value: object, path: str) -> Accuracy:
     if value is None:
         return SURVEY
     if isinstance(value, str):
         return preset(value)
-    table = _table(value, "accuracy", {"flux", "shape", "position", "background"})
-    return Accuracy(**{key: _number(table, f"accuracy.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
-
-
-def _area(table: Toml) -> Area:
-    if len(table) != 1:
-        raise BadInput("area wants exactly one of polygon, cone, box")
-    if "polygon" in table:
-        return _polygon(table["polygon"], "area.polygon")
-    if "cone" in table:
-        cone = _table(table["cone"], "area.cone", {"ra", "dec", "radius"})
-        ra = _number(cone, "area.cone.ra", -360.0, 360.0) % 360.0
-        dec = _number(cone, "area.cone.dec", -90.0, 90.0)
-        radius = _number(cone, "area.cone.radius", 0.0, 180.0)
-        return Area(ra=ra, dec=dec, radius=radius)
-    box = _table(table["box"], "area.box", {"ra", "dec"})
-    west, east = _pair(box, "area.box.ra", -360.0, 360.0)
-    south, north = _pair(box, "area.box.dec", -90.0, 90.0)
-    if not 0.0 < east - west < 180.0:
-        raise BadInput(f"area.box.ra = [{west}, {east}]: the second must be larger, by less than 180")
-    if not north > south:
-        raise BadInput(f"area.box.dec = [{south}, {north}]: the second must be larger")
-    return Area(box=(west % 360.0, east % 360.0, south, north))
-
-
-def _polygon(value: object, path: str) -> Area:
-    if not isinstance(value, list) or not 3 <= len(value) <= 1000:
-        raise BadInput(f"{path} wants a list of 3 to 1000 [ra, dec] pairs")
-    vertices = []
-    for i, pair in enumerate(value):
-        if not isinstance(pair, list) or len(pair) != 2:
-            raise BadInput(f"{path}[{i}] wants [ra, dec]")
-        ra = _checked_number(pair[0], f"{path}[{i}].ra", -360.0, 360.0) % 360.0
-        vertices.append((ra, _checked_number(pair[1], f"{path}[{i}].dec", -90.0, 90.0)))
-    try:
-        sky.cells_in_polygon(vertices, 0)
-    except BadInput as error:
-        raise BadInput(f"{path}: {error}") from None
-    return Area(vertices=tuple(vertices))
+    table = _table(value, path, {"flux", "shape", "position", "background"})
+    return Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
 
 
 def _universe(table: Toml) -> Universe:
@@ -311,8 +361,6 @@ def _file(folder: Path, name: str) -> Path:
 
 def _mission(table: Toml) -> MissionChoice:
     ladder = _strings(table, "mission.ladder", STATUSES) or LADDER
-    if len(set(ladder)) != len(ladder):
-        raise BadInput(f"mission.ladder = {list(ladder)} names a status twice")
     overrides = _table(table.get("overrides", {}), "mission.overrides", None)
     return MissionChoice(ladder, tuple(sorted((key, _override(value, key)) for key, value in overrides.items())))
 
@@ -324,19 +372,16 @@ def _override(value: object, key: str) -> Override:
 
 
 def _pointings(table: Toml) -> tuple[Pointing, ...]:
-    found = table.get("pointing", [])
-    if not isinstance(found, list) or len(found) > _MOST_POINTINGS:
-        raise BadInput(f"pointing wants a list of at most {_MOST_POINTINGS} tables")
+    found = _tables(table, "pointing", _MOST_POINTINGS)
     return tuple(_pointing(value, f"pointing[{i}]") for i, value in enumerate(found))
 
 
 def _pointing(value: object, path: str) -> Pointing:
     table = _table(value, path, set(Pointing.__slots__))
     channel = _string(table, f"{path}.channel", CHANNELS)
-    exposure = _number(table, f"{path}.exposure_time_s", 0.0, 1e6, math.nan)
     return Pointing(
         channel=channel,
-        camera=layout.name(_string(table, f"{path}.camera")) if "camera" in table else channel.lower(),
+        camera=layout.name(_string(table, f"{path}.camera", default=channel.lower().partition("-")[0])),
         band=layout.name(_string(table, f"{path}.band")),
         ra=_number(table, f"{path}.ra", -360.0, 360.0) % 360.0,
         dec=_number(table, f"{path}.dec", -90.0, 90.0),
@@ -344,8 +389,64 @@ def _pointing(value: object, path: str) -> Pointing:
         mjd=_number(table, f"{path}.mjd", 40_000.0, 100_000.0),
         detectors=_strings(table, f"{path}.detectors"),
         centre_on=_string(table, f"{path}.centre_on") if "centre_on" in table else None,
-        exposure_time_s=None if math.isnan(exposure) else exposure,
+        exposure_time_s=_optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
     )
+
+
+def _observations(table: Toml) -> tuple[Observation, ...]:
+    found = _tables(table, "observation", _MOST_OBSERVATIONS)
+    return tuple(_observation(value, f"observation[{i}]") for i, value in enumerate(found))
+
+
+def _observation(value: object, path: str) -> Observation:
+    table = _table(value, path, set(Observation.__slots__))
+    channels = _strings(table, f"{path}.channels", CHANNELS)
+    if not channels:
+        raise BadInput(f"{path}.channels is missing or empty")
+    ground = "EXT" in channels
+    if ground and len(channels) > 1:
+        raise BadInput(f"{path}.channels: EXT stands alone")
+    image_type = _string(table, f"{path}.image_type", IMAGE_TYPES, "science")
+    if image_type not in _SKY_TYPES:
+        for channel in channels:
+            if image_type not in _CALIBRATIONS[channel]:
+                legal = ", ".join((*_SKY_TYPES, *_CALIBRATIONS[channel]))
+                raise BadInput(f"{path}.image_type = {image_type!r} is none of {channel}'s: {legal}")
+    surveys = GROUND_SURVEYS if ground else EUCLID_SURVEYS
+    own = _has(table, f"{path}.area")
+    return Observation(
+        channels=channels,
+        image_type=image_type,
+        survey=_string(table, f"{path}.survey", surveys, None if ground else "wide"),
+        pointings=_string(table, f"{path}.pointings", default=""),
+        area=areas.parse(_section(table, "area", None), f"{path}.area") if own else None,
+        fields=_integer(table, f"{path}.fields", 1, 1_000_000, 0),
+        visits=_integer(table, f"{path}.visits", 1, 1000, 0),
+        exposures=_integer(table, f"{path}.exposures", 1, 1_000_000, 0),
+        dither=_string(table, f"{path}.dither", DITHERS, "S"),
+        short=_boolean(table, f"{path}.short", True),
+        flat=_boolean(table, f"{path}.flat", True),
+        blue=_boolean(table, f"{path}.blue", False),
+        bands=tuple(layout.name(band) for band in _strings(table, f"{path}.bands")),
+        detectors=_strings(table, f"{path}.detectors"),
+        mjd=_optional(table, f"{path}.mjd", 40_000.0, 100_000.0),
+        exposure_time_s=_optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
+    )
+
+
+def _with_files_beside(request: Request, folder: Path) -> Request:
+    """Tables of pointings are named relative to the request's file, and may not leave its folder."""
+    found = []
+    for i, block in enumerate(request.observations):
+        if block.pointings:
+            path = folder / block.pointings
+            if not path.resolve().is_relative_to(folder.resolve()):
+                raise BadInput(f"observation[{i}].pointings = {_shown(block.pointings)} leaves the request's folder")
+            if not path.is_file():
+                raise BadInput(f"observation[{i}].pointings = {_shown(block.pointings)}: no such file")
+            block = replace(block, pointings=str(path))
+        found.append(block)
+    return replace(request, observations=tuple(found))
 
 
 def _own_curves(table: Toml, folder: Path) -> OwnCurves:
@@ -376,95 +477,89 @@ def _truth(table: Toml) -> tuple[str, ...]:
     return _strings(table, "products.truth", TRUTH)
 
 
-# ------------------------------------------------------------------------------------------------ values
+def _effects(table: Toml) -> Effects:
+    legal = effect_names()
+    on, off = (_strings(table, f"effects.{key}", legal) for key in ("on", "off"))
+    if both := sorted(set(on) & set(off)):
+        raise BadInput(f"effects: {both[0]!r} is both on and off")
+    return Effects(on, off)
 
 
-def _known(table: Toml, path: str, keys: set[str]) -> None:
-    unknown = sorted(set(table) - keys)
-    if unknown:
-        where = f"{path}.{unknown[0]}" if path else unknown[0]
-        raise BadInput(f"{where} is not a key of a request; known here: {', '.join(sorted(keys))}")
+def effect_names() -> tuple[str, ...]:
+    """The effects there are: one a file."""
+    folder = Path(__file__).parent / "render" / "effects"
+    return tuple(sorted({path.stem for path in folder.glob("[a-z]*.py")} - {"effect"}))
 
 
-def _section(table: Toml, key: str, keys: set[str]) -> Toml:
-    return _table(table.get(key, {}), key, keys)
+def _explore(table: Toml) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    found, count = [], 1
+    for key in sorted(table):
+        values = _choices(key, table[key])
+        if not values:
+            raise BadInput(f"explore.{key} names no value")
+        if len(set(values)) != len(values):
+            raise BadInput(f"explore.{key} names a value twice")
+        count *= len(values)
+        if count > _MOST_VARIANTS:
+            raise BadInput(f"explore.{key}: the product of the values is more than {_MOST_VARIANTS} requests")
+        found.append((key, values))
+    return tuple(found)
 
 
-def _table(value: object, path: str, keys: set[str] | None) -> Toml:
-    if not isinstance(value, dict):
-        raise BadInput(f"{path} wants a table, got {_shown(value)}")
-    if keys is not None:
-        _known(value, path, keys)
-    return cast(Toml, value)
+def _choices(key: str, value: object) -> tuple[str, ...]:
+    """The values of one explored parameter, as JSON."""
+    path = f"explore.{key}"
+    if key != "accuracy" and not key.startswith("effects."):
+        table = _table(value, path, {"values", "unit"})
+        unit, numbers = _string(table, f"{path}.unit"), _value(table, f"{path}.values")
+        if not isinstance(numbers, list):
+            raise BadInput(f"{path}.values wants a list of numbers, got {_shown(numbers)}")
+        checked = [_checked_number(n, f"{path}.values[{i}]", -math.inf, math.inf) for i, n in enumerate(numbers)]
+        return tuple(json.dumps([number, unit]) for number in checked)
+    if not isinstance(value, list):
+        raise BadInput(f"{path} wants a list, got {_shown(value)}")
+    if key == "accuracy":
+        return tuple(json.dumps(asdict(_accuracy(item, f"{path}[{i}]"))) for i, item in enumerate(value))
+    if key.removeprefix("effects.") not in effect_names():
+        raise BadInput(f"{path} is not one of the effects {', '.join(effect_names())}")
+    return tuple(json.dumps(_boolean({"x": item}, f"{path}[{i}].x", True)) for i, item in enumerate(value))
 
 
-def _value(table: Toml, path: str) -> object:
-    key = path.rpartition(".")[2]
-    if key not in table:
-        raise BadInput(f"{path} is missing")
-    return table[key]
+def _check_mission(request: Request) -> None:
+    """Overrides and explored values must be of the database's names, units and ranges."""
+    from lake_schema.mission.configuration import resolve
+
+    own = {key: (override.value, override.unit) for key, override in request.mission.overrides}
+    try:
+        mission = resolve(ladder=request.mission.ladder, overrides=own)
+    except BadInput as error:
+        raise BadInput(f"mission: {error}") from None
+    for key, values in request.explore:
+        if key == "accuracy" or key.startswith("effects."):
+            continue
+        for value in values:
+            try:
+                mission.overridden_with({key: tuple(json.loads(value))})
+            except BadInput as error:
+                raise BadInput(f"explore.{key}: {error}") from None
 
 
-def _string(table: Toml, path: str, legal: Sequence[str] = ()) -> str:
-    value = _value(table, path)
-    if not isinstance(value, str):
-        raise BadInput(f"{path} wants text, got {_shown(value)}")
-    if legal and value not in legal:
-        raise BadInput(f"{path} = {_shown(value)} is not one of {', '.join(legal)}")
-    return value
+def main(argv: Sequence[str] | None = None) -> int:
+    """python -m jobs.request check FILE: 0 and a line where the request is good, 2 and the key that is not."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if len(arguments) != 2 or arguments[0] != "check":
+        print("usage: python -m jobs.request check FILE", file=sys.stderr)
+        return 2
+    try:
+        request = parse(Path(arguments[1]))
+    except LakeError as error:
+        print(error, file=sys.stderr)
+        return 2
+    variants = sum(1 for _ in request.variants())
+    counts = f"{len(request.pointings)} pointings, {len(request.observations)} observations, {variants} variants"
+    print(f"{request.name}: good: {counts}")
+    return 0
 
 
-def _strings(table: Toml, path: str, legal: Sequence[str] = ()) -> tuple[str, ...]:
-    value = table.get(path.rpartition(".")[2], [])
-    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise BadInput(f"{path} wants a list of texts, got {_shown(value)}")
-    for item in value:
-        if legal and item not in legal:
-            raise BadInput(f"{path}: {_shown(item)} is not one of {', '.join(legal)}")
-    return tuple(value)
-
-
-def _number(table: Toml, path: str, lo: float, hi: float, default: float | None = None) -> float:
-    if default is not None and path.rpartition(".")[2] not in table:
-        return default
-    return _checked_number(_value(table, path), path, lo, hi)
-
-
-def _checked_number(value: object, path: str, lo: float, hi: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise BadInput(f"{path} wants a number, got {_shown(value)}")
-    # Whole numbers are compared before they become floats: TOML's have no largest one.
-    if not lo <= value <= hi or not math.isfinite(value):
-        raise OutOfRange(path, _shown(value), lo, hi)
-    return float(value)
-
-
-def _integer(table: Toml, path: str, lo: int, hi: int) -> int:
-    value = _value(table, path)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise BadInput(f"{path} wants a whole number, got {_shown(value)}")
-    if not lo <= value <= hi:
-        raise OutOfRange(path, value, lo, hi)
-    return value
-
-
-def _choice(table: Toml, path: str, legal: Sequence[int], default: int) -> int:
-    if path.rpartition(".")[2] not in table:
-        return default
-    value = _integer(table, path, min(legal), max(legal))
-    if value not in legal:
-        raise BadInput(f"{path} = {value} is not one of {', '.join(map(str, legal))}")
-    return value
-
-
-def _pair(table: Toml, path: str, lo: float, hi: float) -> tuple[float, float]:
-    value = _value(table, path)
-    if not isinstance(value, list) or len(value) != 2:
-        raise BadInput(f"{path} wants [from, to], got {_shown(value)}")
-    first, second = (_checked_number(item, path, lo, hi) for item in value)
-    return first, second
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+if __name__ == "__main__":
+    sys.exit(main())

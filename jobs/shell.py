@@ -55,12 +55,14 @@ class Job:
     """A job: its name, what it does (the text of --help), and its steps for a lake and a request.
 
     options : lists of the request, such as bands, that its command line may give instead, each with its text of help
+    dry_run : what is done in place of the steps where only a forecast is asked for; None = there is none
     """
 
     name: str
     doc: str
     steps: Callable[[Path, requests.Request], Sequence[Step]]
     options: tuple[tuple[str, str], ...] = ()
+    dry_run: Callable[[Path, requests.Request], Sequence[Step]] | None = None
 
 
 _RESULT = pa.schema(
@@ -83,6 +85,8 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
     options = _options(job, argv)
     try:
         with _stoppable(job):
+            if job.dry_run is not None and options.dry_run:
+                job = replace(job, steps=job.dry_run)
             run(job, layout.lake(options.lake), _request(job, options), options.verbose)
     except BadInput as error:
         return _say(job, error, 2)
@@ -113,6 +117,8 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--request", required=True, type=Path, help="simulation request, a TOML file")
     for name, text in job.options:
         parser.add_argument(f"--{name}", nargs="+", help=text)
+    if job.dry_run is not None:
+        parser.add_argument("--dry-run", action="store_true", help="print the forecast, write nothing")
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and Spark's own messages")
     return parser.parse_args(argv)
 

@@ -2,7 +2,6 @@
 
 render          the whole of it
 sources_of      the rows that touch the detector, as what is drawn
-throughput      zero point and electron rates of a camera's band
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from jobs import rng
 from jobs.accuracy import Accuracy
 from jobs.fluxes import passbands
 from jobs.fluxes.templates import Library
-from jobs.render import chromatic, focal_plane, profiles, psf, selection, stamps
+from jobs.render import chromatic, exposing, focal_plane, profiles, psf, selection, stamps
 from jobs.render.channels import ext, vis
 from jobs.render.effects.effect import Decision, Effect, Scene, apply_all
 from jobs.render.focal_plane import Detector
@@ -114,7 +113,8 @@ def render(
         detector = focal_plane.detector(camera, str(task["detector"]), mission)
     system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
     exposure_time = float(exposure["exposure_time_s"])
-    zero_point, electrons_per_ujy = throughput(detector.section, band, mission)
+    zero_point = float(exposure["zero_point"])
+    electrons_per_ujy = float(10.0 ** (0.4 * (zero_point - units.AB_UJY)))
     scene = Scene(mission, detector.section, exposure_time, float(exposure["sky"]), 0.0)
     electrons = [
         _fluxes(rows, fluxes, f"f_nu_{band}") * electrons_per_ujy * exposure_time
@@ -140,7 +140,7 @@ def render(
         noise_free,
         EFFECTS[channel],
         scene,
-        lambda name: rng.stream(seed, int(exposure["exposure_id"]), detector.name, name),
+        lambda name: rng.stream(seed, exposing.identity(exposure), detector.name, name),
         forced,
     )
     return Rendered(
@@ -157,18 +157,6 @@ def render(
         accuracy,
         seed,
     )
-
-
-def throughput(section: str, band: str, mission: MissionConfiguration) -> tuple[float, float]:
-    """(AB magnitude of 1 e-/s, e-/s per microjansky).
-
-    Euclid : from the band's throughput and the collecting area;  ground : the mission database's zero point
-    """
-    if f"{section}.{band}.zero_point" in mission:
-        zero_point = mission.value(f"{section}.{band}.zero_point", "mag")
-        return zero_point, float(10.0 ** (0.4 * (zero_point - units.AB_UJY)))
-    area, width = mission.value("plm.collecting_area", "cm2"), passbands.log_width(passbands.load(band))
-    return units.zero_point(area, width), float(units.electron_rate(1.0, area, width))
 
 
 def sources_of(

@@ -8,12 +8,13 @@ detectors       the detectors of a camera, from the layout rules
 boresight_for   the pointing that puts a detector's centre on a target
 wcs             the TAN world coordinate system of a detector (astropy)
 sky_of_pixel, pixel_of_sky, jacobian
+sky_of_plane, outline    all detectors of an exposure at once
 corners, s_region, radius
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -141,18 +142,47 @@ def boresight_for(detector: Detector, ra: float, dec: float, position_angle: flo
     # Right-handed: (east-like = -x, y, outward).
     centre = np.array([-detector.x * _ARCSEC, detector.y * _ARCSEC, 1.0])
     camera = _triad(centre, np.array([0.0, 1.0, 0.0]))
-    east, north, out = _basis(ra, dec)
+    east, north, out = basis(ra, dec)
     angle = np.radians(position_angle)
     sky = _triad(out, np.sin(angle) * east + np.cos(angle) * north)
     rotation = sky @ camera.T
     boresight, up = rotation[:, 2], rotation[:, 1]
     ra0 = float(np.degrees(np.arctan2(boresight[1], boresight[0])) % 360.0)
     dec0 = float(np.degrees(np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1]))))
-    east0, north0, _ = _basis(ra0, dec0)
+    east0, north0, _ = basis(ra0, dec0)
     return ra0, dec0, float(np.degrees(np.arctan2(up @ east0, up @ north0)))
 
 
-def _basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
+def sky_of_plane(
+    x: npt.ArrayLike, y: npt.ArrayLike, ra: float, dec: float, position_angle: float
+) -> tuple[Float, Float]:
+    """Focal-plane coordinates [n] arcsec on the tangent plane -> ra [n] in [0, 360), dec [n], deg.
+
+    ra, dec, position_angle : deg, of the boresight and of the y axis there
+    """
+    angle = np.radians(position_angle)
+    u, v = np.asarray(x, float) * _ARCSEC, np.asarray(y, float) * _ARCSEC
+    east, north, out = basis(ra, dec)
+    to_east, to_north = np.sin(angle) * v - np.cos(angle) * u, np.cos(angle) * v + np.sin(angle) * u
+    to = out[:, None] + east[:, None] * to_east.ravel() + north[:, None] * to_north.ravel()
+    lon = np.degrees(np.arctan2(to[1], to[0])) % 360.0
+    lat = np.degrees(np.arctan2(to[2], np.hypot(to[0], to[1])))
+    return lon.reshape(u.shape), lat.reshape(u.shape)
+
+
+def outline(some: Sequence[Detector]) -> tuple[Float, Float]:
+    """x, y [n, 5] arcsec of each detector's centre and corners in the focal plane; corners as of `corners`."""
+    column = np.array([0.0, -0.5, 0.5, 0.5, -0.5])
+    row = np.array([0.0, -0.5, -0.5, 0.5, 0.5])
+    width = np.array([[d.nx * d.pixel_scale] for d in some]) * column
+    height = np.array([[d.ny * d.pixel_scale] for d in some]) * row
+    turn = np.radians([[d.rotation] for d in some])
+    x = np.array([[d.x] for d in some]) + np.cos(turn) * width - np.sin(turn) * height
+    y = np.array([[d.y] for d in some]) + np.sin(turn) * width + np.cos(turn) * height
+    return x, y
+
+
+def basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
     """East, north and outward unit vectors [3, ...] at sky positions, deg."""
     lon, lat = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     zero = np.zeros_like(lon * lat)
@@ -191,6 +221,8 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     system.wcs.crpix = [(detector.nx + 1) / 2 + from_centre[0], (detector.ny + 1) / 2 + from_centre[1]]
     system.wcs.cd = axes @ rotation * detector.pixel_scale / 3600.0
     system.wcs.radesys = "ICRS"
+    # Else north would be turned by 180 deg for a boresight at the pole itself.
+    system.wcs.lonpole = 180.0
     system.wcs.set()
     return system
 
@@ -215,7 +247,7 @@ def jacobian(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> Float:
     Error       : 2e-8 relative (central difference of one pixel; rounding of the positions)
     """
     x, y = np.asarray(column, float), np.asarray(row, float)
-    east, north, _ = _basis(*sky_of_pixel(system, x, y))
+    east, north, _ = basis(*sky_of_pixel(system, x, y))
     step_x = _direction(system, x + 0.5, y) - _direction(system, x - 0.5, y)
     step_y = _direction(system, x, y + 0.5) - _direction(system, x, y - 0.5)
     rows = [
@@ -226,7 +258,7 @@ def jacobian(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> Float:
 
 
 def _direction(system: WCS, x: Float, y: Float) -> Float:
-    return _basis(*sky_of_pixel(system, x, y))[2]
+    return basis(*sky_of_pixel(system, x, y))[2]
 
 
 def corners(detector: Detector, system: WCS) -> Float:
@@ -264,6 +296,7 @@ def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
         ("CD1_2", float(header.cd[0, 1]), "[deg/pix]"),
         ("CD2_1", float(header.cd[1, 0]), "[deg/pix]"),
         ("CD2_2", float(header.cd[1, 1]), "[deg/pix]"),
+        ("LONPOLE", 180.0, "[deg] native longitude of the celestial pole"),
         ("RADESYS", "ICRS", "celestial reference system"),
     )
 
@@ -278,6 +311,7 @@ def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
         system.wcs.crval = [values["CRVAL1"], values["CRVAL2"]]
         system.wcs.crpix = [values["CRPIX1"], values["CRPIX2"]]
         system.wcs.cd = [[values["CD1_1"], values["CD1_2"]], [values["CD2_1"], values["CD2_2"]]]
+        system.wcs.lonpole = values["LONPOLE"]
         system.wcs.radesys = values["RADESYS"]
     except KeyError as error:
         raise BadInput(f"the header has no card {error.args[0]}") from None

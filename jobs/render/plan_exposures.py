@@ -7,9 +7,14 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
-from jobs.render import survey
+from collections.abc import Sequence
+
+import pyarrow as pa
+
+from jobs.render import exposing, forecast, survey, tasks
 from jobs.request import MissionChoice, Request
 from jobs.shell import Job, Step, common_facts, main
+from lake_schema import layout, read
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput
 from lake_schema.mission import checks, configuration, published
@@ -22,6 +27,9 @@ from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
 
+# What of a request decides which exposures are taken and what they cost.
+PARTS = ("seed", "area", "universe", "pointings", "observations", "explore", "truth")
+
 
 def mission_of(choice: MissionChoice) -> MissionConfiguration:
     """The mission configuration that a request chooses."""
@@ -29,14 +37,32 @@ def mission_of(choice: MissionChoice) -> MissionConfiguration:
     return configuration.resolve(ladder=choice.ladder, overrides=overrides)
 
 
-def steps(lake: Path, request: Request) -> list[Step]:
-    """The mission configuration, the exposures, and a task for each of their detectors."""
-    if not request.pointings:
-        raise BadInput(f"request {request.name}: pointing is missing: there is nothing to plan")
+def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
+    """The mission configuration, and rows of the tables `exposures` and `tasks`."""
+    if not request.pointings and not request.observations:
+        raise BadInput(f"request {request.name}: pointing and observation are missing: there is nothing to plan")
     mission = mission_of(request.mission)
     checks.check(mission)
-    exposures, tasks = survey.plan(request.pointings, mission)
-    facts = {**common_facts(request, "pointings"), "mission": mission.fingerprint}
+    found = survey.exposures(request, mission)
+    exposures = exposing.table([exposure for exposure, _ in found], [own for _, own in found])
+    densities = tasks.Densities(mission, request.universe, _catalogues(lake))
+    wanted = [exposure.detectors for exposure, _ in found]
+    return mission, exposures, tasks.table(exposures, wanted, mission, densities, request.truth)
+
+
+def _catalogues(lake: Path) -> list[read.Version]:
+    """The lake's catalogues, if it has them all."""
+    names = ("galaxies", "stars")
+    return [read.version(lake, name) for name in names] if all(layout.current(lake, n).exists() for n in names) else []
+
+
+def steps(lake: Path, request: Request) -> list[Step]:
+    """The mission configuration, the exposures, and a task for each of their detectors; prints the forecast."""
+    mission, exposures, rows = plan(lake, request)
+    for line in forecast.text(forecast.rows(exposures, rows)):
+        print(line)
+    facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint}
+    costs = {**facts, "counts": {v.table: v.key for v in _catalogues(lake)}}
     about = {
         "mission": mission.fingerprint,
         "ladder": list(mission.ladder),
@@ -45,7 +71,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     return [
         _step(MISSION, published.output(mission), about),
         _step(EXPOSURES, Output(exposures), facts),
-        _step(TASKS, Output(tasks), facts),
+        _step(TASKS, Output(rows), costs),
     ]
 
 
@@ -53,7 +79,20 @@ def _step(table: Table, output: Output, facts: Json) -> Step:
     return Step(Plan(table, facts, (Part("all.parquet", {}),)), lambda lake, part: output, on_driver=True)
 
 
-JOB = Job("plan_exposures", "Plan which detectors are rendered, with which sky and which sources.", steps)
+def dry_run(lake: Path, request: Request) -> Sequence[Step]:
+    """The forecast alone."""
+    _, exposures, rows = plan(lake, request)
+    for line in forecast.text(forecast.rows(exposures, rows)):
+        print(line)
+    return ()
+
+
+JOB = Job(
+    "plan_exposures",
+    "Plan which detectors are rendered, with which sky and which sources.",
+    steps,
+    dry_run=dry_run,
+)
 
 if __name__ == "__main__":
     sys.exit(main(JOB))

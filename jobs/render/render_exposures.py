@@ -9,12 +9,13 @@ if __name__ == "__main__":
 
 from collections.abc import Mapping
 
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of
-from jobs.render import exposure, fits_product
-from jobs.render.plan_exposures import mission_of
+from jobs.render import exposure, fits_product, survey
+from jobs.render.plan_exposures import PARTS, mission_of
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema import read
@@ -25,6 +26,8 @@ from lake_schema.provenance import canonical
 from lake_schema.publish import Json, Output, Part, Plan
 from lake_schema.tables.products import PRODUCTS
 
+# Image types that are of the sky alone.
+IMAGE_TYPES = ("science", "deep")
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 
 
@@ -33,10 +36,11 @@ def steps(lake: Path, request: Request) -> list[Step]:
     inputs = {name: read.version(lake, name) for name in INPUTS}
     _refuse_other_plan(inputs, request)
     tasks = inputs["tasks"].rows().to_pylist()
+    _refuse_unrendered(inputs["exposures"].rows(["channel", "image_type"]))
     for name in ("galaxies", "stars"):
         _refuse_uncovered(inputs[name], {cell for task in tasks for cell in task["cells"]})
     facts = {
-        **common_facts(request, "seed", "accuracy", "mission", "truth"),
+        **common_facts(request, "seed", "accuracy", "mission", "effects", "truth"),
         "mission": mission_of(request.mission).fingerprint,
         "inputs": {name: version.key for name, version in inputs.items()},
     }
@@ -53,7 +57,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
 def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> None:
     """What lies in the lake must have been made for this request, and the tables from one another."""
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
-    wanted = {"request": request.facts("pointings"), "mission": mission_of(request.mission).fingerprint}
+    wanted = {"request": request.facts(*PARTS), "mission": mission_of(request.mission).fingerprint}
     for name in ("exposures", "tasks"):
         if canonical({key: facts[name].get(key) for key in wanted}) != canonical(wanted):
             raise BadInput(f"table {name} was planned for another request: run plan_exposures first")
@@ -68,6 +72,16 @@ def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> 
             raise BadInput(f"table {fluxes} was computed from another version of {catalogue}: run compute_fluxes first")
 
 
+def _refuse_unrendered(exposures: pa.Table) -> None:
+    """Every exposure must be of a kind that has a simulator."""
+    for row in exposures.group_by(["channel", "image_type"]).aggregate([([], "count_all")]).to_pylist():
+        if row["channel"] not in exposure.EFFECTS or row["image_type"] not in IMAGE_TYPES:
+            kind = f"{row['channel']} {row['image_type']}"
+            raise BadInput(
+                f"no simulator renders {kind} yet: {row['count_all']} exposures; leave them out of the request"
+            )
+
+
 def _refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
     """The detectors must lie where the catalogue was drawn."""
     drawn = {cell for part in catalogue.manifest["parts"] for cell in part["facts"]["generation_cells"]}
@@ -80,6 +94,7 @@ def _refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
 def work(lake: Path, facts: Json) -> Output:
     """One detector: its sources from its own cells, its image, its files."""
     request = facts["request"]
+    forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
     inputs = {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
     here = pc.field("exposure_id") == facts["exposure_id"]
     (exposed,) = inputs["exposures"].rows(where=here).to_pylist()
@@ -92,14 +107,16 @@ def work(lake: Path, facts: Json) -> Output:
         "star_fluxes": flux,
     }
     rows = {name: inputs[name].in_cells(task["cells"], GENERATION_ORDER, wanted) for name, wanted in columns.items()}
+    own = survey.variant(exposed["settings"], read_back(inputs["mission"]), Accuracy(**request["accuracy"]), forced)
     rendered = exposure.render(
         task,
         exposed,
         **rows,
-        mission=read_back(inputs["mission"]),
-        accuracy=Accuracy(**request["accuracy"]),
+        mission=own.mission,
+        accuracy=own.accuracy,
         seed=request["seed"],
         library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
+        forced=own.forced,
     )
     return Output(*fits_product.products(rendered, request["truth"]))
 

@@ -1,12 +1,15 @@
 """The diffuse sky: electrons per second in a pixel.
 
-sky_rate              of a camera and band, at a position and date
+sky_band, sky_rate    of a camera and band, at a position and date
 zodiacal_intensity    W m-2 sr-1 um-1 at 500 nm
 zodiacal_rate         through a passband
-ecliptic, sun_longitude
+sun_longitude
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -14,14 +17,13 @@ import numpy.typing as npt
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.focal_plane import Detector
+from lake_schema.ecliptic import ecliptic
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.units import LIGHT_ANGSTROM_S, PLANCK_ERG_S
 
 Float = npt.NDArray[np.float64]
 
-# IAU 1976 obliquity at J2000, deg.
-_OBLIQUITY = 23.4392911
 _MJD_J2000 = 51544.5
 # Mean longitude, mean anomaly (value at J2000, rate a day) and equation of the centre, deg: The Astronomical
 # Almanac, low-precision formula for the Sun (0.01 deg, 1950-2050); general precession a day turns "of date"
@@ -35,33 +37,43 @@ _TABLE_UNIT = 1e-8
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
-def sky_rate(detector: Detector, band: str, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
-    """Electrons per second in a pixel of a detector.
+@dataclass(frozen=True, slots=True)
+class SkyBand:
+    """What of a band's sky depends neither on the place nor on the date.
+
+    constant            : electrons per second in a pixel: scattered starlight, thermal light, the ground's sky
+    zodi, red, blue     : electrons per second in a pixel for a unit of intensity at 500 nm: of the Sun's spectrum,
+                          and of it times the decades of wavelength on either side of 500 nm
+    """
+
+    constant: float
+    zodi: float = 0.0
+    red: float = 0.0
+    blue: float = 0.0
+
+
+def sky_band(detector: Detector, band: str, mission: MissionConfiguration) -> SkyBand:
+    """The sky of a camera's band.
 
     Euclid : zodiacal light and scattered starlight;  ground : the band's dark-sky rate of the mission
              database, or what follows from its surface brightness and zero point
     """
     section = detector.section
     if section in ("vis", "nisp"):
-        area = mission.value("plm.collecting_area", "m2")
-        rate = zodiacal_rate(ra, dec, mjd, passbands.load(band), area, detector.pixel_scale, mission)
         extra = f"{section}.scattered_light" if section == "vis" else f"{section}.{band}.thermal"
-        return rate + mission.value(extra, "electron / (s pix)")
+        constant = mission.value(extra, "electron / (s pix)")
+        area = mission.value("plm.collecting_area", "m2")
+        return SkyBand(constant, *_zodiacal_integrals(passbands.load(band), area, detector.pixel_scale, mission))
     if f"{section}.{band}.sky" in mission:
-        return mission.value(f"{section}.{band}.sky", "electron / (s pix)")
-    contrast = mission.value(f"{section}.{band}.zero_point", "mag") - mission.value(
-        f"{section}.{band}.sky_brightness", "mag / arcsec2"
-    )
-    return float(10.0 ** (0.4 * contrast) * detector.pixel_scale**2)
+        return SkyBand(mission.value(f"{section}.{band}.sky", "electron / (s pix)"))
+    zero_point = mission.value(f"{section}.{band}.zero_point", "mag")
+    contrast = zero_point - mission.value(f"{section}.{band}.sky_brightness", "mag / arcsec2")
+    return SkyBand(float(10.0 ** (0.4 * contrast) * detector.pixel_scale**2))
 
 
-def ecliptic(ra: float, dec: float) -> tuple[float, float]:
-    """ICRS -> ecliptic longitude [0, 360) and latitude, deg, J2000.  Error: 0.1 arcsec (frame bias)."""
-    lon, lat, tilt = np.radians([ra, dec, _OBLIQUITY])
-    x, y, z = np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)
-    across = np.cos(tilt) * y + np.sin(tilt) * z
-    up = np.cos(tilt) * z - np.sin(tilt) * y
-    return float(np.degrees(np.arctan2(across, x)) % 360.0), float(np.degrees(np.arctan2(up, np.hypot(x, across))))
+def sky_rate(own: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
+    """Electrons per second in a pixel of a band, at a place and date."""
+    return own.constant + (_zodiacal(own, ra, dec, mjd, mission) if own.zodi else 0.0)
 
 
 def sun_longitude(mjd: float) -> float:
@@ -98,7 +110,12 @@ _LATITUDES = np.array([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 45.0, 60.0, 75.0,
 
 def _zodiacal_table(mission: MissionConfiguration) -> tuple[Float, Float]:
     """|longitude from the Sun| [19] deg, values [19, 11]; an empty entry takes the next away from the Sun."""
-    table = np.array(mission.numbers("env.zodi.map"))
+    return _filled(mission.numbers("env.zodi.map"))
+
+
+@lru_cache(maxsize=8)
+def _filled(rows: tuple[tuple[float, ...], ...]) -> tuple[Float, Float]:
+    table = np.array(rows)
     values = table[:, 1:]
     for row in range(len(values) - 2, -1, -1):
         empty = np.isnan(values[row])
@@ -121,19 +138,32 @@ def zodiacal_rate(
     Spectrum : the Sun's, reddened with the wavelength and the elongation
     Ref      : Leinert et al. 1998, section 8
     """
-    longitude, latitude = ecliptic(ra, dec)
+    own = SkyBand(0.0, *_zodiacal_integrals(band, area, pixel_scale, mission))
+    return _zodiacal(own, ra, dec, mjd, mission)
+
+
+def _zodiacal(own: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
+    longitude, latitude = (float(angle) for angle in ecliptic(ra, dec))
     from_sun = longitude - sun_longitude(mjd)
     cosine = np.cos(np.radians(latitude)) * np.cos(np.radians(from_sun))
     elongation = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    at_500 = zodiacal_intensity(from_sun, latitude, mission)
+    red, blue = _reddening(elongation, mission)
+    return zodiacal_intensity(from_sun, latitude, mission) * (own.zodi + red * own.red + blue * own.blue)
+
+
+def _zodiacal_integrals(
+    band: Passband, area: float, pixel_scale: float, mission: MissionConfiguration
+) -> tuple[float, float, float]:
     wavelength = band.wavelength / 10.0
-    reference = np.array([mission.value("env.zodi.reference_wavelength", "nm")])
-    spectrum = _solar(wavelength, mission) / _solar(reference, mission)
-    intensity = at_500 * spectrum * _reddening(wavelength, elongation, mission)
+    reference = mission.value("env.zodi.reference_wavelength", "nm")
+    spectrum = _solar(wavelength, mission) / _solar(np.array([reference]), mission)
     energy = PLANCK_ERG_S * 1e-7 * LIGHT_ANGSTROM_S / band.wavelength
     # W m-2 sr-1 um-1 over steps of 1 A = 1e-4 um.
-    photons = np.trapezoid(intensity * band.response / energy, band.wavelength) * 1e-4
-    return float(photons * area * (pixel_scale * _ARCSEC) ** 2)
+    photons = spectrum * band.response / energy * (1e-4 * area * (pixel_scale * _ARCSEC) ** 2)
+    decades = np.log10(wavelength / reference)
+    weights = (np.ones_like(decades), np.maximum(decades, 0.0), np.minimum(decades, 0.0))
+    zodi, red, blue = (float(np.trapezoid(photons * weight, band.wavelength)) for weight in weights)
+    return zodi, red, blue
 
 
 def _solar(wavelength: Float, mission: MissionConfiguration) -> Float:
@@ -144,18 +174,11 @@ def _solar(wavelength: Float, mission: MissionConfiguration) -> Float:
     return np.asarray(np.interp(wavelength, table[:, 0], table[:, 1]))
 
 
-def _reddening(wavelength: Float, elongation: float, mission: MissionConfiguration) -> Float:
-    """f_co of Leinert et al. 1998: 1 + k log10(lambda / 500 nm), k by side of 500 nm and by elongation."""
-    near, far = (mission.value(f"env.zodi.elongation_{end}", "deg") for end in ("near", "far"))
-    slopes = {
-        side: float(
-            np.interp(
-                elongation,
-                [near, far],
-                [mission.value(f"env.zodi.colour_{side}_{end}") for end in ("near", "far")],
-            )
-        )
+def _reddening(elongation: float, mission: MissionConfiguration) -> tuple[float, float]:
+    """Slopes k of f_co = 1 + k log10(lambda / 500 nm), Leinert et al. 1998: red of 500 nm, blue of it."""
+    ends = [mission.value(f"env.zodi.elongation_{end}", "deg") for end in ("near", "far")]
+    red, blue = (
+        float(np.interp(elongation, ends, [mission.value(f"env.zodi.colour_{side}_{end}") for end in ("near", "far")]))
         for side in ("red", "blue")
-    }
-    decades = np.log10(wavelength / mission.value("env.zodi.reference_wavelength", "nm"))
-    return np.asarray(1.0 + np.where(decades > 0, slopes["red"], slopes["blue"]) * decades)
+    )
+    return red, blue

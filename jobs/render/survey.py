@@ -1,118 +1,163 @@
-"""From pointings to exposures and render tasks."""
+"""From a request to its exposures, in the order they are taken.
+
+exposures    pointings and observation blocks -> exposures, once for each variant of an exploration
+variant      what a variant changes: mission, accuracy, effects
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
-from jobs.render import focal_plane
-from jobs.render.focal_plane import Detector
-from jobs.render.sky import sky_rate
-from jobs.request import Pointing
-from lake_schema import sky
+from jobs.accuracy import Accuracy
+from jobs.area import Area
+from jobs.render import calibration, fields, focal_plane, ground
+from jobs.render.exposing import SKY_TYPES, Exposure, bands_of, exposure_time
+from jobs.render.sequence import sequence
+from jobs.request import Observation, Pointing, Request
 from lake_schema.errors import BadInput
-from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.tables.exposures import EXPOSURES
-from lake_schema.tables.tasks import TASKS
 
-# Cameras of a channel, and the passbands of a camera.
-_CAMERAS = {"VIS": ("vis",), "EXT": ("lsstcam",)}
-_BANDS = {"vis": ("euclid_vis",), "lsstcam": tuple(f"lsst_{letter}" for letter in "ugrizy")}
-# Measured on one core of an AMD EPYC: a detector's PSF, sky, noise and files; each source, by channel.
-_SECONDS_DETECTOR, _SECONDS_SOURCE = 8.0, {"VIS": 2.0e-3, "EXT": 0.8e-3}
-# Peak memory: interpreter, PSF and tables; bytes held a pixel (frames in double precision, noise, files).
-_GB_DETECTOR, _BYTES_PIXEL_HELD = 0.5, 48
-# Files: uint16 science and float32 truth.
-_BYTES_PIXEL_WRITTEN = 6
+_DEEP = ("edf_north", "edf_south", "edf_fornax")
+_CALIBRATION = ("bias", "dark", "flat", "self_calibration", "standard_star", "planetary_nebula")
 
 
-def plan(
-    pointings: Sequence[Pointing], mission: MissionConfiguration, deflection: float = 0.0
-) -> tuple[pa.Table, pa.Table]:
-    """Tables `exposures` and `tasks` of the pointings, numbered from 1 in their order.
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """What one request of an exploration is rendered with."""
 
-    deflection : deg, the largest distance between a source's true position (which tells its cell) and where
-                 it is seen
-    """
-    exposures: list[dict[str, Any]] = []
-    tasks: list[dict[str, Any]] = []
-    for number, pointing in enumerate(pointings, start=1):
-        exposure = _exposure(number, pointing, mission)
-        exposures.append(exposure)
-        tasks.extend(_task(exposure, detector, mission, deflection) for detector in _wanted(pointing, mission))
-    tasks.sort(key=lambda task: (-task["seconds"], task["exposure_id"], task["detector"]))
-    return _build(EXPOSURES, exposures), _build(TASKS, tasks)
+    mission: MissionConfiguration
+    accuracy: Accuracy
+    forced: Mapping[str, bool]
 
 
-def _build(table: Any, rows: Sequence[dict[str, Any]]) -> pa.Table:
-    return table.build({name: [row[name] for row in rows] for name in table.names}) if rows else table.empty()
+def variant(
+    settings: str | None, mission: MissionConfiguration, accuracy: Accuracy, forced: Mapping[str, bool]
+) -> Variant:
+    """The mission, accuracy and forced effects of an exposure, from its `settings`."""
+    values: dict[str, Any] = json.loads(settings) if settings else {}
+    overrides = {k: (v[0], v[1]) for k, v in values.items() if k != "accuracy" and not k.startswith("effects.")}
+    effects = {k.removeprefix("effects."): bool(v) for k, v in values.items() if k.startswith("effects.")}
+    return Variant(
+        mission.overridden_with(overrides) if overrides else mission,
+        Accuracy(**values["accuracy"]) if "accuracy" in values else accuracy,
+        {**forced, **effects},
+    )
 
 
-def _wanted(pointing: Pointing, mission: MissionConfiguration) -> tuple[Detector, ...]:
-    everything = focal_plane.detectors(pointing.camera, mission)
-    by_name = {detector.name: detector for detector in everything}
-    unknown = [name for name in pointing.detectors if name not in by_name]
-    if unknown:
-        raise BadInput(f"camera {pointing.camera} has no detector {unknown[0]!r}")
-    return tuple(by_name[name] for name in dict.fromkeys(pointing.detectors)) or everything
+def forced(request: Request) -> dict[str, bool]:
+    """Effect -> on or off, of a request."""
+    return {**dict.fromkeys(request.effects.on, True), **dict.fromkeys(request.effects.off, False)}
 
 
-def _exposure(number: int, pointing: Pointing, mission: MissionConfiguration) -> dict[str, Any]:
-    if pointing.camera not in _CAMERAS.get(pointing.channel, ()):
-        raise BadInput(f"pointing[{number - 1}].camera: channel {pointing.channel} has no camera {pointing.camera!r}")
-    if pointing.band not in _BANDS[pointing.camera]:
-        known = ", ".join(_BANDS[pointing.camera])
-        raise BadInput(f"pointing[{number - 1}].band: camera {pointing.camera} has no band {pointing.band!r} ({known})")
+def exposures(request: Request, mission: MissionConfiguration) -> list[tuple[Exposure, MissionConfiguration]]:
+    """Every exposure of a request with the mission it is planned with; BadInput names the pointing or observation."""
+    found = []
+    for values in request.variants():
+        settings = json.dumps(values, sort_keys=True) if values else None
+        own = variant(settings, mission, request.accuracy, {}).mission
+        for exposure in _of_mission(request, own):
+            found.append((replace(exposure, settings=settings), own))
+    return found
+
+
+def _of_mission(request: Request, mission: MissionConfiguration) -> Iterator[Exposure]:
+    for i, pointing in enumerate(request.pointings):
+        yield _pointing(pointing, f"pointing[{i}]", request.name, mission)
+    for i, block in enumerate(request.observations):
+        where = f"observation[{i}]"
+        found = 0
+        for exposure in _block(block, request, mission, where):
+            found += 1
+            yield exposure
+        if not found:
+            raise BadInput(f"{where} asks for no exposure")
+
+
+def _pointing(pointing: Pointing, where: str, survey: str, mission: MissionConfiguration) -> Exposure:
+    try:
+        bands = bands_of(pointing.channel, pointing.camera, mission)
+    except BadInput as error:
+        raise BadInput(f"{where}.camera: {error}") from None
+    if pointing.band not in bands:
+        known = ", ".join(bands)
+        raise BadInput(f"{where}.band: camera {pointing.camera} has no band {pointing.band!r} ({known})")
+    known_detectors(pointing.camera, pointing.detectors, mission, f"{where}.detectors")
     ra, dec, angle = pointing.ra % 360.0, pointing.dec, pointing.position_angle
     if pointing.centre_on is not None:
+        known_detectors(pointing.camera, (pointing.centre_on,), mission, f"{where}.centre_on")
         target = focal_plane.detector(pointing.camera, pointing.centre_on, mission)
         ra, dec, angle = focal_plane.boresight_for(target, ra, dec, angle)
-    first = _wanted(pointing, mission)[0]
-    exposure_time = pointing.exposure_time_s
-    if exposure_time is None:
-        exposure_time = mission.value(f"{first.section}.exposure_time", "s")
-    seeing = 0.0 if first.section == "vis" else mission.value(f"{first.section}.{pointing.band}.seeing", "arcsec")
-    return {
-        "exposure_id": number,
-        "channel": pointing.channel,
-        "camera": pointing.camera,
-        "band": pointing.band,
-        "image_type": "science",
-        "ra": ra,
-        "dec": dec,
-        "position_angle": (angle + 180.0) % 360.0 - 180.0,
-        "mjd": pointing.mjd,
-        "exposure_time_s": exposure_time,
-        "sky": sky_rate(first, pointing.band, ra, dec, pointing.mjd, mission),
-        "seeing": seeing,
-    }
+    if pointing.channel != "EXT":
+        fields.check_aspect(ra, dec, pointing.mjd, mission, where)
+    seconds = pointing.exposure_time_s
+    if seconds is None:
+        seconds = exposure_time(pointing.channel, pointing.camera, pointing.band, mission)
+    return Exposure(
+        pointing.channel, pointing.camera, pointing.band, "science", ra, dec, angle, pointing.mjd, seconds, survey,
+        detectors=pointing.detectors,
+        grism="RGS000" if pointing.band == "nisp_red" else "BGS000" if pointing.band == "nisp_blue" else None,
+        grism_angle=0.0 if pointing.channel == "NISP-S" else None,
+    )  # fmt: skip
 
 
-def _task(
-    exposure: dict[str, Any], detector: Detector, mission: MissionConfiguration, deflection: float
-) -> dict[str, Any]:
-    system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
-    ra, dec = focal_plane.centre(detector, system)
-    radius = (detector.half_diagonal + mission.value("survey.selection_margin", "arcsec")) / 3600.0 + deflection
-    pixels = detector.nx * detector.ny
-    area = pixels * (detector.pixel_scale / 60.0) ** 2
-    density = sum(mission.value(f"survey.{kind}_density", "arcmin-2") for kind in ("galaxy", "star"))
-    sources = int(np.ceil(area * density))
-    return {
-        "exposure_id": exposure["exposure_id"],
-        "detector": detector.name,
-        "channel": exposure["channel"],
-        "ra": ra,
-        "dec": dec,
-        "radius": radius,
-        "cells": sky.cells_in_cone(ra, dec, radius, GENERATION_ORDER).tolist(),
-        "s_region": focal_plane.s_region(detector, system),
-        "sources": sources,
-        "seconds": _SECONDS_DETECTOR + sources * _SECONDS_SOURCE[exposure["channel"]],
-        "memory": _GB_DETECTOR + pixels * _BYTES_PIXEL_HELD / 1e9,
-        "bytes": pixels * _BYTES_PIXEL_WRITTEN,
-    }
+def known_detectors(camera: str, names: tuple[str, ...], mission: MissionConfiguration, where: str) -> None:
+    """Refuse detectors that a camera does not have."""
+    there = {detector.name for detector in focal_plane.detectors(camera, mission)} if names else set()
+    unknown = [name for name in names if name not in there]
+    if unknown:
+        raise BadInput(f"{where}: camera {camera} has no detector {unknown[0]!r}")
+
+
+def _block(block: Observation, request: Request, mission: MissionConfiguration, where: str) -> Iterator[Exposure]:
+    area = block.area or request.area
+    start = block.mjd if block.mjd is not None else mission.value("svm.launch", "d")
+    try:
+        found = _exposures(block, area, request.seed, start, mission)
+        for exposure in found:
+            known_detectors(exposure.camera, exposure.detectors, mission, "detectors")
+            if exposure.channel != "EXT" and block.pointings and exposure.image_type in SKY_TYPES:
+                fields.check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
+            yield exposure
+    except BadInput as error:
+        raise BadInput(f"{where}: {error}") from None
+
+
+def _exposures(
+    block: Observation, area: Area, seed: int, start: float, mission: MissionConfiguration
+) -> Iterator[Exposure]:
+    if block.pointings:
+        yield from ground.read(Path(block.pointings), block, mission)
+    elif block.image_type in _CALIBRATION:
+        camera = ground.camera_of(block.survey, mission) if "EXT" in block.channels else ""
+        yield from calibration.exposures(block, camera, area.bounds()[:2], mission, seed, start)
+    elif "EXT" in block.channels:
+        yield from ground.exposures(block, area, mission, seed, start)
+    else:
+        for field in _fields(block, area, start, mission):
+            yield from sequence(field, block, block.survey, mission, seed)
+
+
+def _fields(block: Observation, area: Area, start: float, mission: MissionConfiguration) -> list[fields.Field]:
+    if block.survey == "wide":
+        return fields.wide(area, mission, start, block.fields, max(block.visits, 1))
+    visits = block.visits
+    if block.survey in _DEEP:
+        prefix = f"survey.{block.survey}"
+        visits = visits or int(mission.value(f"{prefix}.visits"))
+        area = block.area or deep_area(prefix, mission)
+    return fields.deep(area, mission, start, max(visits, 1), block.fields)
+
+
+def deep_area(prefix: str, mission: MissionConfiguration) -> Area:
+    """A deep field: its corners where they are published, else a circle of its area."""
+    if f"{prefix}.corners" in mission:
+        return Area(vertices=tuple((float(ra), float(dec)) for ra, dec in mission.numbers(f"{prefix}.corners")))
+    cap = np.arccos(1.0 - mission.value(f"{prefix}.area", "rad2") / (2.0 * np.pi))
+    ra, dec = (mission.value(f"{prefix}.{axis}", "deg") for axis in ("ra", "dec"))
+    return Area(ra=ra, dec=dec, radius=float(np.degrees(cap)))

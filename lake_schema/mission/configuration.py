@@ -80,6 +80,15 @@ class MissionConfiguration:
         """A model that is a table of texts: its rows by column name."""
         return model.rows(model.content(self.model(key), self.folder))
 
+    def overridden_with(self, overrides: Mapping[str, tuple[float, str]]) -> MissionConfiguration:
+        """The same with other values of some names; BadInput / OutOfRange name the parameter."""
+        chosen = dict(self._index)
+        for key, (value, unit) in overrides.items():
+            chosen[key] = _overridden(chosen, key, value, unit)
+            _check_bounds(chosen[key])
+        names = tuple(sorted({*self.overridden, *overrides}))
+        return replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
+
     @property
     def fingerprint(self) -> str:
         """sha256 of every name, value, unit and file, hexadecimal: equal for configurations that act alike."""
@@ -118,16 +127,14 @@ def resolve(
     files_ = {key: _choose(key, group, ladder, mjd) for key, group in _grouped(models).items()}
     if twice := sorted(set(chosen) & set(files_)):
         raise BadInput(f"mission parameter {twice[0]} is a value and a model")
-    for key, (value, unit) in (overrides or {}).items():
-        chosen[key] = _overridden(chosen, key, value, unit)
     for parameter in chosen.values():
         _check_bounds(parameter)
-    return MissionConfiguration(
+    found = MissionConfiguration(
         tuple(chosen[key] for key in sorted(chosen)),
         tuple(ladder),
-        tuple(sorted(overrides or {})),
-        tuple(files_[key] for key in sorted(files_)),
+        models=tuple(files_[key] for key in sorted(files_)),
     )
+    return found.overridden_with(overrides) if overrides else found
 
 
 def _grouped(records: Iterable[Chosen]) -> dict[str, list[Chosen]]:

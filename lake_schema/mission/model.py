@@ -14,7 +14,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -113,6 +113,7 @@ def _installed(file: str) -> bytes | None:
         return None
 
 
+@lru_cache(maxsize=256)
 def numbers(data: bytes) -> tuple[tuple[float, ...], ...]:
     """A table of numbers: header dropped, lines that begin with '#' are comments, a blank entry is NaN."""
     table = list(csv.reader(_lines(data)))

@@ -4,12 +4,26 @@ from __future__ import annotations
 
 from lake_schema.columns import Column, Table
 
-CHANNELS = (("VIS", "Euclid visible camera"), ("EXT", "ground camera"))
-IMAGE_TYPES = (("science", "sky exposure"),)
+CHANNELS = (
+    ("VIS", "Euclid visible camera"),
+    ("NISP-P", "Euclid near-infrared photometer"),
+    ("NISP-S", "Euclid near-infrared slitless spectrometer"),
+    ("EXT", "ground camera"),
+)
+IMAGE_TYPES = (
+    ("science", "sky exposure of a wide survey"),
+    ("deep", "sky exposure of a deep field"),
+    ("bias", "read-out alone"),
+    ("dark", "closed shutter or cold shutter"),
+    ("flat", "calibration lamp"),
+    ("self_calibration", "dense field, many dithers"),
+    ("standard_star", "standard star"),
+    ("planetary_nebula", "emission lines for the wavelength scale"),
+)
 
 EXPOSURES = Table(
     "exposures",
-    1,
+    2,
     (
         Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="identifier of the exposure", lo=0),
         Column("channel", "string", ucd="instr", doc="channel", codes=CHANNELS),
@@ -38,6 +52,29 @@ EXPOSURES = Table(
             0.0,
         ),
         Column("seeing", "float64", "arcsec", "instr.obsty.seeing", "FWHM of the atmosphere, 0 in space", 0.0, 10.0),
+        Column("zero_point", "float64", "mag", "phot.mag;arith.zp", "AB magnitude of 1 electron/s", 0.0, 50.0, since=2),
+        Column("survey", "string", ucd="meta.id", doc="survey or request that it belongs to", since=2),
+        Column("field", "int64", "", "obs.field", "field of the survey, from 1", 1, nullable=True, since=2),
+        Column("visit", "int32", "", "meta.number;obs", "visit of the field, from 1", 1, nullable=True, since=2),
+        Column("dither", "int32", "", "meta.number;obs", "dither of the visit, from 1", 1, nullable=True, since=2),
+        Column("grism", "string", "", "instr.disp", "grism", nullable=True, since=2),
+        Column(
+            "grism_angle", "float64", "deg", "pos.posAng;instr.disp", "of the dispersion", -360.0, 360.0, True, since=2
+        ),
+        Column("lamp", "int32", "", "meta.number;instr", "calibration lamp, from 1", 1, nullable=True, since=2),
+        Column("target", "string", "", "meta.id;src", "calibration source", nullable=True, since=2),
+        Column(
+            "psf", "string", "", "meta.file;instr.det.psf", "file of the PSF model, where given", nullable=True, since=2
+        ),
+        Column(
+            "settings",
+            "string",
+            "",
+            "meta.note",
+            "JSON of what this exposure changes of the request: the variant of an exploration",
+            nullable=True,
+            since=2,
+        ),
     ),
     "Exposures, in the order they are taken.",
     key=("exposure_id",),

@@ -94,6 +94,6 @@ def test_what_a_camera_sees():
     vis = focal_plane.detector("vis", "3-4", MISSION)
     place = at(90, 30)
     zodi = sky.zodiacal_rate(*place, passbands.load("euclid_vis"), 0.9926, 0.1, MISSION)
-    assert sky.sky_rate(vis, "euclid_vis", *place, MISSION) == pytest.approx(zodi + 0.0296)
+    assert sky.sky_rate(sky.sky_band(vis, "euclid_vis", MISSION), *place, MISSION) == pytest.approx(zodi + 0.0296)
     lsst = focal_plane.detector("lsstcam", "R22_S11", MISSION)
-    assert sky.sky_rate(lsst, "lsst_r", *place, MISSION) == 32.95
+    assert sky.sky_rate(sky.sky_band(lsst, "lsst_r", MISSION), *place, MISSION) == 32.95

@@ -1,12 +1,19 @@
-"""Plans: pointings become exposures and tasks that miss nothing."""
+"""From requests to exposures and tasks that miss nothing."""
+
+import copy
+import tomllib
+from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs.render import focal_plane, survey
-from jobs.request import Pointing
+from jobs import request as requests
+from jobs.render import exposing, fields, focal_plane, survey, tasks
+from jobs.render.plan_exposures import plan
+from jobs.render.sequence import offsets
 from lake_schema import sky, validate
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
@@ -14,40 +21,52 @@ from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.tasks import TASKS
 
 MISSION = resolve()
-VIS = Pointing("VIS", "vis", "euclid_vis", 53.117, -27.808, 0.0, 60950.0, ("3-4",), "3-4")
-LSST = Pointing("EXT", "lsstcam", "lsst_r", 53.117, -27.808, 0.0, 60950.25, ("R22_S11",), "R22_S11")
+DEMO = Path(__file__).parents[3] / "requests" / "demo.toml"
+BASE = {"name": "x", "seed": 7, "area": {"cone": {"ra": 150.0, "dec": 20.0, "radius": 0.5}}}
+VIS = {"channel": "VIS", "band": "euclid_vis", "ra": 53.117, "dec": -27.808, "mjd": 60905.0}
 
 
-def test_the_demo_s_two_detectors_look_at_the_same_place():
-    exposures, tasks = survey.plan((VIS, LSST), MISSION)
+def made(**sections):
+    return requests.from_table(copy.deepcopy({**BASE, **sections}))
+
+
+def planned(tmp_path, **sections):
+    _, exposures, rows = plan(tmp_path, made(**sections))
     assert validate.violations(exposures, EXPOSURES) == []
-    assert validate.violations(tasks, TASKS) == []
-    for task in tasks.to_pylist():
+    assert validate.violations(rows, TASKS) == []
+    return exposures, rows
+
+
+def test_the_demo_s_two_detectors_look_at_the_same_place(tmp_path):
+    _, exposures, rows = plan(tmp_path, requests.parse(DEMO))
+    for task in rows.to_pylist():
         assert float(sky.separation(task["ra"], task["dec"], 53.117, -27.808)) < 1e-9
     assert exposures["exposure_id"].to_pylist() == [1, 2]
     assert exposures["exposure_time_s"].to_pylist() == [560.53, 30.0]
     assert exposures["seeing"].to_pylist() == pytest.approx([0.0, 0.73])
     assert exposures["sky"].to_pylist()[1] == 32.95
+    assert exposures["zero_point"].to_pylist() == pytest.approx([25.93, 28.36], abs=0.01)
+    assert exposures["survey"].to_pylist() == ["demo", "demo"]
     # The larger field has more sources, takes longer, and comes first.
-    assert tasks["detector"].to_pylist() == ["R22_S11", "3-4"]
-    assert (np.diff(tasks["seconds"].to_numpy()) < 0).all()
-    assert tasks["bytes"].to_pylist()[1] == 4096 * 4132 * 6
+    assert rows["detector"].to_pylist() == ["R22_S11", "3-4"]
+    assert (np.diff(rows["seconds"].to_numpy()) < 0).all()
+    assert rows["bytes"].to_pylist()[1] == pytest.approx(4096 * 4132 * 6, rel=1e-3)
 
 
-def test_all_detectors_where_none_is_named():
-    everything = Pointing("VIS", "vis", "euclid_vis", 10.0, 20.0, 30.0, 60950.0)
-    exposures, tasks = survey.plan((everything,), MISSION)
-    assert len(tasks) == 36
-    assert exposures["ra"][0].as_py() == 10.0
+def test_all_detectors_where_none_is_named(tmp_path):
+    exposures, rows = planned(tmp_path, pointing=[{**VIS, "position_angle": 30.0}])
+    assert len(rows) == 36
     assert exposures["position_angle"][0].as_py() == 30.0
 
 
 @given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(-360, 360))
 def test_cells_hold_everything_that_a_detector_sees(ra, dec, angle):
-    pointing = Pointing("VIS", "vis", "euclid_vis", ra, dec, angle, 60950.0, ("1-6",))
-    exposures, tasks = survey.plan((pointing,), MISSION)
+    exposure = exposing.Exposure("VIS", "vis", "euclid_vis", "science", ra, dec, angle, 60905.0, 560.0, "x", sky=0.2)
+    exposures = exposing.table([exposure], [MISSION])
+    densities = tasks.Densities(MISSION, requests.Universe())
+    rows = tasks.table(exposures, [("1-6",)], MISSION, densities)
     assert validate.violations(exposures, EXPOSURES) == []
-    (exposed,), (task,) = exposures.to_pylist(), tasks.to_pylist()
+    (exposed,), (task,) = exposures.to_pylist(), rows.to_pylist()
     detector = focal_plane.detector("vis", "1-6", MISSION)
     system = focal_plane.wcs(detector, *(exposed[k] for k in ("ra", "dec", "position_angle")))
     rng = np.random.default_rng(1)
@@ -56,40 +75,204 @@ def test_cells_hold_everything_that_a_detector_sees(ra, dec, angle):
     x, y = rng.uniform(-margin, detector.nx + margin, 200), rng.uniform(-margin, detector.ny + margin, 200)
     seen = focal_plane.sky_of_pixel(system, x, y)
     assert (sky.separation(task["ra"], task["dec"], *seen) <= task["radius"]).all()
-    cells = sky.cell_of(*seen, 8)
-    assert set(cells) <= set(task["cells"])
+    assert set(sky.cell_of(*seen, 8)) <= set(task["cells"])
+    # Footprints of all detectors at once are those of each one's own projection.
+    corners = np.array(task["s_region"].split()[2:], float).reshape(4, 2)
+    own = focal_plane.corners(detector, system)
+    assert sky.separation(corners[:, 0], corners[:, 1], own[:, 0], own[:, 1]).max() < 2e-7
 
 
 def test_a_deflection_widens_the_circle():
-    (plain,), (wide,) = (survey.plan((VIS,), MISSION, d)[1]["radius"].to_pylist() for d in (0.0, 0.1))
+    exposure = exposing.Exposure("VIS", "vis", "euclid_vis", "science", 10.0, 5.0, 0.0, 60905.0, 560.0, "x")
+    rows, densities = exposing.table([exposure], [MISSION]), tasks.Densities(MISSION, requests.Universe())
+    plain, wide = (tasks.table(rows, [("1-1",)], MISSION, densities, (), d)["radius"][0].as_py() for d in (0.0, 0.1))
     assert wide == pytest.approx(plain + 0.1)
 
 
-def test_an_exposure_time_of_the_request_s_own():
-    exposures, _ = survey.plan((Pointing(*VIS_FIELDS, exposure_time_s=89.52),), MISSION)
-    assert exposures["exposure_time_s"][0].as_py() == 89.52
-
-
-VIS_FIELDS = ("VIS", "vis", "euclid_vis", 53.117, -27.808, 0.0, 60950.0, ("3-4",), "3-4")
-
-
 @pytest.mark.parametrize(
-    ("change", "word"),
+    ("change", "words"),
     [
-        ({"channel": "EXT"}, "vis"),
-        ({"camera": "hsc"}, "hsc"),
-        ({"detectors": ("9-9",)}, "9-9"),
-        ({"centre_on": "9-9"}, "9-9"),
-        ({"band": "euclid"}, "euclid"),
+        ({"channel": "EXT", "camera": "vis"}, r"pointing\[0\]\.camera"),
+        ({"camera": "hsc"}, r"pointing\[0\]\.camera.*hsc"),
+        ({"detectors": ["9-9"]}, r"pointing\[0\]\.detectors.*9-9"),
+        ({"centre_on": "9-9"}, r"pointing\[0\]\.centre_on.*9-9"),
+        ({"band": "euclid"}, r"pointing\[0\]\.band.*euclid_vis"),
+        ({"mjd": 60950.0}, r"pointing\[0\].*126\.\d deg from the Sun.*87 to 110"),
     ],
 )
-def test_bad_pointings_are_refused(change, word):
-    names = ("channel", "camera", "band", "ra", "dec", "position_angle", "mjd", "detectors", "centre_on")
-    wanted = dict(zip(names, VIS_FIELDS, strict=True)) | change
-    with pytest.raises(BadInput, match=word):
-        survey.plan((Pointing(**wanted),), MISSION)
+def test_bad_pointings_are_refused(tmp_path, change, words):
+    with pytest.raises(BadInput, match=words):
+        plan(tmp_path, made(pointing=[{**VIS, **change}]))
 
 
-def test_no_pointing_no_rows():
-    exposures, tasks = survey.plan((), MISSION)
-    assert len(exposures) == len(tasks) == 0
+def test_nothing_to_plan_is_refused(tmp_path):
+    with pytest.raises(BadInput, match="nothing to plan"):
+        plan(tmp_path, made())
+
+
+# ------------------------------------------------------------------------------------------------ the wide sequence
+
+
+def test_the_sequence_of_a_field(tmp_path):
+    """Serrano et al. 2024: VIS with NISP-S, then J, H, Y; a short VIS exposure, a closing flat; 4218 s in all."""
+    block = {"channels": ["VIS", "NISP-P", "NISP-S"], "fields": 1}
+    exposures, _ = planned(tmp_path, observation=[block])
+    rows = exposures.to_pylist()
+    kinds = [(r["channel"], r["band"].partition("_")[2]) for r in rows if r["dither"] == 2]
+    assert kinds == [("VIS", "vis"), ("NISP-S", "red"), ("NISP-P", "j"), ("NISP-P", "h"), ("NISP-P", "y")]
+    assert [r["grism_angle"] for r in rows if r["channel"] == "NISP-S"] == [0.0, 184.0, -4.0, 180.0]
+    assert [r["grism"] for r in rows if r["channel"] == "NISP-S"] == ["RGS000", "RGS180"] * 2
+    vis = [r for r in rows if r["channel"] == "VIS"]
+    assert [r["exposure_time_s"] for r in vis] == [560.53, 89.52, 560.53, 560.53, 560.53, 10.0]
+    assert [r["image_type"] for r in vis] == ["science"] * 5 + ["flat"]
+    assert [r["dither"] for r in vis] == [1, 1, 2, 3, 4, 4]
+    start = rows[0]["mjd"] * 86400 - 8
+    assert max(r["mjd"] for r in rows) * 86400 - start == pytest.approx(4218, abs=1)
+    spectra = [r for r in rows if r["channel"] == "NISP-S"]
+    assert {round(r["exposure_time_s"], 1) for r in spectra} == {549.6}
+    assert {round(r["exposure_time_s"], 1) for r in rows if r["channel"] == "NISP-P"} == {87.2}
+    # VIS and NISP-S begin together.
+    assert [r["mjd"] for r in spectra] == [r["mjd"] for r in vis if r["exposure_time_s"] == 560.53]
+
+
+def test_dithers_step_as_they_should(tmp_path):
+    exposures, _ = planned(tmp_path, observation=[{"channels": ["NISP-S"], "fields": 25}])
+    by_field = {}
+    for row in exposures.to_pylist():
+        by_field.setdefault(row["field"], []).append(row)
+    steps = []
+    for rows in by_field.values():
+        probe = focal_plane.Detector("x", "vis", 1, 1, 0, 0, 0, 1.0)
+        system = focal_plane.wcs(probe, *(rows[0][k] for k in ("ra", "dec", "position_angle")))
+        x, y = focal_plane.pixel_of_sky(system, [r["ra"] for r in rows], [r["dec"] for r in rows])
+        steps.append(np.diff(np.stack([x, y]), axis=1))
+    steps = np.array(steps)
+    np.testing.assert_allclose(steps.mean(axis=0), [[50, 0, 50], [100, 100, 100]], atol=3 * 11 / 3 / 5)
+    # A random error of 11 arcsec at three sigma after each step.
+    assert steps.std(axis=0).mean() == pytest.approx(11 / 3, rel=0.2)
+
+
+def test_patterns_of_dithers(tmp_path):
+    for pattern, last in (("S", (100, 300)), ("J", (50, 300))):
+        quiet = resolve(overrides={"svm.aocs.pointing_error": (0.0, "arcsec")})
+        np.testing.assert_allclose(offsets(pattern, quiet, 1, "x")[-1], last)
+    none, _ = planned(tmp_path, observation=[{"channels": ["VIS"], "fields": 1, "dither": "none", "flat": False}])
+    assert none["dither"].to_pylist() == [1, 1]
+
+
+def test_fields_cover_their_area_and_look_away_from_the_sun(tmp_path):
+    found = fields.wide(made().area, MISSION, 60200.0)
+    assert len({field.number for field in found}) == len(found)
+    for field in found:
+        assert 87 <= fields.solar_aspect(field.ra, field.dec, field.mjd) <= 110
+        assert field.mjd >= 60200.0
+    assert (np.diff([field.mjd for field in found]) >= MISSION.value("svm.field_time", "d") - 1e-9).all()
+    # Any place of the area lies in the field of view of some field.
+    rng = np.random.default_rng(3)
+    ra, dec = 150 + 0.5 * rng.uniform(-1, 1, 300), 20 + 0.45 * rng.uniform(-1, 1, 300)
+    inside = np.zeros(ra.size, bool)
+    for field in found:
+        probe = focal_plane.Detector("x", "vis", 7001, 7640, 0, 0, 0, 0.36)
+        system = focal_plane.wcs(probe, field.ra, field.dec, field.position_angle)
+        x, y = focal_plane.pixel_of_sky(system, ra, dec)
+        inside |= (x > 0) & (x < 7001) & (y > 0) & (y < 7640)
+    assert inside[made().area.contains(ra, dec)].all()
+
+
+def test_the_lattice_does_not_depend_on_the_area():
+    small, large = (fields.lattice(requests.Area(ra=150.0, dec=20.0, radius=radius), MISSION) for radius in (1.0, 3.0))
+    assert set(small[0]) < set(large[0])
+    where = {n: (a, d) for n, a, d in zip(*large, strict=True)}
+    assert all(where[n] == (a, d) for n, a, d in zip(*small, strict=True))
+
+
+def test_deep_fields_are_visited_again(tmp_path):
+    block = {"channels": ["NISP-S"], "survey": "deep", "image_type": "deep", "fields": 3, "visits": 4, "blue": True}
+    pole = {"cone": {"ra": 269.7, "dec": 66.0, "radius": 0.6}}
+    exposures, _ = planned(tmp_path, area=pole, observation=[block])
+    rows = exposures.to_pylist()
+    assert Counter((r["field"], r["visit"]) for r in rows) == {(f, v): 4 for f in (1, 2, 3) for v in (1, 2, 3, 4)}
+    assert {r["band"] for r in rows if r["visit"] % 2 == 0} == {"nisp_blue"}
+    assert {r["grism"] for r in rows if r["visit"] % 2 == 0} == {"BGS000"}
+    # The telescope turns with the Sun.
+    for row in rows:
+        turned = fields.position_angle(row["ra"], row["dec"], row["mjd"]) - row["position_angle"]
+        assert abs((turned + 180) % 360 - 180) < 0.5
+        assert 87 <= fields.solar_aspect(row["ra"], row["dec"], row["mjd"]) <= 110
+
+
+@pytest.mark.parametrize(("name", "area"), [("edf_north", 20), ("edf_south", 23), ("edf_fornax", 10)])
+def test_the_deep_fields_have_their_published_areas(name, area):
+    place = survey.deep_area(f"survey.{name}", MISSION)
+    cells = np.array(place.cells(8))
+    ra, dec = sky.positions((cells << 42) + (1 << 41))
+    found = place.contains(ra, dec).sum() * sky.cell_area(8)
+    assert found == pytest.approx(area, rel=0.06)
+    assert place.contains([MISSION.value(f"survey.{name}.ra")], [MISSION.value(f"survey.{name}.dec")]).all()
+
+
+# ------------------------------------------------------------------------------------------------ exploration
+
+
+def test_an_exploration_is_the_product_of_requests(tmp_path):
+    explore = {"vis.read_noise": {"values": [4.0, 5.0, 6.0], "unit": "electron"}, "accuracy": ["draft", "survey"]}
+    pointing = [{**VIS, "detectors": ["3-4"]}]
+    exposures, rows = planned(tmp_path, pointing=pointing, explore=explore)
+    assert len(exposures) == len(rows) == 6
+    own = [survey.variant(s, MISSION, requests.SURVEY, {}) for s in exposures["settings"].to_pylist()]
+    assert sorted({v.mission.value("vis.read_noise") for v in own}) == [4.0, 5.0, 6.0]
+    assert {v.accuracy.flux for v in own} == {5e-3, 1e-3}
+    # Each variant has the same noise but for what it changes.
+    assert len({exposing.identity(row) for row in exposures.to_pylist()}) == 1
+    forced = survey.variant('{"effects.full_well": false}', MISSION, requests.SURVEY, {"full_well": True}).forced
+    assert forced == {"full_well": False}
+
+
+def test_a_pointing_in_front_changes_nobody_else_s_noise(tmp_path):
+    first, second = {**VIS, "detectors": ["1-1"]}, {**VIS, "mjd": 60906.0, "detectors": ["1-1"]}
+    alone, _ = planned(tmp_path, pointing=[second])
+    both, _ = planned(tmp_path, pointing=[first, second])
+    (a,), (_, b) = alone.to_pylist(), both.to_pylist()
+    assert a["exposure_id"] != b["exposure_id"]
+    assert exposing.identity(a) == exposing.identity(b)
+
+
+# ------------------------------------------------------------------------------------------------ pilot phase
+
+
+def test_the_pilot_phase_counts_exactly():
+    """Serrano et al. 2024, the table of the pilot phase's products."""
+    own = [e for e, _ in survey.exposures(requests.parse(DEMO.with_name("sc8_pilot.toml")), MISSION)]
+    count = Counter((e.channel, e.survey, e.image_type) for e in own)
+    ground = {"des": 76, "lsst": 65, "cfis": 14, "jedis": 23, "ps1": 40, "wishes": 7}
+    assert count == {
+        ("VIS", "wide", "science"): 16,
+        ("NISP-P", "wide", "science"): 48,
+        ("NISP-S", "wide", "science"): 16,
+        ("VIS", "calibration", "bias"): 60,
+        ("VIS", "calibration", "flat"): 60,
+        ("NISP-P", "calibration", "dark"): 600,
+        ("NISP-P", "calibration", "flat"): 750,
+        ("NISP-P", "calibration", "self_calibration"): 180,
+        ("NISP-P", "calibration", "standard_star"): 24,
+        ("NISP-S", "calibration", "standard_star"): 8,
+        ("NISP-S", "calibration", "planetary_nebula"): 16,
+        ("EXT", "calibration", "flat"): 40,
+        ("EXT", "calibration", "bias"): 10,
+        **{("EXT", name, "science"): number for name, number in ground.items()},
+    }
+    detectors = {"lsst": 189, "cfis": 40, "jedis": 14, "ps1": 60, "wishes": 103, "des": 62}
+    for e in own:
+        if e.survey in detectors:
+            assert len(focal_plane.detectors(e.camera, MISSION)) == detectors.pop(e.survey)
+        if not detectors:
+            break
+    assert not detectors
+    lamps = Counter(e.lamp for e in own if e.channel == "NISP-P" and e.image_type == "flat")
+    assert lamps == dict.fromkeys(range(1, 6), 150)
+
+
+def test_other_requests_are_good():
+    for path in sorted(DEMO.parent.glob("*.toml")):
+        assert requests.parse(path).name == path.stem
+        assert tomllib.loads(path.read_text())["name"] == path.stem

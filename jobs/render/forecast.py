@@ -1,0 +1,86 @@
+"""What a plan will cost, before anything is rendered.
+
+rows     a line a channel, survey and image type: exposures, products, core-hours, storage, peak memory
+text     the table that a person reads
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One kind of exposure."""
+
+    channel: str
+    survey: str
+    image_type: str
+    exposures: int
+    detectors: int
+    sources: int
+    core_hours: float
+    gigabytes: float
+    memory_gb: float
+
+
+def rows(exposures: pa.Table, tasks: pa.Table) -> list[Line]:
+    """Sums by channel, survey and image type, in that order, and of everything."""
+    about = exposures.select(["exposure_id", "survey", "image_type"])
+    joined = tasks.drop_columns(["cells", "s_region"]).join(about, "exposure_id")
+    keys = ["channel", "survey", "image_type"]
+    sums = joined.group_by(keys).aggregate(
+        [
+            ("exposure_id", "count_distinct"),
+            ("detector", "count"),
+            ("sources", "sum"),
+            ("seconds", "sum"),
+            ("bytes", "sum"),
+            ("memory", "max"),
+        ]
+    )
+    lines = [_line(row) for row in sums.sort_by([(key, "ascending") for key in keys]).to_pylist()]
+    total = Line(
+        "all",
+        "",
+        "",
+        sum(line.exposures for line in lines),
+        sum(line.detectors for line in lines),
+        sum(line.sources for line in lines),
+        sum(line.core_hours for line in lines),
+        sum(line.gigabytes for line in lines),
+        float(pc.max(tasks["memory"]).as_py() or 0.0),
+    )
+    return [*lines, total]
+
+
+def _line(row: dict[str, Any]) -> Line:
+    return Line(
+        row["channel"],
+        row["survey"],
+        row["image_type"],
+        row["exposure_id_count_distinct"],
+        row["detector_count"],
+        row["sources_sum"],
+        row["seconds_sum"] / 3600.0,
+        row["bytes_sum"] / 1e9,
+        row["memory_max"],
+    )
+
+
+def text(lines: list[Line]) -> Iterator[str]:
+    """The forecast as lines of text."""
+    yield (
+        f"{'channel':8} {'survey':12} {'image type':17} {'exposures':>10} {'detectors':>10} {'sources':>14} "
+        f"{'core-hours':>11} {'GB':>10} {'peak GB':>8}"
+    )
+    for line in lines:
+        yield (
+            f"{line.channel:8} {line.survey:12} {line.image_type:17} {line.exposures:10,} {line.detectors:10,} "
+            f"{line.sources:14,} {line.core_hours:11,.2f} {line.gigabytes:10,.2f} {line.memory_gb:8.2f}"
+        )

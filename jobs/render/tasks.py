@@ -1,0 +1,194 @@
+"""From exposures to render tasks: one a detector, with its cells and what it will cost.
+
+table      rows of the table `tasks`, longest first
+Densities  how many sources there are where: of the lake's catalogues, or of the mission's count models
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from jobs.render import focal_plane
+from jobs.render.exposing import SKY_TYPES
+from jobs.request import Universe
+from lake_schema import layout, sky
+from lake_schema.errors import BadInput
+from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.read import Version
+from lake_schema.tables.tasks import TASKS
+
+Float = npt.NDArray[np.float64]
+Row = Mapping[str, Any]
+
+# A FITS header and its padding, one an image.
+_HEADER_BYTES = 8640
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Seconds a detector and a source, gigabytes and bytes a pixel, measured by benchmarks.planner."""
+
+    detector_s: float
+    source_s: float
+    base_gb: float
+    bytes_held_pixel: float
+    bytes_written_pixel: float
+
+
+@cache
+def costs() -> dict[str, Cost]:
+    """Cost of each channel's detectors."""
+    with (files("jobs.render") / "costs.csv").open(encoding="utf-8") as stream:
+        names = Cost.__slots__
+        return {row["channel"]: Cost(*(float(row[name]) for name in names)) for row in csv.DictReader(stream)}
+
+
+# ------------------------------------------------------------------------------------------------ sources
+
+
+class Densities:
+    """Sources a square degree at a place, galaxies and stars together."""
+
+    def __init__(self, mission: MissionConfiguration, universe: Universe, catalogues: Sequence[Version] = ()) -> None:
+        self.published = [_published(version) for version in catalogues]
+        counts = np.array(mission.numbers("survey.galaxy_counts"))
+        self.galaxies = float(np.exp(np.interp(universe.galaxy_limit, counts[:, 0], np.log(counts[:, 1]))))
+        stars = np.array(mission.numbers("survey.star_counts"))
+        # Columns: l, |b|, then counts to H = 8, 10, .., 26.
+        limits = 8.0 + 2.0 * np.arange(stars.shape[1] - 2)
+        at_limit = [np.interp(universe.star_limit, limits, np.log(row)) for row in stars[:, 2:]]
+        self.lon, self.lat = np.unique(stars[:, 0]), np.unique(stars[:, 1])
+        self.stars = np.reshape(at_limit, (self.lon.size, self.lat.size))
+
+    def at(self, ra: Float, dec: Float) -> Float:
+        """[n] deg-2; of the published catalogues where they reach, else of the count models."""
+        if self.published:
+            cells = sky.cell_of(ra, dec, GENERATION_ORDER)
+            found = sum(np.array([table.get(int(cell), np.nan) for cell in cells]) for table in self.published)
+            return np.where(np.isfinite(found), found, self._model(ra, dec))
+        return self._model(ra, dec)
+
+    def _model(self, ra: Float, dec: Float) -> Float:
+        lon, lat = sky.galactic(ra, dec)
+        folded, height = np.abs((lon + 180.0) % 360.0 - 180.0), np.abs(lat)
+        i = np.clip(np.searchsorted(self.lon, folded, "right") - 1, 0, self.lon.size - 2)
+        j = np.clip(np.searchsorted(self.lat, height, "right") - 1, 0, self.lat.size - 2)
+        s = (folded - self.lon[i]) / (self.lon[i + 1] - self.lon[i])
+        t = (height - self.lat[j]) / (self.lat[j + 1] - self.lat[j])
+        low = (1 - s) * self.stars[i, j] + s * self.stars[i + 1, j]
+        high = (1 - s) * self.stars[i, j + 1] + s * self.stars[i + 1, j + 1]
+        return np.asarray(self.galaxies + np.exp((1 - t) * low + t * high))
+
+
+def _published(version: Version) -> dict[int, float]:
+    """Density of each generation cell that a catalogue covers: that of its file."""
+    density: dict[int, float] = {}
+    for part in version.manifest["parts"]:
+        cells = part["facts"]["generation_cells"]
+        _, file = layout.cell_of_file(part["name"])
+        if any(cell >> 2 * (GENERATION_ORDER - FILE_ORDER) != file for cell in cells):
+            raise BadInput(f"table {version.table}: part {part['name']} names cells of another file")
+        mean = version.part_rows(part["name"]) / (len(cells) * sky.cell_area(GENERATION_ORDER))
+        density.update(dict.fromkeys(cells, mean))
+    return density
+
+
+# ------------------------------------------------------------------------------------------------ tasks
+
+
+def table(
+    exposures: pa.Table,
+    detectors: Sequence[tuple[str, ...]],
+    mission: MissionConfiguration,
+    densities: Densities,
+    truth: Sequence[str] = (),
+    deflection: float = 0.0,
+) -> pa.Table:
+    """Rows of the table `tasks`.
+
+    exposures  : rows of the table `exposures`;  detectors : of each exposure, () = all of its camera
+    truth      : truth maps that are wanted, which take space
+    deflection : deg, the largest distance between a source's true position (which tells its cell) and where
+                 it is seen
+    """
+    cameras = {camera: _Camera(camera, mission, deflection) for camera in set(exposures["camera"].to_pylist())}
+    shared: dict[tuple[Any, ...], _Places] = {}
+    columns: dict[str, list[Any]] = {name: [] for name in TASKS.names}
+    for row, wanted in zip(exposures.to_pylist(), detectors, strict=True):
+        camera = cameras[row["camera"]]
+        where = (row["camera"], row["ra"], row["dec"], row["position_angle"])
+        if where not in shared:
+            shared[where] = camera.places(*where[1:], densities)
+        _append(columns, row, wanted, camera, shared[where], len(truth))
+    seconds = np.array(columns["seconds"], float)
+    numbers = np.array(columns["exposure_id"], np.int64)
+    order = np.lexsort((np.array(columns["detector"]), numbers, -seconds)) if numbers.size else np.empty(0, np.int64)
+    return TASKS.build({name: [values[i] for i in order] for name, values in columns.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class _Places:
+    ra: list[float]
+    dec: list[float]
+    cells: list[list[int]]
+    regions: list[str]
+    density: Float
+
+
+class _Camera:
+    """Detectors of a camera, and what of them does not depend on the pointing."""
+
+    def __init__(self, camera: str, mission: MissionConfiguration, deflection: float) -> None:
+        self.detectors = focal_plane.detectors(camera, mission)
+        self.index = {detector.name: i for i, detector in enumerate(self.detectors)}
+        self.x, self.y = focal_plane.outline(self.detectors)
+        margin = mission.value("survey.selection_margin", "arcsec")
+        reach = np.array([detector.half_diagonal for detector in self.detectors])
+        self.radius = (reach + margin) / 3600.0 + deflection
+        self.pixels = np.array([detector.nx * detector.ny for detector in self.detectors])
+        self.area = np.array([d.nx * d.ny * (d.pixel_scale / 3600.0) ** 2 for d in self.detectors])
+
+    def places(self, ra: float, dec: float, angle: float, densities: Densities) -> _Places:
+        lon, lat = focal_plane.sky_of_plane(self.x, self.y, ra, dec, angle)
+        cells = [
+            sky.cells_in_cone(x, y, radius, GENERATION_ORDER).tolist()
+            for x, y, radius in zip(lon[:, 0].tolist(), lat[:, 0].tolist(), self.radius.tolist(), strict=True)
+        ]
+        regions = [
+            "POLYGON ICRS " + " ".join(f"{value:.7f}" for value in corners)
+            for corners in np.stack([lon[:, 1:], lat[:, 1:]], axis=2).reshape(len(lon), -1).tolist()
+        ]
+        return _Places(lon[:, 0].tolist(), lat[:, 0].tolist(), cells, regions, densities.at(lon[:, 0], lat[:, 0]))
+
+
+def _append(
+    columns: dict[str, list[Any]], row: Row, wanted: tuple[str, ...], camera: _Camera, places: _Places, maps: int
+) -> None:
+    cost = costs()[row["channel"]]
+    looks = row["image_type"] in SKY_TYPES
+    for i in [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors)):
+        sources = int(np.ceil(places.density[i] * camera.area[i])) if looks else 0
+        pixels = int(camera.pixels[i])
+        columns["exposure_id"].append(row["exposure_id"])
+        columns["detector"].append(camera.detectors[i].name)
+        columns["channel"].append(row["channel"])
+        columns["ra"].append(places.ra[i])
+        columns["dec"].append(places.dec[i])
+        columns["radius"].append(float(camera.radius[i]))
+        columns["cells"].append(places.cells[i] if looks else [])
+        columns["s_region"].append(places.regions[i])
+        columns["sources"].append(sources)
+        columns["seconds"].append(cost.detector_s + sources * cost.source_s)
+        columns["memory"].append(cost.base_gb + pixels * cost.bytes_held_pixel / 1e9)
+        # Truth maps are in single precision.
+        columns["bytes"].append(int(pixels * (cost.bytes_written_pixel + 4 * maps)) + _HEADER_BYTES * (1 + maps))

@@ -1,0 +1,78 @@
+"""Ecliptic coordinates, and the tiles that the sky is cut into along them.
+
+ecliptic, equatorial     ICRS <-> ecliptic longitude and latitude
+tile_of, tile_corners    which tile a place lies in, and where a tile lies
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.errors import OutOfRange
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+
+# IAU 1976 obliquity at J2000, deg.
+OBLIQUITY = 23.4392911
+# Tiles are about 0.5 deg2, the field of view (Serrano et al. 2024); rows as high as a field's step.
+_ROWS, _WIDTH = 257, 0.714
+
+
+def ecliptic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
+    """ICRS [n] -> ecliptic longitude [0, 360) and latitude [n], deg, J2000.  Error: 0.1 arcsec (frame bias)."""
+    return _turned(ra, dec, OBLIQUITY)
+
+
+def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
+    """Ecliptic longitude and latitude [n], J2000 -> ICRS ra [0, 360), dec [n], deg.  Error: 0.1 arcsec"""
+    return _turned(lon, lat, -OBLIQUITY)
+
+
+def _turned(lon: npt.ArrayLike, lat: npt.ArrayLike, angle: float) -> tuple[Float, Float]:
+    lon_rad, lat_rad, tilt = (np.radians(np.asarray(value, float)) for value in (lon, lat, angle))
+    x, y, z = np.cos(lat_rad) * np.cos(lon_rad), np.cos(lat_rad) * np.sin(lon_rad), np.sin(lat_rad)
+    across = np.cos(tilt) * y + np.sin(tilt) * z
+    up = np.cos(tilt) * z - np.sin(tilt) * y
+    return np.degrees(np.arctan2(across, x)) % 360.0, np.degrees(np.arctan2(up, np.hypot(x, across)))
+
+
+# ------------------------------------------------------------------------------------------------ tiles
+
+
+def tile_count() -> int:
+    """Number of tiles; they are numbered from 0, rows from the south, eastward in a row."""
+    return int(_first_of_row()[-1])
+
+
+def tile_of(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
+    """Tile[n] that each place lies in: every place lies in exactly one."""
+    lon, lat = ecliptic(ra, dec)
+    row = np.clip(np.floor((lat + 90.0) / 180.0 * _ROWS), 0, _ROWS - 1).astype(np.int64)
+    first = _first_of_row()
+    count = first[row + 1] - first[row]
+    column = np.clip(np.floor(lon / 360.0 * count), 0, count - 1).astype(np.int64)
+    return np.asarray(first[row] + column, np.int64)
+
+
+def tile_corners(tile: int) -> Float:
+    """[4, 2] ICRS ra, dec deg of a tile's corners, in order around it."""
+    first = _first_of_row()
+    if not 0 <= tile < first[-1]:
+        raise OutOfRange("tile", tile, 0, int(first[-1]) - 1)
+    row = int(np.searchsorted(first, tile, "right")) - 1
+    count, column = int(first[row + 1] - first[row]), tile - int(first[row])
+    west, east = 360.0 * column / count, 360.0 * (column + 1) / count
+    south, north = -90.0 + 180.0 * row / _ROWS, -90.0 + 180.0 * (row + 1) / _ROWS
+    return np.stack(equatorial([west, east, east, west], [south, south, north, north]), axis=1)
+
+
+@cache
+def _first_of_row() -> Int:
+    """Number of the first tile of each row, and of all tiles."""
+    middle = -90.0 + 180.0 * (np.arange(_ROWS) + 0.5) / _ROWS
+    counts = np.maximum(np.ceil(360.0 * np.cos(np.radians(middle)) / _WIDTH), 3)
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
