@@ -42,7 +42,7 @@ MISSION = Table(
         Column("chosen", "bool", ucd="meta.code", doc="is this the value that the run used?"),
         Column("overridden", "bool", ucd="meta.code", doc="did the request put it in place of the database's?"),
         Column(
-            "file", "string", ucd="meta.file", doc="file of a model, as the package names it", nullable=True, since=2
+            "file", "string", ucd="meta.ref", doc="file of a model, as the package names it", nullable=True, since=2
         ),
         Column(
             "sha256",
