@@ -1,10 +1,10 @@
-"""Dark current: thermal electrons, counted."""
+"""Dark current: thermal electrons, counted; and hot pixels, that have many."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from jobs.render.effects.effect import Effect, Frame
+from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
 
@@ -15,4 +15,26 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     return frame + rng.poisson(electrons, frame.shape)
 
 
+def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Generator) -> Frame:
+    """frame [ny, nx] e- -> plus whole electrons in hot pixels.
+
+    fraction  : of the pixels;  electrons : mean of a hot pixel, exponentially distributed
+    Error     : the count of a hot pixel has no noise of its own from exposure to exposure
+    """
+    if not 0.0 <= fraction <= 1.0:
+        raise OutOfRange("hot pixels", fraction, 0.0, 1.0)
+    if not 0.0 <= electrons < 1e12:
+        raise OutOfRange("hot electrons", electrons, 0.0, 1e12)
+    out = np.array(frame, dtype=float)
+    count = int(rng.binomial(out.size, fraction))
+    where = rng.integers(0, max(out.size, 1), count)
+    np.add.at(out.reshape(-1), where, np.rint(electrons * rng.standard_exponential(count)))
+    return out
+
+
+def _hot(scene: Scene) -> tuple[float, float]:
+    return scene.value("hot_pixels", ""), scene.value("hot_current", "electron / (s pix)") * scene.exposure_time_s
+
+
 EFFECT = Effect("dark_current", apply, lambda scene: (scene.dark_electrons,), lambda scene: scene.dark_electrons)
+HOT = Effect("hot_pixels", apply_hot, _hot, lambda scene: _hot(scene)[1] * (_hot(scene)[0] > 0), fixed=True)

@@ -3,18 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema.errors import BadInput
+from jobs.accuracy import SURVEY, Accuracy
+from jobs.render.focal_plane import Detector
+from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 
 Frame = npt.NDArray[np.float64]
 
 # An effect is needed where its largest contribution exceeds this part of a pixel's noise.
 NOTICEABLE = 0.1
+
+
+# Boltzmann's constant, eV / K (CODATA 2018).
+_BOLTZMANN = 8.617333e-5
+
+
+def warmth(temperature: float, reference: float, band_gap: float) -> float:
+    """Dark current over that at the reference temperature, K; band gap in eV.
+
+    Ref : Janesick 2001, Scientific Charge-Coupled Devices: T^1.5 exp(-Eg / 2 k T)
+    """
+    for value in (temperature, reference):
+        if not 50.0 <= value <= 400.0:
+            raise OutOfRange("detector temperature", value, 50.0, 400.0)
+    exponent = band_gap / (2.0 * _BOLTZMANN) * (1.0 / temperature - 1.0 / reference)
+    return float((temperature / reference) ** 1.5 * np.exp(-exponent))
+
+
+@dataclass(frozen=True, slots=True)
+class Lights:
+    """Bright sources on a detector and around it, as points.
+
+    column, row : float64[n] 0-based pixel position, also outside the frame
+    electrons   : float64[n] expected in the exposure
+    """
+
+    column: Frame = field(default_factory=lambda: np.zeros(0))
+    row: Frame = field(default_factory=lambda: np.zeros(0))
+    electrons: Frame = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +56,9 @@ class Scene:
     section        : prefix of the detector's parameters, "vis" or "ext.lsstcam"
     sky_rate       : electrons per second in a pixel
     peak_electrons : brightest pixel of the expected image of the sources
+    detector       : where it lies in the focal plane; None: at its centre
+    lights         : what shines around corners: ghosts, straylight
+    lamp           : the LED of a flat, from 1
     """
 
     mission: MissionConfiguration
@@ -31,6 +66,10 @@ class Scene:
     exposure_time_s: float
     sky_rate: float
     peak_electrons: float
+    detector: Detector | None = None
+    lights: Lights = field(default_factory=Lights)
+    lamp: int = 1
+    accuracy: Accuracy = SURVEY
 
     def value(self, key: str, unit: str) -> float:
         """A parameter of the detector."""
@@ -41,8 +80,18 @@ class Scene:
         return self.sky_rate * self.exposure_time_s
 
     @property
+    def dark_rate(self) -> float:
+        """Dark current at the detector's temperature, e-/s in a pixel."""
+        rate = self.value("dark_current", "electron / (s pix)")
+        # Ground cameras are given at the temperature they are run at.
+        if f"{self.section}.detector_temperature" not in self.mission:
+            return rate
+        temperatures = self.value("detector_temperature", "K"), self.value("dark_reference_temperature", "K")
+        return rate * warmth(*temperatures, self.value("dark_band_gap", "eV"))
+
+    @property
     def dark_electrons(self) -> float:
-        return self.value("dark_current", "electron / (s pix)") * self.exposure_time_s
+        return self.dark_rate * self.exposure_time_s
 
     @property
     def pixel_noise(self) -> float:
@@ -59,13 +108,17 @@ class Effect:
     parameters   : scene -> the numbers that `apply` wants
     contribution : scene -> its largest change of a pixel, electrons
     optional     : False where the frame is no product without it
+    fixed        : a pattern of the detector itself: its random numbers are the same in every exposure
+    cost         : seconds a million pixels take on one core (measured by benchmarks/effects)
     """
 
     name: str
     apply: Callable[..., Frame]
-    parameters: Callable[[Scene], tuple[float, ...]]
+    parameters: Callable[[Scene], tuple[Any, ...]]
     contribution: Callable[[Scene], float]
     optional: bool = True
+    fixed: bool = False
+    cost: float = 0.0
 
     def margin(self, scene: Scene) -> float:
         """Contribution over what would be noticed: above 1 the effect is needed."""

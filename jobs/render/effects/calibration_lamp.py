@@ -1,0 +1,38 @@
+"""Flats: the calibration unit shines through one of its six LEDs; what it lights is far from even."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jobs.render.effects import illumination
+from jobs.render.effects.effect import Effect, Frame, Scene
+from lake_schema.errors import OutOfRange
+
+LEDS = 6
+
+
+def apply(frame: Frame, level: float, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
+    """frame [ny, nx] expected e- -> plus level (1 + columns [nx] + rows [ny])."""
+    if not 0.0 <= level <= 1e9:
+        raise OutOfRange("lamp", level, 0.0, 1e9)
+    return np.asarray(frame + level * illumination.apply(np.ones(frame.shape), columns, rows))
+
+
+def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
+    """What an LED lights: a paraboloid, and a slope whose direction is the LED's place on the unit."""
+    if not 1 <= led <= LEDS:
+        raise OutOfRange("LED", led, 1, LEDS)
+    angle = 2.0 * np.pi * (led - 1) / LEDS
+    slope = scene.value("flat.gradient", "")
+    direction = (slope * float(np.cos(angle)), slope * float(np.sin(angle)))
+    return illumination.pattern(scene, nx, ny, scene.value("flat.illumination", ""), direction)
+
+
+def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:
+    nx, ny = int(scene.value("fpa.nx", "pix")), int(scene.value("fpa.ny", "pix"))
+    if scene.detector is not None:
+        nx, ny = scene.detector.nx, scene.detector.ny
+    return scene.value("flat.signal", "electron"), *pattern(scene, scene.lamp, nx, ny)
+
+
+EFFECT = Effect("calibration_lamp", apply, _parameters, lambda scene: _parameters(scene)[0], cost=1e-2)

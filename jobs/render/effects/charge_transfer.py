@@ -1,0 +1,86 @@
+"""Charge transfer inefficiency: traps in the silicon hold charge back while it is shifted to the output.
+
+PARALLEL    down the columns, row by row, into the serial register
+SERIAL      along the register, pixel by pixel, into the amplifier
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jobs.accuracy import Accuracy
+from jobs.render.effects import traps
+from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects.traps import Sweeps, Traps
+
+# Species of the mission database.
+_SPECIES = 3
+# Error of the charge that is displaced, at the end of the mission: of one sweep, of Heun's rule, and in four steps
+# (held against smaller steps by the tests; allowed is what a source loses of its flux, some per cent, times it).
+_SWEEPS = ((5e-3, Sweeps(1, 1)), (1e-3, Sweeps(1, 2)), (0.0, Sweeps(4, 2)))
+
+
+def apply_parallel(
+    frame: Frame, lattice: Traps, sweeps: Sweeps, rows: int, rng: np.random.Generator | None = None
+) -> Frame:
+    """quadrants [.., ny, nx] e- in readout order, `rows` of them pixels, the rest overscan."""
+    return traps.shifted(frame, lattice, sweeps, -2, min(rows, frame.shape[-2]))[0]
+
+
+def apply_serial(
+    frame: Frame, lattice: Traps, sweeps: Sweeps, columns: int, rng: np.random.Generator | None = None
+) -> Frame:
+    """quadrants [.., ny, nx] e- in readout order, `columns` of them register pixels, the rest overscan."""
+    return traps.shifted(frame, lattice, sweeps, -1, min(columns, frame.shape[-1]))[0]
+
+
+def sweeps_for(accuracy: Accuracy) -> Sweeps:
+    """How closely charge is followed."""
+    return next(sweeps for error, sweeps in _SWEEPS if accuracy.flux >= error)
+
+
+def lattice(scene: Scene, direction: str) -> Traps:
+    """The traps of a direction, "parallel" or "serial": damage since the launch times those of the mission's end."""
+    damage = scene.value("cti.age", "")
+    if direction == "serial":
+        damage *= scene.value("cti.serial_ratio", "")
+    species = range(1, _SPECIES + 1)
+    return Traps(
+        tuple(damage * scene.value(f"cti.density_{number}", "pix-1") for number in species),
+        tuple(scene.value(f"cti.release_{number}", "pix") for number in species),
+        scene.value("cti.full_well", "electron"),
+        scene.value("cti.notch", "electron"),
+        scene.value("cti.well_fill_power", ""),
+    )
+
+
+def _rows(scene: Scene) -> int:
+    return (scene.detector.ny if scene.detector is not None else int(scene.value("fpa.ny", "pix"))) // 2
+
+
+def _columns(scene: Scene) -> int:
+    half = (scene.detector.nx if scene.detector is not None else int(scene.value("fpa.nx", "pix"))) // 2
+    return half + int(scene.value("fpa.prescan", "pix"))
+
+
+def _loss(scene: Scene, direction: str, transfers: int) -> float:
+    """Electrons that the brightest packet loses on the longest way, if all traps it reaches are empty."""
+    silicon = lattice(scene, direction)
+    brightest = scene.peak_electrons + scene.sky_electrons
+    return transfers * sum(silicon.density) * float(silicon.volume(brightest))
+
+
+PARALLEL = Effect(
+    "parallel_cti",
+    apply_parallel,
+    lambda scene: (lattice(scene, "parallel"), sweeps_for(scene.accuracy), _rows(scene)),
+    lambda scene: _loss(scene, "parallel", _rows(scene)),
+    cost=0.15,
+)
+SERIAL = Effect(
+    "serial_cti",
+    apply_serial,
+    lambda scene: (lattice(scene, "serial"), sweeps_for(scene.accuracy), _columns(scene)),
+    lambda scene: _loss(scene, "serial", _columns(scene)),
+    cost=0.15,
+)

@@ -1,0 +1,47 @@
+"""Crosstalk: the four amplifiers read at the same time, and each sees a little of the others."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jobs.render.effects.effect import Effect, Frame, Scene
+from lake_schema.errors import BadInput, OutOfRange
+
+# Of the coupling between neighbours (assumed).
+_DIAGONAL = 0.5
+
+
+def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = None) -> Frame:
+    """quadrants [4, ny, nx] in readout order -> each plus its share of the others, all at once.
+
+    coefficients : [4, 4] of signal from the second index into the first, 0 on the diagonal
+    """
+    count = len(frame)
+    if coefficients.shape != (count, count):
+        raise BadInput(f"crosstalk of {coefficients.shape} coefficients for {count} quadrants")
+    if not np.all(np.abs(coefficients) <= 1.0):
+        raise OutOfRange("crosstalk", float(np.abs(coefficients).max()), 0.0, 1.0)
+    out = frame.copy()
+    for victim in range(count):
+        for source in range(count):
+            if source != victim and coefficients[victim, source]:
+                out[victim] += coefficients[victim, source] * frame[source]
+    return out
+
+
+def coefficients(scene: Scene) -> Frame:
+    """The mission's for neighbours along a side, half of it across the diagonal."""
+    near = far = scene.value("crosstalk", "")
+    diagonal = _DIAGONAL * near
+    # E F G H: upper left, upper right, lower right, lower left.
+    return np.array(
+        [[0, near, diagonal, far], [near, 0, far, diagonal], [diagonal, far, 0, near], [far, diagonal, near, 0]]
+    )
+
+
+def _contribution(scene: Scene) -> float:
+    full = min(scene.peak_electrons, scene.value("full_well", "electron")) + scene.sky_electrons
+    return float(np.abs(coefficients(scene)).max()) * full
+
+
+EFFECT = Effect("crosstalk", apply, lambda scene: (coefficients(scene),), _contribution, cost=3e-2)

@@ -1,0 +1,53 @@
+"""Pixel response: each pixel's own sensitivity (PRNU), dead pixels, dark columns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jobs.render.effects.effect import Effect, Frame, Scene
+from lake_schema.errors import OutOfRange
+
+# What a dead pixel still sees, at most.
+_DEAD = 0.5
+
+
+def apply(frame: Frame, rms: float, dead: float, dark_columns: float, rng: np.random.Generator) -> Frame:
+    """frame [ny, nx] e- -> times `response`."""
+    return np.asarray(frame * response(frame.shape, rms, dead, dark_columns, rng))
+
+
+def response(shape: tuple[int, ...], rms: float, dead: float, dark_columns: float, rng: np.random.Generator) -> Frame:
+    """Sensitivity of every pixel, mean 1 but for the defects, never below 0.
+
+    rms : between pixels;  dead : fraction of pixels that see little
+    dark_columns : mean number of columns that see nothing from some row on
+    """
+    for name, value, most in (
+        ("pixel response rms", rms, 1.0), ("dead pixels", dead, 1.0), ("dark columns", dark_columns, 1e4)
+    ):  # fmt: skip
+        if not 0.0 <= value <= most:
+            raise OutOfRange(name, value, 0.0, most)
+    out = np.asarray(rng.standard_normal(shape, dtype=np.float32), float)
+    out *= rms
+    out += 1.0
+    np.maximum(out, 0.0, out=out)
+    ny, nx = shape[-2:]
+    count = int(rng.binomial(ny * nx, dead))
+    rows, columns = rng.integers(0, max(ny, 1), count), rng.integers(0, max(nx, 1), count)
+    out[..., rows, columns] = _DEAD * rng.random(count)
+    for _ in range(int(rng.poisson(dark_columns)) if nx else 0):
+        out[..., int(rng.integers(0, ny)) :, int(rng.integers(0, nx))] = 0.0
+    return out
+
+
+def _parameters(scene: Scene) -> tuple[float, float, float]:
+    return scene.value("prnu", ""), scene.value("dead_pixels", ""), scene.value("dark_columns", "")
+
+
+def _contribution(scene: Scene) -> float:
+    rms, dead, columns = _parameters(scene)
+    brightest = scene.peak_electrons + scene.sky_electrons
+    return max(rms * brightest, scene.sky_electrons * (dead > 0 or columns > 0))
+
+
+EFFECT = Effect("pixel_response", apply, _parameters, _contribution, fixed=True, cost=1.5e-2)

@@ -1,0 +1,66 @@
+"""Quadrants: a detector is read through its four corners, each with its own pre- and overscan.
+
+Readout order: [E, F, G, H][row, column], where [0, 0] is read first. E lies upper left, F upper right, G lower right,
+H lower left (Euclid Data Product Description Document, LE1 VIS). Columns: prescan, pixels, overscan; rows: pixels,
+overscan.
+
+apply, EFFECT    detector -> quadrants in readout order, no charge outside the pixels
+placed           one quadrant in readout order -> as it lies on the detector, and back
+assembled        quadrants -> detector, without pre- and overscan
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs.render.effects.effect import Effect, Frame, Scene
+from lake_schema.errors import BadInput, OutOfRange
+
+NAMES = "EFGH"
+# Whether a quadrant lies in the upper half, in the right half.
+_UPPER, _RIGHT = (True, True, False, False), (False, True, True, False)
+
+Number = TypeVar("Number", bound=np.generic)
+
+
+def apply(frame: Frame, prescan: int, overscan: int, rows: int, rng: np.random.Generator | None = None) -> Frame:
+    """frame [ny, nx] e- -> quadrants [4, ny / 2 + rows, prescan + nx / 2 + overscan] e-."""
+    for name, value in (("prescan", prescan), ("overscan", overscan), ("overscan rows", rows)):
+        if not 0 <= value <= 4096:
+            raise OutOfRange(name, value, 0, 4096)
+    ny, nx = frame.shape
+    if ny % 2 or nx % 2:
+        raise BadInput(f"a detector of {ny} x {nx} pixels has no quadrants: its sides must be even")
+    half_y, half_x = ny // 2, nx // 2
+    out = np.zeros((4, half_y + rows, prescan + half_x + overscan), frame.dtype)
+    for number in range(4):
+        y, x = half_y * _UPPER[number], half_x * _RIGHT[number]
+        part = frame[y : y + half_y, x : x + half_x]
+        out[number, :half_y, prescan : prescan + half_x] = placed(part, number)
+    return out
+
+
+def placed(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
+    """A quadrant [ny, nx] in readout order -> in the detector's own axes; applied twice it is itself."""
+    return quadrant[:: -1 if _UPPER[number] else 1, :: -1 if _RIGHT[number] else 1]
+
+
+def assembled(quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int) -> npt.NDArray[Number]:
+    """Quadrants [4, ..] in readout order -> detector [ny, nx], pre- and overscan cut off."""
+    pixels = [placed(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)]
+    e, f, g, h = pixels
+    return np.block([[h, g], [e, f]])
+
+
+def sizes(scene: Scene) -> tuple[int, int, int]:
+    """prescan, overscan, overscan rows."""
+    prescan, overscan, rows = (
+        int(scene.value(f"fpa.{key}", "pix")) for key in ("prescan", "overscan", "parallel_overscan")
+    )
+    return prescan, overscan, rows
+
+
+EFFECT = Effect("quadrants", apply, sizes, lambda scene: 0.0, optional=False, cost=1e-2)

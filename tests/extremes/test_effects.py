@@ -1,0 +1,99 @@
+"""Effects at the edges of what a detector may meet: finite, conserving, bounded in time."""
+
+import time
+
+import numpy as np
+import pytest
+
+from jobs.render.effects import bleeding, charge_transfer, cosmic_rays, poisson, traps
+from jobs.render.effects.effect import Scene
+from jobs.render.effects.traps import Sweeps
+from lake_schema.mission.configuration import resolve
+from tests.jobs.render.effects.battery import CASES, END_OF_LIFE, call
+
+SIDE = 256
+# Seconds of processor time that any effect may take for a frame of SIDE x SIDE, compiled.
+BOUND = 2.0
+
+
+def scenes(shape):
+    """Frames that break simple code."""
+    ny, nx = shape
+    star, column, ends = np.zeros(shape), np.full(shape, 130.0), np.zeros(shape)
+    star[ny // 3, nx // 3] = 1e11
+    column[:, nx // 2] = 2e5
+    ends[0, 0] = ends[-1, -1] = 1e9
+    return {
+        "star of 1e11": star,
+        "full column": column,
+        "corners": ends,
+        "empty": np.zeros(shape),
+        "one electron": np.eye(ny, nx),
+        "all saturated": np.full(shape, 1e7),
+    }
+
+
+@pytest.mark.parametrize("shape", [(SIDE, SIDE), (2, 2), (2, SIDE), (SIDE, 2)])
+@pytest.mark.parametrize("name", CASES)
+def test_finite_and_bounded(name, shape):
+    case = CASES[name]
+    for frame in scenes(shape).values():
+        wanted = np.stack([frame] * 4) if case.planes else frame
+        call(case, wanted[..., :2, :2])
+        started = time.process_time()
+        after = call(case, wanted)
+        assert time.process_time() - started < BOUND
+        assert np.isfinite(after).all()
+        if case.conserves:
+            assert after.sum() == pytest.approx(frame.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1)])
+@pytest.mark.parametrize("name", [name for name in CASES if name != "quadrants"])
+def test_single_rows_and_columns(name, shape):
+    case = CASES[name]
+    for frame in (np.zeros(shape), np.full(shape, 1e7)):
+        wanted = np.stack([frame] * 4) if case.planes else frame
+        assert np.isfinite(call(case, wanted)).all()
+
+
+@pytest.mark.parametrize("shape", [(SIDE, SIDE), (1, SIDE), (SIDE, 1), (1, 1)])
+def test_bleeding_and_transfer_account_for_every_electron(shape):
+    """Charge in = charge out + what is still trapped + what left through the registers."""
+    for frame in scenes((max(shape), max(shape))).values():
+        part = np.ascontiguousarray(frame[: shape[0], : shape[1]])
+        held, lost = bleeding.bleed(part, 2e5, 2)
+        assert held.sum() + lost == part.sum()
+        out, below = traps.shifted(held, END_OF_LIFE, Sweeps(1, 2), -2)
+        read, along = traps.shifted(out, END_OF_LIFE, Sweeps(1, 2), -1)
+        assert read.sum() + below + along + lost == pytest.approx(part.sum(), rel=1e-12)
+        assert read.min() >= 0
+
+
+@pytest.mark.parametrize("age", [0.0, 1.0, 10.0])
+def test_no_traps_and_far_beyond_the_end_of_life(age):
+    scene = Scene(resolve(overrides={"vis.cti.age": (age, "")}), "vis", 560.0, 0.25, 1e4)
+    silicon = charge_transfer.lattice(scene, "parallel")
+    for frame in scenes((SIDE, 8)).values():
+        out, still = traps.shifted(frame, silicon, Sweeps(1, 2), -2)
+        assert out.sum() + still == pytest.approx(frame.sum(), rel=1e-12)
+        if age == 0:
+            np.testing.assert_array_equal(out, frame)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 1e5])
+def test_exposure_times_from_nothing_to_a_day(seconds):
+    scene = Scene(resolve(), "vis", seconds, 0.25, 1e4)
+    assert np.isfinite([effect.margin(scene) for effect in (cosmic_rays.EFFECT, cosmic_rays.READOUT)]).all()
+    (expected,) = cosmic_rays.EFFECT.parameters(scene)
+    started = time.process_time()
+    image = cosmic_rays.tracks((SIDE, SIDE), expected * (SIDE / 4096) ** 2, np.random.default_rng(1))
+    assert time.process_time() - started < BOUND
+    assert (image.sum() > 0) == (seconds > 0)
+
+
+@pytest.mark.parametrize("mean", [1e-300, 1e9, 1e18])
+def test_counting_the_countless(mean):
+    counted = poisson.apply(np.full((200, 200), mean), rng=np.random.default_rng(1))
+    assert counted.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean) / 200)
+    assert counted.var() == pytest.approx(mean, rel=0.03, abs=1e-290)

@@ -1,0 +1,75 @@
+"""Brighter-fatter: charge only moves, stars widen in proportion to their peaks, flats lose variance as predicted."""
+
+import numpy as np
+import pytest
+
+from jobs.render.effects import brighter_fatter
+from lake_schema.errors import OutOfRange
+
+SHIFT, SOFT, FULL = 1.2e-7, 0.5, 2e5
+
+
+def widths(image):
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    total = image.sum()
+    dx, dy = x - (image * x).sum() / total, y - (image * y).sum() / total
+    return np.sqrt([(image * dx * dx).sum() / total, (image * dy * dy).sum() / total])
+
+
+def star(peak):
+    y, x = np.mgrid[:25, :25]
+    return np.rint(peak * np.exp(-((x - 12.2) ** 2 + (y - 11.9) ** 2) / (2 * 0.7**2)))
+
+
+def test_a_star_at_full_well_is_one_to_two_per_cent_wider():
+    growth = {}
+    for peak in (5e4, 2e5):
+        image = star(peak)
+        mean = np.mean(
+            [brighter_fatter.apply(image, SHIFT, SOFT, FULL, np.random.default_rng(i)) for i in range(50)], axis=0
+        )
+        growth[peak] = widths(mean) / widths(image) - 1
+    assert (growth[2e5] > 0.01).all()
+    assert (growth[2e5] < 0.02).all()
+    np.testing.assert_allclose(growth[5e4], growth[2e5] / 4, rtol=0.1)
+
+
+def test_variance_of_a_flat_falls_as_predicted():
+    level = 1e5
+    flat = np.random.default_rng(1).poisson(level, (1200, 1200)).astype(float)
+    out = brighter_fatter.apply(flat, SHIFT, SOFT, FULL, np.random.default_rng(2))
+    assert out.sum() == flat.sum()
+    lost = 1 - out.var() / flat.var()
+    assert lost == pytest.approx(brighter_fatter.curvature(SHIFT, SOFT) * level, rel=0.1)
+    # What a pixel loses of its fluctuation its neighbours get.
+    rest = out - out.mean()
+    assert (rest[:, 1:] * rest[:, :-1]).mean() > 0.0015 * level
+    assert (rest[1:] * rest[:-1]).mean() > 0.0015 * level
+
+
+def test_rows_and_columns_are_alike():
+    image = star(1e5)
+    one = np.mean([brighter_fatter.apply(image, SHIFT, SOFT, FULL, np.random.default_rng(i)) for i in range(60)], 0)
+    two = np.mean([brighter_fatter.apply(image.T, SHIFT, SOFT, FULL, np.random.default_rng(i)) for i in range(60)], 0)
+    assert np.abs(one - two.T).max() < 1.0
+
+
+def test_kernel_falls_off():
+    weights = brighter_fatter.kernel(SHIFT, SOFT)
+    assert weights.shape == (5, 2)
+    assert weights[2, 0] == SHIFT
+    assert (np.diff(weights[2:, 0]) < 0).all()
+    np.testing.assert_array_equal(weights, weights[::-1])
+
+
+def test_what_no_pixel_holds_does_not_repel():
+    image = star(1e9)
+    out = brighter_fatter.apply(image, SHIFT, SOFT, FULL, np.random.default_rng(1))
+    assert out.min() >= 0
+    assert out.sum() == image.sum()
+
+
+@pytest.mark.parametrize("wrong", [(-1.0, 0.5, 2e5), (np.nan, 0.5, 2e5), (1e-7, -1.0, 2e5), (1e-7, 0.5, 0.0)])
+def test_nonsense_is_refused(wrong):
+    with pytest.raises(OutOfRange, match=r"brighter|full well"):
+        brighter_fatter.apply(np.ones((3, 3)), *wrong, np.random.default_rng(1))

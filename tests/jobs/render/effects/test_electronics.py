@@ -1,0 +1,146 @@
+"""From charge to numbers: quadrants, amplifiers, crosstalk, the bias, injected charge, temperature."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jobs.render.effects import bias_structure, charge_injection, crosstalk, dark_current, nonlinearity, quadrants
+from jobs.render.effects.effect import Scene, warmth
+from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.mission.configuration import resolve
+
+SCENE = Scene(resolve(), "vis", 560.53, 0.25, 1e4)
+CURVE = (0.05, 2.28e5, 0.01, 2e3)
+
+
+@given(
+    half_y=st.integers(1, 6),
+    half_x=st.integers(1, 6),
+    pre=st.integers(0, 3),
+    over=st.integers(0, 3),
+    rows=st.integers(0, 2),
+)
+def test_quadrants_are_put_together_again(half_y, half_x, pre, over, rows):
+    frame = np.arange(4.0 * half_y * half_x).reshape(2 * half_y, 2 * half_x) + 1
+    parts = quadrants.apply(frame, pre, over, rows)
+    assert parts.shape == (4, half_y + rows, pre + half_x + over)
+    np.testing.assert_array_equal(quadrants.assembled(parts, pre, over, rows), frame)
+    assert (parts > 0).sum() == frame.size
+    for number in range(4):
+        turned = quadrants.placed(parts[number], number)
+        np.testing.assert_array_equal(quadrants.placed(turned, number), parts[number])
+
+
+def test_each_corner_is_read_first():
+    frame = np.zeros((4132, 4096))
+    frame[-1, 0], frame[-1, -1], frame[0, -1], frame[0, 0] = 1, 2, 3, 4
+    parts = quadrants.apply(frame, *quadrants.sizes(SCENE))
+    assert parts.shape == (4, 2086, 2128)
+    assert "".join(quadrants.NAMES) == "EFGH"
+    assert [parts[i, 0, 51] for i in range(4)] == [1, 2, 3, 4]
+    assert parts.sum() == 10
+
+
+def test_odd_detectors_have_no_quadrants():
+    with pytest.raises(BadInput, match="even"):
+        quadrants.apply(np.zeros((3, 4)), 1, 1, 1)
+    with pytest.raises(OutOfRange, match="prescan"):
+        quadrants.apply(np.zeros((2, 4)), -1, 1, 1)
+
+
+@given(st.floats(0, 1e6), st.floats(0, 0.3), st.floats(0, 0.5))
+def test_nonlinearity_and_its_inverse(electrons, high, low):
+    curve = (high, 2.28e5, low, 2e3)
+    measured = nonlinearity.apply(np.array([electrons]), *curve)
+    assert 0 <= measured[0] <= electrons
+    again = nonlinearity.linearised(measured, *curve)
+    assert again[0] == pytest.approx(electrons, rel=1e-9, abs=1e-6)
+
+
+def test_nonlinearity_is_one_and_five_per_cent():
+    n = np.array([1e-3, 2.28e5])
+    lost = 1 - nonlinearity.apply(n, *CURVE) / n
+    assert lost[0] == pytest.approx(0.01, rel=1e-3)
+    assert lost[1] == pytest.approx(0.05 / 1.05, rel=0.005)
+    steps = nonlinearity.apply(np.linspace(0, 1e6, 10_001), *CURVE)
+    assert (np.diff(steps) > 0).all()
+    np.testing.assert_array_equal(nonlinearity.apply(np.array([-5.0]), *CURVE), [-5.0])
+    assert nonlinearity.linearised(np.array([1e9]), *CURVE)[0] == np.inf
+    assert nonlinearity.parameters(SCENE) == pytest.approx((0.05, 65535 * 3.48, 0.01, 2000.0))
+    for wrong in ((-1.0, *CURVE[1:]), (*CURVE[:2], 1.0, 2e3), (0.05, 0.0, 0.01, 2e3), (*CURVE[:3], 0.0)):
+        with pytest.raises(OutOfRange, match=r"non-linearity|saturation"):
+            nonlinearity.apply(n, *wrong)
+
+
+def test_crosstalk_is_taken_from_what_was():
+    frame = np.zeros((4, 3, 5))
+    frame[0, 1, 2], frame[3, 0, 0] = 1e5, 2e4
+    table = crosstalk.coefficients(SCENE)
+    out = crosstalk.apply(frame, table)
+    np.testing.assert_allclose(out[:, 1, 2], [1e5, 1e5 * table[1, 0], 1e5 * table[2, 0], 1e5 * table[3, 0]])
+    assert out[0, 0, 0] == pytest.approx(2e4 * table[0, 3])
+    np.testing.assert_array_equal(table, table.T)
+    np.testing.assert_array_equal(np.diag(table), 0)
+    with pytest.raises(BadInput, match="crosstalk"):
+        crosstalk.apply(frame, np.zeros((3, 3)))
+    with pytest.raises(OutOfRange, match="crosstalk"):
+        crosstalk.apply(frame, np.full((4, 4), np.nan))
+
+
+def test_structure_of_the_bias():
+    pattern = bias_structure.structure(400, 2128, 34.8, -10.0, 40.0, 1.0, np.random.default_rng(1))
+    assert pattern.shape == (400, 2128)
+    settled = pattern[:, 1000:]
+    assert settled.mean(axis=1).std() == pytest.approx(34.8, rel=0.1)
+    assert (settled - settled.mean(axis=1, keepdims=True)).std() == pytest.approx(1.0, rel=0.02)
+    first = pattern[:, 0] - settled.mean(axis=1)
+    assert first.mean() == pytest.approx(-10.0, abs=0.2)
+    frame = np.zeros((4, 5, 7))
+    out = bias_structure.apply(frame, 3.0, 1.0, 4.0, 1.0, np.random.default_rng(2))
+    np.testing.assert_array_equal(out, np.repeat(out[:, :1], 5, axis=1))
+    assert bias_structure.EFFECT.fixed
+    for wrong in ((-1.0, 0.0, 4.0, 1.0), (1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 4.0, -1.0)):
+        with pytest.raises(OutOfRange, match="bias"):
+            bias_structure.apply(frame, *wrong, np.random.default_rng(2))
+
+
+def test_injected_charge_comes_in_blocks():
+    out = charge_injection.apply(np.zeros((1200, 50)), 15_000.0, 100, 200, 0.03, 60.0, np.random.default_rng(1))
+    rows = out.mean(axis=1)
+    lit = np.flatnonzero(rows > 0)
+    assert [lit[0], lit[99], lit[100]] == [200, 299, 500]
+    np.testing.assert_array_equal(rows > 0, rows[::-1] > 0)
+    columns = out[lit].mean(axis=0)
+    assert columns.mean() == pytest.approx(15_000, rel=0.02)
+    assert columns.std() == pytest.approx(450, rel=0.4)
+    assert (out[lit] - columns).std() == pytest.approx(60, rel=0.05)
+    np.testing.assert_array_equal(out, np.rint(out))
+    for wrong in ((-1.0, 1, 1, 0.0, 0.0), (1.0, 0, 1, 0.0, 0.0), (1.0, 1, -1, 0.0, 0.0), (1.0, 1, 1, np.nan, 0.0)):
+        with pytest.raises(OutOfRange, match="inject"):
+            charge_injection.apply(np.zeros((4, 4)), *wrong, np.random.default_rng(1))
+
+
+def test_dark_current_doubles_in_a_few_kelvin():
+    assert warmth(153.0, 153.0, 1.12) == 1.0
+    assert warmth(155.4, 153.0, 1.12) == pytest.approx(2.0, rel=0.03)
+    assert warmth(150.6, 153.0, 1.12) == pytest.approx(0.5, rel=0.05)
+    with pytest.raises(OutOfRange, match="temperature"):
+        warmth(0.0, 153.0, 1.12)
+
+
+def test_dark_current_follows_the_detector_s_temperature():
+    warm = Scene(resolve(overrides={"vis.detector_temperature": (163.0, "K")}), "vis", 560.53, 0.25, 1e4)
+    assert warm.dark_electrons / SCENE.dark_electrons == pytest.approx(warmth(163.0, 153.0, 1.12))
+    assert SCENE.dark_electrons == pytest.approx(560.53 * SCENE.value("dark_current", "electron / (s pix)"))
+
+
+def test_hot_pixels_are_few_and_the_detector_s_own():
+    out = dark_current.apply_hot(np.zeros((500, 400)), 1e-3, 100.0, np.random.default_rng(1))
+    hot = out[out > 0]
+    assert len(hot) == pytest.approx(200, abs=50)
+    assert hot.mean() == pytest.approx(100, rel=0.25)
+    assert dark_current.HOT.fixed
+    for wrong in ((2.0, 1.0), (0.1, -1.0), (np.nan, 1.0)):
+        with pytest.raises(OutOfRange, match="hot"):
+            dark_current.apply_hot(np.zeros((3, 3)), *wrong, np.random.default_rng(1))

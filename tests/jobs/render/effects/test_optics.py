@@ -1,0 +1,261 @@
+"""What the optics add and take: ghosts, straylight, illumination, shutter, lamp, the pixel's own response."""
+
+from dataclasses import replace
+
+import galsim
+import numpy as np
+import pytest
+
+from jobs.render import focal_plane
+from jobs.render.effects import (
+    calibration_lamp,
+    ghosts,
+    illumination,
+    intra_pixel,
+    pixel_response,
+    readout_trail,
+    straylight,
+)
+from jobs.render.effects.effect import NOTICEABLE, Lights, Scene
+from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.mission.configuration import resolve
+
+MISSION = resolve()
+PLACES = ("1-1", "3-4", "6-2")
+EMPTY = np.zeros((400, 300))
+
+
+def scene(name="3-4", **more):
+    return Scene(MISSION, "vis", 560.53, 0.25, 1e4, focal_plane.detector("vis", name, MISSION), **more)
+
+
+def light(column, row, electrons=1e8):
+    return Lights(np.array([float(column)]), np.array([float(row)]), np.array([electrons]))
+
+
+# ------------------------------------------------------------------------------------------------ ghosts
+
+
+def test_a_ghost_is_an_annulus_of_the_right_light():
+    image = ghosts.apply(EMPTY, light(150.3, 100.6), 1e-4, (0.0, 100.0), 56.0, 0.33, (), 0.0)
+    assert image.sum() == pytest.approx(1e4, rel=1e-6)
+    y, x = np.mgrid[:400, :300]
+    radius = np.hypot(x - 150.3, y - 200.6)
+    lit = (radius > 0.33 * 56 + 2) & (radius < 54)
+    assert image[radius > 58].max() == 0
+    assert image[radius < 0.33 * 56 - 2].max() == 0
+    np.testing.assert_allclose(image[lit], 1e4 / (np.pi * 56**2 * (1 - 0.33**2)), rtol=0.02)
+    assert (image * x).sum() / image.sum() == pytest.approx(150.3, abs=1e-3)
+    assert (image * y).sum() / image.sum() == pytest.approx(200.6, abs=1e-3)
+
+
+def test_arms_of_the_ghost():
+    """Three dark spokes, where the arms are."""
+    image = ghosts.apply(EMPTY, light(150.0, 100.0), 1e-4, (0.0, 100.0), 56.0, 0.33, (0.0, 90.0, 225.0), 4.0)
+    along = {
+        angle: (150 + 40 * np.cos(np.radians(angle)), 200 + 40 * np.sin(np.radians(angle)))
+        for angle in range(0, 360, 15)
+    }
+    dark = [angle for angle, (x, y) in along.items() if image[round(y), round(x)] == 0]
+    assert dark == [0, 90, 225]
+
+
+def test_stars_outside_send_their_ghosts_in():
+    """A star below the frame; the ghost is the one of a larger frame."""
+    large = ghosts.apply(np.zeros((1000, 300)), light(100, 200), 1e-4, (0.0, 700.0), 56.0, 0.33, (16.8,), 1.0)
+    inside = ghosts.apply(np.zeros((400, 300)), light(100, -400), 1e-4, (0.0, 700.0), 56.0, 0.33, (16.8,), 1.0)
+    np.testing.assert_array_equal(large[600:], inside)
+    assert inside.sum() == pytest.approx(1e4, rel=1e-6)
+    far = ghosts.apply(np.zeros((400, 300)), light(100, 250), 1e-4, (0.0, 700.0), 56.0, 0.33, (16.8,), 1.0)
+    assert (far == 0).all()
+
+
+def test_ghosts_add_up():
+    one, two = light(100, 50), light(150, 180, 3e7)
+    both = Lights(*(np.concatenate([getattr(one, k), getattr(two, k)]) for k in ("column", "row", "electrons")))
+    args = (1e-4, (0.0, 60.0), 20.0, 0.33, (), 0.0)
+    together = ghosts.apply(EMPTY, both, *args)
+    np.testing.assert_allclose(together, ghosts.apply(EMPTY, one, *args) + ghosts.apply(EMPTY, two, *args), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_the_offset_is_the_focal_plane_s(name):
+    """Detectors that are mounted upside down see it the other way."""
+    shown = scene(name, lights=light(100, 100, 1e12))
+    chosen, ratio, offset, radius, hole, arms, width = ghosts.parameters(shown)
+    assert len(chosen.electrons) == 1
+    assert ratio == 1e-6
+    assert (radius, hole) == (56.0, 0.33)
+    assert len(arms) == 3
+    assert width == pytest.approx(56 * 12 / 600)
+    np.testing.assert_allclose(offset, (0.0, -750.0 if shown.detector.rotation else 750.0), atol=1e-9)
+
+
+def test_what_no_ghost_shows_is_left_out():
+    """On either side of the threshold the ghost, as a whole, is 0.1 of the noise under it."""
+    noise = scene().pixel_noise
+    edge = NOTICEABLE * noise * np.sqrt(np.pi) * 56 / 1e-6
+    for factor, shown in ((0.9, False), (1.1, True)):
+        one = scene(lights=light(100, 100, factor * edge))
+        assert ghosts.EFFECT.needed_if(one) == shown
+        assert len(ghosts.parameters(one)[0].electrons) == shown
+        image = ghosts.apply(EMPTY, one.lights, 1e-6, (0.0, 100.0), 56.0, 0.33, (), 0.0)
+        if not shown:
+            assert image.max() < NOTICEABLE * noise
+            assert image.sum() < NOTICEABLE * noise * np.sqrt((image > 0).sum()) * 1.1
+
+
+@pytest.mark.parametrize("wrong", [(-1.0, 56.0, 0.3), (1e-4, 0.0, 0.3), (1e-4, 56.0, 1.0), (np.nan, 56.0, 0.3)])
+def test_impossible_ghosts_are_refused(wrong):
+    with pytest.raises(OutOfRange, match="ghost"):
+        ghosts.apply(EMPTY, light(1, 1), wrong[0], (0.0, 0.0), *wrong[1:], (), 0.0)
+
+
+# ------------------------------------------------------------------------------------------------ straylight
+
+
+def test_a_halo_has_its_form():
+    image = straylight.apply(EMPTY, light(150.4, 190.2, 1e9), 5e-4, 40.0)
+    y, x = np.mgrid[:400, :300]
+    u = 1 + ((x - 150.4) ** 2 + (y - 190.2) ** 2) / 40.0**2
+    wanted = 1e9 * 5e-4 / (2 * np.pi * 40.0**2) * u**-1.5
+    np.testing.assert_allclose(image, wanted, atol=2e-3 * wanted.max())
+    total = 1 - 1 / np.sqrt(1 + (140 / 40.0) ** 2)
+    assert image[np.hypot(x - 150, y - 190) < 140].sum() == pytest.approx(5e5 * total, rel=0.01)
+
+
+def test_halos_come_from_outside_too():
+    image = straylight.apply(EMPTY, light(-50.0, 200.0, 1e9), 5e-4, 40.0)
+    assert image[200, 0] > image[200, 50] > image[200, 299] > 0
+
+
+def test_faint_stars_have_no_halo():
+    many = Lights(np.full(3, 10.0), np.full(3, 10.0), np.array([1e3, 1e6, 1e11]))
+    chosen, fraction, scale = straylight.EFFECT.parameters(scene(lights=many))
+    assert (fraction, scale) == (5e-4, 400.0)
+    np.testing.assert_array_equal(chosen.electrons, [1e11])
+
+
+# ------------------------------------------------------------------------------------------------ illumination
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_illumination_is_one_map_over_the_focal_plane(name):
+    """Pixel by pixel what the formula says at its place, in whatever way the detector is turned."""
+    turned = replace(scene(name).detector, nx=60, ny=40, pixel_scale=7.0)
+    one = replace(scene(name), detector=turned)
+    columns, rows = illumination.pattern(one, 60, 40, 0.02, (0.003, -0.01))
+    everything = focal_plane.detectors("vis", MISSION)
+    half_x = max(d.x for d in everything) + 204.8
+    half_y = max(d.y for d in everything) + 206.6
+    for c, r in ((0, 0), (59, 39), (17, 30)):
+        turn = np.radians(turned.rotation)
+        dx, dy = 7.0 * (c - 29.5), 7.0 * (r - 19.5)
+        x = turned.x + dx * np.cos(turn) - dy * np.sin(turn)
+        y = turned.y + dx * np.sin(turn) + dy * np.cos(turn)
+        wanted = 1 - 0.02 * (x**2 + y**2) / (half_x**2 + half_y**2) + 0.003 * x / half_x - 0.01 * y / half_y
+        assert 1 + columns[c] + rows[r] == pytest.approx(wanted, abs=1e-12)
+
+
+def test_vignetting_and_shutter_are_per_cents():
+    corner = illumination.apply(np.ones((4132, 4096)), *illumination.EFFECT.parameters(scene("1-1")))
+    assert corner[-1, 0] == pytest.approx(0.98, abs=1e-5)
+    shutter = [
+        illumination.apply(np.ones((4132, 4096)), *illumination.SHUTTER.parameters(scene(name)))
+        for name in ("1-1", "6-1")
+    ]
+    assert shutter[0].max() == pytest.approx(1.003)
+    assert shutter[1].min() == pytest.approx(0.997)
+
+
+def test_lamps_differ_in_where_they_shine():
+    ones = np.ones((40, 60))
+    maps = [
+        1 + ones * 0 + rows[:, None] + columns
+        for columns, rows in (calibration_lamp.pattern(scene(), led, 60, 40) for led in range(1, 7))
+    ]
+    for i in range(6):
+        for other in maps[:i]:
+            assert np.abs(maps[i] - other).max() > 1e-4
+    with pytest.raises(OutOfRange, match="LED"):
+        calibration_lamp.pattern(scene(), 7, 60, 40)
+    with pytest.raises(OutOfRange, match="lamp"):
+        calibration_lamp.apply(ones, -1.0, np.zeros(60), np.zeros(40))
+
+
+def test_a_map_of_other_size_is_refused():
+    with pytest.raises(BadInput, match="illumination"):
+        illumination.apply(EMPTY, np.zeros(3), np.zeros(400))
+    with pytest.raises(OutOfRange, match="illumination"):
+        illumination.apply(EMPTY, np.full(300, -3.0), np.zeros(400))
+
+
+def test_the_response_of_pixels():
+    response = pixel_response.response((600, 500), 0.01, 1e-3, 3.0, np.random.default_rng(2))
+    good = response > 0.6
+    assert response[good].std() == pytest.approx(0.01, rel=0.02)
+    assert response[good].mean() == pytest.approx(1.0, abs=1e-4)
+    dark = (response == 0).sum(axis=0)
+    assert 1 <= (dark > 2).sum() <= 9
+    assert ((response > 0) & ~good).sum() == pytest.approx(300, abs=80)
+    assert pixel_response.EFFECT.fixed
+
+
+@pytest.mark.parametrize("wrong", [(-1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, -1.0), (np.nan, 0.0, 0.0)])
+def test_impossible_responses_are_refused(wrong):
+    with pytest.raises(OutOfRange, match=r"pixel|dark"):
+        pixel_response.response((3, 3), *wrong, np.random.default_rng(1))
+
+
+# ------------------------------------------------------------------------------------------------ intra-pixel, trail
+
+
+def test_intra_pixel_response_against_the_integral_over_pixels():
+    """The transform of the response, sampled finely; unity at k = 0; the plain pixel without it."""
+    u = (np.arange(400) + 0.5) / 200 - 1
+    response = 1 - 0.05 * (u[:, None] ** 2 + u**2)
+    response /= response.mean()
+    for x, y in ((0.0, 0.0), (1e-3, 0.0), (0.04, 0.05), (0.3, -0.2), (0.5, 0.5), (1.0, 0.7)):
+        wanted = (response * np.cos(np.pi * x * u) * np.cos(np.pi * y * u[:, None])).mean()
+        assert intra_pixel.apply(x, y, 0.05) == pytest.approx(wanted, abs=1e-5)
+    assert intra_pixel.apply(0.0, 0.0, 0.3) == 1.0
+    x, y = np.mgrid[-1:1:9j, -1:1:9j]
+    np.testing.assert_allclose(intra_pixel.apply(x, y, 0.0), np.sinc(x) * np.sinc(y), atol=1e-15)
+    # Series and closed form meet.
+    edge = 0.15 / np.pi
+    below, above = (intra_pixel.apply(edge * (1 + step), 0.0, 0.5) for step in (-1e-9, 1e-9))
+    assert below == pytest.approx(above, abs=1e-10)
+    with pytest.raises(OutOfRange, match="intra-pixel"):
+        intra_pixel.apply(0.0, 0.0, 0.7)
+
+
+def test_intra_pixel_response_changes_a_star_as_stated():
+    """Through GalSim: a star of VIS's width loses 0.3 % of its wings to its centre."""
+    star = galsim.Convolve(galsim.Airy(lam=700, diam=1.2, obscuration=0.35), galsim.Gaussian(sigma=0.033))
+    fine = star.drawImage(nx=41 * 15, ny=41 * 15, scale=0.1 / 15, method="no_pixel").array.astype(float)
+    blocks = fine.reshape(41, 15, 41, 15)
+    u = (np.arange(15) + 0.5) / 7.5 - 1
+    response = 1 - 0.05 * (u[:, None] ** 2 + u**2)
+    plain, changed = blocks.sum(axis=(1, 3)), np.einsum("aibj,ij->ab", blocks, response / response.mean())
+    most = np.abs(changed - plain).max() / plain.max()
+    one = scene()
+    assert intra_pixel.EFFECT.contribution(one) == pytest.approx(most * one.peak_electrons, rel=0.15)
+
+
+def test_open_shutter_draws_a_trail():
+    frame = np.zeros((20, 3))
+    frame[4, 1] = frame[13, 2] = 1000.0
+    out = readout_trail.apply(frame, 1e-3, 2)
+    # Rows read after the star pass over it: away from the register, up to the middle.
+    np.testing.assert_allclose(out[5:10, 1], 1.0)
+    np.testing.assert_allclose(out[10:13, 2], 1.0)
+    assert out[:, 0].max() == 0
+    assert (out[:4, 1] == 0).all()
+    assert (out[14:, 2] == 0).all()
+    share, halves = readout_trail.EFFECT.parameters(scene())
+    assert share == pytest.approx(72 / 2086 / 560.53)
+    assert halves == 2
+    with pytest.raises(OutOfRange, match="trail"):
+        readout_trail.apply(frame, -1.0, 2)
+    with pytest.raises(OutOfRange, match="halves"):
+        readout_trail.apply(frame, 1.0, 4)
