@@ -42,4 +42,9 @@ def _parameters(scene: Scene) -> tuple[float, int, int, float, float]:
     )
 
 
-EFFECT = Effect("charge_injection", apply, _parameters, lambda scene: _parameters(scene)[0], cost=2e-2)
+def _contribution(scene: Scene) -> float:
+    level, *_, noise = _parameters(scene)
+    return (level + noise) * (level > 0.0)
+
+
+EFFECT = Effect("charge_injection", apply, _parameters, _contribution, cost=2e-2)

@@ -22,6 +22,8 @@ from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
 _SQUARE_CM = 1e-8
+# Expected tracks that nobody waits for.
+_FEW = 1e-3
 
 
 def apply(frame: Frame, expected: float, rng: np.random.Generator) -> Frame:
@@ -140,12 +142,14 @@ def _readout(scene: Scene) -> tuple[float, int, int, int]:
     return pixels, rows, int(scene.value("fpa.prescan", "pix")), columns
 
 
-def _contribution(scene: Scene) -> float:
+def _in_a_pixel(expected: float) -> float:
     """The median track's charge in a pixel, where there is one."""
     _, length, charge = _quantiles()
     middle = len(length) // 2
-    return float(charge[middle] / length[middle]) * (_expected(scene)[0] > 1e-3)
+    return float(charge[middle] / length[middle]) * (expected > _FEW)
 
 
-EFFECT = Effect("cosmic_rays", apply, _expected, _contribution, cost=1e-2)
-READOUT = Effect("readout_cosmic_rays", apply_readout, _readout, _contribution, cost=1e-2)
+EFFECT = Effect("cosmic_rays", apply, _expected, lambda scene: _in_a_pixel(*_expected(scene)), cost=1e-2)
+READOUT = Effect(
+    "readout_cosmic_rays", apply_readout, _readout, lambda scene: _in_a_pixel(_readout(scene)[0]), cost=1e-2
+)

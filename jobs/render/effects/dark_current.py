@@ -36,5 +36,10 @@ def _hot(scene: Scene) -> tuple[float, float]:
     return scene.value("hot_pixels", ""), scene.value("hot_current", "electron / (s pix)") * scene.exposure_time_s
 
 
-EFFECT = Effect("dark_current", apply, lambda scene: (scene.dark_electrons,), lambda scene: scene.dark_electrons)
-HOT = Effect("hot_pixels", apply_hot, _hot, lambda scene: _hot(scene)[1] * (_hot(scene)[0] > 0), fixed=True)
+def _rms(scene: Scene) -> float:
+    """Of what it adds: its mean, and its own shot noise."""
+    return float(np.sqrt(scene.dark_electrons * (1.0 + scene.dark_electrons)))
+
+
+EFFECT = Effect("dark_current", apply, lambda scene: (scene.dark_electrons,), _rms, cost=3e-2)
+HOT = Effect("hot_pixels", apply_hot, _hot, lambda scene: _hot(scene)[1] * (_hot(scene)[0] > 0), fixed=True, cost=2e-3)

@@ -26,7 +26,7 @@ def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | 
 
 
 def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, float]) -> tuple[Frame, Frame]:
-    """(columns [nx], rows [ny]) of 1 - bowl r^2 + slope . (x, y); x, y = 1 at the focal plane's edges, r at a corner."""
+    """(columns [nx], rows [ny]) of 1 - bowl r^2 + slope . (x, y); x, y, r = 1 at the edges and corners of the field."""
     half_x, half_y = _half_sides(scene)
     corner = float(np.hypot(half_x, half_y))
     detector = scene.detector

@@ -170,8 +170,8 @@ def _shift(
 @jit
 def _sweep(
     line: Any, change: Any, low: int, high: int, pixels: int, density: Float, left: Float, filled: Float,
-    inverse: Float, released: Float, volumes: Float, notch: float, scale: float, height: Float, full: Float, since: Any, held: Float,
-    part: Float, bits: Any,
+    inverse: Float, released: Float, volumes: Float, notch: float, scale: float, height: Float, full: Float,
+    since: Any, held: Float, part: Float, bits: Any,
 ) -> float:  # fmt: skip
     """Fills `change` with what the pixels low .. high - 1 do to the packets; returns what they hold at the end.
 

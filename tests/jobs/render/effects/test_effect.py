@@ -73,43 +73,10 @@ def test_strange_or_impossible_wishes_are_refused():
         decide(vis.EFFECTS, SCENE, {"adc": False})
 
 
-@pytest.mark.parametrize("name", ["background", "dark_current", "read_noise", "full_well"])
-def test_what_is_left_out_is_not_noticed(name):
-    """On either side of its threshold: what is below it changes a pixel by < 0.1 of the noise."""
-    (effect,) = (e for e in vis.EFFECTS if e.name == name)
-    mission, found = SCENE.mission, set()
-    # Scenes in which each contribution is small, then large.
-    for scale in (1e-6, 1e-3, 1e-2, 0.1, 1.0, 30.0):
-        changed = resolve(
-            overrides={
-                "vis.dark_current": (scale * 0.02, "electron / (s pix)"),
-                "vis.read_noise": (scale * 50, "electron"),
-            }
-        )
-        scene = Scene(
-            changed,
-            "vis",
-            560.0,
-            scale * 2.0 if name == "background" else 0.25,
-            1.9e5 * max(scale, 1e-3) + 1e4,
-        )
-        frame = np.full((200, 200), 100.0)
-        frame[0, 0] = scene.peak_electrons + scene.sky_electrons
-        after = effect.apply(frame, *effect.parameters(scene), rng=np.random.default_rng(1))
-        change = np.sqrt(np.mean((after - frame)[0, 0] ** 2 if name == "full_well" else (after - frame) ** 2))
-        found.add(effect.needed_if(scene))
-        if not effect.needed_if(scene) and name != "dark_current":
-            assert change <= 0.1 * scene.pixel_noise * 1.05
-        if not effect.needed_if(scene) and name == "dark_current":
-            # Its mean; its own shot noise adds in quadrature to what is there.
-            assert (after - frame).mean() <= 0.1 * scene.pixel_noise * 1.05
-    assert found == {True, False}
-    assert mission.fingerprint == SCENE.mission.fingerprint
-
-
 def test_margins_tell_the_ratio():
     (dark,) = (e for e in vis.EFFECTS if e.name == "dark_current")
-    assert dark.margin(SCENE) == pytest.approx(SCENE.dark_electrons / (0.1 * SCENE.pixel_noise))
+    d = SCENE.dark_electrons
+    assert dark.margin(SCENE) == pytest.approx(np.sqrt(d + d**2) / (0.1 * SCENE.pixel_noise))
     longer = replace(SCENE, exposure_time_s=1e5, sky_rate=0.0)
     assert dark.needed_if(longer)
     assert not dark.needed_if(SCENE)
