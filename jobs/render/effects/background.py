@@ -15,4 +15,4 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator | None = None
     return frame + electrons
 
 
-EFFECT = Effect("background", apply, lambda scene: (scene.sky_electrons,), lambda scene: scene.sky_electrons)
+EFFECT = Effect("background", apply, lambda scene: (scene.sky_electrons,), lambda scene: scene.sky_electrons, cost=3e-3)

@@ -46,4 +46,4 @@ def _contribution(scene: Scene) -> float:
     return offset + abs(settling) + stripes
 
 
-EFFECT = Effect("bias_structure", apply, _parameters, _contribution, fixed=True, cost=1e-2)
+EFFECT = Effect("bias_structure", apply, _parameters, _contribution, fixed=True, cost=4e-3)

@@ -15,9 +15,12 @@ from jobs.render.effects.traps import Sweeps, Traps
 
 # Species of the mission database.
 _SPECIES = 3
-# Error of the charge that is displaced, at the end of the mission: of one sweep, of Heun's rule, and in four steps
-# (held against smaller steps by the tests; allowed is what a source loses of its flux, some per cent, times it).
-_SWEEPS = ((5e-3, Sweeps(1, 1)), (1e-3, Sweeps(1, 2)), (0.0, Sweeps(4, 2)))
+# Traps passed that stand for the end of the mission: one in each of 2066 pixels.
+_END_OF_LIFE = 2066.0
+# What they then do to a source at the far end: of its flux, its position (pixels), its ellipticity; and the error of
+# that, from one sweep, from Heun's rule and from four steps of it (both as measured against arCTIc by the tests).
+_FLUX, _SHIFT, _SHAPE = 0.05, 0.02, 0.005
+_SWEEPS = ((0.016, Sweeps(1, 1)), (0.0017, Sweeps(1, 2)), (0.0008, Sweeps(4, 2)))
 
 
 def apply_parallel(
@@ -34,9 +37,14 @@ def apply_serial(
     return traps.shifted(frame, lattice, sweeps, -1, min(columns, frame.shape[-1]))[0]
 
 
-def sweeps_for(accuracy: Accuracy) -> Sweeps:
-    """How closely charge is followed."""
-    return next(sweeps for error, sweeps in _SWEEPS if accuracy.flux >= error)
+def sweeps_for(accuracy: Accuracy, passed: float) -> Sweeps:
+    """How closely charge is followed past so many traps: as little as the errors of sources allow.
+
+    Losses grow with the traps, and so does the error of what is left out: the next order in them.
+    """
+    damage = passed / _END_OF_LIFE
+    allowed = min(accuracy.flux / _FLUX, accuracy.position / _SHIFT, accuracy.shape / _SHAPE)
+    return next((sweeps for error, sweeps in _SWEEPS if error * damage**2 <= allowed), _SWEEPS[-1][1])
 
 
 def lattice(scene: Scene, direction: str) -> Traps:
@@ -70,17 +78,22 @@ def _loss(scene: Scene, direction: str, transfers: int) -> float:
     return transfers * sum(silicon.density) * float(silicon.volume(brightest))
 
 
+def _parameters(scene: Scene, direction: str, transfers: int) -> tuple[Traps, Sweeps, int]:
+    silicon = lattice(scene, direction)
+    return silicon, sweeps_for(scene.accuracy, transfers * sum(silicon.density)), transfers
+
+
 PARALLEL = Effect(
     "parallel_cti",
     apply_parallel,
-    lambda scene: (lattice(scene, "parallel"), sweeps_for(scene.accuracy), _rows(scene)),
+    lambda scene: _parameters(scene, "parallel", _rows(scene)),
     lambda scene: _loss(scene, "parallel", _rows(scene)),
-    cost=0.15,
+    cost=0.1,
 )
 SERIAL = Effect(
     "serial_cti",
     apply_serial,
-    lambda scene: (lattice(scene, "serial"), sweeps_for(scene.accuracy), _columns(scene)),
+    lambda scene: _parameters(scene, "serial", _columns(scene)),
     lambda scene: _loss(scene, "serial", _columns(scene)),
-    cost=0.15,
+    cost=0.1,
 )

@@ -149,7 +149,7 @@ def _in_a_pixel(expected: float) -> float:
     return float(charge[middle] / length[middle]) * (expected > _FEW)
 
 
-EFFECT = Effect("cosmic_rays", apply, _expected, lambda scene: _in_a_pixel(*_expected(scene)), cost=1e-2)
+EFFECT = Effect("cosmic_rays", apply, _expected, lambda scene: _in_a_pixel(*_expected(scene)), cost=4e-3)
 READOUT = Effect(
-    "readout_cosmic_rays", apply_readout, _readout, lambda scene: _in_a_pixel(_readout(scene)[0]), cost=1e-2
+    "readout_cosmic_rays", apply_readout, _readout, lambda scene: _in_a_pixel(_readout(scene)[0]), cost=4e-3
 )

@@ -23,4 +23,4 @@ def _contribution(scene: Scene) -> float:
     return max(scene.peak_electrons + scene.sky_electrons - _capacity(scene), 0.0)
 
 
-EFFECT = Effect("full_well", apply, lambda scene: (_capacity(scene),), _contribution)
+EFFECT = Effect("full_well", apply, lambda scene: (_capacity(scene),), _contribution, cost=3e-3)

@@ -25,4 +25,4 @@ def _contribution(scene: Scene) -> float:
     return float(np.sqrt(max(scene.peak_electrons, 0.0) + scene.sky_electrons))
 
 
-EFFECT = Effect("poisson", apply, lambda scene: (), _contribution)
+EFFECT = Effect("poisson", apply, lambda scene: (), _contribution, cost=6e-2)

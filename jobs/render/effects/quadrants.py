@@ -63,4 +63,4 @@ def sizes(scene: Scene) -> tuple[int, int, int]:
     return prescan, overscan, rows
 
 
-EFFECT = Effect("quadrants", apply, sizes, lambda scene: 0.0, optional=False, cost=1e-2)
+EFFECT = Effect("quadrants", apply, sizes, lambda scene: 0.0, optional=False, cost=3e-3)

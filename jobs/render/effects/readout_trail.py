@@ -40,4 +40,4 @@ def _contribution(scene: Scene) -> float:
     return share * (scene.peak_electrons + rows * scene.sky_electrons)
 
 
-EFFECT = Effect("readout_trail", apply, _parameters, _contribution, cost=2e-2)
+EFFECT = Effect("readout_trail", apply, _parameters, _contribution, cost=3.5e-2)

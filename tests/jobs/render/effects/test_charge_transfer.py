@@ -18,7 +18,7 @@ from lake_schema.mission.configuration import resolve
 
 ISRAEL = Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
 PIXELS, UNIT = 2066, 0.001
-SURVEY = charge_transfer.sweeps_for(accuracy.SURVEY)
+SURVEY = charge_transfer.sweeps_for(accuracy.SURVEY, PIXELS)
 EXACT = Sweeps(64, 2)
 
 
@@ -57,7 +57,7 @@ def every_transfer(line, silicon, pixels):
 @pytest.mark.parametrize("name", ["clean", "hit"])
 def test_as_arctic_does_it(name, preset, limit):
     image, wanted, _ = reference(name)
-    sweeps = charge_transfer.sweeps_for(accuracy.preset(preset))
+    sweeps = charge_transfer.sweeps_for(accuracy.preset(preset), PIXELS)
     found, _ = traps.shifted(image, ISRAEL, sweeps, -2, PIXELS)
     assert rms(found - wanted) <= limit * rms(wanted - image)
     turned, _ = traps.shifted(image.T, ISRAEL, sweeps, -1, PIXELS)
@@ -158,6 +158,26 @@ def test_volume_from_its_table():
     silicon = Traps((1e-6,), (1e6,), 2e5, 0.0, 0.58)
     found, _ = traps.shifted(n[:, None], silicon, Sweeps(1, 1), -1)
     np.testing.assert_allclose((n - found[:, 0]) * 1e6, silicon.volume(n), rtol=2e-4, atol=2e-10 / 1e-6 * 1e-3)
+
+
+def test_young_detectors_are_followed_less_closely():
+    presets = [accuracy.preset(name) for name in ("draft", "survey", "reference")]
+    old = [charge_transfer.sweeps_for(preset, PIXELS) for preset in presets]
+    assert old == [Sweeps(1, 1), Sweeps(1, 2), Sweeps(4, 2)]
+    assert [charge_transfer.sweeps_for(preset, 0.03 * PIXELS) for preset in presets] == [Sweeps(1, 1)] * 3
+
+
+@pytest.mark.parametrize("age", [0.03, 0.3, 1.0])
+def test_what_following_less_closely_does_to_galaxies(age):
+    """Flux, position and ellipticity of every galaxy, against small steps: within the survey's errors."""
+    image, _, table = reference("clean")
+    silicon = replace(ISRAEL, density=tuple(age * d for d in ISRAEL.density))
+    chosen = charge_transfer.sweeps_for(accuracy.SURVEY, age * PIXELS)
+    found, best = (measured(traps.shifted(image, silicon, s, -2, PIXELS)[0], table) for s in (chosen, EXACT))
+    bright = table[:, 2] > 2000
+    assert np.abs(found / best - 1)[bright, 0].max() < accuracy.SURVEY.flux
+    assert np.abs(found - best)[bright, 1].max() < accuracy.SURVEY.position
+    assert np.abs(found - best)[bright, 3].max() < accuracy.SURVEY.shape
 
 
 def test_damage_grows_with_age():
