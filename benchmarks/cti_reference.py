@@ -61,8 +61,11 @@ def cosmic_rays(rng: np.random.Generator) -> np.ndarray:
 
 
 def main(file: Path) -> None:
-    import arcticpy
-
+    try:
+        import arcticpy
+    except ImportError:
+        print("cti_reference: left out, this environment has no arcticpy")
+        return
     rng = np.random.default_rng(11)
     image, table = galaxies(rng)
     arrays = {"galaxies": image, "cosmic_rays": cosmic_rays(rng), "table": table}
