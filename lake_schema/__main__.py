@@ -19,16 +19,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[:1] == ["mission"]:
         return _mission(arguments[1:])
     parser = argparse.ArgumentParser(prog="python -m lake_schema", description=__doc__, epilog=f"truesky {__version__}")
-    parser.add_argument("command", choices=("verify", "gc", "describe", "tables"))
-    parser.add_argument("lake", nargs="?", help="folder of the lake")
-    parser.add_argument("table", nargs="?", help="one table (default: all of them)")
-    parser.add_argument("--deep", action="store_true", help="verify: read every byte and compare its sha256")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="verify|gc|describe|tables")
+    for command in ("verify", "gc", "describe"):
+        one = commands.add_parser(command)
+        one.add_argument("lake", help="folder of the lake")
+        one.add_argument("table", nargs="?", help="one table (default: all of them)")
+        one.set_defaults(deep=False)
+        if command == "verify":
+            one.add_argument("--deep", action="store_true", help="read every byte and compare its sha256")
+    commands.add_parser("tables")
     options = parser.parse_args(arguments)
     if options.command == "tables":
         print(tables.markdown(), end="")
         return 0
-    if options.lake is None:
-        parser.error("the folder of the lake is missing")
     try:
         root = layout.lake(options.lake)
         names = [options.table] if options.table else _names(root, options.command)
@@ -36,6 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise BadInput(f"lake {root} holds no table")
     except BadInput as error:
         return _say(error, 2)
+    except OSError as error:
+        return _say(error, 1)
     actions = {"verify": _verify, "gc": _gc, "describe": _describe}
     return max(_status(actions[options.command], root, name, options.deep) for name in names)
 
@@ -71,11 +76,11 @@ def _status(action: Callable[[Path, str, bool], bool], root: Path, name: str, de
         return int(action(root, name, deep))
     except BadInput as error:
         return _say(error, 2)
-    except LakeError as error:
+    except (LakeError, OSError) as error:
         return _say(error, 1)
 
 
-def _say(error: LakeError, status: int) -> int:
+def _say(error: Exception, status: int) -> int:
     print(error, file=sys.stderr)
     return status
 

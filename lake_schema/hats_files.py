@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from lake_schema import layout, parquet, sky
 from lake_schema.columns import Table
@@ -67,7 +66,7 @@ def _write_margin(folder: Path, table: Table, borders: dict[Cell, Path]) -> int:
 
 
 def _rows_in(path: Path, rim: sky.Int) -> pa.Table:
-    rows = pq.read_table(path, partitioning=None, page_checksum_verification=True)
+    rows = parquet.read(path)
     fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, _MARGIN_ORDER)
     return rows.filter(pa.array(np.isin(fine, rim)))
 
@@ -106,7 +105,7 @@ def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, fil
 def _skymap(files: list[Path]) -> sky.Int:
     counts = np.zeros(12 << (2 * _SKYMAP_ORDER), np.int64)
     for path in files:
-        index = pq.read_table(path, columns=["_healpix_29"], partitioning=None)["_healpix_29"].to_numpy()
+        index = parquet.read(path, ["_healpix_29"])["_healpix_29"].to_numpy()
         counts += np.bincount(sky.parent(index, sky.DEEPEST, _SKYMAP_ORDER), minlength=counts.size)
     return counts
 

@@ -14,13 +14,15 @@ LAKE/runs/<id>.jsonl                          what each run did
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Damaged
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
 _CELL = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet", re.ASCII)
+_VERSION = re.compile(r"v-([0-9a-f]{16})", re.ASCII)
 _REMOTE = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+:/")
 
 
@@ -32,10 +34,22 @@ def name(text: str) -> str:
 
 
 def lake(text: str | Path) -> Path:
-    """The root of a lake: a folder of a POSIX file system, absolute; object stores are refused (they cannot rename)."""
+    """The root of a lake: a folder of a POSIX file system, absolute; object stores are refused (they cannot rename).
+
+    It need not be there yet.
+    """
+    if not str(text):
+        raise BadInput("lake: its path is empty")
     if _REMOTE.match(str(text)):
         raise BadInput(f"lake {text}: only a POSIX file system can publish by rename; mount it and give the path")
-    return Path(text).expanduser().resolve()
+    try:
+        root = Path(text).expanduser().resolve()
+        if os.path.lexists(root) and not root.is_dir():
+            raise BadInput(f"lake {root} is not a folder")
+    except (OSError, RuntimeError, ValueError) as error:
+        # No such user, a circle of links, a path too long.
+        raise BadInput(f"lake {text!r}: {error}") from None
+    return root
 
 
 def table(root: Path, table_name: str) -> Path:
@@ -56,6 +70,29 @@ def version(root: Path, table_name: str, key: str) -> Path:
 def current(root: Path, table_name: str) -> Path:
     """The link to the published version."""
     return table(root, table_name) / "current"
+
+
+def tables(root: Path) -> list[str]:
+    """Names of the tables that have been published, sorted; also of one whose version has gone since."""
+    folders = [path for path in root.iterdir() if _NAME.fullmatch(path.name)] if root.is_dir() else []
+    return sorted(path.name for path in folders if path.is_dir() and "current" in os.listdir(path))
+
+
+def current_key(root: Path, table_name: str) -> str | None:
+    """Key of the published version, which may be missing; None where nothing has been published.
+
+    Errors : Damaged where `current` is not a link to a version beside it
+    """
+    link = current(root, table_name)
+    try:
+        found = _VERSION.fullmatch(os.readlink(link))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise Damaged(f"{link} is no link ({error.strerror}): a copy of a lake must keep its links") from None
+    if found is None:
+        raise Damaged(f"{link} does not lead to a version of table {table_name}")
+    return found[1]
 
 
 def runs(root: Path) -> Path:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pyarrow as pa
@@ -22,6 +22,9 @@ from lake_schema.plan import Json
 from lake_schema.provenance import canonical, digest, file_sha256
 
 MANIFEST = "manifest.json"
+# Types of what every manifest says, and of what it says of each file.
+_FACTS = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
+_FILE = {"path": str, "bytes": int, "sha256": str}
 
 
 def write(folder: Path, facts: Json) -> None:
@@ -30,8 +33,11 @@ def write(folder: Path, facts: Json) -> None:
     write_json(folder / MANIFEST, {**plain, "digest": digest(plain)})
 
 
-def load(folder: Path) -> dict[str, Any]:
-    """The manifest of a version's folder.  Errors: Damaged where it is missing, cut short or changed."""
+def load(folder: Path, table: str) -> dict[str, Any]:
+    """The manifest of a version's folder.
+
+    Errors : Damaged where it is missing, cut short, changed, or that of another version or table
+    """
     path = folder / MANIFEST
     try:
         facts = json.loads(path.read_bytes())
@@ -40,7 +46,32 @@ def load(folder: Path) -> dict[str, Any]:
         raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
     if digest(facts) != seal:
         raise Damaged(f"{path} is not what was written: its digest differs")
+    if not _is_manifest(facts):
+        raise Damaged(f"{path} is not a manifest of this form")
+    if facts["table"] != table or folder.name != f"v-{facts['key']}":
+        raise Damaged(f"{path} is that of table {facts['table']}, version {facts['key']}")
     return dict(facts)
+
+
+def _is_manifest(facts: Any) -> bool:
+    return (
+        _has(facts, _FACTS)
+        and type(facts.get("deflection_deg", 0.0)) is float
+        and all(_has(part, {"name": str}) for part in facts["parts"])
+        and all(_is_entry(entry) for entry in facts["files"])
+    )
+
+
+def _is_entry(entry: Any) -> bool:
+    if not _has(entry, _FILE) or type(entry.get("rows", 0)) is not int:
+        return False
+    path, tail = PurePosixPath(entry["path"]), entry.get("tail", [0, ""])
+    inside = not path.is_absolute() and ".." not in path.parts
+    return inside and isinstance(tail, list) and [type(value) for value in tail] == [int, str]
+
+
+def _has(value: Any, kinds: dict[str, type]) -> bool:
+    return isinstance(value, dict) and all(type(value.get(key)) is kind for key, kind in kinds.items())
 
 
 def file_facts(path: Path, relative: str) -> dict[str, Any]:
@@ -70,6 +101,8 @@ def _misfit(path: Path, entry: Json) -> str:
     except FileNotFoundError:
         # Removed since, with its whole version.
         return f"{path} is missing"
+    except OSError as error:
+        return f"{path} cannot be read: {error.strerror}"
 
 
 def _difference(path: Path, entry: Json) -> str:
@@ -108,12 +141,10 @@ def _file_faults(path: Path, entry: Json, deep: bool) -> list[str]:
         return [fault]
     if not deep:
         return []
-    if file_sha256(path) != entry["sha256"]:
-        return [f"{path} has other contents than the manifest says"]
-    if "rows" not in entry:
-        return []
     try:
-        return _row_faults(path, entry)
+        if file_sha256(path) != entry["sha256"]:
+            return [f"{path} has other contents than the manifest says"]
+        return _row_faults(path, entry) if "rows" in entry else []
     except (OSError, pa.ArrowInvalid) as error:
         return [f"{path}: {error}"]
 

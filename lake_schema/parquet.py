@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from pyarrow.fs import LocalFileSystem
 
 from lake_schema.columns import Table
+from lake_schema.errors import Damaged
 
 # Sorted by position, 65,536 rows a group is where small cones are fast and the footer still small (tried: 4k to 262k).
 ROWS_A_GROUP = 65_536
@@ -34,6 +35,15 @@ def dataset(paths: Sequence[Path], schema: pa.Schema) -> ds.FileSystemDataset:
     """The files as one Arrow dataset, in the order given, every page checked as it is read."""
     names = [str(path) for path in paths]
     return ds.FileSystemDataset.from_paths(names, schema=schema, format=_FORMAT, filesystem=LocalFileSystem())
+
+
+def read(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """The rows of one file, every page checked.  Errors: Damaged names the file."""
+    names = None if columns is None else list(columns)
+    try:
+        return pq.read_table(path, columns=names, partitioning=None, page_checksum_verification=True)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise Damaged(f"{path}: {error}") from None
 
 
 def tail_start(path: Path) -> int:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -26,6 +27,7 @@ from pathlib import Path
 
 from lake_schema import __version__, hats_files, layout, manifest
 from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
+from lake_schema.layout import current_key
 from lake_schema.manifest import sync
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
 from lake_schema.stage import attempt, border_path, is_done, missing, receipt_of, receipts, write_part
@@ -38,6 +40,9 @@ __all__ = [
 
 # A table's own lock is held for a few renames; how long to wait for another holder, and how often to look, s.
 _PATIENCE, _POLL = 10.0, 0.02
+
+# What stands in a table's folder by a version's key.
+_KEYED = re.compile(r"(?:v|\.stage|\.receipts|\.lock)-([0-9a-f]{16})", re.ASCII)
 
 Mapper = Callable[[Callable[[Part], Json], Sequence[Part]], Iterable[Json]]
 
@@ -52,13 +57,19 @@ def make(root: Path, plan: Plan, work: Work, mapper: Mapper = map, base: str | N
              holds the same plan, or has published another version since; Damaged where it is there and not whole
     """
     name, key = plan.table.name, plan.key
-    base = current_key(root, name) if base == "" else base
+    now = current_key(root, name)
+    base = now if base == "" else base
     target = layout.version(root, name, key)
     folder = layout.table(root, name)
+    lock = folder / f".lock-{key}"
+    if now == key and target.exists() and not lock.exists():
+        # Nothing is left to do: said without a lock, also where nothing can be written.
+        _refuse_damaged(target, name)
+        return target
     folder.mkdir(parents=True, exist_ok=True)
-    with _lock(folder / f".lock-{key}", f"table {name}: another run is making version {key}"):
+    with _lock(lock, f"table {name}: another run is making version {key}"):
         if target.exists():
-            _refuse_damaged(target)
+            _refuse_damaged(target, name)
         else:
             stage = layout.stage(root, name, key)
             stage.mkdir(exist_ok=True)
@@ -68,8 +79,8 @@ def make(root: Path, plan: Plan, work: Work, mapper: Mapper = map, base: str | N
     return target
 
 
-def _refuse_damaged(target: Path) -> None:
-    if found := manifest.faults(target, manifest.load(target)):
+def _refuse_damaged(target: Path, name: str) -> None:
+    if found := manifest.faults(target, manifest.load(target, name)):
         raise Damaged(f"{found[0]}; remove {target} to have it made again")
 
 
@@ -181,27 +192,22 @@ def _take(path: Path, descriptor: int) -> bool:
         return False
 
 
-def current_key(root: Path, name: str) -> str | None:
-    """Key of the published version, None where there is none."""
-    try:
-        return os.readlink(layout.current(root, name)).removeprefix("v-")
-    except FileNotFoundError:
-        return None
-
-
 def gc(root: Path, name: str) -> list[Path]:
     """Remove every version but the current one, and every stage that no run is working on; returns what was removed.
 
     A folder is renamed before it is emptied, so that a death in between leaves no half version that looks whole.
+    Errors : BadInput where there is no such table; Damaged where none of its versions is known to be the current one
     """
     folder = layout.table(root, name)
-    if not folder.is_dir():
+    if not any(folder.glob(".lock*")):
         raise BadInput(f"lake {root} has no table {name}")
     removed: list[Path] = []
     _empty(folder)
     with _lock(folder / ".lock", f"table {name}: another run is publishing", _PATIENCE):
         keep = current_key(root, name)
-        for key in sorted({path.name.rpartition("-")[2] for path in folder.glob("*-*")}):
+        if keep is not None and not layout.version(root, name, keep).exists():
+            raise Damaged(f"{layout.current(root, name)} leads to v-{keep}, which is missing: nothing is removed")
+        for key in sorted({found[1] for path in folder.iterdir() if (found := _KEYED.fullmatch(path.name))}):
             lock = folder / f".lock-{key}"
             with contextlib.suppress(Superseded), _lock(lock, "in use"):
                 stage = layout.stage(root, name, key)

@@ -76,10 +76,6 @@ class Version:
         """A part's Parquet file; Damaged where its size or footer is not what the manifest says."""
         return manifest.checked(self.folder, self._entry(part))
 
-    def part_rows(self, part: str) -> int:
-        """Number of rows of a part."""
-        return int(self._entry(part)["rows"])
-
     def _entry(self, part: str) -> dict[str, Any]:
         files = self._files()
         for prefix in (f"{self.table}/dataset/", "dataset/"):
@@ -219,14 +215,18 @@ def _in_ranges(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
 def version(root: Path, name: str, key: str | None = None) -> Version:
     """The published version of a table, or the one of a key.
 
-    Errors : BadInput where the lake has no such table or version; Damaged where its manifest cannot be read;
-             VersionMismatch where it was written with a declaration that this code cannot read
+    Errors : BadInput where the lake has no such table or version; Damaged where its manifest is missing, broken or
+             another's; VersionMismatch where it was written with a declaration that this code cannot read
     """
-    link = layout.current(root, name) if key is None else layout.version(root, name, key)
-    if not link.exists():
-        raise BadInput(f"lake {root} has no table {name}" + (f" of version {key}" if key else ""))
-    folder = link.resolve()
-    about = manifest.load(folder)
+    wanted = key or layout.current_key(root, name)
+    if wanted is None:
+        raise BadInput(f"lake {root} has no table {name}")
+    folder = layout.version(root, name, wanted)
+    if not folder.exists():
+        if key:
+            raise BadInput(f"lake {root} has no table {name} of version {key}")
+        raise Damaged(f"{layout.current(root, name)} leads to {folder.name}, which is missing")
+    about = manifest.load(folder, name)
     opened = Version(folder, about, pa.schema([]))
     if opened.parts:
         first = opened.path(opened.parts[0])
@@ -274,8 +274,8 @@ def _difference(stored: pa.Schema, table: Table, was: int) -> str:
 
 
 def tables(root: Path) -> list[str]:
-    """Names of the published tables."""
-    return sorted(path.parent.name for path in root.glob("*/current"))
+    """Names of the published tables, those that are damaged among them."""
+    return layout.tables(root)
 
 
 def verify(published: Version, deep: bool = False) -> list[str]:

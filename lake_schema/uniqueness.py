@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow.parquet as pq
 
+from lake_schema import parquet
 from lake_schema.errors import BadInput
 from lake_schema.ids import BLOCK_BITS
 from lake_schema.plan import Json, Plan, data_path
@@ -31,7 +31,7 @@ def refuse_duplicates(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
 
     @lru_cache(maxsize=16)
     def ids(path: Path) -> Int:
-        return np.sort(pq.read_table(path, columns=list(table.key), partitioning=None).column(0).to_numpy())
+        return np.sort(parquet.read(path, table.key).column(0).to_numpy())
 
     for block, sharers in _shared_blocks(made, paths).items():
         _refuse_within(f"table {table.name}: {table.key[0]}", block, sharers, ids)
@@ -65,7 +65,7 @@ def _refuse_within(what: str, block: int | None, files: Sequence[Path], ids: Cal
 def _refuse_any(name: str, key: Sequence[str], paths: Sequence[Path]) -> None:
     seen: dict[tuple[object, ...], str] = {}
     for path in paths:
-        columns = pq.read_table(path, columns=list(key), partitioning=None)
+        columns = parquet.read(path, key)
         for value in zip(*(columns[k].to_pylist() for k in key), strict=True):
             if value in seen:
                 raise BadInput(f"table {name}: key {value} stands in {seen[value]} and in {path.name}")

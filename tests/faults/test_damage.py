@@ -23,19 +23,20 @@ def toy(lake):
     return read.version(lake, "toy")
 
 
-def image(part):
-    rng = np.random.default_rng(part)
+def image(part, seed=1):
+    rng = np.random.default_rng([seed, part])
     return fits.Image(rng.integers(0, 60_000, (80, 50)).astype(np.uint16), (("EXPTIME", 560.5, "s"),))
+
+
+def image_work(root, facts):
+    part, seed = facts["part"], facts["seed"]
+    files = {f"images/{part}.fits": lambda path: fits.write_images(path, [image(part, seed)])}
+    return Output(plain_work(root, facts).rows, files)
 
 
 @pytest.fixture
 def images(lake):
-    def work(root, facts):
-        part = facts["part"]
-        files = {f"images/{part}.fits": lambda path: fits.write_images(path, [image(part)])}
-        return Output(plain_work(root, facts).rows, files)
-
-    publish.make(lake, plain_plan(), work)
+    publish.make(lake, plain_plan(), image_work)
     return read.version(lake, "plain")
 
 
@@ -127,11 +128,9 @@ def test_a_folder_that_was_edited_is_named(lake, toy, images, kind, harm):
         later = (
             publish.make(lake, toy_plan(2), toy_work)
             if kind == "rows"
-            else publish.make(lake, plain_plan(2), plain_work)
+            else publish.make(lake, plain_plan(2), image_work)
         )
-        found = later / first.relative_to(version.folder)
-        found.parent.mkdir(parents=True, exist_ok=True)
-        first.write_bytes(found.read_bytes() if kind == "rows" else first.read_bytes()[:-1] + b"x")
+        shutil.copy(later / first.relative_to(version.folder), first)
     found = read.verify(version, deep=True)
     assert found
     assert all(first.name in line or second.name in line for line in found)

@@ -48,6 +48,18 @@ def test_object_stores_are_refused(text):
         layout.lake(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("", "empty"), ("file", "not a folder"), ("~no-such-user/lake", "lake"), ("loop", "lake"), ("a\0b", "lake")],
+)
+def test_what_cannot_be_a_lake_is_refused(tmp_path, monkeypatch, text, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(BadInput, match=words):
+        layout.lake(text)
+
+
 def test_cells_are_filed_as_hats_wants():
     assert layout.cell_file(5, 1607) == "Norder=5/Dir=0/Npix=1607.parquet"
     assert layout.cell_file(8, 574968) == "Norder=8/Dir=570000/Npix=574968.parquet"

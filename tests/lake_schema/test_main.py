@@ -1,14 +1,16 @@
 """The commands that look after a lake: what they print and how they end."""
 
+import errno
 import os
+import shutil
 import subprocess
 import sys
 
 import pytest
 
-from lake_schema import __version__, layout, publish, read
+from lake_schema import __version__, layout, manifest, publish, read
 from lake_schema.__main__ import main
-from lake_schema.errors import PartsFailed
+from lake_schema.errors import Damaged, PartsFailed
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
 
 
@@ -52,6 +54,82 @@ def test_verify_goes_on_after_a_broken_manifest(filled, capsys):
     out, err = capsys.readouterr()
     assert "manifest.json" in err
     assert "toy" in out
+
+
+def test_verify_names_a_version_that_is_gone(filled, capsys):
+    shutil.rmtree(layout.version(filled, "plain", plain_plan(2).key))
+    assert main(["verify", str(filled)]) == 1
+    out, err = capsys.readouterr()
+    assert f"v-{plain_plan(2).key}, which is missing" in err
+    assert "toy" in out
+
+
+def test_verify_goes_on_after_a_file_that_cannot_be_read(filled, capsys, monkeypatch):
+    real = manifest.file_sha256
+
+    def sha256(path):
+        if path.name == "Npix=1608.parquet":
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return real(path)
+
+    version = read.version(filled, "toy")
+    flip(version.path(version.parts[0]), 100)
+    monkeypatch.setattr(manifest, "file_sha256", sha256)
+    assert main(["verify", str(filled), "toy", "--deep"]) == 1
+    out = capsys.readouterr().out
+    assert "Npix=1607.parquet has other contents" in out
+    assert "Npix=1608.parquet: [Errno 5] Input/output error" in out
+    monkeypatch.setattr(manifest, "_difference", lambda path, entry: sha256(path) and "")
+    assert [line for line in read.verify(version) if "Npix=1608.parquet cannot be read: Input/output error" in line]
+
+
+def test_a_copy_that_followed_links_is_damaged_for_everyone(filled, tmp_path, capsys):
+    shutil.copytree(filled, tmp_path / "copy", symlinks=False)
+    for command in ("verify", "gc", "describe"):
+        assert main([command, str(tmp_path / "copy"), "toy"]) == 1
+    assert len([line for line in capsys.readouterr().err.splitlines() if "must keep its links" in line]) == 3
+    with pytest.raises(Damaged, match="must keep its links"):
+        publish.make(tmp_path / "copy", toy_plan(), toy_work)
+
+
+def test_a_disc_that_refuses_is_one_line(filled, capsys, monkeypatch):
+    def refuse(root, name):
+        raise OSError(errno.EROFS, "Read-only file system", str(root))
+
+    monkeypatch.setattr(publish, "gc", refuse)
+    assert main(["gc", str(filled), "toy"]) == 1
+    assert capsys.readouterr().err == f"[Errno 30] Read-only file system: '{filled}'\n"
+
+
+def test_gc_leaves_what_is_not_its_own(filled, capsys):
+    (filled / "plain" / "my-Notes.txt").touch()
+    (filled / "plain" / "v-2").mkdir()
+    (filled / "runs").mkdir()
+    assert main(["gc", str(filled)]) == 0
+    assert capsys.readouterr().out == f"removed {layout.version(filled, 'plain', plain_plan(1).key)}\n"
+    assert main(["gc", str(filled), "runs"]) == 2
+    assert list((filled / "runs").iterdir()) == []
+    assert {"my-Notes.txt", "v-2"} < {path.name for path in (filled / "plain").iterdir()}
+
+
+@pytest.mark.parametrize("to", ["gone", "elsewhere"])
+def test_gc_keeps_everything_while_it_does_not_know_what_is_current(filled, capsys, to):
+    versions = sorted((filled / "plain").glob("v-*"))
+    if to == "gone":
+        shutil.rmtree(versions.pop(versions.index(layout.version(filled, "plain", plain_plan(2).key))))
+    else:
+        (filled / "plain" / "current").unlink()
+        (filled / "plain" / "current").symlink_to(versions[0])
+    assert main(["gc", str(filled), "plain"]) == 1
+    assert sorted((filled / "plain").glob("v-*")) == versions
+    assert str(filled / "plain" / "current") in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["tables", "x"], ["tables", "--deep"], ["gc", "x", "--deep"], ["verify"], []])
+def test_an_argument_that_means_nothing_is_refused(arguments, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    assert "usage" in capsys.readouterr().err
 
 
 def test_gc_removes_what_is_old_and_says_so(filled, capsys):

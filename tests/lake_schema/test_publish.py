@@ -2,13 +2,14 @@
 
 import json
 import os
+import shutil
 
 import pytest
 
-from lake_schema import layout, publish, read
+from lake_schema import layout, manifest, parquet, publish, read
 from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
 from lake_schema.publish import Output, Part, Plan
-from tests.universe import CELLS, TOY, toy_plan, toy_rows, toy_work
+from tests.universe import CELLS, TOY, plain_plan, plain_work, toy_plan, toy_rows, toy_work
 
 
 def sums(lake):
@@ -179,6 +180,86 @@ def test_a_receipt_without_its_file_does_not_count(lake):
     assert publish.missing(stage, plan) == [plan.parts[0]]
     victim.unlink()
     assert publish.missing(stage, plan) == [plan.parts[0]]
+
+
+def test_what_is_done_needs_no_lock(lake, monkeypatch):
+    """A lake that cannot be written is no reason to fail where nothing is left to do."""
+    folder = publish.make(lake, toy_plan(), toy_work)
+    monkeypatch.delattr(publish, "_lock")
+    assert publish.make(lake, toy_plan(), None) == folder
+
+
+def test_a_current_version_that_is_gone_can_be_made_again(lake):
+    folder = publish.make(lake, toy_plan(), toy_work)
+    shutil.rmtree(folder)
+    with pytest.raises(Damaged, match="which is missing"):
+        read.version(lake, "toy")
+    assert read.tables(lake) == ["toy"]
+    assert publish.make(lake, toy_plan(), toy_work) == folder
+    assert read.verify(read.version(lake, "toy"), deep=True) == []
+
+
+def test_two_versions_that_changed_names_are_found_out(lake):
+    first, second = (publish.make(lake, toy_plan(seed), toy_work) for seed in (1, 2))
+    other = first.with_name("other")
+    first.rename(other)
+    second.rename(first)
+    other.rename(second)
+    for key in (None, toy_plan(1).key, toy_plan(2).key):
+        with pytest.raises(Damaged, match="is that of table toy, version"):
+            read.version(lake, "toy", key)
+    for seed in (1, 2):
+        with pytest.raises(Damaged, match="is that of table toy, version"):
+            publish.make(lake, toy_plan(seed), toy_work)
+
+
+def test_a_link_to_another_table_is_found_out(lake):
+    folder = publish.make(lake, toy_plan(), toy_work)
+    publish.make(lake, plain_plan(), plain_work)
+    link = layout.current(lake, "plain")
+    link.unlink()
+    link.symlink_to(f"../toy/{folder.name}")
+    with pytest.raises(Damaged, match="does not lead to a version of table plain"):
+        read.version(lake, "plain")
+    shutil.copytree(folder, link.with_name(folder.name))
+    with pytest.raises(Damaged, match="is that of table toy"):
+        read.version(lake, "plain", toy_plan().key)
+
+
+CHANGES = {
+    "a fact is missing": lambda facts: facts.pop("parts"),
+    "a fact is another thing": lambda facts: facts.update(rows="550"),
+    "a part has no name": lambda facts: facts["parts"].append({}),
+    "a file has no sha256": lambda facts: facts["files"][0].pop("sha256"),
+    "a file is a text": lambda facts: facts["files"].append("x"),
+    "a file above the version": lambda facts: facts["files"][0].update(path="../x"),
+    "a file elsewhere": lambda facts: facts["files"][0].update(path="/etc/hosts"),
+    "a tail of another form": lambda facts: facts["files"][0].update(tail=["x"]),
+    "a deflection in words": lambda facts: facts.update(deflection_deg="far"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_a_manifest_of_another_form_is_damage(lake, change):
+    folder = publish.make(lake, toy_plan(), toy_work)
+    facts = dict(read.version(lake, "toy").manifest)
+    manifest.write(folder, facts)
+    read.version(lake, "toy")
+    change(facts)
+    manifest.write(folder, facts)
+    with pytest.raises(Damaged, match="not a manifest of this form"):
+        read.version(lake, "toy")
+
+
+def test_a_changed_page_is_not_read_while_a_version_is_made(lake):
+    version = read.version(lake, "toy", publish.make(lake, toy_plan(), toy_work).name[2:])
+    path = version.path(version.parts[0])
+    assert parquet.read(path, ["id"])["id"].equals(version.rows(["id"], [version.parts[0]])["id"])
+    data = bytearray(path.read_bytes())
+    data[100] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(Damaged, match=r"Npix=1607"):
+        parquet.read(path)
 
 
 def test_a_broken_manifest_is_named(lake):
