@@ -5,10 +5,12 @@ write_images    images -> one file: checksums, the same bytes for the same input
 read_images     a file -> images; checksums are demanded and verified, sizes checked before data
 read_numbers    somebody's binary table -> its columns of numbers
 table_to_fits   an Arrow table -> a binary table, units and UCDs from the table's declaration
+fits_unit       a unit as FITS spells it
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 import warnings
@@ -21,6 +23,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+from astropy import units
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
 
@@ -29,6 +32,8 @@ from lake_schema.errors import BadInput, Damaged
 
 Card = tuple[str, str | int | float | bool, str]
 
+# What fits into the card of a column's name.
+_LONGEST_NAME = 68
 # A header that promises more than this is a mistake or an attack; the largest product is far below.
 MOST_BYTES = 8 << 30
 _STRUCTURE = {
@@ -121,16 +126,24 @@ def _numbers_of(unit: Any) -> dict[str, npt.NDArray[np.float64]]:
 
 
 def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
-    """Export rows of a declared table as a binary table extension; columns of lists are left out.
+    """Export rows of a declared table as a binary table extension; lists become arrays of variable length.
 
-    table : Arrow table with (some of) the declared columns; null becomes NaN, or TNULL for integers
+    table  : Arrow table with (some of) the declared columns; null becomes NaN, TNULL for integers, the byte 0 for
+             booleans, "" for texts, an empty array for lists
+    Errors : BadInput names a column whose name FITS cannot hold; ValueError or TypeError for such values
     """
     columns = [declared.column(name) for name in table.column_names]
-    kept = [c for c in columns if not c.type.startswith("list")]
+    for column in columns:
+        if not (column.name.isascii() and column.name.isprintable() and 0 < len(column.name) <= _LONGEST_NAME):
+            raise BadInput(f"{path}: column {column.name!r} has a name that FITS cannot hold; give it another with AS")
     unit = fits.BinTableHDU.from_columns(
-        [_fits_column(c, table.column(c.name)) for c in kept], name=declared.name.upper()
+        [_fits_column(c, table.column(c.name)) for c in columns], name=declared.name.upper()
     )
-    for number, column in enumerate(kept, start=1):
+    stored = unit.data.view(np.ndarray)
+    for column in columns:
+        if column.type == "bool":
+            stored[column.name][table.column(column.name).is_null().to_numpy()] = 0
+    for number, column in enumerate(columns, start=1):
         if column.ucd:
             unit.header[f"TUCD{number}"] = (column.ucd, "IVOA UCD")
     unit.header["TABLEVER"] = (declared.version, "version of the table's declaration")
@@ -207,17 +220,49 @@ def _umask() -> int:
 
 
 def _fits_column(column: Column, values: pa.ChunkedArray) -> fits.Column:
-    unit = {"unit": column.unit} if column.unit else {}
+    unit = {"unit": fits_unit(column.unit)} if column.unit else {}
+    if column.type.startswith("list"):
+        return _fits_lists(column, values, unit)
     if column.type == "string":
         texts = [value or "" for value in values.to_pylist()]
         width = max([1, *(len(text.encode()) for text in texts)])
         return fits.Column(column.name, f"{width}A", array=np.array(texts, dtype=f"U{width}"), **unit)
     code = _TABLE_FORMATS[column.type]
-    if code in "DEL" or values.null_count == 0:
-        filled = values if values.null_count == 0 or code == "L" else values.fill_null(float("nan"))
+    if values.null_count == 0 or code in "DEL":
+        filled = values.fill_null(False if code == "L" else float("nan")) if values.null_count else values
         return fits.Column(column.name, code, array=filled.to_numpy(), **unit)
-    missing = -1 if column.lo is not None and column.lo >= 0 else -(2**15)
-    return fits.Column(column.name, code, array=values.fill_null(missing).to_numpy(), null=missing, **unit)
+    # FITS has no signed bytes: they are written as 16 bits.
+    wide = values.cast(pa.int16()) if column.type == "int8" else values
+    missing = _unused(wide.drop_null().to_numpy())
+    return fits.Column(column.name, code, array=wide.fill_null(missing).to_numpy(), null=missing, **unit)
+
+
+def _unused(values: npt.NDArray[Any]) -> int:
+    """The lowest number of an integer type that does not occur."""
+    limits, seen = np.iinfo(values.dtype), np.unique(values)
+    taken = np.flatnonzero(seen != limits.min + np.arange(seen.size))
+    lowest = int(limits.min) + int(taken[0] if taken.size else seen.size)
+    if lowest > limits.max:
+        raise ValueError(f"every number of {values.dtype} occurs: none is left for what is missing")
+    return lowest
+
+
+def _fits_lists(column: Column, values: pa.ChunkedArray, unit: dict[str, str]) -> fits.Column:
+    code = _TABLE_FORMATS[column.type.removeprefix("list<").removesuffix(">")]
+    arrays = np.empty(len(values), object)
+    for i, value in enumerate(values.to_pylist()):
+        arrays[i] = np.array(value or [], fits.column.FITS2NUMPY[code])
+    return fits.Column(column.name, f"P{code}()", array=arrays, **unit)
+
+
+def fits_unit(text: str) -> str:
+    """A unit as FITS spells it; one that it does not know, such as the electron, as it is."""
+    try:
+        units.Unit(text, format="fits")
+    except ValueError:
+        with contextlib.suppress(ValueError):
+            return str(units.Unit(text).to_string("fits"))
+    return text
 
 
 # ------------------------------------------------------------------------------------------------ reading

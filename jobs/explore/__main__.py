@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jobs.explore import results
-from jobs.explore.explorer import Explorer
+from jobs.explore.explorer import MEMORY, TIMEOUT, Explorer
 from lake_schema import __version__
 from lake_schema.errors import BadInput, LakeError
 
@@ -20,13 +20,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: 0, 1 the lake is damaged, 2 the call or the query is wrong."""
     options = _options(argv)
     try:
-        with Explorer(options.lake, int(options.memory * _GIGABYTE), options.timeout) as lake:
+        with Explorer(options.lake, options.memory * _GIGABYTE, options.timeout) as lake:
             if options.sql is None:
                 print(lake.tables().to_string())
-                return 0
+                return int(bool(lake.damaged))
             rows = lake.sql(options.sql, into="arrow")
         if options.out is None:
-            print(rows.to_pandas().to_string(max_rows=_MOST_ROWS_SHOWN, index=False))
+            print(results.converted(rows, "pandas").to_string(max_rows=_MOST_ROWS_SHOWN, index=False))
             print(f"{rows.num_rows:,} rows")
         else:
             results.write(rows, options.out)
@@ -49,8 +49,9 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("sql", nargs="?", help="a SELECT, in DuckDB's SQL")
     parser.add_argument("--lake", required=True, help="folder of the lake")
     parser.add_argument("--out", type=Path, help="write to this .csv, .parquet or .fits file")
-    parser.add_argument("--memory", type=float, default=4.0, help="GB that the query may take (default 4)")
-    parser.add_argument("--timeout", type=float, default=300.0, help="s that it may take (default 300)")
+    limit = MEMORY / _GIGABYTE
+    parser.add_argument("--memory", type=float, default=limit, help=f"GB that it may take (default {limit:g})")
+    parser.add_argument("--timeout", type=float, default=TIMEOUT, help=f"s that it may take (default {TIMEOUT:g})")
     return parser.parse_args(argv)
 
 

@@ -19,13 +19,18 @@ import pyarrow as pa
 
 from jobs.explore import results
 from lake_schema import layout, read, sky
-from lake_schema.errors import BadInput, Damaged, LakeError
+from lake_schema.errors import BadInput, Damaged, LakeError, OutOfRange
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 Range = tuple[float, float]
 
 _ROOT = Path(__file__).resolve().parents[2]
+# Bytes that a query may take, and s, where nobody says otherwise; and between which bounds anybody may.
+MEMORY, TIMEOUT = 4e9, 300.0
+_MEMORY_LO, _MEMORY_HI = 1e7, 1e15
+_TIMEOUT_HI = 1e6
+_MOST_BINS = 10_000
 _ERRORS = {"BadInput": BadInput, "Damaged": Damaged}
 
 
@@ -34,14 +39,23 @@ class Explorer:
 
     memory  : bytes that a query and its result may take together
     timeout : s after which a query is stopped
+    damaged : tables that cannot be opened, and why; the others can be looked at
     """
 
-    def __init__(self, lake: str | Path, memory: int = 4 << 30, timeout: float = 60.0) -> None:
+    def __init__(self, lake: str | Path, memory: float = MEMORY, timeout: float = TIMEOUT) -> None:
+        _check("memory", memory, _MEMORY_LO, _MEMORY_HI)
+        _check("timeout", timeout, 0.0, _TIMEOUT_HI)
         self.root = layout.lake(lake)
-        self.versions = {name: read.version(self.root, name) for name in read.tables(self.root)}
-        if not self.versions:
+        self.versions: dict[str, read.Version] = {}
+        self.damaged: dict[str, LakeError] = {}
+        for name in read.tables(self.root):
+            try:
+                self.versions[name] = read.version(self.root, name)
+            except LakeError as error:
+                self.damaged[name] = error
+        if not self.versions and not self.damaged:
             raise BadInput(f"lake {self.root} holds no table")
-        self.memory, self.timeout = memory, timeout
+        self.memory, self.timeout = int(memory), timeout
         self._worker: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Explorer:
@@ -72,7 +86,10 @@ class Explorer:
             }
             for name, version in self.versions.items()
         ]
-        return pd.DataFrame(rows).set_index("table")
+        rows += [{"table": name, "version": "damaged", "meaning": str(error)} for name, error in self.damaged.items()]
+        columns = ["table", "rows", "MB", "files", "version", "meaning"]
+        frame = pd.DataFrame(rows, columns=columns).astype({"rows": "Int64", "files": "Int64"})
+        return frame.set_index("table").sort_index()
 
     def describe(self, table: str) -> pd.DataFrame:
         """The columns of a table: type, unit, range, UCD, meaning."""
@@ -86,6 +103,8 @@ class Explorer:
         return pd.DataFrame(rows).set_index("column")
 
     def _version(self, table: str) -> read.Version:
+        if table in self.damaged:
+            raise self.damaged[table]
         if table not in self.versions:
             raise BadInput(f"lake {self.root} has no table {table}; it has {', '.join(self.versions)}")
         return self.versions[table]
@@ -139,7 +158,8 @@ class Explorer:
         x, where, weight : SQL of the table's columns;  span : lowest and highest value, None = all
         returns          : counts[bins], edges[bins + 1]
         """
-        lo, hi = span or self._span(table, x, where)
+        _check("bins", bins, 1, _MOST_BINS)
+        lo, hi = _ordered(span or self._span(table, x, where))
         text = f"""
             SELECT {_bin("x", "x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x})::DOUBLE AS x, {_weight(weight)}
             FROM {table} WHERE ({where})) WHERE x BETWEEN $x_lo AND $x_hi GROUP BY i"""
@@ -156,7 +176,10 @@ class Explorer:
 
         returns : counts[y bins, x bins], edges of x, edges of y
         """
-        (x_lo, x_hi), (y_lo, y_hi) = span or (self._span(table, x, where), self._span(table, y, where))
+        for axis in bins:
+            _check("bins", axis, 1, _MOST_BINS)
+        spans = span or (self._span(table, x, where), self._span(table, y, where))
+        (x_lo, x_hi), (y_lo, y_hi) = (_ordered(axis) for axis in spans)
         text = f"""
             SELECT {_bin("x", "x")} AS i, {_bin("y", "y")} AS j, {_counted(weight)} AS n
             FROM (SELECT ({x})::DOUBLE AS x, ({y})::DOUBLE AS y, {_weight(weight)} FROM {table} WHERE ({where}))
@@ -220,12 +243,26 @@ class Explorer:
     def _running(self) -> subprocess.Popen[bytes]:
         if self._worker is None or self._worker.poll() is not None:
             versions = [f"{name}={version.key}" for name, version in self.versions.items()]
+            # Whoever asks for one of these is told what is wrong with it.
+            versions += [f"{name}=" for name in self.damaged]
             command = [sys.executable, "-m", "jobs.explore.worker", str(self.root), str(self.memory), *versions]
             pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
             # Arrow's other allocators reserve a gigabyte at the start, which would count against the limit.
             environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
             self._worker = subprocess.Popen(command, cwd=_ROOT, env=environment, **pipes)
         return self._worker
+
+
+def _check(name: str, value: float, lo: float, hi: float) -> None:
+    if not lo <= value <= hi:
+        raise OutOfRange(name, value, lo, hi)
+
+
+def _ordered(span: Range) -> Range:
+    lo, hi = span
+    if not (np.isfinite([lo, hi]).all() and lo < hi):
+        raise BadInput(f"span = {span} is not from a finite number to a larger one")
+    return lo, hi
 
 
 def _bin(x: str, axis: str) -> str:

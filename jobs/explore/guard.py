@@ -33,7 +33,8 @@ class Query:
     """A query that may run.
 
     tables  : those of the lake that it names
-    columns : names of the result that are columns of these tables, as they are; None = every name of a table's column
+    columns : names of the result, in lower case, that are columns of these tables, as they are; None = every name of
+              a table's column
     """
 
     text: str
@@ -136,9 +137,9 @@ def _plain_columns(tree: Tree, tables: Collection[str]) -> frozenset[str] | None
         ):
             everything = True
         elif entry["class"] == "COLUMN_REF" and not entry["alias"]:
-            plain.add(str(entry["column_names"][-1]))
+            plain.add(str(entry["column_names"][-1]).lower())
         else:
-            renamed.add(str(entry["alias"]))
+            renamed.add(str(entry["alias"]).lower())
     if everything and not renamed:
         return None
     return frozenset(plain - renamed)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
@@ -16,12 +17,19 @@ from lake_schema.errors import BadInput
 from lake_schema.fits import table_to_fits
 
 INTO = ("pandas", "astropy", "arrow")
+# Where some are missing: pandas' own way is to make floats of integers, which rounds an identifier.
+_NULLABLE: dict[pa.DataType, Any] = {pa.bool_(): pd.BooleanDtype()}
+_NULLABLE |= {
+    pa.type_for_alias(kind.lower()): pd.api.types.pandas_dtype(kind)
+    for kind in ("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64")
+}
 
 
 def converted(rows: pa.Table, into: str) -> Any:
     """The rows as a pandas DataFrame, an astropy Table with units, or as they are."""
     if into == "pandas":
-        return rows.to_pandas()
+        gaps = {column.type for column in rows.columns if column.null_count}
+        return rows.to_pandas(types_mapper=lambda kind: _NULLABLE.get(kind) if kind in gaps else None)
     if into == "arrow":
         return rows
     if into == "astropy":
@@ -34,12 +42,13 @@ def _astropy(rows: pa.Table) -> Any:
     from astropy.table import MaskedColumn
     from astropy.table import Table as AstropyTable
 
+    _refuse_same_names(rows)
     table = AstropyTable()
     for field, values in zip(rows.schema, rows.columns, strict=True):
         facts = _facts(field)
         about = {"unit": facts.get("unit") or None, "description": facts.get("description")}
         if values.null_count:
-            filled = values.fill_null(0) if pa.types.is_integer(field.type) else values
+            filled = values.fill_null(pa.scalar(0).cast(field.type)) if field.type in _NULLABLE else values
             table[field.name] = MaskedColumn(filled.to_numpy(), mask=values.is_null().to_numpy(), **about)
         else:
             table[field.name] = AstropyColumn(values.to_numpy(), **about)
@@ -53,23 +62,39 @@ def _facts(field: pa.Field) -> dict[str, str]:
 def write(rows: pa.Table, path: Path) -> None:
     """Write rows to a file of the kind that its ending says: .csv, .parquet or .fits; replaced in one rename.
 
-    Errors : BadInput for another ending; OSError where the disc refuses
+    Errors : BadInput for another ending, or names the column that such a file cannot hold; OSError where the disc
+             refuses
     """
     writer = _WRITERS.get(path.suffix.lower())
     if writer is None:
         raise BadInput(f"{path}: the ending is not one of {', '.join(_WRITERS)}")
-    if len(set(rows.column_names)) != rows.num_columns:
-        raise BadInput(f"{path}: two columns have the same name; give one of them another with AS")
+    _refuse_same_names(rows)
     temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
     try:
-        writer(rows, temporary)
+        if error := _refusal(writer, rows, temporary):
+            column = next((name for name in rows.column_names if _refusal(writer, rows.select([name]), temporary)), "")
+            raise BadInput(f"{path}: column {column}: {' '.join(str(error).split())[:300]}") from None
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
+def _refusal(writer: Callable[[pa.Table, Path], None], rows: pa.Table, path: Path) -> Exception | None:
+    """Why a kind of file cannot hold the rows, if it cannot."""
+    try:
+        writer(rows, path)
+    except (pa.ArrowException, ValueError, TypeError, OverflowError) as error:
+        return error
+    return None
+
+
+def _refuse_same_names(rows: pa.Table) -> None:
+    if len(set(rows.column_names)) != rows.num_columns:
+        raise BadInput("two columns of the result have the same name; give one of them another with AS")
+
+
 def _csv(rows: pa.Table, path: Path) -> None:
-    pa.csv.write_csv(_without_lists(rows), path)
+    pa.csv.write_csv(rows, path)
 
 
 def _parquet(rows: pa.Table, path: Path) -> None:
@@ -77,28 +102,27 @@ def _parquet(rows: pa.Table, path: Path) -> None:
 
 
 def _fits(rows: pa.Table, path: Path) -> None:
-    kept = _without_lists(rows)
-    declared = Table("result", 1, tuple(_column(field) for field in kept.schema), "Result of a query.", key=())
-    table_to_fits(path, kept.cast(declared.arrow()), declared)
-
-
-def _without_lists(rows: pa.Table) -> pa.Table:
-    return rows.drop_columns([field.name for field in rows.schema if pa.types.is_nested(field.type)])
+    declared = Table("result", 1, tuple(_column(field) for field in rows.schema), "Result of a query.", key=())
+    table_to_fits(path, rows.cast(declared.arrow()), declared)
 
 
 def _column(field: pa.Field) -> Column:
     """A declaration that suits a result's column."""
-    facts, kind = _facts(field), str(field.type)
-    if pa.types.is_integer(field.type):
-        kind = kind if kind.startswith("int") else "int64"
-    elif pa.types.is_floating(field.type):
-        kind = kind if kind in ("float", "double") else "float"
-        kind = {"float": "float32", "double": "float64"}[kind]
-    elif not pa.types.is_boolean(field.type):
-        kind = "string"
+    facts, kind = _facts(field), _kind(field.type)
     return Column(
         field.name, kind, facts.get("unit", ""), facts.get("ucd", ""), facts.get("description", ""), nullable=True
     )
+
+
+def _kind(kind: pa.DataType) -> str:
+    if pa.types.is_list(kind):
+        inner = _kind(kind.value_type)
+        return f"list<{'int64' if inner.startswith('int') else inner}>"
+    if pa.types.is_integer(kind):
+        return str(kind) if pa.types.is_signed_integer(kind) else "int64"
+    if pa.types.is_floating(kind):
+        return "float64" if kind == pa.float64() else "float32"
+    return "bool" if pa.types.is_boolean(kind) else "string"
 
 
 _WRITERS: dict[str, Callable[[pa.Table, Path], None]] = {".csv": _csv, ".parquet": _parquet, ".fits": _fits}

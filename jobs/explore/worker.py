@@ -47,7 +47,7 @@ _BASE_BYTES, _SHARE = 1 << 30, 0.5
 def main(argv: Sequence[str]) -> int:
     """Answer queries until stdin ends.
 
-    argv : lake, most bytes of memory, TABLE=KEY of each table
+    argv : lake, most bytes of memory, TABLE=KEY of each table, without a key where it could not be opened
     """
     root, memory = layout.lake(argv[0]), int(argv[1])
     resource.setrlimit(resource.RLIMIT_DATA, (memory + _BASE_BYTES, memory + _BASE_BYTES))
@@ -64,7 +64,7 @@ def main(argv: Sequence[str]) -> int:
 def _answer(out: IO[bytes], root: Path, versions: dict[str, str], memory: int, question: dict[str, Any]) -> None:
     try:
         query = checked(question["sql"], versions)
-        opened = {name: read.version(root, name, versions[name]) for name in query.tables}
+        opened = {name: read.version(root, name, versions[name] or None) for name in query.tables}
         found = _with_units(_run(query, opened, memory, question["parameters"]), query, opened)
     except LakeError as error:
         kind = "Damaged" if isinstance(error, Damaged) else "BadInput"
@@ -115,21 +115,27 @@ def _collected(batches: pa.RecordBatchReader, most: int) -> pa.Table:
             raise BadInput(_TOO_LARGE)
         kept.append(batch)
     table = pa.Table.from_batches(kept, batches.schema)
-    fields = [_exportable(field) for field in table.schema]
-    return table.cast(pa.schema(fields))
+    columns = [_exportable(name, column) for name, column in zip(table.column_names, table.columns, strict=True)]
+    return pa.Table.from_arrays(columns, table.column_names)
 
 
-def _exportable(field: pa.Field) -> pa.Field:
+def _exportable(name: str, column: pa.ChunkedArray) -> pa.ChunkedArray:
     """Sums of integers come as 128-bit decimals, which no file format of astronomy has."""
-    return field.with_type(pa.float64()) if pa.types.is_decimal(field.type) else field
+    if not pa.types.is_decimal(column.type):
+        return column
+    try:
+        return column.cast(pa.float64() if column.type.scale else pa.int64())
+    except pa.ArrowInvalid:
+        raise BadInput(f"SQL: column {name} holds integers beyond 64 bits; make it {name}::DOUBLE") from None
 
 
 def _with_units(found: pa.Table, query: Query, opened: dict[str, read.Version]) -> pa.Table:
     """Give the columns that came unchanged from a table its unit and description."""
     fields = []
     for field in found.schema:
-        sources = [v.schema.field(field.name) for v in opened.values() if field.name in v.schema.names]
-        same = [s for s in sources if s.type == field.type and (query.columns is None or field.name in query.columns)]
+        name = field.name.lower()
+        sources = [source for version in opened.values() for source in version.schema if source.name.lower() == name]
+        same = [s for s in sources if s.type == field.type and (query.columns is None or name in query.columns)]
         fields.append(field.with_metadata(same[0].metadata) if same else field)
     return pa.Table.from_arrays(found.columns, schema=pa.schema(fields))
 

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 from astropy.io import fits as astropy_fits
+from astropy.table import Table as AstropyTable
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from lake_schema import fits
+from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
@@ -156,3 +158,59 @@ def test_tables_with_texts_gaps_and_lists(tmp_path):
     fits.table_to_fits(path, GALAXIES.build(columns), GALAXIES)
     with astropy_fits.open(path) as units:
         np.testing.assert_array_equal(units[1].data["log_halo_mass"], [11.0, np.nan, 13.0])
+
+
+def exported(path, table, **columns):
+    """The table as an independent reader sees it, and its raw bytes."""
+    fits.table_to_fits(path, table.build({"id": np.arange(3), **columns}), table)
+    with astropy_fits.open(path, character_as_bytes=True) as units:
+        raw = np.array(units[1].data.view(np.ndarray))
+    return AstropyTable.read(path, hdu=1), raw
+
+
+@pytest.mark.parametrize("kind", ["int8", "int16", "int32", "int64"])
+def test_what_is_missing_is_told_from_every_number(tmp_path, kind):
+    table = Table("t", 1, (Column("id", "int64"), Column("x", kind, lo=0, nullable=True)), "t")
+    limits = np.iinfo(kind)
+    for values in ([limits.min, limits.max, 0], [-1, -(2**15) % limits.max, 5], [limits.min, limits.min + 1, 7]):
+        masked = np.ma.MaskedArray(np.array(values, kind), [False, False, True])
+        found, _ = exported(tmp_path / "a.fits", table, x=masked)
+        assert found["x"].mask.tolist() == [False, False, True]
+        assert found["x"][:2].tolist() == values[:2]
+
+
+def test_a_column_of_all_numbers_has_none_for_what_is_missing():
+    with pytest.raises(ValueError, match="every number of int8"):
+        fits._unused(np.arange(-128, 128).astype(np.int8))
+    assert fits._unused(np.array([], np.int16)) == -(2**15)
+
+
+def test_a_missing_boolean_is_neither_true_nor_false(tmp_path):
+    table = Table("t", 1, (Column("id", "int64"), Column("x", "bool", nullable=True)), "t")
+    _, raw = exported(tmp_path / "a.fits", table, x=np.ma.MaskedArray([True, False, True], [False, False, True]))
+    assert raw["x"].view("i1").tolist() == [ord("T"), ord("F"), 0]
+    with astropy_fits.open(tmp_path / "a.fits", checksum=True) as units:
+        assert units[1].verify_checksum() == units[1].verify_datasum() == 1
+
+
+def test_lists_are_arrays_of_variable_length(tmp_path):
+    kinds = ("list<int64>", "list<float32>")
+    table = Table("t", 1, (Column("id", "int64"), *(Column(f"x{i}", k) for i, k in enumerate(kinds))), "t")
+    lists = [[1, 2, 3], [], [2**62]]
+    found, _ = exported(tmp_path / "a.fits", table, x0=lists, x1=[[0.5], [1.5, 2.5], []])
+    assert [list(value) for value in found["x0"]] == lists
+    assert [list(value) for value in found["x1"]] == [[0.5], [1.5, 2.5], []]
+
+
+@pytest.mark.parametrize("name", ["é", "x" * 69, "a\nb", ""])
+def test_a_name_that_fits_cannot_hold_is_refused(tmp_path, name):
+    table = Table("t", 1, (Column(name, "int64"),), "t", key=())
+    with pytest.raises(BadInput, match="give it another"):
+        fits.table_to_fits(tmp_path / "a.fits", table.build({name: [1]}), table)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_units_are_spelled_as_fits_wants():
+    assert fits.fits_unit("GB") == "Gbyte"
+    assert fits.fits_unit("erg s-1 cm-2") == "erg s-1 cm-2"
+    assert fits.fits_unit("electron pix-1 s-1") == "electron pix-1 s-1"

@@ -78,10 +78,31 @@ def test_nulls_are_masked(explorer):
     assert table["i"].mask.sum() == table["x"].mask.sum() == 6
 
 
+def test_identifiers_beside_missing_ones_stay_whole(explorer):
+    text = f"SELECT unnest([{2**53 + 1}, NULL]) AS id, unnest([true, NULL]) AS flag, unnest([0.5, NULL])::DOUBLE AS x"
+    found = explorer.sql(text)
+    assert found.dtypes.astype(str).to_dict() == {"id": "Int64", "flag": "boolean", "x": "float64"}
+    assert found["id"][0] == 2**53 + 1
+    assert found.isna().sum().tolist() == [1, 1, 1]
+    table = explorer.sql(text, into="astropy")
+    assert table["id"][0] == 2**53 + 1
+    assert table["flag"].dtype == bool
+    assert [list(table[name].mask) for name in ("id", "flag", "x")] == [[False, True]] * 3
+    assert explorer.sql("SELECT id FROM plain")["id"].dtype == np.int64
+
+
+def test_astropy_has_no_two_columns_of_one_name(explorer):
+    with pytest.raises(BadInput, match="same name"):
+        explorer.sql("SELECT 1 AS a, 2 AS a", into="astropy")
+    assert explorer.sql("SELECT 1 AS a, 2 AS a").shape == (1, 2)
+
+
 # A unit stays with a column that is the table's own, and with no other.
 UNITS = [
     ("SELECT ra FROM galaxies", {"ra": "deg"}),
     ("SELECT * FROM galaxies", {"ra": "deg", "a_v": "mag"}),
+    ("select RA, g.Dec from galaxies g", {"ra": "deg", "dec": "deg"}),
+    ("SELECT RA, z_obs::DOUBLE AS Ra FROM galaxies", {"Ra": ""}),
     ("FROM galaxies", {"dec": "deg"}),
     (
         "SELECT g.ra, f_nu_euclid_vis FROM galaxies g JOIN galaxy_fluxes f USING (id)",
@@ -109,6 +130,14 @@ def test_sums_of_integers_are_numbers(explorer):
     assert explorer.sql("SELECT sum(id) AS s FROM plain", into="arrow")["s"].to_pylist() == [
         sum(i for part in range(3) for i in range(100 * part, 100 * part + 20))
     ]
+
+
+def test_integers_beyond_64_bits_are_never_rounded(explorer):
+    big = 2**53 + 1
+    assert explorer.sql(f"SELECT sum(x) AS s FROM (SELECT {big} AS x)", into="arrow")["s"].to_pylist() == [big]
+    with pytest.raises(BadInput, match="column s holds integers beyond 64 bits; make it s::DOUBLE"):
+        explorer.sql(f"SELECT sum(x) AS s FROM (SELECT unnest([{2**62}, {2**62}]) AS x)")
+    assert explorer.sql("SELECT 1.5 AS d", into="arrow")["d"].to_pylist() == [1.5]
 
 
 def test_macros(explorer, galaxies):
@@ -177,6 +206,14 @@ def test_skymap_counts_cells(explorer, galaxies):
         (lambda e: e.hist("galaxies", "1) FROM plain; DROP VIEW plain --"), "SQL"),
         (lambda e: e.hist("galaxies", "ra) AS x FROM read_text('/etc/passwd') --"), "read_text"),
         (lambda e: e.hist("galaxies", "log_sfr", where="ra < 0"), "no finite"),
+        (lambda e: e.hist("galaxies", "ra", 0), "bins = 0"),
+        (lambda e: e.hist("galaxies", "ra", -1), "bins = -1"),
+        (lambda e: e.hist("galaxies", "ra", 5, (1.0, 0.0)), "span"),
+        (lambda e: e.hist("galaxies", "ra", 5, (0.0, float("inf"))), "span"),
+        (lambda e: e.heatmap("galaxies", "ra", "dec", (5, 10**9)), "bins"),
+        (lambda e: e.heatmap("galaxies", "ra", "dec", (5, 5), ((0.0, 1.0), (1.0, 1.0))), "span"),
+        (lambda e: Explorer(e.root, memory=float("nan")), "memory"),
+        (lambda e: Explorer(e.root, timeout=float("inf")), "timeout"),
         (lambda e: e.skymap("galaxies", 30), "order"),
         (lambda e: e.skymap("plain"), "_healpix_29"),
         (lambda e: e.sql("SELECT 1", into="numpy"), "into"),
@@ -254,11 +291,37 @@ def test_what_fits_cannot_hold(explorer, tmp_path):
 
     text = "SELECT date '2020-01-01' AS d, [1, 2] AS l, 1::UTINYINT AS k, sum(id) AS s, NULL::BIGINT AS n FROM plain"
     found = Table.read(explorer.export(text, tmp_path / "a.fits"))
-    assert found.colnames == ["d", "k", "s", "n"]
+    assert found.colnames == ["d", "l", "k", "s", "n"]
+    assert list(found["l"][0]) == [1, 2]
+    assert found["n"].mask.all()
     assert found["d"][0] == "2020-01-01"
     assert found["s"][0] == explorer.sql(text)["s"][0]
     with pytest.raises(BadInput, match="same name"):
         explorer.export("SELECT 1 AS a, 2 AS a", tmp_path / "b.fits")
+
+
+@pytest.mark.parametrize(
+    ("column", "kinds"),
+    [
+        ("18446744073709551615::UBIGINT", ["fits"]),
+        ("'naïve'", ["fits"]),
+        ("INTERVAL 1 DAY", ["csv", "fits", "parquet"]),
+        ("{'a': 1}", ["csv", "fits"]),
+        ("[1, 2]", ["csv"]),
+        ("[['a']]", ["csv", "fits"]),
+    ],
+)
+def test_a_column_that_a_file_cannot_hold_is_named(explorer, tmp_path, column, kinds):
+    for kind in ("csv", "fits", "parquet"):
+        call = (f"SELECT 1 AS a, {column} AS bad", tmp_path / f"x.{kind}")
+        if kind in kinds:
+            with pytest.raises(BadInput, match=r"column bad: .+"):
+                explorer.export(*call)
+            assert not call[1].exists()
+        else:
+            assert explorer.export(*call).stat().st_size
+    with pytest.raises(BadInput, match=r"column 'x{80}'"):
+        explorer.export(f"SELECT 1 AS {'x' * 80}", tmp_path / "y.fits")
 
 
 def test_questions_are_one_line_of_json(explorer):
