@@ -10,15 +10,18 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from types import FrameType
 
 from jobs import request as requests
 from jobs.render import plan_exposures, preview
-from lake_schema import layout, read
+from lake_schema import __version__, layout, read
 from lake_schema.errors import LakeError
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -32,44 +35,72 @@ JOBS = (
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the jobs; the exit status is 0, or that of the first job that fails."""
+    """Run the jobs; the exit status is 0, or that of the first job that fails; 130/143 stopped."""
     parser = argparse.ArgumentParser(
-        prog="python -m jobs.demo", description="Simulate a field: five jobs, a table, pictures."
+        prog="python -m jobs.demo",
+        description="Simulate a field: five jobs, a table, pictures.",
+        epilog=f"truesky {__version__}",
     )
     parser.add_argument("--request", type=Path, default=_ROOT / "requests" / "demo.toml", help="simulation request")
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the lake and the pictures")
     options = parser.parse_args(argv)
+    before = {number: signal.signal(number, _stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        # Whatever is wrong with the pointings is said before the first job runs.
-        plan_exposures.steps(options.out, requests.parse(options.request))
-        root = layout.lake(options.out / "lake")
+        # Whatever is wrong with the folder or the pointings is said before the first job runs.
+        root = layout.lake(layout.lake(options.out) / "lake")
+        plan_exposures.steps(root, requests.parse(options.request))
         status = _run_all(root, options.request)
         if status == 0:
             _show(root, options.out)
     except LakeError as error:
         print(f"demo: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stopped:
         print("demo: stopped; a second run continues where this one ended", file=sys.stderr)
-        return 130
+        return 128 + int(stopped.args[0])
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return status
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt(number)
 
 
 def _run_all(root: Path, request: Path) -> int:
     submit = shutil.which("spark-submit", path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
     if submit is None:
         raise LakeError("no spark-submit on PATH: activate the environment that `make` made (. .venv/bin/activate)")
+    environment = {**os.environ, **_settings()}
     rows, start = [], time.perf_counter()
     for script, tables in JOBS:
         began = time.perf_counter()
         print(f"{Path(script).stem} ...", flush=True)
         command = [submit, str(_ROOT / script), "--lake", str(root), "--request", str(request)]
-        done = subprocess.run(command)
-        if done.returncode:
-            return done.returncode
+        if status := _call(command, environment):
+            return status
         rows.append((Path(script).stem, tables, time.perf_counter() - began))
     _table(root, rows, time.perf_counter() - start)
     return 0
+
+
+def _settings() -> dict[str, str]:
+    """What an activated environment tells spark-submit."""
+    conf, found = Path(sys.prefix) / "spark-conf", find_spec("pyspark")
+    if not conf.is_dir() or found is None or found.origin is None:
+        return {}
+    return {"SPARK_HOME": str(Path(found.origin).parent), "SPARK_CONF_DIR": str(conf)}
+
+
+def _call(command: Sequence[str], environment: dict[str, str]) -> int:
+    """Exit status of a job; it is stopped where we are."""
+    with subprocess.Popen(command, env=environment) as job:
+        try:
+            return job.wait()
+        except BaseException:
+            job.terminate()
+            raise
 
 
 def _table(root: Path, stages: Sequence[tuple[str, Sequence[str], float]], total: float) -> None:

@@ -6,6 +6,7 @@ spark-defaults.conf.  Where the master is not local, no path of this machine goe
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 import threading
@@ -69,9 +70,14 @@ def views(spark: SparkSession, root: Path) -> list[str]:
         version = read.version(root, name)
         if faults := read.verify(version, deep=True):
             raise Damaged(faults[0])
-        files = [str(version.path(part)) for part in version.parts]
+        files = [_literal(version.path(part)) for part in version.parts]
         spark.read.schema(struct(version.schema)).parquet(*files).createOrReplaceTempView(name)
     return names
+
+
+def _literal(path: Path) -> str:
+    """A path in which Spark finds no pattern."""
+    return re.sub(r"[\[\]{}*?\\]", r"\\\g<0>", str(path))
 
 
 def struct(schema: pa.Schema) -> StructType:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import json
 import logging
 import os
@@ -17,13 +18,14 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import pyarrow as pa
 from tqdm import tqdm
@@ -90,7 +92,7 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
             run(job, layout.lake(options.lake), _request(job, options), options.verbose)
     except BadInput as error:
         return _say(job, error, 2)
-    except LakeError as error:
+    except (LakeError, OSError) as error:
         return _say(job, error, 1)
     return 0
 
@@ -170,13 +172,13 @@ def _run(job: Job, step: Step, root: Path, request: requests.Request, verbose: b
     root.mkdir(parents=True, exist_ok=True)
     try:
         publish.make(root, plan, step.work, mapper)
-    except PartsFailed:
+    except BaseException as error:
+        log.close(time.time() - started, error)
         if verbose:
-            for result in results:
-                print(result.get("traceback") or "", file=sys.stderr)
+            failed = [result["traceback"] for result in results if result.get("traceback")]
+            print(*(failed if isinstance(error, PartsFailed) else [traceback.format_exc()]), sep="\n", file=sys.stderr)
         raise
-    finally:
-        log.close(time.time() - started)
+    log.close(time.time() - started)
     version = read.version(root, plan.table.name, plan.key)
     _summary(version, len(results), time.time() - started, before)
 
@@ -202,14 +204,22 @@ class _Measured:
 
 
 class _RunLog:
-    """LAKE/runs/<id>.jsonl: a line at the start, one a part, one at the end."""
+    """LAKE/runs/<id>.jsonl: a line at the start, one a part, one at the end.
+
+    A run goes on where it cannot be written.
+    """
 
     def __init__(self, root: Path, job: Job, step: Step, request: requests.Request) -> None:
         folder = layout.runs(root)
-        folder.mkdir(parents=True, exist_ok=True)
         now = datetime.now(UTC)
         self.common = {"job": job.name, "table": step.plan.table.name}
-        self.stream = (folder / f"{now:%Y%m%dT%H%M%S.%f}-{step.plan.table.name}-{os.getpid()}.jsonl").open("w")
+        path = folder / f"{now:%Y%m%dT%H%M%S.%f}-{step.plan.table.name}-{os.getpid()}.jsonl"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self.stream: IO[str] = path.open("w")
+        except OSError as error:
+            _say(job, f"no log of this run: {error}", 0)
+            self.stream = io.StringIO()
         about = {"started": now.isoformat(), "request": request.name, "key": step.plan.key}
         self.write({**about, "truesky": __version__, "commit": git_commit(), "parts": len(step.plan.parts)})
 
@@ -217,8 +227,12 @@ class _RunLog:
         kept = {k: v for k, v in line.items() if k not in ("files", "final")}
         print(json.dumps({**self.common, **kept}), file=self.stream, flush=True)
 
-    def close(self, seconds: float) -> None:
-        self.write({"ended": datetime.now(UTC).isoformat(), "seconds": seconds})
+    def close(self, seconds: float, error: BaseException | None = None) -> None:
+        about: dict[str, Any] = {"ended": datetime.now(UTC).isoformat(), "seconds": seconds, "status": "done"}
+        if error is not None:
+            about |= {"status": "failed", "error": f"{type(error).__name__}: {error}"}
+            about["traceback"] = "".join(traceback.format_exception(error))
+        self.write(about)
         self.stream.close()
 
 
@@ -261,12 +275,17 @@ def _spark_map(function: Callable[[Part], Json], parts: Sequence[Part], name: st
 
     from jobs.session import is_alive, session
 
-    spark = session(name)
-    if not verbose:
-        # Whatever fails is reported by us, in one line.
-        spark.sparkContext.setLogLevel("OFF")
+    # Whatever fails is reported by us, in one line.
+    quietly = contextlib.nullcontext if verbose else _hushed
     try:
-        with contextlib.nullcontext() if verbose else _hushed():
+        with quietly():
+            spark = session(name)
+            if not verbose:
+                spark.sparkContext.setLogLevel("OFF")
+    except (Py4JError, PySparkException, OSError) as error:
+        raise LakeError(f"Spark did not start: {' '.join(str(error).split())[:300]}") from None
+    try:
+        with quietly():
             return _collect(spark, function, parts)
     except (Py4JError, PySparkException, OSError):
         if not is_alive(spark):

@@ -43,6 +43,15 @@ def test_all_readers_give_the_same_rows(spark, lake):
     assert spark.table("tasks").select("cells").first().cells == rows_of(tasks, 7)["cells"][0].as_py()
 
 
+def test_no_name_of_a_folder_is_a_pattern(spark, tmp_path):
+    lake = tmp_path / "a[b]{c,d}*e?"
+    publish.make(lake, plain_plan(), plain_work)
+    publish.make(tmp_path / "ab{c,d}xef", plain_plan(2), plain_work)
+    assert views(spark, lake) == ["plain"]
+    assert {row["value"] for row in spark.table("plain").collect()} == {1.0}
+    assert spark.table("plain").count() == 60
+
+
 def test_a_changed_byte_is_found_before_spark_reads_it(spark, lake):
     publish.make(lake, plain_plan(), plain_work)
     path = read.version(lake, "plain").path("1.parquet")

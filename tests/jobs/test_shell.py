@@ -1,7 +1,9 @@
 """The shell of a job, without Spark: statuses, lines, the log of a run."""
 
+import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,10 +11,11 @@ import time
 from pathlib import Path
 
 import pytest
+from py4j.protocol import Py4JNetworkError
 
 from jobs import shell
 from jobs.shell import Job, Step
-from lake_schema import __version__, layout, read
+from lake_schema import __version__, layout, publish, read
 from lake_schema.publish import Plan
 from tests.universe import PLAIN, plain_plan, plain_work
 
@@ -82,12 +85,17 @@ def test_a_failure_is_one_line_and_its_traceback_is_in_the_log(run, lake, capsys
     assert out == ""
     assert err == "toy_job: table plain: 1 of 3 parts failed: 1.parquet: ValueError: row 17\n"
     (log,) = logs(lake)
-    (failed,) = [line for line in log if "error" in line]
+    (failed,) = [line for line in log if "error" in line and "part" in line]
     assert failed["part"] == "1.parquet"
     assert 'raise ValueError("row 17")' in failed["traceback"]
     assert log[-1]["ended"]
+    assert log[-1]["status"] == "failed"
+    assert log[-1]["error"].startswith("PartsFailed: table plain: 1 of 3 parts failed")
+    assert "in make" in log[-1]["traceback"]
     assert run(plain_work) == 0
     assert [line["part"] for line in logs(lake)[1] if "part" in line] == ["1.parquet"]
+    assert logs(lake)[1][-1]["status"] == "done"
+    assert "error" not in logs(lake)[1][-1]
 
 
 def test_verbose_shows_the_traceback(run, capsys):
@@ -123,6 +131,38 @@ def test_another_run_of_the_same_plan_is_refused(run, lake, request_file, capsys
         capsys.readouterr().err.splitlines()
         == [f"toy_job: table plain: another run is making version {plain_plan(2).key}"] * 3
     )
+
+
+def test_a_run_that_breaks_off_says_so_in_its_log(run, lake, capsys, monkeypatch):
+    def full(root, plan, base):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(publish, "_publish", full)
+    assert run(plain_work) == 1
+    assert capsys.readouterr().err == "toy_job: [Errno 28] No space left on device\n"
+    assert (logs(lake)[0][-1]["status"], logs(lake)[0][-1]["error"][:7]) == ("failed", "OSError")
+
+
+def test_what_is_already_there_needs_no_log(run, lake, capsys):
+    assert run(plain_work) == 0
+    shutil.rmtree(layout.runs(lake))
+    layout.runs(lake).touch()
+    assert run(plain_work) == 0
+    out, err = capsys.readouterr()
+    assert "already there" in out
+    assert "no log of this run" in err
+
+
+def test_a_java_that_dies_while_it_starts_is_one_line(lake, request_file, capsys, monkeypatch):
+    def dead(name):
+        raise Py4JNetworkError("Answer from Java side is empty\nTraceback ...")
+
+    monkeypatch.setattr("jobs.session.session", dead)
+    arguments = ["--lake", str(lake), "--request", str(request_file)]
+    assert shell.main(job_of(plain_work, on_driver=False), arguments) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("toy_job: Spark did not start: ")
+    assert len(err.splitlines()) == 1
 
 
 def test_the_bar_counts_receipts(run, monkeypatch, capsys):
