@@ -76,6 +76,10 @@ class Version:
         """A part's Parquet file; Damaged where its size or footer is not what the manifest says."""
         return manifest.checked(self.folder, self._entry(part))
 
+    def part_rows(self, part: str) -> int:
+        """Number of rows of a part."""
+        return int(self._entry(part)["rows"])
+
     def _entry(self, part: str) -> dict[str, Any]:
         files = self._files()
         for prefix in (f"{self.table}/dataset/", "dataset/"):

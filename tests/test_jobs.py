@@ -107,7 +107,6 @@ def test_what_must_be_built_first_is_named(job, tmp_path, capsys):
     assert missing[job.name] in capsys.readouterr().err
 
 
-
 @pytest.mark.spark
 def test_the_same_request_gives_the_same_bytes_under_any_master(tmp_path):
     path = tmp_path / "r.toml"

@@ -22,7 +22,7 @@ from jobs.render.exposing import SKY_TYPES
 from jobs.request import Universe
 from lake_schema import layout, sky
 from lake_schema.errors import BadInput
-from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
+from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.read import Version
 from lake_schema.tables.tasks import TASKS
@@ -95,8 +95,8 @@ def _published(version: Version) -> dict[int, float]:
     density: dict[int, float] = {}
     for part in version.manifest["parts"]:
         cells = part["facts"]["generation_cells"]
-        _, file = layout.cell_of_file(part["name"])
-        if any(cell >> 2 * (GENERATION_ORDER - FILE_ORDER) != file for cell in cells):
+        order, file = layout.cell_of_file(part["name"])
+        if any(cell >> 2 * (GENERATION_ORDER - order) != file for cell in cells):
             raise BadInput(f"table {version.table}: part {part['name']} names cells of another file")
         mean = version.part_rows(part["name"]) / (len(cells) * sky.cell_area(GENERATION_ORDER))
         density.update(dict.fromkeys(cells, mean))
