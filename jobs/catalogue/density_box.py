@@ -155,7 +155,7 @@ def biased(model: BoxModel, x: Float) -> tuple[npt.NDArray[np.int64], Float]:
 
     Halos drawn in voxels from exp(A g_R) have the power x^2 P_linear(z = 0) in the band of the model; A = x would be
     wrong by up to a half.
-    Error: bias within 10 % at 0.02 < k < 0.25 h/Mpc for 0.5 < x < 6 (tests)
+    Error: bias within 10 % at 0.02 < k < 0.25 h/Mpc for 0.7 < x < 6 (tests)
     """
     names = [float(value) for name in astuple(model) for value in np.atleast_1d(name)]
     key = content_key(Path(__file__).read_bytes(), (Path(__file__).parent / "linear_theory.py").read_bytes(), *names)

@@ -63,7 +63,16 @@ def drawn(universe, cells, dust, library):
     bands = ("euclid_vis", "euclid_y", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")
     mags = {band: mag(band) for band in bands}
     return SimpleNamespace(
-        every=every, rows=rows, halos=halos, columns=columns, z=z, m_r=m_r, sed=sed, mags=mags, area=area
+        every=every,
+        rows=rows,
+        halos=halos,
+        columns=columns,
+        z=z,
+        m_r=m_r,
+        sed=sed,
+        mags=mags,
+        area=area,
+        places=places,
     )
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from jobs.catalogue import galaxies, luminosity_function, morphology, population
+from jobs.catalogue import galaxies, lightcone, luminosity_function, morphology, population
 from jobs.fluxes import cosmology
 from lake_schema import ids, sky, validate
 from lake_schema.tables.galaxies import GALAXIES
@@ -55,15 +55,33 @@ def expected_number(lf, near, far, faintest, area):
     return float(np.sum(0.5 * (density[1:] + density[:-1]) * shells) * area * np.radians(1.0) ** 2)
 
 
+def richness(universe, places, near, far, log_mass):
+    """Density that the box has in these cells for halos of a mass, against its mean: what structure does to counts."""
+    model = universe.population.halos
+    steps = (model.line.z > near) & (model.line.z < far)
+    column = np.searchsorted(model.log_mass, log_mass) - 1
+    total = []
+    for place in places:
+        found = lightcone.voxels(model.box, model.turned, model.line, ids.GENERATION_ORDER, place, steps)
+        amplitude, field = model.amplitude[found.step, column], model.field[found.step, column]
+        g = np.stack([smooth.ravel()[found.box] for smooth in model.box.smoothed], 1)[np.arange(field.size), field]
+        volume = model.line.volume[found.step] / 4.0**found.order
+        density = np.exp(amplitude * g - 0.5 * amplitude**2 * model.box.variance[field])
+        total.append([np.sum(volume * density), np.sum(volume)])
+    return float(np.divide(*np.sum(total, 0)))
+
+
 @pytest.mark.parametrize(
-    ("z", "half", "reddest", "within"), [(0.1, 0.08, 0.2, 0.25), (0.5, 0.05, 0.3, 0.15), (1.0, 0.1, 1.5, 0.10)]
+    ("z", "half", "reddest", "mass", "within"),
+    [(0.1, 0.08, 0.2, 11.4, 0.15), (0.5, 0.05, 0.3, 11.4, 0.10), (1.0, 0.1, 1.5, 12.0, 0.10)],
 )
-def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, half, reddest, within):
-    """Counted where the reddest spectrum (I_E - M_r - DM) beats the limit (structure moves the near ones)."""
+def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, half, reddest, mass, within):
+    """Counted where the reddest spectrum (I_E - M_r - DM) beats the limit, and as rich as the box is there."""
     near, far = z - half, z + half
     faintest = min(26.0 - float(cosmology.distance_modulus(far)) - reddest, -16.0)
     found = np.sum((drawn.z > near) & (drawn.z < far) & (drawn.m_r < faintest))
     expected = expected_number(universe.luminosities, near, far, faintest, drawn.area)
+    expected *= richness(universe, drawn.places, near, far, mass)
     assert expected > 400
     assert found == pytest.approx(expected, rel=within)
 
