@@ -48,7 +48,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         # Whatever is wrong with the folder or the pointings is said before the first job runs.
         root = layout.lake(layout.lake(options.out) / "lake")
-        plan_exposures.steps(root, requests.parse(options.request))
+        plan_exposures.plan(root, requests.parse(options.request))
         status = _run_all(root, options.request)
         if status == 0:
             _show(root, options.out)

@@ -458,7 +458,7 @@ def _own_curves(table: Toml, folder: Path) -> OwnCurves:
     if "templates" in table:
         path = "fluxes.templates"
         given = _table(table["templates"], path, {"files", "format"})
-        files = _strings(given, f"{path}.files")
+        files = _strings(given, f"{path}.files", distinct=False)
         if not files:
             raise BadInput(f"{path}.files is missing")
         templates = Curves(tuple(_file(folder, file) for file in files), _string(given, f"{path}.format"))

@@ -66,7 +66,7 @@ def string(table: Toml, path: str, legal: Sequence[str] = (), default: str | Non
     return found
 
 
-def strings(table: Toml, path: str, legal: Sequence[str] = ()) -> tuple[str, ...]:
+def strings(table: Toml, path: str, legal: Sequence[str] = (), distinct: bool = True) -> tuple[str, ...]:
     """A list of texts, empty where it is not there."""
     found = table.get(path.rpartition(".")[2], [])
     if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
@@ -74,7 +74,7 @@ def strings(table: Toml, path: str, legal: Sequence[str] = ()) -> tuple[str, ...
     for item in found:
         if legal and item not in legal:
             raise BadInput(f"{path}: {shown(item)} is not one of {', '.join(legal)}")
-    if len(set(found)) != len(found):
+    if distinct and len(set(found)) != len(found):
         raise BadInput(f"{path} = {shown(found)} names something twice")
     return tuple(found)
 

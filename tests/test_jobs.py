@@ -101,7 +101,8 @@ def test_what_must_be_built_first_is_named(job, tmp_path, capsys):
     assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 2
     missing = {
         "compute_fluxes": "no table galaxies",
-        "plan_exposures": "pointing is missing",
+        "build_gaia": "no table stars",
+        "plan_exposures": "pointing and observation are missing",
         "render_exposures": "no table mission",
     }
     assert missing[job.name] in capsys.readouterr().err

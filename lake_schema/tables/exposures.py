@@ -54,17 +54,25 @@ EXPOSURES = Table(
         Column("seeing", "float64", "arcsec", "instr.obsty.seeing", "FWHM of the atmosphere, 0 in space", 0.0, 10.0),
         Column("zero_point", "float64", "mag", "phot.mag;arith.zp", "AB magnitude of 1 electron/s", 0.0, 50.0, since=2),
         Column("survey", "string", ucd="meta.id", doc="survey or request that it belongs to", since=2),
-        Column("field", "int64", "", "obs.field", "field of the survey, from 1", 1, nullable=True, since=2),
+        Column("field", "int64", "", "meta.id;obs", "field of the survey, from 1", 1, nullable=True, since=2),
         Column("visit", "int32", "", "meta.number;obs", "visit of the field, from 1", 1, nullable=True, since=2),
         Column("dither", "int32", "", "meta.number;obs", "dither of the visit, from 1", 1, nullable=True, since=2),
-        Column("grism", "string", "", "instr.disp", "grism", nullable=True, since=2),
+        Column("grism", "string", "", "instr.dispersion", "grism", nullable=True, since=2),
         Column(
-            "grism_angle", "float64", "deg", "pos.posAng;instr.disp", "of the dispersion", -360.0, 360.0, True, since=2
+            "grism_angle",
+            "float64",
+            "deg",
+            "pos.posAng;instr.dispersion",
+            "of the dispersion",
+            -360.0,
+            360.0,
+            True,
+            since=2,
         ),
         Column("lamp", "int32", "", "meta.number;instr", "calibration lamp, from 1", 1, nullable=True, since=2),
         Column("target", "string", "", "meta.id;src", "calibration source", nullable=True, since=2),
         Column(
-            "psf", "string", "", "meta.file;instr.det.psf", "file of the PSF model, where given", nullable=True, since=2
+            "psf", "string", "", "meta.ref;instr.det.psf", "file of the PSF model, where given", nullable=True, since=2
         ),
         Column(
             "settings",

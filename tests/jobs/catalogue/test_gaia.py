@@ -164,6 +164,7 @@ def filled(lake):
     def beside(root, facts):
         rows = read.version(root, "stars").rows(parts=[layout.cell_file(5, facts["cell"])])
         flux = {f"f_nu_{b}": np.full(len(rows), units.f_nu_of_mag(20.5 + v)) for b, v in zip(BANDS, VEGA, strict=True)}
+        flux["integrated"] = np.zeros(len(rows), bool)
         return Output(flux_table.build({name: rows[name] for name in ("id", "ra", "dec", "_healpix_29")} | flux))
 
     parts = tuple(Part(layout.cell_file(5, cell), {"cell": cell}) for cell in files)
@@ -233,6 +234,7 @@ def test_what_it_must_have_is_named(lake):
     flux = fluxes("star", ["lsst_r"])
     rows = {
         "f_nu_lsst_r": np.zeros(0),
+        "integrated": np.zeros(0, bool),
         **{name: np.zeros(0, flux.column(name).type) for name in ("id", "ra", "dec", "_healpix_29")},
     }
     part = (Part(layout.cell_file(5, 1607), {}),)

@@ -20,6 +20,8 @@ seed = 5
 cone = { ra = 53.117, dec = -27.808, radius = 0.02 }
 [universe]
 galaxy_limit = 23.5
+box_cells = 192
+lensing_nside = 64
 star_limit = 20.0
 [fluxes]
 bands = ["euclid_vis", "lsst_r"]
