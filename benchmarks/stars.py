@@ -37,7 +37,7 @@ Float = npt.NDArray[np.float64]
 SEED = 7
 AREA = sky.cell_area(GENERATION_ORDER)
 BANDS = [f"euclid_{b}" for b in ("vis", "y", "j", "h")] + [f"lsst_{b}" for b in "ugrizy"]
-# Latitude -> stars deg-2 to I = 18, 20, 22, 24.5 and H = 18, 22, 26 (Vega), mean over longitude, without dust.
+# Northern latitude -> stars deg-2 to I = 18, 20, 22, 24.5 and H = 18, 22, 26 (Vega), mean over longitude, without dust.
 COUNTS = {
     90: (898, 2248, 5119, 12869, 2149, 10947, 36451),
     60: (1174, 2984, 6864, 17121, 2833, 14687, 47254),
@@ -64,11 +64,14 @@ def pole_counts(v: float) -> float:
     return float(disc + spheroid)
 
 
-def around(b: float, cells: int) -> list[int]:
-    """Generation cells at Galactic latitudes b and -b, evenly in longitude."""
+def around(b: float, cells: int, south: bool = False) -> list[int]:
+    """Generation cells at Galactic latitude b, evenly in longitude; with `south`, every other one at -b.
+
+    The Sun stands north of the plane, so that there are more stars in the south.
+    """
     lon = np.arange(cells) * 360.0 / cells
     # At a pole the parallel is too short for them.
-    lat = np.where(np.arange(cells) % 2, -1.0, 1.0) * np.minimum(b, 89.9 - 0.1 * np.arange(cells))
+    lat = np.minimum(b, 89.9 - 0.1 * np.arange(cells)) * np.where(south & (np.arange(cells) % 2 == 1), -1.0, 1.0)
     return sorted({int(cell) for cell in sky.cell_of(*sky.equatorial(lon, lat), GENERATION_ORDER)})
 
 
@@ -128,10 +131,10 @@ def brighter_than_11(step: int, dust: npt.NDArray[np.float32]) -> float:
 
 
 def pole(cells: int, dust: npt.NDArray[np.float32]) -> dict[str, float]:
-    """Stars deg-2 at the pole to V = 20 and G = 20 from the flux table, against published counts in the same band."""
+    """Stars deg-2 at both poles to V = 20 and G = 20 from the flux table, against published counts in the same band."""
     universe, library = stars.model(24.0), templates.stellar_library()
     zero = {"bessell_v": vega_magnitude(passbands.load("bessell_v")), "gaia_g": gaia.ab_minus_vega()[0]}
-    drawn = around(90.0, cells)
+    drawn = around(90.0, cells, south=True)
     found = {band: [] for band in zero}
     for cell in drawn:
         rows = stars.draw(cell, SEED, universe, dust)

@@ -61,13 +61,12 @@ class Component:
 
 @dataclass(frozen=True, slots=True)
 class Metallicity:
-    """Normal distributions of [M/H] of the three components (milky_way.toml, [metallicity])."""
+    """Normal distributions of [M/H] of the three components, and what it does (milky_way.toml, [metallicity])."""
 
     mean: tuple[float, ...]
     scatter: tuple[float, ...]
     limits: tuple[float, float]
-    poor: float
-    hotter: float
+    hotter: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,10 +230,10 @@ def metallicity(galaxy: MilkyWay, component: Int, rng: np.random.Generator) -> F
     return np.clip(mean + scatter * rng.standard_normal(component.size), *law.limits)
 
 
-def teff(galaxy: MilkyWay, stars: Sample, metals: Float) -> Float:
-    """Effective temperature[n], K; metal-poor stars are hotter at their luminosity."""
-    poor = (metals < galaxy.metallicity.poor) & (stars.stage != WHITE_DWARF)
-    return _of_sequence(galaxy, stars, "teff") + np.where(poor, galaxy.metallicity.hotter, 0.0)
+def teff(galaxy: MilkyWay, stars: Sample) -> Float:
+    """Effective temperature[n], K; the metal-poor components' stars are hotter at their luminosity."""
+    hotter = np.array(galaxy.metallicity.hotter)[stars.component]
+    return _of_sequence(galaxy, stars, "teff") + np.where(stars.stage == WHITE_DWARF, 0.0, hotter)
 
 
 def log_g(galaxy: MilkyWay, stars: Sample) -> Float:

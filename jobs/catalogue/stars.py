@@ -178,7 +178,7 @@ def _drawn(cell: int, seed: int, universe: StarModel, dust: npt.NDArray[np.float
     galaxy = universe.galaxy
     stars = milky_way.draw(galaxy, milky_way.expected(galaxy, *where), stream(seed, "stars.luminosity", cell))
     metals = milky_way.metallicity(galaxy, stars.component, stream(seed, "stars.metallicity", cell))
-    teff = milky_way.teff(galaxy, stars, metals)
+    teff = milky_way.teff(galaxy, stars)
     return {
         **_placed(cell, universe, dust, stars.distance, stream(seed, "stars.position", cell)),
         "component": stars.component,

@@ -116,9 +116,15 @@ def test_labels(rng):
     # The halo: Ivezic et al. 2008.
     assert means == pytest.approx([-0.05, -0.60, -1.46], abs=0.03)
     sample = mw.Sample(component[:2], np.array([mw.DWARF, mw.GIANT]), np.ones(2), np.array([3.31, -1.5]))
-    assert mw.teff(GALAXY, sample, np.array([0.0, 0.0])) == pytest.approx([5770, 4750], abs=60)
-    assert mw.teff(GALAXY, sample, np.array([-1.5, -0.5])) == pytest.approx([5920, 4750], abs=60)
+    assert mw.teff(GALAXY, sample) == pytest.approx([5770, 4750], abs=60)
     assert mw.log_g(GALAXY, sample) == pytest.approx([4.43, 2.5], abs=0.05)
+
+
+def test_metal_poor_components_are_hotter():
+    """All but white dwarfs, which have their own temperatures."""
+    stage, m_h = np.repeat([mw.DWARF, mw.GIANT, mw.WHITE_DWARF], 3), np.repeat([4.0, -1.5, 13.0], 3)
+    teff = mw.teff(GALAXY, mw.Sample(np.tile([mw.THIN, mw.THICK, mw.HALO], 3), stage, np.ones(9), m_h)).reshape(3, 3)
+    np.testing.assert_allclose(teff - teff[:, :1], [[0, 150, 400], [0, 150, 400], [0, 0, 0]], atol=1e-9)
 
 
 def test_white_dwarfs_of_the_solar_neighbourhood():

@@ -29,6 +29,13 @@ def test_bright_stars_of_the_whole_sky(dust):
     assert 0.85e6 < benchmark.brighter_than_11(61, dust) < 1.15e6
 
 
+def test_stars_at_the_pole(dust):
+    """To G = 20 and V = 20, from the flux table: Bahcall & Soneira 1980, good to 15 %."""
+    found = benchmark.pole(12, dust)
+    assert found["against_pole_g20"] == pytest.approx(1.0, abs=0.2)
+    assert found["against_pole_v20"] == pytest.approx(1.0, abs=0.2)
+
+
 @pytest.mark.nightly
 def test_the_benchmark(tmp_path):
     file = tmp_path / "stars.json"

@@ -126,7 +126,7 @@ def test_the_plane_is_refused_or_has_its_own_limit():
 
 
 def test_labels_leave_the_numbers_of_the_others(dust, cell):
-    metallicity = dataclasses.replace(UNIVERSE.galaxy.metallicity, mean=(0.1, -0.2, -0.5))
+    metallicity = dataclasses.replace(UNIVERSE.galaxy.metallicity, mean=(0.1, -0.2, -0.5), hotter=(0.0, 0.0, 300.0))
     changed = dataclasses.replace(UNIVERSE, galaxy=dataclasses.replace(UNIVERSE.galaxy, metallicity=metallicity))
     other = stars.draw(CELL, SEED, changed, dust)
     differ = {name for name in cell.column_names if not cell[name].equals(other[name])}
