@@ -162,7 +162,8 @@ def speed(radius: float) -> dict[str, float]:
     table = {"name": "benchmark", "seed": SEED, "area": {"cone": {"ra": ra, "dec": dec, "radius": radius}}}
     wanted = request.from_table({**table, "fluxes": {"bands": BANDS}})
     # Libraries and machine code are made once, whatever is asked for.
-    spectra.prepare(BANDS, wanted.accuracy)
+    curves = [passbands.load(band) for band in BANDS]
+    spectra.prepare(curves, [None] * len(curves), templates.galaxy_library(), wanted.accuracy)
     dust_map.load(SEED)
     with tempfile.TemporaryDirectory() as folder:
         lake = layout.lake(folder)
