@@ -163,7 +163,8 @@ def speed(radius: float) -> dict[str, float]:
     wanted = request.from_table({**table, "fluxes": {"bands": BANDS}})
     # Libraries and machine code are made once, whatever is asked for.
     curves = [passbands.load(band) for band in BANDS]
-    spectra.prepare(curves, [None] * len(curves), templates.galaxy_library(), wanted.accuracy)
+    libraries = templates.galaxy_library(), templates.stellar_library()
+    spectra.prepare(curves, [None] * len(curves), *libraries, wanted.accuracy)
     dust_map.load(SEED)
     with tempfile.TemporaryDirectory() as folder:
         lake = layout.lake(folder)

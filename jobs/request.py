@@ -9,6 +9,7 @@
     [fluxes]       bands = [..]           default: the bands of the pointings and observations
     [fluxes.passbands.NAME]        your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
     [fluxes.templates]             your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
+    [fluxes.stars]                 your own dwarfs: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
     [fluxes.extinction.CODE]       your own law in place of law 1 .. 4: file, format
     [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
@@ -220,11 +221,16 @@ class Curves:
 
 @dataclass(frozen=True, slots=True)
 class OwnCurves:
-    """What stands beside the embedded passbands, and in place of the embedded galaxies and extinction laws."""
+    """What stands beside the embedded passbands, and in place of the embedded galaxies, extinction laws and dwarfs.
+
+    basel : models of dwarfs;  irtf : spectra of stars whose infrared the dwarfs are given
+    """
 
     passbands: tuple[tuple[str, Curves], ...] = ()
     templates: Curves | None = None
     extinction: tuple[tuple[int, Curves], ...] = ()
+    basel: Path | None = None
+    irtf: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,7 +295,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     sections = {"area", "universe", "stars", "mission", "fluxes", "effects", "explore", "products"}
     _known(table, "", {"name", "seed", "accuracy", "pointing", "observation", *sections})
     pointings, observations = _pointings(table), _observations(table)
-    fluxes = _section(table, "fluxes", {"bands", "passbands", "templates", "extinction"})
+    fluxes = _section(table, "fluxes", {"bands", "passbands", "templates", "stars", "extinction"})
     curves = _own_curves(fluxes, folder)
     bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in pointings)
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
@@ -309,6 +315,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         effects=_effects(_section(table, "effects", {"on", "off"})),
         explore=_explore(_section(table, "explore", None)),
     )
+    _check_bands(request)
     _check_mission(request)
     return request
 
@@ -462,8 +469,15 @@ def _own_curves(table: Toml, folder: Path) -> OwnCurves:
         if not files:
             raise BadInput(f"{path}.files is missing")
         templates = Curves(tuple(_file(folder, file) for file in files), _string(given, f"{path}.format"))
+    stars = _table(table.get("stars", {}), "fluxes.stars", {"basel", "irtf"})
+    if "stars" in table and not stars:
+        raise BadInput("fluxes.stars names neither basel nor irtf")
     return OwnCurves(
-        tuple(zip(filters, passbands, strict=True)), templates, tuple(zip(map(int, laws), extinction, strict=True))
+        tuple(zip(filters, passbands, strict=True)),
+        templates,
+        tuple(zip(map(int, laws), extinction, strict=True)),
+        _file(folder, _string(stars, "fluxes.stars.basel")) if "basel" in stars else None,
+        tuple(_file(folder, name) for name in _strings(stars, "fluxes.stars.irtf")),
     )
 
 
@@ -523,6 +537,18 @@ def _choices(key: str, value: object) -> tuple[str, ...]:
     if key.removeprefix("effects.") not in effect_names():
         raise BadInput(f"{path} is not one of the effects {', '.join(effect_names())}")
     return tuple(json.dumps(_boolean({"x": item}, f"{path}[{i}].x", True)) for i, item in enumerate(value))
+
+
+def _check_bands(request: Request) -> None:
+    """Of its own bands a request can point VIS in: of no other camera are zero point, sky and seeing known there."""
+    own = {name for name, _ in request.curves.passbands}
+    for i, pointing in enumerate(request.pointings):
+        if pointing.band in own and pointing.channel != "VIS":
+            what = f"{pointing.band} is your own passband, in which camera {pointing.camera} has no zero point and sky"
+            raise BadInput(f"pointing[{i}].band: {what}: only VIS can be pointed in it")
+    for i, block in enumerate(request.observations):
+        if found := sorted(own & set(block.bands)):
+            raise BadInput(f"observation[{i}].bands: {found[0]} is your own passband: no survey observes in it")
 
 
 def _check_mission(request: Request) -> None:

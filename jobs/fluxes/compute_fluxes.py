@@ -21,11 +21,10 @@ from typing import Any
 import pyarrow as pa
 
 from jobs.accuracy import Accuracy
-from jobs.fluxes import grid_errors, grid_settings, inputs, passbands, spectra, templates
+from jobs.fluxes import grid_errors, grid_settings, inputs, spectra
 from jobs.fluxes.grid_settings import Choice
 from jobs.fluxes.grid_tables import Setting
 from jobs.fluxes.inputs import Own
-from jobs.fluxes.passbands import Passband
 from jobs.request import Request
 from jobs.shell import Job, Step, main
 from lake_schema import layout, read
@@ -50,7 +49,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     made = [_step(catalogue, kind, request, own, chosen, sources) for kind, catalogue in catalogues]
     if not all(layout.version(lake, step.plan.table.name, step.plan.key).exists() for step in made):
         # Here once, and not in every worker at the same time.
-        spectra.prepare(curves, [choice.setting for choice in chosen], own.library, request.accuracy)
+        spectra.prepare(curves, [choice.setting for choice in chosen], own.library, own.stars, request.accuracy)
     return [*sources, *made]
 
 
@@ -99,22 +98,12 @@ def _errors(kind: str, request: Request, chosen: Sequence[Choice]) -> dict[str, 
 def work(lake: Path, facts: Json) -> Output:
     """The fluxes of one cell, in the order of its rows."""
     rows = read.version(lake, facts["catalogue"], facts["input"]).rows(parts=[facts["part"]])
-    curves = _curves(lake, facts)
+    curves = [inputs.passband_of(lake, facts, band) for band in facts["bands"]]
     if facts["catalogue"] == "galaxies":
         chosen = [facts["errors"][band]["setting"] for band in facts["bands"]]
         settings = [Setting(*numbers) if numbers else None for numbers in chosen]
         return Output(spectra.galaxy_fluxes_by(rows, curves, settings, inputs.library_of(lake, facts)))
-    return Output(spectra.star_fluxes(rows, curves, templates.stellar_library(), Accuracy(**facts["accuracy"])))
-
-
-def _curves(lake: Path, facts: Json) -> list[Passband]:
-    key = facts["sources"]["passbands"]
-    return [
-        inputs.published_passband(lake, key, band)
-        if f"fluxes.passbands.{band}" in facts["files"]
-        else passbands.load(band)
-        for band in facts["bands"]
-    ]
+    return Output(spectra.star_fluxes(rows, curves, inputs.stars_of(lake, facts), Accuracy(**facts["accuracy"])))
 
 
 JOB = Job(

@@ -9,6 +9,7 @@ line_table     what a band makes of a line: wavelength x width
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -59,8 +60,9 @@ class Setting:
         return float(np.log1p(Z_FIRST)) + self.step * node
 
 
+@lru_cache(maxsize=4)
 def library_key(library: Library) -> str:
-    """Key of a library's spectra and of the dust in front of them."""
+    """Key of a library's spectra and of the dust in front of them; a tenth of a second, once a library."""
     return cache.content_key(library.wavelength, np.asarray(library.flux), dust_of(library))
 
 

@@ -5,15 +5,13 @@ read            wavelengths and values of one file
 library         galaxy templates on our grid, from files in the order of a list
 law             an extinction law on the wavelengths of a library
 passband        a user's filter
-basel           stellar spectra of Lejeune, Cuisinier & Buser 1997 (.cor)
-splice          IRTF spectra of stars onto those of low resolution, by their Y - H colour
+check, resampled, text_of   what they are read with
 
 Every refusal is a BadInput that names the file, and the row where there is one.
 """
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,27 +26,17 @@ from jobs.fluxes.passbands import Passband
 from jobs.fluxes.stellar import normalised
 from jobs.fluxes.templates import Library
 from lake_schema.errors import BadInput
-from lake_schema.units import LIGHT_ANGSTROM_S
 
 Float = npt.NDArray[np.float64]
 
 _FORMATS = Path(__file__).with_name("spectrum_formats.toml")
 _MOST_BYTES = 64 << 20
-_ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4}
+ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4}
 # f_lambda beyond the red end of a file of galaxies.
 _RED_SLOPE = -3.2
 
-# Lejeune, Cuisinier & Buser 1997, ReadMe: 1221 wavelengths in nm, 8 of 10 characters a line; models in blocks of a
-# header "2I6,4F6.2" and 1221 values of H_nu, 7 of 11 characters a line; f_lambda = 4 pi H_nu c / lambda^2 / pi.
-_BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH, _BASEL_FLUX_WIDTH = 1221, 10, 11
-_BASEL_HEADER = (0, 6, 12, 18, 24)
-
 # k of the steepest law, at 912 A, is some 25.
 _MOST_EXTINCTION = 100.0
-
-# The colour by which stars are compared, and the stretch of IRTF spectra that is used, A.
-SPLICE_BANDS = ("euclid_y", "euclid_h")
-_SPLICE_FROM, _SPLICE_TO, _SPLICE_JOIN = 8_200.0, 24_000.0, 200.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,17 +45,6 @@ class Curve:
 
     wavelength: Float
     value: Float
-
-
-@dataclass(frozen=True, slots=True)
-class BaselModels:
-    """wavelength float64[1221] A; teff K, log_g, metallicity float64[n]; flux float64[n, 1221] f_lambda."""
-
-    wavelength: Float
-    teff: Float
-    log_g: Float
-    metallicity: Float
-    flux: Float
 
 
 def formats() -> Mapping[str, Mapping[str, Any]]:
@@ -89,7 +66,7 @@ def read(path: Path, name: str) -> Curve:
         wavelength, value = _columns(path, form)
     except (OSError, ValueError, KeyError, IndexError, TypeError, UnicodeDecodeError) as error:
         raise BadInput(f"{path}: cannot be read as {name}: {' '.join(str(error).split())[:200]}") from None
-    _check(path, wavelength, value, form)
+    check(path, wavelength, value, form)
     return Curve(wavelength, value)
 
 
@@ -102,7 +79,7 @@ def library(files: Sequence[Path], name: str = "cosmos") -> Library:
     from jobs.fluxes.templates import rest_grid
 
     grid = rest_grid()
-    flux = np.stack([_resampled(grid, read(path, name)) for path in files])
+    flux = np.stack([resampled(grid, read(path, name)) for path in files])
     names = tuple(path.stem for path in files)
     return Library(grid, normalised(grid, flux).astype(np.float32), names, own=True)
 
@@ -126,67 +103,18 @@ def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -
     return Passband(name, wavelength, response, medium)
 
 
-def basel(path: Path) -> BaselModels:
-    """All models of a BaSeL file, lcb[mp]NN.cor."""
-    try:
-        lines = _text(path).splitlines()
-        wavelength, at = _numbers(lines, 0, _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH)
-        labels, spectra = [], []
-        while at < len(lines) and lines[at].strip():
-            head = lines[at]
-            labels.append([float(head[a:b]) for a, b in zip(_BASEL_HEADER[1:], (*_BASEL_HEADER[2:], 30), strict=True)])
-            h_nu, at = _numbers(lines, at + 1, _BASEL_COUNT, _BASEL_FLUX_WIDTH)
-            spectra.append(h_nu)
-    except (OSError, ValueError, IndexError) as error:
-        raise BadInput(f"{path}: cannot be read as BaSeL: {error}") from None
-    if not spectra:
-        raise BadInput(f"{path}: holds no model")
-    angstrom = wavelength * _ANGSTROM["nm"]
-    for h_nu in spectra:
-        _check(path, angstrom, h_nu, {"bounds": [1.0, 1e8], "covers": [2000.0, 20000.0], "largest_gap": 0.1})
-    teff, log_g, metallicity = np.array(labels)[:, :3].T
-    flux = 4.0 * np.stack(spectra) * LIGHT_ANGSTROM_S / angstrom**2
-    return BaselModels(angstrom, teff, log_g, metallicity, flux)
-
-
-def splice(wavelength: Float, flux: Float, stars: Sequence[Curve]) -> Float:
-    """Low-resolution spectra float64[n, n_lambda] with the infrared of the stars that are nearest in Y - H.
-
-    The IRTF spectrum is scaled to meet the other at both ends; the broad shape stays that of the low resolution.
-    """
-    infrared = [np.interp(wavelength, star.wavelength, star.value) for star in stars]
-    ends = [(max(star.wavelength[0], _SPLICE_FROM), min(star.wavelength[-1], _SPLICE_TO)) for star in stars]
-    bands = [passbands.load(name) for name in SPLICE_BANDS]
-    colors = np.array([_color(bands, wavelength, each) for each in infrared])
-    out = np.array(flux, float)
-    for spectrum in out:
-        k = int(np.argmin(np.abs(colors - _color(bands, wavelength, spectrum))))
-        blue, red = ends[k]
-        inside = (wavelength >= blue) & (wavelength <= red)
-        joins = [inside & (np.abs(wavelength - end) <= _SPLICE_JOIN) for end in (blue, red)]
-        scale = [float(spectrum[join].mean() / infrared[k][join].mean()) for join in joins]
-        share = (wavelength[inside] - blue) / (red - blue)
-        spectrum[inside] = infrared[k][inside] * (scale[0] * (1.0 - share) + scale[1] * share)
-    return out
-
-
-def _color(bands: Sequence[Passband], wavelength: Float, flux: Float) -> float:
-    y, h = (float(passbands.ab_flux(band, wavelength, flux)) for band in bands)
-    return -2.5 * math.log10(y / h)
-
-
 def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
     """Wavelengths, A, and values, as the file has them."""
     reader, names = form["reader"], (form["wavelength"], form["value"])
-    scale = _ANGSTROM[form["unit"]]
+    scale = ANGSTROM[form["unit"]]
     if reader == "ascii":
-        rows = np.loadtxt(_text(path).splitlines(), comments="#", usecols=[names[0] - 1, names[1] - 1], ndmin=2)
+        rows = np.loadtxt(text_of(path).splitlines(), comments="#", usecols=[names[0] - 1, names[1] - 1], ndmin=2)
         return rows[:, 0] * scale, rows[:, 1]
     # Slow to import, and not needed for the form that most files have.
     from astropy.table import QTable
     from astropy.units import Quantity, dimensionless_unscaled
 
-    text = _text(path) if reader != "fits" else _sized(path)
+    text = text_of(path) if reader != "fits" else _sized(path)
     if reader == "votable" and "<!DOCTYPE" in text:
         raise ValueError("a VOTable has no DOCTYPE")
     options: dict[str, Any] = {"csv": {"format": "ascii.csv"}, "ecsv": {"format": "ascii.ecsv"}}.get(
@@ -205,7 +133,8 @@ def _plain(column: Any) -> Float:
     return np.asarray(np.ma.filled(np.ma.asarray(bare, dtype=float), np.nan), float)
 
 
-def _check(path: Path, wavelength: Float, value: Float, form: Mapping[str, Any]) -> None:
+def check(path: Path, wavelength: Float, value: Float, form: Mapping[str, Any]) -> None:
+    """Refuse what is no curve, naming the row; form : bounds, largest_gap and covers as in the formats."""
     lo, hi = form["bounds"]
     if len(wavelength) < 2:
         raise BadInput(f"{path}: {len(wavelength)} rows are no curve")
@@ -232,7 +161,7 @@ def _refuse(path: Path, bad: npt.NDArray[np.bool_], what: str) -> None:
         raise BadInput(f"{path}: row {int(np.flatnonzero(bad)[0]) + 1} {what}")
 
 
-def _resampled(grid: Float, curve: Curve) -> Float:
+def resampled(grid: Float, curve: Curve) -> Float:
     """Mean over each bin of 1 A, from the integral of the piecewise linear spectrum."""
     at, value = curve.wavelength, curve.value
     if at[-1] < grid[-1] + 0.5:
@@ -246,19 +175,8 @@ def _resampled(grid: Float, curve: Curve) -> Float:
     return np.diff(np.interp(edges, every, integral))
 
 
-def _numbers(lines: Sequence[str], at: int, count: int, width: int) -> tuple[Float, int]:
-    """`count` numbers of fixed width from line `at` on, and the line after them."""
-    found: list[float] = []
-    while len(found) < count:
-        line = lines[at].rstrip()
-        found += [float(line[k : k + width]) for k in range(0, len(line), width)]
-        at += 1
-    if len(found) != count:
-        raise ValueError(f"line {at} holds too many numbers")
-    return np.array(found), at
-
-
-def _text(path: Path) -> str:
+def text_of(path: Path) -> str:
+    """A file's text.  Errors: OSError, ValueError where it is too large"""
     _sized(path)
     return path.read_text(encoding="utf-8")
 

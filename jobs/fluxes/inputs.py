@@ -1,9 +1,10 @@
 """What fluxes are made with: the embedded spectra, laws and passbands, and a request's own; all of it as lake tables.
 
-Own, read             the files that a request names, checked
+Own, read             the files that a request names, checked;  filters : those of passbands alone
 curves                passbands by name
 template_rows, law_rows, passband_rows   tables `templates`, `extinction_laws`, `passbands`
-library_of, published_library, published_passband    back from these tables, wherever a worker runs
+library_of, stars_of, passband_of     back from these tables, wherever a worker runs
+published_library, published_stars, published_passband
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import importlib.util
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,17 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs import cache
-from jobs.fluxes import brown_dwarfs, extinction, high_redshift, ingest, passbands, standards, stellar, templates
+from jobs.fluxes import (
+    brown_dwarfs,
+    extinction,
+    high_redshift,
+    ingest,
+    own_stars,
+    passbands,
+    standards,
+    stellar,
+    templates,
+)
 from jobs.fluxes.continuum import dust_of
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
@@ -34,14 +46,22 @@ from lake_schema.tables import passbands as passband_table
 from lake_schema.tables import templates as template_table
 from lake_schema.tables.common import Origin
 
+# Beginnings of the keys of a request's own files.
+FILTER, _TEMPLATES, _LAWS, _STARS = (f"fluxes.{part}." for part in ("passbands", "templates", "extinction", "stars"))
+
 
 @dataclass(frozen=True, slots=True)
 class Own:
-    """passbands : by name;  library : galaxies with their laws;  origins : by the key in the request."""
+    """passbands : by name;  library : galaxies with their laws;  stars;  origins : of files, by the key in the request.
+
+    dwarfs : origins of the first of the stars, () = embedded
+    """
 
     passbands: Mapping[str, Passband]
     library: Library
+    stars: Library
     origins: Mapping[str, Origin]
+    dwarfs: Sequence[Origin] = ()
 
     def sha256(self) -> dict[str, str]:
         """What names the files' contents in a plan."""
@@ -53,29 +73,52 @@ def read(given: OwnCurves) -> Own:
 
     Errors: BadInput names the key of the request, the file, and the row where there is one
     """
-    filters, origins = {}, {}
-    for name, curves in given.passbands:
-        key = f"fluxes.passbands.{name}"
-        if name in passbands.names():
-            raise BadInput(f"{key}: there is a passband of this name: choose another")
-        with _named(key):
-            filters[name] = ingest.passband(curves.files[0], name, curves.medium, curves.format)
-            origins[key] = _origin_of(curves)
+    found, origins = filters(given)
     library = templates.galaxy_library()
     if given.templates is not None:
         with _named("fluxes.templates"):
             library = ingest.library(given.templates.files, given.templates.format)
             each = (replace(given.templates, files=(file,)) for file in given.templates.files)
-            origins |= {f"fluxes.templates.{k}": _origin_of(curves) for k, curves in enumerate(each)}
+            origins |= {f"{_TEMPLATES}{k}": _origin_of(curves) for k, curves in enumerate(each)}
     if given.extinction:
         dust = dust_of(library).copy()
         for code, curves in given.extinction:
-            key = f"fluxes.extinction.{code}"
+            key = f"{_LAWS}{code}"
             with _named(key):
                 dust[code] = ingest.law(curves.files[0], curves.format, library.wavelength)
                 origins[key] = _origin_of(curves)
         library = replace(library, dust=dust, own=True)
-    return Own(filters, library, origins)
+    stars, of_stars, dwarfs = _stars(given)
+    return Own(found, library, stars, origins | of_stars, dwarfs)
+
+
+def filters(given: OwnCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
+    """The request's own passbands by name, and their origins by key; errors as of `read`."""
+    found, origins = {}, {}
+    for name, curves in given.passbands:
+        key = f"{FILTER}{name}"
+        if name in passbands.names():
+            raise BadInput(f"{key}: there is a passband of this name: choose another")
+        with _named(key):
+            found[name] = ingest.passband(curves.files[0], name, curves.medium, curves.format)
+            origins[key] = _origin_of(curves)
+    return found, origins
+
+
+def _stars(given: OwnCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
+    """Stars, the request's files by key, and what each of its own dwarfs was made of."""
+    if given.basel is None and not given.irtf:
+        return templates.stellar_library(), {}, []
+    low, how, origins = stellar.table_file(), "Pecaut & Mamajek 2013, as MeanStars has them", {}
+    with _named("fluxes.stars"):
+        library, infrared = own_stars.library(given.basel, given.irtf)
+        if given.basel is not None:
+            low, how = given.basel, "read as basel"
+            origins[f"{_STARS}basel"] = _origin(how, low)
+        origins |= {f"{_STARS}irtf.{k}": _origin("read as irtf", file) for k, file in enumerate(given.irtf)}
+        spliced = f"{how}; the last, read as irtf, in the infrared"
+        dwarfs = [_origin(how, low) if k < 0 else _origin(spliced, low, given.irtf[k]) for k in infrared]
+    return library, origins, dwarfs
 
 
 def curves(names: Sequence[str], own: Mapping[str, Passband]) -> list[Passband]:
@@ -93,15 +136,15 @@ def template_rows(own: Own) -> pa.Table:
         "galaxy": own.library,
         "qso": high_redshift.quasar_library(),
         "high_redshift": high_redshift.high_redshift_library(),
-        "star": templates.stellar_library(),
+        "star": own.stars,
     }
-    given = [origin for key, origin in own.origins.items() if key.startswith("fluxes.templates.")]
+    given = [origin for key, origin in own.origins.items() if key.startswith(_TEMPLATES)]
     quasars = _origin("Vanden Berk et al. 2001", high_redshift.QUASAR_LINES)
     origins = {
         "galaxy": given or [_galaxy_origin(k) for k in range(len(own.library))],
         "qso": [quasars] * len(libraries["qso"]),
         "high_redshift": [_origin("power laws", Path(high_redshift.__file__))] * len(libraries["high_redshift"]),
-        "star": _star_origins(),
+        "star": [*own.dwarfs, *_star_origins()[len(own.dwarfs) :]],
     }
     return template_table.rows(libraries, origins)
 
@@ -115,7 +158,7 @@ def law_rows(own: Own) -> pa.Table:
         _origin("Calzetti et al. 2000", code),
         *(_origin("Calzetti et al. 2000 with the bump of Fitzpatrick & Massa 1986", code) for _ in range(2)),
     )
-    origins = [own.origins.get(f"fluxes.extinction.{law}", origin) for law, origin in enumerate(embedded)]
+    origins = [own.origins.get(f"{_LAWS}{law}", origin) for law, origin in enumerate(embedded)]
     return extinction_laws.rows(own.library.wavelength, dust_of(own.library), origins)
 
 
@@ -123,18 +166,33 @@ def passband_rows(own: Own) -> pa.Table:
     """Table `passbands`: the embedded ones, and the request's own."""
     bands = [*(passbands.load(name) for name in passbands.names()), *own.passbands.values()]
     origins = [_passband_origin(name) for name in passbands.names()]
-    origins += [own.origins[f"fluxes.passbands.{name}"] for name in own.passbands]
+    origins += [own.origins[f"{FILTER}{name}"] for name in own.passbands]
     pivots, widths = [passbands.pivot_wavelength(b) for b in bands], [passbands.log_width(b) for b in bands]
     return passband_table.rows(bands, pivots, widths, origins)
 
 
 def library_of(lake: Path, facts: Mapping[str, Any]) -> Library:
     """The galaxies that a table of fluxes was, or is to be, made with; facts : of its plan."""
-    if not any(key.startswith(("fluxes.templates.", "fluxes.extinction.")) for key in facts.get("files", ())):
+    if not any(key.startswith((_TEMPLATES, _LAWS)) for key in facts.get("files", ())):
         return templates.galaxy_library()
     return published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
 
 
+def stars_of(lake: Path, facts: Mapping[str, Any]) -> Library:
+    """The same of stars."""
+    if not any(key.startswith(_STARS) for key in facts.get("files", ())):
+        return templates.stellar_library()
+    return published_stars(lake, facts["sources"]["templates"])
+
+
+def passband_of(lake: Path, facts: Mapping[str, Any], name: str) -> Passband:
+    """The same of a passband."""
+    if f"{FILTER}{name}" not in facts.get("files", ()):
+        return passbands.load(name)
+    return published_passband(lake, facts["sources"]["passbands"], name)
+
+
+@lru_cache(maxsize=2)
 def published_library(lake: Path, templates_key: str, laws_key: str) -> Library:
     """The galaxies of published versions of `templates` and `extinction_laws`, kept in the cache and mapped."""
 
@@ -150,6 +208,20 @@ def published_library(lake: Path, templates_key: str, laws_key: str) -> Library:
     arrays = cache.cached_arrays("published_library", key, read_rows)
     names = tuple(str(k) for k in range(len(arrays["flux"])))
     return Library(arrays["wavelength"], arrays["flux"], names, dust=arrays["dust"], own=True)
+
+
+@lru_cache(maxsize=2)
+def published_stars(lake: Path, templates_key: str) -> Library:
+    """The stars of a published version of `templates`, kept in the cache and mapped."""
+
+    def read_rows() -> dict[str, cache.Array]:
+        rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "star")
+        return {"flux": np.stack(rows.sort_by("sed")["flux"].to_numpy()).astype(np.float32)}
+
+    key = cache.content_key(templates_key, Path(__file__).read_bytes())
+    return replace(
+        templates.stellar_library(), flux=cache.cached_arrays("published_stars", key, read_rows)["flux"], own=True
+    )
 
 
 def published_passband(lake: Path, key: str, name: str) -> Passband:

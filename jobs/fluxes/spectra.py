@@ -132,16 +132,20 @@ def star_fluxes(
 
 
 def prepare(
-    curves: Sequence[Passband], settings: Sequence[Setting | None], library: Library, accuracy: Accuracy
+    curves: Sequence[Passband],
+    settings: Sequence[Setting | None],
+    library: Library,
+    stars: Library,
+    accuracy: Accuracy,
 ) -> None:
-    """Make what the cache lacks for these bands, tables and machine code, so that workers find it there."""
-    from jobs.fluxes import templates
+    """Make what the cache lacks for these bands, tables and machine code, so that workers find it there.
 
+    library, stars : of galaxies, of stars
+    """
     chosen = [(curve, setting) for curve, setting in zip(curves, settings, strict=True) if setting is not None]
     if chosen:
         grid = flux_grid.open_grid([curve for curve, _ in chosen], [setting for _, setting in chosen], library)
         flux_grid.warm(grid)
-    stars = templates.stellar_library()
     if grid_settings.stars_tabulated(accuracy):
         flux_grid.stars(Stars(np.zeros(1, np.int64), np.zeros(1), np.zeros(1)), curves, stars)
 

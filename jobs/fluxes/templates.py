@@ -14,6 +14,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -54,9 +55,9 @@ _BALMER_EDGE, _LYMAN_EDGE, _BELOW_LYMAN = 3646.0, 912.0, 0.02
 _VEGA_SLOPE = -3.95
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Library:
-    """Template spectra, all on one grid.
+    """Template spectra, all on one grid; never changed, and the same only as itself.
 
     wavelength : float64[n_lambda] A, whole numbers in steps of 1
     flux       : float32[n, n_lambda] f_lambda, mean 1 between 5450 and 5550 A
@@ -77,6 +78,7 @@ class Library:
         return len(self.names)
 
 
+@lru_cache(maxsize=1)
 def galaxy_library() -> Library:
     """The 31 galaxy templates, from 0, elliptical, to 30, starburst; 80 .. 24500 A, rest frame."""
     key = cache.content_key(
@@ -103,6 +105,7 @@ def rest_grid() -> Float:
     return np.arange(_REST_FIRST, _REST_LAST + 1, dtype=float)
 
 
+@lru_cache(maxsize=1)
 def stellar_library() -> Library:
     """On the observed grid: 0 .. 75 the dwarfs O9V .. M9V, hottest first (with their table of types), 76 .. 440 the L
     and T dwarfs, 441 .. 443 Vega, a white dwarf, a planetary nebula.

@@ -80,11 +80,11 @@ def _usual(rows: pa.Table, parts: Sequence[Passband], library: Library) -> Float
     return f_nu
 
 
-def stars(rows: pa.Table, band: Passband) -> Float:
-    """float64[n, PARTS] fractions of the detected photons of rows of the table `stars`."""
+def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
+    """float64[n, PARTS] fractions of the detected photons of rows of the table `stars`; library as in `galaxies`."""
     if not len(rows) or not set(STAR_COLUMNS) <= set(rows.column_names):
         return _flat(len(rows))
-    library, parts = templates.stellar_library(), sub_bands(band)
+    library, parts = library or templates.stellar_library(), sub_bands(band)
     found = stars_of(rows, library)
     tabulated = flux_grid.covered_stars(found)
     f_nu = np.empty((len(found), len(parts)))

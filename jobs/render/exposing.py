@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from jobs.fluxes import passbands
+from jobs.fluxes.passbands import Passband
 from jobs.render import focal_plane
 from jobs.render.sky import SkyBand, sky_band, sky_rate
 from lake_schema import units
@@ -92,10 +93,14 @@ def exposure_time(channel: str, camera: str, band: str, mission: MissionConfigur
     return mission.value(own if own in mission else f"{section(camera)}.exposure_time", "s")
 
 
-def table(exposures: Sequence[Exposure], missions: Sequence[MissionConfiguration]) -> pa.Table:
+def table(
+    exposures: Sequence[Exposure],
+    missions: Sequence[MissionConfiguration],
+    own: Mapping[str, Passband] | None = None,
+) -> pa.Table:
     """Rows of the table `exposures`, numbered from 1 in their order.
 
-    missions : the configuration of each
+    missions : the configuration of each;  own : passbands by name besides the embedded ones
     """
     if not exposures:
         return EXPOSURES.empty()
@@ -104,7 +109,7 @@ def table(exposures: Sequence[Exposure], missions: Sequence[MissionConfiguration
     for number, (exposure, mission) in enumerate(zip(exposures, missions, strict=True), start=1):
         key = (id(mission), exposure.camera, exposure.band)
         if key not in bands:
-            bands[key] = _Band.of(exposure.camera, exposure.band, mission)
+            bands[key] = _Band.of(exposure.camera, exposure.band, mission, (own or {}).get(exposure.band))
         rows.append(_row(number, exposure, bands[key], mission))
     return EXPOSURES.build({name: _column(name, [row[name] for row in rows]) for name in EXPOSURES.names})
 
@@ -118,11 +123,11 @@ class _Band:
     sky: SkyBand
 
     @classmethod
-    def of(cls, camera: str, band: str, mission: MissionConfiguration) -> _Band:
+    def of(cls, camera: str, band: str, mission: MissionConfiguration, curve: Passband | None) -> _Band:
         prefix = section(camera)
         seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec") if camera in CAMERAS else 0.0
         first = focal_plane.detectors(camera, mission)[0]
-        return cls(zero_point_of(prefix, band, mission), seeing, sky_band(first, band, mission))
+        return cls(zero_point_of(prefix, band, mission, curve), seeing, sky_band(first, band, mission, curve))
 
 
 def _column(name: str, values: list[Any]) -> Any:
@@ -148,11 +153,16 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration) -
     }
 
 
-def zero_point_of(prefix: str, band: str, mission: MissionConfiguration) -> float:
-    """AB magnitude of one electron a second: of ground cameras as published, of Euclid's from throughput and area."""
+def zero_point_of(prefix: str, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> float:
+    """AB magnitude of one electron a second: of ground cameras as published, of Euclid's from throughput and area.
+
+    curve : the passband, None = the embedded one
+    """
     if f"{prefix}.{band}.zero_point" in mission:
         return mission.value(f"{prefix}.{band}.zero_point", "mag")
-    return units.zero_point(mission.value("plm.collecting_area", "cm2"), passbands.log_width(passbands.load(band)))
+    return units.zero_point(
+        mission.value("plm.collecting_area", "cm2"), passbands.log_width(curve or passbands.load(band))
+    )
 
 
 def identity(exposure: Mapping[str, Any]) -> str:

@@ -18,6 +18,7 @@ from astropy.wcs import WCS
 from jobs import rng
 from jobs.accuracy import Accuracy
 from jobs.fluxes import passbands
+from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
 from jobs.render import chromatic, exposing, focal_plane, profiles, psf, selection, stamps
 from jobs.render.channels import ext, vis
@@ -96,6 +97,8 @@ def render(
     detector: Detector | None = None,
     progress: Callable[[int], None] | None = None,
     library: Library | None = None,
+    stellar: Library | None = None,
+    passband: Passband | None = None,
 ) -> Rendered:
     """Render one detector.
 
@@ -103,10 +106,12 @@ def render(
     galaxies ..    : rows that may touch the detector (GALAXY_COLUMNS, STAR_COLUMNS) and, row by row, their
                      f_nu in the band
     forced         : effect name -> on or off, instead of what the scene needs
-    library        : what the galaxies' sed_1 and sed_2 count, None = the embedded one
+    library        : what the galaxies' sed_1 and sed_2 count, stellar : what the stars' sed, None = the embedded ones
+    passband       : the exposure's, None = the embedded one of its name
     detector       : another geometry than the mission's for task["detector"], e.g. a part of it
     """
     camera, band, channel = str(exposure["camera"]), str(exposure["band"]), str(exposure["channel"])
+    passband = passband or passbands.load(band)
     if channel not in EFFECTS:
         raise BadInput(f"exposure {exposure['exposure_id']}: channel {channel!r} is not one of {', '.join(EFFECTS)}")
     if detector is None:
@@ -121,7 +126,7 @@ def render(
         for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
     ]
     settings = stamps.settings_for(accuracy)
-    spread = _psf(detector, band, float(exposure["seeing"]), mission, settings.positions)
+    spread = _psf(detector, passband, float(exposure["seeing"]), mission, settings.positions)
     sources, sizes = sources_of(
         (galaxies, electrons[0]),
         (stars, electrons[1]),
@@ -130,8 +135,9 @@ def render(
         spread,
         scene.pixel_noise,
         settings,
-        band,
+        passband,
         library,
+        stellar,
     )
     floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
     noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors)
@@ -167,8 +173,9 @@ def sources_of(
     spread: Psf,
     noise: float,
     settings: Settings,
-    band: str,
+    band: Passband,
     library: Library | None = None,
+    stellar: Library | None = None,
 ) -> tuple[Sources, stamps.Int]:
     """Everything whose stamp touches the detector, ascending id, and the stamps' sides.
 
@@ -190,18 +197,22 @@ def sources_of(
     here = selection.touching(column, row, sizes, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
-    photons = _colours(kept, catalogue, points, band, library) if spread.planes is not None else None
+    photons = _colours(kept, catalogue, points, band, (library, stellar)) if spread.planes is not None else None
     return Sources(ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons), sizes[here]
 
 
 def _colours(
-    kept: npt.NDArray[np.int64], galaxies: pa.Table, stars: pa.Table, band: str, library: Library | None
+    kept: npt.NDArray[np.int64],
+    galaxies: pa.Table,
+    stars: pa.Table,
+    band: Passband,
+    libraries: tuple[Library | None, Library | None],
 ) -> Float:
     """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
-    curve, of_galaxy = passbands.load(band), kept < len(galaxies)
+    of_galaxy = kept < len(galaxies)
     out = np.empty((len(kept), chromatic.PARTS))
-    out[of_galaxy] = chromatic.galaxies(galaxies.take(kept[of_galaxy]), curve, library)
-    out[~of_galaxy] = chromatic.stars(stars.take(kept[~of_galaxy] - len(galaxies)), curve)
+    out[of_galaxy] = chromatic.galaxies(galaxies.take(kept[of_galaxy]), band, libraries[0])
+    out[~of_galaxy] = chromatic.stars(stars.take(kept[~of_galaxy] - len(galaxies)), band, libraries[1])
     return out
 
 
@@ -221,8 +232,8 @@ def _fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
     return np.asarray(fluxes[column].to_numpy(), float)
 
 
-def _psf(detector: Detector, band: str, seeing: float, mission: MissionConfiguration, positions: int) -> Psf:
+def _psf(detector: Detector, band: Passband, seeing: float, mission: MissionConfiguration, positions: int) -> Psf:
     if detector.section == "vis":
-        return psf.vis_psf(detector, passbands.load(band), mission, positions)
+        return psf.vis_psf(detector, band, mission, positions)
     beta = mission.value(f"{detector.section}.psf.moffat_beta")
     return psf.ground_psf(seeing, beta, detector.pixel_scale)

@@ -11,8 +11,10 @@ from collections.abc import Sequence
 
 import pyarrow as pa
 
+from jobs.fluxes import inputs
+from jobs.fluxes.passbands import Passband
 from jobs.render import exposing, forecast, survey, tasks
-from jobs.request import MissionChoice, Request
+from jobs.request import MissionChoice, OwnCurves, Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema import layout, read
 from lake_schema.columns import Table
@@ -37,6 +39,18 @@ def mission_of(choice: MissionChoice) -> MissionConfiguration:
     return configuration.resolve(ladder=choice.ladder, overrides=overrides)
 
 
+def own_filters(request: Request) -> tuple[dict[str, Passband], Json]:
+    """The request's own passbands that it points in, by name, and their sha256 as facts of a plan."""
+    wanted = {pointing.band for pointing in request.pointings}
+    given = OwnCurves(tuple(own for own in request.curves.passbands if own[0] in wanted))
+    found, origins = inputs.filters(given)
+    for name, band in found.items():
+        if band.response.max() > 1.0:
+            what = f"responds with {band.response.max():.4g}: a pointing wants the fraction of photons detected"
+            raise BadInput(f"{inputs.FILTER}{name}: {what}")
+    return found, {"files": {key: origin.sha256 for key, origin in origins.items()}} if found else {}
+
+
 def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
     """The mission configuration, and rows of the tables `exposures` and `tasks`."""
     if not request.pointings and not request.observations:
@@ -44,7 +58,8 @@ def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, 
     mission = mission_of(request.mission)
     checks.check(mission)
     found = survey.exposures(request, mission)
-    exposures = exposing.table([exposure for exposure, _ in found], [own for _, own in found])
+    filters, _ = own_filters(request)
+    exposures = exposing.table([exposure for exposure, _ in found], [own for _, own in found], filters)
     densities = tasks.Densities(mission, request.universe, _catalogues(lake))
     wanted = [exposure.detectors for exposure, _ in found]
     return mission, exposures, tasks.table(exposures, wanted, mission, densities, request.truth)
@@ -61,7 +76,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     mission, exposures, rows = plan(lake, request)
     for line in forecast.text(forecast.rows(exposures, rows)):
         print(line)
-    facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint}
+    facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **own_filters(request)[1]}
     costs = {**facts, "counts": {v.table: v.key for v in _catalogues(lake)}}
     about = {
         "mission": mission.fingerprint,

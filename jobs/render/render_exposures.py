@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs.accuracy import Accuracy
-from jobs.fluxes.inputs import library_of
+from jobs.fluxes.inputs import library_of, passband_of, stars_of
 from jobs.render import exposure, fits_product, survey
-from jobs.render.plan_exposures import PARTS, mission_of
+from jobs.render.plan_exposures import PARTS, mission_of, own_filters
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema import read
@@ -57,7 +57,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
 def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> None:
     """What lies in the lake must have been made for this request, and the tables from one another."""
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
-    wanted = {"request": request.facts(*PARTS), "mission": mission_of(request.mission).fingerprint}
+    filters = own_filters(request)[1]
+    wanted = {"request": request.facts(*PARTS), "mission": mission_of(request.mission).fingerprint, **filters}
     for name in ("exposures", "tasks"):
         if canonical({key: facts[name].get(key) for key in wanted}) != canonical(wanted):
             raise BadInput(f"table {name} was planned for another request: run plan_exposures first")
@@ -70,6 +71,9 @@ def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> 
     for fluxes, catalogue in (("galaxy_fluxes", "galaxies"), ("star_fluxes", "stars")):
         if facts[fluxes].get("input") != inputs[catalogue].key:
             raise BadInput(f"table {fluxes} was computed from another version of {catalogue}: run compute_fluxes first")
+        for key, sha256 in filters.get("files", {}).items():
+            if facts[fluxes]["files"].get(key) != sha256:
+                raise BadInput(f"table {fluxes} was computed with another {key}: run compute_fluxes first")
 
 
 def _refuse_unrendered(exposures: pa.Table) -> None:
@@ -116,6 +120,8 @@ def work(lake: Path, facts: Json) -> Output:
         accuracy=own.accuracy,
         seed=request["seed"],
         library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
+        stellar=stars_of(lake, inputs["star_fluxes"].manifest["facts"]),
+        passband=passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], str(exposed["band"])),
         forced=own.forced,
     )
     return Output(*fits_product.products(rendered, request["truth"]))

@@ -52,8 +52,8 @@ class SkyBand:
     blue: float = 0.0
 
 
-def sky_band(detector: Detector, band: str, mission: MissionConfiguration) -> SkyBand:
-    """The sky of a camera's band.
+def sky_band(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
+    """The sky of a camera's band; curve : the passband, None = the embedded one.
 
     Euclid : zodiacal light and scattered starlight;  ground : the band's dark-sky rate of the mission
              database, or what follows from its surface brightness and zero point
@@ -63,7 +63,9 @@ def sky_band(detector: Detector, band: str, mission: MissionConfiguration) -> Sk
         extra = f"{section}.scattered_light" if section == "vis" else f"{section}.{band}.thermal"
         constant = mission.value(extra, "electron / (s pix)")
         area = mission.value("plm.collecting_area", "m2")
-        return SkyBand(constant, *_zodiacal_integrals(passbands.load(band), area, detector.pixel_scale, mission))
+        return SkyBand(
+            constant, *_zodiacal_integrals(curve or passbands.load(band), area, detector.pixel_scale, mission)
+        )
     if f"{section}.{band}.sky" in mission:
         return SkyBand(mission.value(f"{section}.{band}.sky", "electron / (s pix)"))
     zero_point = mission.value(f"{section}.{band}.zero_point", "mag")

@@ -68,7 +68,7 @@ def exposures(request: Request, mission: MissionConfiguration) -> list[tuple[Exp
 
 def _of_mission(request: Request, mission: MissionConfiguration) -> Iterator[Exposure]:
     for i, pointing in enumerate(request.pointings):
-        yield _pointing(pointing, f"pointing[{i}]", request.name, mission)
+        yield _pointing(pointing, f"pointing[{i}]", request, mission)
     for i, block in enumerate(request.observations):
         where = f"observation[{i}]"
         found = 0
@@ -79,12 +79,12 @@ def _of_mission(request: Request, mission: MissionConfiguration) -> Iterator[Exp
             raise BadInput(f"{where} asks for no exposure")
 
 
-def _pointing(pointing: Pointing, where: str, survey: str, mission: MissionConfiguration) -> Exposure:
+def _pointing(pointing: Pointing, where: str, request: Request, mission: MissionConfiguration) -> Exposure:
     try:
         bands = bands_of(pointing.channel, pointing.camera, mission)
     except BadInput as error:
         raise BadInput(f"{where}.camera: {error}") from None
-    if pointing.band not in bands:
+    if pointing.band not in bands and pointing.band not in {name for name, _ in request.curves.passbands}:
         known = ", ".join(bands)
         raise BadInput(f"{where}.band: camera {pointing.camera} has no band {pointing.band!r} ({known})")
     known_detectors(pointing.camera, pointing.detectors, mission, f"{where}.detectors")
@@ -99,8 +99,8 @@ def _pointing(pointing: Pointing, where: str, survey: str, mission: MissionConfi
     if seconds is None:
         seconds = exposure_time(pointing.channel, pointing.camera, pointing.band, mission)
     return Exposure(
-        pointing.channel, pointing.camera, pointing.band, "science", ra, dec, angle, pointing.mjd, seconds, survey,
-        detectors=pointing.detectors,
+        pointing.channel, pointing.camera, pointing.band, "science", ra, dec, angle, pointing.mjd, seconds,
+        request.name, detectors=pointing.detectors,
         grism="RGS000" if pointing.band == "nisp_red" else "BGS000" if pointing.band == "nisp_blue" else None,
         grism_angle=0.0 if pointing.channel == "NISP-S" else None,
     )  # fmt: skip

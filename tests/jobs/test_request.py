@@ -71,6 +71,8 @@ BAD = [
     ("fluxes", {"templates": {"files": ["x"]}}, "fluxes.templates.format is missing"),
     ("fluxes", {"extinction": {"5": {"file": "x", "format": "extinction"}}}, "fluxes.extinction.5 is not a key"),
     ("fluxes", {"extinction": {"2": {"file": 3, "format": "extinction"}}}, "fluxes.extinction.2.file wants text"),
+    ("fluxes", {"stars": {}}, "fluxes.stars names neither basel nor irtf"),
+    ("fluxes", {"stars": {"basel": ["x.cor"]}}, "fluxes.stars.basel wants text"),
     ("products", {"truth": ["everything"]}, "products.truth"),
     ("pointing", {}, "pointing wants a list"),
     ("pointing", [3], r"pointing\[0\]"),
@@ -166,6 +168,9 @@ format = "cosmos"
 [fluxes.extinction.3]
 file = "bump.dat"
 format = "extinction"
+[fluxes.stars]
+basel = "lcbp00.cor"
+irtf = ["G2V.txt", "M0V.txt"]
 """
     (tmp_path / "r.toml").write_text(DEMO.read_text() + fluxes)
     asked = request.parse(tmp_path / "r.toml")
@@ -174,4 +179,6 @@ format = "extinction"
     assert (name, mine.medium, mine.files) == ("mine", "air", (tmp_path / "filters" / "mine.dat",))
     assert asked.curves.templates.files == (tmp_path / "a.sed", Path("/b.sed"))
     assert [code for code, _ in asked.curves.extinction] == [3]
+    assert asked.curves.basel == tmp_path / "lcbp00.cor"
+    assert asked.curves.irtf == (tmp_path / "G2V.txt", tmp_path / "M0V.txt")
     assert request.parse(DEMO).curves == request.OwnCurves()

@@ -13,6 +13,7 @@ from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 from tests.jobs.fluxes.test_ingest import BAND, RESPONSE, WAVELENGTH, ascii_file
+from tests.jobs.fluxes.test_own_stars import black_bodies, irtf_file
 from tests.universe import rows_of
 
 CELLS = (1607, 1608)
@@ -160,6 +161,27 @@ format = "extinction"
     # Another content of the same file is another table.
     ascii_file(tmp_path / "mine.dat", BAND, RESPONSE**2)
     assert compute_fluxes.step_of("galaxy", filled, request.parse(tmp_path / "own.toml")).plan.key != made.key
+
+
+def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
+    """Models and an infrared spectrum of the request's own, through the lake."""
+    black_bodies(tmp_path / "synthetic.cor")
+    irtf_file(tmp_path / "star.txt", -2.5, wiggle=0.3)
+    text = f"name = 'own'\nseed = 1\narea = {{ cone = {{ ra = 10, dec = 10, radius = 1 }} }}\nfluxes.bands = {BANDS}\n"
+    (tmp_path / "own.toml").write_text(text + "[fluxes.stars]\nbasel = 'synthetic.cor'\nirtf = ['star.txt']\n")
+    asked = request.parse(tmp_path / "own.toml")
+    own = inputs.read(asked.curves)
+    for step in (*compute_fluxes.source_steps(own), compute_fluxes.step_of("star", filled, asked)):
+        publish.make(filled, step.plan, step.work)
+    made, rows = read.version(filled, "star_fluxes"), read.version(filled, "stars").rows()
+    truth = spectra.star_fluxes(rows, BANDS, own.stars, REFERENCE)
+    embedded = spectra.star_fluxes(rows, BANDS, stars_library, REFERENCE)
+    for band in BANDS:
+        np.testing.assert_allclose(made.rows()[f"f_nu_{band}"], truth[f"f_nu_{band}"], rtol=1e-5)
+    assert np.abs(np.log(np.asarray(truth["f_nu_euclid_vis"]) / np.asarray(embedded["f_nu_euclid_vis"]))).min() > 0.05
+    facts = made.manifest["facts"]
+    assert facts["files"]["fluxes.stars.irtf.0"] == hashlib.sha256((tmp_path / "star.txt").read_bytes()).hexdigest()
+    np.testing.assert_array_equal(inputs.stars_of(filled, facts).flux, own.stars.flux)
 
 
 def test_what_is_there_is_not_prepared_again(filled, monkeypatch):

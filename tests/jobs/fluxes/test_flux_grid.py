@@ -206,8 +206,15 @@ def test_the_example_compiles(grid):
     flux_grid.warm(grid)
 
 
+def test_a_library_is_hashed_once(monkeypatch):
+    library = dataclasses.replace(templates.stellar_library())
+    key = grid_tables.library_key(library)
+    monkeypatch.setattr(grid_tables, "dust_of", None)
+    assert grid_tables.library_key(library) == key
+
+
 def test_prepare_leaves_nothing_to_make(monkeypatch):
-    wanted = (CURVES, chosen(SURVEY), templates.galaxy_library(), SURVEY)
+    wanted = (CURVES, chosen(SURVEY), templates.galaxy_library(), templates.stellar_library(), SURVEY)
     spectra.prepare(*wanted)
     monkeypatch.setattr(grid_tables, "_galaxies", None)
     monkeypatch.setattr(grid_tables, "_stars", None)

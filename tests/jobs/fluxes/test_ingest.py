@@ -39,20 +39,6 @@ def votable(path, wavelength=BAND, value=RESPONSE):
     return path
 
 
-def basel_file(path, models=((5750, 4.5, -0.5), (3500, 1.0, 0.2)), value=1e-5):
-    lines = []
-    nm = 9.1 + (160_000.0 - 9.1) * np.expm1(0.0075 * np.arange(1221)) / np.expm1(0.0075 * 1220)
-    for start in range(0, 1221, 8):
-        lines.append("".join(f"{x:10.1f}" for x in nm[start : start + 8]))
-    for k, (teff, log_g, metallicity) in enumerate(models):
-        lines.append(f"{k + 1:6d}{teff:6d}{log_g:6.2f}{metallicity:6.2f}{2.0:6.2f}{0.7:6.2f}")
-        h_nu = np.full(1221, value * (k + 1))
-        for start in range(0, 1221, 7):
-            lines.append("".join(f"{x:11.4E}" for x in h_nu[start : start + 7]))
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
 def test_every_format_names_its_source_and_reader():
     for name, form in ingest.formats().items():
         assert form["source"], name
@@ -214,49 +200,3 @@ def test_a_library_keeps_the_flux_of_its_files(tmp_path):
     grid = flux_grid.open_grid([passbands.load("euclid_h")], [flux_grid.Setting(0.1, 2, 2)], library)
     assert np.isfinite(grid.tables[0]).all()
     assert SURVEY.flux < 1.0
-
-
-def test_basel(tmp_path):
-    models = ingest.basel(basel_file(tmp_path / "synthetic_lcbm05.cor"))
-    assert models.teff.tolist() == [5750.0, 3500.0]
-    assert models.log_g.tolist() == [4.5, 1.0]
-    assert models.metallicity.tolist() == [-0.5, 0.2]
-    assert models.wavelength[[0, -1]].tolist() == [91.0, 1.6e6]
-    # ReadMe: f_lambda = 0.4 H_nu c / lambda^2 with c = 2.997925e17 nm/s and lambda in nm, per A.
-    nm = models.wavelength / 10.0
-    np.testing.assert_allclose(models.flux[0], 0.4 * 1e-5 * 2.997925e17 / nm**2, rtol=1e-5)
-    np.testing.assert_allclose(models.flux[1], 2.0 * models.flux[0], rtol=1e-12)
-
-
-@pytest.mark.parametrize("damage", ["cut", "header", "negative", "empty", "absent"])
-def test_damaged_basel_files_are_refused(tmp_path, damage):
-    path = basel_file(tmp_path / "synthetic_lcb.cor", value=-1e-5 if damage == "negative" else 1e-5)
-    lines = path.read_text().splitlines()
-    if damage == "cut":
-        path.write_text("\n".join(lines[:-10]))
-    elif damage == "header":
-        path.write_text("\n".join([*lines[:153], "no model at all", *lines[154:]]))
-    elif damage == "empty":
-        path.write_text("\n".join(lines[:153]))
-    elif damage == "absent":
-        path.unlink()
-    with pytest.raises(BadInput, match=r"lcb\.cor"):
-        ingest.basel(path)
-
-
-def test_infrared_stars_are_spliced_by_colour():
-    grid = passbands.grid()
-    slopes = (-1.0, -2.0, -3.0)
-    wiggle = 1.0 + 0.05 * np.sin(grid / 30.0)
-    irtf = [ingest.Curve(grid[grid > 8000.0], ((grid / 1e4) ** s * wiggle)[grid > 8000.0]) for s in slopes]
-    low = np.stack([7.0 * (grid / 1e4) ** s for s in (-2.9, -1.05)])
-    out = ingest.splice(grid, low, irtf)
-    outside = grid < 8200.0
-    np.testing.assert_array_equal(out[:, outside], low[:, outside])
-    middle = (grid > 8300.0) & (grid < 23_900.0)
-    # The structure is the star's, the shape and the level are the low resolution's.
-    ratio = out[:, middle] / low[:, middle]
-    assert np.abs(ratio - 1.0).max() < 0.12
-    for row, slope in ((0, -3.0), (1, -1.0)):
-        detail = out[row, middle] / (grid[middle] / 1e4) ** slope / wiggle[middle]
-        assert np.abs(np.diff(np.log(detail))).max() < 1e-5

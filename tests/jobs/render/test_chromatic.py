@@ -36,3 +36,12 @@ def test_galaxies_have_the_colours_of_the_library_that_is_given():
     one, other = (chromatic.galaxies(galaxy(sed), BAND, library) for sed, library in ((3, None), (27, turned)))
     np.testing.assert_allclose(one, other, rtol=1e-5)
     assert np.abs(chromatic.galaxies(galaxy(3), BAND, turned) - one).max() > 0.01
+
+
+def test_stars_have_the_colours_of_the_library_that_is_given():
+    embedded = templates.stellar_library()
+    turned = replace(embedded, flux=embedded.flux[::-1], own=True)
+    rows = pa.table({"id": [1], "sed": [5], "mag_h": [18.0], "a_v": [0.1]})
+    last = pa.table({"id": [1], "sed": [len(embedded) - 6], "mag_h": [18.0], "a_v": [0.1]})
+    np.testing.assert_allclose(chromatic.stars(last, BAND, turned), chromatic.stars(rows, BAND), rtol=1e-5)
+    assert np.abs(chromatic.stars(rows, BAND, turned) - chromatic.stars(rows, BAND)).max() > 0.01
