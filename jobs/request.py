@@ -43,53 +43,40 @@ from pathlib import Path
 from typing import Any
 
 from jobs import area as areas
+from jobs import observations, own_files
 from jobs.accuracy import SURVEY, Accuracy, preset
 from jobs.area import Area
+from jobs.observations import Observation, Pointing
+from jobs.own_files import OwnCurves
 from jobs.toml_values import Toml
 from jobs.toml_values import boolean as _boolean
 from jobs.toml_values import checked_number as _checked_number
 from jobs.toml_values import choice as _choice
-from jobs.toml_values import has as _has
 from jobs.toml_values import integer as _integer
 from jobs.toml_values import known as _known
 from jobs.toml_values import number as _number
-from jobs.toml_values import optional as _optional
 from jobs.toml_values import section as _section
 from jobs.toml_values import shown as _shown
 from jobs.toml_values import string as _string
 from jobs.toml_values import strings as _strings
 from jobs.toml_values import table_of as _table
-from jobs.toml_values import tables as _tables
 from jobs.toml_values import value as _value
 from lake_schema import layout
 from lake_schema.errors import BadInput, LakeError
-from lake_schema.tables import exposures as declared
 from lake_schema.tables import mission as database
 from lake_schema.tables import products
 
 __all__ = ["Area", "Override", "Request", "parse"]
 
 _MOST_BYTES = 1 << 20
-_MOST_POINTINGS, _MOST_OBSERVATIONS, _MOST_VARIANTS = 100_000, 1000, 10_000
+_MOST_VARIANTS = 10_000
 STATUSES = tuple(code for code, _ in database.STATUSES)
 LADDER = database.LADDER
-CHANNELS = tuple(code for code, _ in declared.CHANNELS)
-IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
 TRUTH = tuple(code for code, _ in products.CONTENTS if code != "science")
 DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
-DITHERS = ("S", "J", "none")
-EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
-GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes")
-# What each channel can be asked for.
-_CALIBRATIONS = {
-    "VIS": ("bias", "dark", "flat", "self_calibration"),
-    "NISP-P": ("dark", "flat", "self_calibration", "standard_star"),
-    "NISP-S": ("dark", "flat", "standard_star", "planetary_nebula"),
-    "EXT": ("bias", "dark", "flat"),
-}
-_SKY_TYPES = ("science", "deep")
+_NO_FILES = OwnCurves()
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,88 +136,11 @@ class MissionChoice:
 
 
 @dataclass(frozen=True, slots=True)
-class Pointing:
-    """One exposure that is asked for.
-
-    ra, dec         : deg, of the boresight, or of the centre of detector `centre_on` where that is given
-    position_angle  : deg, of the focal plane's y axis, north through east
-    detectors       : names, () = all of the camera
-    exposure_time_s : None = the mission's
-    """
-
-    channel: str
-    camera: str
-    band: str
-    ra: float
-    dec: float
-    position_angle: float
-    mjd: float
-    detectors: tuple[str, ...] = ()
-    centre_on: str | None = None
-    exposure_time_s: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """A block of exposures that the planner lays out.
-
-    survey    : whose pattern;  pointings : a table of pointings (path) instead
-    area      : where, None = the request's
-    fields    : how many fields at most, those deepest in the area, 0 = all
-    visits    : how often each field is observed, 0 = the survey's
-    exposures : of a ground survey, in all bands together of which the positions are its own; of calibrations, frames
-    dither    : pattern within a field;  short, flat : with the short VIS exposure, the closing flat
-    blue      : with the blue grism besides the red ones
-    mjd       : the earliest date, None = the mission's launch
-    """
-
-    channels: tuple[str, ...]
-    image_type: str = "science"
-    survey: str = "wide"
-    pointings: str = ""
-    area: Area | None = None
-    fields: int = 0
-    visits: int = 0
-    exposures: int = 0
-    dither: str = "S"
-    short: bool = True
-    flat: bool = True
-    blue: bool = False
-    bands: tuple[str, ...] = ()
-    detectors: tuple[str, ...] = ()
-    mjd: float | None = None
-    exposure_time_s: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Effects:
     """Effects that are forced on or off, whatever a scene needs."""
 
     on: tuple[str, ...] = ()
     off: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Curves:
-    """Files of spectra, of a filter or of an extinction law; medium : of a filter's wavelengths, "air" or "vacuum"."""
-
-    files: tuple[Path, ...]
-    format: str
-    medium: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class OwnCurves:
-    """What stands beside the embedded passbands, and in place of the embedded galaxies, extinction laws and dwarfs.
-
-    basel : models of dwarfs;  irtf : spectra of stars whose infrared the dwarfs are given
-    """
-
-    passbands: tuple[tuple[str, Curves], ...] = ()
-    templates: Curves | None = None
-    extinction: tuple[tuple[int, Curves], ...] = ()
-    basel: Path | None = None
-    irtf: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,7 +160,7 @@ class Request:
     bands: tuple[str, ...]
     pointings: tuple[Pointing, ...]
     truth: tuple[str, ...]
-    curves: OwnCurves = OwnCurves()
+    curves: OwnCurves = _NO_FILES
     observations: tuple[Observation, ...] = ()
     effects: Effects = Effects()
     explore: tuple[tuple[str, tuple[str, ...]], ...] = ()
@@ -294,10 +204,10 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
     sections = {"area", "universe", "stars", "mission", "fluxes", "effects", "explore", "products"}
     _known(table, "", {"name", "seed", "accuracy", "pointing", "observation", *sections})
-    pointings, observations = _pointings(table), _observations(table)
+    asked, blocks = observations.pointings(table), observations.observations(table)
     fluxes = _section(table, "fluxes", {"bands", "passbands", "templates", "stars", "extinction"})
-    curves = _own_curves(fluxes, folder)
-    bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in pointings)
+    curves = own_files.parse(fluxes, folder)
+    bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in asked)
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
     request = Request(
         name=layout.name(_string(table, "name")),
@@ -308,10 +218,10 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder),
         mission=mission,
         bands=tuple(dict.fromkeys((*bands, *(name for name, _ in curves.passbands)))),
-        pointings=pointings,
+        pointings=asked,
         truth=_truth(_section(table, "products", {"truth"})),
         curves=curves,
-        observations=observations,
+        observations=blocks,
         effects=_effects(_section(table, "effects", {"on", "off"})),
         explore=_explore(_section(table, "explore", None)),
     )
@@ -354,16 +264,12 @@ def _stars(table: Toml, folder: Path) -> Stars:
     return Stars(
         density=_string(table, "stars.density", DENSITIES) if "density" in table else default.density,
         brown_dwarf_boost=_number(table, "stars.brown_dwarf_boost", 0.0, 1e4, default.brown_dwarf_boost),
-        tycho2=tuple(_file(folder, name) for name in _strings(table, "stars.tycho2")),
-        catalogue=_file(folder, _string(given, "stars.catalogue.file")) if given else None,
+        tycho2=tuple(own_files.file_of(folder, name) for name in _strings(table, "stars.tycho2")),
+        catalogue=own_files.file_of(folder, _string(given, "stars.catalogue.file")) if given else None,
         columns=tuple((key, _string(columns, f"stars.catalogue.columns.{key}")) for key in sorted(columns)),
         plane_limit=None if math.isnan(plane_limit) else plane_limit,
         rows_a_file=rows,
     )
-
-
-def _file(folder: Path, name: str) -> Path:
-    return folder / Path(name).expanduser()
 
 
 def _mission(table: Toml) -> MissionChoice:
@@ -376,69 +282,6 @@ def _override(value: object, key: str) -> Override:
     path = f"mission.overrides.{key}"
     table = _table(value, path, {"value", "unit"})
     return Override(_number(table, f"{path}.value", -math.inf, math.inf), _string(table, f"{path}.unit"))
-
-
-def _pointings(table: Toml) -> tuple[Pointing, ...]:
-    found = _tables(table, "pointing", _MOST_POINTINGS)
-    return tuple(_pointing(value, f"pointing[{i}]") for i, value in enumerate(found))
-
-
-def _pointing(value: object, path: str) -> Pointing:
-    table = _table(value, path, set(Pointing.__slots__))
-    channel = _string(table, f"{path}.channel", CHANNELS)
-    return Pointing(
-        channel=channel,
-        camera=layout.name(_string(table, f"{path}.camera", default=channel.lower().partition("-")[0])),
-        band=layout.name(_string(table, f"{path}.band")),
-        ra=_number(table, f"{path}.ra", -360.0, 360.0) % 360.0,
-        dec=_number(table, f"{path}.dec", -90.0, 90.0),
-        position_angle=_number(table, f"{path}.position_angle", -360.0, 360.0, 0.0),
-        mjd=_number(table, f"{path}.mjd", 40_000.0, 100_000.0),
-        detectors=_strings(table, f"{path}.detectors"),
-        centre_on=_string(table, f"{path}.centre_on") if "centre_on" in table else None,
-        exposure_time_s=_optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
-    )
-
-
-def _observations(table: Toml) -> tuple[Observation, ...]:
-    found = _tables(table, "observation", _MOST_OBSERVATIONS)
-    return tuple(_observation(value, f"observation[{i}]") for i, value in enumerate(found))
-
-
-def _observation(value: object, path: str) -> Observation:
-    table = _table(value, path, set(Observation.__slots__))
-    channels = _strings(table, f"{path}.channels", CHANNELS)
-    if not channels:
-        raise BadInput(f"{path}.channels is missing or empty")
-    ground = "EXT" in channels
-    if ground and len(channels) > 1:
-        raise BadInput(f"{path}.channels: EXT stands alone")
-    image_type = _string(table, f"{path}.image_type", IMAGE_TYPES, "science")
-    if image_type not in _SKY_TYPES:
-        for channel in channels:
-            if image_type not in _CALIBRATIONS[channel]:
-                legal = ", ".join((*_SKY_TYPES, *_CALIBRATIONS[channel]))
-                raise BadInput(f"{path}.image_type = {image_type!r} is none of {channel}'s: {legal}")
-    surveys = GROUND_SURVEYS if ground else EUCLID_SURVEYS
-    own = _has(table, f"{path}.area")
-    return Observation(
-        channels=channels,
-        image_type=image_type,
-        survey=_string(table, f"{path}.survey", surveys, None if ground else "wide"),
-        pointings=_string(table, f"{path}.pointings", default=""),
-        area=areas.parse(_section(table, "area", None), f"{path}.area") if own else None,
-        fields=_integer(table, f"{path}.fields", 1, 1_000_000, 0),
-        visits=_integer(table, f"{path}.visits", 1, 1000, 0),
-        exposures=_integer(table, f"{path}.exposures", 1, 1_000_000, 0),
-        dither=_string(table, f"{path}.dither", DITHERS, "S"),
-        short=_boolean(table, f"{path}.short", True),
-        flat=_boolean(table, f"{path}.flat", True),
-        blue=_boolean(table, f"{path}.blue", False),
-        bands=tuple(layout.name(band) for band in _strings(table, f"{path}.bands")),
-        detectors=_strings(table, f"{path}.detectors"),
-        mjd=_optional(table, f"{path}.mjd", 40_000.0, 100_000.0),
-        exposure_time_s=_optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
-    )
 
 
 def _with_files_beside(request: Request, folder: Path) -> Request:
@@ -454,37 +297,6 @@ def _with_files_beside(request: Request, folder: Path) -> Request:
             block = replace(block, pointings=str(path))
         found.append(block)
     return replace(request, observations=tuple(found))
-
-
-def _own_curves(table: Toml, folder: Path) -> OwnCurves:
-    filters = _table(table.get("passbands", {}), "fluxes.passbands", None)
-    laws = _table(table.get("extinction", {}), "fluxes.extinction", set("1234"))
-    passbands = [_curves(value, f"fluxes.passbands.{layout.name(key)}", folder, True) for key, value in filters.items()]
-    extinction = [_curves(value, f"fluxes.extinction.{key}", folder) for key, value in laws.items()]
-    templates = None
-    if "templates" in table:
-        path = "fluxes.templates"
-        given = _table(table["templates"], path, {"files", "format"})
-        files = _strings(given, f"{path}.files", distinct=False)
-        if not files:
-            raise BadInput(f"{path}.files is missing")
-        templates = Curves(tuple(_file(folder, file) for file in files), _string(given, f"{path}.format"))
-    stars = _table(table.get("stars", {}), "fluxes.stars", {"basel", "irtf"})
-    if "stars" in table and not stars:
-        raise BadInput("fluxes.stars names neither basel nor irtf")
-    return OwnCurves(
-        tuple(zip(filters, passbands, strict=True)),
-        templates,
-        tuple(zip(map(int, laws), extinction, strict=True)),
-        _file(folder, _string(stars, "fluxes.stars.basel")) if "basel" in stars else None,
-        tuple(_file(folder, name) for name in _strings(stars, "fluxes.stars.irtf")),
-    )
-
-
-def _curves(value: object, path: str, folder: Path, has_medium: bool = False) -> Curves:
-    table = _table(value, path, {"file", "format", *(["medium"] if has_medium else [])})
-    medium = _string(table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
-    return Curves((_file(folder, _string(table, f"{path}.file")),), _string(table, f"{path}.format"), medium)
 
 
 def _truth(table: Toml) -> tuple[str, ...]:

@@ -37,7 +37,7 @@ from jobs.fluxes import (
 from jobs.fluxes.continuum import dust_of
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
-from jobs.request import Curves, OwnCurves
+from jobs.own_files import Curves, OwnCurves
 from lake_schema import read as lake_read
 from lake_schema.errors import BadInput
 from lake_schema.provenance import file_sha256

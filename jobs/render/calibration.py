@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs import rng
+from jobs.observations import Observation
 from jobs.render import focal_plane
 from jobs.render.exposing import Exposure, bands_of, exposure_time
 from jobs.render.fields import position_angle
 from jobs.render.sequence import FILTERS, RED, offsets
-from jobs.request import Observation
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 

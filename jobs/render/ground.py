@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from jobs import rng
 from jobs.area import Area
+from jobs.observations import CHANNELS, Observation
 from jobs.render import focal_plane
 from jobs.render.exposing import Exposure, bands_of, exposure_time
-from jobs.request import CHANNELS, Observation
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 

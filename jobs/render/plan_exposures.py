@@ -13,8 +13,9 @@ import pyarrow as pa
 
 from jobs.fluxes import inputs
 from jobs.fluxes.passbands import Passband
+from jobs.own_files import OwnCurves
 from jobs.render import exposing, forecast, survey, tasks
-from jobs.request import MissionChoice, OwnCurves, Request
+from jobs.request import MissionChoice, Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema import layout, read
 from lake_schema.columns import Table

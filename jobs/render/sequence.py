@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs import rng
+from jobs.observations import Observation
 from jobs.render import focal_plane
 from jobs.render.exposing import Exposure, exposure_time
 from jobs.render.fields import Field
-from jobs.request import Observation
 from lake_schema.mission.configuration import MissionConfiguration
 
 Float = npt.NDArray[np.float64]

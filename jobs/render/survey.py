@@ -16,10 +16,11 @@ import numpy as np
 
 from jobs.accuracy import Accuracy
 from jobs.area import Area
+from jobs.observations import Observation, Pointing
 from jobs.render import calibration, fields, focal_plane, ground
 from jobs.render.exposing import SKY_TYPES, Exposure, bands_of, exposure_time
 from jobs.render.sequence import sequence
-from jobs.request import Observation, Pointing, Request
+from jobs.request import Request
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from jobs import request
+from jobs.own_files import OwnCurves
 from lake_schema.errors import BadInput
 
 DEMO = Path(__file__).parents[2] / "requests" / "demo.toml"
@@ -181,4 +182,4 @@ irtf = ["G2V.txt", "M0V.txt"]
     assert [code for code, _ in asked.curves.extinction] == [3]
     assert asked.curves.basel == tmp_path / "lcbp00.cor"
     assert asked.curves.irtf == (tmp_path / "G2V.txt", tmp_path / "M0V.txt")
-    assert request.parse(DEMO).curves == request.OwnCurves()
+    assert request.parse(DEMO).curves == OwnCurves()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jobs.fluxes import continuum, inputs, passbands, templates
-from jobs.request import Curves, OwnCurves
+from jobs.own_files import Curves, OwnCurves
 from lake_schema.errors import BadInput
 from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
 from lake_schema.tables.passbands import PASSBANDS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jobs.fluxes import ingest, inputs, own_stars, passbands, stellar, templates
-from jobs.request import OwnCurves
+from jobs.own_files import OwnCurves
 from lake_schema.errors import BadInput
 from lake_schema.tables.templates import TEMPLATES
 from lake_schema.validate import check
