@@ -1,13 +1,14 @@
 """One detector of one exposure: catalogue rows in, a raw image and its noise-free truth out.
 
 render          the whole of it
+least_flux      what a source beyond the margin must have to be read
 sources_of      the rows that touch the detector, as what is drawn
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,7 @@ class Rendered:
     noise_free : float32[ny, nx] expected electrons of the sources alone
     sources    : what was drawn, ascending id
     zero_point : AB magnitude of one electron per second
+    complete   : how far beyond the detector every source was known that may reach it, arcsec
     """
 
     exposure: Row
@@ -81,6 +83,7 @@ class Rendered:
     decisions: tuple[Decision, ...]
     accuracy: Accuracy
     seed: int
+    complete: float
 
 
 def render(
@@ -99,6 +102,7 @@ def render(
     library: Library | None = None,
     stellar: Library | None = None,
     passband: Passband | None = None,
+    complete: float = 0.0,
 ) -> Rendered:
     """Render one detector.
 
@@ -109,6 +113,7 @@ def render(
     library        : what the galaxies' sed_1 and sed_2 count, stellar : what the stars' sed, None = the embedded ones
     passband       : the exposure's, None = the embedded one of its name
     detector       : another geometry than the mission's for task["detector"], e.g. a part of it
+    complete       : how far beyond the detector the rows have every source, arcsec; for the header
     """
     camera, band, channel = str(exposure["camera"]), str(exposure["band"]), str(exposure["channel"])
     passband = passband or passbands.load(band)
@@ -117,12 +122,9 @@ def render(
     if detector is None:
         detector = focal_plane.detector(camera, str(task["detector"]), mission)
     system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
-    exposure_time = float(exposure["exposure_time_s"])
-    zero_point = float(exposure["zero_point"])
-    electrons_per_ujy = float(10.0 ** (0.4 * (zero_point - units.AB_UJY)))
-    scene = Scene(mission, detector.section, exposure_time, float(exposure["sky"]), 0.0)
+    zero_point, scene = float(exposure["zero_point"]), _scene(exposure, detector, mission)
     electrons = [
-        _fluxes(rows, fluxes, f"f_nu_{band}") * electrons_per_ujy * exposure_time
+        _fluxes(rows, fluxes, f"f_nu_{band}") * _rate(exposure) * scene.exposure_time_s
         for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
     ]
     settings = stamps.settings_for(accuracy)
@@ -141,7 +143,7 @@ def render(
     )
     floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
     noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors)
-    scene = Scene(mission, detector.section, exposure_time, scene.sky_rate, float(noise_free.max()))
+    scene = replace(scene, peak_electrons=float(noise_free.max()))
     frame, decisions = apply_all(
         noise_free,
         EFFECTS[channel],
@@ -162,7 +164,25 @@ def render(
         decisions,
         accuracy,
         seed,
+        complete,
     )
+
+
+def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
+    """f_nu of the faintest source that reaches the detector from beyond its selection margin, microjansky."""
+    margin, noise = mission.value("survey.selection_margin", "arcsec"), _scene(exposure, detector, mission).pixel_noise
+    least = stamps.least_electrons(margin, detector.pixel_scale, noise, stamps.settings_for(accuracy))
+    return least / (_rate(exposure) * float(exposure["exposure_time_s"]))
+
+
+def _scene(exposure: Row, detector: Detector, mission: MissionConfiguration) -> Scene:
+    """Before anything is drawn."""
+    return Scene(mission, detector.section, float(exposure["exposure_time_s"]), float(exposure["sky"]), 0.0)
+
+
+def _rate(exposure: Row) -> float:
+    """Electrons a second of a source of one microjansky."""
+    return float(10.0 ** (0.4 * (float(exposure["zero_point"]) - units.AB_UJY)))
 
 
 def sources_of(

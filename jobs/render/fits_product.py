@@ -114,6 +114,7 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("PSFFWHM", rendered.psf.fwhm, "[arcsec] of a point source, pixel included"),
         ("SEEING", float(exposure["seeing"]), "[arcsec] FWHM of the atmosphere"),
         ("NSOURCES", len(rendered.sources), "number of sources drawn"),
+        ("SRCREACH", rendered.complete, "[arcsec] beyond the detector: sources complete"),
         ("SEED", str(rendered.seed), "of the random numbers"),
         ("MISSION", rendered.scene.mission.fingerprint, ""),
         ("TRUESKY", __version__, "version of the simulator"),

@@ -7,14 +7,15 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
-from jobs.render import exposure, fits_product, survey
+from jobs.render import exposure, fits_product, focal_plane, selection, stamps, survey
 from jobs.render.plan_exposures import PARTS, mission_of, own_filters
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
@@ -37,8 +38,10 @@ def steps(lake: Path, request: Request) -> list[Step]:
     _refuse_other_plan(inputs, request)
     tasks = inputs["tasks"].rows().to_pylist()
     _refuse_unrendered(inputs["exposures"].rows(["channel", "image_type"]))
+    places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in tasks if task["cells"]}
     for name in ("galaxies", "stars"):
-        _refuse_uncovered(inputs[name], {cell for task in tasks for cell in task["cells"]})
+        of_task = [selection.needed(task, _deflection(inputs[name])) for task in places.values()]
+        _refuse_uncovered(inputs[name], {cell for cells in of_task for cell in cells})
     facts = {
         **common_facts(request, "seed", "accuracy", "mission", "effects", "truth"),
         "mission": mission_of(request.mission).fingerprint,
@@ -88,11 +91,45 @@ def _refuse_unrendered(exposures: pa.Table) -> None:
 
 def _refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
     """The detectors must lie where the catalogue was drawn."""
-    drawn = {cell for part in catalogue.manifest["parts"] for cell in part["facts"]["generation_cells"]}
-    if missing := sorted(cells - drawn):
+    if missing := sorted(cells - _drawn(catalogue)):
         some = ", ".join(map(str, missing[:3])) + (", ..." if len(missing) > 3 else "")
         wanted = f"{len(missing)} order-{GENERATION_ORDER} cells that the detectors see ({some})"
         raise BadInput(f"table {catalogue.table} lacks {wanted}: build it over a larger area first")
+
+
+def _drawn(catalogue: read.Version) -> set[int]:
+    """Order-8 cells that a catalogue was drawn in."""
+    return {cell for part in catalogue.manifest["parts"] for cell in part["facts"]["generation_cells"]}
+
+
+def _deflection(catalogue: read.Version) -> float:
+    """How far a source may be seen from where its cell says, deg; stars are not lensed."""
+    return catalogue.deflection() if "ra_lensed" in catalogue.schema.names else 0.0
+
+
+def sources(
+    catalogue: read.Version,
+    fluxes: read.Version,
+    task: Mapping[str, Any],
+    columns: Sequence[str],
+    band: str,
+    farther: float,
+    least: float,
+) -> tuple[pa.Table, pa.Table, float]:
+    """(rows of a catalogue that a task may draw, their fluxes, how far beyond the task's circle they are complete).
+
+    farther : how far beyond the circle a source may be seen and reach the detector, arcsec
+    least   : microjansky, of sources beyond the cells of the circle
+    """
+    deflection, flux = _deflection(catalogue), ["id", f"f_nu_{band}"]
+    near = selection.needed(task, deflection)
+    far, complete = selection.beyond(task, deflection, farther, _drawn(catalogue))
+    rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
+    if far:
+        more, bright = (v.in_cells(far, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
+        shows = pc.greater_equal(bright[flux[1]], least)
+        rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, more), (light, bright)))
+    return rows, light, complete
 
 
 def work(lake: Path, facts: Json) -> Output:
@@ -103,19 +140,23 @@ def work(lake: Path, facts: Json) -> Output:
     here = pc.field("exposure_id") == facts["exposure_id"]
     (exposed,) = inputs["exposures"].rows(where=here).to_pylist()
     (task,) = inputs["tasks"].rows(where=here & (pc.field("detector") == facts["detector"])).to_pylist()
-    flux = ["id", f"f_nu_{exposed['band']}"]
-    columns = {
-        "galaxies": exposure.GALAXY_COLUMNS,
-        "galaxy_fluxes": flux,
-        "stars": exposure.STAR_COLUMNS,
-        "star_fluxes": flux,
-    }
-    rows = {name: inputs[name].in_cells(task["cells"], GENERATION_ORDER, wanted) for name, wanted in columns.items()}
     own = survey.variant(exposed["settings"], read_back(inputs["mission"]), Accuracy(**request["accuracy"]), forced)
+    detector = focal_plane.detector(exposed["camera"], task["detector"], own.mission)
+    margin = own.mission.value("survey.selection_margin", "arcsec")
+    farther = max(stamps.reach(detector.pixel_scale) - margin, 0.0)
+    least = exposure.least_flux(exposed, detector, own.mission, own.accuracy)
+    found = [
+        sources(inputs[rows], inputs[fluxes], task, columns, exposed["band"], farther, least)
+        for rows, fluxes, columns in (
+            ("galaxies", "galaxy_fluxes", exposure.GALAXY_COLUMNS),
+            ("stars", "star_fluxes", exposure.STAR_COLUMNS),
+        )
+    ]
     rendered = exposure.render(
         task,
         exposed,
-        **rows,
+        *found[0][:2],
+        *found[1][:2],
         mission=own.mission,
         accuracy=own.accuracy,
         seed=request["seed"],
@@ -123,6 +164,7 @@ def work(lake: Path, facts: Json) -> Output:
         stellar=stars_of(lake, inputs["star_fluxes"].manifest["facts"]),
         passband=passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], str(exposed["band"])),
         forced=own.forced,
+        complete=margin + min(complete for *_, complete in found),
     )
     return Output(*fits_product.products(rendered, request["truth"]))
 

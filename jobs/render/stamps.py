@@ -8,6 +8,7 @@ its edge, and below the flux budget in the source's aperture. The PSF's wings be
 Sources         what is drawn: galaxies (with a shape) and points
 settings_for    what an accuracy takes, from the measured table
 stamp_sizes     pixels, from flux, shape, PSF, noise and settings
+reach, least_electrons   how far a source may show, and what it takes to show there
 draw            sources -> frame
 reference       one source by galsim's own drawImage: what `draw` is held against
 """
@@ -46,6 +47,8 @@ _APERTURE = 1.0
 _LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
 # Of a galaxy's half-light radius, that its stamp is wider than a point's.
 _EXTENT = 4.0
+# Axis ratio of the thinnest sources: discs of the scale height profiles.py draws, seen edge-on.
+_THINNEST = 0.1
 # Above this many electrons the rounding of single precision would show.
 _BRIGHT = 1e7
 # Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
@@ -151,6 +154,21 @@ def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: f
     # A point has no light beyond the PSF's plane.
     enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
     return np.asarray(SIZES[np.argmax(enough, axis=1)])
+
+
+def reach(pixel_scale: float) -> float:
+    """Distance from a source to the farthest corner of the largest stamp, arcsec."""
+    return float(SIZES[-1]) / 2.0 * float(np.sqrt(2.0)) * pixel_scale
+
+
+def least_electrons(distance: float, pixel_scale: float, noise: float, settings: Settings) -> float:
+    """Electrons of which a source must have more to show at a distance, arcsec, from its middle.
+
+    No profile rises outward: at its edge an ellipse is no brighter than all of the light spread over it.
+    Error : of a source thinner than 1 : 10, the edge-on disc, what shows may be left out
+    """
+    pixels = np.pi * _THINNEST * (distance / pixel_scale) ** 2
+    return float(settings.edge * noise * pixels)
 
 
 def _beyond_the_table(psf: Psf, radius: Int) -> Float:

@@ -112,16 +112,13 @@ def table(
     mission: MissionConfiguration,
     densities: Densities,
     truth: Sequence[str] = (),
-    deflection: float = 0.0,
 ) -> pa.Table:
     """Rows of the table `tasks`.
 
     exposures  : rows of the table `exposures`;  detectors : of each exposure, () = all of its camera
     truth      : truth maps that are wanted, which take space
-    deflection : deg, the largest distance between a source's true position (which tells its cell) and where
-                 it is seen
     """
-    cameras = {camera: _Camera(camera, mission, deflection) for camera in set(exposures["camera"].to_pylist())}
+    cameras = {camera: _Camera(camera, mission) for camera in set(exposures["camera"].to_pylist())}
     shared: dict[tuple[Any, ...], _Places] = {}
     columns: dict[str, list[Any]] = {name: [] for name in TASKS.names}
     for row, wanted in zip(exposures.to_pylist(), detectors, strict=True):
@@ -148,13 +145,13 @@ class _Places:
 class _Camera:
     """Detectors of a camera, and what of them does not depend on the pointing."""
 
-    def __init__(self, camera: str, mission: MissionConfiguration, deflection: float) -> None:
+    def __init__(self, camera: str, mission: MissionConfiguration) -> None:
         self.detectors = focal_plane.detectors(camera, mission)
         self.index = {detector.name: i for i, detector in enumerate(self.detectors)}
         self.x, self.y = focal_plane.outline(self.detectors)
         margin = mission.value("survey.selection_margin", "arcsec")
         reach = np.array([detector.half_diagonal for detector in self.detectors])
-        self.radius = (reach + margin) / 3600.0 + deflection
+        self.radius = (reach + margin) / 3600.0
         self.pixels = np.array([detector.nx * detector.ny for detector in self.detectors])
         self.area = np.array([d.nx * d.ny * (d.pixel_scale / 3600.0) ** 2 for d in self.detectors])
 

@@ -19,7 +19,7 @@ TASKS = Table(
             "float64",
             "deg",
             "phys.angSize",
-            "circle about the centre that holds every source it may need",
+            "circle about the centre: every source seen in it must be known",
             0.0,
             10.0,
         ),

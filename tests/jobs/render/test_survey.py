@@ -82,13 +82,6 @@ def test_cells_hold_everything_that_a_detector_sees(ra, dec, angle):
     assert sky.separation(corners[:, 0], corners[:, 1], own[:, 0], own[:, 1]).max() < 2e-7
 
 
-def test_a_deflection_widens_the_circle():
-    exposure = exposing.Exposure("VIS", "vis", "euclid_vis", "science", 10.0, 5.0, 0.0, 60905.0, 560.0, "x")
-    rows, densities = exposing.table([exposure], [MISSION]), tasks.Densities(MISSION, requests.Universe())
-    plain, wide = (tasks.table(rows, [("1-1",)], MISSION, densities, (), d)["radius"][0].as_py() for d in (0.0, 0.1))
-    assert wide == pytest.approx(plain + 0.1)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
