@@ -1,15 +1,17 @@
-"""Files of spectra, filters and extinction laws that a request names.
+"""Files of others that a request names.
 
-Curves, OwnCurves    what is named;  parse : of the request's section `fluxes`
-file_of              a file beside the request
+OwnCurves, curves   spectra, filters and extinction laws: the section `fluxes`
+Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
+file_of             a file beside the request
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from jobs.toml_values import Toml, string, strings, table_of
+from jobs.toml_values import Toml, shown, string, strings, table_of
 from lake_schema import layout
 from lake_schema.errors import BadInput
 
@@ -37,12 +39,41 @@ class OwnCurves:
     irtf: tuple[Path, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class Catalogue:
+    """Files of a catalogue of others; columns : (our key, JSON of what stands for it) beside those of the format."""
+
+    files: tuple[Path, ...]
+    format: str = ""
+    columns: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class DustMap:
+    """A HEALPix map of E(B-V) or A(V); ordering, coordinates : what its header must say, or does not say."""
+
+    file: Path
+    column: str
+    quantity: str = "ebv"
+    ordering: str = ""
+    coordinates: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Ingest:
+    """What is taken from others instead of being made."""
+
+    galaxies: Catalogue | None = None
+    halos: Catalogue | None = None
+    dust: DustMap | None = None
+
+
 def file_of(folder: Path, name: str) -> Path:
     """A file by its name, found from the request's folder."""
     return folder / Path(name).expanduser()
 
 
-def parse(table: Toml, folder: Path) -> OwnCurves:
+def curves(table: Toml, folder: Path) -> OwnCurves:
     """The section `fluxes`; files are found from `folder`.  BadInput names the key."""
     filters = table_of(table.get("passbands", {}), "fluxes.passbands", None)
     laws = table_of(table.get("extinction", {}), "fluxes.extinction", set("1234"))
@@ -72,3 +103,42 @@ def _curves(value: object, path: str, folder: Path, has_medium: bool = False) ->
     table = table_of(value, path, {"file", "format", *(["medium"] if has_medium else [])})
     medium = string(table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
     return Curves((file_of(folder, string(table, f"{path}.file")),), string(table, f"{path}.format"), medium)
+
+
+def ingest(table: Toml, folder: Path) -> Ingest:
+    """The section `ingest`; files are found from `folder`.  BadInput names the key."""
+    galaxies = _catalogue(table["galaxies"], "ingest.galaxies", folder) if "galaxies" in table else None
+    halos = _catalogue(table["halos"], "ingest.halos", folder) if "halos" in table else None
+    if galaxies and halos:
+        raise BadInput("ingest.halos: a finished catalogue of galaxies wants no halos")
+    dust = None
+    if "dust" in table:
+        given = table_of(table["dust"], "ingest.dust", set(DustMap.__slots__))
+        dust = DustMap(
+            file_of(folder, string(given, "ingest.dust.file")),
+            string(given, "ingest.dust.column"),
+            string(given, "ingest.dust.quantity", ("ebv", "a_v"), "ebv"),
+            string(given, "ingest.dust.ordering", ("RING", "NESTED"), "RING") if "ordering" in given else "",
+            string(given, "ingest.dust.coordinates", ("G", "C"), "G") if "coordinates" in given else "",
+        )
+    return Ingest(galaxies, halos, dust)
+
+
+def _catalogue(value: object, path: str, folder: Path) -> Catalogue:
+    table = table_of(value, path, {"files", "format", "columns"} - ({"format"} if path.endswith("halos") else set()))
+    files = strings(table, f"{path}.files")
+    if not files:
+        raise BadInput(f"{path}.files is missing or empty")
+    columns = table_of(table.get("columns", {}), f"{path}.columns", None)
+    return Catalogue(
+        tuple(file_of(folder, name) for name in files),
+        string(table, f"{path}.format", default=""),
+        tuple((key, _json(columns[key], f"{path}.columns.{key}")) for key in sorted(columns)),
+    )
+
+
+def _json(value: object, path: str) -> str:
+    try:
+        return json.dumps(value, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError):
+        raise BadInput(f"{path} wants texts, numbers and tables, got {shown(value)}") from None

@@ -5,6 +5,10 @@
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
     [universe]     galaxy_limit (I_E), star_limit (H, Vega), z_max, box_cells, lensing_nside
     [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
+    [ingest.galaxies]  files = [..]  a finished catalogue instead of ours: Parquet, FITS, CSV, a HATS folder
+                       format = "flagship1" | "flagship2" | "euclid" | "skycatalogs"   columns = {ours = theirs, ..}
+    [ingest.halos]     files = [..]  columns = {ra, dec, z_true, log_mass, ..}   a halo light-cone instead of ours
+    [ingest.dust]      file, column, quantity = "ebv" | "a_v"   a HEALPix map of the Milky Way's dust instead of ours
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
     [fluxes]       bands = [..]           default: the bands of the pointings and observations
     [fluxes.passbands.NAME]        your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
@@ -47,7 +51,7 @@ from jobs import observations, own_files
 from jobs.accuracy import SURVEY, Accuracy, preset
 from jobs.area import Area
 from jobs.observations import Observation, Pointing
-from jobs.own_files import OwnCurves
+from jobs.own_files import Ingest, OwnCurves
 from jobs.toml_values import Toml
 from jobs.toml_values import boolean as _boolean
 from jobs.toml_values import checked_number as _checked_number
@@ -77,6 +81,7 @@ DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
 _NO_FILES = OwnCurves()
+_NOTHING_TAKEN = Ingest()
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +169,7 @@ class Request:
     observations: tuple[Observation, ...] = ()
     effects: Effects = Effects()
     explore: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    ingest: Ingest = _NOTHING_TAKEN
 
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""
@@ -202,11 +208,11 @@ def _one_line(error: Exception) -> str:
 
 def from_table(table: Toml, folder: Path = Path()) -> Request:
     """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
-    sections = {"area", "universe", "stars", "mission", "fluxes", "effects", "explore", "products"}
+    sections = {"area", "universe", "stars", "ingest", "mission", "fluxes", "effects", "explore", "products"}
     _known(table, "", {"name", "seed", "accuracy", "pointing", "observation", *sections})
     asked, blocks = observations.pointings(table), observations.observations(table)
     fluxes = _section(table, "fluxes", {"bands", "passbands", "templates", "stars", "extinction"})
-    curves = own_files.parse(fluxes, folder)
+    curves = own_files.curves(fluxes, folder)
     bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in asked)
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
     request = Request(
@@ -224,6 +230,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         observations=blocks,
         effects=_effects(_section(table, "effects", {"on", "off"})),
         explore=_explore(_section(table, "explore", None)),
+        ingest=own_files.ingest(_section(table, "ingest", {"galaxies", "halos", "dust"}), folder),
     )
     _check_bands(request)
     _check_mission(request)

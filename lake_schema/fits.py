@@ -4,6 +4,8 @@ Image           an image with its header cards
 write_images    images -> one file: checksums, the same bytes for the same input
 read_images     a file -> images; checksums are demanded and verified, sizes checked before data
 read_numbers    somebody's binary table -> its columns of numbers
+number_batches  the same, some columns and a bounded piece at a time
+read_map        somebody's HEALPix map -> its pixels and header
 table_to_fits   an Arrow table -> a binary table, units and UCDs from the table's declaration
 fits_unit       a unit as FITS spells it
 """
@@ -36,6 +38,7 @@ Card = tuple[str, str | int | float | bool, str]
 _LONGEST_NAME = 68
 # A header that promises more than this is a mistake or an attack; the largest product is far below.
 MOST_BYTES = 8 << 30
+_ROWS_A_BATCH = 65_536
 _STRUCTURE = {
     "SIMPLE",
     "XTENSION",
@@ -109,6 +112,63 @@ def read_numbers(path: Path) -> dict[str, npt.NDArray[np.float64]]:
         for unit in units:
             if isinstance(unit, fits.BinTableHDU):
                 return _numbers_of(unit)
+    raise BadInput(f"{path}: holds no table")
+
+
+def number_batches(
+    path: Path, columns: Sequence[str], rows: int = _ROWS_A_BATCH
+) -> Iterator[tuple[dict[str, npt.NDArray[Any]], dict[str, str]]]:
+    """Columns of numbers of a file's first table: (title -> numbers[n], whole numbers as they are; title -> TUNIT).
+
+    Errors : Damaged for a file that is cut short or is none; BadInput names a column that is missing or no number
+    """
+    with _refusing(path), fits.open(path, memmap=True) as units:
+        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
+        unit = next((unit for unit in units if isinstance(unit, fits.BinTableHDU)), None)
+        if unit is None:
+            raise BadInput(f"{path}: holds no table")
+        _whole_file(path, unit)
+        known = {column.name: column for column in unit.columns}
+        for name in columns:
+            if name not in known:
+                raise BadInput(f"{path}: has no column {name}; it has {', '.join(known)}"[:500])
+            if unit.data[name].dtype.kind not in "fiub" or unit.data[name].ndim != 1:
+                raise BadInput(f"{path}: column {name} is {unit.data[name].dtype}, wanted a number a row")
+        said = {name: known[name].unit for name in columns if known[name].unit}
+        for first in range(0, len(unit.data), rows):
+            part = slice(first, first + rows)
+            yield {name: _native(unit.data[name][part], known[name].null) for name in columns}, said
+
+
+def _native(values: Any, null: int | None) -> npt.NDArray[Any]:
+    numbers = np.array(values)
+    numbers = numbers.astype(np.int8 if numbers.dtype.kind == "b" else numbers.dtype.newbyteorder("="))
+    if numbers.dtype.kind in "iu" and null is not None and (numbers == null).any():
+        return np.where(numbers == null, np.nan, numbers.astype(np.float64))
+    return numbers
+
+
+def _whole_file(path: Path, unit: Any) -> None:
+    # A table that is cut short would be mapped beyond the end of its file.
+    end = unit.fileinfo()["datLoc"] + unit.header["NAXIS1"] * unit.header["NAXIS2"]
+    if end > path.stat().st_size:
+        raise Damaged(f"{path}: is cut short, {end} bytes promised, {path.stat().st_size} there")
+
+
+def read_map(path: Path, column: str) -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
+    """A column of a HEALPix map, float64[pixels] in its file's order, and the cards of its header.
+
+    Errors : Damaged for a file that is cut short or is none; BadInput where there is no table or column
+    """
+    with _refusing(path), fits.open(path, memmap=True) as units:
+        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
+        for unit in units:
+            if not isinstance(unit, fits.BinTableHDU):
+                continue
+            _whole_file(path, unit)
+            if column not in unit.columns.names:
+                raise BadInput(f"{path}: has no column {column}; it has {', '.join(unit.columns.names)}")
+            return np.asarray(unit.data[column], np.float64).ravel(), dict(unit.header.items())
     raise BadInput(f"{path}: holds no table")
 
 

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 from jobs.catalogue import bright_stars, cells, dust_map, star_catalogue, stars
+from jobs.own_files import DustMap
 from jobs.request import Request, Stars
 from jobs.shell import Job, Step, main
 from lake_schema.errors import BadInput
@@ -32,12 +33,13 @@ def steps(lake: Path, request: Request) -> list[Step]:
         "density": choice.density,
         "brown_dwarf_boost": choice.brown_dwarf_boost,
         **_files(choice),
+        **dust_map.facts(request.ingest.dust),
         "code": code_version(),
     }
     drawn = request.area.cells()
     numbers = stars.numbers(drawn, _model(facts, choice))
     parts = cells.by_number(drawn, numbers, choice.rows_a_file, _LARGEST)
-    return [Step(Plan(STARS, facts, parts), partial(work, choice=choice))]
+    return [Step(Plan(STARS, facts, parts), partial(work, choice=choice, own=request.ingest.dust))]
 
 
 def _files(choice: Stars) -> dict[str, Any]:
@@ -57,10 +59,10 @@ def _files(choice: Stars) -> dict[str, Any]:
     return facts
 
 
-def work(lake: Path, facts: Json, choice: Stars) -> Output:
+def work(lake: Path, facts: Json, choice: Stars, own: DustMap | None = None) -> Output:
     """The stars of one file's cell."""
     model = _model(facts, choice)
-    dust = dust_map.load(facts["seed"])
+    dust = dust_map.chosen(facts["seed"], own)
     return Output(cells.rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
 
 

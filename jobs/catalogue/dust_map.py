@@ -1,6 +1,8 @@
 """The dust of the Milky Way: extinction A(V) to infinity from a full-sky map, and to a distance.
 
 embedded    the default map: a cosecant law times a log-normal field, from the universe's seed
+chosen      the map of a request: a file of its own, else the default
+facts       what stands for the file in a plan
 a_v         read a map at sky positions
 a_v_at      the part of it in front of a star
 
@@ -9,9 +11,11 @@ Maps are HEALPix, RING, Galactic.  Ref: the numbers and their sources are in dus
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, astuple, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import healpy as hp
 import numpy as np
@@ -19,10 +23,19 @@ import numpy.typing as npt
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
+from jobs.own_files import DustMap
 from jobs.rng import stream
-from lake_schema.sky import galactic
+from lake_schema.errors import BadInput
+from lake_schema.fits import read_map
+from lake_schema.provenance import canonical, file_sha256
+from lake_schema.sky import equatorial, galactic
 
 Float = npt.NDArray[np.float64]
+
+# Table `galaxies` holds no more.
+_MOST_A_V = 40.0
+# Of the steps between neighbours, the other ordering's over that which the header says.
+_MUCH_SMOOTHER = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +99,79 @@ def load(seed: int) -> npt.NDArray[np.float32]:
     model = cosecant()
     key = content_key(Path(__file__).read_bytes(), version("healpy"), seed, *astuple(model))
     return cached_arrays("dust_map", key, lambda: {"a_v": embedded(seed, model)})["a_v"]
+
+
+def facts(own: DustMap | None) -> dict[str, Any]:
+    """Empty without a file; BadInput where it is not there."""
+    if own is None:
+        return {}
+    if not own.file.is_file():
+        raise BadInput(f"ingest.dust.file: {own.file}: no such file")
+    about = {name: value for name, value in asdict(own).items() if name != "file"}
+    return {"dust": {"sha256": file_sha256(own.file), **about}}
+
+
+def chosen(seed: int, own: DustMap | None) -> npt.NDArray[np.float32]:
+    """Map of A(V), RING and Galactic, of a request's file (from the cache or read now), or the embedded one."""
+    if own is None:
+        return load(seed)
+    key = content_key(Path(__file__).read_bytes(), version("healpy"), canonical(facts(own)))
+    return cached_arrays("dust_file", key, lambda: {"a_v": read(own)})["a_v"]
+
+
+def read(own: DustMap) -> npt.NDArray[np.float32]:
+    """A map of others as ours are: A(V), RING, Galactic, not finer than the embedded one.
+
+    Errors: BadInput names the file, and what is missing or wrong: ordering, coordinates, or the row of a pixel
+    """
+    values, cards = read_map(own.file, own.column)
+    where = f"{own.file}: column {own.column}"
+    ordering = _agreed(own, "ORDERING", "ordering", cards, {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"})
+    frame = _agreed(own, "COORDSYS", "coordinates", cards, {"G": "G", "GALACTIC": "G", "C": "C", "Q": "C"})
+    if not hp.isnpixok(values.size):
+        raise BadInput(f"{where}: {values.size} pixels are not those of a HEALPix map of the whole sky")
+    nside = hp.npix2nside(values.size)
+    if int(cards.get("NSIDE", nside)) != nside:
+        raise BadInput(f"{where}: NSIDE is {cards['NSIDE']}, {values.size} pixels are of {nside}")
+    model = cosecant()
+    to_a_v = model.r_v if own.quantity == "ebv" else 1.0
+    bad = ~((values >= 0.0) & (values * to_a_v <= _MOST_A_V))
+    if bad.any():
+        row = int(bad.argmax())
+        raise BadInput(f"{where} of row {row + 1} is {values[row]:g} ({bad.sum()} rows like it), no {own.quantity}")
+    _refuse_other_ordering(where, values, ordering)
+    ring = hp.reorder(values, n2r=True) if ordering == "NESTED" else values
+    if nside > model.nside:
+        ring = hp.ud_grade(ring, model.nside)
+    if frame == "C":
+        ra, dec = equatorial(*hp.pix2ang(hp.npix2nside(ring.size), np.arange(ring.size), lonlat=True))
+        ring = hp.get_interp_val(ring, ra, dec, lonlat=True)
+    return np.asarray(to_a_v * ring, np.float32)
+
+
+def _agreed(own: DustMap, card: str, key: str, cards: Mapping[str, Any], names: Mapping[str, str]) -> str:
+    """What header and request say; one of them is enough."""
+    said, wanted = str(cards.get(card, "")).strip().upper(), getattr(own, key)
+    if said and said not in names:
+        raise BadInput(f"{own.file}: {card} is {said!r}, not one of {', '.join(names)}")
+    if said and wanted and names[said] != wanted:
+        raise BadInput(f"{own.file}: {card} is {said!r}, ingest.dust.{key} says {wanted!r}")
+    if not said and not wanted:
+        raise BadInput(f"{own.file}: column {own.column}: no {card} in its header: name it by ingest.dust.{key}")
+    return names[said] if said else str(wanted)
+
+
+def _refuse_other_ordering(where: str, values: Float, ordering: str) -> None:
+    """Dust is smooth: where neighbours differ much less in the other ordering, that is the map's own."""
+    nside = hp.npix2nside(values.size)
+    pixel = np.unique(np.linspace(0, values.size - 1, 20_000).astype(np.int64))
+    step = {}
+    for name, nested in (("RING", False), ("NESTED", True)):
+        around = hp.get_all_neighbours(nside, pixel, nest=nested)
+        step[name] = np.mean(np.abs(np.where(around >= 0, values[around] - values[pixel], 0.0)))
+    other = "RING" if ordering == "NESTED" else "NESTED"
+    if step[other] < _MUCH_SMOOTHER * step[ordering]:
+        raise BadInput(f"{where}: ORDERING is said to be {ordering}, but the map is smooth in {other} only")
 
 
 def _gaussian_field(seed: int, model: Cosecant) -> Float:

@@ -30,6 +30,7 @@ from jobs.catalogue import (
 )
 from jobs.catalogue.band_ratios import BandRatios, Sed
 from jobs.catalogue.emission_lines import LineModel
+from jobs.catalogue.halo_catalogue import LightCone
 from jobs.catalogue.high_redshift import Kind
 from jobs.catalogue.lensing import Planes
 from jobs.catalogue.luminosity_function import Schechter
@@ -94,6 +95,7 @@ def model(
     lensing_nside: int = 512,
     high_redshift_boost: float = 1.0,
     quasar_boost: float = 1.0,
+    light_cone: LightCone | None = None,
 ) -> GalaxyModel:
     """The embedded universe of a seed: its galaxies with I_E < limit and z < z_max.
 
@@ -101,7 +103,7 @@ def model(
     """
     library, colours = templates.galaxy_library(), sed_assignment.colours_model()
     selection = _selection(z_max)
-    population_of = people(seed, limit, z_max, box_cells)
+    population_of = people(seed, limit, z_max, box_cells, light_cone)
     dustiest = colours.dust.highest
     distant = high_redshift.model(high_redshift_boost, quasar_boost)
     return GalaxyModel(
@@ -121,7 +123,7 @@ def model(
     )
 
 
-def people(seed: int, limit: float, z_max: float, box_cells: int) -> Population:
+def people(seed: int, limit: float, z_max: float, box_cells: int, light_cone: LightCone | None = None) -> Population:
     """The halos and galaxies that an I_E < limit can be asked of, before they have colours."""
     nodes, brightest = band_ratios.brightest(_selection(z_max))
 
@@ -129,7 +131,7 @@ def people(seed: int, limit: float, z_max: float, box_cells: int) -> Population:
         return limit + _MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
 
     inverse = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
-    return population.model(seed, box_cells, luminosity_function.volume(z_max), inverse, faintest)
+    return population.model(seed, box_cells, luminosity_function.volume(z_max), inverse, faintest, light_cone)
 
 
 def _selection(z_max: float) -> BandRatios:

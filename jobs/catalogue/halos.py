@@ -113,7 +113,7 @@ def model(
     x = x * density_box.growth(line.z)[:, None]
     field, amplitude = density_box.biased(box.model, x)
     wide = masses.radius(edge[1:])[None, :] / line.edge[:-1, None]
-    level = _levels(wide)
+    level = levels(wide)
     level[edge[None, 1:] < limit[:, None] - depth] = -1
     return HaloModel(
         box=box,
@@ -160,7 +160,8 @@ def draw(halos: HaloModel, seed: int, order: int, cell: int) -> Halos:
     return Halos(index[row], chi[row], log_mass[row], proxy[row], velocity[row], number)
 
 
-def _levels(wide: Float) -> Int:
+def levels(wide: Float) -> Int:
+    """Order of the cells that draw a halo whose radius spans this angle, rad; -1 where it spans more than any."""
     level = np.full(wide.shape, -1)
     for order in sorted(LEVELS):
         level[wide < reach(order)] = order

@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from jobs.catalogue import density_box, halos, matching, satellites
+from jobs.catalogue import density_box, halo_catalogue, halos, matching, satellites
+from jobs.catalogue.halo_catalogue import LightCone
 from jobs.catalogue.halos import LEVELS, HaloModel, Halos
 from jobs.catalogue.luminosity_function import Inverse, Volume
 from jobs.catalogue.matching import Masses
@@ -38,11 +39,12 @@ _KEPT = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Population:
-    """Everything that halos and luminosities are drawn from."""
+    """Everything that halos and luminosities are drawn from; light_cone : halos that take the place of ours."""
 
     seed: int
     halos: HaloModel
     masses: Masses
+    light_cone: LightCone | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,10 +80,13 @@ class Cells:
         """Halos drawn by a cell of a level, and their satellites, wherever these are."""
         place = (order, cell)
         if place not in self.drawn:
-            seed = self.population.seed
-            hosts = halos.draw(self.population.halos, seed, order, cell)
-            rng = stream(seed, "satellites", order, cell)
-            self.drawn[place] = hosts, satellites.draw(self.population.halos, self.population.masses, hosts, rng)
+            people = self.population
+            if people.light_cone is None:
+                hosts = halos.draw(people.halos, people.seed, order, cell)
+            else:
+                hosts = halo_catalogue.draw(people.halos, people.masses, people.light_cone, people.seed, order, cell)
+            rng = stream(people.seed, "satellites", order, cell)
+            self.drawn[place] = hosts, satellites.draw(people.halos, people.masses, hosts, rng)
             if len(self.drawn) > _KEPT:
                 self.drawn.popitem(last=False)
         self.drawn.move_to_end(place)
@@ -89,11 +94,17 @@ class Cells:
 
 
 def model(
-    seed: int, box_cells: int, space: Volume, luminosities: Inverse, faintest: Callable[[Float], Float]
+    seed: int,
+    box_cells: int,
+    space: Volume,
+    luminosities: Inverse,
+    faintest: Callable[[Float], Float],
+    light_cone: LightCone | None = None,
 ) -> Population:
     """The population of a seed.
 
-    faintest : z[n] -> faintest M_r[n] that is wanted; the volume's own limit holds as well
+    faintest   : z[n] -> faintest M_r[n] that is wanted; the volume's own limit holds as well
+    light_cone : halos that take the place of ours
     """
     masses = matching.masses()
     matched = matching.matching(masses, luminosities)
@@ -102,7 +113,8 @@ def model(
         return np.minimum(faintest(z), space.m_faintest)
 
     box = density_box.load(seed, box_cells)
-    return Population(seed, halos.model(box, space.z_min, space.z_max, masses, matched, wanted), masses)
+    drawn_from = halos.model(box, space.z_min, space.z_max, masses, matched, wanted)
+    return Population(seed, drawn_from, masses, light_cone)
 
 
 def halos_of(cells: Cells, cell: int) -> tuple[Halos, Int]:

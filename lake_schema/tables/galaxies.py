@@ -44,7 +44,7 @@ def _component(k: int) -> tuple[Column, ...]:
 
 GALAXIES = Table(
     "galaxies",
-    1,
+    2,
     (
         # 1 identity
         id_of_kinds(0, 4),
@@ -207,6 +207,15 @@ GALAXIES = Table(
         # 10 Milky Way
         Column(
             "a_v", "float32", "mag", "phys.absorption.gal", "extinction A(V) of the Milky Way, R_V = 3.1", 0.0, 40.0
+        ),
+        # Of another catalogue
+        Column(
+            "origin_id",
+            "int64",
+            ucd="meta.id",
+            doc="identifier in the catalogue that the galaxy was taken from; missing where it was drawn here",
+            nullable=True,
+            since=2,
         ),
     ),
     "Galaxies of the True Universe: central, satellite, QSO, high-redshift and strongly lensed.",

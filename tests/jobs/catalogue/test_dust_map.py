@@ -3,10 +3,14 @@ import dataclasses
 import healpy as hp
 import numpy as np
 import pytest
+from astropy.io import fits
 from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.catalogue import dust_map
+from jobs.own_files import DustMap
+from lake_schema import sky
+from lake_schema.errors import BadInput
 
 LAYER = dust_map.layer()
 R_V = 3.1
@@ -71,3 +75,70 @@ def test_extinction_grows_with_distance(total, distance, times, b):
     near, far = dust_map.a_v_at(np.full(2, total), ways, b, LAYER, 0.01)
     assert 0.0 <= near <= far * (1 + 1e-12)
     assert far <= total
+
+
+# ------------------------------------------------------------------------------------------------ maps of others
+
+
+def synthetic_map(nside=64, frame="G"):
+    """E(B-V) that grows towards (l, b) = (40, 30) deg; made up."""
+    lon, lat = hp.pix2ang(nside, np.arange(hp.nside2npix(nside)), lonlat=True)
+    if frame == "C":
+        lon, lat = sky.galactic(lon, lat)
+    return 0.02 + 0.5 * np.exp(-((sky.separation(lon, lat, 40.0, 30.0) / 25.0) ** 2))
+
+
+def written_map(path, values, nest=False, coord="G", **cards):
+    hp.write_map(path, values, nest=nest, coord=coord, column_names=["EBV"], overwrite=True, dtype=np.float64)
+    with fits.open(path, mode="update") as units:
+        for card, value in cards.items():
+            if value is None:
+                del units[1].header[card]
+            else:
+                units[1].header[card] = value
+    return DustMap(path, "EBV")
+
+
+@pytest.mark.parametrize("nest", [False, True])
+@pytest.mark.parametrize("coord", ["G", "C"])
+def test_a_map_of_others_is_read_in_its_ordering_and_coordinates(tmp_path, nest, coord):
+    values = synthetic_map(frame=coord)
+    given = written_map(tmp_path / "map.fits", hp.reorder(values, r2n=True) if nest else values, nest, coord)
+    ra, dec = sky.equatorial(np.array([40.0, 60.0, 200.0]), np.array([30.0, 40.0, -70.0]))
+    expected = 3.1 * (0.02 + 0.5 * np.exp(-((sky.separation(*sky.galactic(ra, dec), 40.0, 30.0) / 25.0) ** 2)))
+    assert dust_map.a_v(dust_map.read(given), ra, dec) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_fine_map_is_averaged(tmp_path, monkeypatch):
+    coarse = dataclasses.replace(dust_map.cosecant(), nside=16)
+    monkeypatch.setattr(dust_map, "cosecant", lambda: coarse)
+    found = dust_map.read(written_map(tmp_path / "map.fits", synthetic_map(64)))
+    assert found.size == hp.nside2npix(16)
+    assert found.mean() == pytest.approx(3.1 * synthetic_map(64).mean(), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("cards", "more", "said"),
+    [
+        ({"ORDERING": "NESTED"}, {}, "smooth in RING only"),
+        ({"ORDERING": "ROUND"}, {}, "ORDERING is 'ROUND'"),
+        ({"ORDERING": None}, {}, "no ORDERING"),
+        ({"COORDSYS": None}, {}, "no COORDSYS"),
+        ({"COORDSYS": "E"}, {}, "COORDSYS is 'E'"),
+        ({}, {"ordering": "NESTED"}, "ORDERING is 'RING', ingest.dust.ordering says 'NESTED'"),
+        ({"NSIDE": 32}, {}, "NSIDE is 32"),
+        ({}, {"column": "TAU"}, "no column TAU"),
+    ],
+)
+def test_a_map_that_is_not_what_it_says(tmp_path, cards, more, said):
+    given = written_map(tmp_path / "map.fits", synthetic_map(), **cards)
+    with pytest.raises(BadInput, match=said):
+        dust_map.read(dataclasses.replace(given, **more))
+
+
+@pytest.mark.parametrize("value", [np.nan, -1.6375e30, -0.1, 500.0])
+def test_a_pixel_that_is_no_dust_is_named(tmp_path, value):
+    values = synthetic_map()
+    values[1234] = value
+    with pytest.raises(BadInput, match=r"map\.fits: column EBV of row 1235 is"):
+        dust_map.read(written_map(tmp_path / "map.fits", values))
