@@ -9,6 +9,7 @@
                        format = "flagship1" | "flagship2" | "euclid" | "skycatalogs"   columns = {ours = theirs, ..}
     [ingest.halos]     files = [..]  columns = {ra, dec, z_true, log_mass, ..}   a halo light-cone instead of ours
     [ingest.dust]      file, column, quantity = "ebv" | "a_v"   a HEALPix map of the Milky Way's dust instead of ours
+    [strong_lenses]  boost   how many times denser than in nature they are drawn
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
     [fluxes]       bands = [..]           default: the bands of the pointings and observations
     [fluxes.passbands.NAME]        your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
@@ -170,6 +171,7 @@ class Request:
     effects: Effects = Effects()
     explore: tuple[tuple[str, tuple[str, ...]], ...] = ()
     ingest: Ingest = _NOTHING_TAKEN
+    strong_lens_boost: float = 1.0
 
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""
@@ -208,7 +210,18 @@ def _one_line(error: Exception) -> str:
 
 def from_table(table: Toml, folder: Path = Path()) -> Request:
     """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
-    sections = {"area", "universe", "stars", "ingest", "mission", "fluxes", "effects", "explore", "products"}
+    sections = {
+        "area",
+        "universe",
+        "stars",
+        "ingest",
+        "strong_lenses",
+        "mission",
+        "fluxes",
+        "effects",
+        "explore",
+        "products",
+    }
     _known(table, "", {"name", "seed", "accuracy", "pointing", "observation", *sections})
     asked, blocks = observations.pointings(table), observations.observations(table)
     fluxes = _section(table, "fluxes", {"bands", "passbands", "templates", "stars", "extinction"})
@@ -231,6 +244,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         effects=_effects(_section(table, "effects", {"on", "off"})),
         explore=_explore(_section(table, "explore", None)),
         ingest=own_files.ingest(_section(table, "ingest", {"galaxies", "halos", "dust"}), folder),
+        strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
     )
     _check_bands(request)
     _check_mission(request)

@@ -206,6 +206,11 @@ _TO_GALACTIC = np.array(
 )
 
 
+def ring_of(order: int, cell: int) -> int:
+    """Number in the RING ordering of a nested cell."""
+    return int(_hp().nest2ring(1 << order, cell))
+
+
 def border_cells(order: int, cell: int, fine: int) -> Int:
     """Cells of the finer order inside `cell` that touch its border, sorted."""
     side = 1 << (fine - order)

@@ -24,10 +24,11 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.passbands import PASSBANDS
     from lake_schema.tables.products import PRODUCTS
     from lake_schema.tables.stars import STARS
+    from lake_schema.tables.strong_lenses import STRONG_LENSES
     from lake_schema.tables.tasks import TASKS
     from lake_schema.tables.templates import TEMPLATES
 
-    catalogues = [HALOS, GALAXIES, STARS, fluxes("galaxy", bands), fluxes("star", bands), GAIA]
+    catalogues = [HALOS, GALAXIES, STRONG_LENSES, STARS, fluxes("galaxy", bands), fluxes("star", bands), GAIA]
     return [*catalogues, TEMPLATES, EXTINCTION_LAWS, PASSBANDS, MISSION, EXPOSURES, TASKS, PRODUCTS]
 
 
