@@ -67,6 +67,7 @@ class Rendered:
     science    : uint16[ny, nx] ADU
     noise_free : float32[ny, nx] expected electrons of the sources alone
     sources    : what was drawn, ascending id
+    sizes      : int[n] sides of their stamps;  drawn : float64[n] electrons of each stamp on the detector
     zero_point : AB magnitude of one electron per second
     complete   : how far beyond the detector every source was known that may reach it, arcsec
     """
@@ -78,6 +79,8 @@ class Rendered:
     science: npt.NDArray[np.uint16]
     noise_free: npt.NDArray[np.float32]
     sources: Sources
+    sizes: stamps.Int
+    drawn: Float
     zero_point: float
     scene: Scene
     decisions: tuple[Decision, ...]
@@ -142,7 +145,8 @@ def render(
         stellar,
     )
     floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
-    noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors)
+    drawn = np.zeros(len(sources))
+    noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors, drawn)
     scene = replace(scene, peak_electrons=float(noise_free.max()))
     frame, decisions = apply_all(
         noise_free,
@@ -159,6 +163,8 @@ def render(
         frame.astype(np.uint16),
         noise_free.astype(np.float32),
         sources,
+        sizes,
+        drawn,
         zero_point,
         scene,
         decisions,

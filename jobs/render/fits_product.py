@@ -1,6 +1,7 @@
 """A rendered detector -> FITS files and rows of the table `products`.
 
 products   rows, and a writer for each file
+truth      rows of the table `rendered_truth`
 science_cards, noise_free_cards
 """
 
@@ -21,7 +22,10 @@ from jobs.render.exposure import Rendered
 from lake_schema import __version__, fits
 from lake_schema.fits import Card
 from lake_schema.tables.products import PRODUCTS
+from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
+# Codes of `method` in the table `rendered_truth`.
+POINT, PROFILE = 0, 1
 _MJD_ZERO = datetime(1858, 11, 17)
 
 Writer = Callable[[Path], None]
@@ -61,6 +65,24 @@ def products(rendered: Rendered, truth: Sequence[str] = ("noise_free",)) -> tupl
         paths[content]: partial(_write, data, cards) for content, (data, cards) in images.items()
     }
     return rows, writers
+
+
+def truth(rendered: Rendered) -> pa.Table:
+    """One row a source that was drawn, ascending id."""
+    sources, n = rendered.sources, len(rendered.sources)
+    return RENDERED_TRUTH.build(
+        {
+            "exposure_id": np.full(n, int(rendered.exposure["exposure_id"]), np.int64),
+            "detector": [rendered.detector.name] * n,
+            "id": sources.ids,
+            "x": sources.column,
+            "y": sources.row,
+            "expected": sources.electrons,
+            "drawn": rendered.drawn,
+            "stamp": rendered.sizes,
+            "method": np.where(sources.shape < 0, POINT, PROFILE),
+        }
+    )
 
 
 def _write(data: npt.NDArray[Any], cards: tuple[Card, ...], path: Path) -> None:

@@ -302,19 +302,26 @@ def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> 
 
 
 @jit
-def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> None:
+def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> Int:
     """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, in units of 1 / FIXED_POINT.
 
     Whole numbers: the sum is the same, bit by bit, in any order.
+    returns : int64[m] what of each stamp fell onto the frame, in the same units
     """
     ny, nx = frame.shape
+    added = np.zeros(len(stamps), np.int64)
     for i in range(len(stamps)):
         left, right = max(0, -x0[i]), min(stamps.shape[2], nx - x0[i])
         for r in range(max(0, -y0[i]), min(stamps.shape[1], ny - y0[i])):
             if left < right:
                 some, out = stamps[i, r, left:right], frame[y0[i] + r, x0[i] + left : x0[i] + right]
+                total = 0
                 for c in range(len(some)):
-                    out[c] += np.int64(np.rint(np.float64(some[c]) * FIXED_POINT))
+                    units = np.int64(np.rint(np.float64(some[c]) * FIXED_POINT))
+                    out[c] += units
+                    total += units
+                added[i] += total
+    return added
 
 
 @jit

@@ -191,11 +191,13 @@ def draw(
     ny: int,
     progress: Callable[[int], None] | None = None,
     floors: Float | None = None,
+    drawn: Float | None = None,
 ) -> Float:
     """Expected electrons of the sources alone.
 
     sizes    : int[n] from stamp_sizes;  floors : float[n] from `floors`, None: nothing is left out
     progress : called now and then with the number of sources drawn
+    drawn    : float64[n] to be filled with what of each source's stamp fell onto the frame, electrons
     returns  : float64[ny, nx], to 5e-7 electrons a source; the same, bit by bit, in any order of the sources
     """
     frame = np.zeros((ny, nx), np.int64)
@@ -221,7 +223,9 @@ def draw(
                 share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
-            _draw_some(frame, sources, chosen, passed, share, bodies, table, cut)
+            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut)
+            if drawn is not None:
+                drawn[chosen] = added / kernel.FIXED_POINT
             done += len(chosen)
             if progress is not None:
                 progress(done)
@@ -238,8 +242,8 @@ def _draw_some(
     bodies: tuple[Array, ...],
     table: Array,
     cut: Float,
-) -> None:
-    """Stamps of one size through one set of planes, onto the frame."""
+) -> Int:
+    """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does."""
     size = passed.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
     x0, y0 = (np.rint(position).astype(np.int64) - size // 2 for position in (column, row))
@@ -250,7 +254,7 @@ def _draw_some(
         zones, passed.planes, some.kx, some.ky, some.runs, some.pieces, some.inner, weights, column - x0, row - y0,
         sources.electrons[chosen], cut[chosen], table, *(part[chosen] for part in bodies),
     )  # fmt: skip
-    kernel.accumulate(frame, scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True), x0, y0)
+    return kernel.accumulate(frame, scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True), x0, y0)
 
 
 def _bodies(sources: Sources) -> tuple[Array, ...]:

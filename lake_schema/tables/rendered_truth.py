@@ -1,0 +1,25 @@
+"""Table `rendered_truth`: what was drawn where, one row a source of a detector."""
+
+from __future__ import annotations
+
+from lake_schema.columns import Column, Table
+
+METHODS = ((0, "a point, through the PSF at its place"), (1, "a profile, convolved with the PSF at its place"))
+
+RENDERED_TRUTH = Table(
+    "rendered_truth",
+    1,
+    (
+        Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure", lo=0),
+        Column("detector", "string", ucd="meta.id;instr.det", doc="detector name"),
+        Column("id", "int64", ucd="meta.id;meta.main", doc="source, as in the catalogues", lo=0),
+        Column("x", "float64", "pix", "pos.cartesian.x;instr.det", "column, 0 = centre of the first pixel"),
+        Column("y", "float64", "pix", "pos.cartesian.y;instr.det", "row, 0 = centre of the first pixel"),
+        Column("expected", "float64", "electron", "phot.count", "expected in the exposure, on and off the detector", 0.0),
+        Column("drawn", "float64", "electron", "phot.count;instr.det", "of its stamp, on the detector"),
+        Column("stamp", "int32", "pix", "instr.fov", "side of the stamp; fainter wings are drawn beyond it", 1),
+        Column("method", "int8", "", "meta.code", "how it was drawn", codes=METHODS),
+    ),
+    "Sources of the rendered images: true places and electrons.",
+    key=("exposure_id", "detector", "id"),
+)
