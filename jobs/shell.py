@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import re
-import resource
 import signal
 import sys
 import threading
@@ -31,6 +30,7 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from jobs import request as requests
+from jobs.measured import Measured
 from lake_schema import __version__, layout, publish, read
 from lake_schema.errors import BadInput, LakeError, PartsFailed
 from lake_schema.provenance import code_version, git_commit
@@ -73,6 +73,7 @@ _RESULT = pa.schema(
         pa.field("rows", pa.int64()),
         pa.field("seconds", pa.float64()),
         pa.field("peak_gb", pa.float64()),
+        pa.field("attempt", pa.int64()),
         pa.field("error", pa.string()),
         pa.field("traceback", pa.string()),
     ]
@@ -161,7 +162,7 @@ def _run(job: Job, step: Step, root: Path, request: requests.Request, verbose: b
     before = layout.version(root, plan.table.name, plan.key).exists()
 
     def mapper(function: Callable[[Part], Json], parts: Sequence[Part]) -> Iterable[Json]:
-        measured = _Measured(function)
+        measured = Measured(function)
         with _bar(root, plan):
             outcome = map(measured, parts) if step.on_driver else _spark_map(measured, parts, job.name, verbose)
             for result in outcome:
@@ -188,19 +189,6 @@ def _summary(version: read.Version, made: int, seconds: float, before: bool) -> 
     note = "already there" if before else f"{version.num_rows / max(seconds, 1e-3):,.0f} rows/s"
     parts = f"{made} of {len(version.parts)} parts made"
     print(f"{version.table:16} {version.num_rows:12,} rows {size / 1e6:10.1f} MB {seconds:8.1f} s   {note}, {parts}")
-
-
-class _Measured:
-    """A part's function with the clock and the memory beside its receipt; crosses to the workers."""
-
-    def __init__(self, function: Callable[[Part], Json]) -> None:
-        self.function = function
-
-    def __call__(self, part: Part) -> Json:
-        started = time.perf_counter()
-        result = self.function(part)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        return {**result, "seconds": time.perf_counter() - started, "peak_gb": peak}
 
 
 class _RunLog:
@@ -323,10 +311,11 @@ def _collect(spark: SparkSession, function: Callable[[Part], Json], parts: Seque
                 last = context is None or context.attemptNumber() >= tries - 1
                 if "error" in result and not result.get("final") and not last:
                     raise RuntimeError(result["error"])
-                row = {field.name: [result.get(field.name)] for field in _RESULT}
+                attempt = 1 if context is None else context.attemptNumber() + 1
+                row = {field.name: [{**result, "attempt": attempt}.get(field.name)] for field in _RESULT}
                 yield pa.RecordBatch.from_pydict(row, _RESULT)
 
-    schema = "part string, rows long, seconds double, peak_gb double, error string, traceback string"
+    schema = "part string, rows long, seconds double, peak_gb double, attempt long, error string, traceback string"
     frame = spark.range(0, len(todo), 1, numPartitions=len(todo)).mapInArrow(run, schema)
     return [{k: v for k, v in row.asDict().items() if v is not None} for row in frame.collect()]
 

@@ -7,7 +7,7 @@ publish   all parts there -> HATS metadata -> manifest -> one rename of the fold
 
 State after a death at any point             what a reader sees        what the next run does
 before the first receipt                     the last version          everything
-between receipts                             the last version          what has no receipt
+between receipts                             the last version          what has no receipt, or not its sha256
 after the last receipt, before the rename    the last version          the metadata and the rename
 after the rename, before the link            the last version          the link
 after the link                               the new version           nothing
@@ -25,12 +25,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from lake_schema import __version__, hats_files, layout, manifest
+from lake_schema import __version__, hats_files, layout, manifest, reuse
 from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
 from lake_schema.layout import current_key
 from lake_schema.manifest import sync
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
-from lake_schema.stage import attempt, border_path, is_done, missing, receipt_of, receipts, write_part
+from lake_schema.stage import attempt, border_path, forget_damaged, is_done, missing, receipt_of, receipts, write_part
 from lake_schema.uniqueness import refuse_duplicates
 
 __all__ = [
@@ -86,6 +86,8 @@ def _refuse_damaged(target: Path, name: str) -> None:
 
 def _make_parts(root: Path, plan: Plan, work: Work, mapper: Mapper) -> None:
     table, stage = plan.table, layout.stage(root, plan.table.name, plan.key)
+    forget_damaged(stage, plan)
+    reuse.take(stage, layout.current(root, table.name), table.name, missing(stage, plan))
     todo = missing(stage, plan)
     failures: dict[str, str] = {}
     function = partial(attempt, root, plan.key, table, plan.facts, work)
@@ -128,7 +130,10 @@ def _finish(stage: Path, plan: Plan) -> None:
             "version": plan.table.version,
             "key": plan.key,
             "facts": dict(plan.facts),
-            "parts": [{"name": part.name, "facts": dict(part.facts)} for part in plan.parts],
+            "parts": [
+                {"name": part.name, "facts": dict(part.facts), **reuse.files_of(part, receipt)}
+                for part, receipt in zip(plan.parts, made, strict=True)
+            ],
             "rows": sum(rows.values()),
             "files": files,
             **deflections,

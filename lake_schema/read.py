@@ -76,6 +76,10 @@ class Version:
         """A part's Parquet file; Damaged where its size or footer is not what the manifest says."""
         return manifest.checked(self.folder, self._entry(part))
 
+    def part_sha256(self, part: str) -> str:
+        """sha256 of a part's Parquet file, as it was published."""
+        return str(self._entry(part)["sha256"])
+
     def part_rows(self, part: str) -> int:
         """Number of rows of a part."""
         return int(self._entry(part)["rows"])

@@ -1,6 +1,6 @@
 """One part of a version: checked, written, hashed, its receipt last.  Everything here runs wherever the map runs it.
 
-A part is done when its receipt is there and its files have the sizes that it says.
+A part is done when its receipt is there and its files have the sizes that it says; where a run begins, their sha256.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import json
 import os
 import traceback
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from lake_schema.columns import Table
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.ids import BLOCK_BITS, kind_of
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
+from lake_schema.provenance import file_sha256
 from lake_schema.validate import check
 
 # A part whose identifiers spread over more blocks than this has none worth noting (order 3 has 1024 of a kind).
@@ -64,8 +66,13 @@ def write_part(stage: Path, table: Table, part: Part, output: Output) -> Json:
         receipt["border"] = _write_file(
             receipts(stage), _flat(part.name), lambda target: parquet.write(target, kept, table)
         )
-    manifest.write_json(_receipt_path(stage, part.name), receipt)
+    write_receipt(stage, receipt)
     return receipt
+
+
+def write_receipt(stage: Path, receipt: Json) -> None:
+    """Put a part's receipt into its place."""
+    manifest.write_json(_receipt_path(stage, receipt["part"]), receipt)
 
 
 def _check_sky(rows: pa.Table, table: Table, part: Part) -> None:
@@ -163,3 +170,20 @@ def is_done(stage: Path, part: Part) -> bool:
 def missing(stage: Path, plan: Plan) -> list[Part]:
     """Parts of the plan that are not done."""
     return [part for part in plan.parts if not is_done(stage, part)]
+
+
+def forget_damaged(stage: Path, plan: Plan) -> None:
+    """Remove the receipts of parts whose files do not have the sha256 that they say."""
+    done = [part for part in plan.parts if is_done(stage, part)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for part, whole in zip(done, pool.map(lambda part: _is_whole(stage, part), done), strict=True):
+            if not whole:
+                _receipt_path(stage, part.name).unlink(missing_ok=True)
+
+
+def _is_whole(stage: Path, part: Part) -> bool:
+    receipt = receipt_of(stage, part.name) or {"files": []}
+    files = [(stage / f["path"], f["sha256"]) for f in receipt["files"]]
+    if "border" in receipt:
+        files.append((receipts(stage) / receipt["border"]["path"], receipt["border"]["sha256"]))
+    return bool(files) and all(file_sha256(path) == sha256 for path, sha256 in files)

@@ -315,7 +315,7 @@ def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> Int:
         for r in range(max(0, -y0[i]), min(stamps.shape[1], ny - y0[i])):
             if left < right:
                 some, out = stamps[i, r, left:right], frame[y0[i] + r, x0[i] + left : x0[i] + right]
-                total = 0
+                total = np.int64(0)
                 for c in range(len(some)):
                     units = np.int64(np.rint(np.float64(some[c]) * FIXED_POINT))
                     out[c] += units

@@ -7,11 +7,13 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
@@ -19,25 +21,30 @@ from jobs.render import exposure, fits_product, focal_plane, selection, stamps, 
 from jobs.render.plan_exposures import PARTS, mission_of, own_filters
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
-from lake_schema import read
+from lake_schema import parquet, read, reuse
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
+from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.published import read_back
-from lake_schema.provenance import canonical
+from lake_schema.provenance import canonical, digest
 from lake_schema.publish import Json, Output, Part, Plan
 from lake_schema.tables.products import PRODUCTS
+from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 # Image types that are of the sky alone.
 IMAGE_TYPES = ("science", "deep")
+# Each with its fluxes.
+CATALOGUES = (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes"))
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """One part a detector of an exposure, the longest first."""
+    """One part a detector of an exposure, the longest first; then what was drawn on each."""
     inputs = {name: read.version(lake, name) for name in INPUTS}
     _refuse_other_plan(inputs, request)
     tasks = inputs["tasks"].rows().to_pylist()
-    _refuse_unrendered(inputs["exposures"].rows(["channel", "image_type"]))
+    exposures = inputs["exposures"].rows()
+    _refuse_unrendered(exposures)
     places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in tasks if task["cells"]}
     for name in ("galaxies", "stars"):
         of_task = [selection.needed(task, _deflection(inputs[name])) for task in places.values()]
@@ -47,14 +54,67 @@ def steps(lake: Path, request: Request) -> list[Step]:
         "mission": mission_of(request.mission).fingerprint,
         "inputs": {name: version.key for name, version in inputs.items()},
     }
+    keys = product_keys(facts, exposures, tasks, inputs, mission_of(request.mission))
     parts = tuple(
         Part(
             f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet",
-            {k: task[k] for k in ("exposure_id", "detector")},
+            {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: key},
+        )
+        for task, key in zip(tasks, keys, strict=True)
+    )
+    plan = Plan(PRODUCTS, facts, parts)
+    drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in parts)
+    return [Step(plan, work), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
+
+
+def product_keys(
+    facts: Json,
+    exposures: pa.Table,
+    tasks: Sequence[Json],
+    inputs: Mapping[str, read.Version],
+    mission: MissionConfiguration,
+) -> list[str]:
+    """Of each task, the digest of everything that shapes its products, and of nothing else.
+
+    facts : of the plan: request, mission, code
+    """
+    flux_facts = inputs["galaxy_fluxes"].manifest["facts"]
+    shared = {
+        **{key: facts[key] for key in ("request", "mission", "code")},
+        "library": [flux_facts.get("files"), flux_facts.get("sources")],
+    }
+    rows = {row["exposure_id"]: row for row in exposures.to_pylist()}
+    files = [(_deflection(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes])) for name, fluxes in CATALOGUES]
+
+    def catalogues(task: Json) -> list[list[tuple[str, str]]]:
+        camera, detector = rows[task["exposure_id"]]["camera"], task["detector"]
+        reach = stamps.reach(focal_plane.detector(camera, detector, mission).pixel_scale)
+        return [
+            sorted({sums for cell in selection.within(task, deflection, reach) for sums in found.get(cell, ())})
+            for deflection, found in files
+        ]
+
+    return [
+        digest(
+            {
+                **shared,
+                "exposure": rows[task["exposure_id"]],
+                "task": {name: task[name] for name in ("detector", "cells", "radius")},
+                "catalogues": catalogues(task) if task["cells"] else [],
+            }
         )
         for task in tasks
-    )
-    return [Step(Plan(PRODUCTS, facts, parts), work)]
+    ]
+
+
+def _files_of_cells(catalogue: read.Version, fluxes: read.Version) -> Mapping[int, list[tuple[str, str]]]:
+    """Generation cell -> sha256 of the files that hold it, of the catalogue and of its fluxes."""
+    found: dict[int, list[tuple[str, str]]] = defaultdict(list)
+    for part in catalogue.manifest["parts"]:
+        sums = catalogue.part_sha256(part["name"]), fluxes.part_sha256(part["name"])
+        for cell in part["facts"]["generation_cells"]:
+            found[cell].append(sums)
+    return found
 
 
 def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> None:
@@ -71,7 +131,7 @@ def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> 
         if facts[name].get("seed") != request.seed:
             seeds = f"seed {facts[name].get('seed')}, the request {request.seed}"
             raise BadInput(f"table {name} has {seeds}: build it first")
-    for fluxes, catalogue in (("galaxy_fluxes", "galaxies"), ("star_fluxes", "stars")):
+    for catalogue, fluxes in CATALOGUES:
         if facts[fluxes].get("input") != inputs[catalogue].key:
             raise BadInput(f"table {fluxes} was computed from another version of {catalogue}: run compute_fluxes first")
         for key, sha256 in filters.get("files", {}).items():
@@ -166,7 +226,22 @@ def work(lake: Path, facts: Json) -> Output:
         forced=own.forced,
         complete=margin + min(complete for *_, complete in found),
     )
-    return Output(*fits_product.products(rendered, request["truth"]))
+    rows, files = fits_product.products(rendered, request["truth"])
+    drawn = fits_product.truth(rendered)
+    name = truth_file(facts["exposure_id"], facts["detector"])
+    return Output(rows, {**files, name: lambda path: parquet.write(path, drawn, RENDERED_TRUTH)})
+
+
+def truth_work(lake: Path, facts: Json) -> Output:
+    """What was drawn on one detector, from beside its images."""
+    products = read.version(lake, "products", facts["products"])
+    (row, *_) = products.rows(["exposure_id", "detector"], [facts["part"]]).to_pylist()
+    return Output(pq.read_table(products.file(truth_file(row["exposure_id"], row["detector"]))))
+
+
+def truth_file(exposure_id: int, detector: str) -> str:
+    """Where a version of `products` keeps what was drawn on a detector."""
+    return f"truth/{exposure_id:06d}/{detector}.parquet"
 
 
 JOB = Job("render_exposures", "Render every planned detector to FITS.", steps)

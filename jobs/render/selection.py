@@ -1,6 +1,7 @@
 """Which catalogue rows a detector needs.
 
 needed     cells of which every source counts
+within     these and whatever cell may matter besides
 beyond     cells that lie farther out, of which the bright sources count
 near       rows within a circle, before any projection
 touching   sources whose stamp overlaps the frame
@@ -36,6 +37,11 @@ def needed(task: Mapping[str, Any], deflection: float) -> list[int]:
     task : ra, dec, radius of the table `tasks`;  deflection : largest of the catalogue, deg
     """
     return _cells(task, deflection)
+
+
+def within(task: Mapping[str, Any], deflection: float, reach: float) -> list[int]:
+    """Order-8 cells of every source whose light may be on the detector; reach : of the largest stamp, arcsec."""
+    return _cells(task, deflection + reach / 3600.0)
 
 
 def beyond(task: Mapping[str, Any], deflection: float, farther: float, drawn: Set[int]) -> tuple[list[int], float]:

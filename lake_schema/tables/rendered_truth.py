@@ -15,7 +15,7 @@ RENDERED_TRUTH = Table(
         Column("id", "int64", ucd="meta.id;meta.main", doc="source, as in the catalogues", lo=0),
         Column("x", "float64", "pix", "pos.cartesian.x;instr.det", "column, 0 = centre of the first pixel"),
         Column("y", "float64", "pix", "pos.cartesian.y;instr.det", "row, 0 = centre of the first pixel"),
-        Column("expected", "float64", "electron", "phot.count", "expected in the exposure, on and off the detector", 0.0),
+        Column("expected", "float64", "electron", "phot.count", "in the exposure, on and off the detector", 0.0),
         Column("drawn", "float64", "electron", "phot.count;instr.det", "of its stamp, on the detector"),
         Column("stamp", "int32", "pix", "instr.fov", "side of the stamp; fainter wings are drawn beyond it", 1),
         Column("method", "int8", "", "meta.code", "how it was drawn", codes=METHODS),

@@ -1,0 +1,68 @@
+"""What an older version already holds is not made twice.
+
+A part whose facts have a PRODUCT, the digest of everything that shapes its bytes, is taken from the version that is
+current where that has the same part of the same product: its files are linked, after their sha256 has been compared.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from lake_schema import manifest
+from lake_schema.errors import Damaged
+from lake_schema.plan import Json, Part
+from lake_schema.provenance import file_sha256
+from lake_schema.stage import write_receipt
+
+PRODUCT = "product"
+
+
+def files_of(part: Part, receipt: Json) -> Json:
+    """What the manifest says of a part that can be used again: its rows and files."""
+    return {"rows": receipt["rows"], "files": [f["path"] for f in receipt["files"]]} if PRODUCT in part.facts else {}
+
+
+def take(stage: Path, current: Path, table: str, parts: Sequence[Part]) -> None:
+    """Give a stage those of the parts that a version has; what is missing or damaged there is made again."""
+    if not any(PRODUCT in part.facts for part in parts) or not current.exists():
+        return
+    try:
+        facts = manifest.load(current.resolve(), table)
+    except Damaged:
+        return
+    entries = {entry["path"]: entry for entry in facts["files"]}
+    there = {entry["name"]: entry for entry in facts["parts"] if "files" in entry}
+    for part in parts:
+        found = there.get(part.name)
+        if found is None or PRODUCT not in part.facts or found["facts"] != part.facts:
+            continue
+        files = [{k: v for k, v in entries[path].items() if k != "rows"} for path in found["files"]]
+        if all(_is_whole(current, entry) for entry in files):
+            for entry in files:
+                _link(current / entry["path"], stage / entry["path"])
+            write_receipt(stage, {"part": part.name, "rows": found["rows"], "files": files})
+
+
+def _is_whole(folder: Path, entry: Json) -> bool:
+    try:
+        return file_sha256(folder / entry["path"]) == str(entry["sha256"])
+    except OSError:
+        return False
+
+
+def _link(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{os.getpid()}.tmp.{target.name}")
+    temporary.unlink(missing_ok=True)
+    try:
+        os.link(source, temporary)
+    except OSError:
+        # A file system without links.
+        shutil.copyfile(source, temporary)
+    os.replace(temporary, target)
+    # Two names of one file: the replacement is then no operation, and leaves the first.
+    temporary.unlink(missing_ok=True)
+    manifest.sync(target.parent)
