@@ -1,143 +1,306 @@
-"""What a task reads: everything near, what is bright farther out, and how far that is all there is."""
+"""The render job on small detectors: what is made, what is made again, and what is not."""
 
-from dataclasses import dataclass, field
+import copy
+import json
+import shutil
+import tomllib
+from collections import Counter
+from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from astropy.io import fits
+from astropy.wcs import WCS
 
-from jobs.accuracy import SURVEY
-from jobs.render import exposure, focal_plane, render_exposures, selection, stamps
-from lake_schema import sky
-from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
-from tests.jobs.render.test_exposure import field as field_of
+from jobs import request as requests
+from jobs import shell
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+from jobs.render import archive, focal_plane, plan_exposures, render_exposures
+from lake_schema import layout, publish, read
+from lake_schema.errors import PartsFailed
+from lake_schema.provenance import file_sha256
 
-BAND, DETECTOR = "lsst_r", small("lsstcam", "R22_S11")
-MARGIN = MISSION.value("survey.selection_margin", "arcsec")
-FARTHER = stamps.reach(DETECTOR.pixel_scale) - MARGIN
-# A giant: in LSST 8e7 electrons, its light far above the noise a few minutes of arc away.
-GIANT = {"disk_half_light_radius": 20.0, "bulge_half_light_radius": 15.0, "bulge_fraction": 1.0,
-         "bulge_sersic_index": 4.0}  # fmt: skip
-
-
-@dataclass
-class Catalogue:
-    """Rows that lie in cells by their true position."""
-
-    rows: pa.Table
-    cells: np.ndarray
-    drawn: set
-    bent: float = 0.0
-    manifest: dict = field(init=False)
-
-    def __post_init__(self):
-        self.schema = self.rows.schema
-        self.manifest = {"parts": [{"facts": {"generation_cells": sorted(self.drawn)}}]}
-
-    def deflection(self):
-        return self.bent
-
-    def in_cells(self, cells, order, columns):
-        assert order == 8
-        return self.rows.filter(pa.array(np.isin(self.cells, cells)))
-
-
-def place():
-    """A place such that what is seen 3 minutes of arc north of the detector lies in cells that are not needed."""
-    for dec in np.arange(-28.0, -27.0, 0.01):
-        task = {"ra": 53.1, "dec": dec, "radius": (DETECTOR.half_diagonal + MARGIN) / 3600}
-        if sky.cell_of([53.1], [dec + 190.0 / 3600], 8)[0] not in selection.needed(task, 0.0):
-            return task
-    raise AssertionError("no such place")
+SIDE = 300
+REQUEST = tomllib.loads("""
+name = "small"
+accuracy = "draft"
+seed = 7
+[area]
+cone = { ra = 53.117, dec = -27.808, radius = 0.03 }
+[universe]
+galaxy_limit = 23.5
+star_limit = 20.0
+box_cells = 192
+lensing_nside = 64
+[fluxes]
+bands = ["lsst_r"]
+[products]
+truth = ["noise_free"]
+[[pointing]]
+channel = "EXT"
+camera = "lsstcam"
+band = "lsst_r"
+ra = 53.117
+dec = -27.808
+centre_on = "R22_S11"
+detectors = ["R22_S11", "R22_S12"]
+mjd = 60905.25
+""")
 
 
-def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
-    """A detector with one galaxy so many arcsec north of its centre, as a task reads it, or as it stands."""
-    task = {"detector": "R22_S11", **place()}
-    ra, dec, angle = focal_plane.boresight_for(DETECTOR, task["ra"], task["dec"], 0.0)
-    exposed = {**field_of("EXT")[1], "ra": ra, "dec": dec, "position_angle": angle}
-    body = galaxies(task["ra"], task["dec"] + distance / 3600, **{**GIANT, **shape})
-    nothing = stars([], [])
-    light = fluxes(body, BAND, flux)
-    complete = 0.0
-    if found:
-        cells = sky.cell_of([task["ra"]], [task["dec"] + distance / 3600], 8)
-        wanted = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist()) if drawn is None else drawn(task)
-        least = exposure.least_flux(exposed, DETECTOR, MISSION, SURVEY)
-        body, light, complete = render_exposures.sources(
-            Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], BAND, FARTHER, least
+@pytest.fixture(scope="module", autouse=True)
+def _small_detectors():
+    """Detectors of LSSTCam cut down to their middles, close together."""
+    listed = focal_plane._listed
+
+    def smaller(section, mission):
+        return tuple(replace(d, nx=SIDE, ny=SIDE, x=d.x / 20, y=d.y / 20) for d in listed(section, mission))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(focal_plane, "_listed", smaller)
+        yield
+
+
+@pytest.fixture(scope="module")
+def catalogues(tmp_path_factory):
+    root = layout.lake(tmp_path_factory.mktemp("render") / "lake")
+    make(root, wanted(), build_galaxies, build_stars, compute_fluxes)
+    return root
+
+
+@pytest.fixture
+def lake(catalogues, tmp_path):
+    """A lake of catalogues and fluxes."""
+    return layout.lake(shutil.copytree(catalogues, tmp_path / "lake", symlinks=True))
+
+
+@pytest.fixture(scope="module")
+def _once(catalogues, tmp_path_factory):
+    root = layout.lake(shutil.copytree(catalogues, tmp_path_factory.mktemp("once") / "lake", symlinks=True))
+    assert render(root, wanted()) == BOTH
+    return root
+
+
+@pytest.fixture
+def rendered(_once, tmp_path):
+    """A lake with the products of `wanted()`."""
+    return layout.lake(shutil.copytree(_once, tmp_path / "rendered", symlinks=True))
+
+
+def wanted(pointings=1, **sections):
+    table = copy.deepcopy({**REQUEST, **sections})
+    table["pointing"] = [{**table["pointing"][0], "mjd": 60905.25 + i} for i in range(pointings)]
+    return requests.from_table(table)
+
+
+def make(root, request, *modules, spy=lambda work: work):
+    for module in modules:
+        for step in module.steps(root, request):
+            publish.make(root, step.plan, spy(step.work))
+
+
+def render(root, request, fail=()):
+    """What was rendered anew: (exposure, detector), and how often."""
+    made = Counter()
+
+    def spy(work):
+        def watched(lake, facts):
+            if work is WORK:
+                made[facts["exposure_id"], facts["detector"]] += 1
+                if facts["detector"] in fail:
+                    raise ValueError("no light")
+            return work(lake, facts)
+
+        return watched
+
+    make(root, request, plan_exposures)
+    if fail:
+        with pytest.raises(PartsFailed, match=r"1 of 2 parts failed: .*ValueError: no light"):
+            make(root, request, render_exposures, spy=spy)
+    else:
+        make(root, request, render_exposures, spy=spy)
+    return made
+
+
+def images(root):
+    version = read.version(root, "products")
+    return {row["path"]: version.file(row["path"]).read_bytes() for row in version.rows().to_pylist()}
+
+
+WORK = render_exposures.work
+BOTH = Counter({(1, "R22_S11"): 1, (1, "R22_S12"): 1})
+
+
+def test_every_planned_detector_has_its_products_and_every_source_its_row(rendered):
+    tasks, products, truth = (read.version(rendered, name).rows() for name in ("tasks", "products", "rendered_truth"))
+    for content in ("science", "noise_free"):
+        rows = products.filter(pc.field("content") == content)
+        assert sorted(rows["detector"].to_pylist()) == sorted(tasks["detector"].to_pylist())
+        for row in rows.to_pylist():
+            assert pc.sum(pc.equal(truth["detector"], row["detector"])).as_py() == row["sources"] > 10
+    version = read.version(rendered, "products")
+    for row in products.filter(pc.field("content") == "noise_free").to_pylist():
+        drawn = truth.filter(pc.field("detector") == row["detector"])
+        ids, x, y, expected, onto = (drawn[c].to_numpy() for c in ("id", "x", "y", "expected", "drawn"))
+        assert (np.diff(ids) > 0).all()
+        with fits.open(version.file(row["path"])) as file:
+            electrons, system = file[0].data.astype(float), WCS(file[0].header)
+        # The image is the sum of the stamps and of wings that are fainter than the noise.
+        assert onto.sum() <= electrons.sum() * (1 + 1e-5)
+        assert onto.sum() > 0.97 * electrons.sum()
+        assert (onto <= expected * 1.001).all()
+        sky = {}
+        for name, ra, dec in (("galaxies", "ra_lensed", "dec_lensed"), ("stars", "ra", "dec")):
+            found = read.version(rendered, name).rows(["id", ra, dec]).to_pydict()
+            sky |= dict(zip(found["id"], zip(found[ra], found[dec], strict=True), strict=True))
+        own = system.all_world2pix([sky[i] for i in ids.tolist()], 0)
+        np.testing.assert_allclose(own, np.stack([x, y], 1), atol=1e-6)
+
+
+def test_a_detector_alone_is_what_it_is_among_others(lake, rendered):
+    among = images(rendered)
+    alone = {**REQUEST["pointing"][0], "detectors": ["R22_S12"]}
+    assert render(lake, wanted(pointing=[alone])) == Counter({(1, "R22_S12"): 1})
+    one = images(lake)
+    assert len(one) == 2
+    assert all(among[path] == data for path, data in one.items())
+
+
+def test_a_bad_detector_is_a_row_and_not_the_end_of_the_run(lake, monkeypatch, tmp_path, capsys):
+    def here(function, parts, *options):
+        return map(function, parts)
+
+    def bad(root, facts):
+        raise ValueError("no light")
+
+    monkeypatch.setattr(shell, "_spark_map", here)
+    make(lake, wanted(), plan_exposures)
+    step, part = render_exposures.steps(lake, wanted())[0], "000001-r22_s11.parquet"
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            render_exposures, "work", lambda root, facts: (bad if facts["detector"] == "R22_S11" else WORK)(root, facts)
         )
-    return exposure.render(
-        task, exposed, body, light, nothing, fluxes(nothing, BAND, 1.0), MISSION, SURVEY, 1, detector=DETECTOR,
-        complete=MARGIN + complete,
-    )  # fmt: skip
+        with pytest.raises(PartsFailed, match=rf"1 of 2 parts failed: {part}: ValueError: no light"):
+            shell.run(render_exposures.JOB, lake, wanted())
+    assert layout.current_key(lake, "products") is None
+    # Planned = made + failed.
+    (failed,) = archive.failures(lake).to_pylist()
+    assert (failed["part"], failed["error"]) == (part, "ValueError: no light")
+    assert failed["seconds"] >= 0
+    assert 0 < failed["peak_gb"] < 100
+    assert len(publish.missing(layout.stage(lake, "products", step.plan.key), step.plan)) == 1
+    # Only what failed is made by the next run, and is then no failure any more.
+    made = []
+    monkeypatch.setattr(render_exposures, "work", lambda root, facts: made.append(facts) or WORK(root, facts))
+    shell.run(render_exposures.JOB, lake, wanted())
+    assert [facts["detector"] for facts in made] == ["R22_S11"]
+    assert archive.failures(lake).num_rows == 0
+    _check_archive(lake, capsys)
 
 
-def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
-    light = []
-    for distance in (60.0, 80.0, 100.0, 150.0, 190.0, 215.0):
-        one, whole = rendered(distance), rendered(distance, found=False)
-        np.testing.assert_array_equal(one.science, whole.science)
-        assert len(one.sources) == 1
-        light.append(float(one.noise_free.sum()))
-    assert (np.diff(light) < 0).all()
-    assert light[-1] > 0
-    assert one.complete == pytest.approx(stamps.reach(0.2), abs=0.5)
+def _check_archive(lake, capsys):
+    version, rows = read.version(lake, "products"), archive.products(lake)
+    for row in rows.to_pylist():
+        assert row["sha256"] == file_sha256(version.file(row["path"]))
+        assert row["bytes"] == version.file(row["path"]).stat().st_size
+        assert row["seconds"] > 0.01
+        assert 0 < row["peak_gb"] < 100
+        assert row["path"] in archive.covering(rows, row["ra"], row["dec"])["path"].to_pylist()
+        # Corners of the footprint are its own; half a degree away there is nothing, nor on the other side of the sky.
+        ra, dec = map(float, row["s_region"].split()[2:4])
+        edge = row["ra"] + (ra - row["ra"]) * 0.999, row["dec"] + (dec - row["dec"]) * 0.999
+        assert row["path"] in archive.covering(rows, *edge)["path"].to_pylist()
+        out = row["ra"] + (ra - row["ra"]) * 1.001, row["dec"] + (dec - row["dec"]) * 1.001
+        assert row["path"] not in archive.covering(rows, *out)["path"].to_pylist()
+    assert archive.covering(rows, 53.117, -27.3).num_rows == 0
+    assert archive.covering(rows, (rows["ra"][0].as_py() + 180) % 360, -rows["dec"][0].as_py()).num_rows == 0
+    capsys.readouterr()
+    query = "select detector from products where content = 'science' order by detector"
+    assert archive.main(["--lake", str(lake), "--sql", query]) == 0
+    assert [json.loads(line)["detector"] for line in capsys.readouterr().out.splitlines()] == ["R22_S11", "R22_S12"]
+    for sql in ("select * from '/etc/passwd'", "selec", "copy products to 'x.csv'", "select * from rows"):
+        assert archive.main(["--lake", str(lake), "--sql", sql]) == 2
+        assert capsys.readouterr().err.startswith("archive: --sql: ")
 
 
-def test_what_lies_beyond_the_reach_or_is_faint_changes_no_byte():
-    empty = rendered(400.0, found=False)
-    assert len(empty.sources) == 0
-    for distance, flux in ((400.0, 1e6), (190.0, 0.1)):
-        one = rendered(distance, flux)
-        np.testing.assert_array_equal(one.science, empty.science)
-        np.testing.assert_array_equal(one.noise_free, empty.noise_free)
+def test_a_staged_image_that_changed_is_rendered_again(lake, rendered):
+    render(lake, wanted(), fail=["R22_S11"])
+    (image,) = layout.table(lake, "products").glob(".stage-*/images/*/*science.fits")
+    data = bytearray(image.read_bytes())
+    data[-5000] ^= 1
+    image.write_bytes(data)
+    assert render(lake, wanted()) == BOTH
+    assert images(lake) == images(rendered)
 
 
-def test_where_the_catalogue_ends_is_said():
-    """With the needed cells alone nothing is refused, but the giant beyond them is not known."""
-    one = rendered(190.0, drawn=lambda task: set(selection.needed(task, 0.0)))
-    assert len(one.sources) == 0
-    assert MARGIN <= one.complete < 190.0 - DETECTOR.half_diagonal
+def test_what_an_older_version_holds_is_not_rendered_again(rendered):
+    lake = rendered
+    first = images(lake)
+    assert render(lake, wanted(pointings=2)) == Counter({(2, "R22_S11"): 1, (2, "R22_S12"): 1})
+    both = images(lake)
+    assert len(both) == 8
+    assert all(both[path] == data for path, data in first.items())
+    assert read.verify(read.version(lake, "products"), deep=True) == []
+    assert read.version(lake, "rendered_truth").num_rows == sum(
+        row["sources"] for row in read.version(lake, "products").rows().to_pylist() if row["content"] == "science"
+    )
+    # The older version may go: what was taken from it stays.
+    publish.gc(lake, "products")
+    assert images(lake) == both
 
 
-@given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(0, 0.05), st.floats(0, 1), st.floats(0, 6.28))
-def test_sources_are_found_however_they_are_deflected(ra, dec, deflection, where, direction):
-    """Seen at the circle's edge or inside it, truly as far out as the deflection allows."""
-    task = {"ra": ra, "dec": dec, "radius": 0.1}
-    distance = where * (task["radius"] + deflection)
-    b = np.radians(dec)
-    d = np.radians(distance)
-    height = np.clip(np.sin(b) * np.cos(d) + np.cos(b) * np.sin(d) * np.cos(direction), -1, 1)
-    turned = np.arctan2(np.sin(direction) * np.sin(d) * np.cos(b), np.cos(d) - np.sin(b) * height)
-    true = (ra + np.degrees(turned)) % 360.0, np.degrees(np.arcsin(height))
-    assert sky.cell_of([true[0]], [true[1]], 8)[0] in selection.needed(task, deflection)
+def test_a_damaged_image_of_an_older_version_is_not_taken(rendered):
+    lake = rendered
+    image = min(layout.current(lake, "products").resolve().glob("images/*/*R22_S12*science.fits"))
+    data = bytearray(image.read_bytes())
+    data[-5000] ^= 1
+    image.write_bytes(data)
+    again = render(lake, wanted(pointings=2))
+    assert again == Counter({(1, "R22_S12"): 1, (2, "R22_S11"): 1, (2, "R22_S12"): 1})
 
 
-@given(st.floats(0, 360, exclude_max=True), st.floats(-89, 89), st.floats(0, 400), st.integers(0, 9))
-def test_completeness_ends_before_the_first_cell_that_is_missing(ra, dec, farther, which):
-    task = {"ra": ra, "dec": dec, "radius": 0.1}
-    near = selection.needed(task, 0.01)
-    drawn = set(sky.cells_in_cone(ra, dec, 0.5, 8).tolist())
-    whole, complete = selection.beyond(task, 0.01, farther, drawn)
-    assert complete == farther
-    assert not set(whole) & set(near)
-    if whole:
-        missing = whole[which % len(whole)]
-        some, complete = selection.beyond(task, 0.01, farther, drawn - {missing})
-        assert set(some) == set(whole) - {missing}
-        assert complete < farther
-        assert missing not in selection.needed({**task, "radius": 0.1 + complete / 3600}, 0.01)
+def keys(root, request, plan=False):
+    """Part -> product key, as a run would have it, after another plan or with the one that is there."""
+    if plan:
+        make(root, request, plan_exposures)
+    return {part.name: part.facts["product"] for part in render_exposures.steps(root, request)[0].plan.parts}
 
 
-def test_the_bound_on_what_shows_holds():
-    """Whatever the profile, a source below the bound is below the edge at that distance."""
-    settings = stamps.settings_for(SURVEY)
-    least = stamps.least_electrons(MARGIN, 0.2, 40.0, settings)
-    for index in (0.5, 1.0, 4.0, 6.0):
-        for radius in (1.0, 10.0, 60.0):
-            form = galaxies(0.0, 0.0, bulge_sersic_index=index, bulge_half_light_radius=radius, bulge_fraction=1.0)
-            surface = stamps.profiles.surface(stamps.profiles.shapes(form), np.array([MARGIN]))[0, 0]
-            assert least * surface * 0.2**2 < settings.edge * 40.0
+def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypatch):
+    there = read.version(rendered, "products").manifest["parts"]
+    assert keys(rendered, wanted()) == {part["name"]: part["facts"]["product"] for part in there}
+    found = [keys(rendered, wanted(**some)) for some in ({}, {"effects": {"off": ["poisson"]}}, {"accuracy": "survey"})]
+    for table in ("galaxies", "galaxy_fluxes", "stars", "star_fluxes"):
+        with monkeypatch.context() as patch:
+            patch.setattr(read.Version, "part_sha256", lambda self, part, name=table: f"{self.table == name}")
+            found.append(keys(rendered, wanted()))
+    with monkeypatch.context() as patch:
+        patch.setattr(shell, "code_version", lambda: "another")
+        found.append(keys(rendered, wanted()))
+    noise = {"ext.lsstcam.read_noise": {"value": 7.0, "unit": "electron"}}
+    found.append(keys(rendered, wanted(mission={"overrides": noise}), plan=True))
+    assert all(len({some[part] for some in found}) == len(found) for part in found[0])
+    # What else is asked for is no part of it.
+    assert found[0].items() < keys(rendered, wanted(pointings=2), plan=True).items()
+
+
+def test_another_mission_makes_everything_again(rendered):
+    before = images(rendered)
+    noise = {"ext.lsstcam.read_noise": {"value": 7.0, "unit": "electron"}}
+    assert render(rendered, wanted(mission={"overrides": noise})) == BOTH
+    for path, data in images(rendered).items():
+        assert ("noise_free" in path) or data != before[path]
+
+
+def test_a_product_is_rebuilt_from_its_own_manifest(rendered, tmp_path):
+    version = read.version(rendered, "products")
+    rebuilt = 0
+    for part in version.manifest["parts"]:
+        output = render_exposures.work(rendered, {**version.manifest["facts"], **part["facts"]})
+        for path, writer in output.files.items():
+            writer(tmp_path / "again")
+            assert file_sha256(tmp_path / "again") == file_sha256(version.file(path))
+            rebuilt += path.endswith(".fits")
+    assert rebuilt == 4

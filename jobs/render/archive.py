@@ -1,0 +1,123 @@
+"""The archive of a lake's images: what there is, of what, made when, with what, and what could not be made.
+
+    python -m jobs.render.archive --lake LAKE [--at RA DEC] [--sql "select .. from products"]
+
+products    the published products, each with its sha256, seconds and peak memory
+failures    detectors that a run could not render
+covering    those products whose footprint holds a place
+
+A product's bytes depend on what it was made of alone; how long that took is in the logs of the runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from jobs.render import focal_plane
+from lake_schema import layout, read
+from lake_schema.errors import BadInput, LakeError
+
+_FAILURES = pa.schema(
+    [
+        pa.field("part", pa.string()),
+        pa.field("error", pa.string()),
+        pa.field("attempt", pa.int64()),
+        pa.field("seconds", pa.float64()),
+        pa.field("peak_gb", pa.float64()),
+        pa.field("run", pa.string()),
+    ]
+)
+
+
+def products(root: Path) -> pa.Table:
+    """Rows of the table `products` with sha256, bytes, seconds (s) and peak_gb (GB), null where no log says so."""
+    version = read.version(root, "products")
+    files = {entry["path"]: entry for entry in version.manifest["files"]}
+    made = {line["part"]: line for line in _lines(root) if "error" not in line}
+    rows = []
+    for part in version.manifest["parts"]:
+        about = made.get(part["name"], {})
+        for row in version.rows(parts=[part["name"]]).to_pylist():
+            measured = {key: about.get(key) for key in ("seconds", "peak_gb")}
+            rows.append({**row, **{key: files[row["path"]][key] for key in ("sha256", "bytes")}, **measured})
+    own = [("sha256", pa.string()), ("bytes", pa.int64()), ("seconds", pa.float64()), ("peak_gb", pa.float64())]
+    return pa.Table.from_pylist(rows, pa.schema([*version.schema, *(pa.field(*column) for column in own)]))
+
+
+def failures(root: Path) -> pa.Table:
+    """Detectors whose last attempt failed: error, attempt, seconds, peak_gb (GB), and the run."""
+    last = {line["part"]: line for line in _lines(root)}
+    failed = [line for _, line in sorted(last.items()) if "error" in line]
+    return pa.Table.from_pylist([{k: line.get(k) for k in _FAILURES.names} for line in failed], _FAILURES)
+
+
+def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
+    """Those of the products whose footprint (STC-S polygon of four corners) holds a place, its edge included."""
+    if not rows.num_rows:
+        return rows
+    corners = np.array([region.split()[2:] for region in rows["s_region"].to_pylist()], float).reshape(-1, 4, 2)
+    lon, lat = np.radians(corners[..., 0]), np.radians(corners[..., 1])
+    edges = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
+    place = focal_plane.basis(ra, dec)[2]
+    # A place is inside where it is on one side of the great circles through all edges, and not at the antipode.
+    side = np.cross(edges, np.roll(edges, -1, axis=1)) @ place
+    inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
+    return rows.filter(pa.array(inside & (edges.sum(axis=1) @ place > 0)))
+
+
+def _lines(root: Path) -> Iterator[dict[str, Any]]:
+    """What the runs' logs say of parts of `products`, oldest first."""
+    for path in sorted(layout.runs(root).glob("*-products-*.jsonl")):
+        for text in path.read_text(encoding="utf-8").splitlines():
+            try:
+                line = json.loads(text)
+            except ValueError:
+                # The last line of a run that was killed.
+                continue
+            if "part" in line:
+                yield {**line, "run": path.stem}
+
+
+def search(rows: pa.Table, sql: str) -> pa.Table:
+    """The answer to a query of the rows, which it calls `products`; it reaches no file."""
+    import duckdb
+
+    with duckdb.connect(
+        config={"enable_external_access": "false", "python_enable_replacements": "false"}
+    ) as connection:
+        connection.register("products", rows)
+        try:
+            return connection.sql(sql).to_arrow_table()
+        except (duckdb.Error, AttributeError) as error:
+            raise BadInput(f"--sql: {' '.join(str(error).split())}") from None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints the products, one JSON object a line; those of a place or of a query where one is given."""
+    parser = argparse.ArgumentParser(prog="python -m jobs.render.archive", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser.add_argument("--at", nargs=2, type=float, metavar=("RA", "DEC"), help="only what holds this place, deg")
+    parser.add_argument("--sql", help="a query of the table products")
+    options = parser.parse_args(argv)
+    try:
+        rows = products(layout.lake(options.lake))
+        rows = rows if options.at is None else covering(rows, *options.at)
+        rows = rows if options.sql is None else search(rows, options.sql)
+    except LakeError as error:
+        print(f"archive: {error}", file=sys.stderr)
+        return 2
+    for row in rows.to_pylist():
+        print(json.dumps(row))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,143 @@
+"""What a task reads: everything near, what is bright farther out, and how far that is all there is."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jobs.accuracy import SURVEY
+from jobs.render import exposure, focal_plane, render_exposures, selection, stamps
+from lake_schema import sky
+from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
+from tests.jobs.render.test_exposure import field as field_of
+
+BAND, DETECTOR = "lsst_r", small("lsstcam", "R22_S11")
+MARGIN = MISSION.value("survey.selection_margin", "arcsec")
+FARTHER = stamps.reach(DETECTOR.pixel_scale) - MARGIN
+# A giant: in LSST 8e7 electrons, its light far above the noise a few minutes of arc away.
+GIANT = {"disk_half_light_radius": 20.0, "bulge_half_light_radius": 15.0, "bulge_fraction": 1.0,
+         "bulge_sersic_index": 4.0}  # fmt: skip
+
+
+@dataclass
+class Catalogue:
+    """Rows that lie in cells by their true position."""
+
+    rows: pa.Table
+    cells: np.ndarray
+    drawn: set
+    bent: float = 0.0
+    manifest: dict = field(init=False)
+
+    def __post_init__(self):
+        self.schema = self.rows.schema
+        self.manifest = {"parts": [{"facts": {"generation_cells": sorted(self.drawn)}}]}
+
+    def deflection(self):
+        return self.bent
+
+    def in_cells(self, cells, order, columns):
+        assert order == 8
+        return self.rows.filter(pa.array(np.isin(self.cells, cells)))
+
+
+def place():
+    """A place such that what is seen 3 minutes of arc north of the detector lies in cells that are not needed."""
+    for dec in np.arange(-28.0, -27.0, 0.01):
+        task = {"ra": 53.1, "dec": dec, "radius": (DETECTOR.half_diagonal + MARGIN) / 3600}
+        if sky.cell_of([53.1], [dec + 190.0 / 3600], 8)[0] not in selection.needed(task, 0.0):
+            return task
+    raise AssertionError("no such place")
+
+
+def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
+    """A detector with one galaxy so many arcsec north of its centre, as a task reads it, or as it stands."""
+    task = {"detector": "R22_S11", **place()}
+    ra, dec, angle = focal_plane.boresight_for(DETECTOR, task["ra"], task["dec"], 0.0)
+    exposed = {**field_of("EXT")[1], "ra": ra, "dec": dec, "position_angle": angle}
+    body = galaxies(task["ra"], task["dec"] + distance / 3600, **{**GIANT, **shape})
+    nothing = stars([], [])
+    light = fluxes(body, BAND, flux)
+    complete = 0.0
+    if found:
+        cells = sky.cell_of([task["ra"]], [task["dec"] + distance / 3600], 8)
+        wanted = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist()) if drawn is None else drawn(task)
+        least = exposure.least_flux(exposed, DETECTOR, MISSION, SURVEY)
+        body, light, complete = render_exposures.sources(
+            Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], BAND, FARTHER, least
+        )
+    return exposure.render(
+        task, exposed, body, light, nothing, fluxes(nothing, BAND, 1.0), MISSION, SURVEY, 1, detector=DETECTOR,
+        complete=MARGIN + complete,
+    )  # fmt: skip
+
+
+def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
+    light = []
+    for distance in (60.0, 80.0, 100.0, 150.0, 190.0, 215.0):
+        one, whole = rendered(distance), rendered(distance, found=False)
+        np.testing.assert_array_equal(one.science, whole.science)
+        assert len(one.sources) == 1
+        light.append(float(one.noise_free.sum()))
+    assert (np.diff(light) < 0).all()
+    assert light[-1] > 0
+    assert one.complete == pytest.approx(stamps.reach(0.2), abs=0.5)
+
+
+def test_what_lies_beyond_the_reach_or_is_faint_changes_no_byte():
+    empty = rendered(400.0, found=False)
+    assert len(empty.sources) == 0
+    for distance, flux in ((400.0, 1e6), (190.0, 0.1)):
+        one = rendered(distance, flux)
+        np.testing.assert_array_equal(one.science, empty.science)
+        np.testing.assert_array_equal(one.noise_free, empty.noise_free)
+
+
+def test_where_the_catalogue_ends_is_said():
+    """With the needed cells alone nothing is refused, but the giant beyond them is not known."""
+    one = rendered(190.0, drawn=lambda task: set(selection.needed(task, 0.0)))
+    assert len(one.sources) == 0
+    assert MARGIN <= one.complete < 190.0 - DETECTOR.half_diagonal
+
+
+@given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(0, 0.05), st.floats(0, 1), st.floats(0, 6.28))
+def test_sources_are_found_however_they_are_deflected(ra, dec, deflection, where, direction):
+    """Seen at the circle's edge or inside it, truly as far out as the deflection allows."""
+    task = {"ra": ra, "dec": dec, "radius": 0.1}
+    distance = where * (task["radius"] + deflection)
+    b = np.radians(dec)
+    d = np.radians(distance)
+    height = np.clip(np.sin(b) * np.cos(d) + np.cos(b) * np.sin(d) * np.cos(direction), -1, 1)
+    turned = np.arctan2(np.sin(direction) * np.sin(d) * np.cos(b), np.cos(d) - np.sin(b) * height)
+    true = (ra + np.degrees(turned)) % 360.0, np.degrees(np.arcsin(height))
+    assert sky.cell_of([true[0]], [true[1]], 8)[0] in selection.needed(task, deflection)
+
+
+@given(st.floats(0, 360, exclude_max=True), st.floats(-89, 89), st.floats(0, 400), st.integers(0, 9))
+def test_completeness_ends_before_the_first_cell_that_is_missing(ra, dec, farther, which):
+    task = {"ra": ra, "dec": dec, "radius": 0.1}
+    near = selection.needed(task, 0.01)
+    drawn = set(sky.cells_in_cone(ra, dec, 0.5, 8).tolist())
+    whole, complete = selection.beyond(task, 0.01, farther, drawn)
+    assert complete == farther
+    assert not set(whole) & set(near)
+    if whole:
+        missing = whole[which % len(whole)]
+        some, complete = selection.beyond(task, 0.01, farther, drawn - {missing})
+        assert set(some) == set(whole) - {missing}
+        assert complete < farther
+        assert missing not in selection.needed({**task, "radius": 0.1 + complete / 3600}, 0.01)
+
+
+def test_the_bound_on_what_shows_holds():
+    """Whatever the profile, a source below the bound is below the edge at that distance."""
+    settings = stamps.settings_for(SURVEY)
+    least = stamps.least_electrons(MARGIN, 0.2, 40.0, settings)
+    for index in (0.5, 1.0, 4.0, 6.0):
+        for radius in (1.0, 10.0, 60.0):
+            form = galaxies(0.0, 0.0, bulge_sersic_index=index, bulge_half_light_radius=radius, bulge_fraction=1.0)
+            surface = stamps.profiles.surface(stamps.profiles.shapes(form), np.array([MARGIN]))[0, 0]
+            assert least * surface * 0.2**2 < settings.edge * 40.0
