@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from jobs import rng
 from jobs.area import Area
-from jobs.observations import CHANNELS, Observation
+from jobs.observations import CHANNELS, IMAGE_TYPES, Observation
 from jobs.render import focal_plane
 from jobs.render.exposing import Exposure, bands_of, exposure_time
 from lake_schema.errors import BadInput
@@ -173,7 +173,8 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
         raise BadInput(f"{path}: larger than {_MOST_BYTES} bytes")
     try:
         with path.open(encoding="utf-8", newline="") as stream:
-            lines = csv.DictReader(line for line in stream if not line.startswith("#"))
+            numbered = [(n, line) for n, line in enumerate(stream, start=1) if not line.startswith("#")]
+            lines = csv.DictReader(line for _, line in numbered)
             names = lines.fieldnames or []
             for name in _COLUMNS:
                 if name not in names:
@@ -185,7 +186,9 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
             for row in lines:
                 if len(found) >= _MOST_ROWS:
                     raise BadInput(f"{path}: more than {_MOST_ROWS} pointings")
-                found.append(_of_row(row, f"{path} line {lines.line_num}", len(found) + 1, block, mission))
+                found.append(
+                    _of_row(row, f"{path} line {numbered[lines.line_num - 1][0]}", len(found) + 1, block, mission)
+                )
     except (UnicodeDecodeError, csv.Error) as error:
         raise BadInput(f"{path}: {' '.join(str(error).split())}") from None
     return found
@@ -197,8 +200,15 @@ def _of_row(
     channel, camera, band = (str(row[name]) for name in ("channel", "camera", "band"))
     if channel not in CHANNELS:
         raise BadInput(f"{where}: channel = {channel!r} is not one of {', '.join(CHANNELS)}")
-    if band not in bands_of(channel, camera, mission):
+    try:
+        bands = bands_of(channel, camera, mission)
+    except BadInput as error:
+        raise BadInput(f"{where}: {error}") from None
+    if band not in bands:
         raise BadInput(f"{where}: camera {camera} has no band {band!r}")
+    image_type = row.get("image_type") or block.image_type
+    if image_type not in IMAGE_TYPES:
+        raise BadInput(f"{where}: image_type = {image_type!r} is not one of {', '.join(IMAGE_TYPES)}")
 
     def number_of(name: str, lo: float, hi: float) -> float:
         try:
@@ -219,7 +229,7 @@ def _of_row(
         channel=channel,
         camera=camera,
         band=band,
-        image_type=row.get("image_type") or block.image_type,
+        image_type=image_type,
         ra=number_of("ra", -360.0, 360.0) % 360.0,
         dec=number_of("dec", -90.0, 90.0),
         position_angle=number_of("position_angle", -360.0, 360.0),

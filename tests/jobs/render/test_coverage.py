@@ -1,0 +1,49 @@
+"""What the survey sees how often, and that every place of a detector counts once."""
+
+import numpy as np
+import pytest
+
+from jobs import request as requests
+from jobs.render import coverage, exposing, focal_plane, tasks
+from jobs.render.plan_exposures import plan
+from lake_schema import sky
+from lake_schema.mission.configuration import resolve
+
+MISSION = resolve()
+
+
+def test_a_footprint_ends_where_the_detector_does():
+    exposure = exposing.Exposure("VIS", "vis", "euclid_vis", "science", 10.0, 85.0, 33.0, 60905.0, 560.0, "x", sky=0.2)
+    rows = tasks.table(
+        exposing.table([exposure], [MISSION]), [("2-5",)], MISSION, tasks.Densities(MISSION, requests.Universe())
+    )
+    detector = focal_plane.detector("vis", "2-5", MISSION)
+    system = focal_plane.wcs(detector, 10.0, 85.0, 33.0)
+    x, y = np.random.default_rng(1).uniform(-500, 4600, (2, 3000))
+    inside = (x > -0.5) & (x < detector.nx - 0.5) & (y > -0.5) & (y < detector.ny - 0.5)
+    assert 0.3 < inside.mean() < 0.95
+    np.testing.assert_array_equal(coverage.counts(rows, *focal_plane.sky_of_pixel(system, x, y)), inside)
+
+
+@pytest.fixture(scope="module")
+def dithers(tmp_path_factory):
+    """Channel -> how often random places in the interior of a request are seen in one band."""
+    area = {"cone": {"ra": 150.0, "dec": 20.0, "radius": 1.4}}
+    block = {"channels": ["VIS", "NISP-P"], "short": False, "flat": False}
+    wanted = requests.from_table({"name": "x", "seed": 7, "area": area, "observation": [block]})
+    _, exposures, rows = plan(tmp_path_factory.mktemp("none"), wanted)
+    seen = {row["exposure_id"] for row in exposures.to_pylist() if row["band"] in ("euclid_vis", "euclid_j")}
+    assert len(seen) > 60
+    rows = rows.filter([i in seen for i in rows["exposure_id"].to_pylist()])
+    rng = np.random.default_rng(2)
+    radius, angle = 0.7 * np.sqrt(rng.random(4000)), 2 * np.pi * rng.random(4000)
+    ra, dec = 150.0 + radius * np.cos(angle) / np.cos(np.radians(20.0)), 20.0 + radius * np.sin(angle)
+    assert sky.separation(ra, dec, 150.0, 20.0).max() < 0.72
+    return {c: coverage.counts(rows.filter([x == c for x in rows["channel"].to_pylist()]), ra, dec)
+            for c in ("VIS", "NISP-P")}  # fmt: skip
+
+
+@pytest.mark.parametrize(("channel", "least"), [("VIS", 0.95), ("NISP-P", 0.88)])
+def test_the_interior_is_seen_three_times(dithers, channel, least):
+    """Scaramella et al. 2022: the dithers fill the gaps between the detectors."""
+    assert (dithers[channel] >= 3).mean() >= least
