@@ -211,7 +211,7 @@ def test_hsc_is_104_ccds_by_rule_of_which_one_is_dead():
     design = resolve(ladder=("DES", "BLT", "CBE", "REQ", "SIM")).rows("ext.hsc.layout")
     measured = np.array([[float(r["x_mm"]), float(r["y_mm"])] for r in design])
     assert len(rule) == 104
-    assert farthest(measured, np.array(rule)) < 0.5
+    assert farthest(measured, np.array(rule)) < 0.066
     assert len(MISSION.rows("ext.hsc.layout")) == 103
 
 

@@ -76,7 +76,7 @@ def test_zero_points(section, band, zero_point):
         *(("ext.lsstcam", f"lsst_{b}", 0.1) for b in "ugrizy"),
         *(("ext.decam", f"des_{b}", 0.25) for b in "griz"),
         *(("ext.megacam", f"cfis_{b}", 0.1) for b in "ur"),
-        ("ext.jpcam", "jedis_g", 0.75),
+        ("ext.jpcam", "jedis_g", 0.70),
         ("ext.gpc1", "ps1_i", 0.15),
         ("ext.hsc", "hsc_z", 0.35),
     ],
