@@ -21,7 +21,7 @@ from jobs.accuracy import Accuracy
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
-from jobs.render import chromatic, exposing, focal_plane, profiles, psf, selection, stamps
+from jobs.render import chromatic, exposing, focal_plane, profiles, psf, selection, stamps, tasks
 from jobs.render.channels import ext, vis
 from jobs.render.effects.effect import Decision, Effect, Scene, apply_all
 from jobs.render.focal_plane import Detector
@@ -57,6 +57,8 @@ GALAXY_COLUMNS = tuple(
     )
 )
 STAR_COLUMNS = ("id", "ra", "dec", *chromatic.STAR_COLUMNS)
+# Memory of a task, bytes: what an executor's core may count on.
+_MOST_BYTES = 2e9
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
 
 
@@ -144,6 +146,7 @@ def render(
         library,
         stellar,
     )
+    _refuse_too_large(exposure, detector, sources, sizes)
     floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
     drawn = np.zeros(len(sources))
     noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors, drawn)
@@ -179,6 +182,18 @@ def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration,
     margin, noise = mission.value("survey.selection_margin", "arcsec"), _scene(exposure, detector, mission).pixel_noise
     least = stamps.least_electrons(margin, detector.pixel_scale, noise, stamps.settings_for(accuracy))
     return least / (_rate(exposure) * float(exposure["exposure_time_s"]))
+
+
+def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes: stamps.Int) -> None:
+    """Before anything is drawn: a task must fit into its memory."""
+    base = tasks.costs()[str(exposure["channel"])].base_gb * 1e9
+    wanted = base + stamps.memory(sources.electrons, sizes, detector.nx, detector.ny)
+    if wanted > _MOST_BYTES:
+        where = f"exposure {exposure['exposure_id']}, detector {detector.name}"
+        raise BadInput(
+            f"{where}: {len(sources)} sources take {wanted / 1e9:.1f} GB, a task has {_MOST_BYTES / 1e9:g}: "
+            "ask for fainter sources to be left out"
+        )
 
 
 def _scene(exposure: Row, detector: Detector, mission: MissionConfiguration) -> Scene:

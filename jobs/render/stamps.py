@@ -10,6 +10,7 @@ settings_for    what an accuracy takes, from the measured table
 stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 reach, least_electrons   how far a source may show, and what it takes to show there
 draw            sources -> frame
+memory          bytes that it takes
 reference       one source by galsim's own drawImage: what `draw` is held against
 """
 
@@ -55,6 +56,10 @@ _BRIGHT = 1e7
 _SHARED = 512
 # For so few the planes are not worth their transforms.
 _FEW = 8
+# Bytes while drawing, measured, of what is drawn to the PSF's last frequency: of a frame's pixel (integers and result),
+# of a pixel of the largest stamp (its plane and transforms) in single and double precision, of a source (its form and
+# weights), of all else (planes of the small stamps).
+_FRAME_BYTES, _STAMP_BYTES, _DOUBLE_BYTES, _SOURCE_BYTES, _OTHER_BYTES = 16, 160, 190, 900, 40_000_000
 # Pixels of stamps that are transformed together.
 _BATCH = 1 << 17
 # What galsim takes for a point in the reference, arcsec.
@@ -231,6 +236,19 @@ def draw(
                 progress(done)
     beyond = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
     return np.asarray(kernel.electrons_of(frame, beyond, wings.BLOCK, wings.MARGIN))
+
+
+def memory(electrons: Float, sizes: Int, nx: int, ny: int) -> float:
+    """Bytes that `draw` takes at its peak on top of its arguments, predicted from the stamps alone.
+
+    Error : the peak is between a third of it and all of it: what is faint is not followed to the last frequency
+    """
+    bright = electrons > _BRIGHT
+    largest = [
+        of * float(sizes[chosen].max(initial=0)) ** 2
+        for of, chosen in ((_STAMP_BYTES, ~bright), (_DOUBLE_BYTES, bright))
+    ]
+    return _FRAME_BYTES * nx * ny + max(largest) + _SOURCE_BYTES * len(sizes) + _OTHER_BYTES
 
 
 def _draw_some(

@@ -216,6 +216,14 @@ def test_draft_is_close_to_survey():
     assert np.abs(fine.noise_free - coarse.noise_free).max() < DRAFT.background * fine.scene.pixel_noise * 2
 
 
+def test_a_scene_that_a_task_has_no_memory_for_is_refused(monkeypatch):
+    """Before anything is drawn; in one line."""
+    monkeypatch.setattr(exposure.stamps, "draw", None)
+    monkeypatch.setattr(exposure.stamps, "memory", lambda *scene: 1.6e9)
+    with pytest.raises(BadInput, match=r"exposure 3, detector 3-4: \d+ sources take 2\.2 GB, a task has 2"):
+        render("VIS")
+
+
 def test_bad_tables_are_refused():
     task, exposed, body, points = field("VIS")
     good = (body, fluxes(body, "euclid_vis", 1.0), points, fluxes(points, "euclid_vis", 1.0))

@@ -1,5 +1,7 @@
 """Drawing: galsim's own drawImage is the reference; angles, fluxes and positions are measured on frames."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
@@ -223,3 +225,31 @@ def test_focal_plane_jacobian_has_the_sign_that_stamps_want():
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 0.0))
     j = focal_plane.jacobian(system, [80.0], [80.0])[0]
     np.testing.assert_allclose(j, np.eye(2) * detector.pixel_scale, atol=1e-5)
+
+
+@pytest.mark.parametrize(("size", "electrons", "side"), [(64, 1e3, 1024), (2048, 1e3, 256), (2048, 1e9, 256)])
+def test_memory_is_what_was_predicted(size, electrons, side):
+    """Compiled code's own buffers are not seen: they are no larger than the stamps."""
+    detector = small("vis", "3-4")
+    system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 0.0))
+    source = one_source(detector, system, electrons, disk_half_light_radius=1.0)
+    spread_out, sizes = spread("vis"), np.array([size])
+    stamps.draw(source, np.array([32]), spread_out, 64, 64)
+    tracemalloc.start()
+    try:
+        stamps.draw(source, sizes, spread_out, side, side)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    predicted = stamps.memory(source.electrons, sizes, side, side)
+    assert peak < predicted, peak
+    assert predicted < 2.0 * peak + 5e7
+
+
+def test_every_scene_that_a_task_takes_has_room():
+    """A whole detector with its 5,000 sources, the largest stamp among them in double precision, beside the rest."""
+    for nx, ny in ((4096, 4132), (4072, 4000)):
+        electrons = np.full(5000, 1e3)
+        electrons[0] = 1e11
+        sizes = np.where(electrons > 1e10, stamps.SIZES[-1], 64)
+        assert 0.6e9 + stamps.memory(electrons, sizes, nx, ny) < 2e9
