@@ -50,7 +50,7 @@ def test_every_cell_runs(field, tmp_path, monkeypatch):
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(NOTEBOOK.parent)}}).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert [output for output in outputs if output.output_type in ("error", "stream")] == []
-    assert sum("image/png" in output.get("data", {}) for output in outputs) == 6
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 8
     taken = Table.read(tmp_path / "redshift_one.fits")
     assert len(taken) > 100
     assert taken["ra"].unit == "deg"
