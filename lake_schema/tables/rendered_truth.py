@@ -17,7 +17,9 @@ RENDERED_TRUTH = Table(
         Column("y", "float64", "pix", "pos.cartesian.y;instr.det", "row, 0 = centre of the first pixel"),
         Column("expected", "float64", "electron", "phot.count", "in the exposure, on and off the detector", 0.0),
         Column("drawn", "float64", "electron", "phot.count;instr.det", "of its stamp, on the detector"),
-        Column("stamp", "int32", "pix", "instr.fov", "side of the stamp; fainter wings are drawn beyond it", 1),
+        Column(
+            "stamp", "int32", "pix", "phys.angSize;instr.det", "side of the stamp; fainter wings are drawn beyond it", 1
+        ),
         Column("method", "int8", "", "meta.code", "how it was drawn", codes=METHODS),
     ),
     "Sources of the rendered images: true places and electrons.",
