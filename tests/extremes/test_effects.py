@@ -85,9 +85,9 @@ def test_no_traps_and_far_beyond_the_end_of_life(age):
 def test_exposure_times_from_nothing_to_a_day(seconds):
     scene = Scene(resolve(), "vis", seconds, 0.25, 1e4)
     assert np.isfinite([effect.margin(scene) for effect in (cosmic_rays.EFFECT, cosmic_rays.READOUT)]).all()
-    (expected,) = cosmic_rays.EFFECT.parameters(scene)
+    expected, quantiles = cosmic_rays.EFFECT.parameters(scene)
     started = time.process_time()
-    image = cosmic_rays.tracks((SIDE, SIDE), expected * (SIDE / 4096) ** 2, np.random.default_rng(1))
+    image = cosmic_rays.tracks((SIDE, SIDE), expected * (SIDE / 4096) ** 2, quantiles, np.random.default_rng(1))
     assert time.process_time() - started < BOUND
     assert (image.sum() > 0) == (seconds > 0)
 

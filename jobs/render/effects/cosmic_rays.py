@@ -10,9 +10,6 @@ tracks                   their charge alone: the truth map
 
 from __future__ import annotations
 
-import csv
-from functools import cache
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -22,30 +19,34 @@ from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
 _SQUARE_CM = 1e-8
+# Quantiles of a track's length (pixels) and charge (electrons).
+_TRACKS = "env.cosmic_rays.vis_tracks"
 # Expected tracks that nobody waits for.
 _FEW = 1e-3
 
 
-def apply(frame: Frame, expected: float, rng: np.random.Generator) -> Frame:
+def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> plus the charge of Poisson(expected) tracks."""
-    return np.asarray(frame + tracks(frame.shape, expected, rng))
+    return np.asarray(frame + tracks(frame.shape, expected, quantiles, rng))
 
 
-def tracks(shape: tuple[int, ...], expected: float, rng: np.random.Generator) -> Frame:
+def tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
     """Charge of cosmic rays [ny, nx], whole e-; `expected` of them in the mean.
+
+    quantiles : [q, 3] probability, length (pixels) and charge (e-) that so many are below; their logarithms are linear
 
     A track that leaves at one edge enters at the other, as its neighbours' tracks do: the density is even.
     """
     out = np.zeros(shape)
     count = _count(expected, rng)
     if out.size:
-        events = _events(count, shape[0], shape[1], rng)
+        events = _events(count, shape[0], shape[1], quantiles, rng)
         _draw(out, events, np.zeros(count, np.int64), shape[0])
     return out
 
 
 def apply_readout(
-    frame: Frame, expected: float, rows: int, prescan: int, columns: int, rng: np.random.Generator
+    frame: Frame, expected: float, quantiles: Frame, rows: int, prescan: int, columns: int, rng: np.random.Generator
 ) -> Frame:
     """quadrants [q, ny, nx] e- in readout order -> plus the tracks that hit while they were read.
 
@@ -56,7 +57,7 @@ def apply_readout(
         count = _count(expected, rng)
         if not rows or not columns:
             continue
-        events = _events(count, rows, columns, rng)
+        events = _events(count, rows, columns, quantiles, rng)
         # Rows read before the hit: the pixel's charge is read that much later.
         before = rng.integers(0, quadrant.shape[0], count)
         _draw(quadrant[:, prescan : prescan + columns], events, before, rows)
@@ -69,24 +70,16 @@ def _count(expected: float, rng: np.random.Generator) -> int:
     return int(rng.poisson(expected))
 
 
-def _events(count: int, ny: int, nx: int, rng: np.random.Generator) -> tuple[Any, ...]:
+def _events(count: int, ny: int, nx: int, quantiles: Frame, rng: np.random.Generator) -> tuple[Any, ...]:
     """Start (x, y), direction, length in pixels, whole electrons.
 
     Length and charge have the same rank, as in Niemi 2015: who crosses more silicon leaves more.
     """
-    chance, length, charge = _quantiles()
+    chance, length, charge = quantiles.T
     angle = 2.0 * np.pi * rng.random(count)
     x, y, rank = nx * rng.random(count), ny * rng.random(count), rng.random(count)
     electrons = np.rint(np.exp(np.interp(rank, chance, np.log(charge))))
     return x, y, np.cos(angle), np.sin(angle), np.exp(np.interp(rank, chance, np.log(length))), electrons
-
-
-@cache
-def _quantiles() -> tuple[Frame, Frame, Frame]:
-    text = (files("jobs.render.effects") / "cosmic_rays.csv").read_text(encoding="utf-8")
-    rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
-    p, length, charge = (np.array([float(row[key]) for row in rows]) for key in ("P", "length_pix", "energy_e"))
-    return p, length, charge
 
 
 @jit
@@ -125,31 +118,50 @@ def rate(scene: Scene, pixels: float) -> float:
     return scene.mission.value("env.cosmic_rays.flux_stardust", "cm-2 s-1") * area
 
 
-def _expected(scene: Scene) -> tuple[float]:
-    pixels = scene.value("fpa.nx", "pix") * scene.value("fpa.ny", "pix")
+def _quantiles(scene: Scene) -> Frame:
+    return np.array(scene.mission.numbers(_TRACKS))
+
+
+def _size(scene: Scene) -> tuple[int, int]:
+    """Columns, rows."""
     if scene.detector is not None:
-        pixels = float(scene.detector.nx * scene.detector.ny)
-    return (rate(scene, pixels) * scene.exposure_time_s,)
+        return scene.detector.nx, scene.detector.ny
+    return int(scene.value("fpa.nx", "pix")), int(scene.value("fpa.ny", "pix"))
 
 
-def _readout(scene: Scene) -> tuple[float, int, int, int]:
-    (pixels,) = _expected(scene)
-    nx, ny = int(scene.value("fpa.nx", "pix")), int(scene.value("fpa.ny", "pix"))
-    if scene.detector is not None:
-        nx, ny = scene.detector.nx, scene.detector.ny
-    rows, columns = ny // 2, nx // 2
-    pixels = rate(scene, float(rows * columns)) * scene.value("readout_time", "s")
-    return pixels, rows, int(scene.value("fpa.prescan", "pix")), columns
+def _expected(scene: Scene) -> float:
+    nx, ny = _size(scene)
+    return rate(scene, float(nx * ny)) * scene.exposure_time_s
 
 
-def _in_a_pixel(expected: float) -> float:
+def _expected_readout(scene: Scene) -> float:
+    nx, ny = _size(scene)
+    return rate(scene, float((nx // 2) * (ny // 2))) * scene.value("readout_time", "s")
+
+
+def _readout(scene: Scene) -> tuple[float, Frame, int, int, int]:
+    nx, ny = _size(scene)
+    return _expected_readout(scene), _quantiles(scene), ny // 2, int(scene.value("fpa.prescan", "pix")), nx // 2
+
+
+def _in_a_pixel(scene: Scene, expected: float) -> float:
     """The median track's charge in a pixel, where there is one."""
-    _, length, charge = _quantiles()
+    _, length, charge = _quantiles(scene).T
     middle = len(length) // 2
     return float(charge[middle] / length[middle]) * (expected > _FEW)
 
 
-EFFECT = Effect("cosmic_rays", apply, _expected, lambda scene: _in_a_pixel(*_expected(scene)), cost=4e-3)
+EFFECT = Effect(
+    "cosmic_rays",
+    apply,
+    lambda scene: (_expected(scene), _quantiles(scene)),
+    lambda scene: _in_a_pixel(scene, _expected(scene)),
+    cost=4e-3,
+)
 READOUT = Effect(
-    "readout_cosmic_rays", apply_readout, _readout, lambda scene: _in_a_pixel(_readout(scene)[0]), cost=4e-3
+    "readout_cosmic_rays",
+    apply_readout,
+    _readout,
+    lambda scene: _in_a_pixel(scene, _expected_readout(scene)),
+    cost=4e-3,
 )

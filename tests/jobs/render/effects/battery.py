@@ -29,10 +29,12 @@ from jobs.render.effects import (
 )
 from jobs.render.effects.effect import Lights
 from jobs.render.effects.traps import Sweeps, Traps
+from lake_schema.mission.configuration import resolve
 
 LIGHTS = Lights(np.array([3.2, 40.0]), np.array([2.0, -30.0]), np.array([1e8, 1e9]))
 END_OF_LIFE = Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
 EMPTY = Traps((0.0,), (1.0,), 2e5, 0.0, 0.58)
+TRACKS = np.array(resolve().numbers("env.cosmic_rays.vis_tracks"))
 PAIRS = np.full((4, 4), 1e-4) - 1e-4 * np.eye(4)
 
 
@@ -88,9 +90,9 @@ CASES = {
     ),
     "dark_current": Case(dark_current.apply, (0.3,), (0.0,), zero=False, whole=True),
     "hot_pixels": Case(dark_current.apply_hot, (0.1, 50.0), (0.0, 50.0), zero=False, whole=True),
-    "cosmic_rays": Case(cosmic_rays.apply, (5.0,), (0.0,), zero=False, whole=True),
+    "cosmic_rays": Case(cosmic_rays.apply, (5.0, TRACKS), (0.0, TRACKS), zero=False, whole=True),
     "readout_cosmic_rays": Case(
-        cosmic_rays.apply_readout, (5.0, 4, 1, 3), (0.0, 4, 1, 3), planes=True, zero=False, whole=True
+        cosmic_rays.apply_readout, (5.0, TRACKS, 4, 1, 3), (0.0, TRACKS, 4, 1, 3), planes=True, zero=False, whole=True
     ),
     "charge_injection": Case(
         charge_injection.apply, (1e4, 2, 2, 0.03, 10.0), (0.0, 2, 2, 0.03, 10.0), zero=False, whole=True
