@@ -23,7 +23,7 @@ EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
 GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes")
 # What each channel can be asked for.
 _CALIBRATIONS = {
-    "VIS": ("bias", "dark", "flat", "self_calibration"),
+    "VIS": ("bias", "dark", "flat", "charge_injection", "self_calibration"),
     "NISP-P": ("dark", "flat", "self_calibration", "standard_star"),
     "NISP-S": ("dark", "flat", "standard_star", "planetary_nebula"),
     "EXT": ("bias", "dark", "flat"),

@@ -21,13 +21,13 @@
     [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
     [[observation]]
         channels = ["VIS", "NISP-P", "NISP-S"] | ["EXT"]
-        image_type = "science" | "deep" | "bias" | "dark" | "flat" | "self_calibration" | "standard_star"
-                     | "planetary_nebula"
+        image_type = "science" | "deep" | "bias" | "dark" | "flat" | "charge_injection" | "self_calibration"
+                     | "standard_star" | "planetary_nebula"
         survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
         pointings = "file.csv"     a table of pointings instead of a survey's pattern
         dither = "S" | "J" | "none"   fields, visits, exposures, short, flat, blue, bands, detectors, mjd,
         exposure_time_s
-    [products]     truth = ["noise_free"]
+    [products]     truth = ["noise_free", "stars", "cosmic_rays", "ghosts", "saturation"]
 
 Files are found from the folder of the request; their formats are in jobs/fluxes/spectrum_formats.toml.
 A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
@@ -81,6 +81,13 @@ TRUTH = tuple(code for code, _ in products.CONTENTS if code != "science")
 DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
+# Of the channels' tuples in jobs/render/channels (a test compares them).
+EFFECTS = (
+    "adc", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp", "charge_injection",
+    "cosmic_rays", "crosstalk", "dark_current", "full_well", "ghosts", "hot_pixels", "illumination", "intra_pixel",
+    "nonlinearity", "parallel_cti", "pixel_response", "poisson", "quadrants", "read_noise", "readout_cosmic_rays",
+    "readout_trail", "serial_cti", "shutter", "straylight",
+)  # fmt: skip
 _NO_FILES = OwnCurves()
 _NOTHING_TAKEN = Ingest()
 
@@ -325,17 +332,10 @@ def _truth(table: Toml) -> tuple[str, ...]:
 
 
 def _effects(table: Toml) -> Effects:
-    legal = effect_names()
-    on, off = (_strings(table, f"effects.{key}", legal) for key in ("on", "off"))
+    on, off = (_strings(table, f"effects.{key}", EFFECTS) for key in ("on", "off"))
     if both := sorted(set(on) & set(off)):
         raise BadInput(f"effects: {both[0]!r} is both on and off")
     return Effects(on, off)
-
-
-def effect_names() -> tuple[str, ...]:
-    """The effects there are: one a file."""
-    folder = Path(__file__).parent / "render" / "effects"
-    return tuple(sorted({path.stem for path in folder.glob("[a-z]*.py")} - {"effect"}))
 
 
 def _explore(table: Toml) -> tuple[tuple[str, tuple[str, ...]], ...]:
@@ -367,8 +367,8 @@ def _choices(key: str, value: object) -> tuple[str, ...]:
         raise BadInput(f"{path} wants a list, got {_shown(value)}")
     if key == "accuracy":
         return tuple(json.dumps(asdict(_accuracy(item, f"{path}[{i}]"))) for i, item in enumerate(value))
-    if key.removeprefix("effects.") not in effect_names():
-        raise BadInput(f"{path} is not one of the effects {', '.join(effect_names())}")
+    if key.removeprefix("effects.") not in EFFECTS:
+        raise BadInput(f"{path} is not one of the effects {', '.join(EFFECTS)}")
     return tuple(json.dumps(_boolean({"x": item}, f"{path}[{i}].x", True)) for i, item in enumerate(value))
 
 

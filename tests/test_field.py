@@ -17,8 +17,12 @@ from scipy.spatial import cKDTree
 from jobs import request, shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import plan_exposures, render_exposures
+from jobs.render import focal_plane, plan_exposures, render_exposures
+from jobs.render.effects import charge_transfer, quadrants
+from jobs.render.effects.effect import Scene
 from lake_schema import layout, read, sky
+from lake_schema.mission.configuration import resolve
+from tests.jobs.render import calibrated
 
 pytestmark = pytest.mark.spark
 
@@ -28,12 +32,18 @@ JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.
 
 @dataclass(frozen=True)
 class Image:
-    """An image with its truth: e-, sky subtracted; sources with 0-based pixel positions and expected e-."""
+    """An image with its truth: e-, sky subtracted; sources with 0-based pixel positions and expected e-.
+
+    bad     : hit by a cosmic ray, or blind
+    delayed : e- that traps took from what lies there, or gave back from what passed, cosmic rays above all
+    """
 
     header: fits.Header
     electrons: np.ndarray
     noise_free: np.ndarray
     variance: np.ndarray
+    bad: np.ndarray
+    delayed: np.ndarray | float
     x: np.ndarray
     y: np.ndarray
     expected: np.ndarray
@@ -64,20 +74,54 @@ def product(field, channel, content):
 @pytest.fixture(scope="session", params=["VIS", "EXT"])
 def image(request, field):
     channel = request.param
-    with fits.open(product(field, channel, "science")) as science:
-        header, adu = science[0].header, science[0].data.astype(float)
+    path = product(field, channel, "science")
+    header = fits.getheader(path)
     noise_free = fits.getdata(product(field, channel, "noise_free")).astype(float)
     diffuse = (header["SKYRATE"] + header["DARKRATE"]) * header["EXPTIME"]
-    electrons = (adu - header["BIAS"]) * header["GAIN"] - diffuse
+    electrons = calibrated_electrons(path, header) - diffuse
+    hit, delayed = np.zeros(noise_free.shape, bool), 0.0
+    if channel == "VIS":
+        charge = fits.getdata(product(field, channel, "cosmic_rays"))
+        hit, held = charge > 0, np.minimum(noise_free + charge, 2e5) + diffuse
+        delayed = trailed(held, header) - held
     variance = noise_free + diffuse + header["RDNOISE"] ** 2 + header["GAIN"] ** 2 / 12
     x, y, expected, is_star = sources(field, header)
     vis = channel == "VIS"
     return Image(
-        header, electrons, noise_free, variance, x, y, expected, is_star,
+        header, np.where(np.isfinite(electrons), electrons, 0.0), noise_free, variance,
+        hit | ~np.isfinite(electrons), delayed, x, y, expected, is_star,
         pixel_scale=0.1 if vis else 0.2,
         aperture=1.3 if vis else 2.0,
         blend=2.0 if vis else 4.0,
     )  # fmt: skip
+
+
+def scene_of(header):
+    mission = resolve()
+    detector = focal_plane.detector("vis", header["DETECTOR"], mission)
+    return Scene(mission, "vis", header["EXPTIME"], header["SKYRATE"], 0.0, detector)
+
+
+def trailed(expected, header):
+    """What traps make of expected charge: it is not lost, it comes later."""
+    scene = scene_of(header)
+    sizes = quadrants.sizes(scene)
+    charge = quadrants.apply(expected, *sizes)
+    for effect in (charge_transfer.PARALLEL, charge_transfer.SERIAL):
+        charge = effect.apply(charge, *effect.parameters(scene))
+    return quadrants.assembled(charge, *sizes)
+
+
+def calibrated_electrons(path, header):
+    """Counted electrons, as a perfect calibration gives them back."""
+    with fits.open(path) as units:
+        if units[0].data is not None:
+            return (units[0].data.astype(float) - header["BIAS"]) * header["GAIN"]
+        raw = np.stack([quadrants.placed(unit.data.astype(np.uint16), i) for i, unit in enumerate(units[1:])])
+    scene = scene_of(header)
+    states = [header[key].split(":") for key in header if key.startswith("EFFECT")]
+    applied = {name for name, state in states if state.split(",")[0].split()[0] == "on"}
+    return calibrated.electrons(raw, scene, int(header["SEED"]), applied)
 
 
 def sources(field, header):
@@ -95,7 +139,8 @@ def sources(field, header):
         x, y = system.all_world2pix(where[ra].to_numpy(), where[dec].to_numpy(), 0)
         microjansky = flux.column(0).to_numpy().astype(float)
         electrons = microjansky / 3631e6 * 10 ** (0.4 * header["ZEROPNT"]) * header["EXPTIME"]
-        inside = (x > -0.5) & (x < header["NAXIS1"] - 0.5) & (y > -0.5) & (y < header["NAXIS2"] - 0.5)
+        nx, ny = (4096, 4132) if header["CHANNEL"] == "VIS" else (header["NAXIS1"], header["NAXIS2"])
+        inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
         found.append((x[inside], y[inside], electrons[inside], np.full(inside.sum(), catalogue == "stars")))
     return (np.concatenate(column) for column in zip(*found, strict=True))
 
@@ -114,7 +159,9 @@ def photometry(image):
     ny, nx = image.electrons.shape
     edge = 2 * radius
     alone &= (image.x > edge) & (image.x < nx - edge) & (image.y > edge) & (image.y < ny - edge)
-    index = np.flatnonzero(alone)
+    # A cosmic ray in the aperture is no fault of the image's.
+    hits = sep.sum_circle(image.bad.astype(float), image.x, image.y, radius, subpix=0)[0]
+    index = np.flatnonzero(alone & (hits == 0))
 
     def aperture(data):
         return sep.sum_circle(np.ascontiguousarray(data), image.x[index], image.y[index], radius, subpix=0)[0]
@@ -128,9 +175,11 @@ def test_bright_unblended_sources_are_found(image, photometry):
     bright = index[truth > 10 * noise]
     assert len(bright) > 300
     sigma = float(np.sqrt(np.median(image.variance)))
-    background = sep.Background(image.electrons, bw=128, bh=128).back()
+    background = sep.Background(image.electrons, mask=image.bad, bw=128, bh=128).back()
     data = image.electrons - background
-    objects = sep.extract(data, 1.5, err=sigma, minarea=5, deblend_cont=0.001, deblend_nthresh=64)
+    objects = sep.extract(
+        data, 1.5, err=sigma, mask=image.bad, minarea=5, deblend_cont=0.001, deblend_nthresh=64
+    )  # fmt: skip
     # Windowed positions, as SExtractor's XWIN_IMAGE: the barycentre of a noisy isophote is a third worse.
     width = 1.5 * image.header["PSFFWHM"] / 2.355 / image.pixel_scale
     x, y, _ = sep.winpos(data, objects["x"], objects["y"], width)
@@ -163,9 +212,9 @@ def test_the_frame_holds_the_light_of_its_sources(image):
 
 
 def test_the_background_is_the_predicted_one(image):
-    empty = image.noise_free < 0.05 * np.sqrt(image.variance)
+    empty = (image.noise_free < 0.05 * np.sqrt(image.variance)) & ~image.bad
     assert empty.mean() > 0.2
-    pixels = (image.electrons - image.noise_free)[empty]
+    pixels = (image.electrons - image.noise_free - image.delayed)[empty]
     noise = np.sqrt(image.variance[empty].mean())
     assert abs(pixels.mean()) < 5 * noise / np.sqrt(empty.sum())
     assert pixels.std() == pytest.approx(noise, rel=0.005)
@@ -182,8 +231,10 @@ def test_files_are_good_fits(field, channel, content):
     header = fits.getheader(path)
     for key in ("EXPTIME", "BUNIT", "SEED", "MISSION", "CTYPE1", "CD1_1", "MJD-OBS", "TRUESKY"):
         assert key in header, key
-    if channel == "VIS":
+    if channel == "VIS" and content == "noise_free":
         assert (header["NAXIS1"], header["NAXIS2"]) == (4096, 4132)
+    elif channel == "VIS":
+        assert [unit.shape for unit in fits.open(path)[1:]] == [(2086, 2128)] * 4
 
 
 def test_other_tools_can_open_the_lake(field):

@@ -23,8 +23,8 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
 _DAY_S = 86400.0
-# Lamps of NISP's calibration unit; the two standard stars (Serrano et al. 2024).
-_NISP_LAMPS = 5
+# Lamps of the calibration units; the two standard stars (Serrano et al. 2024).
+_NISP_LAMPS, _VIS_LAMPS = 5, 6
 _STARS = ("Vega", "white dwarf DA")
 _GRISMS = ("RGS000", "RGS180", "RGS000", "RGS180")
 # From the end of a frame to the start of the next, s: the slowest of the read-outs.
@@ -64,14 +64,14 @@ def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, 
     elif not block.exposures:
         raise BadInput(f"an observation of image_type {first.image_type} wants exposures = how many frames")
     else:
-        lamps = _NISP_LAMPS if first.camera == "nisp" else 1
+        lamps = {"nisp": _NISP_LAMPS, "vis": _VIS_LAMPS}.get(first.camera, 1)
         for i in range(block.exposures):
             lamp = i % lamps + 1 if first.image_type == "flat" else None
             yield replace(in_bands[i % len(in_bands)], lamp=lamp)
 
 
 def _seconds(first: Exposure, band: str, block: Observation, mission: MissionConfiguration) -> float:
-    if first.image_type == "bias":
+    if first.image_type in ("bias", "charge_injection"):
         return 0.0
     if block.exposure_time_s is not None:
         return block.exposure_time_s
@@ -86,7 +86,9 @@ def _bands(first: Exposure, mission: MissionConfiguration) -> tuple[str, ...]:
         return FILTERS[-1:] if first.image_type == "dark" else FILTERS
     if first.channel == "NISP-S":
         return (RED,)
-    return bands_of(first.channel, first.camera, mission)[: 1 if first.image_type in ("bias", "dark") else None]
+    return bands_of(first.channel, first.camera, mission)[
+        : 1 if first.image_type in ("bias", "dark", "charge_injection") else None
+    ]
 
 
 def _targets(

@@ -25,7 +25,7 @@ from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.exposures import EXPOSURES
 
 SKY_TYPES = ("science", "deep", "self_calibration")
-_DARK_TYPES = ("bias", "dark")
+_DARK_TYPES = ("bias", "dark", "charge_injection")
 _EUCLID_BANDS = {
     "VIS": ("euclid_vis",),
     "NISP-P": ("euclid_y", "euclid_j", "euclid_h"),
@@ -65,6 +65,11 @@ class Exposure:
     seeing: float | None = None
     zero_point: float | None = None
     settings: str | None = None
+
+
+def sees_sky(channel: str, image_type: str) -> bool:
+    """Whether sources shine on the detectors; a flat of VIS is taken with its shutter open."""
+    return image_type in SKY_TYPES or (channel, image_type) == ("VIS", "flat")
 
 
 def section(camera: str) -> str:

@@ -7,7 +7,7 @@ sources_of      the rows that touch the detector, as what is drawn
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,14 +21,16 @@ from jobs.accuracy import Accuracy
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
-from jobs.render import chromatic, exposing, focal_plane, profiles, psf, selection, stamps, tasks
+from jobs.render import chromatic, exposing, focal_plane, profiles, psf, selection, stamps, tasks, truth_maps
 from jobs.render.channels import ext, vis
-from jobs.render.effects.effect import Decision, Effect, Scene, apply_all
+from jobs.render.effects import quadrants
+from jobs.render.effects.effect import Decision, Effect, Lights, Scene, apply_all, decide
 from jobs.render.focal_plane import Detector
 from jobs.render.psf import Psf
 from jobs.render.stamps import Settings, Sources
 from lake_schema import units
 from lake_schema.errors import BadInput
+from lake_schema.ids import kind_of
 from lake_schema.mission.configuration import MissionConfiguration
 
 Float = npt.NDArray[np.float64]
@@ -59,15 +61,19 @@ GALAXY_COLUMNS = tuple(
 STAR_COLUMNS = ("id", "ra", "dec", *chromatic.STAR_COLUMNS)
 # Memory of a task, bytes: what an executor's core may count on.
 _MOST_BYTES = 2e9
-EFFECTS: Mapping[str, tuple[Effect, ...]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
+EFFECTS: Mapping[str, Mapping[str, tuple[Effect, ...]]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
+# Electrons of a source that may shine where it is not.
+_LIGHT = 1e6
+# Code of a star in an identifier.
+_STAR = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Rendered:
     """One detector's products before they are files.
 
-    science    : uint16[ny, nx] ADU
-    noise_free : float32[ny, nx] expected electrons of the sources alone
+    raw        : uint16[ny, nx] ADU, or [4, ny, nx] quadrants in readout order with pre- and overscan
+    maps       : truth [ny, nx] by its name: noise_free, and what was asked for besides
     sources    : what was drawn, ascending id
     sizes      : int[n] sides of their stamps;  drawn : float64[n] electrons of each stamp on the detector
     zero_point : AB magnitude of one electron per second
@@ -77,9 +83,9 @@ class Rendered:
     exposure: Row
     detector: Detector
     wcs: WCS
-    psf: Psf
-    science: npt.NDArray[np.uint16]
-    noise_free: npt.NDArray[np.float32]
+    psf: Psf | None
+    raw: npt.NDArray[np.uint16]
+    maps: Mapping[str, npt.NDArray[Any]]
     sources: Sources
     sizes: stamps.Int
     drawn: Float
@@ -89,6 +95,16 @@ class Rendered:
     accuracy: Accuracy
     seed: int
     complete: float
+
+    @property
+    def science(self) -> npt.NDArray[np.uint16]:
+        """uint16[ny, nx] ADU: the pixels alone, in the detector's own axes."""
+        return self.raw if self.raw.ndim == 2 else quadrants.assembled(self.raw, *quadrants.sizes(self.scene))
+
+    @property
+    def noise_free(self) -> npt.NDArray[np.float32]:
+        """float32[ny, nx] expected electrons of the sources alone."""
+        return self.maps["noise_free"]
 
 
 def render(
@@ -108,6 +124,7 @@ def render(
     stellar: Library | None = None,
     passband: Passband | None = None,
     complete: float = 0.0,
+    truth: Sequence[str] = (),
 ) -> Rendered:
     """Render one detector.
 
@@ -119,69 +136,107 @@ def render(
     passband       : the exposure's, None = the embedded one of its name
     detector       : another geometry than the mission's for task["detector"], e.g. a part of it
     complete       : how far beyond the detector the rows have every source, arcsec; for the header
+    truth          : maps that are wanted besides the noise-free one, of lake_schema.tables.products.CONTENTS
     """
     camera, band, channel = str(exposure["camera"]), str(exposure["band"]), str(exposure["channel"])
     passband = passband or passbands.load(band)
-    if channel not in EFFECTS:
-        raise BadInput(f"exposure {exposure['exposure_id']}: channel {channel!r} is not one of {', '.join(EFFECTS)}")
+    effects = effects_of(channel, str(exposure["image_type"]), f"exposure {exposure['exposure_id']}")
     if detector is None:
         detector = focal_plane.detector(camera, str(task["detector"]), mission)
     system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
-    zero_point, scene = float(exposure["zero_point"]), _scene(exposure, detector, mission)
-    electrons = [
-        _fluxes(rows, fluxes, f"f_nu_{band}") * _rate(exposure) * scene.exposure_time_s
-        for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
-    ]
-    settings = stamps.settings_for(accuracy)
-    spread = _psf(detector, passband, float(exposure["seeing"]), mission, settings.positions)
-    sources, sizes = sources_of(
-        (galaxies, electrons[0]),
-        (stars, electrons[1]),
-        detector,
-        system,
-        spread,
-        scene.pixel_noise,
-        settings,
-        passband,
-        library,
-        stellar,
-    )
-    _refuse_too_large(exposure, detector, sources, sizes)
-    floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
-    drawn = np.zeros(len(sources))
-    noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors, drawn)
-    scene = replace(scene, peak_electrons=float(noise_free.max()))
-    frame, decisions = apply_all(
-        noise_free,
-        EFFECTS[channel],
-        scene,
-        lambda name: rng.stream(seed, exposing.identity(exposure), detector.name, name),
-        forced,
-    )
+    zero_point, scene = float(exposure["zero_point"]), _scene(exposure, detector, mission, accuracy)
+    forced = forced or {}
+    decisions: tuple[Decision, ...] = ()
+    spread: Psf | None = None
+    maps: dict[str, npt.NDArray[Any]] = {}
+    sources, sizes, drawn = _no_sources(galaxies), np.zeros(0, np.int64), np.zeros(0)
+    if exposing.sees_sky(channel, str(exposure["image_type"])):
+        light = [
+            _fluxes(rows, fluxes, f"f_nu_{band}") * _rate(exposure) * scene.exposure_time_s
+            for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
+        ]
+        settings = stamps.settings_for(accuracy)
+        spread = _psf(detector, passband, float(exposure["seeing"]), mission, settings.positions)
+        sources, sizes = sources_of(
+            (galaxies, light[0]), (stars, light[1]), detector, system, spread, scene.pixel_noise, settings, passband,
+            library, stellar,
+        )  # fmt: skip
+        _refuse_too_large(exposure, detector, sources, sizes)
+        if channel == "VIS":
+            lights = _lights((galaxies, light[0]), (stars, light[1]), detector, system)
+            peak = float(spread.surface[0]) * float(sources.electrons.max(initial=0.0))
+            scene = replace(scene, lights=lights, peak_electrons=peak)
+            decisions = decide((vis.DRAWN,), scene, forced)
+            if decisions[0].applied:
+                (strength,) = vis.DRAWN.parameters(scene)
+                spread = replace(spread, intra_pixel=strength)
+        floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
+        drawn = np.zeros(len(sources))
+        noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors, drawn)
+        scene = replace(scene, peak_electrons=float(noise_free.max()))
+        if "stars" in truth:
+            of_stars = kind_of(sources.ids) == _STAR
+            maps["stars"] = stamps.draw(
+                sources.take(of_stars), sizes[of_stars], spread, detector.nx, detector.ny, None, floors[of_stars]
+            ).astype(np.float32)
+    else:
+        noise_free = np.zeros((detector.ny, detector.nx))
+
+    def stream(effect: Effect) -> np.random.Generator:
+        # What belongs to the detector is the same in every exposure.
+        what = camera if effect.fixed else exposing.identity(exposure)
+        return rng.stream(seed, what, detector.name, effect.name)
+
+    frame, more = apply_all(noise_free, effects, scene, stream, forced, truth_maps.watch(maps, scene, truth))
+    raw = frame.astype(np.uint16)
+    maps["noise_free"] = noise_free.astype(np.float32)
+    truth_maps.complete(maps, raw, effects, scene, truth)
     return Rendered(
-        exposure,
-        detector,
-        system,
-        spread,
-        frame.astype(np.uint16),
-        noise_free.astype(np.float32),
-        sources,
-        sizes,
-        drawn,
-        zero_point,
-        scene,
-        decisions,
-        accuracy,
-        seed,
-        complete,
-    )
+        exposure, detector, system, spread, raw, maps, sources, sizes, drawn, zero_point, scene, (*decisions, *more),
+        accuracy, seed, complete,
+    )  # fmt: skip
+
+
+def effects_of(channel: str, image_type: str, where: str) -> tuple[Effect, ...]:
+    """The effects of a kind of image, in their order; BadInput where nothing renders it."""
+    if channel not in EFFECTS:
+        raise BadInput(f"{where}: channel {channel!r} is not one of {', '.join(EFFECTS)}")
+    if image_type not in EFFECTS[channel]:
+        raise BadInput(f"{where}: {channel} has no image type {image_type!r}, only {', '.join(EFFECTS[channel])}")
+    return EFFECTS[channel][image_type]
+
+
+def _no_sources(galaxies: pa.Table) -> Sources:
+    none, whole = np.zeros(0), np.zeros(0, np.int64)
+    return Sources(whole, none, none, np.zeros((0, 2, 2)), none, whole, profiles.shapes(galaxies.slice(0, 0)))
+
+
+def _lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], detector: Detector, system: WCS) -> Lights:
+    """Bright sources on the detector and around it, as far as rows were given."""
+    found = []
+    for (rows, electrons), (ra, dec) in ((galaxies, ("ra_lensed", "dec_lensed")), (stars, ("ra", "dec"))):
+        bright = np.flatnonzero(electrons > _LIGHT)
+        chosen = rows.select(["id", ra, dec]).take(bright)
+        column, row = focal_plane.pixel_of_sky(system, chosen[ra].to_numpy(), chosen[dec].to_numpy())
+        found.append((chosen["id"].to_numpy(), column, row, electrons[bright]))
+    ids, column, row, electrons = (np.concatenate(part) for part in zip(*found, strict=True))
+    order = np.argsort(ids)
+    return Lights(column[order], row[order], electrons[order])
 
 
 def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
-    """f_nu of the faintest source that reaches the detector from beyond its selection margin, microjansky."""
-    margin, noise = mission.value("survey.selection_margin", "arcsec"), _scene(exposure, detector, mission).pixel_noise
-    least = stamps.least_electrons(margin, detector.pixel_scale, noise, stamps.settings_for(accuracy))
-    return least / (_rate(exposure) * float(exposure["exposure_time_s"]))
+    """f_nu of the faintest source that reaches the detector from beyond its selection margin, microjansky.
+
+    Infinite where no source shows: in the dark, or in no time.
+    """
+    time = float(exposure["exposure_time_s"])
+    if time == 0.0 or not exposing.sees_sky(str(exposure["channel"]), str(exposure["image_type"])):
+        return float("inf")
+    margin = mission.value("survey.selection_margin", "arcsec")
+    noise = _scene(exposure, detector, mission, accuracy).pixel_noise
+    return stamps.least_electrons(margin, detector.pixel_scale, noise, stamps.settings_for(accuracy)) / (
+        _rate(exposure) * time
+    )
 
 
 def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes: stamps.Int) -> None:
@@ -196,9 +251,12 @@ def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes
         )
 
 
-def _scene(exposure: Row, detector: Detector, mission: MissionConfiguration) -> Scene:
+def _scene(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> Scene:
     """Before anything is drawn."""
-    return Scene(mission, detector.section, float(exposure["exposure_time_s"]), float(exposure["sky"]), 0.0)
+    return Scene(
+        mission, detector.section, float(exposure["exposure_time_s"]), float(exposure["sky"]), 0.0, detector,
+        lamp=int(exposure.get("lamp") or 1), accuracy=accuracy,
+    )  # fmt: skip
 
 
 def _rate(exposure: Row) -> float:

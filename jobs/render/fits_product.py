@@ -1,8 +1,13 @@
-"""A rendered detector -> FITS files and rows of the table `products`.
+"""A rendered detector -> FITS files and rows of the table `products`; and back.
+
+A detector that is read in quadrants is a file of four extensions, each in the detector's own axes with its pre- and
+overscan, behind a header that holds for all of them.
 
 products   rows, and a writer for each file
 truth      rows of the table `rendered_truth`
-science_cards, noise_free_cards
+frame      a science file -> the detector's pixels in one piece, ADU
+electrons  the same less the level of each amplifier's overscan
+science_cards, truth_cards
 """
 
 from __future__ import annotations
@@ -11,13 +16,13 @@ from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.render import focal_plane
+from jobs.render.effects import quadrants
 from jobs.render.exposure import Rendered
 from lake_schema import __version__, fits
 from lake_schema.fits import Card
@@ -36,11 +41,10 @@ def products(rendered: Rendered, truth: Sequence[str] = ("noise_free",)) -> tupl
 
     truth : truth maps that are wanted beside the science image
     """
-    images: dict[str, tuple[npt.NDArray[Any], tuple[Card, ...]]] = {
-        "science": (rendered.science, science_cards(rendered))
-    }
-    if "noise_free" in truth:
-        images["noise_free"] = (rendered.noise_free, noise_free_cards(rendered))
+    images = {"science": _science(rendered)}
+    for content in truth:
+        if content in rendered.maps:
+            images[content] = [fits.Image(rendered.maps[content], truth_cards(rendered, content))]
     exposure, detector = rendered.exposure, rendered.detector
     stem = f"images/{int(exposure['exposure_id']):06d}/{exposure['channel']}_{exposure['band']}_{detector.name}"
     paths = {content: f"{stem}_{content}.fits" for content in images}
@@ -61,9 +65,7 @@ def products(rendered: Rendered, truth: Sequence[str] = ("noise_free",)) -> tupl
             "sources": [len(rendered.sources)] * n,
         }
     )
-    writers: dict[str, Writer] = {
-        paths[content]: partial(_write, data, cards) for content, (data, cards) in images.items()
-    }
+    writers: dict[str, Writer] = {paths[content]: partial(_write, units) for content, units in images.items()}
     return rows, writers
 
 
@@ -85,36 +87,95 @@ def truth(rendered: Rendered) -> pa.Table:
     )
 
 
-def _write(data: npt.NDArray[Any], cards: tuple[Card, ...], path: Path) -> None:
-    fits.write_images(path, [fits.Image(data, cards)])
+def _write(units: Sequence[fits.Image], path: Path) -> None:
+    fits.write_images(path, units)
+
+
+def _science(rendered: Rendered) -> list[fits.Image]:
+    """The image; or a header, and an extension for each quadrant, named as detector.quadrant."""
+    if rendered.raw.ndim == 2:
+        return [fits.Image(rendered.raw, science_cards(rendered))]
+    prescan, overscan, rows = quadrants.sizes(rendered.scene)
+    detector, scans = rendered.detector, (
+        ("PRESCAN", prescan, "[pix] columns before the pixels"),
+        ("OVERSCAN", overscan, "[pix] columns after the pixels"),
+        ("OVERROWS", rows, "[pix] rows after the pixels"),
+    )  # fmt: skip
+    units = [fits.Image(None, (*science_cards(rendered), *scans))]
+    for number, data in enumerate(rendered.raw):
+        # Of the detector's first pixel in the extension, from 0.
+        across, up = quadrants.origin(number, data.shape, prescan, overscan, rows)
+        system = focal_plane.shifted(rendered.wcs, across, up)
+        cards = (("QUADRANT", quadrants.NAMES[number], "quadrant"), *scans, *focal_plane.cards(system))
+        name = f"{detector.name}.{quadrants.NAMES[number]}"
+        units.append(fits.Image(quadrants.placed(data, number), cards, name))
+    return units
+
+
+def frame(path: Path) -> fits.Image:
+    """A science file's pixels [ny, nx], uint16 ADU, without pre- and overscan, with the header of the whole."""
+    read = fits.read_images(path)
+    if read[0].data is not None:
+        return read[0]
+    raw, sizes = _raw(read)
+    return fits.Image(quadrants.assembled(raw, *sizes), read[0].cards)
+
+
+def electrons(path: Path) -> fits.Image:
+    """A science file's pixels [ny, nx], float64 e- above the level of each amplifier."""
+    read = fits.read_images(path)
+    header = {keyword: value for keyword, value, _ in read[0].cards}
+    gain, bias = float(header["GAIN"]), float(header["BIAS"])
+    if read[0].data is not None:
+        return fits.Image((read[0].data - bias) * gain, read[0].cards)
+    raw, (prescan, overscan, rows) = _raw(read)
+    # The last half of the columns after the pixels: charge that traps gave back is in the first.
+    level = raw[:, : raw.shape[1] - rows, raw.shape[2] - max(overscan // 2, 1) :].mean(axis=(1, 2), keepdims=True)
+    above = quadrants.assembled((raw - level) * gain, prescan, overscan, rows)
+    return fits.Image(above, read[0].cards)
+
+
+def _raw(read: Sequence[fits.Image]) -> tuple[npt.NDArray[np.uint16], tuple[int, int, int]]:
+    """Quadrants in readout order; prescan, overscan, overscan rows."""
+    header = {keyword: value for keyword, value, _ in read[0].cards}
+    raw = np.stack([quadrants.placed(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
+    return raw, (int(header["PRESCAN"]), int(header["OVERSCAN"]), int(header["OVERROWS"]))
 
 
 def science_cards(rendered: Rendered) -> tuple[Card, ...]:
     """Header of the science image: what an astronomer needs to calibrate it, and what made it."""
     scene = rendered.scene
     gain = scene.value("gain", "electron / adu")
-    dark = scene.value("dark_current", "electron / (s pix)")
-    applied = {decision.name: decision.applied for decision in rendered.decisions}
+    applied = {decision.name for decision in rendered.decisions if decision.applied}
     return (
         *_common(rendered),
         ("BUNIT", "adu", "unit of the pixels"),
         ("GAIN", gain, "[electron/adu]"),
         (
             "RDNOISE",
-            applied["read_noise"] * scene.value("read_noise", "electron"),
+            ("read_noise" in applied) * scene.value("read_noise", "electron"),
             "[electron] rms in the image",
         ),
         ("BIAS", scene.value("bias", "adu"), "[adu] added to every pixel"),
         ("SATURATE", _saturation(rendered, gain), "[adu] largest value"),
-        ("SKYRATE", applied["background"] * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
-        ("DARKRATE", applied["dark_current"] * dark, "[electron/s/pix] mean dark current in the image"),
+        ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
+        ("DARKRATE", ("dark_current" in applied) * scene.dark_rate, "[electron/s/pix] mean dark current in the image"),
         *_effect_cards(rendered),
     )
 
 
-def noise_free_cards(rendered: Rendered) -> tuple[Card, ...]:
-    """Header of the truth image: expected electrons of the sources in the exposure, no sky, no detector."""
-    return (*_common(rendered), ("BUNIT", "electron", "unit of the pixels: expected, sources alone"))
+_TRUTH = {
+    "noise_free": ("electron", "unit of the pixels: expected, sources alone"),
+    "stars": ("electron", "unit of the pixels: expected, stars alone"),
+    "cosmic_rays": ("electron", "unit of the pixels: of cosmic rays"),
+    "ghosts": ("electron", "unit of the pixels: expected, ghosts alone"),
+    "saturation": ("", "1 where a pixel or the converter is full"),
+}
+
+
+def truth_cards(rendered: Rendered, content: str) -> tuple[Card, ...]:
+    """Header of a truth map: what one thing adds to the exposure, before the rest of the detector."""
+    return (*_common(rendered), ("BUNIT", *_TRUTH[content]))
 
 
 def _common(rendered: Rendered) -> tuple[Card, ...]:
@@ -133,7 +194,7 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         *focal_plane.cards(rendered.wcs),
         ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] at the boresight"),
         ("ZEROPNT", rendered.zero_point, "[mag] AB of 1 electron/s"),
-        ("PSFFWHM", rendered.psf.fwhm, "[arcsec] of a point source, pixel included"),
+        ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] of a point source, pixel included"),
         ("SEEING", float(exposure["seeing"]), "[arcsec] FWHM of the atmosphere"),
         ("NSOURCES", len(rendered.sources), "number of sources drawn"),
         ("SRCREACH", rendered.complete, "[arcsec] beyond the detector: sources complete"),

@@ -301,6 +301,14 @@ def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
     )
 
 
+def shifted(system: WCS, columns: float, rows: float) -> WCS:
+    """The same sky on a frame in which every pixel lies so many columns and rows farther on."""
+    out = system.deepcopy()
+    out.wcs.crpix = [out.wcs.crpix[0] + columns, out.wcs.crpix[1] + rows]
+    out.wcs.set()
+    return out
+
+
 def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
     """The world coordinate system that `cards` wrote."""
     values = {keyword: value for keyword, value, _ in header}

@@ -241,13 +241,13 @@ def _interpolate(sersic: Float32, row: int, row_weights: Float, least: float, mo
 def take(spectrum: npt.NDArray[Any], runs: Int, pixel: Float, out: npt.NDArray[Any]) -> None:
     """Fills out [2, s] with the samples of transfer.Grid.runs: real and imaginary part of spectrum times pixel.
 
-    spectrum : complex[iy, ix], ix >= 0 of a real image;  pixel : [k] its transform along an axis
+    spectrum : complex[iy, ix], ix >= 0 of a real image;  pixel : [|iy|, |ix|] the pixel's own transform
     """
     for j in range(len(runs) - 1):
         start, left, iy = runs[j]
         for c in range(runs[j + 1, 0] - start):
             ix = left + c
-            through = pixel[abs(ix)] * pixel[abs(iy)]
+            through = pixel[abs(iy), abs(ix)]
             # What lies to the left of kx = 0 is the mirror image's conjugate.
             sample = spectrum[iy, ix] if ix >= 0 else spectrum[-iy, -ix]
             out[0, start + c] = through * sample.real

@@ -1,7 +1,7 @@
 """Pictures of rendered images: asinh stretch, the brightest sources labelled, scale bar, compass, close-ups.
 
 picture     one image -> a PNG
-previews    every science image of a lake -> PNGs
+previews    every science image of a lake -> PNGs, without the cosmic rays whose truth the lake has
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from astropy.wcs import WCS
 
-from jobs.render import focal_plane
+from jobs.render import fits_product, focal_plane
 from lake_schema import fits, read, sky, units
 from lake_schema.fits import Card
 from lake_schema.ids import GENERATION_ORDER
@@ -29,6 +29,8 @@ _OVERVIEW = 1000
 _LABELS, _CLOSE_UPS = 8, 3
 # Height, and width / height.
 _CLOSE_UP_ARCSEC, _CLOSE_UP_SHAPE = 14.0, 1.145
+# Pixels on each side that mend a cosmic ray.
+_MEND = 2
 # Pixels that tell sky and noise of a whole image.
 _STRIDE = 8
 # Black this many sigma below the sky; the stretch turns from linear to logarithmic at _KNEE sigma; white at
@@ -56,14 +58,38 @@ class Label:
 def previews(root: Path, out: Path) -> list[Path]:
     """A PNG beside each other in `out` for every science image of the lake; returns their paths."""
     version = read.version(root, "products")
-    made = []
-    for row in version.rows().to_pylist():
+    made, rows = [], version.rows().to_pylist()
+    hits = {_frame_of(row): version.file(row["path"]) for row in rows if row["content"] == "cosmic_rays"}
+    for row in rows:
         if row["content"] == "science":
-            (image,) = fits.read_images(version.file(row["path"]))
+            image = fits_product.electrons(version.file(row["path"]))
+            if _frame_of(row) in hits:
+                (truth,) = fits.read_images(hits[_frame_of(row)])
+                image = fits.Image(_mended(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
             path = out / f"{row['channel']}_{row['band']}_{row['detector']}_{row['exposure_id']}.png".lower()
             picture(path, np.asarray(image.data), image.cards, labels(root, row, image))
             made.append(path)
     return made
+
+
+def _frame_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    return row["exposure_id"], row["detector"]
+
+
+def _mended(image: Float, hit: npt.NDArray[np.bool_]) -> Float:
+    """Pixels that cosmic rays hit take the median of those around them that none did."""
+    rows, columns = np.nonzero(hit)
+    whole = np.where(hit, np.nan, image)
+    step = np.arange(-_MEND, _MEND + 1)
+    r = np.clip(rows[:, None, None] + step[:, None], 0, image.shape[0] - 1)
+    c = np.clip(columns[:, None, None] + step, 0, image.shape[1] - 1)
+    around = np.sort(whole[r, c].reshape(len(rows), step.size**2), axis=1)
+    # Sorted, what is missing comes last.
+    count = np.isfinite(around).sum(axis=1)
+    middle = around[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
+    out = image.copy()
+    out[rows, columns] = np.where(count > 0, middle, image[rows, columns])
+    return out
 
 
 def labels(root: Path, product: dict[str, Any], image: fits.Image) -> list[Label]:
@@ -105,7 +131,7 @@ def _labels_of(kind: str, rows: pa.Table, flux: Float, position: tuple[str, str]
 def picture(path: Path, image: npt.NDArray[Any], cards: Sequence[Card], names: Sequence[Label]) -> None:
     """Draw one image.
 
-    image : [ny, nx] ADU;  cards : its header;  names : sources, brightest first
+    image : [ny, nx] electrons or ADU;  cards : its header;  names : sources, brightest first
     """
     # A canvas of its own: no window system, and no state shared with a caller's figures.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -176,7 +202,7 @@ def _levels(image: npt.NDArray[Any]) -> tuple[float, float]:
 
 
 def _stretched(image: npt.NDArray[Any], level: float, noise: float) -> Float:
-    """ADU -> 0 .. 1 by asinh."""
+    """Electrons or ADU -> 0 .. 1 by asinh."""
     signal = np.clip((image - level) / noise, _BLACK, _WHITE)
     lo, hi = np.arcsinh(_BLACK / _KNEE), np.arcsinh(_WHITE / _KNEE)
     return np.asarray((np.arcsinh(signal / _KNEE) - lo) / (hi - lo))

@@ -80,6 +80,7 @@ class Psf:
     outside     : float64[SIDE / 2] fraction of the flux beyond r pixels
     fwhm        : arcsec, pixel included
     planes      : by wavelength and place; None where `profile` is all
+    intra_pixel : how much less a pixel's edges see than its centre (effects/intra_pixel), 0 = nothing
     """
 
     profile: galsim.GSObject
@@ -88,6 +89,7 @@ class Psf:
     outside: Float
     fwhm: float
     planes: Planes | None = None
+    intra_pixel: float = 0.0
 
 
 def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = len(_NODES)) -> Psf:

@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -31,8 +32,6 @@ from lake_schema.publish import Json, Output, Part, Plan
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
-# Image types that are of the sky alone.
-IMAGE_TYPES = ("science", "deep")
 # Each with its fluxes.
 CATALOGUES = (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes"))
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
@@ -142,7 +141,7 @@ def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> 
 def _refuse_unrendered(exposures: pa.Table) -> None:
     """Every exposure must be of a kind that has a simulator."""
     for row in exposures.group_by(["channel", "image_type"]).aggregate([([], "count_all")]).to_pylist():
-        if row["channel"] not in exposure.EFFECTS or row["image_type"] not in IMAGE_TYPES:
+        if row["image_type"] not in exposure.EFFECTS.get(row["channel"], {}):
             kind = f"{row['channel']} {row['image_type']}"
             raise BadInput(
                 f"no simulator renders {kind} yet: {row['count_all']} exposures; leave them out of the request"
@@ -179,11 +178,15 @@ def sources(
     """(rows of a catalogue that a task may draw, their fluxes, how far beyond the task's circle they are complete).
 
     farther : how far beyond the circle a source may be seen and reach the detector, arcsec
-    least   : microjansky, of sources beyond the cells of the circle
+    least   : microjansky, of sources beyond the cells of the circle; infinite where no source at all shows
     """
     deflection, flux = _deflection(catalogue), ["id", f"f_nu_{band}"]
-    near = selection.needed(task, deflection)
-    far, complete = selection.beyond(task, deflection, farther, _drawn(catalogue))
+    near: list[int] = []
+    far: list[int] = []
+    complete = farther
+    if np.isfinite(least):
+        near = selection.needed(task, deflection)
+        far, complete = selection.beyond(task, deflection, farther, _drawn(catalogue))
     rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
     if far:
         more, bright = (v.in_cells(far, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
@@ -225,6 +228,7 @@ def work(lake: Path, facts: Json) -> Output:
         passband=passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], str(exposed["band"])),
         forced=own.forced,
         complete=margin + min(complete for *_, complete in found),
+        truth=request["truth"],
     )
     rows, files = fits_product.products(rendered, request["truth"])
     drawn = fits_product.truth(rendered)

@@ -25,7 +25,9 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
 _DEEP = ("edf_north", "edf_south", "edf_fornax")
-_CALIBRATION = ("bias", "dark", "flat", "self_calibration", "standard_star", "planetary_nebula")
+_CALIBRATION = (
+    "bias", "dark", "flat", "charge_injection", "self_calibration", "standard_star", "planetary_nebula"
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

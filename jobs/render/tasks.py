@@ -18,7 +18,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.render import focal_plane
-from jobs.render.exposing import SKY_TYPES
+from jobs.render.exposing import sees_sky
 from jobs.request import Universe
 from lake_schema import layout, sky
 from lake_schema.errors import BadInput
@@ -172,7 +172,7 @@ def _append(
     columns: dict[str, list[Any]], row: Row, wanted: tuple[str, ...], camera: _Camera, places: _Places, maps: int
 ) -> None:
     cost = costs()[row["channel"]]
-    looks = row["image_type"] in SKY_TYPES
+    looks = sees_sky(row["channel"], row["image_type"])
     for i in [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors)):
         sources = int(np.ceil(places.density[i] * camera.area[i])) if looks else 0
         pixels = int(camera.pixels[i])

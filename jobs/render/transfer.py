@@ -22,6 +22,7 @@ import scipy.signal
 from scipy.ndimage import maximum
 
 from jobs.render import kernel
+from jobs.render.effects import intra_pixel
 from jobs.render.psf import SAMPLES, SIDE, Planes, Psf, galsim_profile, spectrum_of
 
 Float = npt.NDArray[np.float64]
@@ -129,7 +130,7 @@ def passing(psf: Psf) -> Float:
         # A smooth edge: a sharp one passes some of every frequency.
         window = scipy.signal.windows.hann(SAMPLES * _PROBE + 1).astype(np.float32)
         middle = _middle(psf.planes.images, SAMPLES * _PROBE)
-        planes = _on_grid(list(middle * window[:, None] * window), probe, np.float32)
+        planes = _on_grid(list(middle * window[:, None] * window), probe, psf.intra_pixel, np.float32)
     modulus = np.hypot(planes[:, 0], planes[:, 1]).max(axis=0)
     ring = (np.hypot(probe.kx, probe.ky) / STEP).astype(int)
     rings = np.asarray(maximum(modulus, ring, np.arange(ring.max() + 1)), float)
@@ -151,7 +152,7 @@ def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any]) -> Transfe
     if psf.planes is None:
         return Transfer(some, _planes(psf, some, dtype))
     image = _image(psf.planes, weights, SAMPLES * some.size).astype(dtype)
-    return Transfer(some, _on_grid([image], some, dtype))
+    return Transfer(some, _on_grid([image], some, psf.intra_pixel, dtype))
 
 
 def profile_of(psf: Psf, weights: Float) -> Any:
@@ -169,23 +170,29 @@ def _planes(psf: Psf, some: Grid, dtype: type[Any]) -> Array:
         step = 2 * np.pi / some.size
         reach = int(np.rint(max(some.kx.max(), -some.kx.min(), some.ky.max()) / step))
         out = np.empty((1, 2, len(some.kx)), dtype)
-        _take(spectrum_of(psf, some.size, reach), some, out[0])
+        _take(spectrum_of(psf, some.size, reach), some, psf.intra_pixel, out[0])
         return out
-    return _on_grid([*psf.planes.images, *psf.planes.drift], some, dtype)
+    return _on_grid([*psf.planes.images, *psf.planes.drift], some, psf.intra_pixel, dtype)
 
 
-def _on_grid(images: list[Array], some: Grid, dtype: type[Any]) -> Array:
+def _on_grid(images: list[Array], some: Grid, strength: float, dtype: type[Any]) -> Array:
     out = np.empty((len(images), 2, len(some.kx)), dtype)
     columns = int(np.rint(np.abs(some.kx).max() * some.size / (2 * np.pi))) + 1
     for image, plane in zip(images, out, strict=True):
-        _take(_spectrum(image, some.size, columns), some, plane)
+        _take(_spectrum(image, some.size, columns), some, strength, plane)
     return out
 
 
-def _take(spectrum: Array, some: Grid, out: Array) -> None:
+def _take(spectrum: Array, some: Grid, strength: float, out: Array) -> None:
     """Fills out [2, s] with spectrum x pixel."""
-    pixel = np.sinc(np.arange(spectrum.shape[1] + len(spectrum)) / some.size)
-    kernel.take(spectrum, some.runs, pixel, out)
+    kernel.take(spectrum, some.runs, _pixel(some, strength), out)
+
+
+def _pixel(some: Grid, strength: float) -> Float:
+    """The pixel's transfer function at |iy|, |ix|; strength : of its response, 0 = even all over."""
+    step = 2 * np.pi / some.size
+    columns, rows = (np.arange(round(float(np.abs(k).max(initial=0.0)) / step) + 1) for k in (some.kx, some.ky))
+    return intra_pixel.apply(columns / some.size, rows[:, None] / some.size, strength)
 
 
 def _image(planes: Planes, weights: Float, side: int) -> Float32:

@@ -16,6 +16,7 @@ IMAGE_TYPES = (
     ("bias", "read-out alone"),
     ("dark", "closed shutter or cold shutter"),
     ("flat", "calibration lamp"),
+    ("charge_injection", "rows filled electronically, which traps delay"),
     ("self_calibration", "dense field, many dithers"),
     ("standard_star", "standard star"),
     ("planetary_nebula", "emission lines for the wavelength scale"),

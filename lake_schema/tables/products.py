@@ -5,7 +5,14 @@ from __future__ import annotations
 from lake_schema.columns import Column, Table
 from lake_schema.tables.exposures import CHANNELS
 
-CONTENTS = (("science", "what the detector delivers"), ("noise_free", "expected electrons of the sources alone"))
+CONTENTS = (
+    ("science", "what the detector delivers"),
+    ("noise_free", "expected electrons of the sources alone"),
+    ("stars", "expected electrons of the stars alone"),
+    ("cosmic_rays", "electrons of cosmic rays, where they hit"),
+    ("ghosts", "expected electrons of ghosts"),
+    ("saturation", "1 where a pixel or the converter is full"),
+)
 
 PRODUCTS = Table(
     "products",

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from jobs.render.effects import adc, background, dark_current, full_well, poisson, read_noise
+from collections.abc import Mapping
 
-EFFECTS = (
+from jobs.render.effects import adc, background, dark_current, full_well, poisson, read_noise
+from jobs.render.effects.effect import Effect
+
+SKY = (
     background.EFFECT,
     poisson.EFFECT,
     dark_current.EFFECT,
@@ -12,3 +15,5 @@ EFFECTS = (
     read_noise.EFFECT,
     adc.EFFECT,
 )
+
+EFFECTS: Mapping[str, tuple[Effect, ...]] = {"science": SKY, "deep": SKY}

@@ -1,14 +1,91 @@
-"""Euclid VIS: the order of physics."""
+"""Euclid VIS: the order of physics.
+
+Light is expected electrons until it is counted; then charge, whole electrons on the detector; then four quadrants in
+the order in which they are read; then what the electronics make of them.
+"""
 
 from __future__ import annotations
 
-from jobs.render.effects import adc, background, dark_current, full_well, poisson, read_noise
+from collections.abc import Mapping
 
-EFFECTS = (
+from jobs.render.effects import (
+    adc,
+    background,
+    bias_structure,
+    bleeding,
+    brighter_fatter,
+    calibration_lamp,
+    charge_injection,
+    charge_transfer,
+    cosmic_rays,
+    crosstalk,
+    dark_current,
+    ghosts,
+    illumination,
+    intra_pixel,
+    nonlinearity,
+    pixel_response,
+    poisson,
+    quadrants,
+    read_noise,
+    readout_trail,
+    straylight,
+)
+from jobs.render.effects.effect import Effect
+
+# What the pixels do to the light while sources are drawn: part of their transfer function.
+DRAWN = intra_pixel.EFFECT
+
+_LIGHT = (
+    ghosts.EFFECT,
+    straylight.EFFECT,
     background.EFFECT,
+    illumination.EFFECT,
+    illumination.SHUTTER,
+)
+_COUNTED = (
+    pixel_response.EFFECT,
     poisson.EFFECT,
+    brighter_fatter.EFFECT,
+)
+_CHARGE = (
     dark_current.EFFECT,
-    full_well.EFFECT,
+    dark_current.HOT,
+    cosmic_rays.EFFECT,
+    bleeding.EFFECT,
+)
+_READOUT = (
+    quadrants.EFFECT,
+    cosmic_rays.READOUT,
+    charge_transfer.PARALLEL,
+    charge_transfer.SERIAL,
+    nonlinearity.EFFECT,
+    crosstalk.EFFECT,
+    bias_structure.EFFECT,
     read_noise.EFFECT,
     adc.EFFECT,
 )
+
+SKY = (*_LIGHT, *_COUNTED, *_CHARGE, *_READOUT)
+# The shutter stays open: sky and stars are in a flat, and what they leave on the way to the register; the lamp is out
+# by then.
+FLAT = (
+    *_LIGHT,
+    readout_trail.EFFECT,
+    calibration_lamp.EFFECT,
+    *_COUNTED,
+    *_CHARGE,
+    *_READOUT,
+)
+DARK = (*_CHARGE, *_READOUT)
+INJECTION = (charge_injection.EFFECT, bleeding.EFFECT, *_READOUT)
+
+EFFECTS: Mapping[str, tuple[Effect, ...]] = {
+    "science": SKY,
+    "deep": SKY,
+    "self_calibration": SKY,
+    "flat": FLAT,
+    "dark": DARK,
+    "charge_injection": INJECTION,
+    "bias": _READOUT,
+}

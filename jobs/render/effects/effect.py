@@ -139,10 +139,7 @@ class Decision:
 
 
 def decide(effects: Sequence[Effect], scene: Scene, forced: Mapping[str, bool]) -> tuple[Decision, ...]:
-    """What a scene needs, and what a request forces on or off (name -> bool)."""
-    unknown = sorted(set(forced) - {effect.name for effect in effects})
-    if unknown:
-        raise BadInput(f"effect {unknown[0]} is not one of {', '.join(effect.name for effect in effects)}")
+    """What a scene needs, and what a request forces on or off (name -> bool; those of other channels do nothing)."""
     for effect in effects:
         if not effect.optional and not forced.get(effect.name, True):
             raise BadInput(f"effect {effect.name} cannot be switched off")
@@ -161,16 +158,19 @@ def apply_all(
     frame: Frame,
     effects: Sequence[Effect],
     scene: Scene,
-    stream: Callable[[str], np.random.Generator],
+    stream: Callable[[Effect], np.random.Generator],
     forced: Mapping[str, bool] | None = None,
+    watch: Callable[[str, Frame, Frame], None] | None = None,
 ) -> tuple[Frame, tuple[Decision, ...]]:
     """Apply a channel's effects in their order.
 
-    stream : effect name -> its own generator, so that switching one effect off leaves the draws of the others
-             as they were
+    stream : effect -> its own generator, so that switching one effect off leaves the draws of the others as they were
+    watch  : sees the name of an effect that is applied, and the frame before and after it
     """
     decisions = decide(effects, scene, forced or {})
     for effect, decision in zip(effects, decisions, strict=True):
         if decision.applied:
-            frame = effect.apply(frame, *effect.parameters(scene), rng=stream(effect.name))
+            before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))
+            if watch is not None:
+                watch(effect.name, before, frame)
     return frame, decisions

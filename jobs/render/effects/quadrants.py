@@ -48,6 +48,13 @@ def placed(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
     return quadrant[:: -1 if _UPPER[number] else 1, :: -1 if _RIGHT[number] else 1]
 
 
+def origin(number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int) -> tuple[int, int]:
+    """What is added to a detector's (column, row) to find it in a quadrant [ny, nx] as it is `placed`."""
+    ny, nx = shape
+    across = overscan - (nx - prescan - overscan) if _RIGHT[number] else prescan
+    return across, rows - (ny - rows) if _UPPER[number] else 0
+
+
 def assembled(quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int) -> npt.NDArray[Number]:
     """Quadrants [4, ..] in readout order -> detector [ny, nx], pre- and overscan cut off."""
     pixels = [placed(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)]

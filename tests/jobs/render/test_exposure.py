@@ -15,6 +15,7 @@ from jobs.render.focal_plane import boresight_for
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_of
+from tests.jobs.render import calibrated
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
 
 SIDE = 256
@@ -44,8 +45,9 @@ def field(channel, n=30):
     return {"detector": name}, exposed, body, stars(where[0][n:], where[1][n:])
 
 
-def render(channel, body=None, points=None, flux=3.0, seed=1, accuracy=SURVEY, **options):
+def render(channel, body=None, points=None, flux=3.0, seed=1, accuracy=SURVEY, kind="science", **options):
     task, exposed, all_bodies, all_points = field(channel)
+    exposed = {**exposed, "image_type": kind, "sky": 0.0 if kind in ("bias", "dark") else exposed["sky"]}
     body = all_bodies if body is None else body
     points = all_points if points is None else points
     camera, name, band = CASES[channel][:3]
@@ -153,21 +155,70 @@ def test_noise_free_totals_are_the_table_s(channel):
 
 @pytest.mark.parametrize("channel", CASES)
 def test_the_image_is_the_truth_with_the_predicted_noise(channel):
-    one = render(channel)
+    one = render(channel, truth=("cosmic_rays",))
     scene = one.scene
-    gain, bias = scene.value("gain", "electron / adu"), scene.value("bias", "adu")
-    applied = {d.name: d.applied for d in one.decisions}
-    assert one.science.dtype == np.uint16
+    applied = {d.name for d in one.decisions if d.applied}
+    assert one.raw.dtype == one.science.dtype == np.uint16
     # In 100 s the ground's sky drowns the reading.
-    left_out = {"VIS": set(), "EXT": {"read_noise"}}[channel]
-    assert {name for name, on in applied.items() if not on} == left_out | {"dark_current", "full_well"}
-    dark = scene.dark_electrons * applied["dark_current"]
-    read_noise = scene.value("read_noise", "electron") * applied["read_noise"]
-    expected = one.noise_free + scene.sky_electrons + dark
-    electrons = (one.science.astype(float) - bias) * gain
-    pull = (electrons - expected) / np.sqrt(expected + read_noise**2 + gain**2 / 12)
-    assert pull.mean() == pytest.approx(0.0, abs=5 / SIDE)
-    assert pull.std() == pytest.approx(1.0, abs=5 / SIDE)
+    assert applied == {
+        "VIS": {
+            "intra_pixel", "background", "illumination", "shutter", "pixel_response", "poisson", "hot_pixels",
+            "cosmic_rays", "quadrants", "readout_cosmic_rays", "nonlinearity", "bias_structure", "read_noise", "adc",
+        },
+        "EXT": {"background", "poisson", "adc"},
+    }[channel]  # fmt: skip
+    read_noise = scene.value("read_noise", "electron") * ("read_noise" in applied)
+    expected = one.noise_free + scene.sky_electrons
+    variance = expected + read_noise**2 + scene.value("gain", "electron / adu") ** 2 / 12
+    found = calibrated.electrons(one.raw, scene, 1, applied)
+    if channel == "VIS":
+        found = np.where(one.maps["cosmic_rays"] > 0, np.nan, found)
+    pull = (found - expected) / np.sqrt(variance)
+    # Dark columns, cosmic rays.
+    assert np.isfinite(pull).mean() > 0.95
+    assert np.nanmean(pull) == pytest.approx(0.0, abs=5 / SIDE)
+    assert np.nanstd(pull) == pytest.approx(1.0, abs=5 / SIDE)
+
+
+def test_switching_one_effect_off_changes_nobody_else_s_numbers():
+    """Without cosmic rays, pixels that none hit are the same, bit by bit."""
+    base = render("VIS", truth=("cosmic_rays",))
+    hit = base.maps["cosmic_rays"] > 0
+    off = {"cosmic_rays": False, "readout_cosmic_rays": False, "crosstalk": False}
+    without = render("VIS", forced=off, truth=("cosmic_rays",))
+    assert hit.any()
+    assert not without.maps["cosmic_rays"].any()
+    np.testing.assert_array_equal(base.science[~hit], without.science[~hit])
+
+
+@pytest.mark.parametrize("name", ["ghosts", "parallel_cti", "bleeding", "dark_current", "read_noise", "intra_pixel"])
+def test_each_effect_can_be_forced_on_and_off(name):
+    for on in (False, True):
+        (decision,) = (d for d in render("VIS", forced={name: on}).decisions if d.name == name)
+        assert (decision.applied, decision.forced) == (on, True)
+
+
+@pytest.mark.parametrize("kind", ["bias", "dark", "flat", "charge_injection", "self_calibration"])
+def test_image_types(kind):
+    """What each is for: a level, few electrons, the lamp, filled rows, a sky."""
+    one = render("VIS", kind=kind, truth=("cosmic_rays", "saturation"))
+    applied = {d.name for d in one.decisions if d.applied}
+    found = calibrated.electrons(one.raw, one.scene, 1, applied - {"pixel_response"})
+    found = np.where(one.maps["cosmic_rays"] > 0, np.nan, found)
+    middle = np.nanmedian(found)
+    assert one.raw.shape == (4, SIDE // 2 + 20, 51 + SIDE // 2 + 29)
+    if kind in ("bias", "dark"):
+        assert len(one.sources) == 0
+        assert middle == pytest.approx(0.0, abs=0.2)
+        assert np.nanstd(found) == pytest.approx(np.hypot(4.4, 3.48 / 12**0.5), rel=0.03)
+    elif kind == "flat":
+        assert len(one.sources) > 10
+        assert middle == pytest.approx(20_000 + one.scene.sky_electrons, rel=0.05)
+    elif kind == "charge_injection":
+        half = np.nanmean(found, axis=1)[: SIDE // 2]
+        assert half[:100].max() < 10  # fewer rows than `off`: nothing is injected
+    else:
+        np.testing.assert_array_equal(one.science, render("VIS").science)
 
 
 def test_sources_are_drawn_in_order_of_id():

@@ -141,3 +141,18 @@ def test_the_bound_on_what_shows_holds():
             form = galaxies(0.0, 0.0, bulge_sersic_index=index, bulge_half_light_radius=radius, bulge_fraction=1.0)
             surface = stamps.profiles.surface(stamps.profiles.shapes(form), np.array([MARGIN]))[0, 0]
             assert least * surface * 0.2**2 < settings.edge * 40.0
+
+
+@pytest.mark.parametrize("dark", [{"image_type": "bias", "exposure_time_s": 0.0}, {"image_type": "charge_injection"},
+                                  {"exposure_time_s": 0.0}])  # fmt: skip
+def test_a_frame_that_no_source_shows_in_reads_none(dark):
+    exposed = {**field_of("VIS")[1], **dark}
+    detector, task = small("vis", "3-4"), place()
+    least = exposure.least_flux(exposed, detector, MISSION, SURVEY)
+    assert least == np.inf
+    cells = sky.cell_of([task["ra"]], [task["dec"]], 8)
+    assert np.isfinite(exposure.least_flux(field_of("VIS")[1], detector, MISSION, SURVEY))
+    body = Catalogue(galaxies(task["ra"], task["dec"], **GIANT), cells, set(cells.tolist()))
+    rows, light, complete = render_exposures.sources(body, body, task, [], BAND, FARTHER, least)
+    assert len(rows) == len(light) == 0
+    assert complete == FARTHER

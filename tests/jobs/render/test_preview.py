@@ -58,3 +58,15 @@ def test_shrinking_keeps_the_mean():
 def test_labels_stand_apart():
     names = [Label(float(x), 0.0, "star", float(x), "") for x in range(10)]
     assert [n.column for n in preview._apart(names, 2.5)] == [0.0, 3.0, 6.0, 9.0]
+
+
+def test_cosmic_rays_are_mended_from_around_them():
+    image = np.add.outer(np.arange(40.0), np.zeros(30))
+    hit = np.zeros(image.shape, bool)
+    hit[20, 3:25] = hit[0, 0] = True
+    spoiled = np.where(hit, 1e5, image)
+    mended = preview._mended(spoiled, hit)
+    np.testing.assert_array_equal(mended[~hit], image[~hit])
+    assert np.abs(mended - image).max() <= 1.0
+    everything = preview._mended(spoiled, np.ones(image.shape, bool))
+    np.testing.assert_array_equal(everything, spoiled)

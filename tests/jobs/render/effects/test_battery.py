@@ -41,7 +41,7 @@ def test_no_effect_is_forgotten():
                 found.add(value)
     # Part of the pixel's transfer function: it acts before there is a frame.
     assert found == {case.apply for case in CASES.values()} | {effects.intra_pixel.apply}
-    assert {e.apply for e in (*vis.EFFECTS, *ext.EFFECTS)} <= found
+    assert {e.apply for kind in (vis, ext) for effects in kind.EFFECTS.values() for e in effects} <= found
 
 
 @named

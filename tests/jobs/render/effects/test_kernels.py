@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy import stats
 
 from jobs.render.effects import adc, background, dark_current, full_well, poisson, read_noise
 from lake_schema.errors import OutOfRange
@@ -42,6 +43,26 @@ def test_shot_noise(mean):
     assert (counted >= 0).all()
     assert counted.mean() == pytest.approx(mean, abs=5 * np.sqrt(mean) / SIDE)
     assert counted.var() == pytest.approx(mean, rel=5 * np.sqrt(2) / SIDE + (mean == 0.3) * 0.01)
+
+
+def test_a_pixel_s_noise_is_its_own():
+    mean = np.geomspace(0.1, 3e9, 400).reshape(20, 20)
+    changed = mean.copy()
+    changed[5, 7] *= 3.0
+    same = poisson.apply(mean, rng=rng()) == poisson.apply(changed, rng=rng())
+    assert list(zip(*np.nonzero(~same), strict=True)) == [(5, 7)]
+
+
+@pytest.mark.parametrize("mean", [0.5, 7.0, 12.0, 130.0])
+def test_counts_are_distributed_as_poisson_s_law_says(mean):
+    counted = poisson.apply(np.full(SIDE**2, mean), rng=rng())
+    found = np.bincount(counted.astype(int), minlength=400)
+    expected = stats.poisson.pmf(np.arange(len(found)), mean) * counted.size
+    often = expected > 20
+    chi2 = ((found - expected)[often] ** 2 / expected[often]).sum()
+    assert stats.chi2.sf(chi2, often.sum() - 1) > 1e-3
+    rare = expected[~often].sum()
+    assert abs(found[~often].sum() - rare) < 5 * np.sqrt(rare) + 1
 
 
 def test_negative_expectations_count_nothing():

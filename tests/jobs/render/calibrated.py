@@ -1,0 +1,51 @@
+"""A perfect calibrator: it knows each detector's patterns, and undoes them."""
+
+import numpy as np
+
+from jobs.render.effects import bias_structure, crosstalk, illumination, nonlinearity, pixel_response, quadrants
+from jobs.rng import stream
+
+
+def electrons(raw, scene, seed, applied):
+    """Raw ADU ([ny, nx], or quadrants) -> e- [ny, nx] as they were counted, sky and dark current included.
+
+    applied : names of the effects that are in the image
+    """
+    found = (raw.astype(float) - scene.value("bias", "adu")) * scene.value("gain", "electron / adu")
+    if raw.ndim == 2:
+        return found
+
+    def fixed(effect):
+        return stream(seed, "vis", scene.detector.name, effect.name)
+
+    if "bias_structure" in applied:
+        parameters = bias_structure.EFFECT.parameters(scene)
+        found -= bias_structure.structure(4, raw.shape[2], *parameters, fixed(bias_structure.EFFECT))[:, None]
+    if "crosstalk" in applied:
+        # To first order in the coefficients: 1e-8.
+        found = 2.0 * found - crosstalk.apply(found, *crosstalk.EFFECT.parameters(scene))
+    if "nonlinearity" in applied:
+        found = nonlinearity.linearised(found, *nonlinearity.EFFECT.parameters(scene))
+    return quadrants.assembled(found, *quadrants.sizes(scene)) / flat(scene, seed, applied)
+
+
+def flat(scene, seed, applied):
+    """What of the light each pixel counts, 1 in the mean; nothing where it is blind."""
+    out = np.ones((scene.detector.ny, scene.detector.nx))
+    for effect in (illumination.EFFECT, illumination.SHUTTER):
+        if effect.name in applied:
+            out = effect.apply(out, *effect.parameters(scene))
+    if "pixel_response" in applied:
+        own = stream(seed, "vis", scene.detector.name, "pixel_response")
+        out = pixel_response.apply(out, *pixel_response.EFFECT.parameters(scene), own)
+    return np.where(out > 0.7, out, np.nan)
+
+
+def without_hits(electrons, hits, reach=40):
+    """NaN where a cosmic ray is, and in the rows after it that its trail is in."""
+    bad = hits > 0
+    upper = len(bad) // 2
+    for half in (bad[:upper], bad[upper:][::-1]):
+        for _ in range(reach):
+            half[1:] |= half[:-1]
+    return np.where(bad, np.nan, electrons)
