@@ -86,6 +86,7 @@ def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, 
     assert found == pytest.approx(expected, rel=within)
 
 
+@pytest.mark.nightly
 def test_the_luminosity_function_comes_out_of_a_deep_catalogue_at_z_2(dust):
     deep = galaxies.model(SEED, 28.0, 2.3, BOX_CELLS, NSIDE)
     drawn, cells = population.Cells(deep.population), (4000, 4001, 4002, 4003, 40_000, 40_001)
