@@ -6,6 +6,7 @@ import resource
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import BINS, Scene
-from jobs.render import psf, stamps
+from jobs.render import profiles, psf, stamps
 from jobs.render.stamps import Settings, Sources
 
 Float = npt.NDArray[np.float64]
@@ -23,6 +24,8 @@ Found = TypeVar("Found")
 MEMORY = 6 << 30
 # Of the weight under which moments are taken, arcsec; radius of the aperture, arcsec.
 WEIGHT, APERTURE = 0.75, 1.0
+# Of 90-degree pairs: the shear whose response is measured.
+SHEAR = 0.02
 # Side of the frames that are compared, pixels.
 COMPARED = 256
 NAMES = ("aperture_mag", "centroid_mas", "r2", "ellipticity", "pixel_sigma")
@@ -90,7 +93,7 @@ def against_galsim(
 
 
 def shear_response(
-    scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int, g: float = 0.02
+    scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int, g: float = SHEAR
 ) -> tuple[dict[str, Float], Sources]:
     """Errors (m, c) [n, 2] of each of the settings and the galaxies: 90-degree pairs under +-g, noise-free.
 
@@ -100,26 +103,61 @@ def shear_response(
     out: dict[str, list[tuple[float, float]]] = {name: [] for name in tiers}
     for i in range(len(some)):
         mine, one = scenes.own(full, some, i), scenes.moved(some, i, 2 * COMPARED)
-        truth = _response(one, mine, scene, FULL, g)
+        truth = response(drawing(mine, scene, FULL), one, scene.scale, g)
         for name, settings in tiers.items():
             less = scenes.own(full, some, i, settings) if settings.positions == 1 else mine
-            found = _response(one, less, scene, settings, g)
-            out[name].append((float(found[0] / truth[0] - 1), float(found[1] - truth[1])))
+            out[name].append(bias(response(drawing(less, scene, settings), one, scene.scale, g), truth))
     return {name: np.array(rows) for name, rows in out.items()}, some
 
 
-def _response(one: Sources, spread: psf.Psf, scene: Scene, settings: Settings, g: float) -> tuple[float, float]:
-    """(de / dg, mean e) of a galaxy and the same turned by 90 degrees."""
-    found = np.zeros(2)
+def drawing(spread: psf.Psf, scene: Scene, settings: Settings) -> Callable[[Sources], Float]:
+    """A way to draw a galaxy: ours, on a frame of twice COMPARED."""
+    return lambda one: scenes.draw(one, spread, scene, settings, 2 * COMPARED)
+
+
+def response(draw: Callable[[Sources], Float], one: Sources, scale: float, g: float = SHEAR) -> Float:
+    """(de1 / dg1, de2 / dg2, mean e1, mean e2) of a galaxy and the same turned by 90 degrees, under +-g.
+
+    draw  : any way to draw a galaxy, free of noise
+    one   : where it stands on the drawing, and its shapes, whose own shear gives way;  scale : arcsec a pixel
+    """
+    slopes, means = np.zeros(2), np.zeros(2)
     for turn in (0.0, np.pi / 2):
-        for k, shear in enumerate((-g, g)):
-            shapes = one.shapes.take(one.shape)
-            shapes = replace(shapes, g1=np.array([shear]), g2=np.zeros(1), beta=shapes.beta + turn)
-            image = scenes.draw(
-                replace(one, shapes=shapes, shape=np.zeros(1, np.int64)), spread, scene, settings, 2 * COMPARED
-            )
-            found[k] += 0.5 * measured(image, scene.scale, float(one.column[0]), float(one.row[0]))[4]
-    return float(found[1] - found[0]) / (2 * g), float(found.mean())
+        for component in (0, 1):
+            for sheared in (-g, g):
+                shapes = one.shapes.take(one.shape)
+                both = [np.array([sheared if k == component else 0.0]) for k in (0, 1)]
+                shapes = replace(shapes, g1=both[0], g2=both[1], beta=shapes.beta + turn)
+                image = draw(replace(one, shapes=shapes, shape=np.zeros(1, np.int64)))
+                e = measured(image, scale, float(one.column[0]), float(one.row[0]))[4:6]
+                slopes[component] += 0.25 * e[component] / sheared
+                means += 0.125 * e
+    return np.concatenate([slopes, means])
+
+
+def bias(found: Float, truth: Float) -> tuple[float, float]:
+    """(m, c) of a response against the true one: of the two components the worse, with its sign."""
+    m, c = found[:2] / truth[:2] - 1, found[2:] - truth[2:]
+    return float(m[np.argmax(np.abs(m))]), float(c[np.argmax(np.abs(c))])
+
+
+def worst_by_kind(biases: Float, some: Sources, scene: Scene) -> dict[str, tuple[int, float, float]]:
+    """Largest |m| and |c| of biases [n, 2], with the number of galaxies: by magnitude, size and index of the bulge."""
+    shapes = some.shapes.take(some.shape)
+    size, index = profiles.half_light(shapes), np.where(shapes.bulge_fraction > 0, shapes.sersic_index, 1.0)
+    kinds = (
+        ("m", scenes.magnitudes(some, scene), BINS),
+        ("r", size, (0.0, 0.2, 0.4, 0.8, np.inf)),
+        ("n", index, (0.0, 1.5, 2.5, 4.0, np.inf)),
+    )
+    out = {}
+    for name, values, edges in kinds:
+        for low, high in pairwise(edges):
+            here = (values >= low) & (values < high)
+            if here.any():
+                m, c = np.abs(biases[here]).max(axis=0)
+                out[f"{name} {low:g}-{high:g}"] = int(here.sum()), float(m), float(c)
+    return out
 
 
 def figures(found: Float) -> dict[str, float]:
