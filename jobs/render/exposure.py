@@ -38,25 +38,7 @@ Row = Mapping[str, Any]
 
 # What is read of the catalogues; fluxes are read besides.
 GALAXY_COLUMNS = tuple(
-    dict.fromkeys(
-        (
-            "id",
-            "kind",
-            "ra_lensed",
-            "dec_lensed",
-            "bulge_half_light_radius",
-            "disk_half_light_radius",
-            "bulge_fraction",
-            "bulge_sersic_index",
-            "bulge_axis_ratio",
-            "inclination",
-            "position_angle",
-            "kappa",
-            "gamma1",
-            "gamma2",
-            *chromatic.GALAXY_COLUMNS,
-        )
-    )
+    dict.fromkeys(("id", "kind", "ra_lensed", "dec_lensed", *profiles.COLUMNS, *chromatic.GALAXY_COLUMNS))
 )
 STAR_COLUMNS = ("id", "ra", "dec", *chromatic.STAR_COLUMNS)
 # Memory of a task, bytes: what an executor's core may count on.

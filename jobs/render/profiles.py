@@ -34,6 +34,21 @@ _LEAST_DETERMINANT = 1e-3
 _SLIMMEST = 0.02
 
 
+# What is read of the catalogue.
+COLUMNS = (
+    "bulge_half_light_radius",
+    "disk_half_light_radius",
+    "bulge_fraction",
+    "bulge_sersic_index",
+    "bulge_axis_ratio",
+    "inclination",
+    "position_angle",
+    "kappa",
+    "gamma1",
+    "gamma2",
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Shapes:
     """Structure of n galaxies, arrays [n].
@@ -69,7 +84,7 @@ def shapes(galaxies: pa.Table) -> Shapes:
     Lensing     : g = gamma / (1 - kappa), held below 0.9; mu = 1 / |(1 - kappa)^2 - gamma^2|, the determinant
                   held above 1e-3
     """
-    columns = {name: np.asarray(galaxies[name].to_numpy(), float) for name in _COLUMNS}
+    columns = {name: np.asarray(galaxies[name].to_numpy(), float) for name in COLUMNS}
     stretch = 1.0 - columns["kappa"]
     gamma = np.hypot(columns["gamma1"], columns["gamma2"])
     determinant = np.maximum(np.abs((stretch - gamma) * (stretch + gamma)), _LEAST_DETERMINANT)
@@ -88,20 +103,6 @@ def shapes(galaxies: pa.Table) -> Shapes:
         g2=np.nan_to_num(-columns["gamma2"] * reduced),
         magnification=1.0 / determinant,
     )
-
-
-_COLUMNS = (
-    "bulge_half_light_radius",
-    "disk_half_light_radius",
-    "bulge_fraction",
-    "bulge_sersic_index",
-    "bulge_axis_ratio",
-    "inclination",
-    "position_angle",
-    "kappa",
-    "gamma1",
-    "gamma2",
-)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,33 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jobs.render.effects import (
-    adc,
-    background,
-    bias_structure,
-    bleeding,
-    brighter_fatter,
-    calibration_lamp,
-    charge_injection,
-    charge_transfer,
-    cosmic_rays,
-    crosstalk,
-    dark_current,
-    full_well,
-    ghosts,
-    illumination,
-    nonlinearity,
-    pixel_response,
-    poisson,
-    quadrants,
-    read_noise,
-    readout_trail,
-    straylight,
-)
+from jobs.render.channels import ext, vis
 from jobs.render.effects.effect import Lights
 from jobs.render.effects.traps import Sweeps, Traps
 from lake_schema.mission.configuration import resolve
 
+# Every effect of a channel, by its name.
+EFFECTS = {e.name: e for channel in (vis, ext) for effects in channel.EFFECTS.values() for e in effects}
 LIGHTS = Lights(np.array([3.2, 40.0]), np.array([2.0, -30.0]), np.array([1e8, 1e9]))
 END_OF_LIFE = Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
 EMPTY = Traps((0.0,), (1.0,), 2e5, 0.0, 0.58)
@@ -42,15 +22,15 @@ PAIRS = np.full((4, 4), 1e-4) - 1e-4 * np.eye(4)
 class Case:
     """How an effect is called.
 
-    apply, on, off : apply(frame, *on, rng=) acts; apply(frame, *off, rng=) does nothing (None: it cannot)
-    planes         : [4, ny, nx] is what it wants, not [ny, nx]
-    linear         : apply(a x) = a apply(x)
-    zero           : nothing comes of nothing
-    conserves      : the sum stays
-    whole          : whole electrons stay whole
+    on, off   : apply(frame, *on, rng=) acts; apply(frame, *off, rng=) does nothing (None: it cannot)
+    planes    : [4, ny, nx] is what it wants, not [ny, nx]
+    linear    : apply(a x) = a apply(x)
+    zero      : nothing comes of nothing
+    conserves : the sum stays
+    whole     : whole electrons stay whole
     """
 
-    apply: object
+    name: str
     on: object
     off: object = None
     planes: bool = False
@@ -59,6 +39,10 @@ class Case:
     conserves: bool = False
     whole: bool = False
     positive: bool = True
+
+    @property
+    def apply(self):
+        return EFFECTS[self.name].apply
 
 
 def bowl(shape):
@@ -71,49 +55,38 @@ def flat(shape):
 
 
 # `on` and `off` may depend on the frame's shape.
-CASES = {
-    "background": Case(background.apply, (120.0,), (0.0,), zero=False, whole=True),
-    "ghosts": Case(
-        ghosts.apply, (LIGHTS, 1e-4, (0.0, 5.0), 6.0, 0.33, (16.8, -39.9), 0.2),
-        (LIGHTS, 0.0, (0.0, 5.0), 6.0, 0.33, (), 0.0), zero=False,
+_CASES = (
+    Case("background", (120.0,), (0.0,), zero=False, whole=True),
+    Case(
+        "ghosts",
+        (LIGHTS, 1e-4, (0.0, 5.0), 6.0, 0.33, (16.8, -39.9), 0.2),
+        (LIGHTS, 0.0, (0.0, 5.0), 6.0, 0.33, (), 0.0),
+        zero=False,
     ),
-    "straylight": Case(straylight.apply, (LIGHTS, 5e-4, 40.0), (LIGHTS, 0.0, 40.0), zero=False),
-    "illumination": Case(illumination.apply, bowl, flat, linear=True),
-    "pixel_response": Case(pixel_response.apply, (0.01, 1e-2, 1.0), (0.0, 0.0, 0.0), linear=True),
-    "calibration_lamp": Case(
-        calibration_lamp.apply, lambda shape: (500.0, *bowl(shape)), lambda shape: (0.0, *bowl(shape)), zero=False
-    ),
-    "readout_trail": Case(readout_trail.apply, (6e-5, 2), (0.0, 2), linear=True),
-    "poisson": Case(poisson.apply, (), None, whole=True),
-    "brighter_fatter": Case(
-        brighter_fatter.apply, (1.2e-7, 0.5, 2e5), (0.0, 0.5, 2e5), conserves=True, whole=True
-    ),
-    "dark_current": Case(dark_current.apply, (0.3,), (0.0,), zero=False, whole=True),
-    "hot_pixels": Case(dark_current.apply_hot, (0.1, 50.0), (0.0, 50.0), zero=False, whole=True),
-    "cosmic_rays": Case(cosmic_rays.apply, (5.0, TRACKS), (0.0, TRACKS), zero=False, whole=True),
-    "readout_cosmic_rays": Case(
-        cosmic_rays.apply_readout, (5.0, TRACKS, 4, 1, 3), (0.0, TRACKS, 4, 1, 3), planes=True, zero=False, whole=True
-    ),
-    "charge_injection": Case(
-        charge_injection.apply, (1e4, 2, 2, 0.03, 10.0), (0.0, 2, 2, 0.03, 10.0), zero=False, whole=True
-    ),
-    "full_well": Case(full_well.apply, (2e5,), (1e300,), whole=True),
-    "bleeding": Case(bleeding.apply, (2e5, 2), (1e300, 2), whole=True),
-    "quadrants": Case(quadrants.apply, (2, 3, 1), None, linear=True, conserves=True, whole=True),
-    "parallel_cti": Case(
-        charge_transfer.apply_parallel, (END_OF_LIFE, Sweeps(1, 2), 3), (EMPTY, Sweeps(1, 2), 3), planes=True
-    ),
-    "serial_cti": Case(
-        charge_transfer.apply_serial, (END_OF_LIFE, Sweeps(1, 2), 3), (EMPTY, Sweeps(1, 2), 3), planes=True
-    ),
-    "nonlinearity": Case(nonlinearity.apply, (0.05, 2.28e5, 0.01, 2e3), (0.0, 2.28e5, 0.0, 2e3)),
-    "crosstalk": Case(crosstalk.apply, (PAIRS,), (np.zeros((4, 4)),), planes=True, linear=True),
-    "bias_structure": Case(
-        bias_structure.apply, (30.0, -9.0, 40.0, 1.0), (0.0, 0.0, 40.0, 0.0), planes=True, zero=False, positive=False
-    ),
-    "read_noise": Case(read_noise.apply, (4.4,), (0.0,), zero=False, positive=False),
-    "adc": Case(adc.apply, (3.48, 0.0, 65535.0), None, whole=True),
-}  # fmt: skip
+    Case("straylight", (LIGHTS, 5e-4, 40.0), (LIGHTS, 0.0, 40.0), zero=False),
+    Case("illumination", bowl, flat, linear=True),
+    Case("pixel_response", (0.01, 1e-2, 1.0), (0.0, 0.0, 0.0), linear=True),
+    Case("calibration_lamp", lambda shape: (500.0, *bowl(shape)), lambda shape: (0.0, *bowl(shape)), zero=False),
+    Case("readout_trail", (6e-5, 2), (0.0, 2), linear=True),
+    Case("poisson", (), None, whole=True),
+    Case("brighter_fatter", (1.2e-7, 0.5, 2e5), (0.0, 0.5, 2e5), conserves=True, whole=True),
+    Case("dark_current", (0.3,), (0.0,), zero=False, whole=True),
+    Case("hot_pixels", (0.1, 50.0), (0.0, 50.0), zero=False, whole=True),
+    Case("cosmic_rays", (5.0, TRACKS), (0.0, TRACKS), zero=False, whole=True),
+    Case("readout_cosmic_rays", (5.0, TRACKS, 4, 1, 3), (0.0, TRACKS, 4, 1, 3), planes=True, zero=False, whole=True),
+    Case("charge_injection", (1e4, 2, 2, 0.03, 10.0), (0.0, 2, 2, 0.03, 10.0), zero=False, whole=True),
+    Case("full_well", (2e5,), (1e300,), whole=True),
+    Case("bleeding", (2e5, 2), (1e300, 2), whole=True),
+    Case("quadrants", (2, 3, 1), None, linear=True, conserves=True, whole=True),
+    Case("parallel_cti", (END_OF_LIFE, Sweeps(1, 2), 3), (EMPTY, Sweeps(1, 2), 3), planes=True),
+    Case("serial_cti", (END_OF_LIFE, Sweeps(1, 2), 3), (EMPTY, Sweeps(1, 2), 3), planes=True),
+    Case("nonlinearity", (0.05, 2.28e5, 0.01, 2e3), (0.0, 2.28e5, 0.0, 2e3)),
+    Case("crosstalk", (PAIRS,), (np.zeros((4, 4)),), planes=True, linear=True),
+    Case("bias_structure", (30.0, -9.0, 40.0, 1.0), (0.0, 0.0, 40.0, 0.0), planes=True, zero=False, positive=False),
+    Case("read_noise", (4.4,), (0.0,), zero=False, positive=False),
+    Case("adc", (3.48, 0.0, 65535.0), None, whole=True),
+)
+CASES = {case.name: case for case in _CASES}
 # The sides of frames that a case can be asked for: quadrants want even ones.
 SHAPES = ((4, 6), (1, 1), (1, 9), (9, 1), (12, 10))
 

@@ -4,28 +4,9 @@ import numpy as np
 import pytest
 
 from jobs.render import focal_plane
-from jobs.render.effects import (
-    background,
-    bias_structure,
-    bleeding,
-    brighter_fatter,
-    calibration_lamp,
-    charge_injection,
-    charge_transfer,
-    cosmic_rays,
-    crosstalk,
-    dark_current,
-    full_well,
-    ghosts,
-    illumination,
-    nonlinearity,
-    pixel_response,
-    read_noise,
-    readout_trail,
-    straylight,
-)
 from jobs.render.effects.effect import NOTICEABLE, Lights, Scene
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render.effects.battery import EFFECTS
 
 NX, NY = 8, 4132
 MISSION = resolve()
@@ -50,36 +31,27 @@ def star(electrons):
 
 # For each effect what makes it large, from far below its threshold to far above.
 CASES = {
-    "background": (background.EFFECT, lambda x: scene(sky=0.01 * x)),
-    "illumination": (illumination.EFFECT, lambda x: scene(illumination=min(1e-4 * x, 0.5))),
-    "shutter": (illumination.SHUTTER, lambda x: scene(shutter_map=min(1e-4 * x, 0.5))),
-    "pixel_response": (
-        pixel_response.EFFECT,
-        lambda x: scene(peak=200.0, prnu=min(3e-3 * x, 0.5), dead_pixels=0.0, dark_columns=0.0),
-    ),
-    "readout_trail": (readout_trail.EFFECT, lambda x: scene(readout_time=0.3 * x)),
-    "brighter_fatter": (brighter_fatter.EFFECT, lambda x: scene(peak=3e3 * x)),
-    "dark_current": (dark_current.EFFECT, lambda x: scene(dark_current=2e-3 * x)),
-    "hot_pixels": (dark_current.HOT, lambda x: scene(hot_pixels=0.01, hot_current=2e-3 * x)),
-    "cosmic_rays": (cosmic_rays.EFFECT, None),
-    "readout_cosmic_rays": (cosmic_rays.READOUT, None),
-    "charge_injection": (charge_injection.EFFECT, lambda x: scene(injection__level=x, injection__noise=0.1 * x)),
-    "calibration_lamp": (calibration_lamp.EFFECT, lambda x: scene(flat__signal=x)),
-    "full_well": (full_well.EFFECT, lambda x: scene(peak=2e5 - 141 + (x - 1))),
-    "bleeding": (bleeding.EFFECT, lambda x: scene(peak=2e5 - 141 + (x - 1))),
-    "parallel_cti": (charge_transfer.PARALLEL, lambda x: scene(cti__age=1e-4 * x)),
-    "serial_cti": (charge_transfer.SERIAL, lambda x: scene(cti__age=3e-4 * x)),
-    "nonlinearity": (
-        nonlinearity.EFFECT, lambda x: scene(nonlinearity__low=min(1e-4 * x, 0.9), nonlinearity__high=1e-4 * x)
-    ),
-    "crosstalk": (crosstalk.EFFECT, lambda x: scene(crosstalk=min(1e-4 * x, 0.1))),
-    "bias_structure": (
-        bias_structure.EFFECT, lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x)
-    ),
-    "read_noise": (read_noise.EFFECT, lambda x: scene(sky=10.0, read_noise=x)),
-    "ghosts": (ghosts.EFFECT, lambda x: scene(lights=star(1e8 * x))),
-    "straylight": (straylight.EFFECT, lambda x: scene(lights=star(1e9 * x))),
-}  # fmt: skip
+    "background": lambda x: scene(sky=0.01 * x),
+    "illumination": lambda x: scene(illumination=min(1e-4 * x, 0.5)),
+    "shutter": lambda x: scene(shutter_map=min(1e-4 * x, 0.5)),
+    "pixel_response": lambda x: scene(peak=200.0, prnu=min(3e-3 * x, 0.5), dead_pixels=0.0, dark_columns=0.0),
+    "readout_trail": lambda x: scene(readout_time=0.3 * x),
+    "brighter_fatter": lambda x: scene(peak=3e3 * x),
+    "dark_current": lambda x: scene(dark_current=2e-3 * x),
+    "hot_pixels": lambda x: scene(hot_pixels=0.01, hot_current=2e-3 * x),
+    "charge_injection": lambda x: scene(injection__level=x, injection__noise=0.1 * x),
+    "calibration_lamp": lambda x: scene(flat__signal=x),
+    "full_well": lambda x: scene(peak=2e5 - 141 + (x - 1)),
+    "bleeding": lambda x: scene(peak=2e5 - 141 + (x - 1)),
+    "parallel_cti": lambda x: scene(cti__age=1e-4 * x),
+    "serial_cti": lambda x: scene(cti__age=3e-4 * x),
+    "nonlinearity": lambda x: scene(nonlinearity__low=min(1e-4 * x, 0.9), nonlinearity__high=1e-4 * x),
+    "crosstalk": lambda x: scene(crosstalk=min(1e-4 * x, 0.1)),
+    "bias_structure": lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x),
+    "read_noise": lambda x: scene(sky=10.0, read_noise=x),
+    "ghosts": lambda x: scene(lights=star(1e8 * x)),
+    "straylight": lambda x: scene(lights=star(1e9 * x)),
+}
 QUADRANTS = ("parallel_cti", "serial_cti", "crosstalk", "bias_structure", "readout_cosmic_rays")
 
 
@@ -94,12 +66,12 @@ def frame(name, one):
     return light[None] if name in QUADRANTS else light
 
 
-@pytest.mark.parametrize("name", [name for name, (_, make) in CASES.items() if make])
+@pytest.mark.parametrize("name", CASES)
 def test_what_is_left_out_is_not_noticed(name):
-    effect, make = CASES[name]
+    effect = EFFECTS[name]
     needed = []
     for size in np.geomspace(1e-2, 1e4, 13):
-        one = make(size)
+        one = CASES[name](size)
         needed.append(effect.needed_if(one))
         if needed[-1]:
             continue
@@ -118,7 +90,7 @@ def test_what_is_left_out_is_not_noticed(name):
 
 @pytest.mark.parametrize("name", ["cosmic_rays", "readout_cosmic_rays"])
 def test_cosmic_rays_are_always_needed_but_without_time(name):
-    effect, _ = CASES[name]
+    effect = EFFECTS[name]
     assert effect.needed_if(scene())
     nothing = Scene(MISSION, "vis", 0.0, 0.25, 0.0, DETECTOR)
     assert effect.needed_if(nothing) == (name == "readout_cosmic_rays")
