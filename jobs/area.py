@@ -25,7 +25,8 @@ _FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
 # The wide survey leaves out what lies nearer to the Galactic and the ecliptic plane, deg: limits that leave about the
 # 15 000 deg2 of Serrano et al. 2024 (adopted; its own region follows maps of stars, dust and zodiacal light).
 _GALACTIC_MIN, _ECLIPTIC_MIN = 30.0, 15.0
-_MOST_PATCHES = 1000
+_MOST_VERTICES, _MOST_PATCHES = 1000, 1000
+_RA, _DEC = ("ra", -360.0, 360.0), ("dec", -90.0, 90.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +48,8 @@ class Area:
         """Nested cells of `order` that the area touches, ascending."""
         if self.wide:
             every = np.arange(12 << (2 * order))
-            reach = sky.cell_radius(order)
-            centre = sky.positions((every << (2 * (sky.DEEPEST - order))) + (1 << (2 * (sky.DEEPEST - order) - 1)))
-            return [int(cell) for cell in every[_in_wide(*centre, 2 * reach)]]
+            touched = self.contains(*sky.cell_centres(order, every), 2 * sky.cell_radius(order))
+            return [int(cell) for cell in every[touched]]
         if self.patches:
             found = [sky.cells_in_cone(*patch, order) for patch in self.patches]
             return [int(cell) for cell in np.unique(np.concatenate(found))]
@@ -107,10 +107,6 @@ def _corners_of(box: tuple[float, float, float, float] | None) -> list[tuple[flo
     return [(float(x) % 360.0, y) for x in lon for y in (south, north)]
 
 
-def _in_wide(ra: Float, dec: Float, margin: float) -> Bool:
-    return Area(wide=True).contains(ra, dec, margin)
-
-
 def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Float) -> Float:
     lon, lat = np.radians(np.array(vertices)).T
     corners = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
@@ -161,19 +157,12 @@ def _box(found: object, path: str) -> Area:
 
 
 def _polygon(found: object, path: str) -> Area:
-    if not isinstance(found, list) or not 3 <= len(found) <= 1000:
-        raise BadInput(f"{path} wants a list of 3 to 1000 [ra, dec] pairs")
-    vertices = []
-    for i, corner in enumerate(found):
-        if not isinstance(corner, list) or len(corner) != 2:
-            raise BadInput(f"{path}[{i}] wants [ra, dec]")
-        ra = checked_number(corner[0], f"{path}[{i}].ra", -360.0, 360.0) % 360.0
-        vertices.append((ra, checked_number(corner[1], f"{path}[{i}].dec", -90.0, 90.0)))
+    vertices = tuple((ra, dec) for ra, dec in _places(found, path, 3, _MOST_VERTICES, _RA, _DEC))
     try:
         sky.cells_in_polygon(vertices, 0)
     except BadInput as error:
         raise BadInput(f"{path}: {error}") from None
-    return Area(vertices=tuple(vertices))
+    return Area(vertices=vertices)
 
 
 def _tile(tile: int) -> Area:
@@ -181,16 +170,23 @@ def _tile(tile: int) -> Area:
 
 
 def _patches(found: object, path: str) -> Area:
-    if not isinstance(found, list) or not 1 <= len(found) <= _MOST_PATCHES:
-        raise BadInput(f"{path} wants a list of 1 to {_MOST_PATCHES} [ra, dec, radius]")
-    patches = []
-    for i, patch in enumerate(found):
-        if not isinstance(patch, list) or len(patch) != 3:
-            raise BadInput(f"{path}[{i}] wants [ra, dec, radius]")
-        ra = checked_number(patch[0], f"{path}[{i}].ra", -360.0, 360.0) % 360.0
-        dec = checked_number(patch[1], f"{path}[{i}].dec", -90.0, 90.0)
-        patches.append((ra, dec, checked_number(patch[2], f"{path}[{i}].radius", 0.0, 90.0)))
-    return Area(patches=tuple(patches))
+    circles = _places(found, path, 1, _MOST_PATCHES, _RA, _DEC, ("radius", 0.0, 90.0))
+    return Area(patches=tuple((ra, dec, radius) for ra, dec, radius in circles))
+
+
+def _places(found: object, path: str, least: int, most: int, *bounds: tuple[str, float, float]) -> list[list[float]]:
+    """A list of lists of numbers, right ascension first; bounds : name, from, to of each number."""
+    form = f"[{', '.join(name for name, _, _ in bounds)}]"
+    if not isinstance(found, list) or not least <= len(found) <= most:
+        raise BadInput(f"{path} wants a list of {least} to {most} {form}")
+    places = []
+    for i, place in enumerate(found):
+        if not isinstance(place, list) or len(place) != len(bounds):
+            raise BadInput(f"{path}[{i}] wants {form}")
+        numbers = zip(place, bounds, strict=True)
+        ra, *others = (checked_number(number, f"{path}[{i}].{name}", lo, hi) for number, (name, lo, hi) in numbers)
+        places.append([ra % 360.0, *others])
+    return places
 
 
 def _wide(wanted: bool, path: str) -> Area:

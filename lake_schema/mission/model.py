@@ -64,16 +64,8 @@ def read(file: Traversable) -> tuple[Model, ...]:
     """The records of a CSV file of exactly the columns _COLUMNS."""
 
     def record(row: Mapping[str, str], version: int, valid_from: float | None) -> Model:
-        return Model(
-            row["key"],
-            row["status"],
-            row["file"],
-            row["sha256"],
-            version,
-            valid_from,
-            row["confidence"],
-            row["source"] or "",
-        )
+        file, sha256, confidence = row["file"], row["sha256"], row["confidence"]
+        return Model(row["key"], row["status"], file, sha256, version, valid_from, confidence, row["source"] or "")
 
     return tuple(read_rows(file, _COLUMNS, record))
 
