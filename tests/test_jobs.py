@@ -13,39 +13,27 @@ from jobs.catalogue import build_gaia, build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
 from lake_schema import layout, read
+from tests import requests
 
 ROOT = Path(__file__).parents[1]
 FIRST = (build_galaxies.JOB, build_stars.JOB)
 LATER = (compute_fluxes.JOB, build_gaia.JOB, plan_exposures.JOB, render_exposures.JOB)
 JOBS = FIRST + LATER
 # Four order-5 cells meet here, so that there is something to share out.
-SMALL = """
-name = "small"
-accuracy = "draft"
-seed = 7
-[area]
-cone = { ra = 53.4375, dec = -27.279613, radius = 0.01 }
-[universe]
-galaxy_limit = 21.0
-star_limit = 20.0
-box_cells = 192
-lensing_nside = 64
-[fluxes]
-bands = ["euclid_vis"]
-"""
+SMALL = requests.text(
+    f'accuracy = "draft"\nfluxes.bands = ["euclid_vis"]\n{requests.shallow(21.0, 20.0)}',
+    "cone = { ra = 53.4375, dec = -27.279613, radius = 0.01 }",
+    seed=7,
+)
 BAD = [
-    ('name = "x"\nseed = 1\ncolour = 3\n[area]\ncone = {ra = 0, dec = 0, radius = 1}', "colour"),
-    ('name = "x"\nseed = 1\n[area]\ncone = {ra = 0, dec = 95, radius = 1}', "area.cone.dec"),
-    ('name = "x"\nseed = 1\n[area]\ncone = {ra = 0, dec = 0, radius = -1}', "area.cone.radius"),
-    ('name = "x"\nseed = 1\n[area]\nbox = {ra = [0, 1], dec = [1, 0]}', "area.box.dec"),
-    ('name = "x"\nseed = 1\n[area]\ncone = {ra = nan, dec = 0, radius = 1}', "area.cone.ra"),
-    ('name = "x"\n[area]\ncone = {ra = 0, dec = 0, radius = 1}', "seed"),
+    (requests.text("colour = 3"), "colour"),
+    (requests.text(area="cone = {ra = 0, dec = 95, radius = 1}"), "area.cone.dec"),
+    (requests.text(area="cone = {ra = 0, dec = 0, radius = -1}"), "area.cone.radius"),
+    (requests.text(area="box = {ra = [0, 1], dec = [1, 0]}"), "area.box.dec"),
+    (requests.text(area="cone = {ra = nan, dec = 0, radius = 1}"), "area.cone.ra"),
+    (requests.text().replace("seed = 1", ""), "seed"),
 ]
 POINTING = """
-name = "x"
-seed = 1
-[area]
-cone = {{ra = 0, dec = 0, radius = 1}}
 [[pointing]]
 channel = "{channel}"
 camera = "{camera}"
@@ -85,8 +73,8 @@ def test_a_bad_request_ends_with_one_line_and_nothing_written(job, text, key, tm
 
 @pytest.mark.parametrize(("words", "key"), BAD_POINTINGS)
 def test_a_bad_pointing_is_refused_before_the_first_job_runs(words, key, tmp_path, capsys):
-    path = tmp_path / "bad.toml"
-    path.write_text(POINTING.format(**dict(zip(("channel", "camera", "band", "detector"), words, strict=True))))
+    names = ("channel", "camera", "band", "detector")
+    path = requests.written(tmp_path, POINTING.format(**dict(zip(names, words, strict=True))))
     assert demo.main(["--request", str(path), "--out", str(tmp_path / "out")]) == 2
     err = capsys.readouterr().err
     assert key in err

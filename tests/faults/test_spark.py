@@ -14,6 +14,7 @@ import pytest
 from jobs import shell
 from jobs.shell import Job, Step
 from lake_schema import layout
+from tests import requests
 from tests.faults import promise, slow_job
 from tests.universe import plain_plan, plain_work
 
@@ -40,9 +41,7 @@ JOB = Job("poisoned", "Toy rows.", lambda root, request: [Step(plain_plan(reques
 
 @pytest.fixture(scope="module")
 def request_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("request") / "r.toml"
-    path.write_text('name = "x"\nseed = 2\n[area]\ncone = {ra = 0, dec = 0, radius = 1}\n')
-    return path
+    return requests.written(tmp_path_factory.mktemp("request"), seed=2)
 
 
 @pytest.fixture

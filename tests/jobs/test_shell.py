@@ -17,6 +17,7 @@ from jobs import shell
 from jobs.shell import Job, Step
 from lake_schema import __version__, layout, publish, read
 from lake_schema.publish import Plan
+from tests import requests
 from tests.universe import PLAIN, plain_plan, plain_work
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,9 +29,7 @@ def job_of(work, on_driver=True):
 
 @pytest.fixture
 def request_file(tmp_path):
-    path = tmp_path / "r.toml"
-    path.write_text('name = "small"\nseed = 2\n[area]\ncone = {ra = 0, dec = 0, radius = 1}\n')
-    return path
+    return requests.written(tmp_path, name="small", seed=2)
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from jobs.fluxes import compute_fluxes
 from jobs.render import render_exposures
 from lake_schema import ids, layout, publish, read, sky
 from lake_schema.errors import BadInput
+from tests import requests
 
 # l = 0, b = 12
 AREA = {"cone": {"ra": 255.4, "dec": -22.2, "radius": 0.5}}
@@ -94,8 +95,7 @@ def test_what_cannot_be_drawn_is_refused_before_anything_is_made(lake, tmp_path,
         build_stars.steps(lake, wanted(area=plane))
     with pytest.raises(BadInput, match=r"ask for a brighter stars\.plane_limit"):
         build_stars.steps(lake, wanted(area=plane, stars={"plane_limit": 26.0}))
-    path = tmp_path / "r.toml"
-    path.write_text('name = "x"\nseed = 1\n[area]\ncone = {ra = 266.4, dec = -28.9, radius = 0.1}')
+    path = requests.written(tmp_path, area="cone = { ra = 266.4, dec = -28.9, radius = 0.1 }")
     assert shell.main(build_stars.JOB, ["--lake", str(tmp_path / "l"), "--request", str(path)]) == 2
     assert "stars.plane_limit" in capsys.readouterr().err
     assert not (tmp_path / "l").exists()

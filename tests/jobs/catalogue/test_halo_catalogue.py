@@ -12,6 +12,7 @@ from jobs.fluxes import cosmology
 from lake_schema import ids, sky
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.provenance import file_sha256
+from tests import requests
 
 from .conftest import BOX_CELLS, SEED
 
@@ -128,11 +129,7 @@ def test_a_file_that_is_cut_short(tmp_path, ending):
         loaded(path)
 
 
-REQUEST = """
-name = "x"
-seed = 1
-[area]
-cone = { ra = 0.0, dec = 0.0, radius = 0.1 }
+HALOS = """
 [ingest.halos]
 files = ["synthetic.parquet"]
 [ingest.halos.columns]
@@ -145,9 +142,8 @@ log_mass = { column = "mass", log10 = true }
 
 def test_a_request_with_a_bad_file_publishes_nothing(tmp_path, capsys):
     write(tmp_path / "synthetic.parquet", broken("ra", 4, np.nan))
-    (tmp_path / "r.toml").write_text(REQUEST)
-    lake = tmp_path / "lake"
-    assert shell.main(build_galaxies.JOB, ["--lake", str(lake), "--request", str(tmp_path / "r.toml")]) == 2
+    path, lake = requests.written(tmp_path, HALOS), tmp_path / "lake"
+    assert shell.main(build_galaxies.JOB, ["--lake", str(lake), "--request", str(path)]) == 2
     said = capsys.readouterr().err.strip()
     assert "column ra (ra) of row 5" in said
     assert "\n" not in said

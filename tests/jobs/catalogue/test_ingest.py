@@ -12,19 +12,11 @@ from jobs.fluxes import cosmology
 from lake_schema import ids, publish, read, sky, validate
 from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import GALAXIES
+from tests import requests
 
 from . import synthetic
 
 FORMATS = ("flagship1", "flagship2", "euclid", "skycatalogs")
-REQUEST = """
-name = "ingest"
-seed = 5
-[area]
-cone = {{ ra = 53.1, dec = -27.8, radius = 0.3 }}
-[ingest.galaxies]
-files = ["{file}"]
-{more}
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -35,10 +27,14 @@ def own_cache(tmp_path, monkeypatch):
     monkeypatch.setattr(ingest, "cache_dir", lambda: tmp_path / "cache")
 
 
+def asked(folder, file, more):
+    """The path of a request for the galaxies of one file."""
+    return requests.written(folder, f'[ingest.galaxies]\nfiles = ["{file}"]\n{more}\n', requests.FIELD.format(0.3))
+
+
 def build(folder, file, more):
     """The published table of one file."""
-    (folder / "r.toml").write_text(REQUEST.format(file=file, more=more))
-    wanted, lake = request.parse(folder / "r.toml"), folder / "lake"
+    wanted, lake = request.parse(asked(folder, file, more)), folder / "lake"
     lake.mkdir(exist_ok=True)
     (step,) = build_galaxies.steps(lake, wanted)
     publish.make(lake, step.plan, step.work)
@@ -171,8 +167,7 @@ def test_a_missing_column_is_named(tmp_path):
 def test_a_file_that_is_cut_short(tmp_path, form):
     path = synthetic.write(tmp_path, form)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    (tmp_path / "r.toml").write_text(REQUEST.format(file=path, more=f'format = "{form}"'))
-    arguments = ["--lake", str(tmp_path / "lake"), "--request", str(tmp_path / "r.toml")]
+    arguments = ["--lake", str(tmp_path / "lake"), "--request", str(asked(tmp_path, path, f'format = "{form}"'))]
     assert shell.main(build_galaxies.JOB, arguments) != 0
     assert not list((tmp_path / "lake").glob("galaxies/v-*"))
 

@@ -15,6 +15,7 @@ from jobs.catalogue.strong_lenses import Disc, Lens
 from lake_schema import publish, read, sky, validate
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.strong_lenses import STRONG_LENSES
+from tests import requests
 
 from .conftest import SEED
 
@@ -141,9 +142,8 @@ def test_a_published_table(tmp_path, drawn):
     name = f"Norder=5/Dir=0/Npix={cell >> 6}.parquet"
     part = publish.Part(name, {"generation_cells": [cell]})
     publish.make(tmp_path, publish.Plan(GALAXIES, {}, (part,)), lambda lake, facts: publish.Output(own))
-    text = 'name = "x"\nseed = 7\n[area]\ncone = {ra = 0.0, dec = 0.0, radius = 1.0}\n[strong_lenses]\nboost = 20.0\n'
-    (tmp_path / "r.toml").write_text(text)
-    (step,) = build_strong_lenses.steps(tmp_path, request.parse(tmp_path / "r.toml"))
+    path = requests.written(tmp_path, "[strong_lenses]\nboost = 20.0\n", seed=7)
+    (step,) = build_strong_lenses.steps(tmp_path, request.parse(path))
     publish.make(tmp_path, step.plan, step.work)
     rows = read.version(tmp_path, "strong_lenses").rows()
     assert rows.num_rows > 0

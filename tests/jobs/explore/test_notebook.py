@@ -7,36 +7,25 @@ import pytest
 from astropy.table import Table
 from nbclient import NotebookClient
 
-from jobs import request as requests
+from jobs import request
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from lake_schema import layout, publish
+from tests import requests
 
 NOTEBOOK = Path(__file__).resolve().parents[3] / "notebooks" / "01_explore_catalogue.ipynb"
-SMALL = """
-name = "small"
-seed = 5
-[area]
-cone = { ra = 53.117, dec = -27.808, radius = 0.02 }
-[universe]
-galaxy_limit = 23.5
-box_cells = 192
-lensing_nside = 64
-star_limit = 20.0
-[fluxes]
-bands = ["euclid_vis", "lsst_r"]
-"""
+SMALL = requests.shallow(23.5, 20.0) + '[fluxes]\nbands = ["euclid_vis", "lsst_r"]\n'
 
 
 @pytest.fixture(scope="module")
 def field(tmp_path_factory):
     """Galaxies, stars and fluxes, made without Spark."""
     folder = tmp_path_factory.mktemp("field")
-    (folder / "r.toml").write_text(SMALL)
-    request, root = requests.parse(folder / "r.toml"), layout.lake(folder / "lake")
+    wanted = request.parse(requests.written(folder, SMALL, requests.FIELD.format(0.02), seed=5))
+    root = layout.lake(folder / "lake")
     root.mkdir()
     for job in (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB):
-        for step in job.steps(root, request):
+        for step in job.steps(root, wanted):
             publish.make(root, step.plan, step.work)
     return root
 

@@ -12,6 +12,7 @@ from lake_schema import ids, layout, publish, read, sky
 from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
+from tests import requests
 from tests.jobs.fluxes.test_ingest import BAND, RESPONSE, WAVELENGTH, ascii_file
 from tests.jobs.fluxes.test_own_stars import black_bodies, irtf_file
 from tests.universe import rows_of
@@ -119,10 +120,7 @@ def test_files_of_the_user_make_the_fluxes(filled, tmp_path, library):
         ascii_file(tmp_path / f"{name}.sed", value=values)
     ascii_file(tmp_path / "mine.dat", BAND, RESPONSE)
     ascii_file(tmp_path / "law.dat", value=4.05 / slope)
-    text = f"""
-name = "own"
-seed = 1
-area = {{ cone = {{ ra = 10, dec = 10, radius = 1 }} }}
+    more = f"""
 [fluxes]
 bands = {BANDS}
 [fluxes.passbands.mine]
@@ -136,8 +134,8 @@ format = "cosmos"
 file = "law.dat"
 format = "extinction"
 """
-    (tmp_path / "own.toml").write_text(text)
-    asked = request.parse(tmp_path / "own.toml")
+    path = requests.written(tmp_path, more)
+    asked = request.parse(path)
     run(filled, asked, sources=True)
     made = read.version(filled, "galaxy_fluxes")
     assert [name for name in made.rows().column_names if name.startswith("f_nu")] == [
@@ -160,16 +158,15 @@ format = "extinction"
     np.testing.assert_array_equal(inputs.library_of(filled, facts).flux, own.library.flux)
     # Another content of the same file is another table.
     ascii_file(tmp_path / "mine.dat", BAND, RESPONSE**2)
-    assert compute_fluxes.step_of("galaxy", filled, request.parse(tmp_path / "own.toml")).plan.key != made.key
+    assert compute_fluxes.step_of("galaxy", filled, request.parse(path)).plan.key != made.key
 
 
 def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
     """Models and an infrared spectrum of the request's own, through the lake."""
     black_bodies(tmp_path / "synthetic.cor")
     irtf_file(tmp_path / "star.txt", -2.5, wiggle=0.3)
-    text = f"name = 'own'\nseed = 1\narea = {{ cone = {{ ra = 10, dec = 10, radius = 1 }} }}\nfluxes.bands = {BANDS}\n"
-    (tmp_path / "own.toml").write_text(text + "[fluxes.stars]\nbasel = 'synthetic.cor'\nirtf = ['star.txt']\n")
-    asked = request.parse(tmp_path / "own.toml")
+    own = "[fluxes.stars]\nbasel = 'synthetic.cor'\nirtf = ['star.txt']\n"
+    asked = request.parse(requests.written(tmp_path, f"fluxes.bands = {BANDS}\n{own}"))
     own = inputs.read(asked.curves)
     for step in (*compute_fluxes.source_steps(own), compute_fluxes.step_of("star", filled, asked)):
         publish.make(filled, step.plan, step.work)
@@ -191,10 +188,9 @@ def test_what_is_there_is_not_prepared_again(filled, monkeypatch):
 
 
 def test_bands_may_be_named_on_the_command_line(filled, tmp_path, monkeypatch, capsys):
-    (tmp_path / "r.toml").write_text('name = "test"\nseed = 1\narea = { cone = { ra = 10, dec = 10, radius = 1 } }\n')
     asked = []
     monkeypatch.setattr(shell, "_run", lambda job, step, *_: asked.append(step.plan.table))
-    line = ["--lake", str(filled), "--request", str(tmp_path / "r.toml"), "--bands"]
+    line = ["--lake", str(filled), "--request", str(requests.written(tmp_path)), "--bands"]
     assert shell.main(compute_fluxes.JOB, [*line, "lsst_r", "euclid_h"]) == 0
     assert asked[-1].names[-3:] == ["f_nu_lsst_r", "f_nu_euclid_h", "integrated"]
     assert shell.main(compute_fluxes.JOB, [*line, "lsst_q"]) == 2

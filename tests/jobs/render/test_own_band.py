@@ -3,33 +3,25 @@
 import numpy as np
 import pytest
 
-from jobs import request as requests
+from jobs import request
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes, inputs, passbands
 from jobs.render import exposing, plan_exposures, render_exposures
 from lake_schema import publish, read, units
 from lake_schema.errors import BadInput
+from tests import requests
 
-MISSION = plan_exposures.mission_of(requests.MissionChoice())
+MISSION = plan_exposures.mission_of(request.MissionChoice())
 WAVELENGTH = np.arange(5000.0, 9501.0, 10.0)
 # A filter within VIS, synthetic.
 RESPONSE = 0.5 * np.exp(-0.5 * ((WAVELENGTH - 6500.0) / 400.0) ** 2)
-REQUEST = """
-name = "own"
-seed = 5
+OWN = f"""
 accuracy = "draft"
-area = {{ cone = {{ ra = 53.117, dec = -27.808, radius = 0.3 }} }}
-[universe]
-galaxy_limit = 20.0
-star_limit = 18.0
-box_cells = 192
-lensing_nside = 64
+{requests.shallow(20.0, 18.0)}
 [fluxes.passbands.mine]
 file = "mine.dat"
 format = "passband_ascii"
 medium = "vacuum"
-[[{block}]]
-{keys}
 """
 POINTING = """
 channel = "VIS"
@@ -47,9 +39,7 @@ SURVEY = 'channels = ["EXT"]\nsurvey = "lsst"\nbands = ["lsst_r", "mine"]'
 
 def asked(folder, keys=POINTING, block="pointing", response=RESPONSE):
     np.savetxt(folder / "mine.dat", np.stack([WAVELENGTH, response], 1))
-    path = folder / "r.toml"
-    path.write_text(REQUEST.format(block=block, keys=keys))
-    return requests.parse(path)
+    return request.parse(requests.written(folder, f"{OWN}[[{block}]]\n{keys}\n", requests.FIELD.format(0.3), seed=5))
 
 
 def test_it_is_planned_with_its_own_zero_point_and_sky(lake, tmp_path):

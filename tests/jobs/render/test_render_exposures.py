@@ -13,27 +13,20 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from jobs import request as requests
 from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import archive, focal_plane, plan_exposures, render_exposures
+from jobs.request import from_table
 from lake_schema import layout, publish, read
 from lake_schema.errors import PartsFailed
 from lake_schema.provenance import file_sha256
+from tests import requests
 
 SIDE = 300
-REQUEST = tomllib.loads("""
-name = "small"
+SMALL = f"""
 accuracy = "draft"
-seed = 7
-[area]
-cone = { ra = 53.117, dec = -27.808, radius = 0.03 }
-[universe]
-galaxy_limit = 23.5
-star_limit = 20.0
-box_cells = 192
-lensing_nside = 64
+{requests.shallow(23.5, 20.0)}
 [fluxes]
 bands = ["lsst_r"]
 [products]
@@ -47,7 +40,8 @@ dec = -27.808
 centre_on = "R22_S11"
 detectors = ["R22_S11", "R22_S12"]
 mjd = 60905.25
-""")
+"""
+REQUEST = tomllib.loads(requests.text(SMALL, requests.FIELD.format(0.03), seed=7))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -92,7 +86,7 @@ def rendered(_once, tmp_path):
 def wanted(pointings=1, **sections):
     table = copy.deepcopy({**REQUEST, **sections})
     table["pointing"] = [{**table["pointing"][0], "mjd": 60905.25 + i} for i in range(pointings)]
-    return requests.from_table(table)
+    return from_table(table)
 
 
 def make(root, request, *modules, spy=lambda work: work):
