@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from jobs import request, shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import focal_plane, plan_exposures, render_exposures
+from jobs.render import fits_product, focal_plane, plan_exposures, preview, render_exposures
 from jobs.render.effects import charge_transfer, quadrants
 from jobs.render.effects.effect import Scene
 from lake_schema import layout, read, sky
@@ -235,6 +235,17 @@ def test_files_are_good_fits(field, channel, content):
         assert (header["NAXIS1"], header["NAXIS2"]) == (4096, 4132)
     elif channel == "VIS":
         assert [unit.shape for unit in fits.open(path)[1:]] == [(2086, 2128)] * 4
+
+
+def test_a_picture_names_the_brightest_of_the_frame(field, image):
+    channel = image.header["CHANNEL"]
+    products = read.version(field, "products").rows().to_pylist()
+    (row,) = (row for row in products if (row["channel"], row["content"]) == (channel, "science"))
+    names = preview.labels(field, row, fits_product.electrons(product(field, channel, "science")))
+    for kind in ("galaxy", "star"):
+        flux = np.sort(image.expected[image.is_star == (kind == "star")])[-16:] / image.header["EXPTIME"]
+        brightest = image.header["ZEROPNT"] - 2.5 * np.log10(flux[::-1])
+        assert [label.mag for label in names if label.kind == kind][:16] == pytest.approx(list(brightest), abs=1e-3)
 
 
 def test_other_tools_can_open_the_lake(field):

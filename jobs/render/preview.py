@@ -27,6 +27,8 @@ _INCHES, _DPI = (13.2, 9.6), 100
 # Largest side of the overview, pixels; close-ups are shown at full resolution.  Labels a kind.
 _OVERVIEW = 1000
 _LABELS, _CLOSE_UPS = 8, 3
+# Room that a label takes, of the image's width and height.
+_TEXT = (0.14, 0.035)
 # Height, and width / height.
 _CLOSE_UP_ARCSEC, _CLOSE_UP_SHAPE = 14.0, 1.145
 # Pixels on each side that mend a cosmic ray.
@@ -107,18 +109,20 @@ def labels(root: Path, product: dict[str, Any], image: fits.Image) -> list[Label
         columns = ["id", *position] + (["z_obs"] if kind == "galaxy" else [])
         rows = read.version(root, table).in_cells(cells, GENERATION_ORDER, columns)
         flux = read.version(root, f"{kind}_fluxes").in_cells(cells, GENERATION_ORDER, ["id", column])
-        found += _labels_of(kind, rows, flux[column].to_numpy(), position, system)
-    inside = [x for x in found if 0 <= x.column < nx and 0 <= x.row < ny]
-    return sorted(inside, key=lambda label: label.mag)
+        near = sky.separation(*centre, *(rows[name].to_numpy() for name in position)) < radius
+        near &= flux[column].to_numpy() > 0
+        if near.any():
+            found += _labels_of(kind, rows.filter(near), flux[column].to_numpy()[near], position, system, (ny, nx))
+    return sorted(found, key=lambda label: label.mag)
 
 
-def _labels_of(kind: str, rows: pa.Table, flux: Float, position: tuple[str, str], system: WCS) -> list[Label]:
-    brightest = np.argsort(-flux)[: 4 * _LABELS]
-    brightest = brightest[flux[brightest] > 0]
-    if not len(brightest):
-        return []
-    ra, dec = (rows[name].to_numpy()[brightest] for name in position)
-    column, row = focal_plane.pixel_of_sky(system, ra, dec)
+def _labels_of(
+    kind: str, rows: pa.Table, flux: Float, position: tuple[str, str], system: WCS, shape: tuple[int, int]
+) -> list[Label]:
+    column, row = focal_plane.pixel_of_sky(system, *(rows[name].to_numpy() for name in position))
+    inside = np.flatnonzero((column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0]))
+    brightest = inside[np.argsort(-flux[inside])[: 4 * _LABELS]]
+    column, row = column[brightest], row[brightest]
     mag = units.mag_of_f_nu(flux[brightest])
     z = rows["z_obs"].to_numpy()[brightest] if kind == "galaxy" else np.full(len(mag), np.nan)
     texts = [f"{m:.1f}" if np.isnan(zi) else f"{m:.1f}  z {zi:.2f}" for m, zi in zip(mag, z, strict=True)]
@@ -145,9 +149,11 @@ def picture(path: Path, image: npt.NDArray[Any], cards: Sequence[Card], names: S
     main = figure.add_axes((0.01, 0.01, 0.715, 0.93))
     block = max(1, int(np.ceil(max(image.shape) / _OVERVIEW)))
     _show(main, _shrunk(image, block), block, image.shape, upside_down)
+    chosen: list[Label] = []
     for kind in ("galaxy", "star"):
-        chosen = _apart([label for label in names if label.kind == kind], min(image.shape) / 14)
-        _annotate(main, chosen[:_LABELS], image.shape, upside_down)
+        among = [label for label in names if label.kind == kind]
+        chosen += _apart(among, _TEXT[0] * image.shape[1], _TEXT[1] * image.shape[0], chosen)[:_LABELS]
+    _annotate(main, chosen, image.shape, upside_down)
     _scale_bar(main, header["PIXSCALE"], image.shape, image.shape[1] / 6)
     _compass(main, system, image.shape)
     for number, label in enumerate(_close_ups(names, image.shape, header["PIXSCALE"])):
@@ -208,11 +214,12 @@ def _stretched(image: npt.NDArray[Any], level: float, noise: float) -> Float:
     return np.asarray((np.arcsinh(signal / _KNEE) - lo) / (hi - lo))
 
 
-def _apart(names: Sequence[Label], distance: float) -> list[Label]:
-    """Labels that do not cover each other, brightest first."""
+def _apart(names: Sequence[Label], wide: float, high: float, taken: Sequence[Label] = ()) -> list[Label]:
+    """Labels that cover neither each other nor those `taken`, brightest first; wide and high in pixels."""
     kept: list[Label] = []
     for label in names:
-        if all(np.hypot(label.column - other.column, label.row - other.row) > distance for other in kept):
+        others = (*taken, *kept)
+        if all(abs(label.column - x.column) > wide or abs(label.row - x.row) > high for x in others):
             kept.append(label)
     return kept
 
@@ -223,7 +230,7 @@ def _close_ups(names: Sequence[Label], shape: tuple[int, ...], pixel_scale: floa
     inside = [
         x for x in names if x.kind == "galaxy" and half < x.column < shape[1] - half and half < x.row < shape[0] - half
     ]
-    return _apart(inside, 3 * half)[:_CLOSE_UPS]
+    return _apart(inside, 2 * half, 2 * half)[:_CLOSE_UPS]
 
 
 def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_down: bool) -> None:
