@@ -18,9 +18,11 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def jit(function: Function) -> Function:
     """The function, compiled when it is first called."""
-    # Sums may be taken in any order, which makes them twice as fast; NaN and infinity keep their meaning.
+    # Sums may be taken in any order, which makes them twice as fast; NaN and infinity keep their meaning.  In which
+    # order depends on what a function is compiled into: always into its caller, or a process that compiles would round
+    # otherwise than one that finds the caller in the cache.
     fast = {"reassoc", "contract", "nsz"}
-    decorate: Any = numba.njit(cache=True, error_model="numpy", fastmath=fast)
+    decorate: Any = numba.njit(cache=True, error_model="numpy", fastmath=fast, forceinline=True)
     compiled: Function = decorate(function)
     return compiled
 
