@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 
 from jobs import request as requests
-from jobs.render import plan_exposures, preview
+from jobs.render import plan_exposures
 from lake_schema import __version__, layout, read
 from lake_schema.errors import LakeError
 
@@ -116,6 +116,9 @@ def _table(root: Path, stages: Sequence[tuple[str, Sequence[str], float]], total
 
 
 def _show(root: Path, out: Path) -> None:
+    # All that renders: seconds that the first job need not wait for.
+    from jobs.render import preview
+
     for picture in preview.previews(root, out):
         print(picture)
 

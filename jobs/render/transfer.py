@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-import scipy.signal
 from scipy.ndimage import maximum
 
 from jobs.render import kernel
@@ -128,7 +127,7 @@ def passing(psf: Psf) -> Float:
         planes = _planes(psf, probe, np.float32)
     else:
         # A smooth edge: a sharp one passes some of every frequency.
-        window = scipy.signal.windows.hann(SAMPLES * _PROBE + 1).astype(np.float32)
+        window = np.hanning(SAMPLES * _PROBE + 1).astype(np.float32)
         middle = _middle(psf.planes.images, SAMPLES * _PROBE)
         planes = _on_grid(list(middle * window[:, None] * window), probe, psf.intra_pixel, np.float32)
     modulus = np.hypot(planes[:, 0], planes[:, 1]).max(axis=0)
