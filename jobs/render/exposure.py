@@ -21,7 +21,7 @@ from jobs.accuracy import Accuracy
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
-from jobs.render import chromatic, exposing, focal_plane, profiles, psf, selection, stamps, tasks, truth_maps
+from jobs.render import chromatic, exposing, focal_plane, pictures, profiles, psf, selection, stamps, tasks, truth_maps
 from jobs.render.channels import ext, vis
 from jobs.render.effects import quadrants
 from jobs.render.effects.effect import Decision, Effect, Lights, Scene, apply_all, decide
@@ -32,6 +32,7 @@ from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_of
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.strong_lenses import STRONG_LENSES
 
 Float = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
@@ -107,6 +108,7 @@ def render(
     passband: Passband | None = None,
     complete: float = 0.0,
     truth: Sequence[str] = (),
+    lenses: pa.Table | None = None,
 ) -> Rendered:
     """Render one detector.
 
@@ -119,6 +121,7 @@ def render(
     detector       : another geometry than the mission's for task["detector"], e.g. a part of it
     complete       : how far beyond the detector the rows have every source, arcsec; for the header
     truth          : maps that are wanted besides the noise-free one, of lake_schema.tables.products.CONTENTS
+    lenses         : rows of `strong_lenses` (pictures.ARC_COLUMNS) whose sources are among the galaxies
     """
     camera, band, channel = str(exposure["camera"]), str(exposure["band"]), str(exposure["channel"])
     passband = passband or passbands.load(band)
@@ -141,7 +144,7 @@ def render(
         spread = _psf(detector, passband, float(exposure["seeing"]), mission, settings.positions)
         sources, sizes = sources_of(
             (galaxies, light[0]), (stars, light[1]), detector, system, spread, scene.pixel_noise, settings, passband,
-            library, stellar,
+            library, stellar, lenses,
         )  # fmt: skip
         _refuse_too_large(exposure, detector, sources, sizes)
         if channel == "VIS":
@@ -257,29 +260,45 @@ def sources_of(
     band: Passband,
     library: Library | None = None,
     stellar: Library | None = None,
+    lenses: pa.Table | None = None,
 ) -> tuple[Sources, stamps.Int]:
     """Everything whose stamp touches the detector, ascending id, and the stamps' sides.
 
-    galaxies, stars : (rows, expected electrons [n])
+    galaxies, stars : (rows, expected electrons [n]);  lenses : rows of `strong_lenses`, None = none
     """
     catalogue, points = galaxies[0], stars[0]
-    ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy()]).astype(np.int64)
-    ra = np.concatenate([catalogue["ra_lensed"].to_numpy(), points["ra"].to_numpy()])
-    dec = np.concatenate([catalogue["dec_lensed"].to_numpy(), points["dec"].to_numpy()])
-    electrons = np.concatenate([galaxies[1], stars[1]])
-    shape = np.concatenate([np.arange(len(catalogue)), np.full(len(points), -1)]).astype(np.int64)
+    form = profiles.shapes(catalogue)
+    arcs = _arcs(lenses, catalogue, galaxies[1], form)
+    ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy(), arcs.ids]).astype(np.int64)
+    ra = np.concatenate([catalogue["ra_lensed"].to_numpy(), points["ra"].to_numpy(), arcs.ra])
+    dec = np.concatenate([catalogue["dec_lensed"].to_numpy(), points["dec"].to_numpy(), arcs.dec])
+    electrons = np.concatenate([galaxies[1], stars[1], arcs.electrons])
+    rest = len(points) + len(arcs.ids)
+    shape = np.concatenate([np.arange(len(catalogue)), np.full(rest, -1)]).astype(np.int64)
+    picture = np.concatenate([np.full(len(catalogue) + len(points), -1), np.arange(len(arcs.ids))]).astype(np.int64)
     _check(ids, electrons)
     reach = detector.half_diagonal + stamps.SIZES[-1] * detector.pixel_scale
     seen = selection.near(ra, dec, focal_plane.centre(detector, system), reach / 3600.0) & (electrons > 0)
     kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
-    form = profiles.shapes(catalogue)
     column, row = focal_plane.pixel_of_sky(system, ra[kept], dec[kept])
-    sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings)
+    wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1]
+    sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings, wide)
     here = selection.touching(column, row, sizes, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
-    photons = _colours(kept, catalogue, points, band, (library, stellar)) if spread.planes is not None else None
-    return Sources(ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons), sizes[here]
+    # Arcs have the colour of what they are an image of.
+    coloured = np.concatenate([np.arange(len(catalogue) + len(points)), arcs.source])[kept]
+    photons = _colours(coloured, catalogue, points, band, (library, stellar)) if spread.planes is not None else None
+    found = Sources(
+        ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons, picture[kept], arcs.pictures
+    )
+    return found, sizes[here]
+
+
+def _arcs(lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: profiles.Shapes) -> pictures.Arcs:
+    """Those of strong lenses: their pictures magnify what the galaxy shines by itself."""
+    rows = STRONG_LENSES.empty().select(pictures.ARC_COLUMNS) if lenses is None else lenses
+    return pictures.arcs(rows, galaxies["id"].to_numpy(), electrons / form.magnification)
 
 
 def _colours(

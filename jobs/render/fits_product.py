@@ -24,13 +24,14 @@ import pyarrow as pa
 from jobs.render import focal_plane
 from jobs.render.effects import quadrants
 from jobs.render.exposure import Rendered
+from jobs.render.stamps import Sources
 from lake_schema import __version__, fits
 from lake_schema.fits import Card
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 # Codes of `method` in the table `rendered_truth`.
-POINT, PROFILE = 0, 1
+POINT, PROFILE, PICTURE = 0, 1, 2
 _MJD_ZERO = datetime(1858, 11, 17)
 
 Writer = Callable[[Path], None]
@@ -82,9 +83,14 @@ def truth(rendered: Rendered) -> pa.Table:
             "expected": sources.electrons,
             "drawn": rendered.drawn,
             "stamp": rendered.sizes,
-            "method": np.where(sources.shape < 0, POINT, PROFILE),
+            "method": _methods(sources),
         }
     )
+
+
+def _methods(sources: Sources) -> npt.NDArray[np.int64]:
+    pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
+    return np.where(pictured, PICTURE, np.where(sources.shape < 0, POINT, PROFILE))
 
 
 def _write(units: Sequence[fits.Image], path: Path) -> None:

@@ -6,6 +6,7 @@ runs          which samples of a stamp's grid are taken, in what order
 take          the samples of a stamp's grid from a transform
 add_planes    planes of a PSF, weighted, summed
 electrons_of  the frame with a smooth layer on top
+between       a transform between its samples
 reaches       how far in Fourier space a source must be followed
 
 Precision is that of the planes: single, but double for sources so bright that it would show.
@@ -346,3 +347,29 @@ def electrons_of(frame: Int, blocks: Float, side: int, margin: int) -> Float:
         for c in range(nx):
             out[r, c] = frame[r, c] / FIXED_POINT + line[left[c]] + part[c] * (line[left[c] + 1] - line[left[c]])
     return out
+
+
+@jit
+def between(
+    spectrum: npt.NDArray[Any], across: Float, up: Float, width: int, slope: float, out: npt.NDArray[Any]
+) -> None:
+    """Fills out [s] with the sums of a periodic spectrum [ny, nx] under a window about frequencies, radian / pixel.
+
+    window : exp(slope (sqrt(1 - z^2) - 1)), z = -1 .. 1 over `width` samples a direction
+    """
+    ny, nx = spectrum.shape
+    x_weights, y_weights = np.empty(width), np.empty(width)
+    for i in range(len(out)):
+        x, y = across[i] * nx / _TWO_PI, up[i] * ny / _TWO_PI
+        left, low = int(np.ceil(x - 0.5 * width)), int(np.ceil(y - 0.5 * width))
+        for j in range(width):
+            zx, zy = 2.0 * (left + j - x) / width, 2.0 * (low + j - y) / width
+            x_weights[j] = np.exp(slope * (np.sqrt(max(1.0 - zx * zx, 0.0)) - 1.0))
+            y_weights[j] = np.exp(slope * (np.sqrt(max(1.0 - zy * zy, 0.0)) - 1.0))
+        total = complex(0.0)
+        for r in range(width):
+            line = complex(0.0)
+            for c in range(width):
+                line += x_weights[c] * spectrum[(low + r) % ny, (left + c) % nx]
+            total += y_weights[r] * line
+        out[i] = total

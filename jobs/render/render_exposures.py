@@ -18,11 +18,11 @@ import pyarrow.parquet as pq
 
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
-from jobs.render import exposure, fits_product, focal_plane, selection, stamps, survey
+from jobs.render import exposure, fits_product, focal_plane, pictures, selection, stamps, survey
 from jobs.render.plan_exposures import PARTS, mission_of, own_filters
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
-from lake_schema import parquet, read, reuse
+from lake_schema import layout, parquet, read, reuse
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
@@ -35,11 +35,16 @@ from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 # Each with its fluxes.
 CATALOGUES = (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes"))
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
+# Drawn where the lake has it.
+LENSES = "strong_lenses"
+# What the parts of catalogues say of themselves.
+_CELLS = "generation_cells"
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """One part a detector of an exposure, the longest first; then what was drawn on each."""
-    inputs = {name: read.version(lake, name) for name in INPUTS}
+    names = (*INPUTS, LENSES) if layout.current_key(lake, LENSES) else INPUTS
+    inputs = {name: read.version(lake, name) for name in names}
     _refuse_other_plan(inputs, request)
     tasks = inputs["tasks"].rows().to_pylist()
     exposures = inputs["exposures"].rows()
@@ -84,8 +89,10 @@ def product_keys(
     }
     rows = {row["exposure_id"]: row for row in exposures.to_pylist()}
     files = [(_deflection(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes])) for name, fluxes in CATALOGUES]
+    if LENSES in inputs:
+        files.append((_deflection(inputs["galaxies"]), _files_of_cells(inputs[LENSES])))
 
-    def catalogues(task: Json) -> list[list[tuple[str, str]]]:
+    def catalogues(task: Json) -> list[list[tuple[str, ...]]]:
         camera, detector = rows[task["exposure_id"]]["camera"], task["detector"]
         reach = stamps.reach(focal_plane.detector(camera, detector, mission).pixel_scale)
         return [
@@ -106,12 +113,12 @@ def product_keys(
     ]
 
 
-def _files_of_cells(catalogue: read.Version, fluxes: read.Version) -> Mapping[int, list[tuple[str, str]]]:
-    """Generation cell -> sha256 of the files that hold it, of the catalogue and of its fluxes."""
-    found: dict[int, list[tuple[str, str]]] = defaultdict(list)
-    for part in catalogue.manifest["parts"]:
-        sums = catalogue.part_sha256(part["name"]), fluxes.part_sha256(part["name"])
-        for cell in part["facts"]["generation_cells"]:
+def _files_of_cells(*tables: read.Version) -> Mapping[int, list[tuple[str, ...]]]:
+    """Generation cell -> sha256 of the files that hold it, of each of the tables."""
+    found: dict[int, list[tuple[str, ...]]] = defaultdict(list)
+    for part in tables[0].manifest["parts"]:
+        sums = tuple(table.part_sha256(part["name"]) for table in tables)
+        for cell in part["facts"][_CELLS]:
             found[cell].append(sums)
     return found
 
@@ -130,6 +137,8 @@ def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> 
         if facts[name].get("seed") != request.seed:
             seeds = f"seed {facts[name].get('seed')}, the request {request.seed}"
             raise BadInput(f"table {name} has {seeds}: build it first")
+    if LENSES in inputs and facts[LENSES].get("galaxies") != inputs["galaxies"].key:
+        raise BadInput(f"table {LENSES} was drawn in another version of galaxies: run build_strong_lenses first")
     for catalogue, fluxes in CATALOGUES:
         if facts[fluxes].get("input") != inputs[catalogue].key:
             raise BadInput(f"table {fluxes} was computed from another version of {catalogue}: run compute_fluxes first")
@@ -158,7 +167,7 @@ def _refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
 
 def _drawn(catalogue: read.Version) -> set[int]:
     """Order-8 cells that a catalogue was drawn in."""
-    return {cell for part in catalogue.manifest["parts"] for cell in part["facts"]["generation_cells"]}
+    return {cell for part in catalogue.manifest["parts"] for cell in part["facts"][_CELLS]}
 
 
 def _deflection(catalogue: read.Version) -> float:
@@ -195,6 +204,17 @@ def sources(
     return rows, light, complete
 
 
+def lenses(table: read.Version, task: Mapping[str, Any], deflection: float) -> pa.Table:
+    """Strong lenses that are seen within a task's circle; deflection : largest of the galaxies, deg."""
+    cells = selection.needed(task, deflection)
+    about = table.in_cells(cells, GENERATION_ORDER, ["id", "ra_lensed", "dec_lensed"])
+    ra, dec = (about[name].to_numpy() for name in ("ra_lensed", "dec_lensed"))
+    seen = about["id"].filter(pa.array(selection.near(ra, dec, (task["ra"], task["dec"]), task["radius"])))
+    # Pictures are large: only those of lenses that are seen are read.
+    parts = [part["name"] for part in table.manifest["parts"] if not set(cells).isdisjoint(part["facts"][_CELLS])]
+    return table.rows(pictures.ARC_COLUMNS, parts if len(seen) else [], pc.field("id").isin(seen))
+
+
 def work(lake: Path, facts: Json) -> Output:
     """One detector: its sources from its own cells, its image, its files."""
     request = facts["request"]
@@ -229,6 +249,7 @@ def work(lake: Path, facts: Json) -> Output:
         forced=own.forced,
         complete=margin + min(complete for *_, complete in found),
         truth=request["truth"],
+        lenses=lenses(inputs[LENSES], task, _deflection(inputs["galaxies"])) if LENSES in inputs else None,
     )
     rows, files = fits_product.products(rendered, request["truth"])
     drawn = fits_product.truth(rendered)

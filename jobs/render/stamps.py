@@ -28,7 +28,8 @@ import numpy.typing as npt
 import scipy.fft
 
 from jobs.accuracy import Accuracy
-from jobs.render import kernel, profiles, sersic, transfer, wings
+from jobs.render import kernel, pictures, profiles, sersic, transfer, wings
+from jobs.render.pictures import Picture
 from jobs.render.profiles import Shapes
 from jobs.render.psf import SIDE, Psf
 from jobs.render.transfer import Transfer
@@ -73,8 +74,9 @@ class Sources:
     column, row : float64[n] 0-based pixel position
     jacobian    : float64[n, 2, 2] d(u, v) / d(column, row), arcsec
     electrons   : float64[n] expected
-    shape       : row of `shapes`, -1 = a point
+    shape       : row of `shapes`, -1 = a point or a picture
     photons     : float64[n, w] fraction of its photons in each sub-band of the PSF; None: flat f_nu
+    picture     : row of `pictures`, -1 = no picture; None: there is none
     """
 
     ids: Int
@@ -85,6 +87,8 @@ class Sources:
     shape: Int
     shapes: Shapes
     photons: Float | None = None
+    picture: Int | None = None
+    pictures: tuple[Picture, ...] = ()
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -100,7 +104,13 @@ class Sources:
             self.shape[chosen],
             self.shapes,
             None if self.photons is None else self.photons[chosen],
+            None if self.picture is None else self.picture[chosen],
+            self.pictures,
         )
+
+    def picture_of(self, i: int) -> Picture | None:
+        """The picture of source i, if it has one."""
+        return None if self.picture is None or self.picture[i] < 0 else self.pictures[self.picture[i]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,11 +143,20 @@ def settings_for(accuracy: Accuracy) -> Settings:
     return Settings(row["edge"], row["ghost"], row["floor"], row["least"], int(row["positions"]))
 
 
-def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: float, settings: Settings) -> Int:
+def stamp_sizes(
+    electrons: Float,
+    shape: Int,
+    shapes: Shapes,
+    psf: Psf,
+    noise: float,
+    settings: Settings,
+    wider: Float | None = None,
+) -> Int:
     """Side of each source's stamp, pixels: int64[n], one of SIZES.
 
     noise : of a pixel, electrons. A cut by noise alone biases faint sources, for what wraps is coherent: the second
             condition holds it to a part of the flux, from the wings of the PSF and of high-n bulges alike
+    wider : [n] arcsec that a picture is wide, 0 where there is none: its stamp is so much wider than a point's
     """
     at = np.concatenate([SIZES // 2, SIZES])
     psf_light = _beyond_the_table(psf, at)
@@ -158,7 +177,10 @@ def stamp_sizes(electrons: Float, shape: Int, shapes: Shapes, psf: Psf, noise: f
     enough[:, -1] = True
     # A point has no light beyond the PSF's plane.
     enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
-    return np.asarray(SIZES[np.argmax(enough, axis=1)])
+    sizes = SIZES[np.argmax(enough, axis=1)]
+    if wider is None:
+        return np.asarray(sizes)
+    return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, sizes + wider / psf.pixel_scale), len(SIZES) - 1)])
 
 
 def reach(pixel_scale: float) -> float:
@@ -212,10 +234,11 @@ def draw(
     body, fraction, bulge, disk, _, row, _ = bodies
     cut = kernel.reaches(passing, transfer.STEP, body, fraction, bulge, disk, table, row, left_out)
     reach, done = transfer.STEP * len(passing), 0
+    pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
     for size in np.unique(sizes):
         of_size = sizes == size
         few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW)
-        alone = of_size & (few | (sources.electrons > _BRIGHT))
+        alone = of_size & (few | (sources.electrons > _BRIGHT) | pictured)
         together = np.flatnonzero(of_size & ~alone)
         shared = transfer.transfer(psf, int(size), reach) if len(together) else None
         own = transfer.grid(int(size), float(cut[alone].max()) if size > SIDE else reach) if alone.any() else None
@@ -225,6 +248,8 @@ def draw(
             if own is not None and alone[chosen[0]]:
                 dtype = np.float64 if sources.electrons[chosen[0]] > _BRIGHT else np.float32
                 passed = transfer.collapsed(psf, weights[chosen[0]], own, dtype)
+                if (picture := sources.picture_of(int(chosen[0]))) is not None:
+                    passed = pictures.through(passed, picture, sources.jacobian[chosen[0]])
                 share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
@@ -298,9 +323,11 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1
         folding_threshold=accuracy, maxk_threshold=accuracy, kvalue_accuracy=1e-7, maximum_fft_size=16384
     )
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)[i]
-    parts = [transfer.profile_of(psf, weights).dilate(1.0 / psf.pixel_scale), galsim.Pixel(1.0)]
-    if sources.shape[i] >= 0:
-        profile = profiles.profile(sources.shapes, int(sources.shape[i]), _POINT)
+    pixel = [] if psf.intra_pixel is None else [galsim.Pixel(1.0)]
+    parts = [transfer.profile_of(psf, weights).dilate(1.0 / psf.pixel_scale), *pixel]
+    picture = sources.picture_of(i)
+    if sources.shape[i] >= 0 or picture is not None:
+        profile = _of(picture) if picture else profiles.profile(sources.shapes, int(sources.shape[i]), _POINT)
         # World frame, arcsec -> pixels, the flux kept.
         parts.append(galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(profile))
     whole = galsim.Convolve(parts, gsparams=settings) * float(sources.electrons[i])
@@ -309,3 +336,10 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1
     image = galsim.ImageD(galsim.BoundsI(0, size - 1, 0, size - 1), scale=1.0)
     whole.drawImage(image, center=centre, method="no_pixel")
     return np.asarray(image.array)
+
+
+def _of(picture: Picture) -> galsim.GSObject:
+    """A picture as galsim interpolates it, world frame (u to the west), flux 1."""
+    image = galsim.Image(np.ascontiguousarray(picture.image[:, ::-1], float), scale=picture.scale)
+    # Padded more than by default: the transform is as good as the reference should be.
+    return galsim.InterpolatedImage(image, x_interpolant="quintic", pad_factor=8.0)

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from lake_schema.columns import Column, Table
 
-METHODS = ((0, "a point, through the PSF at its place"), (1, "a profile, convolved with the PSF at its place"))
+METHODS = (
+    (0, "a point, through the PSF at its place"),
+    (1, "a profile, convolved with the PSF at its place"),
+    (2, "a strong lens' picture, convolved with the PSF at its place"),
+)
 
 RENDERED_TRUTH = Table(
     "rendered_truth",

@@ -8,19 +8,21 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
 from jobs import shell
-from jobs.catalogue import build_galaxies, build_stars
+from jobs.catalogue import build_galaxies, build_stars, build_strong_lenses, strong_lenses
 from jobs.fluxes import compute_fluxes
-from jobs.render import archive, focal_plane, plan_exposures, render_exposures
+from jobs.render import archive, fits_product, focal_plane, plan_exposures, render_exposures
 from jobs.request import from_table
-from lake_schema import layout, publish, read
-from lake_schema.errors import PartsFailed
+from lake_schema import ids, layout, publish, read, sky
+from lake_schema.errors import BadInput, PartsFailed
 from lake_schema.provenance import file_sha256
+from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests import requests
 
 SIDE = 300
@@ -286,6 +288,48 @@ def test_another_mission_makes_everything_again(rendered):
     assert render(rendered, wanted(mission={"overrides": noise})) == BOTH
     for path, data in images(rendered).items():
         assert ("noise_free" in path) or data != before[path]
+
+
+def two_lenses(cell, galaxies, seed, boost):
+    """Instead of shooting rays: the two of a cell's galaxies that are nearest to where the detectors look."""
+    away = sky.separation(*(galaxies[name].to_numpy() for name in ("ra_lensed", "dec_lensed")), 53.117, -27.808)
+    rows = galaxies.take(np.argsort(away)[:2])
+    rest = {c.name: np.ones(2, int if c.type.startswith("int") else float) for c in STRONG_LENSES.columns}
+    placed = {name: rows[name].to_numpy() for name in ("ra", "dec", "_healpix_29", "ra_lensed", "dec_lensed")}
+    named = {"id": ids.source_id(np.full(2, 4), cell, 4_000_000 + np.arange(2)), "lens_id": rows["id"].to_numpy()}
+    drawn = {"stamp_side": np.full(2, 20), "stamp": pa.array([[0.01] * 400] * 2, pa.list_(pa.float32()))}
+    order = np.argsort(placed["_healpix_29"])
+    table = {**rest, **placed, **named, **drawn, "source_id": named["lens_id"], "kind": np.full(2, 4)}
+    return STRONG_LENSES.build({**table, "velocity_dispersion": np.full(2, 200.0)}).take(order)
+
+
+def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
+    lake, before = rendered, keys(rendered, wanted())
+    plain = images(lake)
+    crowded = wanted(strong_lenses={"boost": 2.0})
+    monkeypatch.setattr(strong_lenses, "draw", two_lenses)
+    make(lake, crowded, build_strong_lenses)
+    version = read.version(lake, "strong_lenses")
+    after = keys(lake, crowded)
+    assert all(after[part] != key for part, key in before.items())
+    assert render(lake, crowded) == BOTH
+    drawn = read.version(lake, "rendered_truth").rows(where=pc.field("method") == fits_product.PICTURE)
+    assert len(drawn) > 0
+    assert set(drawn["id"].to_pylist()) <= set(version.rows(["id"])["id"].to_pylist())
+    changed = {path for path, data in images(lake).items() if data != plain[path]}
+    for detector in set(drawn["detector"].to_pylist()):
+        assert sum(f"_{detector}_" in path for path in changed) == 2
+    ahead = render_exposures._refuse_other_plan
+    # Of other galaxies they are not drawn.
+    facts = {**version.manifest["facts"], "galaxies": "0" * 64}
+    other = replace(version, manifest={**version.manifest, "facts": facts})
+    monkeypatch.setattr(
+        render_exposures,
+        "_refuse_other_plan",
+        lambda inputs, request: ahead({**inputs, "strong_lenses": other}, request),
+    )
+    with pytest.raises(BadInput, match="strong_lenses was drawn in another version of galaxies: run build_strong_lens"):
+        render_exposures.steps(lake, crowded)
 
 
 def test_a_product_is_rebuilt_from_its_own_manifest(rendered, tmp_path):

@@ -1,0 +1,150 @@
+"""Sources that are a picture: the arcs of strong lenses.
+
+Picture         surface brightness on a grid of its own, north up, east to the right
+transform       its Fourier transform where the kernel takes its samples
+through         a PSF's planes with the picture behind them
+arcs            rows of strong lenses -> pictures, places and electrons
+
+Between its pixels a picture is what the quintic interpolant makes of them; its transform is then that of the pixels
+times the interpolant's own.
+Ref : Bernstein & Gruen 2014, PASP 126, 287 (the interpolant)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import scipy.fft
+
+from jobs.render import kernel
+from jobs.render.transfer import Grid, Transfer
+from lake_schema.errors import BadInput
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+Array = npt.NDArray[Any]
+
+# What is read of the table `strong_lenses`; arcsec of a pixel of its pictures, as the table declares.
+ARC_COLUMNS = ("id", "source_id", "ra_lensed", "dec_lensed", "stamp_side", "stamp")
+ARC_SCALE = 0.05
+# Of the transform at frequencies between those of the padded picture: it is padded to twice its side, WIDTH samples
+# are taken a direction, under the window exp(SLOPE (sqrt(1 - z^2) - 1)); the error is 1e-7 of the picture's flux.
+# Ref : Barnett, Magland & af Klinteberg 2019, SIAM J. Sci. Comput. 41, C479
+_WIDTH = 8
+_SLOPE = 2.30 * _WIDTH
+# Nodes of the integral that is the window's transform.
+_NODES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """image : float32[ny, nx] of sum 1, south to north and west to east, its place in the middle;  scale : arcsec"""
+
+    image: npt.NDArray[np.float32]
+    scale: float
+
+    @property
+    def diagonal(self) -> float:
+        """Corner to corner, arcsec."""
+        return float(np.hypot(*self.image.shape)) * self.scale
+
+
+def quintic(frequency: Array) -> Array:
+    """The interpolant's transform at radian / pixel.  Ref: Bernstein & Gruen 2014, appendix"""
+    half = 0.5 * frequency
+    s, c = np.sinc(half / np.pi), np.cos(half)
+    return np.asarray(s**5 * (s * (55.0 - 19.0 * half**2) + 2.0 * c * (half**2 - 27.0)))
+
+
+def transform(picture: Picture, jacobian: Float, kx: Array, ky: Array) -> Array:
+    """complex128[s]: the picture's transform, about its middle, at (kx, ky) radian / pixel of the detector.
+
+    jacobian : [2, 2] d(u, v) / d(column, row), arcsec, u to the west
+    Error    : 1e-6 of the flux (tests/jobs/render/test_pictures)
+    """
+    west, north = (np.linalg.inv(jacobian).T @ np.stack([kx, ky]).astype(float)) * picture.scale
+    across, up = -west, north
+    rows, columns = picture.image.shape
+    found = np.empty(len(kx), complex)
+    kernel.between(_spectrum(picture.image), across, up, _WIDTH, _SLOPE, found)
+    if rows % 2 == 0 or columns % 2 == 0:
+        # The middle lies between pixels.
+        found *= np.exp(-0.5j * (across * (columns % 2 == 0) + up * (rows % 2 == 0)))
+    return np.asarray(found * quintic(across) * quintic(up))
+
+
+def through(passed: Transfer, picture: Picture, jacobian: Float) -> Transfer:
+    """One plane, as of a point -> as of the picture."""
+    grid: Grid = passed.grid
+    found = transform(picture, jacobian, grid.kx, grid.ky)
+    re, im = passed.planes[0].astype(float)
+    turned = np.stack([re * found.real - im * found.imag, re * found.imag + im * found.real])
+    return Transfer(grid, turned[None].astype(passed.planes.dtype))
+
+
+@dataclass(frozen=True, slots=True)
+class Arcs:
+    """n lensed galaxies: id, ra, dec in deg, electrons, the row of the galaxy that they are an image of, pictures."""
+
+    ids: Int
+    ra: Float
+    dec: Float
+    electrons: Float
+    source: Int
+    pictures: tuple[Picture, ...]
+
+
+def arcs(rows: pa.Table, ids: Int, electrons: Float) -> Arcs:
+    """Rows of the table `strong_lenses` -> Arcs.
+
+    ids, electrons : [m] of galaxies, without the magnification of their own that fluxes hold
+    """
+    wanted, order = rows["source_id"].to_numpy(), np.argsort(ids, kind="stable")
+    at = np.searchsorted(ids, wanted, sorter=order)
+    source = order[np.minimum(at, len(ids) - 1)] if len(ids) else np.zeros(len(wanted), np.int64)
+    for lens, of, i in zip(rows["id"].to_pylist(), wanted.tolist(), source.tolist(), strict=True):
+        if not len(ids) or ids[i] != of:
+            raise BadInput(f"strong lens {lens}: its source {of} is not among the galaxies")
+    drawn = rows["stamp"].combine_chunks()
+    pixels, ends = drawn.flatten().to_numpy(zero_copy_only=False), np.cumsum(drawn.value_lengths().to_numpy())
+    lenses, sides = rows["id"].to_pylist(), rows["stamp_side"].to_pylist()
+    stamps = np.split(pixels, ends[:-1]) if len(ends) else []
+    found = [_picture(*some) for some in zip(lenses, sides, stamps, strict=True)]
+    return Arcs(
+        rows["id"].to_numpy().astype(np.int64),
+        rows["ra_lensed"].to_numpy(),
+        rows["dec_lensed"].to_numpy(),
+        electrons[source] * np.array([total for _, total in found]),
+        source,
+        tuple(picture for picture, _ in found),
+    )
+
+
+def _picture(lens: int, side: int, pixels: Array) -> tuple[Picture, float]:
+    """A strong lens' picture, and its sum."""
+    total = float(pixels.sum(dtype=float))
+    if len(pixels) != side**2 or not total > 0.0 or not np.isfinite(total):
+        raise BadInput(f"strong lens {lens}: its stamp of side {side} has {len(pixels)} pixels of sum {total:g}")
+    return Picture((pixels / total).reshape(side, side).astype(np.float32), ARC_SCALE), total
+
+
+def _spectrum(image: Array) -> Array:
+    """Transform of the picture about its middle pixel, padded to twice its side, the window's part undone."""
+    middle = [n // 2 for n in image.shape]
+    period = [2 * scipy.fft.next_fast_len(max(n, _WIDTH)) for n in image.shape]
+    rows, columns = (_window_transform(np.arange(n) - n // 2, p) for n, p in zip(image.shape, period, strict=True))
+    padded = np.zeros(period)
+    padded[: image.shape[0], : image.shape[1]] = image / (rows[:, None] * columns)
+    return np.asarray(scipy.fft.fft2(np.roll(padded, [-n for n in middle], (0, 1))))
+
+
+def _window_transform(place: Array, period: int) -> Array:
+    """What the window about a frequency makes of a pixel at `place`."""
+    z, weights = np.polynomial.legendre.leggauss(_NODES)
+    window = weights * np.exp(_SLOPE * (np.sqrt((1 - z) * (1 + z)) - 1.0))
+    half = 0.5 * _WIDTH
+    return np.asarray(half * np.cos(np.outer(2 * np.pi * place / period, half * z)) @ window)
