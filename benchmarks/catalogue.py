@@ -34,6 +34,7 @@ from lake_schema.tables.halos import HALOS
 FACTS = {
     "seed": 20240401,
     "galaxy_limit": 26.0,
+    "galaxy_band": "euclid_vis",
     "z_max": 2.3,
     "box_cells": 192,
     "lensing_nside": 256,

@@ -61,10 +61,11 @@ class DustMap:
 
 @dataclass(frozen=True, slots=True)
 class Ingest:
-    """What is taken from others instead of being made."""
+    """What is taken from others instead of being made; training : galaxies whose spectra ours have."""
 
     galaxies: Catalogue | None = None
     halos: Catalogue | None = None
+    training: Catalogue | None = None
     dust: DustMap | None = None
 
 
@@ -108,9 +109,13 @@ def _curves(value: object, path: str, folder: Path, has_medium: bool = False) ->
 def ingest(table: Toml, folder: Path) -> Ingest:
     """The section `ingest`; files are found from `folder`.  BadInput names the key."""
     galaxies = _catalogue(table["galaxies"], "ingest.galaxies", folder) if "galaxies" in table else None
-    halos = _catalogue(table["halos"], "ingest.halos", folder) if "halos" in table else None
+    halos, training = (
+        _catalogue(table[name], f"ingest.{name}", folder) if name in table else None for name in ("halos", "training")
+    )
     if galaxies and halos:
         raise BadInput("ingest.halos: a finished catalogue of galaxies wants no halos")
+    if galaxies and training:
+        raise BadInput("ingest.training: the galaxies of a finished catalogue have their own spectra")
     dust = None
     if "dust" in table:
         given = table_of(table["dust"], "ingest.dust", set(DustMap.__slots__))
@@ -121,11 +126,11 @@ def ingest(table: Toml, folder: Path) -> Ingest:
             string(given, "ingest.dust.ordering", ("RING", "NESTED"), "RING") if "ordering" in given else "",
             string(given, "ingest.dust.coordinates", ("G", "C"), "G") if "coordinates" in given else "",
         )
-    return Ingest(galaxies, halos, dust)
+    return Ingest(galaxies, halos, training, dust)
 
 
 def _catalogue(value: object, path: str, folder: Path) -> Catalogue:
-    table = table_of(value, path, {"files", "format", "columns"} - ({"format"} if path.endswith("halos") else set()))
+    table = table_of(value, path, {"files", "columns", *(["format"] if path.endswith("galaxies") else [])})
     files = strings(table, f"{path}.files")
     if not files:
         raise BadInput(f"{path}.files is missing or empty")

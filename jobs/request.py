@@ -3,11 +3,14 @@
     name = "demo"      seed = 2024      accuracy = "survey" | "draft" | "reference" | {flux = .., shape = .., ..}
     [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
-    [universe]     galaxy_limit (I_E), star_limit (H, Vega), z_max, box_cells, lensing_nside
+    [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
+                   high_redshift_boost, quasar_boost
     [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
     [ingest.galaxies]  files = [..]  a finished catalogue instead of ours: Parquet, FITS, CSV, a HATS folder
                        format = "flagship1" | "flagship2" | "euclid" | "skycatalogs"   columns = {ours = theirs, ..}
     [ingest.halos]     files = [..]  columns = {ra, dec, z_true, log_mass, ..}   a halo light-cone instead of ours
+    [ingest.training]  files = [..]  columns = {z_true, abs_mag_r01, color_gr_01, sed, ext_law, ebv}
+                       observed galaxies: each of ours has the spectrum of one like it
     [ingest.dust]      file, column, quantity = "ebv" | "a_v"   a HEALPix map of the Milky Way's dust instead of ours
     [strong_lenses]  boost   how many times denser than in nature they are drawn
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
@@ -96,13 +99,15 @@ _NOTHING_TAKEN = Ingest()
 class Universe:
     """How deep and how fine.
 
-    galaxy_limit, star_limit : I_E (AB, before Milky Way dust), H (Vega, as observed);  z_max : highest redshift
+    galaxy_limit, galaxy_band : faintest magnitude (AB, before Milky Way dust) in which passband
+    star_limit               : H (Vega, as observed);  z_max : highest redshift
     box_cells                : cells of 4 Mpc/h a side of the box of matter
     lensing_nside            : HEALPix resolution of the lensing maps
     high_redshift_boost, quasar_boost : how many times denser than in nature these kinds are drawn, 0 = not at all
     """
 
     galaxy_limit: float = 26.0
+    galaxy_band: str = "euclid_vis"
     star_limit: float = 26.0
     z_max: float = 2.3
     box_cells: int = 256
@@ -250,7 +255,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         observations=blocks,
         effects=_effects(_section(table, "effects", {"on", "off"})),
         explore=_explore(_section(table, "explore", None)),
-        ingest=own_files.ingest(_section(table, "ingest", {"galaxies", "halos", "dust"}), folder),
+        ingest=own_files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
         strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
     )
     _check_bands(request)
@@ -274,6 +279,7 @@ def _universe(table: Toml) -> Universe:
     default = Universe()
     return Universe(
         galaxy_limit=_number(table, "universe.galaxy_limit", 10.0, 30.0, default.galaxy_limit),
+        galaxy_band=_string(table, "universe.galaxy_band", default=default.galaxy_band),
         star_limit=_number(table, "universe.star_limit", 0.0, 30.0, default.star_limit),
         z_max=_number(table, "universe.z_max", 0.01, 3.0, default.z_max),
         box_cells=_choice(table, "universe.box_cells", BOX_CELLS, default.box_cells),

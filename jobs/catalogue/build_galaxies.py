@@ -1,6 +1,10 @@
-"""Build tables `halos` and `galaxies`: spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQUEST."""
+"""Build tables `halos`, `galaxies` and `quarantine` of a request.
+
+spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQUEST
+"""
 
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,35 +14,70 @@ if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from jobs.catalogue import cells, dust_map, galaxies, halo_catalogue, ingest, ingested_galaxies, mapping, population
+from jobs.catalogue import (
+    cells,
+    dust_map,
+    galaxies,
+    halo_catalogue,
+    ingest,
+    ingested_galaxies,
+    lensing,
+    mapping,
+    nearest_sed,
+    population,
+)
 from jobs.catalogue.galaxies import GalaxyModel
+from jobs.catalogue.halo_catalogue import LightCone
+from jobs.catalogue.nearest_sed import Training
+from jobs.fluxes import passbands
 from jobs.own_files import Catalogue, DustMap, Ingest
 from jobs.request import Request
 from jobs.shell import Job, Step, main
-from lake_schema import layout
+from lake_schema import layout, parquet, read
+from lake_schema.errors import BadInput
+from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.provenance import code_version
-from lake_schema.publish import Json, Output, Plan
+from lake_schema.publish import Json, Output, Part, Plan
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
+from lake_schema.tables.quarantine import QUARANTINE
 
 _HALO_FACTS = ("galaxy_limit", "z_max", "box_cells")
+_GALAXY_FACTS = (*_HALO_FACTS, "lensing_nside", "high_redshift_boost", "quasar_boost")
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Two tables of one part an order-5 cell each, made of the generation cells that the request's area touches.
+    """Tables of one part an order-5 cell each, made of the generation cells that the request's area touches.
 
-    Galaxies of a finished catalogue are one table: its halos are not known.
+    Galaxies of a finished catalogue have no table of halos: these are not known. Galaxies that weak lensing cannot
+    describe lie in files beside the others, and are a table of their own.
     """
+    # Whatever is wrong with a file is said before anything is published.
+    dust_map.chosen(request.seed, request.ingest.dust)
     if request.ingest.galaxies is not None:
-        return [_ingested(lake, request, request.ingest.galaxies)]
+        made = [_ingested(lake, request, request.ingest.galaxies)]
+    else:
+        made = _drawn(lake, request)
+    facts = {"galaxies": made[-1].plan.key, "code": code_version()}
+    apart = Plan(QUARANTINE, facts, (Part("all.parquet", {}),))
+    return [*made, Step(apart, quarantine_work, on_driver=True)]
+
+
+def _drawn(lake: Path, request: Request) -> list[Step]:
     universe = request.facts("universe")["universe"]
     del universe["star_limit"]
     own = request.ingest
-    light_cone = {"halos": _halo_facts(own.halos)} if own.halos else {}
-    facts = {"seed": request.seed, **universe, **light_cone, **dust_map.facts(own.dust), "code": code_version()}
+    if universe["galaxy_band"] not in passbands.names():
+        band, known = universe["galaxy_band"], ", ".join(passbands.names())
+        raise BadInput(f"universe.galaxy_band = {band!r} is not one of {known}")
+    # The spectra of a training table say how faint a halo's galaxy may be.
+    theirs = {"halos": _about(own.halos, mapping.halos(dict(own.halos.columns)))} if own.halos else {}
+    theirs |= {"training": _about(own.training, mapping.training(dict(own.training.columns)))} if own.training else {}
+    facts = {"seed": request.seed, **universe, **theirs, **dust_map.facts(own.dust), "code": code_version()}
     parts = cells.parts(request.area)
-    halos = Plan(HALOS, {key: facts[key] for key in ("seed", *_HALO_FACTS, *light_cone, "code")}, parts)
+    halos = Plan(HALOS, {key: facts[key] for key in ("seed", *_HALO_FACTS, "galaxy_band", *theirs, "code")}, parts)
     # Up to this multipole the lensing has the power of linear theory within 10 %.
     plan = Plan(GALAXIES, {**facts, "lensing_l_max": facts["lensing_nside"]}, parts)
     if not layout.version(lake, GALAXIES.name, plan.key).exists():
@@ -49,7 +88,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 def halo_work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
     """The halos of one order-5 cell."""
-    given: list[Any] = [facts["seed"], *(facts[name] for name in _HALO_FACTS), _light_cone(facts, own)]
+    given: list[Any] = [facts["seed"], *(facts[name] for name in _HALO_FACTS), *_chosen(facts, own)]
     people = galaxies.people(*given)
     drawn = population.Cells(people)
     return Output(cells.rows(facts, HALOS, lambda cell: galaxies.halo_table(cell, people, drawn)))
@@ -60,26 +99,55 @@ def work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
     universe = _universe(facts, own)
     dust = dust_map.chosen(facts["seed"], own.dust if own else None)
     drawn = population.Cells(universe.population)
-    return Output(cells.rows(facts, GALAXIES, lambda cell: galaxies.draw(cell, universe, drawn, dust)))
+    return _parted(facts, cells.rows(facts, GALAXIES, lambda cell: galaxies.draw(cell, universe, drawn, dust)))
 
 
-def _universe(facts: Json, own: Ingest | None) -> GalaxyModel:
-    names = ("seed", "galaxy_limit", "z_max", "box_cells", "lensing_nside", "high_redshift_boost", "quasar_boost")
-    given: list[Any] = [*(facts[name] for name in names), _light_cone(facts, own)]
+def quarantine_work(lake: Path, facts: Json) -> Output:
+    """What lies beside the galaxies of all cells."""
+    version = read.version(lake, GALAXIES.name, facts["galaxies"])
+    there = {entry["path"] for entry in version.manifest["files"]}
+    names = (quarantine_file(part["facts"]["generation_cells"]) for part in version.manifest["parts"])
+    found = [pq.read_table(version.file(name)) for name in names if name in there]
+    return Output(pa.concat_tables([QUARANTINE.empty(), *found]))
+
+
+def quarantine_file(generation_cells: Sequence[int]) -> str:
+    """Where a version of `galaxies` keeps what weak lensing cannot describe; not there where nothing is."""
+    return f"quarantine/{layout.cell_file(FILE_ORDER, generation_cells[0] >> 2 * (GENERATION_ORDER - FILE_ORDER))}"
+
+
+def _parted(facts: Json, rows: pa.Table) -> Output:
+    kappa, gamma1, gamma2 = (rows[name].to_numpy().astype(float) for name in ("kappa", "gamma1", "gamma2"))
+    apart = lensing.near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
+    if not apart.any():
+        return Output(rows)
+    given = {name: rows[name].filter(pa.array(apart)) for name in rows.column_names}
+    found = QUARANTINE.build({**given, "determinant": lensing.determinant(kappa, gamma1, gamma2)[apart]})
+    name = quarantine_file(facts["generation_cells"])
+    return Output(rows.filter(pa.array(~apart)), {name: lambda path: parquet.write(path, found, QUARANTINE)})
+
+
+def _universe(facts: Json, own: Ingest | None = None) -> GalaxyModel:
+    given: list[Any] = [facts["seed"], *(facts[name] for name in _GALAXY_FACTS), *_chosen(facts, own)]
     return galaxies.model(*given)
 
 
-def _halo_facts(given: Catalogue) -> Json:
-    columns = mapping.halos(dict(given.columns))
+def _chosen(facts: Json, own: Ingest | None) -> tuple[LightCone | None, str, Training | None]:
+    """Halos of others, the limit's band, spectra of others."""
+    light_cone = training = None
+    if own is not None and own.halos is not None:
+        columns = mapping.halos(dict(own.halos.columns))
+        found, _ = ingest.listed(own.halos.files, columns)
+        light_cone = halo_catalogue.load(found, facts["halos"]["sha256"], columns)
+    if own is not None and own.training is not None:
+        columns = mapping.training(dict(own.training.columns))
+        found, _ = ingest.listed(own.training.files, columns)
+        training = nearest_sed.load(found, facts["training"]["sha256"], columns)
+    return light_cone, facts["galaxy_band"], training
+
+
+def _about(given: Catalogue, columns: mapping.Columns) -> Json:
     return {"sha256": ingest.files(given.files, columns)[1], "columns": dict(given.columns)}
-
-
-def _light_cone(facts: Json, own: Ingest | None) -> halo_catalogue.LightCone | None:
-    if own is None or own.halos is None:
-        return None
-    columns = mapping.halos(dict(own.halos.columns))
-    found, _ = ingest.listed(own.halos.files, columns)
-    return halo_catalogue.load(found, facts["halos"]["sha256"], columns)
 
 
 def _ingested(lake: Path, request: Request, given: Catalogue) -> Step:
@@ -105,7 +173,7 @@ def ingested_work(lake: Path, facts: Json, given: Catalogue, dust: DustMap | Non
     def draw(cell: int) -> pa.Table:
         return ingested_galaxies.draw(cell, ingest.rows(laid_out, cell), model, sky_map)
 
-    return Output(cells.rows(facts, GALAXIES, draw))
+    return _parted(facts, cells.rows(facts, GALAXIES, draw))
 
 
 JOB = Job("build_galaxies", "Draw the halos and galaxies of a sky area.", steps)

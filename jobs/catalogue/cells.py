@@ -3,6 +3,7 @@
 parts      one file an order-5 cell
 by_number  files of about as many rows, in cells of whatever order that takes
 rows       what a file holds
+in_order   rows of a cell as files hold them
 
 A generation cell is always drawn whole, so that its rows are the same bytes in every request that touches it, and in
 whichever file it lies.
@@ -59,3 +60,8 @@ def by_number(generation_cells: Sequence[int], numbers: npt.ArrayLike, most: flo
 def rows(facts: Json, table: Table, draw: Callable[[int], pa.Table]) -> pa.Table:
     """Rows of a part: its generation cells one after another, which is the order of _healpix_29."""
     return pa.concat_tables([table.empty(), *(draw(cell) for cell in sorted(facts["generation_cells"]))])
+
+
+def in_order(drawn: pa.Table) -> pa.Table:
+    """Rows by _healpix_29, those of one place by identifier."""
+    return drawn.take(np.lexsort((drawn["id"].to_numpy(), drawn["_healpix_29"].to_numpy())))

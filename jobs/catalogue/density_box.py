@@ -38,7 +38,6 @@ Float = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Complex64 = npt.NDArray[np.complex64]
 
-SIZES = (192, 256, 384)
 _FILE = "density_box.toml"
 # Interpolation nodes of P(k), in ln k over what a box can hold: 1e-5 relative.
 _K_NODES = 2000

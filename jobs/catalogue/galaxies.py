@@ -24,24 +24,26 @@ from jobs.catalogue import (
     luminosity_function,
     matching,
     morphology,
+    nearest_sed,
     population,
     sed_assignment,
     stellar_mass,
 )
 from jobs.catalogue.band_ratios import BandRatios, Sed
+from jobs.catalogue.cells import in_order
 from jobs.catalogue.emission_lines import LineModel
 from jobs.catalogue.halo_catalogue import LightCone
 from jobs.catalogue.high_redshift import Kind
 from jobs.catalogue.lensing import Planes
 from jobs.catalogue.luminosity_function import Schechter
 from jobs.catalogue.morphology import Shapes
+from jobs.catalogue.nearest_sed import Training
 from jobs.catalogue.population import Cells, Members, Population
 from jobs.fluxes import cosmology, templates
 from jobs.rng import stream
 from lake_schema import sky
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
-from lake_schema.units import LIGHT_KM_S
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
@@ -56,8 +58,9 @@ _MARGIN = 0.02
 class GalaxyModel:
     """Everything that galaxies are drawn from; a few MB, made once by `model`.
 
-    limit     : faintest I_E, AB, before the Milky Way's dust
-    selection : I_E against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
+    limit     : faintest magnitude, AB, before the Milky Way's dust
+    selection : the limit's band against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
+    training  : observed galaxies whose spectra ours have, None = spectra that have the colours
     """
 
     limit: float
@@ -73,6 +76,7 @@ class GalaxyModel:
     light: stellar_mass.Light
     lines: LineModel
     distant: tuple[Kind, ...]
+    training: Training | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,15 +100,18 @@ def model(
     high_redshift_boost: float = 1.0,
     quasar_boost: float = 1.0,
     light_cone: LightCone | None = None,
+    band: str = SELECTION_BAND,
+    training: Training | None = None,
 ) -> GalaxyModel:
-    """The embedded universe of a seed: its galaxies with I_E < limit and z < z_max.
+    """The embedded universe of a seed: its galaxies brighter than a limit in a band, and with z < z_max.
 
+    light_cone, training : halos and observed galaxies of others, in place of ours
     1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
     """
     library, colours = templates.galaxy_library(), sed_assignment.colours_model()
-    selection = _selection(z_max)
-    population_of = people(seed, limit, z_max, box_cells, light_cone)
-    dustiest = colours.dust.highest
+    selection = _selection(band, z_max, training)
+    dustiest = float(selection.ebv[-1])
+    population_of = people(seed, limit, z_max, box_cells, light_cone, band, training)
     distant = high_redshift.model(high_redshift_boost, quasar_boost)
     return GalaxyModel(
         limit=limit,
@@ -120,12 +127,21 @@ def model(
         light=stellar_mass.light(library, selection.ebv),
         lines=emission_lines.model(),
         distant=distant,
+        training=training,
     )
 
 
-def people(seed: int, limit: float, z_max: float, box_cells: int, light_cone: LightCone | None = None) -> Population:
-    """The halos and galaxies that an I_E < limit can be asked of, before they have colours."""
-    nodes, brightest = band_ratios.brightest(_selection(z_max))
+def people(
+    seed: int,
+    limit: float,
+    z_max: float,
+    box_cells: int,
+    light_cone: LightCone | None = None,
+    band: str = SELECTION_BAND,
+    training: Training | None = None,
+) -> Population:
+    """The halos and galaxies that a limit can be asked of, before they have colours."""
+    nodes, brightest = band_ratios.brightest(_selection(band, z_max, training))
 
     def faintest(z: Float) -> Float:
         return limit + _MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
@@ -134,9 +150,9 @@ def people(seed: int, limit: float, z_max: float, box_cells: int, light_cone: Li
     return population.model(seed, box_cells, luminosity_function.volume(z_max), inverse, faintest, light_cone)
 
 
-def _selection(z_max: float) -> BandRatios:
-    dustiest = sed_assignment.colours_model().dust.highest
-    return band_ratios.load(templates.galaxy_library(), SELECTION_BAND, z_max, dustiest)
+def _selection(band: str, z_max: float, training: Training | None) -> BandRatios:
+    dustiest = max(sed_assignment.colours_model().dust.highest, training.dustiest if training else 0.0)
+    return band_ratios.load(templates.galaxy_library(), band, z_max, dustiest)
 
 
 def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.float32]) -> pa.Table:
@@ -159,14 +175,13 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.fl
         "color_gr_01": drawn.colour,
         "log_stellar_mass": log_mass,
         "log_sfr": log_sfr,
-        **_sed_columns(drawn.sed),
+        **sed_assignment.columns(drawn.sed),
         **emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, drawn.red, drawn.sed.ebv, rng),
         **_shape_columns(cell, seed, universe.shapes, drawn, log_mass),
     }
     rows = [GALAXIES.build(columns)]
     rows += [high_redshift.draw(cell, seed, kind, universe.planes, dust) for kind in universe.distant]
-    together = pa.concat_tables(rows)
-    return together.take(np.lexsort((together["id"].to_numpy(), together["_healpix_29"].to_numpy())))
+    return in_order(pa.concat_tables(rows))
 
 
 def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
@@ -181,7 +196,7 @@ def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
             "dec": dec,
             "_healpix_29": hosts.index,
             "z_true": z,
-            "z_obs": (1.0 + z) * (1.0 + hosts.velocity / LIGHT_KM_S) - 1.0,
+            "z_obs": population.observed_redshift(z, hosts.velocity),
             "log_mass": hosts.log_mass,
             "concentration": universe.masses.at(universe.masses.concentration, z, hosts.log_mass),
             "complete": hosts.log_mass >= universe.halos.mass_limit(hosts.chi),
@@ -197,7 +212,7 @@ def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed) -> 
 
 
 def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
-    """I_E[n], AB, unmagnified and before the Milky Way's dust.
+    """Magnitude[n] in the limit's band, AB, unmagnified and before the Milky Way's dust.
 
     Error: < 0.001 mag (tests/jobs/catalogue/test_band_ratios)
     """
@@ -210,6 +225,9 @@ def _light(cell: int, seed: int, universe: GalaxyModel, people: Members) -> tupl
     red, colour = sed_assignment.draw_colour(
         universe.colours, m_r, people.z, people.kind, stream(seed, "galaxies.colour", cell)
     )
+    if universe.training is not None:
+        rng = stream(seed, "galaxies.nearest", cell)
+        return people.z, m_r, red, nearest_sed.assign(universe.training, colour, m_r, people.z, rng)
     law, ebv = sed_assignment.draw_dust(universe.colours.dust, m_r, red, colour, stream(seed, "galaxies.dust", cell))
     return people.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
 
@@ -237,19 +255,6 @@ def _places(
         "gamma1": gamma1,
         "gamma2": gamma2,
         "a_v": dust_map.a_v(dust, ra, dec),
-    }
-
-
-def _sed_columns(sed: Sed) -> dict[str, npt.NDArray[np.generic]]:
-    return {
-        "sed_1": sed.template_1,
-        "frac_1": sed.frac_1,
-        "ext_law_1": sed.law,
-        "ebv_1": sed.ebv,
-        "sed_2": sed.template_2,
-        "frac_2": sed.frac_2,
-        "ext_law_2": sed.law,
-        "ebv_2": sed.ebv,
     }
 
 

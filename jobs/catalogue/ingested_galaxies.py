@@ -18,12 +18,22 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from jobs.catalogue import band_ratios, dust_map, emission_lines, lensing, morphology, sed_assignment, stellar_mass
+from jobs.catalogue import (
+    band_ratios,
+    cells,
+    dust_map,
+    emission_lines,
+    lensing,
+    morphology,
+    sed_assignment,
+    stellar_mass,
+)
 from jobs.catalogue.band_ratios import BandRatios, Sed
 from jobs.catalogue.emission_lines import LineModel
 from jobs.catalogue.ingest import Split
 from jobs.catalogue.mapping import Columns
 from jobs.catalogue.morphology import Shapes
+from jobs.catalogue.population import SATELLITE
 from jobs.fluxes import cosmology, templates
 from jobs.rng import stream
 from lake_schema import ids
@@ -35,7 +45,6 @@ Int = npt.NDArray[np.int64]
 Array = npt.NDArray[Any]
 Given = Mapping[str, Array]
 
-SATELLITE = 1
 # Of a galaxy whose mapping says nothing of dust: as far as tables of E(B-V) reach at the least.
 _LEAST_EBV = 0.5
 
@@ -109,12 +118,7 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: npt.NDArray[np.fl
         "log_halo_mass": _or_missing(given, "log_halo_mass", n),
         "log_stellar_mass": log_mass,
         "log_sfr": log_sfr,
-        "sed_1": sed.template_1,
-        "frac_1": sed.frac_1,
-        "ext_law_1": sed.law,
-        "ebv_1": sed.ebv,
-        "sed_2": sed.template_2,
-        "frac_2": sed.frac_2,
+        **sed_assignment.columns(sed),
         "ext_law_2": law_2,
         "ebv_2": ebv_2,
         **{name: _or_missing(given, name, n) if _has_lines(given) else values for name, values in drawn.items()},
@@ -123,7 +127,7 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: npt.NDArray[np.fl
     }
     if "origin_id" in given:
         columns["origin_id"] = given["origin_id"]
-    return _sorted(GALAXIES.build({name: _masked(name, values) for name, values in columns.items()}))
+    return cells.in_order(GALAXIES.build({name: _masked(name, values) for name, values in columns.items()}))
 
 
 def _streams(seed: int, cell: int) -> Any:
@@ -151,10 +155,6 @@ def _masked(name: str, values: Array) -> Any:
     if GALAXIES.column(name).nullable and values.dtype.kind == "f" and not isinstance(values, np.ma.MaskedArray):
         return np.ma.masked_invalid(values)
     return values
-
-
-def _sorted(rows: pa.Table) -> pa.Table:
-    return rows.take(np.lexsort((rows["id"].to_numpy(), rows["_healpix_29"].to_numpy())))
 
 
 def _identity(given: Given, cell: int, kind: Int) -> dict[str, Int]:
@@ -189,8 +189,10 @@ def _seen(given: Given, universe: IngestModel, lens: Mapping[str, Array], a_v: F
     over_v = universe.columns.seen_over_v
     if over_v is None:
         return given["mag"]
-    mu = lensing.magnification(lens["kappa"], lens["gamma1"], lens["gamma2"])
-    return np.asarray(given["mag"] - over_v * a_v + 2.5 * np.log10(np.abs(mu)))
+    # Those nearer to a caustic go into quarantine.
+    found = lensing.determinant(*(lens[name] for name in ("kappa", "gamma1", "gamma2")))
+    bounded = np.maximum(np.abs(found), lensing.settings().caustic)
+    return np.asarray(given["mag"] - over_v * a_v - 2.5 * np.log10(bounded))
 
 
 def _light(
@@ -221,10 +223,7 @@ def _light(
 
 def _spectra(given: Given, count: int) -> Sed:
     if "sed" in given:
-        real = given["sed"]
-        upper = np.maximum(np.ceil(real), 1.0).astype(np.int64)
-        share = np.asarray(upper - real, np.float64)
-        sed = Sed(upper, 1.0 - share, np.asarray(upper - 1), share, given["ext_law"], given["ebv"])
+        sed = sed_assignment.between(given["sed"], given["ext_law"], given["ebv"])
     else:
         sed = Sed(*(given[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
     highest = max(int(sed.template_1.max()), int(sed.template_2.max()))

@@ -117,14 +117,16 @@ def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, 
     return np.degrees(moved) % 360.0, np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
 
 
-def magnification(kappa: Float, gamma1: Float, gamma2: Float) -> Float:
-    """mu[n] = 1 / ((1 - kappa)^2 - gamma^2)."""
-    return np.asarray(1.0 / ((1.0 - kappa) ** 2 - gamma1**2 - gamma2**2))
+def determinant(kappa: Float, gamma1: Float, gamma2: Float) -> Float:
+    """(1 - kappa)^2 - gamma^2 [n], one over the magnification."""
+    shear = np.hypot(gamma1, gamma2)
+    # A product of differences keeps its digits where the difference of squares loses them.
+    return np.asarray((1.0 - kappa - shear) * (1.0 - kappa + shear))
 
 
 def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> npt.NDArray[np.bool_]:
-    """Sources[n] that weak lensing cannot describe."""
-    return np.asarray(((1.0 - kappa) ** 2 - gamma1**2 - gamma2**2 < caustic) | (kappa >= 1.0))
+    """Sources[n] that weak lensing cannot describe: at a caustic, or beyond it."""
+    return np.asarray((determinant(kappa, gamma1, gamma2) < caustic) | (kappa >= 1.0))
 
 
 def transform(kappa: Float32, nside: int, gain: Float) -> Float32:

@@ -2,7 +2,7 @@
 
 formats     the mappings that are shipped (ingest_formats.toml)
 galaxies    a shipped mapping with a request's own entries over it, checked
-halos       the same for halos, which have no shipped one
+halos, training     the same for halos and training tables, which have no shipped one
 read        the rows of files by key, checked: a wrong value is refused with its file, column and row
 """
 
@@ -59,6 +59,14 @@ HALO_BOUNDS: Bounds = {
     "velocity": (-1e4, 1e4),
     "log_mass": (8.0, 16.5),
     "origin_id": (-(2.0**63), 2.0**63),
+}
+TRAINING_BOUNDS: Bounds = {
+    "z_true": (0.0, 15.0),
+    "abs_mag_r01": (-30.0, 5.0),
+    "color_gr_01": (-2.0, 4.0),
+    "sed": (0.0, 1000.0),
+    "ext_law": (0, 4),
+    "ebv": (0.0, 3.0),
 }
 _INTEGERS = ("kind", "ext_law", "ext_law_1", "ext_law_2", "sed_1", "sed_2")
 
@@ -141,6 +149,14 @@ def halos(own: Mapping[str, str]) -> Columns:
     fields = _fields({key: json.loads(text) for key, text in own.items()}, HALO_BOUNDS, "ingest.halos.columns")
     _need(fields, "ingest.halos.columns", ("ra",), ("dec",), ("z_true",), ("log_mass",))
     return Columns(fields, HALO_BOUNDS)
+
+
+def training(own: Mapping[str, str]) -> Columns:
+    """The mapping of a request's training table; each of its keys is needed."""
+    given = {key: json.loads(text) for key, text in own.items()}
+    fields = _fields(given, TRAINING_BOUNDS, "ingest.training.columns")
+    _need(fields, "ingest.training.columns", *((key,) for key in TRAINING_BOUNDS))
+    return Columns(fields, TRAINING_BOUNDS)
 
 
 def read(files: Sequence[Path], columns: Columns) -> Iterator[Rows]:

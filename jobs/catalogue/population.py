@@ -138,8 +138,13 @@ def members(cells: Cells, cell: int) -> Members:
     order = np.lexsort((columns[0], columns[2]))
     source, halo_id, index, ra, dec, chi, velocity, proxy, mass = (column[order] for column in columns)
     z = cells.population.halos.distances.redshift(chi)
-    z_obs = (1.0 + z) * (1.0 + velocity / LIGHT_KM_S) - 1.0
+    z_obs = observed_redshift(z, velocity)
     return Members(own, own_ids, source, halo_id, ids.kind_of(source), index, ra, dec, chi, z, z_obs, proxy, mass)
+
+
+def observed_redshift(z: Float, velocity: Float) -> Float:
+    """[n] of sources that recede with a peculiar velocity, km/s."""
+    return np.asarray((1.0 + z) * (1.0 + velocity / LIGHT_KM_S) - 1.0)
 
 
 def _around(order: int, cell: int) -> list[int]:

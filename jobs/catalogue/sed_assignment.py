@@ -3,7 +3,8 @@
 red_fraction, draw_colour   the red and blue sequences of 0.1(g - r) against luminosity and redshift
 draw_dust                   E(B-V) and extinction law
 invert                      the SED that has the colour: two neighbouring templates and their shares
-colours                     0.1(g - r) of an SED
+between                     the SED of a real template index
+columns, colours            an SED as columns of table `galaxies`, its 0.1(g - r)
 
 Ref: Skibba & Sheth 2009, Ilbert et al. 2009; the numbers and their sources are in sed_assignment.toml.
 """
@@ -150,6 +151,30 @@ def invert(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
     late, early = ratio[row, template], ratio[row, template - 1]
     share = np.clip((late - target) / (late - early), 0.0, 1.0)
     return Sed(template, 1.0 - share, template - 1, share, law, ebv)
+
+
+def between(index: Float, law: Int, ebv: Float) -> Sed:
+    """Of real template indices t[n] >= 0: i = max(ceil(t), 1) and i - 1, with shares 1 - f and f = i - t.
+
+    Ref: Serrano et al. 2024, appendix B
+    """
+    upper = np.maximum(np.ceil(index), 1.0).astype(np.int64)
+    share = np.asarray(upper - index, np.float64)
+    return Sed(upper, 1.0 - share, upper - 1, share, law, ebv)
+
+
+def columns(sed: Sed) -> dict[str, npt.NDArray[np.generic]]:
+    """Spectra as columns of table `galaxies`: both components behind the same dust."""
+    return {
+        "sed_1": sed.template_1,
+        "frac_1": sed.frac_1,
+        "ext_law_1": sed.law,
+        "ebv_1": sed.ebv,
+        "sed_2": sed.template_2,
+        "frac_2": sed.frac_2,
+        "ext_law_2": sed.law,
+        "ebv_2": sed.ebv,
+    }
 
 
 def colours(table: BandRatios, sed: Sed) -> Float:

@@ -23,14 +23,16 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.mission import MISSION
     from lake_schema.tables.passbands import PASSBANDS
     from lake_schema.tables.products import PRODUCTS
+    from lake_schema.tables.quarantine import QUARANTINE
     from lake_schema.tables.rendered_truth import RENDERED_TRUTH
     from lake_schema.tables.stars import STARS
     from lake_schema.tables.strong_lenses import STRONG_LENSES
     from lake_schema.tables.tasks import TASKS
     from lake_schema.tables.templates import TEMPLATES
 
-    catalogues = [HALOS, GALAXIES, STRONG_LENSES, STARS, fluxes("galaxy", bands), fluxes("star", bands), GAIA]
-    return [*catalogues, TEMPLATES, EXTINCTION_LAWS, PASSBANDS, MISSION, EXPOSURES, TASKS, PRODUCTS, RENDERED_TRUTH]
+    galaxies, stars = (fluxes(kind, bands) for kind in ("galaxy", "star"))
+    skies = [HALOS, GALAXIES, QUARANTINE, STRONG_LENSES, STARS, galaxies, stars, GAIA]
+    return [*skies, TEMPLATES, EXTINCTION_LAWS, PASSBANDS, MISSION, EXPOSURES, TASKS, PRODUCTS, RENDERED_TRUTH]
 
 
 def markdown() -> str:

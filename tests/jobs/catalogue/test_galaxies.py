@@ -1,11 +1,20 @@
 import dataclasses
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
-from jobs.catalogue import galaxies, lightcone, luminosity_function, morphology, population
+from jobs.catalogue import (
+    band_ratios,
+    build_galaxies,
+    galaxies,
+    lightcone,
+    luminosity_function,
+    morphology,
+    population,
+)
 from jobs.fluxes import cosmology
 from lake_schema import ids, sky, validate
 from lake_schema.tables.galaxies import GALAXIES
@@ -191,13 +200,17 @@ def test_positions_are_lensed(drawn):
     assert shift[drawn.z < 0.1].max() < 0.2 * shift.max()
 
 
-def test_a_cell_is_the_same_alone_or_among_others(universe, dust, cell):
-    """In another process, after other cells: every byte."""
+def test_a_cell_is_the_same_alone_or_among_others(universe, dust, cell, monkeypatch):
+    """In another process, in a file between other cells: every byte."""
     other = pickle.loads(pickle.dumps(universe))
-    drawn = population.Cells(other.population)
-    galaxies.draw(CELL + 5, other, drawn, dust)
-    again = galaxies.draw(CELL, other, drawn, dust)
-    assert again.equals(cell)
+    monkeypatch.setattr(build_galaxies, "_universe", lambda facts, own: other)
+    monkeypatch.setattr(build_galaxies.dust_map, "chosen", lambda seed, own: dust)
+    facts = {"seed": SEED, "generation_cells": [CELL + 1, CELL, CELL - 8]}
+    rows = build_galaxies.work(Path(), facts).rows
+    first, last = np.searchsorted(rows["_healpix_29"].to_numpy(), sky.cell_range(ids.GENERATION_ORDER, CELL))
+    assert 0 < first < last < rows.num_rows
+    again = rows.slice(first, last - first).combine_chunks()
+    assert again.equals(cell.combine_chunks())
     # Null columns apart, the bytes themselves.
     for name in cell.column_names:
         if not cell[name].null_count:
@@ -234,6 +247,35 @@ def test_an_empty_cell_is_an_empty_table(dust):
     assert (rows["z_true"].to_numpy() < 6).sum() < 5
     assert rows.schema.equals(GALAXIES.arrow())
     assert validate.violations(rows, GALAXIES) == []
+
+
+@pytest.mark.parametrize(("band", "limit"), [("euclid_h", 21.5), ("lsst_g", 23.0)])
+def test_a_limit_in_another_band(drawn, dust, band, limit):
+    """As many as a deeper catalogue has there, none fainter, and of fewer halos."""
+    there = galaxies.model(SEED, limit, 2.3, BOX_CELLS, NSIDE, 0.0, 0.0, band=band)
+    cells = population.Cells(there.population)
+    places = drawn.places[::3]
+    rows = pa.concat_tables([galaxies.draw(cell, there, cells, dust) for cell in places])
+    wanted = np.isin(sky.cell_of(drawn.columns["ra"], drawn.columns["dec"], ids.GENERATION_ORDER), places)
+    expected = np.sum(drawn.mags[band][wanted] < limit)
+    assert rows.num_rows == pytest.approx(expected, rel=0.1)
+    z, m_r = (rows[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01"))
+    sed = band_ratios.Sed(
+        *(rows[name].to_numpy() for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1"))
+    )
+    seen = galaxies.apparent(there, z, m_r, sed)
+    assert limit - 0.1 < seen.max() < limit + 1e-3
+    halos = sum(galaxies.halo_table(cell, there.population, cells).num_rows for cell in places)
+    assert halos < 0.5 * drawn.halos.num_rows * len(places) / len(drawn.places)
+
+
+def test_a_shallow_limit_needs_little_of_the_volume():
+    """Steps that no galaxy of the limit can be seen from are left out."""
+    near, deep = (galaxies.people(SEED, limit, 2.3, BOX_CELLS).halos for limit in (18.0, 26.0))
+    used = [(model.level >= 0) & (model.number * model.line.volume[:, None] > 1e-3) for model in (near, deep)]
+    assert near.line.z[used[0].any(1)].max() < 1.2
+    assert deep.line.z[used[1].any(1)].max() > 2.29
+    assert used[0].sum() < 0.3 * used[1].sum()
 
 
 @pytest.mark.parametrize("place", [(0.0, 90.0), (0.0, -90.0), (0.0, 0.0)])

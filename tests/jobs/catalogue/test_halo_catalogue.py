@@ -6,13 +6,11 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.table import Table
 
-from jobs import shell
-from jobs.catalogue import build_galaxies, galaxies, halo_catalogue, mapping, population
+from jobs.catalogue import galaxies, halo_catalogue, mapping, population
 from jobs.fluxes import cosmology
 from lake_schema import ids, sky
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.provenance import file_sha256
-from tests import requests
 
 from .conftest import BOX_CELLS, SEED
 
@@ -127,24 +125,3 @@ def test_a_file_that_is_cut_short(tmp_path, ending):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(LakeError, match=f"synthetic.{ending}"):
         loaded(path)
-
-
-HALOS = """
-[ingest.halos]
-files = ["synthetic.parquet"]
-[ingest.halos.columns]
-ra = "ra"
-dec = "dec"
-z_true = "z"
-log_mass = { column = "mass", log10 = true }
-"""
-
-
-def test_a_request_with_a_bad_file_publishes_nothing(tmp_path, capsys):
-    write(tmp_path / "synthetic.parquet", broken("ra", 4, np.nan))
-    path, lake = requests.written(tmp_path, HALOS), tmp_path / "lake"
-    assert shell.main(build_galaxies.JOB, ["--lake", str(lake), "--request", str(path)]) == 2
-    said = capsys.readouterr().err.strip()
-    assert "column ra (ra) of row 5" in said
-    assert "\n" not in said
-    assert not list(lake.glob("*/v-*"))

@@ -8,10 +8,11 @@ from astropy.table import Table
 
 from jobs import request, shell
 from jobs.catalogue import build_galaxies, mapping
-from jobs.fluxes import cosmology
+from jobs.fluxes import cosmology, sources
 from lake_schema import ids, publish, read, sky, validate
 from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.quarantine import QUARANTINE
 from tests import requests
 
 from . import synthetic
@@ -36,8 +37,8 @@ def build(folder, file, more):
     """The published table of one file."""
     wanted, lake = request.parse(asked(folder, file, more)), folder / "lake"
     lake.mkdir(exist_ok=True)
-    (step,) = build_galaxies.steps(lake, wanted)
-    publish.make(lake, step.plan, step.work)
+    for step in build_galaxies.steps(lake, wanted):
+        publish.make(lake, step.plan, step.work)
     return read.version(lake, "galaxies").rows()
 
 
@@ -97,6 +98,27 @@ def test_seen_magnitudes_are_taken_back_to_before_dust_and_lens(tmp_path):
     kappa, gamma1, gamma2, a_v = (values[name][order] for name in ("kappa", "gamma1", "gamma2", "a_v"))
     found = found + 2.70 / 3.1 * a_v + 2.5 * np.log10((1 - kappa) ** 2 - gamma1**2 - gamma2**2)
     assert found == pytest.approx(values["mag"][order], abs=2e-3)
+
+
+def test_galaxies_at_a_caustic_are_kept_apart_and_counted(tmp_path):
+    """The table `galaxies` is whole without them; what they are is in the table `quarantine`."""
+    values = synthetic.columns()
+    values["kappa"][:4], values["gamma1"][:4], values["gamma2"][:4] = (0.9, 1.0, 1.5, 0.3), (0.0, 0.0, 0.1, 0.69), 0.0
+    rows = build(tmp_path, synthetic.write(tmp_path, "skycatalogs", values), 'format = "skycatalogs"')
+    apart = read.version(tmp_path / "lake", "quarantine").rows()
+    assert (rows.num_rows, apart.num_rows) == (296, 4)
+    assert validate.violations(rows, GALAXIES) == []
+    assert validate.violations(apart, QUARANTINE) == []
+    assert set(apart["origin_id"].to_pylist()) == set(values["origin_id"][:4].tolist())
+    assert sorted(apart["determinant"].to_pylist()) == pytest.approx([0.0, 0.01, 0.0139, 0.24], abs=1e-6)
+    assert not set(rows["id"].to_pylist()) & set(apart["id"].to_pylist())
+    sources.magnification_of(rows)
+
+
+def test_without_any_at_a_caustic_the_quarantine_is_an_empty_table(tmp_path):
+    build(tmp_path, synthetic.write(tmp_path, "flagship2"), 'format = "flagship2"')
+    assert read.version(tmp_path / "lake", "quarantine").rows().schema.equals(QUARANTINE.arrow())
+    assert read.version(tmp_path / "lake", "quarantine").num_rows == 0
 
 
 def test_a_folder_and_a_text_file_with_a_mapping_of_ones_own(tmp_path):

@@ -118,10 +118,13 @@ def test_tangential_shear_about_massive_halos(universe, drawn):
     assert np.mean(shear) > 0
 
 
-def test_magnification_and_caustics():
+def test_determinants_and_caustics():
     kappa, none = np.array([0.0, 0.1, 0.95, 1.2]), np.zeros(4)
-    assert lensing.magnification(kappa[:2], none[:2], none[:2]) == pytest.approx([1.0, 1 / 0.81])
+    assert lensing.determinant(kappa, none, none) == pytest.approx([1.0, 0.81, 0.0025, 0.04])
+    assert lensing.determinant(np.array([0.1]), np.array([0.3]), np.array([0.4])) == pytest.approx([0.81 - 0.25])
     assert lensing.near_caustic(kappa, none, none, 0.05).tolist() == [False, False, True, True]
+    # Beyond both caustics the determinant is positive again.
+    assert lensing.near_caustic(np.array([2.5]), none[:1], none[:1], 0.05).all()
 
 
 def test_a_resolution_that_healpix_has_not_is_refused(box):

@@ -44,6 +44,24 @@ def test_replicas_are_turns_of_one_box(box):
         assert np.all(np.minimum(step, box.n - step) <= 1)
 
 
+def test_nothing_lies_across_the_edge_of_the_box(box):
+    """Steps end where a replica does; positions a side apart are one cell, also where a side ends."""
+    table = lightcone.distances(2.3)
+    line = lightcone.steps(box.model.cell, 6.0, float(table.chi[-1]), table)
+    edges = box.length * np.arange(1, int(table.chi[-1] // box.length) + 1)
+    assert edges.size == 5
+    assert np.isin(edges, line.edge).all()
+    turned = lightcone.Replicas(np.array([[0, 1, 2]] * 6), np.ones((6, 3)), np.zeros((6, 3)))
+    ahead = np.array([[1.0, 0.0, 0.0]] * 3)
+    at = np.array([0.25, 0.25, box.model.cell * 0.75])
+    first, _ = lightcone.box_cells(box, turned, ahead, at)
+    later, _ = lightcone.box_cells(box, turned, ahead, at + box.length * np.array([1, 3, 4]))
+    before, _ = lightcone.box_cells(box, turned, ahead, box.length * np.array([1, 3, 4]) - 0.25)
+    assert np.array_equal(first, later)
+    assert np.array_equal(before, first + (box.n - 1) * box.n**2)
+    assert np.all((later >= 0) & (before < box.n**3))
+
+
 def test_a_deeper_light_cone_leaves_the_nearer_shells(box):
     near, far = lightcone.replicas(box, 2000.0), lightcone.replicas(box, 6000.0)
     assert np.array_equal(near.shift, far.shift[: len(near.shift)])
