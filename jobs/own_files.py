@@ -11,7 +11,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from jobs.toml_values import Toml, shown, string, strings, table_of
+from jobs.toml_values import Toml, boolean, shown, string, strings, table_of
 from lake_schema import layout
 from lake_schema.errors import BadInput
 
@@ -30,6 +30,7 @@ class OwnCurves:
     """What stands beside the embedded passbands, and in place of the embedded galaxies, extinction laws and dwarfs.
 
     basel : models of dwarfs;  irtf : spectra of stars whose infrared the dwarfs are given
+    intergalactic : galaxies are seen through the hydrogen between them
     """
 
     passbands: tuple[tuple[str, Curves], ...] = ()
@@ -37,6 +38,7 @@ class OwnCurves:
     extinction: tuple[tuple[int, Curves], ...] = ()
     basel: Path | None = None
     irtf: tuple[Path, ...] = ()
+    intergalactic: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +99,7 @@ def curves(table: Toml, folder: Path) -> OwnCurves:
         tuple(zip(map(int, laws), extinction, strict=True)),
         file_of(folder, string(stars, "fluxes.stars.basel")) if "basel" in stars else None,
         tuple(file_of(folder, name) for name in strings(stars, "fluxes.stars.irtf")),
+        boolean(table, "fluxes.intergalactic", False),
     )
 
 

@@ -15,6 +15,7 @@
     [strong_lenses]  boost   how many times denser than in nature they are drawn
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
     [fluxes]       bands = [..]           default: the bands of the pointings and observations
+                   intergalactic = true   galaxies are seen through the hydrogen between them
     [fluxes.passbands.NAME]        your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
     [fluxes.templates]             your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
     [fluxes.stars]                 your own dwarfs: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
@@ -236,7 +237,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     }
     _known(table, "", {"name", "seed", "accuracy", "pointing", "observation", *sections})
     asked, blocks = observations.pointings(table), observations.observations(table)
-    fluxes = _section(table, "fluxes", {"bands", "passbands", "templates", "stars", "extinction"})
+    fluxes = _section(table, "fluxes", {"bands", "intergalactic", "passbands", "templates", "stars", "extinction"})
     curves = own_files.curves(fluxes, folder)
     bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in asked)
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))

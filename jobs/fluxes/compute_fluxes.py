@@ -81,6 +81,7 @@ def _step(
         "accuracy": asdict(request.accuracy),
         **_errors(kind, request, chosen),
         "files": own.sha256(),
+        **({"intergalactic": True} if kind == "galaxy" and own.library.intergalactic else {}),
         "sources": {step.plan.table.name: step.plan.key for step in sources},
         "code": code_version(),
     }

@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from jobs.fluxes import extinction, passbands
+from jobs.fluxes import extinction, intergalactic, passbands
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
 from lake_schema.errors import BadInput, OutOfRange
@@ -132,7 +132,7 @@ def observed_shape(mix: Mix, amplitude: Float, library: Library, dust: Float32, 
 
     amplitude : float64[2, n] factor of each component
     Combined and extinguished on the library's grid; then wavelengths times (1 + z), flux divided by (1 + z),
-    and linear interpolation onto the observed grid.
+    and linear interpolation onto the observed grid, behind what is between the galaxies where the library says so.
     """
     shrink = 1.0 / (1.0 + mix.z_obs)
     start = first * shrink - library.wavelength[0]
@@ -152,6 +152,8 @@ def observed_shape(mix: Mix, amplitude: Float, library: Library, dust: Float32, 
     shape = steps.ravel().take(index, mode="clip")
     shape *= position.astype(np.float32)
     shape += rest.ravel().take(index, mode="clip")
+    if library.intergalactic:
+        shape *= intergalactic.transmission(first + np.arange(float(count)), mix.z_obs).astype(np.float32)
     return shape
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from jobs import cache
 from jobs.accuracy import Accuracy
-from jobs.fluxes import extinction, flux_grid, grid_settings, grid_tables, integration, lines
+from jobs.fluxes import extinction, flux_grid, grid_settings, grid_tables, integration, intergalactic, lines
 from jobs.fluxes.continuum import Mix
 from jobs.fluxes.grid_settings import CANDIDATES, MARGIN, Choice
 from jobs.fluxes.grid_tables import Setting
@@ -28,16 +28,20 @@ _SAMPLE, _SEED = 4000, 5
 def choose(bands: Sequence[Passband], accuracy: Accuracy, library: Library) -> tuple[Choice, ...]:
     """For each band the smallest setting that is fine enough, see grid_settings.choose.
 
-    For a passband or a library of others the errors of 4000 random galaxies decide, from the setting upwards that
-    is fine enough for all bands with the embedded library.
+    For a passband or a library of others, or one behind absorbing gas, the errors of 4000 random galaxies decide, from
+    the setting upwards that is fine enough for all bands with the embedded library.
     """
     known = grid_settings.choose([band.name for band in bands], accuracy)
     return tuple(
         _fine_enough(band, choice, accuracy, library)
-        if library.own or band.name not in grid_settings.known()
+        if library.own or band.name not in grid_settings.known() or _is_absorbed(band, library)
         else choice
         for band, choice in zip(bands, known, strict=True)
     )
+
+
+def _is_absorbed(band: Passband, library: Library) -> bool:
+    return library.intergalactic and intergalactic.sees(band, grid_tables.Z_LAST)
 
 
 def measured(band: Passband, setting: Setting, library: Library) -> Choice:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs import cache
-from jobs.fluxes import extinction, lines, passbands
+from jobs.fluxes import extinction, intergalactic, lines, passbands
 from jobs.fluxes.continuum import REFERENCE_BAND, dust_of, rest_flux
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
@@ -63,7 +63,8 @@ class Setting:
 @lru_cache(maxsize=4)
 def library_key(library: Library) -> str:
     """Key of a library's spectra and of the dust in front of them; a tenth of a second, once a library."""
-    return cache.content_key(library.wavelength, np.asarray(library.flux), dust_of(library))
+    absorbed = [Path(intergalactic.__file__).read_bytes()] if library.intergalactic else []
+    return cache.content_key(library.wavelength, np.asarray(library.flux), dust_of(library), *absorbed)
 
 
 def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -> Float32:
@@ -141,7 +142,10 @@ def _galaxies(library: Library, band: Passband, reference: Passband, setting: Se
     observed = np.empty((setting.z_count, len(sed), setting.n_av))
     for i in range(setting.z_count):
         stretch = np.exp(setting.log_z(i))
-        low, moved = _moved(band.wavelength / stretch - library.wavelength[first], dimmed / stretch)
+        left = dimmed / stretch
+        if library.intergalactic:
+            left = left * intergalactic.transmission(band.wavelength, stretch - 1.0)
+        low, moved = _moved(band.wavelength / stretch - library.wavelength[first], left)
         observed[i] = spectra[:, low : low + moved.shape[1]] @ moved.T.astype(np.float32)
     # A template without flux that far in the ultraviolet: as faint as single precision goes.
     np.maximum(observed, np.finfo(np.float32).tiny, out=observed)

@@ -88,6 +88,8 @@ def read(given: OwnCurves) -> Own:
                 dust[code] = ingest.law(curves.files[0], curves.format, library.wavelength)
                 origins[key] = _origin_of(curves)
         library = replace(library, dust=dust, own=True)
+    if given.intergalactic:
+        library = replace(library, intergalactic=True)
     stars, of_stars, dwarfs = _stars(given)
     return Own(found, library, stars, origins | of_stars, dwarfs)
 
@@ -173,9 +175,10 @@ def passband_rows(own: Own) -> pa.Table:
 
 def library_of(lake: Path, facts: Mapping[str, Any]) -> Library:
     """The galaxies that a table of fluxes was, or is to be, made with; facts : of its plan."""
-    if not any(key.startswith((_TEMPLATES, _LAWS)) for key in facts.get("files", ())):
-        return templates.galaxy_library()
-    return published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
+    library = templates.galaxy_library()
+    if any(key.startswith((_TEMPLATES, _LAWS)) for key in facts.get("files", ())):
+        library = published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
+    return replace(library, intergalactic=True) if facts.get("intergalactic") else library
 
 
 def stars_of(lake: Path, facts: Mapping[str, Any]) -> Library:

@@ -65,6 +65,7 @@ class Library:
     types      : what is known of the first stars, the dwarf sequence; None for galaxies
     dust       : float32[5, n_lambda] k(lambda) of the laws in front of galaxies, None = those of extinction.laws
     own        : read from files of others: what was measured of the embedded one says nothing about it
+    intergalactic : what is between the galaxies absorbs (jobs.fluxes.intergalactic)
     """
 
     wavelength: Float
@@ -73,6 +74,7 @@ class Library:
     types: stellar.StellarTypes | None = None
     dust: Float32 | None = None
     own: bool = False
+    intergalactic: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
