@@ -5,6 +5,11 @@ deflection      of an SIE
 shoot           the picture of an exponential disc behind it
 image_positions where a point behind it is seen: roots of one equation in one angle, no rays
 
+Lenses are all galaxies redder than the blue sequence: at 0.1 < z < 0.7 their dispersions have the fourth moment, which
+is what cross-sections add up to, of Choi et al. 2007 within 15 %. Their number is that of Collett 2015 by his criteria
+of detection: 10.2 +- 1.1 deg-2 of I_E < 26 and z < 2.3 behind them, against 11.3 (14.9 +- 1.3 in all). Centrals of
+halos above 10^12.7 Msun/h alone would be a fifth of it: most lenses are galaxies of smaller halos.
+
 Coordinates are arcsec east and north of the lens on the tangent plane. The pictures are of the smooth lens alone; the
 weak lensing of what lies in front and behind is left out.
 Ref: Kormann, Schneider & Bartelmann 1994, A&A 284, 285
@@ -33,7 +38,7 @@ Array = npt.NDArray[Any]
 
 COLUMNS = (
     "id", "kind", "ra", "dec", "_healpix_29", "ra_lensed", "dec_lensed", "z_true", "abs_mag_r01", "color_gr_01",
-    "log_halo_mass", "disk_half_light_radius", "disk_axis_ratio", "position_angle",
+    "disk_half_light_radius", "disk_axis_ratio", "position_angle",
 )  # fmt: skip
 STRONG_LENS = 4
 _FILE = "strong_lenses.toml"
@@ -71,7 +76,6 @@ class Disc:
 class Laws:
     """Which galaxies are lenses, and what of (strong_lenses.toml, [lenses])."""
 
-    least_halo_mass: float
     reddest_blue: float
     sigma_star: float
     scatter: float
@@ -210,9 +214,9 @@ def _pairs(
     law: Laws, columns: dict[str, Array], boost: float, area: float, rng: np.random.Generator
 ) -> list[tuple[int, int, float, float]]:
     """(lens, source, sigma, Einstein radius) of what is drawn; area : of the cell, arcsec2."""
-    massive = (columns["kind"] == 0) & (np.nan_to_num(columns["log_halo_mass"]) > law.least_halo_mass)
-    lens = np.flatnonzero(massive & (columns["color_gr_01"] > law.reddest_blue) & (columns["z_true"] > 0.02))
-    source = np.flatnonzero(columns["kind"] < 2)
+    usual = columns["kind"] < 2
+    lens = np.flatnonzero(usual & (columns["color_gr_01"] > law.reddest_blue) & (columns["z_true"] > 0.02))
+    source = np.flatnonzero(usual)
     source = source[np.argsort(columns["z_true"][source], kind="stable")]
     z_source = columns["z_true"][source].astype(float)
     z_lens = columns["z_true"][lens].astype(float)

@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from scipy.special import gamma
 
 from jobs import request
-from jobs.catalogue import build_strong_lenses, strong_lenses
+from jobs.catalogue import build_strong_lenses, luminosity_function, strong_lenses
 from jobs.catalogue.strong_lenses import Disc, Lens
+from jobs.fluxes import cosmology
 from lake_schema import publish, read, sky, validate
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.strong_lenses import STRONG_LENSES
@@ -22,6 +24,7 @@ from .conftest import SEED
 STAMPS = strong_lenses.stamps()
 SIDE = 200
 PIXEL = STAMPS.pixel_scale
+BOOST = 7.0
 
 
 def place(n=SIDE):
@@ -107,16 +110,54 @@ def systems(drawn):
     """Many times as many as there are, in the cells that were drawn."""
     index = drawn.rows["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - 8)
     found = [
-        strong_lenses.draw(int(cell), drawn.rows.filter(pa.array(index == cell)), SEED, 20.0)
+        strong_lenses.draw(int(cell), drawn.rows.filter(pa.array(index == cell)), SEED, BOOST)
         for cell in np.unique(index)[:4]
     ]
     return pa.concat_tables(found), 4 * sky.cell_area(8)
 
 
-def test_there_are_as_many_as_expected(systems):
-    """Collett 2015: 11 per deg2. Ours have sources that reach I_E < 26 before they are magnified: a third of those."""
+def test_dispersions_are_those_of_nearby_galaxies(drawn):
+    """sum of (sigma / 161 km/s)^4, (Mpc/h)^-3: Choi, Park & Vogeley 2007 have phi* Gamma((alpha + 4) / beta) / ..."""
+    law, columns = strong_lenses.laws(), drawn.columns
+    phi, alpha, beta = 8.0e-3, 2.32, 2.67
+    expected = phi * gamma((alpha + 4.0) / beta) / gamma(alpha / beta)
+    near = (drawn.z > 0.1) & (drawn.z < 0.7) & (columns["color_gr_01"] > law.reddest_blue)
+    m_star, _, _ = luminosity_function.schechter().at(drawn.z[near])
+    fourth = 10.0 ** (0.4 * (m_star - drawn.m_r[near])) * np.exp(8.0 * (law.scatter * np.log(10.0)) ** 2)
+    volume = float(cosmology.comoving_volume(0.1, 0.7)) * np.radians(1.0) ** 2 * drawn.area
+    assert law.sigma_star == 161.0
+    assert fourth.sum() / volume == pytest.approx(expected, rel=0.15)
+
+
+def signal_to_noise(stamp, mag):
+    """Of arcs over the best choice of pixels, as Collett 2015 observes with Euclid."""
+    side = int(np.sqrt(len(stamp)))
+    picture = np.reshape(stamp, (side // 2, 2, side // 2, 2)).sum((1, 3))
+    picture = ndimage.gaussian_filter(picture, 0.18 / 2.3548 / 0.1)
+    electrons = np.sort(picture.ravel())[::-1] * 1610.0 * 10.0 ** (-0.4 * (mag - 25.5))
+    background = 1610.0 * 0.01 * 10.0 ** (-0.4 * (22.2 - 25.5)) + 4 * 4.5**2
+    total, pixels = np.cumsum(electrons), np.arange(1, electrons.size + 1)
+    return np.max(total / np.sqrt(total + background * pixels))
+
+
+def test_there_are_as_many_as_expected(systems, drawn):
+    """Collett 2015: 170,000 in 15,000 deg2, found at S/N > 20, resolved, stretched and magnified three times."""
     rows, area = systems
-    assert 1.0 < rows.num_rows / area / 20.0 < 11.0
+    mag = dict(zip(drawn.columns["id"].tolist(), drawn.mags["euclid_vis"], strict=True))
+    size = dict(zip(drawn.columns["id"].tolist(), drawn.columns["disk_half_light_radius"], strict=True))
+    source = rows["source_id"].to_pylist()
+    deep = [signal_to_noise(stamp, mag[i]) for stamp, i in zip(rows["stamp"].to_pylist(), source, strict=True)]
+    radius, magnified = rows["einstein_radius"].to_numpy(), rows["magnification"].to_numpy()
+    r = np.array([size[i] for i in source])
+    found = (np.array(deep) > 20.0) & (np.hypot(r, 0.09) < radius) & (magnified * r > 0.18)
+    assert 5.0 < rows.num_rows / area / BOOST < 60.0
+    assert found.sum() / area / BOOST == pytest.approx(11.3, rel=0.5)
+
+
+def test_an_empty_cell_has_none():
+    rows = strong_lenses.draw(7, GALAXIES.empty(), SEED, 1.0)
+    assert rows.num_rows == 0
+    assert validate.violations(rows, STRONG_LENSES) == []
 
 
 def test_rows_are_what_the_table_declares(systems, drawn):
@@ -142,9 +183,9 @@ def test_a_published_table(tmp_path, drawn):
     name = f"Norder=5/Dir=0/Npix={cell >> 6}.parquet"
     part = publish.Part(name, {"generation_cells": [cell]})
     publish.make(tmp_path, publish.Plan(GALAXIES, {}, (part,)), lambda lake, facts: publish.Output(own))
-    path = requests.written(tmp_path, "[strong_lenses]\nboost = 20.0\n", seed=7)
+    path = requests.written(tmp_path, "[strong_lenses]\nboost = 3.0\n", seed=7)
     (step,) = build_strong_lenses.steps(tmp_path, request.parse(path))
     publish.make(tmp_path, step.plan, step.work)
     rows = read.version(tmp_path, "strong_lenses").rows()
     assert rows.num_rows > 0
-    assert rows.equals(strong_lenses.draw(cell, own, 7, 20.0))
+    assert rows.equals(strong_lenses.draw(cell, own, 7, 3.0))

@@ -116,8 +116,8 @@ def test_tables_hold_it(library):
 def test_tables_know_their_errors_behind_it(library):
     """No setting is trusted that was measured without the gas; the chosen one is as good as was asked for."""
     behind = replace(library, intergalactic=True)
-    u, i = passbands.load("lsst_u"), passbands.load("lsst_i")
+    u, i = passbands.load("lsst_u"), passbands.load("des_i")
     found = grid_errors.choose([u, i], SURVEY, behind)
-    assert found[1] == grid_settings.choose(["lsst_i"], SURVEY)[0]
+    assert found[1] == grid_settings.choose(["des_i"], SURVEY)[0]
     assert grid_settings.MARGIN * found[0].largest <= SURVEY.flux
     assert differing(u, found[0].setting, behind, 9) < SURVEY.flux
