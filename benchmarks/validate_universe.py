@@ -1,238 +1,308 @@
 """Is the universe what it should be: python -m benchmarks.validate_universe [--quick] [--json FILE] [--figures FOLDER].
 
-Blocks of generation cells spread over the sky are drawn and counted: against the mass and luminosity functions,
-the published counts, H alpha, and the angular correlation of Limber's approximation; the lensing maps are measured.
+Galaxies of blocks spread over the sky, drawn at the settings that a request has by default, are counted and measured;
+halos and the galaxies of massive ones over hundreds of deg2 are correlated; the lensing maps are compared with linear
+theory in several boxes, the stars with published counts.  Each figure that validate_universe.csv has an expectation of
+is printed with it and with PASS or FAIL; the exit status is 1 where one fails.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
-import platform
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
-from scipy.special import j0
 
-from jobs.catalogue import band_ratios, density_box, dust_map, emission_lines, galaxies, lensing, population
+from benchmarks import _census as census
+from benchmarks import _clustering as clustering
+from benchmarks import _shear as shear
+from benchmarks import _universe_figures as pictures
+from benchmarks import report, stars
+from jobs.catalogue import band_ratios, density_box, dust_map, gaia, galaxies, linear_theory, luminosity_function
+from jobs.catalogue import stars as milky_way_stars
 from jobs.fluxes import cosmology, templates
-from lake_schema import sky
-from lake_schema.provenance import git_commit
+from jobs.request import Universe
 
 Float = npt.NDArray[np.float64]
 
-SEED, BOX_CELLS, NSIDE = 7, 192, 256
-ARCMIN2 = 3600.0
-# Observed i-band counts, per arcmin2: GAMA, zCOSMOS, VVDS, LSST Science Book.
-OBSERVED_I = {20: 0.57, 21: 1.45, 22: 3.7, 23: 9.0, 24: 21.0, 25: 44.5}
-COLUMNS = (
-    "id", "ra", "dec", "kind", "z_true", "z_obs", "abs_mag_r01", "color_gr_01", "sed_1", "frac_1", "sed_2", "frac_2",
-    "ext_law_1", "ebv_1", "flux_halpha", "kappa", "gamma1", "gamma2", "log_halo_mass",
-)  # fmt: skip
+SEED = 7
+EXPECTED = Path(__file__).with_suffix(".csv")
+POWER_EDGES = np.array([0.02, 0.05, 0.10, 0.15, 0.20])
+BIASES, BIAS_EDGES = (0.7, 1.0, 1.4, 2.0, 2.9), np.array([0.03, 0.10])
+# Of the sample whose clustering is measured: redshifts, and log10 of the least halo and proxy mass.
+NEAR, FAR, LOG_MASS = 0.4, 0.8, 12.0
+WIDE_EDGES, NARROW_EDGES = np.array([0.3, 0.5, 0.7, 1.0, 1.5]), np.array([0.03, 0.05, 0.08, 0.13, 0.2, 0.3])
+BANDS = (30, 64, 128, 256, 384, 512)
+PLANES = ((7, 1.0), (12, 2.4))
+# K-corrections and I_E - M_r - DM at z = 0.1, 0.5, 1, 2 of three templates.
+K_REDSHIFTS = (0.1, 0.5, 1.0, 2.0)
+K_CORRECTIONS = {
+    "sdss_r01": {0: (0.16, 1.60, 3.29, 5.06), 13: (0.005, 0.54, 1.17, 1.12), 25: (-0.14, -0.42, -0.75, -1.31)},
+    "euclid_vis": {0: (-0.43, 0.07, 1.15, 3.63), 13: (-0.27, -0.17, 0.29, 0.91), 25: (-0.15, -0.46, -0.73, -1.25)},
+}
 
 
-def blocks(count: int, side_order: int) -> list[list[int]]:
-    """Nested blocks of generation cells, spread over the sky."""
-    many, inside = 12 << 2 * (8 - side_order), 1 << 2 * side_order
-    first = np.linspace(0.31 * many / count, many * (1 - 0.5 / count), count).astype(int)
-    return [[int(block) * inside + i for i in range(inside)] for block in first]
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How much is drawn.
+
+    settings : of the universe;  blocks : of 4^side_order generation cells;  deep : blocks of one cell to I_E < 28
+    wide : blocks of 54 deg2 whose clustering is measured;  near : of 215 deg2, for satellites at z = 0.1
+    boxes : seeds of further boxes whose power and lensing are measured;  stars : cells a latitude
+    """
+
+    settings: Universe
+    blocks: int
+    side_order: int
+    deep: int
+    wide: int
+    near: int
+    boxes: tuple[int, ...]
+    stars: int
 
 
-def counts(rows: dict[str, Float], area: float) -> dict[str, float]:
-    """Galaxies per arcmin2, n(z), satellites, H alpha, per deg2."""
-    z, m = rows["z_true"].astype(float), rows["abs_mag_r01"].astype(float)
-    names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
-    sed, library = band_ratios.Sed(*(rows[name] for name in names)), templates.galaxy_library()
-
-    def mag(band: str) -> Float:
-        table = band_ratios.load(library, band, 2.3, 0.5)
-        return m + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed)
-
-    vis, i_band, g, r = mag("euclid_vis"), mag("lsst_i"), mag("lsst_g"), mag("lsst_r")
-    bright = vis < 24.5
-    figures = {
-        "vis_26_arcmin2": np.sum(vis < 26) / area / ARCMIN2,
-        "vis_245_arcmin2": np.sum(bright) / area / ARCMIN2,
-        "median_z_245": np.median(z[bright]),
-        "median_g_r_245": np.median((g - r)[bright]),
-        "median_r_i_245": np.median((r - i_band)[bright]),
-        "satellites_245": np.mean(rows["kind"][bright]),
-        "satellites_m20_near": np.mean(rows["kind"][(m < -20) & (z < 0.2)]),
-        "red_245": np.mean(rows["color_gr_01"][bright] > 0.75),
-        "vis_slope_20_23": np.mean(np.diff(np.log10(np.histogram(vis, np.arange(19.5, 24.0, 1.0))[0]))),
-    }
-    figures |= {f"i_{limit}_arcmin2": np.sum(i_band < limit) / area / ARCMIN2 for limit in OBSERVED_I}
-    figures |= {f"i_{limit}_to_observed": figures[f"i_{limit}_arcmin2"] / seen for limit, seen in OBSERVED_I.items()}
-    flux = rows["flux_halpha"].astype(float)
-    for near, far in ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0)):
-        for limit in (5e-17, 1e-16, 2e-16, 3e-16):
-            expected = float(emission_lines.expected_counts(np.array([limit]), near, far)[0])
-            found = np.sum((z > near) & (z < far) & (flux > limit)) / area
-            figures[f"halpha_{limit:g}_{near}_{far}_to_published"] = found / expected
-    velocity = 299792.458 * (rows["z_obs"] - z) / (1 + z)
-    figures["velocity_rms_near_km_s"] = np.std(velocity[(rows["kind"] == 0) & (z < 0.3)])
-    return {name: float(value) for name, value in figures.items()}
+FULL = Size(Universe(), 48, 1, 12, 12, 3, (8, 9), 12)
+QUICK = Size(Universe(box_cells=192, lensing_nside=64), 4, 0, 0, 2, 0, (), 0)
 
 
-def luminosity_function(universe: galaxies.GalaxyModel, rows: dict[str, Float], area: float) -> dict[str, float]:
-    """Found / expected galaxies where every spectrum beats the limit."""
-    law, figures = universe.luminosities, {}
-    z, m = rows["z_true"].astype(float), rows["abs_mag_r01"].astype(float)
-    for at, half, reddest in ((0.1, 0.05, 0.2), (0.5, 0.1, 0.4), (1.0, 0.15, 1.5)):
-        grid = np.linspace(at - half, at + half, 41)
-        faintest = min(26.0 - float(cosmology.distance_modulus(at + half)) - reddest, -16.0)
-        density = galaxies.luminosity_function.number_density(law, faintest, grid)
-        shells = cosmology.comoving_volume(grid[:-1], grid[1:]) * np.radians(1.0) ** 2 * area
-        expected = float(np.sum(0.5 * (density[1:] + density[:-1]) * shells))
-        figures[f"luminosity_function_z{at}"] = float(np.sum((np.abs(z - at) < half) & (m < faintest)) / expected)
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One expectation: what was found lies between two values."""
+
+    name: str
+    found: float
+    least: float
+    most: float
+    source: str
+
+    @property
+    def passed(self) -> bool:
+        return self.least <= self.found <= self.most
+
+
+def checks(figures: Mapping[str, float]) -> list[Check]:
+    """Every expectation of a figure that was measured."""
+    found = []
+    with EXPECTED.open(newline="") as file:
+        for row in csv.DictReader(file):
+            name, expected = row["name"], float(row["expected"])
+            if name not in figures:
+                continue
+            around = float(row["tolerance"]) * (expected if row["kind"] == "relative" else 1.0)
+            if float(row["errors"]):
+                around += float(row["errors"]) * figures[f"{name}_error"]
+            least = -np.inf if row["kind"] == "most" else expected - around
+            most = np.inf if row["kind"] == "least" else expected + around
+            found.append(Check(name, figures[name], least, most, row["source"]))
+    return found
+
+
+# ------------------------------------------------------------------------------------------------ figures
+
+
+def theory() -> dict[str, float]:
+    """sigma_8, distance, K-corrections."""
+    k = np.geomspace(1e-4, 50.0, 20_000)
+    x = 8.0 * k
+    window = 3.0 * (np.sin(x) - x * np.cos(x)) / x**3
+    variance = np.trapezoid(density_box.linear_power(k) * window**2 * k**3 / (2 * np.pi**2), np.log(k))
+    figures = {"sigma_8": float(np.sqrt(variance)), "chi_2.3": float(cosmology.comoving_distance(2.3))}
+    # The numbers are of the observed spectra with their weak lines, which the library bridges.
+    with mock.patch.object(templates, "_LINE_MASK", -1.0):
+        wavelength = templates.rest_grid()
+        kinds = list(K_CORRECTIONS["sdss_r01"])
+        flux = templates._galaxies(wavelength)[kinds].astype(np.float32)
+    library = templates.Library(wavelength, flux, tuple(map(str, kinds)))
+    z, none = np.array(K_REDSHIFTS), np.zeros(len(K_REDSHIFTS), int)
+    for band, published in K_CORRECTIONS.items():
+        table = band_ratios.build(library, band, 2.3, 0.5)
+        for row, (kind, expected) in enumerate(published.items()):
+            found = -2.5 / np.log(10.0) * band_ratios.ln_ratio(table, z, none + row, none, np.zeros(z.size))
+            off = found - np.array(expected)
+            figures[f"k_{band}_t{kind}_off"] = float(off[np.abs(off).argmax()])
     return figures
 
 
-def mass_function(universe: galaxies.GalaxyModel, halos: pa.Table, area: float) -> dict[str, float]:
-    """Found / expected halos above a mass."""
-    model, figures = universe.population.halos, {}
-    z, mass = (halos[name].to_numpy() for name in ("z_true", "log_mass"))
-    for near, far in ((0.3, 0.8), (0.8, 1.5), (1.5, 2.3)):
-        steps = (model.line.z > near) & (model.line.z < far)
-        for least in (11.0, 12.0, 13.0):
-            bins = np.round(model.log_mass[:-1], 3) >= least - 1e-3
-            mean = np.sum(model.number[np.ix_(steps, bins)].sum(1) * model.line.volume[steps]) * area
-            found = np.sum((z > near) & (z < far) & (mass > least))
-            figures[f"halos_{least:g}_z{near}"] = float(found / (mean * np.radians(1.0) ** 2))
-    return figures
-
-
-def correlation(universe: galaxies.GalaxyModel, groups: list[pa.Table], cells: list[list[int]]) -> dict[str, float]:
-    """w(theta) of centrals with M > 10^12 at 0.4 < z < 0.8, all blocks together, beside Limber with the halos' bias."""
-    edges = np.geomspace(0.03, 1.2, 9)
-    pairs = np.zeros((3, edges.size - 1))
-    rng = np.random.default_rng(5)
-    total, area = 0, 0.0
-    points = []
-    for rows, block in zip(groups, cells, strict=True):
-        mass, z = rows["log_mass"].to_numpy(), rows["z_true"].to_numpy()
-        keep = (mass > 12.0) & (z > 0.4) & (z < 0.8)
-        points.append((rows["ra"].to_numpy()[keep], rows["dec"].to_numpy()[keep], block))
-        total, area = total + int(keep.sum()), area + len(block) * sky.cell_area(8)
-    for ra, dec, block in points:
-        spread = [sky.random_in_cell(8, cell, 2 * total // sum(len(b) for b in cells), rng)[1:] for cell in block]
-        random = [np.concatenate(part) for part in zip(*spread, strict=True)]
-        weight = total / area * len(block) * sky.cell_area(8) / random[0].size
-        for k, (one, two) in enumerate((((ra, dec), (ra, dec)), ((ra, dec), random), (random, random))):
-            pairs[k] += _pairs(one, two, edges) * weight**k
-    found = (pairs[0] - 2 * pairs[1] + pairs[2]) / pairs[2]
-    theta = np.sqrt(edges[1:] * edges[:-1])
-    expected = _limber(universe, theta)
+def matter(size: Size) -> dict[str, float]:
+    """Power and bias of the box, velocities."""
+    cells = size.settings.box_cells
+    box = density_box.load(SEED, cells)
+    boxes = [box, *(shear.gaussian_box(seed, cells) for seed in size.boxes)]
     figures = {}
-    for at, one, other in zip(theta, found, expected, strict=True):
-        figures[f"w_{at:.2f}_deg"] = float(one)
-        figures[f"w_{at:.2f}_deg_to_limber"] = float(one / other)
-    return figures
+    if size.boxes:
+        power = np.array([clustering.box_power(box, POWER_EDGES) for box in boxes])
+        figures = _named("box_power_k{:.2f}", POWER_EDGES, power.mean(0), power.std(0, ddof=1) / np.sqrt(len(boxes)))
+    bias = clustering.halo_bias(box, BIASES, BIAS_EDGES)[:, 0]
+    figures |= {f"halo_bias_x{x}": float(value) for x, value in zip(BIASES, bias, strict=True)}
+    masses = galaxies.matching.masses()
+    of_12 = float(masses.at(masses.bias, np.zeros(1), np.full(1, 12.0))[0])
+    return figures | {"velocity_rms": clustering.velocities(box, of_12)}
 
 
-def _pairs(one: Any, two: Any, edges: Float) -> Float:
-    number = np.zeros(edges.size - 1)
-    for ra, dec in zip(*one, strict=True):
-        number += np.histogram(sky.separation(ra, dec, two[0], two[1]), edges)[0]
-    return number
+def _named(pattern: str, edges: Sequence[float] | Float, values: Float, errors: Float) -> dict[str, float]:
+    names = [pattern.format(edge) for edge in edges[:-1]]
+    figures = {name: float(value) for name, value in zip(names, values, strict=True)}
+    return figures | {f"{name}_error": float(value) for name, value in zip(names, errors, strict=True)}
 
 
-def _limber(universe: galaxies.GalaxyModel, theta: Float) -> Float:
-    model = universe.population.halos
-    steps = np.flatnonzero((model.line.z > 0.4) & (model.line.z < 0.8))
-    bins = np.round(model.log_mass[:-1], 3) >= 12.0 - 1e-3
-    number = model.number[np.ix_(steps, bins)]
-    growing = np.sum(number * model.x[np.ix_(steps, bins)], 1) / number.sum(1)
-    chi = model.line.middle[steps]
-    weight = number.sum(1) * chi**2
-    weight /= np.trapezoid(weight, chi)
-    ell = np.geomspace(2.0, 6000.0, 400)
-    k = (ell[:, None] + 0.5) / chi
-    power = density_box.linear_power(k.ravel()).reshape(k.shape) * (k < np.pi / 4.0)
-    c_l = np.trapezoid((weight * growing / chi) ** 2 * power, chi, axis=1)
-    fine = np.arange(2, 6001)
-    c_fine = np.interp(np.log(fine), np.log(ell), c_l)
-    return np.array([np.sum((2 * fine + 1) / (4 * np.pi) * c_fine * j0((fine + 0.5) * np.radians(t))) for t in theta])
+def published_halos(least: float, z: float) -> float:
+    """Halos above a mass, (Mpc/h)^-3: the mass function itself, without what the draw makes of it."""
+    log_mass = np.linspace(least, 16.0, 501)
+    density = linear_theory.halo_tables(log_mass, np.array([z, z + 1e-3]))["density"][0]
+    return float(np.trapezoid(density, log_mass))
 
 
-def lensing_figures(universe: galaxies.GalaxyModel) -> dict[str, float]:
-    """rms of the maps."""
-    figures = {}
-    for number, name in ((7, "z1"), (12, "z24")):
-        fields = universe.planes.maps[number]
-        figures[f"kappa_rms_{name}"] = float(fields[:, lensing.KAPPA].std(dtype=float))
-        figures[f"kappa_mean_{name}"] = float(fields[:, lensing.KAPPA].mean(dtype=float))
-        figures[f"gamma_rms_{name}"] = float(fields[:, lensing.GAMMA_1].std(dtype=float))
-        bend = np.hypot(fields[:, lensing.EAST], fields[:, lensing.NORTH]).astype(float)
-        figures[f"deflection_rms_arcmin_{name}"] = float(60 * np.degrees(np.sqrt(np.mean(bend**2))))
-        figures[f"deflection_max_arcmin_{name}"] = float(60 * np.degrees(bend.max()))
-    return figures
+def counted(size: Size) -> tuple[dict[str, float], census.Census]:
+    """Everything that the galaxies of small blocks tell."""
+    universe = galaxies.model(SEED, box_cells=size.settings.box_cells, lensing_nside=size.settings.lensing_nside)
+    dust, law = dust_map.load(SEED), luminosity_function.schechter()
+    seen = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
+    figures = {"galaxies": float(seen.block.size), "galaxies_deg2": seen.area}
+    figures |= census.counts(seen) | census.colours(seen) | census.sizes(seen) | census.halpha(seen)
+    figures |= census.halos(seen, published_halos) | census.luminosities(seen, law, 0.0, 1.5)
+    if size.deep:
+        deep = galaxies.model(SEED, 28.0, box_cells=size.settings.box_cells, lensing_nside=size.settings.lensing_nside)
+        far = census.draw(deep, dust, census.blocks(size.deep, 0))
+        figures |= census.luminosities(far, law, 1.5, 2.3)
+    return figures, seen
 
 
-def run(count: int, order: int) -> tuple[dict[str, Any], dict[str, Float]]:
-    """All figures, and the galaxies that they were counted from."""
-    universe, dust = galaxies.model(SEED, 26.0, 2.3, BOX_CELLS, NSIDE), dust_map.load(SEED)
-    drawn, started = population.Cells(universe.population), time.process_time()
-    places, tables, groups = blocks(count, order), [], []
-    for block in places:
-        tables += [galaxies.draw(cell, universe, drawn, dust).select(COLUMNS) for cell in block]
-        groups.append(pa.concat_tables([galaxies.halo_table(cell, universe.population, drawn) for cell in block]))
-    seconds = time.process_time() - started
-    rows = pa.concat_tables(tables)
-    rows = rows.filter(pa.array(rows["kind"].to_numpy() < 2))
-    columns = {name: rows[name].to_numpy() for name in COLUMNS}
-    area = sum(len(block) for block in places) * sky.cell_area(8)
-    halos = pa.concat_tables(groups)
-    figures: dict[str, Any] = {"area_deg2": area, "galaxies": rows.num_rows, "halos": halos.num_rows, "cpu_s": seconds}
-    figures |= counts(columns, area) | luminosity_function(universe, columns, area)
-    figures |= mass_function(universe, halos, area) | correlation(universe, groups, places)
-    return figures | lensing_figures(universe), columns
+def clustered(size: Size) -> tuple[dict[str, float], dict[str, Any], clustering.Tracers]:
+    """w(theta) of halos and of galaxies over Limber's; the curves; the halos themselves."""
+    universe = clustering.people(SEED, size.settings.box_cells, NEAR, FAR, LOG_MASS)
+    many = 12 << 2 * clustering.BLOCK_ORDER
+    cells = ((np.arange(size.wide) + 0.37) * many / size.wide).astype(int).tolist()
+    whole, pieces, figures, curves = [], [], {}, {}
+    for cell in cells:
+        found = clustering.tracers(universe, clustering.BLOCK_ORDER, cell)
+        kinds = (found.part(~found.satellite & (found.log_mass > LOG_MASS)), found.part(found.proxy > LOG_MASS))
+        whole.append((cell, kinds))
+        pieces.append((cell << 2 * (clustering.PIECE_ORDER - clustering.BLOCK_ORDER), kinds))
+    for scale, given, order, edges in (
+        ("wide", whole, clustering.BLOCK_ORDER, WIDE_EDGES),
+        ("narrow", pieces, clustering.PIECE_ORDER, NARROW_EDGES),
+    ):
+        for kind, found in enumerate(clustering.correlation(given, order, edges)):
+            name = ("halos", "galaxies")[kind]
+            everything = clustering.joined([kinds[kind] for _, kinds in whole])
+            expected, left = clustering.limber(everything, NEAR, FAR, found)
+            # The mean of a block takes as much from what is found as from what is expected.
+            w = found.w + expected - left
+            curves[f"{name}_{scale}"] = (found.theta, w, found.error, expected)
+            figures |= _named(f"w_{name}_{{:g}}", edges, w / expected, found.error / expected)
+    figures["clustering_deg2"] = size.wide * clustering.sky.cell_area(clustering.BLOCK_ORDER)
+    return figures, curves, clustering.joined([kinds[0] for _, kinds in whole])
 
 
-def draw_figures(folder: Path, columns: dict[str, Float]) -> None:
-    """A slice of the light-cone and n(z)."""
-    import matplotlib
+def nearby(size: Size) -> dict[str, float]:
+    """Satellites of M_r < -20 at z = 0.1, SDSS's limit of volume."""
+    universe = clustering.people(SEED, size.settings.box_cells, 0.05, 0.15, 11.8)
+    cells = ((np.arange(size.near) + 0.4) * 192 / size.near).astype(int).tolist()
+    found = clustering.joined([clustering.tracers(universe, 2, cell) for cell in cells])
+    z = universe.halos.distances.redshift(found.chi)
+    bright = universe.halos.matching.magnitude(z, found.proxy) < -20.0
+    share = float(np.mean(found.satellite[bright]))
+    return {"satellites_m20_z0.1": share, "satellites_m20_z0.1_number": float(bright.sum())}
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
 
-    folder.mkdir(parents=True, exist_ok=True)
-    figure, axes = pyplot.subplots(2, 1, figsize=(11, 7))
-    first = np.abs(columns["ra"] - np.median(columns["ra"][:1000])) < 5
-    for kind, colour in ((0, "0.2"), (1, "tab:red")):
-        part = first & (columns["kind"] == kind) & (columns["z_true"] < 0.8)
-        axes[0].plot(columns["z_obs"][part], columns["ra"][part], ",", color=colour)
-    axes[0].set(xlabel="z_obs", ylabel="ra [deg]")
-    axes[1].hist(columns["z_true"], np.arange(0, 2.35, 0.02), histtype="step")
-    axes[1].set(xlabel="z_true", ylabel="galaxies")
-    figure.savefig(folder / "universe.png", dpi=110)
+def lensed(size: Size, halos: clustering.Tracers) -> tuple[dict[str, float], Float]:
+    """Maps, their power in several boxes, shear about halos; C_l over theory [plane, band]."""
+    cells, nside = size.settings.box_cells, size.settings.lensing_nside
+    box = density_box.load(SEED, cells)
+    planes = galaxies.lensing.load(box, nside, far=True)
+    figures: dict[str, float] = {}
+    for number, z in PLANES:
+        figures |= shear.maps(planes, number, f"z{z}")
+    heavy = halos.part(halos.log_mass > 13.5)
+    mean, error = shear.tangential(planes, heavy, float(cosmology.comoving_distance(1.2)))
+    for radius, value, wrong in zip(shear.RINGS, mean, error, strict=True):
+        figures[f"gamma_t_{radius}deg"], figures[f"gamma_t_{radius}deg_in_errors"] = float(value), float(value / wrong)
+    if not size.boxes:
+        return figures, np.ones((0, 0))
+    for z, rms in zip((1.0, 2.3), shear.raw_rms(box, 256, (1.0, 2.3)), strict=True):
+        figures[f"kappa_raw_rms_z{z}"] = rms
+    found = np.stack(
+        [shear.power_of(planes, [number for number, _ in PLANES], BANDS)]
+        + [shear.power_of_box(seed, cells, nside, [z for _, z in PLANES], BANDS) for seed in size.boxes]
+    )
+    for plane, (_, z) in enumerate(PLANES):
+        error = found[:, plane].std(0, ddof=1) / np.sqrt(len(found))
+        figures |= _named(f"c_l_z{z}_{{}}", BANDS, found[:, plane].mean(0), error)
+    return figures, found.mean(0)
+
+
+def milky_way(size: Size) -> dict[str, float]:
+    """Stars and dwarfs against other code, the errors of Gaia."""
+    universe, dust, figures = milky_way_stars.model(), dust_map.load(SEED), {}
+    for b, published in stars.COUNTS.items():
+        off = stars.counts(b, size.stars, universe, dust) / np.array(published) - 1.0
+        figures[f"stars_b{b}_off"] = float(off[np.abs(off).argmax()])
+    for b, published in stars.DWARFS.items():
+        off = stars.dwarf_counts(b, 1000.0) / np.array(published) - 1.0
+        figures[f"dwarfs_b{b}_off"] = float(off[np.abs(off).argmax()])
+    return figures | {f"gaia_parallax_g{g:g}": float(gaia.astrometric_errors(g)[2]) for g in stars.PARALLAX}
+
+
+def run(size: Size, folder: Path | None = None) -> dict[str, float]:
+    """All figures; their pictures into a folder."""
+    started = time.process_time()
+    figures, seen = counted(size)
+    found, curves, halos = clustered(size)
+    figures |= theory() | matter(size) | found
+    found, power = lensed(size, halos)
+    figures |= found
+    if size.near:
+        figures |= nearby(size)
+    if size.stars:
+        figures |= milky_way(size)
+    if folder is not None:
+        pictures.draw(folder, seen, curves, power, BANDS, figures)
+    return figures | {"cpu_s": time.process_time() - started}
+
+
+def report_of(figures: Mapping[str, float], results: Sequence[Check]) -> list[str]:
+    """Print every figure and every check; returns the names of those that fail."""
+    expected = {check.name for check in results}
+    for name, value in figures.items():
+        if name not in expected and not name.endswith("_error"):
+            print(f"     {name:34} {value:12,.4g}")
+    for check in results:
+        error = f" +- {figures[check.name + '_error']:.2g}" if f"{check.name}_error" in figures else ""
+        verdict, span = "PASS" if check.passed else "FAIL", f"{check.least:.4g} .. {check.most:.4g}"
+        print(f"{verdict} {check.name:34} {check.found:12,.4g}{error:10} {span:20} {check.source}")
+    failed = [check.name for check in results if not check.passed]
+    print(
+        f"{len(results) - len(failed)} of {len(results)} as expected", *(f"  not: {name}" for name in failed), sep="\n"
+    )
+    return failed
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.validate_universe", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="two small blocks, for tests")
-    parser.add_argument("--blocks", type=int, default=24, help="blocks of 16 generation cells (0.84 deg2 each)")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.validate_universe", description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="a few small blocks and no second box, for tests")
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--figures", type=Path, metavar="FOLDER")
     options = parser.parse_args(argv)
-    figures, columns = run(2, 1) if options.quick else run(options.blocks, 2)
-    for name, value in figures.items():
-        print(f"{name:42} {value:,.4g}")
-    if options.figures:
-        draw_figures(options.figures, columns)
+    figures = run(QUICK if options.quick else FULL, options.figures)
+    results = checks(figures)
+    failed = report_of(figures, results)
     if options.json:
-        about = {"name": "validate_universe", "commit": git_commit(), "machine": platform.machine(), "repeats": 1}
-        options.json.write_text(json.dumps({**about, **figures}, indent=1) + "\n")
-    return 0
+        about = {"name": "validate_universe", "commit": report.git_commit(), "machine": report.machine(), "repeats": 1}
+        summary = {"checks": len(results), "failed": ", ".join(failed), "load_average": round(os.getloadavg()[0], 2)}
+        options.json.write_text(json.dumps({**about, **summary, **figures}, indent=1) + "\n")
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -1,0 +1,243 @@
+"""Galaxies of many small blocks of the sky, counted: counts, colours, sizes, H alpha, luminosities, halos.
+
+draw      galaxies and halos of blocks of generation cells
+figures   what is counted, by name; a count's own error, from the scatter of the blocks, under name + "_error"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from jobs.catalogue import band_ratios, emission_lines, galaxies, luminosity_function, morphology, population
+from jobs.catalogue.galaxies import GalaxyModel
+from jobs.fluxes import cosmology, templates
+from lake_schema import sky
+from lake_schema.ids import GENERATION_ORDER
+
+Float = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+
+ARCMIN2 = 3600.0
+AREA = sky.cell_area(GENERATION_ORDER)
+BANDS = ("euclid_vis", "euclid_y", "euclid_j", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")
+COLUMNS = (
+    "ra", "dec", "kind", "z_true", "z_obs", "abs_mag_r01", "color_gr_01", "sed_1", "frac_1", "sed_2", "frac_2",
+    "ext_law_1", "ebv_1", "flux_halpha", "flux_hbeta", "flux_nii", "flux_oiii", "bulge_half_light_radius",
+    "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index",
+)  # fmt: skip
+HALO_COLUMNS = ("z_true", "log_mass")
+# Limits of the i band whose observed counts are known.
+I_LIMITS = (20, 21, 22, 23, 24, 25, 26)
+HALPHA_LIMITS, HALPHA_SHELLS = (5e-17, 1e-16, 2e-16, 3e-16), ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0))
+SIZE_BINS = ((19, 20), (21, 22), (22, 23), (23, 24), (24, 24.5), (25, 26))
+# Redshift, half width, and the reddest I_E - M_r - DM there, which every galaxy that is counted has to afford.
+SHELLS = ((0.1, 0.05, 0.2), (0.5, 0.1, 0.4), (1.0, 0.15, 1.5), (2.0, 0.15, 4.0))
+HALO_MASSES, HALO_SHELLS = (11.0, 12.0, 13.0), ((0.5, 0.1), (1.0, 0.1), (2.0, 0.1))
+_SIZED = 20_000
+_Z_MAX = 2.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Census:
+    """Galaxies of the light-cone and halos: columns by name, the block of each row, and magnitudes by band."""
+
+    blocks: int
+    area: float
+    limit: float
+    rows: dict[str, npt.NDArray[np.generic]]
+    block: npt.NDArray[np.int64]
+    mags: dict[str, Float32]
+    halos: dict[str, npt.NDArray[np.generic]]
+    halo_block: npt.NDArray[np.int64]
+
+    def per_deg2(self, kept: npt.NDArray[np.bool_]) -> Float:
+        """Galaxies[block] deg-2."""
+        return np.bincount(self.block[kept], minlength=self.blocks) * (self.blocks / self.area)
+
+
+def blocks(count: int, side_order: int) -> list[list[int]]:
+    """Nested blocks of 4^side_order generation cells, spread over the sky."""
+    many, inside = 12 << 2 * (GENERATION_ORDER - side_order), 1 << 2 * side_order
+    first = ((np.arange(count) + 0.31) * many / count).astype(int)
+    return [[int(block) * inside + i for i in range(inside)] for block in first]
+
+
+def draw(universe: GalaxyModel, dust: npt.NDArray[np.float32], places: Sequence[Sequence[int]]) -> Census:
+    """What the catalogue holds in the blocks."""
+    drawn, library = population.Cells(universe.population), templates.galaxy_library()
+    rows, hosts, mags = [], [], []
+    for place in places:
+        found = pa.concat_tables([galaxies.draw(cell, universe, drawn, dust).select(COLUMNS) for cell in place])
+        found = found.filter(pa.array(found["kind"].to_numpy() < 2))
+        rows.append({name: found[name].to_numpy() for name in COLUMNS})
+        mags.append(magnitudes(rows[-1], library, _Z_MAX))
+        table = pa.concat_tables([galaxies.halo_table(cell, universe.population, drawn) for cell in place])
+        hosts.append({name: table[name].to_numpy() for name in HALO_COLUMNS})
+
+    def together(parts: Sequence[dict[str, npt.NDArray[np.generic]]]) -> dict[str, npt.NDArray[np.generic]]:
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def which(parts: Sequence[dict[str, npt.NDArray[np.generic]]]) -> npt.NDArray[np.int64]:
+        return np.repeat(np.arange(len(parts)), [part["z_true"].size for part in parts])
+
+    area = sum(len(place) for place in places) * AREA
+    return Census(
+        len(places), area, universe.limit, together(rows), which(rows), together(mags), together(hosts), which(hosts)
+    )
+
+
+def magnitudes(
+    rows: dict[str, npt.NDArray[np.generic]], library: templates.Library, z_max: float
+) -> dict[str, npt.NDArray[np.generic]]:
+    """Magnitudes by band, AB, unlensed and before the Milky Way's dust."""
+    names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
+    sed = band_ratios.Sed(*(rows[name] for name in names))  # type: ignore[arg-type]
+    z = rows["z_true"].astype(float)
+    plain = rows["abs_mag_r01"] + cosmology.distance_modulus(z)
+    return {
+        band: (plain + band_ratios.offset(band_ratios.load(library, band, z_max, 0.5), z, sed)).astype(np.float32)
+        for band in BANDS
+    }
+
+
+def _mean(values: Float) -> tuple[float, float]:
+    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(values.size))
+
+
+def _with_errors(found: dict[str, Float]) -> dict[str, float]:
+    figures: dict[str, float] = {}
+    for name, values in found.items():
+        figures[name], figures[f"{name}_error"] = _mean(values)
+    return figures
+
+
+def counts(census: Census) -> dict[str, float]:
+    """Galaxies per arcmin2, their slope and their redshifts."""
+    vis, i_band, z = census.mags["euclid_vis"], census.mags["lsst_i"], census.rows["z_true"]
+    found = {f"vis_{limit}": census.per_deg2(vis < limit) / ARCMIN2 for limit in (24.5, 26.0)}
+    found |= {f"i_{limit}": census.per_deg2(i_band < limit) / ARCMIN2 for limit in I_LIMITS}
+    bright = vis < 24.5
+    number = [np.sum(np.abs(vis - at) < 0.5) for at in (20, 21, 22, 23)]
+    return _with_errors(found) | {
+        "vis_slope_20_23": float(np.mean(np.diff(np.log10(number)))),
+        "median_z_24.5": float(np.median(z[bright])),
+        "satellites_24.5": float(np.mean(census.rows["kind"][bright])),
+        "red_24.5": float(np.mean(census.rows["color_gr_01"][bright] > 0.75)),
+    }
+
+
+def colours(census: Census) -> dict[str, float]:
+    """Medians of I_E < 24.5, and percentiles in thin shells."""
+    mags, z = census.mags, census.rows["z_true"]
+    bright = mags["euclid_vis"] < 24.5
+    pairs = {
+        "g_r": ("lsst_g", "lsst_r"), "r_i": ("lsst_r", "lsst_i"), "i_z": ("lsst_i", "lsst_z"),
+        "vis_h": ("euclid_vis", "euclid_h"), "y_j": ("euclid_y", "euclid_j"), "j_h": ("euclid_j", "euclid_h"),
+        "vis_y": ("euclid_vis", "euclid_y"),
+    }  # fmt: skip
+    colour = {name: mags[blue][bright] - mags[red][bright] for name, (blue, red) in pairs.items()}
+    figures = {f"median_{name}": float(np.median(value)) for name, value in colour.items() if name != "vis_y"}
+    for name, at in (("g_r", 0.3), ("r_i", 0.6), ("i_z", 1.0), ("vis_y", 1.0)):
+        shell = np.abs(z[bright] - at) < 0.05
+        for percent, value in zip((16, 50, 84), np.percentile(colour[name][shell], (16, 50, 84)), strict=True):
+            figures[f"{name}_z{at}_p{percent}"] = float(value)
+    return figures
+
+
+def half_light(rows: dict[str, npt.NDArray[np.generic]], part: npt.NDArray[np.int64]) -> Float:
+    """Half-light radius[n] of both components together, arcsec, by bisection."""
+    names = ("bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index")
+    bulge, disc, fraction, sersic = (rows[name][part].astype(float) for name in names)
+    return bisected(bulge, disc, fraction, sersic)
+
+
+def bisected(bulge: Float, disc: Float, fraction: Float, sersic: Float) -> Float:
+    low, high = np.minimum(bulge, disc), np.maximum(bulge, disc)
+    for _ in range(30):
+        middle = np.sqrt(low * high)
+        light = fraction * morphology.light_within(middle, bulge, sersic)
+        light += (1 - fraction) * morphology.light_within(middle, disc, 1.0)
+        low, high = np.where(light < 0.5, middle, low), np.where(light < 0.5, high, middle)
+    return np.asarray(np.sqrt(low * high))
+
+
+def sizes(census: Census) -> dict[str, float]:
+    """Median radii by magnitude, the range of the Sersic index, and how well two components have the total's radius."""
+    vis, figures = census.mags["euclid_vis"], {}
+    for bright, faint in SIZE_BINS:
+        inside = np.flatnonzero((vis >= bright) & (vis < faint))
+        some = inside[:: max(inside.size // _SIZED, 1)]
+        figures[f"size_{bright}_{faint}"] = float(np.median(half_light(census.rows, some)))
+    sersic = census.rows["bulge_sersic_index"]
+    figures |= {"sersic_least": float(sersic.min()), "sersic_most": float(sersic.max())}
+    rng, n, shapes = np.random.default_rng(3), _SIZED, morphology.shapes()
+    bulge = shapes.bulge
+    fraction, radius = rng.random(n), np.exp(rng.uniform(np.log(0.01), np.log(10.0), n))
+    red = rng.random(n) < 0.3
+    index, ratio = morphology.sersic_index(bulge, red, rng), morphology.radius_ratio(bulge, red, rng)
+    both = morphology.component_radii(shapes, radius, fraction, ratio, index)
+    figures["half_light_worst"] = float(np.abs(bisected(*both, fraction, index) / radius - 1.0).max())
+    return figures
+
+
+def halpha(census: Census) -> dict[str, float]:
+    """H alpha emitters / the published numbers, with Poisson's error, and the place of line ratios on the locus."""
+    z, flux = census.rows["z_true"], census.rows["flux_halpha"]
+    figures = {}
+    for near, far in HALPHA_SHELLS:
+        for limit in HALPHA_LIMITS:
+            expected = float(emission_lines.expected_counts(np.array([limit]), near, far)[0]) * census.area
+            found = float(np.sum((z > near) & (z < far) & (flux > limit)))
+            name = f"halpha_{limit:g}_{near}_{far}"
+            figures[name], figures[f"{name}_error"] = found / expected, np.sqrt(found) / expected
+    bright = flux > 5e-17
+    line = {name: census.rows[f"flux_{name}"][bright].astype(float) for name in ("halpha", "hbeta", "nii", "oiii")}
+    n2, o3 = np.log10(line["nii"] / line["halpha"]), np.log10(line["oiii"] / line["hbeta"])
+    locus = np.clip(0.61 / (np.minimum(n2, -0.25) + 0.08) + 1.1 + 0.03 * z[bright], -1.0, 0.95)
+    return figures | {"oiii_off_locus": float(np.median(o3 - locus)), "oiii_scatter": float(np.std(o3 - locus))}
+
+
+def luminosities(census: Census, law: luminosity_function.Schechter, near: float, far: float) -> dict[str, float]:
+    """Galaxies / those of the luminosity function, where all spectra beat the limit; shells between near and far."""
+    z, m = census.rows["z_true"], census.rows["abs_mag_r01"]
+    found = {}
+    for at, half, reddest in SHELLS:
+        if not near < at < far:
+            continue
+        faintest = min(census.limit - float(cosmology.distance_modulus(at + half)) - reddest, -16.0)
+        number = per_deg2(lambda shell, m=faintest: luminosity_function.number_density(law, m, shell), at, half)  # type: ignore[misc]
+        found[f"luminosity_function_z{at}"] = census.per_deg2((np.abs(z - at) < half) & (m < faintest)) / number
+    return _with_errors(found)
+
+
+def per_deg2(density: Callable[[Float], Float], at: float, half: float) -> float:
+    """Objects deg-2 in a shell of redshift, of a comoving density (Mpc/h)^-3."""
+    grid = np.linspace(at - half, at + half, 41)
+    value = density(grid)
+    shells = cosmology.comoving_volume(grid[:-1], grid[1:]) * np.radians(1.0) ** 2
+    return float(np.sum(0.5 * (value[1:] + value[:-1]) * shells))
+
+
+def halos(census: Census, published: Callable[[float, float], float]) -> dict[str, float]:
+    """Halos above a mass / the published number density(mass, z), in thin shells."""
+    z, mass = census.halos["z_true"], census.halos["log_mass"]
+    found = {}
+    for at, half in HALO_SHELLS:
+        volume = float(cosmology.comoving_volume(at - half, at + half)) * np.radians(1.0) ** 2
+        for least in HALO_MASSES:
+            kept = (np.abs(z - at) < half) & (mass > least)
+            each = np.bincount(census.halo_block[kept], minlength=census.blocks) * (census.blocks / census.area)
+            found[f"halos_{least:g}_z{at}"] = each / (volume * published(least, at))
+    return _with_errors(found)
+
+
+def redshifts(census: Census) -> tuple[Float, Float]:
+    """n(z) of I_E < 24.5, in shares of 0.2: (edges, shares)."""
+    edges = np.arange(0.0, 2.41, 0.2)
+    number = np.histogram(census.rows["z_true"][census.mags["euclid_vis"] < 24.5], edges)[0]
+    return edges, number / number.sum()

@@ -1,0 +1,221 @@
+"""How the embedded universe clusters: power of the box, bias of its halos, and w(theta) beside Limber's approximation.
+
+box_power       P(k) of the box over that of linear theory;  halo_bias : bias of the fields that halos are drawn from
+velocities      of centrals at z = 0
+people          halos and galaxies of a mass or more between two redshifts, to be drawn over hundreds of deg2
+tracers         them, in one block of the sky
+correlation     w(theta) of counts in pixels;  limber : what linear bias makes of linear power
+
+Ref: Limber 1953, ApJ 117, 134; Landy & Szalay 1993, ApJ 412, 64 (in pixels their estimator is <delta delta'>)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+from scipy.special import j0
+
+from jobs.catalogue import density_box, halos, luminosity_function, matching, population, satellites
+from jobs.catalogue.density_box import Box
+from jobs.catalogue.luminosity_function import Volume
+from jobs.catalogue.population import Population
+from jobs.fluxes import cosmology
+from jobs.rng import stream
+from lake_schema import sky
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+
+# Blocks are cells of this order (53.7 deg2), in pixels of 6.9 arcmin; small separations are counted in one piece of
+# each, in pixels of 0.9 arcmin: DEPTH orders finer.
+BLOCK_ORDER, PIECE_ORDER, DEPTH = 3, 6, 6
+_ROWS, _NODES, _SPARSE = 512, 200, 16
+# Shells in which the redshift distribution and the bias are taken, Mpc/h, and multipoles.
+_SHELL, _ELL_MOST = 80.0, 20_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracers:
+    """n points: deg, Mpc/h, bias times growth of the halo, and is it a satellite, log10 of halo and proxy mass."""
+
+    ra: Float
+    dec: Float
+    chi: Float
+    x: Float
+    satellite: npt.NDArray[np.bool_]
+    log_mass: Float
+    proxy: Float
+    velocity: Float
+
+    def part(self, keep: npt.NDArray[np.generic]) -> Tracers:
+        return Tracers(*(getattr(self, name)[keep] for name in self.__slots__))
+
+
+def joined(parts: Sequence[Tracers]) -> Tracers:
+    return Tracers(*(np.concatenate([getattr(part, name) for part in parts]) for name in Tracers.__slots__))
+
+
+# ------------------------------------------------------------------------------------------------ the box
+
+
+def _binned(field: npt.NDArray[np.floating], cell: float, edges: Float) -> Float:
+    """P(k)[bin] of a cube, k h/Mpc between edges."""
+    n = field.shape[0]
+    power = (np.abs(fft.rfftn(field)) ** 2).ravel() * (cell**3 / n**3)
+    axis, half = 2 * np.pi * fft.fftfreq(n, cell), 2 * np.pi * fft.rfftfreq(n, cell)
+    k = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + half**2)
+    weight = np.full(k.shape, 2.0)
+    weight[..., 0] = weight[..., -1] = 1.0
+    place = np.digitize(k.ravel(), edges)
+    linear = density_box.linear_power(np.maximum(k.ravel(), 1e-4))
+    total = [np.bincount(place, weight.ravel() * value, edges.size + 1)[1:-1] for value in (power, linear)]
+    return np.asarray(total[0] / total[1])
+
+
+def box_power(box: Box, edges: Float) -> Float:
+    """P(k) / P_linear(k)[bin] of the matter at z = 0."""
+    return _binned(np.expm1(box.smoothed[0] - np.float32(0.5 * box.variance[0])), box.model.cell, edges)
+
+
+def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
+    """Bias[x, bin] that the fields of halos of x = b D have against the matter's own, / x."""
+    matter = box_power(box, edges)
+    field, amplitude = density_box.biased(box.model, np.array(x))
+    rows = []
+    for i, times in zip(field.tolist(), amplitude.tolist(), strict=True):
+        number = np.exp(np.float32(times) * box.smoothed[i] - np.float32(0.5 * times**2 * box.variance[i]))
+        rows.append(np.sqrt(_binned(number, box.model.cell, edges) / matter))
+    return np.array(rows) / np.array(x)[:, None]
+
+
+def velocities(box: Box, x: float) -> float:
+    """rms of one component of the velocity, km/s, of halos of bias x at z = 0, anywhere in the box."""
+    field, amplitude = (value[0] for value in density_box.biased(box.model, np.array([x])))
+    weight = np.exp(np.float32(amplitude) * box.smoothed[int(field)])
+    square = [np.average(u**2, weights=weight) for u in box.velocity]
+    return float(density_box.velocity_factor(box.model, 0.0) * np.sqrt(np.mean(square)))
+
+
+# ------------------------------------------------------------------------------------------------ on the sky
+
+
+def people(seed: int, box_cells: int, near: float, far: float, log_mass: float) -> Population:
+    """Halos, and galaxies of a proxy mass, above log_mass."""
+    table, inverse = matching.masses(), luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
+    matched = matching.matching(table, inverse)
+    volume = Volume(near, far, 0.0)
+    return population.model(
+        seed, box_cells, volume, inverse, lambda z: matched.magnitude(z, np.full(np.size(z), log_mass))
+    )
+
+
+def tracers(universe: Population, order: int, block: int) -> Tracers:
+    """Halos of a cell of any order, and their satellites that lie in it."""
+    parts = []
+    for level in halos.LEVELS:
+        many = 1 << 2 * max(level - order, 0)
+        first = block << 2 * (level - order) if level >= order else block >> 2 * (order - level)
+        for cell in range(first, first + many):
+            hosts = halos.draw(universe.halos, universe.seed, level, cell)
+            rng = stream(universe.seed, "satellites", level, cell)
+            found = satellites.draw(universe.halos, universe.masses, hosts, rng)
+            ra, dec = sky.positions(hosts.index)
+            z = universe.halos.distances.redshift(hosts.chi)
+            x = universe.masses.at(universe.masses.bias, z, hosts.log_mass) * density_box.growth(z)
+            is_satellite = np.repeat([False, True], [ra.size, found.ra.size])
+            host = np.concatenate([np.arange(ra.size), found.host])
+            pairs = ((ra, found.ra), (dec, found.dec), (hosts.chi, found.chi), (hosts.proxy, found.proxy))
+            ra, dec, chi, proxy = (np.concatenate(pair) for pair in pairs)
+            speed = np.concatenate([hosts.velocity, found.velocity])
+            inside = sky.cell_of(ra, dec, order) == block
+            parts.append(Tracers(ra, dec, chi, x[host], is_satellite, hosts.log_mass[host], proxy, speed).part(inside))
+    return joined(parts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correlation:
+    """theta[bin] deg; w against each block's own mean, and its error from the scatter of the blocks.
+
+    within : nodes[m] and their share of all pairs of a block: w averaged over them is what its own mean has taken away
+    """
+
+    theta: Float
+    w: Float
+    error: Float
+    within: tuple[Float, Float]
+
+
+def correlation(blocks: Sequence[tuple[int, Sequence[Tracers]]], order: int, edges: Float) -> list[Correlation]:
+    """w(theta) of each kind of tracer in blocks, cells of an order."""
+    counts = np.array([[_counts(one, order, cell) for one in given] for cell, given in blocks], float)
+    # What is common to a block says nothing of its inside, and is most of the noise.
+    delta = counts / counts.mean(2, keepdims=True) - 1.0
+    bins, kinds = edges.size - 1, counts.shape[1]
+    product, number, angle = np.zeros((len(blocks), kinds, bins)), np.zeros((len(blocks), bins)), np.zeros(bins)
+    for row, (cell, _) in enumerate(blocks):
+        place = _vectors(order, cell)
+        for first in range(0, len(place), _ROWS):
+            part = slice(first, first + _ROWS)
+            which, theta = _separations(place[part], place, edges)
+            kept = np.flatnonzero((which >= 0) & (which < bins))
+            number[row] += np.bincount(which[kept], minlength=bins)
+            angle += np.bincount(which[kept], theta[kept], bins)
+            for kind in range(kinds):
+                both = (delta[row, kind, part, None] * delta[row, kind][None, :]).ravel()[kept]
+                product[row, kind] += np.bincount(which[kept], both, bins)
+    within = _within(order, blocks[0][0])
+    scatter = np.std(product / number[:, None], axis=0, ddof=1) / np.sqrt(len(blocks))
+    total = product.sum(0) / number.sum(0)
+    return [Correlation(angle / number.sum(0), w, error, within) for w, error in zip(total, scatter, strict=True)]
+
+
+def _separations(some: Float, every: Float, edges: Float) -> tuple[Int, Float]:
+    """Bin of the separation of each pair, -1 or the number of bins outside; and the separation, deg."""
+    theta = np.degrees(np.arccos(np.clip(some @ every.T, -1.0, 1.0))).ravel()
+    return np.searchsorted(edges, theta) - 1, theta
+
+
+def _within(order: int, cell: int) -> tuple[Float, Float]:
+    """Separations of the pairs of a block, and their shares: of every _SPARSE-th pixel against all."""
+    place = _vectors(order, cell)
+    edges = np.linspace(0.0, 3.0 * sky.cell_radius(order), _NODES + 1)
+    number = np.bincount(_separations(place[::_SPARSE], place, edges)[0] + 1, minlength=_NODES + 1)[1:]
+    return 0.5 * (edges[1:] + edges[:-1]), number / number.sum()
+
+
+def _counts(one: Tracers, order: int, cell: int) -> Int:
+    pixel = sky.cell_of(one.ra, one.dec, order + DEPTH) - (cell << 2 * DEPTH)
+    inside = (pixel >= 0) & (pixel < 1 << 2 * DEPTH)
+    return np.bincount(pixel[inside], minlength=1 << 2 * DEPTH)
+
+
+def _vectors(order: int, cell: int) -> Float:
+    ra, dec = sky.cell_centres(order + DEPTH, (cell << 2 * DEPTH) + np.arange(1 << 2 * DEPTH))
+    lon, lat = np.radians(ra), np.radians(dec)
+    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], 1)
+
+
+def limber(everything: Tracers, near: float, far: float, found: Correlation) -> tuple[Float, Float]:
+    """w(theta) of linear power and of the tracers' own redshifts and biases, and what is left of it in blocks."""
+    ends = [float(cosmology.comoving_distance(z)) for z in (near, far)]
+    edges = np.linspace(*ends, int(np.ceil((ends[1] - ends[0]) / _SHELL)) + 1)
+    number = np.histogram(everything.chi, edges)[0]
+    x = np.histogram(everything.chi, edges, weights=everything.x)[0] / number
+    chi, wide = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    share = number / number.sum() / wide
+    ell = np.geomspace(1.0, _ELL_MOST, 400)
+    k = (ell[:, None] + 0.5) / chi
+    power = density_box.linear_power(k.ravel()).reshape(k.shape)
+    c_l = np.sum(wide * (share * x / chi) ** 2 * power, 1)
+    every = np.arange(1, _ELL_MOST + 1)
+    # Beyond the multipoles of the smallest separation the sum ends softly.
+    weight = (2 * every + 1) / (4 * np.pi) * np.interp(np.log(every), np.log(ell), c_l)
+    weight *= np.exp(-((every / (0.5 * _ELL_MOST)) ** 2))
+    nodes, shares = found.within
+    theta = np.concatenate([found.theta, nodes])
+    w = np.array([np.sum(weight * j0((every + 0.5) * np.radians(at))) for at in theta])
+    return w[: found.theta.size], w[: found.theta.size] - np.sum(shares * w[found.theta.size :])

@@ -1,0 +1,138 @@
+"""How the embedded universe lenses: C_l of the convergence, its rms, B modes, and the shear about massive halos.
+
+maps         what the maps of the catalogue hold
+power_of     C_l of the convergence over that of linear theory, of these maps;  power_of_box : of another seed's
+raw_rms      of the sums along lines of sight, before they become maps
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import healpy as hp
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks._clustering import Tracers
+from jobs.catalogue import convergence, density_box, lensing
+from jobs.catalogue.density_box import Box
+from jobs.catalogue.lensing import Planes
+from jobs.fluxes import cosmology
+
+Float = npt.NDArray[np.float64]
+
+# Patches of the sky whose scatter gives the error of a mean: cells of this nside.
+_PATCHES = 2
+_STEPS = 1500
+# Rings about halos, deg, and directions.
+RINGS, _DIRECTIONS = (0.1, 0.2, 0.4, 0.8), 8
+
+
+def theory(ell: Float, chi: float) -> Float:
+    """C_l of the convergence of sources at chi Mpc/h, linear theory, by Limber's approximation."""
+    x = np.linspace(2.0, chi - 0.5, _STEPS)
+    z = cosmology.redshift(x)
+    weight = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * x * (1.0 - x / chi) * (1.0 + z)
+    k = (ell[:, None] + 0.5) / x
+    power = density_box.linear_power(k.ravel()).reshape(k.shape)
+    return np.asarray(np.trapezoid((weight * density_box.growth(z) / x) ** 2 * power, x, axis=1))
+
+
+def bands(power: Float, chi: float, edges: Sequence[int]) -> Float:
+    """C_l / theory between multipoles, each l counting as its number of modes."""
+    ell = np.arange(edges[0], edges[-1] + 1)
+    nodes = np.unique(np.geomspace(edges[0], edges[-1], 60).astype(int))
+    expected = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(theory(nodes.astype(float), chi))))
+    ratio = (2 * ell + 1) * power[ell] / expected
+    modes = 2.0 * ell + 1.0
+    place = np.digitize(ell, edges) - 1
+    place[-1] = len(edges) - 2
+    return np.bincount(place, ratio) / np.bincount(place, modes)
+
+
+def sums(box: Box, nside: int, redshifts: Sequence[float], l_max: int) -> tuple[npt.NDArray[np.float32], Float]:
+    """Convergence [plane, pixel] (nested) along lines of sight, and what its multipoles are multiplied by for maps."""
+    chosen = lensing.settings()
+    direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)
+    chi = np.asarray(cosmology.comoving_distance(np.array(redshifts)))
+    width, how = hp.nside2resol(nside), (chosen.coarsest, chosen.stretch)
+    return (
+        convergence.convergence(box, direction, width, chi, *how),
+        convergence.transfer(box, width, chi, l_max, *how),
+    )
+
+
+def gaussian_box(seed: int, n: int) -> Box:
+    """A box without its smoothed fields and velocities, which lensing does not ask for; not kept."""
+    model = density_box.box_model()
+    g = density_box._gaussian(seed, n, model.cell)
+    return Box(model, n, seed, (g,), np.array([g.var(dtype=float)]), ())
+
+
+def power_of_box(seed: int, n: int, nside: int, redshifts: Sequence[float], edges: Sequence[int]) -> Float:
+    """C_l / theory [plane, band] of the maps that the catalogue would have of another seed."""
+    kappa, gain = sums(gaussian_box(seed, n), nside, redshifts, edges[-1])
+    rows = []
+    for plane, z in enumerate(redshifts):
+        power = hp.anafast(hp.reorder(kappa[plane].astype(float), n2r=True), lmax=edges[-1], iter=0)
+        rows.append(bands(power * gain[plane] ** 2, float(cosmology.comoving_distance(z)), edges))
+    return np.array(rows)
+
+
+def power_of(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) -> Float:
+    """C_l / theory [plane, band] of the catalogue's own maps."""
+    rows = []
+    for number in numbers:
+        ring = hp.reorder(planes.maps[number][:, lensing.KAPPA].astype(float), n2r=True)
+        rows.append(bands(hp.anafast(ring, lmax=edges[-1], iter=0), float(planes.chi[number]), edges))
+    return np.array(rows)
+
+
+def raw_rms(box: Box, nside: int, redshifts: Sequence[float]) -> list[float]:
+    """rms of the sums along the lines of sight of pixels."""
+    kappa, _ = sums(box, nside, redshifts, 8)
+    return [float(plane.std(dtype=float)) for plane in kappa]
+
+
+def map_rms(nside: int, chi: float, l_max: int) -> float:
+    """rms that linear theory gives a map to that multipole."""
+    ell = np.arange(2, l_max + 1)
+    nodes = np.unique(np.geomspace(2, l_max, 80).astype(int))
+    power = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(theory(nodes.astype(float), chi))))
+    return float(np.sqrt(np.sum((2 * ell + 1) / (4 * np.pi) * power)))
+
+
+def maps(planes: Planes, number: int, name: str) -> dict[str, float]:
+    """Moments of one plane's maps, and the share of B modes."""
+    fields, chi, l_max = planes.maps[number], float(planes.chi[number]), int(lensing.settings().l_max * planes.nside)
+    kappa = fields[:, lensing.KAPPA].astype(float)
+    patches = kappa.reshape(12 * _PATCHES**2, -1).mean(1)
+    gamma = [hp.reorder(fields[:, i].astype(float), n2r=True) for i in (lensing.GAMMA_1, lensing.GAMMA_2)]
+    e_mode, b_mode = hp.map2alm_spin(gamma, 2, lmax=l_max)
+    bend = np.hypot(fields[:, lensing.EAST], fields[:, lensing.NORTH]).astype(float)
+    return {
+        f"kappa_mean_{name}_in_errors": float(patches.mean() / (patches.std(ddof=1) / np.sqrt(patches.size))),
+        f"kappa_rms_{name}": float(kappa.std()),
+        f"kappa_rms_{name}_to_theory": float(kappa.std() / map_rms(planes.nside, chi, l_max)),
+        f"gamma_rms_{name}": float(np.std(gamma[0])),
+        f"b_modes_{name}": float(np.sum(np.abs(b_mode) ** 2) / np.sum(np.abs(e_mode) ** 2)),
+        f"deflection_rms_arcmin_{name}": float(60 * np.degrees(np.sqrt(np.mean(bend**2)))),
+        f"deflection_max_arcmin_{name}": float(60 * np.degrees(bend.max())),
+    }
+
+
+def tangential(planes: Planes, halos: Tracers, chi: float) -> tuple[Float, Float]:
+    """Mean tangential shear[ring] of sources at chi about halos, and its error."""
+    mean, error = [], []
+    for radius in RINGS:
+        around = np.zeros(halos.ra.size)
+        for turn in 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
+            east, north = radius * np.sin(turn), radius * np.cos(turn)
+            offset = np.radians(np.full((2, halos.ra.size), [[east], [north]]))
+            ra, dec = lensing.displaced(halos.ra, halos.dec, *offset)
+            found = lensing.at(planes, ra, dec, np.full(ra.size, chi))
+            # Position angle from north to east; gamma1 > 0 is north-south.
+            around += found[1] * np.cos(2 * turn) - found[2] * np.sin(2 * turn)
+        mean.append(np.mean(around) / _DIRECTIONS)
+        error.append(np.std(around) / _DIRECTIONS / np.sqrt(around.size))
+    return np.array(mean), np.array(error)
