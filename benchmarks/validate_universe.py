@@ -13,8 +13,10 @@ import csv
 import json
 import os
 import sys
+import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,8 +61,8 @@ class Size:
     """How much is drawn.
 
     settings : of the universe;  blocks : of 4^side_order generation cells;  deep : blocks of one cell to I_E < 28
-    wide : blocks of 54 deg2 whose clustering is measured;  near : of 215 deg2, for satellites at z = 0.1
-    boxes : seeds of further boxes whose power and lensing are measured;  stars : cells a latitude
+    wide : blocks of 54 deg2 a box whose clustering is measured;  near : of 215 deg2, for satellites at z = 0.1
+    boxes : seeds of further boxes whose power, clustering and lensing are measured;  stars : cells a latitude
     """
 
     settings: Universe
@@ -73,7 +75,7 @@ class Size:
     stars: int
 
 
-FULL = Size(Universe(), 48, 1, 12, 12, 3, (8, 9), 12)
+FULL = Size(Universe(), 48, 1, 12, 8, 3, (8, 9), 12)
 QUICK = Size(Universe(box_cells=192, lensing_nside=64), 4, 0, 0, 2, 0, (), 0)
 
 
@@ -179,20 +181,32 @@ def counted(size: Size) -> tuple[dict[str, float], census.Census]:
     return figures, seen
 
 
+@contextmanager
+def own_cache(seed: int) -> Iterator[None]:
+    """The boxes of other seeds are not kept."""
+    if seed == SEED:
+        yield
+        return
+    with tempfile.TemporaryDirectory() as folder, mock.patch.dict(os.environ, {"TRUESKY_CACHE": folder}):
+        yield
+
+
 def clustered(size: Size) -> tuple[dict[str, float], dict[str, Any], clustering.Tracers]:
-    """w(theta) of halos and of galaxies over Limber's; the curves; the halos themselves."""
-    universe = clustering.people(SEED, size.settings.box_cells, NEAR, FAR, LOG_MASS)
-    many = 12 << 2 * clustering.BLOCK_ORDER
+    """w(theta) of halos and of galaxies over Limber's, all boxes together; the curves; the halos of the first box."""
+    many, seeds = 12 << 2 * clustering.BLOCK_ORDER, (SEED, *size.boxes)
     cells = ((np.arange(size.wide) + 0.37) * many / size.wide).astype(int).tolist()
     whole, pieces, figures, curves = [], [], {}, {}
-    for cell in cells:
-        found = clustering.tracers(universe, clustering.BLOCK_ORDER, cell)
-        kinds = (found.part(~found.satellite & (found.log_mass > LOG_MASS)), found.part(found.proxy > LOG_MASS))
-        whole.append((cell, kinds))
-        pieces.append((cell << 2 * (clustering.PIECE_ORDER - clustering.BLOCK_ORDER), kinds))
-    for scale, given, order, edges in (
-        ("wide", whole, clustering.BLOCK_ORDER, WIDE_EDGES),
-        ("narrow", pieces, clustering.PIECE_ORDER, NARROW_EDGES),
+    for seed in seeds:
+        with own_cache(seed):
+            universe = clustering.people(seed, size.settings.box_cells, NEAR, FAR, LOG_MASS)
+            for cell in cells:
+                found = clustering.tracers(universe, clustering.BLOCK_ORDER, cell)
+                kinds = (found.part(~found.satellite & (found.log_mass > LOG_MASS)), found.part(found.proxy > LOG_MASS))
+                whole.append((cell, kinds))
+                pieces.append((cell << 2 * (clustering.PIECE_ORDER - clustering.BLOCK_ORDER), kinds))
+    for given, order, edges in (
+        (whole, clustering.BLOCK_ORDER, WIDE_EDGES),
+        (pieces, clustering.PIECE_ORDER, NARROW_EDGES),
     ):
         for kind, found in enumerate(clustering.correlation(given, order, edges)):
             name = ("halos", "galaxies")[kind]
@@ -200,10 +214,12 @@ def clustered(size: Size) -> tuple[dict[str, float], dict[str, Any], clustering.
             expected, left = clustering.limber(everything, NEAR, FAR, found)
             # The mean of a block takes as much from what is found as from what is expected.
             w = found.w + expected - left
-            curves[f"{name}_{scale}"] = (found.theta, w, found.error, expected)
+            curves[f"{name}_{'wide' if order == clustering.BLOCK_ORDER else 'narrow'}"] = (
+                found.theta, w, found.error, expected,
+            )  # fmt: skip
             figures |= _named(f"w_{name}_{{:g}}", edges, w / expected, found.error / expected)
-    figures["clustering_deg2"] = size.wide * clustering.sky.cell_area(clustering.BLOCK_ORDER)
-    return figures, curves, clustering.joined([kinds[0] for _, kinds in whole])
+    figures["clustering_deg2"] = len(whole) * clustering.sky.cell_area(clustering.BLOCK_ORDER)
+    return figures, curves, clustering.joined([kinds[0] for _, kinds in whole[: size.wide]])
 
 
 def nearby(size: Size) -> dict[str, float]:
