@@ -32,6 +32,7 @@
         dither = "S" | "J" | "none"   fields, visits, exposures, short, flat, blue, bands, detectors, mjd,
         exposure_time_s
     [products]     truth = ["noise_free", "stars", "cosmic_rays", "ghosts", "saturation"]
+                   compression = "none" | "rice"   of images of whole numbers, without loss
 
 Files are found from the folder of the request; their formats are in jobs/fluxes/spectrum_formats.toml.
 A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
@@ -82,6 +83,7 @@ _MOST_VARIANTS = 10_000
 STATUSES = tuple(code for code, _ in database.STATUSES)
 LADDER = database.LADDER
 TRUTH = tuple(code for code, _ in products.CONTENTS if code != "science")
+COMPRESSIONS = ("none", "rice")
 DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
@@ -185,6 +187,7 @@ class Request:
     explore: tuple[tuple[str, tuple[str, ...]], ...] = ()
     ingest: Ingest = _NOTHING_TAKEN
     strong_lens_boost: float = 1.0
+    compression: str = "none"
 
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""
@@ -241,6 +244,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     curves = own_files.curves(fluxes, folder)
     bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in asked)
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
+    products_ = _section(table, "products", {"truth", "compression"})
     request = Request(
         name=layout.name(_string(table, "name")),
         seed=_integer(table, "seed", 0, 2**63 - 1),
@@ -251,7 +255,8 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         mission=mission,
         bands=tuple(dict.fromkeys((*bands, *(name for name, _ in curves.passbands)))),
         pointings=asked,
-        truth=_truth(_section(table, "products", {"truth"})),
+        truth=_truth(products_),
+        compression=_string(products_, "products.compression", COMPRESSIONS, "none"),
         curves=curves,
         observations=blocks,
         effects=_effects(_section(table, "effects", {"on", "off"})),

@@ -1,7 +1,7 @@
 """FITS files: the one module that touches astropy.io.fits.
 
 Image           an image with its header cards
-write_images    images -> one file: checksums, the same bytes for the same input
+write_images    images -> one file: checksums, the same bytes for the same input; whole numbers packed where wanted
 read_images     a file -> images; checksums are demanded and verified, sizes checked before data
 read_numbers    somebody's binary table -> its columns of numbers
 number_batches  the same, some columns and a bounded piece at a time
@@ -13,6 +13,7 @@ fits_unit       a unit as FITS spells it
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import tempfile
 import warnings
@@ -76,12 +77,20 @@ class Image:
     name: str = ""
 
 
-def write_images(path: Path, images: Sequence[Image]) -> None:
-    """Write a file of images, the first as the primary one; replaces `path` in one rename."""
+def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> None:
+    """Write a file of images, the first as the primary one; replaces `path` in one rename.
+
+    rice : whole numbers are packed, row by row, without loss (FITS standard 4.0, section 10: RICE_1). A packed image
+           is an extension: before a first one that has pixels there is then a primary unit without any
+    """
     if not images:
         raise BadInput(f"{path}: a FITS file wants at least one image")
-    units = [_primary(images[0]), *(_extension(image) for image in images[1:])]
-    _write(path, fits.HDUList(units))
+    make = [_packed if rice and _is_whole(image) else _extension for image in images]
+    if make[0] is _packed:
+        first, rest = [fits.PrimaryHDU()], zip(make, images, strict=True)
+    else:
+        first, rest = [_primary(images[0])], zip(make[1:], images[1:], strict=True)
+    _write(path, fits.HDUList([*first, *(function(image) for function, image in rest)]))
 
 
 def read_images(path: Path, most_bytes: int = MOST_BYTES) -> list[Image]:
@@ -92,13 +101,17 @@ def read_images(path: Path, most_bytes: int = MOST_BYTES) -> list[Image]:
                  large
     """
     with _refusing(path):
-        with fits.open(path, memmap=False, lazy_load_hdus=True) as units:
+        with fits.open(path, memmap=False, lazy_load_hdus=True, disable_image_compression=True) as units:
             _check_size(path, units, most_bytes)
-        with fits.open(path, memmap=False, checksum=True) as units:
+        with fits.open(path, memmap=False, checksum=True, disable_image_compression=True) as units:
             missing = [unit.name or "primary" for unit in units if "CHECKSUM" not in unit.header]
             if missing:
                 raise Damaged(f"{path}: no checksum in {', '.join(missing)}")
-            return [_image(unit) for unit in units]
+            if not any(_is_packed(unit) for unit in units):
+                return [_image(unit) for unit in units]
+            hollow = _is_packed(units[1]) and _is_hollow(units[0])
+        with fits.open(path, memmap=False) as units:
+            return [_image(unit) for unit in units[hollow:]]
 
 
 def read_numbers(path: Path) -> dict[str, npt.NDArray[np.float64]]:
@@ -222,6 +235,28 @@ def _extension(image: Image) -> fits.ImageHDU:
     return _dressed(fits.ImageHDU(data=None if image.data is None else _big_enough(image.data)), image)
 
 
+def _packed(image: Image) -> fits.BinTableHDU:
+    unit = _dressed(fits.CompImageHDU(data=_big_enough(image.data), compression_type="RICE_1"), image)
+    # Taken as the table that it is stored as, whose bytes the checksums are of.
+    stream = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), unit]).writeto(stream)
+    # Left open: its rows are copied from there when it is written.
+    return fits.open(io.BytesIO(stream.getvalue()), disable_image_compression=True)[1]
+
+
+def _is_whole(image: Image) -> bool:
+    return image.data is not None and image.data.dtype.kind in "iu" and image.data.size > 0
+
+
+def _is_packed(unit: Any) -> bool:
+    return bool(unit.header.get("ZIMAGE", False))
+
+
+def _is_hollow(unit: Any) -> bool:
+    """Whether a primary unit stands there only because a file must begin with one."""
+    return unit.header["NAXIS"] == 0 and all(card.keyword in _STRUCTURE for card in unit.header.cards)
+
+
 def _dressed(unit: Any, image: Image) -> Any:
     for keyword, value, comment in image.cards:
         if keyword.upper() in _STRUCTURE:
@@ -339,20 +374,26 @@ def _refusing(path: Path) -> Iterator[None]:
 
 
 def _check_size(path: Path, units: fits.HDUList, most_bytes: int) -> None:
-    promised = 0
+    stored, unpacked = 0, 0
     for unit in units:
-        header = unit.header
-        axes = [int(header[f"NAXIS{i}"]) for i in range(1, int(header["NAXIS"]) + 1)]
-        if any(axis < 0 for axis in axes):
-            raise Damaged(f"{path}: a negative NAXIS")
-        pixels = 1
-        for axis in axes:
-            pixels *= axis
-        promised += (pixels if axes else 0) * abs(int(header["BITPIX"])) // 8
-        if promised > most_bytes:
+        here = _promised(path, unit.header, "") + max(int(unit.header.get("PCOUNT", 0)), 0)
+        stored += here
+        unpacked += _promised(path, unit.header, "Z") if _is_packed(unit) else here
+        if max(stored, unpacked) > most_bytes:
             raise BadInput(f"{path}: holds more than {most_bytes} bytes")
-    if promised > path.stat().st_size:
-        raise Damaged(f"{path}: is cut short, {promised} bytes promised, {path.stat().st_size} there")
+    if stored > path.stat().st_size:
+        raise Damaged(f"{path}: is cut short, {stored} bytes promised, {path.stat().st_size} there")
+
+
+def _promised(path: Path, header: Any, prefix: str) -> int:
+    """Bytes of a unit's data, or with the prefix Z of what is packed in it."""
+    axes = [int(header[f"{prefix}NAXIS{i}"]) for i in range(1, int(header[f"{prefix}NAXIS"]) + 1)]
+    if any(axis < 0 for axis in axes):
+        raise Damaged(f"{path}: a negative NAXIS")
+    pixels = 1
+    for axis in axes:
+        pixels *= axis
+    return (pixels if axes else 0) * abs(int(header[f"{prefix}BITPIX"])) // 8
 
 
 def _image(unit: Any) -> Image:

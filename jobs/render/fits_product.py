@@ -31,16 +31,18 @@ from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 # Codes of `method` in the table `rendered_truth`.
-POINT, PROFILE, PICTURE = 0, 1, 2
+POINT, PROFILE, PICTURE, TRAIL = 0, 1, 2, 3
 _MJD_ZERO = datetime(1858, 11, 17)
 
 Writer = Callable[[Path], None]
 
 
-def products(rendered: Rendered, truth: Sequence[str] = ("noise_free",)) -> tuple[pa.Table, dict[str, Writer]]:
+def products(
+    rendered: Rendered, truth: Sequence[str] = ("noise_free",), rice: bool = False
+) -> tuple[pa.Table, dict[str, Writer]]:
     """Rows of `products` and, by path, what writes each file.
 
-    truth : truth maps that are wanted beside the science image
+    truth : truth maps that are wanted beside the science image;  rice : images of whole numbers are packed
     """
     images = {"science": _science(rendered)}
     for content in truth:
@@ -66,13 +68,15 @@ def products(rendered: Rendered, truth: Sequence[str] = ("noise_free",)) -> tupl
             "sources": [len(rendered.sources)] * n,
         }
     )
-    writers: dict[str, Writer] = {paths[content]: partial(_write, units) for content, units in images.items()}
+    writers: dict[str, Writer] = {paths[content]: partial(_write, units, rice) for content, units in images.items()}
     return rows, writers
 
 
 def truth(rendered: Rendered) -> pa.Table:
     """One row a source that was drawn, ascending id."""
     sources, n = rendered.sources, len(rendered.sources)
+    trail = np.zeros((n, 2)) if sources.trail is None else sources.trail
+    method = np.where(sources.length > 0, TRAIL, np.where(sources.shape < 0, POINT, PROFILE))
     return RENDERED_TRUTH.build(
         {
             "exposure_id": np.full(n, int(rendered.exposure["exposure_id"]), np.int64),

@@ -54,7 +54,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
         of_task = [selection.needed(task, _deflection(inputs[name])) for task in places.values()]
         _refuse_uncovered(inputs[name], {cell for cells in of_task for cell in cells})
     facts = {
-        **common_facts(request, "seed", "accuracy", "mission", "effects", "truth"),
+        **common_facts(request, "seed", "accuracy", "mission", "effects", "truth", "compression"),
         "mission": mission_of(request.mission).fingerprint,
         "inputs": {name: version.key for name, version in inputs.items()},
     }
@@ -251,7 +251,7 @@ def work(lake: Path, facts: Json) -> Output:
         truth=request["truth"],
         lenses=lenses(inputs[LENSES], task, _deflection(inputs["galaxies"])) if LENSES in inputs else None,
     )
-    rows, files = fits_product.products(rendered, request["truth"])
+    rows, files = fits_product.products(rendered, request["truth"], request["compression"] == "rice")
     drawn = fits_product.truth(rendered)
     name = truth_file(facts["exposure_id"], facts["detector"])
     return Output(rows, {**files, name: lambda path: parquet.write(path, drawn, RENDERED_TRUTH)})

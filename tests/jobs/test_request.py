@@ -75,6 +75,7 @@ BAD = [
     ("fluxes", {"stars": {}}, "fluxes.stars names neither basel nor irtf"),
     ("fluxes", {"stars": {"basel": ["x.cor"]}}, "fluxes.stars.basel wants text"),
     ("products", {"truth": ["everything"]}, "products.truth"),
+    ("products", {"compression": "zip"}, "products.compression"),
     ("pointing", {}, "pointing wants a list"),
     ("pointing", [3], r"pointing\[0\]"),
     ("pointing.channel", "RADIO", r"pointing\[0\].channel"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from astropy.io import fits as astropy_fits
 from astropy.table import Table as AstropyTable
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -45,6 +45,57 @@ def test_the_same_input_gives_the_same_bytes(tmp_path):
         fits.write_images(tmp_path / name, [fits.Image(science(), CARDS), fits.Image(None, CARDS, "EMPTY")])
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]
+
+
+@settings(max_examples=12)
+@given(st.sampled_from(TYPES).flatmap(lambda t: hnp.arrays(t, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))))
+def test_what_is_packed_is_read_as_it_was(tmp_path_factory, data):
+    """In the first place of a file and in another, whole numbers or not."""
+    path = tmp_path_factory.mktemp("fits") / "a.fits"
+    for images in ([fits.Image(data, CARDS), fits.Image(data, name="COPY")], [fits.Image(None, CARDS),
+                   fits.Image(data, CARDS, "COPY")]):  # fmt: skip
+        fits.write_images(path, images, rice=True)
+        found = fits.read_images(path)
+        assert [(image.cards, image.name) for image in found] == [(image.cards, image.name) for image in images]
+        for image, wanted in zip(found, images, strict=True):
+            assert (image.data is None) == (wanted.data is None)
+            if image.data is not None:
+                assert image.data.dtype == data.dtype
+                np.testing.assert_array_equal(image.data, data)
+
+
+def test_packed_images_are_small_sound_and_the_same_every_time(tmp_path):
+    noise = np.rint(np.random.default_rng(1).normal(2000.0, 3.0, (200, 300))).astype(np.uint16)
+    for name in ("a", "b"):
+        fits.write_images(tmp_path / name, [fits.Image(noise, CARDS, "1-1.E")], rice=True)
+    good = (tmp_path / "a").read_bytes()
+    assert good == (tmp_path / "b").read_bytes()
+    # 3.5 bits a pixel is what such noise holds; and headers.
+    assert len(good) < 0.35 * noise.nbytes + 6 * 2880
+    with astropy_fits.open(tmp_path / "a", checksum=True, disable_image_compression=True) as units:
+        units.verify("exception")
+        assert all(unit.verify_checksum() == unit.verify_datasum() == 1 for unit in units)
+    with astropy_fits.open(tmp_path / "a") as units:
+        assert units["1-1.E"].header["EXPTIME"] == 560.53
+        np.testing.assert_array_equal(units["1-1.E"].data, noise)
+
+
+@pytest.mark.parametrize("where", ["pixels", "card", "end"])
+def test_a_changed_byte_of_a_packed_image_is_noticed(tmp_path, where):
+    path = tmp_path / "a.fits"
+    fits.write_images(path, [fits.Image(science(), CARDS)], rice=True)
+    good = path.read_bytes()
+    place = {"pixels": len(good) - 2880 + 50, "card": good.index(b"560.53") + 1, "end": 0}[where]
+    path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :] if place else good[:-2880])
+    with pytest.raises(Damaged, match=r"a\.fits"):
+        fits.read_images(path)
+
+
+def test_what_would_be_too_large_unpacked_is_refused(tmp_path):
+    path = tmp_path / "a.fits"
+    fits.write_images(path, [fits.Image(np.zeros((300, 300), np.uint16))], rice=True)
+    with pytest.raises(BadInput, match="more than 100000 bytes"):
+        fits.read_images(path, most_bytes=100_000)
 
 
 def test_other_tools_find_it_sound(tmp_path):
