@@ -1,12 +1,13 @@
 """Cameras: where detectors lie in the focal plane, and where their pixels look.
 
 Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, as the sky is seen from
-inside: with y to the north, x points west (east is left).  Pixel coordinates (column, row) are 0-based,
+inside: with y to the north, x points west (east is left).  Where the optics distort, they are those of the
+detectors' own places, and `distortion` tells what is seen there.  Pixel coordinates (column, row) are 0-based,
 and whole at a pixel's centre.
 
 detectors       the detectors of a camera, from the layout rules
 boresight_for   the pointing that puts a detector's centre on a target
-wcs             the TAN world coordinate system of a detector (astropy)
+wcs             the world coordinate system of a detector (astropy): TAN, with SIP where the optics distort
 sky_of_pixel, pixel_of_sky, jacobian
 sky_of_plane, outline    all detectors of an exposure at once
 corners, s_region, radius
@@ -15,13 +16,14 @@ corners, s_region, radius
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from astropy.wcs import WCS
+from astropy.wcs import WCS, Sip
 
+from jobs.render import distortion
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import CAMERAS
@@ -45,6 +47,7 @@ class Detector:
     x, y        : arcsec, its centre in the focal plane
     rotation    : deg, of its columns-rows axes against the focal plane's, from x to y
     pixel_scale : arcsec
+    bending     : distortion of its camera's optics
     """
 
     name: str
@@ -55,6 +58,12 @@ class Detector:
     y: float
     rotation: float
     pixel_scale: float
+    bending: distortion.Terms = ()
+
+    @property
+    def upside_down(self) -> bool:
+        """Whether it is mounted so."""
+        return float(np.cos(np.radians(self.rotation))) < 0.0
 
     @property
     def half_diagonal(self) -> float:
@@ -68,9 +77,9 @@ def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...
     Ref : VIS and NISP, Scaramella et al. 2022, Table 1 (gaps); ground cameras, the mission database's layouts
     """
     if camera == "vis":
-        return tuple(
-            _grid(mission, "vis", lambda row, column: (f"{row}-{column}", column >= _VIS_FIRST_ROTATED_COLUMN))
-        )
+        planned = _grid(mission, "vis", lambda row, column: (f"{row}-{column}", column >= _VIS_FIRST_ROTATED_COLUMN))
+        bending = distortion.terms("vis", mission)
+        return tuple(replace(d, bending=bending) for d in _mounted(planned, "vis", mission))
     if camera == "nisp":
         return tuple(_grid(mission, "nisp", lambda row, column: (f"DET{row}{column}", row >= _NISP_FIRST_ROTATED_ROW)))
     if camera in CAMERAS:
@@ -109,6 +118,23 @@ def _grid(
             )
 
 
+def _mounted(planned: Iterable[Detector], section: str, mission: MissionConfiguration) -> Iterator[Detector]:
+    """Detectors as they were mounted: shifted and turned a little, each in its own way."""
+    key = f"{section}.fpa.metrology"
+    if key not in mission:
+        yield from planned
+        return
+    measured = {row["detector"]: row for row in mission.rows(key)}
+    shift, turn = (mission.value(f"{key}_{kind}", unit) for kind, unit in (("shift", "pix"), ("rotation", "deg")))
+    for d in planned:
+        row = measured.get(d.name)
+        if row is None:
+            yield d
+            continue
+        x, y = (d.pixel_scale * shift * float(row[f"shift_{axis}"]) for axis in "xy")
+        yield replace(d, x=d.x + x, y=d.y + y, rotation=d.rotation + turn * float(row["rotation"]))
+
+
 def _listed(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
     """Detectors of a layout in millimetres."""
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
@@ -140,7 +166,8 @@ def boresight_for(detector: Detector, ra: float, dec: float, position_angle: flo
                      target because meridians converge; defined everywhere, poles included
     """
     # Right-handed: (east-like = -x, y, outward).
-    centre = np.array([-detector.x * _ARCSEC, detector.y * _ARCSEC, 1.0])
+    x, y = (float(place) for place in distortion.bent(detector.x, detector.y, detector.bending))
+    centre = np.array([-x * _ARCSEC, y * _ARCSEC, 1.0])
     camera = _triad(centre, np.array([0.0, 1.0, 0.0]))
     east, north, out = basis(ra, dec)
     angle = np.radians(position_angle)
@@ -171,7 +198,7 @@ def sky_of_plane(
 
 
 def outline(some: Sequence[Detector]) -> tuple[Float, Float]:
-    """x, y [n, 5] arcsec of each detector's centre and corners in the focal plane; corners as of `corners`."""
+    """x, y [n, 5] arcsec on the tangent plane: what each detector's centre and corners see; corners as of `corners`."""
     column = np.array([0.0, -0.5, 0.5, 0.5, -0.5])
     row = np.array([0.0, -0.5, -0.5, 0.5, 0.5])
     width = np.array([[d.nx * d.pixel_scale] for d in some]) * column
@@ -179,6 +206,9 @@ def outline(some: Sequence[Detector]) -> tuple[Float, Float]:
     turn = np.radians([[d.rotation] for d in some])
     x = np.array([[d.x] for d in some]) + np.cos(turn) * width - np.sin(turn) * height
     y = np.array([[d.y] for d in some]) + np.sin(turn) * width + np.cos(turn) * height
+    for bending in {d.bending for d in some if d.bending}:
+        bends = np.array([d.bending == bending for d in some])
+        x[bends], y[bends] = distortion.bent(x[bends], y[bends], bending)
     return x, y
 
 
@@ -204,7 +234,7 @@ def _triad(direction: Float, along: Float) -> Float:
 
 
 def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS:
-    """The world coordinate system of a detector: ICRS, TAN about the boresight, no distortion.
+    """The world coordinate system of a detector: ICRS, TAN about the boresight, and the distortion as SIP.
 
     ra, dec        : deg, boresight
     position_angle : deg, of the focal plane's y axis at the boresight, north through east
@@ -215,7 +245,8 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     from_centre = rotation.T @ np.array([-detector.x, -detector.y]) / detector.pixel_scale
     system = WCS(naxis=2)
-    system.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    bends = bool(detector.bending)
+    system.wcs.ctype = [f"{axis}{_PROJECTIONS[bends]}" for axis in ("RA---", "DEC--")]
     system.wcs.cunit = ["deg", "deg"]
     system.wcs.crval = [ra, dec]
     system.wcs.crpix = [(detector.nx + 1) / 2 + from_centre[0], (detector.ny + 1) / 2 + from_centre[1]]
@@ -223,8 +254,18 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     system.wcs.radesys = "ICRS"
     # Else north would be turned by 180 deg for a boresight at the pole itself.
     system.wcs.lonpole = 180.0
+    if bends:
+        system.sip = Sip(*distortion.sip(detector.bending, detector.pixel_scale * rotation), None, None, _crpix(system))
     system.wcs.set()
     return system
+
+
+# Without and with SIP.
+_PROJECTIONS = ("TAN", "TAN-SIP")
+
+
+def _crpix(system: WCS) -> Float:
+    return np.asarray(system.wcs.crpix, float)
 
 
 def sky_of_pixel(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
@@ -234,9 +275,16 @@ def sky_of_pixel(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> tupl
 
 
 def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
-    """ra, dec [n] deg -> 0-based column [n], row [n]; only for positions within 90 deg of the boresight."""
-    column, row = system.all_world2pix(np.asarray(ra, float), np.asarray(dec, float), 0)
-    return np.asarray(column), np.asarray(row)
+    """ra, dec [n] deg -> 0-based column [n], row [n]; only for positions within 90 deg of the boresight.
+
+    Error : 1e-8 pixels (rounding)
+    """
+    column, row = system.wcs_world2pix(np.asarray(ra, float), np.asarray(dec, float), 0)
+    if system.sip is None:
+        return np.asarray(column), np.asarray(row)
+    x0, y0 = _crpix(system) - 1.0
+    u, v = distortion.straight(column - x0, row - y0, system.sip.a, system.sip.b)
+    return u + x0, v + y0
 
 
 def jacobian(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> Float:
@@ -275,17 +323,18 @@ def centre(detector: Detector, system: WCS) -> tuple[float, float]:
 
 
 def s_region(detector: Detector, system: WCS) -> str:
-    """The footprint as an STC-S polygon."""
+    """The footprint as an STC-S polygon.  Error: its sides are straight; VIS's distortion bends them by 2 pixels."""
     return "POLYGON ICRS " + " ".join(f"{value:.7f}" for value in corners(detector, system).ravel())
 
 
 def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
     """The world coordinate system as FITS cards (a card holds 16 characters of a number: 1e-14)."""
-    header = system.wcs
+    header, bends = system.wcs, system.sip is not None
+    projection = "gnomonic projection" + (", distortion as SIP" if bends else "")
     return (
         ("WCSAXES", 2, "number of world coordinate axes"),
-        ("CTYPE1", "RA---TAN", "gnomonic projection"),
-        ("CTYPE2", "DEC--TAN", "gnomonic projection"),
+        ("CTYPE1", f"RA---{_PROJECTIONS[bends]}", projection),
+        ("CTYPE2", f"DEC--{_PROJECTIONS[bends]}", projection),
         ("CUNIT1", "deg", "unit of CRVAL1, CD1_1, CD1_2"),
         ("CUNIT2", "deg", "unit of CRVAL2, CD2_1, CD2_2"),
         ("CRVAL1", float(header.crval[0]), "[deg] boresight right ascension"),
@@ -298,13 +347,24 @@ def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
         ("CD2_2", float(header.cd[1, 1]), "[deg/pix]"),
         ("LONPOLE", 180.0, "[deg] native longitude of the celestial pole"),
         ("RADESYS", "ICRS", "celestial reference system"),
+        *(_sip_cards(system.sip) if bends else ()),
     )
+
+
+def _sip_cards(sip: Sip) -> Iterator[tuple[str, Any, str]]:
+    """Polynomials of SIP, terms that are not 0."""
+    for name, coefficients in (("A", sip.a), ("B", sip.b)):
+        yield f"{name}_ORDER", len(coefficients) - 1, f"distortion of {'columns' if name == 'A' else 'rows'}"
+        for p, q in np.argwhere(coefficients).tolist():
+            yield f"{name}_{p}_{q}", float(coefficients[p, q]), f"[pix] times u^{p} v^{q}"
 
 
 def shifted(system: WCS, columns: float, rows: float) -> WCS:
     """The same sky on a frame in which every pixel lies so many columns and rows farther on."""
     out = system.deepcopy()
     out.wcs.crpix = [out.wcs.crpix[0] + columns, out.wcs.crpix[1] + rows]
+    if out.sip is not None:
+        out.sip = Sip(out.sip.a, out.sip.b, None, None, _crpix(out))
     out.wcs.set()
     return out
 
@@ -321,7 +381,14 @@ def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
         system.wcs.cd = [[values["CD1_1"], values["CD1_2"]], [values["CD2_1"], values["CD2_2"]]]
         system.wcs.lonpole = values["LONPOLE"]
         system.wcs.radesys = values["RADESYS"]
+        if str(values["CTYPE1"]).endswith("-SIP"):
+            system.sip = Sip(*(_coefficients(values, name) for name in "AB"), None, None, _crpix(system))
     except KeyError as error:
         raise BadInput(f"the header has no card {error.args[0]}") from None
     system.wcs.set()
     return system
+
+
+def _coefficients(values: dict[str, Any], name: str) -> Float:
+    side = int(values[f"{name}_ORDER"]) + 1
+    return np.array([[float(values.get(f"{name}_{p}_{q}", 0.0)) for q in range(side)] for p in range(side)])

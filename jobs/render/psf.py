@@ -217,11 +217,11 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
         }
 
     arrays = cache.cached_arrays("vis_psf", key, make)
-    turned = slice(None, None, -1 if detector.rotation == 180.0 else 1)
+    turned = slice(None, None, -1 if detector.upside_down else 1)
     # Upside down, both the planes and the places that the drift is written in are turned.
     powers = _POWERS[: len(arrays["drift"])]
     sign = np.array([(-1) ** (i + j) for i, j, _ in powers], np.float32)[:, None, None]
-    drift = arrays["drift"][:, turned, turned] * (sign if detector.rotation == 180.0 else np.float32(1.0))
+    drift = arrays["drift"][:, turned, turned] * (sign if detector.upside_down else np.float32(1.0))
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
     return Planes(waves, arrays["images"][:, turned, turned], drift, half, powers)
 

@@ -150,7 +150,9 @@ class _Camera:
         self.index = {detector.name: i for i, detector in enumerate(self.detectors)}
         self.x, self.y = focal_plane.outline(self.detectors)
         margin = mission.value("survey.selection_margin", "arcsec")
-        reach = np.array([detector.half_diagonal for detector in self.detectors])
+        # On the tangent plane, where a detector that the optics distort is larger than it is.
+        corner = np.hypot(self.x[:, 1:] - self.x[:, :1], self.y[:, 1:] - self.y[:, :1]).max(axis=1)
+        reach = np.array([max(d.half_diagonal, c) for d, c in zip(self.detectors, corner, strict=True)])
         self.radius = (reach + margin) / 3600.0
         self.pixels = np.array([detector.nx * detector.ny for detector in self.detectors])
         self.area = np.array([d.nx * d.ny * (d.pixel_scale / 3600.0) ** 2 for d in self.detectors])

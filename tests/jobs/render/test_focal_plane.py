@@ -22,10 +22,19 @@ from lake_schema import sky
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 
-MISSION = resolve()
+# As drawn on paper: no distortion, every detector where the grid has it.
+MISSION = resolve(
+    overrides={
+        "vis.fpa.distortion": (0.0, ""),
+        "vis.fpa.metrology_shift": (0.0, "pix"),
+        "vis.fpa.metrology_rotation": (0.0, "deg"),
+    }
+)
 VIS, LSST, NISP = (detectors(camera, MISSION) for camera in ("vis", "lsstcam", "nisp"))
+BENT = detectors("vis", resolve())
 SKY = st.tuples(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(-180, 180))
-ANY_DETECTOR = st.sampled_from([VIS[0], VIS[15], VIS[35], LSST[0], LSST[94], LSST[188]])
+STRAIGHT = st.sampled_from([VIS[0], VIS[15], VIS[35], LSST[0], LSST[94], LSST[188]])
+ANY_DETECTOR = st.one_of(STRAIGHT, st.sampled_from([BENT[0], BENT[15], BENT[35]]))
 
 
 # ------------------------------------------------------------------------------------------------ layouts
@@ -124,7 +133,7 @@ def test_east_is_left_when_north_is_up(d):
     )
 
 
-@given(SKY, ANY_DETECTOR)
+@given(SKY, STRAIGHT)
 def test_the_sky_is_never_mirrored(pointing, d):
     system = wcs(d, *boresight_for(d, *pointing))
     j = jacobian(system, [(d.nx - 1) / 2], [(d.ny - 1) / 2])[0]
@@ -153,7 +162,7 @@ def test_a_pointing_puts_the_detector_on_its_target(pointing, d):
     system = wcs(d, *boresight_for(d, ra, dec, angle))
     x, y = pixel_of_sky(system, [ra], [dec])
     assert np.hypot(x[0] - (d.nx - 1) / 2, y[0] - (d.ny - 1) / 2) < 1e-6
-    if abs(dec) < 89.9:
+    if abs(dec) < 89.9 and not d.bending:
         # At the target itself, the detector's axes have the angle that was asked for.
         j = jacobian(system, x, y)[0]
         measured = np.degrees(np.arctan2(-j[0, 1], j[1, 1])) - d.rotation
@@ -231,7 +240,7 @@ def test_a_header_without_a_world_is_refused():
         focal_plane.from_cards((("EXPTIME", 1.0, ""),))
 
 
-@given(SKY, ANY_DETECTOR)
+@given(SKY, STRAIGHT)
 def test_footprints(pointing, d):
     system = wcs(d, *boresight_for(d, *pointing))
     corners = focal_plane.corners(d, system)

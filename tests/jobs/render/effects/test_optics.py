@@ -88,7 +88,10 @@ def test_the_offset_is_the_focal_plane_s(name):
     assert (radius, hole) == (56.0, 0.33)
     assert len(arms) == 3
     assert width == pytest.approx(56 * 12 / 600)
-    np.testing.assert_allclose(offset, (0.0, -750.0 if shown.detector.rotation else 750.0), atol=1e-9)
+    assert (offset[1] < 0) == shown.detector.upside_down
+    turn = np.radians(shown.detector.rotation)
+    to_plane = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    np.testing.assert_allclose(to_plane @ offset, (0.0, 750.0), atol=1e-9)
 
 
 def test_what_no_ghost_shows_is_left_out():
