@@ -3,6 +3,7 @@
 sub_bands   a band cut into parts of equal photon number for flat f_nu
 galaxies    fractions of each galaxy's photons in each part, from its spectrum
 stars       the same of stars
+of_spectrum the same of one spectrum
 
 Whose spectrum the table does not hold has flat f_nu.
 """
@@ -93,6 +94,13 @@ def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Flo
             part = Stars(*(getattr(found, field.name)[chosen] for field in fields(found)))
             f_nu[chosen] = kernel(part, parts, library)
     return _shares(f_nu, parts)
+
+
+def of_spectrum(band: Passband, f_lambda: Float) -> Float:
+    """float64[PARTS] fractions of the detected photons of a spectrum given on the band's wavelengths."""
+    parts = sub_bands(band)
+    f_nu = np.array([[passbands.ab_flux(part, band.wavelength, f_lambda) for part in parts]])
+    return np.asarray(_shares(f_nu, parts)[0])
 
 
 def _flat(n: int) -> Float:

@@ -21,7 +21,19 @@ from jobs.accuracy import Accuracy
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
-from jobs.render import chromatic, exposing, focal_plane, pictures, profiles, psf, selection, stamps, tasks, truth_maps
+from jobs.render import (
+    chromatic,
+    exposing,
+    focal_plane,
+    moving,
+    pictures,
+    profiles,
+    psf,
+    selection,
+    stamps,
+    tasks,
+    truth_maps,
+)
 from jobs.render.channels import ext, vis
 from jobs.render.effects import quadrants
 from jobs.render.effects.effect import Decision, Effect, Lights, Scene, apply_all, decide
@@ -146,6 +158,10 @@ def render(
             (galaxies, light[0]), (stars, light[1]), detector, system, spread, scene.pixel_noise, settings, passband,
             library, stellar, lenses,
         )  # fmt: skip
+        if channel == "VIS":
+            sources, sizes = _with_moving(
+                sources, sizes, exposure, detector, system, passband, scene, spread, settings, seed
+            )
         _refuse_too_large(exposure, detector, sources, sizes)
         if channel == "VIS":
             lights = _lights((galaxies, light[0]), (stars, light[1]), detector, system)
@@ -281,7 +297,7 @@ def sources_of(
     seen = selection.near(ra, dec, focal_plane.centre(detector, system), reach / 3600.0) & (electrons > 0)
     kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
     column, row = focal_plane.pixel_of_sky(system, ra[kept], dec[kept])
-    wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1]
+    wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
     sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings, wide)
     here = selection.touching(column, row, sizes, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
@@ -299,6 +315,29 @@ def _arcs(lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: p
     """Those of strong lenses: their pictures magnify what the galaxy shines by itself."""
     rows = STRONG_LENSES.empty().select(pictures.ARC_COLUMNS) if lenses is None else lenses
     return pictures.arcs(rows, galaxies["id"].to_numpy(), electrons / form.magnification)
+
+
+def _with_moving(
+    sources: Sources, sizes: stamps.Int, exposure: Row, detector: Detector, system: WCS, band: Passband, scene: Scene,
+    spread: Psf, settings: Settings, seed: int,
+) -> tuple[Sources, stamps.Int]:  # fmt: skip
+    """The sources with those that move, whose identifiers are the largest."""
+    reach = (detector.half_diagonal + stamps.SIZES[-1] * detector.pixel_scale) / 3600.0
+    found = moving.sources(exposure, detector, system, band, scene.mission, seed, reach, sources.shapes)
+    own = stamps.stamp_sizes(
+        found.electrons,
+        found.shape,
+        found.shapes,
+        spread,
+        scene.pixel_noise,
+        settings,
+        stamps.piece_length(found.length),
+    )
+    wide = own + np.ceil(found.length).astype(np.int64)
+    here = selection.touching(found.column, found.row, wide, detector.nx, detector.ny) & (found.electrons > 0)
+    if not here.any():
+        return sources, sizes
+    return sources.with_moving(found.take(here)), np.concatenate([sizes, own[here]])
 
 
 def _colours(

@@ -76,7 +76,6 @@ def truth(rendered: Rendered) -> pa.Table:
     """One row a source that was drawn, ascending id."""
     sources, n = rendered.sources, len(rendered.sources)
     trail = np.zeros((n, 2)) if sources.trail is None else sources.trail
-    method = np.where(sources.length > 0, TRAIL, np.where(sources.shape < 0, POINT, PROFILE))
     return RENDERED_TRUTH.build(
         {
             "exposure_id": np.full(n, int(rendered.exposure["exposure_id"]), np.int64),
@@ -88,17 +87,20 @@ def truth(rendered: Rendered) -> pa.Table:
             "drawn": rendered.drawn,
             "stamp": rendered.sizes,
             "method": _methods(sources),
+            "trail_x": trail[:, 0],
+            "trail_y": trail[:, 1],
         }
     )
 
 
 def _methods(sources: Sources) -> npt.NDArray[np.int64]:
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
-    return np.where(pictured, PICTURE, np.where(sources.shape < 0, POINT, PROFILE))
+    method = np.where(pictured, PICTURE, np.where(sources.shape < 0, POINT, PROFILE))
+    return np.where(sources.length > 0, TRAIL, method)
 
 
-def _write(units: Sequence[fits.Image], path: Path) -> None:
-    fits.write_images(path, units)
+def _write(units: Sequence[fits.Image], rice: bool, path: Path) -> None:
+    fits.write_images(path, units, rice)
 
 
 def _science(rendered: Rendered) -> list[fits.Image]:
@@ -207,6 +209,7 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] of a point source, pixel included"),
         ("SEEING", float(exposure["seeing"]), "[arcsec] FWHM of the atmosphere"),
         ("NSOURCES", len(rendered.sources), "number of sources drawn"),
+        ("NMOVING", int((rendered.sources.length > 0).sum()), "of them moving: bodies of the Solar System"),
         ("SRCREACH", rendered.complete, "[arcsec] beyond the detector: sources complete"),
         ("SEED", str(rendered.seed), "of the random numbers"),
         ("MISSION", rendered.scene.mission.fingerprint, ""),

@@ -37,7 +37,7 @@ _FIRST = int(FIRST_BITS)
 def nyquist_zones(
     zones: npt.NDArray[Any], planes: npt.NDArray[Any], kx: Float32, ky: Float32, runs: Int, pieces: Int, inner: Float,
     weights: npt.NDArray[Any], x: Float, y: Float, electrons: Float, cut: Float, sersic: Float32, body: Bool,
-    fraction: Float, bulge: Float, disk: Float, thick: Float, row: Int, row_weights: Float,
+    fraction: Float, bulge: Float, disk: Float, thick: Float, row: Int, row_weights: Float, trail: Float,
 ) -> None:  # fmt: skip
     """Fills zones, complex[m, N, N / 2 + 1]: what irfft2 turns into the stamps of m sources.
 
@@ -48,6 +48,7 @@ def nyquist_zones(
     sersic      : table of sersic.py; row, row_weights : [m], [m, 4] from sersic.row_of
     cut         : [m] pieces from this |k| on, radian / pixel, are left out
     x, y        : [m] position in the stamp, pixels, 0 = centre of the first;  electrons : [m]
+    trail       : [m, 2] pixels that it moves by, along columns and rows, about this position
     """
     m, n, columns = zones.shape
     most, low, high, far = 0, 0, 0, 0
@@ -93,6 +94,8 @@ def nyquist_zones(
                 for c in range(len(some)):
                     some_re[c] *= some[c]
                     some_im[c] *= some[c]
+            if trail[i, 0] != 0.0 or trail[i, 1] != 0.0:
+                _smear(trail[i, 0], trail[i, 1], kx[first:last], ky[first:last], some_re, some_im)
             for j in range(pieces[p], pieces[p + 1]):
                 start, ix, iy = runs[j]
                 length, left, up = runs[j + 1, 0] - start, ix % n, iy % n
@@ -166,6 +169,16 @@ def _profile(
             part = np.float32(bits[c] & np.int32(0xFFFF)) * np.float32(1.0 / 65536.0)
             below = table[i]
             out[c] += share * (below + part * (table[i + np.uint32(1)] - below))
+
+
+@jit
+def _smear(across: float, along: float, kx: Float32, ky: Float32, re: Any, im: Any) -> None:
+    """Multiplies by the transform of an even straight line: sin(q) / q, q = k . line / 2."""
+    for c in range(len(re)):
+        q = 0.5 * (across * kx[c] + along * ky[c])
+        smeared = np.sin(q) / q if abs(q) > 1e-4 else 1.0
+        re[c] *= smeared
+        im[c] *= smeared
 
 
 @jit

@@ -3,6 +3,7 @@
 sky_band, sky_rate    of a camera and band, at a position and date
 zodiacal_intensity    W m-2 sr-1 um-1 at 500 nm
 zodiacal_rate         through a passband
+solar                 the Sun's spectrum
 sun_longitude
 """
 
@@ -158,7 +159,7 @@ def _zodiacal_integrals(
 ) -> tuple[float, float, float]:
     wavelength = band.wavelength / 10.0
     reference = mission.value("env.zodi.reference_wavelength", "nm")
-    spectrum = _solar(wavelength, mission) / _solar(np.array([reference]), mission)
+    spectrum = solar(wavelength, mission) / solar(np.array([reference]), mission)
     energy = PLANCK_ERG_S * 1e-7 * LIGHT_ANGSTROM_S / band.wavelength
     # W m-2 sr-1 um-1 over steps of 1 A = 1e-4 um.
     photons = spectrum * band.response / energy * (1e-4 * area * (pixel_scale * _ARCSEC) ** 2)
@@ -168,7 +169,7 @@ def _zodiacal_integrals(
     return zodi, red, blue
 
 
-def _solar(wavelength: Float, mission: MissionConfiguration) -> Float:
+def solar(wavelength: Float, mission: MissionConfiguration) -> Float:
     """Solar spectral irradiance, W m-2 nm-1, 25 nm means; wavelength in nm.  Ref: Gueymard 2004."""
     table = np.array(mission.numbers("env.sun.spectrum"))
     if wavelength.min() < table[0, 0] or wavelength.max() > table[-1, 0]:

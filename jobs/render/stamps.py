@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,8 @@ _FEW = 8
 # of a pixel of the largest stamp (its plane and transforms) in single and double precision, of a source (its form and
 # weights), of all else (planes of the small stamps).
 _FRAME_BYTES, _STAMP_BYTES, _DOUBLE_BYTES, _SOURCE_BYTES, _OTHER_BYTES = 16, 160, 190, 900, 40_000_000
+# A trail is drawn in pieces no longer than this, pixels, each on a stamp of its own.
+_PIECE = 64.0
 # Pixels of stamps that are transformed together.
 _BATCH = 1 << 17
 # What galsim takes for a point in the reference, arcsec.
@@ -77,6 +79,8 @@ class Sources:
     shape       : row of `shapes`, -1 = a point or a picture
     photons     : float64[n, w] fraction of its photons in each sub-band of the PSF; None: flat f_nu
     picture     : row of `pictures`, -1 = no picture; None: there is none
+    trail       : float64[n, 2] pixels that a point moves by in the exposure, in the middle of which it is at its
+                  position; None: nothing moves
     """
 
     ids: Int
@@ -89,6 +93,7 @@ class Sources:
     photons: Float | None = None
     picture: Int | None = None
     pictures: tuple[Picture, ...] = ()
+    trail: Float | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -106,11 +111,28 @@ class Sources:
             None if self.photons is None else self.photons[chosen],
             None if self.picture is None else self.picture[chosen],
             self.pictures,
+            None if self.trail is None else self.trail[chosen],
         )
 
     def picture_of(self, i: int) -> Picture | None:
         """The picture of source i, if it has one."""
         return None if self.picture is None or self.picture[i] < 0 else self.pictures[self.picture[i]]
+
+    def with_moving(self, moving: Sources) -> Sources:
+        """These, at rest, and points that move, of later identifiers and the same shapes."""
+        names = ("ids", "column", "row", "jacobian", "electrons", "shape")
+        both: dict[str, Any] = {n: np.concatenate([getattr(self, n), getattr(moving, n)]) for n in names}
+        photons = None if self.photons is None else np.concatenate([self.photons, moving.photons])
+        picture = None if self.picture is None else np.concatenate([self.picture, np.full(len(moving), -1)])
+        trail = np.concatenate([np.zeros((len(self), 2)), moving.trail])
+        return Sources(
+            **both, shapes=self.shapes, photons=photons, picture=picture, pictures=self.pictures, trail=trail
+        )
+
+    @property
+    def length(self) -> Float:
+        """Of the trails, pixels."""
+        return np.zeros(len(self)) if self.trail is None else np.hypot(*self.trail.T)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +176,9 @@ def stamp_sizes(
 ) -> Int:
     """Side of each source's stamp, pixels: int64[n], one of SIZES.
 
+    wider : float64[n] pixels that a stamp is wider than a point's: the length of a piece of a trail, a picture's side
     noise : of a pixel, electrons. A cut by noise alone biases faint sources, for what wraps is coherent: the second
             condition holds it to a part of the flux, from the wings of the PSF and of high-n bulges alike
-    wider : [n] arcsec that a picture is wide, 0 where there is none: its stamp is so much wider than a point's
     """
     at = np.concatenate([SIZES // 2, SIZES])
     psf_light = _beyond_the_table(psf, at)
@@ -177,10 +199,10 @@ def stamp_sizes(
     enough[:, -1] = True
     # A point has no light beyond the PSF's plane.
     enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
-    sizes = SIZES[np.argmax(enough, axis=1)]
+    found = SIZES[np.argmax(enough, axis=1)]
     if wider is None:
-        return np.asarray(sizes)
-    return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, sizes + wider / psf.pixel_scale), len(SIZES) - 1)])
+        return np.asarray(found)
+    return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, found + wider), len(SIZES) - 1)])
 
 
 def reach(pixel_scale: float) -> float:
@@ -227,11 +249,69 @@ def draw(
     drawn    : float64[n] to be filled with what of each source's stamp fell onto the frame, electrons
     returns  : float64[ny, nx], to 5e-7 electrons a source; the same, bit by bit, in any order of the sources
     """
+    if sources.trail is not None:
+        return _draw_trails(sources, sources.trail, sizes, psf, nx, ny, progress, floors, drawn)
+    return _draw(sources, np.zeros((len(sources), 2)), sizes, psf, nx, ny, progress, floors, drawn)
+
+
+def piece_length(length: Float) -> Float:
+    """Of the pieces that trails [n] of a length are drawn in, pixels."""
+    return np.asarray(length / _pieces(length))
+
+
+def _pieces(length: Float) -> Int:
+    return np.maximum(np.ceil(length / _PIECE), 1.0).astype(np.int64)
+
+
+def _draw_trails(
+    sources: Sources,
+    trails: Float,
+    sizes: Int,
+    psf: Psf,
+    nx: int,
+    ny: int,
+    progress: Callable[[int], None] | None,
+    floors: Float | None,
+    drawn: Float | None,
+) -> Float:
+    """`draw` of sources with trails: each piece of a trail as a source."""
+    count = _pieces(sources.length)
+    whole = np.repeat(np.arange(len(sources)), count)
+    number = np.arange(len(whole)) - np.repeat(np.cumsum(count) - count, count)
+    # From the middle of the trail to that of the piece, in lengths of the trail.
+    along = (number + 0.5) / count[whole] - 0.5
+    trail = trails[whole]
+    pieces = replace(
+        sources.take(whole),
+        column=sources.column[whole] + along * trail[:, 0],
+        row=sources.row[whole] + along * trail[:, 1],
+        electrons=sources.electrons[whole] / count[whole],
+        trail=None,
+    )
+    of_piece = np.zeros(len(whole))
+    some_floors = None if floors is None else floors[whole]
+    frame = _draw(pieces, trail / count[whole, None], sizes[whole], psf, nx, ny, progress, some_floors, of_piece)
+    if drawn is not None:
+        drawn[:] = np.bincount(whole, of_piece, len(sources))
+    return frame
+
+
+def _draw(
+    sources: Sources,
+    trail: Float,
+    sizes: Int,
+    psf: Psf,
+    nx: int,
+    ny: int,
+    progress: Callable[[int], None] | None,
+    floors: Float | None,
+    drawn: Float | None,
+) -> Float:
     frame = np.zeros((ny, nx), np.int64)
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
-    bodies, table, passing = _bodies(sources), sersic.table(), transfer.passing(psf)
+    bodies, table, passing = (*_bodies(sources), trail), sersic.table(), transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
-    body, fraction, bulge, disk, _, row, _ = bodies
+    body, fraction, bulge, disk, _, row, *_ = bodies
     cut = kernel.reaches(passing, transfer.STEP, body, fraction, bulge, disk, table, row, left_out)
     reach, done = transfer.STEP * len(passing), 0
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
@@ -286,7 +366,10 @@ def _draw_some(
     table: Array,
     cut: Float,
 ) -> Int:
-    """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does."""
+    """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does.
+
+    bodies : arrays by source, as of `_bodies`, and trails
+    """
     size = passed.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
     x0, y0 = (np.rint(position).astype(np.int64) - size // 2 for position in (column, row))

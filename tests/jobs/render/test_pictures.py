@@ -37,7 +37,7 @@ def pictured(camera, name, picture, electrons, column=80.3, row=77.6):
 
 
 def drawn(source, psf, accuracy=SURVEY):
-    settings, wide = stamps.settings_for(accuracy), np.array([source.pictures[0].diagonal])
+    settings, wide = stamps.settings_for(accuracy), np.array([source.pictures[0].diagonal / psf.pixel_scale])
     sizes = stamps.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings, wide)
     floors = stamps.floors(source.electrons, NOISE, settings)
     return stamps.draw(source, sizes, psf, 160, 160, floors=floors), int(sizes[0])
