@@ -148,15 +148,15 @@ def render(
     maps: dict[str, npt.NDArray[Any]] = {}
     sources, sizes, drawn = _no_sources(galaxies), np.zeros(0, np.int64), np.zeros(0)
     if exposing.sees_sky(channel, str(exposure["image_type"])):
-        light = [
+        electrons = [
             _fluxes(rows, fluxes, f"f_nu_{band}") * _rate(exposure) * scene.exposure_time_s
             for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
         ]
         settings = stamps.settings_for(accuracy)
         spread = _psf(detector, passband, float(exposure["seeing"]), mission, settings.positions)
         sources, sizes = sources_of(
-            (galaxies, light[0]), (stars, light[1]), detector, system, spread, scene.pixel_noise, settings, passband,
-            library, stellar, lenses,
+            (galaxies, electrons[0]), (stars, electrons[1]), detector, system, spread, scene.pixel_noise, settings,
+            passband, library, stellar, lenses,
         )  # fmt: skip
         if channel == "VIS":
             sources, sizes = _with_moving(
@@ -164,7 +164,7 @@ def render(
             )
         _refuse_too_large(exposure, detector, sources, sizes)
         if channel == "VIS":
-            lights = _lights((galaxies, light[0]), (stars, light[1]), detector, system)
+            lights = _lights((galaxies, electrons[0]), (stars, electrons[1]), detector, system)
             peak = float(spread.surface[0]) * float(sources.electrons.max(initial=0.0))
             scene = replace(scene, lights=lights, peak_electrons=peak)
             decisions = decide((vis.DRAWN,), scene, forced)
@@ -188,9 +188,12 @@ def render(
         what = camera if effect.fixed else exposing.identity(exposure)
         return rng.stream(seed, what, detector.name, effect.name)
 
-    frame, more = apply_all(noise_free, effects, scene, stream, forced, truth_maps.watch(maps, scene, truth))
-    raw = frame.astype(np.uint16)
     maps["noise_free"] = noise_free.astype(np.float32)
+    # Handed over: a frame that nobody looks at any more is freed.
+    light = [noise_free]
+    del noise_free
+    frame, more = apply_all(light.pop(), effects, scene, stream, forced, truth_maps.watch(maps, scene, truth))
+    raw = frame.astype(np.uint16)
     truth_maps.complete(maps, raw, effects, scene, truth)
     return Rendered(
         exposure, detector, system, spread, raw, maps, sources, sizes, drawn, zero_point, scene, (*decisions, *more),

@@ -15,7 +15,11 @@ def apply(frame: Frame, gain: float, bias: float, largest: float, rng: np.random
     """
     if not 0.0 < gain < np.inf:
         raise OutOfRange("gain", gain, 0.0, np.inf)
-    return np.clip(np.floor(frame / gain + bias + 0.5), 0.0, largest)
+    out = frame / gain
+    out += bias
+    out += 0.5
+    np.floor(out, out=out)
+    return np.clip(out, 0.0, largest, out=out)
 
 
 def _parameters(scene: Scene) -> tuple[float, float, float]:

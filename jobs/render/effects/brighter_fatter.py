@@ -36,11 +36,13 @@ def apply(frame: Frame, shift: float, softening: float, capacity: float, rng: np
     out = np.array(frame, dtype=float, order="C")
     if shift == 0.0 or out.size == 0 or out.max() <= 0.0:
         return out
-    held = np.pad(np.minimum(out, capacity), REACH, mode="edge")
+    held = np.pad(out, REACH, mode="edge")
+    np.minimum(held, capacity, out=held)
     for down in (False, True):
         # What crosses is a whole number of electrons, right in the mean.
         dice = rng.random(out.shape, dtype=np.float32)
         _cross(held, out, kernel(shift, softening), dice, down)
+        del dice
     return out
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jobs.accuracy import Accuracy
 from jobs.render.effects import traps
-from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects.effect import NOTICEABLE, Effect, Frame, Scene
 from jobs.render.effects.traps import Sweeps, Traps
 
 # Species of the mission database.
@@ -72,10 +72,20 @@ def _columns(scene: Scene) -> int:
 
 
 def _loss(scene: Scene, direction: str, transfers: int) -> float:
-    """Electrons that the brightest packet loses on the longest way, if all traps it reaches are empty."""
+    """Electrons that the brightest packet loses on the longest way, if all traps it reaches are empty.
+
+    Where sources change by less than the accuracy allows, that tells the margin.
+    """
     silicon = lattice(scene, direction)
     brightest = scene.peak_electrons + scene.sky_electrons
-    return transfers * sum(silicon.density) * float(silicon.volume(brightest))
+    lost = transfers * sum(silicon.density) * float(silicon.volume(brightest))
+    over = _over_accuracy(scene.accuracy, transfers * sum(silicon.density))
+    return lost if over > 1.0 else min(lost, over * NOTICEABLE * scene.pixel_noise)
+
+
+def _over_accuracy(accuracy: Accuracy, passed: float) -> float:
+    """What so many traps do to a source, over what is allowed."""
+    return passed / _END_OF_LIFE * max(_FLUX / accuracy.flux, _SHIFT / accuracy.position, _SHAPE / accuracy.shape)
 
 
 def _parameters(scene: Scene, direction: str, transfers: int) -> tuple[Traps, Sweeps, int]:

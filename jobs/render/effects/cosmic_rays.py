@@ -27,7 +27,9 @@ _FEW = 1e-3
 
 def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> plus the charge of Poisson(expected) tracks."""
-    return np.asarray(frame + tracks(frame.shape, expected, quantiles, rng))
+    out = np.array(frame, dtype=float, order="C")
+    _add_tracks(out, expected, quantiles, rng)
+    return out
 
 
 def tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
@@ -38,11 +40,15 @@ def tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: np.ra
     A track that leaves at one edge enters at the other, as its neighbours' tracks do: the density is even.
     """
     out = np.zeros(shape)
+    _add_tracks(out, expected, quantiles, rng)
+    return out
+
+
+def _add_tracks(out: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> None:
     count = _count(expected, rng)
     if out.size:
-        events = _events(count, shape[0], shape[1], quantiles, rng)
-        _draw(out, events, np.zeros(count, np.int64), shape[0])
-    return out
+        events = _events(count, *out.shape, quantiles, rng)
+        _draw(out, events, np.zeros(count, np.int64), out.shape[0])
 
 
 def apply_readout(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from jobs.compiling import jit
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import BadInput, OutOfRange
 
@@ -21,12 +24,22 @@ def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = N
         raise BadInput(f"crosstalk of {coefficients.shape} coefficients for {count} quadrants")
     if not np.all(np.abs(coefficients) <= 1.0):
         raise OutOfRange("crosstalk", float(np.abs(coefficients).max()), 0.0, 1.0)
-    out = frame.copy()
-    for victim in range(count):
-        for source in range(count):
-            if source != victim and coefficients[victim, source]:
-                out[victim] += coefficients[victim, source] * frame[source]
-    return out
+    flat = np.ascontiguousarray(frame, dtype=float).reshape(count, -1)
+    out = np.empty_like(flat)
+    _mix(flat, np.asarray(coefficients, float), out)
+    return out.reshape(frame.shape)
+
+
+@jit
+def _mix(frame: Any, coefficients: Any, out: Any) -> None:
+    for victim in range(len(frame)):
+        line = out[victim]
+        line[:] = frame[victim]
+        for source in range(len(frame)):
+            share, other = coefficients[victim, source], frame[source]
+            if source != victim and share != 0.0:
+                for i in range(len(line)):
+                    line[i] += share * other[i]
 
 
 def coefficients(scene: Scene) -> Frame:

@@ -173,4 +173,6 @@ def apply_all(
             before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))
             if watch is not None:
                 watch(effect.name, before, frame)
+            # Frames are large: the next effect needs one.
+            del before
     return frame, decisions

@@ -22,7 +22,9 @@ def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | 
         raise BadInput(f"an illumination of {len(rows)} x {len(columns)} pixels for a frame of {frame.shape[-2:]}")
     if frame.size and not (1.0 + columns.min() + rows.min() >= 0.0 and columns.max() + rows.max() < np.inf):
         raise OutOfRange("illumination", 1.0 + float(columns.min() + rows.min()), 0.0, np.inf)
-    return np.asarray(frame * (1.0 + (columns + rows[:, None])))
+    out = np.asarray(columns + rows[:, None])
+    out += 1.0
+    return np.multiply(frame, out, out=out) if frame.ndim == 2 else frame * out
 
 
 def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, float]) -> tuple[Frame, Frame]:

@@ -8,8 +8,11 @@ linearised    its inverse: what a calibration does
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from jobs.compiling import jit
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
@@ -25,9 +28,19 @@ def apply(
     high : a, what is missing at `saturation` e-;  low : b, what is missing of the first electrons;  knee : n0, e-
     """
     _check(high, saturation, low, knee)
-    light = np.maximum(frame, 0.0)
-    response = light / (1.0 + high / saturation * light)
-    return np.asarray(response + low * knee * np.expm1(-response / knee) + np.minimum(frame, 0.0))
+    out = np.array(frame, dtype=float, order="C")
+    _respond(out.reshape(-1), high / saturation, low * knee, 1.0 / knee)
+    return out
+
+
+@jit
+def _respond(signal: Any, high: float, low: float, inverse: float) -> None:
+    """In place; high : per electron, low : electrons, inverse : of the knee."""
+    for i in range(len(signal)):
+        light = signal[i]
+        if light > 0.0:
+            response = light / (1.0 + high * light)
+            signal[i] = response + low * np.expm1(-response * inverse)
 
 
 def linearised(measured: Frame, high: float, saturation: float, low: float, knee: float) -> Frame:

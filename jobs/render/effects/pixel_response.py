@@ -13,7 +13,9 @@ _DEAD = 0.5
 
 def apply(frame: Frame, rms: float, dead: float, dark_columns: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> times `response`."""
-    return np.asarray(frame * response(frame.shape, rms, dead, dark_columns, rng))
+    out = response(frame.shape, rms, dead, dark_columns, rng)
+    out *= frame
+    return out
 
 
 def response(shape: tuple[int, ...], rms: float, dead: float, dark_columns: float, rng: np.random.Generator) -> Frame:

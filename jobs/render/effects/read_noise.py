@@ -12,7 +12,10 @@ def apply(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> frame + N(0, sigma) e-."""
     if not 0.0 <= sigma < np.inf:
         raise OutOfRange("read noise", sigma, 0.0, np.inf)
-    return frame + sigma * rng.standard_normal(frame.shape)
+    noise = rng.standard_normal(frame.shape)
+    noise *= sigma
+    noise += frame
+    return noise
 
 
 def _sigma(scene: Scene) -> float:
