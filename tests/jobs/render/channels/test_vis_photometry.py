@@ -1,0 +1,76 @@
+"""How bright stars are when a photometer measures them, and what the effects that it does not undo take."""
+
+import numpy as np
+import pytest
+import sep
+from scipy.ndimage import uniform_filter
+
+from jobs.render import fits_product, focal_plane, transfer
+from tests.jobs.render import calibrated, nominal
+from tests.jobs.render.fields import MISSION, small
+
+# Radius of the aperture, of the ring that tells the sky, arcsec.
+APERTURE, RING = 1.3, (2.2, 3.0)
+# Samples a pixel of the drawn PSF.
+FINE = 5
+
+
+def in_aperture(image, x, y, scale):
+    """Electrons inside the aperture above the ring's mean; pixels of both."""
+    circle = sep.sum_circle(image, x, y, APERTURE / scale, subpix=11)[0]
+    ring, _, _ = sep.sum_circann(image, x, y, RING[0] / scale, RING[1] / scale, subpix=11)
+    inside, around = (np.pi * (outer**2 - inner**2) / scale**2 for inner, outer in ((0.0, APERTURE), RING))
+    return circle - ring * inside / around, inside, around
+
+
+def correction(one):
+    """What of a star's light is counted: the model PSF of each star, drawn by galsim."""
+    weights = transfer.basis_weights(one.psf, one.sources.photons, one.sources.column, one.sources.row)
+    fine = transfer.profile_of(one.psf, weights.mean(axis=0)).drawImage(
+        nx=801, ny=801, scale=one.psf.pixel_scale / FINE, method="no_pixel", dtype=float
+    )
+    seen, middle = uniform_filter(fine.array, FINE, mode="constant"), np.array([400.0])
+    return float(in_aperture(seen, middle, middle, one.psf.pixel_scale / FINE)[0][0])
+
+
+def photometry(one, number=1):
+    """Measured less true magnitude of every star, and the noise that is expected of it, mag."""
+    applied = {decision.name for decision in one.decisions if decision.applied}
+    image = calibrated.electrons(one.raw, one.scene, number, applied)
+    bad = ~np.isfinite(image)
+    rows, scale = fits_product.truth(one), one.detector.pixel_scale
+    x, y, true = (rows[name].to_numpy() for name in ("x", "y", "expected"))
+    found, inside, around = in_aperture(np.ascontiguousarray(np.where(bad, 0.0, image)), x, y, scale)
+    blind = sep.sum_circle(bad.astype(float), x, y, RING[1] / scale)[0]
+    noise = np.sqrt(true + inside * (1 + inside / around) * one.scene.pixel_noise**2) / true
+    good = (blind == 0) & (1 / noise > 200)
+    return -2.5 * np.log10(found / correction(one) / true)[good], 1.0857 * noise[good]
+
+
+def stars(detector, pitch, mags, forced, mission=MISSION, number=1):
+    x, y = nominal.lattice(detector.nx, pitch, number)
+    inside = y < detector.ny - pitch / 2
+    mags = np.resize(mags, inside.sum())
+    return nominal.rendered(detector, mags, x[inside], y[inside], mission=mission, forced=forced, number=number)
+
+
+def test_isolated_stars_are_as_bright_as_the_catalogue_says():
+    """Linearised, without charge transfer's and cosmic rays' part; S/N > 200."""
+    forced, detector = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE), small("vis", "3-4", 256)
+    mags = [18.5, 19.0, 19.5, 20.0]
+    found = [photometry(stars(detector, 64, mags, forced, number=number), number) for number in (1, 2)]
+    change, noise = np.concatenate(found, axis=1)
+    assert len(change) >= 20
+    assert abs(np.median(change)) <= 0.003
+    assert change.std() <= 1.2 * np.sqrt(np.mean(noise**2)) + 0.005
+
+
+@pytest.mark.nightly
+def test_stars_of_a_whole_detector():
+    forced = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
+    detector = focal_plane.detector("vis", "1-1", MISSION)
+    change, noise = photometry(stars(detector, 128, np.arange(18.2, 20.2, 0.1), forced))
+    print(f"{len(change)} stars: median {np.median(change):.5f}, rms {change.std():.5f}, expected {noise.mean():.5f}")
+    assert len(change) > 800
+    assert abs(np.median(change)) <= 0.003
+    assert change.std() <= 1.2 * np.sqrt(np.mean(noise**2)) + 0.005
