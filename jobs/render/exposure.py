@@ -35,7 +35,7 @@ from jobs.render import (
     truth_maps,
 )
 from jobs.render.channels import ext, vis
-from jobs.render.effects import quadrants
+from jobs.render.effects import calibration_lamp, charge_injection, quadrants
 from jobs.render.effects.effect import Decision, Effect, Lights, Scene, apply_all, decide
 from jobs.render.focal_plane import Detector
 from jobs.render.psf import Psf
@@ -57,6 +57,8 @@ STAR_COLUMNS = ("id", "ra", "dec", *chromatic.STAR_COLUMNS)
 # Memory of a task, bytes: what an executor's core may count on.
 _MOST_BYTES = 2e9
 EFFECTS: Mapping[str, Mapping[str, tuple[Effect, ...]]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
+# What fills pixels besides the sky and its sources.
+_LAMPS = (calibration_lamp.EFFECT, charge_injection.EFFECT)
 # Electrons of a source that may shine where it is not.
 _LIGHT = 1e6
 # Code of a star in an identifier.
@@ -182,6 +184,9 @@ def render(
             ).astype(np.float32)
     else:
         noise_free = np.zeros((detector.ny, detector.nx))
+    # A lamp's light and injected charge are moved and squeezed like a star's.
+    own = sum(effect.contribution(scene) for effect in effects if effect in _LAMPS and forced.get(effect.name, True))
+    scene = replace(scene, peak_electrons=scene.peak_electrons + own)
 
     def stream(effect: Effect) -> np.random.Generator:
         # What belongs to the detector is the same in every exposure.

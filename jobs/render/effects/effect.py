@@ -55,7 +55,7 @@ class Scene:
 
     section        : prefix of the detector's parameters, "vis" or "ext.lsstcam"
     sky_rate       : electrons per second in a pixel
-    peak_electrons : brightest pixel of the expected image of the sources
+    peak_electrons : brightest pixel of the expected image: of the sources, with a lamp's light or injected charge
     detector       : where it lies in the focal plane; None: at its centre
     lights         : what shines around corners: ghosts, straylight
     lamp           : the LED of a flat, from 1

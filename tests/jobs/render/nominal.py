@@ -3,13 +3,15 @@
 from functools import cache
 
 import numpy as np
+import pytest
 
 from jobs.accuracy import SURVEY
-from jobs.render import exposing, exposure, focal_plane
+from jobs.fluxes import passbands
+from jobs.render import exposing, exposure, focal_plane, psf
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, stars
 
 TIME = MISSION.value("vis.exposure_time", "s")
-SKY = 0.25
+SKY, SEED = 0.25, 1
 COSMIC_RAYS = ("cosmic_rays", "readout_cosmic_rays")
 # What moves charge, or squeezes it: all that calibration does not undo.
 CHARGE = ("parallel_cti", "serial_cti", "brighter_fatter")
@@ -18,6 +20,12 @@ CHARGE = ("parallel_cti", "serial_cti", "brighter_fatter")
 def off(*names):
     """A request's wish: effects that are off."""
     return dict.fromkeys(names, False)
+
+
+@cache
+def spread(detector):
+    """The detector's PSF, for all of its exposures."""
+    return psf.vis_psf(detector, passbands.load("euclid_vis"), MISSION)
 
 
 @cache
@@ -32,7 +40,7 @@ def rendered(
 ):  # fmt: skip
     """Stars (or galaxies: `body`, their columns) of AB magnitudes `mags` at pixels x, y.
 
-    number : of the exposure: its random numbers
+    number : of the exposure: its noise; the detector stays the same
     """
     ra, dec, angle = pointing(detector)
     exposed = {
@@ -45,12 +53,15 @@ def rendered(
     bodies, points = galaxies(*where, **(body or {})), stars(*where)
     bodies, points = (bodies, points.slice(0, 0)) if body else (bodies.slice(0, 0), points)
     f_nu = 10 ** (-0.4 * (np.atleast_1d(mags) - 23.9))
-    return exposure.render(
-        {"detector": detector.name}, exposed,
-        bodies, fluxes(bodies, "euclid_vis", f_nu if body else 0.0),
-        points, fluxes(points, "euclid_vis", 0.0 if body else f_nu),
-        mission, accuracy, number, forced, detector, truth=truth,
-    )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        if mission is MISSION:
+            patch.setattr(exposure, "_psf", lambda detector, *_: spread(detector))
+        return exposure.render(
+            {"detector": detector.name}, exposed,
+            bodies, fluxes(bodies, "euclid_vis", f_nu if body else 0.0),
+            points, fluxes(points, "euclid_vis", 0.0 if body else f_nu),
+            mission, accuracy, SEED, forced, detector, truth=truth,
+        )  # fmt: skip
 
 
 def lattice(side, pitch, seed=1):

@@ -301,3 +301,13 @@ def test_the_passband_is_the_one_of_the_fluxes():
     width = passbands.log_width(passbands.load("euclid_vis"))
     found = exposing.zero_point_of("vis", "euclid_vis", MISSION)
     assert found == pytest.approx(units.zero_point(9926.0, width))
+
+
+def test_a_lamp_s_light_is_moved_and_squeezed_like_a_star_s():
+    """A flat of 20 000 electrons is as crooked as a star of as many, though nothing shines on it from the sky."""
+    body, points = (table.slice(0, 0) for table in field("VIS")[2:])
+    for kind, named in (("flat", "calibration_lamp"), ("charge_injection", "charge_injection")):
+        applied = {d.name for d in render("VIS", body, points, kind=kind).decisions if d.applied}
+        assert {"nonlinearity", "crosstalk", "parallel_cti", named} <= applied
+        without = {d.name for d in render("VIS", body, points, kind=kind, forced={named: False}).decisions if d.applied}
+        assert not {"nonlinearity", "crosstalk", "parallel_cti", named} & without

@@ -200,7 +200,7 @@ def residuals(detector, pitch, mag, number=1):
     forced = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE, "nonlinearity")
     one = nominal.rendered(detector, np.full(inside.sum(), mag), x[inside], y[inside], forced=forced, number=number)
     applied = {decision.name for decision in one.decisions if decision.applied}
-    image = calibrated.electrons(one.raw, one.scene, number, applied)
+    image = calibrated.electrons(one.raw, one.scene, nominal.SEED, applied)
     bad = ~np.isfinite(image)
     image = np.ascontiguousarray(np.where(bad, 0.0, image) - one.scene.sky_electrons)
     rows = fits_product.truth(one)

@@ -1,0 +1,118 @@
+"""A whole VIS exposure at the edges of what may be asked for: finite, within the converter, every electron counted."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jobs.accuracy import SURVEY
+from jobs.render.channels import vis
+from jobs.render.effects import bleeding, traps
+from jobs.render.effects.effect import Lights, Scene, apply_all
+from jobs.rng import stream
+from lake_schema.mission.configuration import resolve
+from tests.extremes.test_effects import scenes
+from tests.jobs.render import nominal
+from tests.jobs.render.fields import small
+
+SIDE = 128
+# Seconds of processor time that a frame of SIDE x SIDE may take through all of a channel, compiled.
+BOUND = 3.0
+END = {"vis.cti.age": (1.0, "")}
+
+
+def scene_of(shape, seconds=nominal.TIME, peak=1e11, light=0.0, **overrides):
+    ny, nx = shape
+    detector = replace(small("vis", "3-4", 2), nx=nx, ny=ny)
+    lights = Lights(np.array([nx / 2]), np.array([ny / 3]), np.array([light]))
+    return Scene(resolve(overrides=overrides), "vis", seconds, 0.25, peak, detector, lights, accuracy=SURVEY)
+
+
+def through(frame, one, kind="science", forced=None, watch=None):
+    """Every effect of a kind of image, wanted or not."""
+    effects = vis.EFFECTS[kind]
+    forced = {effect.name: True for effect in effects} | (forced or {})
+    return apply_all(frame, effects, one, lambda effect: stream(1, effect.name), forced, watch)[0]
+
+
+@pytest.mark.parametrize("age", [0.0, 1.0])
+@pytest.mark.parametrize("shape", [(SIDE, SIDE), (2, 2), (2, SIDE), (SIDE, 2)])
+def test_every_effect_on_every_frame(shape, age):
+    traps_of = {"vis.cti.age": (age, "")}
+    for kind in vis.EFFECTS:
+        through(np.zeros((2, 2)), scene_of((2, 2), light=1e11, **traps_of), kind)
+    for frame in scenes(shape).values():
+        one = scene_of(shape, light=float(frame.max()), **traps_of)
+        for kind in vis.EFFECTS:
+            started = time.process_time()
+            raw = through(frame if kind != "bias" else np.zeros(shape), one, kind)
+            assert time.process_time() - started < BOUND
+            assert raw.min() >= 0
+            assert raw.max() <= 65535
+            np.testing.assert_array_equal(raw, np.rint(raw))
+
+
+@pytest.mark.parametrize("seconds", [0.0, 1e5])
+@pytest.mark.parametrize("kind", vis.EFFECTS)
+def test_exposures_of_no_time_and_of_a_day(kind, seconds):
+    """In no time there is neither sky nor dark current; in a day the sky is near full well."""
+    one = scene_of((SIDE, SIDE), seconds, peak=0.0)
+    quiet = nominal.off("cosmic_rays", "readout_cosmic_rays", "hot_pixels", "pixel_response")
+    through(np.zeros((2, 2)), scene_of((2, 2), seconds, peak=0.0), kind)
+    started = time.process_time()
+    raw = through(np.zeros((SIDE, SIDE)), one, kind, quiet)
+    assert time.process_time() - started < BOUND
+    pixels = (raw[:, : SIDE // 2, 51 : 51 + SIDE // 2] - one.value("bias", "adu")) * one.value("gain", "electron / adu")
+    assert np.isfinite(raw).all()
+    if kind in ("science", "deep", "self_calibration"):
+        assert np.median(pixels) == pytest.approx(0.25 * seconds, rel=0.05, abs=60)
+    if kind in ("bias", "dark"):
+        assert np.median(pixels) == pytest.approx(one.dark_electrons if kind == "dark" else 0.0, abs=60)
+    busy = through(np.zeros((SIDE, SIDE)), one, kind)
+    assert np.isfinite(busy).all()
+
+
+def counted(frame, one):
+    """Electrons through bleeding and both transfers: (before, after, trapped, lost); no other effect between them."""
+    seen = {}
+
+    def watch(name, before, after):
+        seen[name] = (before, after)
+
+    through(frame, one, forced=nominal.off("readout_cosmic_rays"), watch=watch)
+    before, after = seen["bleeding"][0], seen["serial_cti"][1]
+    held, lost = bleeding.bleed(before, *bleeding.EFFECT.parameters(one))
+    np.testing.assert_array_equal(held, seen["bleeding"][1])
+    trapped = 0.0
+    for name, axis in (("parallel_cti", -2), ("serial_cti", -1)):
+        (effect,) = (e for e in vis.SKY if e.name == name)
+        out, still = traps.shifted(seen[name][0], *effect.parameters(one)[:2], axis, effect.parameters(one)[2])
+        np.testing.assert_array_equal(out, seen[name][1])
+        trapped += still
+    return before.sum(), after, trapped, lost
+
+
+@pytest.mark.parametrize("scene", scenes((2, 2)))
+def test_charge_is_in_the_frame_or_trapped_or_counted_as_lost(scene):
+    frame = scenes((SIDE, SIDE))[scene]
+    before, after, trapped, lost = counted(frame, scene_of((SIDE, SIDE), **END))
+    assert after.sum() + trapped + lost == pytest.approx(before, rel=1e-12)
+    assert after.min() >= 0
+    assert trapped > 0
+    assert (lost > 0) == (frame.max() > 1e6)
+
+
+def test_the_brightest_star_is_rendered():
+    """1e11 electrons: a frame full of charge, no number lost, and its neighbour's light still counted."""
+    detector = small("vis", "3-4", 256)
+    mag = 25.93 + 2.5 * np.log10(nominal.TIME / 1e11)
+    started = time.process_time()
+    one = nominal.rendered(detector, [mag, 20.0], [100.2, 30.0], [110.7, 220.0], truth=("saturation", "ghosts"))
+    assert time.process_time() - started < 20
+    assert np.isfinite(one.noise_free).all()
+    assert one.noise_free.sum(dtype=float) == pytest.approx(1e11, rel=0.1)
+    assert one.sources.electrons.max() == pytest.approx(1e11, rel=0.01)
+    # Its column is full from the register to the middle, where the flow stops.
+    assert (one.maps["saturation"][:128, 100] == 1).all()
+    assert one.raw.max() <= 65535

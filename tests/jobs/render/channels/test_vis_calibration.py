@@ -1,0 +1,92 @@
+"""Calibration as an observer does it: master biases and flats made of frames, and what is left in a science frame."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from jobs.render import fits_product, focal_plane
+from jobs.render.effects import calibration_lamp, illumination, nonlinearity, quadrants
+from tests.jobs.render import calibrated, nominal
+from tests.jobs.render.fields import MISSION, small
+
+FRAMES, BLOCK = 20, 64
+
+
+def raw(detector, kind, number, seconds, sky=nominal.SKY):
+    """Electrons above the converter's zero, quadrants with their overscan; and the exposure."""
+    sky = 0.0 if kind == "bias" else sky
+    one = nominal.rendered(
+        detector, [], [], [], kind=kind, number=number, seconds=seconds, sky=sky, truth=("cosmic_rays",)
+    )
+    return one.raw.astype(np.float32) * np.float32(one.scene.value("gain", "electron / adu")), one
+
+
+def combined(frames):
+    """Mean of what lies within four deviations (of the median's) of the median: no cosmic ray is left."""
+    stack = np.stack(frames)
+    middle = np.median(stack, axis=0)
+    spread = 1.4826 * np.median(np.abs(stack - middle), axis=0)
+    kept = np.abs(stack - middle) <= 4.0 * np.maximum(spread, 1.0)
+    return np.where(kept, stack, 0.0).sum(axis=0) / kept.sum(axis=0)
+
+
+def linearised(frame, one):
+    electrons = nonlinearity.linearised(frame.astype(float), *nonlinearity.EFFECT.parameters(one.scene))
+    return quadrants.assembled(electrons, *quadrants.sizes(one.scene))
+
+
+@cache
+def masters(detector):
+    """Bias, quadrants; flat [ny, nx], 1 in the mean."""
+    bias = combined([raw(detector, "bias", i, 0.0)[0] for i in range(1, FRAMES + 1)])
+    flats = []
+    for i in range(1, FRAMES + 1):
+        frame, one = raw(detector, "flat", 100 + i, 10.0)
+        # What the open shutter let in besides is known; the lamp's unevenness is the calibration unit's own.
+        flats.append((linearised(frame - bias, one) - one.scene.sky_electrons).astype(np.float32))
+    level, *pattern = calibration_lamp.EFFECT.parameters(one.scene)
+    return bias, combined(flats) / (level * illumination.apply(np.ones(flats[0].shape), *pattern))
+
+
+def calibrated_science(detector, sky):
+    """A science frame, NaN where it is spoilt, and what it should be, e- [ny, nx]; its exposure."""
+    bias, flat = masters(detector)
+    frame, one = raw(detector, "science", 200, nominal.TIME, sky)
+    found = linearised(frame - bias, one) / np.where(flat > 0.7, flat, np.nan)
+    expected = np.full(found.shape, one.scene.sky_electrons)
+    for part in (illumination.EFFECT, illumination.SHUTTER):
+        expected = part.apply(expected, *part.parameters(one.scene))
+    # What the header says of the dark current: where it is not noticed there is none.
+    (dark,) = (value for keyword, value, _ in fits_product.science_cards(one) if keyword == "DARKRATE")
+    expected += dark * nominal.TIME
+    found = calibrated.without_hits(found, one.maps["cosmic_rays"])
+    # Hot pixels are known to the darks.
+    return np.where(found > expected + 10 * np.sqrt(expected), np.nan, found), expected
+
+
+def block_means(values):
+    ny, nx = (n // BLOCK for n in values.shape)
+    return np.nanmean(values[: ny * BLOCK, : nx * BLOCK].reshape(ny, BLOCK, nx, BLOCK), axis=(1, 3))
+
+
+def check(detector):
+    # The nominal sky, where blocks scatter by 0.13 % of shot noise, and one that is bright enough to see less.
+    for sky in (nominal.SKY, 9.0):
+        found, expected = calibrated_science(detector, sky)
+        left = block_means(found - expected) / block_means(expected)
+        scatter = np.nanstd(found - expected) / np.sqrt(expected.mean())
+        print(f"{expected.mean():.0f} e-: blocks mean {left.mean():.5f}, rms {left.std():.5f}, "
+              f"largest {np.abs(left).max():.5f}; scatter {scatter:.4f} of shot noise")  # fmt: skip
+        assert np.sqrt(np.mean(left**2)) < 0.003
+        assert np.abs(left).max() < 0.003 or sky == nominal.SKY
+        assert scatter <= 1.1
+
+
+def test_masters_calibrate_a_science_frame():
+    check(small("vis", "3-4", 256))
+
+
+@pytest.mark.nightly
+def test_masters_calibrate_a_whole_detector():
+    check(focal_plane.detector("vis", "1-1", MISSION))
