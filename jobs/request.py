@@ -31,7 +31,7 @@
         pointings = "file.csv"     a table of pointings instead of a survey's pattern
         dither = "S" | "J" | "none"   fields, visits, exposures, short, flat, blue, bands, detectors, mjd,
         exposure_time_s
-    [products]     truth = ["noise_free", "stars", "cosmic_rays", "ghosts", "saturation"]
+    [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation"]
                    compression = "none" | "rice"   of images of whole numbers, without loss
 
 Files are found from the folder of the request; their formats are in jobs/fluxes/spectrum_formats.toml.

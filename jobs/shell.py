@@ -45,11 +45,13 @@ class Step:
     """One table of a job.
 
     on_driver : the work is too small to be worth a trip to the workers
+    unit      : what a part is, for the progress bar
     """
 
     plan: Plan
     work: Work
     on_driver: bool = False
+    unit: str = "part"
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +165,7 @@ def _run(job: Job, step: Step, root: Path, request: requests.Request, verbose: b
 
     def mapper(function: Callable[[Part], Json], parts: Sequence[Part]) -> Iterable[Json]:
         measured = Measured(function)
-        with _bar(root, plan):
+        with _bar(root, plan, step.unit):
             outcome = map(measured, parts) if step.on_driver else _spark_map(measured, parts, job.name, verbose)
             for result in outcome:
                 results.append(result)
@@ -225,7 +227,7 @@ class _RunLog:
 
 
 @contextmanager
-def _bar(root: Path, plan: Plan) -> Iterator[None]:
+def _bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
     """A progress bar that counts receipts, so that it is right after a resume and under any scheduler."""
     folder = publish.receipts(layout.stage(root, plan.table.name, plan.key))
 
@@ -234,7 +236,7 @@ def _bar(root: Path, plan: Plan) -> Iterator[None]:
 
     quiet = not sys.stderr.isatty() and "TRUESKY_PROGRESS" not in os.environ
     with tqdm(
-        total=len(plan.parts), initial=count(), desc=plan.table.name, unit="part", disable=quiet, leave=False
+        total=len(plan.parts), initial=count(), desc=plan.table.name, unit=unit, disable=quiet, leave=False
     ) as bar:
         done = threading.Event()
 

@@ -1,10 +1,12 @@
 """The archive of a lake's images: what there is, of what, made when, with what, and what could not be made.
 
     python -m jobs.render.archive --lake LAKE [--at RA DEC] [--sql "select .. from products"]
+    python -m jobs.render.archive --lake LAKE --again PATH --out FILE.fits [--version KEY]
 
 products    the published products, each with its sha256, seconds and peak memory
 failures    detectors that a run could not render
 covering    those products whose footprint holds a place
+again       renders one of them anew, from the tables and the mission that it was made from
 
 A product's bytes depend on what it was made of alone; how long that took is in the logs of the runs.
 """
@@ -24,6 +26,7 @@ import pyarrow as pa
 from jobs.render import focal_plane
 from lake_schema import layout, read
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.provenance import code_version, file_sha256
 
 _FAILURES = pa.schema(
     [
@@ -100,18 +103,52 @@ def search(rows: pa.Table, sql: str) -> pa.Table:
             raise BadInput(f"--sql: {' '.join(str(error).split())}") from None
 
 
+def again(root: Path, product: str, out: Path, key: str | None = None) -> str:
+    """Render a product into a file of its own; returns what is to be said of it, empty where its bytes are the same.
+
+    product : its path in the table;  key : of the version of `products` that has it, None = the current one
+    Errors  : BadInput where there is no such product, or where a table that it was made from has been removed
+    """
+    from jobs.render import render_exposures
+
+    version = read.version(root, "products", key)
+    rows = [row for row in version.rows().to_pylist() if row["path"] == product]
+    if not rows:
+        raise BadInput(f"table products: version {version.key} has no product {product}")
+    place = {name: rows[0][name] for name in ("exposure_id", "detector")}
+    (part,) = (part for part in version.manifest["parts"] if place.items() <= part["facts"].items())
+    facts = version.manifest["facts"]
+    render_exposures.work(root, {**facts, **part["facts"]}).files[product](out)
+    if file_sha256(out) == file_sha256(version.file(product)):
+        return ""
+    code = "" if facts["code"] == code_version() else ": it was made by another version of the code"
+    return f"{out} differs from {product}{code}"
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints the products, one JSON object a line; those of a place or of a query where one is given."""
+    """Prints the products, one JSON object a line; those of a place or of a query where one is given.
+
+    Exit status: 0, 1 a product came out otherwise when it was rendered again, 2 the call is wrong.
+    """
     parser = argparse.ArgumentParser(prog="python -m jobs.render.archive", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lake", required=True, help="folder of the lake")
     parser.add_argument("--at", nargs=2, type=float, metavar=("RA", "DEC"), help="only what holds this place, deg")
     parser.add_argument("--sql", help="a query of the table products")
+    parser.add_argument("--again", metavar="PATH", help="render this product again, as it was made")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="where to; wanted with --again")
+    parser.add_argument("--version", metavar="KEY", help="of an older version of the table products")
     options = parser.parse_args(argv)
+    if (options.again is None) != (options.out is None):
+        parser.error("--again and --out belong together")
     try:
+        if options.again is not None:
+            said = again(layout.lake(options.lake), options.again, options.out, options.version)
+            print(said or f"{options.out} equals {options.again}")
+            return int(bool(said))
         rows = products(layout.lake(options.lake))
         rows = rows if options.at is None else covering(rows, *options.at)
         rows = rows if options.sql is None else search(rows, options.sql)
-    except LakeError as error:
+    except (LakeError, OSError) as error:
         print(f"archive: {error}", file=sys.stderr)
         return 2
     for row in rows.to_pylist():

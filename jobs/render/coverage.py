@@ -1,28 +1,194 @@
-"""How often each place of the sky is looked at.
+"""How often each place of the sky is looked at: measured, and as a map.
 
-counts   of places: how many of the planned detectors see each
+    python -m jobs.render.coverage --lake LAKE --out coverage.png
+
+counts     of places: how many of the planned detectors see each
+depths     of the lake's plan, each band over its area
+picture    the same as maps
 """
 
 from __future__ import annotations
 
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from jobs.area import Area
 from jobs.render import focal_plane
+from jobs.render.exposing import SKY_TYPES
+from lake_schema import layout, read, sky
+from lake_schema.errors import BadInput, LakeError
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+
+# Places along a side of a map; the widest map, and how far inside an area its edge is no longer felt, deg.
+_SIDE, _WIDEST, _INSIDE = 500, 60.0, 0.5
+# Colours are told apart up to so many exposures.
+_MOST_COLOURS = 12
 
 
-def counts(tasks: pa.Table, ra: npt.ArrayLike, dec: npt.ArrayLike) -> npt.NDArray[np.int64]:
+@dataclass(frozen=True, slots=True)
+class Depth:
+    """How often a band's exposures see the places of a map.
+
+    seen      : int[side, side], x to the west, y to the north;  extent : half a side, deg
+    interior  : places more than 0.5 deg inside the request's area, or nearly so where it is small
+    exposures : number of the band's
+    """
+
+    channel: str
+    band: str
+    exposures: int
+    seen: Int
+    interior: npt.NDArray[np.bool_]
+    extent: float
+
+    def share(self, least: int) -> float:
+        """Part of the interior that at least so many exposures see."""
+        return float((self.seen[self.interior] >= least).mean()) if self.interior.any() else 0.0
+
+
+def counts(tasks: pa.Table, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
     """[n] How many footprints of the tasks hold each place, gaps between detectors left out; ra, dec : [n] deg."""
+    from scipy.spatial import cKDTree
+
     places = focal_plane.basis(np.asarray(ra, float), np.asarray(dec, float))[2].T
     found = np.zeros(len(places), np.int64)
     centres = focal_plane.basis(tasks["ra"].to_numpy(), tasks["dec"].to_numpy())[2].T
-    reach = np.cos(np.radians(tasks["radius"].to_numpy()))
-    for i, region in enumerate(tasks["s_region"].to_pylist()):
-        near = np.flatnonzero(places @ centres[i] > reach[i])
-        if near.size:
+    chords = 2.0 * np.sin(np.radians(tasks["radius"].to_numpy()) / 2.0)
+    nearby = cKDTree(places).query_ball_point(centres, chords) if len(tasks) else []
+    for near, region in zip(nearby, tasks["s_region"].to_pylist(), strict=True):
+        if near:
             corners = np.array(region.split()[2:], float).reshape(-1, 2)
             edges = focal_plane.basis(corners[:, 0], corners[:, 1])[2].T
             side = places[near] @ np.cross(edges, np.roll(edges, -1, axis=0)).T
             found[near] += (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
     return found
+
+
+def depths(exposures: pa.Table, tasks: pa.Table, area: Area, side: int = _SIDE) -> list[Depth]:
+    """Of every channel and band that looks at the sky, long exposures alone.
+
+    area : of the request, where its interior lies
+    """
+    looks = exposures.filter(pc.is_in(exposures["image_type"], pa.array(SKY_TYPES)))
+    if not looks.num_rows:
+        raise BadInput("table exposures has none of the sky")
+    ra0, dec0 = _centre(looks)
+    far = float(np.max(sky.separation(looks["ra"].to_numpy(), looks["dec"].to_numpy(), ra0, dec0)))
+    extent = far + float(pc.max(_reach(tasks, looks)).as_py())
+    if 2.0 * extent > _WIDEST:
+        raise BadInput(f"the exposures lie {2 * extent:.0f} deg apart: a map shows {_WIDEST:g} deg at most")
+    # Square on the tangent plane; x to the west.
+    grid = np.tan(np.radians(extent)) * np.degrees(1.0) * 3600.0 * np.linspace(-1.0, 1.0, side)
+    ra, dec = (a.ravel() for a in focal_plane.sky_of_plane(*np.meshgrid(grid, grid), ra0, dec0, 0.0))
+    inside = area.depth(ra, dec)
+    interior = (inside > min(_INSIDE, 0.5 * float(inside.max()))).reshape(side, side)
+    found = []
+    for channel, band in sorted({(row["channel"], row["band"]) for row in looks.to_pylist()}):
+        own = looks.filter(pc.and_(pc.equal(looks["channel"], channel), pc.equal(looks["band"], band)))
+        long = own.filter(pc.greater(own["exposure_time_s"], 0.5 * pc.max(own["exposure_time_s"]).as_py()))
+        seen = counts(tasks.filter(pc.is_in(tasks["exposure_id"], long["exposure_id"])), ra, dec)
+        found.append(Depth(channel, band, len(long), seen.reshape(side, side), interior, extent))
+    return found
+
+
+def _centre(exposures: pa.Table) -> tuple[float, float]:
+    x, y, z = focal_plane.basis(exposures["ra"].to_numpy(), exposures["dec"].to_numpy())[2].sum(axis=1)
+    return float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+
+
+def _reach(tasks: pa.Table, exposures: pa.Table) -> pa.Array:
+    """How far from its boresight each task of some exposures looks, deg."""
+    at = {row["exposure_id"]: (row["ra"], row["dec"]) for row in exposures.to_pylist()}
+    own = tasks.filter(pc.is_in(tasks["exposure_id"], exposures["exposure_id"]))
+    ra, dec = np.array([at[i] for i in own["exposure_id"].to_pylist()]).T
+    return pa.array(sky.separation(own["ra"].to_numpy(), own["dec"].to_numpy(), ra, dec) + own["radius"].to_numpy())
+
+
+def line(depth: Depth) -> str:
+    """What a person reads of a band."""
+    shares = ", ".join(f">= {n}: {depth.share(n):.3f}" for n in range(1, 5))
+    return f"{depth.channel:7} {depth.band:12} {depth.exposures:6,} exposures   of the interior {shares}"
+
+
+def picture(found: Sequence[Depth], path: Path) -> None:
+    """A map a band, north up, east to the left: how many exposures see each place; the interior outlined."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import BoundaryNorm
+    from matplotlib.figure import Figure
+
+    columns = min(len(found), 3)
+    rows = -(-len(found) // columns)
+    figure = Figure(figsize=(5.2 * columns, 5.4 * rows), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, depth in zip(np.ravel(figure.subplots(rows, columns, squeeze=False)), found, strict=False):
+        most = max(int(depth.seen.max()), 1)
+        step = -(-most // _MOST_COLOURS)
+        bounds = np.arange(0, most + step + 1, step) - 0.5
+        half = depth.extent
+        # x of the map runs to the west.
+        shown = axes.imshow(
+            depth.seen, origin="lower", extent=(half, -half, -half, half), cmap="viridis", interpolation="nearest",
+            norm=BoundaryNorm(bounds, 256),
+        )  # fmt: skip
+        if depth.interior.any() and not depth.interior.all():
+            axes.contour(
+                depth.interior.astype(float), [0.5], extent=(half, -half, -half, half), colors="w", linewidths=1.2
+            )
+        axes.set_title(f"{depth.channel} {depth.band}: >= 3 over {100 * depth.share(3):.1f} %", fontsize=11)
+        axes.set_xlabel("east [deg]")
+        axes.set_ylabel("north [deg]")
+        bar = figure.colorbar(shown, ax=axes, shrink=0.8, label="exposures")
+        bar.set_ticks(bounds[:-1] + 0.5)
+    for axes in figure.axes:
+        if not axes.has_data():
+            axes.set_visible(False)
+    figure.savefig(path, metadata={"Software": None})
+
+
+def area_of(version: read.Version) -> Area:
+    """The area of the request that a plan was made for."""
+    facts = version.manifest["facts"]["request"]["area"]
+    box = facts["box"]
+    return Area(
+        **{
+            **facts,
+            "vertices": tuple(map(tuple, facts["vertices"])),
+            "box": None if box is None else tuple(box),
+            "patches": tuple(map(tuple, facts["patches"])),
+        }
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints a line a band and draws the maps."""
+    parser = argparse.ArgumentParser(prog="python -m jobs.render.coverage", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--lake", required=True, help="folder of the lake, with a plan")
+    parser.add_argument("--out", type=Path, help="PNG of the maps")
+    options = parser.parse_args(argv)
+    try:
+        root = layout.lake(options.lake)
+        exposures, tasks = read.version(root, "exposures"), read.version(root, "tasks")
+        found = depths(exposures.rows(), tasks.rows(), area_of(exposures))
+        for depth in found:
+            print(line(depth))
+        if options.out is not None:
+            picture(found, options.out)
+            print(options.out)
+    except (LakeError, OSError) as error:
+        print(f"coverage: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -23,6 +23,7 @@ from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
 from jobs.render import (
     chromatic,
+    costs,
     exposing,
     focal_plane,
     moving,
@@ -31,7 +32,6 @@ from jobs.render import (
     psf,
     selection,
     stamps,
-    tasks,
     truth_maps,
 )
 from jobs.render.channels import ext, vis
@@ -250,7 +250,7 @@ def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration,
 
 def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes: stamps.Int) -> None:
     """Before anything is drawn: a task must fit into its memory."""
-    base = tasks.costs()[str(exposure["channel"])].base_gb * 1e9
+    base = costs.of_channel(str(exposure["channel"])).base_gb * 1e9
     wanted = base + stamps.memory(sources.electrons, sizes, detector.nx, detector.ny)
     if wanted > _MOST_BYTES:
         where = f"exposure {exposure['exposure_id']}, detector {detector.name}"

@@ -1,6 +1,6 @@
 """What a plan will cost, before anything is rendered.
 
-rows     a line a channel, survey and image type: exposures, products, core-hours, storage, peak memory
+rows     a line a channel, survey and image type, one a channel, one in all: exposures, detectors, core-hours, storage
 text     the table that a person reads
 """
 
@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +29,7 @@ class Line:
 
 
 def rows(exposures: pa.Table, tasks: pa.Table) -> list[Line]:
-    """Sums by channel, survey and image type, in that order, and of everything."""
+    """Sums by channel, survey and image type, in that order; by channel; of everything."""
     about = exposures.select(["exposure_id", "survey", "image_type"])
     joined = tasks.drop_columns(["cells", "s_region"]).join(about, "exposure_id")
     keys = ["channel", "survey", "image_type"]
@@ -44,19 +43,24 @@ def rows(exposures: pa.Table, tasks: pa.Table) -> list[Line]:
             ("memory", "max"),
         ]
     )
-    lines = [_line(row) for row in sums.sort_by([(key, "ascending") for key in keys]).to_pylist()]
-    total = Line(
+    kinds = [_line(row) for row in sums.sort_by([(key, "ascending") for key in keys]).to_pylist()]
+    channels = sorted({line.channel for line in kinds})
+    own = [[line for line in kinds if line.channel == channel] for channel in channels]
+    return [*kinds, *(_sum(channel, lines) for channel, lines in zip(channels, own, strict=True)), _sum("all", kinds)]
+
+
+def _sum(name: str, lines: list[Line]) -> Line:
+    return Line(
+        name,
         "all",
-        "",
         "",
         sum(line.exposures for line in lines),
         sum(line.detectors for line in lines),
         sum(line.sources for line in lines),
         sum(line.core_hours for line in lines),
         sum(line.gigabytes for line in lines),
-        float(pc.max(tasks["memory"]).as_py() or 0.0),
+        max((line.memory_gb for line in lines), default=0.0),
     )
-    return [*lines, total]
 
 
 def _line(row: dict[str, Any]) -> Line:

@@ -63,7 +63,8 @@ def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, 
     exposures = exposing.table([exposure for exposure, _ in found], [own for _, own in found], filters)
     densities = tasks.Densities(mission, request.universe, _catalogues(lake))
     wanted = [exposure.detectors for exposure, _ in found]
-    return mission, exposures, tasks.table(exposures, wanted, mission, densities, request.truth)
+    rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, survey.forced(request))
+    return mission, exposures, rows
 
 
 def _catalogues(lake: Path) -> list[read.Version]:
@@ -78,7 +79,9 @@ def steps(lake: Path, request: Request) -> list[Step]:
     for line in forecast.text(forecast.rows(exposures, rows)):
         print(line)
     facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **own_filters(request)[1]}
-    costs = {**facts, "counts": {v.table: v.key for v in _catalogues(lake)}}
+    # What they cost depends on more than which they are.
+    counts = {v.table: v.key for v in _catalogues(lake)}
+    costs = {**facts, "counts": counts, "rendered": request.facts("accuracy", "effects")}
     about = {
         "mission": mission.fingerprint,
         "ladder": list(mission.ladder),

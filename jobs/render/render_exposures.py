@@ -68,7 +68,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     )
     plan = Plan(PRODUCTS, facts, parts)
     drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in parts)
-    return [Step(plan, work), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
+    return [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
 
 
 def product_keys(
@@ -162,7 +162,8 @@ def _refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
     if missing := sorted(cells - _drawn(catalogue)):
         some = ", ".join(map(str, missing[:3])) + (", ..." if len(missing) > 3 else "")
         wanted = f"{len(missing)} order-{GENERATION_ORDER} cells that the detectors see ({some})"
-        raise BadInput(f"table {catalogue.table} lacks {wanted}: build it over a larger area first")
+        first = f"run build_{catalogue.table} over an area that holds all detectors, then compute_fluxes"
+        raise BadInput(f"table {catalogue.table} lacks {wanted}: {first}")
 
 
 def _drawn(catalogue: read.Version) -> set[int]:

@@ -6,7 +6,7 @@ its edge, and below the flux budget in the source's aperture. The PSF's wings be
 (wings.py). Nothing is lost, nothing is rescaled.
 
 Sources         what is drawn: galaxies (with a shape) and points
-settings_for    what an accuracy takes, from the measured table
+settings_for, seconds_for   what an accuracy takes, from the measured table
 stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 reach, least_electrons   how far a source may show, and what it takes to show there
 draw            sources -> frame
@@ -19,6 +19,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -155,14 +156,24 @@ class Settings:
 
 def settings_for(accuracy: Accuracy) -> Settings:
     """The cheapest settings whose measured errors are within an accuracy (settings.csv), or the most accurate."""
+    row = _row_for(accuracy)
+    return Settings(row["edge"], row["ghost"], row["floor"], row["least"], int(row["positions"]))
+
+
+def seconds_for(accuracy: Accuracy) -> float:
+    """CPU s of the sources of a VIS detector, measured with these settings."""
+    return _row_for(accuracy)["seconds"]
+
+
+@cache
+def _row_for(accuracy: Accuracy) -> dict[str, float]:
     with Path(__file__).with_name("settings.csv").open(newline="", encoding="utf-8") as file:
         rows = [
             {name: float(value) for name, value in row.items()}
             for row in csv.DictReader(line for line in file if not line.startswith("#"))
         ]
     good = [row for row in rows if all(row[f"{f.name}_error"] <= getattr(accuracy, f.name) for f in fields(accuracy))]
-    row = min(good, key=lambda row: row["seconds"]) if good else max(rows, key=lambda row: row["seconds"])
-    return Settings(row["edge"], row["ghost"], row["floor"], row["least"], int(row["positions"]))
+    return min(good, key=lambda row: row["seconds"]) if good else max(rows, key=lambda row: row["seconds"])
 
 
 def stamp_sizes(

@@ -6,18 +6,17 @@ Densities  how many sources there are where: of the lake's catalogues, or of the
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from jobs.render import focal_plane
+from jobs.accuracy import SURVEY, Accuracy
+from jobs.render import exposure, focal_plane, survey
+from jobs.render.costs import Price, price
 from jobs.render.exposing import sees_sky
 from jobs.request import Universe
 from lake_schema import layout, sky
@@ -29,29 +28,6 @@ from lake_schema.tables.tasks import TASKS
 
 Float = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
-
-# A FITS header and its padding, one an image.
-_HEADER_BYTES = 8640
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """Seconds a detector and a source, gigabytes and bytes a pixel, measured by benchmarks.planner."""
-
-    detector_s: float
-    source_s: float
-    base_gb: float
-    bytes_held_pixel: float
-    bytes_written_pixel: float
-
-
-@cache
-def costs() -> dict[str, Cost]:
-    """Cost of each channel's detectors."""
-    with (files("jobs.render") / "costs.csv").open(encoding="utf-8") as stream:
-        names = Cost.__slots__
-        return {row["channel"]: Cost(*(float(row[name]) for name in names)) for row in csv.DictReader(stream)}
-
 
 # ------------------------------------------------------------------------------------------------ sources
 
@@ -112,21 +88,28 @@ def table(
     mission: MissionConfiguration,
     densities: Densities,
     truth: Sequence[str] = (),
+    accuracy: Accuracy = SURVEY,
+    forced: Mapping[str, bool] | None = None,
 ) -> pa.Table:
     """Rows of the table `tasks`.
 
     exposures  : rows of the table `exposures`;  detectors : of each exposure, () = all of its camera
-    truth      : truth maps that are wanted, which take space
+    truth      : truth maps that are wanted
+    forced     : effects that the request forces on or off
     """
     cameras = {camera: _Camera(camera, mission) for camera in set(exposures["camera"].to_pylist())}
     shared: dict[tuple[Any, ...], _Places] = {}
+    prices: dict[tuple[Any, ...], Price] = {}
     columns: dict[str, list[Any]] = {name: [] for name in TASKS.names}
     for row, wanted in zip(exposures.to_pylist(), detectors, strict=True):
         camera = cameras[row["camera"]]
         where = (row["camera"], row["ra"], row["dec"], row["position_angle"])
         if where not in shared:
             shared[where] = camera.places(*where[1:], densities)
-        _append(columns, row, wanted, camera, shared[where], len(truth))
+        kind = tuple(row[name] for name in ("channel", "image_type", "settings"))
+        if kind not in prices:
+            prices[kind] = _price(row, survey.variant(row["settings"], mission, accuracy, forced or {}), truth)
+        _append(columns, row, wanted, camera, shared[where], prices[kind])
     seconds = np.array(columns["seconds"], float)
     numbers = np.array(columns["exposure_id"], np.int64)
     order = np.lexsort((np.array(columns["detector"]), numbers, -seconds)) if numbers.size else np.empty(0, np.int64)
@@ -171,9 +154,8 @@ class _Camera:
 
 
 def _append(
-    columns: dict[str, list[Any]], row: Row, wanted: tuple[str, ...], camera: _Camera, places: _Places, maps: int
+    columns: dict[str, list[Any]], row: Row, wanted: tuple[str, ...], camera: _Camera, places: _Places, cost: Price
 ) -> None:
-    cost = costs()[row["channel"]]
     looks = sees_sky(row["channel"], row["image_type"])
     for i in [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors)):
         sources = int(np.ceil(places.density[i] * camera.area[i])) if looks else 0
@@ -187,7 +169,15 @@ def _append(
         columns["cells"].append(places.cells[i] if looks else [])
         columns["s_region"].append(places.regions[i])
         columns["sources"].append(sources)
-        columns["seconds"].append(cost.detector_s + sources * cost.source_s)
-        columns["memory"].append(cost.base_gb + pixels * cost.bytes_held_pixel / 1e9)
-        # Truth maps are in single precision.
-        columns["bytes"].append(int(pixels * (cost.bytes_written_pixel + 4 * maps)) + _HEADER_BYTES * (1 + maps))
+        columns["seconds"].append(cost.seconds(pixels, sources))
+        columns["memory"].append(cost.memory(pixels))
+        columns["bytes"].append(cost.bytes(pixels))
+
+
+def _price(row: Row, own: survey.Variant, truth: Sequence[str]) -> Price:
+    """Of the detectors of an exposure; every effect that is not switched off is counted."""
+    channel, kind = str(row["channel"]), str(row["image_type"])
+    effects = exposure.EFFECTS.get(channel, {}).get(kind)
+    if effects is not None:
+        effects = tuple(effect for effect in effects if own.forced.get(effect.name, True))
+    return price(channel, sees_sky(channel, kind), effects, own.accuracy, truth)

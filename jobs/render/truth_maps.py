@@ -1,5 +1,6 @@
-"""Truth of what a detector adds to its image: cosmic rays, ghosts, what is full.
+"""Truth of what is in an image besides the sources: the diffuse sky, cosmic rays, ghosts, what is full.
 
+made       which of the maps that are wanted an image has
 watch      what is called for every effect that is applied
 complete   adds the maps of effects that were not needed, and what the converter could not hold
 """
@@ -17,6 +18,24 @@ from jobs.render.effects.effect import Effect, Frame, Scene
 
 Maps = dict[str, npt.NDArray[Any]]
 
+# Bytes a pixel of each map's file.
+BYTES = {"noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "saturation": 1}
+# What adds to a map of the same name as an effect, or of another.
+_OF_EFFECT = {
+    "ghosts": "ghosts", "background": "sky", "straylight": "sky", "cosmic_rays": "cosmic_rays",
+    "readout_cosmic_rays": "cosmic_rays",
+}  # fmt: skip
+
+
+def made(truth: Sequence[str], effects: Sequence[str] | None, looks: bool) -> list[str]:
+    """Those of the wanted maps that an image has.
+
+    effects : names of its channel's, None = not known: all maps;  looks : whether sources shine on it
+    """
+    found = {_OF_EFFECT[name] for name in effects or () if name in _OF_EFFECT}
+    found |= {"noise_free", "saturation"} | ({"stars"} if looks else set())
+    return [name for name in truth if effects is None or name in found]
+
 
 def watch(maps: Maps, scene: Scene, truth: Sequence[str]) -> Callable[[str, Frame, Frame], None]:
     """Fills in the truth that effects add to the frame."""
@@ -24,6 +43,8 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str]) -> Callable[[str, Fram
     def see(name: str, before: Frame, after: Frame) -> None:
         if name == "ghosts" and "ghosts" in truth:
             maps["ghosts"] = (after - before).astype(np.float32)
+        if name in ("background", "straylight") and "sky" in truth:
+            maps["sky"] = (after - before).astype(np.float32) + maps.get("sky", np.float32(0.0))
         if name in ("bleeding", "full_well") and "saturation" in truth:
             maps["saturation"] = bleeding.saturated(after, scene.value("full_well", "electron")).astype(np.uint8)
         if name in ("cosmic_rays", "readout_cosmic_rays") and "cosmic_rays" in truth:
@@ -39,9 +60,14 @@ def complete(
 ) -> None:
     """Adds maps of effects that were not needed, and pixels that the converter could not hold."""
     shape = maps["noise_free"].shape
-    names = {effect.name for effect in effects}
-    for name, dtype in (("ghosts", np.float32), ("cosmic_rays", np.int32), ("saturation", np.uint8)):
-        if name in truth and (name in names or name == "saturation") and name not in maps:
+    wanted = made(truth, [effect.name for effect in effects], False)
+    for name, dtype in (
+        ("ghosts", np.float32),
+        ("sky", np.float32),
+        ("cosmic_rays", np.int32),
+        ("saturation", np.uint8),
+    ):
+        if name in wanted and name not in maps:
             maps[name] = np.zeros(shape, dtype)
     if "saturation" in truth:
         full = raw >= scene.value("adc_max", "adu")

@@ -9,6 +9,7 @@ CONTENTS = (
     ("science", "what the detector delivers"),
     ("noise_free", "expected electrons of the sources alone"),
     ("stars", "expected electrons of the stars alone"),
+    ("sky", "expected electrons of the diffuse sky and of starlight that strays"),
     ("cosmic_rays", "electrons of cosmic rays, where they hit"),
     ("ghosts", "expected electrons of ghosts"),
     ("saturation", "1 where a pixel or the converter is full"),

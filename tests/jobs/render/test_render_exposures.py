@@ -2,9 +2,12 @@
 
 import copy
 import json
+import os
 import shutil
+import signal
 import tomllib
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -17,13 +20,15 @@ from astropy.wcs import WCS
 from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars, build_strong_lenses, strong_lenses
 from jobs.fluxes import compute_fluxes
-from jobs.render import archive, fits_product, focal_plane, plan_exposures, render_exposures
+from jobs.render import archive, fits_product, focal_plane, plan_exposures, render_exposures, truth_maps
 from jobs.request import from_table
-from lake_schema import ids, layout, publish, read, sky
+from lake_schema import ids, layout, publish, read, sky, tables
 from lake_schema.errors import BadInput, PartsFailed
+from lake_schema.plan import Part
 from lake_schema.provenance import file_sha256
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests import requests
+from tests.faults.victims import CONTEXT
 
 SIDE = 300
 SMALL = f"""
@@ -46,8 +51,8 @@ mjd = 60905.25
 REQUEST = tomllib.loads(requests.text(SMALL, requests.FIELD.format(0.03), seed=7))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _small_detectors():
+@contextmanager
+def small_detectors():
     """Detectors of LSSTCam cut down to their middles, close together."""
     listed = focal_plane._listed
 
@@ -56,6 +61,12 @@ def _small_detectors():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(focal_plane, "_listed", smaller)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small():
+    with small_detectors():
         yield
 
 
@@ -221,6 +232,67 @@ def _check_archive(lake, capsys):
         assert capsys.readouterr().err.startswith("archive: --sql: ")
 
 
+def test_a_source_beyond_the_reach_of_any_stamp_changes_no_byte(lake, rendered):
+    """The same lake without the sources 8 minutes of arc and more from the detectors, in the cells that they read."""
+    for name in ("galaxies", "stars"):
+        version = read.version(lake, name)
+        table, whole = tables.find(name, version.schema.names), version.manifest
+        parts = tuple(Part(part["name"], {**part["facts"], "part": part["name"]}) for part in whole["parts"])
+
+        def near(root, facts, version=version):
+            rows = version.rows(parts=[facts["part"]])
+            distance = sky.separation(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 53.117, -27.808)
+            return publish.Output(rows.filter(distance < 8 / 60))
+
+        publish.make(lake, publish.Plan(table, {**whole["facts"], "without": "the far ones"}, parts), near)
+        assert 100 < read.version(lake, name).num_rows < 0.8 * version.num_rows
+    make(lake, wanted(), compute_fluxes)
+    # Their files are others, so they are rendered, to the same bytes.
+    assert render(lake, wanted()) == BOTH
+    assert images(lake) == images(rendered)
+    drawn = [read.version(root, "rendered_truth").rows() for root in (lake, rendered)]
+    assert drawn[0].equals(drawn[1])
+
+
+def _killed(root, request):
+    """Render in a process that is killed while it writes its last image."""
+
+    def work(lake, facts):
+        output = step.work(lake, facts)
+        (path,) = (path for path in output.files if path.endswith("science.fits"))
+
+        def torn(target):
+            output.files[path](target)
+            os.truncate(target, target.stat().st_size // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        last = facts["detector"] == step.plan.parts[-1].facts["detector"]
+        return replace(output, files={**output.files, path: torn}) if last else output
+
+    with small_detectors():
+        step = render_exposures.steps(root, request)[0]
+        publish.make(root, step.plan, work)
+
+
+def test_a_run_that_is_killed_half_way_ends_with_the_same_bytes(lake, rendered):
+    make(lake, wanted(), plan_exposures)
+    child = CONTEXT.Process(target=_killed, args=(lake, wanted()))
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
+    assert layout.current_key(lake, "products") is None
+    assert list(layout.table(lake, "products").glob(".stage-*/**/.*tmp*"))
+    # What was done before is not done again.
+    (made,) = render(lake, wanted()).items()
+    assert made[1] == 1
+    assert images(lake) == images(rendered)
+    assert _manifests(lake) == _manifests(rendered)
+
+
+def _manifests(root):
+    return [(read.version(root, name).folder / "manifest.json").read_bytes() for name in ("products", "rendered_truth")]
+
+
 def test_a_staged_image_that_changed_is_rendered_again(lake, rendered):
     render(lake, wanted(), fail=["R22_S11"])
     (image,) = layout.table(lake, "products").glob(".stage-*/images/*/*science.fits")
@@ -342,3 +414,69 @@ def test_a_product_is_rebuilt_from_its_own_manifest(rendered, tmp_path):
             assert file_sha256(tmp_path / "again") == file_sha256(version.file(path))
             rebuilt += path.endswith(".fits")
     assert rebuilt == 4
+
+
+def test_an_old_product_is_rendered_again_with_the_mission_that_it_had(rendered, tmp_path, capsys):
+    old = read.version(rendered, "products")
+    before = images(rendered)
+    noise = {"ext.lsstcam.read_noise": {"value": 7.0, "unit": "electron"}}
+    render(rendered, wanted(mission={"overrides": noise}))
+    path = next(path for path in sorted(before) if "science" in path)
+    assert images(rendered)[path] != before[path]
+    command = ["--lake", str(rendered), "--again", path, "--out", str(tmp_path / "again.fits")]
+    assert archive.main([*command, "--version", old.key]) == 0
+    assert (tmp_path / "again.fits").read_bytes() == before[path]
+    assert archive.main(command) == 0
+    assert (tmp_path / "again.fits").read_bytes() == images(rendered)[path]
+    assert archive.main([*command[:3], "images/no.fits", *command[4:]]) == 2
+    assert "has no product images/no.fits" in capsys.readouterr().err
+    # The tables that it was made from have gone.
+    publish.gc(rendered, "mission")
+    assert archive.main([*command, "--version", old.key]) == 2
+    assert "no table mission of version" in capsys.readouterr().err
+
+
+def test_an_exploration_is_rendered_with_what_each_of_its_requests_asks(lake):
+    explore = {"ext.lsstcam.read_noise": {"values": [5.0, 50.0], "unit": "electron"}, "effects.poisson": [True, False]}
+    one = {**REQUEST["pointing"][0], "detectors": ["R22_S11"]}
+    assert sum(render(lake, wanted(pointing=[one], explore=explore)).values()) == 4
+    version = read.version(lake, "products")
+    settings = {
+        row["exposure_id"]: json.loads(row["settings"]) for row in read.version(lake, "exposures").rows().to_pylist()
+    }
+    rows = [row for row in version.rows().to_pylist() if row["content"] == "science"]
+    assert len({row["mission"] for row in rows}) == 2
+    assert len({version.file(row["path"]).read_bytes() for row in rows}) == 4
+    for row in rows:
+        asked, header = settings[row["exposure_id"]], fits.getheader(version.file(row["path"]))
+        assert header["RDNOISE"] == asked["ext.lsstcam.read_noise"][0]
+        states = {header[key].split(":")[0]: header[key].split(":")[1] for key in header if key.startswith("EFFECT")}
+        assert states["poisson"].startswith(" on" if asked["effects.poisson"] else " off (forced)")
+
+
+def test_truth_maps_are_those_that_were_asked_for_and_that_a_channel_has(lake):
+    everything = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation"]
+    request = wanted(products={"truth": everything})
+    render(lake, request)
+    version, tasks = read.version(lake, "products"), read.version(lake, "tasks").rows().to_pylist()
+    assert Counter(version.rows()["content"].to_pylist()) == dict.fromkeys(
+        ("science", "noise_free", "stars", "sky", "saturation"), 2
+    )
+    assert set(everything) == set(truth_maps.BYTES)
+    maps = {row["content"]: fits.getdata(version.file(row["path"])) for row in version.rows().to_pylist()}
+    exposed = read.version(lake, "exposures").rows().to_pylist()[0]
+    np.testing.assert_allclose(maps["sky"], exposed["sky"] * exposed["exposure_time_s"], rtol=1e-6)
+    assert (maps["stars"] <= maps["noise_free"] + 1e-3).all()
+    for task in tasks:
+        mine = [row for row in version.rows().to_pylist() if row["detector"] == task["detector"]]
+        measured = sum(version.file(row["path"]).stat().st_size for row in mine)
+        assert task["bytes"] == pytest.approx(measured, rel=0.05)
+
+
+def test_what_the_catalogue_does_not_hold_is_refused_before_anything_is_rendered(lake):
+    far = {**REQUEST["pointing"][0], "dec": -29.0}
+    request = wanted(pointing=[far])
+    make(lake, request, plan_exposures)
+    with pytest.raises(BadInput, match=r"table galaxies lacks \d+ order-8 cells .*: run build_galaxies over an area"):
+        render_exposures.steps(lake, request)
+    assert not (lake / "products").exists()
