@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from jobs import request, shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import fits_product, focal_plane, plan_exposures, preview, render_exposures
+from jobs.render import archive, fits_product, focal_plane, plan_exposures, preview, render_exposures
 from jobs.render.effects import charge_transfer, quadrants
 from jobs.render.effects.effect import Scene
 from lake_schema import layout, read, sky
@@ -168,6 +168,17 @@ def photometry(image):
 
     noise = np.sqrt(aperture(image.variance))
     return index, aperture(image.electrons), aperture(image.noise_free), noise
+
+
+def test_the_forecast_is_what_was_measured(field):
+    """Memory and bytes of every detector within 30 %; its time depends on who else uses the machine."""
+    rows, tasks = archive.products(field).to_pylist(), read.version(field, "tasks").rows().to_pylist()
+    assert len(tasks) == 2
+    for task in tasks:
+        own = [row for row in rows if row["detector"] == task["detector"]]
+        assert task["bytes"] == pytest.approx(sum(row["bytes"] for row in own), rel=0.05)
+        # The first worker of all may have compiled what it runs.
+        assert task["memory"] == pytest.approx(own[0]["peak_gb"], rel=0.3)
 
 
 def test_bright_unblended_sources_are_found(image, photometry):

@@ -143,7 +143,7 @@ def render(
     if detector is None:
         detector = focal_plane.detector(camera, str(task["detector"]), mission)
     system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
-    zero_point, scene = float(exposure["zero_point"]), _scene(exposure, detector, mission, accuracy)
+    zero_point, scene = float(exposure["zero_point"]), scene_of(exposure, detector, mission, accuracy)
     forced = forced or {}
     decisions: tuple[Decision, ...] = ()
     spread: Psf | None = None
@@ -242,7 +242,7 @@ def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration,
     if time == 0.0 or not exposing.sees_sky(str(exposure["channel"]), str(exposure["image_type"])):
         return float("inf")
     margin = mission.value("survey.selection_margin", "arcsec")
-    noise = _scene(exposure, detector, mission, accuracy).pixel_noise
+    noise = scene_of(exposure, detector, mission, accuracy).pixel_noise
     return stamps.least_electrons(margin, detector.pixel_scale, noise, stamps.settings_for(accuracy)) / (
         _rate(exposure) * time
     )
@@ -260,7 +260,7 @@ def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes
         )
 
 
-def _scene(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> Scene:
+def scene_of(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> Scene:
     """Before anything is drawn."""
     return Scene(
         mission, detector.section, float(exposure["exposure_time_s"]), float(exposure["sky"]), 0.0, detector,

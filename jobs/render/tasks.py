@@ -106,7 +106,7 @@ def table(
         where = (row["camera"], row["ra"], row["dec"], row["position_angle"])
         if where not in shared:
             shared[where] = camera.places(*where[1:], densities)
-        kind = tuple(row[name] for name in ("channel", "image_type", "settings"))
+        kind = tuple(row[name] for name in ("camera", "channel", "image_type", "exposure_time_s", "lamp", "settings"))
         if kind not in prices:
             prices[kind] = _price(row, survey.variant(row["settings"], mission, accuracy, forced or {}), truth)
         _append(columns, row, wanted, camera, shared[where], prices[kind])
@@ -175,9 +175,14 @@ def _append(
 
 
 def _price(row: Row, own: survey.Variant, truth: Sequence[str]) -> Price:
-    """Of the detectors of an exposure; every effect that is not switched off is counted."""
+    """Of the detectors of an exposure.
+
+    Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
+    """
     channel, kind = str(row["channel"]), str(row["image_type"])
-    effects = exposure.EFFECTS.get(channel, {}).get(kind)
+    looks, effects = sees_sky(channel, kind), exposure.EFFECTS.get(channel, {}).get(kind)
     if effects is not None:
-        effects = tuple(effect for effect in effects if own.forced.get(effect.name, True))
-    return price(channel, sees_sky(channel, kind), effects, own.accuracy, truth)
+        first = focal_plane.detectors(str(row["camera"]), own.mission)[0]
+        scene = exposure.scene_of(row, first, own.mission, own.accuracy)
+        effects = tuple(e for e in effects if own.forced.get(e.name, looks or e.needed_if(scene)))
+    return price(channel, looks, effects, own.accuracy, truth)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from jobs import request as requests
-from jobs.render import coverage, exposing, focal_plane, tasks
+from jobs.render import coverage, exposing, focal_plane, plan_exposures, tasks
 from jobs.render.plan_exposures import plan
-from lake_schema import sky
+from lake_schema import publish, read, sky
 from lake_schema.mission.configuration import resolve
 
 
@@ -54,3 +54,29 @@ def dithers(tmp_path_factory):
 def test_the_interior_is_seen_three_times(dithers, channel, least):
     """Scaramella et al. 2022: the dithers fill the gaps between the detectors."""
     assert (dithers[channel] >= 3).mean() >= least
+
+
+def test_a_plan_is_mapped_from_the_lake(lake, capsys):
+    """One field of four dithers: its middle is seen four times, but for the gaps; the map shows what was measured."""
+    area = {"cone": {"ra": 150.0, "dec": 20.0, "radius": 0.5}}
+    block = {"channels": ["VIS"], "fields": 1}
+    wanted = requests.from_table({"name": "x", "seed": 7, "area": area, "observation": [block]})
+    for step in plan_exposures.steps(lake, wanted):
+        publish.make(lake, step.plan, step.work)
+    picture = lake / "coverage.png"
+    assert coverage.main(["--lake", str(lake), "--out", str(picture)]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1] == str(picture)
+    assert said[-2].startswith("VIS     euclid_vis        4 exposures   of the interior >= 1: ")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    exposures, tasks = (read.version(lake, name) for name in ("exposures", "tasks"))
+    assert coverage.area_of(exposures) == wanted.area
+    (depth,) = coverage.depths(exposures.rows(), tasks.rows(), wanted.area, side=120)
+    assert depth.seen.max() == 4
+    # The short exposure and the flat are no dithers; outside the field there is nothing.
+    assert (depth.seen[0] == 0).all()
+    middle = depth.seen[50:70, 50:70]
+    assert 0.5 < (middle == 4).mean() < 1.0
+    assert (middle >= 2).all()
+    assert coverage.main(["--lake", str(lake / "none")]) == 2
+    assert "no table exposures" in capsys.readouterr().err
