@@ -236,7 +236,7 @@ def _extension(image: Image) -> fits.ImageHDU:
 
 
 def _packed(image: Image) -> fits.BinTableHDU:
-    unit = _dressed(fits.CompImageHDU(data=_big_enough(image.data), compression_type="RICE_1"), image)
+    unit = _dressed(fits.CompImageHDU(data=_big_enough(np.asarray(image.data)), compression_type="RICE_1"), image)
     # Taken as the table that it is stored as, whose bytes the checksums are of.
     stream = io.BytesIO()
     fits.HDUList([fits.PrimaryHDU(), unit]).writeto(stream)

@@ -89,7 +89,8 @@ def depths(exposures: pa.Table, tasks: pa.Table, area: Area, side: int = _SIDE) 
         raise BadInput(f"the exposures lie {2 * extent:.0f} deg apart: a map shows {_WIDEST:g} deg at most")
     # Square on the tangent plane; x to the west.
     grid = np.tan(np.radians(extent)) * np.degrees(1.0) * 3600.0 * np.linspace(-1.0, 1.0, side)
-    ra, dec = (a.ravel() for a in focal_plane.sky_of_plane(*np.meshgrid(grid, grid), ra0, dec0, 0.0))
+    x, y = np.meshgrid(grid, grid)
+    ra, dec = (a.ravel() for a in focal_plane.sky_of_plane(x, y, ra0, dec0, 0.0))
     inside = area.depth(ra, dec)
     interior = (inside > min(_INSIDE, 0.5 * float(inside.max()))).reshape(side, side)
     found = []
@@ -148,7 +149,7 @@ def picture(found: Sequence[Depth], path: Path) -> None:
         axes.set_xlabel("east [deg]")
         axes.set_ylabel("north [deg]")
         bar = figure.colorbar(shown, ax=axes, shrink=0.8, label="exposures")
-        bar.set_ticks(bounds[:-1] + 0.5)
+        bar.set_ticks((bounds[:-1] + 0.5).tolist())
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_visible(False)

@@ -91,13 +91,13 @@ def straight(u: Float, v: Float, a: Float, b: Float) -> tuple[Float, Float]:
     with np.errstate(invalid="ignore"):
         near = np.hypot(*wanted) < _FARTHEST
     at, goal = found[:, near], wanted[:, near]
-    slopes = [polynomial.polyder(c, axis=axis) for c in (a, b) for axis in (0, 1)]
+    slopes = [np.asarray(polynomial.polyder(c, axis=axis), float) for c in (a, b) for axis in (0, 1)]
     for _ in range(_MOST_STEPS):
         wrong = at + np.stack([_at(at, c) for c in (a, b)]) - goal
         au, av, bu, bv = (_at(at, c) for c in slopes)
         determinant = (1.0 + au) * (1.0 + bv) - av * bu
         step = np.stack([(1.0 + bv) * wrong[0] - av * wrong[1], (1.0 + au) * wrong[1] - bu * wrong[0]]) / determinant
-        at = at - step
+        at = np.asarray(at - step)
         if np.abs(step).max(initial=0.0) < _EXACT:
             break
     else:

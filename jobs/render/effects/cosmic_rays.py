@@ -47,7 +47,8 @@ def tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: np.ra
 def _add_tracks(out: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> None:
     count = _count(expected, rng)
     if out.size:
-        events = _events(count, *out.shape, quantiles, rng)
+        ny, nx = out.shape
+        events = _events(count, ny, nx, quantiles, rng)
         _draw(out, events, np.zeros(count, np.int64), out.shape[0])
 
 
