@@ -1,0 +1,30 @@
+"""What is compiled gives the same bytes, whether a process compiles it or finds it in the cache."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+# A kernel whose inner function sums in any order.
+SCRIPT = """
+import hashlib
+import numpy as np
+from jobs.render.effects.traps import Sweeps, Traps, shifted
+frame = np.random.default_rng(1).poisson(100, (2000, 300)).astype(float)
+moved, held = shifted(frame, Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58), Sweeps(1, 2), -2)
+print(hashlib.sha256(moved.tobytes()).hexdigest(), held.hex())
+"""
+
+
+@pytest.mark.nightly
+def test_compiled_here_or_found_in_the_cache(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment["TRUESKY_CACHE"] = str(tmp_path)
+    command = [sys.executable, "-c", SCRIPT]
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2)
+    )
+    assert list(tmp_path.glob("numba/*/*.nbc"))
+    assert first == second
+    assert len(first.split()) == 2
