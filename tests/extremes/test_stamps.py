@@ -1,14 +1,24 @@
-"""Drawing at the edges of what a catalogue may hold: finite, bounded, and with the flux that was asked for."""
+"""Drawing at the edges of what a catalogue may hold: finite, bounded, and with the flux that was asked for.
+
+Photons that are shot one by one are the independent reference: positions drawn from the profile's own distribution,
+lensed, spread by the seeing disc, counted in pixels.
+"""
 
 import time
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import gammaincinv
 
-from jobs.accuracy import SURVEY
-from jobs.render import profiles, stamps
-from jobs.render.focal_plane import boresight_for, wcs
-from tests.jobs.render.fields import galaxies, one_source, small, spread
+from jobs.accuracy import DRAFT, SURVEY
+from jobs.fluxes import passbands
+from jobs.render import exposure, profiles, stamps
+from jobs.render.focal_plane import boresight_for, sky_of_pixel, wcs
+from jobs.render.profiles import EXPONENTIAL_RADIUS
+from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
+from tests.jobs.render.fields import galaxies, moments, one_source, small, spread, stars
 
 NOISE = 12.0
 SIDE = 256
@@ -22,7 +32,13 @@ SHAPES = {
     "edge-on": {"inclination": 90.0},
     "sheared": {"gamma1": 0.63, "gamma2": -0.63, "disk_half_light_radius": 0.1},
     "magnified": {"kappa": 0.9, "disk_half_light_radius": 0.1},
-}
+    "magnified bulge": {
+        "kappa": 0.9, "bulge_fraction": 1.0, "bulge_half_light_radius": 0.05, "bulge_sersic_index": 4.0,
+    },
+    "disc and bulge": {
+        "bulge_fraction": 0.5, "bulge_sersic_index": 3.0, "bulge_axis_ratio": 0.3, "inclination": 70.0, "gamma1": 0.3,
+    },
+}  # fmt: skip
 HUGE = {
     "bulge": {"bulge_fraction": 1.0, "bulge_half_light_radius": 60.0, "bulge_sersic_index": 6.2},
     "disc": {"disk_half_light_radius": 60.0, "inclination": 90.0},
@@ -116,3 +132,188 @@ def test_any_order_gives_the_same_bits(seed):
         stamps.draw(source.take(part), sizes[part], spread("vis"), SIDE, SIDE) for part in np.array_split(order, 2)
     ]
     np.testing.assert_array_equal(base, sum(halves))
+
+
+# ------------------------------------------------------------------------------------------------ the whole of the box
+
+
+@st.composite
+def anything(draw):
+    """Any galaxy or point that a catalogue may hold, and its electrons."""
+    size = st.floats(-4, np.log10(60)).map(lambda x: 10**x)
+    g, angle = draw(st.floats(0, 0.9)), draw(st.floats(0, np.pi))
+    kappa = draw(st.sampled_from([0.0, -0.2, 0.5, 0.9]))
+    shape = {
+        "bulge_fraction": draw(st.sampled_from([0.0, 1.0]) | st.floats(0, 1)),
+        "bulge_sersic_index": draw(st.floats(0.3, 6.2)),
+        "bulge_half_light_radius": draw(size),
+        "disk_half_light_radius": draw(size),
+        "bulge_axis_ratio": draw(st.floats(0.02, 1)),
+        "inclination": draw(st.sampled_from([0.0, 90.0]) | st.floats(0, 90)),
+        "position_angle": draw(st.floats(0, 179.9)),
+        "kappa": kappa,
+        "gamma1": (1 - kappa) * g * np.cos(angle),
+        "gamma2": (1 - kappa) * g * np.sin(angle),
+    }
+    electrons = draw(st.sampled_from([0.0, 1e-6, 1e11]) | st.floats(-3, 9).map(lambda x: 10**x))
+    return draw(st.sampled_from([{}, shape, shape, shape])), electrons
+
+
+@given(anything(), st.sampled_from(["vis", "lsstcam"]), st.sampled_from([DRAFT, SURVEY]))
+def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
+    """On a frame as large as the stamp nothing is lost; memory and seconds are bounded before anything is drawn."""
+    shape, electrons = what
+    source, psf = source_of(camera, electrons, **shape), spread(camera)
+    settings = stamps.settings_for(accuracy)
+    sizes = stamps.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
+    assert stamps.memory(source.electrons, sizes, 4096, 4132) < 1.4e9
+    # The largest have tests of their own.
+    if sizes[0] > 1024:
+        return
+    side = int(sizes[0])
+    source.column[:], source.row[:] = side // 2, side // 2
+    start = time.process_time()
+    image = stamps.draw(source, sizes, psf, side, side, floors=stamps.floors(source.electrons, NOISE, settings))
+    assert time.process_time() - start < 10
+    assert np.isfinite(image).all()
+    # A pixel is rounded to 2^-20 electrons; single precision sums to 1e-6.
+    assert image.sum() == pytest.approx(electrons, rel=2e-6, abs=image.size * 2.0**-21)
+    assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
+
+
+@given(st.floats(1e-3, 1e10), st.sampled_from(sorted(SHAPES)))
+def test_half_the_flux_is_half_the_image(electrons, kind):
+    source, psf, sizes = source_of("lsstcam", electrons, **SHAPES[kind]), spread("lsstcam"), np.array([64])
+    half = source_of("lsstcam", 0.5 * electrons, **SHAPES[kind])
+    whole, less = (stamps.draw(one, sizes, psf, 64, 64) for one in (centred(source), centred(half)))
+    np.testing.assert_allclose(less, 0.5 * whole, atol=3e-6 * whole.max() + 2.0**-20)
+
+
+def centred(source, at=32.0):
+    source.column[:], source.row[:] = at, at
+    return source
+
+
+@given(st.sampled_from(sorted(SHAPES)), st.integers(-9, 9), st.integers(-9, 9), st.floats(60, 68), st.floats(60, 68))
+def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
+    source = source_of("vis", 1e4, column=x, row=y, **SHAPES[kind])
+    base = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
+    source.column[:] += dx
+    source.row[:] += dy
+    moved = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
+    # Beside a half pixel the stamp itself may lie one farther.
+    middle = slice(44, 84)
+    expected = np.roll(base, (dy, dx), (0, 1))[middle, middle]
+    np.testing.assert_allclose(moved[middle, middle], expected, atol=2e-4 * base.max() + 2.0**-20)
+
+
+@given(st.sampled_from([kind for kind in SHAPES if "gamma1" not in SHAPES[kind]]), st.floats(0, 180))
+def test_a_galaxy_turned_by_half_a_turn_is_itself(kind, angle):
+    image = stamps.draw(
+        centred(source_of("vis", 1e4, position_angle=angle, **SHAPES[kind])), np.array([64]), spread("vis"), 65, 65
+    )
+    inside = image[1:64, 1:64]
+    np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(sorted(SHAPES)), st.floats(-20, 84), st.floats(0, 9)), min_size=2, max_size=6)
+)
+def test_any_sources_in_any_order_give_the_same_bits(several):
+    some = [source_of("vis", 10.0**e, column=x, row=84 - x, **SHAPES[kind]) for kind, x, e in several]
+    drawn = [stamps.draw(one, np.array([56]), spread("vis"), 64, 64) for one in some]
+    together = sum(drawn[1:], drawn[0])
+    np.testing.assert_array_equal(sum(drawn[::-1][1:], drawn[-1]), together)
+
+
+@pytest.mark.parametrize("camera", ["vis", pytest.param("lsstcam", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("kind", SHAPES)
+def test_single_precision_is_as_good_as_double(camera, kind, monkeypatch):
+    source, sizes = source_of(camera, 9e6, **SHAPES[kind]), np.array([96])
+    single = stamps.draw(source, sizes, spread(camera), SIDE, SIDE)
+    monkeypatch.setattr(stamps, "_BRIGHT", 0.0)
+    double = stamps.draw(source, sizes, spread(camera), SIDE, SIDE)
+    assert np.abs(single - double).max() < 5e-7 * double.max()
+
+
+# ------------------------------------------------------------------------------------------------ photons
+
+
+def photons(source, shape, n, rng, seeing, beta):
+    """Pixels (column, row) that n photons of a galaxy fall on."""
+    row = {**{k: v[0] for k, v in galaxies(0.0, 0.0, **shape).to_pydict().items()}}
+    in_bulge = rng.random(n) < row["bulge_fraction"]
+    index, angle = row["bulge_sersic_index"], 2 * np.pi * rng.random(n)
+    b = gammaincinv(2 * index, 0.5)
+    radius = row["bulge_half_light_radius"] * (gammaincinv(2 * index, rng.random(n)) / b) ** index
+    bulge = np.stack([radius * np.cos(angle), row["bulge_axis_ratio"] * radius * np.sin(angle)])
+    tilt, scale = np.radians(row["inclination"]), row["disk_half_light_radius"] / EXPONENTIAL_RADIUS
+    radius = scale * rng.gamma(2.0, size=n)
+    height = DISK_SCALE_HEIGHT * scale * np.arctanh(np.clip(2 * rng.random(n) - 1, -1 + 1e-15, 1 - 1e-15))
+    disk = np.stack([radius * np.cos(angle), radius * np.sin(angle) * np.cos(tilt) + height * np.sin(tilt)])
+    along, across = np.where(in_bulge, bulge, disk)
+    # To (east, north); position angle from north through east. The image's distortion is (1 - kappa - gamma)^-1.
+    pa = np.radians(row["position_angle"])
+    east, north = along * np.sin(pa) + across * np.cos(pa), along * np.cos(pa) - across * np.sin(pa)
+    kappa, g1, g2 = row["kappa"], row["gamma1"], row["gamma2"]
+    east, north = np.linalg.solve([[1 - kappa - g1, -g2], [-g2, 1 - kappa + g1]], np.stack([east, north]))
+    moffat = seeing / (2 * np.sqrt(2 ** (1 / beta) - 1)) * np.sqrt(rng.random(n) ** (1 / (1 - beta)) - 1)
+    angle = 2 * np.pi * rng.random(n)
+    x, y = np.linalg.solve(source.jacobian[0], np.stack([-east, north]))
+    x, y = x + source.column[0] + moffat * np.cos(angle), y + source.row[0] + moffat * np.sin(angle)
+    return np.rint(x).astype(int), np.rint(y).astype(int)
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+@pytest.mark.parametrize("camera", ["vis", pytest.param("lsstcam", marks=pytest.mark.nightly)])
+def test_photons_fall_where_the_image_is_bright(camera, kind):
+    n, seeing, beta = 100_000, *((0.16, 3.5) if camera == "vis" else (0.73, 3.0))
+    where = {"column": 125.3, "row": 130.6, "position_angle": 40.0}
+    source = source_of(camera, float(n), **where, **SHAPES[kind])
+    scale = 0.1 if camera == "vis" else 0.2
+    x, y = photons(source, {"position_angle": 40.0, **SHAPES[kind]}, n, np.random.default_rng(8), seeing / scale, beta)
+    inside = (x >= 0) & (x < SIDE) & (y >= 0) & (y < SIDE)
+    counted = np.bincount(y[inside] * SIDE + x[inside], minlength=SIDE**2).reshape(SIDE, SIDE)
+    image, _ = drawn(source, spread(camera))
+    bright = image > 20
+    pull = (counted - image)[bright] / np.sqrt(image[bright])
+    assert bright.sum() > 20
+    assert (pull**2).mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / bright.sum()))
+    assert abs(pull).max() < 6
+    # What lies farther out, in one sum.
+    outside = ~bright
+    assert counted[outside].sum() == pytest.approx(image[outside].sum(), abs=5 * np.sqrt(image[outside].sum() + 25))
+
+
+# ------------------------------------------------------------------------------------------------ anywhere on the sky
+
+
+@pytest.mark.parametrize("camera", ["vis", "lsstcam"])
+@pytest.mark.parametrize(
+    ("ra", "dec"), [(0.0, 90.0), (123.0, -90.0), (77.0, 89.9999), (0.0, 0.0), (359.99999, -45.0), (180.0, 60.0)]
+)
+def test_poles_and_the_seam_are_as_good_as_any_place(camera, ra, dec):
+    """A galaxy and a star by their sky positions: on their pixels, of their flux."""
+    detector = small(camera, "3-4" if camera == "vis" else "R22_S11", 128)
+    system = wcs(detector, *boresight_for(detector, ra, dec, 33.0))
+    places = np.array([[40.2, 90.7], [88.4, 31.9]])
+    lon, lat = sky_of_pixel(system, *places.T)
+    settings, band = stamps.settings_for(SURVEY), passbands.load("euclid_vis" if camera == "vis" else "lsst_r")
+    body = galaxies(lon[:1], lat[:1], inclination=75.0, disk_half_light_radius=0.3)
+    found, sizes = exposure.sources_of(
+        (body, np.array([1e5])), (stars(lon[1:], lat[1:]), np.array([1e5])), detector, system, spread(camera), NOISE,
+        settings, band,
+    )  # fmt: skip
+    np.testing.assert_allclose(np.stack([found.column, found.row], 1), places, atol=2e-6)
+    np.testing.assert_allclose(np.linalg.det(found.jacobian), detector.pixel_scale**2, rtol=1e-4)
+    image = stamps.draw(found, sizes, spread(camera), 128, 128, floors=stamps.floors(found.electrons, NOISE, settings))
+    assert np.isfinite(image).all()
+    assert image.sum() == pytest.approx(2e5, rel=1e-3)
+    cut = image[60:121, 10:71]
+    centre, _ = moments(np.where(cut > 0.02 * cut.max(), cut, 0))
+    np.testing.assert_allclose(centre, places[0] - (10, 60), atol=0.05)
+
+
+def test_nothing_is_drawn_of_no_flux():
+    image, _ = drawn(source_of("vis", 0.0, **SHAPES["slim"]), spread("vis"))
+    assert not image.any()
