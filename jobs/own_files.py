@@ -2,6 +2,7 @@
 
 OwnCurves, curves   spectra, filters and extinction laws: the section `fluxes`
 Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
+psfs                point-spread functions: the section `psf`
 file_of             a file beside the request
 """
 
@@ -130,6 +131,11 @@ def ingest(table: Toml, folder: Path) -> Ingest:
             string(given, "ingest.dust.coordinates", ("G", "C"), "G") if "coordinates" in given else "",
         )
     return Ingest(galaxies, halos, training, dust)
+
+
+def psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
+    """The section `psf`: (band, file), found from `folder`.  BadInput names the key."""
+    return tuple((layout.name(band), str(file_of(folder, string(table, f"psf.{band}")))) for band in sorted(table))
 
 
 def _catalogue(value: object, path: str, folder: Path) -> Catalogue:

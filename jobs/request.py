@@ -20,6 +20,8 @@
     [fluxes.templates]             your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
     [fluxes.stars]                 your own dwarfs: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
     [fluxes.extinction.CODE]       your own law in place of law 1 .. 4: file, format
+    [psf]          BAND = "file.fits"   your own PSF in a band: a cube of planes or PSFEx's (jobs/render/own_psf.py);
+                   {detector} in the name stands for the detector's
     [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
     [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
@@ -169,6 +171,7 @@ class Request:
     """A simulation request, checked.
 
     explore : parameter -> the values (JSON) that it takes in turn
+    psfs    : (band, file) of PSFs in place of ours
     """
 
     name: str
@@ -188,6 +191,7 @@ class Request:
     ingest: Ingest = _NOTHING_TAKEN
     strong_lens_boost: float = 1.0
     compression: str = "none"
+    psfs: tuple[tuple[str, str], ...] = ()
 
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""
@@ -234,6 +238,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         "strong_lenses",
         "mission",
         "fluxes",
+        "psf",
         "effects",
         "explore",
         "products",
@@ -262,6 +267,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         effects=_effects(_section(table, "effects", {"on", "off"})),
         explore=_explore(_section(table, "explore", None)),
         ingest=own_files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
+        psfs=own_files.psfs(_section(table, "psf", None), folder),
         strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
     )
     _check_bands(request)

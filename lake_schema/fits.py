@@ -6,6 +6,7 @@ read_images     a file -> images; checksums are demanded and verified, sizes che
 read_numbers    somebody's binary table -> its columns of numbers
 number_batches  the same, some columns and a bounded piece at a time
 read_map        somebody's HEALPix map -> its pixels and header
+read_planes     somebody's image of two or three axes -> its samples and header
 table_to_fits   an Arrow table -> a binary table, units and UCDs from the table's declaration
 fits_unit       a unit as FITS spells it
 """
@@ -183,6 +184,29 @@ def read_map(path: Path, column: str) -> tuple[npt.NDArray[np.float64], dict[str
                 raise BadInput(f"{path}: has no column {column}; it has {', '.join(unit.columns.names)}")
             return np.asarray(unit.data[column], np.float64).ravel(), dict(unit.header.items())
     raise BadInput(f"{path}: holds no table")
+
+
+def read_planes(
+    path: Path, column: str, most_bytes: int = MOST_BYTES
+) -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
+    """Somebody's planes, float64[ny, nx] or [n, ny, nx], with the cards of their header.
+
+    The first image of two or three axes, or the array that the first row of a table has in `column`.
+
+    Errors : Damaged for a file that is cut short or is none; BadInput where it holds neither, or more than most_bytes
+    """
+    with _refusing(path), fits.open(path, memmap=False, lazy_load_hdus=True) as units:
+        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
+        _check_size(path, units, most_bytes)
+        for unit in units:
+            found = None
+            if isinstance(unit, fits.BinTableHDU) and column in unit.columns.names and len(unit.data):
+                found = np.asarray(unit.data[column][0])
+            elif unit.is_image and unit.data is not None:
+                found = np.asarray(unit.data)
+            if found is not None and found.ndim in (2, 3) and found.size and found.dtype.kind in "fiu":
+                return found.astype(np.float64), dict(unit.header.items())
+    raise BadInput(f"{path}: holds no image of two or three axes and no table with a column {column}")
 
 
 def _numbers_of(unit: Any) -> dict[str, npt.NDArray[np.float64]]:

@@ -27,6 +27,7 @@ from jobs.render import (
     exposing,
     focal_plane,
     moving,
+    own_psf,
     pictures,
     profiles,
     psf,
@@ -155,7 +156,7 @@ def render(
             for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
         ]
         settings = stamps.settings_for(accuracy)
-        spread = _psf(detector, passband, float(exposure["seeing"]), mission, settings.positions)
+        spread = _psf(exposure, detector, passband, mission, settings.positions)
         sources, sizes = sources_of(
             (galaxies, electrons[0]), (stars, electrons[1]), detector, system, spread, scene.pixel_noise, settings,
             passband, library, stellar, lenses,
@@ -170,7 +171,7 @@ def render(
             peak = float(spread.surface[0]) * float(sources.electrons.max(initial=0.0))
             scene = replace(scene, lights=lights, peak_electrons=peak)
             decisions = decide((vis.DRAWN,), scene, forced)
-            if decisions[0].applied:
+            if decisions[0].applied and spread.intra_pixel is not None:
                 (strength,) = vis.DRAWN.parameters(scene)
                 spread = replace(spread, intra_pixel=strength)
         floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
@@ -312,7 +313,8 @@ def sources_of(
     jacobian = focal_plane.jacobian(system, column, row)
     # Arcs have the colour of what they are an image of.
     coloured = np.concatenate([np.arange(len(catalogue) + len(points)), arcs.source])[kept]
-    photons = _colours(coloured, catalogue, points, band, (library, stellar)) if spread.planes is not None else None
+    colourful = spread.planes is not None and len(spread.planes.wavelength) > 1
+    photons = _colours(coloured, catalogue, points, band, (library, stellar)) if colourful else None
     found = Sources(
         ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons, picture[kept], arcs.pictures
     )
@@ -379,8 +381,10 @@ def _fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
     return np.asarray(fluxes[column].to_numpy(), float)
 
 
-def _psf(detector: Detector, band: Passband, seeing: float, mission: MissionConfiguration, positions: int) -> Psf:
+def _psf(exposure: Row, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
+    if exposure.get("psf"):
+        return own_psf.read(own_psf.file_of(exposure["psf"], detector.name), detector, band)
     if detector.section == "vis":
         return psf.vis_psf(detector, band, mission, positions)
     beta = mission.value(f"{detector.section}.psf.moffat_beta")
-    return psf.ground_psf(seeing, beta, detector.pixel_scale)
+    return psf.ground_psf(float(exposure["seeing"]), beta, detector.pixel_scale)

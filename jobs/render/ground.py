@@ -165,7 +165,8 @@ def _by_chips(
 
 def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[Exposure]:
     """Pointings of a CSV file: columns channel, camera, band, ra, dec, position_angle, mjd, and any of exposure_time_s,
-    sky (electron / (s pix)), seeing (arcsec), zero_point (mag), psf (file), detectors (by blanks), image_type.
+    sky (electron / (s pix)), seeing (arcsec), zero_point (mag), psf (a file beside it), detectors
+    (by blanks), image_type.
 
     Errors : BadInput names the file, the line and the column
     """
@@ -187,7 +188,14 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
                 if len(found) >= _MOST_ROWS:
                     raise BadInput(f"{path}: more than {_MOST_ROWS} pointings")
                 found.append(
-                    _of_row(row, f"{path} line {numbered[lines.line_num - 1][0]}", len(found) + 1, block, mission)
+                    _of_row(
+                        row,
+                        f"{path} line {numbered[lines.line_num - 1][0]}",
+                        len(found) + 1,
+                        block,
+                        mission,
+                        path.parent,
+                    )
                 )
     except (UnicodeDecodeError, csv.Error) as error:
         raise BadInput(f"{path}: {' '.join(str(error).split())}") from None
@@ -195,7 +203,7 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
 
 
 def _of_row(
-    row: Mapping[str, str], where: str, number: int, block: Observation, mission: MissionConfiguration
+    row: Mapping[str, str], where: str, number: int, block: Observation, mission: MissionConfiguration, folder: Path
 ) -> Exposure:
     channel, camera, band = (str(row[name]) for name in ("channel", "camera", "band"))
     if channel not in CHANNELS:
@@ -240,6 +248,6 @@ def _of_row(
         sky=optional("sky", 0.0, 1e6),
         seeing=optional("seeing", 0.01, 10.0) if channel == "EXT" else None,
         zero_point=optional("zero_point", 0.0, 50.0),
-        psf=row.get("psf") or None,
+        psf=str(folder / row["psf"]) if row.get("psf") else None,
         detectors=tuple((row.get("detectors") or "").split()) or block.detectors,
     )

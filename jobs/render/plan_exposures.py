@@ -14,7 +14,7 @@ import pyarrow as pa
 from jobs.fluxes import inputs
 from jobs.fluxes.passbands import Passband
 from jobs.own_files import OwnCurves
-from jobs.render import exposing, forecast, survey, tasks
+from jobs.render import exposing, forecast, own_psf, survey, tasks
 from jobs.request import MissionChoice, Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema import layout, read
@@ -31,7 +31,7 @@ from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
 
 # What of a request decides which exposures are taken and what they cost.
-PARTS = ("seed", "area", "universe", "pointings", "observations", "explore", "truth")
+PARTS = ("seed", "area", "universe", "pointings", "observations", "explore", "truth", "psfs")
 
 
 def mission_of(choice: MissionChoice) -> MissionConfiguration:
@@ -61,6 +61,7 @@ def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, 
     found = survey.exposures(request, mission)
     filters, _ = own_filters(request)
     exposures = exposing.table([exposure for exposure, _ in found], [own for _, own in found], filters)
+    own_psf.check([(exposure, own) for exposure, own in found], filters)
     densities = tasks.Densities(mission, request.universe, _catalogues(lake))
     wanted = [exposure.detectors for exposure, _ in found]
     rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, survey.forced(request))

@@ -3,7 +3,7 @@
 Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), without the pixel, centred on the
 chief ray (coma moves the centroid by a few mas).
 
-vis_psf, ground_psf   -> Psf
+vis_psf, ground_psf   -> Psf;  sampled : the same of any planes
 spectrum_of           the Fourier transform of a PSF without planes
 pupil, wavefront      the parts of the Euclid model
 """
@@ -81,7 +81,8 @@ class Psf:
     outside     : float64[SIDE / 2] fraction of the flux beyond r pixels
     fwhm        : arcsec, pixel included
     planes      : by wavelength and place; None where `profile` is all
-    intra_pixel : how much less a pixel's edges see than its centre (effects/intra_pixel), 0 = nothing
+    intra_pixel : how much less a pixel's edges see than its centre (effects/intra_pixel), 0 = nothing; None: the PSF
+                  has the pixel in it already
     """
 
     profile: galsim.GSObject
@@ -90,7 +91,7 @@ class Psf:
     outside: Float
     fwhm: float
     planes: Planes | None = None
-    intra_pixel: float = 0.0
+    intra_pixel: float | None = 0.0
 
 
 def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = len(_NODES)) -> Psf:
@@ -100,9 +101,7 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
     Error     : second moments 2e-4 from the number of wavelengths; across the detector as measured (settings.csv)
     Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
     """
-    planes = _vis_planes(detector, band, mission, positions)
-    mean = planes.images.mean(axis=0, dtype=float)
-    return _tabulated(galsim_profile(mean, detector.pixel_scale), detector.pixel_scale, planes)
+    return sampled(_vis_planes(detector, band, mission, positions), detector.pixel_scale, has_pixel=False)
 
 
 def galsim_profile(image: Array, pixel_scale: float) -> galsim.GSObject:
@@ -126,7 +125,15 @@ def ground_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
     return _tabulated(galsim.Moffat(beta=beta, fwhm=seeing), pixel_scale)
 
 
-def _tabulated(profile: galsim.GSObject, pixel_scale: float, planes: Planes | None = None) -> Psf:
+def sampled(planes: Planes, pixel_scale: float, has_pixel: bool) -> Psf:
+    """A PSF of planes; has_pixel : the detector's pixel is in them."""
+    mean = planes.images.mean(axis=0, dtype=float)
+    return _tabulated(galsim_profile(mean, pixel_scale), pixel_scale, planes, has_pixel)
+
+
+def _tabulated(
+    profile: galsim.GSObject, pixel_scale: float, planes: Planes | None = None, has_pixel: bool = False
+) -> Psf:
     """With azimuthal means of the profile sampled on pixels."""
     image = profile.drawImage(nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
     grid = np.arange(SIDE + 1) - SIDE // 2
@@ -136,8 +143,9 @@ def _tabulated(profile: galsim.GSObject, pixel_scale: float, planes: Planes | No
     surface = np.maximum(total / np.bincount(ring[inside]), 0.0)
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
     core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / _FINE, method="no_pixel", dtype=float)
-    with_pixel = galsim.Image(uniform_filter(core.array, _FINE), scale=pixel_scale / _FINE)
-    return Psf(profile, pixel_scale, surface, outside, float(with_pixel.calculateFWHM()), planes)
+    with_pixel = core.array if has_pixel else uniform_filter(core.array, _FINE)
+    fwhm = float(galsim.Image(with_pixel, scale=pixel_scale / _FINE).calculateFWHM())
+    return Psf(profile, pixel_scale, surface, outside, fwhm, planes, None if has_pixel else 0.0)
 
 
 def spectrum_of(psf: Psf, size: int, reach: int) -> Array:

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
-from jobs.render import exposure, fits_product, focal_plane, pictures, selection, stamps, survey
+from jobs.render import exposure, fits_product, focal_plane, own_psf, pictures, selection, stamps, survey
 from jobs.render.plan_exposures import PARTS, mission_of, own_filters
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
@@ -27,7 +27,7 @@ from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.published import read_back
-from lake_schema.provenance import canonical, digest
+from lake_schema.provenance import canonical, digest, file_sha256
 from lake_schema.publish import Json, Output, Part, Plan
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
@@ -58,6 +58,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
         "mission": mission_of(request.mission).fingerprint,
         "inputs": {name: version.key for name, version in inputs.items()},
     }
+    if psfs := _psf_files(exposures, tasks):
+        facts["psf"] = psfs
     keys = product_keys(facts, exposures, tasks, inputs, mission_of(request.mission))
     parts = tuple(
         Part(
@@ -100,6 +102,10 @@ def product_keys(
             for deflection, found in files
         ]
 
+    def own(task: Json) -> Json:
+        psf = rows[task["exposure_id"]]["psf"]
+        return {"psf": facts["psf"][str(own_psf.file_of(psf, task["detector"]))]} if psf else {}
+
     return [
         digest(
             {
@@ -107,10 +113,18 @@ def product_keys(
                 "exposure": rows[task["exposure_id"]],
                 "task": {name: task[name] for name in ("detector", "cells", "radius")},
                 "catalogues": catalogues(task) if task["cells"] else [],
+                **own(task),
             }
         )
         for task in tasks
     ]
+
+
+def _psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
+    """sha256 of the PSFs that the tasks' exposures name, by file."""
+    named = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
+    pairs = {(named[task["exposure_id"]], task["detector"]) for task in tasks}
+    return {(file := str(own_psf.file_of(psf, detector))): file_sha256(Path(file)) for psf, detector in pairs if psf}
 
 
 def _files_of_cells(*tables: read.Version) -> Mapping[int, list[tuple[str, ...]]]:
@@ -226,6 +240,10 @@ def work(lake: Path, facts: Json) -> Output:
     (task,) = inputs["tasks"].rows(where=here & (pc.field("detector") == facts["detector"])).to_pylist()
     own = survey.variant(exposed["settings"], read_back(inputs["mission"]), Accuracy(**request["accuracy"]), forced)
     detector = focal_plane.detector(exposed["camera"], task["detector"], own.mission)
+    if exposed["psf"]:
+        file = str(own_psf.file_of(exposed["psf"], task["detector"]))
+        if file_sha256(Path(file)) != facts["psf"][file]:
+            raise BadInput(f"{file}: has changed since the rendering began")
     margin = own.mission.value("survey.selection_margin", "arcsec")
     farther = max(stamps.reach(detector.pixel_scale) - margin, 0.0)
     least = exposure.least_flux(exposed, detector, own.mission, own.accuracy)

@@ -65,7 +65,11 @@ def exposures(request: Request, mission: MissionConfiguration) -> list[tuple[Exp
         settings = json.dumps(values, sort_keys=True) if values else None
         own = variant(settings, mission, request.accuracy, {}).mission
         for exposure in _of_mission(request, own):
-            found.append((replace(exposure, settings=settings), own))
+            psf = exposure.psf or dict(request.psfs).get(exposure.band)
+            found.append((replace(exposure, settings=settings, psf=psf), own))
+    for band, _ in request.psfs:
+        if band not in {exposure.band for exposure, _ in found}:
+            raise BadInput(f"psf.{band}: no exposure is taken in this band")
     return found
 
 

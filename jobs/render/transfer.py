@@ -174,7 +174,7 @@ def _planes(psf: Psf, some: Grid, dtype: type[Any]) -> Array:
     return _on_grid([*psf.planes.images, *psf.planes.drift], some, psf.intra_pixel, dtype)
 
 
-def _on_grid(images: list[Array], some: Grid, strength: float, dtype: type[Any]) -> Array:
+def _on_grid(images: list[Array], some: Grid, strength: float | None, dtype: type[Any]) -> Array:
     out = np.empty((len(images), 2, len(some.kx)), dtype)
     columns = int(np.rint(np.abs(some.kx).max() * some.size / (2 * np.pi))) + 1
     for image, plane in zip(images, out, strict=True):
@@ -182,15 +182,17 @@ def _on_grid(images: list[Array], some: Grid, strength: float, dtype: type[Any])
     return out
 
 
-def _take(spectrum: Array, some: Grid, strength: float, out: Array) -> None:
+def _take(spectrum: Array, some: Grid, strength: float | None, out: Array) -> None:
     """Fills out [2, s] with spectrum x pixel."""
     kernel.take(spectrum, some.runs, _pixel(some, strength), out)
 
 
-def _pixel(some: Grid, strength: float) -> Float:
-    """The pixel's transfer function at |iy|, |ix|; strength : of its response, 0 = even all over."""
+def _pixel(some: Grid, strength: float | None) -> Float:
+    """The pixel's transfer function at |iy|, |ix|; strength : of its response, 0 = even all over, None = 1."""
     step = 2 * np.pi / some.size
     columns, rows = (np.arange(round(float(np.abs(k).max(initial=0.0)) / step) + 1) for k in (some.kx, some.ky))
+    if strength is None:
+        return np.ones((len(rows), len(columns)))
     return intra_pixel.apply(columns / some.size, rows[:, None] / some.size, strength)
 
 

@@ -29,6 +29,7 @@ from lake_schema.provenance import file_sha256
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests import requests
 from tests.faults.victims import CONTEXT
+from tests.jobs.render.test_own_psf import cube, gaussian
 
 SIDE = 300
 SMALL = f"""
@@ -336,7 +337,7 @@ def keys(root, request, plan=False):
     return {part.name: part.facts["product"] for part in render_exposures.steps(root, request)[0].plan.parts}
 
 
-def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypatch):
+def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypatch, tmp_path):
     there = read.version(rendered, "products").manifest["parts"]
     assert keys(rendered, wanted()) == {part["name"]: part["facts"]["product"] for part in there}
     found = [keys(rendered, wanted(**some)) for some in ({}, {"effects": {"off": ["poisson"]}}, {"accuracy": "survey"})]
@@ -349,6 +350,14 @@ def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypat
         found.append(keys(rendered, wanted()))
     noise = {"ext.lsstcam.read_noise": {"value": 7.0, "unit": "electron"}}
     found.append(keys(rendered, wanted(mission={"overrides": noise}), plan=True))
+    for width in (0.3, 0.4):
+        own = cube(tmp_path / "psf.fits", gaussian(width))
+        found.append(keys(rendered, wanted(psf={"lsst_r": str(own)}), plan=True))
+    with monkeypatch.context() as patch:
+        patch.setattr(render_exposures, "file_sha256", lambda path: "another")
+        step = render_exposures.steps(rendered, wanted(psf={"lsst_r": str(own)}))[0]
+    with pytest.raises(BadInput, match=r"psf.fits: has changed since the rendering began"):
+        render_exposures.work(rendered, {**step.plan.facts, **step.plan.parts[0].facts})
     assert all(len({some[part] for some in found}) == len(found) for part in found[0])
     # What else is asked for is no part of it.
     assert found[0].items() < keys(rendered, wanted(pointings=2), plan=True).items()
