@@ -7,28 +7,25 @@ import pytest
 
 from jobs import shell
 from jobs.catalogue import build_galaxies
+from tests import requests
 
 from . import synthetic, test_dust_map, test_halo_catalogue, test_nearest_sed
 
-HEAD = 'name = "x"\nseed = 1\n[area]\ncone = { ra = 53.1, dec = -27.8, radius = 0.1 }\n'
-GALAXIES = HEAD + '[ingest.galaxies]\nfiles = ["theirs.parquet"]\nformat = "flagship2"\n'
+GALAXIES = '[ingest.galaxies]\nfiles = ["theirs.parquet"]\nformat = "flagship2"\n'
 HALOS = (
-    HEAD + '[ingest.halos]\nfiles = ["theirs.parquet"]\n[ingest.halos.columns]\norigin_id = "halo_id"\nra = "ra"\n'
+    '[ingest.halos]\nfiles = ["theirs.parquet"]\n[ingest.halos.columns]\norigin_id = "halo_id"\nra = "ra"\n'
     'dec = "dec"\nz_true = "z"\nlog_mass = { column = "mass", log10 = true }\n'
 )
-TRAINING = (
-    HEAD
-    + '[ingest.training]\nfiles = ["theirs.parquet"]\n[ingest.training.columns]\n'
-    + "".join(f'{key} = "{key}"\n' for key in ("z_true", "abs_mag_r01", "color_gr_01", "sed", "ext_law", "ebv"))
+TRAINING = '[ingest.training]\nfiles = ["theirs.parquet"]\n[ingest.training.columns]\n' + "".join(
+    f'{key} = "{key}"\n' for key in ("z_true", "abs_mag_r01", "color_gr_01", "sed", "ext_law", "ebv")
 )
-DUST = HEAD + '[ingest.dust]\nfile = "theirs.fits"\ncolumn = "EBV"\n'
+DUST = '[ingest.dust]\nfile = "theirs.fits"\ncolumn = "EBV"\n'
 
 
 def refused(folder, text, capsys):
     """What a job says of a request."""
-    (folder / "r.toml").write_text(text)
-    lake = folder / "lake"
-    assert shell.main(build_galaxies.JOB, ["--lake", str(lake), "--request", str(folder / "r.toml")]) in (1, 2)
+    path, lake = requests.written(folder, text, requests.FIELD.format(0.1)), folder / "lake"
+    assert shell.main(build_galaxies.JOB, ["--lake", str(lake), "--request", str(path)]) in (1, 2)
     assert not list(lake.glob("*/v-*"))
     said = capsys.readouterr().err.strip()
     assert "\n" not in said

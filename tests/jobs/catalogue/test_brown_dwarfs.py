@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.stars import DWARFS as DWARF_COUNTS
 from jobs.catalogue import brown_dwarfs, milky_way, stars
 from jobs.fluxes import brown_dwarfs as spectra
 from jobs.fluxes import passbands, templates
@@ -12,21 +13,15 @@ from .conftest import SEED
 GALAXY = milky_way.milky_way()
 DWARFS = brown_dwarfs.brown_dwarfs(1.0)
 TYPES = spectra.templates()
-# Per deg2 to J = 22, 24, 26 (Vega), without dust, of the same densities summed once by a code of its own.
-COUNTS = {
-    30: ((62, 267, 458), (6, 60, 330)),
-    60: ((32, 81, 105), (5, 35, 116)),
-    90: ((25, 57, 69), (5, 29, 83)),
-}
 
 
-@pytest.mark.parametrize("b", COUNTS)
+@pytest.mark.parametrize("b", DWARF_COUNTS)
 def test_counts(b, rng):
     """L and T dwarfs over 100 deg2 along one line of sight."""
     found = brown_dwarfs.draw(DWARFS, GALAXY, 90.0, float(b), 100.0, 30.0, rng)
     m_j = TYPES.abs_mag_j[found.template] + 5 * np.log10(found.distance) - 5
     is_t = TYPES.subtype[found.template] >= 10
-    for kind, published in ((~is_t, COUNTS[b][0]), (is_t, COUNTS[b][1])):
+    for kind, published in ((~is_t, DWARF_COUNTS[b][:3]), (is_t, DWARF_COUNTS[b][3:])):
         number = np.array([np.sum(kind & (m_j < limit)) for limit in (22, 24, 26)]) / 100.0
         published = np.array(published, float)
         assert number == pytest.approx(published, rel=0.2, abs=3 * np.sqrt(published.max() / 100))

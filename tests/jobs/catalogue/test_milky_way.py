@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.stars import COUNTS
 from jobs import request
 from jobs.catalogue import milky_way as mw
 from jobs.fluxes import stellar
@@ -10,13 +11,6 @@ from jobs.fluxes import stellar
 GALAXY = mw.milky_way()
 BESANCON = mw.milky_way("besancon")
 GALAXIES = st.sampled_from([GALAXY, BESANCON])
-COUNTS = {
-    90: (898, 2248, 5119, 12869, 2149, 10947, 36451),
-    60: (1174, 2984, 6864, 17121, 2833, 14687, 47254),
-    45: (1708, 4439, 10413, 25723, 4154, 22374, 67569),
-    30: (3250, 8707, 21375, 52519, 7870, 46724, 124538),
-    20: (6699, 18113, 46740, 116048, 15669, 104824, 249659),
-}
 # I - H of K giants.
 GIANT_I_H = 1.68
 
