@@ -148,10 +148,10 @@ def luminosities(count: int, about: dict[str, object]) -> float:
     return float(sum(one.id.size for one in found) / (time.process_time() - started))
 
 
-def run(quick: bool) -> dict[str, float]:
+def run(quick: bool, repeats: int) -> dict[str, float]:
     """All figures."""
     about, count = facts(quick), 4 if quick else 64
-    turns = [make(CELL, count, about) for _ in range(1 if quick else 2)]
+    turns = [make(CELL, count, about) for _ in range(repeats)]
     figures = {"generation_cells": count, **min(turns, key=lambda turn: turn["cell_s"])}
     figures["galaxies_per_s_core"] = figures["cell_rows"] / figures["cell_s"]
     figures["projected_core_hours_922m"] = SURVEY_GALAXIES / figures["galaxies_per_s_core"] / 3600.0
@@ -159,12 +159,12 @@ def run(quick: bool) -> dict[str, float]:
     figures |= {"draw_per_s_core": own, "peer_draw_per_s_core": other}
     if other:
         figures["vs_peer"] = own / other
-    return figures | two_cores(quick, 1 if quick else 2)
+    return figures | two_cores(quick, repeats)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     options = report.options("catalogue", __doc__ or "", argv)
-    report.finish("catalogue", 1 if options.quick else 2, run(options.quick), NOTES, options.json)
+    report.finish("catalogue", 1, run(options.quick, 1), NOTES, options.json)
     return 0
 
 

@@ -60,7 +60,7 @@ def drawn(universe, cells, dust, library):
         return m_r + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed)
 
     area = len(places) * sky.cell_area(GENERATION_ORDER)
-    bands = ("euclid_vis", "euclid_y", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")
+    bands = ("euclid_vis", "euclid_y", "euclid_j", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")
     mags = {band: mag(band) for band in bands}
     return SimpleNamespace(
         every=every,

@@ -20,16 +20,6 @@ def test_expected_counts(near, far, published):
     assert emission_lines.expected_counts(FLUXES, near, far) == pytest.approx(published, rel=0.025)
 
 
-@pytest.mark.parametrize(("near", "far"), [(0.9, 1.8), (0.4, 1.8), (0.7, 2.0)])
-def test_halpha_counts_of_the_catalogue(drawn, near, far):
-    """5 %, and what structure and chance move in a square degree."""
-    flux = drawn.columns["flux_halpha"]
-    inside = (drawn.z > near) & (drawn.z < far)
-    for limit, expected in zip(FLUXES, emission_lines.expected_counts(FLUXES, near, far) * drawn.area, strict=True):
-        found = np.sum(inside & (flux > limit))
-        assert found == pytest.approx(expected, rel=0.10, abs=3 * np.sqrt(expected))
-
-
 def test_the_matching_is_monotone():
     lines = emission_lines.model()
     for z in (0.05, 0.5, 1.3, 2.9):

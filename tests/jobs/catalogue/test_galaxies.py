@@ -12,7 +12,6 @@ from jobs.catalogue import (
     galaxies,
     lightcone,
     luminosity_function,
-    morphology,
     population,
 )
 from jobs.fluxes import cosmology
@@ -23,37 +22,12 @@ from lake_schema.units import LIGHT_KM_S
 
 from .conftest import BOX_CELLS, NSIDE, SEED
 
-ARCMIN2_PER_DEG2 = 3600.0
 CELL = 303_117
 
 
 @pytest.fixture(scope="module")
 def cell(universe, cells, dust):
     return galaxies.draw(CELL, universe, cells, dust)
-
-
-def test_counts_to_the_limits_of_the_survey(drawn):
-    """Serrano et al. 2024: 102 an arcmin2 with I_E < 26; 30 or more with I_E < 24.5, median z > 0.8."""
-    vis = drawn.mags["euclid_vis"]
-    area = drawn.area * ARCMIN2_PER_DEG2
-    bright = vis < 24.5
-    assert np.sum(vis < 26) / area == pytest.approx(97.6, rel=0.15)
-    assert np.sum(vis < 26) / area == pytest.approx(102.0, rel=0.10)
-    assert np.sum(bright) / area == pytest.approx(31.0, rel=0.15)
-    assert np.sum(bright) / area >= 30
-    assert np.median(drawn.z[bright]) == pytest.approx(0.87, abs=0.05)
-
-
-@pytest.mark.parametrize(("limit", "observed"), [(21, 1.45), (22, 3.7), (23, 9.0), (24, 21.0), (25, 44.5)])
-def test_i_band_counts_are_the_observed_ones(drawn, limit, observed):
-    """Per arcmin2: GAMA (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST Science Book 2009."""
-    found = np.sum(drawn.mags["lsst_i"] < limit) / (drawn.area * ARCMIN2_PER_DEG2)
-    assert found == pytest.approx(observed, rel=0.22)
-
-
-def test_slope_of_the_counts(drawn):
-    number = np.histogram(drawn.mags["euclid_vis"], np.arange(19.5, 24.0, 1.0))[0]
-    assert np.mean(np.diff(np.log10(number))) == pytest.approx(0.39, abs=0.03)
 
 
 def expected_number(lf, near, far, faintest, area):
@@ -107,39 +81,6 @@ def test_the_luminosity_function_comes_out_of_a_deep_catalogue_at_z_2(dust):
     expected = expected_number(deep.luminosities, 1.85, 2.15, faintest, area)
     assert expected > 400
     assert found == pytest.approx(expected, rel=0.20)
-
-
-@pytest.mark.parametrize(
-    ("blue", "red", "median"),
-    [
-        ("lsst_g", "lsst_r", 0.44),
-        ("lsst_r", "lsst_i", 0.39),
-        ("lsst_i", "lsst_z", 0.26),
-        ("euclid_vis", "euclid_h", 1.33),
-    ],
-)
-def test_median_colours_of_the_wide_survey(drawn, blue, red, median):
-    """Observed medians of I_E < 24.5."""
-    bright = drawn.mags["euclid_vis"] < 24.5
-    assert np.median((drawn.mags[blue] - drawn.mags[red])[bright]) == pytest.approx(median, abs=0.08)
-
-
-@pytest.mark.parametrize(
-    ("bright", "faint", "median"),
-    [(19, 20, 1.18), (21, 22, 0.68), (22, 23, 0.52), (23, 24, 0.41), (24, 24.5, 0.34), (25, 26, 0.23)],
-)
-def test_median_sizes(drawn, bright, faint, median):
-    vis = drawn.mags["euclid_vis"]
-    inside = np.flatnonzero((vis >= bright) & (vis < faint))[:10_000]
-    names = ("bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index")
-    bulge, disc, fraction, sersic = (drawn.columns[name][inside].astype(float) for name in names)
-    low, high = np.minimum(bulge, disc), np.maximum(bulge, disc)
-    for _ in range(20):
-        middle = np.sqrt(low * high)
-        light = fraction * morphology.light_within(middle, bulge, sersic)
-        light += (1 - fraction) * morphology.light_within(middle, disc, 1.0)
-        low, high = np.where(light < 0.5, middle, low), np.where(light < 0.5, high, middle)
-    assert np.median(low) == pytest.approx(median, rel=0.10)
 
 
 @pytest.mark.parametrize("z", [0.3, 0.9, 1.5, 2.1])

@@ -1,0 +1,155 @@
+"""The universe against its list of expectations, benchmarks/validate_universe.csv: at a few cells, and whole at night.
+
+A few cells hold a few structures: here every tolerance is as wide as the list says and one error of the blocks more.
+"""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import _census as census
+from benchmarks import _clustering as clustering
+from benchmarks import _shear as shear
+from benchmarks import catalogue, validate_universe
+from jobs.catalogue import luminosity_function
+from jobs.fluxes import cosmology
+from lake_schema import sky
+from lake_schema.ids import GENERATION_ORDER
+
+from .test_lensing import limber
+
+
+@pytest.fixture(scope="module")
+def seen(drawn):
+    """The drawn sky, as the benchmark counts it."""
+    first = np.array(drawn.places[::4]) // 4
+    deepest = 2 * (sky.DEEPEST - GENERATION_ORDER) + 2
+
+    def block(index):
+        return np.searchsorted(first, index >> deepest)
+
+    halos = {name: drawn.halos[name].to_numpy() for name in census.HALO_COLUMNS}
+    return census.Census(
+        blocks=first.size,
+        area=drawn.area,
+        limit=26.0,
+        rows=drawn.columns,
+        block=block(drawn.columns["_healpix_29"]),
+        mags=drawn.mags,
+        halos=halos,
+        halo_block=block(drawn.halos["_healpix_29"].to_numpy()),
+    )
+
+
+def failed(figures):
+    return [(check.name, check.found) for check in validate_universe.checks(figures, 1.0) if not check.passed]
+
+
+def test_counts_and_redshifts(seen):
+    """Serrano et al. 2024: 102 an arcmin2 with I_E < 26, 30 or more with I_E < 24.5, median z > 0.8; and the i band."""
+    figures = census.counts(seen)
+    assert figures["median_z_24.5"] > 0.8
+    assert failed(figures) == []
+
+
+def test_colours(seen):
+    assert failed(census.colours(seen)) == []
+
+
+def test_sizes(seen):
+    assert failed(census.sizes(seen)) == []
+
+
+def test_halpha(seen):
+    assert failed(census.halpha(seen)) == []
+
+
+def test_halos(seen):
+    assert failed(census.halos(seen, validate_universe.published_halos)) == []
+
+
+def test_luminosities(seen):
+    figures = census.luminosities(seen, luminosity_function.schechter(), 0.0, 1.5)
+    assert len(figures) == 6
+    assert failed(figures) == []
+
+
+def test_a_figure_that_is_off_fails():
+    good, bad = {"sigma_8": 0.833, "half_light_worst": 0.009, "vis_24.5": 31.0}, {"sigma_8": 0.81, "vis_24.5": 29.5}
+    assert failed({**good, "vis_24.5_error": 0.0}) == []
+    assert [name for name, _ in failed({**bad, "vis_24.5_error": 0.1})] == ["sigma_8", "vis_24.5"]
+    # The share of emitters is given the error of their number.
+    counted = {"halpha_2e-16_0.9_1.8": 1.07, "halpha_2e-16_0.9_1.8_error": 0.03}
+    (check,) = validate_universe.checks(counted)
+    assert check.passed
+    assert check.most == pytest.approx(1.08)
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """Pixels of 27 arcmin in blocks of 54 deg2."""
+    monkeypatch.setattr(clustering, "DEPTH", 4)
+
+
+def points(ra, dec):
+    none = np.zeros(ra.size)
+    return clustering.Tracers(ra, dec, none, none, none > 0, none, none, none)
+
+
+def test_uniform_points_are_not_correlated(coarse, rng):
+    edges, order, blocks = np.array([0.6, 1.0, 2.0]), clustering.BLOCK_ORDER, []
+    for cell in (3, 100, 500, 767):
+        _, ra, dec = sky.random_in_cell(order, cell, 40_000, rng)
+        blocks.append((cell, (points(ra, dec),)))
+    (found,) = clustering.correlation(blocks, order, edges)
+    assert np.all((found.theta > edges[:-1]) & (found.theta < edges[1:]))
+    assert np.abs(found.w).max() < 2e-3
+    nodes, shares = found.within
+    assert np.sum(shares) == pytest.approx(1.0)
+    assert 3.0 < np.sum(nodes * shares) < 5.0
+
+
+def test_points_of_a_dense_half_are_correlated(coarse, rng):
+    """Half of a block has three times the density of the other: delta is +-1/2; 16 of 480 neighbours lie across."""
+    edges, order, blocks = np.array([0.4, 0.6]), clustering.BLOCK_ORDER, []
+    for cell in (3, 100, 500, 767):
+        _, ra, dec = sky.random_in_cell(order, cell, 60_000, rng)
+        dense = sky.cell_of(ra, dec, order + 1) % 4 < 2
+        kept = dense | (rng.random(ra.size) < 1 / 3)
+        blocks.append((cell, (points(ra[kept], dec[kept]),)))
+    (found,) = clustering.correlation(blocks, order, edges)
+    assert found.w[0] == pytest.approx(0.25 * (1 - 2 * 16 / 480), abs=0.02)
+
+
+def test_theories_agree():
+    """Of C_l with the sums of the lensing tests; of a band with itself."""
+    ell = np.array([50.0, 200.0, 400.0])
+    chi = float(cosmology.comoving_distance(1.0))
+    assert shear.theory(ell, chi) == pytest.approx(limber(ell, chi), rel=0.02)
+    power = np.concatenate([np.zeros(30), shear.theory(np.arange(30.0, 129.0), chi)])
+    assert shear.bands(power, chi, (30, 64, 128)) == pytest.approx([1.0, 1.0], abs=1e-3)
+
+
+@pytest.mark.nightly
+def test_the_fuller_report(tmp_path):
+    """Every expectation, at the settings that a request has by default: ten minutes of one core, and the boxes' own."""
+    file = tmp_path / "universe.json"
+    status = validate_universe.main(["--json", str(file), "--figures", str(tmp_path)])
+    figures = json.loads(file.read_text())
+    assert (tmp_path / "universe.png").stat().st_size > 10_000
+    assert figures["failed"] == ""
+    assert status == 0
+
+
+@pytest.mark.spark
+@pytest.mark.nightly
+def test_the_benchmark(tmp_path):
+    file = tmp_path / "catalogue.json"
+    assert catalogue.main(["--quick", "--json", str(file)]) == 0
+    figures = json.loads(file.read_text())
+    keys = (
+        "cell_rows", "cell_s", "cell_peak_gb", "speedup_2_cores", "galaxies_per_s_core", "projected_core_hours_922m",
+    )  # fmt: skip
+    assert {"name", "commit", "machine", "repeats", *keys} <= set(figures)
+    assert figures["cell_peak_gb"] < 1.5
