@@ -1,6 +1,7 @@
-"""Effects of VIS: what each costs, how much of the image it changes, and whether a nominal scene asks for it.
+"""Effects of VIS: what each costs, what it changes, and whether a nominal scene asks for it.
 
-One full detector with a made-up sky of points and squares; each effect acts on what those before it left.
+One full detector with a made-up sky of points and squares; each effect acts on what those before it left. And the same
+with a standard set of sources: what each effect does to their magnitude, size and ellipticity.
 """
 
 from __future__ import annotations
@@ -8,21 +9,31 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from benchmarks import report
-from jobs.render import focal_plane
+from jobs.fluxes import passbands
+from jobs.render import chromatic, focal_plane, psf, stamps
 from jobs.render.channels import vis
-from jobs.render.effects import quadrants
+from jobs.render.effects import cosmic_rays, quadrants
 from jobs.render.effects.effect import Frame, Lights, Scene
+from jobs.render.focal_plane import Detector
+from jobs.render.profiles import Shapes
+from jobs.render.stamps import Sources
 from jobs.rng import stream
 from lake_schema.mission.configuration import resolve
 
 # Sources of the scene, and the brightest light, electrons.
 _SOURCES, _STARS, _LIGHT = 30_000, 200, 1e9
-_EXPOSURE, _SKY = 560.53, 0.25
+_EXPOSURE, _SKY, _ZERO_POINT = 560.53, 0.25, 25.93
+# The standard set: magnitudes, half-light radius (of an exponential disc), arcsec; pixels apart, and of a stamp.
+_STAR, _GALAXY, _RADIUS = 19.0, 22.5, 0.3
+_PITCH, _STAMP = 64, 64
+# Radius that fluxes are measured in, arcsec.
+APERTURE = 1.3
 
 
 def light(ny: int, nx: int) -> Frame:
@@ -65,10 +76,86 @@ def measured(side: int | None, repeats: int) -> dict[str, float]:
     return out
 
 
+def standard(detector: Detector, pitch: int) -> Sources:
+    """The standard set, in turns on a lattice: stars of _STAR, round exponential galaxies of _GALAXY and _RADIUS."""
+    rng = np.random.default_rng(2)
+    middle = [np.arange(pitch / 2, n - pitch / 2 + 1, pitch) for n in (detector.nx, detector.ny)]
+    column, row = (axis.ravel() for axis in np.meshgrid(*middle))
+    n = len(column)
+    star, one, nothing = np.arange(n) % 2 == 0, np.ones(1), np.zeros(1)
+    light = _EXPOSURE * 10.0 ** (0.4 * (_ZERO_POINT - np.where(star, _STAR, _GALAXY)))
+    disc = Shapes(one, one * _RADIUS, nothing, one, one, nothing, nothing, nothing, nothing, one)
+    jacobian = np.tile(detector.pixel_scale * np.eye(2), (n, 1, 1))
+    shift = rng.uniform(-0.5, 0.5, (2, n))
+    return Sources(
+        np.arange(n), column + shift[0], row + shift[1], jacobian, light, np.where(star, -1, 0), disc,
+        np.full((n, chromatic.PARTS), 1.0 / chromatic.PARTS),
+    )  # fmt: skip
+
+
+def forms(frame: Frame, some: Sources, radius: float = APERTURE, scale: float = 0.1) -> Frame:
+    """Of each source: flux within `radius` arcsec above its surroundings, R^2, e1, e2 under a Gaussian of 0.75"."""
+    half, out = round(2.0 * radius / scale), []
+    for x, y in zip(some.column, some.row, strict=True):
+        x0, y0 = max(round(x) - half, 0), max(round(y) - half, 0)
+        part = frame[y0 : y0 + 2 * half + 1, x0 : x0 + 2 * half + 1]
+        rows, columns = np.mgrid[: part.shape[0], : part.shape[1]]
+        dx, dy = (columns - (x - x0)) * scale, (rows - (y - y0)) * scale
+        distance = np.hypot(dx, dy)
+        part = part - np.median(part[distance > 1.5 * radius])
+        weighted = part * np.exp(-0.5 * (distance / 0.75) ** 2)
+        xx, yy, xy = ((weighted * a).sum() / weighted.sum() for a in (dx * dx, dy * dy, dx * dy))
+        out.append([part[distance < radius].sum(), xx + yy, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
+    return np.array(out)
+
+
+def changes(scene: Scene, some: Sources, frame: Frame, radius: float = APERTURE) -> dict[str, Frame]:
+    """What each effect that leaves electrons does to each source: magnitude, dR^2 / R^2, de1, de2, [n, 4].
+
+    Cosmic rays hit some sources and not others: they are left out.
+
+    frame : [ny, nx] expected e- of the sources
+    """
+    out: dict[str, Frame] = {}
+    sizes = quadrants.sizes(scene)
+    before = forms(frame, some, radius)
+    for effect in vis.SKY[:-1]:
+        if effect in (cosmic_rays.EFFECT, cosmic_rays.READOUT):
+            continue
+        frame = effect.apply(frame, *effect.parameters(scene), rng=stream(1, effect.name))
+        after = forms(frame if frame.ndim == 2 else quadrants.assembled(frame, *sizes), some, radius)
+        ratio = after[:, :2] / before[:, :2]
+        out[effect.name] = np.column_stack(
+            [-2.5 * np.log10(ratio[:, 0]), ratio[:, 1] - 1, after[:, 2:] - before[:, 2:]]
+        )
+        before = after
+    return out
+
+
+def sources_changed(side: int | None) -> dict[str, float]:
+    """Medians over the standard set of what each effect changes; shear is half an ellipticity."""
+    mission = resolve()
+    detector = focal_plane.detector("vis", "3-4", mission)
+    detector = detector if side is None else replace(detector, nx=side, ny=side)
+    some = standard(detector, _PITCH)
+    spread = psf.vis_psf(detector, passbands.load("euclid_vis"), mission)
+    light = stamps.draw(some, np.full(len(some), _STAMP), spread, detector.nx, detector.ny)
+    lights = Lights(np.array([100.0]), np.array([100.0]), np.array([_LIGHT]))
+    scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(light.max()), detector, lights)
+    out: dict[str, float] = {}
+    for name, change in changes(scene, some, light).items():
+        for kind, chosen in (("star", some.shape < 0), ("galaxy", some.shape >= 0)):
+            mag, size, e1, e2 = np.nanmedian(change[chosen], axis=0)
+            out[f"{name}_{kind}_mag"], out[f"{name}_{kind}_size"] = float(mag), float(size)
+            out[f"{name}_{kind}_shear"] = float(np.hypot(e1, e2)) / 2
+    return out
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures and prints everything."""
     options = report.options("effects", __doc__ or "", argv)
-    figures = measured(512 if options.quick else None, 1 if options.quick else 3)
+    side = 512 if options.quick else None
+    figures = measured(side, 1 if options.quick else 3) | sources_changed(side)
     report.finish(
         "effects", 1 if options.quick else 3, figures, {"all_s": "CPU, every effect of a detector"}, options.json
     )

@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.fluxes import passbands
+from jobs.fluxes.passbands import Passband
 from jobs.render import focal_plane, sky
+from lake_schema import units
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
 
@@ -74,6 +76,16 @@ def test_vis_zodiacal_rate_at_quadrature(latitude, rate):
     """e-/s in a VIS pixel: Leinert et al. 1998 through the throughput, to the model's 10 %."""
     found = sky.zodiacal_rate(*at(90, latitude), passbands.load("euclid_vis"), 0.9926, 0.1, MISSION)
     assert found == pytest.approx(rate, rel=0.10)
+
+
+def test_vis_zodiacal_rate_through_the_design_s_curve():
+    """0.219 e-/s, 0.86 of the current best estimate's: the curve of 2015 has less light."""
+    table = np.array(resolve(ladder=("DES", "CBE", "BLT", "SIM", "REQ")).numbers("vis.euclid_vis.throughput"))
+    wavelength = np.arange(10 * table[0, 0], 10 * table[-1, 0] + 1)
+    band = Passband("design", wavelength, np.interp(wavelength, *(table.T * [[10.0], [1.0]])), "vacuum")
+    assert units.zero_point(9926.0, passbands.log_width(band)) == pytest.approx(25.76, abs=0.02)
+    found = sky.zodiacal_rate(*at(90, 30), band, 0.9926, 0.1, MISSION)
+    assert found == pytest.approx(0.219, rel=0.10)
 
 
 def test_vis_sky_brightness_in_magnitudes():

@@ -1,11 +1,15 @@
 """How bright stars are when a photometer measures them, and what the effects that it does not undo take."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import sep
 from scipy.ndimage import uniform_filter
 
+from benchmarks import effects
 from jobs.render import fits_product, focal_plane, transfer
+from lake_schema.mission.configuration import resolve
 from tests.jobs.render import calibrated, nominal
 from tests.jobs.render.fields import MISSION, small
 
@@ -63,6 +67,27 @@ def test_isolated_stars_are_as_bright_as_the_catalogue_says():
     assert len(change) >= 20
     assert abs(np.median(change)) <= 0.003
     assert change.std() <= 1.2 * np.sqrt(np.mean(noise**2)) + 0.005
+
+
+def test_what_the_effects_take_is_what_the_benchmark_says():
+    """Through old traps and brighter-fatter a star is dimmer by what benchmarks/effects finds of each, added up."""
+    old = resolve(overrides={"vis.cti.age": (10.0, "")})
+    detector = small("vis", "3-4", 256)
+    quiet = nominal.off(*nominal.COSMIC_RAYS)
+    # The same noise: the calibrator's photometry of both.
+    without = stars(detector, 64, 20.0, quiet | nominal.off(*nominal.CHARGE), old)
+    through = stars(detector, 64, 20.0, quiet | dict.fromkeys(nominal.CHARGE, True), old)
+    (before, noise), (after, _) = photometry(without), photometry(through)
+    found = np.mean(after - before)
+    rows = fits_product.truth(without)
+    places = replace(
+        without.sources, column=rows["x"].to_numpy(), row=rows["y"].to_numpy(), electrons=rows["expected"].to_numpy()
+    )
+    told = effects.changes(without.scene, places, without.noise_free.astype(float))
+    expected = sum(np.nanmean(told[name][:, 0]) for name in nominal.CHARGE)
+    print(f"shift {1e3 * found:.2f} mmag, by the benchmark {1e3 * expected:.2f}, noise of a star {1e3 * noise[0]:.2f}")
+    assert expected > 0.003
+    assert found == pytest.approx(expected, rel=0.1)
 
 
 @pytest.mark.nightly
