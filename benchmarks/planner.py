@@ -104,7 +104,7 @@ def rendering(root: Path, wanted: Request, name: str) -> dict[str, float]:
             for part, (result, seconds, peak) in zip(parts, pool.map(partial(_taken, function), parts), strict=True):
                 task = tasks[part.facts["exposure_id"], part.facts["detector"]]
                 key = f"{name}_{task['channel']}_{kinds[part.facts['exposure_id']]}".lower().replace("_science", "")
-                size = sum(file["bytes"] for file in result["files"])
+                size = sum(file["bytes"] for file in result["files"] if file["path"].endswith(".fits"))
                 out[f"{key}_sources"] = task["sources"]
                 took = {"s": seconds, "gb": peak, "mb": size / 1e6}
                 said = {"s": task["seconds"], "gb": task["memory"], "mb": task["bytes"] / 1e6}

@@ -16,8 +16,8 @@ from jobs.accuracy import SURVEY, Accuracy
 from jobs.render import stamps, truth_maps
 from jobs.render.effects.effect import Effect
 
-# A FITS header and its padding; one an image, and one more an extension.
-_HEADER_BYTES = 8640
+# A FITS header and its padding, one an image; how often a truth map is held while it is made and written.
+_HEADER_BYTES, _COPIES = 8640, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +89,13 @@ def price(
     own, applied = of_channel(channel), effects or ()
     maps = truth_maps.made(truth, None if effects is None else [e.name for e in effects], looks)
     tier = stamps.seconds_for(accuracy) / stamps.seconds_for(SURVEY)
-    written = own.written + sum(truth_maps.BYTES[name] for name in maps)
+    mapped = sum(truth_maps.BYTES[name] for name in maps)
     return Price(
         start_s=own.frame_s + looks * own.sky_s,
         pixel_s=1e-6 * sum(effect.cost for effect in applied),
         source_s=looks * own.source_s * tier,
         start_gb=own.base_gb,
-        pixel_gb=1e-9 * (own.held_sky if looks else own.held),
+        pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + _COPIES * mapped),
         start_bytes=_HEADER_BYTES * (1 + len(maps)),
-        pixel_bytes=written,
+        pixel_bytes=own.written + mapped,
     )

@@ -31,8 +31,8 @@ Int = npt.NDArray[np.int64]
 
 # Places along a side of a map; the widest map, and how far inside an area its edge is no longer felt, deg.
 _SIDE, _WIDEST, _INSIDE = 500, 60.0, 0.5
-# Colours are told apart up to so many exposures.
-_MOST_COLOURS = 12
+# Colours of a map, besides that of what nothing sees; more exposures than all but a few places have share the last.
+_COLOURS, _FEW, _NOTHING = 8, 0.01, "#efece6"
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,33 +123,38 @@ def line(depth: Depth) -> str:
 
 def picture(found: Sequence[Depth], path: Path) -> None:
     """A map a band, north up, east to the left: how many exposures see each place; the interior outlined."""
+    import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import BoundaryNorm
     from matplotlib.figure import Figure
 
-    columns = min(len(found), 3)
+    columns = int(np.ceil(np.sqrt(len(found))))
     rows = -(-len(found) // columns)
-    figure = Figure(figsize=(5.2 * columns, 5.4 * rows), dpi=100, layout="constrained")
+    figure = Figure(figsize=(5.6 * columns, 5.2 * rows), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
+    colours = matplotlib.colormaps["viridis"].with_extremes(under=_NOTHING)
     for axes, depth in zip(np.ravel(figure.subplots(rows, columns, squeeze=False)), found, strict=False):
-        most = max(int(depth.seen.max()), 1)
-        step = -(-most // _MOST_COLOURS)
-        bounds = np.arange(0, most + step + 1, step) - 0.5
+        seen = depth.seen[depth.seen > 0]
+        most = int(np.quantile(seen, 1.0 - _FEW)) if seen.size else 1
+        step = -(-most // _COLOURS)
+        bounds = 0.5 + step * np.arange(-(-most // step) + 1)
         half = depth.extent
         # x of the map runs to the west.
         shown = axes.imshow(
-            depth.seen, origin="lower", extent=(half, -half, -half, half), cmap="viridis", interpolation="nearest",
-            norm=BoundaryNorm(bounds, 256),
+            np.minimum(depth.seen, most), origin="lower", extent=(half, -half, -half, half), cmap=colours,
+            interpolation="nearest", norm=BoundaryNorm(bounds, colours.N),
         )  # fmt: skip
         if depth.interior.any() and not depth.interior.all():
             axes.contour(
-                depth.interior.astype(float), [0.5], extent=(half, -half, -half, half), colors="w", linewidths=1.2
+                depth.interior.astype(float), [0.5], extent=(half, -half, -half, half), colors="r", linewidths=1.2
             )
         axes.set_title(f"{depth.channel} {depth.band}: >= 3 over {100 * depth.share(3):.1f} %", fontsize=11)
         axes.set_xlabel("east [deg]")
         axes.set_ylabel("north [deg]")
         bar = figure.colorbar(shown, ax=axes, shrink=0.8, label="exposures")
-        bar.set_ticks((bounds[:-1] + 0.5).tolist())
+        lowest = [round(b + 0.5) for b in bounds[:-1]]
+        named = [f"{a}" if step == 1 else f"{a} - {a + step - 1}" for a in lowest]
+        bar.set_ticks((bounds[:-1] + bounds[1:]) / 2, labels=[*named[:-1], f">= {lowest[-1]}"])
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_visible(False)
