@@ -154,7 +154,7 @@ def picture(found: Sequence[Depth], path: Path) -> None:
         bar = figure.colorbar(shown, ax=axes, shrink=0.8, label="exposures")
         lowest = [round(b + 0.5) for b in bounds[:-1]]
         named = [f"{a}" if step == 1 else f"{a} - {a + step - 1}" for a in lowest]
-        bar.set_ticks((bounds[:-1] + bounds[1:]) / 2, labels=[*named[:-1], f">= {lowest[-1]}"])
+        bar.set_ticks(list((bounds[:-1] + bounds[1:]) / 2), labels=[*named[:-1], f">= {lowest[-1]}"])
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_visible(False)

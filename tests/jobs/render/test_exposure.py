@@ -10,7 +10,7 @@ import pytest
 
 from jobs.accuracy import DRAFT, SURVEY
 from jobs.fluxes import passbands
-from jobs.render import exposing, exposure, focal_plane
+from jobs.render import exposing, exposure, focal_plane, truth_maps
 from jobs.render.focal_plane import boresight_for
 from lake_schema import units
 from lake_schema.errors import BadInput
@@ -201,7 +201,16 @@ def test_each_effect_can_be_forced_on_and_off(name):
 @pytest.mark.parametrize("kind", ["bias", "dark", "flat", "charge_injection", "self_calibration"])
 def test_image_types(kind):
     """What each is for: a level, few electrons, the lamp, filled rows, a sky."""
-    one = render("VIS", kind=kind, truth=("cosmic_rays", "saturation"))
+    truth = ("cosmic_rays", "saturation", "sky", "stars")
+    one = render("VIS", kind=kind, truth=truth)
+    looks, names = kind in ("flat", "self_calibration"), [d.name for d in one.decisions]
+    assert set(one.maps) == {"noise_free", *truth_maps.made(truth, names, looks)}
+    assert ("sky" in one.maps) == ("stars" in one.maps) == looks
+    if looks:
+        # With the starlight that strays, where that is noticed.
+        stray = any(d.applied for d in one.decisions if d.name == "straylight") * one.scene.lights.electrons.sum()
+        assert one.maps["sky"].min() >= one.scene.sky_electrons * (1 - 1e-6)
+        assert one.maps["sky"].max() <= one.scene.sky_electrons * (1 + 1e-6) + stray
     applied = {d.name for d in one.decisions if d.applied}
     found = calibrated.electrons(one.raw, one.scene, 1, applied - {"pixel_response"})
     found = np.where(one.maps["cosmic_rays"] > 0, np.nan, found)
