@@ -25,7 +25,7 @@ class Cost:
     """Of a channel's detectors, its effects left out.
 
     frame_s      : s of any frame: its task, its writing;  sky_s : more, where the sky is drawn
-    source_s     : s of a source drawn with the accuracy "survey"
+    galaxy_s, star_s : s of a source drawn with the accuracy "survey"
     base_gb      : of a worker before it draws
     held, held_sky : bytes a pixel while a frame is made, without and with a sky
     written      : bytes a pixel of the image, pre- and overscan counted
@@ -33,7 +33,8 @@ class Cost:
 
     frame_s: float
     sky_s: float
-    source_s: float
+    galaxy_s: float
+    star_s: float
     base_gb: float
     held: float
     held_sky: float
@@ -50,19 +51,20 @@ def of_channel(channel: str) -> Cost:
 
 @dataclass(frozen=True, slots=True)
 class Price:
-    """What a detector of so many pixels and sources takes: start + pixel a pixel + source a source."""
+    """What a detector of so many pixels and sources takes: something to start with, and something for each of them."""
 
     start_s: float
     pixel_s: float
-    source_s: float
+    galaxy_s: float
+    star_s: float
     start_gb: float
     pixel_gb: float
     start_bytes: int
     pixel_bytes: float
 
-    def seconds(self, pixels: int, sources: int) -> float:
+    def seconds(self, pixels: int, galaxies: float, stars: float) -> float:
         """Of one core."""
-        return self.start_s + pixels * self.pixel_s + sources * self.source_s
+        return self.start_s + pixels * self.pixel_s + galaxies * self.galaxy_s + stars * self.star_s
 
     def memory(self, pixels: int) -> float:
         """GB at the peak."""
@@ -93,7 +95,8 @@ def price(
     return Price(
         start_s=own.frame_s + looks * own.sky_s,
         pixel_s=1e-6 * sum(effect.cost for effect in applied),
-        source_s=looks * own.source_s * tier,
+        galaxy_s=looks * own.galaxy_s * tier,
+        star_s=looks * own.star_s * tier,
         start_gb=own.base_gb,
         pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + _COPIES * mapped),
         start_bytes=_HEADER_BYTES * (1 + len(maps)),

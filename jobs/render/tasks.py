@@ -6,6 +6,7 @@ Densities  how many sources there are where: of the lake's catalogues, or of the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +34,10 @@ Row = Mapping[str, Any]
 
 
 class Densities:
-    """Sources a square degree at a place, galaxies and stars together."""
+    """Sources a square degree at a place.
+
+    catalogues : published galaxies and stars, both or none
+    """
 
     def __init__(self, mission: MissionConfiguration, universe: Universe, catalogues: Sequence[Version] = ()) -> None:
         self.published = [_published(version) for version in catalogues]
@@ -47,12 +51,13 @@ class Densities:
         self.stars = np.reshape(at_limit, (self.lon.size, self.lat.size))
 
     def at(self, ra: Float, dec: Float) -> Float:
-        """[n] deg-2; of the published catalogues where they reach, else of the count models."""
-        if self.published:
-            cells = sky.cell_of(ra, dec, GENERATION_ORDER)
-            found = sum(np.array([table.get(int(cell), np.nan) for cell in cells]) for table in self.published)
-            return np.where(np.isfinite(found), found, self._model(ra, dec))
-        return self._model(ra, dec)
+        """[2, n] deg-2, galaxies and stars; of the published catalogues where they reach, else of the count models."""
+        model = self._model(ra, dec)
+        if not self.published:
+            return model
+        cells = [int(cell) for cell in sky.cell_of(ra, dec, GENERATION_ORDER)]
+        found = np.array([[table.get(cell, np.nan) for cell in cells] for table in self.published])
+        return np.where(np.isfinite(found).all(axis=0), found, model)
 
     def _model(self, ra: Float, dec: Float) -> Float:
         lon, lat = sky.galactic(ra, dec)
@@ -63,7 +68,7 @@ class Densities:
         t = (height - self.lat[j]) / (self.lat[j + 1] - self.lat[j])
         low = (1 - s) * self.stars[i, j] + s * self.stars[i + 1, j]
         high = (1 - s) * self.stars[i, j + 1] + s * self.stars[i + 1, j + 1]
-        return np.asarray(self.galaxies + np.exp((1 - t) * low + t * high))
+        return np.stack([np.full(lon.shape, self.galaxies), np.exp((1 - t) * low + t * high)])
 
 
 def _published(version: Version) -> dict[int, float]:
@@ -158,7 +163,7 @@ def _append(
 ) -> None:
     looks = sees_sky(row["channel"], row["image_type"])
     for i in [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors)):
-        sources = int(np.ceil(places.density[i] * camera.area[i])) if looks else 0
+        galaxies, stars = (places.density[:, i] * (camera.area[i] * looks)).tolist()
         pixels = int(camera.pixels[i])
         columns["exposure_id"].append(row["exposure_id"])
         columns["detector"].append(camera.detectors[i].name)
@@ -168,8 +173,8 @@ def _append(
         columns["radius"].append(float(camera.radius[i]))
         columns["cells"].append(places.cells[i] if looks else [])
         columns["s_region"].append(places.regions[i])
-        columns["sources"].append(sources)
-        columns["seconds"].append(cost.seconds(pixels, sources))
+        columns["sources"].append(math.ceil(galaxies + stars))
+        columns["seconds"].append(cost.seconds(pixels, galaxies, stars))
         columns["memory"].append(cost.memory(pixels))
         columns["bytes"].append(cost.bytes(pixels))
 

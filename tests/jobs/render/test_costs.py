@@ -16,16 +16,18 @@ SKY = exposure.EFFECTS["VIS"]["science"]
 
 def test_more_is_dearer():
     base = costs.price("VIS", True, SKY)
-    assert base.seconds(PIXELS, 1000) < base.seconds(PIXELS, 2000) < base.seconds(2 * PIXELS, 2000)
-    tiers = [costs.price("VIS", True, SKY, accuracy).seconds(PIXELS, 5000) for accuracy in (DRAFT, SURVEY, REFERENCE)]
+    assert base.seconds(PIXELS, 1000, 0) < base.seconds(PIXELS, 2000, 0) < base.seconds(2 * PIXELS, 2000, 100)
+    tiers = [
+        costs.price("VIS", True, SKY, accuracy).seconds(PIXELS, 5000, 0) for accuracy in (DRAFT, SURVEY, REFERENCE)
+    ]
     assert tiers == sorted(set(tiers))
     fewer = costs.price("VIS", True, SKY[:-5])
-    assert base.seconds(PIXELS, 0) - fewer.seconds(PIXELS, 0) == pytest.approx(
+    assert base.seconds(PIXELS, 0, 0) - fewer.seconds(PIXELS, 0, 0) == pytest.approx(
         sum(effect.cost for effect in SKY[-5:]) * PIXELS / 1e6
     )
     # A bias frame has neither sky nor light.
     bias = costs.price("VIS", False, exposure.EFFECTS["VIS"]["bias"])
-    assert bias.seconds(PIXELS, 5000) == bias.seconds(PIXELS, 0) < 0.7 * base.seconds(PIXELS, 0)
+    assert bias.seconds(PIXELS, 5000, 10) == bias.seconds(PIXELS, 0, 0) < 0.7 * base.seconds(PIXELS, 0, 0)
 
 
 def test_each_map_has_its_place_on_the_disc():
