@@ -5,6 +5,7 @@ generator: equal identities give equal numbers on any core, in any order, after 
 and leaves the numbers of the others as they were.
 
 stream     a generator of one identity
+name_of    its key, for a header
 uniforms   a few numbers for each of many sources, whichever others they are drawn with
 """
 
@@ -18,6 +19,12 @@ import numpy.typing as npt
 from lake_schema.errors import BadInput
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+def name_of(*identity: int | str) -> str:
+    """The key of an identity's generator as text: 32 hexadecimal digits, the first word of Philox's key first."""
+    first, second = _key(identity)
+    return f"{int(first):016x}{int(second):016x}"
 
 
 def stream(*identity: int | str) -> np.random.Generator:

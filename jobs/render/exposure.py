@@ -1,6 +1,7 @@
 """One detector of one exposure: catalogue rows in, a raw image and its noise-free truth out.
 
 render          the whole of it
+numbers_of      whose random numbers an effect takes
 least_flux      what a source beyond the margin must have to be read
 sources_of      the rows that touch the detector, as what is drawn
 """
@@ -189,15 +190,14 @@ def render(
     own = sum(effect.contribution(scene) for effect in effects if effect in _LAMPS and forced.get(effect.name, True))
     scene = replace(scene, peak_electrons=scene.peak_electrons + own)
 
-    def stream(effect: Effect) -> np.random.Generator:
-        # What belongs to the detector is the same in every exposure.
-        what = camera if effect.fixed else exposing.identity(exposure)
-        return rng.stream(seed, what, detector.name, effect.name)
-
     maps["noise_free"] = noise_free.astype(np.float32)
     # Handed over: a frame that nobody looks at any more is freed.
     light = [noise_free]
     del noise_free
+
+    def stream(effect: Effect) -> np.random.Generator:
+        return rng.stream(*numbers_of(effect, exposure, detector.name, seed))
+
     frame, more = apply_all(light.pop(), effects, scene, stream, forced, truth_maps.watch(maps, scene, truth))
     raw = frame.astype(np.uint16)
     truth_maps.complete(maps, raw, effects, scene, truth)
@@ -205,6 +205,12 @@ def render(
         exposure, detector, system, spread, raw, maps, sources, sizes, drawn, zero_point, scene, (*decisions, *more),
         accuracy, seed, complete,
     )  # fmt: skip
+
+
+def numbers_of(effect: Effect, exposure: Row, detector: str, seed: int) -> tuple[int | str, ...]:
+    """The identity of an effect's random numbers: nobody else's.  A detector's own patterns are in every exposure."""
+    what = str(exposure["camera"]) if effect.fixed else exposing.identity(exposure)
+    return seed, what, detector, effect.name
 
 
 def effects_of(channel: str, image_type: str, where: str) -> tuple[Effect, ...]:

@@ -21,9 +21,10 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from jobs import rng
 from jobs.render import focal_plane
 from jobs.render.effects import quadrants
-from jobs.render.exposure import Rendered
+from jobs.render.exposure import Rendered, effects_of, numbers_of
 from jobs.render.stamps import Sources
 from lake_schema import __version__, fits
 from lake_schema.fits import Card
@@ -199,6 +200,7 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("DETECTOR", rendered.detector.name, "detector"),
         ("FILTER", str(exposure["band"]), "passband"),
         ("IMAGETYP", str(exposure["image_type"]), "image type"),
+        *((("LAMP", int(exposure["lamp"]), "LED of the calibration unit"),) if exposure.get("lamp") else ()),
         ("EXPOSURE", int(exposure["exposure_id"]), "identifier of the exposure"),
         ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
         ("DATE-OBS", _date(float(exposure["mjd"])), "start of the exposure"),
@@ -232,9 +234,15 @@ def _saturation(rendered: Rendered, gain: float) -> float:
 
 
 def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:
-    """EFFECTn = name, whether it was applied, and its contribution over what would be noticed (margin)."""
+    """EFFECTn = name, whether it was applied, and its contribution over what would be noticed (margin); EFKEYn seed."""
     cards: list[Card] = []
+    exposed = rendered.exposure
+    where = f"exposure {exposed['exposure_id']}"
+    known = {e.name: e for e in effects_of(str(exposed["channel"]), str(exposed["image_type"]), where)}
     for number, decision in enumerate(rendered.decisions, start=1):
         state = ("on" if decision.applied else "off") + (" (forced)" if decision.forced else "")
         cards.append((f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1"))
+        if decision.applied and decision.name in known:
+            numbers = numbers_of(known[decision.name], exposed, rendered.detector.name, rendered.seed)
+            cards.append((f"EFKEY{number}", rng.name_of(*numbers), "key of its numbers (Philox)"))
     return tuple(cards)

@@ -1,0 +1,202 @@
+"""A VIS detector with everything: seconds from the catalogue to the file, of each stage, and memory; an exposure of 36.
+
+One process, one thread, the demo's field. Each time is of a process that has rendered before, as a worker has; "cold"
+is without the PSF's planes in the cache, "warm" with them. Everything: every effect of a science image is forced on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks import report
+from jobs import cache
+from jobs import request as requests
+from jobs.accuracy import preset
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+from jobs.measured import forget_peak, peak_gb
+from jobs.render import exposure, plan_exposures, render_exposures, stamps
+from jobs.render.channels import vis
+from jobs.request import Effects, Request
+from lake_schema import layout, publish
+from lake_schema.plan import Json
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results" / "vis.json"
+_PRESETS = ("draft", "survey", "reference")
+# Where a detector's sources may lie, deg from the exposure's centre.
+_FIELD = 0.62
+_NOTES = {
+    "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed (target 15)",
+    "survey_warm_s": "the same, PSF planes from the cache",
+    "draft_warm_s": "the same at draft accuracy, its own choice of effects (target 4)",
+    "reference_cold_s": "at reference accuracy, everything on (target 60)",
+    "survey_needed_s": "warm, with the effects that the scene asks for",
+    "survey_cold_peak_gb": "largest memory of the process (target 2)",
+    "exposure_s": "wall, 36 detectors by the Spark job on 2 cores (target 360)",
+}
+
+
+def lake(folder: Path, wanted: Request) -> Path:
+    """Catalogues and fluxes of a request."""
+    root = layout.lake(folder / "lake")
+    for module in (build_galaxies, build_stars, compute_fluxes):
+        for step in module.steps(root, wanted):
+            publish.make(root, step.plan, step.work)
+    return root
+
+
+def request(quick: bool) -> Request:
+    """The demo's VIS detector; of a brighter universe where it must be quick."""
+    wanted = requests.parse(ROOT / "requests" / "demo.toml")
+    wanted = replace(wanted, pointings=wanted.pointings[:1], bands=wanted.bands[:1], truth=())
+    if quick:
+        universe = replace(wanted.universe, galaxy_limit=20.0, star_limit=16.0, lensing_nside=64)
+        wanted = replace(wanted, universe=universe)
+    return wanted
+
+
+def full(wanted: Request) -> Request:
+    """With every effect of a science image forced on."""
+    names = [effect.name for effect in (vis.DRAWN, *vis.SKY) if effect.optional]
+    return replace(wanted, effects=Effects(on=tuple(names)))
+
+
+def prepared(root: Path, wanted: Request) -> Json:
+    """Plans the request; facts of its detector's task."""
+    for step in plan_exposures.steps(root, wanted):
+        publish.make(root, step.plan, step.work)
+    step = render_exposures.steps(root, wanted)[0]
+    return {**step.plan.facts, **step.plan.parts[0].facts}
+
+
+def rendered(root: Path, facts: Json, folder: Path) -> tuple[float, float]:
+    """CPU s and largest memory, GB, from reading the sources to the last byte written."""
+    forget_peak()
+    started = time.process_time()
+    output = render_exposures.work(root, facts)
+    for path, write in output.files.items():
+        file = folder / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write(file)
+    return time.process_time() - started, peak_gb()
+
+
+def without_planes() -> None:
+    """Empties the cache of PSF planes."""
+    for folder in cache.cache_dir().glob("vis_psf-*"):
+        for file in folder.iterdir():
+            file.unlink()
+        folder.rmdir()
+
+
+@contextmanager
+def stages(seconds: dict[str, float]) -> Iterator[None]:
+    """Adds up the CPU seconds of a render's stages and effects while it is open."""
+    places: tuple[tuple[Any, str, str], ...] = (
+        (render_exposures, "sources", "read"),
+        (exposure, "_psf", "psf"),
+        (exposure, "sources_of", "choose"),
+        (stamps, "draw", "draw"),
+    )
+    kept = [(module, name, getattr(module, name)) for module, name, _ in places]
+    effects = exposure.EFFECTS["VIS"]["science"]
+    for module, name, stage in places:
+        setattr(module, name, _timed(getattr(module, name), f"stage_{stage}_s", seconds))
+    timed = tuple(replace(e, apply=_timed(e.apply, f"effect_{e.name}_s", seconds)) for e in effects)
+    exposure.EFFECTS["VIS"]["science"] = timed  # type: ignore[index]
+    try:
+        yield
+    finally:
+        exposure.EFFECTS["VIS"]["science"] = effects  # type: ignore[index]
+        for module, name, function in kept:
+            setattr(module, name, function)
+
+
+def _timed(function: Callable[..., Any], name: str, seconds: dict[str, float]) -> Callable[..., Any]:
+    def timed(*arguments: Any, **options: Any) -> Any:
+        started = time.process_time()
+        try:
+            return function(*arguments, **options)
+        finally:
+            seconds[name] += time.process_time() - started
+
+    return timed
+
+
+def detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
+    """All of a detector's figures."""
+    plain = request(quick)
+    root, out = lake(folder, plain), {}
+    everything = prepared(root, full(plain))
+    rendered(root, everything, folder)  # Compiles, and fills the other caches.
+    for name in _PRESETS[:2] if quick else _PRESETS:
+        wanted = replace(plain, accuracy=preset(name))
+        facts = prepared(root, wanted if name == "draft" else full(wanted))
+        for state in ("cold", "warm"):
+            seconds, peaks = [], []
+            for _ in range(repeats):
+                if state == "cold":
+                    without_planes()
+                used, peak = rendered(root, facts, folder)
+                seconds.append(used)
+                peaks.append(peak)
+            out |= {f"{name}_{state}_s": min(seconds), f"{name}_{state}_peak_gb": max(peaks)}
+    out["survey_needed_s"] = rendered(root, prepared(root, plain), folder)[0]
+    parts: dict[str, float] = defaultdict(float)
+    with stages(parts):
+        rendered(root, prepared(root, full(plain)), folder)
+    return out | parts
+
+
+def whole_exposure(folder: Path) -> Mapping[str, float]:
+    """Wall s of the Spark job that renders all 36 detectors of an exposure."""
+    wanted = requests.parse(ROOT / "requests" / "demo.toml")
+    text = (ROOT / "requests" / "demo.toml").read_text(encoding="utf-8")
+    head, *blocks = text.split("[[pointing]]")
+    pointing = "\n".join(line for line in blocks[0].splitlines() if not line.startswith(("centre_on", "detectors")))
+    file = folder / "exposure.toml"
+    file.write_text(f"{head.replace('radius = 0.2', f'radius = {_FIELD}')}[[pointing]]{pointing}\n", encoding="utf-8")
+    wanted = requests.parse(file)
+    root = lake(folder / "exposure", wanted)
+    prepared(root, wanted)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = ["spark-submit", "--master", "local[2]", str(ROOT / "jobs" / "render" / "render_exposures.py")]
+    started = time.perf_counter()
+    subprocess.run([*command, "--lake", str(root), "--request", str(file)], check=True, env=environment)
+    return {"exposure_s": time.perf_counter() - started}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measures and prints everything."""
+    own = argparse.ArgumentParser(add_help=False)
+    own.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
+    own.add_argument("--only-exposure", action="store_true", help="the exposure alone")
+    own.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
+    known, others = own.parse_known_args(argv)
+    options = report.options("vis", __doc__ or "", others)
+    repeats = 1 if options.quick else known.repeats
+    figures: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as name:
+        if not known.only_exposure:
+            figures |= detectors(Path(name), options.quick, repeats)
+        if known.exposure or known.only_exposure:
+            figures |= whole_exposure(Path(name))
+    written = options.json or (None if options.quick or known.only_exposure else RESULTS)
+    report.finish("vis", repeats, figures, _NOTES, written)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
