@@ -32,7 +32,7 @@ demo: spark
 	@$(RUN) python -m jobs.demo
 
 test: .venv/installed-test spark
-	@$(RUN) python -m pytest --numprocesses 2 --dist loadgroup --no-loadscope-reorder
+	@$(RUN) python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 check: .venv/installed-test
 	@$(RUN) ruff check . && ruff format --check . && mypy && lint-imports --no-cache

@@ -17,26 +17,38 @@ settings.register_profile("nightly", max_examples=5000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "default"))
 
 
-# What is made once a process and takes long, so that its tests stay in one, and begin first: they are the most.
-_SHARED = ("spark", "universe")
+# Where tests run in several processes (pytest-xdist, --dist loadfile), a file stays in one, and so do these together:
+# what shares the Spark session, and what shares the drawn sky. They begin first, for they take longest.
+_SPARK = ("tests/faults/test_spark.py", "tests/jobs/test_session.py", "tests/test_field.py")
+_SKY = "tests/jobs/catalogue/"
+
+
+def _scope(file):
+    return "Spark" if file in _SPARK else "sky" if file.startswith(_SKY) else file
 
 
 def pytest_collection_modifyitems(items):
-    """For several processes (pytest-xdist): what shares the Spark session or the drawn sky stays together, or a file.
+    """The long ones first: of the Spark session, of other Javas, of the sky."""
+    files = {item: item.nodeid.partition("::")[0] for item in items}
+    for item, file in files.items():
+        if "spark" in item.fixturenames and file not in _SPARK:
+            raise pytest.UsageError(f"{file} wants the Spark session: it is to be named in tests/conftest.py")
+    java = {file for item, file in files.items() if item.get_closest_marker("spark")}
+    items.sort(key=lambda item: (files[item] not in _SPARK, files[item] not in java, _scope(files[item]) != "sky"))
 
-    Those that start a Java begin before the others, so that no process is left alone with them at the end.
-    """
-    groups, marked = {}, set()
-    for item in items:
-        for name in _SHARED:
-            if name in item.fixturenames:
-                groups.setdefault(item.path, name)
-        if item.get_closest_marker("spark"):
-            marked.add(item.path)
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(groups.get(item.path, item.nodeid.partition("::")[0])))
-    order = {name: place for place, name in enumerate(_SHARED)}
-    items.sort(key=lambda item: (item.path not in marked, order.get(groups.get(item.path), len(order))))
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """By file, or by what files share."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class Sharing(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            return _scope(super()._split_scope(nodeid))
+
+    return Sharing(config, log)
 
 
 @pytest.fixture(scope="session")
