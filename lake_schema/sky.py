@@ -212,7 +212,7 @@ def ring_of(order: int, cell: int) -> int:
 
 
 def border_cells(order: int, cell: int, fine: int) -> Int:
-    """Cells of the finer order inside `cell` that touch its border, sorted."""
+    """int64[n] cells of the finer order inside `cell` that touch its border, sorted."""
     side = 1 << (fine - order)
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     rim = (x == 0) | (y == 0) | (x == side - 1) | (y == side - 1)
@@ -220,7 +220,7 @@ def border_cells(order: int, cell: int, fine: int) -> Int:
 
 
 def margin_cells(order: int, cell: int, fine: int) -> Int:
-    """Cells of the finer order outside `cell` that touch its border (8 neighbours), sorted: a rim about the cell."""
+    """int64[n] cells of the finer order outside `cell` that touch its border (8 neighbours), sorted: its rim."""
     around = _hp().get_all_neighbours(1 << fine, border_cells(order, cell, fine), nest=True).ravel()
     around = np.unique(around[around >= 0]).astype(np.int64)
     outside: Int = around[parent(around, fine, order) != cell]

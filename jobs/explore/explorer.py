@@ -191,7 +191,7 @@ class Explorer:
         return counts, np.linspace(x_lo, x_hi, bins[0] + 1), np.linspace(y_lo, y_hi, bins[1] + 1)
 
     def skymap(self, table: str, order: int = 8, where: str = "true", weight: str | None = None) -> tuple[Int, Float]:
-        """Counts in HEALPix cells (nested) of an order: the cells that hold any, ascending, and their counts."""
+        """Counts in nested HEALPix cells of an order: int64[n] cells that hold any, ascending, and their counts [n]."""
         if not 0 <= order <= sky.DEEPEST:
             raise BadInput(f"order = {order} is outside [0, {sky.DEEPEST}]")
         text = f"""

@@ -13,14 +13,20 @@ Float = npt.NDArray[np.float64]
 
 
 def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
-    """Steps; returns the axes."""
+    """Steps; returns the axes.
+
+    counts : [bins];  edges : [bins + 1], as `Explorer.hist` gives them
+    """
     axes = _axes(ax)
     axes.stairs(counts, edges, **style)
     return axes
 
 
 def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **style: Any) -> Any:
-    """Colours, logarithmic, blank where there is nothing; returns the axes."""
+    """Colours, logarithmic, blank where there is nothing; returns the axes.
+
+    counts : [y bins, x bins];  x_edges, y_edges : one more than bins, as `Explorer.heatmap` gives them
+    """
     from matplotlib.colors import LogNorm
 
     axes = _axes(ax)
@@ -32,7 +38,10 @@ def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **sty
 
 
 def skymap(cells: npt.NDArray[np.int64], counts: Float, order: int, ax: Any = None, **style: Any) -> Any:
-    """Number a square degree in HEALPix cells, east to the left; returns the axes."""
+    """Number a square degree in HEALPix cells, east to the left; returns the axes.
+
+    cells : int64[n] nested cells of the order;  counts : [n], as `Explorer.skymap` gives them
+    """
     from matplotlib.collections import PolyCollection
 
     axes = _axes(ax)
