@@ -62,6 +62,18 @@ def _draw(some: Sources, i: int, spread: galsim.GSObject, index: float) -> None:
     whole.drawImage(scale=1.0, offset=(some.column[i] % 1, some.row[i] % 1))
 
 
+def galsim_image(one: Sources, own: psf.Psf, side: int) -> scenes.Float:
+    """The only source by galsim's defaults, on a stamp that galsim chooses, on a frame [side, side]."""
+    assert own.planes is not None
+    body = galsim.JacobianWCS(*one.jacobian[0].ravel()).toImage(profiles.profile(one.shapes, int(one.shape[0]), 1e-6))
+    whole = galsim.Convolve([body.withFlux(one.electrons[0]), _image(own, np.ones(1))])
+    drawn = whole.drawImage(scale=1.0, center=galsim.PositionD(one.column[0], one.row[0]), dtype=float)
+    frame = galsim.ImageD(galsim.BoundsI(0, side - 1, 0, side - 1), init_value=0.0)
+    shared = frame.bounds & drawn.bounds
+    frame[shared] = drawn[shared]
+    return np.asarray(frame.array)
+
+
 def ufig_seconds(scene: Scene) -> float:
     """CPU s of UFig's photons of all galaxies (bulge and disc an entry each, a grey Moffat); NaN if not installed."""
     try:

@@ -6,6 +6,10 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,9 +77,7 @@ def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | N
         magnification=1 + 0.04 * rng.normal(size=n),
     )
     jacobian = scene.scale * np.array([[1.001, 0.002], [-0.003, 0.998]])
-    # Power laws in wavelength, of photons.
-    waves = np.linspace(-0.25, 0.25, chromatic.PARTS)
-    photons = np.exp(np.outer(rng.normal(0.5, 1.5, total), waves))
+    photons = colours(total, rng)
     return Sources(
         np.arange(total),
         rng.uniform(0, scene.nx - 1, total),
@@ -86,6 +88,26 @@ def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | N
         shapes,
         photons / photons.sum(axis=1, keepdims=True),
     )
+
+
+def colours(n: int, rng: np.random.Generator) -> Float:
+    """Photons in each of the PSF's wavelengths, [n, PARTS]: power laws."""
+    waves = np.linspace(-0.25, 0.25, chromatic.PARTS)
+    return np.asarray(np.exp(np.outer(rng.normal(0.5, 1.5, n), waves)))
+
+
+@contextmanager
+def empty_cache() -> Iterator[None]:
+    """What is cached is made anew, meanwhile."""
+    before = os.environ.get("TRUESKY_CACHE")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["TRUESKY_CACHE"] = folder
+        try:
+            yield
+        finally:
+            del os.environ["TRUESKY_CACHE"]
+            if before is not None:
+                os.environ["TRUESKY_CACHE"] = before
 
 
 def _magnitudes(rng: np.random.Generator, bright: float, faint: float, slope: float, n: int) -> Float:
@@ -120,17 +142,15 @@ def draw(some: Sources, spread_: psf.Psf, scene: Scene, settings: Settings, side
     return stamps.draw(some, sizes, spread_, nx, ny, None, floors)
 
 
-def own(spread_: psf.Psf, some: Sources, i: int, settings: Settings | None = None) -> psf.Psf:
-    """The PSF of source i everywhere on a frame; with settings, as they have it (one position: without drift)."""
+def own(spread_: psf.Psf, some: Sources, i: int) -> psf.Psf:
+    """The PSF of source i everywhere on a frame."""
     planes = spread_.planes
     if planes is None:
         return spread_
     weights = transfer.basis_weights(spread_, some.photons, some.column, some.row)[i]
-    if settings is not None and settings.positions == 1:
-        weights[len(planes.wavelength) :] = 0.0
     image = transfer.image_of(planes, weights)
     alone = psf.Planes(planes.wavelength[:1], image[None], planes.drift[:0], planes.half)
-    return replace(spread_, profile=psf.galsim_profile(image, spread_.pixel_scale), planes=alone)
+    return replace(spread_, planes=alone)
 
 
 def moved(some: Sources, i: int, side: int) -> Sources:

@@ -6,9 +6,7 @@ Errors are of galaxies that no setting was chosen on, of the accuracy "survey" w
 from __future__ import annotations
 
 import argparse
-import os
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -65,16 +63,12 @@ def seconds(scene: Scene, settings: Settings, repeats: int, stars: bool = True, 
 
 def planes_seconds() -> tuple[float, float]:
     """CPU s of a detector's PSF: its optics computed, and from the cache."""
-    before, out = os.environ.get("TRUESKY_CACHE"), []
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["TRUESKY_CACHE"] = folder
+    out = []
+    with scenes.empty_cache():
         for _ in range(2):
             start = time.process_time()
             scenes.spread(VIS)
             out.append(time.process_time() - start)
-    os.environ.pop("TRUESKY_CACHE")
-    if before is not None:
-        os.environ["TRUESKY_CACHE"] = before
     return out[0], out[1]
 
 

@@ -10,6 +10,7 @@ pupil, wavefront      the parts of the Euclid model
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -41,10 +42,8 @@ SIDE = 512
 _TRANSFORM = 2048
 # The same for what changes across a detector: the core alone.
 _CORE_TRANSFORM, _CORE_SIDE = 768, 160
-# Where the PSF is computed across a detector, in half sides from its centre.
-_NODES = tuple((x, y) for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0))
-# Of the drift: the mean PSF to second order in place, its slope with wavelength to first.
-_POWERS = ((1, 0, 0), (0, 1, 0), (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1))
+# Of the drift, by the number of positions: degree in place of the mean PSF, and of its slope with wavelength.
+DEGREES = {1: (0, 0), 4: (1, 0), 9: (2, 1), 25: (4, 2)}
 # Side and samples a pixel of the drawing that tells the width.
 _CORE, _FINE = 243, 9
 _ARCSEC = np.pi / 180.0 / 3600.0
@@ -94,11 +93,11 @@ class Psf:
     intra_pixel: float | None = 0.0
 
 
-def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = len(_NODES)) -> Psf:
+def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = 9) -> Psf:
     """The Euclid PSF of a VIS detector: optics, pointing jitter, charge diffusion.
 
-    positions : 1, or 9 for one that changes across the detector
-    Error     : second moments 2e-4 from the number of wavelengths; across the detector as measured (settings.csv)
+    positions : where it is computed, one of DEGREES; polynomials lie between
+    Error     : second moments 2e-4 from the number of wavelengths; across the detector as measured (psf_positions.csv)
     Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
     """
     return sampled(_vis_planes(detector, band, mission, positions), detector.pixel_scale, has_pixel=False)
@@ -205,8 +204,8 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
     parts = sub_bands(band)
     # Second moments of diffraction go with the square of the wavelength.
     waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
-    places = [_field(detector, x, y, mission) for x, y in (_NODES if positions > 1 else _NODES[:0])]
-    coefficients = [wavefront(*_field(detector, 0.0, 0.0, mission), mission), *(wavefront(*p, mission) for p in places)]
+    nodes, powers = _nodes(positions), _powers(positions)
+    coefficients = [wavefront(*_field(detector, *place, mission), mission) for place in ((0.0, 0.0), *nodes)]
     sampling = detector.pixel_scale / SAMPLES
     blur = _blur_variances(detector, mission)
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
@@ -222,13 +221,12 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
         centre = [_plane(coefficients[0], w, _TRANSFORM, SIDE, sampling, blur, mission) for w in waves]
         return {
             "images": np.stack(centre).astype(np.float32),
-            "drift": _drift(coefficients[1:], waves, sampling, blur, mission).astype(np.float32),
+            "drift": _drift(coefficients, positions, waves, sampling, blur, mission).astype(np.float32),
         }
 
     arrays = cache.cached_arrays("vis_psf", key, make)
     turned = slice(None, None, -1 if detector.upside_down else 1)
     # Upside down, both the planes and the places that the drift is written in are turned.
-    powers = _POWERS[: len(arrays["drift"])]
     sign = np.array([(-1) ** (i + j) for i, j, _ in powers], np.float32)[:, None, None]
     drift = arrays["drift"][:, turned, turned] * (sign if detector.upside_down else np.float32(1.0))
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
@@ -252,31 +250,52 @@ def _blur_variances(detector: Detector, mission: MissionConfiguration) -> tuple[
     return jitter_x**2 + diffusion**2, jitter_y**2 + diffusion**2
 
 
+def _nodes(positions: int) -> tuple[tuple[float, float], ...]:
+    """Where the PSF is computed across a detector, in half sides from its centre."""
+    axis = np.linspace(-1.0, 1.0, math.isqrt(positions)).tolist() if positions > 1 else []
+    return tuple((x, y) for y in axis for x in axis)
+
+
+def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
+    """Planes.powers of the drift: of the mean PSF, then of its slope with wavelength."""
+    return tuple(
+        (degree - j, j, colour)
+        for colour, most in enumerate(DEGREES[positions])
+        for degree in range(1, most + 1)
+        for j in range(degree + 1)
+    )
+
+
 def _drift(
-    nodes: Sequence[Float], waves: Float, sampling: float, blur: tuple[float, float], mission: MissionConfiguration
+    coefficients: Sequence[Float],
+    positions: int,
+    waves: Float,
+    sampling: float,
+    blur: tuple[float, float],
+    mission: MissionConfiguration,
 ) -> Float:
-    """Planes of Planes.drift, [7, t, t] or [0, t, t], in the focal plane's axes, by least squares over the nodes."""
+    """Planes of Planes.drift in the focal plane's axes, by least squares; coefficients: of the centre and the nodes."""
     side = _CORE_SIDE * SAMPLES + 1
-    if not nodes:
+    powers = _powers(positions)
+    if not powers:
         return np.zeros((0, side, side))
-    mean, slope = np.zeros((2, len(nodes), _CORE_TRANSFORM, _CORE_TRANSFORM))
+    mean, slope = np.zeros((2, len(coefficients), _CORE_TRANSFORM, _CORE_TRANSFORM))
     redder = (waves - waves.mean()) / np.sum((waves - waves.mean()) ** 2)
     for wavelength, tilt in zip(waves, redder, strict=True):
         optics = _optics(float(wavelength), sampling, mission, _CORE_TRANSFORM)
-        for i, nm in enumerate(nodes):
+        for i, nm in enumerate(coefficients):
             image = _diffracted(nm, optics)
             mean[i] += image / len(waves)
             slope[i] += image * tilt
-    # The blur is the same for all.
-    mean, slope = (np.stack([_blurred(x, _CORE_SIDE, sampling, blur) for x in some]) for some in (mean, slope))
-    x, y = np.array(_NODES).T
-    middle = _NODES.index((0.0, 0.0))
-    second, first = (
-        np.linalg.pinv(np.stack([x**i * y**j for i, j, colour in _POWERS if colour == order], axis=1))
-        for order in (0, 1)
-    )
-    changes = np.tensordot(second, mean - mean[middle], 1), np.tensordot(first, slope - slope[middle], 1)
-    return np.concatenate(changes)
+    x, y = np.array(_nodes(positions)).T
+    changes = []
+    for order, images in enumerate((mean, slope)):
+        terms = [x**i * y**j for i, j, colour in powers if colour == order]
+        if terms:
+            change = np.tensordot(np.linalg.pinv(np.stack(terms, axis=1)), images[1:] - images[0], 1)
+            # The blur is the same for all, and linear.
+            changes += [_blurred(image, _CORE_SIDE, sampling, blur) for image in change]
+    return np.stack(changes)
 
 
 def _plane(

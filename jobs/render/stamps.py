@@ -144,7 +144,7 @@ class Settings:
     ghost : largest part of a source's flux that wraps into its own aperture
     floor : Fourier samples of less than this are left out, 1 at k = 0
     least : smallest side of a stamp, arcsec: what of the PSF a source keeps
-    positions : of the PSF on a detector
+    positions : of the PSF on a detector, one of psf.DEGREES
     """
 
     edge: float
@@ -157,7 +157,7 @@ class Settings:
 def settings_for(accuracy: Accuracy) -> Settings:
     """The cheapest settings whose measured errors are within an accuracy (settings.csv), or the most accurate."""
     row = _row_for(accuracy)
-    return Settings(row["edge"], row["ghost"], row["floor"], row["least"], int(row["positions"]))
+    return Settings(row["edge"], row["ghost"], row["floor"], row["least"], _positions(accuracy.shape))
 
 
 def seconds_for(accuracy: Accuracy) -> float:
@@ -167,13 +167,23 @@ def seconds_for(accuracy: Accuracy) -> float:
 
 @cache
 def _row_for(accuracy: Accuracy) -> dict[str, float]:
-    with Path(__file__).with_name("settings.csv").open(newline="", encoding="utf-8") as file:
-        rows = [
-            {name: float(value) for name, value in row.items()}
-            for row in csv.DictReader(line for line in file if not line.startswith("#"))
-        ]
+    rows = _table("settings.csv")
     good = [row for row in rows if all(row[f"{f.name}_error"] <= getattr(accuracy, f.name) for f in fields(accuracy))]
     return min(good, key=lambda row: row["seconds"]) if good else max(rows, key=lambda row: row["seconds"])
+
+
+@cache
+def _positions(shape: float) -> int:
+    """The fewest positions whose R2 (rms) and ellipticity (largest error) are within `shape` (psf_positions.csv)."""
+    rows = [row for row in _table("psf_positions.csv") if not row["nearest"]]
+    good = [row["positions"] for row in rows if max(row["r2_rms"], row["ellipticity_error"]) <= shape]
+    return int(min(good, default=max(row["positions"] for row in rows)))
+
+
+def _table(name: str) -> list[dict[str, float]]:
+    with Path(__file__).with_name(name).open(newline="", encoding="utf-8") as file:
+        lines = [line for line in file if not line.startswith("#")]
+    return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(lines)]
 
 
 def stamp_sizes(
@@ -408,13 +418,15 @@ def _bodies(sources: Sources) -> tuple[Array, ...]:
     return body, fraction, bulge, disk, thick, row, row_weights
 
 
-def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4) -> Float:
+def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4, highest: float = 1e-4) -> Float:
     """Source i by galsim.Convolve and drawImage, tight thresholds: slow, with none of `draw`'s transforms.
 
+    accuracy, highest : galsim's folding_threshold and maxk_threshold; what is cut at 1e-4 shows as 3e-3 of the noise in
+                        the middle of bright discs
     returns : float64[size, size], lower left pixel at round(position) - size / 2
     """
     settings = galsim.GSParams(
-        folding_threshold=accuracy, maxk_threshold=accuracy, kvalue_accuracy=1e-7, maximum_fft_size=16384
+        folding_threshold=accuracy, maxk_threshold=highest, kvalue_accuracy=1e-7, maximum_fft_size=16384
     )
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)[i]
     pixel = [] if psf.intra_pixel is None else [galsim.Pixel(1.0)]

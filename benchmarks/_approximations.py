@@ -1,0 +1,184 @@
+"""What others leave out to be fast (Serrano et al. 2024, sections 4 and 6.2), done to our own drawing.
+
+Each takes effect on the galaxies it was meant for; all else is drawn as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import zoom
+from scipy.special import gammaincinv
+
+from benchmarks import _scenes as scenes
+from benchmarks._scenes import Scene
+from jobs.render import profiles, psf, stamps
+from jobs.render.stamps import Settings, Sources
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+# The paper's: folding threshold; half-light radii below which galaxies are exponential, above which they are sampled
+# down, arcsec. The magnitude that a galaxy is fainter than to have one component is VIS's limit there; ours has half
+# of the scene beyond it.
+FOLDING, TINY, HUGE, FAINT = 5e-3, 0.01, 10.0, 24.5
+
+
+Anything = TypeVar("Anything")
+
+
+def _as_it_is(what: Anything) -> Anything:
+    return what
+
+
+def _sizes(some: Sources, spread: psf.Psf, scene: Scene, settings: Settings) -> Int:
+    return stamps.stamp_sizes(some.electrons, some.shape, some.shapes, spread, scene.noise, settings)
+
+
+@dataclass(frozen=True)
+class Approximation:
+    """Galaxies that it concerns, and what it does to them, to their PSF, to their stamps, to their image.
+
+    concerned : a sample of them: (scene, seed, number) -> Sources
+    numbers   : of galaxies that errors are measured of, of pairs, and that are timed: 0 = all of the scene
+    timed     : what is timed, where the image is not drawn as the approximation would
+    """
+
+    name: str
+    concerned: Callable[[Scene, int, int], Sources] = scenes.sample
+    simplified: Callable[[Sources], Sources] = _as_it_is
+    spread: Callable[[psf.Psf], psf.Psf] = _as_it_is
+    sizes: Callable[[Sources, psf.Psf, Scene, Settings], Int] = _sizes
+    after: Callable[[Float], Float] = _as_it_is
+    numbers: tuple[int, int, int] = (48, 12, 0)
+    timed: Approximation | None = None
+
+    def draw(self, some: Sources, spread: psf.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
+        """Sources that are simplified, through a PSF that is."""
+        floors = stamps.floors(some.electrons, scene.noise, settings)
+        nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
+        sizes = self.sizes(some, spread, scene, settings)
+        return self.after(stamps.draw(some, sizes, spread, nx, ny, None, floors))
+
+
+def _folded(some: Sources, spread: psf.Psf, scene: Scene, settings: Settings) -> Int:
+    """Stamps as wide as galsim's folding_threshold asks for: all but that of the light."""
+    shapes = some.shapes.take(some.shape)
+    stretch = np.sqrt(shapes.magnification)
+    radius = np.zeros(len(shapes))
+    for share, half_light, index in (
+        (shapes.bulge_fraction, shapes.bulge_radius, shapes.sersic_index),
+        (1 - shapes.bulge_fraction, shapes.disk_radius, np.ones(len(shapes))),
+    ):
+        whole = (gammaincinv(2 * index, 1 - FOLDING) / gammaincinv(2 * index, 0.5)) ** index
+        radius = np.maximum(radius, np.where(share > 0, half_light * stretch * whole, 0.0))
+    light = spread.outside / (spread.outside[0] + spread.surface[0])
+    of_psf = np.argmax(light < FOLDING) if (light < FOLDING).any() else len(light)
+    wanted = 2 * np.hypot(radius / spread.pixel_scale, of_psf)
+    return np.asarray(stamps.SIZES[np.minimum(np.searchsorted(stamps.SIZES, wanted), len(stamps.SIZES) - 1)])
+
+
+def _rounded(some: Sources) -> Sources:
+    return replace(some, shapes=replace(some.shapes, sersic_index=np.round(some.shapes.sersic_index, 1)))
+
+
+def _exponential(some: Sources) -> Sources:
+    """Discs of the same half-light radius; those that had a bulge alone are seen as round as it was."""
+    shapes = some.shapes
+    fraction = shapes.bulge_fraction
+    radius = fraction * shapes.bulge_radius + (1 - fraction) * shapes.disk_radius
+    axis_ratio = np.degrees(np.arccos(np.clip(shapes.bulge_axis_ratio, 0.0, 1.0)))
+    inclination = np.where(fraction < 1, shapes.inclination, axis_ratio)
+    return replace(
+        some,
+        shapes=replace(shapes, disk_radius=radius, bulge_fraction=np.zeros(len(shapes)), inclination=inclination),
+    )
+
+
+def _faint(scene: Scene, seed: int, n: int) -> Sources:
+    """Bulge and disc, beyond the limit."""
+    some = scenes.sources(scene, seed, galaxies=40 * n, stars=0)
+    fraction = some.shapes.bulge_fraction
+    both = (fraction > 0) & (fraction < 1) & (scenes.magnitudes(some, scene) > FAINT)
+    return some.take(np.flatnonzero(both)[:n])
+
+
+def _sized(scene: Scene, seed: int, n: int, radius: float, magnitude: float) -> Sources:
+    some = scenes.sources(scene, seed, galaxies=n, stars=0)
+    shapes = some.shapes
+    scale = radius / profiles.half_light(shapes)
+    shapes = replace(shapes, bulge_radius=shapes.bulge_radius * scale, disk_radius=shapes.disk_radius * scale)
+    electrons = np.full(n, scene.exposure * 10 ** (0.4 * (scene.zero_point - magnitude)))
+    return replace(some, shapes=shapes, electrons=electrons)
+
+
+def _tiny(scene: Scene, seed: int, n: int) -> Sources:
+    return _sized(scene, seed, n, TINY, 23.0)
+
+
+def _huge(scene: Scene, seed: int, n: int) -> Sources:
+    """The steep ones, which the paper had no memory for."""
+    some = _sized(scene, seed, n, 1.2 * HUGE, 17.0)
+    index = 2.5 + 3.5 * np.linspace(0.0, 1.0, n)
+    return replace(some, shapes=replace(some.shapes, sersic_index=index, bulge_fraction=np.ones(n)))
+
+
+def _down_and_up(image: Float) -> Float:
+    """Pixels twice as wide, and a biquadratic interpolation between them."""
+    ny, nx = image.shape
+    coarse = image.reshape(ny // 2, 2, nx // 2, 2).sum(axis=(1, 3))
+    return np.asarray(zoom(coarse, 2, order=2, mode="nearest", grid_mode=True)) / 4
+
+
+def _half(some: Sources, spread: psf.Psf, scene: Scene, settings: Settings) -> Int:
+    sizes = _sizes(some, spread, scene, settings)
+    return np.asarray(stamps.SIZES[np.searchsorted(stamps.SIZES, sizes // 2)])
+
+
+def _up(image: Float) -> Float:
+    """What `_down_and_up` takes besides the drawing, of an image of half the side."""
+    zoom(image[: len(image) // 2, : len(image) // 2], 2, order=2, mode="nearest", grid_mode=True)
+    return image
+
+
+def _grey(some: Sources) -> Sources:
+    return replace(some, photons=None)
+
+
+def _grey_planes(spread: psf.Psf) -> psf.Psf:
+    """One plane for all colours; its drift across the detector stays."""
+    planes = spread.planes
+    assert planes is not None
+    kept = [i for i, power in enumerate(planes.powers) if power[2] == 0]
+    mean = planes.images.mean(axis=0, keepdims=True)
+    powers = tuple(planes.powers[i] for i in kept)
+    waves = planes.wavelength.mean(keepdims=True)
+    return replace(spread, planes=psf.Planes(waves, mean, planes.drift[kept], planes.half, powers))
+
+
+def _still(spread: psf.Psf) -> psf.Psf:
+    """The detector's centre everywhere."""
+    planes = spread.planes
+    assert planes is not None
+    return replace(spread, planes=replace(planes, drift=planes.drift[:0], powers=()))
+
+
+NONE = Approximation("none")
+ALL = (
+    Approximation("index rounded to 0.1", simplified=_rounded),
+    Approximation("single component, faint", concerned=_faint, simplified=_exponential, numbers=(48, 12, 1000)),
+    Approximation("folding threshold 0.5 %", sizes=_folded),
+    Approximation("exponential below 0.01 arcsec", concerned=_tiny, simplified=_exponential, numbers=(12, 6, 1000)),
+    Approximation(
+        "sampled down and up",
+        concerned=_huge,
+        after=_down_and_up,
+        numbers=(6, 3, 6),
+        timed=Approximation("half the side", sizes=_half, after=_up),
+    ),
+    Approximation("one PSF for all colours", simplified=_grey, spread=_grey_planes),
+    Approximation("one PSF for all places", spread=_still),
+)

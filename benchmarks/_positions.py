@@ -1,0 +1,142 @@
+"""Positions of the PSF on a VIS detector: what their number costs, and what error it leaves in a star.
+
+Polynomials through a few positions, as images are drawn, and the nearest of a grid, as it is usual.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks import _errors as errors
+from benchmarks import _scenes as scenes
+from benchmarks._scenes import VIS
+from jobs.render import focal_plane, psf
+from lake_schema.mission.configuration import resolve
+
+Float = npt.NDArray[np.float64]
+# Stars that the errors are of, by a seed of their own.
+STARS, _SEED = 24, 5
+# Of the planes' wavelengths those that a star here is made of: a blue and a red one.
+_WAVES = (1, 6)
+# Grids that the nearest position is taken of: positions along a side.
+_NEAREST = (1, 2, 3, 4, 6, 10, 15, 20, 30, 40)
+_COLUMNS = "positions,nearest,r2_rms,r2_error,ellipticity_rms,ellipticity_error,seconds,megabytes"
+_ABOUT = f"""\
+# Error of the VIS PSF by the number of its positions on a detector: of the R2 and the ellipticity of {STARS} stars of
+# other places and colours, under a Gaussian weight of 0.75" (rms and largest); CPU seconds to compute its planes, and
+# what they hold. nearest: 0 = polynomials through the positions (psf.DEGREES), 1 = the nearest of a grid, as in
+# Serrano et al. 2024. Written by python -m benchmarks.trade --positions.
+"""
+
+
+@dataclass(frozen=True)
+class Star:
+    """Its place in half sides from the centre, the shares of its light in the wavelengths, its PSF."""
+
+    place: tuple[float, float]
+    shares: Float
+    truth: Float
+
+
+def optics() -> Callable[[tuple[float, float]], Float]:
+    """The PSF at a place, computed: (x, y) in half sides -> [wavelengths, t, t], in the detector's axes."""
+    mission = resolve()
+    detector = focal_plane.detector("vis", "3-4", mission)
+    waves = scenes.spread(VIS, 1).planes.wavelength  # type: ignore[union-attr]
+    blur = psf._blur_variances(detector, mission)
+    sign = -1 if detector.upside_down else 1
+
+    def at(place: tuple[float, float]) -> Float:
+        nm = psf.wavefront(*psf._field(detector, sign * place[0], sign * place[1], mission), mission)
+        scale = detector.pixel_scale / psf.SAMPLES
+        size = psf._CORE_TRANSFORM, psf._CORE_SIDE
+        return np.stack([psf._plane(nm, float(waves[w]), *size, scale, blur, mission)[::sign, ::sign] for w in _WAVES])
+
+    return at
+
+
+def rows(stars: int, nearest: tuple[int, ...] = _NEAREST) -> list[dict[str, float]]:
+    """A row a way and number of positions: keys as _COLUMNS."""
+    at, rng = optics(), np.random.default_rng(_SEED)
+    at((0.0, 0.0))
+    start = time.process_time()
+    centre = at((0.0, 0.0))
+    plane_s = (time.process_time() - start) / len(_WAVES)
+    some = [_star(at, rng) for _ in range(stars)]
+    out = []
+    for positions in psf.DEGREES:
+        cold, spread = _cold(positions)
+        found = np.array([_errors(centre + _drift(spread, star), star) for star in some])
+        out.append(_row(positions, False, found, cold, (spread.images.nbytes + spread.drift.nbytes) / 1e6))
+    for side in nearest:
+        middles = (2 * np.arange(side) + 1) / side - 1
+        found = np.array([_errors(at(_nearest(middles, star.place)), star) for star in some])
+        # The wings are the centre's everywhere: a position has the core alone.
+        planes = side**2 * len(spread.wavelength)
+        megabytes = (planes * centre[0].size * spread.images.itemsize + spread.images.nbytes) / 1e6
+        out.append(_row(side**2, True, found, out[0]["seconds"] + planes * plane_s, megabytes))
+    return out
+
+
+def text(found: list[dict[str, float]]) -> str:
+    """The table that stamps.settings_for reads."""
+    lines = [
+        ",".join(f"{row[name]:.2g}" if name not in _EXACT else f"{row[name]:.0f}" for name in row) for row in found
+    ]
+    return "\n".join([_ABOUT + _COLUMNS, *lines]) + "\n"
+
+
+_EXACT = ("positions", "nearest", "megabytes")
+
+
+def _star(at: Callable[[tuple[float, float]], Float], rng: np.random.Generator) -> Star:
+    place = rng.uniform(-1, 1, 2).tolist()
+    photons = scenes.colours(1, rng)[0, list(_WAVES)]
+    return Star((place[0], place[1]), photons / photons.sum(), at((place[0], place[1])))
+
+
+def _errors(planes: Float, star: Star) -> tuple[float, float]:
+    """|dR2 / R2| and the ellipticity's error."""
+    found, truth = (_moments(np.tensordot(star.shares, each, 1)) for each in (planes, star.truth))
+    return abs(found[3] / truth[3] - 1), float(np.hypot(*(found - truth)[4:6]))
+
+
+def _moments(image: Float) -> Float:
+    middle = image.shape[0] // 2
+    return errors.measured(image, VIS.scale / psf.SAMPLES, middle, middle)
+
+
+def _drift(spread: psf.Planes, star: Star) -> Float:
+    """What the polynomials add to the centre's planes: [wavelengths, t, t]."""
+    out = []
+    for w in _WAVES:
+        redder = spread.wavelength[w] - spread.wavelength.mean()
+        terms = [star.place[0] ** i * star.place[1] ** j * redder**colour for i, j, colour in spread.powers]
+        out.append(np.tensordot(terms, spread.drift, 1) if terms else 0.0)
+    return np.stack([np.broadcast_to(each, star.truth.shape[1:]) for each in out])
+
+
+def _nearest(middles: Float, place: tuple[float, float]) -> tuple[float, float]:
+    x, y = (float(middles[np.argmin(np.abs(middles - at))]) for at in place)
+    return x, y
+
+
+def _cold(positions: int) -> tuple[float, psf.Planes]:
+    """CPU s to compute the planes, and they."""
+    with scenes.empty_cache():
+        start = time.process_time()
+        planes = scenes.spread(VIS, positions).planes
+        seconds = time.process_time() - start
+    assert planes is not None
+    return seconds, planes
+
+
+def _row(positions: int, nearest: bool, found: Float, seconds: float, megabytes: float) -> dict[str, float]:
+    rms, worst = np.sqrt((found**2).mean(axis=0)), found.max(axis=0)
+    values = positions, nearest, rms[0], worst[0], rms[1], worst[1], seconds, megabytes
+    return {name: float(value) for name, value in zip(_COLUMNS.split(","), values, strict=True)}
