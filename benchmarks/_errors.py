@@ -165,6 +165,11 @@ def figures(found: Float) -> dict[str, float]:
     return {key: float(value) for name, a, b in named for key, value in ((f"{name}_rms", a), (f"{name}_worst", b))}
 
 
+def by_bin(found: Float, bins: npt.NDArray[np.int64]) -> dict[str, float]:
+    """`figures` of each magnitude bin: their keys end in the bin's bright edge."""
+    return {f"{key}_m{BINS[b]:.0f}": value for b in np.unique(bins) for key, value in figures(found[bins == b]).items()}
+
+
 def table(title: str, found: Float, bins: npt.NDArray[np.int64]) -> None:
     """Prints rms / worst of errors by magnitude bin."""
     print(f"{title:24}" + "".join(f"{name:>20}" for name in NAMES))

@@ -67,15 +67,15 @@ def rows(stars: int, nearest: tuple[int, ...] = _NEAREST) -> list[dict[str, floa
     start = time.process_time()
     centre = at((0.0, 0.0))
     plane_s = (time.process_time() - start) / len(_WAVES)
-    some = [_star(at, rng) for _ in range(stars)]
+    some = [star(at, rng) for _ in range(stars)]
     out = []
     for positions in psf.DEGREES:
         cold, spread = _cold(positions)
-        found = np.array([_errors(centre + _drift(spread, star), star) for star in some])
+        found = np.array([errors_of(centre + drift(spread, one), one) for one in some])
         out.append(_row(positions, False, found, cold, (spread.images.nbytes + spread.drift.nbytes) / 1e6))
     for side in nearest:
         middles = (2 * np.arange(side) + 1) / side - 1
-        found = np.array([_errors(at(_nearest(middles, star.place)), star) for star in some])
+        found = np.array([errors_of(at(_nearest(middles, one.place)), one) for one in some])
         # The wings are the centre's everywhere: a position has the core alone.
         planes = side**2 * len(spread.wavelength)
         megabytes = (planes * centre[0].size * spread.images.itemsize + spread.images.nbytes) / 1e6
@@ -94,13 +94,13 @@ def text(found: list[dict[str, float]]) -> str:
 _EXACT = ("positions", "nearest", "megabytes")
 
 
-def _star(at: Callable[[tuple[float, float]], Float], rng: np.random.Generator) -> Star:
+def star(at: Callable[[tuple[float, float]], Float], rng: np.random.Generator) -> Star:
     place = rng.uniform(-1, 1, 2).tolist()
     photons = scenes.colours(1, rng)[0, list(_WAVES)]
     return Star((place[0], place[1]), photons / photons.sum(), at((place[0], place[1])))
 
 
-def _errors(planes: Float, star: Star) -> tuple[float, float]:
+def errors_of(planes: Float, star: Star) -> tuple[float, float]:
     """|dR2 / R2| and the ellipticity's error."""
     found, truth = (_moments(np.tensordot(star.shares, each, 1)) for each in (planes, star.truth))
     return abs(found[3] / truth[3] - 1), float(np.hypot(*(found - truth)[4:6]))
@@ -111,7 +111,7 @@ def _moments(image: Float) -> Float:
     return errors.measured(image, VIS.scale / psf.SAMPLES, middle, middle)
 
 
-def _drift(spread: psf.Planes, star: Star) -> Float:
+def drift(spread: psf.Planes, star: Star) -> Float:
     """What the polynomials add to the centre's planes: [wavelengths, t, t]."""
     out = []
     for w in _WAVES:

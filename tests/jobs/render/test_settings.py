@@ -4,8 +4,11 @@ import csv
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from benchmarks import _positions as positions
+from benchmarks._scenes import VIS, spread
 from jobs.accuracy import DRAFT, REFERENCE, SURVEY
 from jobs.render import psf, stamps
 
@@ -49,3 +52,15 @@ def test_more_is_asked_for_more_is_taken():
     assert [tier.positions for tier in tiers] == sorted(tier.positions for tier in tiers)
     most = stamps.settings_for(replace(REFERENCE, shape=1e-12, background=1e-12))
     assert most.positions == max(psf.DEGREES)
+
+
+def test_between_its_positions_the_psf_is_as_wrong_as_the_table_says():
+    """Against the optics computed at the place of a star."""
+    table = {row["positions"]: row for row in rows("psf_positions.csv") if row["nearest"] == 0}
+    at = positions.optics()
+    star, planes = positions.star(at, np.random.default_rng(8)), spread(VIS, 9).planes
+    r2, ellipticity = positions.errors_of(at((0.0, 0.0)) + positions.drift(planes, star), star)
+    assert r2 <= table[9]["r2_error"]
+    assert ellipticity <= table[9]["ellipticity_error"]
+    none, _ = positions.errors_of(at((0.0, 0.0)), star)
+    assert none > 3 * r2
