@@ -134,7 +134,7 @@ def _kind(code: int, numbers: dict[str, Any], boost: float) -> Kind:
     middle_z, middle_m = z[:, None] + 0.5 * _Z_STEP, m[None, :] + 0.5 * _M_STEP
     volume = cosmology.comoving_volume(z, z + _Z_STEP)[:, None] * np.radians(1.0) ** 2 / cosmology.HUBBLE**3
     counts = density(code, numbers, middle_m, middle_z) * volume * _M_STEP
-    bright = ultraviolet_magnitude(middle_m, np.broadcast_to(middle_z, counts.shape)) < numbers["limit"]
+    bright = ultraviolet_magnitude(middle_m, middle_z) < numbers["limit"]
     return Kind(code, numbers, boost, z, m, np.where(bright, counts, 0.0))
 
 

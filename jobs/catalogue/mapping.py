@@ -17,8 +17,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from astropy import units
-from astropy.cosmology.units import littleh
 
 from lake_schema import foreign_rows
 from lake_schema.errors import BadInput
@@ -217,6 +215,10 @@ def _need(fields: Mapping[str, Field], path: str, *groups: tuple[str, ...]) -> N
 
 
 def _unit(text: str, where: str) -> Any:
+    # Slow to import, and needed for catalogues of others only.
+    from astropy import units
+    from astropy.cosmology.units import littleh
+
     try:
         # h is a unit of astropy's, but only where it is asked for.
         with units.add_enabled_units([littleh]):

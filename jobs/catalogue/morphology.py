@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import RegularGridInterpolator
 from scipy.special import gammainc, gammaincinv, ndtr, ndtri
 
 from jobs.catalogue import parameters
@@ -164,6 +163,9 @@ def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float,
     fraction : bulge / total; ratio : bulge radius / disc radius; sersic : index of the bulge
     Error: the light within `radius` is 0.5 to 0.005 (tests/jobs/catalogue/test_morphology)
     """
+    # Slow to import, and not needed where a job is only submitted.
+    from scipy.interpolate import RegularGridInterpolator
+
     axes = (model.fraction, model.ln_ratio, model.ln_sersic)
     # The last bit of a logarithm may put a limit just outside: no error, no fill.
     table = RegularGridInterpolator(axes, model.ln_disc, bounds_error=False, fill_value=None)

@@ -13,11 +13,10 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import KDTree
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import mapping, parameters, sed_assignment
@@ -25,6 +24,9 @@ from jobs.catalogue.band_ratios import Sed
 from jobs.catalogue.mapping import Columns
 from jobs.fluxes import templates
 from lake_schema.errors import BadInput
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
@@ -78,6 +80,9 @@ def load(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Trai
 
 def training(values: dict[str, npt.NDArray[Any]], last: int) -> Training:
     """Of columns by our key."""
+    # Slow to import, and seldom needed.
+    from scipy.spatial import KDTree
+
     law = Nearness(**parameters.section("sed_assignment.toml", "nearest"))
     tree = KDTree(_scaled(law, *(values[name] for name in _KEYS[:3])))
     return Training(law, tree, values["sed"], values["ext_law"], values["ebv"], last)
