@@ -142,6 +142,9 @@ def test_a_generation_cell_is_the_same_in_every_request(tmp_path):
     wanted = request.from_table(tomllib.loads(SMALL))
     for module in (build_galaxies, build_stars):
         for step in module.steps(tmp_path, wanted):
+            if step.on_driver:
+                # Taken from the tables of the others.
+                continue
             facts = step.plan.facts
             alone = step.work(tmp_path, {**facts, "generation_cells": [574971]}).rows
             among = step.work(tmp_path, {**facts, "generation_cells": [574970, 574972, 574971]}).rows
