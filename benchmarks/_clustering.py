@@ -5,13 +5,14 @@ velocities      of centrals at z = 0
 people          halos and galaxies of a mass or more between two redshifts, to be drawn over hundreds of deg2
 tracers         them, in one block of the sky
 correlation     w(theta) of counts in pixels;  limber : what linear bias makes of linear power
+structure       the Gaussian field along the same lines of sight, whose w(theta) says what the blocks happen to hold
 
 Ref: Limber 1953, ApJ 117, 134; Landy & Szalay 1993, ApJ 412, 64 (in pixels their estimator is <delta delta'>)
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy.typing as npt
 from scipy import fft
 from scipy.special import j0
 
-from jobs.catalogue import density_box, halos, luminosity_function, matching, population, satellites
+from jobs.catalogue import density_box, halos, lightcone, luminosity_function, matching, population, satellites
 from jobs.catalogue.density_box import Box
 from jobs.catalogue.luminosity_function import Volume
 from jobs.catalogue.population import Population
@@ -36,6 +37,8 @@ BLOCK_ORDER, PIECE_ORDER, DEPTH = 3, 6, 6
 _ROWS, _NODES, _SPARSE = 512, 200, 16
 # Shells in which the redshift distribution and the bias are taken, Mpc/h, and multipoles.
 _SHELL, _ELL_MOST = 80.0, 20_000
+# Cells a side that the power of the Gaussian field is tabulated on.
+_MODES = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,12 +152,10 @@ class Correlation:
     within: tuple[Float, Float]
 
 
-def correlation(blocks: Sequence[tuple[int, Sequence[Tracers]]], order: int, edges: Float) -> list[Correlation]:
-    """w(theta) of each kind of tracer in blocks, cells of an order."""
-    counts = np.array([[_counts(one, order, cell) for one in given] for cell, given in blocks], float)
-    # What is common to a block says nothing of its inside, and is most of the noise.
-    delta = counts / counts.mean(2, keepdims=True) - 1.0
-    bins, kinds = edges.size - 1, counts.shape[1]
+def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: int, edges: Float) -> list[Correlation]:
+    """w(theta) of each kind of tracer in blocks, cells of an order; or of maps of their pixels."""
+    delta = np.array([[_delta(one, order, cell) for one in given] for cell, given in blocks])
+    bins, kinds = edges.size - 1, delta.shape[1]
     product, number, angle = np.zeros((len(blocks), kinds, bins)), np.zeros((len(blocks), bins)), np.zeros(bins)
     for row, (cell, _) in enumerate(blocks):
         place = _vectors(order, cell)
@@ -187,10 +188,14 @@ def _within(order: int, cell: int) -> tuple[Float, Float]:
     return 0.5 * (edges[1:] + edges[:-1]), number / number.sum()
 
 
-def _counts(one: Tracers, order: int, cell: int) -> Int:
+def _delta(one: Tracers | Float, order: int, cell: int) -> Float:
+    """Overdensity of the pixels. What is common to a block says nothing of its inside, and is most of the noise."""
+    if not isinstance(one, Tracers):
+        return np.asarray(one - one.mean())
     pixel = sky.cell_of(one.ra, one.dec, order + DEPTH) - (cell << 2 * DEPTH)
     inside = (pixel >= 0) & (pixel < 1 << 2 * DEPTH)
-    return np.bincount(pixel[inside], minlength=1 << 2 * DEPTH)
+    number = np.bincount(pixel[inside], minlength=1 << 2 * DEPTH)
+    return np.asarray(number / number.mean() - 1.0)
 
 
 def _vectors(order: int, cell: int) -> Float:
@@ -199,18 +204,30 @@ def _vectors(order: int, cell: int) -> Float:
     return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], 1)
 
 
-def limber(everything: Tracers, near: float, far: float, found: Correlation) -> tuple[Float, Float]:
-    """w(theta) of linear power and of the tracers' own redshifts and biases, and what is left of it in blocks."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Shells:
+    """Comoving distances[s] and widths, Mpc/h, share of the tracers a Mpc/h times their bias and growth."""
+
+    chi: Float
+    wide: Float
+    weight: Float
+
+
+def shells(everything: Tracers, near: float, far: float) -> Shells:
+    """The tracers' own redshifts and biases."""
     ends = [float(cosmology.comoving_distance(z)) for z in (near, far)]
     edges = np.linspace(*ends, int(np.ceil((ends[1] - ends[0]) / _SHELL)) + 1)
     number = np.histogram(everything.chi, edges)[0]
     x = np.histogram(everything.chi, edges, weights=everything.x)[0] / number
-    chi, wide = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
-    share = number / number.sum() / wide
+    wide = np.diff(edges)
+    return Shells(0.5 * (edges[1:] + edges[:-1]), wide, number / number.sum() / wide * x)
+
+
+def limber(seen: Shells, found: Correlation, power: Callable[[Float], Float]) -> tuple[Float, Float]:
+    """w(theta) of a power P(k), and what is left of it in blocks whose means are their own."""
     ell = np.geomspace(1.0, _ELL_MOST, 400)
-    k = (ell[:, None] + 0.5) / chi
-    power = density_box.linear_power(k.ravel()).reshape(k.shape)
-    c_l = np.sum(wide * (share * x / chi) ** 2 * power, 1)
+    k = (ell[:, None] + 0.5) / seen.chi
+    c_l = np.sum(seen.wide * (seen.weight / seen.chi) ** 2 * power(k.ravel()).reshape(k.shape), 1)
     every = np.arange(1, _ELL_MOST + 1)
     # Beyond the multipoles of the smallest separation the sum ends softly.
     weight = (2 * every + 1) / (4 * np.pi) * np.interp(np.log(every), np.log(ell), c_l)
@@ -219,3 +236,28 @@ def limber(everything: Tracers, near: float, far: float, found: Correlation) -> 
     theta = np.concatenate([found.theta, nodes])
     w = np.array([np.sum(weight * j0((every + 0.5) * np.radians(at))) for at in theta])
     return w[: found.theta.size], w[: found.theta.size] - np.sum(shares * w[found.theta.size :])
+
+
+def structure(box: Box, order: int, cell: int, seen: Shells) -> Float:
+    """The Gaussian field of the box along the lines of sight of a block's pixels, weighted as the tracers are."""
+    turned, direction = lightcone.replicas(box, float(seen.chi[-1] + seen.wide[-1])), _vectors(order, cell)
+    step, g, total = box.model.cell, box.smoothed[0].ravel(), np.zeros(len(direction))
+    ends = seen.chi[0] - 0.5 * seen.wide[0], seen.chi[-1] + 0.5 * seen.wide[-1]
+    for chi in np.arange(ends[0] + 0.5 * step, ends[1], step):
+        place, _ = lightcone.box_cells(box, turned, direction, np.full(len(direction), chi))
+        total += step * np.interp(chi, seen.chi, seen.weight) * g[place]
+    return total
+
+
+def gaussian_power(k: Float) -> Float:
+    """P(k) of the Gaussian field, (Mpc/h)^3, without what lies between the cells of the box."""
+    cell = density_box.box_model().cell
+    on_modes = density_box._log_power(_MODES, cell).ravel()
+    length = np.sqrt(density_box._k_squared(_MODES, cell)).ravel()
+    edges = np.concatenate([[0.0], (np.arange(8) + 0.5) * 2 * np.pi / (_MODES * cell), np.geomspace(0.12, 1.3, 40)])
+    place = np.digitize(length[1:], edges)
+    number = np.maximum(np.bincount(place), 1)
+    at, share = (np.bincount(place, value) / number for value in (length[1:], on_modes[1:]))
+    kept = at > 0
+    ratio = np.interp(k, at[kept], share[kept] / density_box.linear_power(at[kept]))
+    return np.where(k < 1.2, density_box.linear_power(k) * ratio, 0.0)

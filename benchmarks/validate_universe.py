@@ -15,7 +15,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +46,7 @@ BIASES, BIAS_EDGES = (0.7, 1.0, 1.4, 2.0, 2.9), np.array([0.03, 0.10])
 # Of the sample whose clustering is measured: redshifts, and log10 of the least halo and proxy mass.
 NEAR, FAR, LOG_MASS = 0.4, 0.8, 12.0
 WIDE_EDGES, NARROW_EDGES = np.array([0.3, 0.5, 0.7, 1.0, 1.5]), np.array([0.03, 0.05, 0.08, 0.13, 0.2, 0.3])
+TRACERS = ("halos", "galaxies")
 BANDS = (30, 64, 128, 256, 384, 512)
 PLANES = ((7, 1.0), (12, 2.4))
 # K-corrections and I_E - M_r - DM at z = 0.1, 0.5, 1, 2 of three templates.
@@ -158,11 +159,16 @@ def _named(pattern: str, edges: Sequence[float] | Float, values: Float, errors: 
     return figures | {f"{name}_error": float(value) for name, value in zip(names, errors, strict=True)}
 
 
-def published_halos(least: float, z: float) -> float:
-    """Halos above a mass, (Mpc/h)^-3: the mass function itself, without what the draw makes of it."""
-    log_mass = np.linspace(least, 16.0, 501)
-    density = linear_theory.halo_tables(log_mass, np.array([z, z + 1e-3]))["density"][0]
-    return float(np.trapezoid(density, log_mass))
+def published_halos() -> Callable[[float, float], float]:
+    """Halos above a mass at z, (Mpc/h)^-3: the mass function itself, without what the draw makes of it."""
+    masses = galaxies.matching.masses()
+
+    def number(least: float, z: float) -> float:
+        log_mass = np.linspace(least, 16.0, 501)
+        ln_density = masses.interpolate(masses.ln_density, np.array([z]), log_mass)[0]
+        return float(np.trapezoid(np.exp(ln_density), log_mass))
+
+    return number
 
 
 def counted(size: Size) -> tuple[dict[str, float], census.Census]:
@@ -172,12 +178,20 @@ def counted(size: Size) -> tuple[dict[str, float], census.Census]:
     seen = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
     figures = {"galaxies": float(seen.block.size), "galaxies_deg2": seen.area}
     figures |= census.counts(seen) | census.colours(seen) | census.sizes(seen) | census.halpha(seen)
-    figures |= census.halos(seen, published_halos) | census.luminosities(seen, law, 0.0, 1.5)
+    figures |= census.halos(seen, published_halos()) | census.luminosities(seen, law, 0.0, 1.5)
     if size.deep:
         deep = galaxies.model(SEED, 28.0, box_cells=size.settings.box_cells, lensing_nside=size.settings.lensing_nside)
         far = census.draw(deep, dust, census.blocks(size.deep, 0))
         figures |= census.luminosities(far, law, 1.5, 2.3)
     return figures, seen
+
+
+def compared(
+    found: clustering.Correlation, of: clustering.Shells, power: Callable[[Float], Float]
+) -> tuple[Float, Float, Float, Float]:
+    """theta, w, its error, and Limber's: the mean of a block takes as much from what is found as from that."""
+    expected, left = clustering.limber(of, found, power)
+    return found.theta, found.w + expected - left, found.error, expected
 
 
 @contextmanager
@@ -203,20 +217,26 @@ def clustered(size: Size) -> tuple[dict[str, float], dict[str, Any], clustering.
                 kinds = (found.part(~found.satellite & (found.log_mass > LOG_MASS)), found.part(found.proxy > LOG_MASS))
                 whole.append((cell, kinds))
                 pieces.append((cell << 2 * (clustering.PIECE_ORDER - clustering.BLOCK_ORDER), kinds))
+    seen = [clustering.shells(clustering.joined([kinds[i] for _, kinds in whole]), NEAR, FAR) for i in range(2)]
     for given, order, edges in (
         (whole, clustering.BLOCK_ORDER, WIDE_EDGES),
         (pieces, clustering.PIECE_ORDER, NARROW_EDGES),
     ):
-        for kind, found in enumerate(clustering.correlation(given, order, edges)):
-            name = ("halos", "galaxies")[kind]
-            everything = clustering.joined([kinds[kind] for _, kinds in whole])
-            expected, left = clustering.limber(everything, NEAR, FAR, found)
-            # The mean of a block takes as much from what is found as from what is expected.
-            w = found.w + expected - left
-            curves[f"{name}_{'wide' if order == clustering.BLOCK_ORDER else 'narrow'}"] = (
-                found.theta, w, found.error, expected,
-            )  # fmt: skip
-            figures |= _named(f"w_{name}_{{:g}}", edges, w / expected, found.error / expected)
+        for name, of, found in zip(TRACERS, seen, clustering.correlation(given, order, edges), strict=True):
+            theta, w, error, expected = compared(found, of, density_box.linear_power)
+            curves[f"{name}_{'wide' if edges is WIDE_EDGES else 'narrow'}"] = (theta, w, error, expected)
+            figures |= _named(f"w_{name}_{{:g}}", edges, w / expected, error / expected)
+    maps = []
+    for seed in seeds:
+        box = shear.gaussian_box(seed, size.settings.box_cells)
+        maps += [(cell, (clustering.structure(box, clustering.BLOCK_ORDER, cell, seen[0]),)) for cell in cells]
+    (found,) = clustering.correlation(maps, clustering.BLOCK_ORDER, WIDE_EDGES)
+    _, w, error, expected = compared(found, seen[0], clustering.gaussian_power)
+    figures |= _named("w_structure_{:g}", WIDE_EDGES, w / expected, error / expected)
+    for name in TRACERS:
+        for edge in WIDE_EDGES[:-1]:
+            alone = figures[f"w_structure_{edge:g}"]
+            figures[f"w_{name}_{edge:g}_to_structure"] = figures[f"w_{name}_{edge:g}"] / alone
     figures["clustering_deg2"] = len(whole) * clustering.sky.cell_area(clustering.BLOCK_ORDER)
     return figures, curves, clustering.joined([kinds[0] for _, kinds in whole[: size.wide]])
 
