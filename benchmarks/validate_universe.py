@@ -32,7 +32,7 @@ from benchmarks import _clustering as clustering
 from benchmarks import _shear as shear
 from benchmarks import _universe_figures as pictures
 from benchmarks import report, stars
-from jobs.catalogue import band_ratios, density_box, dust_map, gaia, galaxies, linear_theory, luminosity_function
+from jobs.catalogue import band_ratios, density_box, dust_map, gaia, galaxies, luminosity_function
 from jobs.catalogue import stars as milky_way_stars
 from jobs.fluxes import cosmology, templates
 from jobs.request import Universe
