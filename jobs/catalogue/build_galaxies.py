@@ -31,7 +31,7 @@ from jobs.catalogue import (
 from jobs.catalogue.galaxies import GalaxyModel
 from jobs.catalogue.halo_catalogue import LightCone
 from jobs.catalogue.nearest_sed import Training
-from jobs.fluxes import passbands
+from jobs.fluxes import passbands, sources
 from jobs.own_files import Catalogue, DustMap, Ingest
 from jobs.request import Request
 from jobs.shell import Job, Step, main
@@ -122,7 +122,7 @@ def _parted(facts: Json, rows: pa.Table) -> Output:
     if not apart.any():
         return Output(rows)
     given = {name: rows[name].filter(pa.array(apart)) for name in rows.column_names}
-    found = QUARANTINE.build({**given, "determinant": lensing.determinant(kappa, gamma1, gamma2)[apart]})
+    found = QUARANTINE.build({**given, "determinant": sources.determinant(kappa, gamma1, gamma2)[apart]})
     name = quarantine_file(facts["generation_cells"])
     return Output(rows.filter(pa.array(~apart)), {name: lambda path: parquet.write(path, found, QUARANTINE)})
 

@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from jobs.fluxes import cosmology, passbands
+from jobs.fluxes.extinction import MILKY_WAY_R_V
 from lake_schema import __version__, layout, read, sky
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.fits import table_to_fits
@@ -26,7 +27,6 @@ from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.units import LIGHT_KM_S, electron_rate
 
 FORMS = ("fits", "skycatalogs")
-_R_V = 3.1
 _YAML = """# Written by truesky {version}. No spectra: fluxes are in galaxy_flux_N.parquet, photons/s/cm2.
 catalog_name: {name}
 catalog_dir: .
@@ -84,7 +84,7 @@ def export(lake: Path, folder: Path, form: str) -> list[Path]:
             _parquet(folder / f"galaxy_flux_{pixel}.parquet", _flux_rows(part, rows, fluxes)),
         ]
     if fluxes is not None:
-        about = {"h0": 100.0 * cosmology.HUBBLE, "om": cosmology.OMEGA_M, "ob": cosmology.OMEGA_B, "r_v": _R_V}
+        about = {"h0": 100.0 * cosmology.HUBBLE, "om": cosmology.OMEGA_M, "ob": cosmology.OMEGA_B, "r_v": MILKY_WAY_R_V}
         document = folder / "skyCatalog.yaml"
         document.write_text(_YAML.format(version=__version__, name="skyCatalog", root=folder, **about))
         written.append(document)
@@ -126,7 +126,7 @@ def _galaxy_rows(rows: pa.Table) -> pa.Table:
             "size_minor_disk_true": disc * c["disk_axis_ratio"],
             "sersic_disk": np.ones_like(disc),
             "position_angle_unlensed": (c["position_angle"].astype(float) + 90.0) % 180.0,
-            "MW_rv": np.full_like(disc, _R_V),
+            "MW_rv": np.full_like(disc, MILKY_WAY_R_V),
             "MW_av": c["a_v"],
         }
     )

@@ -236,24 +236,18 @@ def _places(
     planes: Planes, people: Members, row: Int, dust: npt.NDArray[np.float32]
 ) -> dict[str, npt.NDArray[np.generic]]:
     ra, dec = people.ra[row], people.dec[row]
-    kappa, gamma1, gamma2, east, north = lensing.at(planes, ra, dec, people.chi[row])
-    ra_lensed, dec_lensed = lensing.displaced(ra, dec, east, north)
     return {
         "id": people.id[row],
         "halo_id": people.halo_id[row],
         "ra": ra,
         "dec": dec,
         "_healpix_29": people.index[row],
-        "ra_lensed": ra_lensed,
-        "dec_lensed": dec_lensed,
+        **lensing.columns(planes, ra, dec, people.chi[row]),
         "kind": people.kind[row],
         "density_boost": np.ones(row.size),
         "z_true": people.z[row],
         "z_obs": people.z_obs[row],
         "log_halo_mass": people.host_mass[row],
-        "kappa": kappa,
-        "gamma1": gamma1,
-        "gamma2": gamma2,
         "a_v": dust_map.a_v(dust, ra, dec),
     }
 

@@ -81,8 +81,6 @@ def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: npt.NDArray[np.
     index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, n, rng)
     source = ids.source_id(np.full(n, kind.code), cell, _FIRST_NUMBER + np.arange(n))
     chi = np.minimum(cosmology.comoving_distance(z), planes.chi[-1])
-    kappa, gamma1, gamma2, east, north = lensing.at(planes, ra, dec, chi)
-    ra_lensed, dec_lensed = lensing.displaced(ra, dec, east, north)
     zeros = np.zeros(n)
     columns = {
         "id": source,
@@ -90,8 +88,7 @@ def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: npt.NDArray[np.
         "ra": ra,
         "dec": dec,
         "_healpix_29": index,
-        "ra_lensed": ra_lensed,
-        "dec_lensed": dec_lensed,
+        **lensing.columns(planes, ra, dec, chi),
         "kind": np.full(n, kind.code),
         "density_boost": np.full(n, kind.boost),
         "z_true": z,
@@ -106,9 +103,6 @@ def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: npt.NDArray[np.
         **{name: zeros.astype(int) for name in ("ext_law_1", "ext_law_2")},
         **{name: zeros for name in ("ebv_1", "ebv_2")},
         **_shapes(kind, z, m, rng),
-        "kappa": kappa,
-        "gamma1": gamma1,
-        "gamma2": gamma2,
         "a_v": dust_map.a_v(dust, ra, dec),
     }
     return GALAXIES.build(columns)

@@ -34,7 +34,7 @@ from jobs.catalogue.ingest import Split
 from jobs.catalogue.mapping import Columns
 from jobs.catalogue.morphology import Shapes
 from jobs.catalogue.population import SATELLITE
-from jobs.fluxes import cosmology, templates
+from jobs.fluxes import cosmology, sources, templates
 from jobs.rng import stream
 from lake_schema import ids
 from lake_schema.errors import BadInput
@@ -190,7 +190,7 @@ def _seen(given: Given, universe: IngestModel, lens: Mapping[str, Array], a_v: F
     if over_v is None:
         return given["mag"]
     # Those nearer to a caustic go into quarantine.
-    found = lensing.determinant(*(lens[name] for name in ("kappa", "gamma1", "gamma2")))
+    found = sources.determinant(*(lens[name] for name in ("kappa", "gamma1", "gamma2")))
     bounded = np.maximum(np.abs(found), lensing.settings().caustic)
     return np.asarray(given["mag"] - over_v * a_v - 2.5 * np.log10(bounded))
 

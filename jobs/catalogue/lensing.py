@@ -3,6 +3,7 @@
 load        the planes of a box, from the cache or made now
 at          kappa, gamma1, gamma2, deflection of sources: bilinear on the sky, linear in distance between planes
 displaced   true positions -> observed ones
+columns     both, as table `galaxies` has them
 
 gamma1, gamma2 are in the frame (x, y) = (east, north): east or west of a mass gamma1 < 0, north-east of it
 gamma2 < 0.  Deflections point away from a mass.
@@ -24,7 +25,7 @@ import numpy.typing as npt
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
 from jobs.catalogue.density_box import Box
-from jobs.fluxes import cosmology
+from jobs.fluxes import cosmology, sources
 from lake_schema.errors import BadInput
 
 Float = npt.NDArray[np.float64]
@@ -104,6 +105,14 @@ def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     return found
 
 
+def columns(planes: Planes, ra: Float, dec: Float, chi: Float) -> dict[str, Float]:
+    """Observed positions and lensing of sources as columns of table `galaxies`."""
+    kappa, gamma1, gamma2, east, north = at(planes, ra, dec, chi)
+    ra_lensed, dec_lensed = displaced(ra, dec, east, north)
+    shear = {"kappa": kappa, "gamma1": gamma1, "gamma2": gamma2}
+    return {"ra_lensed": ra_lensed, "dec_lensed": dec_lensed, **shear}
+
+
 def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, Float]:
     """Positions moved along great circles by (east, north) rad; all [n], ra, dec deg."""
     angle = np.hypot(east, north)
@@ -117,16 +126,9 @@ def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, 
     return np.degrees(moved) % 360.0, np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
 
 
-def determinant(kappa: Float, gamma1: Float, gamma2: Float) -> Float:
-    """(1 - kappa)^2 - gamma^2 [n], one over the magnification."""
-    shear = np.hypot(gamma1, gamma2)
-    # A product of differences keeps its digits where the difference of squares loses them.
-    return np.asarray((1.0 - kappa - shear) * (1.0 - kappa + shear))
-
-
 def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> npt.NDArray[np.bool_]:
     """Sources[n] that weak lensing cannot describe: at a caustic, or beyond it."""
-    return np.asarray((determinant(kappa, gamma1, gamma2) < caustic) | (kappa >= 1.0))
+    return np.asarray((sources.determinant(kappa, gamma1, gamma2) < caustic) | (kappa >= 1.0))
 
 
 def transform(kappa: Float32, nside: int, gain: Float) -> Float32:

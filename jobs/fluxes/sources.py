@@ -114,17 +114,21 @@ def magnification(
     Errors: OutOfRange names the source where mu is not in (0, 100], at and inside the critical curve
     Ref: Serrano et al. 2024, eq. magnification_factor
     """
-    k, g1, g2 = (np.asarray(x, float) for x in (kappa, gamma1, gamma2))
-    shear = np.hypot(g1, g2)
-    # A product of differences keeps its digits where the difference of squares loses them.
-    determinant = (1.0 - k - shear) * (1.0 - k + shear)
     with np.errstate(divide="ignore"):
-        mu = 1.0 / determinant
+        mu = 1.0 / determinant(kappa, gamma1, gamma2)
     bad = ~((mu > 0.0) & (mu <= MAGNIFICATION_MAX))
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
         raise OutOfRange(f"magnification of source {int(ids[first])}", float(mu[first]), 0.0, MAGNIFICATION_MAX)
     return np.asarray(mu)
+
+
+def determinant(kappa: npt.ArrayLike, gamma1: npt.ArrayLike, gamma2: npt.ArrayLike) -> Float:
+    """(1 - kappa)^2 - gamma^2, float64[n]: one over the magnification."""
+    stretch = 1.0 - np.asarray(kappa, float)
+    shear = np.hypot(np.asarray(gamma1, float), np.asarray(gamma2, float))
+    # A product of differences keeps its digits where the difference of squares loses them.
+    return np.asarray((stretch - shear) * (stretch + shear))
 
 
 def magnification_of(table: pa.Table) -> Float:

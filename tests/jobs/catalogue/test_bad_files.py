@@ -82,6 +82,11 @@ def test_a_file_that_is_cut_short(tmp_path, monkeypatch, capsys, text, values):
     assert "theirs.parquet" in refused(tmp_path, text, capsys)
 
 
+def test_a_band_that_is_not_there(tmp_path, capsys):
+    said = refused(tmp_path, '[universe]\ngalaxy_band = "euclid_x"\n', capsys)
+    assert "universe.galaxy_band = 'euclid_x' is not one of euclid_vis, " in said
+
+
 def test_a_map_in_the_wrong_ordering(tmp_path, capsys):
     test_dust_map.written_map(tmp_path / "theirs.fits", test_dust_map.synthetic_map(), ORDERING="NESTED")
     found = refused(tmp_path, DUST, capsys)

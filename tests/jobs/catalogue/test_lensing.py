@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jobs.catalogue import density_box, lensing
-from jobs.fluxes import cosmology
+from jobs.fluxes import cosmology, sources
 from lake_schema import sky
 from lake_schema.errors import BadInput
 
@@ -120,8 +120,8 @@ def test_tangential_shear_about_massive_halos(universe, drawn):
 
 def test_determinants_and_caustics():
     kappa, none = np.array([0.0, 0.1, 0.95, 1.2]), np.zeros(4)
-    assert lensing.determinant(kappa, none, none) == pytest.approx([1.0, 0.81, 0.0025, 0.04])
-    assert lensing.determinant(np.array([0.1]), np.array([0.3]), np.array([0.4])) == pytest.approx([0.81 - 0.25])
+    assert sources.determinant(kappa, none, none) == pytest.approx([1.0, 0.81, 0.0025, 0.04])
+    assert sources.determinant(np.array([0.1]), np.array([0.3]), np.array([0.4])) == pytest.approx([0.81 - 0.25])
     assert lensing.near_caustic(kappa, none, none, 0.05).tolist() == [False, False, True, True]
     # Beyond both caustics the determinant is positive again.
     assert lensing.near_caustic(np.array([2.5]), none[:1], none[:1], 0.05).all()
