@@ -216,3 +216,13 @@ def test_sep_finds_stars_to_three_mas():
     found, clear = residuals(SMALL, 32, 19.4)
     assert clear.min() > 300
     assert np.sqrt(np.mean(found**2)) <= 3.0
+
+
+@pytest.mark.nightly
+def test_sep_finds_stars_all_over_a_detector():
+    """One offset for all of them: what the PSF's centroid does across the detector is in the residuals."""
+    found, clear = residuals(focal_plane.detector("vis", "1-1", MISSION), 128, 19.4)
+    print(f"{found.shape[1]} stars: rms {np.sqrt(np.mean(found**2)):.3f} mas, S/N above {clear.min():.0f}")
+    assert found.shape[1] > 800
+    assert clear.min() > 300
+    assert np.sqrt(np.mean(found**2)) <= 3.0
