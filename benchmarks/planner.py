@@ -186,8 +186,8 @@ def _one(root: Path, facts: Json) -> float:
     return time.process_time() - started
 
 
-def reading(folder: Path, quick: bool) -> float:
-    """s to read a detector's generation cells from one file."""
+def reading(folder: Path, quick: bool) -> dict[str, float]:
+    """s, wall and CPU, to read a detector's generation cells from one file."""
     rows = 100_000 if quick else CELL_ROWS
     root = layout.lake(folder / "crowded")
     publish.make(root, bulk.plan(1, rows), bulk.work)
@@ -196,7 +196,8 @@ def reading(folder: Path, quick: bool) -> float:
     place = version.rows(["ra", "dec"]).slice(rows // 2, 1).to_pylist()[0]
     # A VIS detector and its margin.
     cells = sky.cells_in_cone(place["ra"], place["dec"], 0.1, GENERATION_ORDER).tolist()
-    return report.best(lambda: version.in_cells(cells, GENERATION_ORDER, names), 3)
+    clocks = {"source_read_s": time.perf_counter, "source_read_cpu_s": time.process_time}
+    return {k: report.best(lambda: version.in_cells(cells, GENERATION_ORDER, names), 3, c) for k, c in clocks.items()}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -205,7 +206,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     quick = options.quick
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        figures = planning(folder, quick) | {"source_read_s": reading(folder, quick)}
+        figures = planning(folder, quick) | reading(folder, quick)
         for sky_name in ("field",) if quick else SKIES:
             root, wanted = lake(folder, sky_name, quick)
             if sky_name == "field":

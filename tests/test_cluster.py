@@ -6,6 +6,7 @@ Spark's event log.
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -23,7 +24,6 @@ from lake_schema import layout, read
 pytestmark = [pytest.mark.spark, pytest.mark.nightly]
 
 ROOT = Path(__file__).parents[1]
-REQUEST = ROOT / "requests" / "demo.toml"
 JOBS = [script for script, _ in demo.JOBS]
 # Which of them have something for workers to do.
 SHARED = [script for script in JOBS if "plan" not in script]
@@ -34,21 +34,33 @@ def environment():
     return {**os.environ, **demo._settings(), "PYTHONPATH": str(ROOT), "SPARK_DAEMON_MEMORY": "256m"}
 
 
-def submit(script, lake, *options):
+@pytest.fixture(scope="module")
+def request_file(tmp_path_factory):
+    """The demo's two detectors, of brighter sources."""
+    text = (ROOT / "requests" / "demo.toml").read_text()
+    for key, value in (("galaxy_limit", 21.0), ("star_limit", 20.0), ("lensing_nside", 64), ("accuracy", '"draft"')):
+        text, found = re.subn(rf"^{key} = [^ \n]+", f"{key} = {value}", text, flags=re.MULTILINE)
+        assert found == 1
+    path = tmp_path_factory.mktemp("request") / "demo.toml"
+    path.write_text(text)
+    return path
+
+
+def submit(script, lake, request_file, *options):
     command = shutil.which("spark-submit", path=str(Path(sys.executable).parent))
     done = subprocess.run(
-        [command, *options, str(ROOT / script), "--lake", str(lake), "--request", str(REQUEST)],
+        [command, *options, str(ROOT / script), "--lake", str(lake), "--request", str(request_file)],
         capture_output=True, text=True, cwd="/", env=environment(), timeout=3000,
     )  # fmt: skip
     assert done.returncode == 0, f"{script}: {done.stdout}{done.stderr}"
 
 
 @pytest.fixture(scope="module")
-def local(tmp_path_factory):
+def local(tmp_path_factory, request_file):
     """The lake that the five jobs make in local mode."""
     root = layout.lake(tmp_path_factory.mktemp("local") / "lake")
     for script in JOBS:
-        submit(script, root)
+        submit(script, root, request_file)
     return root
 
 
@@ -95,7 +107,7 @@ def events(path):
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_the_demo_on_a_cluster_gives_the_bytes_of_one_machine(local, cluster, tmp_path):
+def test_the_demo_on_a_cluster_gives_the_bytes_of_one_machine(local, cluster, request_file, tmp_path):
     master, folder = cluster
     lake = layout.lake(tmp_path / "lake")
     told = {
@@ -107,7 +119,7 @@ def test_the_demo_on_a_cluster_gives_the_bytes_of_one_machine(local, cluster, tm
     }
     options = [word for key, value in told.items() for word in ("--conf", f"{key}={value}")]
     for script in JOBS:
-        submit(script, lake, "--master", master, *options)
+        submit(script, lake, request_file, "--master", master, *options)
     logs = [events(path) for path in sorted((folder / "events").iterdir())]
     assert len(logs) == len(SHARED)
     for log in logs:
@@ -138,14 +150,14 @@ def same(one, other):
     return [name for name in texts[0] if texts[0][name] != texts[1][name]]
 
 
-def test_a_render_that_is_killed_half_way_ends_with_the_same_bytes(local, tmp_path):
+def test_a_render_that_is_killed_half_way_ends_with_the_same_bytes(local, request_file, tmp_path):
     lake = layout.lake(shutil.copytree(local, tmp_path / "lake", symlinks=True))
     for name in ("products", "rendered_truth"):
         shutil.rmtree(lake / name)
     command = shutil.which("spark-submit", path=str(Path(sys.executable).parent))
     script = ROOT / "jobs" / "render" / "render_exposures.py"
     driver = subprocess.Popen(
-        [command, "--master", "local[1]", str(script), "--lake", str(lake), "--request", str(REQUEST)],
+        [command, "--master", "local[1]", str(script), "--lake", str(lake), "--request", str(request_file)],
         cwd="/", start_new_session=True, env=environment(), stdout=subprocess.DEVNULL,
     )  # fmt: skip
     while not list(lake.glob("products/.receipts-*/*.json")):
@@ -154,7 +166,7 @@ def test_a_render_that_is_killed_half_way_ends_with_the_same_bytes(local, tmp_pa
     os.killpg(driver.pid, signal.SIGKILL)
     driver.wait()
     assert layout.current_key(lake, "products") is None
-    submit(script.relative_to(ROOT), lake)
+    submit(script.relative_to(ROOT), lake, request_file)
     log = max((lake / "runs").glob("*-products-*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
     assert sum("part" in event for event in events(log)) == 1
     assert same(lake, local) == []
