@@ -180,7 +180,7 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
 _TRUTH = {
     "noise_free": ("electron", "unit of the pixels: expected, sources alone"),
     "stars": ("electron", "unit of the pixels: expected, stars alone"),
-    "sky": ("electron", "unit of the pixels: expected, diffuse sky and straylight"),
+    "sky": ("electron", "unit of the pixels: expected, sky alone"),
     "cosmic_rays": ("electron", "unit of the pixels: of cosmic rays"),
     "ghosts": ("electron", "unit of the pixels: expected, ghosts alone"),
     "saturation": ("", "1 where a pixel or the converter is full"),
