@@ -169,7 +169,7 @@ def _planes(psf: Psf, some: Grid, dtype: type[Any]) -> Array:
         step = 2 * np.pi / some.size
         reach = int(np.rint(max(some.kx.max(), -some.kx.min(), some.ky.max()) / step))
         out = np.empty((1, 2, len(some.kx)), dtype)
-        _take(spectrum_of(psf, some.size, reach), some, psf.intra_pixel, out[0])
+        kernel.take(spectrum_of(psf, some.size, reach), some.runs, _pixel(some, psf.intra_pixel), out[0])
         return out
     return _on_grid([*psf.planes.images, *psf.planes.drift], some, psf.intra_pixel, dtype)
 
@@ -177,14 +177,10 @@ def _planes(psf: Psf, some: Grid, dtype: type[Any]) -> Array:
 def _on_grid(images: list[Array], some: Grid, strength: float | None, dtype: type[Any]) -> Array:
     out = np.empty((len(images), 2, len(some.kx)), dtype)
     columns = int(np.rint(np.abs(some.kx).max() * some.size / (2 * np.pi))) + 1
+    pixel = _pixel(some, strength)
     for image, plane in zip(images, out, strict=True):
-        _take(_spectrum(image, some.size, columns), some, strength, plane)
+        kernel.take(_spectrum(image, some.size, columns), some.runs, pixel, plane)
     return out
-
-
-def _take(spectrum: Array, some: Grid, strength: float | None, out: Array) -> None:
-    """Fills out [2, s] with spectrum x pixel."""
-    kernel.take(spectrum, some.runs, _pixel(some, strength), out)
 
 
 def _pixel(some: Grid, strength: float | None) -> Float:

@@ -73,7 +73,7 @@ def _count(light: Any, key: Any) -> None:
             continue
         b = 0.931 + 2.53 * math.sqrt(mean)
         a = -0.059 + 0.02483 * b
-        inverse, squeeze = 1.1239 + 1.1328 / (b - 3.4), 0.9277 - 3.6224 / (b - 2.0)
+        squeeze = 0.9277 - 3.6224 / (b - 2.0)
         while True:
             u -= 0.5
             us = 0.5 - abs(u)
@@ -81,6 +81,7 @@ def _count(light: Any, key: Any) -> None:
             if us >= 0.07 and v <= squeeze:
                 break
             if count >= 0.0 and (us >= 0.013 or v <= us):
+                inverse = 1.1239 + 1.1328 / (b - 3.4)
                 wanted = math.log(v * inverse / (a / (us * us) + b))
                 if wanted <= count * math.log(mean) - mean - math.lgamma(count + 1.0):
                     break

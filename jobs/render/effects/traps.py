@@ -137,7 +137,7 @@ def _shift(
     n = lines.shape[1]
     first, second = np.empty(n), np.empty(n)
     height, full, since = np.empty(n + 1), np.empty(n + 1), np.empty(n + 1, np.int64)
-    held, part = np.empty(_SPECIES), np.empty(1)
+    part = np.empty(1)
     bits = part.view(np.int64)
     # What a pixel filled so many rows ago holds, of all species; 1 / n.
     filled, inverse = np.zeros(n + 1), np.zeros(n + 1)
@@ -152,12 +152,12 @@ def _shift(
         for e in range(len(edges) - 1):
             high, low = edges[e], edges[e + 1]
             held_back = _sweep(line, first, low, high, edges[0], density, left, filled, inverse, released, volumes,
-                               notch, scale, height, full, since, held, part, bits)  # fmt: skip
+                               notch, scale, height, full, since, part, bits)  # fmt: skip
             for i in range(n):
                 first[i] += line[i]
             if order == 2:
                 again = _sweep(first, second, low, high, edges[0], density, left, filled, inverse, released, volumes,
-                               notch, scale, height, full, since, held, part, bits)  # fmt: skip
+                               notch, scale, height, full, since, part, bits)  # fmt: skip
                 held_back = 0.5 * (held_back + again)
                 for i in range(n):
                     line[i] = 0.5 * (line[i] + first[i] + second[i])
@@ -171,33 +171,32 @@ def _shift(
 def _sweep(
     line: Any, change: Any, low: int, high: int, pixels: int, density: Float, left: Float, filled: Float,
     inverse: Float, released: Float, volumes: Float, notch: float, scale: float, height: Float, full: Float,
-    since: Any, held: Float, part: Float, bits: Any,
+    since: Any, part: Float, bits: Any,
 ) -> float:  # fmt: skip
     """Fills `change` with what the pixels low .. high - 1 do to the packets; returns what they hold at the end.
 
     height, full, since : the stack of watermarks, lowest last: up to which height, how many pixels, from which row
-    held                : scratch, filled volume of each species, summed over the pixels
+    part, bits          : scratch of `_volume`
     """
-    depth, total = 0, 0.0
-    for s in range(_SPECIES):
-        held[s] = 0.0
-        total += density[s]
+    # Species by species, in registers: an array of four would be read and written at every packet.
+    d0, d1, d2, d3 = density[0], density[1], density[2], density[3]
+    r0, r1, r2, r3 = released[0], released[1], released[2], released[3]
+    h0, h1, h2, h3 = 0.0, 0.0, 0.0, 0.0
+    depth, total = 0, d0 + d1 + d2 + d3
     for i in range(min(low, len(line))):
         change[i] = 0.0
     for i in range(low, len(line)):
         count = min(min(i, pixels - 1) + 1, high) - low
         reached = float(count)
-        gain = 0.0
-        for s in range(_SPECIES):
-            given = held[s] * released[s]
-            held[s] -= given
-            gain += density[s] * given
+        g0, g1, g2, g3 = h0 * r0, h1 * r1, h2 * r2, h3 * r3
+        h0, h1, h2, h3 = h0 - g0, h1 - g1, h2 - g2, h3 - g3
+        gain = d0 * g0 + d1 * g1 + d2 * g2 + d3 * g3
+        # Never more than the packet has: the cloud then ends lower.
+        most = line[i] + gain
         top = _volume(line[i] + gain * inverse[count], volumes, notch, scale, part, bits)
         if top <= 0.0:
             change[i] = gain
             continue
-        # Never more than the packet has: the cloud then ends lower.
-        most = line[i] + gain
         taken, bottom, empty = 0.0, 0.0, reached * total
         while depth > 0:
             end, weight, age = height[depth - 1], full[depth - 1], i - since[depth - 1]
@@ -207,8 +206,11 @@ def _sweep(
             if short:
                 step = (most - taken) / free
                 top = bottom + step
-            for s in range(_SPECIES):
-                held[s] -= step * weight * left[age, s]
+            emptied = step * weight
+            h0 -= emptied * left[age, 0]
+            h1 -= emptied * left[age, 1]
+            h2 -= emptied * left[age, 2]
+            h3 -= emptied * left[age, 3]
             taken += step * free
             bottom += step
             if short or end > top:
@@ -222,13 +224,10 @@ def _sweep(
         if bottom > 0.0:
             height[depth], full[depth], since[depth] = bottom, reached, i
             depth += 1
-            for s in range(_SPECIES):
-                held[s] += bottom * reached
+            more = bottom * reached
+            h0, h1, h2, h3 = h0 + more, h1 + more, h2 + more, h3 + more
         change[i] = gain - taken
-    trapped = 0.0
-    for s in range(_SPECIES):
-        trapped += density[s] * held[s]
-    return trapped
+    return float(d0 * h0 + d1 * h1 + d2 * h2 + d3 * h3)
 
 
 @jit
