@@ -58,6 +58,8 @@ GALAXY_COLUMNS = tuple(
 STAR_COLUMNS = ("id", "ra", "dec", *chromatic.STAR_COLUMNS)
 # Memory of a task, bytes: what an executor's core may count on.
 _MOST_BYTES = 2e9
+# And its drawing's time, CPU s: a scene that takes longer is a mistake.
+_MOST_SECONDS = 6 * 3600.0
 EFFECTS: Mapping[str, Mapping[str, tuple[Effect, ...]]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
 # What fills pixels besides the sky and its sources.
 _LAMPS = (calibration_lamp.EFFECT, charge_injection.EFFECT)
@@ -166,7 +168,7 @@ def render(
             sources, sizes = _with_moving(
                 sources, sizes, exposure, detector, system, passband, scene, spread, settings, seed
             )
-        _refuse_too_large(exposure, detector, sources, sizes)
+        _refuse_too_large(exposure, detector, sources, sizes, spread)
         if channel == "VIS":
             lights = _lights((galaxies, electrons[0]), (stars, electrons[1]), detector, system)
             peak = float(spread.surface[0]) * float(sources.electrons.max(initial=0.0))
@@ -255,15 +257,21 @@ def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration,
     )
 
 
-def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes: stamps.Int) -> None:
-    """Before anything is drawn: a task must fit into its memory."""
+def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes: stamps.Int, spread: Psf) -> None:
+    """Before anything is drawn: a task must fit into its memory, and end."""
+    where = f"exposure {exposure['exposure_id']}, detector {detector.name}: {len(sources)} sources"
     base = costs.of_channel(str(exposure["channel"])).base_gb * 1e9
-    wanted = base + stamps.memory(sources.electrons, sizes, detector.nx, detector.ny)
+    wanted = base + stamps.memory(sources.electrons, sizes, detector.nx, detector.ny, sources.picture)
     if wanted > _MOST_BYTES:
-        where = f"exposure {exposure['exposure_id']}, detector {detector.name}"
         raise BadInput(
-            f"{where}: {len(sources)} sources take {wanted / 1e9:.1f} GB, a task has {_MOST_BYTES / 1e9:g}: "
+            f"{where} take {wanted / 1e9:.1f} GB, a task has {_MOST_BYTES / 1e9:g}: "
             "ask for fainter sources to be left out"
+        )
+    seconds = stamps.seconds(sources, sizes, spread, detector.nx, detector.ny)
+    if seconds > _MOST_SECONDS:
+        raise BadInput(
+            f"{where} take {seconds / 3600:.1f} h, a task has {_MOST_SECONDS / 3600:g}: "
+            "ask for less accuracy, or for fainter sources to be left out"
         )
 
 

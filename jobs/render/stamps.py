@@ -10,7 +10,7 @@ settings_for, seconds_for   what an accuracy takes, from the measured table
 stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 reach, least_electrons   how far a source may show, and what it takes to show there
 draw            sources -> frame
-memory          bytes that it takes
+work, seconds, memory    what it goes through, and takes
 reference       one source by galsim's own drawImage: what `draw` is held against
 """
 
@@ -62,6 +62,11 @@ _FEW = 8
 # of a pixel of the largest stamp (its plane and transforms) in single and double precision, of a source (its form and
 # weights), of all else (planes of the small stamps).
 _FRAME_BYTES, _STAMP_BYTES, _DOUBLE_BYTES, _SOURCE_BYTES, _OTHER_BYTES = 16, 160, 190, 900, 40_000_000
+# The same of a pixel of the largest stamp of a picture.
+_PICTURE_BYTES = 370
+# CPU s while drawing, measured (2.5 GHz, one core): of a pixel of a stamp, of a plane of the PSF on a stamp's grid and
+# of the frame; of all else.
+_STAMP_S, _PLANE_S, _FRAME_S, _START_S = 2.0e-8, 2.3e-7, 1.1e-8, 0.01
 # A trail is drawn in pieces no longer than this, pixels, each on a stamp of its own.
 _PIECE = 64.0
 # Pixels of stamps that are transformed together.
@@ -330,23 +335,21 @@ def _draw(
 ) -> Float:
     frame = np.zeros((ny, nx), np.int64)
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
-    bodies, table, passing = (*_bodies(sources), trail), sersic.table(), transfer.passing(psf)
+    bodies, table = (*_bodies(sources), trail), sersic.table()
+    passing = transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
     body, fraction, bulge, disk, _, row, *_ = bodies
     cut = kernel.reaches(passing, transfer.STEP, body, fraction, bulge, disk, table, row, left_out)
-    reach, done = transfer.STEP * len(passing), 0
-    pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
+    reach = transfer.STEP * len(passing)
+    done = 0
     for size in np.unique(sizes):
-        of_size = sizes == size
-        few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW)
-        alone = of_size & (few | (sources.electrons > _BRIGHT) | pictured)
-        together = np.flatnonzero(of_size & ~alone)
+        alone, together = _split(sources, sizes, psf, int(size))
         shared = transfer.transfer(psf, int(size), reach) if len(together) else None
-        own = transfer.grid(int(size), float(cut[alone].max()) if size > SIDE else reach) if alone.any() else None
+        own = transfer.grid(int(size), float(cut[alone].max()) if size > SIDE else reach) if len(alone) else None
         batch = max(_BATCH // int(size) ** 2, 2)
         groups = [together[i : i + batch] for i in range(0, len(together), batch)]
-        for chosen in [*groups, *np.flatnonzero(alone)[:, None]]:
-            if own is not None and alone[chosen[0]]:
+        for number, chosen in enumerate([*groups, *alone[:, None]]):
+            if own is not None and number >= len(groups):
                 dtype = np.float64 if sources.electrons[chosen[0]] > _BRIGHT else np.float32
                 passed = transfer.collapsed(psf, weights[chosen[0]], own, dtype)
                 if (picture := sources.picture_of(int(chosen[0]))) is not None:
@@ -364,15 +367,45 @@ def _draw(
     return np.asarray(kernel.electrons_of(frame, beyond, wings.BLOCK, wings.MARGIN))
 
 
-def memory(electrons: Float, sizes: Int, nx: int, ny: int) -> float:
+def _split(sources: Sources, sizes: Int, psf: Psf, size: int) -> tuple[Int, Int]:
+    """Sources of a size that are drawn each through a PSF of its own, and those that share planes."""
+    of_size = sizes == size
+    few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW)
+    pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
+    alone = of_size & (few | (sources.electrons > _BRIGHT) | pictured)
+    return np.flatnonzero(alone), np.flatnonzero(of_size & ~alone)
+
+
+def work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
+    """(pixels of stamps, samples' places of the PSF's planes) that `draw` goes through, before anything is drawn."""
+    planes = 1 if psf.planes is None else len(psf.planes.images) + len(psf.planes.drift)
+    transformed = 0
+    for size in np.unique(sizes).tolist():
+        alone, together = _split(sources, sizes, psf, size)
+        transformed += size**2 * (len(alone) + planes * (len(together) > 0))
+    return int((sizes.astype(np.int64) ** 2).sum()), transformed
+
+
+def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
+    """CPU s that `draw` takes, predicted from the stamps alone (trails left out).
+
+    Error : between half and twice of what the machine takes that it was measured on
+    """
+    pixels, transformed = work(sources, sizes, psf)
+    return _STAMP_S * pixels + _PLANE_S * transformed + _FRAME_S * nx * ny + _START_S
+
+
+def memory(electrons: Float, sizes: Int, nx: int, ny: int, picture: Int | None = None) -> float:
     """Bytes that `draw` takes at its peak on top of its arguments, predicted from the stamps alone.
 
+    picture : of Sources
     Error : the peak is between a third of it and all of it: what is faint is not followed to the last frequency
     """
     bright = electrons > _BRIGHT
+    pictured = np.zeros(len(sizes), bool) if picture is None else picture >= 0
     largest = [
         of * float(sizes[chosen].max(initial=0)) ** 2
-        for of, chosen in ((_STAMP_BYTES, ~bright), (_DOUBLE_BYTES, bright))
+        for of, chosen in ((_STAMP_BYTES, ~bright), (_DOUBLE_BYTES, bright), (_PICTURE_BYTES, pictured))
     ]
     return _FRAME_BYTES * nx * ny + max(largest) + _SOURCE_BYTES * len(sizes) + _OTHER_BYTES
 

@@ -284,6 +284,15 @@ def test_a_scene_that_a_task_has_no_memory_for_is_refused(monkeypatch):
         render("VIS")
 
 
+def test_a_scene_that_would_not_end_is_refused(monkeypatch):
+    monkeypatch.setattr(exposure.stamps, "draw", None)
+    monkeypatch.setattr(exposure.stamps, "seconds", lambda *scene: 9e4)
+    with pytest.raises(
+        BadInput, match=r"exposure 3, detector 3-4: \d+ sources take 25\.0 h, a task has 6: ask for less"
+    ):
+        render("VIS")
+
+
 def test_bad_tables_are_refused():
     task, exposed, body, points = field("VIS")
     good = (body, fluxes(body, "euclid_vis", 1.0), points, fluxes(points, "euclid_vis", 1.0))

@@ -1,5 +1,6 @@
 """Arcs of strong lenses in the exposures: galsim's quintic interpolation is the reference; places are on the sky."""
 
+import tracemalloc
 from dataclasses import replace
 
 import galsim
@@ -67,6 +68,19 @@ def test_a_picture_is_what_galsim_draws(camera, name, side, electrons):
     theirs = np.roll(stamps.reference(source, 0, psf, 160), (78 - 80, 80 - 80), (0, 1))
     assert np.abs(ours - theirs)[8:-8, 8:-8].max() < 2e-4 * theirs.max()
     assert ours.sum() == pytest.approx(electrons, rel=1e-5)
+
+
+@pytest.mark.parametrize(("size", "electrons"), [(320, 1e5), (512, 1e9)])
+def test_memory_is_what_was_predicted(size, electrons):
+    source = pictured("vis", "2-3", ring(200), electrons)
+    stamps.draw(source, np.array([96]), spread("vis"), 64, 64)
+    tracemalloc.start()
+    try:
+        stamps.draw(source, np.array([size]), spread("vis"), 256, 256)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < stamps.memory(source.electrons, np.array([size]), 256, 256, source.picture) < 2.0 * peak + 5e7
 
 
 # ------------------------------------------------------------------------------------------------ in an exposure

@@ -1,5 +1,6 @@
 """Drawing: galsim's own drawImage is the reference; angles, fluxes and positions are measured on frames."""
 
+import time
 import tracemalloc
 
 import numpy as np
@@ -253,3 +254,41 @@ def test_every_scene_that_a_task_takes_has_room():
         electrons[0] = 1e11
         sizes = np.where(electrons > 1e10, stamps.SIZES[-1], 64)
         assert 0.6e9 + stamps.memory(electrons, sizes, nx, ny) < 2e9
+
+
+def test_what_is_drawn_through_was_counted_before(monkeypatch):
+    """Pixels of stamps, and of the PSF's planes on their grids: of many, of few, of bright ones."""
+    sources, psf = many(60), spread("lsstcam")
+    sources.electrons[:3] = 1e9
+    sizes = np.where(np.arange(60) % 7 == 0, 96, 48)
+    counted = {"stamps": 0, "planes": 0}
+
+    def watched(function, kind, pixels):
+        def call(*args):
+            found = function(*args)
+            counted[kind] += pixels(found, *args)
+            return found
+
+        return call
+
+    add = stamps._draw_some
+    monkeypatch.setattr(
+        stamps, "_draw_some", watched(add, "stamps", lambda _, f, s, chosen, p, *a: chosen.size * p.grid.size**2)
+    )
+    for name in ("transfer", "collapsed"):
+        made = watched(getattr(stamps.transfer, name), "planes", lambda t, *a: len(t.planes) * t.grid.size**2)
+        monkeypatch.setattr(stamps.transfer, name, made)
+    stamps.draw(sources, sizes, psf, 160, 160)
+    assert stamps.work(sources, sizes, psf) == (counted["stamps"], counted["planes"])
+
+
+def test_seconds_follow_the_stamps():
+    sources, psf = many(400), spread("lsstcam")
+    small, large = np.full(400, 64), np.full(400, 192)
+    start = time.process_time()
+    stamps.draw(sources, large, psf, 160, 160)
+    spent = time.process_time() - start
+    predicted = stamps.seconds(sources, large, psf, 160, 160)
+    # Machines differ, and are shared: only a wrong power of the sizes would show.
+    assert 0.1 * predicted < spent < 10 * predicted
+    assert 4 * stamps.seconds(sources, small, psf, 160, 160) < predicted
