@@ -7,10 +7,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from jobs.catalogue import galaxies, mapping, nearest_sed, population
-from lake_schema import validate
+from jobs import request
+from jobs.catalogue import build_galaxies, galaxies, mapping, nearest_sed, population
+from lake_schema import publish, read, validate
 from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import GALAXIES
+from tests import requests
 
 KEYS = ("z_true", "abs_mag_r01", "color_gr_01", "sed", "ext_law", "ebv")
 
@@ -79,6 +81,26 @@ def test_galaxies_are_drawn_with_these_spectra(universe, dust, given):
     theirs = set(observed()["ext_law"].tolist())
     assert set(np.unique(rows["ext_law_1"].to_numpy()).tolist()) == theirs
     assert 5_000 < rows.num_rows < 40_000
+
+
+def test_a_request_with_a_training_table(tmp_path):
+    """Its galaxies have other spectra than without."""
+    pq.write_table(pa.table(observed()), tmp_path / "synthetic.parquet")
+    columns = "".join(f'{key} = "{key}"\n' for key in KEYS)
+    theirs = f'[ingest.training]\nfiles = ["synthetic.parquet"]\n[ingest.training.columns]\n{columns}'
+    more = 'galaxy_band = "euclid_h"\nhigh_redshift_boost = 0.0\nquasar_boost = 0.0\n'
+    found = []
+    for name, own in (("with", theirs), ("without", "")):
+        text = requests.shallow(20.0, 18.0, more) + own
+        path = requests.written(tmp_path, text, requests.FIELD.format(0.05), name)
+        for step in build_galaxies.steps(tmp_path / name, request.parse(path)):
+            publish.make(tmp_path / name, step.plan, step.work)
+        found.append(read.version(tmp_path / name, "galaxies"))
+    with_table, without = (version.rows() for version in found)
+    assert found[0].manifest["facts"]["training"]["columns"] == {key: f'"{key}"' for key in KEYS}
+    assert validate.violations(with_table, GALAXIES) == []
+    assert with_table.num_rows > 20
+    assert not with_table["ebv_1"].equals(without["ebv_1"])
 
 
 def test_dustier_galaxies_are_searched_for_as_deep_as_they_can_be_seen(given):

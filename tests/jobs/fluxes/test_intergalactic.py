@@ -1,18 +1,22 @@
 """Hydrogen between the galaxies: its published formulas, the sky as observed, and the same flux by every way."""
 
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jobs import request
 from jobs.accuracy import SURVEY
 from jobs.fluxes import (
     flux_grid,
     grid_errors,
     grid_settings,
     grid_tables,
+    inputs,
     integration,
     intergalactic,
     passbands,
@@ -20,6 +24,7 @@ from jobs.fluxes import (
     spectra,
 )
 from jobs.fluxes.grid_tables import Setting
+from tests import requests
 
 
 def test_the_forest_has_the_observed_opacity():
@@ -110,6 +115,14 @@ def test_tables_hold_it(library):
     g, behind = passbands.load("lsst_g"), replace(library, intergalactic=True)
     assert differing(g, Setting(0.007, 6, 3), behind, 8) < 3e-4
     assert grid_tables.library_key(behind) != grid_tables.library_key(library)
+
+
+def test_a_request_asks_for_it():
+    """From the request to the library of the workers."""
+    wanted = request.from_table(tomllib.loads(requests.text("[fluxes]\nintergalactic = true\n")))
+    assert inputs.read(wanted.curves).library.intergalactic
+    assert inputs.library_of(Path(), {"intergalactic": True}).intergalactic
+    assert not inputs.library_of(Path(), {}).intergalactic
 
 
 @pytest.mark.nightly
