@@ -83,6 +83,7 @@ def test_galaxies_are_drawn_with_these_spectra(universe, dust, given):
     assert 5_000 < rows.num_rows < 40_000
 
 
+@pytest.mark.nightly
 def test_a_request_with_a_training_table(tmp_path):
     """Its galaxies have other spectra than without."""
     pq.write_table(pa.table(observed()), tmp_path / "synthetic.parquet")

@@ -17,28 +17,47 @@ def block(universe):
     return {cell: population.members(drawn, cell) for cell in BLOCK}
 
 
-def test_satellites_are_neither_lost_nor_doubled(universe, block):
-    """All satellites of all halos near, wherever they fall: those that fall into the block are its members."""
+def falling_in(universe, block):
+    """Identifiers of all satellites of all halos near, wherever they fall: of those that fall into the block."""
     drawn = Cells(universe.population)
-    expected = []
+    found_in = []
     for order in halos.LEVELS:
-        own = {cell >> 2 * (8 - order) for cell in BLOCK}
+        own = {cell >> 2 * (8 - order) for cell in block}
         ring = {int(c) for cell in own for c in sky.margin_cells(order, cell, order)}
         # One ring more than is needed: nothing comes from there.
         wide = {int(c) for cell in ring for c in sky.margin_cells(order, cell, order)} if order == 8 else set()
         for cell in sorted(own | ring | wide):
             hosts, found = drawn.at(order, cell)
             home = sky.cell_of(*sky.positions(hosts.index), 8)[found.host]
-            inside = np.isin(sky.cell_of(found.ra, found.dec, 8), BLOCK)
+            inside = np.isin(sky.cell_of(found.ra, found.dec, 8), block)
             edge = universe.population.halos.line.edge
             inside &= (found.chi > edge[0]) & (found.chi < edge[-1])
             number, member = hosts.number[found.host], found.member
-            expected.append(ids.source_id(np.ones(home.size), home, number, member)[inside])
-    expected = np.sort(np.concatenate(expected))
-    found = np.sort(np.concatenate([people.id[people.kind == 1] for people in block.values()]))
+            found_in.append(ids.source_id(np.ones(home.size), home, number, member)[inside])
+    return np.sort(np.concatenate(found_in))
+
+
+def satellites_of(members):
+    return np.sort(np.concatenate([people.id[people.kind == 1] for people in members]))
+
+
+def test_satellites_are_neither_lost_nor_doubled(universe, block):
+    found = satellites_of(block.values())
     assert found.size > 1000
-    assert np.array_equal(found, expected)
+    assert np.array_equal(found, falling_in(universe, BLOCK))
     assert np.unique(found).size == found.size
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("ra", "dec"), [((45, 135, 225, 315), 89.9), ((45, 135, 225, 315), -89.9), ((359.9, 0, 0.1), 0.1)]
+)
+def test_nor_at_a_pole_or_across_the_first_meridian(universe, ra, dec):
+    places = sorted({int(cell) for cell in sky.cell_of(np.array(ra, float), np.full(len(ra), dec), 8)})
+    drawn = Cells(universe.population)
+    found = satellites_of([population.members(drawn, cell) for cell in places])
+    assert found.size > 500
+    assert np.array_equal(found, falling_in(universe, places))
 
 
 def test_some_satellites_live_next_door(block):
