@@ -37,6 +37,7 @@ class Densities:
     """Sources a square degree at a place.
 
     catalogues : published galaxies and stars, both or none
+    Error: without them a limit in another band than I_E is taken for one in I_E
     """
 
     def __init__(self, mission: MissionConfiguration, universe: Universe, catalogues: Sequence[Version] = ()) -> None:
