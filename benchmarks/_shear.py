@@ -2,7 +2,7 @@
 
 maps         what the maps of the catalogue hold
 power_of     C_l of the convergence over that of linear theory, of these maps;  power_of_box : of another seed's
-raw_rms      of the sums along lines of sight, before they become maps
+sight_rms    of the convergence along lines of sight, before it becomes a map;  skipping_rms : of too few cells
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks._clustering import Tracers
-from jobs.catalogue import convergence, density_box, lensing
+from jobs.catalogue import convergence, density_box, lensing, lightcone
 from jobs.catalogue.density_box import Box
 from jobs.catalogue.lensing import Planes
 from jobs.fluxes import cosmology
@@ -24,18 +24,25 @@ Float = npt.NDArray[np.float64]
 # Patches of the sky whose scatter gives the error of a mean: cells of this nside.
 _PATCHES = 2
 _STEPS = 1500
+_SIGHT_NSIDE = 128
+_LENS = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2
 # Rings about halos, deg, and directions.
 RINGS, _DIRECTIONS = (0.1, 0.2, 0.4, 0.8), 8
 
 
 def theory(ell: Float, chi: float) -> Float:
     """C_l of the convergence of sources at chi Mpc/h, linear theory, by Limber's approximation."""
-    x = np.linspace(2.0, chi - 0.5, _STEPS)
-    z = cosmology.redshift(x)
-    weight = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * x * (1.0 - x / chi) * (1.0 + z)
+    x, weight = _weight(chi)
     k = (ell[:, None] + 0.5) / x
     power = density_box.linear_power(k.ravel()).reshape(k.shape)
-    return np.asarray(np.trapezoid((weight * density_box.growth(z) / x) ** 2 * power, x, axis=1))
+    return np.asarray(np.trapezoid((weight / x) ** 2 * power, x, axis=1))
+
+
+def _weight(chi: float) -> tuple[Float, Float]:
+    """Distances[n] and what the overdensity of z = 0 counts for there, of sources at chi."""
+    x = np.linspace(2.0, chi - 0.5, _STEPS)
+    z = cosmology.redshift(x)
+    return x, _LENS * x * (1.0 - x / chi) * (1.0 + z) * density_box.growth(z)
 
 
 def bands(power: Float, chi: float, edges: Sequence[int]) -> Float:
@@ -88,10 +95,31 @@ def power_of(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) -> Fl
     return np.array(rows)
 
 
-def raw_rms(box: Box, nside: int, redshifts: Sequence[float]) -> list[float]:
-    """rms of the sums along the lines of sight of pixels."""
-    kappa, _ = sums(box, nside, redshifts, 8)
-    return [float(plane.std(dtype=float)) for plane in kappa]
+def sight_rms(box: Box, redshifts: Sequence[float]) -> list[tuple[float, float]]:
+    """rms of the convergence along lines of sight through cells of the box, and what linear theory gives such cells."""
+    chosen, chi = lensing.settings(), np.asarray(cosmology.comoving_distance(np.array(redshifts)))
+    direction = np.stack(hp.pix2vec(_SIGHT_NSIDE, np.arange(12 * _SIGHT_NSIDE**2), nest=True)).astype(np.float32)
+    kappa = convergence.convergence(box, direction, hp.nside2resol(_SIGHT_NSIDE), chi, 1, chosen.stretch)
+    k = np.geomspace(1e-3, 2.0 * np.pi, 300)
+    power = density_box.linear_power(k) * convergence.window(box.model.cell, 1, k)
+    inside, found = np.trapezoid(k * power / (2 * np.pi), k), []
+    for plane, far in zip(kappa, chi, strict=True):
+        x, weight = _weight(float(far))
+        found.append((float(plane.std(dtype=float)), float(np.sqrt(np.trapezoid(weight**2, x) * inside))))
+    return found
+
+
+def skipping_rms(box: Box, redshift: float, step: float) -> float:
+    """rms of the sums over single cells every `step` Mpc/h, as if each stood for all between: too large."""
+    far, width = float(cosmology.comoving_distance(redshift)), 0.5 * step
+    direction = np.stack(hp.pix2vec(_SIGHT_NSIDE // 2, np.arange(3 * _SIGHT_NSIDE**2), nest=True), 1)
+    turned, kappa = lightcone.replicas(box, far), np.zeros(len(direction))
+    for chi in np.arange(width, far, step):
+        z = cosmology.redshift(chi)
+        growths = np.full(len(direction), density_box.growth(z))
+        place, _ = lightcone.box_cells(box, turned, direction, np.full(len(direction), chi))
+        kappa += step * _LENS * chi * (1.0 - chi / far) * (1.0 + z) * density_box.overdensity(box, place, growths)
+    return float(kappa.std())
 
 
 def map_rms(nside: int, chi: float, l_max: int) -> float:

@@ -49,6 +49,8 @@ WIDE_EDGES, NARROW_EDGES = np.array([0.3, 0.5, 0.7, 1.0, 1.5]), np.array([0.03, 
 TRACERS = ("halos", "galaxies")
 BANDS = (30, 64, 128, 256, 384, 512)
 PLANES = ((7, 1.0), (12, 2.4))
+# Redshifts of sources, and steps along the line of sight, Mpc/h, of which one cell in five is seen.
+SIGHTS, SKIPPING = (1.0, 2.3), 20.0
 # K-corrections and I_E - M_r - DM at z = 0.1, 0.5, 1, 2 of three templates.
 K_REDSHIFTS = (0.1, 0.5, 1.0, 2.0)
 K_CORRECTIONS = {
@@ -266,8 +268,9 @@ def lensed(size: Size, halos: clustering.Tracers) -> tuple[dict[str, float], Flo
         figures[f"gamma_t_{radius}deg"], figures[f"gamma_t_{radius}deg_in_errors"] = float(value), float(value / wrong)
     if not size.boxes:
         return figures, np.ones((0, 0))
-    for z, rms in zip((1.0, 2.3), shear.raw_rms(box, 256, (1.0, 2.3)), strict=True):
-        figures[f"kappa_raw_rms_z{z}"] = rms
+    for z, (rms, linear) in zip(SIGHTS, shear.sight_rms(box, SIGHTS), strict=True):
+        figures |= {f"kappa_sight_rms_z{z}": rms, f"kappa_sight_rms_z{z}_to_theory": rms / linear}
+        figures[f"kappa_skipping_rms_z{z}"] = shear.skipping_rms(box, z, SKIPPING)
     found = np.stack(
         [shear.power_of(planes, [number for number, _ in PLANES], BANDS)]
         + [shear.power_of_box(seed, cells, nside, [z for _, z in PLANES], BANDS) for seed in size.boxes]
