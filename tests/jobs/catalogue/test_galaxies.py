@@ -22,12 +22,37 @@ from lake_schema.units import LIGHT_KM_S
 
 from .conftest import BOX_CELLS, NSIDE, SEED
 
+ARCMIN2_PER_DEG2 = 3600.0
 CELL = 303_117
 
 
 @pytest.fixture(scope="module")
 def cell(universe, cells, dust):
     return galaxies.draw(CELL, universe, cells, dust)
+
+
+def test_counts_to_the_limits_of_the_survey(drawn):
+    """Serrano et al. 2024: 102 an arcmin2 with I_E < 26; 30 or more with I_E < 24.5, median z > 0.8."""
+    vis = drawn.mags["euclid_vis"]
+    area = drawn.area * ARCMIN2_PER_DEG2
+    bright = vis < 24.5
+    assert np.sum(vis < 26) / area == pytest.approx(97.6, rel=0.15)
+    assert np.sum(vis < 26) / area == pytest.approx(102.0, rel=0.10)
+    assert np.sum(bright) / area == pytest.approx(31.0, rel=0.15)
+    assert np.sum(bright) / area >= 30
+    assert np.median(drawn.z[bright]) == pytest.approx(0.87, abs=0.05)
+
+
+@pytest.mark.parametrize(("limit", "observed"), [(21, 1.45), (22, 3.7), (23, 9.0), (24, 21.0), (25, 44.5)])
+def test_i_band_counts_are_the_observed_ones(drawn, limit, observed):
+    """Per arcmin2: GAMA (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST Science Book 2009."""
+    found = np.sum(drawn.mags["lsst_i"] < limit) / (drawn.area * ARCMIN2_PER_DEG2)
+    assert found == pytest.approx(observed, rel=0.22)
+
+
+def test_slope_of_the_counts(drawn):
+    number = np.histogram(drawn.mags["euclid_vis"], np.arange(19.5, 24.0, 1.0))[0]
+    assert np.mean(np.diff(np.log10(number))) == pytest.approx(0.39, abs=0.03)
 
 
 def expected_number(lf, near, far, faintest, area):
