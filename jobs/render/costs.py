@@ -16,8 +16,8 @@ from jobs.accuracy import SURVEY, Accuracy
 from jobs.render import stamps, truth_maps
 from jobs.render.effects.effect import Effect
 
-# A FITS header and its padding, one an image; how often a truth map is held while it is made and written.
-_HEADER_BYTES, _COPIES = 8640, 2
+# A FITS header and its padding, one an image; s a byte of a truth map, to write and to hash it.
+_HEADER_BYTES, _MAP_S = 8640, 5.2e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,11 +94,11 @@ def price(
     mapped = sum(truth_maps.BYTES[name] for name in maps)
     return Price(
         start_s=own.frame_s + looks * own.sky_s,
-        pixel_s=1e-6 * sum(effect.cost for effect in applied),
+        pixel_s=1e-6 * sum(effect.cost for effect in applied) + _MAP_S * mapped,
         galaxy_s=looks * own.galaxy_s * tier,
         star_s=looks * own.star_s * tier,
         start_gb=own.base_gb,
-        pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + _COPIES * mapped),
+        pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + mapped),
         start_bytes=_HEADER_BYTES * (1 + len(maps)),
         pixel_bytes=own.written + mapped,
     )
