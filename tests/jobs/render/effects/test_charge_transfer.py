@@ -180,6 +180,27 @@ def test_what_following_less_closely_does_to_galaxies(age):
     assert np.abs(found - best)[bright, 3].max() < accuracy.SURVEY.shape
 
 
+def test_a_draft_leaves_out_what_it_allows_to_be_wrong():
+    """Few traps change galaxies by less than a draft may; a survey follows them, and so does a draft that of many."""
+    image, _, table = reference("clean")
+    for age, preset, needed in (
+        (0.02, accuracy.DRAFT, False), (0.02, accuracy.SURVEY, True), (0.3, accuracy.DRAFT, True)
+    ):  # fmt: skip
+        scene = Scene(resolve(overrides={"vis.cti.age": (age, "")}), "vis", 560.0, 0.25, 1e4, accuracy=preset)
+        assert charge_transfer.PARALLEL.needed_if(scene) == needed
+        found, _ = traps.shifted(image, charge_transfer.lattice(scene, "parallel"), SURVEY, -2, PIXELS)
+        before, after = measured(image, table), measured(found, table)
+        bright = table[:, 2] > 2000
+        worst = (
+            np.abs(after / before - 1)[bright, 0].max() / preset.flux,
+            np.abs(after - before)[bright, 1].max() / preset.position,
+            np.abs(after - before)[bright, 3].max() / preset.shape,
+        )
+        assert (max(worst) > 1.0) == needed
+        if not needed:
+            assert rms(found - image) < 0.1 * scene.pixel_noise
+
+
 def test_damage_grows_with_age():
     new, old = (Scene(resolve(overrides={"vis.cti.age": (age, "")}), "vis", 560.0, 0.25, 1e4) for age in (0.03, 1.0))
     assert sum(charge_transfer.lattice(new, "parallel").density) == pytest.approx(0.03)
