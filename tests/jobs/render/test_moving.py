@@ -80,7 +80,7 @@ def test_a_trail_is_a_row_of_points(line):
     sizes = stamps.stamp_sizes(body.electrons, body.shape, body.shapes, psf, 12.0, settings, piece_length(body.length))
     drawn = np.zeros(1)
     image = stamps.draw(body, sizes, psf, SIDE, SIDE, drawn=drawn)
-    count = 1 if line == (0.0, 0.0) else 2000
+    count = max(int(12 * np.hypot(*line)), 1)
     part = (np.arange(count) + 0.5) / count - 0.5
     row = Sources(
         np.arange(count), point.column + part * line[0], point.row + part * line[1],
