@@ -36,12 +36,13 @@ def apply(frame: Frame, shift: float, softening: float, capacity: float, rng: np
     out = np.array(frame, dtype=float, order="C")
     if shift == 0.0 or out.size == 0 or out.max() <= 0.0:
         return out
-    held = np.pad(out, REACH, mode="edge")
-    np.minimum(held, capacity, out=held)
+    # In single precision: whole electrons below 2^24 are exact, and what crosses to 1e-7 of it.
+    held = np.pad(np.minimum(out, capacity, dtype=np.float32, casting="same_kind"), REACH, mode="edge")
+    weights = kernel(shift, softening).astype(np.float32)
     for down in (False, True):
         # What crosses is a whole number of electrons, right in the mean.
         dice = rng.random(out.shape, dtype=np.float32)
-        _cross(held, out, kernel(shift, softening), dice, down)
+        _cross(held, out, weights, dice, down)
         del dice
     return out
 
@@ -71,7 +72,7 @@ def _cross(held: Any, out: Any, weights: Any, dice: Any, down: bool) -> None:
     """
     ny, nx = out.shape
     last_row, last = (ny - 1, nx) if down else (ny, nx - 1)
-    displaced = np.empty(last)
+    displaced, quarter = np.empty(last, np.float32), np.float32(0.25)
     for r in range(last_row):
         displaced[:] = 0.0
         for i in range(2 * REACH + 1):
@@ -90,7 +91,7 @@ def _cross(held: Any, out: Any, weights: Any, dice: Any, down: bool) -> None:
         here, there = held[r + REACH, REACH:], held[r + REACH + down, REACH + 1 - down :]
         for c in range(last):
             # The border moves towards the fuller side, on average by half: what falls into the strip changes sides.
-            strip = 0.25 * displaced[c] * (here[c] + there[c])
+            strip = quarter * displaced[c] * (here[c] + there[c])
             moved = np.floor(strip + dice[r, c])
             giver = out[r, c] if moved > 0.0 else out[r + down, c + 1 - down]
             if abs(moved) > MOST * giver:
