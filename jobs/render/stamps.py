@@ -48,6 +48,9 @@ _APERTURE = 1.0
 # A source's light a stamp's side away, times this, is what all its periodic images bring to its middle: the sum of
 # r^-3 over the square lattice (the PSF's wings), and of the flattest wings of galaxies.
 _LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
+# Logarithmic slope of the light that wraps from which on its response to shear is what counts, not its flux; and the
+# step in which the slope is taken.
+_RESPONSE, _FARTHER = 3.0, 1.05
 # Of a galaxy's half-light radius, that its stamp is wider than a point's.
 _EXTENT = 4.0
 # Axis ratio of the thinnest sources: discs of the scale height profiles.py draws, seen edge-on.
@@ -206,16 +209,20 @@ def stamp_sizes(
     noise : of a pixel, electrons. A cut by noise alone biases faint sources, for what wraps is coherent: the second
             condition holds it to a part of the flux, from the wings of the PSF and of high-n bulges alike
     """
-    at = np.concatenate([SIZES // 2, SIZES])
-    psf_light = _beyond_the_table(psf, at)
+    at = np.concatenate([SIZES // 2, SIZES, _FARTHER * SIZES])
+    psf_light = _beyond_the_table(psf, np.concatenate([SIZES // 2, SIZES]))
     galaxy_light = np.zeros((len(shape), len(at)))
     body = shape >= 0
     if body.any():
         galaxy_light[body] = profiles.surface(shapes, at * psf.pixel_scale)[shape[body]] * psf.pixel_scale**2
     edge = psf_light[: len(SIZES)] + galaxy_light[:, : len(SIZES)]
     # A PSF in planes is cut to the stamp and does not wrap.
+    near, far = slice(len(SIZES), 2 * len(SIZES)), slice(2 * len(SIZES), None)
     wings = _LATTICE_PSF * psf_light[len(SIZES) :] * (psf.planes is None)
-    wrapped = wings + _LATTICE_GALAXY * galaxy_light[:, len(SIZES) :]
+    steepness = np.log(np.maximum(galaxy_light[:, near], 1e-300) / np.maximum(galaxy_light[:, far], 1e-300))
+    # What shear makes of the light that wraps goes with how steeply it falls.
+    steeper = np.maximum(steepness / (_RESPONSE * np.log(_FARTHER)), 1.0)
+    wrapped = wings + _LATTICE_GALAXY * steeper * galaxy_light[:, near]
     aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
     enough = (electrons[:, None] * edge < settings.edge * noise) & (wrapped * aperture < settings.ghost)
     # The PSF's wings beyond a stamp are those of a point: the larger a galaxy, the farther out that may begin.

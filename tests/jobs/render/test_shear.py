@@ -74,7 +74,7 @@ def test_response_to_shear(tier, kind, magnitude):
 @pytest.mark.parametrize("scene", [VIS, LSST], ids=lambda scene: scene.name)
 def test_response_of_many_galaxies_through_their_own_psf(scene, tier):
     accuracy, most_m, most_c = BOUNDS[tier]
-    found, some = errors.shear_response(scene, {tier: stamps.settings_for(accuracy)}, 91, 60)
+    found, some = errors.shear_response(scene, {tier: stamps.settings_for(accuracy)}, 92, 24)
     kinds = errors.worst_by_kind(found[tier], some, scene)
     for kind, (_, m, c) in kinds.items():
         assert (m <= most_m, c <= most_c) == (True, True), (kind, m, c)
