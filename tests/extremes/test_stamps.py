@@ -305,7 +305,8 @@ def test_poles_and_the_seam_are_as_good_as_any_place(camera, ra, dec):
         settings, band,
     )  # fmt: skip
     np.testing.assert_allclose(np.stack([found.column, found.row], 1), places, atol=2e-6)
-    np.testing.assert_allclose(np.linalg.det(found.jacobian), detector.pixel_scale**2, rtol=1e-4)
+    # The telescope's distortion aside.
+    np.testing.assert_allclose(np.linalg.det(found.jacobian), detector.pixel_scale**2, rtol=0.02)
     image = stamps.draw(found, sizes, spread(camera), 128, 128, floors=stamps.floors(found.electrons, NOISE, settings))
     assert np.isfinite(image).all()
     assert image.sum() == pytest.approx(2e5, rel=1e-3)
