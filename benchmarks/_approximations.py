@@ -53,7 +53,7 @@ class Approximation:
     spread: Callable[[psf.Psf], psf.Psf] = _as_it_is
     sizes: Callable[[Sources, psf.Psf, Scene, Settings], Int] = _sizes
     after: Callable[[Float], Float] = _as_it_is
-    numbers: tuple[int, int, int] = (48, 12, 0)
+    numbers: tuple[int, int, int] = (24, 6, 0)
     timed: Approximation | None = None
 
     def draw(self, some: Sources, spread: psf.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
@@ -122,8 +122,9 @@ def _tiny(scene: Scene, seed: int, n: int) -> Sources:
 def _huge(scene: Scene, seed: int, n: int) -> Sources:
     """The steep ones, which the paper had no memory for."""
     some = _sized(scene, seed, n, 1.2 * HUGE, 17.0)
-    index = 2.5 + 3.5 * np.linspace(0.0, 1.0, n)
-    return replace(some, shapes=replace(some.shapes, sersic_index=index, bulge_fraction=np.ones(n)))
+    index, radius = np.linspace(2.5, 6.0, n), np.full(n, 1.2 * HUGE)
+    shapes = replace(some.shapes, bulge_radius=radius, sersic_index=index, bulge_fraction=np.ones(n))
+    return replace(some, shapes=shapes)
 
 
 def _down_and_up(image: Float) -> Float:
@@ -169,14 +170,14 @@ def _still(spread: psf.Psf) -> psf.Psf:
 NONE = Approximation("none")
 ALL = (
     Approximation("index rounded to 0.1", simplified=_rounded),
-    Approximation("single component, faint", concerned=_faint, simplified=_exponential, numbers=(48, 12, 1000)),
+    Approximation("single component, faint", concerned=_faint, simplified=_exponential, numbers=(24, 6, 1000)),
     Approximation("folding threshold 0.5 %", sizes=_folded),
-    Approximation("exponential below 0.01 arcsec", concerned=_tiny, simplified=_exponential, numbers=(12, 6, 1000)),
+    Approximation("exponential below 0.01 arcsec", concerned=_tiny, simplified=_exponential, numbers=(12, 3, 1000)),
     Approximation(
         "sampled down and up",
         concerned=_huge,
         after=_down_and_up,
-        numbers=(6, 3, 6),
+        numbers=(4, 2, 4),
         timed=Approximation("half the side", sizes=_half, after=_up),
     ),
     Approximation("one PSF for all colours", simplified=_grey, spread=_grey_planes),

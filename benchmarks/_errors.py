@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 import numpy as np
@@ -35,9 +35,23 @@ FULL = Settings(edge=1e-7, ghost=1e-9, floor=0.0, least=51.2, positions=9)
 
 
 def capped(work: Callable[..., Found], *args: Any) -> Found:
-    """work(*args) in a process of its own whose memory is limited."""
-    with ProcessPoolExecutor(1, get_context("spawn"), _cap) as pool:
-        return pool.submit(work, *args).result()
+    """work(*args) in a process of its own whose memory is limited; what it is given is shared, not copied."""
+    context = get_context("fork")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_report, args=(theirs, work, args))
+    process.start()
+    theirs.close()
+    try:
+        found: Found = ours.recv()
+    except EOFError:
+        raise RuntimeError(f"{work.__name__} failed in its process") from None
+    process.join()
+    return found
+
+
+def _report(out: Connection, work: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    _cap()
+    out.send(work(*args))
 
 
 def _cap() -> None:

@@ -30,7 +30,7 @@ def image(one: Sources, spread: psf.Psf, side: int, highest: float = ACCURACY) -
         one.electrons,
         *(getattr(shapes, field.name) for field in fields(shapes)),
     ]
-    through = [repr(spread.profile)] if spread.planes is None else [spread.planes.images, spread.planes.wavelength]
+    through = [repr(spread.profile)] if spread.planes is None else ["Lanczos 31", spread.planes.images]
     key = cache.content_key(
         galsim.__version__, highest, side, spread.pixel_scale, spread.intra_pixel, *seen, *through
     )  # fmt: skip

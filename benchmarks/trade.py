@@ -11,7 +11,7 @@ import csv
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +31,10 @@ from jobs.render.stamps import Settings, Sources
 
 Float = npt.NDArray[np.float64]
 Row = dict[str, str | float]
-# From draft to reference; then the third with one setting changed at a time.
+# From draft to reference; then the survey's with one setting changed at a time.
 _CHAIN = (
     Settings(0.15, 3e-4, 2e-2, 4.0, 4),
+    Settings(0.13, 2e-4, 2e-2, 4.4, 4),
     Settings(0.15, 1e-4, 3e-2, 4.8, 4),
     Settings(0.08, 1e-4, 1e-2, 4.8, 4),
     Settings(0.03, 5e-5, 1e-3, 4.8, 9),
@@ -41,62 +42,67 @@ _CHAIN = (
     Settings(0.002, 5e-6, 3e-6, 8.0, 9),
     Settings(0.0005, 1e-6, 1e-7, 12.8, 25),
 )
-_SURVEY = 4
+_SURVEY = 5
 _CHANGED = (("edge", 0.05), ("ghost", 1e-3), ("floor", 1e-2), ("least", 3.2))
 # Galaxies: that the settings are chosen on, against galsim, and sheared in pairs; that the errors are quoted of.
-_CHOSEN_ON, _CHOSEN_PAIRS, _QUOTED, _PAIRS = 24, 12, 48, 12
+_CHOSEN_ON, _QUOTED, _PAIRS = 24, 24, 6
 _CHOSEN_SEED, _QUOTED_SEED, _SCENE_SEED = 12, 21, 1
 # Threshold of galsim's largest frequency where settings are chosen: at 1e-4 its middles of bright discs are 3e-3 of
 # the noise wrong.
 _HIGHEST = 1e-5
+# What others are held against: no approximation but the stamp, and that large.
+_TRUTH = Settings(edge=1e-6, ghost=1e-8, floor=0.0, least=25.6, positions=9)
 # Magnitudes of a relative error.
 _MAG = 1.0857362
 _SETTINGS = f"""\
 # Settings of stamps by python -m benchmarks.trade --settings: the largest errors over {_CHOSEN_ON} VIS galaxies
 # that they are chosen on, against galsim at its tightest. flux: in a 1" aperture; shape: the larger of half the
-# ellipticity's error and of |m|, |c| of {_CHOSEN_PAIRS} 90-degree pairs; position: pixels; background: of a pixel's
+# ellipticity's error and of |m|, |c| of {_PAIRS} 90-degree pairs; position: pixels; background: of a pixel's
 # noise; CPU seconds of a VIS detector's sources. Errors of other galaxies: benchmarks/results/trade.csv.
 edge,ghost,floor,least,flux_error,shape_error,position_error,background_error,seconds
 """
 
 
-def truths(seed: int, n: int, approximation: Approximation = NONE) -> Float:
-    """Responses to shear [n, 4] on the largest stamps."""
-    some, full = approximation.concerned(VIS, seed, n), scenes.spread(VIS)
-    return np.array([_response(some, full, i, NONE, errors.FULL) for i in range(len(some))])
+@dataclass(frozen=True)
+class Galaxy:
+    """One of a sample: itself, on frames that it is in the middle of, and its PSF; its image and response to shear."""
+
+    sources: Sources
+    spread: psf.Psf
+    image: Float
+    response: Float | None
 
 
-def _response(some: Sources, full: psf.Psf, i: int, approximation: Approximation, settings: Settings) -> Float:
-    own = scenes.own(full, some, i)
+def sample(some: Sources, pairs: int, highest: float = 0.0) -> list[Galaxy]:
+    """Galaxies with the truth about them, the first ones' response too; highest : galsim's, where it is the truth."""
+    full, out = scenes.spread(VIS), []
+    order = np.random.default_rng(_CHOSEN_SEED).permutation(len(some))
+    for k, i in enumerate(order):
+        own, one = scenes.own(full, some, i), scenes.moved(some, i, errors.COMPARED)
+        image = references.image(one, own, errors.COMPARED, highest) if highest else None
+        if image is None:
+            image = scenes.draw(one, own, VIS, _TRUTH, errors.COMPARED)
+        out.append(Galaxy(one, own, image, _response(one, own, NONE, _TRUTH) if k < pairs else None))
+    return out
+
+
+def _response(one: Sources, spread: psf.Psf, approximation: Approximation, settings: Settings) -> Float:
     return errors.response(
-        lambda one: approximation.draw(one, own, VIS, settings, 2 * errors.COMPARED),
-        scenes.moved(some, i, 2 * errors.COMPARED),
-        VIS.scale,
+        lambda each: approximation.draw(each, spread, VIS, settings, errors.COMPARED), one, VIS.scale
     )
 
 
 def compared(
-    settings: Settings, seed: int, n: int, responses: Float, approximation: Approximation = NONE, highest: float = 0.0
+    settings: Settings, galaxies: list[Galaxy], others: list[Galaxy], approximation: Approximation = NONE
 ) -> tuple[Float, Float]:
-    """(errors [n, 5], m and c [pairs, 2]) of galaxies that an approximation concerns.
-
-    responses : `truths` of pairs;  highest : galsim's, where the truth is galsim's
-    """
-    full = scenes.spread(VIS)
-    less, found, bias = approximation.spread(full), [], []
-    some = approximation.concerned(VIS, seed, n)
-    simple = approximation.simplified(some)
-    for i in range(len(some)):
-        own, one = scenes.own(full, some, i), scenes.moved(some, i, errors.COMPARED)
-        truth = references.image(one, own, errors.COMPARED, highest) if highest else None
-        if truth is None:
-            truth = scenes.draw(one, own, VIS, errors.FULL, errors.COMPARED)
-        its = own if less is full and simple is some else scenes.own(less, simple, i)
-        image = approximation.draw(scenes.moved(simple, i, errors.COMPARED), its, VIS, settings, errors.COMPARED)
-        found.append(errors.errors(image, truth, VIS, one))
-    some = approximation.simplified(approximation.concerned(VIS, seed, len(responses)))
-    for i, truth in enumerate(responses):
-        bias.append(errors.bias(_response(some, less, i, approximation, settings), truth))
+    """(errors [n, 5], m and c [pairs, 2]) of galaxies; others : the same as they are approximated, or themselves."""
+    found, bias = [], []
+    for galaxy, other in zip(galaxies, others, strict=True):
+        image = approximation.draw(other.sources, other.spread, VIS, settings, errors.COMPARED)
+        found.append(errors.errors(image, galaxy.image, VIS, galaxy.sources))
+        if galaxy.response is not None:
+            response = _response(other.sources, other.spread, approximation, settings)
+            bias.append(errors.bias(response, galaxy.response))
     return np.array(found), np.array(bias)
 
 
@@ -105,9 +111,9 @@ def _summary(found: Float, bias: Float) -> Row:
     return {**errors.figures(found), "shear_m_worst": float(m), "shear_c_worst": float(c), "galaxies": len(found)}
 
 
-def point(settings: Settings, chosen: Float, quoted: Float, repeats: int, n: tuple[int, int]) -> Row:
-    """Seconds and errors of settings; chosen, quoted : `truths` of the two samples; n : galaxies in them."""
-    found, bias = compared(settings, _CHOSEN_SEED, n[0], chosen, highest=_HIGHEST)
+def point(settings: Settings, chosen: list[Galaxy], quoted: list[Galaxy], repeats: int) -> Row:
+    """Seconds and errors of settings: of the galaxies that settings are chosen on, and of others."""
+    found, bias = compared(settings, chosen, chosen)
     worst = found.max(axis=0)
     row: Row = {
         "flux_error": float(np.expm1(worst[0] / _MAG)),
@@ -117,24 +123,33 @@ def point(settings: Settings, chosen: Float, quoted: Float, repeats: int, n: tup
     }
     some, spread = scenes.sources(VIS, _SCENE_SEED), scenes.spread(VIS, settings.positions)
     row["seconds"] = _seconds(some, spread, settings, repeats)
-    return {**row, **_summary(*compared(settings, _QUOTED_SEED, n[1], quoted))}
+    return {**row, **_summary(*compared(settings, quoted, quoted))}
 
 
-def approximated(name: str, settings: Settings, repeats: int, few: int) -> Row:
+def approximated(approximation: Approximation, settings: Settings, repeats: int, quoted: list[Galaxy]) -> Row:
     """What an approximation buys and costs: seconds of its galaxies with and without, and errors."""
-    approximation = next(each for each in approximations.ALL if each.name == name)
     n, pairs, timed = approximation.numbers
-    n, pairs = -(-n // few), -(-pairs // few)
-    some, spread = scenes.sources(VIS, _SCENE_SEED, stars=0), scenes.spread(VIS, settings.positions)
+    some, full = scenes.sources(VIS, _SCENE_SEED, stars=0), scenes.spread(VIS)
     if timed:
         some = approximation.concerned(VIS, _SCENE_SEED, timed)
-    row: Row = {"galaxies_timed": len(some), "seconds_before": _seconds(some, spread, settings, repeats)}
-    simple, less = approximation.simplified(some), approximation.spread(spread)
+    row: Row = {"galaxies_timed": len(some), "seconds_before": _seconds(some, full, settings, repeats)}
+    simple, less = approximation.simplified(some), approximation.spread(full)
     row["seconds"] = _seconds(simple, less, settings, repeats, approximation.timed or approximation)
-    # Nothing but the approximation is wrong: the stamps are the largest, unless they are what is approximated.
-    wide = errors.FULL if approximation.sizes is NONE.sizes else settings
-    responses = truths(_QUOTED_SEED, pairs, approximation)
-    return {**row, **_summary(*compared(wide, _QUOTED_SEED, n, responses, approximation))}
+    some = approximation.concerned(VIS, _QUOTED_SEED, n)
+    galaxies = quoted if approximation.concerned is NONE.concerned else sample(some, pairs)
+    others = [_changed(galaxy, some, less, approximation) for galaxy in galaxies]
+    # Nothing but the approximation is wrong: the stamps are large, unless they are what is approximated.
+    wide = _TRUTH if approximation.sizes is NONE.sizes else settings
+    return {**row, **_summary(*compared(wide, galaxies, others, approximation))}
+
+
+def _changed(galaxy: Galaxy, some: Sources, less: psf.Psf, approximation: Approximation) -> Galaxy:
+    """A galaxy of `some` as it is approximated; `less`: the detector's PSF as it is."""
+    one = replace(approximation.simplified(galaxy.sources), photons=None)
+    if approximation.spread is NONE.spread:
+        return replace(galaxy, sources=one)
+    place = np.flatnonzero(some.ids == galaxy.sources.ids[0])
+    return replace(galaxy, sources=one, spread=scenes.own(less, approximation.simplified(some), int(place[0])))
 
 
 def _seconds(
@@ -145,14 +160,12 @@ def _seconds(
     return report.best(lambda: approximation.draw(some, spread, VIS, settings), repeats, time.process_time)
 
 
-def by_galsim(each: int, n: int) -> Row:
+def by_galsim(quoted: list[Galaxy], each: int) -> Row:
     """galsim's default: seconds of the scene's galaxies, errors."""
     default, _ = peers.galsim_seconds(VIS, each)
-    some, full, found = scenes.sample(VIS, _QUOTED_SEED, n), scenes.spread(VIS), []
-    for i in range(len(some)):
-        own, one = scenes.own(full, some, i), scenes.moved(some, i, errors.COMPARED)
-        truth = scenes.draw(one, own, VIS, errors.FULL, errors.COMPARED)
-        found.append(errors.errors(peers.galsim_image(one, own, errors.COMPARED), truth, VIS, one))
+    found = [
+        errors.errors(peers.galsim_image(g.sources, g.spread, errors.COMPARED), g.image, VIS, g.sources) for g in quoted
+    ]
     return {"seconds": default, **errors.figures(np.array(found)), "galaxies": len(found)}
 
 
@@ -160,19 +173,19 @@ def walk(quick: bool, repeats: int) -> Iterator[Row]:
     """A row a point, each in a process of its own."""
     chain = [_CHAIN[0], _CHAIN[_SURVEY]] if quick else _CHAIN
     changed = [] if quick else [Settings(**{**asdict(_CHAIN[_SURVEY]), name: value}) for name, value in _CHANGED]
-    n = (6, 6) if quick else (_CHOSEN_ON, _QUOTED)
-    chosen = errors.capped(truths, _CHOSEN_SEED, 2 if quick else _CHOSEN_PAIRS)
-    quoted = errors.capped(truths, _QUOTED_SEED, 2 if quick else _PAIRS)
+    n, pairs = (6, 2) if quick else (_QUOTED, _PAIRS)
+    chosen = sample(scenes.sample(VIS, _CHOSEN_SEED, 6 if quick else _CHOSEN_ON), pairs, 0.0 if quick else _HIGHEST)
+    quoted = sample(scenes.sample(VIS, _QUOTED_SEED, n), pairs)
     for kind, some in (("settings", chain), ("changed", changed)):
         for i, settings in enumerate(some):
             name = f"{i + 1}" if kind == "settings" else "{} {:g}".format(*_CHANGED[i])
-            found = errors.capped(point, settings, chosen, quoted, repeats, n)
+            found = errors.capped(point, settings, chosen, quoted, repeats)
             yield {"kind": kind, "name": name, **asdict(settings), **found}
-    if not quick:
-        yield {"kind": "peer", "name": "galsim", **errors.capped(by_galsim, 4, _QUOTED)}
     for approximation in approximations.ALL[:1] if quick else approximations.ALL:
-        found = errors.capped(approximated, approximation.name, _CHAIN[_SURVEY], repeats, 6 if quick else 1)
+        found = errors.capped(approximated, approximation, _CHAIN[_SURVEY], repeats, quoted)
         yield {"kind": "approximation", "name": approximation.name, **found}
+    if not quick:
+        yield {"kind": "peer", "name": "galsim", **errors.capped(by_galsim, quoted, 4)}
 
 
 def _line(row: Row) -> str:
@@ -190,11 +203,10 @@ def write(rows: list[Row], file: Path) -> None:
 
 
 def settings_table(rows: list[Row]) -> str:
-    """The table that stamps.settings_for reads."""
+    """The table that stamps.settings_for reads, of the rows of trade.csv."""
     names = _SETTINGS.splitlines()[-1].split(",")
-    return _SETTINGS + "".join(
-        ",".join(f"{row[name]:.2g}" for name in names) + "\n" for row in rows if row["kind"] == "settings"
-    )
+    some = [row for row in rows if row["kind"] == "settings"]
+    return _SETTINGS + "".join(",".join(f"{float(row[name]):.4g}" for name in names) + "\n" for row in some)
 
 
 def pareto(rows: list[Row], file: Path) -> None:

@@ -156,7 +156,9 @@ def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any]) -> Transfe
 
 def profile_of(psf: Psf, weights: Float) -> Any:
     """A source's own PSF as a galsim object, arcsec."""
-    return psf.profile if psf.planes is None else galsim_profile(image_of(psf.planes, weights), psf.pixel_scale)
+    if psf.planes is None:
+        return psf.profile
+    return galsim_profile(image_of(psf.planes, weights), psf.pixel_scale, exact=True)
 
 
 def image_of(planes: Planes, weights: Float) -> Float32:
