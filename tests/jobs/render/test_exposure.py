@@ -10,7 +10,7 @@ import pytest
 
 from jobs.accuracy import DRAFT, SURVEY
 from jobs.fluxes import passbands
-from jobs.render import exposing, exposure, focal_plane, truth_maps
+from jobs.render import costs, exposing, exposure, focal_plane, truth_maps
 from jobs.render.focal_plane import boresight_for
 from lake_schema import units
 from lake_schema.errors import BadInput
@@ -279,7 +279,7 @@ def test_draft_is_close_to_survey():
 def test_a_scene_that_a_task_has_no_memory_for_is_refused(monkeypatch):
     """Before anything is drawn; in one line."""
     monkeypatch.setattr(exposure.stamps, "draw", None)
-    monkeypatch.setattr(exposure.stamps, "memory", lambda *scene: 1.6e9)
+    monkeypatch.setattr(exposure.stamps, "memory", lambda *scene: (2.2 - costs.of_channel("VIS").base_gb) * 1e9)
     with pytest.raises(BadInput, match=r"exposure 3, detector 3-4: \d+ sources take 2\.2 GB, a task has 2"):
         render("VIS")
 
