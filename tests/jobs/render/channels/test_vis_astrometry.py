@@ -103,7 +103,7 @@ def oversampled(detector, column, row, side, strength):
     # Half a sample of the fine grid from the pixel's border: the middle of the star is in the middle of a sample.
     half_x, half_y = 409.6 / 2, 413.2 / 2
     place = [
-        (position - (n - 1) / 2) * detector.pixel_scale * (-1 if detector.rotation else 1)
+        (position - (n - 1) / 2) * detector.pixel_scale * (-1 if detector.upside_down else 1)
         for position, n in ((column, detector.nx), (row, detector.ny))
     ]
     everything = focal_plane.detectors("vis", MISSION)
@@ -123,7 +123,7 @@ def oversampled(detector, column, row, side, strength):
             lam=wave, diam=1.2, aberrations=list(nm / wave), pupil_plane_im=clear, oversampling=1.5, pad_factor=1.0,
             gsparams=galsim.GSParams(maximum_fft_size=8192),
         )  # fmt: skip
-        if detector.rotation:
+        if detector.upside_down:
             optics = optics.rotate(180 * galsim.degrees)
         image = galsim.ImageD(side * OVER, side * OVER, scale=scale)
         fine += optics.drawImage(image, offset=(-dx * OVER, -dy * OVER), method="no_pixel").array / len(parts)
