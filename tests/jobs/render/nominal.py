@@ -55,7 +55,8 @@ def rendered(
     f_nu = 10 ** (-0.4 * (np.atleast_1d(mags) - 23.9))
     with pytest.MonkeyPatch.context() as patch:
         if mission is MISSION:
-            patch.setattr(exposure, "_psf", lambda detector, *_: spread(detector))
+            own = spread(detector)
+            patch.setattr(psf, "vis_psf", lambda *_: own)
         return exposure.render(
             {"detector": detector.name}, exposed,
             bodies, fluxes(bodies, "euclid_vis", f_nu if body else 0.0),
