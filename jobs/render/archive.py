@@ -1,6 +1,6 @@
 """The archive of a lake's images: what there is, of what, made when, with what, and what could not be made.
 
-    python -m jobs.render.archive --lake LAKE [--at RA DEC] [--sql "select .. from products"]
+    python -m jobs.render.archive --lake LAKE [--at RA DEC] [--sql "select .. from products"] [--failures]
     python -m jobs.render.archive --lake LAKE --again PATH --out FILE.fits [--version KEY]
 
 products    the published products, each with its sha256, seconds and peak memory
@@ -134,10 +134,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--lake", required=True, help="folder of the lake")
     parser.add_argument("--at", nargs=2, type=float, metavar=("RA", "DEC"), help="only what holds this place, deg")
     parser.add_argument("--sql", help="a query of the table products")
+    parser.add_argument("--failures", action="store_true", help="what could not be made, in place of the products")
     parser.add_argument("--again", metavar="PATH", help="render this product again, as it was made")
     parser.add_argument("--out", type=Path, metavar="FILE", help="where to; wanted with --again")
     parser.add_argument("--version", metavar="KEY", help="of an older version of the table products")
     options = parser.parse_args(argv)
+    if options.failures and options.at is not None:
+        parser.error("failures have no place")
     if (options.again is None) != (options.out is None):
         parser.error("--again and --out belong together")
     try:
@@ -145,7 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             said = again(layout.lake(options.lake), options.again, options.out, options.version)
             print(said or f"{options.out} equals {options.again}")
             return int(bool(said))
-        rows = products(layout.lake(options.lake))
+        rows = (failures if options.failures else products)(layout.lake(options.lake))
         rows = rows if options.at is None else covering(rows, *options.at)
         rows = rows if options.sql is None else search(rows, options.sql)
     except (LakeError, OSError) as error:

@@ -196,6 +196,8 @@ def test_a_bad_detector_is_a_row_and_not_the_end_of_the_run(lake, monkeypatch, t
     # Planned = made + failed.
     (failed,) = archive.failures(lake).to_pylist()
     assert (failed["part"], failed["error"]) == (part, "ValueError: no light")
+    assert archive.main(["--lake", str(lake), "--failures", "--sql", "select error from products"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == {"error": failed["error"]}
     assert failed["seconds"] >= 0
     assert 0 < failed["peak_gb"] < 100
     assert len(publish.missing(layout.stage(lake, "products", step.plan.key), step.plan)) == 1

@@ -50,7 +50,8 @@ def test_the_demo_s_two_detectors_look_at_the_same_place(tmp_path):
     # Fewer sources, but each through a PSF of its own colour: it takes longer, and comes first.
     assert rows["detector"].to_pylist() == ["3-4", "R22_S11"]
     assert (np.diff(rows["seconds"].to_numpy()) < 0).all()
-    assert rows["bytes"].to_pylist()[0] == pytest.approx(4096 * 4132 * 10, rel=1e-3)
+    # Four quadrants with pre- and overscan, and two truth maps: the files' bytes.
+    assert rows["bytes"].to_pylist()[0] == pytest.approx(35_536_320 + 2 * 67_705_920, rel=1e-3)
 
 
 def test_all_detectors_where_none_is_named(tmp_path):
