@@ -76,7 +76,9 @@ def test_a_plan_is_mapped_from_the_lake(lake, capsys):
     # The short exposure and the flat are no dithers; outside the field there is nothing.
     assert (depth.seen[0] == 0).all()
     middle = depth.seen[50:70, 50:70]
-    assert 0.5 < (middle == 4).mean() < 1.0
-    assert (middle >= 2).all()
+    # Half of it in the gap between detectors once; hardly a place twice, and none four times.
+    assert 0.3 < (middle == 4).mean() < 0.7
+    assert (middle >= 3).mean() > 0.9
+    assert (middle >= 1).all()
     assert coverage.main(["--lake", str(lake / "none")]) == 2
     assert "no table exposures" in capsys.readouterr().err
