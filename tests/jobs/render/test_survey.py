@@ -3,6 +3,7 @@
 import copy
 import tomllib
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -229,6 +230,50 @@ def test_a_pointing_in_front_changes_nobody_else_s_noise(tmp_path):
     (a,), (_, b) = alone.to_pylist(), both.to_pylist()
     assert a["exposure_id"] != b["exposure_id"]
     assert exposing.identity(a) == exposing.identity(b)
+
+
+# ------------------------------------------------------------------------------------------------ ground surveys
+
+
+def layers(exposures, ra, dec):
+    """[n] How many exposures of a camera see each place, gaps between its detectors left out."""
+    assert {e.position_angle for e in exposures} == {0.0}
+    east, north, out = focal_plane.basis(*np.array([(e.ra, e.dec) for e in exposures]).T)
+    places = focal_plane.basis(ra, dec)[2]
+    near, which = np.nonzero(out.T @ places > np.cos(np.radians(2.0)))
+    # On the tangent plane; x to the west.
+    x, y = (
+        np.degrees(3600.0) * (axis[:, near] * places[:, which]).sum(0) / (out[:, near] * places[:, which]).sum(0)
+        for axis in (-east, north)
+    )
+    inside = [
+        (side.min(axis=1) < at[:, None]) & (at[:, None] < side.max(axis=1))
+        for at, side in zip(
+            (x, y), focal_plane.outline(focal_plane.detectors(exposures[0].camera, MISSION)), strict=True
+        )
+    ]
+    return np.bincount(which, (inside[0] & inside[1]).sum(axis=1), len(ra))
+
+
+def test_ground_surveys_see_the_main_run_as_often_as_theirs_did():
+    """Serrano et al. 2024, their table of exposures and layers."""
+    wanted = requests.parse(DEMO.with_name("sc8_main.toml"))
+    rules = list(MISSION.rows("survey.external"))
+    assert len(wanted.observations) == 1 + len(rules)
+    for block, rule in zip(wanted.observations[1:], rules, strict=True):
+        assert (block.survey, block.exposures) == (rule["survey"], int(rule["exposures"]))
+        taken = [e for e, _ in survey.exposures(replace(wanted, observations=(block,)), MISSION)]
+        assert {e.band for e in taken} == set(rule["bands"].split())
+        if rule["shared"] == "0":
+            taken = [e for e in taken if e.band == taken[0].band]
+        assert len(taken) == block.exposures
+        ra, dec, radius = block.area.bounds()
+        places = np.random.default_rng(5).uniform(-radius, radius, (2, 1000))
+        ra, dec = ra + places[0] / np.cos(np.radians(dec)), dec + places[1]
+        inside = block.area.contains(ra, dec)
+        assert inside.sum() > 50
+        mean = layers(taken, ra[inside][:200], dec[inside][:200]).mean()
+        assert int(rule["layers_min"]) <= round(mean) <= int(rule["layers_max"]), (block.survey, block.bands, mean)
 
 
 # ------------------------------------------------------------------------------------------------ pilot phase
