@@ -147,10 +147,13 @@ def _refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> 
             raise BadInput(f"table {name} was planned for another request: run plan_exposures first")
     if facts["mission"].get("mission") != wanted["mission"]:
         raise BadInput("table mission was planned for another request: run plan_exposures first")
+    drawn = {"seed": request.seed, **request.facts("universe")["universe"]}
     for name in ("galaxies", "stars"):
-        if facts[name].get("seed") != request.seed:
-            seeds = f"seed {facts[name].get('seed')}, the request {request.seed}"
-            raise BadInput(f"table {name} has {seeds}: build it first")
+        # A catalogue that was not drawn by us has a seed alone.
+        for key in ("seed", *(key for key in drawn if key in facts[name])):
+            if facts[name].get(key) != drawn[key]:
+                values = f"{key} {facts[name].get(key)}, the request {drawn[key]}"
+                raise BadInput(f"table {name} has {values}: run build_{name} first, then compute_fluxes")
     if LENSES in inputs and facts[LENSES].get("galaxies") != inputs["galaxies"].key:
         raise BadInput(f"table {LENSES} was drawn in another version of galaxies: run build_strong_lenses first")
     for catalogue, fluxes in CATALOGUES:

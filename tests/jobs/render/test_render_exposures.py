@@ -491,3 +491,20 @@ def test_what_the_catalogue_does_not_hold_is_refused_before_anything_is_rendered
     with pytest.raises(BadInput, match=r"table galaxies lacks \d+ order-8 cells .*: run build_galaxies over an area"):
         render_exposures.steps(lake, request)
     assert not (lake / "products").exists()
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        ({"seed": 8}, "table galaxies has seed 7, the request 8: run build_galaxies first"),
+        ({"galaxy_limit": 24.0}, "table galaxies has galaxy_limit 23.5, the request 24.0: run build_galaxies first"),
+        ({"star_limit": 21.0}, "table stars has star_limit 20.0, the request 21.0: run build_stars first"),
+    ],
+)
+def test_a_catalogue_of_another_universe_is_refused(lake, other, words):
+    universe = {**REQUEST["universe"], **{key: value for key, value in other.items() if key != "seed"}}
+    request = wanted(universe=universe, seed=other.get("seed", REQUEST["seed"]))
+    make(lake, request, plan_exposures)
+    with pytest.raises(BadInput, match=words):
+        render_exposures.steps(lake, request)
+    assert not (lake / "products").exists()
