@@ -259,7 +259,7 @@ def _bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
 
 
 def _spark_map(function: Callable[[Part], Json], parts: Sequence[Part], name: str, verbose: bool) -> Iterable[Json]:
-    """Map over parts, one Spark task each; a part that kills its worker is found by running what is left one by one."""
+    """Map over parts, one Spark task each; a part that kills its worker is found by running what is left in halves."""
     from py4j.protocol import Py4JError
     from pyspark.errors import PySparkException
 
@@ -282,10 +282,8 @@ def _spark_map(function: Callable[[Part], Json], parts: Sequence[Part], name: st
             raise LakeError(f"Spark has ended; {_AGAIN}") from None
         if len(parts) == 1:
             return [{"part": parts[0].name, "error": "its worker died"}]
-    results: list[Json] = []
-    for part in parts:
-        results += _spark_map(function, [part], name, verbose)
-    return results
+    half = len(parts) // 2
+    return [r for some in (parts[:half], parts[half:]) for r in _spark_map(function, some, name, verbose)]
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from py4j.protocol import Py4JNetworkError
 from jobs import shell
 from jobs.shell import Job, Step
 from lake_schema import __version__, layout, publish, read
-from lake_schema.publish import Plan
+from lake_schema.publish import Part, Plan
 from tests import requests
 from tests.universe import PLAIN, plain_plan, plain_work
 
@@ -162,6 +162,26 @@ def test_a_java_that_dies_while_it_starts_is_one_line(lake, request_file, capsys
     err = capsys.readouterr().err
     assert err.startswith("toy_job: Spark did not start: ")
     assert len(err.splitlines()) == 1
+
+
+def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
+    """Of a thousand parts all but the poisoned one are made, in runs of many parts each."""
+    runs = []
+
+    def collect(spark, function, parts):
+        runs.append(len(parts))
+        if any(part.name == "700" for part in parts):
+            raise Py4JNetworkError("the worker is gone")
+        return [{"part": part.name} for part in parts]
+
+    monkeypatch.setattr("jobs.session.session", lambda name: None)
+    monkeypatch.setattr("jobs.session.is_alive", lambda spark: True)
+    monkeypatch.setattr(shell, "_collect", collect)
+    parts = [Part(f"{i:03}", {}) for i in range(1000)]
+    results = shell._spark_map(dict, parts, "toy", verbose=True)
+    assert [result["part"] for result in results] == [part.name for part in parts]
+    assert [result for result in results if "error" in result] == [{"part": "700", "error": "its worker died"}]
+    assert len(runs) <= 2 * 10 + 1
 
 
 def test_the_bar_counts_receipts(run, monkeypatch, capsys):
