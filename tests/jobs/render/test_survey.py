@@ -311,6 +311,16 @@ def test_the_pilot_phase_counts_exactly():
     assert lamps == dict.fromkeys(range(1, 6), 150)
 
 
+@pytest.mark.parametrize(("name", "fields"), [("sc8_main", 331), ("sc8_deep", 3 * 10)])
+def test_the_main_and_the_deep_run_count_by_their_fields(name, fields):
+    """Serrano et al. 2024, their tables; of the main run's three bands they print 3948."""
+    wanted = requests.parse(DEMO.with_name(f"{name}.toml"))
+    own = survey.exposures(replace(wanted, observations=wanted.observations[:1]), MISSION)
+    count = Counter(e.channel for e, _ in own)
+    assert count == {"VIS": 4 * fields, "NISP-P": 3 * 4 * fields, "NISP-S": 4 * fields}
+    assert len({(e.field, e.visit) for e, _ in own}) == fields
+
+
 def test_other_requests_are_good():
     for path in sorted(DEMO.parent.glob("*.toml")):
         assert requests.parse(path).name == path.stem
