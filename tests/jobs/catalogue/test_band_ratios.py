@@ -70,11 +70,14 @@ def test_a_galaxy_at_z_01_in_sdss_r_is_seen_in_its_reference_band(library, templ
     assert -2.5 * np.log10(seen / rest) == pytest.approx(-2.5 * np.log10(1.1), abs=1e-3)
 
 
-@pytest.mark.parametrize("band", ["euclid_vis", "sdss_r01"])
-def test_table_against_integration_of_the_dusty_redshifted_spectrum(library, band, rng):
-    table = band_ratios.load(library, band, 2.3, 0.5)
+@pytest.mark.parametrize(
+    ("band", "dustiest"), [("euclid_vis", 0.5), ("sdss_r01", 0.5), ("lsst_u", 0.5), ("euclid_vis", 3.0)]
+)
+def test_table_against_integration_of_the_dusty_redshifted_spectrum(library, band, dustiest, rng):
+    """In the ultraviolet, and behind as much dust as a training table may have, too."""
+    table = band_ratios.load(library, band, 2.3, dustiest)
     n = 60
-    z, ebv = rng.uniform(0.0, 2.3, n), rng.uniform(0.0, 0.5, n)
+    z, ebv = rng.uniform(0.0, 2.3, n), rng.uniform(0.0, dustiest, n)
     template, law = rng.integers(0, 31, n), rng.integers(0, 5, n)
     k = extinction.laws(library.wavelength)
     curve, rest = passbands.load(band), passbands.load("sdss_r01")
