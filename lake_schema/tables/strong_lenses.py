@@ -16,7 +16,7 @@ STRONG_LENSES = Table(
         Column("ra_lensed", "float64", "deg", "pos.eq.ra", "observed right ascension of the lens", 0.0, 360.0),
         Column("dec_lensed", "float64", "deg", "pos.eq.dec", "observed declination of the lens", -90.0, 90.0),
         Column("kind", "int8", ucd="src.class", doc="kind of source", codes=((4, "strong lens"),), lo=4, hi=4),
-        Column("lens_id", "int64", ucd="meta.id.assoc", doc="the lens: a central of table galaxies", lo=0),
+        Column("lens_id", "int64", ucd="meta.id.assoc", doc="the lens: a central or satellite of table galaxies", lo=0),
         Column(
             "source_id",
             "int64",
