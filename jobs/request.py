@@ -104,7 +104,8 @@ _NOTHING_TAKEN = Ingest()
 class Universe:
     """How deep and how fine.
 
-    galaxy_limit, galaxy_band : faintest magnitude (AB, before Milky Way dust) in which passband
+    galaxy_limit, galaxy_band : faintest magnitude (AB, before the Milky Way's dust and intergalactic hydrogen), in
+                               which of the embedded passbands
     star_limit               : H (Vega, as observed);  z_max : highest redshift
     box_cells                : cells of 4 Mpc/h a side of the box of matter
     lensing_nside            : HEALPix resolution of the lensing maps

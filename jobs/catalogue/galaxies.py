@@ -58,7 +58,7 @@ _MARGIN = 0.02
 class GalaxyModel:
     """Everything that galaxies are drawn from; a few MB, made once by `model`.
 
-    limit     : faintest magnitude, AB, before the Milky Way's dust
+    limit     : faintest magnitude, AB, before the Milky Way's dust and intergalactic hydrogen
     selection : the limit's band against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
     training  : observed galaxies whose spectra ours have, None = spectra that have the colours
     """
@@ -212,7 +212,7 @@ def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed) -> 
 
 
 def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
-    """Magnitude[n] in the limit's band, AB, unmagnified and before the Milky Way's dust.
+    """Magnitude[n] in the limit's band, AB, unmagnified, before intergalactic hydrogen and the Milky Way's dust.
 
     Error: < 0.001 mag (tests/jobs/catalogue/test_band_ratios)
     """
