@@ -222,9 +222,12 @@ def sources(
     return rows, light, complete
 
 
-def lenses(table: read.Version, task: Mapping[str, Any], deflection: float) -> pa.Table:
-    """Strong lenses that are seen within a task's circle; deflection : largest of the galaxies, deg."""
-    cells = selection.needed(task, deflection)
+def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, least: float) -> pa.Table:
+    """Strong lenses that are seen within a task's circle.
+
+    deflection : largest of the galaxies, deg;  least : infinite where no source shows, as in `sources`
+    """
+    cells = selection.needed(task, deflection) if np.isfinite(least) else []
     about = table.in_cells(cells, GENERATION_ORDER, ["id", "ra_lensed", "dec_lensed"])
     ra, dec = (about[name].to_numpy() for name in ("ra_lensed", "dec_lensed"))
     seen = about["id"].filter(pa.array(selection.near(ra, dec, (task["ra"], task["dec"]), task["radius"])))
@@ -271,7 +274,7 @@ def work(lake: Path, facts: Json) -> Output:
         forced=own.forced,
         complete=margin + min(complete for *_, complete in found),
         truth=request["truth"],
-        lenses=lenses(inputs[LENSES], task, _deflection(inputs["galaxies"])) if LENSES in inputs else None,
+        lenses=lenses(inputs[LENSES], task, _deflection(inputs["galaxies"]), least) if LENSES in inputs else None,
     )
     rows, files = fits_product.products(rendered, request["truth"], request["compression"] == "rice")
     drawn = fits_product.truth(rendered)

@@ -398,6 +398,11 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
     assert render(lake, crowded) == BOTH
     drawn = read.version(lake, "rendered_truth").rows(where=pc.field("method") == fits_product.PICTURE)
     assert len(drawn) > 0
+    # In an exposure of no time nothing shows: neither galaxies are read nor what lenses make of them.
+    for least, shows in ((0.0, True), (np.inf, False)):
+        tasks = read.version(lake, "tasks").rows().to_pylist()
+        found = sum(render_exposures.lenses(version, task, 0.1, least).num_rows for task in tasks)
+        assert (found > 0) == shows
     assert set(drawn["id"].to_pylist()) <= set(version.rows(["id"])["id"].to_pylist())
     changed = {path for path, data in images(lake).items() if data != plain[path]}
     for detector in set(drawn["detector"].to_pylist()):
