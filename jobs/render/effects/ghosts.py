@@ -19,13 +19,14 @@ _FINE = 4
 
 def apply(
     frame: Frame, lights: Lights, ratio: float, offset: tuple[float, float], radius: float, hole: float,
-    arms: tuple[float, ...], width: float, rng: np.random.Generator | None = None,
+    arms: tuple[tuple[float, float, float, float], ...], width: float, rng: np.random.Generator | None = None,
 ) -> Frame:  # fmt: skip
     """frame [ny, nx] e- -> plus the ghost of every light, also of those outside the frame.
 
     ratio  : light of a ghost over its star's;  offset : (columns, rows) from star to ghost
     radius : pixels;  hole : its inner radius over the outer
-    arms   : degrees, where the arms lie, from x to y;  width : pixels
+    arms   : of each its middle's column and row from the ghost's centre, its angle from x to y (degrees), half its
+             length;  width : of all.  Pixels
     """
     for name, value, least, most in (
         ("ghost ratio", ratio, 0.0, 1.0), ("ghost radius", radius, 0.5, 1e4), ("ghost hole", hole, 0.0, 0.99),
@@ -36,15 +37,14 @@ def apply(
     out = np.array(frame, dtype=float, order="C")
     if ratio == 0.0 or out.size == 0 or not len(lights.electrons):
         return out
-    angles = np.radians(np.array(arms, float).reshape(-1))
-    stamp = _pupil(radius, hole, np.cos(angles), np.sin(angles), width)
+    stamp = _pupil(radius, hole, np.array(arms, float).reshape(-1, 4), width)
     stamp /= stamp.sum()
     _add(out, lights.column + offset[0], lights.row + offset[1], ratio * lights.electrons, stamp)
     return out
 
 
 @jit
-def _pupil(radius: float, hole: float, cosine: Any, sine: Any, width: float) -> Any:
+def _pupil(radius: float, hole: float, arms: Any, width: float) -> Any:
     """What of each pixel is lit: [n, n], n odd, its middle the centre."""
     half = int(np.ceil(radius)) + 1
     stamp = np.zeros((2 * half + 1, 2 * half + 1))
@@ -56,9 +56,10 @@ def _pupil(radius: float, hole: float, cosine: Any, sine: Any, width: float) -> 
                     x, y = c - half + (j + 0.5) / _FINE - 0.5, r - half + (i + 0.5) / _FINE - 0.5
                     distance = np.hypot(x, y)
                     inside = hole * radius <= distance <= radius
-                    for a in range(len(cosine)):
-                        along, across = x * cosine[a] + y * sine[a], y * cosine[a] - x * sine[a]
-                        inside = inside and not (along > 0 and abs(across) < 0.5 * width)
+                    for arm in arms:
+                        dx, dy, angle = x - arm[0], y - arm[1], np.radians(arm[2])
+                        across = dy * np.cos(angle) - dx * np.sin(angle)
+                        inside = inside and not (np.hypot(dx, dy) <= arm[3] and abs(across) < 0.5 * width)
                     lit += inside
             stamp[r, c] = lit / (_FINE * _FINE)
     return stamp
@@ -86,18 +87,27 @@ def _add(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -> None:
 
 
 def parameters(scene: Scene) -> tuple[Any, ...]:
-    """Of the mission database; the offset is along the focal plane's y axis."""
-    turn = np.radians(scene.detector.rotation) if scene.detector is not None else 0.0
+    """Of the mission database; the offset is along the focal plane's y axis, and the arms are the pupil's."""
+    turn = scene.detector.rotation if scene.detector is not None else 0.0
+    cosine, sine = float(np.cos(np.radians(turn))), float(np.sin(np.radians(turn)))
     length = scene.value("ghost.offset_y", "pix")
-    offset = (length * float(np.sin(turn)), length * float(np.cos(turn)))
-    arms = tuple(
-        scene.mission.value(f"plm.pupil.spider{number}.angle", "deg") + float(np.degrees(turn)) for number in (1, 2, 3)
-    )
     radius = scene.value("ghost.radius_out", "pix")
     aperture = 0.5 * scene.mission.value("plm.aperture_diameter", "mm")
-    width = scene.mission.value("plm.pupil.spider_width", "mm") / aperture * radius
+
+    def of(key: str, unit: str) -> float:
+        return scene.mission.value(f"plm.pupil.{key}", unit)
+
+    scale = radius / aperture
+    reach = scale * of("spider_half_length", "mm")
+    places = [[scale * of(f"spider{number}.{axis}", "mm") for axis in "xy"] for number in (1, 2, 3)]
+    # From the focal plane's axes to the detector's.
+    arms = tuple(
+        (x * cosine + y * sine, y * cosine - x * sine, of(f"spider{number}.angle", "deg") - turn, reach)
+        for number, (x, y) in enumerate(places, start=1)
+    )
+    width = scale * of("spider_width", "mm")
     ratio, hole = scene.value("ghost.flux_ratio", ""), scene.value("ghost.radius_in_ratio", "")
-    return noticeable(scene, ratio), ratio, offset, radius, hole, arms, width
+    return noticeable(scene, ratio), ratio, (length * sine, length * cosine), radius, hole, arms, width
 
 
 def noticeable(scene: Scene, ratio: float) -> Lights:

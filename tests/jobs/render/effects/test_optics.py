@@ -6,7 +6,7 @@ import galsim
 import numpy as np
 import pytest
 
-from jobs.render import focal_plane
+from jobs.render import focal_plane, psf
 from jobs.render.effects import (
     calibration_lamp,
     ghosts,
@@ -50,8 +50,11 @@ def test_a_ghost_is_an_annulus_of_the_right_light():
 
 
 def test_arms_of_the_ghost():
-    """Three dark spokes, where the arms are."""
-    image = ghosts.apply(EMPTY, light(150.0, 100.0), 1e-4, (0.0, 100.0), 56.0, 0.33, (0.0, 90.0, 225.0), 4.0)
+    """Three dark bars, where the arms are."""
+    arms = tuple(
+        (40 * np.cos(np.radians(angle)), 40 * np.sin(np.radians(angle)), angle, 20.0) for angle in (0.0, 90.0, 225.0)
+    )
+    image = ghosts.apply(EMPTY, light(150.0, 100.0), 1e-4, (0.0, 100.0), 56.0, 0.33, arms, 4.0)
     along = {
         angle: (150 + 40 * np.cos(np.radians(angle)), 200 + 40 * np.sin(np.radians(angle)))
         for angle in range(0, 360, 15)
@@ -60,13 +63,35 @@ def test_arms_of_the_ghost():
     assert dark == [0, 90, 225]
 
 
+@pytest.mark.parametrize("name", PLACES)
+def test_the_ghost_s_arms_are_the_pupil_s(name):
+    """Pixel by pixel what the pupil of the PSF lets through, in whatever way the detector is mounted."""
+    shown = scene(name, lights=light(150, 100, 1e12))
+    _, _, _, radius, _, arms, width = ghosts.parameters(shown)
+    image = ghosts.apply(EMPTY, light(150, 200), 1.0, (0.0, 0.0), radius, 0.0, arms, width)
+    y, x = np.mgrid[:400, :300] - np.array([200.0, 150.0])[:, None, None]
+    turn, mm = np.radians(shown.detector.rotation), 600.0 / radius
+    place = mm * (x * np.cos(turn) - y * np.sin(turn)), mm * (x * np.sin(turn) + y * np.cos(turn))
+    clear = psf.pupil(*place, mm, MISSION)
+    # Outside the central stop, which the ghost has in its own size and place, and inside the edge.
+    seen = (np.hypot(*place) > 270.0) & (np.hypot(*place) < 580.0)
+    np.testing.assert_allclose(image[seen] / image.max(), clear[seen], atol=0.25)
+    assert (image[seen] < 0.1 * image.max()).sum() > 20
+
+
 def test_stars_outside_send_their_ghosts_in():
     """A star below the frame; the ghost is the one of a larger frame."""
-    large = ghosts.apply(np.zeros((1000, 300)), light(100, 200), 1e-4, (0.0, 700.0), 56.0, 0.33, (16.8,), 1.0)
-    inside = ghosts.apply(np.zeros((400, 300)), light(100, -400), 1e-4, (0.0, 700.0), 56.0, 0.33, (16.8,), 1.0)
+    large = ghosts.apply(
+        np.zeros((1000, 300)), light(100, 200), 1e-4, (0.0, 700.0), 56.0, 0.33, ((20.0, 6.0, 16.8, 30.0),), 1.0
+    )
+    inside = ghosts.apply(
+        np.zeros((400, 300)), light(100, -400), 1e-4, (0.0, 700.0), 56.0, 0.33, ((20.0, 6.0, 16.8, 30.0),), 1.0
+    )
     np.testing.assert_array_equal(large[600:], inside)
     assert inside.sum() == pytest.approx(1e4, rel=1e-6)
-    far = ghosts.apply(np.zeros((400, 300)), light(100, 250), 1e-4, (0.0, 700.0), 56.0, 0.33, (16.8,), 1.0)
+    far = ghosts.apply(
+        np.zeros((400, 300)), light(100, 250), 1e-4, (0.0, 700.0), 56.0, 0.33, ((20.0, 6.0, 16.8, 30.0),), 1.0
+    )
     assert (far == 0).all()
 
 
