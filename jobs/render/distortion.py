@@ -6,6 +6,7 @@ linear terms, so that the boresight stays, and the scale there. In pixels it is 
 terms      a camera's polynomial, from the mission database
 bent       P -> P + D(P)
 sip        the same in a detector's pixels: coefficients of the header's cards
+stretch    what it does to a pixel's area
 straight   what SIP makes of pixels, undone
 
 Ref : Shupe et al. 2005 (SIP)
@@ -74,6 +75,25 @@ def sip(some: Terms, matrix: Float) -> tuple[Float, Float]:
         to_y += b * power
     inverse = np.linalg.inv(matrix)
     return inverse[0, 0] * to_x + inverse[0, 1] * to_y, inverse[1, 0] * to_x + inverse[1, 1] * to_y
+
+
+def stretch(some: Terms, matrix: Float) -> Float:
+    """Coefficients [n, n] of u^p v^q: the area that a pixel sees over that at the boresight, less 1.
+
+    matrix : as of `sip`, whose derivative's determinant it is
+    """
+    a, b = sip(some, matrix)
+    (au, av), (bu, bv) = ([np.asarray(polynomial.polyder(c, axis=axis), float) for axis in (0, 1)] for c in (a, b))
+    side = 2 * len(a) - 1
+    out = np.zeros((side, side))
+    for sign, factors in ((1.0, (au, _ONE)), (1.0, (bv, _ONE)), (1.0, (au, bv)), (-1.0, (av, bu))):
+        one, other = factors
+        for p, q in np.argwhere(one).tolist():
+            out[p : p + other.shape[0], q : q + other.shape[1]] += sign * one[p, q] * other
+    return out
+
+
+_ONE = np.ones((1, 1))
 
 
 def _binomial(line: Float, n: int) -> Float:

@@ -22,7 +22,7 @@ Maps = dict[str, npt.NDArray[Any]]
 BYTES = {"noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "saturation": 1}
 # What adds to a map of the same name as an effect, or of another.
 _OF_EFFECT = {
-    "ghosts": "ghosts", "background": "sky", "straylight": "sky", "cosmic_rays": "cosmic_rays",
+    "ghosts": "ghosts", "background": "sky", "pixel_area": "sky", "straylight": "sky", "cosmic_rays": "cosmic_rays",
     "readout_cosmic_rays": "cosmic_rays",
 }  # fmt: skip
 
@@ -43,7 +43,7 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str]) -> Callable[[str, Fram
     def see(name: str, before: Frame, after: Frame) -> None:
         if name == "ghosts" and "ghosts" in truth:
             maps["ghosts"] = (after - before).astype(np.float32)
-        if name in ("background", "straylight") and "sky" in truth:
+        if name in ("background", "pixel_area", "straylight") and "sky" in truth:
             maps["sky"] = (after - before).astype(np.float32) + maps.get("sky", np.float32(0.0))
         if name in ("bleeding", "full_well") and "saturation" in truth:
             maps["saturation"] = bleeding.saturated(after, scene.value("full_well", "electron")).astype(np.uint8)

@@ -24,6 +24,7 @@ from jobs.render.effects import (
     illumination,
     intra_pixel,
     nonlinearity,
+    pixel_area,
     pixel_response,
     poisson,
     quadrants,
@@ -40,6 +41,7 @@ _LIGHT = (
     ghosts.EFFECT,
     straylight.EFFECT,
     background.EFFECT,
+    pixel_area.EFFECT,
     illumination.EFFECT,
     illumination.SHUTTER,
 )

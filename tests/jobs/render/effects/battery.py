@@ -54,6 +54,10 @@ def flat(shape):
     return tuple(np.zeros(n) for n in shape[::-1])
 
 
+def stretched(strength):
+    return lambda shape: (120.0, *(np.arange(float(n)) for n in shape[:-3:-1]), np.array([[0.0, strength], [0.0, 0.0]]))
+
+
 # `on` and `off` may depend on the frame's shape.
 _CASES = (
     Case("background", (120.0,), (0.0,), zero=False, whole=True),
@@ -63,6 +67,7 @@ _CASES = (
         (LIGHTS, 0.0, (0.0, 5.0), 6.0, 0.33, (), 0.0),
         zero=False,
     ),
+    Case("pixel_area", stretched(1e-2), stretched(0.0), zero=False),
     Case("straylight", (LIGHTS, 5e-4, 40.0), (LIGHTS, 0.0, 40.0), zero=False),
     Case("illumination", bowl, flat, linear=True),
     Case("pixel_response", (0.01, 1e-2, 1.0), (0.0, 0.0, 0.0), linear=True),

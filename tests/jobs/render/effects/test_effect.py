@@ -24,8 +24,8 @@ def test_the_order_of_physics():
     """Light is counted once, before anything is charge; charge is read before it is amplified and converted."""
     assert [effect.name for effect in ext.SKY] == NAMES
     assert [effect.name for effect in vis.SKY] == [
-        "ghosts", "straylight", "background", "illumination", "shutter", "pixel_response", "poisson",
-        "brighter_fatter", "dark_current", "hot_pixels", "cosmic_rays", "bleeding", "quadrants",
+        "ghosts", "straylight", "background", "pixel_area", "illumination", "shutter", "pixel_response",
+        "poisson", "brighter_fatter", "dark_current", "hot_pixels", "cosmic_rays", "bleeding", "quadrants",
         "readout_cosmic_rays", "parallel_cti", "serial_cti", "nonlinearity", "crosstalk", "bias_structure",
         "read_noise", "adc",
     ]  # fmt: skip

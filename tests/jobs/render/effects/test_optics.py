@@ -12,6 +12,7 @@ from jobs.render.effects import (
     ghosts,
     illumination,
     intra_pixel,
+    pixel_area,
     pixel_response,
     readout_trail,
     straylight,
@@ -162,6 +163,31 @@ def test_faint_stars_have_no_halo():
     chosen, fraction, scale = straylight.EFFECT.parameters(scene(lights=many))
     assert (fraction, scale) == (5e-4, 400.0)
     np.testing.assert_array_equal(chosen.electrons, [1e11])
+
+
+# ------------------------------------------------------------------------------------------------ pixel area
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_a_pixel_sees_of_the_sky_what_the_jacobian_says(name):
+    """Corners and middle, against differences of the header's world coordinates; at the boresight nothing changes."""
+    one = scene(name)
+    electrons, u, v, stretch = pixel_area.parameters(one)
+    assert electrons == one.sky_electrons
+    column, row = (np.array(at) for at in ((0, 4095, 2000, 0, 4095), (0, 0, 2000, 4131, 4131)))
+    found = np.diag(pixel_area.change(u[column], v[row], stretch))
+    system = focal_plane.wcs(one.detector, 150.0, 2.0, 33.0)
+    area = np.abs(np.linalg.det(focal_plane.jacobian(system, column, row))) / 0.1**2
+    # The tangent plane is 1.2e-4 larger than the sky at the corners of the field.
+    np.testing.assert_allclose(found, area - 1.0, atol=2e-4)
+    assert np.abs(pixel_area.change(np.zeros(1), np.zeros(1), stretch)).max() == 0
+    assert pixel_area.EFFECT.needed_if(one) == (name == "1-1")
+
+
+def test_without_distortion_all_pixels_see_the_same():
+    straight = replace(scene(), detector=replace(scene().detector, bending=()))
+    for one in (straight, replace(straight, detector=None)):
+        assert pixel_area.EFFECT.contribution(one) == 0.0
 
 
 # ------------------------------------------------------------------------------------------------ illumination

@@ -32,6 +32,7 @@ def star(electrons):
 # For each effect what makes it large, from far below its threshold to far above.
 CASES = {
     "background": lambda x: scene(sky=0.01 * x),
+    "pixel_area": lambda x: scene(sky=0.01 * x),
     "illumination": lambda x: scene(illumination=min(1e-4 * x, 0.5)),
     "shutter": lambda x: scene(shutter_map=min(1e-4 * x, 0.5)),
     "pixel_response": lambda x: scene(peak=200.0, prnu=min(3e-3 * x, 0.5), dead_pixels=0.0, dark_columns=0.0),
@@ -80,6 +81,9 @@ def test_what_is_left_out_is_not_noticed(name):
         if name in ("illumination", "shutter", "calibration_lamp"):
             *level, columns, rows = parameters
             parameters = (*level, columns[:NX], rows)
+        if name == "pixel_area":
+            electrons, u, v, stretch = parameters
+            parameters = (electrons, u[:NX], v, stretch)
         change = effect.apply(before, *parameters, rng=np.random.default_rng(1)) - before
         assert np.sqrt(np.mean(change**2)) < NOTICEABLE * one.pixel_noise
         assert np.abs(change).max() < one.pixel_noise
