@@ -22,7 +22,7 @@ def response(shape: tuple[int, ...], rms: float, dead: float, dark_columns: floa
     """Sensitivity of every pixel, mean 1 but for the defects, never below 0.
 
     rms : between pixels;  dead : fraction of pixels that see little
-    dark_columns : mean number of columns that see nothing from some row on
+    dark_columns : mean number of columns that see nothing from some row on, away from their register, to the middle
     """
     for name, value, most in (
         ("pixel response rms", rms, 1.0), ("dead pixels", dead, 1.0), ("dark columns", dark_columns, 1e4)
@@ -37,8 +37,12 @@ def response(shape: tuple[int, ...], rms: float, dead: float, dark_columns: floa
     count = int(rng.binomial(ny * nx, dead))
     rows, columns = rng.integers(0, max(ny, 1), count), rng.integers(0, max(nx, 1), count)
     out[..., rows, columns] = _DEAD * rng.random(count)
+    middle = (ny + 1) // 2
     for _ in range(int(rng.poisson(dark_columns)) if nx else 0):
-        out[..., int(rng.integers(0, ny)) :, int(rng.integers(0, nx))] = 0.0
+        row, column = int(rng.integers(0, ny)), int(rng.integers(0, nx))
+        # Charge from beyond the defect does not come past it to its register, at either end of the columns.
+        blind = slice(row, middle) if row < middle else slice(middle, row + 1)
+        out[..., blind, column] = 0.0
     return out
 
 

@@ -253,6 +253,14 @@ def test_the_response_of_pixels():
     assert 1 <= (dark > 2).sum() <= 9
     assert ((response > 0) & ~good).sum() == pytest.approx(300, abs=80)
     assert pixel_response.EFFECT.fixed
+    # A defect hides what lies behind it, as seen from its own register: up to the middle, and no farther.
+    many = pixel_response.response((40, 500), 0.0, 0.0, 200.0, np.random.default_rng(3)) == 0
+    below, above = many[:20], many[20:][::-1]
+    assert below.any()
+    assert above.any()
+    for half in (below, above):
+        assert (np.diff(half.astype(int), axis=0) >= 0).all()
+    assert (below.any(axis=0) != above.any(axis=0)).sum() > 50
 
 
 @pytest.mark.parametrize("wrong", [(-1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, -1.0), (np.nan, 0.0, 0.0)])
