@@ -3,6 +3,7 @@
 sky_band, sky_rate    of a camera and band, at a position and date
 zodiacal_intensity    W m-2 sr-1 um-1 at 500 nm
 zodiacal_rate         through a passband
+starlight             of a field's stars, of which the telescope scatters some
 solar                 the Sun's spectrum
 sun_longitude
 """
@@ -21,6 +22,7 @@ from jobs.render.focal_plane import Detector
 from lake_schema.ecliptic import ecliptic
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.sky import galactic
 from lake_schema.units import LIGHT_ANGSTROM_S, PLANCK_ERG_S
 
 Float = npt.NDArray[np.float64]
@@ -42,15 +44,17 @@ _ARCSEC = np.pi / 180.0 / 3600.0
 class SkyBand:
     """What of a band's sky depends neither on the place nor on the date.
 
-    constant            : electrons per second in a pixel: scattered starlight, thermal light, the ground's sky
+    constant            : electrons per second in a pixel: thermal light, the ground's sky
     zodi, red, blue     : electrons per second in a pixel for a unit of intensity at 500 nm: of the Sun's spectrum,
                           and of it times the decades of wavelength on either side of 500 nm
+    stars               : electrons per second in a pixel: scattered light of the stars of |b| = 60 deg
     """
 
     constant: float
     zodi: float = 0.0
     red: float = 0.0
     blue: float = 0.0
+    stars: float = 0.0
 
 
 def sky_band(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
@@ -62,11 +66,11 @@ def sky_band(detector: Detector, band: str, mission: MissionConfiguration, curve
     section = detector.section
     if section in ("vis", "nisp"):
         extra = f"{section}.scattered_light" if section == "vis" else f"{section}.{band}.thermal"
-        constant = mission.value(extra, "electron / (s pix)")
+        rate = mission.value(extra, "electron / (s pix)")
+        constant, stars = (0.0, rate) if section == "vis" else (rate, 0.0)
         area = mission.value("plm.collecting_area", "m2")
-        return SkyBand(
-            constant, *_zodiacal_integrals(curve or passbands.load(band), area, detector.pixel_scale, mission)
-        )
+        zodi = _zodiacal_integrals(curve or passbands.load(band), area, detector.pixel_scale, mission)
+        return SkyBand(constant, *zodi, stars)
     if f"{section}.{band}.sky" in mission:
         return SkyBand(mission.value(f"{section}.{band}.sky", "electron / (s pix)"))
     zero_point = mission.value(f"{section}.{band}.zero_point", "mag")
@@ -76,7 +80,27 @@ def sky_band(detector: Detector, band: str, mission: MissionConfiguration, curve
 
 def sky_rate(own: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
     """Electrons per second in a pixel of a band, at a place and date."""
-    return own.constant + (_zodiacal(own, ra, dec, mjd, mission) if own.zodi else 0.0)
+    scattered = own.stars * starlight(ra, dec, mission) if own.stars else 0.0
+    return own.constant + scattered + (_zodiacal(own, ra, dec, mjd, mission) if own.zodi else 0.0)
+
+
+def starlight(ra: float, dec: float, mission: MissionConfiguration) -> float:
+    """Light of a field's stars over its mean at a Galactic latitude of 60 deg, bilinear in the logarithm.
+
+    Error : without dust: within 10 deg of the Galactic plane too bright, several times in the plane
+    """
+    longitude, latitude = (float(angle) for angle in galactic(ra, dec))
+    longitudes, latitudes, logarithms = _starlight_table(mission.numbers("env.straylight.map"))
+    along = [np.interp(abs(latitude), latitudes, line) for line in logarithms]
+    return float(np.exp(np.interp(min(longitude, 360.0 - longitude), longitudes, along)))
+
+
+@lru_cache(maxsize=8)
+def _starlight_table(rows: tuple[tuple[float, ...], ...]) -> tuple[Float, Float, Float]:
+    """Longitudes [l] folded at 180 deg, latitudes [b], deg, logarithms [l, b]."""
+    table = np.array(sorted(rows))
+    longitudes, latitudes = np.unique(table[:, 0]), np.unique(table[:, 1])
+    return longitudes, latitudes, np.log(table[:, 2]).reshape(len(longitudes), len(latitudes))
 
 
 def sun_longitude(mjd: float) -> float:

@@ -106,6 +106,29 @@ def test_what_a_camera_sees():
     vis = focal_plane.detector("vis", "3-4", MISSION)
     place = at(90, 30)
     zodi = sky.zodiacal_rate(*place, passbands.load("euclid_vis"), 0.9926, 0.1, MISSION)
-    assert sky.sky_rate(sky.sky_band(vis, "euclid_vis", MISSION), *place, MISSION) == pytest.approx(zodi + 0.0296)
+    scattered = 0.0296 * sky.starlight(*place[:2], MISSION)
+    assert sky.sky_rate(sky.sky_band(vis, "euclid_vis", MISSION), *place, MISSION) == pytest.approx(zodi + scattered)
     lsst = focal_plane.detector("lsstcam", "R22_S11", MISSION)
     assert sky.sky_rate(sky.sky_band(lsst, "lsst_r", MISSION), *place, MISSION) == 32.95
+
+
+@pytest.mark.parametrize(
+    ("longitude", "latitude", "wanted"),
+    [
+        (0.0, 60.0, 1.19),
+        (330.0, -10.0, 14.6),
+        (30.0, 10.0, 14.6),
+        (75.0, 60.0, (1.069 * 0.9783) ** 0.5),
+        (5.0, 90.0, 0.8116),
+    ],
+)
+def test_scattered_light_is_of_the_field_s_stars(longitude, latitude, wanted):
+    """The table's own numbers, where astropy has the place; between them the mean of the logarithms."""
+    place = SkyCoord(longitude, latitude, unit="deg", frame="galactic").icrs
+    assert sky.starlight(place.ra.deg, place.dec.deg, MISSION) == pytest.approx(wanted, rel=1e-3)
+
+
+def test_scattered_light_has_its_mission_value_at_sixty_degrees():
+    latitude = MISSION.value("env.straylight.reference_latitude", "deg")
+    places = [SkyCoord(lon, latitude, unit="deg", frame="galactic").icrs for lon in np.arange(0.0, 360.0, 15.0)]
+    assert np.mean([sky.starlight(p.ra.deg, p.dec.deg, MISSION) for p in places]) == pytest.approx(1.0, rel=0.02)
