@@ -18,7 +18,7 @@ from benchmarks import report
 from jobs.fluxes import passbands
 from jobs.render import chromatic, focal_plane, psf, stamps
 from jobs.render.channels import vis
-from jobs.render.effects import cosmic_rays, quadrants
+from jobs.render.effects import cosmic_rays, ghosts, quadrants
 from jobs.render.effects.effect import Frame, Lights, Scene
 from jobs.render.focal_plane import Detector
 from jobs.render.profiles import Shapes
@@ -56,8 +56,12 @@ def measured(side: int | None, repeats: int) -> dict[str, float]:
     if side is not None:
         detector = type(detector)("3-4", "vis", side, side, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = light(detector.ny, detector.nx)
-    lights = Lights(np.array([100.0]), np.array([100.0]), np.array([_LIGHT]))
-    scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(frame.max()), detector, lights)
+    scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(frame.max()), detector)
+    # The light is where its ghost falls into the middle.
+    _, _, across, *_ = ghosts.parameters(scene)
+    place = (0.5 * n - shift for n, shift in zip((detector.nx, detector.ny), across, strict=True))
+    lights = Lights(*(np.array([at]) for at in (*place, _LIGHT)))
+    scene = replace(scene, lights=lights)
     out: dict[str, float] = {}
     for effect in vis.SKY:
         parameters = effect.parameters(scene)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jobs.render import fits_product
-from jobs.render.effects import calibration_lamp, illumination, nonlinearity, quadrants
+from jobs.render.effects import calibration_lamp, illumination, nonlinearity, pixel_area, quadrants
 from tests.jobs.render import calibrated, nominal
 from tests.jobs.render.fields import small
 
@@ -55,6 +55,8 @@ def calibrated_science(detector, sky):
     frame, one = raw(detector, "science", 200, nominal.TIME, sky)
     found = linearised(frame - bias, one) / np.where(flat > 0.7, flat, np.nan)
     expected = np.full(found.shape, one.scene.sky_electrons)
+    if pixel_area.EFFECT.needed_if(one.scene):
+        expected = pixel_area.apply(expected, *pixel_area.EFFECT.parameters(one.scene))
     for part in (illumination.EFFECT, illumination.SHUTTER):
         expected = part.apply(expected, *part.parameters(one.scene))
     # What the header says of the dark current: where it is not noticed there is none.
