@@ -37,12 +37,12 @@ _CHAIN = (
     Settings(0.15, 1e-4, 3e-2, 4.8, 4),
     Settings(0.08, 1e-4, 1e-2, 4.8, 4),
     Settings(0.03, 5e-5, 1e-3, 4.8, 9),
-    Settings(0.004, 2e-5, 1e-5, 5.6, 9),
+    Settings(0.004, 1e-5, 1e-5, 6.4, 9),
     Settings(0.002, 5e-6, 3e-6, 8.0, 9),
     Settings(0.0005, 1e-6, 1e-7, 12.8, 25),
 )
 _SURVEY = 4
-_CHANGED = (("edge", 0.05), ("ghost", 1e-3), ("floor", 1e-2), ("least", 3.2))
+_CHANGED = (("edge", 0.05), ("ghost", 1e-3), ("floor", 1e-2), ("least", 5.6), ("least", 3.2))
 # Galaxies: that the settings are chosen on, against galsim, and sheared in pairs; that the errors are quoted of.
 _CHOSEN_ON, _QUOTED, _PAIRS = 24, 24, 6
 _CHOSEN_SEED, _QUOTED_SEED, _SCENE_SEED = 12, 21, 1
@@ -155,7 +155,9 @@ def _seconds(
     some: Sources, spread: psf.Psf, settings: Settings, repeats: int, approximation: Approximation = NONE
 ) -> float:
     """CPU s of sources on the scene's frame."""
-    approximation.draw(some.take(np.arange(len(some)) % 500 == 0), spread, VIS, settings)
+    # The brightest are drawn in double precision, which is compiled on its own.
+    bright = some.electrons >= np.sort(some.electrons)[-3:].min()
+    approximation.draw(some.take(bright | (np.arange(len(some)) % 500 == 0)), spread, VIS, settings)
     return report.best(lambda: approximation.draw(some, spread, VIS, settings), repeats, time.process_time)
 
 

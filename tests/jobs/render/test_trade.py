@@ -1,0 +1,78 @@
+"""The price of accuracy: what others leave out, done to our drawing, is measured; settings are what was measured."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import _approximations as approximations
+from benchmarks import _scenes as scenes
+from benchmarks import trade
+from benchmarks._scenes import VIS
+from jobs.accuracy import SURVEY
+from jobs.render import profiles, stamps
+
+RESULTS = Path(trade.__file__).with_name("results")
+BY_NAME = {each.name: each for each in approximations.ALL}
+
+
+def rows():
+    with (RESULTS / "trade.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_settings_are_those_that_were_measured():
+    assert trade.settings_table(rows()) == Path(stamps.__file__).with_name("settings.csv").read_text()
+
+
+def test_every_approximation_was_measured():
+    assert [row["name"] for row in rows() if row["kind"] == "approximation"] == list(BY_NAME)
+
+
+@pytest.mark.parametrize("name", list(BY_NAME))
+def test_an_approximation_keeps_what_it_should(name):
+    """Sources, places and light stay; the galaxies are those it is meant for."""
+    approximation = BY_NAME[name]
+    some = approximation.concerned(VIS, 3, 6)
+    simple = approximation.simplified(some)
+    assert len(simple) == len(some) == 6
+    np.testing.assert_array_equal(simple.electrons, some.electrons)
+    np.testing.assert_array_equal(simple.column, some.column)
+    size, index = profiles.half_light(some.shapes), some.shapes.sersic_index
+    if "below" in name:
+        assert size[some.shape] == pytest.approx(approximations.TINY)
+    if "down and up" in name:
+        assert (size[some.shape] > approximations.HUGE).all()
+    if "faint" in name:
+        assert (scenes.magnitudes(some, VIS) > approximations.FAINT).all()
+    if "rounded" in name:
+        assert np.abs(simple.shapes.sersic_index - index).max() <= 0.05 + 1e-12
+        assert 10 * simple.shapes.sersic_index == pytest.approx(np.rint(10 * simple.shapes.sersic_index))
+
+
+def test_stamps_of_a_folding_threshold_hold_all_but_that():
+    """Of a point, against the PSF itself: the rest lies beyond half the stamp."""
+    some, spread = scenes.sample(VIS, 3, 6), scenes.spread(VIS, 1)
+    settings = stamps.settings_for(SURVEY)
+    sizes = BY_NAME["folding threshold 0.5 %"].sizes(some, spread, VIS, settings)
+    outside = spread.outside[np.minimum(sizes // 2, len(spread.outside) - 1)]
+    assert (outside < approximations.FOLDING).all()
+
+
+def test_sampling_down_and_up_keeps_a_plane():
+    """A biquadratic interpolation is exact where light changes evenly."""
+    y, x = np.mgrid[:32, :32]
+    plane = 5.0 + 0.3 * x - 0.1 * y
+    found = BY_NAME["sampled down and up"].after(plane)
+    np.testing.assert_allclose(found[8:-8, 8:-8], plane[8:-8, 8:-8], rtol=1e-3)
+
+
+@pytest.mark.nightly
+def test_the_walk_in_haste(tmp_path):
+    assert trade.main(["--quick", "--csv", str(tmp_path / "t.csv"), "--figure", str(tmp_path / "t.png")]) == 0
+    assert (tmp_path / "t.png").stat().st_size > 10_000
+    with (tmp_path / "t.csv").open() as file:
+        found = {row["kind"]: row for row in csv.DictReader(file)}
+    assert float(found["settings"]["shear_m_worst"]) < 1e-3
+    assert float(found["approximation"]["seconds_before"]) > 0
