@@ -29,7 +29,8 @@ def test_a_line_is_an_exposure(tmp_path):
     assert (plain.exposure_time_s, plain.image_type, plain.detectors) == (77.0, "science", ("R22_S11",))
     assert (plain.sky, plain.seeing, plain.zero_point, plain.psf) == (None, None, None, None)
     assert (full.exposure_time_s, full.sky, full.seeing, full.zero_point) == (30.0, 12.5, 0.61, 28.1)
-    assert (full.psf, full.detectors, full.image_type) == ("psf.fits", ("R22_S11", "R22_S12"), "deep")
+    # Found from the table's folder.
+    assert (full.psf, full.detectors, full.image_type) == (str(tmp_path / "psf.fits"), ("R22_S11", "R22_S12"), "deep")
     assert (plain.field, full.field, full.survey) == (1, 2, "lsst")
 
 
