@@ -282,9 +282,13 @@ def draw(
     drawn    : float64[n] to be filled with what of each source's stamp fell onto the frame, electrons
     returns  : float64[ny, nx], to 5e-7 electrons a source; the same, bit by bit, in any order of the sources
     """
-    if sources.trail is not None:
-        return _draw_trails(sources, sources.trail, sizes, psf, nx, ny, progress, floors, drawn)
-    return _draw(sources, np.zeros((len(sources), 2)), sizes, psf, nx, ny, progress, floors, drawn)
+    pieces, trail, whole = _in_pieces(sources)
+    of_piece = np.zeros(len(pieces))
+    some_floors = None if floors is None else floors[whole]
+    frame = _draw(pieces, trail, sizes[whole], psf, nx, ny, progress, some_floors, of_piece)
+    if drawn is not None:
+        drawn[:] = np.bincount(whole, of_piece, len(sources))
+    return frame
 
 
 def piece_length(length: Float) -> Float:
@@ -296,24 +300,16 @@ def _pieces(length: Float) -> Int:
     return np.maximum(np.ceil(length / _PIECE), 1.0).astype(np.int64)
 
 
-def _draw_trails(
-    sources: Sources,
-    trails: Float,
-    sizes: Int,
-    psf: Psf,
-    nx: int,
-    ny: int,
-    progress: Callable[[int], None] | None,
-    floors: Float | None,
-    drawn: Float | None,
-) -> Float:
-    """`draw` of sources with trails: each piece of a trail as a source."""
+def _in_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
+    """(what is drawn: each piece of a trail as a source [p], its own trail [p, 2] pixels, whose piece it is [p])."""
+    if sources.trail is None:
+        return sources, np.zeros((len(sources), 2)), np.arange(len(sources))
     count = _pieces(sources.length)
     whole = np.repeat(np.arange(len(sources)), count)
     number = np.arange(len(whole)) - np.repeat(np.cumsum(count) - count, count)
     # From the middle of the trail to that of the piece, in lengths of the trail.
     along = (number + 0.5) / count[whole] - 0.5
-    trail = trails[whole]
+    trail = sources.trail[whole]
     pieces = replace(
         sources.take(whole),
         column=sources.column[whole] + along * trail[:, 0],
@@ -321,12 +317,7 @@ def _draw_trails(
         electrons=sources.electrons[whole] / count[whole],
         trail=None,
     )
-    of_piece = np.zeros(len(whole))
-    some_floors = None if floors is None else floors[whole]
-    frame = _draw(pieces, trail / count[whole, None], sizes[whole], psf, nx, ny, progress, some_floors, of_piece)
-    if drawn is not None:
-        drawn[:] = np.bincount(whole, of_piece, len(sources))
-    return frame
+    return pieces, trail / count[whole, None], whole
 
 
 def _draw(
@@ -338,7 +329,7 @@ def _draw(
     ny: int,
     progress: Callable[[int], None] | None,
     floors: Float | None,
-    drawn: Float | None,
+    drawn: Float,
 ) -> Float:
     frame = np.zeros((ny, nx), np.int64)
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
@@ -365,8 +356,7 @@ def _draw(
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
             added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut)
-            if drawn is not None:
-                drawn[chosen] = added / kernel.FIXED_POINT
+            drawn[chosen] = added / kernel.FIXED_POINT
             done += len(chosen)
             if progress is not None:
                 progress(done)
