@@ -168,8 +168,6 @@ def render(
             sources, sizes = _with_moving(
                 sources, sizes, exposure, detector, system, passband, scene, spread, settings, seed
             )
-        _refuse_too_large(exposure, detector, sources, sizes, spread)
-        if channel == "VIS":
             lights = _lights((galaxies, electrons[0]), (stars, electrons[1]), detector, system)
             peak = float(spread.surface[0]) * float(sources.electrons.max(initial=0.0))
             scene = replace(scene, lights=lights, peak_electrons=peak)
@@ -177,6 +175,7 @@ def render(
             if decisions[0].applied and spread.intra_pixel is not None:
                 (strength,) = vis.DRAWN.parameters(scene)
                 spread = replace(spread, intra_pixel=strength)
+        _refuse_too_large(exposure, detector, sources, sizes, spread)
         floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
         drawn = np.zeros(len(sources))
         noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors, drawn)
