@@ -2,6 +2,7 @@
 
 nyquist_zones profile x PSF x pixel x phase on the half plane, wrapped onto the pixels' Nyquist zone
 accumulate    stamps onto the frame, in fixed point
+returning     the light that comes in at the opposite edges of a stamp;  leaving : where it belongs
 runs          which samples of a stamp's grid are taken, in what order
 take          the samples of a stamp's grid from a transform
 add_planes    planes of a PSF, weighted, summed
@@ -31,6 +32,8 @@ Bool = npt.NDArray[np.bool_]
 FIXED_POINT = float(1 << 20)
 _TWO_PI = 2.0 * np.pi
 _FIRST = int(FIRST_BITS)
+# Of a float's bits, those within a sixteenth of an octave; square of the scale lengths at which a disc ends.
+_COARSE, _DARK = 19, 900.0
 
 
 @jit
@@ -316,9 +319,10 @@ def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> 
 
 
 @jit
-def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> Int:
+def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, x: Float, y: Float, curve: Float) -> Int:
     """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, in units of 1 / FIXED_POINT.
 
+    x, y    : [m] position in the stamp, about which curve [m, 4] of `returning` is taken off
     Whole numbers: the sum is the same, bit by bit, in any order.
     returns : int64[m] what of each stamp fell onto the frame, in the same units
     """
@@ -326,12 +330,17 @@ def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> Int:
     added = np.zeros(len(stamps), np.int64)
     for i in range(len(stamps)):
         left, right = max(0, -x0[i]), min(stamps.shape[2], nx - x0[i])
+        second = curve[i, 1]
         for r in range(max(0, -y0[i]), min(stamps.shape[1], ny - y0[i])):
             if left < right:
                 some, out = stamps[i, r, left:right], frame[y0[i] + r, x0[i] + left : x0[i] + right]
+                up = r - y[i]
+                level, slope = curve[i, 0] + curve[i, 3] * up * up, curve[i, 2] * up
                 total = np.int64(0)
                 for c in range(len(some)):
-                    units = np.int64(np.rint(np.float64(some[c]) * FIXED_POINT))
+                    across = (left + c) - x[i]
+                    light = np.float64(some[c]) - (level + across * (slope + across * second))
+                    units = np.int64(np.rint(light * FIXED_POINT))
                     out[c] += units
                     total += units
                 added[i] += total
@@ -339,13 +348,117 @@ def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> Int:
 
 
 @jit
+def returning(size: int, stray: Float) -> Float:
+    """[m, 4] light that enters stamps at their edges: its level in the middle, and terms of x^2, x y and y^2.
+
+    stray : [m, 11] of wings.strays, electrons a pixel
+    Error : of what lies within an eighth of the stamp of the middle, 2 %
+    """
+    out = np.zeros((len(stray), 4))
+    for i in range(len(stray)):
+        if stray[i, 0] == 0.0 and stray[i, 1] == 0.0:
+            continue
+        h = size / 8.0
+        # The lattice of the stamp's images has no odd terms.
+        middle, rising = _images(stray[i], size, 0.0, 0.0), _images(stray[i], size, h, h)
+        right, up = _images(stray[i], size, h, 0.0), _images(stray[i], size, 0.0, h)
+        falling = _images(stray[i], size, h, -h)
+        out[i, 0] = middle
+        out[i, 1], out[i, 3] = (right - middle) / h**2, (up - middle) / h**2
+        out[i, 2] = 0.5 * (rising - falling) / h**2
+    return out
+
+
+@jit
+def _images(stray: Float, size: int, x: float, y: float) -> Any:
+    """Light of a source's images in the stamps about its own, three deep."""
+    total = 0.0
+    for r in range(-3, 4):
+        for c in range(-3, 4):
+            if r != 0 or c != 0:
+                total += _light(stray, x - c * size, y - r * size)
+    return total
+
+
+@jit
+def _light(stray: Float, x: float, y: float) -> Any:
+    """Of a galaxy, electrons a pixel at (x, y) pixels from its middle."""
+    out = 0.0
+    if stray[0] > 0.0:
+        u, v = stray[2] * x + stray[3] * y, stray[4] * x + stray[5] * y
+        out += stray[0] * np.exp(-np.exp(stray[6] * np.log(u * u + v * v + 1e-300)))
+    return out + _disk_light(stray, x, y)
+
+
+@jit
+def _disk_light(stray: Float, x: float, y: float) -> Any:
+    u, v = stray[7] * x + stray[8] * y, stray[9] * x + stray[10] * y
+    lengths = u * u + v * v
+    return stray[1] * np.exp(-np.sqrt(lengths)) if lengths < _DARK else 0.0
+
+
+@jit
+def leaving(
+    blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, stray: Float
+) -> None:
+    """Adds the light of galaxies outside their stamps to blocks of `side` pixels, in units of 1 / FIXED_POINT.
+
+    margin : blocks before the frame's first;  size, reach : [m] side of the stamp, and as far as it is followed, pixels
+    column, row : [m] pixels;  stray : [m, 11] of wings.strays
+    """
+    ny, nx = blocks.shape
+    middle = 0.5 * (side - 1)
+    square = np.empty(1, np.float32)
+    bits = square.view(np.int32)
+    for i in range(len(size)):
+        half = size[i] // 2
+        least = 0.9 * half**2 * _smaller(stray[i, 2:6].copy().reshape(2, 2))
+        bulge, first = _by_square(stray[i], least, 3.0 * (reach[i] + side) ** 2 * np.sum(stray[i, 2:6] ** 2))
+        x0, y0 = np.rint(column[i]) - half - 0.5, np.rint(row[i]) - half - 0.5
+        left = max(int(np.floor((column[i] - reach[i]) / side)) + margin, 0)
+        right = min(int(np.ceil((column[i] + reach[i]) / side)) + margin, nx - 1)
+        low = max(int(np.floor((row[i] - reach[i]) / side)) + margin, 0)
+        high = min(int(np.ceil((row[i] + reach[i]) / side)) + margin, ny - 1)
+        for r in range(low, high + 1):
+            bottom = (r - margin) * side - 0.5
+            covered_y = max(min(bottom + side, y0 + size[i]) - max(bottom, y0), 0.0) / side
+            for c in range(left, right + 1):
+                edge = (c - margin) * side - 0.5
+                covered_x = max(min(edge + side, x0 + size[i]) - max(edge, x0), 0.0) / side
+                outside = 1.0 - covered_x * covered_y
+                if outside > 0.0:
+                    x, y = edge + 0.5 + middle - column[i], bottom + 0.5 + middle - row[i]
+                    u, v = stray[i, 2] * x + stray[i, 3] * y, stray[i, 4] * x + stray[i, 5] * y
+                    square[0] = u * u + v * v
+                    place = min(max((bits[0] >> _COARSE) - first, 0), len(bulge) - 2)
+                    part = (bits[0] & ((1 << _COARSE) - 1)) / (1 << _COARSE)
+                    light = bulge[place] + part * (bulge[place + 1] - bulge[place]) + _disk_light(stray[i], x, y)
+                    blocks[r, c] += np.int64(np.rint(outside * light * FIXED_POINT))
+
+
+@jit
+def _by_square(stray: Float, least: float, most: float) -> tuple[Float, int]:
+    """(light of the bulge by u^2 + v^2, 16 places an octave, linear between; the top bits of the first)."""
+    ends = np.array([max(least, 1e-30), min(max(most, 1e-30), 1e30)], np.float32)
+    bits = ends.view(np.int32)
+    first, last = bits[0] >> _COARSE, (bits[1] >> _COARSE) + 2
+    nodes = ((np.arange(last - first) + first) << _COARSE).astype(np.int32).view(np.float32)
+    out = np.zeros(len(nodes))
+    if stray[0] > 0.0:
+        for j in range(len(nodes)):
+            out[j] = stray[0] * np.exp(-np.exp(stray[6] * np.log(nodes[j])))
+    return out, first
+
+
+@jit
 def electrons_of(frame: Int, blocks: Float, side: int, margin: int) -> Float:
     """The frame's electrons, with those of blocks of `side` pixels, `margin` of them before the frame's first.
 
-    blocks : electrons a pixel, interpolated linearly between the blocks' centres;  returns float64[ny, nx]
+    blocks : electrons a pixel, interpolated linearly between the blocks' centres
+    returns : float64[ny, nx] in the place of the frame, which is lost
     """
     ny, nx = frame.shape
-    out = np.empty((ny, nx))
+    out = frame.view(np.float64)
     middle = 0.5 * (side - 1)
     left, part = np.empty(nx, np.int64), np.empty(nx)
     for c in range(nx):

@@ -7,6 +7,7 @@ shapes        rows -> Shapes, checked arrays
 forms         what the kernel draws them from, in pixels
 profile       one galaxy by galsim, for the reference
 surface       its light at a radius, for the choice of a stamp's size
+outside       its light beyond a radius;  on_the_sky : its light at any place, for what lies outside its stamp
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import galsim
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from scipy.special import gammaln
+from scipy.special import gammaincc, gammaln
 
 from jobs.render import sersic
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
@@ -32,6 +33,8 @@ EXPONENTIAL_RADIUS = 1.6783469900166605
 _MOST_SHEAR = 0.9
 _LEAST_DETERMINANT = 1e-3
 _SLIMMEST = 0.02
+# Square pixels of a component that has no light to speak of outside any stamp.
+_NO_AREA = 1e-8
 
 
 # What is read of the catalogue.
@@ -200,6 +203,52 @@ def surface(shape: Shapes, radius: Float) -> Float:
     return np.asarray(
         bulge[:, None] * _sersic_surface(radius, shape.bulge_radius * stretch, shape.sersic_index, stretch)
         + disk[:, None] * _sersic_surface(radius, shape.disk_radius * stretch, np.ones(len(shape)), stretch)
+    )
+
+
+def outside(shape: Shapes, radius: Float) -> Float:
+    """Fraction of the flux beyond a radius along the major axis, an upper bound for what is beyond that circle.
+
+    radius : [n] arcsec;  returns [n]
+    """
+    stretch, n = _lensed_stretch(shape), shape.sersic_index
+    bulge_radius, disk_radius = (np.maximum(r * stretch, 1e-6) for r in (shape.bulge_radius, shape.disk_radius))
+    bulge = gammaincc(2 * n, _b(n) * (radius / bulge_radius) ** (1 / n))
+    lengths = radius / disk_radius * EXPONENTIAL_RADIUS
+    disk = (1 + lengths) * np.exp(-lengths)
+    return np.asarray(shape.bulge_fraction * bulge + (1 - shape.bulge_fraction) * disk)
+
+
+def on_the_sky(shape: Shapes, form: Forms) -> Float:
+    """float64[n, 11]: what kernel.py takes the light at a place from, of unit flux.
+
+    Of the bulge and of the disc the light in the middle, by square pixel; of the bulge, of pixels (x, y) from the
+    middle, the rows of a matrix and an exponent p: light exp(-(u^2 + v^2)^p); of the disc a matrix:
+    light exp(-sqrt(u^2 + v^2)).
+    Error : the disc is thin, of the axis ratio that it is seen with
+    """
+    n, b = np.maximum(shape.sersic_index, 0.36), _b(shape.sersic_index)
+    # A disc on edge is as thick as it is high.
+    across = form.disk[:, :, 1], form.thick * (2 / np.pi)
+    disk = np.stack([form.disk[:, :, 0], np.copysign(np.hypot(*across), across[0] + across[1])], -1)
+    areas = [np.abs(np.linalg.det(matrix)) for matrix in (form.bulge, disk)]
+    some = [area > _NO_AREA for area in areas]
+    with np.errstate(divide="ignore"):
+        middles = (
+            shape.bulge_fraction * np.exp(2 * n * np.log(b) - np.log(2 * np.pi * n) - gammaln(2 * n)) / areas[0],
+            (1 - shape.bulge_fraction) / (2 * np.pi) / areas[1],
+        )
+    inverse = [
+        np.linalg.inv(np.where(kept[:, None, None], m, np.eye(2)))
+        for kept, m in zip(some, (form.bulge, disk), strict=True)
+    ]
+    return np.column_stack(
+        [
+            *(np.where(kept, middle, 0.0) for kept, middle in zip(some, middles, strict=True)),
+            (inverse[0] * (b**n)[:, None, None]).reshape(-1, 4),
+            0.5 / n,
+            inverse[1].reshape(-1, 4),
+        ]
     )
 
 

@@ -1,9 +1,9 @@
 """Drawing sources: each on its own stamp, through its own PSF, in Fourier space, summed onto a frame.
 
 A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid. A galaxy's light
-that belongs outside its stamp comes in at the opposite edge; a stamp is large enough that this is below the noise at
-its edge, and below the flux budget in the source's aperture. The PSF's wings beyond the stamp are drawn on their own
-(wings.py). Nothing is lost, nothing is rescaled.
+that belongs outside its stamp comes in at the opposite edge: it is taken off there and drawn where it belongs, as are
+the PSF's wings beyond the stamp (wings.py). A stamp is large enough that all of this is below the noise at its edge,
+and what comes in below a part of the flux in the source's aperture. Nothing is lost, nothing is rescaled.
 
 Sources         what is drawn: galaxies (with a shape) and points
 settings_for, seconds_for   what an accuracy takes, from the measured table
@@ -31,7 +31,7 @@ import scipy.fft
 from jobs.accuracy import Accuracy
 from jobs.render import kernel, pictures, profiles, sersic, transfer, wings
 from jobs.render.pictures import Picture
-from jobs.render.profiles import Shapes
+from jobs.render.profiles import Forms, Shapes
 from jobs.render.psf import SIDE, Psf
 from jobs.render.transfer import Transfer
 
@@ -59,8 +59,8 @@ _THINNEST = 0.1
 _BRIGHT = 1e7
 # Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
 _SHARED = 512
-# For so few the planes are not worth their transforms.
-_FEW = 8
+# For fewer than this a plane the planes are not worth their transforms.
+_FEW = 0.5
 # Bytes while drawing, measured, of what is drawn to the PSF's last frequency: of a frame's pixel (integers and result),
 # of a pixel of the largest stamp (its plane and transforms) in single and double precision, of a source (its form and
 # weights), of all else (planes of the small stamps).
@@ -72,6 +72,8 @@ _PICTURE_BYTES = 370
 _STAMP_S, _PLANE_S, _FRAME_S, _START_S = 2.0e-8, 2.3e-7, 1.1e-8, 0.01
 # A trail is drawn in pieces no longer than this, pixels, each on a stamp of its own.
 _PIECE = 64.0
+# Of a galaxy's light, what leaves its stamp unseen, and what may be lost; half stamps within which it is looked for.
+_STRAY, _LOST, _STEPS = 2e-6, 1e-4, (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
 # Pixels of stamps that are transformed together.
 _BATCH = 1 << 17
 # What galsim takes for a point in the reference, arcsec.
@@ -333,7 +335,9 @@ def _draw(
 ) -> Float:
     frame = np.zeros((ny, nx), np.int64)
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
-    bodies, table = (*_bodies(sources), trail), sersic.table()
+    some, form = _forms(sources)
+    bodies, table = (*_bodies(sources, some, form), trail), sersic.table()
+    stray, beyond = _strays(sources, some, form, sizes, psf.pixel_scale)
     passing = transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
     body, fraction, bulge, disk, _, row, *_ = bodies
@@ -355,19 +359,20 @@ def _draw(
                 share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
-            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut)
+            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, stray[chosen])
             drawn[chosen] = added / kernel.FIXED_POINT
             done += len(chosen)
             if progress is not None:
                 progress(done)
-    beyond = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
-    return np.asarray(kernel.electrons_of(frame, beyond, wings.BLOCK, wings.MARGIN))
+    layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
+    layer += wings.galaxies(sources.column, sources.row, stray, beyond, sizes, nx, ny)
+    return np.asarray(kernel.electrons_of(frame, layer, wings.BLOCK, wings.MARGIN))
 
 
 def _split(sources: Sources, sizes: Int, psf: Psf, size: int) -> tuple[Int, Int]:
     """Sources of a size that are drawn each through a PSF of its own, and those that share planes."""
     of_size = sizes == size
-    few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW)
+    few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW * transfer.plane_count(psf))
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
     alone = of_size & (few | (sources.electrons > _BRIGHT) | pictured)
     return np.flatnonzero(alone), np.flatnonzero(of_size & ~alone)
@@ -375,8 +380,7 @@ def _split(sources: Sources, sizes: Int, psf: Psf, size: int) -> tuple[Int, Int]
 
 def work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
     """(pixels of stamps, samples' places of the PSF's planes) that `draw` goes through, before anything is drawn."""
-    planes = 1 if psf.planes is None else len(psf.planes.images) + len(psf.planes.drift)
-    transformed = 0
+    planes, transformed = transfer.plane_count(psf), 0
     for size in np.unique(sizes).tolist():
         alone, together = _split(sources, sizes, psf, size)
         transformed += size**2 * (len(alone) + planes * (len(together) > 0))
@@ -416,10 +420,11 @@ def _draw_some(
     bodies: tuple[Array, ...],
     table: Array,
     cut: Float,
+    stray: Float,
 ) -> Int:
     """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does.
 
-    bodies : arrays by source, as of `_bodies`, and trails
+    bodies : arrays by source, as of `_bodies`, and trails;  stray : of the chosen, as of `_strays`
     """
     size = passed.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
@@ -431,21 +436,43 @@ def _draw_some(
         zones, passed.planes, some.kx, some.ky, some.runs, some.pieces, some.inner, weights, column - x0, row - y0,
         sources.electrons[chosen], cut[chosen], table, *(part[chosen] for part in bodies),
     )  # fmt: skip
-    return kernel.accumulate(frame, scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True), x0, y0)
+    stamps = scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True)
+    return kernel.accumulate(frame, stamps, x0, y0, column - x0, row - y0, kernel.returning(size, stray))
 
 
-def _bodies(sources: Sources) -> tuple[Array, ...]:
+def _forms(sources: Sources) -> tuple[Shapes, Forms]:
+    """Shapes and forms of the sources that have a shape."""
+    body = sources.shape >= 0
+    shapes = sources.shapes.take(sources.shape[body])
+    return shapes, profiles.forms(shapes, sources.jacobian[body])
+
+
+def _bodies(sources: Sources, shapes: Shapes, form: Forms) -> tuple[Array, ...]:
     """The kernel's arguments of each source's profile: body, fraction, bulge, disk, thick, row, row_weights."""
     n, body = len(sources), sources.shape >= 0
     fraction, row, row_weights = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 4))
     bulge, disk, thick = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2))
-    if body.any():
-        shapes = sources.shapes.take(sources.shape[body])
-        form = profiles.forms(shapes, sources.jacobian[body])
-        fraction[body] = shapes.bulge_fraction
-        bulge[body], disk[body], thick[body] = form.bulge, form.disk, form.thick
-        row[body], row_weights[body] = sersic.row_of(shapes.sersic_index)
+    fraction[body] = shapes.bulge_fraction
+    bulge[body], disk[body], thick[body] = form.bulge, form.disk, form.thick
+    row[body], row_weights[body] = sersic.row_of(shapes.sersic_index)
     return body, fraction, bulge, disk, thick, row, row_weights
+
+
+def _strays(sources: Sources, shapes: Shapes, form: Forms, sizes: Int, pixel_scale: float) -> tuple[Float, Float]:
+    """([n, 11] profiles.on_the_sky of a source's electrons, 0 where nothing leaves its stamp; [n] how far, pixels).
+
+    How far : to what leaves it with less than _LOST of the light; 0 where no more than that leaves the stamp
+    """
+    body = sources.shape >= 0
+    stray, reach = np.zeros((len(sources), 11)), np.zeros(len(sources))
+    half = sizes[body] / 2
+    beyond = np.stack([profiles.outside(shapes, half * step * pixel_scale) for step in _STEPS], 1)
+    sky = profiles.on_the_sky(shapes, form)
+    sky[:, :2] *= np.where(beyond[:, 0] > _STRAY, sources.electrons[body], 0.0)[:, None]
+    stray[body] = sky
+    far = np.array(_STEPS)[np.minimum((beyond > _LOST).sum(axis=1), len(_STEPS) - 1)]
+    reach[body] = np.where(beyond[:, 0] > _LOST, half * far, 0.0)
+    return stray, reach
 
 
 def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4, highest: float = 1e-4) -> Float:

@@ -1,6 +1,7 @@
 """What passes a PSF and the pixels: transfer functions on the Fourier grids of stamps.
 
 basis_weights what each source takes of the PSF's planes: its colour, its place on the detector
+plane_count   how many there are
 passing       how much passes at most, by frequency
 grid          the samples of a stamp's half plane inside a disc, in the order in which the kernel takes them
 transfer      all planes of a PSF on such a grid
@@ -118,6 +119,11 @@ def _grid(size: int, reach: float) -> Grid:
     kx, ky = (step * along).astype(np.float32), np.repeat((step * iy[:-1]).astype(np.float32), length)
     inner = np.asarray(shell[pieces[:-1]] * (reach / shells), float)
     return Grid(size, kx, ky, np.ascontiguousarray(runs[:, :3]), pieces, inner)
+
+
+def plane_count(psf: Psf) -> int:
+    """How many planes `transfer` has."""
+    return 1 if psf.planes is None else len(psf.planes.images) + len(psf.planes.drift)
 
 
 def passing(psf: Psf) -> Float:

@@ -2,7 +2,7 @@
 
 A stamp is as large as the noise and the source's own light ask for, and the PSF is cut to it. What is cut off (in VIS
 2 % of the light, beyond 3") lies below the noise of a pixel, but it belongs to the sky: of all sources together it is
-drawn here on blocks of pixels, through the mean PSF.
+drawn here on blocks of pixels, through the mean PSF. So is what the stamps of galaxies do not hold of their own light.
 """
 
 from __future__ import annotations
@@ -45,6 +45,19 @@ def wings(column: Float, row: Float, electrons: Float, sizes: Int, psf: Psf, nx:
         total += scipy.fft.rfft2(light, period) * scipy.fft.rfft2(_beyond(cells, int(size), period))
     found = scipy.fft.irfft2(total, period)[: shape[0], : shape[1]]
     return np.asarray(np.maximum(found, 0.0) / BLOCK**2)
+
+
+def galaxies(column: Float, row: Float, stray: Float, reach: Float, sizes: Int, nx: int, ny: int) -> Float:
+    """Electrons a pixel of galaxies [n] outside stamps of `sizes`, on the blocks of `wings`.
+
+    stray   : float64[n, 11] profiles.on_the_sky, of a galaxy's electrons;  reach : [n] pixels, 0 = it has none there
+    returns : float64[blocks, blocks], the same in any order of the galaxies
+    Error   : a galaxy's own light, as if the PSF did nothing to it so far out
+    """
+    out = np.zeros((-(-ny // BLOCK) + 2 * MARGIN, -(-nx // BLOCK) + 2 * MARGIN), np.int64)
+    some = reach > 0
+    kernel.leaving(out, BLOCK, MARGIN, sizes[some], reach[some], column[some], row[some], stray[some])
+    return out / kernel.FIXED_POINT
 
 
 def _on_blocks(column: Float, row: Float, electrons: Float, shape: tuple[int, int]) -> Float:
