@@ -2,10 +2,11 @@
 
 nyquist_zones profile x PSF x pixel x phase on the half plane, wrapped onto the pixels' Nyquist zone
 accumulate    stamps onto the frame, in fixed point
-returning     the light that comes in at the opposite edges of a stamp;  leaving : where it belongs
+returning     the light that comes in at the opposite edges of stamps;  leaving : the same where it belongs
 runs          which samples of a stamp's grid are taken, in what order
 take          the samples of a stamp's grid from a transform
 add_planes    planes of a PSF, weighted, summed
+spread        an image about points
 electrons_of  the frame with a smooth layer on top
 between       a transform between its samples
 reaches       how far in Fourier space a source must be followed
@@ -322,7 +323,7 @@ def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> 
 def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, x: Float, y: Float, curve: Float) -> Int:
     """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, in units of 1 / FIXED_POINT.
 
-    x, y    : [m] position in the stamp, about which curve [m, 4] of `returning` is taken off
+    x, y    : [m] position in the stamp, about which curve [m, 5] of `returning` is taken off
     Whole numbers: the sum is the same, bit by bit, in any order.
     returns : int64[m] what of each stamp fell onto the frame, in the same units
     """
@@ -348,24 +349,28 @@ def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, x: Float,
 
 
 @jit
-def returning(size: int, stray: Float) -> Float:
-    """[m, 4] light that enters stamps at their edges: its level in the middle, and terms of x^2, x y and y^2.
+def returning(size: Int, x: Float, y: Float, stray: Float) -> Float:
+    """[m, 5] light that enters stamps at their edges: its level in the middle, terms of x^2, x y and y^2; its sum.
 
-    stray : [m, 11] of wings.strays, electrons a pixel
-    Error : of what lies within an eighth of the stamp of the middle, 2 %
+    size, x, y : [m] side of the stamp, position in it, pixels;  stray : [m, 11] profiles.on_the_sky, electrons
+    Error : 2 % within an eighth of the stamp of the middle, too little farther out
     """
-    out = np.zeros((len(stray), 4))
+    out = np.zeros((len(stray), 5))
     for i in range(len(stray)):
+        n, h = size[i], size[i] / 8.0
         if stray[i, 0] == 0.0 and stray[i, 1] == 0.0:
             continue
-        h = size / 8.0
         # The lattice of the stamp's images has no odd terms.
-        middle, rising = _images(stray[i], size, 0.0, 0.0), _images(stray[i], size, h, h)
-        right, up = _images(stray[i], size, h, 0.0), _images(stray[i], size, 0.0, h)
-        falling = _images(stray[i], size, h, -h)
+        middle, rising = _images(stray[i], n, 0.0, 0.0), _images(stray[i], n, h, h)
+        right, up = _images(stray[i], n, h, 0.0), _images(stray[i], n, 0.0, h)
+        falling = _images(stray[i], n, h, -h)
         out[i, 0] = middle
         out[i, 1], out[i, 3] = (right - middle) / h**2, (up - middle) / h**2
         out[i, 2] = 0.5 * (rising - falling) / h**2
+        across, along = 0.5 * (n - 1) - x[i], 0.5 * (n - 1) - y[i]
+        spread = (n * n - 1) / 12.0
+        second = out[i, 1] * (across**2 + spread) + out[i, 2] * across * along + out[i, 3] * (along**2 + spread)
+        out[i, 4] = n * n * (middle + second)
     return out
 
 
@@ -398,15 +403,40 @@ def _disk_light(stray: Float, x: float, y: float) -> Any:
 
 
 @jit
-def leaving(
-    blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, stray: Float
-) -> None:
-    """Adds the light of galaxies outside their stamps to blocks of `side` pixels, in units of 1 / FIXED_POINT.
+def spread(blocks: Int, image: Float, x: Float, y: Float, electrons: Float) -> None:
+    """Adds an image about points (x, y) [m], blocks, each shared among the four nearest, in units of 1 / FIXED_POINT.
 
-    margin : blocks before the frame's first;  size, reach : [m] side of the stamp, and as far as it is followed, pixels
-    column, row : [m] pixels;  stray : [m, 11] of wings.strays
+    image : electrons a pixel of one electron, on blocks, its middle one the point's, with a border of nothing
     """
     ny, nx = blocks.shape
+    side = len(image) - 1
+    for i in range(len(x)):
+        left, low = int(np.floor(x[i])), int(np.floor(y[i]))
+        right, up = x[i] - left, y[i] - low
+        light = electrons[i] * FIXED_POINT
+        w0, w1 = light * (1.0 - right) * (1.0 - up), light * right * (1.0 - up)
+        w2, w3 = light * (1.0 - right) * up, light * right * up
+        left, low = left - (side - 1) // 2, low - (side - 1) // 2
+        first, last = max(0, -left), min(side, nx - left)
+        if first >= last:
+            continue
+        for r in range(max(0, -low), min(side, ny - low)):
+            out = blocks[low + r, left + first : left + last]
+            a, b = image[r + 1, first + 1 : last + 1], image[r + 1, first:last]
+            c, d = image[r, first + 1 : last + 1], image[r, first:last]
+            for j in range(len(out)):
+                out[j] += np.int64(np.rint(w0 * a[j] + w1 * b[j] + w2 * c[j] + w3 * d[j]))
+
+
+@jit
+def leaving(
+    blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, stray: Float, light: Float
+) -> None:
+    """Adds what is taken off galaxies' stamps to blocks of `side` pixels outside, in units of 1 / FIXED_POINT.
+
+    margin : blocks before the frame's first;  size, reach : [m] side of the stamp, and as far as it goes, pixels
+    column, row : [m] pixels;  stray : [m, 11] profiles.on_the_sky;  light : [m] electrons, all of which come there
+    """
     middle = 0.5 * (side - 1)
     square = np.empty(1, np.float32)
     bits = square.view(np.int32)
@@ -415,15 +445,14 @@ def leaving(
         least = 0.9 * half**2 * _smaller(stray[i, 2:6].copy().reshape(2, 2))
         bulge, first = _by_square(stray[i], least, 3.0 * (reach[i] + side) ** 2 * np.sum(stray[i, 2:6] ** 2))
         x0, y0 = np.rint(column[i]) - half - 0.5, np.rint(row[i]) - half - 0.5
-        left = max(int(np.floor((column[i] - reach[i]) / side)) + margin, 0)
-        right = min(int(np.ceil((column[i] + reach[i]) / side)) + margin, nx - 1)
-        low = max(int(np.floor((row[i] - reach[i]) / side)) + margin, 0)
-        high = min(int(np.ceil((row[i] + reach[i]) / side)) + margin, ny - 1)
-        for r in range(low, high + 1):
-            bottom = (r - margin) * side - 0.5
+        left, low = int(np.floor((column[i] - reach[i]) / side)), int(np.floor((row[i] - reach[i]) / side))
+        right, high = int(np.ceil((column[i] + reach[i]) / side)), int(np.ceil((row[i] + reach[i]) / side))
+        image = np.zeros((high - low + 1, right - left + 1))
+        for r in range(len(image)):
+            bottom = (low + r) * side - 0.5
             covered_y = max(min(bottom + side, y0 + size[i]) - max(bottom, y0), 0.0) / side
-            for c in range(left, right + 1):
-                edge = (c - margin) * side - 0.5
+            for c in range(image.shape[1]):
+                edge = (left + c) * side - 0.5
                 covered_x = max(min(edge + side, x0 + size[i]) - max(edge, x0), 0.0) / side
                 outside = 1.0 - covered_x * covered_y
                 if outside > 0.0:
@@ -432,8 +461,21 @@ def leaving(
                     square[0] = u * u + v * v
                     place = min(max((bits[0] >> _COARSE) - first, 0), len(bulge) - 2)
                     part = (bits[0] & ((1 << _COARSE) - 1)) / (1 << _COARSE)
-                    light = bulge[place] + part * (bulge[place + 1] - bulge[place]) + _disk_light(stray[i], x, y)
-                    blocks[r, c] += np.int64(np.rint(outside * light * FIXED_POINT))
+                    some = bulge[place] + part * (bulge[place + 1] - bulge[place]) + _disk_light(stray[i], x, y)
+                    image[r, c] = outside * some
+        whole = np.sum(image) * side**2
+        if whole > 0.0:
+            _add(blocks, image, left + margin, low + margin, light[i] / whole * FIXED_POINT)
+
+
+@jit
+def _add(blocks: Int, image: Float, left: int, low: int, scale: float) -> None:
+    """Adds an image times `scale`, rounded, to blocks from (left, low) on, as far as it lies on them."""
+    ny, nx = blocks.shape
+    first, last = max(0, -left), min(image.shape[1], nx - left)
+    for r in range(max(0, -low), min(len(image), ny - low)):
+        for c in range(first, last):
+            blocks[low + r, left + c] += np.int64(np.rint(scale * image[r, c]))
 
 
 @jit

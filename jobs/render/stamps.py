@@ -72,8 +72,9 @@ _PICTURE_BYTES = 370
 _STAMP_S, _PLANE_S, _FRAME_S, _START_S = 2.0e-8, 2.3e-7, 1.1e-8, 0.01
 # A trail is drawn in pieces no longer than this, pixels, each on a stamp of its own.
 _PIECE = 64.0
-# Of a galaxy's light, what leaves its stamp unseen, and what may be lost; half stamps within which it is looked for.
-_STRAY, _LOST, _STEPS = 2e-6, 1e-4, (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
+# Of a galaxy's light: what leaves its stamp unseen, and what may lie nearer than it should; half stamps, and pixels, as
+# far as which it is drawn.
+_STRAY, _LOST, _STEPS, _FARTHEST = 2e-6, 3e-4, (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0), 2048.0
 # Pixels of stamps that are transformed together.
 _BATCH = 1 << 17
 # What galsim takes for a point in the reference, arcsec.
@@ -337,7 +338,9 @@ def _draw(
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
     some, form = _forms(sources)
     bodies, table = (*_bodies(sources, some, form), trail), sersic.table()
-    stray, beyond = _strays(sources, some, form, sizes, psf.pixel_scale)
+    stray, farthest = _strays(sources, some, form, sizes, psf.pixel_scale)
+    x0, y0 = (np.rint(position).astype(np.int64) - sizes // 2 for position in (sources.column, sources.row))
+    curve = kernel.returning(sizes, sources.column - x0, sources.row - y0, stray)
     passing = transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
     body, fraction, bulge, disk, _, row, *_ = bodies
@@ -359,13 +362,13 @@ def _draw(
                 share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
-            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, stray[chosen])
+            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, curve)
             drawn[chosen] = added / kernel.FIXED_POINT
             done += len(chosen)
             if progress is not None:
                 progress(done)
     layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
-    layer += wings.galaxies(sources.column, sources.row, stray, beyond, sizes, nx, ny)
+    layer += wings.galaxies(sources.column, sources.row, stray, curve[:, 4], farthest, sizes, nx, ny)
     return np.asarray(kernel.electrons_of(frame, layer, wings.BLOCK, wings.MARGIN))
 
 
@@ -420,11 +423,11 @@ def _draw_some(
     bodies: tuple[Array, ...],
     table: Array,
     cut: Float,
-    stray: Float,
+    curve: Float,
 ) -> Int:
     """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does.
 
-    bodies : arrays by source, as of `_bodies`, and trails;  stray : of the chosen, as of `_strays`
+    bodies, cut, curve : arrays by source: of `_bodies` and trails; of kernel.reaches; of kernel.returning
     """
     size = passed.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
@@ -437,7 +440,7 @@ def _draw_some(
         sources.electrons[chosen], cut[chosen], table, *(part[chosen] for part in bodies),
     )  # fmt: skip
     stamps = scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True)
-    return kernel.accumulate(frame, stamps, x0, y0, column - x0, row - y0, kernel.returning(size, stray))
+    return kernel.accumulate(frame, stamps, x0, y0, column - x0, row - y0, curve[chosen])
 
 
 def _forms(sources: Sources) -> tuple[Shapes, Forms]:
@@ -461,7 +464,7 @@ def _bodies(sources: Sources, shapes: Shapes, form: Forms) -> tuple[Array, ...]:
 def _strays(sources: Sources, shapes: Shapes, form: Forms, sizes: Int, pixel_scale: float) -> tuple[Float, Float]:
     """([n, 11] profiles.on_the_sky of a source's electrons, 0 where nothing leaves its stamp; [n] how far, pixels).
 
-    How far : to what leaves it with less than _LOST of the light; 0 where no more than that leaves the stamp
+    How far : until no more than _LOST of the light lies farther out
     """
     body = sources.shape >= 0
     stray, reach = np.zeros((len(sources), 11)), np.zeros(len(sources))
@@ -470,8 +473,8 @@ def _strays(sources: Sources, shapes: Shapes, form: Forms, sizes: Int, pixel_sca
     sky = profiles.on_the_sky(shapes, form)
     sky[:, :2] *= np.where(beyond[:, 0] > _STRAY, sources.electrons[body], 0.0)[:, None]
     stray[body] = sky
-    far = np.array(_STEPS)[np.minimum((beyond > _LOST).sum(axis=1), len(_STEPS) - 1)]
-    reach[body] = np.where(beyond[:, 0] > _LOST, half * far, 0.0)
+    far = np.array(_STEPS)[np.clip((beyond > _LOST).sum(axis=1), 1, len(_STEPS) - 1)]
+    reach[body] = np.where(beyond[:, 0] > _STRAY, np.maximum(np.minimum(half * far, _FARTHEST), 1.5 * half), 0.0)
     return stray, reach
 
 

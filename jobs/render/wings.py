@@ -7,11 +7,8 @@ drawn here on blocks of pixels, through the mean PSF. So is what the stamps of g
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 
 from jobs.render import kernel
 from jobs.render.psf import SAMPLES, SIDE, Psf
@@ -32,45 +29,35 @@ def wings(column: Float, row: Float, electrons: Float, sizes: Int, psf: Psf, nx:
     returns : float64[blocks, blocks], the same in any order of the sources
     Error   : the PSF of mean colour at the detector's centre, on blocks: a few per cent of what is beyond the stamp
     """
-    shape = -(-ny // BLOCK) + 2 * MARGIN, -(-nx // BLOCK) + 2 * MARGIN
+    out = _layer(nx, ny)
     if psf.planes is None:
-        return np.zeros(shape)
+        return out / kernel.FIXED_POINT
     cells = _cells(psf.planes.images.mean(axis=0))
-    # Wide enough that nothing comes round: the margin is as wide as the wings.
-    period = [scipy.fft.next_fast_len(side, real=True) for side in shape]
-    total = np.zeros((period[0], period[1] // 2 + 1), complex)
+    x, y = ((at - (BLOCK - 1) / 2) / BLOCK + MARGIN for at in (column, row))
     for size in np.unique(sizes[sizes < SIDE]):
-        chosen = sizes == size
-        light = _on_blocks(column[chosen], row[chosen], electrons[chosen], shape)
-        total += scipy.fft.rfft2(light, period) * scipy.fft.rfft2(_beyond(cells, int(size), period))
-    found = scipy.fft.irfft2(total, period)[: shape[0], : shape[1]]
-    return np.asarray(np.maximum(found, 0.0) / BLOCK**2)
-
-
-def galaxies(column: Float, row: Float, stray: Float, reach: Float, sizes: Int, nx: int, ny: int) -> Float:
-    """Electrons a pixel of galaxies [n] outside stamps of `sizes`, on the blocks of `wings`.
-
-    stray   : float64[n, 11] profiles.on_the_sky, of a galaxy's electrons;  reach : [n] pixels, 0 = it has none there
-    returns : float64[blocks, blocks], the same in any order of the galaxies
-    Error   : a galaxy's own light, as if the PSF did nothing to it so far out
-    """
-    out = np.zeros((-(-ny // BLOCK) + 2 * MARGIN, -(-nx // BLOCK) + 2 * MARGIN), np.int64)
-    some = reach > 0
-    kernel.leaving(out, BLOCK, MARGIN, sizes[some], reach[some], column[some], row[some], stray[some])
+        some = sizes == size
+        kernel.spread(out, _beyond(cells, int(size)) / BLOCK**2, x[some], y[some], electrons[some])
     return out / kernel.FIXED_POINT
 
 
-def _on_blocks(column: Float, row: Float, electrons: Float, shape: tuple[int, int]) -> Float:
-    """Electrons shared among the four nearest blocks, summed in fixed point: the same in any order."""
-    out = np.zeros(shape, np.int64)
-    x, y = ((at - (BLOCK - 1) / 2) / BLOCK + MARGIN for at in (column, row))
-    x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    for right in (0, 1):
-        for up in (0, 1):
-            share = np.abs(1 - right - (x - x0)) * np.abs(1 - up - (y - y0))
-            inside = (x0 + right >= 0) & (x0 + right < shape[1]) & (y0 + up >= 0) & (y0 + up < shape[0])
-            whole = np.rint(electrons * share * kernel.FIXED_POINT).astype(np.int64)
-            np.add.at(out, (y0[inside] + up, x0[inside] + right), whole[inside])
+def _layer(nx: int, ny: int) -> Int:
+    return np.zeros((-(-ny // BLOCK) + 2 * MARGIN, -(-nx // BLOCK) + 2 * MARGIN), np.int64)
+
+
+def galaxies(
+    column: Float, row: Float, stray: Float, light: Float, reach: Float, sizes: Int, nx: int, ny: int
+) -> Float:
+    """Electrons a pixel of galaxies [n] outside stamps of `sizes`, on the blocks of `wings`.
+
+    stray   : float64[n, 11] profiles.on_the_sky;  light : [n] electrons taken off the stamp;  reach : [n] pixels
+    returns : float64[blocks, blocks], the same in any order of the galaxies
+    Error   : a galaxy's own light, as if the PSF did nothing to it so far out; what is left on the stamp is missing
+    """
+    out = _layer(nx, ny)
+    some = light > 0
+    kernel.leaving(
+        out, BLOCK, MARGIN, sizes[some], reach[some], column[some], row[some], stray[some], light[some]
+    )  # fmt: skip
     return out / kernel.FIXED_POINT
 
 
@@ -83,12 +70,10 @@ def _cells(plane: Float32) -> Float:
     return np.asarray(whole.sum(axis=(1, 3), dtype=float))
 
 
-def _beyond(cells: Float, size: int, period: Sequence[int]) -> Float:
-    """What lies outside a square of `size` pixels, on blocks, the middle one first: [period]."""
+def _beyond(cells: Float, size: int) -> Float:
+    """What lies outside a square of `size` pixels, on blocks about the middle one, and a border of nothing."""
     middle, half = len(cells) // 2, min(size // BLOCK, len(cells) // 2)
     hollow = cells.copy()
     hollow[middle - half : middle + half, middle - half : middle + half] = 0.0
     count = len(cells) // 4
-    out = np.zeros(period)
-    out[: 2 * count + 1, : 2 * count + 1] = hollow.reshape(2 * count + 1, 2, 2 * count + 1, 2).sum(axis=(1, 3))
-    return np.roll(out, (-count, -count), (0, 1))
+    return np.pad(hollow.reshape(2 * count + 1, 2, 2 * count + 1, 2).sum(axis=(1, 3)), 1)

@@ -60,13 +60,13 @@ def source_of(camera, electrons, **where_and_shape):
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("camera", ["vis", "lsstcam"])
 def test_flux_is_right_and_nothing_rings(camera, kind):
-    # A frame that holds the largest stamp of these.
-    side = 2 * SIDE
-    source = source_of(camera, 1e4, column=SIDE + 0.3, row=SIDE - 0.4, **SHAPES[kind])
+    # A frame that holds the largest stamp of these, and what is drawn beyond it.
+    side = 4 * SIDE
+    source = source_of(camera, 1e4, column=side / 2 + 0.3, row=side / 2 - 0.4, **SHAPES[kind])
     image, size = drawn(source, spread(camera), side)
     assert size < side
     assert np.isfinite(image).all()
-    assert image.sum() == pytest.approx(1e4, rel=1e-3)
+    assert image.sum() == pytest.approx(1e4, rel=2e-6 if kind != "n 6.2" else 2e-4)
     assert image.min() > -max(1e-3 * image.max(), SURVEY.background * NOISE)
 
 
@@ -164,7 +164,8 @@ def anything(draw):
 
 @given(anything(), st.sampled_from(["vis", "lsstcam"]), st.sampled_from([DRAFT, SURVEY]))
 def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
-    """On a frame as large as the stamp nothing is lost; memory and seconds are bounded before anything is drawn."""
+    """On a frame as large as the stamp nothing is lost but what the profile has outside; memory and seconds are bounded
+    before anything is drawn."""
     shape, electrons = what
     source, psf = source_of(camera, electrons, **shape), spread(camera)
     settings = stamps.settings_for(accuracy)
@@ -180,7 +181,10 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     assert time.process_time() - start < 10
     assert np.isfinite(image).all()
     # A pixel is rounded to 2^-20 electrons; single precision sums to 1e-6.
-    assert image.sum() == pytest.approx(electrons, rel=2e-6, abs=image.size * 2.0**-21)
+    least, rounding = 1.0, image.size * 2.0**-21 + 2e-6 * electrons
+    if len(source.shapes):
+        least -= profiles.outside(source.shapes, np.array([0.5 * side * psf.pixel_scale]))[0]
+    assert least * electrons - rounding <= image.sum() <= electrons + rounding
     assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
 
 
@@ -197,25 +201,25 @@ def centred(source, at=32.0):
     return source
 
 
-@given(st.sampled_from(sorted(SHAPES)), st.integers(-9, 9), st.integers(-9, 9), st.floats(60, 68), st.floats(60, 68))
+@given(st.sampled_from(sorted(SHAPES)), st.integers(-9, 9), st.integers(-9, 9), st.floats(92, 100), st.floats(92, 100))
 def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
     source = source_of("vis", 1e4, column=x, row=y, **SHAPES[kind])
-    base = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
+    base = stamps.draw(source, np.array([128]), spread("vis"), 192, 192)
     source.column[:] += dx
     source.row[:] += dy
-    moved = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
-    # Beside a half pixel the stamp itself may lie one farther.
-    middle = slice(44, 84)
+    moved = stamps.draw(source, np.array([128]), spread("vis"), 192, 192)
+    # Beside a half pixel the stamp itself may lie one farther; what lies beyond it is on blocks of the frame.
+    middle = slice(76, 116)
     expected = np.roll(base, (dy, dx), (0, 1))[middle, middle]
     np.testing.assert_allclose(moved[middle, middle], expected, atol=2e-4 * base.max() + 2.0**-20)
 
 
 @given(st.sampled_from([kind for kind in SHAPES if "gamma1" not in SHAPES[kind]]), st.floats(0, 180))
 def test_a_galaxy_turned_by_half_a_turn_is_itself(kind, angle):
-    image = stamps.draw(
-        centred(source_of("vis", 1e4, position_angle=angle, **SHAPES[kind])), np.array([64]), spread("vis"), 65, 65
-    )
-    inside = image[1:64, 1:64]
+    source = centred(source_of("vis", 1e4, position_angle=angle, **SHAPES[kind]), 48.0)
+    image = stamps.draw(source, np.array([96]), spread("vis"), 97, 97)
+    # What lies beyond the stamp is on blocks, which have another middle.
+    inside = image[17:80, 17:80]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
 
 

@@ -8,6 +8,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import gammaincc, gammaincinv
 
 from jobs.accuracy import DRAFT, REFERENCE, SURVEY
 from jobs.render import focal_plane, profiles, stamps
@@ -96,11 +97,38 @@ def test_neighbouring_orientations_show_the_same_sky():
     st.sampled_from([DRAFT, SURVEY]),
 )
 def test_no_light_is_lost(kind, x, y, electrons, accuracy):
-    detector, system, psf = scene("lsstcam", "R22_S11")
-    image = drawn(one_source(detector, system, electrons, x, y, **KINDS[kind]), psf, accuracy=accuracy)
+    # A frame that holds what is drawn beyond the stamps, too.
+    detector, system, psf = scene("lsstcam", "R22_S11", n=640)
+    source = one_source(detector, system, electrons, x + 240, y + 240, **KINDS[kind])
+    image = drawn(source, psf, n=640, accuracy=accuracy)
     # Each pixel is rounded to 2^-20 electrons: the faintest all to nothing.
-    assert image.sum() == pytest.approx(electrons, rel=1e-5, abs=image.size * 2.0**-21)
+    assert image.sum() == pytest.approx(electrons, rel=2e-6, abs=image.size * 2.0**-21)
     assert image.min() > -1e-3 * image.max()
+
+
+@pytest.mark.parametrize(("camera", "sizes"), [("vis", (64, 96, 160)), ("lsstcam", (48, 64, 96))])
+@pytest.mark.parametrize(("index", "radius"), [(2.5, 0.5), (4.0, 0.4), (6.2, 0.2)])
+def test_light_beyond_the_stamp_is_where_it_belongs(camera, sizes, index, radius):
+    """The light inside circles is that of a stamp that holds the frame, and of the closed form where no PSF matters."""
+    detector, system, psf = scene(camera, {"vis": "3-4", "lsstcam": "R22_S11"}[camera], n=512)
+    shape = {"bulge_fraction": 1.0, "bulge_sersic_index": index, "bulge_half_light_radius": radius}
+    source = one_source(detector, system, 1e6, 255.7, 256.4, **shape, bulge_axis_ratio=1.0)
+    y, x = np.mgrid[:512, :512]
+    far = np.hypot(x - 255.7, y - 256.4) * detector.pixel_scale
+    circles = np.array([1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 20.0])
+
+    def inside(size):
+        image = stamps.draw(source, np.array([size]), psf, 512, 512)
+        return np.array([image[far < circle].sum() for circle in circles]) / 1e6
+
+    whole = inside(2048)
+    beyond = gammaincc(2 * index, gammaincinv(2 * index, 0.5) * (circles / radius) ** (1 / index))
+    for size in sizes:
+        found = inside(size)
+        assert np.abs(found - whole).max() < 3e-3
+        assert abs(found[0] - whole[0]) < 1e-4
+        outside = circles >= 0.75 * size * detector.pixel_scale
+        np.testing.assert_allclose(1 - found[outside], beyond[outside], rtol=0.15, atol=5e-4)
 
 
 @given(st.floats(75, 85), st.floats(75, 85))
