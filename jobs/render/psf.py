@@ -148,7 +148,10 @@ def _tabulated(
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
     core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / _FINE, method="no_pixel", dtype=float)
     with_pixel = core.array if has_pixel else uniform_filter(core.array, _FINE)
-    fwhm = float(galsim.Image(with_pixel, scale=pixel_scale / _FINE).calculateFWHM())
+    # About the middle of the core: a user's PSF may lie off the source's place.
+    bright = with_pixel > 0.5 * with_pixel.max()
+    y, x = (float(at[bright].mean()) + 1.0 for at in np.indices(with_pixel.shape))
+    fwhm = float(galsim.Image(with_pixel, scale=pixel_scale / _FINE).calculateFWHM(center=galsim.PositionD(x, y)))
     return Psf(profile, pixel_scale, surface, outside, fwhm, planes, None if has_pixel else 0.0)
 
 

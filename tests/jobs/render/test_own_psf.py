@@ -88,6 +88,9 @@ def test_a_detector_that_is_mounted_turned_sees_it_turned(tmp_path):
     other, _ = moments(star(turned, small("vis", "2-4")))
     np.testing.assert_allclose(centre - (80.3, 77.6), (3.0, 1.0), atol=0.01)
     np.testing.assert_allclose(other - (80.3, 77.6), (-3.0, -1.0), atol=0.01)
+    # As wide as if it lay in the middle: sigma and pixel.
+    width = 2.3548 * np.hypot(0.15, 0.1 / 12**0.5)
+    assert (upright.fwhm, turned.fwhm) == pytest.approx((width, width), rel=0.02)
     # The chief ray's place may be told.
     centred = cube(tmp_path / "b.fits", gaussian(0.15, x=0.3, y=0.1), CRPIX1=81.0 + 6, CRPIX2=81.0 + 2)
     found, _ = moments(star(own_psf.read(centred, small("vis", "2-3"), BAND), small("vis", "2-3")))
