@@ -229,7 +229,7 @@ def stamp_sizes(
     aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
     enough = (electrons[:, None] * edge < settings.edge * noise) & (wrapped * aperture < settings.ghost)
     # The PSF's wings beyond a stamp are those of a point: the larger a galaxy, the farther out that may begin.
-    least = np.full(len(shape), settings.least)
+    least = np.full(len(shape), float(settings.least))
     least[body] += _EXTENT * profiles.half_light(shapes)[shape[body]]
     enough &= SIZES * psf.pixel_scale >= least[:, None]
     enough[:, -1] = True
