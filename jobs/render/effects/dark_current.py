@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 
+from jobs.compiling import jit
+from jobs.render.effects import dice, poisson
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
@@ -12,7 +17,16 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> frame + Poisson(electrons) in every pixel."""
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("dark electrons", electrons, 0.0, np.inf)
-    return frame + rng.poisson(electrons, frame.shape)
+    out = np.empty(frame.shape)
+    _add(np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1), electrons, dice.key(rng))
+    return out
+
+
+@jit
+def _add(frame: Any, out: Any, electrons: float, own: Any) -> None:
+    none = math.exp(-electrons)
+    for i in range(len(frame)):
+        out[i] = frame[i] + poisson.counted(electrons, none, dice.word(own, i))
 
 
 def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Generator) -> Frame:

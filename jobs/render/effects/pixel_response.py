@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from jobs.compiling import jit
+from jobs.render.effects import dice
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
@@ -29,10 +33,8 @@ def response(shape: tuple[int, ...], rms: float, dead: float, dark_columns: floa
     ):  # fmt: skip
         if not 0.0 <= value <= most:
             raise OutOfRange(name, value, 0.0, most)
-    out = np.asarray(rng.standard_normal(shape, dtype=np.float32), float)
-    out *= rms
-    out += 1.0
-    np.maximum(out, 0.0, out=out)
+    out = np.empty(shape)
+    _spread(out.reshape(-1), rms, dice.key(rng))
     ny, nx = shape[-2:]
     count = int(rng.binomial(ny * nx, dead))
     rows, columns = rng.integers(0, max(ny, 1), count), rng.integers(0, max(nx, 1), count)
@@ -44,6 +46,12 @@ def response(shape: tuple[int, ...], rms: float, dead: float, dark_columns: floa
         blind = slice(row, middle) if row < middle else slice(middle, row + 1)
         out[..., blind, column] = 0.0
     return out
+
+
+@jit
+def _spread(out: Any, rms: float, own: Any) -> None:
+    for i in range(len(out)):
+        out[i] = max(1.0 + rms * dice.normal(dice.word(own, i)), 0.0)
 
 
 def _parameters(scene: Scene) -> tuple[float, float, float]:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from jobs.compiling import jit
+from jobs.render.effects import dice
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
@@ -12,10 +16,15 @@ def apply(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> frame + N(0, sigma) e-."""
     if not 0.0 <= sigma < np.inf:
         raise OutOfRange("read noise", sigma, 0.0, np.inf)
-    noise = rng.standard_normal(frame.shape)
-    noise *= sigma
-    noise += frame
-    return noise
+    out = np.empty(frame.shape)
+    _add(np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1), sigma, dice.key(rng))
+    return out
+
+
+@jit
+def _add(frame: Any, out: Any, sigma: float, own: Any) -> None:
+    for i in range(len(frame)):
+        out[i] = frame[i] + sigma * dice.normal(dice.word(own, i))
 
 
 def _sigma(scene: Scene) -> float:

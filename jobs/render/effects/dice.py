@@ -1,0 +1,96 @@
+"""Dice of pixels: each pixel has random numbers of its own, so that what changes in one of them changes no other.
+
+key       of a frame's dice, from an effect's generator
+word      64 random bits of a pixel
+further   the next 64 of the same pixel
+uniform   in (0, 1] of a word
+normal    standard normal deviate of a word
+
+Compiled; they are called from effects' kernels. A number takes a few ns.
+
+Ref : Steele, Lea & Flood 2014 (SplitMix64); Marsaglia & Tsang 2000 (ziggurat), with the bits apart as in Doornik 2005
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from jobs.compiling import jit
+
+_GOLDEN, _FIRST, _SECOND = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+_LAYER, _SIGN = np.uint64(255), np.uint64(256)
+# Of 256 layers of equal area under exp(-x^2 / 2): where the tail begins, and the area (Doornik 2005).
+_TAIL, _AREA = 3.6541528853610088, 4.92867323399e-3
+
+
+def key(rng: np.random.Generator) -> np.uint64:
+    """What a frame's dice count on from."""
+    return rng.integers(0, 2**64, dtype=np.uint64)
+
+
+def _layers() -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Right ends of the layers, from the lowest, whose end stands for its tail, to 0."""
+    ends = [_AREA * math.exp(0.5 * _TAIL**2), _TAIL]
+    while len(ends) < 256:
+        ends.append(math.sqrt(-2.0 * math.log(_AREA / ends[-1] + math.exp(-0.5 * ends[-1] ** 2))))
+    return np.array([*ends, 0.0])
+
+
+_ENDS = _layers()
+_INSIDE = _ENDS[1:] / _ENDS[:-1]
+_HEIGHTS = np.exp(-0.5 * _ENDS**2)
+
+
+@jit
+def _mixed(word: Any) -> Any:
+    word = (word ^ (word >> _S30)) * _FIRST
+    word = (word ^ (word >> _S27)) * _SECOND
+    return word ^ (word >> _S31)
+
+
+@jit
+def word(own: Any, pixel: int) -> Any:
+    return _mixed(own + np.uint64(pixel) * _GOLDEN)
+
+
+@jit
+def further(before: Any) -> Any:
+    return _mixed(before + _GOLDEN)
+
+
+@jit
+def uniform(bits: Any) -> float:
+    return (float(bits >> _S11) + 1.0) * 2.0**-53
+
+
+@jit
+def normal(bits: Any) -> float:
+    while True:
+        # Layer, sign and place are of different bits.
+        layer = np.int64(bits & _LAYER)
+        part = float(bits >> _S11) * 2.0**-53
+        x = part * _ENDS[layer]
+        if part >= _INSIDE[layer]:
+            sign = bits & _SIGN
+            bits = further(bits)
+            if layer == 0:
+                # Beyond the last layer: Marsaglia's exponential tail.
+                x = -math.log(uniform(bits)) / _TAIL
+                bits = further(bits)
+                y = -2.0 * math.log(uniform(bits))
+                while y < x * x:
+                    bits = further(bits)
+                    x = -math.log(uniform(bits)) / _TAIL
+                    bits = further(bits)
+                    y = -2.0 * math.log(uniform(bits))
+                return -_TAIL - x if sign else _TAIL + x
+            low, high = _HEIGHTS[layer], _HEIGHTS[layer + 1]
+            if low + uniform(bits) * (high - low) >= math.exp(-0.5 * x * x):
+                bits = further(bits)
+                continue
+            return -x if sign else x
+        return -x if bits & _SIGN else x
