@@ -13,37 +13,50 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
+from jobs.render.effects import dice
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
 # Pixels to each side that a border feels.
 REACH = 2
+# Pixels of a row that are looked at together.
+_RUN = 64
 # Of a pixel's charge, the part that can leave it over one border: strips are thin.
 MOST = 0.2
 
 
-def apply(frame: Frame, shift: float, softening: float, capacity: float, rng: np.random.Generator) -> Frame:
+def apply(
+    frame: Frame, shift: float, softening: float, capacity: float, least: float, rng: np.random.Generator
+) -> Frame:
     """frame [ny, nx] whole e- >= 0 -> whole e- >= 0, the same sum.
 
     shift     : pixels that one electron displaces each border of its own pixel
     softening : pixels, depth of the charge below the borders: how fast the displacement falls off
     capacity  : e-; what a pixel cannot hold does not repel either
+    least     : e-; borders that fewer cross, whatever lies around them, are left as they are
     """
-    if not 0.0 <= shift <= 1e-4:
-        raise OutOfRange("brighter-fatter shift", shift, 0.0, 1e-4)
-    if not 1.0 <= capacity <= 1e9:
-        raise OutOfRange("full well", capacity, 1.0, 1e9)
+    for name, value, low, high in (
+        ("brighter-fatter shift", shift, 0.0, 1e-4), ("full well", capacity, 1.0, 1e9),
+        ("brighter-fatter least", least, 0.0, np.inf),
+    ):  # fmt: skip
+        if not low <= value <= high:
+            raise OutOfRange(name, value, low, high)
     out = np.array(frame, dtype=float, order="C")
     if shift == 0.0 or out.size == 0 or out.max() <= 0.0:
         return out
     # In single precision: whole electrons below 2^24 are exact, and what crosses to 1e-7 of it.
-    held = np.pad(np.minimum(out, capacity, dtype=np.float32, casting="same_kind"), REACH, mode="edge")
+    held = np.empty((out.shape[0] + 2 * REACH, out.shape[1] + 2 * REACH), np.float32)
+    np.minimum(out, capacity, out=held[REACH:-REACH, REACH:-REACH], casting="same_kind")
+    for sides in (held, held.T):
+        sides[:REACH], sides[-REACH:] = sides[REACH], sides[-REACH - 1]
     weights = kernel(shift, softening).astype(np.float32)
+    # Where all charge is below this, `least` do not cross: sum of weights x charge, times twice the charge, a quarter.
+    dim = np.sqrt(2.0 * least / weights.sum())
+    # Of each run of pixels, and none after the last.
+    most = np.zeros((len(held), -(-held.shape[1] // _RUN) + 1), np.float32)
+    _highest(held.view(np.int32), most.view(np.int32))
     for down in (False, True):
-        # What crosses is a whole number of electrons, right in the mean.
-        dice = rng.random(out.shape, dtype=np.float32)
-        _cross(held, out, weights, dice, down)
-        del dice
+        _cross(held, most, out, weights, dice.key(rng), down, dim)
     return out
 
 
@@ -65,51 +78,75 @@ def curvature(shift: float, softening: float) -> float:
 
 
 @jit
-def _cross(held: Any, out: Any, weights: Any, dice: Any, down: bool) -> None:
+def _cross(held: Any, most: Any, out: Any, weights: Any, own: Any, down: bool, dim: float) -> None:
     """Moves charge over the borders between neighbours in a row (or, `down`, in a column), in place.
 
-    held : the charge that repels, with a margin of REACH pixels
+    held : the charge that repels, with a margin of REACH pixels, and most [row, run] of it
+    dim  : nothing crosses where all of it is less
     """
     ny, nx = out.shape
     last_row, last = (ny - 1, nx) if down else (ny, nx - 1)
-    displaced, quarter = np.empty(last, np.float32), np.float32(0.25)
+    displaced = np.empty(_RUN, np.float32)
     for r in range(last_row):
-        displaced[:] = 0.0
-        for i in range(2 * REACH + 1):
-            for j in range(REACH):
-                # Pixels j from the border on this side, and on the other.
-                if down:
-                    near, far = held[r + REACH - j, i : i + last], held[r + REACH + 1 + j, i : i + last]
-                else:
-                    near, far = (
-                        held[r + i, REACH - j : REACH - j + last],
-                        held[r + i, REACH + 1 + j : REACH + 1 + j + last],
-                    )
-                weight = weights[i, j]
-                for c in range(last):
-                    displaced[c] += weight * (near[c] - far[c])
-        here, there = held[r + REACH, REACH:], held[r + REACH + down, REACH + 1 - down :]
-        for c in range(last):
-            # The border moves towards the fuller side, on average by half: what falls into the strip changes sides.
-            strip = quarter * displaced[c] * (here[c] + there[c])
-            moved = np.floor(strip + dice[r, c])
-            giver = out[r, c] if moved > 0.0 else out[r + down, c + 1 - down]
-            if abs(moved) > MOST * giver:
-                moved = np.floor(MOST * giver) * (1.0 if moved > 0.0 else -1.0)
-            out[r, c] -= moved
-            out[r + down, c + 1 - down] += moved
+        for run in range((last + _RUN - 1) // _RUN):
+            # A border feels the margin, too: it lies in the next run.
+            if most[r : r + 2 * REACH + 1 + down, run : run + 2].max() < dim:
+                continue
+            first = run * _RUN
+            some = displaced[: min(_RUN, last - first)]
+            _displace(held, weights, down, r, first, some)
+            here, there = held[r + REACH, first + REACH :], held[r + REACH + down, first + REACH + 1 - down :]
+            giver, taker = out[r, first:], out[r + down, first + 1 - down :]
+            for c in range(len(some)):
+                # The border moves towards the fuller side, on average by half: what falls into the strip changes sides.
+                strip = np.float32(0.25) * some[c] * (here[c] + there[c])
+                # What crosses is a whole number of electrons, right in the mean.
+                moved = np.floor(strip + dice.uniform(dice.word(own, r * nx + first + c)))
+                most_moved = np.floor(MOST * (giver[c] if moved > 0.0 else taker[c]))
+                moved = min(max(moved, -most_moved), most_moved)
+                giver[c] -= moved
+                taker[c] += moved
 
 
-def _parameters(scene: Scene) -> tuple[float, float, float]:
+@jit
+def _highest(bits: Any, most: Any) -> None:
+    """Of each run of pixels of each row; as whole numbers, which are in the order of the numbers >= 0 they stand for."""
+    for r in range(len(bits)):
+        for run in range(most.shape[1] - 1):
+            line, highest = bits[r, run * _RUN : (run + 1) * _RUN], np.int32(0)
+            for c in range(len(line)):
+                highest = max(highest, line[c])
+            most[r, run] = highest
+
+
+@jit
+def _displace(held: Any, weights: Any, down: bool, r: int, first: int, displaced: Any) -> None:
+    """Of the borders of a row from a pixel on."""
+    displaced[:] = np.float32(0.0)
+    for i in range(2 * REACH + 1):
+        for j in range(REACH):
+            # Pixels j from the border on this side, and on the other.
+            if down:
+                near, far = held[r + REACH - j, first + i :], held[r + REACH + 1 + j, first + i :]
+            else:
+                near, far = held[r + i, first + REACH - j :], held[r + i, first + REACH + 1 + j :]
+            weight = weights[i, j]
+            for c in range(len(displaced)):
+                displaced[c] += weight * (near[c] - far[c])
+
+
+def _parameters(scene: Scene) -> tuple[float, float, float, float]:
     return (
         scene.value("bfe.shift", "pix / electron"),
         scene.value("bfe.softening", "pix"),
         scene.value("full_well", "electron"),
+        # A pixel has four borders.
+        scene.accuracy.background * scene.pixel_noise / 4.0,
     )
 
 
 def _contribution(scene: Scene) -> float:
-    shift, _, capacity = _parameters(scene)
+    shift, _, capacity, _ = _parameters(scene)
     full = min(scene.peak_electrons, capacity) + scene.sky_electrons
     # Four borders, half the final displacement, two thirds of the light at a border: 1.2 of this for a VIS star.
     return 1.5 * shift * full**2

@@ -18,9 +18,15 @@ _SPECIES = 3
 # Traps passed that stand for the end of the mission: one in each of 2066 pixels.
 _END_OF_LIFE = 2066.0
 # What they then do to a source at the far end: of its flux, its position (pixels), its ellipticity; and the error of
-# that, from one sweep, from Heun's rule and from four steps of it (both as measured against arCTIc by the tests).
+# that, with the power of the damage that it grows with: from levels of traps, from one sweep, from Heun's rule and from
+# four steps of it (as measured against arCTIc by the tests; levels against small steps).
 _FLUX, _SHIFT, _SHAPE = 0.05, 0.036, 0.01
-_SWEEPS = ((0.016, Sweeps(1, 1)), (0.0017, Sweeps(1, 2)), (0.0008, Sweeps(4, 2)))
+_SWEEPS = (
+    (0.75, 1, Sweeps(1, 1, 9)),
+    (0.016, 2, Sweeps(1, 1)),
+    (0.0017, 2, Sweeps(1, 2)),
+    (0.0008, 2, Sweeps(4, 2)),
+)
 
 
 def apply_parallel(
@@ -40,11 +46,11 @@ def apply_serial(
 def sweeps_for(accuracy: Accuracy, passed: float) -> Sweeps:
     """How closely charge is followed past so many traps: as little as the errors of sources allow.
 
-    Losses grow with the traps, and so does the error of what is left out: the next order in them.
+    Losses grow with the traps, and so does the error: what is left out is the next order in them.
     """
     damage = passed / _END_OF_LIFE
     allowed = min(accuracy.flux / _FLUX, accuracy.position / _SHIFT, accuracy.shape / _SHAPE)
-    return next((sweeps for error, sweeps in _SWEEPS if error * damage**2 <= allowed), _SWEEPS[-1][1])
+    return next((sweeps for error, power, sweeps in _SWEEPS if error * damage**power <= allowed), _SWEEPS[-1][-1])
 
 
 def lattice(scene: Scene, direction: str) -> Traps:

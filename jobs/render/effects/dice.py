@@ -63,12 +63,12 @@ def further(before: Any) -> Any:
 
 
 @jit
-def uniform(bits: Any) -> float:
+def uniform(bits: Any) -> Any:
     return (float(bits >> _S11) + 1.0) * 2.0**-53
 
 
 @jit
-def normal(bits: Any) -> float:
+def normal(bits: Any) -> Any:
     while True:
         # Layer, sign and place are of different bits.
         layer = np.int64(bits & _LAYER)

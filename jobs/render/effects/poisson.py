@@ -35,7 +35,7 @@ def _count(light: Any, counts: Any, own: Any) -> None:
 
 
 @jit
-def counted(mean: float, none: float, bits: Any) -> float:
+def counted(mean: float, none: float, bits: Any) -> Any:
     """A count of an expectation >= 0, by a pixel's dice; none : exp(-mean) where that is below 10."""
     if mean < _SUMMED_BELOW:
         u, term, count = dice.uniform(bits), none, 0.0

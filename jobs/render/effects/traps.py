@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs.compiling import jit
+from jobs.render.effects import trap_levels
 from lake_schema.errors import BadInput, OutOfRange
 
 Float = npt.NDArray[np.float64]
@@ -75,12 +76,20 @@ class Traps:
 
 @dataclass(frozen=True, slots=True)
 class Sweeps:
-    """How a line is followed: steps along it, and sweeps a step (1: packets as they were; 2: Heun's rule)."""
+    """How a line is followed: steps along it, and sweeps a step (1: packets as they were; 2: Heun's rule).
+
+    levels : 0, or into how many levels the traps of a pixel are put instead of watermarks, in one sweep of one step
+    """
 
     steps: int
     order: int
+    levels: int = 0
 
     def __post_init__(self) -> None:
+        if self.levels and not trap_levels.FEWEST <= self.levels <= 1000:
+            raise OutOfRange("levels of traps", self.levels, trap_levels.FEWEST, 1000)
+        if self.levels and (self.steps, self.order) != (1, 1):
+            raise BadInput(f"{self.levels} levels of traps take one sweep of one step")
         if not 1 <= self.steps <= 10_000:
             raise OutOfRange("steps of a transfer", self.steps, 1, 10_000)
         if self.order not in (1, 2):
@@ -110,9 +119,13 @@ def shifted(frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int |
     released = -np.expm1(-1.0 / release)
     edges = np.rint(np.linspace(physical, 0, min(sweeps.steps, max(physical, 1)) + 1)).astype(np.int64)
     volumes = _volumes(traps)
+    ends = trap_levels.heights(out, traps.notch, sweeps.levels) if sweeps.levels else None
     trapped = 0.0
     for plane in out.reshape(-1, *out.shape[-2:]):
         lines = plane if axis == -1 else plane.T
+        if ends is not None:
+            trapped += trap_levels.follow_all(lines, physical, density, released, ends, traps.volume(ends))
+            continue
         # Some lines at a time: those that are columns lie far apart in memory.
         for start in range(0, len(lines), _BLOCK):
             some = np.array(lines[start : start + _BLOCK], order="C")

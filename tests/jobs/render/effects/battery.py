@@ -74,7 +74,7 @@ _CASES = (
     Case("calibration_lamp", lambda shape: (500.0, *bowl(shape)), lambda shape: (0.0, *bowl(shape)), zero=False),
     Case("readout_trail", (6e-5, 2), (0.0, 2), linear=True),
     Case("poisson", (), None, whole=True),
-    Case("brighter_fatter", (1.2e-7, 0.5, 2e5), (0.0, 0.5, 2e5), conserves=True, whole=True),
+    Case("brighter_fatter", (1.2e-7, 0.5, 2e5, 0.0), (0.0, 0.5, 2e5, 0.0), conserves=True, whole=True),
     Case("dark_current", (0.3,), (0.0,), zero=False, whole=True),
     Case("hot_pixels", (0.1, 50.0), (0.0, 50.0), zero=False, whole=True),
     Case("cosmic_rays", (5.0, TRACKS), (0.0, TRACKS), zero=False, whole=True),

@@ -26,7 +26,7 @@ def test_a_star_at_full_well_is_one_to_two_per_cent_wider():
     for peak in (5e4, 2e5):
         image = star(peak)
         mean = np.mean(
-            [brighter_fatter.apply(image, SHIFT, SOFT, FULL, np.random.default_rng(i)) for i in range(50)], axis=0
+            [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(i)) for i in range(50)], axis=0
         )
         growth[peak] = widths(mean) / widths(image) - 1
     assert (growth[2e5] > 0.01).all()
@@ -37,7 +37,7 @@ def test_a_star_at_full_well_is_one_to_two_per_cent_wider():
 def test_variance_of_a_flat_falls_as_predicted():
     level = 1e5
     flat = np.random.default_rng(1).poisson(level, (1200, 1200)).astype(float)
-    out = brighter_fatter.apply(flat, SHIFT, SOFT, FULL, np.random.default_rng(2))
+    out = brighter_fatter.apply(flat, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(2))
     assert out.sum() == flat.sum()
     lost = 1 - out.var() / flat.var()
     assert lost == pytest.approx(brighter_fatter.curvature(SHIFT, SOFT) * level, rel=0.1)
@@ -49,8 +49,12 @@ def test_variance_of_a_flat_falls_as_predicted():
 
 def test_rows_and_columns_are_alike():
     image = star(1e5)
-    one = np.mean([brighter_fatter.apply(image, SHIFT, SOFT, FULL, np.random.default_rng(i)) for i in range(60)], 0)
-    two = np.mean([brighter_fatter.apply(image.T, SHIFT, SOFT, FULL, np.random.default_rng(i)) for i in range(60)], 0)
+    one = np.mean(
+        [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(i)) for i in range(60)], 0
+    )
+    two = np.mean(
+        [brighter_fatter.apply(image.T, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(i)) for i in range(60)], 0
+    )
     assert np.abs(one - two.T).max() < 1.0
 
 
@@ -64,12 +68,36 @@ def test_kernel_falls_off():
 
 def test_what_no_pixel_holds_does_not_repel():
     image = star(1e9)
-    out = brighter_fatter.apply(image, SHIFT, SOFT, FULL, np.random.default_rng(1))
+    out = brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(1))
     assert out.min() >= 0
     assert out.sum() == image.sum()
 
 
-@pytest.mark.parametrize("wrong", [(-1.0, 0.5, 2e5), (np.nan, 0.5, 2e5), (1e-7, -1.0, 2e5), (1e-7, 0.5, 0.0)])
+def test_what_is_not_noticed_is_left_out():
+    """Faint pixels stay as they are; about a bright star the same electrons cross as if all were followed."""
+    light = np.random.default_rng(3).poisson(140.0, (300, 400)).astype(float)
+    light[100:125, 200:225] += star(1.5e5)
+    light[297:, 397:] += 5e4
+    every, some = (
+        brighter_fatter.apply(light, SHIFT, SOFT, FULL, least, np.random.default_rng(4)) for least in (0.0, 0.06)
+    )
+    assert some.sum() == light.sum()
+    np.testing.assert_array_equal(every[105:120, 205:220], some[105:120, 205:220])
+    np.testing.assert_array_equal(every[298:, 398:], some[298:, 398:])
+    assert (some != light)[100:125, 200:225].sum() > 20
+    np.testing.assert_array_equal(some[:90], light[:90])
+    left_out = every - some
+    assert 0 < np.sqrt(np.mean(left_out**2)) < 0.1 * np.sqrt(140.0 + 4.4**2)
+    assert np.abs(left_out).max() <= 1.0
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        (-1.0, 0.5, 2e5, 0.0), (np.nan, 0.5, 2e5, 0.0), (1e-7, -1.0, 2e5, 0.0), (1e-7, 0.5, 0.0, 0.0),
+        (1e-7, 0.5, 2e5, np.nan),
+    ],
+)  # fmt: skip
 def test_nonsense_is_refused(wrong):
     with pytest.raises(OutOfRange, match=r"brighter|full well"):
         brighter_fatter.apply(np.ones((3, 3)), *wrong, np.random.default_rng(1))
