@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from jobs.compiling import jit
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
@@ -15,11 +18,15 @@ def apply(frame: Frame, gain: float, bias: float, largest: float, rng: np.random
     """
     if not 0.0 < gain < np.inf:
         raise OutOfRange("gain", gain, 0.0, np.inf)
-    out = frame / gain
-    out += bias
-    out += 0.5
-    np.floor(out, out=out)
-    return np.clip(out, 0.0, largest, out=out)
+    out = np.empty(frame.shape)
+    _convert(np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1), gain, bias + 0.5, largest)
+    return out
+
+
+@jit
+def _convert(electrons: Any, numbers: Any, gain: float, offset: float, largest: float) -> None:
+    for i in range(len(electrons)):
+        numbers[i] = min(max(np.floor(electrons[i] / gain + offset), 0.0), largest)
 
 
 def _parameters(scene: Scene) -> tuple[float, float, float]:

@@ -36,10 +36,11 @@ def bleed(frame: Frame, capacity: float, halves: int) -> tuple[Frame, float]:
     if halves not in (1, 2):
         raise OutOfRange("halves of a column", halves, 1, 2)
     out = np.array(frame, dtype=np.float64, order="C")
-    if out.size == 0 or out.max() <= capacity:
+    highest = out.max(axis=0, initial=0.0)
+    if highest.max(initial=0.0) <= capacity:
         return out, 0.0
     full, middle = float(np.floor(capacity)), (out.shape[0] + 1) // 2 if halves == 2 else out.shape[0]
-    columns = np.flatnonzero(out.max(axis=0) > full)
+    columns = np.flatnonzero(highest > full)
     lost = _bleed(out[:middle], columns, full)
     return out, lost + (_bleed(out[middle:][::-1], columns, full) if middle < len(out) else 0.0)
 

@@ -110,7 +110,7 @@ def _cross(held: Any, most: Any, out: Any, weights: Any, own: Any, down: bool, d
 
 @jit
 def _highest(bits: Any, most: Any) -> None:
-    """Of each run of pixels of each row; as whole numbers, which are in the order of the numbers >= 0 they stand for."""
+    """Of each run of pixels of each row; by their bits, which are in the order of the numbers >= 0 they stand for."""
     for r in range(len(bits)):
         for run in range(most.shape[1] - 1):
             line, highest = bits[r, run * _RUN : (run + 1) * _RUN], np.int32(0)

@@ -12,6 +12,7 @@ from lake_schema.errors import BadInput, OutOfRange
 
 # Of the coupling between neighbours (assumed).
 _DIAGONAL = 0.5
+_RUN = 1024
 
 
 def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = None) -> Frame:
@@ -32,14 +33,16 @@ def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = N
 
 @jit
 def _mix(frame: Any, coefficients: Any, out: Any) -> None:
-    for victim in range(len(frame)):
-        line = out[victim]
-        line[:] = frame[victim]
-        for source in range(len(frame)):
-            share, other = coefficients[victim, source], frame[source]
-            if source != victim and share != 0.0:
-                for i in range(len(line)):
-                    line[i] += share * other[i]
+    # As many pixels at a time as the processor has near at hand.
+    for start in range(0, frame.shape[1], _RUN):
+        for victim in range(len(frame)):
+            line = out[victim, start : start + _RUN]
+            line[:] = frame[victim, start : start + _RUN]
+            for source in range(len(frame)):
+                share, other = coefficients[victim, source], frame[source, start : start + _RUN]
+                if source != victim and share != 0.0:
+                    for i in range(len(line)):
+                        line[i] += share * other[i]
 
 
 def coefficients(scene: Scene) -> Frame:

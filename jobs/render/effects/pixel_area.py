@@ -22,8 +22,7 @@ def apply(
     """frame [ny, nx] e- -> plus electrons times `change`: what a pixel of the boresight's area has of the sky."""
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("sky electrons", electrons, 0.0, np.inf)
-    out = change(u, v, stretch)
-    out *= electrons
+    out = change(u, v, electrons * stretch)
     out += frame
     return out
 

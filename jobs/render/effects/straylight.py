@@ -58,9 +58,10 @@ def _interpolate(frame: Any, nodes: Any, step: int) -> None:
         low, part = r // step, (r % step) / step
         for k in range(len(line)):
             line[k] = nodes[low, k] + part * (nodes[low + 1, k] - nodes[low, k])
-        for c in range(nx):
-            left = c // step
-            frame[r, c] += line[left] + (c - left * step) / step * (line[left + 1] - line[left])
+        for k in range(len(line) - 1):
+            some, slope = frame[r, k * step : min((k + 1) * step, nx)], (line[k + 1] - line[k]) / step
+            for c in range(len(some)):
+                some[c] += line[k] + c * slope
 
 
 def _halo(scene: Scene) -> tuple[float, float]:
