@@ -50,7 +50,8 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str]) -> Callable[[str, Fram
         if name in ("cosmic_rays", "readout_cosmic_rays") and "cosmic_rays" in truth:
             hit = after - before
             hit = hit if hit.ndim == 2 else quadrants.assembled(hit, *quadrants.sizes(scene))
-            maps["cosmic_rays"] = hit.astype(np.int32) + maps.get("cosmic_rays", 0)
+            # Traps may have held some of it back: to the electron.
+            maps["cosmic_rays"] = np.rint(hit).astype(np.int32) + maps.get("cosmic_rays", 0)
 
     return see
 

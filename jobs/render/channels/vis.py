@@ -58,8 +58,8 @@ _CHARGE = (
 )
 _READOUT = (
     quadrants.EFFECT,
-    cosmic_rays.READOUT,
     charge_transfer.PARALLEL,
+    cosmic_rays.READOUT,
     charge_transfer.SERIAL,
     nonlinearity.EFFECT,
     crosstalk.EFFECT,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,7 @@ class Scene:
     detector       : where it lies in the focal plane; None: at its centre
     lights         : what shines around corners: ghosts, straylight
     lamp           : the LED of a flat, from 1
+    forced         : effect name -> on or off, instead of what the scene needs
     """
 
     mission: MissionConfiguration
@@ -70,6 +71,7 @@ class Scene:
     lights: Lights = field(default_factory=Lights)
     lamp: int = 1
     accuracy: Accuracy = SURVEY
+    forced: Mapping[str, bool] = field(default_factory=dict)
 
     def value(self, key: str, unit: str) -> float:
         """A parameter of the detector."""
@@ -127,6 +129,9 @@ class Effect:
     def needed_if(self, scene: Scene) -> bool:
         return not self.optional or self.margin(scene) > 1.0
 
+    def applied(self, scene: Scene) -> bool:
+        return scene.forced.get(self.name, self.needed_if(scene))
+
 
 @dataclass(frozen=True, slots=True)
 class Decision:
@@ -168,6 +173,7 @@ def apply_all(
     watch  : sees the name of an effect that is applied, and the frame before and after it
     """
     decisions = decide(effects, scene, forced or {})
+    scene = replace(scene, forced=forced or {})
     for effect, decision in zip(effects, decisions, strict=True):
         if decision.applied:
             before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))

@@ -34,13 +34,18 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def every_transfer(line, silicon, pixels):
-    """One transfer at a time, each pixel with its own watermarks per species: the definition, slowly."""
-    levels = 10_000
+def every_transfer(line, silicon, pixels, hits=(), levels=10_000):
+    """One transfer at a time, each pixel with its own watermarks per species: the definition, slowly.
+
+    hits : pixel -> (packet, charge that it gets there)
+    """
     heights = (np.arange(levels) + 0.5) / levels
     line, n = np.array(line, float), len(line)
     trapped = 0.0
     for pixel in range(pixels - 1, -1, -1):
+        if pixel in hits:
+            packet, charge = hits[pixel]
+            line[packet] += charge
         full = np.zeros((len(silicon.density), levels))
         for i in range(pixel, n):
             released = full * -np.expm1(-1.0 / np.array(silicon.release))[:, None]

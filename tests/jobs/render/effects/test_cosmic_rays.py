@@ -1,13 +1,17 @@
 """Cosmic rays: how many, how long, how much; even over the frame; in the readout where they belong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from jobs.render import focal_plane
-from jobs.render.effects import cosmic_rays
+from jobs.render.effects import charge_transfer, cosmic_rays
 from jobs.render.effects.effect import Scene
+from jobs.render.effects.traps import Traps
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render.effects.test_charge_transfer import every_transfer
 
 MISSION = resolve()
 TRACKS = np.array(MISSION.numbers("env.cosmic_rays.vis_tracks"))
@@ -45,9 +49,11 @@ def test_quantiles():
 
 
 def test_a_track_is_one_pixel_thin_and_straight():
-    image = np.zeros((40, 40))
     one = tuple(np.array([value]) for value in (5.5, 8.5, np.cos(0.3), np.sin(0.3), 20.0, 10_001.0))
-    cosmic_rays._draw(image, one, np.zeros(1, np.int64), 40)
+    event, columns, rows, charge = cosmic_rays._hits(one)
+    assert (event == 0).all()
+    image = np.zeros((40, 40))
+    image[rows, columns] = charge
     assert image.sum() == 10_001
     rows, columns = np.nonzero(image)
     assert columns.min() == 5
@@ -67,11 +73,13 @@ def test_even_over_the_frame():
 
 def test_readout_hits_lie_in_readout_coordinates():
     """Rows that are read later have been on the detector for longer; prescan and overscan columns have no silicon."""
-    expected, _, rows, prescan, columns = cosmic_rays.READOUT.parameters(SCENE)
+    expected, _, rows, prescan, columns, silicon = cosmic_rays.READOUT.parameters(SCENE)
+    assert silicon == charge_transfer.lattice(SCENE, "parallel")
+    assert cosmic_rays.READOUT.parameters(replace(SCENE, forced={"parallel_cti": False}))[-1] is None
     assert (rows, prescan, columns) == (2066, 51, 2048)
     assert expected == pytest.approx(72 * 2066 * 2048 * (12e-4) ** 2)
     empty = np.zeros((40, 126, 90))
-    out = cosmic_rays.apply_readout(empty, 60.0, TRACKS, 120, 10, 64, np.random.default_rng(1))
+    out = cosmic_rays.apply_readout(empty, 60.0, TRACKS, 120, 10, 64, None, np.random.default_rng(1))
     assert (out[:, :, :10] == 0).all()
     assert (out[:, :, 74:] == 0).all()
     hits = (out[:, :, 10:74] > 0).mean(axis=(0, 2))
@@ -79,6 +87,32 @@ def test_readout_hits_lie_in_readout_coordinates():
     assert late > 3 * early
     # Overscan rows are hit, too.
     assert hits[120:].mean() > 0.8 * late
+
+
+@pytest.mark.parametrize(("rows", "charges"), [([12], [12_000.0]), ([30, 31, 32], [600.0] * 3)])
+def test_a_readout_hit_passes_the_traps_from_its_row_on(rows, charges):
+    """Pixel by pixel, with the charge put where it hits, 30 rows after the readout began, against its own trail."""
+    before, pixels, silicon = 30, 80, Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
+    sky = np.random.default_rng(1).poisson(140.0, 140).astype(float)
+    hits = {row: (row + before, charge) for row, charge in zip(rows, charges, strict=True)}
+    without, wanted = (every_transfer(sky, silicon, pixels, some, 1000)[0] for some in ({}, hits))
+    found = without[:, None].copy()
+    packet = np.array(rows) + before
+    column = np.zeros(len(rows), int)
+    cosmic_rays._deposit(found, column, packet, np.array(rows), np.array(charges), silicon)
+    # What traps do to the hit: its loss and its trail; far from nothing, and far from what all rows would do.
+    hit = np.zeros(140)
+    hit[packet] = charges
+    true, ours = wanted - without - hit, found[:, 0] - without - hit
+    assert np.abs(ours - true).max() < 0.1 * np.abs(true).max()
+    assert ours[packet].sum() == pytest.approx(true[packet].sum(), rel=0.05)
+    assert ours[packet[-1] + 1 :].sum() == pytest.approx(true[packet[-1] + 1 :].sum(), rel=0.1)
+    late, _ = every_transfer(sky + hit, silicon, pixels, levels=1000)
+    assert np.abs(late - without - hit - true).max() > 0.3 * np.abs(true).max()
+    # Without traps all of it arrives.
+    plain = without[:, None].copy()
+    cosmic_rays._deposit(plain, column, packet, np.array(rows), np.array(charges), None)
+    np.testing.assert_array_equal(plain[:, 0], without + hit)
 
 
 def test_too_many_are_refused():

@@ -26,7 +26,7 @@ def test_the_order_of_physics():
     assert [effect.name for effect in vis.SKY] == [
         "ghosts", "straylight", "background", "pixel_area", "illumination", "shutter", "pixel_response",
         "poisson", "brighter_fatter", "dark_current", "hot_pixels", "cosmic_rays", "bleeding", "quadrants",
-        "readout_cosmic_rays", "parallel_cti", "serial_cti", "nonlinearity", "crosstalk", "bias_structure",
+        "parallel_cti", "readout_cosmic_rays", "serial_cti", "nonlinearity", "crosstalk", "bias_structure",
         "read_noise", "adc",
     ]  # fmt: skip
     assert set(vis.SKY) | {vis.DRAWN} < {vis.DRAWN, *vis.FLAT, *vis.SKY}
