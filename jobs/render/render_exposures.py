@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from jobs import heap
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
 from jobs.render import exposure, fits_product, focal_plane, own_psf, pictures, selection, stamps, survey
@@ -260,22 +261,23 @@ def work(lake: Path, facts: Json) -> Output:
             ("stars", "star_fluxes", exposure.STAR_COLUMNS),
         )
     ]
-    rendered = exposure.render(
-        task,
-        exposed,
-        *found[0][:2],
-        *found[1][:2],
-        mission=own.mission,
-        accuracy=own.accuracy,
-        seed=request["seed"],
-        library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
-        stellar=stars_of(lake, inputs["star_fluxes"].manifest["facts"]),
-        passband=passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], str(exposed["band"])),
-        forced=own.forced,
-        complete=margin + min(complete for *_, complete in found),
-        truth=request["truth"],
-        lenses=lenses(inputs[LENSES], task, _deflection(inputs["galaxies"]), least) if LENSES in inputs else None,
-    )
+    with heap.kept():
+        rendered = exposure.render(
+            task,
+            exposed,
+            *found[0][:2],
+            *found[1][:2],
+            mission=own.mission,
+            accuracy=own.accuracy,
+            seed=request["seed"],
+            library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
+            stellar=stars_of(lake, inputs["star_fluxes"].manifest["facts"]),
+            passband=passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], str(exposed["band"])),
+            forced=own.forced,
+            complete=margin + min(complete for *_, complete in found),
+            truth=request["truth"],
+            lenses=lenses(inputs[LENSES], task, _deflection(inputs["galaxies"]), least) if LENSES in inputs else None,
+        )
     rows, files = fits_product.products(rendered, request["truth"], request["compression"] == "rice")
     drawn = fits_product.truth(rendered)
     name = truth_file(facts["exposure_id"], facts["detector"])

@@ -1,0 +1,61 @@
+"""Memory that is kept while arrays come and go, and given back."""
+
+import resource
+
+import numpy as np
+import pytest
+
+from jobs import heap
+from jobs.measured import forget_peak, peak_gb
+
+MEGABYTES = 64
+
+pytestmark = pytest.mark.skipif(heap._library() is None, reason="another C library")
+
+
+def faults_of_new_arrays(count):
+    """How often memory had to be asked for, for arrays that live one after the other."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(count):
+        np.ones(MEGABYTES << 17)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+def held_now():
+    forget_peak()
+    return peak_gb()
+
+
+def test_later_arrays_find_the_memory_of_those_before():
+    usual = faults_of_new_arrays(10)
+    with heap.kept():
+        faults_of_new_arrays(1)
+        assert faults_of_new_arrays(10) < 0.2 * usual
+    assert faults_of_new_arrays(10) > 0.5 * usual
+
+
+def test_it_is_given_back():
+    before = held_now()
+    with heap.kept():
+        faults_of_new_arrays(4)
+        assert held_now() > before + 0.8 * MEGABYTES / 1e3
+    assert held_now() < before + 0.3 * MEGABYTES / 1e3
+
+
+def test_it_is_given_back_after_an_error():
+    before = held_now()
+
+    @heap.kept()
+    def fails():
+        faults_of_new_arrays(1)
+        raise KeyError
+
+    with pytest.raises(KeyError):
+        fails()
+    assert held_now() < before + 0.3 * MEGABYTES / 1e3
+
+
+def test_another_library_is_left_alone(monkeypatch):
+    monkeypatch.setattr(heap, "_library", lambda: None)
+    with heap.kept():
+        assert faults_of_new_arrays(2) > 0
