@@ -24,7 +24,7 @@ _BELOW = 2
 # With fewer there are no levels where most packets do not end.
 FEWEST = 6
 # Lines that are followed together.
-_BLOCK = 128
+_BLOCK = 256
 # Pixels that are always full: numbers that fade to below single precision take the processor a hundred times longer.
 _LEAST = np.float32(1e-30)
 
@@ -45,53 +45,65 @@ def heights(frame: Float, notch: float, count: int) -> Float:
     return np.unique(np.concatenate(steps))
 
 
-def follow_all(lines: Float, pixels: int, density: Float, released: Float, ends: Float, volume: Float) -> float:
-    """Every line lines[k, :], in place, over the traps of `pixels` pixels; returns what is still trapped.
+def shift(
+    plane: Float, axis: int, pixels: int, density: Float, released: Float, ends: Float, volume: Float
+) -> float:  # fmt: skip
+    """Lines plane[:, k] (axis -2) or plane[k, :] (axis -1), in place, over the traps of `pixels` pixels.
 
     ends, volume : electrons and parts of a pixel's volume at the levels' ends
+    returns      : what is still trapped
     """
     some = density > 0.0
+    silicon = pixels, density[some], released[some], ends, volume
+    if axis == -2:
+        return float(_follow(plane, *silicon))
     trapped = 0.0
-    for start in range(0, len(lines), _BLOCK):
-        block = np.array(lines[start : start + _BLOCK].T, order="C")
-        trapped += _follow(block, pixels, density[some], released[some], ends, volume)
-        lines[start : start + _BLOCK] = block.T
+    for start in range(0, len(plane), _BLOCK):
+        packets = np.array(plane[start : start + _BLOCK].T, order="C")
+        trapped += _follow(packets, *silicon)
+        plane[start : start + _BLOCK] = packets.T
     return trapped
 
 
 @jit
-def _follow(lines: Float, pixels: int, density: Float, released: Float, ends: Float, volume: Float) -> float:
-    """Packets lines[i, :] of all lines, one after the other."""
-    n, m = lines.shape
-    gain, taken, cloud, part = np.empty(m), np.empty(m), np.empty(m, np.float32), np.empty(m, np.float32)
+def _follow(packets: Float, pixels: int, density: Float, released: Float, ends: Float, volume: Float) -> float:
+    """Lines packets[:, k]."""
+    n, total = packets.shape
+    gain, taken = np.empty(_BLOCK), np.empty(_BLOCK)
+    cloud, part = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
     # Traps that are full: of each level in pixels, of all in electrons.
-    room, held = np.zeros((len(density), len(ends) - 1, m), np.float32), np.zeros((len(density), m))
-    for i in range(n):
-        line, count = lines[i], min(i + 1, pixels)
-        passed, inverse = np.float32(count), 1.0 / max(count, 1)
-        gain[:], taken[:] = 0.0, 0.0
-        for s in range(len(density)):
-            own = held[s]
+    full, held = np.empty((len(density), len(ends) - 1, _BLOCK), np.float32), np.empty((len(density), _BLOCK))
+    trapped = 0.0
+    for first in range(0, total, _BLOCK):
+        m = min(_BLOCK, total - first)
+        full[:], held[:] = np.float32(0.0), 0.0
+        for i in range(n):
+            line, count = packets[i, first : first + m], min(i + 1, pixels)
+            passed, inverse = np.float32(count), 1.0 / max(count, 1)
+            gain[:], taken[:] = 0.0, 0.0
+            for s in range(len(density)):
+                own = held[s]
+                for c in range(m):
+                    back = released[s] * own[c]
+                    own[c] -= back
+                    gain[c] += back
             for c in range(m):
-                back = released[s] * own[c]
-                own[c] -= back
-                gain[c] += back
-        for c in range(m):
-            cloud[c] = line[c] + gain[c] * inverse
-        for s in range(len(density)):
-            own, left = held[s], np.float32(1.0 - released[s])
-            part[:] = np.float32(0.0)
-            for k in range(len(ends) - 1):
-                slope, thick = np.float32(1.0 / (ends[k + 1] - ends[k])), np.float32(volume[k + 1] - volume[k])
-                _fill(cloud, room[s, k], part, np.float32(ends[k]), slope, thick, passed, left)
+                cloud[c] = line[c] + gain[c] * inverse
+            for s in range(len(density)):
+                own, left = held[s], np.float32(1.0 - released[s])
+                part[:] = np.float32(0.0)
+                for k in range(len(ends) - 1):
+                    slope, thick = np.float32(1.0 / (ends[k + 1] - ends[k])), np.float32(volume[k + 1] - volume[k])
+                    _fill(cloud[:m], full[s, k], part, np.float32(ends[k]), slope, thick, passed, left)
+                for c in range(m):
+                    # Never more than the packet has.
+                    new = min(density[s] * part[c], line[c] + gain[c] - taken[c])
+                    taken[c] += new
+                    own[c] += new
             for c in range(m):
-                # Never more than the packet has.
-                new = min(density[s] * part[c], line[c] + gain[c] - taken[c])
-                taken[c] += new
-                own[c] += new
-        for c in range(m):
-            line[c] += gain[c] - taken[c]
-    return float(held.sum())
+                line[c] += gain[c] - taken[c]
+        trapped += held.sum()
+    return trapped
 
 
 @jit

@@ -124,7 +124,7 @@ def shifted(frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int |
     for plane in out.reshape(-1, *out.shape[-2:]):
         lines = plane if axis == -1 else plane.T
         if ends is not None:
-            trapped += trap_levels.follow_all(lines, physical, density, released, ends, traps.volume(ends))
+            trapped += trap_levels.shift(plane, axis, physical, density, released, ends, traps.volume(ends))
             continue
         # Some lines at a time: those that are columns lie far apart in memory.
         for start in range(0, len(lines), _BLOCK):
