@@ -21,23 +21,23 @@ from lake_schema.errors import OutOfRange
 REACH = 2
 # Pixels of a row that are looked at together.
 _RUN = 64
+# Of R^2 of a VIS star: it grows by so many times the shift for each electron of its brightest pixel.
+_GROWTH = 1.25
 # Of a pixel's charge, the part that can leave it over one border: strips are thin.
 MOST = 0.2
 
 
-def apply(
-    frame: Frame, shift: float, softening: float, capacity: float, least: float, rng: np.random.Generator
-) -> Frame:
+def apply(frame: Frame, shift: float, softening: float, capacity: float, dim: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] whole e- >= 0 -> whole e- >= 0, the same sum.
 
     shift     : pixels that one electron displaces each border of its own pixel
     softening : pixels, depth of the charge below the borders: how fast the displacement falls off
     capacity  : e-; what a pixel cannot hold does not repel either
-    least     : e-; borders that fewer cross, whatever lies around them, are left as they are
+    dim       : e-; borders about which no pixel holds as much are left as they are
     """
     for name, value, low, high in (
         ("brighter-fatter shift", shift, 0.0, 1e-4), ("full well", capacity, 1.0, 1e9),
-        ("brighter-fatter least", least, 0.0, np.inf),
+        ("brighter-fatter dim", dim, 0.0, np.inf),
     ):  # fmt: skip
         if not low <= value <= high:
             raise OutOfRange(name, value, low, high)
@@ -50,8 +50,6 @@ def apply(
     for sides in (held, held.T):
         sides[:REACH], sides[-REACH:] = sides[REACH], sides[-REACH - 1]
     weights = kernel(shift, softening).astype(np.float32)
-    # Where all charge is below this, `least` do not cross: sum of weights x charge, times twice the charge, a quarter.
-    dim = np.sqrt(2.0 * least / weights.sum())
     # Of each run of pixels, and none after the last.
     most = np.zeros((len(held), -(-held.shape[1] // _RUN) + 1), np.float32)
     _highest(held.view(np.int32), most.view(np.int32))
@@ -136,13 +134,14 @@ def _displace(held: Any, weights: Any, down: bool, r: int, first: int, displaced
 
 
 def _parameters(scene: Scene) -> tuple[float, float, float, float]:
-    return (
-        scene.value("bfe.shift", "pix / electron"),
-        scene.value("bfe.softening", "pix"),
-        scene.value("full_well", "electron"),
-        # A pixel has four borders.
-        scene.accuracy.background * scene.pixel_noise / 4.0,
+    shift, softening = scene.value("bfe.shift", "pix / electron"), scene.value("bfe.softening", "pix")
+    # Over a border between pixels of n e- at most sum(kernel) n x 2 n / 4 cross; a pixel has four.
+    noise = scene.accuracy.background * scene.pixel_noise / 4.0
+    dim = min(
+        np.sqrt(2.0 * noise / max(float(kernel(shift, softening).sum()), 1e-30)),
+        scene.accuracy.shape / (_GROWTH * max(shift, 1e-30)),
     )
+    return shift, softening, scene.value("full_well", "electron"), float(dim)
 
 
 def _contribution(scene: Scene) -> float:

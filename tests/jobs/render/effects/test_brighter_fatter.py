@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from jobs import accuracy
 from jobs.render.effects import brighter_fatter
+from jobs.render.effects.effect import Scene
 from lake_schema.errors import OutOfRange
+from lake_schema.mission.configuration import resolve
 
 SHIFT, SOFT, FULL = 1.2e-7, 0.5, 2e5
 
@@ -79,7 +82,7 @@ def test_what_is_not_noticed_is_left_out():
     light[100:125, 200:225] += star(1.5e5)
     light[297:, 397:] += 5e4
     every, some = (
-        brighter_fatter.apply(light, SHIFT, SOFT, FULL, least, np.random.default_rng(4)) for least in (0.0, 0.06)
+        brighter_fatter.apply(light, SHIFT, SOFT, FULL, dim, np.random.default_rng(4)) for dim in (0.0, 700.0)
     )
     assert some.sum() == light.sum()
     np.testing.assert_array_equal(every[105:120, 205:220], some[105:120, 205:220])
@@ -89,6 +92,23 @@ def test_what_is_not_noticed_is_left_out():
     left_out = every - some
     assert 0 < np.sqrt(np.mean(left_out**2)) < 0.1 * np.sqrt(140.0 + 4.4**2)
     assert np.abs(left_out).max() <= 1.0
+
+
+@pytest.mark.parametrize("preset", ["draft", "survey", "reference"])
+def test_what_is_left_out_is_within_the_accuracy(preset):
+    """Of a star just too dim to be followed: its size; and what would cross the borders of its pixels."""
+    wanted = accuracy.preset(preset)
+    scene = Scene(resolve(), "vis", 560.53, 0.25, 1e4, accuracy=wanted)
+    shift, softening, full, dim = brighter_fatter.EFFECT.parameters(scene)
+    bright = star(2e5)
+    mean = np.mean(
+        [brighter_fatter.apply(bright, shift, softening, full, 0.0, np.random.default_rng(i)) for i in range(50)],
+        axis=0,
+    )
+    growth = (widths(mean) ** 2).sum() / (widths(bright) ** 2).sum() - 1
+    assert 0 < growth * dim / 2e5 <= wanted.shape
+    crossed = 0.25 * brighter_fatter.kernel(shift, softening).sum() * dim * 2 * dim
+    assert 4 * crossed <= 1.0001 * wanted.background * scene.pixel_noise
 
 
 @pytest.mark.parametrize(
