@@ -321,7 +321,9 @@ def sources_of(
     column, row = focal_plane.pixel_of_sky(system, ra[kept], dec[kept])
     wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
     sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings, wide)
-    here = selection.touching(column, row, sizes, detector.nx, detector.ny)
+    farther = stamps.shining(electrons[kept], sizes, shape[kept], picture[kept], spread)
+    reaches = np.where(farther, stamps.SIZES[-1], sizes)
+    here = selection.touching(column, row, reaches, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
     # Arcs have the colour of what they are an image of.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,9 @@ from scipy.ndimage import uniform_filter
 
 from jobs import cache
 from jobs.fluxes.passbands import Passband
+from jobs.render import edges
 from jobs.render.chromatic import sub_bands
+from jobs.render.edges import Edges
 from jobs.render.focal_plane import Detector, detectors
 from lake_schema.mission.configuration import MissionConfiguration
 
@@ -36,7 +38,8 @@ Array = npt.NDArray[Any]
 
 # Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide.
 SAMPLES = 3
-# Side of the plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is lost.
+# Side of the plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is drawn for bright
+# stars alone (edges.py).
 SIDE = 512
 # Side of the optical transform, samples; the 0.15 % of the light beyond its border is absent.
 _TRANSFORM = 2048
@@ -82,6 +85,7 @@ class Psf:
     planes      : by wavelength and place; None where `profile` is all
     intra_pixel : how much less a pixel's edges see than its centre (effects/intra_pixel), 0 = nothing; None: the PSF
                   has the pixel in it already
+    edges       : what shines beyond the planes; None: nothing does
     """
 
     profile: galsim.GSObject
@@ -91,6 +95,7 @@ class Psf:
     fwhm: float
     planes: Planes | None = None
     intra_pixel: float | None = 0.0
+    edges: Edges | None = None
 
 
 def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = 9) -> Psf:
@@ -100,7 +105,10 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
     Error     : second moments 2e-4 from the number of wavelengths; across the detector as measured (psf_positions.csv)
     Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
     """
-    return sampled(_vis_planes(detector, band, mission, positions), detector.pixel_scale, has_pixel=False)
+    found = sampled(_vis_planes(detector, band, mission, positions), detector.pixel_scale, has_pixel=False)
+    blur = float(np.sqrt(np.mean(_blur_variances(detector, mission))))
+    beyond = edges.of_pupil(sub_bands(band), blur, detector.pixel_scale, _TRANSFORM / SAMPLES, mission)
+    return replace(found, edges=beyond)
 
 
 def galsim_profile(image: Array, pixel_scale: float, exact: bool = False) -> galsim.GSObject:

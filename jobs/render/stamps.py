@@ -10,6 +10,7 @@ settings_for, seconds_for   what an accuracy takes, from the measured table
 stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 reach, least_electrons   how far a source may show, and what it takes to show there
 draw            sources -> frame
+shining         points that do so beyond their stamps
 work, seconds, memory    what it goes through, and takes
 reference       one source by galsim's own drawImage: what `draw` is held against
 """
@@ -29,7 +30,7 @@ import numpy.typing as npt
 import scipy.fft
 
 from jobs.accuracy import Accuracy
-from jobs.render import kernel, pictures, profiles, sersic, transfer, wings
+from jobs.render import edges, kernel, pictures, profiles, selection, sersic, transfer, wings
 from jobs.render.pictures import Picture
 from jobs.render.profiles import Forms, Shapes
 from jobs.render.psf import SIDE, Psf
@@ -346,9 +347,11 @@ def _draw(
     body, fraction, bulge, disk, _, row, *_ = bodies
     cut = kernel.reaches(passing, transfer.STEP, body, fraction, bulge, disk, table, row, left_out)
     reach = transfer.STEP * len(passing)
-    done = 0
+    far = shining(sources.electrons, sizes, sources.shape, sources.picture, psf)
+    here = selection.touching(sources.column, sources.row, sizes, nx, ny)
+    done = int(np.sum(~here))
     for size in np.unique(sizes):
-        alone, together = _split(sources, sizes, psf, int(size))
+        alone, together = (found[here[found]] for found in _split(sources, sizes, psf, int(size)))
         shared = transfer.transfer(psf, int(size), reach) if len(together) else None
         own = transfer.grid(int(size), float(cut[alone].max()) if size > SIDE else reach) if len(alone) else None
         batch = max(_BATCH // int(size) ** 2, 2)
@@ -356,7 +359,7 @@ def _draw(
         for number, chosen in enumerate([*groups, *alone[:, None]]):
             if own is not None and number >= len(groups):
                 dtype = np.float64 if sources.electrons[chosen[0]] > _BRIGHT else np.float32
-                passed = transfer.collapsed(psf, weights[chosen[0]], own, dtype)
+                passed = transfer.collapsed(psf, weights[chosen[0]], own, dtype, bool(far[chosen[0]]))
                 if (picture := sources.picture_of(int(chosen[0]))) is not None:
                     passed = pictures.through(passed, picture, sources.jacobian[chosen[0]])
                 share = np.ones((1, 1), dtype)
@@ -367,9 +370,21 @@ def _draw(
             done += len(chosen)
             if progress is not None:
                 progress(done)
+    for i in np.flatnonzero(far):
+        photons = None if sources.photons is None else sources.photons[i]
+        edges.add(
+            frame, sources.column[i], sources.row[i], sources.electrons[i], photons, int(sizes[i]),
+            left_out[i] * sources.electrons[i], psf.edges,
+        )  # fmt: skip
     layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
     layer += wings.galaxies(sources.column, sources.row, stray, curve[:, 4], farthest, sizes, nx, ny)
     return np.asarray(kernel.electrons_of(frame, layer, wings.BLOCK, wings.MARGIN))
+
+
+def shining(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: Psf) -> npt.NDArray[np.bool_]:
+    """[n] True of points so bright that their light does not end where the PSF's plane does: `draw` takes it on."""
+    point = shape < 0 if picture is None else (shape < 0) & (picture < 0)
+    return np.asarray(point & (sizes >= SIDE) & (electrons > _BRIGHT) & (psf.edges is not None))
 
 
 def _split(sources: Sources, sizes: Int, psf: Psf, size: int) -> tuple[Int, Int]:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy.ndimage import maximum
 
-from jobs.render import kernel
+from jobs.render import edges, kernel
 from jobs.render.effects import intra_pixel
 from jobs.render.psf import SAMPLES, SIDE, Planes, Psf, galsim_profile, spectrum_of
 
@@ -149,14 +149,17 @@ def transfer(psf: Psf, size: int, reach: float) -> Transfer:
     return Transfer(some, _planes(psf, some, np.float32))
 
 
-def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any]) -> Transfer:
+def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any], fading: bool = False) -> Transfer:
     """One plane: a source's own PSF, for large stamps or in double precision (float64).
 
-    weights : [planes] from basis_weights
+    weights : [planes] from basis_weights;  fading : towards its border, into what edges.py draws
     """
     if psf.planes is None:
         return Transfer(some, _planes(psf, some, dtype))
     image = _image(psf.planes, weights, SAMPLES * some.size).astype(dtype)
+    if fading:
+        left = edges.left(some.size, SAMPLES, len(image))
+        image *= left[:, None] * left
     return Transfer(some, _on_grid([image], some, psf.intra_pixel, dtype))
 
 

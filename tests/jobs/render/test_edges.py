@@ -1,0 +1,177 @@
+"""Wings of bright stars beyond the PSF's plane: against Airy's pattern, the pupil's own transform, and the light."""
+
+from dataclasses import replace
+
+import galsim
+import numpy as np
+import pytest
+
+from jobs.accuracy import SURVEY
+from jobs.fluxes import passbands
+from jobs.render import chromatic, edges, kernel, psf, stamps
+from jobs.render.focal_plane import boresight_for, detector, wcs
+from jobs.render.psf import SIDE
+from lake_schema.mission.configuration import resolve
+from tests.jobs.render.fields import one_source, small
+from tests.jobs.render.nominal import COSMIC_RAYS, TIME, off, rendered, spread
+
+MISSION = resolve()
+PARTS = chromatic.sub_bands(passbands.load("euclid_vis"))
+EQUAL = np.full(len(PARTS), 1.0 / len(PARTS))
+NOISE = 12.7
+ARCSEC = np.pi / 648000
+# A star of 6 mag in a nominal exposure.
+BRIGHT = 5e10
+
+
+def of_pupil(blur=0.034, pixel_scale=0.1, parts=PARTS):
+    return edges.of_pupil(parts, blur, pixel_scale, 2048 / 3, MISSION)
+
+
+@pytest.fixture(scope="module")
+def vis():
+    return spread(detector("vis", "3-4", MISSION))
+
+
+def shone(spread, side, column, row, electrons=BRIGHT, least=0.0):
+    """What `add` adds to an empty frame, electrons."""
+    frame = np.zeros((side, side), np.int64)
+    edges.add(frame, column, row, electrons, None, SIDE, least, spread.edges)
+    return frame / kernel.FIXED_POINT
+
+
+def off_spikes(spread, dx, dy, clear):
+    """Pixels more than `clear` from the middle of every spike."""
+    along = [np.abs(dx * np.cos(a) + dy * np.sin(a)) for a in spread.edges.bars[:, 0]]
+    return np.min(along, axis=0) > clear
+
+
+@pytest.mark.parametrize("wavelength", [5500.0, 9000.0])
+def test_the_ring_is_airy_s(wavelength):
+    """Two circles: the mean of an obscured Airy pattern over its rings."""
+    own = replace(of_pupil(), wavelength=np.array([[wavelength]]))
+    clear = np.pi * (600.0**2 - 197.5**2)
+    airy = galsim.Airy(lam=wavelength / 10, diam=1.2, obscuration=197.5 / 600.0)
+    radius = np.linspace(20.0, 60.0, 40001)
+    mean = np.mean([airy.xValue(r, 0.0) * r**3 for r in radius])
+    # In pixels of 0.1"; the bars leave less of the light, and none of the edges.
+    ours = edges.ring(own, np.ones(1)) * own.area / clear * 0.1
+    assert ours == pytest.approx(mean, rel=0.01)
+
+
+@pytest.mark.parametrize("bar", [0, *(pytest.param(bar, marks=pytest.mark.nightly) for bar in (1, 2))])
+def test_a_spike_is_the_pupil_s_transform(bar):
+    """Along a spike the transform of the pupil is that of its projection; neighbouring edges beat, and are averaged."""
+    own = of_pupil(blur=0.0, pixel_scale=0.02)
+    turn, step, along = own.bars[bar, 0], 0.25, 1.0
+    axis, other = np.arange(-602.0, 602.1, step), np.arange(-602.0, 602.1, along)
+    u, v = np.meshgrid(other, axis)
+    clear = psf.pupil(u * np.cos(turn) - v * np.sin(turn), u * np.sin(turn) + v * np.cos(turn), step, MISSION)
+    projected = clear.sum(axis=1) * along
+    radius = np.linspace(30.0, 60.0, 61)
+    found = np.zeros(len(radius))
+    for wavelength in own.wavelength[:, 1::3].ravel() * 1e-7:
+        turns = np.exp(-2j * np.pi * np.outer(radius * ARCSEC / wavelength, axis))
+        found += np.abs(turns @ projected * step) ** 2 / (wavelength**2 * projected.sum() * step)
+    theirs = found / own.wavelength[:, 1::3].size * (0.02 * ARCSEC) ** 2
+    line = edges.spikes(own, EQUAL, 70.0 / 0.02)[bar, :, 0]
+    ours = np.interp(radius / 0.02, 8.0 * np.arange(len(line)), line) + edges.ring(own, EQUAL) / (radius / 0.02) ** 3
+    assert (ours * radius**2).mean() == pytest.approx((theirs * radius**2).mean(), rel=0.05)
+
+
+def test_no_light_is_lost_beyond_the_plane(vis):
+    """The plane has what the pupil sends there: outside lies the rest of all light."""
+    side = 3000
+    light = shone(vis, side, side / 2, side / 2).sum() / BRIGHT
+    # What the frame does not show of r^-3 around a square, and of the spikes, whose fringes leave a half of r^-2.
+    beyond = edges.ring(vis.edges, EQUAL) * 4 * np.sqrt(2) / (side / 2)
+    wavelength = vis.edges.wavelength.mean() * 1e-7
+    for turn, _, length in vis.edges.bars:
+        border = side / 2 / max(abs(np.cos(turn)), abs(np.sin(turn)))
+        beyond += 2 * length * wavelength / (2 * np.pi**2 * vis.edges.area * 0.1 * ARCSEC * border)
+    left = edges.left(SIDE, 3, vis.planes.images.shape[1])
+    kept = (vis.planes.images.mean(axis=0, dtype=float) * left[:, None] * left).sum()
+    assert 0.997 < kept < 0.998
+    assert light + beyond == pytest.approx(1 - kept, rel=0.05)
+
+
+def test_the_frame_has_no_seam(vis):
+    """Between spikes the mean light of a 6 mag star falls as r^-3, through the border of its plane."""
+    field = replace(small("vis", "3-4", 1200), nx=1200, ny=1200)
+    source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), BRIGHT, 600.3, 599.8)
+    image = stamps.draw(source, np.array([SIDE]), vis, 1200, 1200)
+    y, x = np.mgrid[:1200, :1200]
+    dx, dy = x - 600.3, y - 599.8
+    radius, clear = np.hypot(dx, dy), off_spikes(vis, dx, dy, 40.0)
+    law = edges.ring(vis.edges, EQUAL) * BRIGHT
+    for inner, outer in ((150, 200), (200, 250), (250, 300), (300, 360), (360, 420), (420, 560)):
+        here = clear & (radius >= inner) & (radius < outer)
+        assert (image * radius**3)[here].mean() == pytest.approx(law, rel=0.06)
+    # Nor holes in the sky, where the plane ends or its transform had put light of elsewhere.
+    assert image.min() > -NOISE
+    # A spike goes on as it was.
+    turn = vis.edges.bars[2, 0]
+    out = np.arange(225, 285)
+    along = [image[round(599.8 + r * np.cos(turn)), round(600.3 - r * np.sin(turn))] for r in out]
+    smooth = np.convolve(np.array(along) * out**2.0, np.ones(9) / 9, "valid")
+    assert smooth.max() / smooth.min() < 2.0
+
+
+def test_colours_differ(vis):
+    """The ring goes with the wavelength: a red star's is brighter."""
+    red, blue = np.zeros(len(PARTS)), np.zeros(len(PARTS))
+    red[-1], blue[0] = 1.0, 1.0
+    ratio = edges.ring(vis.edges, red) / edges.ring(vis.edges, blue)
+    assert ratio == pytest.approx(vis.planes.wavelength[-1] / vis.planes.wavelength[0], rel=0.01)
+
+
+def stars(column, row, electrons, side):
+    field = replace(small("vis", "3-4"), nx=side, ny=side)
+    system = wcs(field, *boresight_for(field, 10.0, 0.0, 0.0))
+    some = [one_source(field, system, e, x, y) for x, y, e in zip(column, row, electrons, strict=True)]
+    together = {n: np.concatenate([getattr(s, n) for s in some]) for n in ("column", "row", "jacobian", "electrons")}
+    return replace(some[0], **together, ids=np.arange(len(some)), shape=np.full(len(some), -1))
+
+
+def drawn(sources, spread, side):
+    settings = stamps.settings_for(SURVEY)
+    sizes = stamps.stamp_sizes(sources.electrons, sources.shape, sources.shapes, spread, NOISE, settings)
+    floors = stamps.floors(sources.electrons, NOISE, settings)
+    return stamps.draw(sources, sizes, spread, side, side, None, floors)
+
+
+def test_only_bright_points_shine_so_far(vis):
+    """Others are drawn as they were, bit by bit."""
+    faint = stars([200.0, 90.0, 310.5], [200.0, 400.0, 11.0], [1e3, 1e5, 5e6], 512)
+    np.testing.assert_array_equal(drawn(faint, vis, 512), drawn(faint, replace(vis, edges=None), 512))
+    sizes, shape = np.array([SIDE, SIDE, 384, SIDE]), np.array([-1, 0, -1, -1])
+    found = stamps.shining(np.array([1e9, 1e9, 1e9, 1e6]), sizes, shape, None, vis)
+    np.testing.assert_array_equal(found, [True, False, False, False])
+
+
+def test_a_frame_is_the_sum_of_its_stars_in_any_order(vis):
+    column, row, electrons = [100.2, 500.0, 900.7], [300.0, 800.4, -700.0], [3e8, 2e9, 4e10]
+    whole = drawn(stars(column, row, electrons, 1000), vis, 1000)
+    turned = drawn(stars(column[::-1], row[::-1], electrons[::-1], 1000), vis, 1000)
+    np.testing.assert_array_equal(whole, turned)
+    parts = [drawn(stars([x], [y], [e], 1000), vis, 1000) for x, y, e in zip(column, row, electrons, strict=True)]
+    np.testing.assert_allclose(whole, sum(parts), rtol=1e-12, atol=1e-5)
+    # The last has its stamp below the frame, and shines there nevertheless.
+    assert parts[2][:200].min() > 1.0
+
+
+def test_light_is_drawn_to_where_it_is_lost_in_the_noise(vis):
+    """Less accuracy, a smaller circle: what is left out is below what may be."""
+    least = 0.1 * NOISE
+    whole, cut = (shone(vis, 2000, 300.0, 300.0, 1e9, part) for part in (0.0, least))
+    assert np.count_nonzero(cut) < 0.5 * np.count_nonzero(whole)
+    assert 0.0 < (whole - cut).max() < least
+
+
+def test_a_star_beside_the_detector_shines_in():
+    """Its stamp of 51" ends before the frame does: an exposure draws its light nevertheless."""
+    field = small("vis", "3-4", 400)
+    found = rendered(field, [5.0], [-500.0], [200.0], forced=off(*COSMIC_RAYS))
+    law = 10 ** (0.4 * (found.zero_point - 5.0)) * TIME * edges.ring(found.psf.edges, EQUAL)
+    assert found.noise_free[150:250, 0].mean() == pytest.approx(law / 500.0**3, rel=0.5)
+    assert found.noise_free.min() > 0.5 * law / 925.0**3
