@@ -88,6 +88,9 @@ def image(request, field):
         charge = fits.getdata(product(field, channel, "cosmic_rays"))
         hit, held = charge > 0, np.minimum(noise_free + charge, 2e5) + diffuse
         delayed = trailed(held, header) - held
+        # No pixels lie between the halves.
+        rows = int(header["INJROWS"])
+        hit[(len(hit) - rows) // 2 : (len(hit) + rows) // 2] = True
     variance = noise_free + diffuse + header["RDNOISE"] ** 2 + header["GAIN"] ** 2 / 12
     x, y, expected, is_star = sources(field, header)
     vis = channel == "VIS"
@@ -143,7 +146,7 @@ def sources(field, header):
         x, y = system.all_world2pix(where[ra].to_numpy(), where[dec].to_numpy(), 0)
         microjansky = flux.column(0).to_numpy().astype(float)
         electrons = microjansky / 3631e6 * 10 ** (0.4 * header["ZEROPNT"]) * header["EXPTIME"]
-        nx, ny = (4096, 4132) if header["CHANNEL"] == "VIS" else (header["NAXIS1"], header["NAXIS2"])
+        nx, ny = (4096, 4136) if header["CHANNEL"] == "VIS" else (header["NAXIS1"], header["NAXIS2"])
         inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
         found.append((x[inside], y[inside], electrons[inside], np.full(inside.sum(), catalogue == "stars")))
     return (np.concatenate(column) for column in zip(*found, strict=True))
@@ -246,7 +249,7 @@ def test_files_are_good_fits(field, channel, content):
     for key in ("EXPTIME", "BUNIT", "SEED", "MISSION", "CTYPE1", "CD1_1", "MJD-OBS", "TRUESKY"):
         assert key in header, key
     if channel == "VIS" and content == "noise_free":
-        assert (header["NAXIS1"], header["NAXIS2"]) == (4096, 4132)
+        assert (header["NAXIS1"], header["NAXIS2"]) == (4096, 4136)
     elif channel == "VIS":
         assert [unit.shape for unit in fits.open(path)[1:]] == [(2086, 2128)] * 4
 

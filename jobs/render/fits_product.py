@@ -108,16 +108,17 @@ def _science(rendered: Rendered) -> list[fits.Image]:
     """The image; or a header, and an extension for each quadrant, named as detector.quadrant."""
     if rendered.raw.ndim == 2:
         return [fits.Image(rendered.raw, science_cards(rendered))]
-    prescan, overscan, rows = quadrants.sizes(rendered.scene)
+    prescan, overscan, rows, middle = quadrants.sizes(rendered.scene)
     detector, scans = rendered.detector, (
         ("PRESCAN", prescan, "[pix] columns before the pixels"),
         ("OVERSCAN", overscan, "[pix] columns after the pixels"),
         ("OVERROWS", rows, "[pix] rows after the pixels"),
+        ("INJROWS", middle, "[pix] rows between the halves, without pixels"),
     )  # fmt: skip
     units = [fits.Image(None, (*science_cards(rendered), *scans))]
     for number, data in enumerate(rendered.raw):
         # Of the detector's first pixel in the extension, from 0.
-        across, up = quadrants.origin(number, data.shape, prescan, overscan, rows)
+        across, up = quadrants.origin(number, data.shape, prescan, overscan, rows, middle)
         system = focal_plane.shifted(rendered.wcs, across, up)
         cards = (("QUADRANT", quadrants.NAMES[number], "quadrant"), *scans, *focal_plane.cards(system))
         name = f"{detector.name}.{quadrants.NAMES[number]}"
@@ -141,18 +142,21 @@ def electrons(path: Path) -> fits.Image:
     gain, bias = float(header["GAIN"]), float(header["BIAS"])
     if read[0].data is not None:
         return fits.Image((read[0].data - bias) * gain, read[0].cards)
-    raw, (prescan, overscan, rows) = _raw(read)
+    raw, sizes = _raw(read)
+    _, overscan, rows, _ = sizes
     # The last half of the columns after the pixels: charge that traps gave back is in the first.
     level = raw[:, : raw.shape[1] - rows, raw.shape[2] - max(overscan // 2, 1) :].mean(axis=(1, 2), keepdims=True)
-    above = quadrants.assembled((raw - level) * gain, prescan, overscan, rows)
+    above = quadrants.assembled((raw - level) * gain, *sizes)
     return fits.Image(above, read[0].cards)
 
 
-def _raw(read: Sequence[fits.Image]) -> tuple[npt.NDArray[np.uint16], tuple[int, int, int]]:
-    """Quadrants in readout order; prescan, overscan, overscan rows."""
+def _raw(read: Sequence[fits.Image]) -> tuple[npt.NDArray[np.uint16], tuple[int, int, int, int]]:
+    """Quadrants in readout order; prescan, overscan, overscan rows, rows between the halves."""
     header = {keyword: value for keyword, value, _ in read[0].cards}
     raw = np.stack([quadrants.placed(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
-    return raw, (int(header["PRESCAN"]), int(header["OVERSCAN"]), int(header["OVERROWS"]))
+    prescan, overscan, rows = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS"))
+    # Files of before have none.
+    return raw, (prescan, overscan, rows, int(header.get("INJROWS", 0)))
 
 
 def science_cards(rendered: Rendered) -> tuple[Card, ...]:

@@ -44,6 +44,7 @@ class Detector:
 
     section     : prefix of its parameters in the mission database, "vis", "nisp" or "ext.lsstcam"
     nx, ny      : columns and rows of its image
+    middle      : of the rows, those between its halves that see no light and are not read
     x, y        : arcsec, its centre in the focal plane
     rotation    : deg, of its columns-rows axes against the focal plane's, from x to y
     pixel_scale : arcsec
@@ -59,11 +60,17 @@ class Detector:
     rotation: float
     pixel_scale: float
     bending: distortion.Terms = ()
+    middle: int = 0
 
     @property
     def upside_down(self) -> bool:
         """Whether it is mounted so."""
         return float(np.cos(np.radians(self.rotation))) < 0.0
+
+    @property
+    def half_rows(self) -> int:
+        """Rows that are read through one register, of two."""
+        return (self.ny - self.middle) // 2
 
     @property
     def half_diagonal(self) -> float:
@@ -101,6 +108,8 @@ def _grid(
     """Rows from the top, columns from the left; `label` gives the name, and whether it is mounted upside down."""
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     nx, ny, rows, columns = (int(mission.value(f"{section}.fpa.{key}")) for key in ("nx", "ny", "rows", "columns"))
+    key = f"{section}.fpa.charge_injection_rows"
+    middle = int(mission.value(key, "pix")) if key in mission else 0
     pitch_x = nx * scale + mission.value(f"{section}.fpa.gap_x", "arcsec")
     pitch_y = ny * scale + mission.value(f"{section}.fpa.gap_y", "arcsec")
     for row in range(1, rows + 1):
@@ -110,11 +119,12 @@ def _grid(
                 name=name,
                 section=section,
                 nx=nx,
-                ny=ny,
+                ny=ny + middle,
                 x=(column - (columns + 1) / 2) * pitch_x,
                 y=((rows + 1) / 2 - row) * pitch_y,
                 rotation=180.0 if turned else 0.0,
                 pixel_scale=scale,
+                middle=middle,
             )
 
 

@@ -59,7 +59,10 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str]) -> Callable[[str, Fram
 def complete(
     maps: Maps, raw: npt.NDArray[np.uint16], effects: Sequence[Effect], scene: Scene, truth: Sequence[str]
 ) -> None:
-    """Adds maps of effects that were not needed, and pixels that the converter could not hold."""
+    """Adds maps of effects that were not needed, and pixels that the converter could not hold.
+
+    Nothing is where no pixel is, between the halves of a detector.
+    """
     shape = maps["noise_free"].shape
     wanted = made(truth, [effect.name for effect in effects], False)
     for name, dtype in (
@@ -73,3 +76,7 @@ def complete(
     if "saturation" in truth:
         full = raw >= scene.value("adc_max", "adu")
         maps["saturation"] |= full if full.ndim == 2 else quadrants.assembled(full, *quadrants.sizes(scene))
+    if scene.detector is not None:
+        first = scene.detector.half_rows
+        for truth_map in maps.values():
+            truth_map[first : first + scene.detector.middle] = 0

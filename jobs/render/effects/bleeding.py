@@ -20,15 +20,18 @@ from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
 
-def apply(frame: Frame, capacity: float, halves: int, rng: np.random.Generator | None = None) -> Frame:
+def apply(
+    frame: Frame, capacity: float, halves: int, between: int = 0, rng: np.random.Generator | None = None
+) -> Frame:
     """frame [ny, nx] whole e- -> no pixel above `capacity`."""
-    return bleed(frame, capacity, halves)[0]
+    return bleed(frame, capacity, halves, between)[0]
 
 
-def bleed(frame: Frame, capacity: float, halves: int) -> tuple[Frame, float]:
+def bleed(frame: Frame, capacity: float, halves: int, between: int = 0) -> tuple[Frame, float]:
     """The frame after bleeding, and the electrons that left through the serial registers.
 
     frame    : float64[ny, nx] e- >= 0;  halves : 2 = registers at both ends of the columns, 1 = at row 0 alone
+    between  : rows between the halves, which stay as they are
     Error    : 0: what was in is in the frame or lost; whole electrons stay whole
     """
     if not 1.0 <= capacity < np.inf:
@@ -39,10 +42,12 @@ def bleed(frame: Frame, capacity: float, halves: int) -> tuple[Frame, float]:
     highest = out.max(axis=0, initial=0.0)
     if highest.max(initial=0.0) <= capacity:
         return out, 0.0
-    full, middle = float(np.floor(capacity)), (out.shape[0] + 1) // 2 if halves == 2 else out.shape[0]
+    full, ny = float(np.floor(capacity)), out.shape[0]
+    middle = (ny - between + 1) // 2 if halves == 2 else ny
     columns = np.flatnonzero(highest > full)
     lost = _bleed(out[:middle], columns, full)
-    return out, lost + (_bleed(out[middle:][::-1], columns, full) if middle < len(out) else 0.0)
+    upper = out[middle + between :][::-1]
+    return out, lost + (_bleed(upper, columns, full) if len(upper) else 0.0)
 
 
 @jit
@@ -78,6 +83,11 @@ def saturated(frame: Frame, capacity: float) -> npt.NDArray[np.bool_]:
     return np.asarray(frame >= np.floor(capacity))
 
 
+def between(scene: Scene) -> int:
+    """Rows between a detector's halves."""
+    return 0 if scene.detector is None else scene.detector.middle
+
+
 def _capacity(scene: Scene) -> float:
     return scene.value("full_well", "electron")
 
@@ -86,4 +96,4 @@ def _contribution(scene: Scene) -> float:
     return max(scene.peak_electrons + scene.sky_electrons - _capacity(scene), 0.0)
 
 
-EFFECT = Effect("bleeding", apply, lambda scene: (_capacity(scene), 2), _contribution, cost=5e-3)
+EFFECT = Effect("bleeding", apply, lambda scene: (_capacity(scene), 2, between(scene)), _contribution, cost=5e-3)

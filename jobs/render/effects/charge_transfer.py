@@ -69,7 +69,7 @@ def lattice(scene: Scene, direction: str) -> Traps:
 
 
 def _rows(scene: Scene) -> int:
-    return (scene.detector.ny if scene.detector is not None else int(scene.value("fpa.ny", "pix"))) // 2
+    return scene.detector.half_rows if scene.detector is not None else int(scene.value("fpa.ny", "pix")) // 2
 
 
 def _columns(scene: Scene) -> int:

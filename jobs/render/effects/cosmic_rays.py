@@ -209,16 +209,18 @@ def _expected(scene: Scene) -> float:
     return rate(scene, float(nx * ny)) * scene.exposure_time_s
 
 
+def _half_rows(scene: Scene) -> int:
+    return _size(scene)[1] // 2 if scene.detector is None else scene.detector.half_rows
+
+
 def _expected_readout(scene: Scene) -> float:
-    nx, ny = _size(scene)
-    return rate(scene, float((nx // 2) * (ny // 2))) * scene.value("readout_time", "s")
+    return rate(scene, float((_size(scene)[0] // 2) * _half_rows(scene))) * scene.value("readout_time", "s")
 
 
 def _readout(scene: Scene) -> tuple[float, Frame, int, int, int, Traps | None]:
-    nx, ny = _size(scene)
-    prescan = int(scene.value("fpa.prescan", "pix"))
+    prescan, half = int(scene.value("fpa.prescan", "pix")), _size(scene)[0] // 2
     silicon = charge_transfer.lattice(scene, "parallel") if charge_transfer.PARALLEL.applied(scene) else None
-    return _expected_readout(scene), _quantiles(scene), ny // 2, prescan, nx // 2, silicon
+    return _expected_readout(scene), _quantiles(scene), _half_rows(scene), prescan, half, silicon
 
 
 def _in_a_pixel(scene: Scene, expected: float) -> float:

@@ -1,5 +1,7 @@
 """Quadrants: a detector is read through its four corners, each with its own pre- and overscan.
 
+Between the halves of a detector lie rows of charge injection: they see no light, and are not read.
+
 Readout order: [E, F, G, H][row, column], where [0, 0] is read first. E lies upper left, F upper right, G lower right,
 H lower left (Euclid Data Product Description Document, LE1 VIS). Columns: prescan, pixels, overscan; rows: pixels,
 overscan.
@@ -26,18 +28,20 @@ _UPPER, _RIGHT = (True, True, False, False), (False, True, True, False)
 Number = TypeVar("Number", bound=np.generic)
 
 
-def apply(frame: Frame, prescan: int, overscan: int, rows: int, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] e- -> quadrants [4, ny / 2 + rows, prescan + nx / 2 + overscan] e-."""
-    for name, value in (("prescan", prescan), ("overscan", overscan), ("overscan rows", rows)):
+def apply(
+    frame: Frame, prescan: int, overscan: int, rows: int, middle: int = 0, rng: np.random.Generator | None = None
+) -> Frame:
+    """frame [ny, nx] e- -> quadrants [4, (ny - middle) / 2 + rows, prescan + nx / 2 + overscan] e-."""
+    for name, value in (("prescan", prescan), ("overscan", overscan), ("overscan rows", rows), ("middle rows", middle)):
         if not 0 <= value <= 4096:
             raise OutOfRange(name, value, 0, 4096)
     ny, nx = frame.shape
-    if ny % 2 or nx % 2:
+    if ny % 2 or nx % 2 or middle % 2 or middle > ny:
         raise BadInput(f"a detector of {ny} x {nx} pixels has no quadrants: its sides must be even")
-    half_y, half_x = ny // 2, nx // 2
+    half_y, half_x = (ny - middle) // 2, nx // 2
     out = np.zeros((4, half_y + rows, prescan + half_x + overscan), frame.dtype)
     for number in range(4):
-        y, x = half_y * _UPPER[number], half_x * _RIGHT[number]
+        y, x = (half_y + middle) * _UPPER[number], half_x * _RIGHT[number]
         part = frame[y : y + half_y, x : x + half_x]
         out[number, :half_y, prescan : prescan + half_x] = placed(part, number)
     return out
@@ -48,26 +52,31 @@ def placed(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
     return quadrant[:: -1 if _UPPER[number] else 1, :: -1 if _RIGHT[number] else 1]
 
 
-def origin(number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int) -> tuple[int, int]:
+def origin(
+    number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, middle: int = 0
+) -> tuple[int, int]:
     """What is added to a detector's (column, row) to find it in a quadrant [ny, nx] as it is `placed`."""
     ny, nx = shape
     across = overscan - (nx - prescan - overscan) if _RIGHT[number] else prescan
-    return across, rows - (ny - rows) if _UPPER[number] else 0
+    return across, rows - (ny - rows) - middle if _UPPER[number] else 0
 
 
-def assembled(quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int) -> npt.NDArray[Number]:
-    """Quadrants [4, ..] in readout order -> detector [ny, nx], pre- and overscan cut off."""
+def assembled(
+    quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int, middle: int = 0
+) -> npt.NDArray[Number]:
+    """Quadrants [4, ..] in readout order -> detector [ny, nx], pre- and overscan cut off, 0 in the rows between."""
     pixels = [placed(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)]
     e, f, g, h = pixels
-    return np.block([[h, g], [e, f]])
+    between = np.zeros((middle, h.shape[1] + g.shape[1]), quadrants.dtype)
+    return np.concatenate([np.hstack([h, g]), between, np.hstack([e, f])])
 
 
-def sizes(scene: Scene) -> tuple[int, int, int]:
-    """prescan, overscan, overscan rows."""
+def sizes(scene: Scene) -> tuple[int, int, int, int]:
+    """prescan, overscan, overscan rows, rows between the halves."""
     prescan, overscan, rows = (
         int(scene.value(f"fpa.{key}", "pix")) for key in ("prescan", "overscan", "parallel_overscan")
     )
-    return prescan, overscan, rows
+    return prescan, overscan, rows, 0 if scene.detector is None else scene.detector.middle
 
 
 EFFECT = Effect("quadrants", apply, sizes, lambda scene: 0.0, optional=False, cost=3e-3)

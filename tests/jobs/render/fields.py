@@ -16,8 +16,8 @@ MISSION = resolve()
 
 @cache
 def small(camera, name, n=160):
-    """A detector cut down to n x n pixels about its centre."""
-    return replace(focal_plane.detector(camera, name, MISSION), nx=n, ny=n)
+    """A detector cut down to n x n pixels about its centre, as if they were all of one half."""
+    return replace(focal_plane.detector(camera, name, MISSION), nx=n, ny=n, middle=0)
 
 
 @cache

@@ -1,5 +1,7 @@
 """Products: files that stand alone, and rows that say what they are."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io import fits as astropy_fits
@@ -8,6 +10,8 @@ from astropy.wcs import WCS
 from jobs.render import fits_product, focal_plane
 from lake_schema import fits, validate
 from lake_schema.tables.products import PRODUCTS
+from tests.jobs.render import nominal
+from tests.jobs.render.fields import small
 from tests.jobs.render.test_exposure import render
 
 
@@ -85,6 +89,38 @@ def test_quadrants_are_extensions_with_their_own_place_on_the_sky(rendered, writ
             x, y = WCS(unit.header).all_world2pix(ra[number], dec[number], 0)
             at = [(40, 210), (200, 210), (200, 30), (40, 30)][number]
             assert unit.data[round(float(y)), round(float(x))] == rendered.science[at[1], at[0]]
+
+
+def test_the_halves_of_a_detector_lie_apart_on_the_sky(tmp_path):
+    """A star in each half, and one between them: in its quadrant where the header says, and nowhere."""
+    detector = replace(small("vis", "3-4", 260), middle=4)
+    quiet = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
+    one = nominal.rendered(
+        detector, [19.0, 19.0, 19.0], [60.0, 190.0, 190.0], [40.0, 215.0, 129.5], forced=quiet,
+        truth=("noise_free", "stars", "sky", "ghosts", "saturation", "cosmic_rays"),
+    )  # fmt: skip
+    assert one.raw.shape[1] == 128 + 20
+    assert one.science.shape == (260, 260)
+    for between in (one.science, *one.maps.values()):
+        assert between.shape == (260, 260)
+        assert not between[128:132].any()
+    rows, writers = fits_product.products(one, ())
+    path = tmp_path / "science.fits"
+    writers[rows["path"][0].as_py()](path)
+    ra, dec = focal_plane.sky_of_pixel(one.wcs, one.sources.column[:2], one.sources.row[:2])
+    with astropy_fits.open(path) as units:
+        assert units[0].header["INJROWS"] == 4
+        for star, number in ((0, 4), (1, 2)):
+            unit = units[number]
+            x, y = WCS(unit.header).all_world2pix(ra[star], dec[star], 0)
+            column, row = round(float(x)), round(float(y))
+            part = unit.data[row - 9 : row + 10, column - 9 : column + 10].astype(float) - np.median(unit.data)
+            axis = np.arange(-9, 10)
+            window = part * np.exp(-0.5 * (axis**2 + axis[:, None] ** 2) / 2.0**2)
+            found = (window * axis).sum() / window.sum(), (window * axis[:, None]).sum() / window.sum()
+            assert found == pytest.approx((x - column, y - row), abs=0.1)
+    np.testing.assert_array_equal(fits_product.frame(path).data, one.science)
+    assert not fits_product.electrons(path).data[128:132].any()
 
 
 def test_astropy_finds_the_sources_where_they_were_drawn(rendered, written):

@@ -48,6 +48,12 @@ def test_vis_fills_the_published_field():
     assert height / 3600 == pytest.approx(0.7781, abs=5e-4)
 
 
+def test_between_the_halves_of_a_vis_detector_nothing_is_read():
+    """Four rows of charge injection between 2 x 2066: 4136 of them from edge to edge."""
+    assert {(d.nx, d.ny, d.middle, d.half_rows) for d in VIS} == {(4096, 4136, 4, 2066)}
+    assert {(d.middle, d.half_rows) for d in LSST} == {(0, 2002), (0, 2000)}
+
+
 def test_vis_rows_count_from_the_top_and_the_right_half_is_upside_down():
     by_name = {d.name: d for d in VIS}
     assert by_name["1-1"].y > 0 > by_name["6-1"].y

@@ -88,6 +88,17 @@ def test_length_of_a_trail():
         assert rows == pytest.approx(electrons * 0.95 / 2e5 / 5, rel=0.3)
 
 
+def test_the_rows_between_the_halves_stop_it_too():
+    """Each half as if the other were not there; what is between them is not read, and stays."""
+    rng = np.random.default_rng(3)
+    frame = np.rint(10 ** rng.uniform(1, 5, (44, 6)))
+    found, lost = bleeding.bleed(frame, 2e4, 2, 4)
+    lower, first = bleeding.bleed(frame[:20], 2e4, 1)
+    upper, second = bleeding.bleed(frame[:23:-1], 2e4, 1)
+    np.testing.assert_array_equal(found, np.concatenate([lower, frame[20:24], upper[::-1]]))
+    assert lost == first + second > 0
+
+
 @pytest.mark.parametrize(("capacity", "halves"), [(0.0, 2), (np.nan, 2), (1e5, 3)])
 def test_nonsense_is_refused(capacity, halves):
     with pytest.raises(OutOfRange, match=r"full well|halves"):

@@ -20,13 +20,22 @@ CURVE = (0.05, 2.28e5, 0.01, 2e3)
     pre=st.integers(0, 3),
     over=st.integers(0, 3),
     rows=st.integers(0, 2),
+    middle=st.sampled_from([0, 2, 4]),
 )
-def test_quadrants_are_put_together_again(half_y, half_x, pre, over, rows):
-    frame = np.arange(4.0 * half_y * half_x).reshape(2 * half_y, 2 * half_x) + 1
-    parts = quadrants.apply(frame, pre, over, rows)
+def test_quadrants_are_put_together_again(half_y, half_x, pre, over, rows, middle):
+    """All that is read: the rows between the halves are not."""
+    frame = np.arange(2.0 * half_x * (2 * half_y + middle)).reshape(2 * half_y + middle, 2 * half_x) + 1
+    parts = quadrants.apply(frame, pre, over, rows, middle)
     assert parts.shape == (4, half_y + rows, pre + half_x + over)
-    np.testing.assert_array_equal(quadrants.assembled(parts, pre, over, rows), frame)
-    assert (parts > 0).sum() == frame.size
+    frame[half_y : half_y + middle] = 0.0
+    np.testing.assert_array_equal(quadrants.assembled(parts, pre, over, rows, middle), frame)
+    assert (parts > 0).sum() == 4 * half_y * half_x
+    shape = parts.shape[1:]
+    for number in range(4):
+        across, up = quadrants.origin(number, shape, pre, over, rows, middle)
+        placed = quadrants.placed(parts[number], number)
+        row, column = (half_y + middle) * (number < 2), half_x * (number in (1, 2))
+        assert placed[row + up, column + across] == frame[row, column]
     for number in range(4):
         turned = quadrants.placed(parts[number], number)
         np.testing.assert_array_equal(quadrants.placed(turned, number), parts[number])
@@ -47,6 +56,8 @@ def test_odd_detectors_have_no_quadrants():
         quadrants.apply(np.zeros((3, 4)), 1, 1, 1)
     with pytest.raises(OutOfRange, match="prescan"):
         quadrants.apply(np.zeros((2, 4)), -1, 1, 1)
+    with pytest.raises(BadInput, match="even"):
+        quadrants.apply(np.zeros((4, 4)), 1, 1, 1, 3)
 
 
 @given(st.floats(0, 1e6), st.floats(0, 0.3), st.floats(0, 0.5))
