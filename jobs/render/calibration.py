@@ -16,15 +16,14 @@ import numpy.typing as npt
 from jobs import rng
 from jobs.observations import Observation
 from jobs.render import focal_plane
-from jobs.render.exposing import Exposure, bands_of, exposure_time
+from jobs.render.exposing import NISP_LAMPS, VIS_LAMPS, Exposure, bands_of, exposure_time
 from jobs.render.fields import position_angle
 from jobs.render.sequence import FILTERS, RED, offsets
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
 _DAY_S = 86400.0
-# Lamps of the calibration units; the two standard stars (Serrano et al. 2024).
-_NISP_LAMPS, _VIS_LAMPS = 5, 6
+# The two standard stars (Serrano et al. 2024).
 _STARS = ("Vega", "white dwarf DA")
 _GRISMS = ("RGS000", "RGS180", "RGS000", "RGS180")
 # From the end of a frame to the start of the next, s: the slowest of the read-outs.
@@ -64,7 +63,7 @@ def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, 
     elif not block.exposures:
         raise BadInput(f"an observation of image_type {first.image_type} wants exposures = how many frames")
     else:
-        lamps = {"nisp": _NISP_LAMPS, "vis": _VIS_LAMPS}.get(first.camera, 1)
+        lamps = {"nisp": NISP_LAMPS, "vis": VIS_LAMPS}.get(first.camera, 1)
         for i in range(block.exposures):
             lamp = i % lamps + 1 if first.image_type == "flat" else None
             yield replace(in_bands[i % len(in_bands)], lamp=lamp)

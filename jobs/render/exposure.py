@@ -148,6 +148,7 @@ def render(
         detector = focal_plane.detector(camera, str(task["detector"]), mission)
     system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
     zero_point, scene = float(exposure["zero_point"]), scene_of(exposure, detector, mission, accuracy)
+    scene = replace(scene, band=passband)
     forced = forced or {}
     decisions: tuple[Decision, ...] = ()
     spread: Psf | None = None

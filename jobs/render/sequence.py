@@ -16,7 +16,7 @@ import numpy.typing as npt
 from jobs import rng
 from jobs.observations import Observation
 from jobs.render import focal_plane
-from jobs.render.exposing import Exposure, exposure_time
+from jobs.render.exposing import VIS_LAMPS, Exposure, exposure_time
 from jobs.render.fields import Field
 from lake_schema.mission.configuration import MissionConfiguration
 
@@ -113,7 +113,9 @@ class _At:
             yield self._one("VIS", "euclid_vis", begin + (len(FILTERS) - 1) * step, seconds)
         if "VIS" in block.channels and block.flat and last:
             seconds = mission.value("vis.exposure_time_flat", "s")
-            yield self._one("VIS", "euclid_vis", _dither_time(mission), seconds, "flat", lamp=1)
+            # One LED after the other, from field to field and from visit to visit.
+            lamp = (self.field.number + self.field.visit) % VIS_LAMPS + 1
+            yield self._one("VIS", "euclid_vis", _dither_time(mission), seconds, "flat", lamp=lamp)
 
     def _spectrum(self, after: float) -> Exposure:
         if self.block.blue and self.field.visit % 2 == 0:

@@ -43,7 +43,6 @@ _LIGHT = (
     background.EFFECT,
     pixel_area.EFFECT,
     illumination.EFFECT,
-    illumination.SHUTTER,
 )
 _COUNTED = (
     pixel_response.EFFECT,
@@ -68,9 +67,9 @@ _READOUT = (
     adc.EFFECT,
 )
 
-SKY = (*_LIGHT, *_COUNTED, *_CHARGE, *_READOUT)
+SKY = (*_LIGHT, illumination.SHUTTER, *_COUNTED, *_CHARGE, *_READOUT)
 # The shutter stays open: sky and stars are in a flat, and what they leave on the way to the register; the lamp is out
-# by then.
+# by then, and how long it shone is its own affair.
 FLAT = (
     *_LIGHT,
     readout_trail.EFFECT,

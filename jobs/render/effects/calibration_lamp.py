@@ -1,14 +1,21 @@
-"""Flats: the calibration unit shines through one of its six LEDs; what it lights is far from even."""
+"""Flats: the calibration unit shines with one of its six LEDs; what it lights is far from even.
+
+Each has its own wavelengths: of as much light the band detects more or less.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
+from jobs.fluxes import passbands
 from jobs.render.effects import illumination
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
 LEDS = 6
+_BAND = "euclid_vis"
+# Standard deviations in a full width at half maximum.
+_FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
 def apply(frame: Frame, level: float, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
@@ -28,11 +35,25 @@ def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
     return illumination.pattern(scene, nx, ny, scene.value("flat.illumination", ""), direction)
 
 
+def seen(scene: Scene, led: int) -> float:
+    """What the band detects of an LED's photons, over what the embedded band would where it sees best."""
+    if not 1 <= led <= LEDS:
+        raise OutOfRange("LED", led, 1, LEDS)
+    usual = passbands.load(_BAND)
+    band = scene.band or usual
+    width = 10.0 * scene.value("flat.led_width", "nm") / _FWHM
+    off = (band.wavelength - 10.0 * scene.value(f"flat.led_{led}", "nm")) / width
+    # On wavelengths 1 A apart.
+    detected = float(np.sum(band.response * np.exp(-0.5 * off**2)) / (width * np.sqrt(2.0 * np.pi)))
+    return detected / float(usual.response.max())
+
+
 def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:
     nx, ny = int(scene.value("fpa.nx", "pix")), int(scene.value("fpa.ny", "pix"))
     if scene.detector is not None:
         nx, ny = scene.detector.nx, scene.detector.ny
-    return scene.value("flat.signal", "electron"), *pattern(scene, scene.lamp, nx, ny)
+    level = scene.value("flat.signal", "electron") * seen(scene, scene.lamp)
+    return level, *pattern(scene, scene.lamp, nx, ny)
 
 
 EFFECT = Effect("calibration_lamp", apply, _parameters, lambda scene: _parameters(scene)[0], cost=1e-2)

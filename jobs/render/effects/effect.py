@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs.accuracy import SURVEY, Accuracy
+from jobs.fluxes.passbands import Passband
 from jobs.render.focal_plane import Detector
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
@@ -60,6 +61,7 @@ class Scene:
     lights         : what shines around corners: ghosts, straylight
     lamp           : the LED of a flat, from 1
     forced         : effect name -> on or off, instead of what the scene needs
+    band           : the exposure's passband, None = the embedded one
     """
 
     mission: MissionConfiguration
@@ -72,6 +74,7 @@ class Scene:
     lamp: int = 1
     accuracy: Accuracy = SURVEY
     forced: Mapping[str, bool] = field(default_factory=dict)
+    band: Passband | None = None
 
     def value(self, key: str, unit: str) -> float:
         """A parameter of the detector."""

@@ -4,7 +4,7 @@ Every map here is 1 + f(column) + g(row): a paraboloid and a slope across the fo
 turned.
 
 pattern     such a map for one detector
-EFFECT      vignetting; SHUTTER: its blades open and close over one side of the focal plane first
+EFFECT      vignetting; SHUTTER: its blades open over one side of the focal plane first, and close over the other
 """
 
 from __future__ import annotations
@@ -67,7 +67,13 @@ def _vignetting(scene: Scene) -> tuple[Frame, Frame]:
 
 
 def _shutter(scene: Scene) -> tuple[Frame, Frame]:
-    return pattern(scene, *_size(scene), 0.0, (0.0, scene.value("shutter_map", "")))
+    return pattern(scene, *_size(scene), 0.0, (0.0, _longer(scene)))
+
+
+def _longer(scene: Scene) -> float:
+    """At the side of the focal plane, of the exposure time: the blades take as long whatever that is."""
+    time = scene.exposure_time_s
+    return float(np.clip(scene.value("shutter_map", "s") / time, -1.0, 1.0)) if time > 0.0 else 0.0
 
 
 def _brightest(scene: Scene) -> float:
@@ -81,6 +87,4 @@ EFFECT = Effect(
     lambda scene: abs(scene.value("illumination", "")) * _brightest(scene),
     cost=5e-3,
 )
-SHUTTER = Effect(
-    "shutter", apply, _shutter, lambda scene: abs(scene.value("shutter_map", "")) * _brightest(scene), cost=5e-3
-)
+SHUTTER = Effect("shutter", apply, _shutter, lambda scene: abs(_longer(scene)) * _brightest(scene), cost=5e-3)

@@ -11,6 +11,7 @@ import pytest
 from jobs.accuracy import DRAFT, REFERENCE, SURVEY
 from jobs.fluxes import passbands
 from jobs.render import costs, exposing, exposure, focal_plane, truth_maps
+from jobs.render.effects import calibration_lamp
 from jobs.render.focal_plane import boresight_for
 from lake_schema import units
 from lake_schema.errors import BadInput
@@ -222,7 +223,8 @@ def test_image_types(kind):
         assert np.nanstd(found) == pytest.approx(np.hypot(4.4, 3.48 / 12**0.5), rel=0.03)
     elif kind == "flat":
         assert len(one.sources) > 10
-        assert middle == pytest.approx(20_000 + one.scene.sky_electrons, rel=0.05)
+        lamp = 20_000 * calibration_lamp.seen(one.scene, 1)
+        assert middle == pytest.approx(lamp + one.scene.sky_electrons, rel=0.05)
     elif kind == "charge_injection":
         half = np.nanmean(found, axis=1)[: SIDE // 2]
         assert half[:100].max() < 10  # fewer rows than `off`: nothing is injected

@@ -10,9 +10,11 @@ from jobs import request as requests
 from jobs import rng
 from jobs.render import exposing, exposure, fits_product, focal_plane
 from jobs.render.channels import vis
-from jobs.render.effects.effect import apply_all
+from jobs.render.effects import calibration_lamp
+from jobs.render.effects.effect import Scene, apply_all
 from jobs.render.plan_exposures import plan
 from lake_schema import fits
+from lake_schema.mission.configuration import resolve
 from tests.jobs.render.fields import fluxes, galaxies, stars
 
 EXAMPLE = Path(__file__).parents[3] / "requests" / "vis_calibration.toml"
@@ -35,7 +37,7 @@ def planned(tmp_path_factory):
 def written(planned, row, folder, forced=None, magnitude=20.0):
     """(what was rendered, what is read of its file): a galaxy and a star in the lower half of the detector."""
     request, mission, _ = planned
-    detector = replace(focal_plane.detector("vis", "3-4", mission), nx=SIDE, ny=SIDE)
+    detector = replace(focal_plane.detector("vis", "3-4", mission), nx=SIDE, ny=SIDE, middle=0)
     system = focal_plane.wcs(detector, row["ra"], row["dec"], row["position_angle"])
     where = [focal_plane.sky_of_pixel(system, [x], [30.0]) for x in (30.0, 90.0)]
     flux = 10 ** (0.4 * (23.9 - magnitude))
@@ -129,12 +131,16 @@ def test_lamps_shine_from_their_own_side(planned, tmp_path):
     quiet = dict.fromkeys(("cosmic_rays", "readout_cosmic_rays", "poisson", "pixel_response"), False)
     slopes = {}
     for lamp in (1, 2, 4):
-        one, header = written(planned, rows["flat", 10, lamp], tmp_path, quiet, magnitude=25.0)
+        # Each as bright as the others, whatever the band sees of it.
+        seen = calibration_lamp.seen(Scene(mission, "vis", 10.0, 0.0, 0.0), lamp)
+        level = mission.value("vis.flat.signal", "electron") / seen
+        as_bright = resolve(overrides={"vis.flat.signal": (level, "electron")})
+        one, header = written((planned[0], as_bright, rows), rows["flat", 10, lamp], tmp_path, quiet, magnitude=25.0)
         assert header["LAMP"] == lamp
         frame, half = one.science.astype(float), SIDE // 2
         slopes[lamp] = np.array([np.diff([f[:, :half].mean(), f[:, half:].mean()])[0] for f in (frame, frame.T)])
     everything = focal_plane.detectors("vis", mission)
-    reach = [max(abs(getattr(d, a)) for d in everything) + d_n * 0.05 for a, d_n in (("x", 4096), ("y", 4132))]
+    reach = [max(abs(getattr(d, a)) for d in everything) + d_n * 0.05 for a, d_n in (("x", 4096), ("y", 4136))]
     # ADU between the halves' middles; the detector is mounted upside down.
     steepest = -mission.value("vis.flat.signal") * mission.value("vis.flat.gradient") / mission.value("vis.gain")
     gx, gy = (steepest * half * 0.1 / r for r in reach)
@@ -148,7 +154,7 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
     """Whatever is switched on or off, every other effect is given its own generator, that has drawn nothing."""
     row = next(row for (name, *_), row in planned[2].items() if name == kind)
     _, mission, _ = planned
-    detector = replace(focal_plane.detector("vis", "3-4", mission), nx=32, ny=32)
+    detector = replace(focal_plane.detector("vis", "3-4", mission), nx=32, ny=32, middle=0)
     scene = exposure.scene_of(row, detector, mission, planned[0].accuracy)
 
     def keys(forced):

@@ -52,7 +52,7 @@ def test_the_demo_s_two_detectors_look_at_the_same_place(tmp_path):
     assert rows["detector"].to_pylist() == ["3-4", "R22_S11"]
     assert (np.diff(rows["seconds"].to_numpy()) < 0).all()
     # Four quadrants with pre- and overscan, and two truth maps: the files' bytes.
-    assert rows["bytes"].to_pylist()[0] == pytest.approx(35_536_320 + 2 * 67_705_920, rel=1e-3)
+    assert rows["bytes"].to_pylist()[0] == pytest.approx(35_536_320 + 2 * 67_772_160, rel=1e-3)
 
 
 def test_all_detectors_where_none_is_named(tmp_path):
@@ -121,6 +121,11 @@ def test_the_sequence_of_a_field(tmp_path):
     assert [r["exposure_time_s"] for r in vis] == [560.53, 89.52, 560.53, 560.53, 560.53, 10.0]
     assert [r["image_type"] for r in vis] == ["science"] * 5 + ["flat"]
     assert [r["dither"] for r in vis] == [1, 1, 2, 3, 4, 4]
+    # The LEDs take turns in the closing flats, from field to field.
+    more, _ = planned(tmp_path, observation=[{**block, "fields": 24}])
+    flats = [r for r in more.to_pylist() if r["image_type"] == "flat"]
+    assert {r["lamp"] for r in flats} == {1, 2, 3, 4, 5, 6}
+    assert all((r["lamp"] - flats[0]["lamp"] - r["field"] + flats[0]["field"]) % 6 == 0 for r in flats)
     start = rows[0]["mjd"] * 86400 - 8
     assert max(r["mjd"] for r in rows) * 86400 - start == pytest.approx(4218, abs=1)
     spectra = [r for r in rows if r["channel"] == "NISP-S"]

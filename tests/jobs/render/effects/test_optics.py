@@ -5,7 +5,9 @@ from dataclasses import replace
 import galsim
 import numpy as np
 import pytest
+from scipy import stats
 
+from jobs.fluxes import passbands
 from jobs.render import focal_plane, psf
 from jobs.render.effects import (
     calibration_lamp,
@@ -201,7 +203,7 @@ def test_illumination_is_one_map_over_the_focal_plane(name):
     columns, rows = illumination.pattern(one, 60, 40, 0.02, (0.003, -0.01))
     everything = focal_plane.detectors("vis", MISSION)
     half_x = max(d.x for d in everything) + 204.8
-    half_y = max(d.y for d in everything) + 206.6
+    half_y = max(d.y for d in everything) + 206.8
     for c, r in ((0, 0), (59, 39), (17, 30)):
         turn = np.radians(turned.rotation)
         dx, dy = 7.0 * (c - 29.5), 7.0 * (r - 19.5)
@@ -212,14 +214,21 @@ def test_illumination_is_one_map_over_the_focal_plane(name):
 
 
 def test_vignetting_and_shutter_are_per_cents():
-    corner = illumination.apply(np.ones((4132, 4096)), *illumination.EFFECT.parameters(scene("1-1")))
+    """The shutter's blades take as long in a short exposure, of which that is more."""
+    corner = illumination.apply(np.ones((4136, 4096)), *illumination.EFFECT.parameters(scene("1-1")))
     assert corner[-1, 0] == pytest.approx(0.98, abs=1e-5)
     shutter = [
-        illumination.apply(np.ones((4132, 4096)), *illumination.SHUTTER.parameters(scene(name)))
-        for name in ("1-1", "6-1")
+        illumination.apply(np.ones((4136, 4096)), *illumination.SHUTTER.parameters(one))
+        for one in (scene("1-1"), scene("6-1"), replace(scene("1-1"), exposure_time_s=89.52))
     ]
-    assert shutter[0].max() == pytest.approx(1.003)
-    assert shutter[1].min() == pytest.approx(0.997)
+    assert shutter[0].max() == pytest.approx(1 + 1.68 / 560.53, abs=1e-6)
+    assert shutter[1].min() == pytest.approx(1 - 1.68 / 560.53, abs=1e-6)
+    assert shutter[2].max() == pytest.approx(1 + 1.68 / 89.52, abs=1e-5)
+    # Nobody is exposed for less than nothing, or at all in no time.
+    for time, most in ((1.0, 2.0), (0.0, 1.0)):
+        columns, rows = illumination.SHUTTER.parameters(replace(scene("1-1"), exposure_time_s=time))
+        assert 1 + columns.max() + rows.max() == pytest.approx(most, abs=1e-3)
+        assert 1 + columns.min() + rows.min() >= 0.0
 
 
 def test_lamps_differ_in_where_they_shine():
@@ -233,8 +242,28 @@ def test_lamps_differ_in_where_they_shine():
             assert np.abs(maps[i] - other).max() > 1e-4
     with pytest.raises(OutOfRange, match="LED"):
         calibration_lamp.pattern(scene(), 7, 60, 40)
+    with pytest.raises(OutOfRange, match="LED"):
+        calibration_lamp.seen(scene(), 0)
     with pytest.raises(OutOfRange, match="lamp"):
         calibration_lamp.apply(ones, -1.0, np.zeros(60), np.zeros(40))
+
+
+def test_lamps_differ_in_what_is_seen_of_them():
+    """Each LED's line through the band, by quadrature of another kind; a narrow band sees its own lamp alone."""
+    band = passbands.load("euclid_vis")
+    for led, centre in enumerate((5500, 6200, 6900, 7600, 8300, 9000), start=1):
+        line = stats.norm(centre, 400 / (2 * np.sqrt(2 * np.log(2))))
+        edges = np.append(band.wavelength - 0.5, band.wavelength[-1] + 0.5)
+        wanted = np.diff(line.cdf(edges)) @ band.response / band.response.max()
+        assert calibration_lamp.seen(scene(), led) == pytest.approx(wanted, rel=1e-5)
+        level, *_ = calibration_lamp.EFFECT.parameters(scene(lamp=led))
+        assert level == pytest.approx(MISSION.value("vis.flat.signal", "electron") * wanted, rel=1e-5)
+    # Half of the bluest shines where the band has not begun.
+    assert calibration_lamp.seen(scene(), 1) < 0.75 * calibration_lamp.seen(scene(), 2)
+    red = passbands.Passband("red", np.arange(8800.0, 9201.0), np.full(401, 0.8), "vacuum")
+    own = [calibration_lamp.seen(scene(band=red), led) for led in range(1, 7)]
+    assert own[5] > 0.5
+    assert max(own[:4]) < 1e-6
 
 
 def test_a_map_of_other_size_is_refused():

@@ -8,9 +8,9 @@ from jobs.render.effects.effect import NOTICEABLE, Lights, Scene
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render.effects.battery import EFFECTS
 
-NX, NY = 8, 4132
 MISSION = resolve()
 DETECTOR = focal_plane.detector("vis", "1-1", MISSION)
+NX, NY = 8, DETECTOR.ny
 
 
 def database(**values):
@@ -34,7 +34,7 @@ CASES = {
     "background": lambda x: scene(sky=0.01 * x),
     "pixel_area": lambda x: scene(sky=0.01 * x),
     "illumination": lambda x: scene(illumination=min(1e-4 * x, 0.5)),
-    "shutter": lambda x: scene(shutter_map=min(1e-4 * x, 0.5)),
+    "shutter": lambda x: scene(shutter_map=min(0.05 * x, 280.0)),
     "pixel_response": lambda x: scene(peak=200.0, prnu=min(3e-3 * x, 0.5), dead_pixels=0.0, dark_columns=0.0),
     "readout_trail": lambda x: scene(readout_time=0.3 * x),
     "brighter_fatter": lambda x: scene(peak=3e3 * x),
