@@ -22,6 +22,7 @@
     [fluxes.extinction.CODE]       your own law in place of law 1 .. 4: file, format
     [psf]          BAND = "file.fits"   your own PSF in a band: a cube of planes or PSFEx's (jobs/render/own_psf.py);
                    {detector} in the name stands for the detector's
+    [solar_system] bodies = "file"      your own moving bodies in place of ours (jobs/render/own_bodies.py)
     [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
     [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
@@ -173,6 +174,7 @@ class Request:
 
     explore : parameter -> the values (JSON) that it takes in turn
     psfs    : (band, file) of PSFs in place of ours
+    bodies  : file of moving bodies in place of ours
     """
 
     name: str
@@ -193,6 +195,7 @@ class Request:
     strong_lens_boost: float = 1.0
     compression: str = "none"
     psfs: tuple[tuple[str, str], ...] = ()
+    bodies: Path | None = None
 
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""
@@ -240,6 +243,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         "mission",
         "fluxes",
         "psf",
+        "solar_system",
         "effects",
         "explore",
         "products",
@@ -251,6 +255,8 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in asked)
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
     products_ = _section(table, "products", {"truth", "compression"})
+    solar_system = _section(table, "solar_system", {"bodies"})
+    bodies = own_files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
     request = Request(
         name=layout.name(_string(table, "name")),
         seed=_integer(table, "seed", 0, 2**63 - 1),
@@ -268,6 +274,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         effects=_effects(_section(table, "effects", {"on", "off"})),
         explore=_explore(_section(table, "explore", None)),
         ingest=own_files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
+        bodies=bodies,
         psfs=own_files.psfs(_section(table, "psf", None), folder),
         strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
     )

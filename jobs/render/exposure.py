@@ -127,6 +127,7 @@ def render(
     complete: float = 0.0,
     truth: Sequence[str] = (),
     lenses: pa.Table | None = None,
+    bodies: Callable[[int], moving.Population] | None = None,
 ) -> Rendered:
     """Render one detector.
 
@@ -140,6 +141,7 @@ def render(
     complete       : how far beyond the detector the rows have every source, arcsec; for the header
     truth          : maps that are wanted besides the noise-free one, of lake_schema.tables.products.CONTENTS
     lenses         : rows of `strong_lenses` (pictures.ARC_COLUMNS) whose sources are among the galaxies
+    bodies         : a day's moving bodies (own_bodies.Bodies.of_day), None = the embedded population
     """
     camera, band, channel = str(exposure["camera"]), str(exposure["band"]), str(exposure["channel"])
     passband = passband or passbands.load(band)
@@ -167,7 +169,7 @@ def render(
         )  # fmt: skip
         if channel == "VIS":
             sources, sizes = _with_moving(
-                sources, sizes, exposure, detector, system, passband, scene, spread, settings, seed
+                sources, sizes, exposure, detector, system, passband, scene, spread, settings, seed, bodies
             )
             lights = _lights((galaxies, electrons[0]), (stars, electrons[1]), detector, system)
             peak = float(spread.surface[0]) * float(sources.electrons.max(initial=0.0))
@@ -345,11 +347,11 @@ def _arcs(lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: p
 
 def _with_moving(
     sources: Sources, sizes: stamps.Int, exposure: Row, detector: Detector, system: WCS, band: Passband, scene: Scene,
-    spread: Psf, settings: Settings, seed: int,
+    spread: Psf, settings: Settings, seed: int, bodies: Callable[[int], moving.Population] | None,
 ) -> tuple[Sources, stamps.Int]:  # fmt: skip
     """The sources with those that move, whose identifiers are the largest."""
     reach = (detector.half_diagonal + stamps.SIZES[-1] * detector.pixel_scale) / 3600.0
-    found = moving.sources(exposure, detector, system, band, scene.mission, seed, reach, sources.shapes)
+    found = moving.sources(exposure, detector, system, band, scene.mission, seed, reach, sources.shapes, bodies)
     own = stamps.stamp_sizes(
         found.electrons,
         found.shape,

@@ -10,7 +10,7 @@ anywhere. They shine like the Sun. At midnight UTC another population takes over
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +50,7 @@ class Population:
 
     lon, lat   : deg, ecliptic, at noon UTC;  east, north : arcsec / h along them
     mag        : I_E, AB
+    hour       : after noon, at which they are there
     """
 
     ids: Int
@@ -58,12 +59,13 @@ class Population:
     east: Float
     north: Float
     mag: Float
+    hour: float | Float = 0.0
 
     def after(self, hours: float) -> tuple[Float, Float]:
         """ra, dec [n] deg so many hours after noon."""
         across = np.maximum(np.cos(np.radians(self.lat)), _LEAST_COSINE)
-        lon = self.lon + self.east * hours / 3600.0 / across
-        return equatorial(lon, np.clip(self.lat + self.north * hours / 3600.0, -90.0, 90.0))
+        since = (hours - self.hour) / 3600.0
+        return equatorial(self.lon + self.east * since / across, np.clip(self.lat + self.north * since, -90.0, 90.0))
 
 
 def population(ra: float, dec: float, radius: float, day: int, mission: MissionConfiguration, seed: int) -> Population:
@@ -128,15 +130,17 @@ def sources(
     seed: int,
     reach: float,
     shapes: Shapes,
+    own: Callable[[int], Population] | None = None,
 ) -> Sources:
     """Bodies within `reach` deg of a detector's centre in the middle of an exposure, ascending id.
 
     exposure : a row of the table `exposures`;  shapes : of the sources that they are drawn with
+    own      : a day's (MJD) bodies in place of the embedded population
     """
     start, seconds = float(exposure["mjd"]), float(exposure["exposure_time_s"])
     centre = focal_plane.centre(detector, system)
     day = int(np.floor(start))
-    found = population(*centre, reach, day, mission, seed)
+    found = own(day) if own else population(*centre, reach, day, mission, seed)
     # An exposure belongs to the day that it begins on.
     begin, middle, end = (
         found.after(24.0 * (start - day - 0.5) + after / _HOUR_S) for after in (0.0, 0.5 * seconds, seconds)

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from jobs import heap
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
-from jobs.render import exposure, fits_product, focal_plane, own_psf, pictures, selection, stamps, survey
+from jobs.render import exposure, fits_product, focal_plane, own_bodies, own_psf, pictures, selection, stamps, survey
 from jobs.render.plan_exposures import PARTS, mission_of, own_filters
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
@@ -61,6 +61,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
     }
     if psfs := _psf_files(exposures, tasks):
         facts["psf"] = psfs
+    if request.bodies is not None:
+        facts["bodies"] = _bodies(request.bodies, exposures)
     keys = product_keys(facts, exposures, tasks, inputs, mission_of(request.mission))
     parts = tuple(
         Part(
@@ -104,8 +106,13 @@ def product_keys(
         ]
 
     def own(task: Json) -> Json:
-        psf = rows[task["exposure_id"]]["psf"]
-        return {"psf": facts["psf"][str(own_psf.file_of(psf, task["detector"]))]} if psf else {}
+        row, files = rows[task["exposure_id"]], {}
+        if psf := row["psf"]:
+            files["psf"] = facts["psf"][str(own_psf.file_of(psf, task["detector"]))]
+        # Of the channels VIS alone draws moving bodies.
+        if "bodies" in facts and row["channel"] == "VIS":
+            (files["bodies"],) = facts["bodies"].values()
+        return files
 
     return [
         digest(
@@ -126,6 +133,16 @@ def _psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
     named = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
     pairs = {(named[task["exposure_id"]], task["detector"]) for task in tasks}
     return {(file := str(own_psf.file_of(psf, detector))): file_sha256(Path(file)) for psf, detector in pairs if psf}
+
+
+def _bodies(file: Path, exposures: pa.Table) -> dict[str, str]:
+    """sha256 of the user's moving bodies, by file; refused before anything is rendered where they cannot be read."""
+    if not file.is_file():
+        raise BadInput(f"solar_system.bodies: {file}: no such file")
+    sha256 = file_sha256(file)
+    of_vis = exposures.filter(pc.equal(exposures["channel"], "VIS"))
+    own_bodies.check(own_bodies.read(file, sha256), file, of_vis["mjd"].to_pylist())
+    return {str(file): sha256}
 
 
 def _files_of_cells(*tables: read.Version) -> Mapping[int, list[tuple[str, ...]]]:
@@ -251,6 +268,11 @@ def work(lake: Path, facts: Json) -> Output:
         file = str(own_psf.file_of(exposed["psf"], task["detector"]))
         if file_sha256(Path(file)) != facts["psf"][file]:
             raise BadInput(f"{file}: has changed since the rendering began")
+    bodies = None
+    for file, sha256 in facts.get("bodies", {}).items():
+        if file_sha256(Path(file)) != sha256:
+            raise BadInput(f"{file}: has changed since the rendering began")
+        bodies = own_bodies.read(Path(file), sha256).of_day
     margin = own.mission.value("survey.selection_margin", "arcsec")
     farther = max(stamps.reach(detector.pixel_scale) - margin, 0.0)
     least = exposure.least_flux(exposed, detector, own.mission, own.accuracy)
@@ -277,6 +299,7 @@ def work(lake: Path, facts: Json) -> Output:
             complete=margin + min(complete for *_, complete in found),
             truth=request["truth"],
             lenses=lenses(inputs[LENSES], task, _deflection(inputs["galaxies"]), least) if LENSES in inputs else None,
+            bodies=bodies,
         )
     rows, files = fits_product.products(rendered, request["truth"], request["compression"] == "rice")
     drawn = fits_product.truth(rendered)

@@ -36,7 +36,7 @@ def pointing(detector):
 
 def rendered(
     detector, mags, x, y, body=None, mission=MISSION, forced=None, accuracy=SURVEY, seconds=TIME, sky=SKY,
-    kind="science", number=1, truth=(),
+    kind="science", number=1, truth=(), asteroids=None,
 ):  # fmt: skip
     """Stars (or galaxies: `body`, their columns) of AB magnitudes `mags` at pixels x, y.
 
@@ -61,7 +61,7 @@ def rendered(
             {"detector": detector.name}, exposed,
             bodies, fluxes(bodies, "euclid_vis", f_nu if body else 0.0),
             points, fluxes(points, "euclid_vis", 0.0 if body else f_nu),
-            mission, accuracy, SEED, forced, detector, truth=truth,
+            mission, accuracy, SEED, forced, detector, truth=truth, bodies=asteroids,
         )  # fmt: skip
 
 

@@ -1,0 +1,119 @@
+"""Moving bodies of the user's own, in place of the embedded population.
+
+Bodies, read   a table of where they are on which date, how they move, how bright they are
+check          that planned exposures are of its days
+
+A table : Parquet, CSV or FITS with the columns of KEYS, one row a body and day: mjd (UTC), ecliptic longitude and
+          latitude then (deg, mean equinox J2000), motion to the east and north along them (arcsec / h), I_E (AB).
+          An exposure sees the rows of the day that it begins on; other columns are left alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+
+from jobs.render.moving import KIND, Population
+from lake_schema import fits, sky
+from lake_schema.ecliptic import equatorial
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.ids import GENERATION_ORDER, source_id
+
+Float = npt.NDArray[np.float64]
+
+# Columns, and the smallest and largest value of each. A day has to fit into an identifier.
+KEYS = {
+    "mjd": (0.0, 2.0**18 - 1.0),
+    "lon": (-360.0, 720.0),
+    "lat": (-90.0, 90.0),
+    "east": (-1e5, 1e5),
+    "north": (-1e5, 1e5),
+    "mag": (-30.0, 60.0),
+}
+_MOST_ROWS = 1 << 28
+_FITS = (".fits", ".fit")
+
+
+@dataclass(frozen=True, slots=True)
+class Bodies:
+    """Rows of a table by the day, int64[n], MJD, that they are of."""
+
+    day: npt.NDArray[np.int64]
+    rows: Population
+
+    def of_day(self, day: int) -> Population:
+        """Those of one day."""
+        here = self.day == day
+        return Population(*(getattr(self.rows, field.name)[here] for field in fields(Population)))
+
+
+@lru_cache(maxsize=2)
+def read(file: Path, sha256: str) -> Bodies:
+    """A table of bodies; BadInput names the file, and the column and row that is wrong.  sha256 : of the file."""
+    values = _bounded(file, _table(file))
+    day = np.floor(values["mjd"]).astype(np.int64)
+    hour = 24.0 * (values["mjd"] - day - 0.5)
+    cell = sky.cell_of(*equatorial(values["lon"], values["lat"]), GENERATION_ORDER)
+    ids = source_id(KIND, cell, np.arange(len(day)), day)
+    return Bodies(day, Population(ids, *(values[key] for key in ("lon", "lat", "east", "north", "mag")), hour=hour))
+
+
+def check(bodies: Bodies, file: Path, mjd: Iterable[float]) -> None:
+    """Refuse a table that has nothing of any exposure's day; mjd : of their starts."""
+    days = sorted({int(np.floor(start)) for start in mjd})
+    if days and not np.isin(days, bodies.day).any():
+        has = f"MJD {bodies.day.min()} to {bodies.day.max()}" if len(bodies.day) else "no day"
+        raise BadInput(f"{file}: has bodies of {has}, the exposures begin on {days[0]} to {days[-1]}")
+
+
+def _table(file: Path) -> dict[str, Float]:
+    if not file.is_file():
+        raise BadInput(f"{file}: no such file")
+    try:
+        if file.suffix.lower() in _FITS:
+            found = fits.read_numbers(file)
+            if absent := [key for key in KEYS if key not in found]:
+                raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(found)}")
+            return {key: np.asarray(found[key], float) for key in KEYS}
+        whole = pq.ParquetFile(file).schema_arrow.empty_table() if _is_parquet(file) else None
+        table = pyarrow.csv.read_csv(file) if whole is None else whole
+        if absent := [key for key in KEYS if key not in table.column_names]:
+            raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(table.column_names)}")
+        table = table.select(list(KEYS)) if whole is None else pq.read_table(file, columns=list(KEYS))
+    except Damaged as error:
+        raise BadInput(str(error)) from None
+    except (pa.ArrowException, OSError) as error:
+        raise BadInput(f"{file}: {' '.join(str(error).split())}") from None
+    return {key: _numbers(file, key, table[key]) for key in KEYS}
+
+
+def _is_parquet(file: Path) -> bool:
+    with file.open("rb") as stream:
+        return stream.read(4) == b"PAR1"
+
+
+def _numbers(file: Path, key: str, column: pa.ChunkedArray) -> Float:
+    if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+        raise BadInput(f"{file}: column {key} is of {column.type}, not of numbers")
+    # A missing value is no number, which the bounds refuse.
+    return np.asarray(column.cast(pa.float64()).to_numpy(), float)
+
+
+def _bounded(file: Path, values: dict[str, Float]) -> dict[str, Float]:
+    if len(values["mjd"]) > _MOST_ROWS:
+        raise BadInput(f"{file}: has more than {_MOST_ROWS} rows")
+    for key, (low, high) in KEYS.items():
+        bad = ~((values[key] >= low) & (values[key] <= high))
+        if bad.any():
+            row = int(bad.argmax())
+            rest = f" ({bad.sum()} of {len(bad)} rows like it)"
+            raise BadInput(f"{file}: {key} of row {row + 1} is {values[key][row]:g}, not in [{low:g}, {high:g}]{rest}")
+    return values

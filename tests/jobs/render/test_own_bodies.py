@@ -1,0 +1,147 @@
+"""Moving bodies of the user's own: tables in three formats, drawn as ours are; what is wrong is said in a line."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+import pytest
+from astropy.table import Table
+
+from jobs import request as requests
+from jobs.fluxes import passbands
+from jobs.render import focal_plane, moving, own_bodies, render_exposures
+from lake_schema.ecliptic import ecliptic, equatorial
+from lake_schema.errors import BadInput
+from lake_schema.ids import kind_of
+from tests.jobs.render import nominal
+from tests.jobs.render.fields import MISSION, small
+
+DAY = 60905
+PLACE = tuple(float(x) for x in equatorial(70.0, 0.0))
+FORMATS = ("parquet", "csv", "fits")
+
+
+def columns(found, mjd=DAY + 0.5):
+    names = ("lon", "lat", "east", "north", "mag")
+    return {"mjd": np.full(len(found.ids), mjd), **{name: getattr(found, name) for name in names}}
+
+
+def written(path, values):
+    if path.suffix == ".fits":
+        Table({name: np.asarray(column) for name, column in values.items()}).write(path)
+    elif path.suffix == ".csv":
+        pyarrow.csv.write_csv(pa.table(values), path)
+    else:
+        pq.write_table(pa.table(values), path)
+    return path
+
+
+def test_a_table_of_our_own_population_is_drawn_as_ours(tmp_path):
+    """In each format, with a column more: the same places, motions and light; of another day, nothing."""
+    ours = moving.population(*PLACE, 0.1, DAY, MISSION, 1)
+    assert len(ours.ids) > 100
+    detector = small("vis", "3-4")
+    ra, dec, angle = focal_plane.boresight_for(detector, *PLACE, 0.0)
+    row = {"ra": ra, "dec": dec, "position_angle": angle, "mjd": DAY + 0.3, "exposure_time_s": 565.0}
+    system = focal_plane.wcs(detector, ra, dec, angle)
+    about = ({**row, "zero_point": 25.9}, detector, system, passbands.load("euclid_vis"), MISSION, 1, 0.1, None)
+    expected = moving.sources(*about)
+    assert len(expected) > 3
+    order = np.argsort(expected.column)
+    for kind in FORMATS:
+        file = written(tmp_path / f"bodies.{kind}", {"name": [str(i) for i in ours.ids], **columns(ours)})
+        bodies = own_bodies.read(file, kind)
+        found = moving.sources(*about, bodies.of_day)
+        assert set(kind_of(found.ids)) == {moving.KIND}
+        assert len(np.unique(found.ids)) == len(found)
+        mine = np.argsort(found.column)
+        for name in ("column", "row", "electrons", "trail"):
+            np.testing.assert_allclose(getattr(found, name)[mine], getattr(expected, name)[order], rtol=1e-9, atol=1e-6)
+        assert len(bodies.of_day(DAY + 1).ids) == 0
+
+
+def test_a_body_is_where_the_table_says_when_it_says(tmp_path):
+    values = {"mjd": [DAY + 0.25], "lon": [359.99], "lat": [-3.0], "east": [36.0], "north": [-18.0], "mag": [20]}
+    body = own_bodies.read(written(tmp_path / "one.csv", values), "one").of_day(DAY)
+    hours = 24 * (0.25 - 0.5)
+    np.testing.assert_allclose(body.after(hours), np.array(equatorial([359.99], [-3.0])), atol=1e-9)
+    # Ten hours later, 360" east and 180" south.
+    wanted = equatorial([359.99 + 0.1 / np.cos(np.radians(3.0))], [-3.05])
+    np.testing.assert_allclose(body.after(hours + 10.0), np.array(wanted), atol=1e-6)
+
+
+def test_an_exposure_shows_the_table_s_bodies_alone(tmp_path):
+    """One bright body in the middle of the detector, where ours would have none."""
+    detector = small("vis", "3-4", 256)
+    ra, dec, angle = nominal.pointing(detector)
+    centre = focal_plane.centre(detector, focal_plane.wcs(detector, ra, dec, angle))
+    lon, lat = (float(x) for x in ecliptic(*centre))
+    start = 60905.0 + 1
+    values = {"mjd": [start], "lon": [lon], "lat": [lat], "east": [60.0], "north": [0.0], "mag": [18.0]}
+    file = written(tmp_path / "one.parquet", values)
+    one = nominal.rendered(detector, [], [], [], asteroids=own_bodies.read(file, "exposure").of_day)
+    assert len(one.sources) == 1
+    length = np.hypot(*one.sources.trail[0]) * 0.1
+    assert length == pytest.approx(60.0 * nominal.TIME / 3600, rel=1e-3)
+    # It begins in the middle.
+    begin = one.sources.column[0] - one.sources.trail[0, 0] / 2, one.sources.row[0] - one.sources.trail[0, 1] / 2
+    assert begin == pytest.approx((127.5, 127.5), abs=0.01)
+    assert one.noise_free[:, 100:].sum() > 1e5
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"lat": [0.0, 91.0]}, r"lat of row 2 is 91, not in \[-90, 90\] \(1 of 2 rows like it\)"),
+        ({"mag": [np.nan, 20.0]}, r"mag of row 1 is nan, not in"),
+        ({"mjd": [-1.0, 2.0]}, r"mjd of row 1 is -1, not in"),
+        ({"north": None}, r"has no column north; it has mjd, lon, lat, east, mag"),
+    ],
+)
+@pytest.mark.parametrize("kind", FORMATS)
+def test_what_is_wrong_is_said_in_a_line(tmp_path, kind, change, said):
+    good = {"mjd": [60905.0] * 2, "lon": [1.0, 2.0], "lat": [0.0, 0.0], "east": [30.0] * 2, "north": [0.0] * 2}
+    values = {key: value for key, value in {**good, "mag": [20.0, 21.0], **change}.items() if value is not None}
+    file = written(tmp_path / f"bodies.{kind}", values)
+    with pytest.raises(BadInput, match=said) as caught:
+        own_bodies.read(file, "bad")
+    assert str(caught.value).startswith(f"{file}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_table_is_refused(tmp_path):
+    for name, data in (("a.csv", b"mjd,lon\n1,2,3\n"), ("b.parquet", b"PAR1 and no more"), ("c.fits", b"SIMPLE"),
+                       ("d.csv", b"mjd,lon,lat,east,north,mag\n1,2,3,4,5,faint\n")):  # fmt: skip
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(BadInput, match=name) as caught:
+            own_bodies.read(tmp_path / name, name)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(BadInput, match="no such file"):
+        own_bodies.read(tmp_path / "none.csv", "none")
+
+
+def test_a_table_of_other_days_is_refused(tmp_path):
+    file = written(tmp_path / "old.csv", columns(moving.population(*PLACE, 0.1, DAY, MISSION, 1)))
+    bodies = own_bodies.read(file, "old")
+    own_bodies.check(bodies, file, [DAY + 0.2, DAY + 7.0])
+    own_bodies.check(bodies, file, [])
+    with pytest.raises(BadInput, match=r"old.csv: has bodies of MJD 60905 to 60905, the exposures begin on 61000"):
+        own_bodies.check(bodies, file, [61000.5])
+
+
+def test_a_request_names_it(tmp_path):
+    demo = (requests.Path(__file__).parents[3] / "requests" / "demo.toml").read_text(encoding="utf-8")
+    path = tmp_path / "own.toml"
+    path.write_text(demo + '\n[solar_system]\nbodies = "bodies.csv"\n', encoding="utf-8")
+    request = requests.parse(path)
+    assert request.bodies == tmp_path / "bodies.csv"
+    exposed = pa.table({"channel": ["VIS", "EXT"], "mjd": [DAY + 0.3, DAY + 90.0]})
+    with pytest.raises(BadInput, match=r"solar_system.bodies: .*bodies.csv: no such file"):
+        render_exposures._bodies(request.bodies, exposed)
+    written(request.bodies, columns(moving.population(*PLACE, 0.1, DAY, MISSION, 1)))
+    assert list(render_exposures._bodies(request.bodies, exposed)) == [str(request.bodies)]
+    with pytest.raises(BadInput, match=r"has bodies of MJD"):
+        render_exposures._bodies(request.bodies, exposed.slice(1).set_column(0, "channel", pa.array(["VIS"])))
+    path.write_text(demo + '\n[solar_system]\nbody = "bodies.csv"\n', encoding="utf-8")
+    with pytest.raises(BadInput, match=r"solar_system.body"):
+        requests.parse(path)
