@@ -63,7 +63,8 @@ def read(file: Path, sha256: str) -> Bodies:
     hour = 24.0 * (values["mjd"] - day - 0.5)
     cell = sky.cell_of(*equatorial(values["lon"], values["lat"]), GENERATION_ORDER)
     ids = source_id(KIND, cell, np.arange(len(day)), day)
-    return Bodies(day, Population(ids, *(values[key] for key in ("lon", "lat", "east", "north", "mag")), hour=hour))
+    lon, lat, east, north, mag = (values[key] for key in ("lon", "lat", "east", "north", "mag"))
+    return Bodies(day, Population(ids, lon, lat, east, north, mag, hour))
 
 
 def check(bodies: Bodies, file: Path, mjd: Iterable[float]) -> None:

@@ -36,6 +36,21 @@ def test_the_scale_changes_by_as_much_as_the_mission_says():
     assert distortion.bent(0.0, 0.0, TERMS) == (0.0, 0.0)
 
 
+def test_it_is_a_cubic_about_the_telescope_s_axis():
+    """Seen from 0.859 deg below the field's centre: D = k r^2 r, less what shifts and scales the whole field."""
+    axis, (x, y) = 0.859 * 3600, np.meshgrid(np.linspace(-1260, 1260, 9), np.linspace(-1400, 1400, 9))
+
+    def cubic(x, y):
+        return np.stack([x, y + axis]) * (x**2 + (y + axis) ** 2)
+
+    # The cubic's own shift and scales at the centre.
+    slope = np.array([axis**2 * x, 3 * axis**2 * y])
+    wanted = cubic(x, y) - cubic(0.0, 0.0)[:, None, None] - slope
+    found = np.array(distortion.bent(x, y, TERMS)) - np.stack([x, y])
+    strength = (found * wanted).sum() / (wanted**2).sum()
+    np.testing.assert_allclose(found, strength * wanted, atol=2e-3 * np.abs(found).max())
+
+
 @given(st.sampled_from(VIS), *FIELD, st.floats(-180, 180))
 def test_the_header_s_polynomial_is_the_focal_plane_s(d, x, y, angle):
     """What a place of the focal plane sees: by the polynomial there, and by the detector's SIP."""
