@@ -37,6 +37,8 @@ _SUN_CENTRE = (1.915, 0.020)
 _PRECESSION = 1.39697 / 36525.0
 # Unit of the table of Leinert et al. 1998.
 _TABLE_UNIT = 1e-8
+# The band that the mission's scattered light is of.
+_VIS = "euclid_vis"
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
@@ -67,7 +69,9 @@ def sky_band(detector: Detector, band: str, mission: MissionConfiguration, curve
     if section in ("vis", "nisp"):
         extra = f"{section}.scattered_light" if section == "vis" else f"{section}.{band}.thermal"
         rate = mission.value(extra, "electron / (s pix)")
-        constant, stars = (0.0, rate) if section == "vis" else (rate, 0.0)
+        # Of the light that a telescope scatters a band has its part, which for flat f_nu goes with its width.
+        part = passbands.log_width(curve) / passbands.log_width(passbands.load(_VIS)) if curve else 1.0
+        constant, stars = (0.0, rate * part) if section == "vis" else (rate, 0.0)
         area = mission.value("plm.collecting_area", "m2")
         zodi = _zodiacal_integrals(curve or passbands.load(band), area, detector.pixel_scale, mission)
         return SkyBand(constant, *zodi, stars)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
-from jobs.render import focal_plane, sky
+from jobs.render import chromatic, focal_plane, sky
 from lake_schema import units
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
@@ -132,3 +132,17 @@ def test_scattered_light_has_its_mission_value_at_sixty_degrees():
     latitude = MISSION.value("env.straylight.reference_latitude", "deg")
     places = [SkyCoord(lon, latitude, unit="deg", frame="galactic").icrs for lon in np.arange(0.0, 360.0, 15.0)]
     assert np.mean([sky.starlight(p.ra.deg, p.dec.deg, MISSION) for p in places]) == pytest.approx(1.0, rel=0.02)
+
+
+def test_bands_share_the_sky_of_the_one_that_they_make_up():
+    """VIS cut into three: what each sees, its part of the scattered starlight with it, is what VIS sees."""
+    mission = resolve()
+    detector = focal_plane.detector("vis", "3-4", mission)
+    whole = passbands.load("euclid_vis")
+    rates = [
+        sky.sky_rate(sky.sky_band(detector, "own", mission, curve), 53.1, -27.8, 60905.0, mission)
+        for curve in (*chromatic.sub_bands(whole, 3), whole)
+    ]
+    # The trapezoids between the pieces are lost.
+    assert sum(rates[:3]) == pytest.approx(rates[3], rel=2e-3)
+    assert rates[3] == sky.sky_rate(sky.sky_band(detector, "euclid_vis", mission), 53.1, -27.8, 60905.0, mission)
