@@ -1,0 +1,99 @@
+"""Every kind of image that VIS takes, by the jobs: from one request and its catalogues to files in the lake."""
+
+import tomllib
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from jobs import shell
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+from jobs.render import fits_product, focal_plane, plan_exposures, render_exposures
+from jobs.request import from_table
+from lake_schema import layout, publish, read
+from tests import requests
+
+MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures)
+BLOCK = {"channels": ["VIS"], "detectors": ["3-4"]}
+SHORT = 89.52
+# Electrons above the bias in half of the pixels: the least and the most.
+KINDS = {
+    "science": (100, 250), "bias": (-4, 4), "dark": (-4, 4), "flat": (11_000, 21_000), "charge_injection": (-4, 4),
+    "self_calibration": (100, 250),
+}  # fmt: skip
+
+
+def wanted():
+    """A visit with its short exposure and closing flat, and one frame of each kind of calibration."""
+    blocks = [{**BLOCK, "fields": 1, "dither": "none"}]
+    for kind in list(KINDS)[1:]:
+        blocks.append({**BLOCK, "image_type": kind, "exposures": 1})
+        if kind == "dark":
+            blocks[-1]["exposure_time_s"] = 600.0
+    sky = requests.shallow(17.0, 12.0)
+    table = tomllib.loads(
+        requests.text(
+            f'accuracy = "draft"\n{sky}[fluxes]\nbands = ["euclid_vis"]\n', requests.FIELD.format(0.2), seed=11
+        )
+    )
+    return from_table({**table, "observation": blocks, "products": {"truth": ["saturation"]}})
+
+
+@contextmanager
+def small_detectors(side=256):
+    """Detectors of VIS cut down to their middles, two halves and what is between them."""
+    mounted = focal_plane._mounted
+
+    def smaller(*args):
+        for d in mounted(*args):
+            yield replace(d, nx=side, ny=side + d.middle)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(focal_plane, "_mounted", smaller)
+        yield
+
+
+def check(lake, rows, columns):
+    """Every frame that was asked for, of its kind, and of the quadrants' size."""
+    exposures = {row["exposure_id"]: row for row in read.version(lake, "exposures").rows().to_pylist()}
+    products = read.version(lake, "products")
+    science = [row for row in products.rows().to_pylist() if row["content"] == "science"]
+    assert len(science) == len(exposures)
+    found = set()
+    for row in science:
+        exposed = exposures[row["exposure_id"]]
+        kind = exposed["image_type"]
+        path = products.file(row["path"])
+        with fits.open(path) as units:
+            header = units[0].header
+            assert header["IMAGETYP"] == kind
+            assert header["EXPTIME"] == pytest.approx(exposed["exposure_time_s"])
+            assert header.get("LAMP") == exposed["lamp"]
+            assert [unit.shape for unit in units[1:]] == [(rows, columns)] * 4
+        least, most = KINDS[kind] if exposed["exposure_time_s"] != SHORT else (10, 40)
+        assert least < np.median(fits_product.electrons(path).data) < most
+        found.add((kind, round(exposed["exposure_time_s"])))
+    assert found == {
+        ("science", 561), ("science", 90), ("flat", 10), ("bias", 0), ("dark", 600), ("charge_injection", 0),
+        ("self_calibration", 561),
+    }  # fmt: skip
+
+
+def test_each_kind_is_planned_rendered_and_published(lake):
+    request = wanted()
+    with small_detectors():
+        for job in MODULES:
+            for step in job.steps(lake, request):
+                publish.make(lake, step.plan, step.work)
+        check(lake, 128 + 20, 51 + 128 + 29)
+
+
+@pytest.mark.nightly
+def test_by_spark_whole_detectors(spark, tmp_path):
+    root = layout.lake(tmp_path / "lake")
+    for module in MODULES:
+        shell.run(module.JOB, root, wanted())
+    check(root, 2086, 2128)
