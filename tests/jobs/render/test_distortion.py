@@ -37,8 +37,9 @@ def test_the_scale_changes_by_as_much_as_the_mission_says():
 
 
 def test_it_is_a_cubic_about_the_telescope_s_axis():
-    """Seen from 0.859 deg below the field's centre: D = k r^2 r, less what shifts and scales the whole field."""
-    axis, (x, y) = 0.859 * 3600, np.meshgrid(np.linspace(-1260, 1260, 9), np.linspace(-1400, 1400, 9))
+    """Which the field lies beside: D = k r^2 r, less what shifts and scales the whole field."""
+    axis = MISSION.value("plm.vis_field_offset_y", "arcsec")
+    x, y = np.meshgrid(np.linspace(-1260, 1260, 9), np.linspace(-1400, 1400, 9))
 
     def cubic(x, y):
         return np.stack([x, y + axis]) * (x**2 + (y + axis) ** 2)
