@@ -252,7 +252,9 @@ def add_layers(
                 y = along_y[p] * scale_y + shift_y
                 z = along_z[p] * scale_z + shift_z
                 x, y, z = x - np.floor(x), y - np.floor(y), z - np.floor(z)
-                index[p] = (int(x * n) * n + int(y * n)) * n + int(z * n)
+                # In single precision a little less than 0 is 1 above the integer below it: the last cell, none after.
+                i, j, k = min(int(x * n), n - 1), min(int(y * n), n - 1), min(int(z * n), n - 1)
+                index[p] = (i * n + j) * n + k
             one, other = weights[0, s], weights[1, s]
             for p in range(pixels):
                 found = delta[index[p]]

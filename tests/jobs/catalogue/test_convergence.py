@@ -35,6 +35,23 @@ def test_sums_are_those_of_the_cells_that_lines_of_sight_meet(box, rng):
     assert np.mean(np.abs(found - wanted) < 1e-4) > 0.99
 
 
+def test_no_cell_lies_beyond_the_last():
+    """A place so little below a side of the box that it rounds onto it is in the last cell; behind it lies no matter."""
+    n = 8
+    memory = np.full(2 * n**3, np.nan, np.float32)
+    memory[: n**3] = np.arange(n**3)
+    direction, one = np.ones((1, 3, 1024), np.float32), np.ones((1, 3), np.float32)
+    for axis in range(3):
+        shift = np.full((1, 3), 0.5, np.float32)
+        shift[0, axis] = -1e-9
+        wanted = [4, 4, 4]
+        wanted[axis] = n - 1
+        sums = np.zeros((1, 2, 1024), np.float32)
+        weights, axes = np.ones((2, 1), np.float32), np.arange(3)[None]
+        convergence.add_layers(direction, memory[: n**3], n, axes, 0.0 * one, shift, weights, sums)
+        assert np.all(sums == np.ravel_multi_index(wanted, (n, n, n)))
+
+
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_averages(box, factor):
     with ThreadPoolExecutor(2) as pool:
