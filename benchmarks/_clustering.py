@@ -20,7 +20,16 @@ import numpy.typing as npt
 from scipy import fft
 from scipy.special import j0
 
-from jobs.catalogue import density_box, halos, lightcone, luminosity_function, matching, population, satellites
+from jobs.catalogue import (
+    convergence,
+    density_box,
+    halos,
+    lightcone,
+    luminosity_function,
+    matching,
+    population,
+    satellites,
+)
 from jobs.catalogue.density_box import Box
 from jobs.catalogue.luminosity_function import Volume
 from jobs.catalogue.population import Population
@@ -34,7 +43,9 @@ Int = npt.NDArray[np.int64]
 # Blocks are cells of this order (53.7 deg2), in pixels of 6.9 arcmin; small separations are counted in one piece of
 # each, in pixels of 0.9 arcmin: DEPTH orders finer.
 BLOCK_ORDER, PIECE_ORDER, DEPTH = 3, 6, 6
-_ROWS, _NODES, _SPARSE = 512, 200, 16
+_ROWS, _SPARSE = 512, 16
+# Nodes of separations: of the pairs of a bin, and of w where it is summed.
+_NODES, _THETAS = 2000, 300
 # Shells in which the redshift distribution and the bias are taken, Mpc/h, and multipoles.
 _SHELL, _ELL_MOST = 80.0, 20_000
 # Cells a side that the power of the Gaussian field is tabulated on.
@@ -143,18 +154,38 @@ def tracers(universe: Population, order: int, block: int) -> Tracers:
 class Correlation:
     """theta[bin] deg; w against each block's own mean, and its error from the scatter of the blocks.
 
-    within : nodes[m] and their share of all pairs of a block: w averaged over them is what its own mean has taken away
+    pairs : the separations that w is an average over
     """
 
     theta: Float
     w: Float
     error: Float
-    within: tuple[Float, Float]
+    pairs: Pairs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Separations of the pairs of pixels of a block: nodes[m] deg, and the shares of pairs that have them.
+
+    of_bin : [bins, m] of the pairs of a bin;  of_pixel : [bins, m] of the pixels of these pairs with the whole block
+    of_all : [m] of all pairs of the block
+    """
+
+    nodes: Float
+    of_bin: Float
+    of_pixel: Float
+    of_all: Float
+
+    def left(self, w: Float) -> tuple[Float, Float]:
+        """w[m] at the nodes -> (w[bin], what is left of it[bin] where each pixel is held against the block's mean)."""
+        mean = self.of_bin @ w
+        return mean, mean - 2.0 * (self.of_pixel @ w) + self.of_all @ w
 
 
 def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: int, edges: Float) -> list[Correlation]:
     """w(theta) of each kind of tracer in blocks, cells of an order; or of maps of their pixels."""
-    delta = np.array([[_delta(one, order, cell) for one in given] for cell, given in blocks])
+    found = [[_delta(one, order, cell) for one in given] for cell, given in blocks]
+    delta, chance = (np.array([[pair[i] for pair in row] for row in found]) for i in range(2))
     bins, kinds = edges.size - 1, delta.shape[1]
     product, number, angle = np.zeros((len(blocks), kinds, bins)), np.zeros((len(blocks), bins)), np.zeros(bins)
     for row, (cell, _) in enumerate(blocks):
@@ -168,10 +199,11 @@ def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: 
             for kind in range(kinds):
                 both = (delta[row, kind, part, None] * delta[row, kind][None, :]).ravel()[kept]
                 product[row, kind] += np.bincount(which[kept], both, bins)
-    within = _within(order, blocks[0][0])
+    pairs = _pairs(order, blocks[0][0], edges)
+    product += chance[:, :, None] * number[:, None]
     scatter = np.std(product / number[:, None], axis=0, ddof=1) / np.sqrt(len(blocks))
     total = product.sum(0) / number.sum(0)
-    return [Correlation(angle / number.sum(0), w, error, within) for w, error in zip(total, scatter, strict=True)]
+    return [Correlation(angle / number.sum(0), w, error, pairs) for w, error in zip(total, scatter, strict=True)]
 
 
 def _separations(some: Float, every: Float, edges: Float) -> tuple[Int, Float]:
@@ -180,22 +212,35 @@ def _separations(some: Float, every: Float, edges: Float) -> tuple[Int, Float]:
     return np.searchsorted(edges, theta) - 1, theta
 
 
-def _within(order: int, cell: int) -> tuple[Float, Float]:
-    """Separations of the pairs of a block, and their shares: of every _SPARSE-th pixel against all."""
-    place = _vectors(order, cell)
-    edges = np.linspace(0.0, 3.0 * sky.cell_radius(order), _NODES + 1)
-    number = np.bincount(_separations(place[::_SPARSE], place, edges)[0] + 1, minlength=_NODES + 1)[1:]
-    return 0.5 * (edges[1:] + edges[:-1]), number / number.sum()
+def _pairs(order: int, cell: int, edges: Float) -> Pairs:
+    """Of every _SPARSE-th pixel with all."""
+    place, bins = _vectors(order, cell), edges.size - 1
+    fine = np.linspace(0.0, 3.0 * sky.cell_radius(order), _NODES + 1)
+    of_bin, of_pixel, of_all = np.zeros((bins, _NODES)), np.zeros((bins, _NODES)), np.zeros(_NODES)
+    for one in place[::_SPARSE]:
+        which, theta = _separations(one[None, :], place, edges)
+        node = np.searchsorted(fine, theta, side="right") - 1
+        every = np.bincount(node, minlength=_NODES)
+        of_all += every
+        for i in range(bins):
+            inside = node[which == i]
+            of_bin[i] += np.bincount(inside, minlength=_NODES)
+            of_pixel[i] += inside.size * every
+    shares = [part / part.sum(-1, keepdims=True) for part in (of_bin, of_pixel, of_all)]
+    return Pairs(0.5 * (fine[1:] + fine[:-1]), *shares)
 
 
-def _delta(one: Tracers | Float, order: int, cell: int) -> Float:
-    """Overdensity of the pixels. What is common to a block says nothing of its inside, and is most of the noise."""
+def _delta(one: Tracers | Float, order: int, cell: int) -> tuple[Float, float]:
+    """Overdensity of the pixels, and what n points, which are nowhere else, keep from one another: 1 / n.
+
+    What is common to a block says nothing of its inside, and is most of the noise.
+    """
     if not isinstance(one, Tracers):
-        return np.asarray(one - one.mean())
+        return np.asarray(one - one.mean()), 0.0
     pixel = sky.cell_of(one.ra, one.dec, order + DEPTH) - (cell << 2 * DEPTH)
     inside = (pixel >= 0) & (pixel < 1 << 2 * DEPTH)
     number = np.bincount(pixel[inside], minlength=1 << 2 * DEPTH)
-    return np.asarray(number / number.mean() - 1.0)
+    return np.asarray(number / number.mean() - 1.0), 1.0 / float(number.sum())
 
 
 def _vectors(order: int, cell: int) -> Float:
@@ -224,7 +269,7 @@ def shells(everything: Tracers, near: float, far: float) -> Shells:
 
 
 def limber(seen: Shells, found: Correlation, power: Callable[[Float], Float]) -> tuple[Float, Float]:
-    """w(theta) of a power P(k), and what is left of it in blocks whose means are their own."""
+    """w of a power P(k) over the pairs of each bin, and what is left of it in blocks whose means are their own."""
     ell = np.geomspace(1.0, _ELL_MOST, 400)
     k = (ell[:, None] + 0.5) / seen.chi
     c_l = np.sum(seen.wide * (seen.weight / seen.chi) ** 2 * power(k.ravel()).reshape(k.shape), 1)
@@ -232,10 +277,10 @@ def limber(seen: Shells, found: Correlation, power: Callable[[Float], Float]) ->
     # Beyond the multipoles of the smallest separation the sum ends softly.
     weight = (2 * every + 1) / (4 * np.pi) * np.interp(np.log(every), np.log(ell), c_l)
     weight *= np.exp(-((every / (0.5 * _ELL_MOST)) ** 2))
-    nodes, shares = found.within
-    theta = np.concatenate([found.theta, nodes])
+    nodes = found.pairs.nodes
+    theta = np.geomspace(nodes[0], nodes[-1], _THETAS)
     w = np.array([np.sum(weight * j0((every + 0.5) * np.radians(at))) for at in theta])
-    return w[: found.theta.size], w[: found.theta.size] - np.sum(shares * w[found.theta.size :])
+    return found.pairs.left(np.interp(np.log(nodes), np.log(theta), w))
 
 
 def structure(box: Box, order: int, cell: int, seen: Shells) -> Float:
@@ -250,7 +295,7 @@ def structure(box: Box, order: int, cell: int, seen: Shells) -> Float:
 
 
 def gaussian_power(k: Float) -> Float:
-    """P(k) of the Gaussian field, (Mpc/h)^3, without what lies between the cells of the box."""
+    """P(k) of the Gaussian field, (Mpc/h)^3, constant within the cells of the box."""
     cell = density_box.box_model().cell
     on_modes = density_box._log_power(_MODES, cell).ravel()
     length = np.sqrt(density_box._k_squared(_MODES, cell)).ravel()
@@ -260,4 +305,6 @@ def gaussian_power(k: Float) -> Float:
     at, share = (np.bincount(place, value) / number for value in (length[1:], on_modes[1:]))
     kept = at > 0
     ratio = np.interp(k, at[kept], share[kept] / density_box.linear_power(at[kept]))
+    nodes = np.geomspace(1e-3, 1.2, 40)
+    ratio *= np.interp(k, nodes, convergence.window(cell, 1, nodes))
     return np.where(k < 1.2, density_box.linear_power(k) * ratio, 0.0)

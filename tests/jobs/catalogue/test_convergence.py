@@ -36,7 +36,7 @@ def test_sums_are_those_of_the_cells_that_lines_of_sight_meet(box, rng):
 
 
 def test_no_cell_lies_beyond_the_last():
-    """A place so little below a side of the box that it rounds onto it is in the last cell; behind it lies no matter."""
+    """A place so little below a side of the box that it rounds onto it is in the last cell; behind it is no matter."""
     n = 8
     memory = np.full(2 * n**3, np.nan, np.float32)
     memory[: n**3] = np.arange(n**3)

@@ -4,6 +4,7 @@ A few cells hold a few structures: here every tolerance is as wide as the list s
 """
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -102,9 +103,27 @@ def test_uniform_points_are_not_correlated(coarse, rng):
     (found,) = clustering.correlation(blocks, order, edges)
     assert np.all((found.theta > edges[:-1]) & (found.theta < edges[1:]))
     assert np.abs(found.w).max() < 2e-3
-    nodes, shares = found.within
-    assert np.sum(shares) == pytest.approx(1.0)
-    assert 3.0 < np.sum(nodes * shares) < 5.0
+    pairs = found.pairs
+    assert 3.0 < pairs.nodes @ pairs.of_all < 5.0
+    assert pairs.of_bin @ pairs.nodes == pytest.approx(found.theta, rel=0.03)
+
+
+def test_what_the_mean_of_a_block_takes_away(coarse):
+    """Against the covariance of all its pixels, each less the mean."""
+    edges, order, cell = np.array([0.6, 1.0, 2.0]), clustering.BLOCK_ORDER, 100
+    pairs = clustering._pairs(order, cell, edges)
+    place = clustering._vectors(order, cell)
+    theta = np.degrees(np.arccos(np.clip(place @ place.T, -1.0, 1.0)))
+    many = len(place)
+    less = np.eye(many) - 1.0 / many
+    left = less @ np.exp(-theta) @ less
+    found, wanted = pairs.left(np.exp(-pairs.nodes)), []
+    for first, last in pairwise(edges):
+        inside = (theta > first) & (theta < last)
+        wanted.append((np.exp(-theta[inside]).mean(), left[inside].mean()))
+    assert np.transpose(found) == pytest.approx(np.array(wanted), rel=0.02)
+    # A pixel that has neighbours at a separation lies further inside than most: the mean of all pairs takes too little.
+    assert np.all(found[1] < found[0] - pairs.of_all @ np.exp(-pairs.nodes))
 
 
 def test_points_of_a_dense_half_are_correlated(coarse, rng):
