@@ -31,8 +31,8 @@ COLUMNS = (
     "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index",
 )  # fmt: skip
 HALO_COLUMNS = ("z_true", "log_mass")
-# Of I_E behind E(B - V) = 0.02 of the Milky Way, mag: a galaxy at high latitude.
-DUST = 2.27 * 0.02
+# Of I_E and of i behind E(B - V) = 0.02 of the Milky Way, mag: a galaxy at high latitude.
+DUST, I_DUST = 2.27 * 0.02, 2.10 * 0.02
 # Limits of the i band whose observed counts are known.
 I_LIMITS = (20, 21, 22, 23, 24, 25, 26)
 HALPHA_LIMITS, HALPHA_SHELLS = (5e-17, 1e-16, 2e-16, 3e-16), ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0))
@@ -123,6 +123,7 @@ def counts(census: Census) -> dict[str, float]:
     vis, i_band, z = census.mags["euclid_vis"], census.mags["lsst_i"], census.rows["z_true"]
     found = {f"vis_{limit}": census.per_deg2(vis < limit) / ARCMIN2 for limit in (24.5, 26.0)}
     found |= {f"i_{limit}": census.per_deg2(i_band < limit) / ARCMIN2 for limit in I_LIMITS}
+    found |= {f"i_{limit}_behind_dust": census.per_deg2(i_band < limit - I_DUST) / ARCMIN2 for limit in I_LIMITS}
     found["vis_24.5_behind_dust"] = census.per_deg2(vis < 24.5 - DUST) / ARCMIN2
     bright = vis < 24.5
     number = [np.sum(np.abs(vis - at) < 0.5) for at in (20, 21, 22, 23)]

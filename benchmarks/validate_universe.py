@@ -1,6 +1,6 @@
 """Is the universe what it should be: python -m benchmarks.validate_universe [--quick] [--json FILE] [--figures FOLDER].
 
-Galaxies of blocks spread over the sky, drawn at the settings that a request has by default, are counted and measured;
+Galaxies of cells spread over the sky, drawn at the settings that a request has by default, are counted and measured;
 halos and the galaxies of massive ones over hundreds of deg2 are correlated; the lensing maps are compared with linear
 theory in several boxes, the stars with published counts.  Each figure that validate_universe.csv has an expectation of
 is printed with it and with PASS or FAIL.
@@ -80,7 +80,7 @@ class Size:
     stars: int
 
 
-FULL = Size(Universe(), 32, 1, 8, 8, 3, 16, (8, 9), 12)
+FULL = Size(Universe(), 160, 0, 8, 20, 3, 16, (8, 9), 12)
 QUICK = Size(Universe(box_cells=192, lensing_nside=64), 4, 0, 0, 2, 0, 0, (), 0)
 
 

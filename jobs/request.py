@@ -107,6 +107,8 @@ class Universe:
 
     galaxy_limit, galaxy_band : faintest magnitude (AB, before the Milky Way's dust and intergalactic hydrogen), in
                                which of the embedded passbands
+                               which of the embedded passbands; another limit draws its cells anew: a shallow request
+                               has as many bright galaxies as a deep one has, not the same
     star_limit               : H (Vega, as observed);  z_max : highest redshift
     box_cells                : cells of 4 Mpc/h a side of the box of matter
     lensing_nside            : HEALPix resolution of the lensing maps

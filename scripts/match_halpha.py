@@ -35,7 +35,7 @@ CM_PER_MPC = 3.0856775814913673e24
 def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
     """(z, raw log L) of galaxies with I_E < LIMIT in so many cells' area."""
     universe = galaxies.model(SEED, LIMIT, Z_MAX, BOX_CELLS, 64)
-    flat = replace(universe.population.halos, x=np.zeros_like(universe.population.halos.x))
+    flat = replace(universe.population.halos, amplitude=np.zeros_like(universe.population.halos.amplitude))
     lines = emission_lines.unmatched(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
     found = []
     for cell in range(0, cells * 5000, 5000):

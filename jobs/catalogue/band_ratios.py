@@ -47,7 +47,10 @@ class Sed:
     ebv: Float
 
     def part(self, keep: npt.NDArray[np.generic]) -> Sed:
-        """The galaxies that are kept."""
+        """The galaxies that are kept.
+
+        keep : bool or int[m] rows
+        """
         return Sed(
             self.template_1[keep],
             self.frac_1[keep],
@@ -124,7 +127,10 @@ def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatio
 
 
 def dusty(library: Library, ebv: Float) -> Float:
-    """Transmission of laws 1 .. 4 at each E(B-V), [4, e, lambda] on the library's wavelengths."""
+    """Transmission of laws 1 .. 4 at each E(B-V), [4, e, lambda] on the library's wavelengths.
+
+    ebv : float[e] mag
+    """
     k = extinction.laws(library.wavelength)[1:]
     return np.asarray(extinction.transmitted(k[:, None, :], ebv[None, :, None]), float)
 
@@ -153,7 +159,10 @@ def _band_flux(library: Library, dust: Float, spectra: Float, weights: Float) ->
 
 
 def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -> Float:
-    """ln(ratio)[n], linear in ln(1 + z), polynomial in E(B-V); law 0 has no dust."""
+    """ln(ratio)[n], linear in ln(1 + z), polynomial in E(B-V); law 0 has no dust.
+
+    z, ebv : float[n] redshift, E(B-V) mag;  template, law : int[n]
+    """
     step = np.log1p(z) / _STEP
     row = np.clip(step.astype(np.int64), 0, table.values.shape[0] - 2)
     part = (step - row)[:, None]
@@ -163,7 +172,10 @@ def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -
 
 
 def ebv_weights(nodes: Float, ebv: Float) -> Float:
-    """Lagrange weights [n, e] of the nodes at E(B-V)[n]."""
+    """Lagrange weights [n, e] of the nodes at E(B-V)[n].
+
+    nodes : float[e] mag;  ebv : float[n] mag
+    """
     weights = np.ones((ebv.size, nodes.size))
     for i, at in enumerate(nodes):
         for j, other in enumerate(nodes):
@@ -173,7 +185,10 @@ def ebv_weights(nodes: Float, ebv: Float) -> Float:
 
 
 def offset(table: BandRatios, z: Float, sed: Sed) -> Float:
-    """m_b - M_r - DM(z) [n] mag of two-component spectra."""
+    """m_b - M_r - DM(z) [n] mag of two-component spectra.
+
+    z : float[n];  sed : n spectra
+    """
     one = np.exp(ln_ratio(table, z, sed.template_1, sed.law, sed.ebv))
     two = np.exp(ln_ratio(table, z, sed.template_2, sed.law, sed.ebv))
     return np.asarray(-2.5 * np.log10(sed.frac_1 * one + sed.frac_2 * two))

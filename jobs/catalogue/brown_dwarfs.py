@@ -64,7 +64,10 @@ def brown_dwarfs(boost: float) -> BrownDwarfs:
 
 
 def numbers(dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float) -> Float:
-    """Dwarfs[n] of cells before their dust; arguments as milky_way.numbers."""
+    """Dwarfs[n] of cells before their dust; arguments as milky_way.numbers.
+
+    lon, lat : float[n] deg, Galactic;  area : deg2;  h_limit : float[n] mag, Vega
+    """
     total = np.zeros(lon.size)
     for limit in np.unique(h_limit):
         chosen = np.flatnonzero(h_limit == limit)

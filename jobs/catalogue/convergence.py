@@ -59,6 +59,7 @@ class Layers:
     weight: Float
 
     def part(self, cut: slice) -> Layers:
+        """The layers of a cut."""
         return Layers(*(getattr(self, field.name)[cut] for field in fields(self)))
 
 
@@ -111,6 +112,7 @@ def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stre
     """sqrt(C_l of linear theory / C_l of the box), [p, l_max + 1], at most 2; arguments as of `convergence`.
 
     Both by Limber's approximation, which holds for the ratio where it matters: it is 1 for small l.
+    chi : float[p] Mpc/h, ascending
     Error: 5 % in power for l < nside and z > 0.4 (tests)
     """
     slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
@@ -148,6 +150,7 @@ def window(cell: float, factor: int, k: Float) -> Float:
 
     Modes up to the highest of the cells' lattice, and the images of them that constant cubes make; averaged over
     directions.
+    cell : Mpc/h;  factor : cells a side;  k : float[n] h/Mpc
     """
     wide = cell * factor
     number = np.arange(_DIRECTIONS) + 0.5

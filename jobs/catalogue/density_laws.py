@@ -83,7 +83,10 @@ Law = Exponential | PowerLaw | Aged | Young | Parabolic | CoredPowerLaw
 
 
 def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike) -> Float:
-    """Density at R, z (broadcast) relative to the one at the Sun, never negative."""
+    """Density at R, z (broadcast) relative to the one at the Sun, never negative.
+
+    radius, height : float[...] pc, galactocentric
+    """
     r, z = np.asarray(radius, float), np.asarray(height, float)
     at_sun = _log(law, np.asarray(sun.radius), np.asarray(sun.height))
     # A difference of logarithms: far out the densities themselves are not numbers any more.

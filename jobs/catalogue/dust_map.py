@@ -80,7 +80,10 @@ def embedded(seed: int, model: Cosecant) -> npt.NDArray[np.float32]:
 
 
 def a_v(sky_map: npt.NDArray[np.float32], ra: Float, dec: Float) -> Float:
-    """A(V)[n] mag at ICRS positions, deg, bilinear between the map's pixels."""
+    """A(V)[n] mag at ICRS positions, deg, bilinear between the map's pixels.
+
+    sky_map : float32[pixel] mag, RING, Galactic;  ra, dec : float[n] deg
+    """
     lon, lat = galactic(ra, dec)
     return np.asarray(hp.get_interp_val(sky_map, lon, lat, lonlat=True), float)
 
@@ -95,7 +98,10 @@ def a_v_at(to_infinity: Float, distance: Float, b: npt.ArrayLike, dust: Layer, s
 
 
 def load(seed: int) -> npt.NDArray[np.float32]:
-    """The embedded map of a seed, from the cache or made now (1 s)."""
+    """The embedded map of a seed, from the cache or made now (1 s).
+
+    returns : float32[pixel] A(V) mag, RING, Galactic
+    """
     model = cosecant()
     key = content_key(Path(__file__).read_bytes(), version("healpy"), seed, *astuple(model))
     return cached_arrays("dust_map", key, lambda: {"a_v": embedded(seed, model)})["a_v"]
@@ -112,7 +118,10 @@ def facts(own: DustMap | None) -> dict[str, Any]:
 
 
 def chosen(seed: int, own: DustMap | None) -> npt.NDArray[np.float32]:
-    """Map of A(V), RING and Galactic, of a request's file (from the cache or read now), or the embedded one."""
+    """Map of A(V), RING and Galactic, of a request's file (from the cache or read now), or the embedded one.
+
+    returns : float32[pixel] mag
+    """
     if own is None:
         return load(seed)
     key = content_key(Path(__file__).read_bytes(), version("healpy"), canonical(facts(own)))
@@ -122,6 +131,7 @@ def chosen(seed: int, own: DustMap | None) -> npt.NDArray[np.float32]:
 def read(own: DustMap) -> npt.NDArray[np.float32]:
     """A map of others as ours are: A(V), RING, Galactic, not finer than the embedded one.
 
+    returns : float32[pixel] mag
     Errors: BadInput names the file, and what is missing or wrong: ordering, coordinates, or the row of a pixel
     """
     values, cards = read_map(own.file, own.column)

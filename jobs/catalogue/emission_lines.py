@@ -104,7 +104,10 @@ def model(matching: Path = MATCHING) -> LineModel:
 
 
 def unmatched(z: Float, log_l: Float, shift: Float) -> LineModel:
-    """The lines with a table of one's own; a shift of nothing leaves H alpha as it is drawn."""
+    """The lines with a table of one's own; a shift of nothing leaves H alpha as it is drawn.
+
+    z : float[r];  log_l : float[l] log10 erg/s;  shift : float[r, l] dex
+    """
     return LineModel(
         Halpha(**parameters.section(_FILE, "halpha")),
         Ratios(**parameters.section(_FILE, "ratios")),
@@ -116,13 +119,20 @@ def unmatched(z: Float, log_l: Float, shift: Float) -> LineModel:
 
 
 def raw_halpha(law: Halpha, dust: float, log_sfr: Float, ebv: Float, rng: np.random.Generator) -> Float:
-    """log10 of the observed H alpha luminosity[n], erg/s.  Ref: Kennicutt 1998"""
+    """log10 of the observed H alpha luminosity[n], erg/s.
+
+    log_sfr : float[n] log10 Msun/yr, Salpeter;  ebv : float[n] mag, internal;  dust : k(H alpha)
+    Ref: Kennicutt 1998
+    """
     intrinsic = log_sfr - np.log10(law.sfr_per_luminosity) + law.scatter * rng.standard_normal(log_sfr.size)
     return np.asarray(intrinsic - 0.4 * dust * ebv / law.stellar_to_gas)
 
 
 def matched(lines: LineModel, z: Float, log_l: Float) -> Float:
-    """log10 L[n] with the observed abundance; bilinear in z and log L, held at the table's edges."""
+    """log10 L[n] with the observed abundance; bilinear in z and log L, held at the table's edges.
+
+    z : float[n];  log_l : float[n] log10 erg/s
+    """
     row, part = _bracket(lines.z, z)
     column, share = _bracket(lines.log_l, log_l)
     low = lines.shift[row, column] * (1.0 - share) + lines.shift[row, column + 1] * share
@@ -135,7 +145,8 @@ def fluxes(
 ) -> dict[str, Float]:
     """Flux[n] of the primary component of each line, erg s-1 cm-2, before magnification and the Milky Way.
 
-    z : true redshift;  log_mass : log10 M* / Msun;  log_sfr : log10 SFR, Salpeter;  ebv : internal E(B-V)
+    z : float[n] true redshift;  log_mass, log_sfr : float[n] log10 Msun, log10 Msun/yr (Salpeter)
+    red : bool[n] on the red sequence;  ebv : float[n] mag, internal
     """
     law, ratios, n = lines.halpha, lines.ratios, z.size
     observed = matched(lines, z, raw_halpha(law, lines.dust["halpha"], log_sfr, ebv, rng))
@@ -162,6 +173,7 @@ def fluxes(
 def expected_counts(flux: Float, near: float, far: float) -> Float:
     """Galaxies[n] per deg2 above H alpha fluxes[n], erg s-1 cm-2, between two redshifts.
 
+    flux : float[n] erg s-1 cm-2
     Ref: Pozzetti et al. 2016, A&A 590, A3, model 3, in the cosmology of that paper
     """
     law = Pozzetti(**parameters.section(_FILE, "pozzetti"))

@@ -60,13 +60,19 @@ def ab_minus_vega() -> tuple[float, ...]:
 
 
 def completeness(g: npt.ArrayLike) -> Float:
-    """Part of the stars[n] of a magnitude G (Vega) that is listed."""
+    """Part of the stars[n] of a magnitude G (Vega) that is listed.
+
+    g : float[n] mag, Vega
+    """
     law = parameters.section(_FILE, "completeness")
     return np.asarray(0.5 * erfc((np.asarray(g, float) - law["half"]) / (np.sqrt(2.0) * law["width"])))
 
 
 def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
-    """Standard errors[n] of right ascension times cos(dec), declination and parallax, mas, at G (Vega)."""
+    """Standard errors[n] of right ascension times cos(dec), declination and parallax, mas, at G (Vega).
+
+    g : float[n] mag, Vega
+    """
     law = parameters.section(_FILE, "astrometry")
     z = 10.0 ** (0.4 * (np.maximum(np.asarray(g, float), law["bright"]) - 15.0))
     parallax = 1e-3 * law["scale"] * np.sqrt(law["c0"] + law["c1"] * z + law["c2"] * z**2)

@@ -106,6 +106,8 @@ def model(
     """The embedded universe of a seed: its galaxies brighter than a limit in a band, and with z < z_max.
 
     light_cone, training : halos and observed galaxies of others, in place of ours
+    The matter is the same to any limit, halos and galaxies are drawn anew for each: those that are brighter than a
+    shallow limit are as many in a deeper universe, not the same.
     1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
     """
     library, colours = templates.galaxy_library(), sed_assignment.colours_model()
@@ -159,7 +161,7 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.fl
     """Table `galaxies` of one order-8 cell, sorted by _healpix_29.
 
     cells : what has been drawn of the universe's population
-    dust  : map of the Milky Way's A(V) (jobs.catalogue.dust_map)
+    dust  : float32[pixel] mag, map of the Milky Way's A(V) (jobs.catalogue.dust_map)
     """
     seed = universe.population.seed
     people = population.members(cells, cell)
@@ -205,7 +207,10 @@ def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
 
 
 def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed) -> Drawn:
-    """The galaxies brighter than the limit, with their realised colours."""
+    """The galaxies brighter than the limit, with their realised colours.
+
+    z, m_r : float[n] redshift, M_r mag;  red : bool[n] on the red sequence;  sed : n spectra
+    """
     row = np.flatnonzero(apparent(universe, z, m_r, sed) < universe.limit)
     kept = sed.part(row)
     return Drawn(row, z[row], m_r[row], red[row], sed_assignment.colours(universe.colour, kept), kept)
@@ -214,6 +219,7 @@ def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed) -> 
 def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
     """Magnitude[n] in the limit's band, AB, unmagnified, before intergalactic hydrogen and the Milky Way's dust.
 
+    z, m_r : float[n] redshift, M_r mag;  sed : n spectra
     Error: < 0.001 mag (tests/jobs/catalogue/test_band_ratios)
     """
     return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)

@@ -89,6 +89,7 @@ class Halos:
     number: Int
 
     def part(self, keep: npt.NDArray[np.generic]) -> Halos:
+        """The halos that are kept: keep : bool or int[m] rows."""
         return Halos(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
@@ -161,7 +162,10 @@ def draw(halos: HaloModel, seed: int, order: int, cell: int) -> Halos:
 
 
 def levels(wide: Float) -> Int:
-    """Order of the cells that draw a halo whose radius spans this angle, rad; -1 where it spans more than any."""
+    """Order of the cells that draw a halo whose radius spans this angle, rad; -1 where it spans more than any.
+
+    wide : float[...] rad
+    """
     level = np.full(wide.shape, -1)
     for order in sorted(LEVELS):
         level[wide < reach(order)] = order

@@ -71,7 +71,10 @@ def model(galaxy_boost: float = 1.0, quasar_boost: float = 1.0) -> tuple[Kind, .
 
 
 def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: npt.NDArray[np.float32]) -> pa.Table:
-    """Rows of one kind in a generation cell, sorted by _healpix_29."""
+    """Rows of one kind in a generation cell, sorted by _healpix_29.
+
+    dust : float32[pixel] map of A(V), mag (jobs.catalogue.dust_map)
+    """
     rng = stream(seed, _STREAM[kind.code], cell)
     n = int(rng.poisson(kind.boost * kind.per_deg2 * sky.cell_area(GENERATION_ORDER)))
     at = np.searchsorted(np.cumsum(kind.counts), rng.random(n) * kind.per_deg2, side="right")
@@ -109,7 +112,10 @@ def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: npt.NDArray[np.
 
 
 def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:
-    """dn/dM, Mpc^-3 mag^-1."""
+    """dn/dM, Mpc^-3 mag^-1.
+
+    m : float[...] absolute ultraviolet AB mag;  z : float[...]
+    """
     since = z - 6.0
     if code == QUASAR:
         x = 0.4 * (m - numbers["m_star"])

@@ -88,7 +88,10 @@ def model(seed: int, columns: Columns, given: Split) -> IngestModel:
 
 
 def draw(cell: int, given: Given, universe: IngestModel, dust: npt.NDArray[np.float32]) -> pa.Table:
-    """Table `galaxies` of one order-8 cell; given : jobs.catalogue.ingest.rows."""
+    """Table `galaxies` of one order-8 cell; given : jobs.catalogue.ingest.rows.
+
+    dust : float32[pixel] map of A(V), mag (jobs.catalogue.dust_map)
+    """
     if not given or not given["index"].size:
         return GALAXIES.empty()
     n, rng = given["index"].size, _streams(universe.seed, cell)

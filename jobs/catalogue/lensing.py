@@ -89,7 +89,10 @@ def load(box: Box, nside: int, far: bool = False) -> Planes:
 
 
 def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
-    """[5, n] kappa, gamma1, gamma2, deflection east, north (rad) of sources at chi[n] Mpc/h."""
+    """[5, n] kappa, gamma1, gamma2, deflection east, north (rad) of sources at chi[n] Mpc/h.
+
+    ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
+    """
     pixel, weight = hp.get_interp_weights(planes.nside, ra, dec, nest=True, lonlat=True)
     node = np.concatenate([[0.0], planes.chi])
     upper = np.clip(np.searchsorted(node, chi, side="right"), 1, planes.chi.size)
@@ -106,7 +109,10 @@ def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
 
 
 def columns(planes: Planes, ra: Float, dec: Float, chi: Float) -> dict[str, Float]:
-    """Observed positions and lensing of sources as columns of table `galaxies`."""
+    """Observed positions and lensing of sources as columns of table `galaxies`.
+
+    ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
+    """
     kappa, gamma1, gamma2, east, north = at(planes, ra, dec, chi)
     ra_lensed, dec_lensed = displaced(ra, dec, east, north)
     shear = {"kappa": kappa, "gamma1": gamma1, "gamma2": gamma2}
@@ -114,7 +120,10 @@ def columns(planes: Planes, ra: Float, dec: Float, chi: Float) -> dict[str, Floa
 
 
 def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, Float]:
-    """Positions moved along great circles by (east, north) rad; all [n], ra, dec deg."""
+    """Positions moved along great circles by (east, north) rad; all [n], ra, dec deg.
+
+    ra, dec : float[n] deg;  east, north : float[n] rad
+    """
     angle = np.hypot(east, north)
     # sin(angle) / angle without the division by zero.
     ratio = np.sinc(angle / np.pi)
@@ -127,13 +136,17 @@ def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, 
 
 
 def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> npt.NDArray[np.bool_]:
-    """Sources[n] that weak lensing cannot describe: at a caustic, or beyond it."""
+    """Sources[n] that weak lensing cannot describe: at a caustic, or beyond it.
+
+    kappa, gamma1, gamma2 : float[n];  caustic : least determinant that is described
+    """
     return np.asarray((sources.determinant(kappa, gamma1, gamma2) < caustic) | (kappa >= 1.0))
 
 
 def transform(kappa: Float32, nside: int, gain: Float) -> Float32:
     """Convergence, shear and deflection, float32[12 nside^2, 5] nested, of a map whose kappa_lm are gain[l] as large.
 
+    kappa : float32[12 nside^2], nested;  gain : float[l_max + 1]
     Ref: Hu 2000, eqs. 35 and 36
     """
     top = gain.size - 1

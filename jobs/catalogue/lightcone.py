@@ -53,11 +53,12 @@ class Steps:
 
     @property
     def middle(self) -> Float:
+        """float[s] Mpc/h."""
         return 0.5 * (self.edge[1:] + self.edge[:-1])
 
     @property
     def volume(self) -> Float:
-        """(Mpc/h)^3 a steradian."""
+        """float[s] (Mpc/h)^3 a steradian."""
         return np.asarray((self.edge[1:] ** 3 - self.edge[:-1] ** 3) / 3.0)
 
 
@@ -84,6 +85,7 @@ class Distances:
     z: Float
 
     def redshift(self, chi: npt.ArrayLike) -> Float:
+        """Redshift[n] of chi : float[n] Mpc/h."""
         return np.asarray(np.interp(np.asarray(chi, float), self.chi, self.z))
 
 
@@ -127,7 +129,10 @@ def steps(cell: float, near: float, far: float, table: Distances) -> Steps:
 
 
 def voxels(box: Box, turned: Replicas, line: Steps, order: int, cell: int, used: npt.NDArray[np.bool_]) -> Voxels:
-    """Voxels of a nested cell, in the steps that are used (bool[s])."""
+    """Voxels of a nested cell, in the steps that are used (bool[s]).
+
+    order, cell : of the nested cell;  used : bool[s]
+    """
     wanted = np.ceil(np.log2(np.maximum(_SIDE * line.middle / (_WIDEST * box.model.cell), 1.0)))
     orders = np.maximum(wanted.astype(np.int64), order)
     pieces: list[tuple[Int, Int, Int, Float]] = []

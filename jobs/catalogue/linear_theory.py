@@ -29,13 +29,17 @@ _Z_COARSE, _COARSE = 7, 20
 
 
 def power(k: Float) -> Float:
-    """P(k)[n] at z = 0, (Mpc/h)^3; k h/Mpc."""
+    """P(k)[n] at z = 0, (Mpc/h)^3; k h/Mpc.
+
+    k : float[n] h/Mpc
+    """
     return np.asarray(_universe().matterPowerSpectrum(k, 0.0, model=_POWER), float)
 
 
 def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
     """Tables of halos of M_200m, log_mass[m] log10 Msun/h.
 
+    log_mass : float[m] log10 Msun/h;  z : float[z]
     density       : [len(z), m] dn/dlog10 M, comoving (Mpc/h)^-3
     bias          : [len(z), m]
     concentration : [_Z_COARSE, m] c_200m, at redshifts uniform in ln(1 + z) over the same range

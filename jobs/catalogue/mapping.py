@@ -85,6 +85,7 @@ class Field:
     beside: bool = False
 
     def titles(self) -> list[str]:
+        """Columns of the file that the field is made of."""
         return [title for title in (self.column, self.minus, self.over) if title]
 
 
@@ -100,6 +101,7 @@ class Columns:
     seen_over_v: float | None = None
 
     def titles(self, beside: bool) -> list[str]:
+        """Columns of the file that are read; beside : of the file beside it."""
         found = [title for field in self.fields.values() if field.beside is beside for title in field.titles()]
         return list(dict.fromkeys(found))
 

@@ -64,23 +64,36 @@ class Masses:
     shape: HaloShape
 
     def interpolate(self, table: Float, z: Float, log_mass: Float) -> Float:
-        """[len(z), len(log_mass)], linear in ln(1 + z) and log10 M."""
+        """[len(z), len(log_mass)], linear in ln(1 + z) and log10 M.
+
+        table : float[z nodes, masses];  z : float[a];  log_mass : float[b] log10 Msun/h
+        """
         row, part = _place(z, table.shape[0])
         column, share = _column(log_mass, self.log_mass)
         along = table[:, column] * (1.0 - share) + table[:, column + 1] * share
         return np.asarray(along[row] * (1.0 - part)[:, None] + along[row + 1] * part[:, None])
 
     def at(self, table: Float, z: Float, log_mass: Float) -> Float:
-        """[n] of pairs (z[n], log_mass[n])."""
+        """[n] of pairs (z[n], log_mass[n]).
+
+        table : float[z nodes, masses];  z, log_mass : float[n] redshift, log10 Msun/h
+        """
         return _pairs(table, self.log_mass, z, log_mass)
 
     def radius(self, log_mass: Float) -> Float:
-        """R_200m[n], comoving Mpc/h."""
+        """R_200m[n], comoving Mpc/h.
+
+        log_mass : float[n] log10 Msun/h
+        """
         density = self.shape.overdensity * cosmology.OMEGA_M * self.shape.critical_density
         return np.asarray(np.cbrt(3.0 * 10.0**log_mass / (4.0 * np.pi * density)))
 
     def dispersion(self, log_mass: Float, z: Float) -> Float:
-        """One-dimensional velocity dispersion[n] of satellites, km/s.  Ref: Evrard et al. 2008"""
+        """One-dimensional velocity dispersion[n] of satellites, km/s.
+
+        log_mass : float[n] log10 Msun/h;  z : float[n]
+        Ref: Evrard et al. 2008
+        """
         mass = self.shape.critical * cosmology.expansion_rate(z) * 10.0 ** (log_mass - 15.0)
         return np.asarray(self.shape.sigma_15 * mass**self.shape.slope)
 
@@ -94,11 +107,17 @@ class Matching:
     occupation: Occupation
 
     def magnitude(self, z: Float, proxy: Float) -> Float:
-        """M_r[n] of log10 proxy masses[n]."""
+        """M_r[n] of log10 proxy masses[n].
+
+        z : float[n];  proxy : float[n] log10 Msun/h
+        """
         return _pairs(self.m_r, self.log_mass, z, proxy)
 
     def mass_of(self, z: Float, m_r: Float) -> Float:
-        """log10 of the proxy mass[n] of galaxies of M_r[n]."""
+        """log10 of the proxy mass[n] of galaxies of M_r[n].
+
+        z : float[n];  m_r : float[n] mag
+        """
         row, part = _place(z, self.m_r.shape[0])
         curves = self.m_r[row] * (1.0 - part)[:, None] + self.m_r[row + 1] * part[:, None]
         return np.array([np.interp(-m, -curve, self.log_mass) for m, curve in zip(m_r, curves, strict=True)])
@@ -142,7 +161,10 @@ def proxies(halos: Masses, occupation: Occupation) -> Float:
 
 
 def satellites_above(log_mass: Float, occupation: Occupation) -> Float:
-    """Mean number of satellites above m[i] in a halo of mass M[j], [i, j]."""
+    """Mean number of satellites above m[i] in a halo of mass M[j], [i, j].
+
+    log_mass : float[m] log10 Msun/h, of halos and of sub-masses
+    """
     over = 10.0 ** (log_mass[None, :] - log_mass[:, None])
     return np.asarray(np.maximum(over - occupation.least, 0.0) / occupation.ratio)
 

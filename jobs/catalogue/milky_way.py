@@ -140,7 +140,10 @@ def _besancon() -> tuple[Sun, tuple[Component, ...]]:
 
 
 def cylindrical(galaxy: MilkyWay, lon: npt.ArrayLike, lat: npt.ArrayLike, distance: Float) -> tuple[Float, Float]:
-    """Galactocentric R, z pc at heliocentric distances along Galactic (l, b) deg, all of them broadcast."""
+    """Galactocentric R, z pc at heliocentric distances along Galactic (l, b) deg, all of them broadcast.
+
+    lon, lat : float[...] deg;  distance : float[...] pc
+    """
     l_rad, b_rad = np.radians(lon), np.radians(lat)
     across = distance * np.cos(b_rad)
     r = np.hypot(galaxy.sun.radius - across * np.cos(l_rad), across * np.sin(l_rad))
@@ -192,7 +195,10 @@ def _seen(galaxy: MilkyWay, h_limit: float) -> npt.NDArray[np.bool_]:
 
 
 def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> Sample:
-    """Poisson sample of `expected` numbers; uniform in volume within a shell and in M_H within a bin."""
+    """Poisson sample of `expected` numbers; uniform in volume within a shell and in M_H within a bin.
+
+    mean : float[p, s, b]
+    """
     drawn = _boxes(mean, rng)
     population, shell, m_bin = np.unravel_index(drawn, mean.shape)
     distance = _distance(galaxy, shell, rng)
@@ -203,7 +209,10 @@ def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> Sample:
 
 
 def in_shells(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> tuple[Int, Float]:
-    """Poisson sample of expected numbers [k, s] of k kinds: kind[n], distance[n] pc, uniform in volume in a shell."""
+    """Poisson sample of expected numbers [k, s] of k kinds: kind[n], distance[n] pc, uniform in volume in a shell.
+
+    mean : float[k, s]
+    """
     kind, shell = np.unravel_index(_boxes(mean, rng), mean.shape)
     return np.asarray(kind), _distance(galaxy, shell, rng)
 
@@ -224,7 +233,10 @@ def _distance(galaxy: MilkyWay, shell: Int, rng: np.random.Generator) -> Float:
 
 
 def metallicity(galaxy: MilkyWay, component: Int, rng: np.random.Generator) -> Float:
-    """[M/H][n], dex."""
+    """[M/H][n], dex.
+
+    component : int[n]
+    """
     law = galaxy.metallicity
     mean, scatter = np.array(law.mean)[component], np.array(law.scatter)[component]
     return np.clip(mean + scatter * rng.standard_normal(component.size), *law.limits)

@@ -120,6 +120,7 @@ def half_light_radius(
 ) -> Float:
     """Half-light semi-major axis[n] of the total light, arcsec.
 
+    z : float[n];  red : bool[n] on the red sequence
     log_stellar_mass : [n] log10 Msun (h = 0.67); kpc_per_arcsec : [n] proper
     Ref: van der Wel et al. 2014
     """
@@ -138,7 +139,10 @@ def _at(size: Size, values: tuple[float, ...], z: Float) -> Float:
 
 
 def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: np.random.Generator) -> Float:
-    """Flux of the bulge / total, [n] in [0, 1]."""
+    """Flux of the bulge / total, [n] in [0, 1].
+
+    log_stellar_mass : float[n] log10 Msun;  red : bool[n]
+    """
     mean = np.clip(bulge.late_mean + bulge.late_rate * (log_stellar_mass - bulge.late_pivot), *bulge.late_limits)
     a = np.where(red, bulge.early_a, bulge.late_concentration * mean)
     b = np.where(red, bulge.early_b, bulge.late_concentration * (1.0 - mean))
@@ -146,13 +150,19 @@ def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: np.ran
 
 
 def sersic_index(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
-    """Sersic index[n] of the bulge."""
+    """Sersic index[n] of the bulge.
+
+    red : bool[n] on the red sequence
+    """
     log_n = np.log10(np.where(red, bulge.early_sersic, bulge.late_sersic))
     return np.clip(10.0 ** (log_n + bulge.sersic_scatter * rng.standard_normal(red.size)), *bulge.sersic_limits)
 
 
 def radius_ratio(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
-    """Half-light radius of the bulge / that of the disc, [n]."""
+    """Half-light radius of the bulge / that of the disc, [n].
+
+    red : bool[n] on the red sequence
+    """
     log_ratio = np.where(red, bulge.early_log_ratio, bulge.late_log_ratio)
     return np.clip(10.0 ** (log_ratio + bulge.log_ratio_scatter * rng.standard_normal(red.size)), *bulge.ratio_limits)
 
@@ -160,6 +170,7 @@ def radius_ratio(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
 def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float, sersic: Float) -> tuple[Float, Float]:
     """Half-light radii of bulge[n] and disc[n] whose summed light has the half-light radius `radius`[n].
 
+    radius : float[n] arcsec, or any length, as what is returned
     fraction : bulge / total; ratio : bulge radius / disc radius; sersic : index of the bulge
     Error: the light within `radius` is 0.5 to 0.005 (tests/jobs/catalogue/test_morphology)
     """
@@ -174,7 +185,11 @@ def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float,
 
 
 def light_within(r: npt.ArrayLike, half_light: npt.ArrayLike, sersic: npt.ArrayLike) -> Float:
-    """Fraction of a Sersic profile's light within r.  Ref: Graham & Driver 2005, PASA 22, 118"""
+    """Fraction of a Sersic profile's light within r.
+
+    r, half_light : float[...] of the same unit;  sersic : float[...] index
+    Ref: Graham & Driver 2005, PASA 22, 118
+    """
     n = np.asarray(sersic, float)
     return _light(np.asarray(r, float) / np.asarray(half_light, float), n, gammaincinv(2.0 * n, 0.5))
 
@@ -184,7 +199,10 @@ def _light(x: Float, n: Float, b: Float) -> Float:
 
 
 def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
-    """Disc radius / total half-light radius by bisection: what `component_radii` tabulates."""
+    """Disc radius / total half-light radius by bisection: what `component_radii` tabulates.
+
+    fraction, ratio, sersic : float[...] bulge / total, bulge radius / disc radius, index of the bulge
+    """
     # The total's radius lies between those of its parts, so the disc's between 1 and 1 / ratio.
     low, high = np.minimum(1.0, 1.0 / ratio), np.maximum(1.0, 1.0 / ratio)
     one = np.ones(1)
@@ -216,6 +234,7 @@ def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
 
     The printed arcsine is not a number for q < h and loses half its digits near 90 deg; this form does
     neither.
+    axis_ratio : float[n];  scale_height : h, of the disc's scale length
     Ref: Serrano et al. 2024, "Bulge and disc model"
     """
     q = np.asarray(axis_ratio, float)

@@ -79,7 +79,10 @@ def load(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Trai
 
 
 def training(values: dict[str, npt.NDArray[Any]], last: int) -> Training:
-    """Of columns by our key."""
+    """Of columns by our key.
+
+    values : float[t] each: colour 0.1(g - r) mag, m_r mag, z, sed, ext_law, ebv mag;  last : template of the library
+    """
     # Slow to import, and seldom needed.
     from scipy.spatial import KDTree
 
@@ -89,7 +92,10 @@ def training(values: dict[str, npt.NDArray[Any]], last: int) -> Training:
 
 
 def assign(given: Training, colour: Float, m_r: Float, z: Float, rng: np.random.Generator) -> Sed:
-    """Spectra[n] of galaxies of 0.1(g - r), M_r and z."""
+    """Spectra[n] of galaxies of 0.1(g - r), M_r and z.
+
+    colour, m_r, z : float[n] 0.1(g - r) mag, M_r mag, redshift
+    """
     law, n = given.law, colour.size
     _, nearest = given.tree.query(_scaled(law, colour, m_r, z), p=1)
     index = np.clip(given.sed[nearest] + law.index * rng.standard_normal(n), 0.0, given.last)

@@ -118,7 +118,10 @@ def model(
 
 
 def halos_of(cells: Cells, cell: int) -> tuple[Halos, Int]:
-    """(halos that lie in a generation cell, their identifiers), sorted by position."""
+    """(halos that lie in a generation cell, their identifiers), sorted by position.
+
+    returns : n halos, int64[n]
+    """
     own = []
     for order in LEVELS:
         hosts, _ = cells.at(order, cell >> 2 * (GENERATION_ORDER - order))
@@ -143,7 +146,10 @@ def members(cells: Cells, cell: int) -> Members:
 
 
 def observed_redshift(z: Float, velocity: Float) -> Float:
-    """[n] of sources that recede with a peculiar velocity, km/s."""
+    """[n] of sources that recede with a peculiar velocity, km/s.
+
+    z : float[n] true redshift;  velocity : float[n] km/s
+    """
     return np.asarray((1.0 + z) * (1.0 + velocity / LIGHT_KM_S) - 1.0)
 
 

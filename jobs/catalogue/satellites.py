@@ -42,6 +42,7 @@ class Satellites:
     velocity: Float
 
     def part(self, keep: npt.NDArray[np.generic]) -> Satellites:
+        """The satellites that are kept: keep : bool or int[m] rows."""
         return Satellites(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
@@ -67,7 +68,11 @@ def draw(halos: HaloModel, masses: Masses, hosts: Halos, rng: np.random.Generato
 
 
 def nfw_radius(concentration: Float, enclosed: Float) -> Float:
-    """Radius / R_200m[n] that holds a share of the mass inside R_200m.  Error: 1e-3"""
+    """Radius / R_200m[n] that holds a share of the mass inside R_200m.
+
+    concentration : float[n] c_200m;  enclosed : float[n] of the mass, 0 .. 1
+    Error: 1e-3
+    """
     row, part = _bracket(np.log(_C_NODES), np.log(concentration))
     step = np.asarray(enclosed) * (_U_NODES.size - 1)
     column = np.clip(step.astype(np.int64), 0, _U_NODES.size - 2)

@@ -103,6 +103,7 @@ def colours_model() -> Colours:
 def red_fraction(law: RedFraction, m_r: Float, z: Float, kind: Int) -> Float:
     """Share[n] of galaxies on the red sequence.
 
+    m_r, z : float[n] M_r mag, redshift
     kind : [n] 0 central, 1 satellite
     Ref: Skibba & Sheth 2009
     """
@@ -112,7 +113,10 @@ def red_fraction(law: RedFraction, m_r: Float, z: Float, kind: Int) -> Float:
 
 
 def draw_colour(model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.Generator) -> tuple[Bool, Float]:
-    """(on the red sequence[n], 0.1(g - r)[n])."""
+    """(on the red sequence[n], 0.1(g - r)[n]).
+
+    m_r, z : float[n] M_r mag, redshift;  kind : int[n] 0 central, 1 satellite
+    """
     law, x = model.sequence, m_r - _PIVOT
     red = rng.random(m_r.size) < red_fraction(model.fraction, m_r, z, kind)
     red_mean = law.red + law.red_rate * x - law.red_z_rate * z
@@ -125,7 +129,11 @@ def draw_colour(model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.
 
 
 def draw_dust(dust: Dust, m_r: Float, red: Bool, colour: Float, rng: np.random.Generator) -> tuple[Int, Float]:
-    """(extinction law[n], E(B-V)[n] mag); red galaxies have no dust.  Ref: Ilbert et al. 2009"""
+    """(extinction law[n], E(B-V)[n] mag); red galaxies have no dust.
+
+    m_r : float[n] mag;  red : bool[n] on the red sequence;  colour : float[n] 0.1(g - r) mag
+    Ref: Ilbert et al. 2009
+    """
     mean = np.clip(dust.mean + dust.mean_rate * (m_r - dust.pivot), *dust.mean_limits)
     ebv = np.minimum(mean / dust.shape * rng.standard_gamma(dust.shape, m_r.size), dust.highest)
     odds = np.cumsum(dust.calzetti_odds)
@@ -138,6 +146,7 @@ def draw_dust(dust: Dust, m_r: Float, red: Bool, colour: Float, rng: np.random.G
 def invert(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
     """The spectra that have the wanted colours; the end of the library where dust leaves none that has.
 
+    colour : float[n] 0.1(g - r) mag;  law : int[n];  ebv : float[n] mag
     table : of 0.1g at z = 0. Mixing templates i and i - 1 with shares 1 - f and f of the 0.1r flux mixes
             their 0.1g / 0.1r ratios with the same shares, so the inversion is exact.
     """
@@ -156,6 +165,7 @@ def invert(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
 def between(index: Float, law: Int, ebv: Float) -> Sed:
     """Of real template indices t[n] >= 0: i = max(ceil(t), 1) and i - 1, with shares 1 - f and f = i - t.
 
+    index : float[n];  law : int[n];  ebv : float[n] mag
     Ref: Serrano et al. 2024, appendix B
     """
     upper = np.maximum(np.ceil(index), 1.0).astype(np.int64)
@@ -164,7 +174,10 @@ def between(index: Float, law: Int, ebv: Float) -> Sed:
 
 
 def columns(sed: Sed) -> dict[str, npt.NDArray[np.generic]]:
-    """Spectra as columns of table `galaxies`: both components behind the same dust."""
+    """Spectra as columns of table `galaxies`: both components behind the same dust.
+
+    returns : [n] each
+    """
     return {
         "sed_1": sed.template_1,
         "frac_1": sed.frac_1,

@@ -85,14 +85,20 @@ def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
 
 
 def numbers(stars: StarCatalogue, cells: npt.ArrayLike) -> Float:
-    """Stars[n] of order-8 cells."""
+    """Stars[n] of order-8 cells.
+
+    cells : int[n] nested
+    """
     edges = np.stack([np.asarray(cells, np.int64), np.asarray(cells, np.int64) + 1])
     first, last = np.searchsorted(stars.index, edges << 2 * (sky.DEEPEST - GENERATION_ORDER))
     return np.asarray(last - first, float)
 
 
 def of_cell(stars: StarCatalogue, cell: int) -> dict[str, npt.NDArray[Any]]:
-    """The values of an order-8 cell's stars, with `index`."""
+    """The values of an order-8 cell's stars, with `index`.
+
+    returns : [n] each, in the units of `load`
+    """
     rows = slice(*np.searchsorted(stars.index, sky.cell_range(GENERATION_ORDER, cell)))
     return {"index": stars.index[rows], **{name: values[rows] for name, values in stars.values.items()}}
 

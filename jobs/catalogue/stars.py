@@ -102,6 +102,7 @@ def model(
 def numbers(cells: npt.ArrayLike, universe: StarModel) -> Float:
     """Stars to expect in order-8 cells, before their dust, float64[n] (20 us a cell).
 
+    cells : int[n] nested
     Errors: BadInput where stars are not to be drawn, or are too many
     """
     lon, lat = _centres(cells)
@@ -145,7 +146,7 @@ def _limits(lat: Float, universe: StarModel) -> Float:
 def draw(cell: int, seed: int, universe: StarModel, dust: npt.NDArray[np.float32]) -> pa.Table:
     """Table `stars` of one order-8 cell, sorted by _healpix_29.
 
-    dust : map of the Milky Way's A(V) to infinity (jobs.catalogue.dust_map)
+    dust : float32[pixel] mag, map of the Milky Way's A(V) to infinity (jobs.catalogue.dust_map)
     Errors: BadInput as `numbers`
     Error: the density is that of the cell's centre: 2 % at its edges at |b| = 20 deg
     """
@@ -284,7 +285,10 @@ def _modulus(distance: Float) -> Float:
 
 
 def nearest_template(library: Float, teff: Float) -> Int:
-    """Index[n] of the library's star of nearest ln(Teff); library : [template] K in any order."""
+    """Index[n] of the library's star of nearest ln(Teff); library : [template] K in any order.
+
+    teff : float[n] K
+    """
     order = np.argsort(library)
     between = 0.5 * np.log(library[order][1:] * library[order][:-1])
     return np.asarray(order[np.searchsorted(between, np.log(teff))], np.int64)

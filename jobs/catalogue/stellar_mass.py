@@ -70,7 +70,10 @@ def mass_to_light() -> MassToLight:
 
 
 def light(library: Library, ebv: Float) -> Light:
-    """Tables of a template library; ebv : nodes of E(B-V)."""
+    """Tables of a template library; ebv : nodes of E(B-V).
+
+    ebv : float[e] mag
+    """
     law = StarFormation(**parameters.section(_FILE, "star_formation"))
     spectra = library.flux.astype(np.float64)
     weights = band_ratios.band_weights(library, band_ratios.REFERENCE_BAND, 0.0)
@@ -93,7 +96,11 @@ def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float) -> Float:
 
 
 def log_sfr(table: Light, m_r: Float, sed: Sed) -> Float:
-    """log10 of the star formation rate[n] / (Msun/yr).  Ref: Kennicutt 1998"""
+    """log10 of the star formation rate[n] / (Msun/yr).
+
+    m_r : float[n] M_r mag;  sed : n spectra
+    Ref: Kennicutt 1998
+    """
     total = sed.frac_1 * _undimmed(table, sed.template_1, sed) + sed.frac_2 * _undimmed(table, sed.template_2, sed)
     area = 4.0 * np.pi * _TEN_PARSEC_CM**2
     log_l_nu = -0.4 * (_physical(m_r) + AB_CGS) + np.log10(area * total)

@@ -136,7 +136,11 @@ def luminosity(m_h: Float, dwarfs: Sequence, share: Float, component: Int) -> Fl
 
 
 def mass_below(masses: MassFunction, m: npt.ArrayLike) -> Float:
-    """Systems pc^-3 at the Sun lighter than m, all components together.  Ref: Kroupa 2001"""
+    """Systems pc^-3 at the Sun lighter than m, all components together.
+
+    m : float[n] Msun
+    Ref: Kroupa 2001
+    """
     return masses.local * _power_law(masses, np.asarray(m, float)) / _power_law(masses, np.asarray(masses.reference))
 
 
@@ -152,7 +156,10 @@ def _power_law(masses: MassFunction, m: Float) -> Float:
 
 
 def giants_below(giants: Giants, m_h: Float) -> Float:
-    """Giants pc^-3 at the Sun brighter than M_H, thin disc."""
+    """Giants pc^-3 at the Sun brighter than M_H, thin disc.
+
+    m_h : float[n] mag, Vega
+    """
     clump = ndtr((m_h - giants.clump_m_h) / giants.clump_scatter)
     rise = giants.slope * np.log(10.0)
     inside = np.clip(m_h, giants.brightest, giants.faintest) - giants.brightest
@@ -161,7 +168,10 @@ def giants_below(giants: Giants, m_h: Float) -> Float:
 
 
 def white_dwarfs_below(numbers: WhiteDwarfs, m_h: Float) -> Float:
-    """White dwarfs pc^-3 at the Sun brighter than M_H."""
+    """White dwarfs pc^-3 at the Sun brighter than M_H.
+
+    m_h : float[n] mag, Vega
+    """
     m_bol, at = _white_dwarf_magnitudes(numbers)
     rise = numbers.slope * np.log(10.0)
     share = np.expm1(rise * (m_bol - m_bol[0])) / np.expm1(rise * (m_bol[-1] - m_bol[0]))

@@ -132,7 +132,10 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
 
 
 def einstein_radius(sigma: npt.ArrayLike, z_lens: npt.ArrayLike, z_source: npt.ArrayLike) -> Float:
-    """Arcsec, of dispersions in km/s: 4 pi (sigma / c)^2 D_ls / D_s in a flat space; 0 where the source is in front."""
+    """Arcsec, of dispersions in km/s: 4 pi (sigma / c)^2 D_ls / D_s in a flat space; 0 where the source is in front.
+
+    sigma : float[n] km/s;  z_lens, z_source : float[n]
+    """
     ratio = 1.0 - cosmology.comoving_distance(z_lens) / cosmology.comoving_distance(z_source)
     return _full_radius(sigma) * np.maximum(ratio, 0.0)
 
@@ -143,7 +146,11 @@ def _full_radius(sigma: npt.ArrayLike) -> Float:
 
 
 def deflection(lens: Lens, east: Float, north: Float) -> tuple[Float, Float]:
-    """Deflection (east, north) of rays, arcsec: they come from (east, north) minus this.  Ref: eqs. 27a, 27b"""
+    """Deflection (east, north) of rays, arcsec: they come from (east, north) minus this.
+
+    east, north : float[...] arcsec from the lens
+    Ref: eqs. 27a, 27b
+    """
     along, across = _turned(lens.angle, east, north)
     q = lens.axis_ratio
     scale, flat = lens.radius * np.sqrt(q), np.sqrt(1.0 - q * q)
@@ -157,7 +164,10 @@ def deflection(lens: Lens, east: Float, north: Float) -> tuple[Float, Float]:
 
 
 def magnification(lens: Lens, east: Float, north: Float) -> Float:
-    """Of a point seen at (east, north), negative where it is mirrored: 1 / (1 - 2 kappa)."""
+    """Of a point seen at (east, north), negative where it is mirrored: 1 / (1 - 2 kappa).
+
+    east, north : float[...] arcsec from the lens
+    """
     along, across = _turned(lens.angle, east, north)
     return np.asarray(1.0 / (1.0 - lens.radius * np.sqrt(lens.axis_ratio) / np.hypot(lens.axis_ratio * along, across)))
 
