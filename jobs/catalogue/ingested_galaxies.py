@@ -99,6 +99,8 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: npt.NDArray[np.fl
     z = np.maximum(z, 1e-4)
     kind = given.get("kind", np.zeros(n, np.int64))
     lens = _lensing(given, n)
+    if universe.columns.lines_magnified:
+        given = {**given, **{name: given[name] * _shrinking(lens) for name in given if name.startswith("flux_")}}
     a_v = given["a_v"] if "a_v" in given else dust_map.a_v(dust, given["ra"], given["dec"])
     m_r, red, sed, law_2, ebv_2 = _light(given, universe, z, kind, _seen(given, universe, lens, a_v), rng)
     colour = given["color_gr_01"] if "color_gr_01" in given else sed_assignment.colours(universe.colour, sed)
@@ -192,10 +194,13 @@ def _seen(given: Given, universe: IngestModel, lens: Mapping[str, Array], a_v: F
     over_v = universe.columns.seen_over_v
     if over_v is None:
         return given["mag"]
-    # Those nearer to a caustic go into quarantine.
+    return np.asarray(given["mag"] - over_v * a_v - 2.5 * np.log10(_shrinking(lens)))
+
+
+def _shrinking(lens: Mapping[str, Array]) -> Float:
+    """1 / magnification[n]; of galaxies nearer to a caustic, which go into quarantine, that at its edge."""
     found = sources.determinant(*(lens[name] for name in ("kappa", "gamma1", "gamma2")))
-    bounded = np.maximum(np.abs(found), lensing.settings().caustic)
-    return np.asarray(given["mag"] - over_v * a_v - 2.5 * np.log10(bounded))
+    return np.asarray(np.maximum(np.abs(found), lensing.settings().caustic))
 
 
 def _light(

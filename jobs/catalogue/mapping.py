@@ -29,7 +29,7 @@ Bounds = Mapping[str, tuple[float, float]]
 _FILE = Path(__file__).with_name("ingest_formats.toml")
 WHOLE = ("origin_id", "halo")
 _FIELD_KEYS = ("column", "minus", "over", "power10", "log10", "scale", "offset", "unit", "value", "beside")
-_FORMAT_KEYS = ("source", "columns", "band", "beside", "seen_over_v")
+_FORMAT_KEYS = ("source", "columns", "band", "beside", "seen_over_v", "lines_magnified")
 _SED = ("sed_1", "frac_1", "ext_law_1", "ebv_1", "sed_2", "frac_2", "ext_law_2", "ebv_2")
 # Computed by us, or another key's affair.
 _NOT_MAPPED = ("id", "halo_id", "_healpix_29")
@@ -91,7 +91,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """A whole mapping: fields by key; band, seen_over_v, beside : as in ingest_formats.toml."""
+    """A whole mapping: fields by key; band, seen_over_v, beside, lines_magnified : as in ingest_formats.toml."""
 
     fields: Mapping[str, Field]
     bounds: Bounds
@@ -99,6 +99,7 @@ class Columns:
     band: str = ""
     beside: tuple[str, ...] = ()
     seen_over_v: float | None = None
+    lines_magnified: bool = False
 
     def titles(self, beside: bool) -> list[str]:
         """Columns of the file that are read; beside : of the file beside it."""
@@ -141,7 +142,8 @@ def galaxies(name: str, own: Mapping[str, str]) -> Columns:
     if "mag" in fields and not about.get("band"):
         raise BadInput("ingest.galaxies.columns: mag wants band beside it")
     beside, seen = tuple(about.get("beside", ())), about.get("seen_over_v")
-    return Columns(fields, GALAXY_BOUNDS, MAY_MISS, about.get("band", ""), beside, seen)
+    lines = bool(about.get("lines_magnified", False))
+    return Columns(fields, GALAXY_BOUNDS, MAY_MISS, about.get("band", ""), beside, seen, lines)
 
 
 def halos(own: Mapping[str, str]) -> Columns:

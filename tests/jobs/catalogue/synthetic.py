@@ -69,6 +69,8 @@ def theirs(form, values):
     for key, entry in mapping.formats()[form]["columns"].items():
         entry = {"column": entry} if isinstance(entry, str) else entry
         given = values[key]
+        if key.startswith("flux_") and mapping.formats()[form].get("lines_magnified"):
+            given = given / ((1.0 - values["kappa"]) ** 2 - values["gamma1"] ** 2 - values["gamma2"] ** 2)
         if "over" in entry:
             given = given * tables[0][entry["over"]]
         elif set(entry) - {"column", "unit", "beside"}:
