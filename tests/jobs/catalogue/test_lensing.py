@@ -103,7 +103,7 @@ def test_power_and_modes_of_the_universe(universe):
 
 
 def test_tangential_shear_about_massive_halos(universe, drawn):
-    """Behind halos of 10^13.5 Msun/h at z < 0.6 sources at z = 1.2 are sheared tangentially on average."""
+    """Behind halos of 10^13.3 Msun/h at 0.2 < z < 0.8 sources at z = 1.2 are sheared tangentially on average."""
     halos = drawn.halos
     heavy = (halos["log_mass"].to_numpy() > 13.3) & (halos["z_true"].to_numpy() > 0.2)
     heavy &= halos["z_true"].to_numpy() < 0.8
