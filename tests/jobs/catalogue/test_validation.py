@@ -20,9 +20,9 @@ from lake_schema.ids import GENERATION_ORDER
 
 from .test_lensing import limber
 
-# Cumulative counts that the luminosity function makes 14 and 17 % larger than observed, where 12 % are allowed; and w
-# at 1 to 1.5 deg, of which 1290 deg2 of three boxes still have an error of 16 %: their Gaussian field has 0.63 there.
-KNOWN = {"i_21", "i_25", "w_halos_1", "w_galaxies_1"}
+# The luminosity function, calibrated on 102 galaxies an arcmin2 with I_E < 26, makes 11 % more than observed to i = 25
+# (test_galaxies has the mean sky), and this sky has 1.5 % more: 12.9 % of 12 % allowed.
+KNOWN = {"i_25"}
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ def test_theories_agree():
 
 @pytest.mark.nightly
 def test_the_fuller_report(tmp_path):
-    """Every expectation, at the settings that a request has by default: ten minutes of one core, and the boxes' own."""
+    """Every expectation, at the settings that a request has by default: a quarter of an hour of one core, and the boxes' own."""
     file = tmp_path / "universe.json"
     validate_universe.main(["--json", str(file), "--figures", str(tmp_path)])
     figures = json.loads(file.read_text())
