@@ -26,6 +26,7 @@ import numpy as np
 
 from benchmarks import report
 from jobs.catalogue import build_galaxies, galaxies, luminosity_function, population
+from jobs.fluxes import cosmology
 from jobs.measured import forget_peak, peak_gb
 from jobs.request import Universe
 from lake_schema import layout, parquet, sky
@@ -49,6 +50,9 @@ NOTES = {
     "speedup_from_shares": "what that share leaves of two free cores",
     "draw_per_s_core": "halos, satellites, redshifts, luminosities",
     "peer_draw_per_s_core": "SkyPy: redshifts and luminosities of a Schechter function; 0 = not installed",
+    "vs_peer": "halos, satellites, redshifts, luminosities / SkyPy's redshifts and luminosities",
+    "schechter_per_s_core": "redshifts and luminosities of our function, as SkyPy draws them",
+    "schechter_vs_peer": "the same sub-task",
     "projected_core_hours_922m": "the simulated survey (target 10)",
 }
 
@@ -136,6 +140,21 @@ def peer(area: float) -> float:
     return float(redshift.size / (time.process_time() - started))
 
 
+def schechter(area: float) -> float:
+    """The peer's sub-task by our own tables: galaxies a second with redshift and luminosity."""
+    law, rng = luminosity_function.schechter(), np.random.default_rng(SEED)
+    table = luminosity_function.inverse(law)
+    started = time.process_time()
+    edges = np.linspace(0.002, 2.3, 200)
+    faintest = 26.0 - cosmology.distance_modulus(edges)
+    density = luminosity_function.number_density(law, faintest, edges)
+    shells = cosmology.comoving_volume(edges[:-1], edges[1:]) * np.radians(1.0) ** 2 * area
+    number = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * shells)])
+    z = np.interp(number[-1] * rng.random(rng.poisson(number[-1])), number, edges)
+    found = luminosity_function.magnitude(table, np.interp(z, edges, density) * rng.random(z.size), z)
+    return float(found.size / (time.process_time() - started))
+
+
 def luminosities(count: int, about: dict[str, object]) -> float:
     """Ours, the same sub-task: candidates a second with halo, position, velocity, redshift and luminosity."""
     given = (about[name] for name in ("seed", "galaxy_limit", "z_max", "box_cells"))
@@ -155,10 +174,11 @@ def run(quick: bool, repeats: int) -> dict[str, float]:
     figures = {"generation_cells": count, **min(turns, key=lambda turn: turn["cell_s"])}
     figures["galaxies_per_s_core"] = figures["cell_rows"] / figures["cell_s"]
     figures["projected_core_hours_922m"] = SURVEY_GALAXIES / figures["galaxies_per_s_core"] / 3600.0
-    own, other = luminosities(min(count, 16), about), peer(sky.cell_area(8) * count)
-    figures |= {"draw_per_s_core": own, "peer_draw_per_s_core": other}
+    area = sky.cell_area(8) * count
+    own, alone, other = luminosities(min(count, 16), about), schechter(area), peer(area)
+    figures |= {"draw_per_s_core": own, "schechter_per_s_core": alone, "peer_draw_per_s_core": other}
     if other:
-        figures["vs_peer"] = own / other
+        figures |= {"vs_peer": own / other, "schechter_vs_peer": alone / other}
     return figures | two_cores(quick, repeats)
 
 
