@@ -34,6 +34,9 @@ _WIDE, _STEP, _LONG = 40, 0.25, 8.0
 _FAINTEST = 0.5
 # Pixels over which the plane fades, and its outermost, which are not used: a stamp is periodic.
 _FADING, _SPARED = 24.0, 2.0
+# Of the light at the plane's sides, at most what was folded into its corners; none to speak of so near to its middle,
+# of the period.
+_FOLDED, _NEAR = 0.2, 0.15
 # Points along a bar that tell how much of it is seen.
 _POINTS = 7001
 _ARCSEC = np.pi / 180.0 / 3600.0
@@ -159,7 +162,8 @@ def add(
     wide = _STEP * float(across[-1] + 1) if len(across) else 0.0
     turned = np.stack([np.cos(edges.bars[:, 0]), np.sin(edges.bars[:, 0])], axis=1)
     _outside(frame, column, row, inner, level, radius, turned, lines, far, wide)
-    _inside(frame, column, row, inner, level, turned, lines, edges.period)
+    folds = _FOLDED * level / inner**3 > faintest
+    _inside(frame, column, row, inner, level, turned, lines, edges.period, folds)
 
 
 def left(size: int, samples: int, count: int) -> Float:
@@ -211,7 +215,7 @@ def _outside(
 
 @jit
 def _inside(
-    frame: Any, x: float, y: float, inner: float, level: float, turned: Any, lines: Any, period: float
+    frame: Any, x: float, y: float, inner: float, level: float, turned: Any, lines: Any, period: float, folds: bool
 ) -> None:  # fmt: skip
     """Inside the square: what has faded of the plane, and less what was folded into what is left of it."""
     ny, nx = frame.shape
@@ -220,7 +224,9 @@ def _inside(
             dx, dy = c - x, r - y
             if abs(dx) < inner and abs(dy) < inner:
                 left = _left(abs(dx), inner) * _left(abs(dy), inner)
-                more = -left * _folded(dx, dy, level, turned, lines, period)
+                more = 0.0
+                if folds and dx * dx + dy * dy > (_NEAR * period) ** 2:
+                    more -= left * _folded(dx, dy, level, turned, lines, period)
                 if left < 1.0:
                     more += (1.0 - left) * _light(dx, dy, level, turned, lines)
                 frame[r, c] += np.int64(np.rint(more * FIXED_POINT))
