@@ -325,7 +325,8 @@ def sources_of(
     wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
     sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings, wide)
     farther = stamps.shining(electrons[kept], sizes, shape[kept], picture[kept], spread)
-    reaches = np.where(farther, stamps.SIZES[-1], sizes)
+    # As far as sources are read.
+    reaches = np.where(farther, int(2.0 * stamps.reach(1.0)), sizes)
     here = selection.touching(column, row, reaches, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
