@@ -106,7 +106,8 @@ def forms(frame: Frame, some: Sources, radius: float = APERTURE, scale: float = 
         rows, columns = np.mgrid[: part.shape[0], : part.shape[1]]
         dx, dy = (columns - (x - x0)) * scale, (rows - (y - y0)) * scale
         distance = np.hypot(dx, dy)
-        part = part - np.median(part[distance > 1.5 * radius])
+        # The mean: a median of counts is a whole number.
+        part = part - part[distance > 1.5 * radius].mean()
         weighted = part * np.exp(-0.5 * (distance / 0.75) ** 2)
         xx, yy, xy = ((weighted * a).sum() / weighted.sum() for a in (dx * dx, dy * dy, dx * dy))
         out.append([part[distance < radius].sum(), xx + yy, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])

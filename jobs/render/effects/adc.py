@@ -38,4 +38,4 @@ def _contribution(scene: Scene) -> float:
     return gain * (bias + 0.5)
 
 
-EFFECT = Effect("adc", apply, _parameters, _contribution, optional=False, cost=1.3e-2)
+EFFECT = Effect("adc", apply, _parameters, _contribution, optional=False, cost=3e-3)

@@ -151,4 +151,4 @@ def _contribution(scene: Scene) -> float:
     return 1.5 * shift * full**2
 
 
-EFFECT = Effect("brighter_fatter", apply, _parameters, _contribution, cost=4e-2)
+EFFECT = Effect("brighter_fatter", apply, _parameters, _contribution, cost=1e-2)

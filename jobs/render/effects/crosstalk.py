@@ -60,4 +60,4 @@ def _contribution(scene: Scene) -> float:
     return float(np.abs(coefficients(scene)).max()) * full
 
 
-EFFECT = Effect("crosstalk", apply, lambda scene: (coefficients(scene),), _contribution, cost=1.7e-2)
+EFFECT = Effect("crosstalk", apply, lambda scene: (coefficients(scene),), _contribution, cost=4e-3)

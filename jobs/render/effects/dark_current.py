@@ -55,5 +55,5 @@ def _rms(scene: Scene) -> float:
     return float(np.sqrt(scene.dark_electrons * (1.0 + scene.dark_electrons)))
 
 
-EFFECT = Effect("dark_current", apply, lambda scene: (scene.dark_electrons,), _rms, cost=3e-2)
+EFFECT = Effect("dark_current", apply, lambda scene: (scene.dark_electrons,), _rms, cost=1e-2)
 HOT = Effect("hot_pixels", apply_hot, _hot, lambda scene: _hot(scene)[1] * (_hot(scene)[0] > 0), fixed=True, cost=2e-3)

@@ -107,4 +107,4 @@ def _contribution(scene: Scene) -> float:
     return float((there - apply(there, *parameters(scene)))[0])
 
 
-EFFECT = Effect("nonlinearity", apply, parameters, _contribution, cost=3.9e-2)
+EFFECT = Effect("nonlinearity", apply, parameters, _contribution, cost=6e-3)

@@ -57,4 +57,4 @@ def _contribution(scene: Scene) -> float:
     return electrons * float(np.abs(change(some_u, some_v, stretch)).max(initial=0.0))
 
 
-EFFECT = Effect("pixel_area", apply, parameters, _contribution, cost=1e-2)
+EFFECT = Effect("pixel_area", apply, parameters, _contribution, cost=5e-3)

@@ -55,4 +55,4 @@ def _contribution(scene: Scene) -> float:
     return float(np.sqrt(max(scene.peak_electrons, 0.0) + scene.sky_electrons))
 
 
-EFFECT = Effect("poisson", apply, lambda scene: (), _contribution, cost=3e-2)
+EFFECT = Effect("poisson", apply, lambda scene: (), _contribution, cost=1.1e-2)

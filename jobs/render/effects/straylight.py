@@ -84,4 +84,4 @@ def _contribution(scene: Scene) -> float:
     return fraction * float(scene.lights.electrons.sum()) / (2.0 * np.pi * scale**2)
 
 
-EFFECT = Effect("straylight", apply, _parameters, _contribution, cost=1e-2)
+EFFECT = Effect("straylight", apply, _parameters, _contribution, cost=5e-3)
