@@ -48,14 +48,17 @@ def optics() -> Callable[[tuple[float, float]], Float]:
     mission = resolve()
     detector = focal_plane.detector("vis", "3-4", mission)
     waves = scenes.spread(VIS, 1).planes.wavelength  # type: ignore[union-attr]
-    blur = psf._blur_variances(detector, mission)
+    blurs = [psf._blur_variances(detector, float(waves[w]), mission) for w in _WAVES]
     sign = -1 if detector.upside_down else 1
 
     def at(place: tuple[float, float]) -> Float:
         nm = psf.wavefront(*psf._field(detector, sign * place[0], sign * place[1], mission), mission)
         scale = detector.pixel_scale / psf.SAMPLES
         size = psf._CORE_TRANSFORM, psf._CORE_SIDE
-        return np.stack([psf._plane(nm, float(waves[w]), *size, scale, blur, mission)[::sign, ::sign] for w in _WAVES])
+        planes = [
+            psf._plane(nm, float(waves[w]), *size, scale, blur, mission) for w, blur in zip(_WAVES, blurs, strict=True)
+        ]
+        return np.stack(planes)[:, ::sign, ::sign]
 
     return at
 

@@ -106,7 +106,8 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
     Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
     """
     found = sampled(_vis_planes(detector, band, mission, positions), detector.pixel_scale, has_pixel=False)
-    blur = float(np.sqrt(np.mean(_blur_variances(detector, mission))))
+    waves = np.concatenate([part.wavelength for part in sub_bands(band)])
+    blur = float(np.sqrt(np.mean(_blur_variances(detector, float(waves.mean()), mission))))
     beyond = edges.of_pupil(sub_bands(band), blur, detector.pixel_scale, _TRANSFORM / SAMPLES, mission)
     return replace(found, edges=beyond)
 
@@ -223,18 +224,23 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
     nodes, powers = _nodes(positions), _powers(positions)
     coefficients = [wavefront(*_field(detector, *place, mission), mission) for place in ((0.0, 0.0), *nodes)]
     sampling = detector.pixel_scale / SAMPLES
-    blur = _blur_variances(detector, mission)
+    blurs = [_blur_variances(detector, float(wavelength), mission) for wavelength in waves]
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
     key = cache.content_key(
         Path(__file__).read_bytes(),
         np.array(coefficients),
         waves,
         repr([(p.key, p.value, p.unit) for p in optics]),
-        repr((sampling, *blur)),
+        repr((sampling, *blurs)),
     )
 
     def make() -> dict[str, Array]:
-        centre = [_plane(coefficients[0], w, _TRANSFORM, SIDE, sampling, blur, mission) for w in waves]
+        centre = [
+            _plane(coefficients[0], w, _TRANSFORM, SIDE, sampling, blur, mission)
+            for w, blur in zip(waves, blurs, strict=True)
+        ]
+        # Of the drift, a part in a hundred of the light, the mean's blur is blur enough.
+        blur = tuple(np.mean(blurs, axis=0).tolist())
         return {
             "images": np.stack(centre).astype(np.float32),
             "drift": _drift(coefficients, positions, waves, sampling, blur, mission).astype(np.float32),
@@ -259,9 +265,11 @@ def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration
     return (detector.x + x * half_x) / reach_x, (detector.y + y * half_y) / reach_y
 
 
-def _blur_variances(detector: Detector, mission: MissionConfiguration) -> tuple[float, float]:
-    """Variance along x and y, arcsec2: pointing jitter and charge diffusion."""
-    diffusion = mission.value("vis.diffusion_sigma", "pix") * detector.pixel_scale
+def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfiguration) -> tuple[float, float]:
+    """Variance along x and y, arcsec2: pointing jitter, and charge diffusion, which is wider for blue light (A)."""
+    redder = 0.1 * wavelength / mission.value("vis.diffusion_wavelength", "nm")
+    wider = redder ** mission.value("vis.diffusion_slope")
+    diffusion = wider * mission.value("vis.diffusion_sigma", "pix") * detector.pixel_scale
     jitter_x, jitter_y = (mission.value(f"svm.aocs.jitter_{axis}", "arcsec") for axis in ("x", "y"))
     return jitter_x**2 + diffusion**2, jitter_y**2 + diffusion**2
 

@@ -133,6 +133,19 @@ def test_the_psf_is_as_wide_as_measured(vis):
     assert vis.outside[13] == pytest.approx(0.04, abs=0.01)
 
 
+def test_blue_light_spreads_wider_in_the_silicon(vis):
+    """Against light that spreads as at 800 nm: a Gaussian of 0.32 pixel times the wavelength to the power of -0.35."""
+    even = psf.vis_psf(
+        detector("vis", "3-4", MISSION), BAND, MISSION.overridden_with({"vis.diffusion_slope": (0.0, "")})
+    )
+    for wavelength, image, less in zip(vis.planes.wavelength, vis.planes.images, even.planes.images, strict=True):
+        sigma = np.array([0.32 * (wavelength / 8000) ** -0.35, 0.32]) * 3
+        passed = [np.abs(np.fft.rfft2(each)[0, 50:301:50]) for each in (image, less)]
+        k = 2 * np.pi * np.arange(50, 301, 50) / image.shape[1]
+        expected = np.exp(-0.5 * (sigma[0] ** 2 - sigma[1] ** 2) * k**2)
+        np.testing.assert_allclose(passed[0] / passed[1], expected, rtol=2e-3)
+
+
 def test_little_is_lost(vis):
     assert 0.9975 < vis.profile.flux < 0.9985
     assert (np.diff(vis.outside) <= 1e-12).all()

@@ -126,10 +126,11 @@ def oversampled(detector, column, row, side, strength):
         if detector.upside_down:
             optics = optics.rotate(180 * galsim.degrees)
         image = galsim.ImageD(side * OVER, side * OVER, scale=scale)
-        fine += optics.drawImage(image, offset=(-dx * OVER, -dy * OVER), method="no_pixel").array / len(parts)
-    # Charge diffusion and pointing jitter.
-    blur = [np.hypot(0.032, MISSION.value(f"svm.aocs.jitter_{axis}", "arcsec")) / scale for axis in "yx"]
-    fine = gaussian_filter(fine, blur, mode="constant")
+        drawn = optics.drawImage(image, offset=(-dx * OVER, -dy * OVER), method="no_pixel").array / len(parts)
+        # Charge diffusion, wider for blue light, and pointing jitter.
+        diffusion = 0.032 * (wave / 800.0) ** -0.35
+        blur = [np.hypot(diffusion, MISSION.value(f"svm.aocs.jitter_{axis}", "arcsec")) / scale for axis in "yx"]
+        fine += gaussian_filter(drawn, blur, mode="constant")
     u = (np.arange(OVER) + 0.5) / (OVER / 2) - 1
     response = 1 - strength * (u[:, None] ** 2 + u**2)
     return np.einsum("aibj,ij->ab", fine.reshape(side, OVER, side, OVER), response / response.mean())
