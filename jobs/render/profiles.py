@@ -233,11 +233,11 @@ def on_the_sky(shape: Shapes, form: Forms) -> Float:
     disk = np.stack([form.disk[:, :, 0], np.copysign(np.hypot(*across), across[0] + across[1])], -1)
     areas = [np.abs(np.linalg.det(matrix)) for matrix in (form.bulge, disk)]
     some = [area > _NO_AREA for area in areas]
-    with np.errstate(divide="ignore"):
-        middles = (
-            shape.bulge_fraction * np.exp(2 * n * np.log(b) - np.log(2 * np.pi * n) - gammaln(2 * n)) / areas[0],
-            (1 - shape.bulge_fraction) / (2 * np.pi) / areas[1],
-        )
+    areas = [np.where(kept, area, 1.0) for kept, area in zip(some, areas, strict=True)]
+    middles = (
+        shape.bulge_fraction * np.exp(2 * n * np.log(b) - np.log(2 * np.pi * n) - gammaln(2 * n)) / areas[0],
+        (1 - shape.bulge_fraction) / (2 * np.pi) / areas[1],
+    )
     inverse = [
         np.linalg.inv(np.where(kept[:, None, None], m, np.eye(2)))
         for kept, m in zip(some, (form.bulge, disk), strict=True)

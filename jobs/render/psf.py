@@ -135,7 +135,9 @@ def ground_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
 
     seeing : FWHM, arcsec;  beta : exponent, > 1;  pixel_scale : arcsec
     """
-    return _tabulated(galsim.Moffat(beta=beta, fwhm=seeing), pixel_scale)
+    # galsim ends it where 1e-5 of the light is left; of bright stars that is seen.
+    far = galsim.GSParams(xvalue_accuracy=1e-12)
+    return _tabulated(galsim.Moffat(beta=beta, fwhm=seeing, gsparams=far), pixel_scale)
 
 
 def sampled(planes: Planes, pixel_scale: float, has_pixel: bool) -> Psf:

@@ -1,9 +1,10 @@
 """Drawing sources: each on its own stamp, through its own PSF, in Fourier space, summed onto a frame.
 
 A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid. A galaxy's light
-that belongs outside its stamp comes in at the opposite edge: it is taken off there and drawn where it belongs, as are
-the PSF's wings beyond the stamp (wings.py). A stamp is large enough that all of this is below the noise at its edge,
-and what comes in below a part of the flux in the source's aperture. Nothing is lost, nothing is rescaled.
+that belongs outside its stamp comes in at the opposite edge. What of it reaches the middle is taken off and drawn where
+it belongs, as are the PSF's wings beyond the stamp (wings.py); the rest stays at the edge, where it is below the noise.
+A stamp is large enough that all that comes in is below a part of the flux in the source's aperture. Nothing is lost,
+nothing is rescaled.
 
 Sources         what is drawn: galaxies (with a shape) and points
 settings_for, seconds_for   what an accuracy takes, from the measured table
@@ -234,8 +235,9 @@ def stamp_sizes(
     least[body] += _EXTENT * profiles.half_light(shapes)[shape[body]]
     enough &= SIZES * psf.pixel_scale >= least[:, None]
     enough[:, -1] = True
-    # A point has no light beyond the PSF's plane.
-    enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
+    if psf.planes is not None:
+        # A point has no light beyond the PSF's planes.
+        enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
     found = SIZES[np.argmax(enough, axis=1)]
     if wider is None:
         return np.asarray(found)
@@ -258,10 +260,10 @@ def least_electrons(distance: float, pixel_scale: float, noise: float, settings:
 
 
 def _beyond_the_table(psf: Psf, radius: Int) -> Float:
-    """psf.surface at any radius, pixels: wings of r^-3 beyond the table, nothing beyond the plane."""
+    """psf.surface at any radius, pixels: wings of r^-3 beyond the table, nothing beyond planes."""
     last = len(psf.surface) - 1
     wing = psf.surface[np.minimum(radius, last)] * (np.minimum(radius, last) / radius) ** 3
-    return np.where(radius < SIDE, wing, 0.0)
+    return np.where((radius < SIDE) | (psf.planes is None), wing, 0.0)
 
 
 def floors(electrons: Float, noise: float, settings: Settings) -> Float:
@@ -339,9 +341,9 @@ def _draw(
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
     some, form = _forms(sources)
     bodies, table = (*_bodies(sources, some, form), trail), sersic.table()
-    stray, farthest = _strays(sources, some, form, sizes, psf.pixel_scale)
+    stray, farthest, most = _strays(sources, some, form, sizes, psf.pixel_scale)
     x0, y0 = (np.rint(position).astype(np.int64) - sizes // 2 for position in (sources.column, sources.row))
-    curve = kernel.returning(sizes, sources.column - x0, sources.row - y0, stray)
+    curve = kernel.returning(sizes, sources.column - x0, sources.row - y0, stray, most)
     passing = transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
     body, fraction, bulge, disk, _, row, *_ = bodies
@@ -476,21 +478,26 @@ def _bodies(sources: Sources, shapes: Shapes, form: Forms) -> tuple[Array, ...]:
     return body, fraction, bulge, disk, thick, row, row_weights
 
 
-def _strays(sources: Sources, shapes: Shapes, form: Forms, sizes: Int, pixel_scale: float) -> tuple[Float, Float]:
-    """([n, 11] profiles.on_the_sky of a source's electrons, 0 where nothing leaves its stamp; [n] how far, pixels).
+def _strays(
+    sources: Sources, shapes: Shapes, form: Forms, sizes: Int, pixel_scale: float
+) -> tuple[Float, Float, Float]:
+    """Of sources [n], what leaves their stamps.
 
-    How far : until no more than _LOST of the light lies farther out
+    returns : ([n, 11] profiles.on_the_sky of a source's electrons, 0 where nothing leaves its stamp; [n] how far,
+              pixels: until no more than _LOST of the light lies farther out; [n] electrons at most)
     """
     body = sources.shape >= 0
-    stray, reach = np.zeros((len(sources), 11)), np.zeros(len(sources))
+    stray, reach, most = np.zeros((len(sources), 11)), np.zeros(len(sources)), np.zeros(len(sources))
     half = sizes[body] / 2
     beyond = np.stack([profiles.outside(shapes, half * step * pixel_scale) for step in _STEPS], 1)
+    leaves = beyond[:, 0] > _STRAY
     sky = profiles.on_the_sky(shapes, form)
-    sky[:, :2] *= np.where(beyond[:, 0] > _STRAY, sources.electrons[body], 0.0)[:, None]
+    sky[:, :2] *= np.where(leaves, sources.electrons[body], 0.0)[:, None]
     stray[body] = sky
+    most[body] = beyond[:, 0] * sources.electrons[body]
     far = np.array(_STEPS)[np.clip((beyond > _LOST).sum(axis=1), 1, len(_STEPS) - 1)]
-    reach[body] = np.where(beyond[:, 0] > _STRAY, np.maximum(np.minimum(half * far, _FARTHEST), 1.5 * half), 0.0)
-    return stray, reach
+    reach[body] = np.where(leaves, np.maximum(np.minimum(half * far, _FARTHEST), 1.5 * half), 0.0)
+    return stray, reach, most
 
 
 def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4, highest: float = 1e-4) -> Float:

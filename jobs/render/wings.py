@@ -51,10 +51,13 @@ def galaxies(
 
     stray   : float64[n, 11] profiles.on_the_sky;  light : [n] electrons taken off the stamp;  reach : [n] pixels
     returns : float64[blocks, blocks], the same in any order of the galaxies
-    Error   : a galaxy's own light, as if the PSF did nothing to it so far out; what is left on the stamp is missing
+    Error   : a galaxy's own light, as if the PSF did nothing to it so far out; what is left on the stamp stays there;
+              a block has whole 2^-20 electrons a pixel: of the faintest little is seen
     """
     out = _layer(nx, ny)
-    some = light > 0
+    edge = reach + MARGIN * BLOCK
+    near = (column > -edge) & (column < nx + edge) & (row > -edge) & (row < ny + edge)
+    some = (light > 0) & near
     kernel.leaving(
         out, BLOCK, MARGIN, sizes[some], reach[some], column[some], row[some], stray[some], light[some]
     )  # fmt: skip
