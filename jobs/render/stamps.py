@@ -70,8 +70,8 @@ _FRAME_BYTES, _STAMP_BYTES, _DOUBLE_BYTES, _SOURCE_BYTES, _OTHER_BYTES = 16, 160
 # The same of a pixel of the largest stamp of a picture.
 _PICTURE_BYTES = 370
 # CPU s while drawing, measured (2.5 GHz, one core): of a pixel of a stamp, of a plane of the PSF on a stamp's grid and
-# of the frame; of all else.
-_STAMP_S, _PLANE_S, _FRAME_S, _START_S = 2.0e-8, 2.3e-7, 1.1e-8, 0.01
+# of the frame; of a block that a galaxy's light beyond its stamp may reach; of all else.
+_STAMP_S, _PLANE_S, _FRAME_S, _BLOCK_S, _START_S = 2.0e-8, 2.3e-7, 1.1e-8, 1.5e-8, 0.01
 # A trail is drawn in pieces no longer than this, pixels, each on a stamp of its own.
 _PIECE = 64.0
 # Of a galaxy's light: what leaves its stamp unseen, and what may lie nearer than it should; half stamps, and pixels, as
@@ -408,12 +408,14 @@ def work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
 
 
 def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
-    """CPU s that `draw` takes, predicted from the stamps alone (trails left out).
+    """CPU s that `draw` takes, predicted from the sources and their stamps (trails left out).
 
     Error : between half and twice of what the machine takes that it was measured on
     """
     pixels, transformed = work(sources, sizes, psf)
-    return _STAMP_S * pixels + _PLANE_S * transformed + _FRAME_S * nx * ny + _START_S
+    _, far, _ = _strays(sources, *_forms(sources), sizes, psf.pixel_scale)
+    blocks = float(((2 * far / wings.BLOCK) ** 2).sum())
+    return _STAMP_S * pixels + _PLANE_S * transformed + _BLOCK_S * blocks + _FRAME_S * nx * ny + _START_S
 
 
 def memory(electrons: Float, sizes: Int, nx: int, ny: int, picture: Int | None = None) -> float:
