@@ -101,6 +101,17 @@ def test_linear_in_flux(electrons):
     np.testing.assert_allclose(whole, electrons * unit, atol=3e-6 * electrons * unit.max() + 1e-6)
 
 
+@pytest.mark.parametrize("electrons", [1e8, 1e10])
+def test_a_bright_star_shines_as_far_as_it_shows(electrons):
+    """Behind an atmosphere: a Moffat's light at any distance, sampled on pixels."""
+    image, size = drawn(source_of("lsstcam", electrons, column=500.0, row=500.0), spread("lsstcam"), 1000)
+    assert size >= (128 if electrons == 1e8 else 256)
+    profile = spread("lsstcam").profile
+    for radius in (30, 60, 100, 140, 300):
+        expected = electrons * profile.xValue(0.2 * radius, 0.0) * 0.2**2
+        assert image[500, 500 + radius] == pytest.approx(expected, rel=0.02, abs=1.5 * SURVEY.background * NOISE)
+
+
 @pytest.mark.parametrize(("x", "y"), [(-0.5, 100.0), (255.5, 255.5), (0.0, 0.0), (300.0, 100.0), (-1e5, 3.0)])
 def test_edges_and_corners(x, y):
     image, _ = drawn(source_of("vis", 1e4, column=x, row=y, inclination=40.0), spread("vis"))

@@ -2,6 +2,7 @@
 
 import time
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.special import gammaincc, gammaincinv
 from jobs.accuracy import DRAFT, REFERENCE, SURVEY
 from jobs.render import focal_plane, profiles, stamps
 from jobs.render.focal_plane import boresight_for, sky_of_pixel, wcs
+from jobs.render.psf import Planes
 from tests.jobs.render.fields import galaxies, moments, one_source, small, spread
 
 NOISE = 12.0
@@ -103,7 +105,8 @@ def test_no_light_is_lost(kind, x, y, electrons, accuracy):
     image = drawn(source, psf, n=640, accuracy=accuracy)
     # Each pixel is rounded to 2^-20 electrons: the faintest all to nothing.
     assert image.sum() == pytest.approx(electrons, rel=2e-6, abs=image.size * 2.0**-21)
-    assert image.min() > -1e-3 * image.max()
+    # What is taken off a draft's smaller stamp is a little more than what came in, at its edge.
+    assert image.min() > -{DRAFT: 5e-3, SURVEY: 1e-3}[accuracy] * image.max()
 
 
 @pytest.mark.parametrize(("camera", "sizes"), [("vis", (64, 96, 160)), ("lsstcam", (48, 64, 96))])
@@ -206,9 +209,13 @@ def test_sizes_follow_flux_noise_and_accuracy():
     assert (sizes(noise=100 * NOISE) <= base).all()
     assert (sizes(accuracy=REFERENCE) >= base).all()
     assert (sizes(accuracy=DRAFT) <= base).all()
-    # A point never needs more than the PSF's own plane.
-    assert (sizes(1e12)[sources.shape < 0] <= stamps.SIDE).all()
     assert (sizes(1e12) <= stamps.SIZES[-1]).all()
+    # A Moffat goes on as far as it shows; a point never needs more than the PSF's own planes.
+    assert (sizes(1e12)[sources.shape < 0] > stamps.SIDE).any()
+    # (How they look counts for nothing here.)
+    nothing = np.zeros((1, 3, 3), np.float32)
+    psf = replace(psf, planes=Planes(np.array([7000.0]), nothing, nothing[:0], (1.0, 1.0)))
+    assert (sizes(1e12)[sources.shape < 0] <= stamps.SIDE).all()
 
 
 @pytest.mark.parametrize(
