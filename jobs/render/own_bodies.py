@@ -10,6 +10,8 @@ A table : Parquet, CSV or FITS with the columns of KEYS, one row a body and day:
 
 from __future__ import annotations
 
+import gzip
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -39,7 +41,6 @@ KEYS = {
     "mag": (-30.0, 60.0),
 }
 _MOST_ROWS = 1 << 28
-_FITS = (".fits", ".fit")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,26 +80,44 @@ def _table(file: Path) -> dict[str, Float]:
     if not file.is_file():
         raise BadInput(f"{file}: no such file")
     try:
-        if file.suffix.lower() in _FITS:
+        start = _start(file)
+        if start.startswith(b"SIMPLE"):
             found = fits.read_numbers(file)
-            if absent := [key for key in KEYS if key not in found]:
-                raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(found)}")
+            _complete(file, list(found))
             return {key: np.asarray(found[key], float) for key in KEYS}
-        whole = pq.ParquetFile(file).schema_arrow.empty_table() if _is_parquet(file) else None
-        table = pyarrow.csv.read_csv(file) if whole is None else whole
-        if absent := [key for key in KEYS if key not in table.column_names]:
-            raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(table.column_names)}")
-        table = table.select(list(KEYS)) if whole is None else pq.read_table(file, columns=list(KEYS))
+        parquet = start.startswith(b"PAR1")
+        _complete(file, pq.read_schema(file).names if parquet else _titles(file))
+        table = pq.read_table(file, columns=list(KEYS)) if parquet else pyarrow.csv.read_csv(file)
     except Damaged as error:
         raise BadInput(str(error)) from None
-    except (pa.ArrowException, OSError) as error:
+    except UnicodeDecodeError:
+        raise BadInput(f"{file}: is neither Parquet nor FITS, nor CSV in UTF-8") from None
+    except (pa.ArrowException, OSError, EOFError, zlib.error) as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())}") from None
     return {key: _numbers(file, key, table[key]) for key in KEYS}
 
 
-def _is_parquet(file: Path) -> bool:
+def _start(file: Path) -> bytes:
+    """The first bytes, which tell the format; of a packed file those inside."""
     with file.open("rb") as stream:
-        return stream.read(4) == b"PAR1"
+        start = stream.read(6)
+    if not start.startswith(b"\x1f\x8b"):
+        return start
+    with gzip.open(file) as stream:
+        return stream.read(6)
+
+
+def _titles(file: Path) -> list[str]:
+    with pyarrow.csv.open_csv(file) as reader:
+        return list(reader.schema.names)
+
+
+def _complete(file: Path, titles: list[str]) -> None:
+    """Refuse columns that are not there, or there twice."""
+    if absent := [key for key in KEYS if key not in titles]:
+        raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(titles)}")
+    if twice := [key for key in KEYS if titles.count(key) > 1]:
+        raise BadInput(f"{file}: has column {', '.join(twice)} more than once")
 
 
 def _numbers(file: Path, key: str, column: pa.ChunkedArray) -> Float:

@@ -139,7 +139,10 @@ def _bodies(file: Path, exposures: pa.Table) -> dict[str, str]:
     """sha256 of the user's moving bodies, by file; refused before anything is rendered where they cannot be read."""
     if not file.is_file():
         raise BadInput(f"solar_system.bodies: {file}: no such file")
-    sha256 = file_sha256(file)
+    try:
+        sha256 = file_sha256(file)
+    except OSError as error:
+        raise BadInput(f"solar_system.bodies: {file}: {error.strerror}") from None
     of_vis = exposures.filter(pc.equal(exposures["channel"], "VIS"))
     own_bodies.check(own_bodies.read(file, sha256), file, of_vis["mjd"].to_pylist())
     return {str(file): sha256}

@@ -1,5 +1,7 @@
 """Moving bodies of the user's own: tables in three formats, drawn as ours are; what is wrong is said in a line."""
 
+import gzip
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
@@ -111,13 +113,38 @@ def test_what_is_wrong_is_said_in_a_line(tmp_path, kind, change, said):
 
 def test_what_is_no_table_is_refused(tmp_path):
     for name, data in (("a.csv", b"mjd,lon\n1,2,3\n"), ("b.parquet", b"PAR1 and no more"), ("c.fits", b"SIMPLE"),
-                       ("d.csv", b"mjd,lon,lat,east,north,mag\n1,2,3,4,5,faint\n")):  # fmt: skip
+                       ("d.csv", b"mjd,lon,lat,east,north,mag\n1,2,3,4,5,faint\n"),
+                       ("e.csv", b"mjd,lon,lat,east,north,mag,nam\xe9\n1,2,3,4,5,6,7\n"),
+                       ("f.fits.gz", b"\x1f\x8b and no more")):  # fmt: skip
         (tmp_path / name).write_bytes(data)
         with pytest.raises(BadInput, match=name) as caught:
             own_bodies.read(tmp_path / name, name)
         assert "\n" not in str(caught.value)
     with pytest.raises(BadInput, match="no such file"):
         own_bodies.read(tmp_path / "none.csv", "none")
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_column_that_is_there_twice_is_refused(tmp_path, kind):
+    file = tmp_path / f"twice.{kind}"
+    names = ["mjd", "lon", "lat", "east", "north", "mag", "mag", "name", "name"]
+    table = pa.table([pa.array([1.0])] * len(names), names=names)
+    pyarrow.csv.write_csv(table, file) if kind == "csv" else pq.write_table(table, file)
+    with pytest.raises(BadInput, match=r"twice\.\w+: has column mag more than once$"):
+        own_bodies.read(file, "twice")
+
+
+def test_what_a_file_is_its_bytes_say_and_not_its_name(tmp_path):
+    """FITS under any name, packed as well."""
+    values = columns(moving.population(*PLACE, 0.1, DAY, MISSION, 1))
+    plain = written(tmp_path / "bodies.fits", values)
+    expected = own_bodies.read(plain, "plain").rows
+    (tmp_path / "bodies.fits.gz").write_bytes(gzip.compress(plain.read_bytes()))
+    (tmp_path / "bodies.dat").write_bytes(plain.read_bytes())
+    for name in ("bodies.fits.gz", "bodies.dat"):
+        found = own_bodies.read(tmp_path / name, name).rows
+        np.testing.assert_array_equal(found.ids, expected.ids)
+        np.testing.assert_array_equal(found.mag, expected.mag)
 
 
 def test_a_table_of_other_days_is_refused(tmp_path):
@@ -129,7 +156,11 @@ def test_a_table_of_other_days_is_refused(tmp_path):
         own_bodies.check(bodies, file, [61000.5])
 
 
-def test_a_request_names_it(tmp_path):
+def forbidden(path):
+    raise PermissionError(13, "Permission denied", str(path))
+
+
+def test_a_request_names_it(tmp_path, monkeypatch):
     demo = (requests.Path(__file__).parents[3] / "requests" / "demo.toml").read_text(encoding="utf-8")
     path = tmp_path / "own.toml"
     path.write_text(demo + '\n[solar_system]\nbodies = "bodies.csv"\n', encoding="utf-8")
@@ -138,6 +169,12 @@ def test_a_request_names_it(tmp_path):
     exposed = pa.table({"channel": ["VIS", "EXT"], "mjd": [DAY + 0.3, DAY + 90.0]})
     with pytest.raises(BadInput, match=r"solar_system.bodies: .*bodies.csv: no such file"):
         render_exposures._bodies(request.bodies, exposed)
+    request.bodies.write_bytes(b"")
+    with monkeypatch.context() as patch:
+        # Whoever runs the tests may read everything.
+        patch.setattr(render_exposures, "file_sha256", forbidden)
+        with pytest.raises(BadInput, match=r"solar_system.bodies: .*bodies.csv: Permission denied"):
+            render_exposures._bodies(request.bodies, exposed)
     written(request.bodies, columns(moving.population(*PLACE, 0.1, DAY, MISSION, 1)))
     assert list(render_exposures._bodies(request.bodies, exposed)) == [str(request.bodies)]
     with pytest.raises(BadInput, match=r"has bodies of MJD"):
