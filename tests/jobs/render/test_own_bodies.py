@@ -134,6 +134,16 @@ def test_a_column_that_is_there_twice_is_refused(tmp_path, kind):
         own_bodies.read(file, "twice")
 
 
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_table_that_no_worker_can_hold_is_refused(tmp_path, monkeypatch, kind):
+    values = {key: np.full(3000, 1.0) for key in own_bodies.KEYS}
+    file = written(tmp_path / f"long.{kind}", values)
+    assert len(own_bodies.read(file, "long").day) == 3000
+    monkeypatch.setattr(own_bodies, "_MOST_ROWS", 2999)
+    with pytest.raises(BadInput, match=r"long.\w+: has more than 2999 rows"):
+        own_bodies.read(file, "too long")
+
+
 def test_what_a_file_is_its_bytes_say_and_not_its_name(tmp_path):
     """FITS under any name, packed as well."""
     values = columns(moving.population(*PLACE, 0.1, DAY, MISSION, 1))
