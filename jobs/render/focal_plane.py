@@ -84,6 +84,7 @@ def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...
     Ref : VIS and NISP, Scaramella et al. 2022, Table 1 (gaps); ground cameras, the mission database's layouts
     """
     if camera == "vis":
+        _refuse_odd("vis", mission)
         planned = _grid(mission, "vis", lambda row, column: (f"{row}-{column}", column >= _VIS_FIRST_ROTATED_COLUMN))
         bending = distortion.terms("vis", mission)
         return tuple(replace(d, bending=bending) for d in _mounted(planned, "vis", mission))
@@ -100,6 +101,14 @@ def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
         if candidate.name == name:
             return candidate
     raise BadInput(f"camera {camera} has no detector {name!r}")
+
+
+def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
+    """Detectors are read as four equal quadrants."""
+    for name in ("nx", "ny", "charge_injection_rows"):
+        count = mission.value(f"{section}.fpa.{name}", "pix")
+        if count % 2.0:
+            raise BadInput(f"mission parameter {section}.fpa.{name} = {count:g}: must be an even number")
 
 
 def _grid(

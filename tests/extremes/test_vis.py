@@ -11,7 +11,8 @@ from jobs.render.channels import vis
 from jobs.render.effects import bleeding, traps
 from jobs.render.effects.effect import Lights, Scene, apply_all
 from jobs.rng import stream
-from lake_schema.mission.configuration import resolve
+from lake_schema.errors import OutOfRange
+from lake_schema.mission.configuration import bounds_of, resolve
 from tests.extremes.test_effects import scenes
 from tests.jobs.render import nominal
 from tests.jobs.render.fields import small
@@ -51,6 +52,30 @@ def test_every_effect_on_every_frame(shape, age):
             assert raw.min() >= 0
             assert raw.max() <= 65535
             np.testing.assert_array_equal(raw, np.rint(raw))
+
+
+@pytest.mark.parametrize(
+    ("key", "unit"),
+    [
+        ("vis.ghost.radius_out", "pix"),
+        ("vis.intra_pixel_response", ""),
+        ("vis.detector_temperature", "K"),
+        ("vis.dark_reference_temperature", "K"),
+        ("vis.fpa.prescan", "pix"),
+        ("vis.fpa.parallel_overscan", "pix"),
+    ],
+)
+def test_what_a_configuration_may_hold_every_effect_takes(key, unit):
+    """At both ends of what is allowed; beyond, the key is named before anything is drawn."""
+    least, most = (edge(value[i] for value in bounds_of(key)) for i, edge in enumerate((max, min)))
+    shape = (8, 8)
+    for value in (least, most):
+        one = scene_of(shape, light=1e8, peak=1e5, **{key: (value, unit)})
+        assert vis.DRAWN.apply(0.0, 0.0, *vis.DRAWN.parameters(one)) == pytest.approx(1.0)
+        assert np.isfinite(through(np.zeros(shape), one)).all()
+    for value in (least - 0.25, most + 0.25):
+        with pytest.raises(OutOfRange, match=key):
+            resolve(overrides={key: (value, unit)})
 
 
 @pytest.mark.parametrize("seconds", [0.0, 1e5])

@@ -21,6 +21,8 @@ Float32 = npt.NDArray[np.float32]
 _SAMPLE, _USUAL = 100_000, (0.002, 0.99)
 # Levels below those.
 _BELOW = 2
+# Electrons above the notch that are no level of their own: the last of a trail fades to below single precision.
+_THINNEST = 1e-6
 # With fewer there are no levels where most packets do not end.
 FEWEST = 6
 # Lines that are followed together.
@@ -42,7 +44,8 @@ def heights(frame: Float, notch: float, count: int) -> Float:
         np.quantile(some, np.linspace(*_USUAL, usual + 1)) if len(some) else np.array([most]),
         notch + np.geomspace(max(high - notch, 1e-6), most - notch, count - _BELOW - usual + 1),
     ]
-    return np.unique(np.concatenate(steps))
+    ends = np.unique(np.concatenate(steps))
+    return ends[(ends <= notch) | (ends > notch + _THINNEST)]
 
 
 def shift(

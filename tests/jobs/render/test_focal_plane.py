@@ -54,6 +54,14 @@ def test_between_the_halves_of_a_vis_detector_nothing_is_read():
     assert {(d.middle, d.half_rows) for d in LSST} == {(0, 2002), (0, 2000)}
 
 
+@pytest.mark.parametrize("name", ["nx", "ny", "charge_injection_rows"])
+def test_a_vis_detector_has_four_equal_quadrants(name):
+    assert len(detectors("vis", resolve(overrides={f"vis.fpa.{name}": (2.0, "pix")}))) == 36
+    for odd in (3.0, 4.5):
+        with pytest.raises(BadInput, match=rf"vis\.fpa\.{name} = {odd:g}: must be an even number"):
+            detectors("vis", resolve(overrides={f"vis.fpa.{name}": (odd, "pix")}))
+
+
 def test_vis_rows_count_from_the_top_and_the_right_half_is_upside_down():
     by_name = {d.name: d for d in VIS}
     assert by_name["1-1"].y > 0 > by_name["6-1"].y
