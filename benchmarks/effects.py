@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks import report
+from benchmarks import _scenes, report
 from jobs.fluxes import passbands
 from jobs.render import chromatic, focal_plane, psf, stamps
 from jobs.render.channels import vis
@@ -40,7 +40,7 @@ def light(ny: int, nx: int) -> Frame:
     """Expected electrons of points and of squares of seven pixels."""
     rng = np.random.default_rng(1)
     frame = np.zeros((ny, nx))
-    share = ny * nx / (4132 * 4096)
+    share = ny * nx / (_scenes.VIS.nx * _scenes.VIS.ny)
     for electrons in 10.0 ** rng.uniform(1.0, 4.0, int(_SOURCES * share)):
         x, y = rng.integers(4, nx - 4), rng.integers(4, ny - 4)
         frame[y - 3 : y + 4, x - 3 : x + 4] += electrons / 49.0

@@ -8,7 +8,7 @@ import pytest
 
 from jobs.accuracy import SURVEY
 from jobs.render.channels import vis
-from jobs.render.effects import bleeding, traps
+from jobs.render.effects import bleeding, quadrants, traps
 from jobs.render.effects.effect import Lights, Scene, apply_all
 from jobs.rng import stream
 from lake_schema.errors import OutOfRange
@@ -23,9 +23,9 @@ BOUND = 3.0
 END = {"vis.cti.age": (1.0, "")}
 
 
-def scene_of(shape, seconds=nominal.TIME, peak=1e11, light=0.0, **overrides):
+def scene_of(shape, seconds=nominal.TIME, peak=1e11, light=0.0, middle=0, **overrides):
     ny, nx = shape
-    detector = replace(small("vis", "3-4", 2), nx=nx, ny=ny)
+    detector = replace(small("vis", "3-4", 2), nx=nx, ny=ny, middle=middle)
     lights = Lights(np.array([nx / 2]), np.array([ny / 3]), np.array([light]))
     return Scene(resolve(overrides=overrides), "vis", seconds, 0.25, peak, detector, lights, accuracy=SURVEY)
 
@@ -76,6 +76,30 @@ def test_what_a_configuration_may_hold_every_effect_takes(key, unit):
     for value in (least - 0.25, most + 0.25):
         with pytest.raises(OutOfRange, match=key):
             resolve(overrides={key: (value, unit)})
+
+
+@pytest.mark.parametrize("kind", vis.EFFECTS)
+@pytest.mark.parametrize("scene", scenes((2, 2)))
+def test_rows_between_the_halves_are_not_read(kind, scene):
+    """Four rows, as full as may be: quadrants are smaller by them, and nothing else than what shines around is new."""
+    frame = scenes((SIDE, SIDE))[scene]
+    one = scene_of((SIDE, SIDE), light=float(frame.max()), middle=4)
+    found = {}
+    raw = through(frame, one, kind, watch=lambda name, before, after: found.setdefault(name, after))
+    assert raw.min() >= 0
+    assert raw.max() <= 65535
+    _, _, rows, middle = quadrants.sizes(one)
+    assert middle == 4
+    assert raw.shape[1] == SIDE // 2 - 2 + rows
+    if "bleeding" in found:
+        full = np.floor(one.value("full_well", "electron"))
+        half = SIDE // 2 - 2
+        held = found["bleeding"]
+        assert held[:half].max() <= full
+        assert held[half + 4 :].max() <= full
+        # A register's first pixel is the first row of its half, from below and from above.
+        cut = found["quadrants"][:, :half]
+        assert cut.sum() == pytest.approx(held[:half].sum() + held[half + 4 :].sum(), rel=1e-12)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 1e5])

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs.compiling import jit
-from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects import full_well
+from jobs.render.effects.effect import Effect, Frame
 from lake_schema.errors import OutOfRange
 
 
@@ -83,17 +84,6 @@ def saturated(frame: Frame, capacity: float) -> npt.NDArray[np.bool_]:
     return np.asarray(frame >= np.floor(capacity))
 
 
-def between(scene: Scene) -> int:
-    """Rows between a detector's halves."""
-    return 0 if scene.detector is None else scene.detector.middle
-
-
-def _capacity(scene: Scene) -> float:
-    return scene.value("full_well", "electron")
-
-
-def _contribution(scene: Scene) -> float:
-    return max(scene.peak_electrons + scene.sky_electrons - _capacity(scene), 0.0)
-
-
-EFFECT = Effect("bleeding", apply, lambda scene: (_capacity(scene), 2, between(scene)), _contribution, cost=5e-3)
+EFFECT = Effect(
+    "bleeding", apply, lambda scene: (full_well.capacity(scene), 2, scene.middle), full_well.contribution, cost=5e-3
+)

@@ -49,11 +49,8 @@ def seen(scene: Scene, led: int) -> float:
 
 
 def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:
-    nx, ny = int(scene.value("fpa.nx", "pix")), int(scene.value("fpa.ny", "pix"))
-    if scene.detector is not None:
-        nx, ny = scene.detector.nx, scene.detector.ny
     level = scene.value("flat.signal", "electron") * seen(scene, scene.lamp)
-    return level, *pattern(scene, scene.lamp, nx, ny)
+    return level, *pattern(scene, scene.lamp, scene.nx, scene.ny)
 
 
 EFFECT = Effect("calibration_lamp", apply, _parameters, lambda scene: _parameters(scene)[0], cost=1e-2)

@@ -68,13 +68,8 @@ def lattice(scene: Scene, direction: str) -> Traps:
     )
 
 
-def _rows(scene: Scene) -> int:
-    return scene.detector.half_rows if scene.detector is not None else int(scene.value("fpa.ny", "pix")) // 2
-
-
 def _columns(scene: Scene) -> int:
-    half = (scene.detector.nx if scene.detector is not None else int(scene.value("fpa.nx", "pix"))) // 2
-    return half + int(scene.value("fpa.prescan", "pix"))
+    return scene.nx // 2 + int(scene.value("fpa.prescan", "pix"))
 
 
 def _loss(scene: Scene, direction: str, transfers: int) -> float:
@@ -102,8 +97,8 @@ def _parameters(scene: Scene, direction: str, transfers: int) -> tuple[Traps, Sw
 PARALLEL = Effect(
     "parallel_cti",
     apply_parallel,
-    lambda scene: _parameters(scene, "parallel", _rows(scene)),
-    lambda scene: _loss(scene, "parallel", _rows(scene)),
+    lambda scene: _parameters(scene, "parallel", scene.half_rows),
+    lambda scene: _loss(scene, "parallel", scene.half_rows),
     cost=0.1,
 )
 SERIAL = Effect(

@@ -197,30 +197,18 @@ def _quantiles(scene: Scene) -> Frame:
     return np.array(scene.mission.numbers(_TRACKS))
 
 
-def _size(scene: Scene) -> tuple[int, int]:
-    """Columns, rows."""
-    if scene.detector is not None:
-        return scene.detector.nx, scene.detector.ny
-    return int(scene.value("fpa.nx", "pix")), int(scene.value("fpa.ny", "pix"))
-
-
 def _expected(scene: Scene) -> float:
-    nx, ny = _size(scene)
-    return rate(scene, float(nx * ny)) * scene.exposure_time_s
-
-
-def _half_rows(scene: Scene) -> int:
-    return _size(scene)[1] // 2 if scene.detector is None else scene.detector.half_rows
+    return rate(scene, float(scene.nx * scene.ny)) * scene.exposure_time_s
 
 
 def _expected_readout(scene: Scene) -> float:
-    return rate(scene, float((_size(scene)[0] // 2) * _half_rows(scene))) * scene.value("readout_time", "s")
+    return rate(scene, float((scene.nx // 2) * scene.half_rows)) * scene.value("readout_time", "s")
 
 
 def _readout(scene: Scene) -> tuple[float, Frame, int, int, int, Traps | None]:
-    prescan, half = int(scene.value("fpa.prescan", "pix")), _size(scene)[0] // 2
+    prescan, half = int(scene.value("fpa.prescan", "pix")), scene.nx // 2
     silicon = charge_transfer.lattice(scene, "parallel") if charge_transfer.PARALLEL.applied(scene) else None
-    return _expected_readout(scene), _quantiles(scene), _half_rows(scene), prescan, half, silicon
+    return _expected_readout(scene), _quantiles(scene), scene.half_rows, prescan, half, silicon
 
 
 def _in_a_pixel(scene: Scene, expected: float) -> float:

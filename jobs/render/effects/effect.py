@@ -81,6 +81,26 @@ class Scene:
         return self.mission.value(f"{self.section}.{key}", unit)
 
     @property
+    def nx(self) -> int:
+        """Columns of its detector; without one, of the mission's."""
+        return self.detector.nx if self.detector is not None else int(self.value("fpa.nx", "pix"))
+
+    @property
+    def ny(self) -> int:
+        """Rows, likewise."""
+        return self.detector.ny if self.detector is not None else int(self.value("fpa.ny", "pix"))
+
+    @property
+    def middle(self) -> int:
+        """Rows between the halves, that are not read."""
+        return self.detector.middle if self.detector is not None else 0
+
+    @property
+    def half_rows(self) -> int:
+        """Rows that are read through one register, of two."""
+        return (self.ny - self.middle) // 2
+
+    @property
     def sky_electrons(self) -> float:
         return self.sky_rate * self.exposure_time_s
 

@@ -1,4 +1,4 @@
-"""Full well: a pixel holds no more than its capacity (the excess is lost; nothing bleeds yet)."""
+"""Full well: a pixel holds no more than its capacity (the excess is lost: ground cameras; in VIS it bleeds)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ def apply(frame: Frame, capacity: float, rng: np.random.Generator | None = None)
     return np.minimum(frame, capacity)
 
 
-def _capacity(scene: Scene) -> float:
+def capacity(scene: Scene) -> float:
+    """Electrons."""
     return scene.value("full_well", "electron")
 
 
-def _contribution(scene: Scene) -> float:
-    return max(scene.peak_electrons + scene.sky_electrons - _capacity(scene), 0.0)
+def contribution(scene: Scene) -> float:
+    """What the brightest pixel has too many."""
+    return max(scene.peak_electrons + scene.sky_electrons - capacity(scene), 0.0)
 
 
-EFFECT = Effect("full_well", apply, lambda scene: (_capacity(scene),), _contribution, cost=3e-3)
+EFFECT = Effect("full_well", apply, lambda scene: (capacity(scene),), contribution, cost=3e-3)

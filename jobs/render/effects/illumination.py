@@ -56,18 +56,12 @@ def _half_sides(scene: Scene) -> tuple[float, float]:
     )
 
 
-def _size(scene: Scene) -> tuple[int, int]:
-    if scene.detector is not None:
-        return scene.detector.nx, scene.detector.ny
-    return int(scene.value("fpa.nx", "pix")), int(scene.value("fpa.ny", "pix"))
-
-
 def _vignetting(scene: Scene) -> tuple[Frame, Frame]:
-    return pattern(scene, *_size(scene), scene.value("illumination", ""), (0.0, 0.0))
+    return pattern(scene, scene.nx, scene.ny, scene.value("illumination", ""), (0.0, 0.0))
 
 
 def _shutter(scene: Scene) -> tuple[Frame, Frame]:
-    return pattern(scene, *_size(scene), 0.0, (0.0, _longer(scene)))
+    return pattern(scene, scene.nx, scene.ny, 0.0, (0.0, _longer(scene)))
 
 
 def _longer(scene: Scene) -> float:

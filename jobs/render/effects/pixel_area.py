@@ -41,8 +41,7 @@ def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
     """Nothing changes without a detector, or where its camera's optics do not distort."""
     d = scene.detector
     if d is None:
-        nx, ny = (int(scene.value(f"fpa.n{axis}", "pix")) for axis in "xy")
-        return scene.sky_electrons, np.zeros(nx), np.zeros(ny), np.zeros((1, 1))
+        return scene.sky_electrons, np.zeros(scene.nx), np.zeros(scene.ny), np.zeros((1, 1))
     cosine, sine = np.cos(np.radians(d.rotation)), np.sin(np.radians(d.rotation))
     u = np.arange(d.nx) - (d.nx - 1) / 2 + (cosine * d.x + sine * d.y) / d.pixel_scale
     v = np.arange(d.ny) - (d.ny - 1) / 2 + (cosine * d.y - sine * d.x) / d.pixel_scale

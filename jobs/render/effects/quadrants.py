@@ -76,7 +76,7 @@ def sizes(scene: Scene) -> tuple[int, int, int, int]:
     prescan, overscan, rows = (
         int(scene.value(f"fpa.{key}", "pix")) for key in ("prescan", "overscan", "parallel_overscan")
     )
-    return prescan, overscan, rows, 0 if scene.detector is None else scene.detector.middle
+    return prescan, overscan, rows, scene.middle
 
 
 EFFECT = Effect("quadrants", apply, sizes, lambda scene: 0.0, optional=False, cost=3e-3)

@@ -30,14 +30,14 @@ def apply(frame: Frame, share: float, halves: int, rng: np.random.Generator | No
 
 
 def _parameters(scene: Scene) -> tuple[float, int]:
+    # A row takes as long whatever part of a detector is looked at.
     rows = scene.value("fpa.ny", "pix") / 2 + scene.value("fpa.parallel_overscan", "pix")
     return scene.value("readout_time", "s") / rows / max(scene.exposure_time_s, 1e-3), 2
 
 
 def _contribution(scene: Scene) -> float:
     share, _ = _parameters(scene)
-    rows = scene.value("fpa.ny", "pix") / 2
-    return share * (scene.peak_electrons + rows * scene.sky_electrons)
+    return share * (scene.peak_electrons + scene.half_rows * scene.sky_electrons)
 
 
 EFFECT = Effect("readout_trail", apply, _parameters, _contribution, cost=3.5e-2)
