@@ -12,6 +12,7 @@ Ref : Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,21 +139,27 @@ def add(
     size: int,
     least: float,
     edges: Edges | None,
+    trail: Float | None = None,
 ) -> None:
-    """Adds what a star shines outside its stamp, whose plane fades by `left`, to a frame of 1 / FIXED_POINT electrons.
+    """Adds what a star shines outside its plane, which fades by `left`, to a frame of 1 / FIXED_POINT electrons.
 
-    photons : [w] share of each sub-band, None = equal;  size : of the stamp, pixels: all of the plane
+    photons : [w] share of each sub-band, None = equal;  size : of the plane, pixels
     least   : electrons in a pixel that may be left out
+    trail   : [2] pixels that it moves by, with its plane; None: it is at rest
     It also takes off what the plane's transform had folded into it: a fifth of what is at its corners.
     """
     if edges is None:
         return
     photons = np.full(len(edges.wavelength), 1.0 / len(edges.wavelength)) if photons is None else photons
+    trail = np.zeros(2) if trail is None else trail
+    points = max(math.ceil(float(np.hypot(*trail)) / _finest(edges)), 1)
+    along = (np.arange(points) + 0.5) / points - 0.5
+    columns, rows = column + along * trail[0], row + along * trail[1]
     ny, nx = frame.shape
-    farthest = float(np.hypot(max(column, nx - column), max(row, ny - row)))
-    level = electrons * ring(edges, photons)
-    lines = electrons * spikes(edges, photons, max(farthest, edges.period))
-    faintest = _FAINTEST * least
+    farthest = float(np.hypot(max(columns.max(), nx - columns.min()), max(rows.max(), ny - rows.min())))
+    level = electrons / points * ring(edges, photons)
+    lines = electrons / points * spikes(edges, photons, max(farthest, edges.period))
+    faintest = _FAINTEST * least / points
     radius = min((level / faintest) ** (1.0 / 3.0), farthest) if faintest > 0.0 else farthest
     inner = size / 2 - _SPARED
     # What a spike shows outside the plane: so far out, so wide.
@@ -161,15 +168,21 @@ def add(
     far = min(inner + _LONG * float(out[-1] + 1) if len(out) else 0.0, farthest)
     wide = _STEP * float(across[-1] + 1) if len(across) else 0.0
     turned = np.stack([np.cos(edges.bars[:, 0]), np.sin(edges.bars[:, 0])], axis=1)
-    _outside(frame, column, row, inner, level, radius, turned, lines, far, wide)
     folds = _FOLDED * level / inner**3 > faintest
-    _inside(frame, column, row, inner, level, turned, lines, edges.period, folds)
+    for x, y in zip(columns.tolist(), rows.tolist(), strict=True):
+        _outside(frame, x, y, inner, level, radius, turned, lines, far, wide)
+        _inside(frame, x, y, inner, level, turned, lines, edges.period, folds)
+
+
+def _finest(edges: Edges) -> float:
+    """Pixels between points that shine as an even line does: across a spike no frequency is higher."""
+    return float(edges.wavelength.min() * 1e-7 / edges.bars[:, 2].max() / (edges.pixel_scale * _ARCSEC))
 
 
 def left(size: int, samples: int, count: int) -> Float:
     """float64[count] what a star's plane is multiplied with along each axis, to fade into `add`'s light.
 
-    size : of the stamp, pixels;  samples : a pixel;  count : of the plane, its middle in the middle
+    size : of the plane, pixels;  samples : a pixel;  count : of samples, its middle in the middle
     """
     distance = np.abs(np.arange(count) - count // 2) / samples
     return np.array([_left(float(d), size / 2 - _SPARED) for d in distance])

@@ -375,8 +375,8 @@ def _draw(
     for i in np.flatnonzero(far):
         photons = None if sources.photons is None else sources.photons[i]
         edges.add(
-            frame, sources.column[i], sources.row[i], sources.electrons[i], photons, int(sizes[i]),
-            left_out[i] * sources.electrons[i], psf.edges,
+            frame, sources.column[i], sources.row[i], sources.electrons[i], photons, SIDE,
+            left_out[i] * sources.electrons[i], psf.edges, trail[i],
         )  # fmt: skip
     layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
     layer += wings.galaxies(sources.column, sources.row, stray, curve[:, 4], farthest, sizes, nx, ny)

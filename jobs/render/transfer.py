@@ -158,7 +158,8 @@ def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any], fading: bo
         return Transfer(some, _planes(psf, some, dtype))
     image = _image(psf.planes, weights, SAMPLES * some.size).astype(dtype)
     if fading:
-        left = edges.left(some.size, SAMPLES, len(image))
+        # A stamp may be wider than the plane, for a trail.
+        left = edges.left(SIDE, SAMPLES, len(image))
         image *= left[:, None] * left
     return Transfer(some, _on_grid([image], some, psf.intra_pixel, dtype))
 

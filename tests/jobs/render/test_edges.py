@@ -119,6 +119,48 @@ def test_the_frame_has_no_seam(vis):
     assert smooth.max() / smooth.min() < 2.0
 
 
+@pytest.mark.parametrize("length", [30.0, 94.0])
+def test_the_frame_of_a_trail_has_no_seam(vis, length):
+    """A moving body's light is a star's along its trail, without holes where planes of its pieces end."""
+    side, middle, angle = 1000, (500.3, 499.8), 0.4
+    field = replace(small("vis", "3-4", side), nx=side, ny=side)
+    source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), BRIGHT, *middle)
+    trail = length * np.array([np.cos(angle), np.sin(angle)])
+    moving = replace(source, trail=trail[None])
+    size = stamps.stamp_sizes(
+        moving.electrons, moving.shape, moving.shapes, vis, NOISE, stamps.settings_for(SURVEY),
+        stamps.piece_length(moving.length),
+    )  # fmt: skip
+    assert size[0] > SIDE
+    image = stamps.draw(moving, size, vis, side, side)
+    assert image.min() > -NOISE
+    # Independent of pieces: stars at rest, each with its share.
+    along = np.arange(-0.5, 0.5, 1 / 16) + 1 / 32
+    y, x = np.mgrid[:side, :side]
+    law, clear = np.zeros((side, side)), np.ones((side, side), bool)
+    for a in along:
+        dx, dy = x - middle[0] - a * trail[0], y - middle[1] - a * trail[1]
+        law += edges.ring(vis.edges, EQUAL) * BRIGHT / len(along) / np.maximum(np.hypot(dx, dy), 1.0) ** 3
+        clear &= off_spikes(vis, dx, dy, 40.0)
+    radius = np.hypot(x - middle[0], y - middle[1])
+    for inner, outer in ((150, 200), (200, 230), (230, 260), (260, 290), (290, 330), (330, 400), (400, 500)):
+        here = clear & (radius >= inner) & (radius < outer)
+        assert image[here].sum() == pytest.approx(law[here].sum(), rel=0.06)
+
+
+def test_a_trail_s_spikes_are_no_comb(vis):
+    """A spike smeared along a trail is even: four times as many points draw the same."""
+    side, x, y, trail, points = 300, 150.3, -290.2, np.array([60.0, 10.0]), 100
+    even, many = np.zeros((side, side), np.int64), np.zeros((side, side), np.int64)
+    edges.add(even, x, y, BRIGHT, None, SIDE, 0.0, vis.edges, trail)
+    for a in (np.arange(points) + 0.5) / points - 0.5:
+        edges.add(many, x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
+    # A spike's table ends 40 pixels from its middle: there a point more or less is a step.
+    wrong = np.abs(even / many - 1.0)
+    assert np.quantile(wrong, 0.99) < 0.03
+    assert wrong.max() < 0.1
+
+
 def test_colours_differ(vis):
     """The ring goes with the wavelength: a red star's is brighter."""
     red, blue = np.zeros(len(PARTS)), np.zeros(len(PARTS))
