@@ -37,7 +37,7 @@ from jobs.render import (
     truth_maps,
 )
 from jobs.render.channels import ext, vis
-from jobs.render.effects import calibration_lamp, charge_injection, quadrants
+from jobs.render.effects import calibration_lamp, charge_injection, cosmic_rays, quadrants
 from jobs.render.effects.effect import Decision, Effect, Lights, Scene, apply_all, decide
 from jobs.render.focal_plane import Detector
 from jobs.render.psf import Psf
@@ -63,6 +63,8 @@ _MOST_SECONDS = 6 * 3600.0
 EFFECTS: Mapping[str, Mapping[str, tuple[Effect, ...]]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
 # What fills pixels besides the sky and its sources.
 _LAMPS = (calibration_lamp.EFFECT, charge_injection.EFFECT)
+# What crosses it besides light: its tracks are squeezed, and left behind, in the dark, too.
+_RAYS = (cosmic_rays.EFFECT, cosmic_rays.READOUT)
 # Electrons of a source that may shine where it is not.
 _LIGHT = 1e6
 # Code of a star in an identifier.
@@ -192,7 +194,12 @@ def render(
         noise_free = np.zeros((detector.ny, detector.nx))
     # A lamp's light and injected charge are moved and squeezed like a star's.
     own = sum(effect.contribution(scene) for effect in effects if effect in _LAMPS and forced.get(effect.name, True))
-    scene = replace(scene, peak_electrons=scene.peak_electrons + own)
+    rays = [effect for effect in effects if effect in _RAYS and forced.get(effect.name, effect.needed_if(scene))]
+    scene = replace(
+        scene,
+        peak_electrons=scene.peak_electrons + own,
+        track_electrons=cosmic_rays.brightest(scene) if rays else 0.0,
+    )
 
     maps["noise_free"] = noise_free.astype(np.float32)
     # Handed over: a frame that nobody looks at any more is freed.

@@ -78,8 +78,7 @@ def _loss(scene: Scene, direction: str, transfers: int) -> float:
     Where sources change by less than the accuracy allows, that tells the margin.
     """
     silicon = lattice(scene, direction)
-    brightest = scene.peak_electrons + scene.sky_electrons
-    lost = transfers * sum(silicon.density) * float(silicon.volume(brightest))
+    lost = transfers * sum(silicon.density) * float(silicon.volume(scene.brightest_electrons))
     over = _over_accuracy(scene.accuracy, transfers * sum(silicon.density))
     return lost if over > 1.0 else min(lost, over * NOTICEABLE * scene.pixel_noise)
 

@@ -8,6 +8,7 @@ trail of their own.
 apply, EFFECT            in the integration, on the detector
 apply_readout, READOUT   in the readout, on quadrants
 tracks                   their charge alone: the truth map
+brightest                what they may bring to a pixel
 """
 
 from __future__ import annotations
@@ -209,6 +210,12 @@ def _readout(scene: Scene) -> tuple[float, Frame, int, int, int, Traps | None]:
     prescan, half = int(scene.value("fpa.prescan", "pix")), scene.nx // 2
     silicon = charge_transfer.lattice(scene, "parallel") if charge_transfer.PARALLEL.applied(scene) else None
     return _expected_readout(scene), _quantiles(scene), scene.half_rows, prescan, half, silicon
+
+
+def brightest(scene: Scene) -> float:
+    """Electrons in the brightest pixel of a track that is likely: all of it, or what a length of one pixel gets."""
+    _, length, charge = _quantiles(scene).T
+    return float((charge / np.maximum(length, 1.0)).max())
 
 
 def _in_a_pixel(scene: Scene, expected: float) -> float:

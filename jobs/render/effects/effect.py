@@ -57,6 +57,7 @@ class Scene:
     section        : prefix of the detector's parameters, "vis" or "ext.lsstcam"
     sky_rate       : electrons per second in a pixel
     peak_electrons : brightest pixel of the expected image: of the sources, with a lamp's light or injected charge
+    track_electrons : brightest likely pixel of cosmic rays' tracks, where there are some
     detector       : where it lies in the focal plane; None: at its centre
     lights         : what shines around corners: ghosts, straylight
     lamp           : the LED of a flat, from 1
@@ -75,6 +76,7 @@ class Scene:
     accuracy: Accuracy = SURVEY
     forced: Mapping[str, bool] = field(default_factory=dict)
     band: Passband | None = None
+    track_electrons: float = 0.0
 
     def value(self, key: str, unit: str) -> float:
         """A parameter of the detector."""
@@ -103,6 +105,11 @@ class Scene:
     @property
     def sky_electrons(self) -> float:
         return self.sky_rate * self.exposure_time_s
+
+    @property
+    def brightest_electrons(self) -> float:
+        """Of a pixel, whatever has brought them: what is read is squeezed and left behind alike."""
+        return max(self.peak_electrons, self.track_electrons) + self.sky_electrons
 
     @property
     def dark_rate(self) -> float:

@@ -102,8 +102,7 @@ def parameters(scene: Scene) -> tuple[float, float, float, float]:
 
 
 def _contribution(scene: Scene) -> float:
-    brightest = min(scene.peak_electrons, scene.value("full_well", "electron")) + scene.sky_electrons
-    there = np.array([brightest])
+    there = np.array([min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)])
     return float((there - apply(there, *parameters(scene)))[0])
 
 

@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
+from jobs import rng
 from jobs.render import focal_plane
-from jobs.render.effects.effect import NOTICEABLE, Lights, Scene
+from jobs.render.channels import vis
+from jobs.render.effects.effect import NOTICEABLE, Lights, Scene, apply_all
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render import nominal
 from tests.jobs.render.effects.battery import EFFECTS
+from tests.jobs.render.fields import small
 
 MISSION = resolve()
 DETECTOR = focal_plane.detector("vis", "1-1", MISSION)
@@ -98,3 +102,23 @@ def test_cosmic_rays_are_always_needed_but_without_time(name):
     assert effect.needed_if(scene())
     nothing = Scene(MISSION, "vis", 0.0, 0.25, 0.0, DETECTOR)
     assert effect.needed_if(nothing) == (name == "readout_cosmic_rays")
+
+
+@pytest.mark.parametrize(
+    ("kind", "seconds", "sky"), [("dark", 565.0, 0.0), ("bias", 0.0, 0.0), ("science", 560.5, 0.2)]
+)
+def test_nothing_is_missing_where_cosmic_rays_alone_are_bright(kind, seconds, sky):
+    """All effects of a frame without sources, tracks and all: what one more that is left out would change."""
+    one = nominal.rendered(small("vis", "3-4", 256), [], [], [], kind=kind, seconds=seconds, sky=sky)
+    # Before it is rounded.
+    effects = [effect for effect in vis.EFFECTS[kind] if effect.name != "adc"]
+
+    def read(forced):
+        return apply_all(np.zeros((256, 256)), effects, one.scene, lambda e: rng.stream(1, kind, e.name), forced)
+
+    found, decisions = read({})
+    assert any(decision.applied for decision in decisions if "cosmic_rays" in decision.name)
+    for decision in decisions:
+        if not decision.applied:
+            change = read({decision.name: True})[0] - found
+            assert np.sqrt(np.mean(change**2)) < NOTICEABLE * one.scene.pixel_noise, decision.name
