@@ -13,6 +13,7 @@ science_cards, truth_cards
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ import pyarrow as pa
 
 from jobs import rng
 from jobs.render import focal_plane
-from jobs.render.effects import quadrants
+from jobs.render.effects import bias_structure, charge_transfer, nonlinearity, quadrants, read_noise
 from jobs.render.exposure import Rendered, effects_of, numbers_of
 from jobs.render.stamps import Sources
 from lake_schema import __version__, fits
@@ -33,6 +34,8 @@ from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 # Codes of `method` in the table `rendered_truth`.
 POINT, PROFILE, PICTURE, TRAIL = 0, 1, 2, 3
+# Of an amplifier's offset, a column's stripe and a reading: what next to no pixel is below.
+_SURE = 5.0
 _MJD_ZERO = datetime(1858, 11, 17)
 
 Writer = Callable[[Path], None]
@@ -174,7 +177,7 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
             "[electron] rms in the image",
         ),
         ("BIAS", scene.value("bias", "adu"), "[adu] added to every pixel"),
-        ("SATURATE", _saturation(rendered, gain), "[adu] largest value"),
+        ("SATURATE", _saturation(rendered, gain), "[adu] a full pixel has no less"),
         ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
         ("DARKRATE", ("dark_current" in applied) * scene.dark_rate, "[electron/s/pix] mean dark current in the image"),
         *_effect_cards(rendered),
@@ -232,9 +235,19 @@ def _date(mjd: float) -> str:
 
 
 def _saturation(rendered: Rendered, gain: float) -> float:
-    scene = rendered.scene
-    full_well = scene.value("full_well", "electron") / gain + scene.value("bias", "adu")
-    return float(np.floor(min(full_well, scene.value("adc_max", "adu"))))
+    """What a full pixel reads at least: of its charge, what transfer and amplifier leave, below all noise."""
+    full = rendered.scene.value("full_well", "electron")
+    scene = replace(rendered.scene, peak_electrons=full)
+    applied = {decision.name for decision in rendered.decisions if decision.applied}
+    # The first of a column, or a row, finds all traps empty.
+    losses = (charge_transfer.PARALLEL, charge_transfer.SERIAL)
+    signal = full - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
+    if nonlinearity.EFFECT.name in applied:
+        signal = float(nonlinearity.apply(np.array([max(signal, 0.0)]), *nonlinearity.parameters(scene))[0])
+    noises = (bias_structure.EFFECT, read_noise.EFFECT)
+    signal -= _SURE * sum(effect.contribution(scene) for effect in noises if effect.name in applied)
+    level = signal / gain + scene.value("bias", "adu")
+    return float(np.floor(np.clip(level, 0.0, scene.value("adc_max", "adu"))))
 
 
 def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:

@@ -71,12 +71,29 @@ def test_the_header_calibrates_the_image(rendered, written):
     ):
         assert header[key] == value
     assert header["ZEROPNT"] == pytest.approx(25.93, abs=0.01)
-    assert header["SATURATE"] == 58471
     assert header["MISSION"] == rendered.scene.mission.fingerprint
     names = [d.name for d in rendered.decisions]
     assert [header[f"EFFECT{i}"].split(":")[0] for i in range(1, len(names) + 1)] == names
     assert header["DARKRATE"] == 0.0
     assert "dark_current: off" in header[f"EFFECT{names.index('dark_current') + 1}"]
+
+
+@pytest.mark.parametrize("forced", [{}, nominal.off("nonlinearity"), {"parallel_cti": True, "serial_cti": True}])
+def test_what_reads_no_less_than_saturate_is_full(tmp_path, forced):
+    """A star of 8 mag: all of its full pixels, and of those that are not, next to none."""
+    one = nominal.rendered(small("vis", "3-4", 256), [8.0], [100.3], [90.2], forced=forced, truth=("saturation",))
+    rows, writers = fits_product.products(one, ("saturation",))
+    path = rows["path"][0].as_py()
+    (tmp_path / path).parent.mkdir(parents=True)
+    writers[path](tmp_path / path)
+    found = fits_product.frame(tmp_path / path)
+    level = {key: value for key, value, _ in found.cards}["SATURATE"]
+    full = one.maps["saturation"] > 0
+    assert full.sum() > 2000
+    assert np.all(found.data[full] >= level)
+    assert np.sum(found.data[~full] >= level) < 0.02 * full.sum()
+    # The lowest of them is not far above.
+    assert found.data[full].min() - level < 0.01 * level
 
 
 def test_quadrants_are_extensions_with_their_own_place_on_the_sky(rendered, written):
