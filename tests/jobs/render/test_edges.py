@@ -81,6 +81,25 @@ def test_a_spike_is_the_pupil_s_transform(bar):
     assert (ours * radius**2).mean() == pytest.approx((theirs * radius**2).mean(), rel=0.05)
 
 
+def test_wings_are_those_of_the_mission_database(vis):
+    """The embedded pupil's azimuthal mean, at 1", where bars shine as much as circles that are as long."""
+    own = of_pupil()
+    circles = (
+        2 * np.pi * (MISSION.value("plm.aperture_diameter", "mm") / 2 + MISSION.value("plm.pupil.stop_radius", "mm"))
+    )
+    bars = 2 * own.bars[:, 2].sum()
+    # Of light in a pixel, at ten pixels; per square arcsec.
+    strength = edges.ring(own, EQUAL) / 10.0**3 / 0.1**2 * (circles + bars) / circles
+    assert strength == pytest.approx(MISSION.value("vis.psf.wing_strength"), rel=0.03)
+    frame = shone(vis, 1401, 700.0, 700.0)
+    y, x = np.mgrid[-700:701, -700:701].astype(float)
+    radius, clear = np.hypot(x, y), off_spikes(vis, x, y, 60.0)
+    far = np.array([400.0, 500.0, 600.0])
+    light = [frame[clear & (np.abs(radius - r) < 3.0)].mean() for r in far]
+    slope = np.polyfit(np.log(far), np.log(light), 1)[0]
+    assert slope == pytest.approx(MISSION.value("vis.psf.wing_slope"), abs=0.05)
+
+
 def test_no_light_is_lost_beyond_the_plane(vis):
     """The plane has what the pupil sends there: outside lies the rest of all light."""
     side = 3000

@@ -345,6 +345,8 @@ def test_open_shutter_draws_a_trail():
     assert (out[14:, 2] == 0).all()
     share, halves = readout_trail.EFFECT.parameters(scene())
     assert share == pytest.approx(72 / 2086 / 560.53)
+    # What traps see of a row: the time that it stays.
+    assert share * 560.53 == pytest.approx(scene().value("cti.dwell_time", "s"), rel=0.03)
     assert halves == 2
     with pytest.raises(OutOfRange, match="trail"):
         readout_trail.apply(frame, -1.0, 2)
