@@ -23,6 +23,7 @@ _MOST = 2**31 - 1
 def kept() -> Iterator[None]:
     """While this is open, memory of arrays that are no more is there for the next; then it is given back.
 
+    Afterwards the library no longer learns from which size on to ask the operating system: it does so from 128 kB.
     Does nothing where the C library is another than GNU's.
     """
     library = _library()
