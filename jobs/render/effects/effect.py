@@ -49,6 +49,14 @@ class Lights:
     row: Frame = field(default_factory=lambda: np.zeros(0))
     electrons: Frame = field(default_factory=lambda: np.zeros(0))
 
+    def and_those(self, more: Lights) -> Lights:
+        """These, then those."""
+        return Lights(
+            np.append(self.column, more.column),
+            np.append(self.row, more.row),
+            np.append(self.electrons, more.electrons),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Scene:
