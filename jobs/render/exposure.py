@@ -67,6 +67,8 @@ _LAMPS = (calibration_lamp.EFFECT, charge_injection.EFFECT)
 _RAYS = (cosmic_rays.EFFECT, cosmic_rays.READOUT)
 # Electrons of a source that may shine where it is not.
 _LIGHT = 1e6
+# Pixels of a trail that shine around corners as a point.
+_PIECE = 32.0
 # Code of a star in an identifier.
 _STAR = 5
 
@@ -170,10 +172,10 @@ def render(
             passband, library, stellar, lenses,
         )  # fmt: skip
         if channel == "VIS":
-            sources, sizes = _with_moving(
+            sources, sizes, bright = _with_moving(
                 sources, sizes, exposure, detector, system, passband, scene, spread, settings, seed, bodies
             )
-            lights = _lights((galaxies, electrons[0]), (stars, electrons[1]), detector, system)
+            lights = _lights((galaxies, electrons[0]), (stars, electrons[1]), detector, system).and_those(bright)
             peak = float(spread.surface[0]) * float(sources.electrons.max(initial=0.0))
             scene = replace(scene, lights=lights, peak_electrons=peak)
             decisions = decide((vis.DRAWN,), scene, forced)
@@ -356,8 +358,8 @@ def _arcs(lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: p
 def _with_moving(
     sources: Sources, sizes: stamps.Int, exposure: Row, detector: Detector, system: WCS, band: Passband, scene: Scene,
     spread: Psf, settings: Settings, seed: int, bodies: Callable[[int], moving.Population] | None,
-) -> tuple[Sources, stamps.Int]:  # fmt: skip
-    """The sources with those that move, whose identifiers are the largest."""
+) -> tuple[Sources, stamps.Int, Lights]:  # fmt: skip
+    """The sources with those that move, whose identifiers are the largest; and bright ones around, as far as read."""
     reach = (detector.half_diagonal + stamps.SIZES[-1] * detector.pixel_scale) / 3600.0
     found = moving.sources(exposure, detector, system, band, scene.mission, seed, reach, sources.shapes, bodies)
     own = stamps.stamp_sizes(
@@ -372,8 +374,21 @@ def _with_moving(
     wide = own + np.ceil(found.length).astype(np.int64)
     here = selection.touching(found.column, found.row, wide, detector.nx, detector.ny) & (found.electrons > 0)
     if not here.any():
-        return sources, sizes
-    return sources.with_moving(found.take(here)), np.concatenate([sizes, own[here]])
+        return sources, sizes, _trails(found)
+    return sources.with_moving(found.take(here)), np.concatenate([sizes, own[here]]), _trails(found)
+
+
+def _trails(bodies: Sources) -> Lights:
+    """Bright bodies as points along their trails, near each other beside what light spreads over around corners."""
+    bright = np.flatnonzero(bodies.electrons > _LIGHT)
+    pieces = np.ceil(bodies.length[bright] / _PIECE).astype(np.int64) + 1
+    body, first = np.repeat(bright, pieces), np.repeat(np.cumsum(pieces) - pieces, pieces)
+    count = np.repeat(pieces, pieces)
+    # Of the trail, from its middle.
+    place = (np.arange(len(body)) - first + 0.5) / count - 0.5
+    trail = np.zeros((len(bodies), 2)) if bodies.trail is None else bodies.trail
+    along = place[:, None] * trail[body]
+    return Lights(bodies.column[body] + along[:, 0], bodies.row[body] + along[:, 1], bodies.electrons[body] / count)
 
 
 def _colours(

@@ -91,6 +91,33 @@ def test_an_exposure_shows_the_table_s_bodies_alone(tmp_path):
     assert one.noise_free[:, 100:].sum() > 1e5
 
 
+def test_bright_bodies_shine_around_corners(tmp_path):
+    """One on the detector and one beside it: as points along their trails, with all of their light."""
+    detector = small("vis", "3-4", 256)
+    ra, dec, angle = nominal.pointing(detector)
+    system = focal_plane.wcs(detector, ra, dec, angle)
+    start = 60905.0 + 1
+    lon, lat = ecliptic(*focal_plane.sky_of_pixel(system, [127.5, 127.5, 127.5], [127.5, 500.0, 20.0]))
+    values = {"mjd": [start] * 3, "lon": lon, "lat": lat, "east": [60.0, 0.0, 0.0], "north": [0.0] * 3}
+    file = written(tmp_path / "bright.parquet", {**values, "mag": [12.0, 8.0, 21.0]})
+    forced = nominal.off("cosmic_rays", "readout_cosmic_rays")
+    one = nominal.rendered(detector, [], [], [], forced=forced, asteroids=own_bodies.read(file, "b").of_day)
+    lights = one.scene.lights
+    rate = nominal.TIME * 10 ** (0.4 * (one.zero_point - np.array([12.0, 8.0])))
+    still = np.isclose(lights.electrons.max(), lights.electrons, rtol=1e-3)
+    assert still.sum() == 1
+    assert lights.electrons[still][0] == pytest.approx(rate[1], rel=0.02)
+    assert (lights.column[still][0], lights.row[still][0]) == pytest.approx((127.5, 500.0), abs=0.1)
+    assert lights.electrons[~still].sum() == pytest.approx(rate[0], rel=0.02)
+    trail = one.sources.trail[one.sources.electrons > 1e6][0]
+    assert np.ptp(lights.column[~still]) == pytest.approx(abs(trail[0]) * (1 - 1 / (~still).sum()))
+    middle = one.sources.column[one.sources.electrons > 1e6][0]
+    assert lights.column[~still].mean() == pytest.approx(middle)
+    assert np.diff(lights.column[~still]) == pytest.approx(
+        np.full((~still).sum() - 1, np.diff(lights.column[~still])[0])
+    )
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
