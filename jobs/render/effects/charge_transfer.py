@@ -98,12 +98,12 @@ PARALLEL = Effect(
     apply_parallel,
     lambda scene: _parameters(scene, "parallel", scene.half_rows),
     lambda scene: _loss(scene, "parallel", scene.half_rows),
-    cost=0.1,
+    cost=0.11,
 )
 SERIAL = Effect(
     "serial_cti",
     apply_serial,
     lambda scene: _parameters(scene, "serial", _columns(scene)),
     lambda scene: _loss(scene, "serial", _columns(scene)),
-    cost=0.1,
+    cost=0.082,
 )

@@ -237,5 +237,5 @@ READOUT = Effect(
     apply_readout,
     _readout,
     lambda scene: _in_a_pixel(scene, _expected_readout(scene)),
-    cost=4e-3,
+    cost=6.5e-3,
 )

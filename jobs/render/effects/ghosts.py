@@ -125,4 +125,4 @@ def _contribution(scene: Scene) -> float:
     return ratio * brightest / float(np.sqrt(np.pi) * radius)
 
 
-EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=9e-3)
+EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=4.5e-3)

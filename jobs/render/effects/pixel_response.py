@@ -64,4 +64,4 @@ def _contribution(scene: Scene) -> float:
     return max(rms * brightest, scene.sky_electrons * (dead > 0 or columns > 0))
 
 
-EFFECT = Effect("pixel_response", apply, _parameters, _contribution, fixed=True, cost=9e-3)
+EFFECT = Effect("pixel_response", apply, _parameters, _contribution, fixed=True, cost=1.2e-2)

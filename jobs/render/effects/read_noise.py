@@ -31,4 +31,4 @@ def _sigma(scene: Scene) -> float:
     return scene.value("read_noise", "electron")
 
 
-EFFECT = Effect("read_noise", apply, lambda scene: (_sigma(scene),), _sigma, cost=7e-3)
+EFFECT = Effect("read_noise", apply, lambda scene: (_sigma(scene),), _sigma, cost=9e-3)
