@@ -19,7 +19,7 @@ from jobs.fluxes import passbands
 from jobs.render import chromatic, focal_plane, psf, stamps
 from jobs.render.channels import vis
 from jobs.render.effects import cosmic_rays, ghosts, quadrants
-from jobs.render.effects.effect import Frame, Lights, Scene
+from jobs.render.effects.effect import Effect, Frame, Lights, Scene
 from jobs.render.focal_plane import Detector
 from jobs.render.profiles import Shapes
 from jobs.render.stamps import Sources
@@ -64,20 +64,37 @@ def measured(side: int | None, repeats: int) -> dict[str, float]:
     scene = replace(scene, lights=lights)
     out: dict[str, float] = {}
     for effect in vis.SKY:
-        parameters = effect.parameters(scene)
-        after = effect.apply(frame, *parameters, rng=stream(1, effect.name))
-        work = partial(effect.apply, frame, *parameters, rng=stream(1, effect.name))
-        out[f"{effect.name}_s"] = report.best(work, repeats, time.process_time)
-        out[f"{effect.name}_margin"] = effect.margin(scene)
-        if after.shape == frame.shape and effect.name != "adc":
-            change = after - frame
-            out[f"{effect.name}_rms_sigma"] = float(np.sqrt(np.mean(change**2))) / scene.pixel_noise
-            out[f"{effect.name}_largest_sigma"] = float(np.abs(change).max()) / scene.pixel_noise
-        frame = after
+        frame = _one(effect, frame, scene, repeats, out)
     assembled = quadrants.assembled(frame, *quadrants.sizes(scene))
     out["all_s"] = sum(value for key, value in out.items() if key.endswith("_s"))
     out["mean_adu"] = float(assembled.mean())
+    # What other images have besides, each on the light, or on nothing where none falls.
+    light_alone = light(detector.ny, detector.nx)
+    for effect in vis.FLAT:
+        if effect not in vis.SKY:
+            _one(effect, light_alone, scene, repeats, out)
+    for effect in vis.INJECTION:
+        if effect not in vis.SKY:
+            _one(effect, np.zeros_like(light_alone), scene, repeats, out)
     return out
+
+
+def _one(effect: Effect, frame: Frame, scene: Scene, repeats: int, out: dict[str, float]) -> Frame:
+    """Adds an effect's figures to `out`; what it leaves."""
+    parameters = effect.parameters(scene)
+    after = effect.apply(frame, *parameters, rng=stream(1, effect.name))
+    work = partial(effect.apply, frame, *parameters, rng=stream(1, effect.name))
+    out[f"{effect.name}_s"] = report.best(work, repeats, time.process_time)
+    out[f"{effect.name}_margin"] = effect.margin(scene)
+    if after.shape == frame.shape and effect.name != "adc":
+        _changed(effect.name, after - frame, scene, out)
+    return after
+
+
+def _changed(name: str, change: Frame, scene: Scene, out: dict[str, float]) -> None:
+    """rms and largest change of a pixel, of its noise."""
+    out[f"{name}_rms_sigma"] = float(np.sqrt(np.mean(change**2))) / scene.pixel_noise
+    out[f"{name}_largest_sigma"] = float(np.abs(change).max()) / scene.pixel_noise
 
 
 def standard(detector: Detector, pitch: int) -> Sources:
@@ -129,15 +146,12 @@ def changes(scene: Scene, some: Sources, frame: Frame, radius: float = APERTURE)
             continue
         frame = effect.apply(frame, *effect.parameters(scene), rng=stream(1, effect.name))
         after = forms(frame if frame.ndim == 2 else quadrants.assembled(frame, *sizes), some, radius)
-        ratio = after[:, :2] / before[:, :2]
-        out[effect.name] = np.column_stack(
-            [-2.5 * np.log10(ratio[:, 0]), ratio[:, 1] - 1, after[:, 2:] - before[:, 2:]]
-        )
+        out[effect.name] = _differences(before, after)
         before = after
     return out
 
 
-def sources_changed(side: int | None) -> dict[str, float]:
+def sources_changed(side: int | None, repeats: int) -> dict[str, float]:
     """Medians over the standard set of what each effect changes; shear is half an ellipticity."""
     mission = resolve()
     detector = focal_plane.detector("vis", "3-4", mission)
@@ -148,7 +162,8 @@ def sources_changed(side: int | None) -> dict[str, float]:
     lights = Lights(np.array([100.0]), np.array([100.0]), np.array([_LIGHT]))
     scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(light.max()), detector, lights)
     out: dict[str, float] = {}
-    for name, change in changes(scene, some, light).items():
+    own = _drawn(some, spread, light, scene, repeats, out)
+    for name, change in {vis.DRAWN.name: own, **changes(scene, some, light)}.items():
         for kind, chosen in (("star", some.shape < 0), ("galaxy", some.shape >= 0)):
             mag, size, e1, e2 = np.nanmedian(change[chosen], axis=0)
             out[f"{name}_{kind}_mag"], out[f"{name}_{kind}_size"] = float(mag), float(size)
@@ -156,14 +171,37 @@ def sources_changed(side: int | None) -> dict[str, float]:
     return out
 
 
+def _drawn(
+    some: Sources, spread: psf.Psf, light: Frame, scene: Scene, repeats: int, out: dict[str, float]
+) -> Frame:  # fmt: skip
+    """Adds the figures of what is part of drawing: what that takes more with it; what it does to sources, [n, 4]."""
+    (strength,) = vis.DRAWN.parameters(scene)
+    sizes, (ny, nx) = np.full(len(some), _STAMP), light.shape
+    with_it, without = (
+        partial(stamps.draw, some, sizes, one, nx, ny) for one in (replace(spread, intra_pixel=strength), spread)
+    )
+    more = report.best(with_it, repeats, time.process_time) - report.best(without, repeats, time.process_time)
+    # Less than two drawings differ by chance.
+    out[f"{vis.DRAWN.name}_s"] = max(more, 0.0)
+    out[f"{vis.DRAWN.name}_margin"] = vis.DRAWN.margin(scene)
+    drawn = with_it()
+    _changed(vis.DRAWN.name, drawn - light, scene, out)
+    return _differences(forms(light, some), forms(drawn, some))
+
+
+def _differences(before: Frame, after: Frame) -> Frame:
+    """Of `forms`: magnitude, dR^2 / R^2, de1, de2."""
+    ratio = after[:, :2] / before[:, :2]
+    return np.column_stack([-2.5 * np.log10(ratio[:, 0]), ratio[:, 1] - 1, after[:, 2:] - before[:, 2:]])
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures and prints everything."""
     options = report.options("effects", __doc__ or "", argv)
     side = 512 if options.quick else None
-    figures = measured(side, 1 if options.quick else 3) | sources_changed(side)
-    report.finish(
-        "effects", 1 if options.quick else 3, figures, {"all_s": "CPU, every effect of a detector"}, options.json
-    )
+    repeats = 1 if options.quick else 3
+    figures = measured(side, repeats) | sources_changed(side, repeats)
+    report.finish("effects", repeats, figures, {"all_s": "CPU, every effect of a science image"}, options.json)
     return 0
 
 
