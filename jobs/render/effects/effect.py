@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -162,7 +163,9 @@ class Effect:
 
     def margin(self, scene: Scene) -> float:
         """Contribution over what would be noticed: above 1 the effect is needed."""
-        return float(self.contribution(scene)) / (NOTICEABLE * scene.pixel_noise)
+        change, noise = float(self.contribution(scene)), NOTICEABLE * scene.pixel_noise
+        # Without any noise everything is noticed.
+        return change / noise if noise > 0.0 else math.inf if change > 0.0 else 0.0
 
     def needed_if(self, scene: Scene) -> bool:
         return not self.optional or self.margin(scene) > 1.0

@@ -90,6 +90,16 @@ def test_strange_or_impossible_wishes_are_refused():
         decide(ext.SKY, SCENE, {"adc": False})
 
 
+def test_without_noise_all_is_noticed():
+    """A bias of an amplifier without noise."""
+    silent = resolve(overrides={"vis.read_noise": (0.0, "electron")})
+    bias = Scene(silent, "vis", 0.0, 0.0, 0.0)
+    assert bias.pixel_noise == 0.0
+    margins = {decision.name: decision.margin for decision in decide(vis.EFFECTS["bias"], bias, {})}
+    assert margins["bias_structure"] == np.inf
+    assert margins["read_noise"] == 0.0
+
+
 def test_margins_tell_the_ratio():
     (dark,) = (e for e in ext.SKY if e.name == "dark_current")
     d = SCENE.dark_electrons
