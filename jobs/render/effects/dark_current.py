@@ -12,6 +12,9 @@ from jobs.render.effects import dice, poisson
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
+# Electrons of a hot pixel in a warm detector: many times what any well holds, so that more makes no difference.
+_OVERFLOWING = 1e11
+
 
 def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> frame + Poisson(electrons) in every pixel."""
@@ -47,7 +50,8 @@ def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Ge
 
 
 def _hot(scene: Scene) -> tuple[float, float]:
-    return scene.value("hot_pixels", ""), scene.value("hot_current", "electron / (s pix)") * scene.exposure_time_s
+    rate = scene.value("hot_current", "electron / (s pix)") * scene.warmth
+    return scene.value("hot_pixels", ""), min(rate * scene.exposure_time_s, _OVERFLOWING)
 
 
 def _rms(scene: Scene) -> float:

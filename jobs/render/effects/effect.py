@@ -121,14 +121,18 @@ class Scene:
         return max(self.peak_electrons, self.track_electrons) + self.sky_electrons
 
     @property
-    def dark_rate(self) -> float:
-        """Dark current at the detector's temperature, e-/s in a pixel."""
-        rate = self.value("dark_current", "electron / (s pix)")
+    def warmth(self) -> float:
+        """Thermal electrons over those at the temperature that they are given at."""
         # Ground cameras are given at the temperature they are run at.
         if f"{self.section}.detector_temperature" not in self.mission:
-            return rate
+            return 1.0
         temperatures = self.value("detector_temperature", "K"), self.value("dark_reference_temperature", "K")
-        return rate * warmth(*temperatures, self.value("dark_band_gap", "eV"))
+        return warmth(*temperatures, self.value("dark_band_gap", "eV"))
+
+    @property
+    def dark_rate(self) -> float:
+        """Dark current at the detector's temperature, e-/s in a pixel."""
+        return self.value("dark_current", "electron / (s pix)") * self.warmth
 
     @property
     def dark_electrons(self) -> float:

@@ -146,6 +146,20 @@ def test_dark_current_follows_the_detector_s_temperature():
     assert SCENE.dark_electrons == pytest.approx(560.53 * SCENE.value("dark_current", "electron / (s pix)"))
 
 
+def test_hot_pixels_freeze_with_the_dark_current():
+    """They are as thermal: at each temperature the same part of what they have at the reference."""
+    reference, warmer = (
+        Scene(resolve(overrides={"vis.detector_temperature": (kelvin, "K")}), "vis", 560.0, 0.25, 0.0)
+        for kelvin in (SCENE.mission.value("vis.dark_reference_temperature", "K"), 170.0)
+    )
+    share, electrons = dark_current.HOT.parameters(reference)
+    assert electrons == pytest.approx(SCENE.mission.value("vis.hot_current", "electron / (s pix)") * 560.0)
+    more = dark_current.HOT.parameters(warmer)
+    assert more[0] == share
+    assert more[1] / electrons == pytest.approx(warmer.dark_electrons / reference.dark_electrons)
+    assert more[1] > 30 * electrons
+
+
 def test_hot_pixels_are_few_and_the_detector_s_own():
     out = dark_current.apply_hot(np.zeros((500, 400)), 1e-3, 100.0, np.random.default_rng(1))
     hot = out[out > 0]
