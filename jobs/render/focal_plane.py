@@ -44,7 +44,7 @@ class Detector:
 
     section     : prefix of its parameters in the mission database, "vis", "nisp" or "ext.lsstcam"
     nx, ny      : columns and rows of its image
-    middle      : of the rows, those between its halves that see no light and are not read
+    middle      : of the rows, those of charge injection between its halves, which are not read
     x, y        : arcsec, its centre in the focal plane
     rotation    : deg, of its columns-rows axes against the focal plane's, from x to y
     pixel_scale : arcsec

@@ -1,6 +1,7 @@
 """Quadrants: a detector is read through its four corners, each with its own pre- and overscan.
 
-Between the halves of a detector lie rows of charge injection: they see no light, and are not read.
+Between the halves of a detector lie rows of charge injection. They are not read: what of light or cosmic rays falls
+there ends here.
 
 Readout order: [E, F, G, H][row, column], where [0, 0] is read first. E lies upper left, F upper right, G lower right,
 H lower left (Euclid Data Product Description Document, LE1 VIS). Columns: prescan, pixels, overscan; rows: pixels,

@@ -1,6 +1,10 @@
 """Readout trail: with the shutter open, a row collects light at every place that it is shifted over.
 
 Runs on expected electrons: what falls in there is counted like all light.
+
+Error : 1 % of the trail, from pixel to pixel: light of the trail takes the response of the pixel that is read, not of
+        where it fell. The lamp is out while rows move, and the response comes once, after all light has. Rows beyond a
+        dark column's defect lose their trail with the rest, rightly; the trail of a dead pixel is too faint.
 """
 
 from __future__ import annotations
