@@ -22,7 +22,7 @@ def capacity(scene: Scene) -> float:
 
 def contribution(scene: Scene) -> float:
     """What the brightest pixel has too many."""
-    return max(scene.peak_electrons + scene.sky_electrons - capacity(scene), 0.0)
+    return max(scene.brightest_electrons - capacity(scene), 0.0)
 
 
 EFFECT = Effect("full_well", apply, lambda scene: (capacity(scene),), contribution, cost=3e-3)

@@ -1,11 +1,14 @@
 """Only what a scene requires: on either side of each threshold, what is left out is not noticed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from jobs import rng
 from jobs.render import focal_plane
 from jobs.render.channels import vis
+from jobs.render.effects import cosmic_rays
 from jobs.render.effects.effect import NOTICEABLE, Lights, Scene, apply_all
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render import nominal
@@ -102,6 +105,13 @@ def test_cosmic_rays_are_always_needed_but_without_time(name):
     assert effect.needed_if(scene())
     nothing = Scene(MISSION, "vis", 0.0, 0.25, 0.0, DETECTOR)
     assert effect.needed_if(nothing) == (name == "readout_cosmic_rays")
+
+
+def test_tracks_bleed_where_they_do_not_fit():
+    """In a dark, too: a pixel of 5000 e- does not hold what a cosmic ray may leave."""
+    small_well = scene(sky=0.0, peak=0.0, full_well=5e3)
+    assert not EFFECTS["bleeding"].needed_if(small_well)
+    assert EFFECTS["bleeding"].needed_if(replace(small_well, track_electrons=cosmic_rays.brightest(small_well)))
 
 
 @pytest.mark.parametrize(
