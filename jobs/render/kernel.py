@@ -35,8 +35,8 @@ _TWO_PI = 2.0 * np.pi
 _FIRST = int(FIRST_BITS)
 # Of a float's bits, those within a sixteenth of an octave; square of the scale lengths at which a disc ends.
 _COARSE, _DARK = 19, 900.0
-# Light that enters a stamp is taken off where it varies by less than this about the middle, of itself.
-_EVEN = 0.5
+# Light that enters a stamp is taken off where it varies by less than this about the middle, of itself, all and in part.
+_EVEN, _STEEP = 1.0, 3.0
 
 
 @jit
@@ -368,18 +368,20 @@ def returning(size: Int, x: Float, y: Float, stray: Float, most: Float) -> Float
         middle, rising = _images(stray[i], n, 0.0, 0.0), _images(stray[i], n, h, h)
         right, up = _images(stray[i], n, h, 0.0), _images(stray[i], n, 0.0, h)
         falling = _images(stray[i], n, h, -h)
-        farthest = max(max(right, up), max(rising, falling)) - middle
-        nearest = min(min(right, up), min(rising, falling)) - middle
-        if max(farthest, -nearest) > _EVEN * middle:
-            continue
+        highest, lowest = max(max(right, up), max(rising, falling)), min(min(right, up), min(rising, falling))
+        uneven = max(highest - middle, middle - lowest) / middle if middle > 0.0 else _STEEP
+        # By and by: where it ended at once, a galaxy and the same one sheared would differ by more than by the shear.
+        z = min(max((_STEEP - uneven) / (_STEEP - _EVEN), 0.0), 1.0)
+        part = z * z * (3.0 - 2.0 * z)
         across2, up2 = (right - middle) / h**2, (up - middle) / h**2
         both = 0.5 * (rising - falling) / h**2
         across, along = 0.5 * (n - 1) - x[i], 0.5 * (n - 1) - y[i]
         spread = (n * n - 1) / 12.0
         second = across2 * (across**2 + spread) + both * across * along + up2 * (along**2 + spread)
         light = n * n * (middle + second)
-        if 0.0 < light <= most[i]:
-            out[i] = middle, across2, both, up2, light
+        if light > 0.0:
+            part = min(part, most[i] / light)
+            out[i] = part * middle, part * across2, part * both, part * up2, part * light
     return out
 
 
