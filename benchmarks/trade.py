@@ -36,7 +36,7 @@ _CHAIN = (
     Settings(0.3, 3e-3, 5e-2, 4.0, 4),
     Settings(0.1, 1e-3, 3e-2, 4.8, 4),
     Settings(0.03, 1e-3, 3e-3, 4.8, 9),
-    Settings(0.015, 1e-4, 3e-4, 6.4, 9),
+    Settings(0.01, 1e-4, 3e-4, 6.4, 9),
     Settings(0.004, 3e-5, 1e-5, 8.0, 9),
     Settings(0.0005, 1e-5, 1e-7, 12.8, 25),
 )
