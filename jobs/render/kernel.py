@@ -2,7 +2,7 @@
 
 nyquist_zones profile x PSF x pixel x phase on the half plane, wrapped onto the pixels' Nyquist zone
 accumulate    stamps onto the frame, in fixed point
-returning     the light that comes in at the opposite edges of stamps;  leaving : the same where it belongs
+returning     the light that comes in at the opposite edges of stamps;  take_off : it;  leaving : it where it belongs
 runs          which samples of a stamp's grid are taken, in what order
 take          the samples of a stamp's grid from a transform
 add_planes    planes of a PSF, weighted, summed
@@ -322,10 +322,9 @@ def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> 
 
 
 @jit
-def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, x: Float, y: Float, curve: Float) -> Int:
+def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int) -> Int:
     """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, in units of 1 / FIXED_POINT.
 
-    x, y    : [m] position in the stamp, about which curve [m, 5] of `returning` is taken off
     Whole numbers: the sum is the same, bit by bit, in any order.
     returns : int64[m] what of each stamp fell onto the frame, in the same units
     """
@@ -333,17 +332,12 @@ def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, x: Float,
     added = np.zeros(len(stamps), np.int64)
     for i in range(len(stamps)):
         left, right = max(0, -x0[i]), min(stamps.shape[2], nx - x0[i])
-        second = curve[i, 1]
         for r in range(max(0, -y0[i]), min(stamps.shape[1], ny - y0[i])):
             if left < right:
                 some, out = stamps[i, r, left:right], frame[y0[i] + r, x0[i] + left : x0[i] + right]
-                up = r - y[i]
-                level, slope = curve[i, 0] + curve[i, 3] * up * up, curve[i, 2] * up
                 total = np.int64(0)
                 for c in range(len(some)):
-                    across = (left + c) - x[i]
-                    light = np.float64(some[c]) - (level + across * (slope + across * second))
-                    units = np.int64(np.rint(light * FIXED_POINT))
+                    units = np.int64(np.rint(np.float64(some[c]) * FIXED_POINT))
                     out[c] += units
                     total += units
                 added[i] += total
@@ -351,15 +345,39 @@ def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, x: Float,
 
 
 @jit
+def take_off(stamps: npt.NDArray[Any], x: Float, y: Float, curve: Float, taken: Float) -> None:
+    """Takes curve [m, 4] of `returning`, about (x, y) [m], off stamps [m, N, N], but leaves no pixel darker than none.
+
+    taken : [m] filled with the electrons
+    """
+    for i in range(len(stamps)):
+        taken[i] = 0.0
+        if curve[i, 0] == 0.0:
+            continue
+        for r in range(stamps.shape[1]):
+            up = r - y[i]
+            level, slope = curve[i, 0] + curve[i, 3] * up * up, curve[i, 2] * up
+            some = stamps[i, r]
+            total = 0.0
+            for c in range(len(some)):
+                across = c - x[i]
+                before = some[c]
+                more = max(level + across * (slope + across * curve[i, 1]), 0.0)
+                some[c] = before - min(more, max(np.float64(before), 0.0))
+                total += np.float64(before) - np.float64(some[c])
+            taken[i] += total
+
+
+@jit
 def returning(size: Int, x: Float, y: Float, stray: Float, most: Float) -> Float:
-    """[m, 5] light that enters stamps at their edges: its level in the middle, terms of x^2, x y and y^2; its sum.
+    """[m, 4] light that enters stamps at their edges: its level in the middle, terms of x^2, x y and y^2.
 
     size, x, y : [m] side of the stamp, position in it, pixels;  stray : [m, 11] profiles.on_the_sky, electrons
     most  : [m] electrons that may enter
     Error : of a round galaxy 2 % within an eighth of the stamp of the middle, of axis ratio 0.3 a third; too little
             farther out. All 0 where the light varies too much for such terms: of steep, slim galaxies
     """
-    out = np.zeros((len(stray), 5))
+    out = np.zeros((len(stray), 4))
     for i in range(len(stray)):
         n, h = size[i], size[i] / 8.0
         if stray[i, 0] == 0.0 and stray[i, 1] == 0.0:
@@ -381,7 +399,7 @@ def returning(size: Int, x: Float, y: Float, stray: Float, most: Float) -> Float
         light = n * n * (middle + second)
         if light > 0.0:
             part = min(part, most[i] / light)
-            out[i] = part * middle, part * across2, part * both, part * up2, part * light
+            out[i] = part * middle, part * across2, part * both, part * up2
     return out
 
 

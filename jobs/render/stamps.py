@@ -344,6 +344,7 @@ def _draw(
     stray, farthest, most = _strays(sources, some, form, sizes, psf.pixel_scale)
     x0, y0 = (np.rint(position).astype(np.int64) - sizes // 2 for position in (sources.column, sources.row))
     curve = kernel.returning(sizes, sources.column - x0, sources.row - y0, stray, most)
+    taken = np.zeros(len(sources))
     passing = transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
     body, fraction, bulge, disk, _, row, *_ = bodies
@@ -367,7 +368,7 @@ def _draw(
                 share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
-            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, curve)
+            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, curve, taken)
             drawn[chosen] = added / kernel.FIXED_POINT
             done += len(chosen)
             if progress is not None:
@@ -379,7 +380,7 @@ def _draw(
             left_out[i] * sources.electrons[i], psf.edges, trail[i],
         )  # fmt: skip
     layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
-    layer += wings.galaxies(sources.column, sources.row, stray, curve[:, 4], farthest, sizes, nx, ny)
+    layer += wings.galaxies(sources.column, sources.row, stray, taken, farthest, sizes, nx, ny)
     return np.asarray(kernel.electrons_of(frame, layer, wings.BLOCK, wings.MARGIN))
 
 
@@ -443,10 +444,12 @@ def _draw_some(
     table: Array,
     cut: Float,
     curve: Float,
+    taken: Float,
 ) -> Int:
     """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does.
 
     bodies, cut, curve : arrays by source: of `_bodies` and trails; of kernel.reaches; of kernel.returning
+    taken : filled at the chosen with what kernel.take_off took
     """
     size = passed.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
@@ -459,7 +462,10 @@ def _draw_some(
         sources.electrons[chosen], cut[chosen], table, *(part[chosen] for part in bodies),
     )  # fmt: skip
     stamps = scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True)
-    return kernel.accumulate(frame, stamps, x0, y0, column - x0, row - y0, curve[chosen])
+    off = np.zeros(len(chosen))
+    kernel.take_off(stamps, column - x0, row - y0, curve[chosen], off)
+    taken[chosen] = off
+    return kernel.accumulate(frame, stamps, x0, y0)
 
 
 def _forms(sources: Sources) -> tuple[Shapes, Forms]:
