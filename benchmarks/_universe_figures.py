@@ -16,8 +16,8 @@ from jobs.fluxes import cosmology
 Float = npt.NDArray[np.float64]
 
 # Galaxies an arcmin2 brighter than i: GAMA and zCOSMOS (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST Science
-# Book (2009, eq. 3.7).
-_OBSERVED = {20: 0.57, 21: 1.45, 22: 3.7, 23: 9.0, 24: 21.0, 25: 46.0, 26: 94.0}
+# Book (2009).
+_OBSERVED = {20: 0.57, 21: 1.45, 22: 3.7, 23: 9.0, 24: 21.0, 25: 44.5, 26: 94.0}
 
 
 def draw(

@@ -204,9 +204,6 @@ def gc(root: Path, name: str) -> list[Path]:
     Errors : BadInput where there is no such table; Damaged where none of its versions is known to be the current one
     """
     folder = layout.table(root, name)
-    if folder.is_dir() and not any(folder.iterdir()):
-        # A run was killed before it had more than the folder.
-        return []
     if not any(folder.glob(".lock*")):
         raise BadInput(f"lake {root} has no table {name}")
     removed: list[Path] = []
