@@ -214,31 +214,31 @@ def stamp_sizes(
     noise : of a pixel, electrons. A cut by noise alone biases faint sources, for what wraps is coherent: the second
             condition holds it to a part of the flux, from the wings of the PSF and of high-n bulges alike
     """
-    at = np.concatenate([SIZES // 2, SIZES, _FARTHER * SIZES])
-    psf_light = _beyond_the_table(psf, np.concatenate([SIZES // 2, SIZES]))
-    galaxy_light = np.zeros((len(shape), len(at)))
-    body = shape >= 0
-    if body.any():
-        galaxy_light[body] = profiles.surface(shapes, at * psf.pixel_scale)[shape[body]] * psf.pixel_scale**2
-    edge = psf_light[: len(SIZES)] + galaxy_light[:, : len(SIZES)]
-    # A PSF in planes is cut to the stamp and does not wrap.
-    near, far = slice(len(SIZES), 2 * len(SIZES)), slice(2 * len(SIZES), None)
-    wings = _LATTICE_PSF * psf_light[len(SIZES) :] * (psf.planes is None)
-    steepness = np.log(np.maximum(galaxy_light[:, near], 1e-300) / np.maximum(galaxy_light[:, far], 1e-300))
-    # What shear makes of the light that wraps goes with how steeply it falls.
-    steeper = np.maximum(steepness / (_RESPONSE * np.log(_FARTHER)), 1.0)
-    wrapped = wings + _LATTICE_GALAXY * steeper * galaxy_light[:, near]
-    aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
-    enough = (electrons[:, None] * edge < settings.edge * noise) & (wrapped * aperture < settings.ghost)
     # The PSF's wings beyond a stamp are those of a point: the larger a galaxy, the farther out that may begin.
     least = np.full(len(shape), float(settings.least))
+    body = shape >= 0
     least[body] += _EXTENT * profiles.half_light(shapes)[shape[body]]
-    enough &= SIZES * psf.pixel_scale >= least[:, None]
-    enough[:, -1] = True
-    if psf.planes is not None:
+    aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
+    found, left = np.full(len(shape), SIZES[-1]), np.arange(len(shape))
+    for size in SIZES[:-1]:
+        psf_light = _beyond_the_table(psf, np.array([size // 2, size]))
+        light, body = np.zeros((len(left), 3)), shape[left] >= 0
+        if body.any():
+            at = np.array([size // 2, size, _FARTHER * size]) * psf.pixel_scale
+            light[body] = profiles.surface(shapes.take(shape[left[body]]), at) * psf.pixel_scale**2
+        edge, near, far = light.T
+        steepness = np.log(np.maximum(near, 1e-300) / np.maximum(far, 1e-300))
+        # What shear makes of the light that wraps goes with how steeply it falls.
+        steeper = np.maximum(steepness / (_RESPONSE * np.log(_FARTHER)), 1.0)
+        # A PSF in planes is cut to the stamp and does not wrap.
+        wings = _LATTICE_PSF * psf_light[1] * (psf.planes is None)
+        wrapped = (wings + _LATTICE_GALAXY * steeper * near) * aperture
+        enough = (electrons[left] * (psf_light[0] + edge) < settings.edge * noise) & (wrapped < settings.ghost)
+        enough &= size * psf.pixel_scale >= least[left]
         # A point has no light beyond the PSF's planes.
-        enough[~body, int(np.searchsorted(SIZES, SIDE)) :] = True
-    found = SIZES[np.argmax(enough, axis=1)]
+        enough |= ~body & (psf.planes is not None) & (size >= SIDE)
+        found[left[enough]] = size
+        left = left[~enough]
     if wider is None:
         return np.asarray(found)
     return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, found + wider), len(SIZES) - 1)])
