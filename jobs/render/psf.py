@@ -24,6 +24,7 @@ import scipy.fft
 from scipy.ndimage import uniform_filter
 
 from jobs import cache
+from jobs.compiling import jit
 from jobs.fluxes.passbands import Passband
 from jobs.render import edges
 from jobs.render.chromatic import sub_bands
@@ -36,8 +37,8 @@ Float32 = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int64]
 Array = npt.NDArray[Any]
 
-# Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide.
-SAMPLES = 3
+# Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide; cycles a sample that are more.
+SAMPLES, _DETAIL = 3, 0.4
 # Side of the plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is drawn for bright
 # stars alone (edges.py).
 SIDE = 512
@@ -301,16 +302,17 @@ def _drift(
     mission: MissionConfiguration,
 ) -> Float:
     """Planes of Planes.drift in the focal plane's axes, by least squares; coefficients: of the centre and the nodes."""
+    powers, weights = _powers(positions), _weights_of(blur, sampling)
     side = _CORE_SIDE * SAMPLES + 1
-    powers = _powers(positions)
     if not powers:
         return np.zeros((0, side, side))
-    mean, slope = np.zeros((2, len(coefficients), _CORE_TRANSFORM, _CORE_TRANSFORM))
+    side += 2 * _margin(weights)
+    mean, slope = np.zeros((2, len(coefficients), side, side))
     redder = (waves - waves.mean()) / np.sum((waves - waves.mean()) ** 2)
     for wavelength, tilt in zip(waves, redder, strict=True):
         optics = _optics(float(wavelength), sampling, mission, _CORE_TRANSFORM)
         for i, nm in enumerate(coefficients):
-            image = _diffracted(nm, optics)
+            image = _diffracted(nm, optics, side)
             mean[i] += image / len(waves)
             slope[i] += image * tilt
     x, y = np.array(_nodes(positions)).T
@@ -320,50 +322,85 @@ def _drift(
         if terms:
             change = np.tensordot(np.linalg.pinv(np.stack(terms, axis=1)), images[1:] - images[0], 1)
             # The blur is the same for all, and linear.
-            changes += [_blurred(image, _CORE_SIDE, sampling, blur) for image in change]
+            changes += [_blurred(image, weights) for image in change]
     return np.stack(changes)
 
 
 def _plane(
     nm: Float, wavelength: float, transform: int, side: int, sampling: float, blur: tuple[float, float],
     mission: MissionConfiguration,
-) -> Float:  # fmt: skip
+) -> Float32:  # fmt: skip
     """One wavelength's PSF: [side * SAMPLES + 1] square, in the focal plane's axes."""
-    return _blurred(_monochromatic(nm, wavelength, sampling, mission, transform), side, sampling, blur)
+    weights = _weights_of(blur, sampling)
+    optics = _optics(wavelength, sampling, mission, transform)
+    return _blurred(_diffracted(nm, optics, side * SAMPLES + 1 + 2 * _margin(weights)), weights)
 
 
-def _blurred(image: Array, side: int, sampling: float, blur: tuple[float, float]) -> Float:
-    """Diffracted light [transform, transform] about [0, 0] -> its middle, the soft edges' loss made good, blurred."""
-    transform = len(image)
-    k = 2 * np.pi * scipy.fft.fftfreq(transform, sampling)
-    along, across = (np.exp(-0.5 * variance * k**2) for variance in (blur[1], blur[0]))
-    # In double precision: what single leaves of the bright core would cover the wings.
-    passed = scipy.fft.rfft2(image * _edge_gain(transform), overwrite_x=True)
-    passed *= along[:, None]
-    passed *= across[: transform // 2 + 1]
-    image = scipy.fft.fftshift(scipy.fft.irfft2(passed, s=image.shape, overwrite_x=True))
-    half = side * SAMPLES // 2
-    kept = slice(transform // 2 - half, transform // 2 + half + 1)
-    return np.asarray(image[kept, kept])
+def _blurred(image: Array, weights: tuple[Float, Float]) -> Float32:
+    """Diffracted light -> blurred by weights along x and y, without a margin.
+
+    On the image: of a transform's rounding the bright core would cover the wings.
+    """
+    across, along = (w.astype(np.float32) for w in weights)
+    return _summed(image.astype(np.float32), across, along, len(image) - 2 * _margin(weights))
 
 
-def _monochromatic(
-    nm: Float, wavelength: float, sampling: float, mission: MissionConfiguration, transform: int = _TRANSFORM
-) -> Float32:
-    """|FFT of the pupil|^2, centred on [0, 0], of unit flux over the whole sky."""
-    return _diffracted(nm, _optics(wavelength, sampling, mission, transform))
+@jit
+def _summed(image: Float32, across: Float32, along: Float32, side: int) -> Float32:
+    """The middle [side, side] of an image, summed with weights [odd] along columns (across) and rows (along)."""
+    margin, reach_x, reach_y = (len(image) - side) // 2, len(across) // 2, len(along) // 2
+    out = np.zeros((side, side), np.float32)
+    line = np.empty(len(image), np.float32)
+    for r in range(side):
+        line[:] = 0.0
+        for j in range(len(along)):
+            weight, row = along[j], image[r + margin + j - reach_y]
+            for c in range(len(row)):
+                line[c] += weight * row[c]
+        for j in range(len(across)):
+            weight, some = across[j], line[margin + j - reach_x : margin + j - reach_x + side]
+            for c in range(side):
+                out[r, c] += weight * some[c]
+    return out
+
+
+def _margin(weights: tuple[Float, Float]) -> int:
+    return max(len(w) // 2 for w in weights)
+
+
+def _weights_of(blur: tuple[float, float], sampling: float) -> tuple[Float, Float]:
+    across, along = (_weights(float(np.sqrt(variance)) / sampling) for variance in blur)
+    return across, along
+
+
+@lru_cache(maxsize=64)
+def _weights(sigma: float) -> Float:
+    """float64[odd]: a Gaussian of sigma samples, for images without detail finer than _DETAIL; their sum is 1.
+
+    Error : of the transfer function, 1e-7
+    """
+    k = np.linspace(0.0, 2 * np.pi * _DETAIL, 400)
+    lost, half = 1.0 - np.exp(-0.5 * (sigma * k) ** 2), 0
+    while True:
+        half += 1
+        basis = 1.0 - np.cos(k[:, None] * np.arange(1, half + 1))
+        outer = np.linalg.lstsq(basis, lost)[0]
+        if np.abs(basis @ outer - lost).max() < 1e-7:
+            return np.concatenate([outer[::-1] / 2, [1.0 - outer.sum()], outer / 2])
 
 
 @dataclass(frozen=True, slots=True)
 class _Optics:
     """The pupil as light of a wavelength samples it.
 
-    transmission : [n, n];  modes : [Noll number, lit samples] phase of 1 nm rms, radian
+    transmission : [n, n];  x, y : [lit samples] of its radius;  wavelength : A
     """
 
     transform: int
     transmission: Float
-    modes: Float
+    x: Float
+    y: Float
+    wavelength: float
 
 
 def _optics(wavelength: float, sampling: float, mission: MissionConfiguration, transform: int) -> _Optics:
@@ -375,37 +412,35 @@ def _optics(wavelength: float, sampling: float, mission: MissionConfiguration, t
     x, y = np.meshgrid(axis, axis)
     transmission = pupil(x, y, step, mission)
     lit = transmission > 0
-    highest = int(max(term[0] for term in mission.numbers("vis.psf.wavefront")))
-    modes = galsim.zernike.zernikeBasis(highest, x[lit], y[lit], R_outer=radius)
-    return _Optics(transform, transmission, np.asarray(modes) * (2 * np.pi / (wavelength / 10.0)))
+    return _Optics(transform, transmission, x[lit] / radius, y[lit] / radius, wavelength)
 
 
-def _diffracted(nm: Float, optics: _Optics) -> Float32:
-    """|FFT of the pupil|^2 [transform, transform]; nm : by Noll number.
+def _diffracted(nm: Float, optics: _Optics, side: int | None = None) -> Float32:
+    """|FFT of the pupil|^2 of unit flux over the whole sky, the soft edges' loss made good: [side, side].
 
+    nm   : by Noll number;  side : samples about the middle, side // 2; None: the whole transform's
     Error : 5e-4 of what is in a sample, 5e-6 in the core: it is in single precision
     """
     transmission, transform = optics.transmission, optics.transform
+    side = transform if side is None else side
     lit = transmission > 0
-    phase = (nm[: len(optics.modes)] @ optics.modes[: len(nm)]).astype(np.float32)
+    phase = galsim.zernike.Zernike(nm * (2 * np.pi / (optics.wavelength / 10.0)))(optics.x, optics.y).astype(np.float32)
     field = np.zeros(transmission.shape, np.complex64)
     field.real[lit] = transmission[lit] * np.cos(phase)
     field.imag[lit] = transmission[lit] * np.sin(phase)
-    # First along the rows that have light.
-    lines = scipy.fft.ifft(field, transform, axis=1, overwrite_x=True)
-    parts = scipy.fft.ifft(lines, transform, axis=0, overwrite_x=True).view(np.float32)
+    middle = (np.arange(side) - side // 2) % transform
+    # First along the rows that have light; then the columns that are wanted.
+    lines = scipy.fft.ifft(field, transform, axis=1, overwrite_x=True)[:, middle]
+    parts = scipy.fft.ifft(lines, transform, axis=0, overwrite_x=True)[middle].view(np.float32)
     parts *= parts
     power = parts[:, 0::2] + parts[:, 1::2]
+    power *= _edge_gain(transform, side)
     power *= np.float32(transform**2 / transmission.sum())
     return np.asarray(power)
 
 
-@lru_cache(maxsize=2)
-def _edge_gain(transform: int) -> Float:
-    return np.asarray(1.0 / _edge_loss(transform))
-
-
-def _edge_loss(transform: int = _TRANSFORM) -> Float:
-    """What the soft edges of `pupil` leave of the diffracted light, by angle: sinc^2(angle / side)."""
-    angle = scipy.fft.fftfreq(transform)
-    return np.asarray(np.sinc(np.hypot(angle[:, None], angle)) ** 2)
+@lru_cache(maxsize=4)
+def _edge_gain(transform: int, side: int) -> Float32:
+    """One over what the soft edges of `pupil` leave of the diffracted light, by angle: sinc^2(angle / side)."""
+    angle = (np.arange(side) - side // 2) / transform
+    return np.asarray(np.sinc(np.hypot(angle[:, None], angle)) ** -2.0, np.float32)

@@ -60,9 +60,7 @@ def test_wavefront_error_over_the_field():
 
 
 def plane(nm, wavelength):
-    image = np.fft.fftshift(psf._monochromatic(nm, wavelength, SAMPLING, MISSION) / psf._edge_loss())
-    half, kept = image.shape[0] // 2, 256
-    return image[half - kept : half + kept + 1, half - kept : half + kept + 1]
+    return psf._diffracted(nm, psf._optics(wavelength, SAMPLING, MISSION, 2048), 513)
 
 
 def test_diffraction_is_galsims():
@@ -96,12 +94,33 @@ def test_wings_hold_what_edges_diffract(wavelength):
     x, y = np.meshgrid(axis, axis)
     clear = psf.pupil(x, y, 1.0, MISSION)
     perimeter = np.hypot(*np.gradient(clear)).sum()
-    image = np.fft.fftshift(psf._monochromatic(np.zeros(12), wavelength, SAMPLING, MISSION) / psf._edge_loss())
+    optics = psf._optics(wavelength, SAMPLING, MISSION, 2048)
+    image = psf._diffracted(np.zeros(12), optics).astype(float)
     grid = (np.arange(len(image)) - len(image) // 2) * SAMPLING
     radius = np.hypot(*np.meshgrid(grid, grid))
     for angle in (5.0, 10.0, 25.0):
         lost = wavelength * 1e-7 * perimeter / (2 * np.pi**2 * clear.sum() * angle * np.pi / 648000)
         assert 1 - image[radius < angle].sum() == pytest.approx(lost, rel=0.15)
+
+
+def test_a_part_of_the_light_is_a_part_of_the_whole():
+    nm, optics = psf.wavefront(-0.4, 0.8, MISSION), psf._optics(6000.0, SAMPLING, MISSION, 768)
+    whole, part = psf._diffracted(nm, optics), psf._diffracted(nm, optics, 201)
+    np.testing.assert_allclose(part, whole[284:485, 284:485], rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize("blur", [(0.0, 0.0), (0.01**2, 0.02**2), (0.04**2, 0.045**2), (0.2**2, 0.1**2)])
+def test_blur_is_a_gaussian_in_fourier_space(blur):
+    """arcsec2 along x and y; against the product of transforms, of the light as diffracted."""
+    nm, n = psf.wavefront(0.6, 0.3, MISSION), 768
+    optics, weights = psf._optics(5500.0, SAMPLING, MISSION, n), psf._weights_of(blur, SAMPLING)
+    found = psf._blurred(psf._diffracted(nm, optics, 301 + 2 * psf._margin(weights)), weights)
+    k = 2 * np.pi * np.fft.fftfreq(n, SAMPLING)
+    passed = np.exp(-0.5 * (blur[0] * k**2 + blur[1] * k[:, None] ** 2))
+    sky = np.fft.fft2(psf._diffracted(nm, optics).astype(float)) * passed
+    expected = np.fft.ifft2(sky).real[n // 2 - 150 : n // 2 + 151, n // 2 - 150 : n // 2 + 151]
+    assert found.sum() == pytest.approx(expected.sum(), rel=1e-6)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * expected.max())
 
 
 @pytest.mark.parametrize(
