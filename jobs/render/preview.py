@@ -149,11 +149,8 @@ def picture(path: Path, image: npt.NDArray[Any], cards: Sequence[Card], names: S
     main = figure.add_axes((0.01, 0.01, 0.715, 0.93))
     block = max(1, int(np.ceil(max(image.shape) / _OVERVIEW)))
     _show(main, _shrunk(image, block), block, image.shape, upside_down)
-    chosen: list[Label] = []
-    for kind in ("galaxy", "star"):
-        among = [label for label in names if label.kind == kind]
-        chosen += _apart(among, _TEXT[0] * image.shape[1], _TEXT[1] * image.shape[0], chosen)[:_LABELS]
-    _annotate(main, chosen, image.shape, upside_down)
+    text_x, text_y = _TEXT[0] * image.shape[1], _TEXT[1] * image.shape[0]
+    _annotate(main, _apart(names, text_x, text_y, _LABELS), image.shape, upside_down)
     _scale_bar(main, header["PIXSCALE"], image.shape, image.shape[1] / 6)
     _compass(main, system, image.shape)
     for number, label in enumerate(_close_ups(names, image.shape, header["PIXSCALE"])):
@@ -214,12 +211,12 @@ def _stretched(image: npt.NDArray[Any], level: float, noise: float) -> Float:
     return np.asarray((np.arcsinh(signal / _KNEE) - lo) / (hi - lo))
 
 
-def _apart(names: Sequence[Label], wide: float, high: float, taken: Sequence[Label] = ()) -> list[Label]:
-    """Labels that cover neither each other nor those `taken`, brightest first; wide and high in pixels."""
+def _apart(names: Sequence[Label], wide: float, high: float, most: int) -> list[Label]:
+    """Labels that do not cover each other, brightest first, at most so many of a kind; wide and high in pixels."""
     kept: list[Label] = []
     for label in names:
-        others = (*taken, *kept)
-        if all(abs(label.column - x.column) > wide or abs(label.row - x.row) > high for x in others):
+        free = all(abs(label.column - x.column) > wide or abs(label.row - x.row) > high for x in kept)
+        if free and sum(x.kind == label.kind for x in kept) < most:
             kept.append(label)
     return kept
 
@@ -230,7 +227,7 @@ def _close_ups(names: Sequence[Label], shape: tuple[int, ...], pixel_scale: floa
     inside = [
         x for x in names if x.kind == "galaxy" and half < x.column < shape[1] - half and half < x.row < shape[0] - half
     ]
-    return _apart(inside, 2 * half, 2 * half)[:_CLOSE_UPS]
+    return _apart(inside, 2 * half, 2 * half, _CLOSE_UPS)
 
 
 def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_down: bool) -> None:

@@ -57,8 +57,10 @@ def test_shrinking_keeps_the_mean():
 
 def test_labels_stand_apart():
     names = [Label(float(x), 0.0, "star", float(x), "") for x in range(10)]
-    assert [n.column for n in preview._apart(names, 2.5, 1.0)] == [0.0, 3.0, 6.0, 9.0]
-    assert [n.column for n in preview._apart(names, 2.5, 1.0, [Label(0.0, 0.5, "galaxy", 9.0, "")])] == [3.0, 6.0, 9.0]
+    assert [n.column for n in preview._apart(names, 2.5, 1.0, 4)] == [0.0, 3.0, 6.0, 9.0]
+    # The brightest keeps its name, whatever its kind, and does not use up another kind's.
+    galaxy = Label(0.0, 0.5, "galaxy", 9.0, "")
+    assert preview._apart([galaxy, *names], 2.5, 1.0, 2) == [galaxy, names[3], names[6]]
 
 
 def test_cosmic_rays_are_mended_from_around_them():
