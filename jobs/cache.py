@@ -1,8 +1,9 @@
 """Arrays that are costly to make and the same for everybody: kept on disc, keyed by what they were made from.
 
-cache_dir       where they lie
-content_key     the key: sha256 of everything that goes into the making
-cached_arrays   load, or make and load
+cache_dir        where they lie
+machine_code_dir where compiled functions lie
+content_key      the key: sha256 of everything that goes into the making
+cached_arrays    load, or make and load
 """
 
 from __future__ import annotations
@@ -35,6 +36,22 @@ def cache_dir() -> Path:
     if home := os.environ.get("XDG_CACHE_HOME"):
         return Path(home).expanduser() / "truesky"
     return Path.home() / ".cache" / "truesky"
+
+
+def machine_code_dir() -> Path:
+    """Of numba: a folder a version of the sources, in $NUMBA_CACHE_DIR or the cache."""
+    folder, key = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_dir() / "numba"), sources_key()[:16]
+    # A process begun by another finds the folder named already.
+    return folder if folder.name == key else folder / key
+
+
+def sources_key(root: Path = Path(__file__).parent) -> str:
+    """sha256 (hex) of every file below a folder that has compiled functions.
+
+    numba compiles a function anew when its own file changes, not when one does whose functions are in it.
+    """
+    compiled = [path for path in sorted(root.rglob("*.py")) if b"jobs.compiling" in path.read_bytes()]
+    return content_key(*(part for path in compiled for part in (path.relative_to(root).as_posix(), path.read_bytes())))
 
 
 def content_key(*parts: bytes | str | int | float | Array) -> str:

@@ -1,4 +1,4 @@
-"""numba, with its machine code in the project's cache: compiled once a machine, not once a process."""
+"""numba, with its machine code in the project's cache: compiled once a machine and version, not once a process."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 from jobs import cache
 
-# numba reads this when it is imported.
-os.environ.setdefault("NUMBA_CACHE_DIR", str(cache.cache_dir() / "numba"))
+# numba reads this when it is imported, and processes begun from here have it.
+os.environ["NUMBA_CACHE_DIR"] = str(cache.machine_code_dir())
 
 import numba
 

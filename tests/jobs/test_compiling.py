@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from jobs import cache
+
 # A kernel whose inner function sums in any order.
 SCRIPT = """
 import hashlib
@@ -25,6 +27,20 @@ def test_compiled_here_or_found_in_the_cache(tmp_path):
     first, second = (
         subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2)
     )
-    assert list(tmp_path.glob("numba/*/*.nbc"))
+    assert list(tmp_path.glob("numba/*/*/*.nbc"))
     assert first == second
     assert len(first.split()) == 2
+
+
+def test_machine_code_is_of_the_sources_as_they_are(tmp_path):
+    """Also of those that are compiled into others."""
+    assert cache.machine_code_dir().name == cache.sources_key()[:16]
+    (tmp_path / "effects").mkdir()
+    inner, plain = tmp_path / "effects" / "dice.py", tmp_path / "units.py"
+    inner.write_text("from jobs.compiling import jit\n")
+    plain.write_text("")
+    first = cache.sources_key(tmp_path)
+    plain.write_text("MILE = 1609.344\n")
+    assert cache.sources_key(tmp_path) == first
+    inner.write_text("from jobs.compiling import jit\n\n")
+    assert cache.sources_key(tmp_path) != first

@@ -21,7 +21,7 @@ from lake_schema.ids import GENERATION_ORDER
 from .test_lensing import limber
 
 # The luminosity function, calibrated on 102 galaxies an arcmin2 with I_E < 26, makes 15 % more than observed to i = 25
-# (test_galaxies has the mean sky, against the upper of two counts), this sky 1.5 % more than that; 12 % are allowed.
+# (test_galaxies has the mean sky), and this sky 1.5 % more than that; 12 % are allowed.
 KNOWN = {"i_25"}
 
 
