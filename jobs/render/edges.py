@@ -5,6 +5,7 @@ spikes across itself, as wide as it is long, with the fringes of its width along
 
 Edges     of a pupil;  of_pupil : the Euclid one's
 add       what a star shines outside the plane, onto a frame
+unfold    what of it the plane has inside, taken off
 left      how the plane fades there
 
 Ref : Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a circle, far out)
@@ -146,15 +147,11 @@ def add(
     photons : [w] share of each sub-band, None = equal;  size : of the plane, pixels
     least   : electrons in a pixel that may be left out
     trail   : [2] pixels that it moves by, with its plane; None: it is at rest
-    It also takes off what the plane's transform had folded into it: a fifth of what is at its corners.
     """
     if edges is None:
         return
-    photons = np.full(len(edges.wavelength), 1.0 / len(edges.wavelength)) if photons is None else photons
-    trail = np.zeros(2) if trail is None else trail
-    points = max(math.ceil(float(np.hypot(*trail)) / _finest(edges)), 1)
-    along = (np.arange(points) + 0.5) / points - 0.5
-    columns, rows = column + along * trail[0], row + along * trail[1]
+    photons, columns, rows, turned = _points(column, row, photons, edges, trail)
+    points = len(columns)
     ny, nx = frame.shape
     farthest = float(np.hypot(max(columns.max(), nx - columns.min()), max(rows.max(), ny - rows.min())))
     level = electrons / points * ring(edges, photons)
@@ -167,11 +164,53 @@ def add(
     out, across = (np.flatnonzero(shown.any(axis=axes)) for axes in ((0, 2), (0, 1)))
     far = min(inner + _LONG * float(out[-1] + 1) if len(out) else 0.0, farthest)
     wide = _STEP * float(across[-1] + 1) if len(across) else 0.0
-    turned = np.stack([np.cos(edges.bars[:, 0]), np.sin(edges.bars[:, 0])], axis=1)
-    folds = _FOLDED * level / inner**3 > faintest
     for x, y in zip(columns.tolist(), rows.tolist(), strict=True):
         _outside(frame, x, y, inner, level, radius, turned, lines, far, wide)
-        _inside(frame, x, y, inner, level, turned, lines, edges.period, folds)
+        _inside(frame, x, y, inner, level, turned, lines)
+
+
+def unfold(
+    stamp: npt.NDArray[Any],
+    left: int,
+    low: int,
+    nx: int,
+    ny: int,
+    column: float,
+    row: float,
+    electrons: float,
+    photons: Float | None,
+    size: int,
+    least: float,
+    edges: Edges | None,
+    trail: Float | None = None,
+) -> None:
+    """Takes off a star's stamp, in place, what its plane's transform had folded into it: a fifth of its corners.
+
+    left, low : the stamp's first pixel on a frame of nx, ny, outside which nothing is done;  others : as of `add`
+    Of each pixel it is the share that folded light has in all that should be there: the two run through each other, and
+    where they cancel there is less than of either.
+    """
+    if edges is None:
+        return
+    photons, columns, rows, turned = _points(column, row, photons, edges, trail)
+    level, inner = electrons / len(columns) * ring(edges, photons), size / 2 - _SPARED
+    if _FOLDED * level / inner**3 > _FAINTEST * least / len(columns):
+        lines = electrons / len(columns) * spikes(edges, photons, edges.period)
+        seen = stamp[max(-low, 0) : max(ny - low, 0), max(-left, 0) : max(nx - left, 0)]
+        x, y = columns - max(left, 0), rows - max(low, 0)
+        _unfold(seen, x, y, inner, level, turned, lines, edges.period)
+
+
+def _points(
+    column: float, row: float, photons: Float | None, edges: Edges, trail: Float | None
+) -> tuple[Float, Float, Float, Float]:
+    """(photons [w], columns and rows [p] of points that shine as a star and its trail do, bars' directions [b, 2])."""
+    photons = np.full(len(edges.wavelength), 1.0 / len(edges.wavelength)) if photons is None else photons
+    trail = np.zeros(2) if trail is None else trail
+    points = max(math.ceil(float(np.hypot(*trail)) / _finest(edges)), 1)
+    along = (np.arange(points) + 0.5) / points - 0.5
+    turned = np.stack([np.cos(edges.bars[:, 0]), np.sin(edges.bars[:, 0])], axis=1)
+    return photons, column + along * trail[0], row + along * trail[1], turned
 
 
 def _finest(edges: Edges) -> float:
@@ -227,22 +266,36 @@ def _outside(
 
 
 @jit
-def _inside(
-    frame: Any, x: float, y: float, inner: float, level: float, turned: Any, lines: Any, period: float, folds: bool
-) -> None:  # fmt: skip
-    """Inside the square: what has faded of the plane, and less what was folded into what is left of it."""
+def _inside(frame: Any, x: float, y: float, inner: float, level: float, turned: Any, lines: Any) -> None:
+    """Adds what has faded of the plane, inside the square."""
     ny, nx = frame.shape
     for r in range(max(int(np.ceil(y - inner)), 0), min(int(np.ceil(y + inner)), ny)):
         for c in range(max(int(np.ceil(x - inner)), 0), min(int(np.ceil(x + inner)), nx)):
             dx, dy = c - x, r - y
             if abs(dx) < inner and abs(dy) < inner:
                 left = _left(abs(dx), inner) * _left(abs(dy), inner)
-                more = 0.0
-                if folds and dx * dx + dy * dy > (_NEAR * period) ** 2:
-                    more -= left * _folded(dx, dy, level, turned, lines, period)
                 if left < 1.0:
-                    more += (1.0 - left) * _light(dx, dy, level, turned, lines)
-                frame[r, c] += np.int64(np.rint(more * FIXED_POINT))
+                    frame[r, c] += np.int64(np.rint((1.0 - left) * _light(dx, dy, level, turned, lines) * FIXED_POINT))
+
+
+@jit
+def _unfold(stamp: Any, x: Float, y: Float, inner: float, level: float, turned: Any, lines: Any, period: float) -> None:
+    """Multiplies a stamp by what is not folded of the light that points at x, y send to each pixel."""
+    for r in range(stamp.shape[0]):
+        for c in range(stamp.shape[1]):
+            folded = 0.0
+            for p in range(len(x)):
+                dx, dy = c - x[p], r - y[p]
+                if abs(dx) < inner and abs(dy) < inner and dx * dx + dy * dy > (_NEAR * period) ** 2:
+                    left = _left(abs(dx), inner) * _left(abs(dy), inner)
+                    folded += left * _folded(dx, dy, level, turned, lines, period)
+            if folded > 0.0:
+                own = 0.0
+                for p in range(len(x)):
+                    dx, dy = c - x[p], r - y[p]
+                    left = _left(abs(dx), inner) * _left(abs(dy), inner)
+                    own += left * _light(dx, dy, level, turned, lines)
+                stamp[r, c] *= own / (own + folded)
 
 
 @jit

@@ -21,7 +21,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -351,6 +351,14 @@ def _draw(
     cut = kernel.reaches(passing, transfer.STEP, body, fraction, bulge, disk, table, row, left_out)
     reach = transfer.STEP * len(passing)
     far = shining(sources.electrons, sizes, sources.shape, sources.picture, psf)
+
+    def star(i: int) -> dict[str, Any]:
+        photons = None if sources.photons is None else sources.photons[i]
+        return {
+            "column": sources.column[i], "row": sources.row[i], "electrons": sources.electrons[i], "photons": photons,
+            "size": SIDE, "least": left_out[i] * sources.electrons[i], "edges": psf.edges, "trail": trail[i],
+        }  # fmt: skip
+
     here = selection.touching(sources.column, sources.row, sizes, nx, ny)
     done = int(np.sum(~here))
     for size in np.unique(sizes):
@@ -368,17 +376,14 @@ def _draw(
                 share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
-            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, curve, taken)
+            unfold = partial(edges.unfold, **star(int(chosen[0]))) if far[chosen[0]] else None
+            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, curve, taken, unfold)
             drawn[chosen] = added / kernel.FIXED_POINT
             done += len(chosen)
             if progress is not None:
                 progress(done)
-    for i in np.flatnonzero(far):
-        photons = None if sources.photons is None else sources.photons[i]
-        edges.add(
-            frame, sources.column[i], sources.row[i], sources.electrons[i], photons, SIDE,
-            left_out[i] * sources.electrons[i], psf.edges, trail[i],
-        )  # fmt: skip
+    for i in np.flatnonzero(far).tolist():
+        edges.add(frame, **star(i))
     layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
     layer += wings.galaxies(sources.column, sources.row, stray, taken, farthest, sizes, nx, ny)
     return np.asarray(kernel.electrons_of(frame, layer, wings.BLOCK, wings.MARGIN))
@@ -445,11 +450,12 @@ def _draw_some(
     cut: Float,
     curve: Float,
     taken: Float,
+    unfold: Callable[..., None] | None = None,
 ) -> Int:
     """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does.
 
     bodies, cut, curve : arrays by source: of `_bodies` and trails; of kernel.reaches; of kernel.returning
-    taken : filled at the chosen with what kernel.take_off took
+    taken : filled at the chosen with what kernel.take_off took;  unfold : edges.unfold of a star that shines so far
     """
     size = passed.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
@@ -465,6 +471,8 @@ def _draw_some(
     off = np.zeros(len(chosen))
     kernel.take_off(stamps, column - x0, row - y0, curve[chosen], off)
     taken[chosen] = off
+    if unfold is not None:
+        unfold(stamps[0], int(x0[0]), int(y0[0]), frame.shape[1], frame.shape[0])
     return kernel.accumulate(frame, stamps, x0, y0)
 
 

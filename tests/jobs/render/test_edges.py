@@ -129,7 +129,7 @@ def test_the_frame_has_no_seam(vis):
         here = clear & (radius >= inner) & (radius < outer)
         assert (image * radius**3)[here].mean() == pytest.approx(law, rel=0.06)
     # Nor holes in the sky, where the plane ends or its transform had put light of elsewhere.
-    assert image.min() > -NOISE
+    assert image.min() > -1e-3 * NOISE
     # A spike goes on as it was.
     turn = vis.edges.bars[2, 0]
     out = np.arange(225, 285)
@@ -152,7 +152,7 @@ def test_the_frame_of_a_trail_has_no_seam(vis, length):
     )  # fmt: skip
     assert size[0] > SIDE
     image = stamps.draw(moving, size, vis, side, side)
-    assert image.min() > -NOISE
+    assert image.min() > -1e-3 * NOISE
     # Independent of pieces: stars at rest, each with its share.
     along = np.arange(-0.5, 0.5, 1 / 16) + 1 / 32
     y, x = np.mgrid[:side, :side]
