@@ -2,7 +2,8 @@
 
 A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the stamp's own k grid. A galaxy's light
 that belongs outside its stamp comes in at the opposite edge. What of it reaches the middle is taken off and drawn where
-it belongs, as are the PSF's wings beyond the stamp (wings.py); the rest stays at the edge, where it is below the noise.
+it belongs, as are the PSF's wings beyond the stamp (wings.py); the rest stays at the edge, where it is below the noise,
+and where a PSF that has no planes leaves all of its wings (transfer.py).
 A stamp is large enough that all that comes in is below a part of the flux in the source's aperture. Nothing is lost,
 nothing is rescaled.
 

@@ -181,9 +181,38 @@ def _planes(psf: Psf, some: Grid, dtype: type[Any]) -> Array:
         step = 2 * np.pi / some.size
         reach = int(np.rint(max(some.kx.max(), -some.kx.min(), some.ky.max()) / step))
         out = np.empty((1, 2, len(some.kx)), dtype)
-        kernel.take(spectrum_of(psf, some.size, reach), some.runs, _pixel(some, psf.intra_pixel), out[0])
+        spectrum = spectrum_of(psf, some.size, reach)
+        _move_out(spectrum, psf, some.size)
+        kernel.take(spectrum, some.runs, _pixel(some, psf.intra_pixel), out[0])
         return out
     return _on_grid([*psf.planes.images, *psf.planes.drift], some, psf.intra_pixel, dtype)
+
+
+def _move_out(spectrum: Array, psf: Psf, size: int) -> None:
+    """The wings that come into a stamp at its edges leave its middle for its edges: no light is lost.
+
+    Harmonics of the stamp, one (cos u + cos v) + both cos u cos v, are added that cancel them in the middle to second
+    order in u, v = 2 pi x / size, 2 pi y / size.
+    spectrum : of spectrum_of
+    """
+    near, across = size / 8.0, size / 8.0 / np.sqrt(2.0)
+    middle = _images(psf, size, 0.0, 0.0)
+    off = 0.5 * (_images(psf, size, near, 0.0) + _images(psf, size, across, across))
+    # The images' light is middle + slope (u^2 + v^2).
+    slope = (off - middle) / (2 * np.pi / 8.0) ** 2
+    one, both = -middle - 2.0 * slope, middle + 4.0 * slope
+    for iy in (-1, 0, 1):
+        for ix in (0, 1):
+            if ix or iy:
+                spectrum[iy, ix] += size**2 * (both / 4.0 if ix and iy else one / 2.0)
+
+
+def _images(psf: Psf, size: int, x: float, y: float) -> float:
+    """Of a star's light, that of its images in the stamps about, two deep, in a pixel at (x, y) from its middle."""
+    steps = [n * size for n in range(-2, 3)]
+    places = [(x - c, y - r) for r in steps for c in steps if r or c]
+    light = [psf.profile.xValue(u * psf.pixel_scale, v * psf.pixel_scale) for u, v in places]
+    return float(np.sum(light)) * psf.pixel_scale**2
 
 
 def _on_grid(images: list[Array], some: Grid, strength: float | None, dtype: type[Any]) -> Array:

@@ -95,3 +95,19 @@ def test_passing_is_an_upper_bound_of_the_seeing_disc_s_transform():
     profile = galsim.Convolve(spread_.profile.dilate(5.0), galsim.Pixel(1.0))
     for at, most in zip(k, passing, strict=True):
         assert abs(profile.kValue(at, 0.0)) <= most * 1.1
+
+
+@pytest.mark.parametrize("beta", [2.5, 3.0])
+@pytest.mark.parametrize("size", [32, 40, 64])
+def test_wings_that_come_in_are_not_in_the_middle(size, beta):
+    """Behind an atmosphere, against a stamp that none reach: nine tenths of them are where the stamp ends."""
+    detector, seeing = small("lsstcam", "R22_S11"), psf.ground_psf(0.7, beta, 0.2)
+    source = one_source(detector, focal_plane.wcs(detector, 10.0, 20.0, 0.0), 1e9, 80.0, 80.0)
+    image, whole = (stamps.draw(source, np.array([n]), seeing, 160, 160) for n in (size, 1024))
+    assert image.sum() == pytest.approx(1e9, rel=1e-9)
+    steps = [n * size for n in range(-8, 9)]
+    came_in = 1e9 * 0.04 * sum(seeing.profile.xValue(0.2 * x, 0.2 * y) for x in steps for y in steps if x or y)
+    y, x = np.mgrid[:160, :160] - 80
+    assert np.abs(image - whole)[np.hypot(x, y) <= size / 8].max() < 0.1 * came_in
+    stamp = (np.abs(x + 0.5) < size / 2) & (np.abs(y + 0.5) < size / 2)
+    assert (image / whole)[stamp].min() > 0.999
