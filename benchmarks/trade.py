@@ -34,7 +34,7 @@ Row = dict[str, str | float]
 # From draft to reference; then the survey's with one setting changed at a time.
 _CHAIN = (
     Settings(0.3, 3e-3, 5e-2, 4.0, 4),
-    Settings(0.1, 1e-3, 3e-2, 4.8, 4),
+    Settings(0.1, 1e-3, 1e-2, 4.8, 4),
     Settings(0.03, 1e-3, 3e-3, 4.8, 9),
     Settings(0.01, 1e-4, 3e-4, 6.4, 9),
     Settings(0.004, 3e-5, 1e-5, 8.0, 9),

@@ -7,6 +7,7 @@ lensed, spread by the seeing disc, counted in pixels.
 import time
 from dataclasses import fields
 from functools import cache
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -198,8 +199,9 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     side = int(sizes[0])
     source.column[:], source.row[:] = side // 2, side // 2
     compiled()
+    floors = stamps.floors(source.electrons, NOISE, settings)
     start = time.process_time()
-    image = stamps.draw(source, sizes, psf, side, side, floors=stamps.floors(source.electrons, NOISE, settings))
+    image = stamps.draw(source, sizes, psf, side, side, floors=floors)
     assert time.process_time() - start < 10
     assert np.isfinite(image).all()
     # A pixel is rounded to 2^-20 electrons; single precision sums to 1e-6.
@@ -207,6 +209,11 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     if len(source.shapes):
         least -= profiles.outside(source.shapes, np.array([0.5 * side * psf.pixel_scale]))[0]
     assert least * electrons - rounding <= image.sum() <= electrons + rounding
+    assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
+    # Where nothing is taken off the stamp all of its light is on it.
+    with mock.patch.object(stamps, "_STRAY", 2.0):
+        image = stamps.draw(source, sizes, psf, side, side, floors=floors)
+    assert image.sum() == pytest.approx(electrons, rel=2e-6, abs=image.size * 2.0**-21)
     assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
 
 
@@ -234,6 +241,17 @@ def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
     middle = slice(76, 116)
     expected = np.roll(base, (dy, dx), (0, 1))[middle, middle]
     np.testing.assert_allclose(moved[middle, middle], expected, atol=2e-4 * base.max() + 2.0**-20)
+    # Of a stamp that nothing is taken off, half as large, too.
+    source.column[:] -= 32.0
+    source.row[:] -= 32.0
+    with mock.patch.object(stamps, "_STRAY", 2.0):
+        moved = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
+        source.column[:] -= dx
+        source.row[:] -= dy
+        base = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
+    middle = slice(44, 84)
+    expected = np.roll(base, (dy, dx), (0, 1))[middle, middle]
+    np.testing.assert_allclose(moved[middle, middle], expected, atol=2e-4 * base.max() + 2.0**-20)
 
 
 @given(st.sampled_from([kind for kind in SHAPES if "gamma1" not in SHAPES[kind]]), st.floats(0, 180))
@@ -242,6 +260,11 @@ def test_a_galaxy_turned_by_half_a_turn_is_itself(kind, angle):
     image = stamps.draw(source, np.array([96]), spread("vis"), 97, 97)
     # What lies beyond the stamp is on blocks, which have another middle.
     inside = image[17:80, 17:80]
+    np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
+    # A stamp that nothing is taken off is so to its edges.
+    with mock.patch.object(stamps, "_STRAY", 2.0):
+        image = stamps.draw(centred(source), np.array([64]), spread("vis"), 65, 65)
+    inside = image[1:64, 1:64]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
 
 
