@@ -51,6 +51,11 @@ def test_i_band_counts_are_the_observed_ones(drawn, limit, observed):
     assert found == pytest.approx(observed, rel=0.22)
 
 
+def test_slope_of_the_counts(drawn):
+    number = np.histogram(drawn.mags["euclid_vis"], np.arange(19.5, 24.0, 1.0))[0]
+    assert np.mean(np.diff(np.log10(number))) == pytest.approx(0.39, abs=0.03)
+
+
 @pytest.fixture(scope="module")
 def mean_sky(universe, library):
     """(I_E, i, z, galaxies an arcmin2) of points that fill redshift and luminosity: the sky without any structure."""
