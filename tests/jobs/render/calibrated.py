@@ -39,3 +39,13 @@ def flat(scene, seed, applied):
         own = stream(seed, "vis", scene.detector.name, "pixel_response")
         out = pixel_response.apply(out, *pixel_response.EFFECT.parameters(scene), own)
     return np.where(out > 0.7, out, np.nan)
+
+
+def without_hits(electrons, hits, reach=40):
+    """NaN where a cosmic ray is, and in the rows after it that its trail is in."""
+    bad = hits > 0
+    upper = len(bad) // 2
+    for half in (bad[:upper], bad[upper:][::-1]):
+        for _ in range(reach):
+            half[1:] |= half[:-1]
+    return np.where(bad, np.nan, electrons)
