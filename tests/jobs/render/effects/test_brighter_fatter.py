@@ -1,5 +1,7 @@
 """Brighter-fatter: charge only moves, stars widen in proportion to their peaks, flats lose variance as predicted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from jobs.render.effects import brighter_fatter
 from jobs.render.effects.effect import Scene
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render.fields import small
 
 SHIFT, SOFT, FULL = 1.2e-7, 0.5, 2e5
 
@@ -29,7 +32,7 @@ def test_a_star_at_full_well_is_one_to_two_per_cent_wider():
     for peak in (5e4, 2e5):
         image = star(peak)
         mean = np.mean(
-            [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(i)) for i in range(50)], axis=0
+            [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(50)], axis=0
         )
         growth[peak] = widths(mean) / widths(image) - 1
     assert (growth[2e5] > 0.01).all()
@@ -40,7 +43,7 @@ def test_a_star_at_full_well_is_one_to_two_per_cent_wider():
 def test_variance_of_a_flat_falls_as_predicted():
     level = 1e5
     flat = np.random.default_rng(1).poisson(level, (1200, 1200)).astype(float)
-    out = brighter_fatter.apply(flat, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(2))
+    out = brighter_fatter.apply(flat, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(2))
     assert out.sum() == flat.sum()
     lost = 1 - out.var() / flat.var()
     assert lost == pytest.approx(brighter_fatter.curvature(SHIFT, SOFT) * level, rel=0.1)
@@ -53,10 +56,10 @@ def test_variance_of_a_flat_falls_as_predicted():
 def test_rows_and_columns_are_alike():
     image = star(1e5)
     one = np.mean(
-        [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(i)) for i in range(60)], 0
+        [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(60)], 0
     )
     two = np.mean(
-        [brighter_fatter.apply(image.T, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(i)) for i in range(60)], 0
+        [brighter_fatter.apply(image.T, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(60)], 0
     )
     assert np.abs(one - two.T).max() < 1.0
 
@@ -71,9 +74,42 @@ def test_kernel_falls_off():
 
 def test_what_no_pixel_holds_does_not_repel():
     image = star(1e9)
-    out = brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, np.random.default_rng(1))
+    out = brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(1))
     assert out.min() >= 0
     assert out.sum() == image.sum()
+
+
+def through(light, between):
+    """As a detector with rows of charge injection does it, all borders followed."""
+    detector = replace(small("vis", "3-4", 2), nx=light.shape[1], ny=len(light), middle=between)
+    one = Scene(resolve(), "vis", 560.53, 0.25, 1e5, detector)
+    *parameters, _, rows = brighter_fatter.EFFECT.parameters(one)
+    return brighter_fatter.EFFECT.apply(light, *parameters, 0.0, rows, rng=np.random.default_rng(5))
+
+
+def test_rows_of_charge_injection_hold_nothing_that_repels():
+    """Neither half knows what shone between them, or on the other; each loses to them as its charge says."""
+    level, rng = 1e5, np.random.default_rng(1)
+    flat = rng.poisson(level, (40, 2000)).astype(float)
+    lit = flat.copy()
+    lit[19:21], lit[22:] = 1.9e5, 0.0
+    out, other = (through(light, 4) for light in (flat, lit))
+    np.testing.assert_array_equal(out[:18], other[:18])
+    assert out.sum() == flat.sum()
+    change = (out - flat).mean(axis=1)
+    # The field of one side alone at the border, half of it on average while light falls; less what comes from behind.
+    weights = brighter_fatter.kernel(SHIFT, SOFT)
+    lost = 0.5 * weights.sum() * level**2
+    passed = 0.5 * weights[:, 1].sum() * level**2
+    error = 5 * np.sqrt(0.05 * level / 2000)
+    for last, before, beside in ((17, 16, 18), (22, 23, 21)):
+        assert change[last] == pytest.approx(passed - lost, rel=0.02, abs=error)
+        assert change[before] == pytest.approx(-passed, rel=0.05, abs=error)
+        assert change[beside] == pytest.approx(lost, rel=0.02, abs=error)
+    assert 0.008 * level < -change[17] < 0.01 * level
+    assert np.abs(change[[2, 10, 30, 37]]).max() < error
+    # Where there are no such rows the halves are neighbours.
+    assert np.abs((through(flat, 0) - flat).mean(axis=1)).max() < error
 
 
 def test_what_is_not_noticed_is_left_out():
@@ -82,7 +118,7 @@ def test_what_is_not_noticed_is_left_out():
     light[100:125, 200:225] += star(1.5e5)
     light[297:, 397:] += 5e4
     every, some = (
-        brighter_fatter.apply(light, SHIFT, SOFT, FULL, dim, np.random.default_rng(4)) for dim in (0.0, 700.0)
+        brighter_fatter.apply(light, SHIFT, SOFT, FULL, dim, 0, np.random.default_rng(4)) for dim in (0.0, 700.0)
     )
     assert some.sum() == light.sum()
     np.testing.assert_array_equal(every[105:120, 205:220], some[105:120, 205:220])
@@ -99,10 +135,10 @@ def test_what_is_left_out_is_within_the_accuracy(preset):
     """Of a star just too dim to be followed: its size; and what would cross the borders of its pixels."""
     wanted = accuracy.preset(preset)
     scene = Scene(resolve(), "vis", 560.53, 0.25, 1e4, accuracy=wanted)
-    shift, softening, full, dim = brighter_fatter.EFFECT.parameters(scene)
+    shift, softening, full, dim, _ = brighter_fatter.EFFECT.parameters(scene)
     bright = star(2e5)
     mean = np.mean(
-        [brighter_fatter.apply(bright, shift, softening, full, 0.0, np.random.default_rng(i)) for i in range(50)],
+        [brighter_fatter.apply(bright, shift, softening, full, 0.0, 0, np.random.default_rng(i)) for i in range(50)],
         axis=0,
     )
     growth = (widths(mean) ** 2).sum() / (widths(bright) ** 2).sum() - 1
@@ -120,4 +156,4 @@ def test_what_is_left_out_is_within_the_accuracy(preset):
 )  # fmt: skip
 def test_nonsense_is_refused(wrong):
     with pytest.raises(OutOfRange, match=r"brighter|full well"):
-        brighter_fatter.apply(np.ones((3, 3)), *wrong, np.random.default_rng(1))
+        brighter_fatter.apply(np.ones((3, 3)), *wrong, 0, np.random.default_rng(1))
