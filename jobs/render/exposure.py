@@ -221,9 +221,12 @@ def render(
 
 
 def numbers_of(effect: Effect, exposure: Row, detector: str, seed: int) -> tuple[int | str, ...]:
-    """The identity of an effect's random numbers: nobody else's.  A detector's own patterns are in every exposure."""
+    """The identity of an effect's random numbers: nobody else's, but where it follows another's pattern.
+
+    A detector's own patterns are in every exposure.
+    """
     what = str(exposure["camera"]) if effect.fixed else exposing.identity(exposure)
-    return seed, what, detector, effect.name
+    return seed, what, detector, effect.numbers or effect.name
 
 
 def effects_of(channel: str, image_type: str, where: str) -> tuple[Effect, ...]:

@@ -154,6 +154,7 @@ class Effect:
     contribution : scene -> its largest change of a pixel, electrons
     optional     : False where the frame is no product without it
     fixed        : a pattern of the detector itself: its random numbers are the same in every exposure
+    numbers      : the effect whose random numbers it takes, "" = its own
     cost         : seconds a million pixels take on one core (measured by benchmarks/effects)
     """
 
@@ -163,6 +164,7 @@ class Effect:
     contribution: Callable[[Scene], float]
     optional: bool = True
     fixed: bool = False
+    numbers: str = ""
     cost: float = 0.0
 
     def margin(self, scene: Scene) -> float:

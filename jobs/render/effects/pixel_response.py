@@ -54,14 +54,15 @@ def _spread(out: Any, rms: float, own: Any) -> None:
         out[i] = max(1.0 + rms * dice.normal(dice.word(own, i)), 0.0)
 
 
-def _parameters(scene: Scene) -> tuple[float, float, float]:
+def parameters(scene: Scene) -> tuple[float, float, float]:
+    """Of `response`."""
     return scene.value("prnu", ""), scene.value("dead_pixels", ""), scene.value("dark_columns", "")
 
 
 def _contribution(scene: Scene) -> float:
-    rms, dead, columns = _parameters(scene)
+    rms, dead, columns = parameters(scene)
     brightest = scene.peak_electrons + scene.sky_electrons
     return max(rms * brightest, scene.sky_electrons * (dead > 0 or columns > 0))
 
 
-EFFECT = Effect("pixel_response", apply, _parameters, _contribution, fixed=True, cost=1.2e-2)
+EFFECT = Effect("pixel_response", apply, parameters, _contribution, fixed=True, cost=1.2e-2)

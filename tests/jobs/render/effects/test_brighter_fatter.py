@@ -32,7 +32,8 @@ def test_a_star_at_full_well_is_one_to_two_per_cent_wider():
     for peak in (5e4, 2e5):
         image = star(peak)
         mean = np.mean(
-            [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(50)], axis=0
+            [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(50)],
+            axis=0,
         )
         growth[peak] = widths(mean) / widths(image) - 1
     assert (growth[2e5] > 0.01).all()

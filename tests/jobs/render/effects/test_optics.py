@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from jobs import rng
 from jobs.fluxes import passbands
-from jobs.render import focal_plane, psf
+from jobs.render import exposure, focal_plane, psf
 from jobs.render.effects import (
     calibration_lamp,
     ghosts,
@@ -19,7 +20,7 @@ from jobs.render.effects import (
     readout_trail,
     straylight,
 )
-from jobs.render.effects.effect import NOTICEABLE, Lights, Scene
+from jobs.render.effects.effect import NOTICEABLE, Lights, Scene, apply_all
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
 
@@ -343,12 +344,41 @@ def test_open_shutter_draws_a_trail():
     assert out[:, 0].max() == 0
     assert (out[:4, 1] == 0).all()
     assert (out[14:, 2] == 0).all()
-    share, halves = readout_trail.EFFECT.parameters(scene())
+    share, halves, response = readout_trail.EFFECT.parameters(scene())
     assert share == pytest.approx(72 / 2086 / 560.53)
     # What traps see of a row: the time that it stays.
     assert share * 560.53 == pytest.approx(scene().value("cti.dwell_time", "s"), rel=0.03)
     assert halves == 2
+    assert response == pixel_response.EFFECT.parameters(scene())
     with pytest.raises(OutOfRange, match="trail"):
         readout_trail.apply(frame, -1.0, 2)
     with pytest.raises(OutOfRange, match="halves"):
         readout_trail.apply(frame, 1.0, 4)
+
+
+def test_light_of_a_trail_is_seen_by_the_pixels_that_it_falls_on():
+    """Row by row: each has seen its own light, and on its way the light of those before it, each by its own pixel."""
+    # Old pixels, some dead.
+    worn = resolve(overrides={"vis.prnu": (0.2, ""), "vis.dead_pixels": (0.05, "")})
+    ny, nx = 40, 30
+    detector = replace(focal_plane.detector("vis", "3-4", worn), nx=nx, ny=ny, middle=4)
+    one = Scene(worn, "vis", 10.0, 0.25, 1e5, detector)
+    row = {"exposure_id": 1, "channel": "VIS", "camera": "vis", "image_type": "flat"}
+    frame = np.random.default_rng(2).uniform(0.0, 1e5, (ny, nx))
+
+    def stream(effect):
+        return rng.stream(*exposure.numbers_of(effect, row, "3-4", 1))
+
+    both = (readout_trail.EFFECT, pixel_response.EFFECT)
+    found, _ = apply_all(frame, both, one, stream, {"readout_trail": True, "pixel_response": True})
+    seen = pixel_response.response((ny, nx), *pixel_response.parameters(one), stream(pixel_response.EFFECT))
+    assert (seen < 0.5).sum() > 20
+    share = one.value("readout_time", "s") / 2086 / 10.0
+    expected = frame * seen
+    for r in range(ny):
+        passed = range(r) if r < ny // 2 else range(r + 1, ny)
+        expected[r] += sum((share * frame[p] * seen[p] for p in passed), np.zeros(nx)) * (seen[r] > 0)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    # Without a response all are alike, whatever the numbers.
+    alike, _ = apply_all(frame, both, one, stream, {"readout_trail": True, "pixel_response": False})
+    np.testing.assert_array_equal(alike, readout_trail.apply(frame, share, 2))
