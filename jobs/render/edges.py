@@ -6,6 +6,7 @@ spikes across itself, as wide as it is long, with the fringes of its width along
 Edges     of a pupil;  of_pupil : the Euclid one's
 add       what a star shines outside the plane, onto a frame
 unfold    what of it the plane has inside, taken off
+reach     how far out a star's spikes are noticed
 left      how the plane fades there
 
 Ref : Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a circle, far out)
@@ -42,6 +43,9 @@ _FOLDED, _NEAR = 0.2, 0.15
 # Points along a bar that tell how much of it is seen.
 _POINTS = 7001
 _ARCSEC = np.pi / 180.0 / 3600.0
+# Spikes are followed so far from a star, arcsec. There one of 7.4 mag still draws lines of a tenth of a pixel's noise
+# over a nominal exposure, one of 4.9 mag of as much as it.
+FARTHEST = 1200.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +126,25 @@ def spikes(edges: Edges, photons: Float, reach: float) -> Float:
     return np.stack(found)
 
 
+def reach(edges: Edges, electrons: Float, least: float) -> Float:
+    """float64[n] pixels as far as which a star's brightest spike has a pixel of `least` electrons, at most FARTHEST.
+
+    Error : 15 %, of fringes along the spike, and of colours: sub-bands are taken as equal
+    """
+    share = 1.0 / edges.wavelength.size
+    cycles = edges.pixel_scale * _ARCSEC / (edges.wavelength.ravel() * 1e-7)
+    across, blur = _STEP * np.arange(2 * round(_WIDE / _STEP)), edges.blur / edges.pixel_scale
+    # Of fringes whose mean is half of r^-2.
+    middle = [
+        float(_blurred(np.sinc(length * cycles[:, None] * across) ** 2, blur, np.full((1, len(cycles)), share))[0, 0])
+        * (length / np.pi) ** 2
+        / (2.0 * edges.area)
+        for _, _, length in edges.bars
+    ]
+    farthest = FARTHEST / edges.pixel_scale
+    return np.asarray(np.minimum(np.sqrt(max(middle) * electrons / max(least, 1e-300)), farthest))
+
+
 def _blurred(lines: Float, blur: float, along: Float) -> Float:
     """Sum of the lines [w, t], t >= 0, through jitter, diffusion and pixel: [r, t] up to _WIDE."""
     both = np.concatenate([lines[:, :0:-1], lines], axis=1)
@@ -153,7 +176,8 @@ def add(
     photons, columns, rows, turned = _points(column, row, photons, edges, trail)
     points = len(columns)
     ny, nx = frame.shape
-    farthest = float(np.hypot(max(columns.max(), nx - columns.min()), max(rows.max(), ny - rows.min())))
+    # Beyond the farthest corner's pixel.
+    farthest = float(np.hypot(max(columns.max() + 1.0, nx - columns.min()), max(rows.max() + 1.0, ny - rows.min())))
     level = electrons / points * ring(edges, photons)
     lines = electrons / points * spikes(edges, photons, max(farthest, edges.period))
     faintest = _FAINTEST * least / points

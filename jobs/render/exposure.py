@@ -2,7 +2,7 @@
 
 render          the whole of it
 numbers_of      whose random numbers an effect takes
-least_flux      what a source beyond the margin must have to be read
+least_flux      what a source beyond the margin must have to be read;  spike_flux : and a star still farther out
 sources_of      the rows that touch the detector, as what is drawn
 """
 
@@ -25,6 +25,7 @@ from jobs.fluxes.templates import Library
 from jobs.render import (
     chromatic,
     costs,
+    edges,
     exposing,
     focal_plane,
     moving,
@@ -38,7 +39,7 @@ from jobs.render import (
 )
 from jobs.render.channels import ext, vis
 from jobs.render.effects import calibration_lamp, charge_injection, cosmic_rays, quadrants
-from jobs.render.effects.effect import Decision, Effect, Lights, Scene, apply_all, decide
+from jobs.render.effects.effect import NOTICEABLE, Decision, Effect, Lights, Scene, apply_all, decide
 from jobs.render.focal_plane import Detector
 from jobs.render.psf import Psf
 from jobs.render.stamps import Settings, Sources
@@ -271,6 +272,19 @@ def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration,
     )
 
 
+def spike_flux(
+    exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy, band: Passband
+) -> float:
+    """f_nu of the faintest star whose spikes are noticed from beyond what else is read, microjansky; or infinite."""
+    time = float(exposure["exposure_time_s"])
+    sees = exposing.sees_sky(str(exposure["channel"]), str(exposure["image_type"]))
+    if time == 0.0 or not sees or detector.section != "vis" or exposure.get("psf"):
+        return float("inf")
+    pupil, noise = psf.vis_edges(detector, band, mission), scene_of(exposure, detector, mission, accuracy).pixel_noise
+    (one,) = edges.reach(pupil, np.ones(1), NOTICEABLE * noise)
+    return float((stamps.reach(1.0) / one) ** 2 / (_rate(exposure) * time))
+
+
 def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes: stamps.Int, spread: Psf) -> None:
     """Before anything is drawn: a task must fit into its memory, and end."""
     where = f"exposure {exposure['exposure_id']}, detector {detector.name}: {len(sources)} sources"
@@ -315,7 +329,7 @@ def sources_of(
     stellar: Library | None = None,
     lenses: pa.Table | None = None,
 ) -> tuple[Sources, stamps.Int]:
-    """Everything whose stamp touches the detector, ascending id, and the stamps' sides.
+    """Everything that shines on the detector, ascending id, and its stamps' sides.
 
     galaxies, stars : (rows, expected electrons [n]);  lenses : rows of `strong_lenses`, None = none
     """
@@ -330,15 +344,14 @@ def sources_of(
     shape = np.concatenate([np.arange(len(catalogue)), np.full(rest, -1)]).astype(np.int64)
     picture = np.concatenate([np.full(len(catalogue) + len(points), -1), np.arange(len(arcs.ids))]).astype(np.int64)
     _check(ids, electrons)
-    reach = detector.half_diagonal + stamps.SIZES[-1] * detector.pixel_scale
+    farthest = np.where((shape < 0) & (picture < 0), _spikes(electrons, detector, spread, noise), 0.0)
+    reach = detector.half_diagonal + np.maximum(farthest, stamps.SIZES[-1] * detector.pixel_scale)
     seen = selection.near(ra, dec, focal_plane.centre(detector, system), reach / 3600.0) & (electrons > 0)
     kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
     column, row = focal_plane.pixel_of_sky(system, ra[kept], dec[kept])
     wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
     sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings, wide)
-    farther = stamps.shining(electrons[kept], sizes, shape[kept], picture[kept], spread)
-    # As far as sources are read.
-    reaches = np.where(farther, int(2.0 * stamps.reach(1.0)), sizes)
+    reaches = stamps.reaches(electrons[kept], sizes, shape[kept], picture[kept], spread, noise)
     here = selection.touching(column, row, reaches, detector.nx, detector.ny)
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
@@ -350,6 +363,13 @@ def sources_of(
         ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons, picture[kept], arcs.pictures
     )
     return found, sizes[here]
+
+
+def _spikes(electrons: Float, detector: Detector, spread: Psf, noise: float) -> Float:
+    """[n] arcsec as far as which points' spikes are noticed."""
+    if spread.edges is None:
+        return np.zeros(len(electrons))
+    return edges.reach(spread.edges, electrons, NOTICEABLE * noise) * detector.pixel_scale
 
 
 def _arcs(lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: profiles.Shapes) -> pictures.Arcs:
@@ -374,7 +394,7 @@ def _with_moving(
         settings,
         stamps.piece_length(found.length),
     )
-    wide = own + np.ceil(found.length).astype(np.int64)
+    wide = stamps.reaches(found.electrons, own, found.shape, None, spread, scene.pixel_noise, found.length)
     here = selection.touching(found.column, found.row, wide, detector.nx, detector.ny) & (found.electrons > 0)
     if not here.any():
         return sources, sizes, _trails(found)

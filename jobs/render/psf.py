@@ -107,10 +107,15 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
     Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
     """
     found = sampled(_vis_planes(detector, band, mission, positions), detector.pixel_scale, has_pixel=False)
-    waves = np.concatenate([part.wavelength for part in sub_bands(band)])
+    return replace(found, edges=vis_edges(detector, band, mission))
+
+
+def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
+    """What shines beyond the planes of the Euclid PSF."""
+    parts = sub_bands(band)
+    waves = np.concatenate([part.wavelength for part in parts])
     blur = float(np.sqrt(np.mean(_blur_variances(detector, float(waves.mean()), mission))))
-    beyond = edges.of_pupil(sub_bands(band), blur, detector.pixel_scale, _TRANSFORM / SAMPLES, mission)
-    return replace(found, edges=beyond)
+    return edges.of_pupil(parts, blur, detector.pixel_scale, _TRANSFORM / SAMPLES, mission)
 
 
 def galsim_profile(image: Array, pixel_scale: float, exact: bool = False) -> galsim.GSObject:

@@ -19,7 +19,18 @@ import pyarrow.parquet as pq
 from jobs import heap
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
-from jobs.render import exposure, fits_product, focal_plane, own_bodies, own_psf, pictures, selection, stamps, survey
+from jobs.render import (
+    edges,
+    exposure,
+    fits_product,
+    focal_plane,
+    own_bodies,
+    own_psf,
+    pictures,
+    selection,
+    stamps,
+    survey,
+)
 from jobs.render.plan_exposures import PARTS, mission_of, own_filters
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
@@ -93,16 +104,22 @@ def product_keys(
         "library": [flux_facts.get("files"), flux_facts.get("sources")],
     }
     rows = {row["exposure_id"]: row for row in exposures.to_pylist()}
-    files = [(_deflection(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes])) for name, fluxes in CATALOGUES]
+    files = {
+        name: (_deflection(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes])) for name, fluxes in CATALOGUES
+    }
     if LENSES in inputs:
-        files.append((_deflection(inputs["galaxies"]), _files_of_cells(inputs[LENSES])))
+        files[LENSES] = _deflection(inputs["galaxies"]), _files_of_cells(inputs[LENSES])
 
     def catalogues(task: Json) -> list[list[tuple[str, ...]]]:
         camera, detector = rows[task["exposure_id"]]["camera"], task["detector"]
         reach = stamps.reach(focal_plane.detector(camera, detector, mission).pixel_scale)
+        # Of the cameras VIS alone has spikes, of stars.
+        reaches = {name: reach for name in files}
+        if rows[task["exposure_id"]]["channel"] == "VIS":
+            reaches["stars"] = max(edges.FARTHEST, reach)
         return [
-            sorted({sums for cell in selection.within(task, deflection, reach) for sums in found.get(cell, ())})
-            for deflection, found in files
+            sorted({sums for cell in selection.within(task, deflection, reaches[name]) for sums in found.get(cell, ())})
+            for name, (deflection, found) in files.items()
         ]
 
     def own(task: Json) -> Json:
@@ -222,23 +239,31 @@ def sources(
     band: str,
     farther: float,
     least: float,
+    spikes: float = float("inf"),
 ) -> tuple[pa.Table, pa.Table, float]:
     """(rows of a catalogue that a task may draw, their fluxes, how far beyond the task's circle they are complete).
 
     farther : how far beyond the circle a source may be seen and reach the detector, arcsec
     least   : microjansky, of sources beyond the cells of the circle; infinite where no source at all shows
+    spikes  : microjansky, of sources still farther out, as far as spikes are followed; infinite where none are
     """
     deflection, flux = _deflection(catalogue), ["id", f"f_nu_{band}"]
     near: list[int] = []
     far: list[int] = []
+    farthest: list[int] = []
     complete = farther
     if np.isfinite(least):
         near = selection.needed(task, deflection)
         far, complete = selection.beyond(task, deflection, farther, _drawn(catalogue))
+    if np.isfinite(spikes):
+        around, _ = selection.beyond(task, deflection, max(edges.FARTHEST, farther), _drawn(catalogue))
+        farthest = sorted(set(around) - set(far))
     rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
-    if far:
-        more, bright = (v.in_cells(far, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
-        shows = pc.greater_equal(bright[flux[1]], least)
+    for cells, limit in ((far, least), (farthest, spikes)):
+        if not cells:
+            continue
+        more, bright = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
+        shows = pc.greater_equal(bright[flux[1]], limit)
         rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, more), (light, bright)))
     return rows, light, complete
 
@@ -279,11 +304,13 @@ def work(lake: Path, facts: Json) -> Output:
     margin = own.mission.value("survey.selection_margin", "arcsec")
     farther = max(stamps.reach(detector.pixel_scale) - margin, 0.0)
     least = exposure.least_flux(exposed, detector, own.mission, own.accuracy)
+    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], str(exposed["band"]))
+    spikes = exposure.spike_flux(exposed, detector, own.mission, own.accuracy, band)
     found = [
-        sources(inputs[rows], inputs[fluxes], task, columns, exposed["band"], farther, least)
-        for rows, fluxes, columns in (
-            ("galaxies", "galaxy_fluxes", exposure.GALAXY_COLUMNS),
-            ("stars", "star_fluxes", exposure.STAR_COLUMNS),
+        sources(inputs[rows], inputs[fluxes], task, columns, exposed["band"], farther, least, limit)
+        for rows, fluxes, columns, limit in (
+            ("galaxies", "galaxy_fluxes", exposure.GALAXY_COLUMNS, np.inf),
+            ("stars", "star_fluxes", exposure.STAR_COLUMNS, spikes),
         )
     ]
     with heap.kept():
@@ -297,7 +324,7 @@ def work(lake: Path, facts: Json) -> Output:
             seed=request["seed"],
             library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
             stellar=stars_of(lake, inputs["star_fluxes"].manifest["facts"]),
-            passband=passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], str(exposed["band"])),
+            passband=band,
             forced=own.forced,
             complete=margin + min(complete for *_, complete in found),
             truth=request["truth"],

@@ -12,7 +12,7 @@ settings_for, seconds_for   what an accuracy takes, from the measured table
 stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 reach, least_electrons   how far a source may show, and what it takes to show there
 draw            sources -> frame
-shining         points that do so beyond their stamps
+shining         points that do so beyond their stamps;  reaches : and how far
 work, seconds, memory    what it goes through, and takes
 reference       one source by galsim's own drawImage: what `draw` is held against
 """
@@ -33,6 +33,7 @@ import scipy.fft
 
 from jobs.accuracy import Accuracy
 from jobs.render import edges, kernel, pictures, profiles, selection, sersic, transfer, wings
+from jobs.render.effects.effect import NOTICEABLE
 from jobs.render.pictures import Picture
 from jobs.render.profiles import Forms, Shapes
 from jobs.render.psf import SIDE, Psf
@@ -394,6 +395,31 @@ def shining(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: 
     """[n] True of points so bright that their light does not end where the PSF's plane does: `draw` takes it on."""
     point = shape < 0 if picture is None else (shape < 0) & (picture < 0)
     return np.asarray(point & (sizes >= SIDE) & (electrons > _BRIGHT) & (psf.edges is not None))
+
+
+def reaches(
+    electrons: Float,
+    sizes: Int,
+    shape: Int,
+    picture: Int | None,
+    psf: Psf,
+    noise: float,
+    length: Float | None = None,
+) -> Int:
+    """Sides of the squares about sources outside which none of their light is noticed, pixels: int64[n].
+
+    Of stamps; about points that shine beyond them all that is read of the sky around (`reach`), and for their spikes
+    more: to where no pixel has a tenth of its noise.
+    length : float64[n] of trails, pixels;  noise : of a pixel, electrons
+    """
+    length = np.zeros(len(sizes)) if length is None else length
+    pieces = _pieces(length)
+    sides = sizes.astype(float)
+    far = shining(electrons / pieces, sizes, shape, picture, psf)
+    if psf.edges is not None and far.any():
+        spikes = edges.reach(psf.edges, electrons[far], NOTICEABLE * noise)
+        sides[far] = 2.0 * np.maximum(spikes, reach(1.0))
+    return np.ceil(sides + length).astype(np.int64)
 
 
 def _split(sources: Sources, sizes: Int, psf: Psf, size: int) -> tuple[Int, Int]:

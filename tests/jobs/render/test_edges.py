@@ -231,6 +231,51 @@ def test_light_is_drawn_to_where_it_is_lost_in_the_noise(vis):
     assert 0.0 < (whole - cut).max() < least
 
 
+def test_the_farthest_pixel_of_a_frame_is_lit(vis):
+    """To its corner, however the distance is rounded."""
+    for x, y in ((132.7667590299948, 168.83949347535636), (-40.3, -70.2), (108.82925776227592, 122.95520170604388)):
+        frame = np.zeros((100, 100), np.int64)
+        edges.add(frame, x, y, 1e13, None, 32, 0.0, vis.edges)
+        assert frame.min() > 0
+
+
+def spike(away, bar=2, middle=128.0):
+    """A place so many pixels from the middle of a frame, one of whose spikes goes through it."""
+    turn = of_pupil().bars[bar, 0]
+    return middle + away * np.sin(turn), middle - away * np.cos(turn)
+
+
+def test_spikes_reach_as_far_as_they_are_noticed(vis):
+    """Where a star's brightest spike is said to have sunk to a level the spike that is drawn has."""
+    least = 0.1 * NOISE
+    electrons = np.array([1e8, 1e9, 1e11])
+    far = edges.reach(vis.edges, electrons, least)
+    np.testing.assert_allclose(far[:2], far[0] * np.sqrt(electrons[:2] / 1e8), rtol=1e-12)
+    assert far[2] == edges.FARTHEST / 0.1
+    for bright, away in zip(electrons[:2], far[:2], strict=True):
+        middle = bright * edges.spikes(vis.edges, EQUAL, 5000.0)[:, :, 0]
+        here = round(away / 8.0)
+        # Over some fringes.
+        assert middle[:, here - 25 : here + 26].mean(axis=1).max() == pytest.approx(least, rel=0.15)
+
+
+def test_spikes_of_a_star_far_from_the_detector_show(vis):
+    """Bright stars are drawn from farther away than others, until their spikes are lost in the noise."""
+    field, away = small("vis", "3-4", 256), 4000.0
+    bright = 25.93 - 2.5 * np.log10(2e10 / TIME)
+    places = np.array([spike(away), spike(away, 1)]).T
+    one = rendered(field, [bright, bright + 6.0], *places, forced=off(*COSMIC_RAYS))
+    assert one.sources.electrons == pytest.approx([2e10], rel=0.01)
+    x, y = one.sources.column[0], one.sources.row[0]
+    law = shone(vis, 256, x, y, one.sources.electrons[0])
+    assert law.max() > 0.5 * NOISE
+    assert law[:, 100:156].max(axis=0).min() > 0.5 * NOISE
+    np.testing.assert_allclose(one.noise_free, law, atol=0.1 * NOISE)
+    # And one whose spikes miss the detector changes nothing that is noticed.
+    beside = rendered(field, [bright], [128.0 + away], [128.0], forced=off(*COSMIC_RAYS))
+    assert beside.noise_free.max() < 0.1 * NOISE
+
+
 @pytest.mark.parametrize("away", [500.0, 1400.0])
 def test_a_star_beside_the_detector_shines_in(away):
     """Its stamp of 51" ends before the frame does: an exposure draws its light nevertheless, from up to 145"."""

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.accuracy import SURVEY
+from jobs.fluxes import passbands
 from jobs.render import exposure, focal_plane, render_exposures, selection, stamps
 from lake_schema import sky
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
@@ -156,3 +157,27 @@ def test_a_frame_that_no_source_shows_in_reads_none(dark):
     rows, light, complete = render_exposures.sources(body, body, task, [], BAND, FARTHER, least)
     assert len(rows) == len(light) == 0
     assert complete == FARTHER
+
+
+def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
+    """Eighteen minutes of arc: one of them, and none where there are no spikes or no light."""
+    detector, task = small("vis", "3-4"), place()
+    exposed = {**field_of("VIS")[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
+    band = passbands.load("euclid_vis")
+    spikes = exposure.spike_flux(exposed, detector, MISSION, SURVEY, band)
+    # A star of 12.1 mag where those of all magnitudes end (2.4 minutes of arc), in a nominal exposure.
+    assert 23.9 - 2.5 * np.log10(spikes) == pytest.approx(12.1, abs=0.3)
+    rows = stars([task["ra"]] * 2, [task["dec"] - 0.3] * 2)
+    light = fluxes(rows, "euclid_vis", np.array([1.5, 0.5]) * spikes)
+    cells = sky.cell_of(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 8)
+    drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
+    catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
+    least = exposure.least_flux(exposed, detector, MISSION, SURVEY)
+    for limit, wanted in ((spikes, [0]), (np.inf, [])):
+        found, shining, complete = render_exposures.sources(*catalogues, task, [], "euclid_vis", 85.0, least, limit)
+        assert found.equals(rows.take(pa.array(wanted, pa.int64())))
+        assert shining["id"].equals(found["id"])
+        assert complete == 85.0
+    for other in ({"image_type": "dark"}, {"exposure_time_s": 0.0}, {"psf": "own.fits"}):
+        assert exposure.spike_flux({**exposed, **other}, detector, MISSION, SURVEY, band) == np.inf
+    assert exposure.spike_flux(field_of("EXT")[1], DETECTOR, MISSION, SURVEY, band) == np.inf

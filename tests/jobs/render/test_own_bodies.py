@@ -118,6 +118,25 @@ def test_bright_bodies_shine_around_corners(tmp_path):
     )
 
 
+@pytest.mark.parametrize(("rate", "away"), [(0.0, 600.0), (60.0, 1300.0)])
+def test_a_bright_body_beside_the_detector_shines_in(tmp_path, rate, away):
+    """As a star does that stands where it is in the middle of the exposure, far from either."""
+    detector = small("vis", "3-4", 256)
+    system = focal_plane.wcs(detector, *nominal.pointing(detector))
+    lon, lat = ecliptic(*focal_plane.sky_of_pixel(system, np.array([127.5]), np.array([-away])))
+    start, east = 60905.0 + 1, rate * 0.5 * nominal.TIME / 3600.0 / 3600.0 / np.cos(np.radians(lat))
+    values = {"mjd": [start], "lon": lon - east, "lat": lat, "east": [rate], "north": [0.0], "mag": [5.0]}
+    file = written(tmp_path / "beside.parquet", values)
+    quiet = nominal.off(*nominal.COSMIC_RAYS)
+    found = nominal.rendered(detector, [], [], [], forced=quiet, asteroids=own_bodies.read(file, f"{away}").of_day)
+    star = nominal.rendered(detector, [5.0], [127.5], [-away], forced=quiet)
+    assert found.sources.length == pytest.approx([rate * nominal.TIME / 360.0], rel=1e-3, abs=0.01)
+    # Where no spikes are; it is bluer than the star.
+    law = np.median(star.noise_free, axis=1)
+    assert law.min() > 1.0
+    np.testing.assert_allclose(np.median(found.noise_free, axis=1), law, rtol=0.05)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
