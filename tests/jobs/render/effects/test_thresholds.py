@@ -45,6 +45,7 @@ CASES = {
     "pixel_response": lambda x: scene(peak=200.0, prnu=min(3e-3 * x, 0.5), dead_pixels=0.0, dark_columns=0.0),
     "readout_trail": lambda x: scene(readout_time=0.3 * x),
     "brighter_fatter": lambda x: scene(peak=3e3 * x),
+    "poisson": lambda x: scene(sky=1e-6 * x, peak=1e-3 * x),
     "dark_current": lambda x: scene(dark_current=2e-3 * x),
     "hot_pixels": lambda x: scene(hot_pixels=0.01, hot_current=2e-3 * x),
     "charge_injection": lambda x: scene(injection__level=x, injection__noise=0.1 * x),
@@ -72,6 +73,13 @@ def frame(name, one):
     if name == "serial_cti":
         return light[1990:2010].repeat(256, axis=1)[None, ::-1].copy()
     return light[None] if name in QUADRANTS else light
+
+
+def test_no_effect_is_left_out_here():
+    """Each that a scene may do without has its test below."""
+    optional = {name for name, effect in EFFECTS.items() if effect.optional}
+    assert optional == set(CASES) | {"cosmic_rays", "readout_cosmic_rays"}
+    assert vis.DRAWN.optional
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -105,6 +113,44 @@ def test_cosmic_rays_are_always_needed_but_without_time(name):
     assert effect.needed_if(scene())
     nothing = Scene(MISSION, "vis", 0.0, 0.25, 0.0, DETECTOR)
     assert effect.needed_if(nothing) == (name == "readout_cosmic_rays")
+
+
+def test_a_pixel_s_own_response_is_left_out_of_faint_stars():
+    """It is part of how they are drawn: five times five pixels of each."""
+    detector, needed = small("vis", "3-4", 256), []
+    for mag in (26.0, 25.3, 24.9, 24.0, 22.0):
+        with_it, without = (
+            nominal.rendered(detector, [mag], [31.8], [32.3], forced={**nominal.off(*nominal.COSMIC_RAYS), **forced})
+            for forced in ({vis.DRAWN.name: True}, {vis.DRAWN.name: False})
+        )
+        needed.append(vis.DRAWN.needed_if(with_it.scene))
+        change = (with_it.noise_free.astype(float) - without.noise_free)[30:35, 30:35]
+        noticed = np.sqrt(np.mean(change**2)) / with_it.scene.pixel_noise
+        assert noticed > 0.0
+        if not needed[-1]:
+            assert noticed < NOTICEABLE
+    assert sorted(needed) == needed
+    assert len(set(needed)) == 2
+    assert noticed > NOTICEABLE
+
+
+@pytest.mark.parametrize("mag", [14.0, 20.0, 24.0, 27.0])
+def test_all_that_a_scene_does_without_is_not_noticed_together(mag):
+    """Stars so faint that little is needed, or so bright that next to everything is."""
+    x, y = nominal.lattice(256, 64)
+    one = nominal.rendered(small("vis", "3-4", 256), np.full(len(x), mag), x, y)
+    # Before it is rounded.
+    effects = [effect for effect in vis.SKY if effect.name != "adc"]
+
+    def read(forced):
+        light = one.noise_free.astype(float)
+        return apply_all(light, effects, one.scene, lambda e: rng.stream(1, e.name), forced)
+
+    found, decisions = read({})
+    left_out = {decision.name: True for decision in decisions if not decision.applied}
+    assert left_out
+    change = read(left_out)[0] - found
+    assert 0.0 < np.sqrt(np.mean(change**2)) < NOTICEABLE * one.scene.pixel_noise, left_out
 
 
 def test_tracks_bleed_where_they_do_not_fit():
