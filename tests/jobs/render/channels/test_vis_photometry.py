@@ -15,6 +15,7 @@ from tests.jobs.render.fields import MISSION, small
 
 # Radius of the aperture, of the ring that tells the sky, arcsec.
 APERTURE, RING = 1.3, (2.2, 3.0)
+CTI = ("parallel_cti", "serial_cti")
 # Samples a pixel of the drawn PSF.
 FINE = 5
 
@@ -60,7 +61,7 @@ def stars(detector, pitch, mags, forced, mission=MISSION, number=1):
 
 def test_isolated_stars_are_as_bright_as_the_catalogue_says():
     """Linearised, without charge transfer's and cosmic rays' part; S/N > 200."""
-    forced, detector = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE), small("vis", "3-4", 256)
+    forced, detector = nominal.off(*nominal.COSMIC_RAYS, *CTI), small("vis", "3-4", 256)
     mags = [18.5, 19.0, 19.5, 20.0]
     found = [photometry(stars(detector, 64, mags, forced, number=number)) for number in (1, 2)]
     change, noise = np.concatenate(found, axis=1)
@@ -92,7 +93,7 @@ def test_what_the_effects_take_is_what_the_benchmark_says():
 
 @pytest.mark.nightly
 def test_stars_of_a_whole_detector():
-    forced = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
+    forced = nominal.off(*nominal.COSMIC_RAYS, *CTI)
     detector = focal_plane.detector("vis", "1-1", MISSION)
     change, noise = photometry(stars(detector, 128, np.arange(18.2, 20.2, 0.1), forced))
     print(f"{len(change)} stars: median {np.median(change):.5f}, rms {change.std():.5f}, expected {noise.mean():.5f}")
