@@ -120,6 +120,22 @@ def test_exposures_of_no_time_and_of_a_day(kind, seconds):
     assert np.isfinite(busy).all()
 
 
+@pytest.mark.parametrize("seconds", [0.0, 1e5])
+def test_sources_in_no_time_and_in_a_day(seconds):
+    """From the catalogue on: nothing of them, or all that wells and converter hold."""
+    started = time.process_time()
+    places = [100.0, 30.0, 200.0], [100.0, 220.0, 40.0]
+    one = nominal.rendered(
+        small("vis", "3-4", 256), [10.0, 18.0, 24.0], *places, seconds=seconds, truth=("saturation", "ghosts", "stars")
+    )
+    assert time.process_time() - started < 20
+    assert len(one.sources) == 3 * (seconds > 0)
+    assert np.isfinite(one.noise_free).all()
+    assert one.noise_free.any() == (seconds > 0)
+    assert one.maps["saturation"].any() == (seconds > 0)
+    assert 0 < one.raw.min() < one.raw.max() < 65535
+
+
 def counted(frame, one):
     """Electrons through bleeding and both transfers: (before, after, trapped, lost); no other effect between them."""
     seen = {}

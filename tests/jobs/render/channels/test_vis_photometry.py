@@ -16,6 +16,7 @@ from tests.jobs.render.fields import MISSION, small
 # Radius of the aperture, of the ring that tells the sky, arcsec.
 APERTURE, RING = 1.3, (2.2, 3.0)
 CTI = ("parallel_cti", "serial_cti")
+BODY = {"disk_half_light_radius": 0.3}
 # Samples a pixel of the drawn PSF.
 FINE = 5
 
@@ -89,6 +90,30 @@ def test_what_the_effects_take_is_what_the_benchmark_says():
     print(f"shift {1e3 * found:.2f} mmag, by the benchmark {1e3 * expected:.2f}, noise of a star {1e3 * noise[0]:.2f}")
     assert expected > 0.003
     assert found == pytest.approx(expected, rel=0.1)
+
+
+def test_galaxies_of_the_weak_lensing_sample_are_as_clear_as_stated():
+    """Of I_E = 24.5 and r_e = 0.3", in a stack of four: the noise that their fluxes scatter by is the expected one."""
+    detector, forced = small("vis", "3-4", 512), nominal.off(*nominal.COSMIC_RAYS, *CTI)
+    x, y = nominal.lattice(512, 32)
+    stack = []
+    for number in range(1, 5):
+        one = nominal.rendered(detector, np.full(len(x), 24.5), x, y, BODY, forced=forced, number=number)
+        applied = {decision.name for decision in one.decisions if decision.applied}
+        stack.append(calibrated.electrons(one.raw, one.scene, nominal.SEED, applied) - one.scene.sky_electrons)
+    image = np.mean(stack, axis=0)
+    bad = ~np.isfinite(image)
+    # An aperture 1.3" across.
+    flux, blind = (sep.sum_circle(part, x, y, 6.5)[0] for part in (np.where(bad, 0.0, image), bad.astype(float)))
+    true = sep.sum_circle(one.noise_free.astype(float), x, y, 6.5)[0].mean()
+    pixel = one.scene.pixel_noise**2 + one.scene.value("gain", "electron / adu") ** 2 / 12
+    noise = np.sqrt((true + np.pi * 6.5**2 * pixel) / 4)
+    seen = flux[blind == 0]
+    assert len(seen) > 240
+    assert seen.mean() == pytest.approx(true, abs=4 * noise / np.sqrt(len(seen)))
+    # The scatter of so many is known to 4.5 %.
+    assert seen.std() == pytest.approx(noise, rel=0.1)
+    assert true / noise == pytest.approx(20.5, rel=0.1)
 
 
 @pytest.mark.nightly
