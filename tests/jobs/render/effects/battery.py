@@ -15,6 +15,7 @@ LIGHTS = Lights(np.array([3.2, 40.0]), np.array([2.0, -30.0]), np.array([1e8, 1e
 END_OF_LIFE = Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
 EMPTY = Traps((0.0,), (1.0,), 2e5, 0.0, 0.58)
 TRACKS = np.array(resolve().numbers("env.cosmic_rays.vis_tracks"))
+DUST = (1e-2, 3.0, 0.2)
 PAIRS = np.full((4, 4), 1e-4) - 1e-4 * np.eye(4)
 
 
@@ -70,9 +71,9 @@ _CASES = (
     Case("pixel_area", stretched(1e-2), stretched(0.0), zero=False),
     Case("straylight", (LIGHTS, 5e-4, 40.0), (LIGHTS, 0.0, 40.0), zero=False),
     Case("illumination", bowl, flat, linear=True),
-    Case("pixel_response", (0.01, 1e-2, 1.0), (0.0, 0.0, 0.0), linear=True),
+    Case("pixel_response", (0.01, 1e-2, 1.0, DUST), (0.0, 0.0, 0.0, (0.0, 3.0, 0.2)), linear=True),
     Case("calibration_lamp", lambda shape: (500.0, *bowl(shape)), lambda shape: (0.0, *bowl(shape)), zero=False),
-    Case("readout_trail", (6e-5, 2, (0.01, 1e-2, 1.0)), (0.0, 2), linear=True),
+    Case("readout_trail", (6e-5, 2, (0.01, 1e-2, 1.0, DUST)), (0.0, 2), linear=True),
     Case("poisson", (), None, whole=True),
     Case("brighter_fatter", (1.2e-7, 0.5, 2e5, 0.0, 0), (0.0, 0.5, 2e5, 0.0, 0), conserves=True, whole=True),
     Case("dark_current", (0.3,), (0.0,), zero=False, whole=True),

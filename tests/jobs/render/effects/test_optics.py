@@ -27,6 +27,7 @@ from lake_schema.mission.configuration import resolve
 MISSION = resolve()
 PLACES = ("1-1", "3-4", "6-2")
 EMPTY = np.zeros((400, 300))
+CLEAN = (0.0, 3.0, 0.2)
 
 
 def scene(name="3-4", **more):
@@ -275,7 +276,7 @@ def test_a_map_of_other_size_is_refused():
 
 
 def test_the_response_of_pixels():
-    response = pixel_response.response((600, 500), 0.01, 1e-3, 3.0, np.random.default_rng(2))
+    response = pixel_response.response((600, 500), 0.01, 1e-3, 3.0, CLEAN, np.random.default_rng(2))
     good = response > 0.6
     assert response[good].std() == pytest.approx(0.01, rel=0.02)
     assert response[good].mean() == pytest.approx(1.0, abs=1e-4)
@@ -284,7 +285,7 @@ def test_the_response_of_pixels():
     assert ((response > 0) & ~good).sum() == pytest.approx(300, abs=80)
     assert pixel_response.EFFECT.fixed
     # A defect hides what lies behind it, as seen from its own register: up to the middle, and no farther.
-    many = pixel_response.response((40, 500), 0.0, 0.0, 200.0, np.random.default_rng(3)) == 0
+    many = pixel_response.response((40, 500), 0.0, 0.0, 200.0, CLEAN, np.random.default_rng(3)) == 0
     below, above = many[:20], many[20:][::-1]
     assert below.any()
     assert above.any()
@@ -293,9 +294,36 @@ def test_the_response_of_pixels():
     assert (below.any(axis=0) != above.any(axis=0)).sum() > 50
 
 
-@pytest.mark.parametrize("wrong", [(-1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, -1.0), (np.nan, 0.0, 0.0)])
+def test_dust_casts_shadows():
+    """As many as stated, each as deep and, in the mean, as wide."""
+    grains, radius, depth = 2e-4, 2.0, 0.3
+    dusty = pixel_response.response((1000, 900), 0.0, 0.0, 0.0, (grains, radius, depth), np.random.default_rng(4))
+    # Two may lie on each other.
+    assert (1 - depth) ** 2 * 0.99 < dusty.min() < 1 - 0.95 * depth
+    # Light that is missing: of a Gaussian 2 pi size^2, whose mean is twice the square of the mean size.
+    missing = grains * dusty.size * depth * 2 * np.pi * 2 * radius**2
+    assert (1 - dusty).sum() == pytest.approx(missing, rel=0.25)
+    # The other defects are where they are without.
+    defects = (0.01, 1e-3, 3.0)
+    clean, same = (
+        pixel_response.response((300, 200), *defects, dust, np.random.default_rng(2))
+        for dust in (CLEAN, (1e-4, radius, depth))
+    )
+    assert 0 < (clean != same).sum() < 6000
+    np.testing.assert_array_equal(clean == 0, same == 0)
+    # They are on the detector, in every exposure.
+    assert MISSION.value("vis.dust") * 4096 * 4132 == pytest.approx(17, abs=1)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        (-1.0, 0.0, 0.0, CLEAN), (0.0, 2.0, 0.0, CLEAN), (0.0, 0.0, -1.0, CLEAN), (np.nan, 0.0, 0.0, CLEAN),
+        (0.0, 0.0, 0.0, (-1.0, 1.0, 0.1)), (0.0, 0.0, 0.0, (0.0, np.inf, 0.1)), (0.0, 0.0, 0.0, (0.0, 1.0, 1.1)),
+    ],
+)  # fmt: skip
 def test_impossible_responses_are_refused(wrong):
-    with pytest.raises(OutOfRange, match=r"pixel|dark"):
+    with pytest.raises(OutOfRange, match=r"pixel|dark|dust"):
         pixel_response.response((3, 3), *wrong, np.random.default_rng(1))
 
 

@@ -42,7 +42,9 @@ CASES = {
     "pixel_area": lambda x: scene(sky=0.01 * x),
     "illumination": lambda x: scene(illumination=min(1e-4 * x, 0.5)),
     "shutter": lambda x: scene(shutter_map=min(0.05 * x, 280.0)),
-    "pixel_response": lambda x: scene(peak=200.0, prnu=min(3e-3 * x, 0.5), dead_pixels=0.0, dark_columns=0.0),
+    "pixel_response": lambda x: scene(
+        peak=200.0, prnu=min(3e-3 * x, 0.5), dead_pixels=0.0, dark_columns=0.0, dust_depth=min(1e-3 * x, 1.0)
+    ),
     "readout_trail": lambda x: scene(readout_time=0.3 * x),
     "brighter_fatter": lambda x: scene(peak=3e3 * x),
     "poisson": lambda x: scene(sky=1e-6 * x, peak=1e-3 * x),
