@@ -274,12 +274,23 @@ def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration
 
 
 def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfiguration) -> tuple[float, float]:
-    """Variance along x and y, arcsec2: pointing jitter, and charge diffusion, which is wider for blue light (A)."""
+    """Variance along x and y, arcsec2: pointing jitter, and charge diffusion.
+
+    Charge spreads wider of blue light (A), and the wider the thicker the detector is.
+    """
     redder = 0.1 * wavelength / mission.value("vis.diffusion_wavelength", "nm")
-    wider = redder ** mission.value("vis.diffusion_slope")
+    wider = redder ** mission.value("vis.diffusion_slope") * _thickness(detector, mission)
     diffusion = wider * mission.value("vis.diffusion_sigma", "pix") * detector.pixel_scale
     jitter_x, jitter_y = (mission.value(f"svm.aocs.jitter_{axis}", "arcsec") for axis in ("x", "y"))
     return jitter_x**2 + diffusion**2, jitter_y**2 + diffusion**2
+
+
+def _thickness(detector: Detector, mission: MissionConfiguration) -> float:
+    """A detector's diffusion length over the mission's."""
+    if "vis.diffusion_detectors" not in mission:
+        return 1.0
+    thicker = {row["detector"]: float(row["diffusion"]) for row in mission.rows("vis.diffusion_detectors")}
+    return max(1.0 + mission.value("vis.diffusion_spread", "") * thicker.get(detector.name, 0.0), 0.0)
 
 
 def _nodes(positions: int) -> tuple[tuple[float, float], ...]:
