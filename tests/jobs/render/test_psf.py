@@ -166,8 +166,8 @@ def test_blue_light_spreads_wider_in_the_silicon(vis):
         np.testing.assert_allclose(passed[0] / passed[1], expected, rtol=2e-3)
 
 
-def test_detectors_are_not_equally_thick(vis):
-    """Charge diffuses wider in one than in another: second moments of the PSF go with the variance."""
+def test_detectors_are_not_equally_thick():
+    """Charge diffuses wider in one than in another: what the planes are blurred by."""
     names = [f"{row}-{column}" for row in range(1, 7) for column in range(1, 7)]
     # Of this one the length is the mission's.
     assert psf._blur_variances(detector("vis", "3-4", MISSION), 8000.0, MISSION)[0] == pytest.approx(
@@ -182,18 +182,6 @@ def test_detectors_are_not_equally_thick(vis):
     spread = MISSION.value("vis.diffusion_spread", "")
     assert np.std(lengths) == pytest.approx(spread, rel=0.02)
     assert np.mean(lengths) == pytest.approx(1.0, abs=spread / 3)
-    # In the planes, against the same detector as thick as the mission says.
-    widest = names[int(np.argmax(lengths))]
-    even = psf.vis_psf(
-        detector("vis", widest, MISSION), BAND, MISSION.overridden_with({"vis.diffusion_spread": (0.0, "")})
-    )
-    thick = psf.vis_psf(detector("vis", widest, MISSION), BAND, MISSION)
-    k = 2 * np.pi * np.arange(50, 301, 50) / vis.planes.images.shape[-1]
-    for wavelength, image, less in zip(thick.planes.wavelength, thick.planes.images, even.planes.images, strict=True):
-        sigma = 0.32 * (wavelength / 8000) ** -0.35 * 3
-        passed = [np.abs(np.fft.rfft2(each)[0, 50:301:50]) for each in (image, less)]
-        expected = np.exp(-0.5 * sigma**2 * (max(lengths) ** 2 - 1) * k**2)
-        np.testing.assert_allclose(passed[0] / passed[1], expected, rtol=2e-3)
 
 
 def test_little_is_lost(vis):
