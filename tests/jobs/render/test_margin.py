@@ -181,3 +181,50 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     for other in ({"image_type": "dark"}, {"exposure_time_s": 0.0}, {"psf": "own.fits"}):
         assert exposure.spike_flux({**exposed, **other}, detector, MISSION, SURVEY, band) == np.inf
     assert exposure.spike_flux(field_of("EXT")[1], DETECTOR, MISSION, SURVEY, band) == np.inf
+
+
+@dataclass
+class Files:
+    """A catalogue's files, or its fluxes': each of some cells."""
+
+    columns: tuple
+    cells: dict
+    sums: dict
+
+    def __post_init__(self):
+        self.schema = pa.schema([(name, pa.int64()) for name in self.columns])
+        parts = [{"name": name, "facts": {"generation_cells": cells}} for name, cells in self.cells.items()]
+        self.manifest = {"parts": parts, "facts": {}}
+
+    def deflection(self):
+        return 0.0
+
+    def part_sha256(self, name):
+        return self.sums[name]
+
+
+def test_a_product_is_of_the_stars_whose_spikes_it_may_show():
+    """A file of stars that changes a quarter of a degree away: VIS is rendered again, where no spikes are is not."""
+    task = place()
+    cells = {"near": selection.needed(task, 0.0)}
+    cells["far"] = [int(sky.cell_of([task["ra"]], [task["dec"] - 0.3], 8)[0])]
+    assert not set(cells["near"]) & set(cells["far"])
+    some = [
+        {"exposure_id": 1, "camera": "vis", "channel": "VIS", "psf": ""},
+        {"exposure_id": 2, "camera": "lsstcam", "channel": "EXT", "psf": ""},
+    ]
+    tasks = [
+        {**task, "exposure_id": 1, "detector": "3-4", "cells": 1},
+        {**task, "exposure_id": 2, "detector": "R22_S11", "cells": 1},
+    ]
+    found = []
+    for changed in ("", "stars", "galaxies"):
+        inputs = {}
+        for name, columns in (("galaxies", ("ra_lensed",)), ("stars", ()), ("galaxy_fluxes", ()), ("star_fluxes", ())):
+            inputs[name] = Files(columns, cells, {"near": "a", "far": "b" if name == changed else "a"})
+        facts = {"request": {}, "mission": "m", "code": "c"}
+        found.append(render_exposures.product_keys(facts, pa.Table.from_pylist(some), tasks, inputs, MISSION))
+    (vis, ext), (vis_stars, ext_stars), others = found
+    assert vis_stars != vis
+    assert ext_stars == ext
+    assert others == [vis, ext]
