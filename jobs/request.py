@@ -93,9 +93,9 @@ LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
 # Of the channels' tuples in jobs/render/channels (a test compares them).
 EFFECTS = (
     "adc", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp", "charge_injection",
-    "cosmic_rays", "crosstalk", "dark_current", "full_well", "ghosts", "hot_pixels", "illumination", "intra_pixel",
-    "nonlinearity", "parallel_cti", "pixel_area", "pixel_response", "poisson", "quadrants", "read_noise",
-    "readout_cosmic_rays", "readout_trail", "serial_cti", "shutter", "straylight",
+    "cosmic_rays", "crosstalk", "dark_current", "full_well", "ghosts", "hot_pixels", "illumination", "injection_noise",
+    "intra_pixel", "nonlinearity", "parallel_cti", "pixel_area", "pixel_response", "poisson", "quadrants",
+    "read_noise", "readout_cosmic_rays", "readout_trail", "serial_cti", "shutter", "straylight",
 )  # fmt: skip
 _NO_FILES = OwnCurves()
 _NOTHING_TAKEN = Ingest()

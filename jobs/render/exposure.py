@@ -63,7 +63,7 @@ _MOST_BYTES = 2e9
 _MOST_SECONDS = 6 * 3600.0
 EFFECTS: Mapping[str, Mapping[str, tuple[Effect, ...]]] = {"VIS": vis.EFFECTS, "EXT": ext.EFFECTS}
 # What fills pixels besides the sky and its sources.
-_LAMPS = (calibration_lamp.EFFECT, charge_injection.EFFECT)
+_LAMPS = (calibration_lamp.EFFECT, charge_injection.EFFECT, charge_injection.NOISE)
 # What crosses it besides light: its tracks are squeezed, and left behind, in the dark, too.
 _RAYS = (cosmic_rays.EFFECT, cosmic_rays.READOUT)
 # Electrons of a source that may shine where it is not.
@@ -196,7 +196,8 @@ def render(
     else:
         noise_free = np.zeros((detector.ny, detector.nx))
     # A lamp's light and injected charge are moved and squeezed like a star's.
-    own = sum(effect.contribution(scene) for effect in effects if effect in _LAMPS and forced.get(effect.name, True))
+    asked = replace(scene, forced=forced)
+    own = sum(effect.contribution(asked) for effect in effects if effect in _LAMPS and forced.get(effect.name, True))
     rays = [effect for effect in effects if effect in _RAYS and forced.get(effect.name, effect.needed_if(scene))]
     scene = replace(
         scene,

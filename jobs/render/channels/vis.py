@@ -79,7 +79,7 @@ FLAT = (
     *_READOUT,
 )
 DARK = (*_CHARGE, *_READOUT)
-INJECTION = (charge_injection.EFFECT, bleeding.EFFECT, *_READOUT)
+INJECTION = (charge_injection.EFFECT, charge_injection.NOISE, bleeding.EFFECT, *_READOUT)
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "science": SKY,

@@ -219,8 +219,8 @@ def apply_all(
     stream : effect -> its own generator, so that switching one effect off leaves the draws of the others as they were
     watch  : sees the name of an effect that is applied, and the frame before and after it
     """
-    decisions = decide(effects, scene, forced or {})
     scene = replace(scene, forced=forced or {})
+    decisions = decide(effects, scene, scene.forced)
     for effect, decision in zip(effects, decisions, strict=True):
         if decision.applied:
             before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))

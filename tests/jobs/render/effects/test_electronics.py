@@ -6,7 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.render.effects import bias_structure, charge_injection, crosstalk, dark_current, nonlinearity, quadrants
-from jobs.render.effects.effect import Scene, warmth
+from jobs.render.effects.effect import Scene, apply_all, warmth
+from jobs.render.exposure import numbers_of
+from jobs.rng import stream
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
 
@@ -117,7 +119,8 @@ def test_structure_of_the_bias():
 
 
 def test_injected_charge_comes_in_blocks():
-    out = charge_injection.apply(np.zeros((1200, 50)), 15_000.0, 100, 200, 0.03, 60.0, np.random.default_rng(1))
+    level = charge_injection.apply(np.zeros((1200, 50)), 15_000.0, 100, 200, 0.03, np.random.default_rng(1))
+    out = charge_injection.apply_noise(level, 100, 200, 60.0, np.random.default_rng(2))
     rows = out.mean(axis=1)
     lit = np.flatnonzero(rows > 0)
     assert [lit[0], lit[99], lit[100]] == [200, 299, 500]
@@ -127,9 +130,32 @@ def test_injected_charge_comes_in_blocks():
     assert columns.std() == pytest.approx(450, rel=0.4)
     assert (out[lit] - columns).std() == pytest.approx(60, rel=0.05)
     np.testing.assert_array_equal(out, np.rint(out))
-    for wrong in ((-1.0, 1, 1, 0.0, 0.0), (1.0, 0, 1, 0.0, 0.0), (1.0, 1, -1, 0.0, 0.0), (1.0, 1, 1, np.nan, 0.0)):
+    assert (np.ptp(level[lit], axis=0) == 0).all()
+    for wrong in ((-1.0, 1, 1, 0.0), (1.0, 0, 1, 0.0), (1.0, 1, -1, 0.0), (1.0, 1, 1, np.nan)):
         with pytest.raises(OutOfRange, match="inject"):
             charge_injection.apply(np.zeros((4, 4)), *wrong, np.random.default_rng(1))
+    for wrong in ((1, 1, -1.0), (0, 1, 0.0), (1, 1, np.nan)):
+        with pytest.raises(OutOfRange, match="inject"):
+            charge_injection.apply_noise(np.zeros((4, 4)), *wrong, np.random.default_rng(1))
+
+
+def test_columns_take_the_same_charge_in_every_exposure():
+    """Two exposures differ by their noise, two detectors by more."""
+    row = {"camera": "vis", "band": "euclid_vis", "ra": 10.0, "dec": 20.0, "position_angle": 0.0}
+    found = {}
+    for detector in ("1-1", "3-4"):
+        for mjd in (60905.0, 60906.0):
+
+            def own(effect, when=mjd, name=detector):
+                return stream(*numbers_of(effect, {**row, "mjd": when}, name, 1))
+
+            both = (charge_injection.EFFECT, charge_injection.NOISE)
+            found[detector, mjd] = apply_all(np.zeros((900, 200)), both, SCENE, own)[0]
+    columns = {key: frame[frame[:, 0] > 0].mean(axis=0) for key, frame in found.items()}
+    noise = SCENE.value("injection.noise", "electron")
+    change = columns["1-1", 60905.0] - columns["1-1", 60906.0]
+    assert 0.0 < change.std() < noise
+    assert (columns["1-1", 60905.0] - columns["3-4", 60905.0]).std() > 5 * noise
 
 
 def test_dark_current_doubles_in_a_few_kelvin():
