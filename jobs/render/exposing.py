@@ -74,6 +74,11 @@ def sees_sky(channel: str, image_type: str) -> bool:
     return image_type in SKY_TYPES or (channel, image_type) == ("VIS", "flat")
 
 
+def sees_bodies(channel: str, image_type: str) -> bool:
+    """Whether moving bodies are drawn: of the channels by VIS alone."""
+    return channel == "VIS" and sees_sky(channel, image_type)
+
+
 def section(camera: str) -> str:
     """Prefix of a camera's parameters in the mission database."""
     return f"ext.{camera}" if camera in CAMERAS else camera

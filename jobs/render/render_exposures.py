@@ -31,6 +31,7 @@ from jobs.render import (
     stamps,
     survey,
 )
+from jobs.render.exposing import sees_bodies
 from jobs.render.plan_exposures import PARTS, mission_of, own_filters
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
@@ -126,8 +127,7 @@ def product_keys(
         row, files = rows[task["exposure_id"]], {}
         if psf := row["psf"]:
             files["psf"] = facts["psf"][str(own_psf.file_of(psf, task["detector"]))]
-        # Of the channels VIS alone draws moving bodies.
-        if "bodies" in facts and row["channel"] == "VIS":
+        if "bodies" in facts and sees_bodies(row["channel"], row["image_type"]):
             (files["bodies"],) = facts["bodies"].values()
         return files
 
@@ -160,8 +160,9 @@ def _bodies(file: Path, exposures: pa.Table) -> dict[str, str]:
         sha256 = file_sha256(file)
     except OSError as error:
         raise BadInput(f"solar_system.bodies: {file}: {error.strerror}") from None
-    of_vis = exposures.filter(pc.equal(exposures["channel"], "VIS"))
-    own_bodies.check(own_bodies.read(file, sha256), file, of_vis["mjd"].to_pylist())
+    kinds = exposures.select(["mjd", "channel", "image_type"]).to_pylist()
+    seen = [row["mjd"] for row in kinds if sees_bodies(row["channel"], row["image_type"])]
+    own_bodies.check(own_bodies.read(file, sha256), file, seen)
     return {str(file): sha256}
 
 
@@ -297,10 +298,11 @@ def work(lake: Path, facts: Json) -> Output:
         if file_sha256(Path(file)) != facts["psf"][file]:
             raise BadInput(f"{file}: has changed since the rendering began")
     bodies = None
-    for file, sha256 in facts.get("bodies", {}).items():
-        if file_sha256(Path(file)) != sha256:
-            raise BadInput(f"{file}: has changed since the rendering began")
-        bodies = own_bodies.read(Path(file), sha256).of_day
+    if sees_bodies(exposed["channel"], exposed["image_type"]):
+        for file, sha256 in facts.get("bodies", {}).items():
+            if file_sha256(Path(file)) != sha256:
+                raise BadInput(f"{file}: has changed since the rendering began")
+            bodies = own_bodies.read(Path(file), sha256).of_day
     margin = own.mission.value("survey.selection_margin", "arcsec")
     farther = max(stamps.reach(detector.pixel_scale) - margin, 0.0)
     least = exposure.least_flux(exposed, detector, own.mission, own.accuracy)

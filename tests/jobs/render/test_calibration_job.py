@@ -1,6 +1,7 @@
 """Every kind of image that VIS takes, by the jobs: from one request and its catalogues to files in the lake."""
 
 import tomllib
+from collections import Counter, defaultdict
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -11,9 +12,12 @@ from astropy.io import fits
 from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import fits_product, focal_plane, plan_exposures, render_exposures
+from jobs.render import fits_product, focal_plane, moving, plan_exposures, render_exposures
 from jobs.request import from_table
 from lake_schema import layout, publish, read
+from lake_schema.ecliptic import ecliptic
+from lake_schema.errors import BadInput
+from lake_schema.ids import kind_of
 from tests import requests
 
 MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures)
@@ -24,6 +28,8 @@ KINDS = {
     "science": (100, 250), "bias": (-4, 4), "dark": (-4, 4), "flat": (11_000, 21_000), "charge_injection": (-4, 4),
     "self_calibration": (100, 250),
 }  # fmt: skip
+
+DARK = ("bias", "dark", "charge_injection")
 
 
 def wanted():
@@ -54,7 +60,7 @@ def small_detectors(side=256):
 
 def check(lake, rows, columns):
     """Every frame that was asked for, of its kind, and of the quadrants' size."""
-    exposures = {row["exposure_id"]: row for row in read.version(lake, "exposures").rows().to_pylist()}
+    exposures = exposures_of(lake)
     products = read.version(lake, "products")
     science = [row for row in products.rows().to_pylist() if row["content"] == "science"]
     assert len(science) == len(exposures)
@@ -78,13 +84,63 @@ def check(lake, rows, columns):
     }  # fmt: skip
 
 
-def test_each_kind_is_planned_rendered_and_published(lake):
+def one_body_each(lake, file, mag):
+    """A table with one body a day in the middle of each frame that sees the sky."""
+    rows = [row for row in exposures_of(lake).values() if row["image_type"] not in DARK]
+    tasks = {row["exposure_id"]: row for row in read.version(lake, "tasks").rows().to_pylist()}
+    lines = ["mjd,lon,lat,east,north,mag,name"]
+    for row in rows:
+        lon, lat = ecliptic(*(tasks[row["exposure_id"]][axis] for axis in ("ra", "dec")))
+        lines.append(f"{row['mjd']},{lon},{lat},0,0,{mag},{row['exposure_id']}")
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
+
+
+def exposures_of(lake):
+    return {row["exposure_id"]: row for row in read.version(lake, "exposures").rows().to_pylist()}
+
+
+def moving_of(lake):
+    """Kind of image -> how many bodies are drawn on its frames."""
+    exposures, found = exposures_of(lake), defaultdict(set)
+    drawn = read.version(lake, "rendered_truth").rows(["exposure_id", "id"])
+    count = Counter(drawn["exposure_id"].to_numpy()[kind_of(drawn["id"].to_numpy()) == moving.KIND].tolist())
+    for number, row in exposures.items():
+        found[row["image_type"]].add(count[number])
+    return found
+
+
+def check_bodies(lake, request):
+    """The table's are drawn, on what sees the sky; nothing else asks what is in it."""
+    seen = moving_of(lake)
+    for kind in KINDS:
+        assert (min(seen[kind]) > 0) == (max(seen[kind]) > 0) == (kind not in DARK)
+    step = render_exposures.steps(lake, request)[0]
+    exposures = exposures_of(lake)
+    before = {part.facts["exposure_id"]: part for part in step.plan.parts}
+    one_body_each(lake, request.bodies, 17.0)
+    after = {part.facts["exposure_id"]: part for part in render_exposures.steps(lake, request)[0].plan.parts}
+    same = {number for number in before if before[number].facts["product"] == after[number].facts["product"]}
+    assert same == {number for number, row in exposures.items() if row["image_type"] in DARK}
+    for number, part in before.items():
+        facts = {**step.plan.facts, **part.facts}
+        if exposures[number]["image_type"] == "bias":
+            assert render_exposures.work(lake, facts).rows.num_rows
+        elif number not in same:
+            with pytest.raises(BadInput, match=r"bodies\.csv: has changed since the rendering began"):
+                render_exposures.work(lake, facts)
+
+
+def test_each_kind_is_planned_rendered_and_published(lake, tmp_path):
     request = wanted()
     with small_detectors():
         for job in MODULES:
+            if job is render_exposures:
+                request = replace(request, bodies=one_body_each(lake, tmp_path / "bodies.csv", 18.0))
             for step in job.steps(lake, request):
                 publish.make(lake, step.plan, step.work)
         check(lake, 128 + 20, 51 + 128 + 29)
+        check_bodies(lake, request)
 
 
 @pytest.mark.nightly

@@ -222,7 +222,9 @@ def test_a_request_names_it(tmp_path, monkeypatch):
     path.write_text(demo + '\n[solar_system]\nbodies = "bodies.csv"\n', encoding="utf-8")
     request = requests.parse(path)
     assert request.bodies == tmp_path / "bodies.csv"
-    exposed = pa.table({"channel": ["VIS", "EXT"], "mjd": [DAY + 0.3, DAY + 90.0]})
+    # A dark one of another day sees none.
+    kinds = {"channel": ["VIS", "EXT", "VIS"], "image_type": ["science", "science", "dark"]}
+    exposed = pa.table({**kinds, "mjd": [DAY + 0.3, DAY + 90.0, DAY + 90.0]})
     with pytest.raises(BadInput, match=r"solar_system.bodies: .*bodies.csv: no such file"):
         render_exposures._bodies(request.bodies, exposed)
     request.bodies.write_bytes(b"")
@@ -233,8 +235,9 @@ def test_a_request_names_it(tmp_path, monkeypatch):
             render_exposures._bodies(request.bodies, exposed)
     written(request.bodies, columns(moving.population(*PLACE, 0.1, DAY, MISSION, 1)))
     assert list(render_exposures._bodies(request.bodies, exposed)) == [str(request.bodies)]
+    assert list(render_exposures._bodies(request.bodies, exposed.slice(1))) == [str(request.bodies)]
     with pytest.raises(BadInput, match=r"has bodies of MJD"):
-        render_exposures._bodies(request.bodies, exposed.slice(1).set_column(0, "channel", pa.array(["VIS"])))
+        render_exposures._bodies(request.bodies, exposed.slice(1).set_column(0, "channel", pa.array(["VIS"] * 2)))
     path.write_text(demo + '\n[solar_system]\nbody = "bodies.csv"\n', encoding="utf-8")
     with pytest.raises(BadInput, match=r"solar_system.body"):
         requests.parse(path)
