@@ -18,6 +18,7 @@ import io
 import os
 import tempfile
 import warnings
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -41,6 +42,10 @@ _LONGEST_NAME = 68
 # A header that promises more than this is a mistake or an attack; the largest product is far below.
 MOST_BYTES = 8 << 30
 _ROWS_A_BATCH = 65_536
+# Of a file that is packed as a whole.
+_MOST_UNPACKED = 512 << 20
+# Of a column of texts, bytes.
+_LONGEST_TEXT = 256
 _STRUCTURE = {
     "SIMPLE",
     "XTENSION",
@@ -130,10 +135,11 @@ def read_numbers(path: Path) -> dict[str, npt.NDArray[np.float64]]:
 
 
 def number_batches(
-    path: Path, columns: Sequence[str], rows: int = _ROWS_A_BATCH
+    path: Path, columns: Sequence[str], texts: Sequence[str] = (), rows: int = _ROWS_A_BATCH
 ) -> Iterator[tuple[dict[str, npt.NDArray[Any]], dict[str, str]]]:
     """Columns of numbers of a file's first table: (title -> numbers[n], whole numbers as they are; title -> TUNIT).
 
+    texts  : columns of texts or whole numbers, which come as texts[n]; left out where there are none
     Errors : Damaged for a file that is cut short or is none; BadInput names a column that is missing or no number
     """
     with _refusing(path), fits.open(path, memmap=True) as units:
@@ -149,9 +155,25 @@ def number_batches(
             if unit.data[name].dtype.kind not in "fiub" or unit.data[name].ndim != 1:
                 raise BadInput(f"{path}: column {name} is {unit.data[name].dtype}, wanted a number a row")
         said = {name: known[name].unit for name in columns if known[name].unit}
+        named = {name: _texts_of(path, unit, name) for name in texts if name in known}
         for first in range(0, len(unit.data), rows):
             part = slice(first, first + rows)
-            yield {name: _native(unit.data[name][part], known[name].null) for name in columns}, said
+            numbers = {name: _native(unit.data[name][part], known[name].null) for name in columns}
+            yield {**numbers, **{name: _decoded(stored[part]) for name, stored in named.items()}}, said
+
+
+def _texts_of(path: Path, unit: Any, name: str) -> npt.NDArray[Any]:
+    """A column of texts as it is stored, bytes, or of whole numbers; astropy would decode all rows at once."""
+    stored = unit.data.view(np.ndarray)[name]
+    if stored.dtype.kind in "iu":
+        stored = unit.data[name]
+    if stored.dtype.kind not in "iuS" or stored.ndim != 1 or stored.dtype.itemsize > _LONGEST_TEXT:
+        raise BadInput(f"{path}: column {name} is {stored.dtype}, wanted a text of at most {_LONGEST_TEXT} bytes a row")
+    return np.asarray(stored)
+
+
+def _decoded(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return np.char.decode(values, "ascii") if values.dtype.kind == "S" else values.astype(str)
 
 
 def _native(values: Any, null: int | None) -> npt.NDArray[Any]:
@@ -165,7 +187,13 @@ def _native(values: Any, null: int | None) -> npt.NDArray[Any]:
 def _whole_file(path: Path, unit: Any) -> None:
     # A table that is cut short would be mapped beyond the end of its file.
     end = unit.fileinfo()["datLoc"] + unit.header["NAXIS1"] * unit.header["NAXIS2"]
-    if end > path.stat().st_size:
+    with path.open("rb") as stream:
+        packed = stream.read(2) == b"\x1f\x8b"
+    if packed:
+        # Unpacked into memory, as far as it goes.
+        if end > _MOST_UNPACKED:
+            raise BadInput(f"{path}: unpacks to {end} bytes, more than {_MOST_UNPACKED}")
+    elif end > path.stat().st_size:
         raise Damaged(f"{path}: is cut short, {end} bytes promised, {path.stat().st_size} there")
 
 
@@ -393,7 +421,9 @@ def _refusing(path: Path) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyUserWarning)
             yield
-    except (OSError, AstropyUserWarning, fits.VerifyError, TypeError, ValueError, LookupError) as error:
+    except (
+        OSError, EOFError, zlib.error, AstropyUserWarning, fits.VerifyError, TypeError, ValueError, LookupError
+    ) as error:  # fmt: skip
         raise Damaged(f"{path}: {' '.join(str(error).split())}") from None
 
 

@@ -3,7 +3,8 @@
 batches     the rows of some flat columns, a bounded piece at a time
 
 A file can be made so that its reader crashes, so it is read by a process of its own, which has little memory and time
-and hands over plain Arrow batches: python -m lake_schema.foreign FILE COLUMN ... >stream
+and hands over plain Arrow batches: python -m lake_schema.foreign FILE NEEDED COLUMN ... >stream
+(so many columns are needed, the others are sent where they are there)
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ _MOST_FOOTER_BYTES = 32 << 20
 _MOST_ENTRIES = 5000
 # What one row group may hold, uncompressed; the largest that is written here is a tenth of it.
 _MOST_GROUP_BYTES = 256 << 20
-_MOST_TEXT_BYTES = 1 << 20
+# Of a column in a batch: as a dictionary, and where each row has a text of its own, 64 bytes each.
+_MOST_TEXT_BYTES, _MOST_OWN_BYTES = 1 << 20, 4 << 20
 _ROWS_A_BATCH = 65_536
 # Of the reading process: address space; CPU time at the least, and bytes of the file for each second more.
 _MOST_MEMORY = 3 << 29
@@ -39,14 +41,15 @@ _REFUSED = 2
 _ROOT = Path(__file__).resolve().parents[1]
 
 
-def batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
+def batches(path: Path, columns: Sequence[str], texts: Sequence[str] = ()) -> Iterator[pa.RecordBatch]:
     """Rows of some columns of a file, in its order; texts come as dictionaries, so that a repeated one is held once.
 
     columns : names of flat columns of numbers, booleans or texts
+    texts   : more of them, sent as they are, each left out where the file has none
     Errors  : BadInput, one line, where the file is not Parquet, is damaged, or asks for more than is reasonable
     """
     _refuse_large_footer(path)
-    command = [sys.executable, "-m", __name__, str(path.resolve()), *columns]
+    command = [sys.executable, "-m", __name__, str(path.resolve()), str(len(columns)), *columns, *texts]
     environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, cwd=_ROOT, env=environment, **pipes) as reader:
@@ -89,15 +92,18 @@ def _refuse_large_footer(path: Path) -> None:
 
 def main(argv: Sequence[str]) -> int:
     """Write the batches of a file to stdout as an Arrow stream; a refusal goes to stderr."""
-    path, columns = Path(argv[0]), list(argv[1:])
+    path, needed, columns = Path(argv[0]), int(argv[1]), list(argv[2:])
     seconds = _LEAST_SECONDS + path.stat().st_size // _BYTES_A_SECOND
     resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     pa.set_cpu_count(1)
     try:
-        with _opened(path, columns) as file, os.fdopen(1, "wb", closefd=False) as out:
-            _send(path, file, columns, out)
+        with (
+            _opened(path, columns[:needed], columns[needed:]) as (file, found),
+            os.fdopen(1, "wb", closefd=False) as out,
+        ):
+            _send(path, file, found, out)
     except BadInput as error:
         print(error, file=sys.stderr)
         return _REFUSED
@@ -120,7 +126,8 @@ def _send(path: Path, file: pq.ParquetFile, columns: list[str], out: IO[bytes]) 
 
 
 @contextmanager
-def _opened(path: Path, columns: Sequence[str]) -> Iterator[pq.ParquetFile]:
+def _opened(path: Path, needed: Sequence[str], texts: Sequence[str]) -> Iterator[tuple[pq.ParquetFile, list[str]]]:
+    """The file, and the columns that are to be read."""
     limits: dict[str, Any] = {
         "thrift_container_size_limit": _MOST_ENTRIES,
         "thrift_string_size_limit": _MOST_FOOTER_BYTES,
@@ -128,18 +135,28 @@ def _opened(path: Path, columns: Sequence[str]) -> Iterator[pq.ParquetFile]:
         "arrow_extensions_enabled": False,
     }
     with pq.ParquetFile(path, **limits) as file:
-        _check_columns(path, file, columns)
-    with pq.ParquetFile(path, read_dictionary=list(columns), **limits) as file:
-        yield file
+        titles = [file.schema.column(i).path for i in range(len(file.schema))]
+        columns = [*needed, *(name for name in texts if name in titles)]
+        _check_columns(path, file, titles, columns)
+    with pq.ParquetFile(path, read_dictionary=list(needed), **limits) as file:
+        yield file, columns
 
 
-def _check_columns(path: Path, file: pq.ParquetFile, columns: Sequence[str]) -> None:
-    about, schema = file.metadata, file.schema
-    places = {schema.column(i).path: i for i in range(len(schema))}
-    count = Counter(schema.column(i).path for i in range(len(schema)))
+def check_titles(path: Path, titles: Sequence[str], columns: Sequence[str]) -> None:
+    """Refuse a file in which a column is not there, or there twice; BadInput names the first."""
+    count = Counter(titles)
     for name in columns:
-        if count[name] != 1:
-            raise BadInput(f"{path}: has {count[name]} flat columns {name!r}, wanted one")
+        if not count[name]:
+            raise BadInput(f"{path}: has no column {name}; it has {' '.join(', '.join(titles).split())}"[:500])
+        if count[name] > 1:
+            raise BadInput(f"{path}: has column {name} more than once")
+
+
+def _check_columns(path: Path, file: pq.ParquetFile, titles: Sequence[str], columns: Sequence[str]) -> None:
+    check_titles(path, titles, columns)
+    about, schema = file.metadata, file.schema
+    places = {title: i for i, title in enumerate(titles)}
+    for name in columns:
         kind = file.schema_arrow.field(name).type
         if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind) or _is_text(kind)):
             raise BadInput(f"{path}: column {name} is {kind}, wanted numbers, booleans or texts")
@@ -158,8 +175,13 @@ def _is_text(kind: pa.DataType) -> bool:
 
 def _bounded(path: Path, batch: pa.RecordBatch) -> pa.RecordBatch:
     for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        if pa.types.is_dictionary(column.type) and column.dictionary.nbytes > _MOST_TEXT_BYTES:
-            raise BadInput(f"{path}: column {name} holds texts of {column.dictionary.nbytes} bytes: too large")
+        size, most = 0, _MOST_OWN_BYTES
+        if pa.types.is_dictionary(column.type):
+            size, most = column.dictionary.nbytes, _MOST_TEXT_BYTES
+        elif _is_text(column.type):
+            size = column.nbytes
+        if size > most:
+            raise BadInput(f"{path}: column {name} holds texts of {size} bytes: too large")
     return batch
 
 

@@ -2,12 +2,16 @@
 
 files    a path -> the files that it stands for: itself, or the Parquet files of a folder such as a HATS catalogue
 pieces   the rows of some columns of a Parquet, FITS or CSV file
+within   a column whose values have to lie between bounds
 
-Parquet is read by a process of its own (lake_schema.foreign), FITS and CSV in pieces.
+Parquet is read by a process of its own (lake_schema.foreign), FITS and CSV in pieces. What a file is, its ending says,
+or where that says nothing its first bytes.
 """
 
 from __future__ import annotations
 
+import gzip
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +38,7 @@ class Piece:
     """Rows of one file.
 
     first   : number of the first row in the file, from 1
-    columns : title -> numbers[n], NaN where a float is missing
+    columns : title -> numbers[n], NaN where a float is missing; texts[n] (object), "" where one is missing
     units   : title -> what the file itself says of its unit, where it says anything
     """
 
@@ -58,26 +62,39 @@ def files(path: Path) -> list[Path]:
     return [path]
 
 
-def pieces(file: Path, columns: Sequence[str], whole: Sequence[str] = ()) -> Iterator[Piece]:
+def pieces(file: Path, columns: Sequence[str], whole: Sequence[str] = (), texts: Sequence[str] = ()) -> Iterator[Piece]:
     """The rows of one file.
 
     whole  : columns of whole numbers, where an empty place is refused: no float holds 64 bits
+    texts  : more columns, of texts or of whole numbers as texts, each left out where the file has none
     Errors : BadInput or Damaged, one line: the file, and the column and row where one is wrong
     """
-    suffix = file.suffix.lower()
-    if suffix in _FITS:
-        first = 1
-        for arrays, units in fits.number_batches(file, columns):
-            yield Piece(file, first, arrays, units)
-            first += len(next(iter(arrays.values())))
-        return
-    batches = foreign.batches(file, columns) if suffix in _PARQUET else _csv_batches(file, columns, whole)
     first = 1
+    kind = _format(file)
+    if kind == _FITS:
+        for arrays, units in fits.number_batches(file, columns, texts):
+            named = {name: np.char.strip(arrays[name]).astype(object) for name in texts if name in arrays}
+            yield Piece(file, first, {**arrays, **named}, units)
+            first += len(arrays[columns[0]])
+        return
+    batches = foreign.batches(file, columns, texts) if kind == _PARQUET else _csv_batches(file, columns, whole, texts)
     for batch in batches:
         arrays = {name: _numbers(file, first, name, batch.column(name), whole) for name in columns}
+        named = {name: _texts(file, name, batch.column(name)) for name in texts if name in batch.schema.names}
         units = {field.name: unit for field in batch.schema if (unit := _unit(field))}
-        yield Piece(file, first, arrays, units)
+        yield Piece(file, first, {**arrays, **named}, units)
         first += batch.num_rows
+
+
+def within(file: Path, column: str, values: Array, bounds: tuple[float, float]) -> Array:
+    """The values of all rows of a file, as they are; BadInput names the column and the first row out of bounds."""
+    low, high = bounds
+    bad = ~((values >= low) & (values <= high))
+    if bad.any():
+        row = int(bad.argmax())
+        where = f"{column} of row {row + 1} is {values[row]:g}, not in [{low:g}, {high:g}]"
+        raise BadInput(f"{file}: {where} ({bad.sum()} of {bad.size} rows like it)")
+    return values
 
 
 def _of_folder(folder: Path) -> list[Path]:
@@ -96,16 +113,42 @@ def _unit(field: pa.Field) -> str:
     return str((field.metadata or {}).get(b"unit", b"").decode(errors="replace"))
 
 
-def _csv_batches(file: Path, columns: Sequence[str], whole: Sequence[str]) -> Iterator[pa.RecordBatch]:
-    types = {name: pa.int64() if name in whole else pa.float64() for name in columns}
-    convert = csv.ConvertOptions(
-        column_types=types, include_columns=list(columns), null_values=["", "NaN", "nan", "null", "NULL", "\\N"]
-    )
+def _format(file: Path) -> tuple[str, ...]:
+    """Its endings."""
+    for endings in (_PARQUET, _FITS, _CSV):
+        if file.suffix.lower() in endings:
+            return endings
+    try:
+        with file.open("rb") as stream:
+            start = stream.read(6)
+        if start.startswith(b"\x1f\x8b"):
+            with gzip.open(file) as packed:
+                start = packed.read(6)
+    except (OSError, EOFError, zlib.error) as error:
+        raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
+    return _PARQUET if start.startswith(b"PAR1") else _FITS if start == b"SIMPLE" else _CSV
+
+
+def _csv_batches(
+    file: Path, columns: Sequence[str], whole: Sequence[str], texts: Sequence[str]
+) -> Iterator[pa.RecordBatch]:
     read = csv.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES)
     try:
+        with csv.open_csv(file, read_options=read) as stream:
+            titles = stream.schema.names
+        found = [*columns, *(name for name in texts if name in titles)]
+        foreign.check_titles(file, titles, found)
+        types = {name: pa.int64() if name in whole else pa.float64() for name in columns}
+        convert = csv.ConvertOptions(
+            column_types={**types, **dict.fromkeys(texts, pa.string())},
+            include_columns=found,
+            null_values=["", "NaN", "nan", "null", "NULL", "\\N"],
+        )
         with csv.open_csv(file, read_options=read, convert_options=convert) as stream:
             yield from stream
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise BadInput(f"{file}: is no CSV in UTF-8") from None
+    except (pa.ArrowException, OSError) as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
 
 
@@ -120,3 +163,11 @@ def _numbers(file: Path, first: int, name: str, values: pa.Array, whole: Sequenc
             raise BadInput(f"{where} is missing in row {first + pc.index(values.is_null(), True).as_py()}")
         values = values.cast(pa.float64(), safe=False)
     return np.asarray(values.to_numpy(zero_copy_only=False))
+
+
+def _texts(file: Path, name: str, values: pa.Array) -> Array:
+    kind = values.type.value_type if pa.types.is_dictionary(values.type) else values.type
+    if not (pa.types.is_integer(kind) or pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+        raise BadInput(f"{file}: column {name} holds {kind}, wanted texts or whole numbers")
+    texts = pc.utf8_trim_whitespace(values.cast(pa.string()))
+    return np.asarray(pc.fill_null(texts, "").to_numpy(zero_copy_only=False))

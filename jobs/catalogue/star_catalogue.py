@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
-from lake_schema import fits, sky
+from lake_schema import fits, foreign_rows, sky
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.provenance import canonical
@@ -106,7 +106,7 @@ def of_cell(stars: StarCatalogue, cell: int) -> dict[str, npt.NDArray[Any]]:
 def _read(file: Path, columns: Mapping[str, str]) -> dict[str, npt.NDArray[Any]]:
     table = _table(file, list(columns.values()))
     values: dict[str, npt.NDArray[Any]] = {
-        key: _bounded(file, key, title, table[title]) for key, title in columns.items()
+        key: foreign_rows.within(file, f"{title} ({key})", table[title], KEYS[key]) for key, title in columns.items()
     }
     if "l" in values:
         values["ra"], values["dec"] = sky.equatorial(values.pop("l"), values.pop("b"))
@@ -128,16 +128,6 @@ def _read(file: Path, columns: Mapping[str, str]) -> dict[str, npt.NDArray[Any]]
 
 def _h_over_v() -> float:
     return float(parameters.section("milky_way.toml", "extinction")["h_over_v"])
-
-
-def _bounded(file: Path, key: str, title: str, values: Float) -> Float:
-    lo, hi = KEYS[key]
-    bad = ~((values >= lo) & (values <= hi))
-    if bad.any():
-        row = int(bad.argmax())
-        where = f"{title} ({key}) of row {row + 1} is {values[row]:g}, not in [{lo:g}, {hi:g}]"
-        raise BadInput(f"{file}: {where} ({bad.sum()} of {values.size} rows like it)")
-    return values
 
 
 def _table(file: Path, titles: list[str]) -> Mapping[str, Float]:

@@ -5,13 +5,13 @@ check          that planned exposures are of its days
 
 A table : Parquet, CSV or FITS with the columns of KEYS, one row a body and day: mjd (UTC), ecliptic longitude and
           latitude then (deg, mean equinox J2000), motion to the east and north along them (arcsec / h), I_E (AB).
-          An exposure sees the rows of the day that it begins on; other columns are left alone.
+          An exposure sees the rows of the day that it begins on. Where there is a column `name` (texts or whole
+          numbers), each row has one, and none stands twice on a day: whoever has an ephemeris by the hour wants one
+          row of each day. Other columns are left alone.
 """
 
 from __future__ import annotations
 
-import gzip
-import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -20,11 +20,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet as pq
+import pyarrow.compute as pc
 
 from jobs.render.moving import KIND, Population
-from lake_schema import fits, sky
+from lake_schema import foreign_rows, sky
 from lake_schema.ecliptic import equatorial
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.ids import GENERATION_ORDER, source_id
@@ -40,6 +39,7 @@ KEYS = {
     "north": (-1e5, 1e5),
     "mag": (-30.0, 60.0),
 }
+_NAME = "name"
 # Every worker holds the table, within the memory of its task (2 GB): 0.2 kB a row, 0.3 kB while it is read.
 _MOST_ROWS = 1 << 21
 
@@ -60,8 +60,12 @@ class Bodies:
 @lru_cache(maxsize=2)
 def read(file: Path, sha256: str) -> Bodies:
     """A table of bodies; BadInput names the file, and the column and row that is wrong.  sha256 : of the file."""
-    values = _bounded(file, _table(file))
+    values, names = _table(file)
+    for key, bounds in KEYS.items():
+        foreign_rows.within(file, key, values[key], bounds)
     day = np.floor(values["mjd"]).astype(np.int64)
+    if names is not None:
+        _refuse_twice(file, names, day)
     hour = 24.0 * (values["mjd"] - day - 0.5)
     cell = sky.cell_of(*equatorial(values["lon"], values["lat"]), GENERATION_ORDER)
     ids = source_id(KIND, cell, np.arange(len(day)), day)
@@ -77,85 +81,35 @@ def check(bodies: Bodies, file: Path, mjd: Iterable[float]) -> None:
         raise BadInput(f"{file}: has bodies of {has}, the exposures begin on {days[0]} to {days[-1]}")
 
 
-def _table(file: Path) -> dict[str, Float]:
+def _table(file: Path) -> tuple[dict[str, Float], pa.ChunkedArray | None]:
+    """Columns of KEYS, and names where it has some."""
     if not file.is_file():
         raise BadInput(f"{file}: no such file")
+    parts: dict[str, list[Float]] = {key: [np.zeros(0)] for key in KEYS}
+    names, rows = [], 0
     try:
-        start = _start(file)
-        if start.startswith(b"SIMPLE"):
-            found = fits.read_numbers(file)
-            _complete(file, list(found))
-            return {key: np.asarray(found[key], float) for key in KEYS}
-        parquet = start.startswith(b"PAR1")
-        _complete(file, pq.read_schema(file).names if parquet else _titles(file))
-        table = _parquet(file) if parquet else _csv(file)
+        for piece in foreign_rows.pieces(file, list(KEYS), texts=[_NAME]):
+            rows += len(piece.columns["mjd"])
+            if rows > _MOST_ROWS:
+                raise BadInput(f"{file}: has more than {_MOST_ROWS} rows")
+            for key, column in parts.items():
+                column.append(np.asarray(piece.columns[key], float))
+            if _NAME in piece.columns:
+                names.append(pa.array(piece.columns[_NAME], pa.string()))
     except Damaged as error:
         raise BadInput(str(error)) from None
-    except UnicodeDecodeError:
-        raise BadInput(f"{file}: is neither Parquet nor FITS, nor CSV in UTF-8") from None
-    except (pa.ArrowException, OSError, EOFError, zlib.error) as error:
-        raise BadInput(f"{file}: {' '.join(str(error).split())}") from None
-    return {key: _numbers(file, key, table[key]) for key in KEYS}
+    return {key: np.concatenate(column) for key, column in parts.items()}, pa.chunked_array(names) if names else None
 
 
-def _start(file: Path) -> bytes:
-    """The first bytes, which tell the format; of a packed file those inside."""
-    with file.open("rb") as stream:
-        start = stream.read(6)
-    if not start.startswith(b"\x1f\x8b"):
-        return start
-    with gzip.open(file) as stream:
-        return stream.read(6)
-
-
-def _titles(file: Path) -> list[str]:
-    with pyarrow.csv.open_csv(file) as reader:
-        return list(reader.schema.names)
-
-
-def _parquet(file: Path) -> pa.Table:
-    _few_enough(file, pq.read_metadata(file).num_rows)
-    return pq.read_table(file, columns=list(KEYS))
-
-
-def _csv(file: Path) -> pa.Table:
-    """Block by block: what is too long is not read to its end."""
-    wanted = pyarrow.csv.ConvertOptions(include_columns=list(KEYS), column_types=dict.fromkeys(KEYS, pa.float64()))
-    blocks, rows = [], 0
-    with pyarrow.csv.open_csv(file, convert_options=wanted) as reader:
-        for block in reader:
-            rows += len(block)
-            _few_enough(file, rows)
-            blocks.append(block)
-        return pa.Table.from_batches(blocks, reader.schema)
-
-
-def _few_enough(file: Path, rows: int) -> None:
-    if rows > _MOST_ROWS:
-        raise BadInput(f"{file}: has more than {_MOST_ROWS} rows")
-
-
-def _complete(file: Path, titles: list[str]) -> None:
-    """Refuse columns that are not there, or there twice."""
-    if absent := [key for key in KEYS if key not in titles]:
-        raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(titles)}")
-    if twice := [key for key in KEYS if titles.count(key) > 1]:
-        raise BadInput(f"{file}: has column {', '.join(twice)} more than once")
-
-
-def _numbers(file: Path, key: str, column: pa.ChunkedArray) -> Float:
-    if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-        raise BadInput(f"{file}: column {key} is of {column.type}, not of numbers")
-    # A missing value is no number, which the bounds refuse.
-    return np.asarray(column.cast(pa.float64()).to_numpy(), float)
-
-
-def _bounded(file: Path, values: dict[str, Float]) -> dict[str, Float]:
-    _few_enough(file, len(values["mjd"]))
-    for key, (low, high) in KEYS.items():
-        bad = ~((values[key] >= low) & (values[key] <= high))
-        if bad.any():
-            row = int(bad.argmax())
-            rest = f" ({bad.sum()} of {len(bad)} rows like it)"
-            raise BadInput(f"{file}: {key} of row {row + 1} is {values[key][row]:g}, not in [{low:g}, {high:g}]{rest}")
-    return values
+def _refuse_twice(file: Path, names: pa.ChunkedArray, day: npt.NDArray[np.int64]) -> None:
+    """One row a name and day."""
+    if (absent := pc.index(names, "").as_py()) >= 0:
+        raise BadInput(f"{file}: {_NAME} of row {absent + 1} is missing")
+    body = names.combine_chunks().dictionary_encode().indices.to_numpy()
+    order = np.lexsort((body, day))
+    same = np.flatnonzero((np.diff(body[order]) == 0) & (np.diff(day[order]) == 0))
+    if len(same):
+        # Sorting keeps the order of equals.
+        row = int(order[same + 1].min())
+        here = f"{_NAME} of row {row + 1} is {names[row].as_py()[:40]!r}, which has a row of MJD {day[row]} before it"
+        raise BadInput(f"{file}: {here} ({len(same)} of {len(day)} rows like it)")

@@ -12,6 +12,7 @@ from astropy.table import Table
 from jobs import request as requests
 from jobs.fluxes import passbands
 from jobs.render import focal_plane, moving, own_bodies, render_exposures
+from lake_schema import foreign_rows
 from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_of
@@ -158,10 +159,18 @@ def test_what_is_wrong_is_said_in_a_line(tmp_path, kind, change, said):
 
 
 def test_what_is_no_table_is_refused(tmp_path):
+    values = columns(moving.population(*PLACE, 0.1, DAY, MISSION, 1))
+    plain = written(tmp_path / "plain.fits", values).read_bytes()
+    rows = f"NAXIS2  = {len(values['mjd']):20d}"
+    assert rows.encode() in plain
+    # Packed: cut short, and of more bytes than fit into memory.
+    half = gzip.compress(plain)[:-4000]
+    promising = plain.replace(rows.encode(), f"NAXIS2  = {10**9:20d}".encode())
     for name, data in (("a.csv", b"mjd,lon\n1,2,3\n"), ("b.parquet", b"PAR1 and no more"), ("c.fits", b"SIMPLE"),
                        ("d.csv", b"mjd,lon,lat,east,north,mag\n1,2,3,4,5,faint\n"),
                        ("e.csv", b"mjd,lon,lat,east,north,mag,nam\xe9\n1,2,3,4,5,6,7\n"),
-                       ("f.fits.gz", b"\x1f\x8b and no more")):  # fmt: skip
+                       ("f.fits.gz", b"\x1f\x8b and no more"), ("g.fits.gz", half),
+                       ("h.fits.gz", gzip.compress(promising)), ("i.dat", b"\x1f")):  # fmt: skip
         (tmp_path / name).write_bytes(data)
         with pytest.raises(BadInput, match=name) as caught:
             own_bodies.read(tmp_path / name, name)
@@ -178,6 +187,86 @@ def test_a_column_that_is_there_twice_is_refused(tmp_path, kind):
     pyarrow.csv.write_csv(table, file) if kind == "csv" else pq.write_table(table, file)
     with pytest.raises(BadInput, match=r"twice\.\w+: has column mag more than once$"):
         own_bodies.read(file, "twice")
+    other = tmp_path / f"names.{kind}"
+    table = table.remove_column(names.index("mag"))
+    pyarrow.csv.write_csv(table, other) if kind == "csv" else pq.write_table(table, other)
+    with pytest.raises(BadInput, match=r"names\.\w+: has column name more than once$"):
+        own_bodies.read(other, "names")
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_body_has_one_row_a_day(tmp_path, kind):
+    """An ephemeris by the hour would draw each body in every one of them."""
+    hours = np.arange(0.0, 48.0, 6.0)
+    one = {**{key: np.full(len(hours), 1.0) for key in own_bodies.KEYS}, "mjd": DAY + hours / 24.0}
+    daily = [0, 4]
+    for names in (["2015 AB1"] * len(hours), np.full(len(hours), 433)):
+        hourly = written(tmp_path / f"hourly-{names[0]}.{kind}", {**one, "name": names})
+        with pytest.raises(BadInput) as caught:
+            own_bodies.read(hourly, f"hourly of {names[0]}")
+        said = f"name of row 2 is {str(names[0])!r}, which has a row of MJD {DAY} before it (6 of 8 rows like it)"
+        assert str(caught.value) == f"{hourly}: {said}"
+        few = {key: np.asarray(column)[daily] for key, column in {**one, "name": names}.items()}
+        file = written(tmp_path / f"daily-{names[0]}.{kind}", few)
+        assert own_bodies.read(file, f"daily of {names[0]}").day.tolist() == [DAY, DAY + 1]
+    # Others beside it, whose rows it stands between.
+    three = {**{key: [1.0] * 3 for key in own_bodies.KEYS}, "name": ["Ceres", "Pallas", "Ceres "]}
+    with pytest.raises(BadInput, match=r"name of row 3 is 'Ceres', which has a row of MJD 1 before it \(1 of 3 rows"):
+        own_bodies.read(written(tmp_path / f"between.{kind}", three), "between")
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_each_row_has_a_name_where_there_are_names(tmp_path, kind):
+    two = {key: [1.0] * 2 for key in own_bodies.KEYS}
+    with pytest.raises(BadInput, match=r"absent.*: name of row 2 is missing$"):
+        own_bodies.read(written(tmp_path / f"absent.{kind}", {**two, "name": ["Ceres", ""]}), "absent")
+    if kind != "csv":
+        with pytest.raises(BadInput, match=r"half.*: column name (is|holds) .*, wanted "):
+            own_bodies.read(written(tmp_path / f"half.{kind}", {**two, "name": [0.5, 1.5]}), "half")
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_long_tables_have_names_too(tmp_path, kind):
+    count = 400_000
+    values = {
+        **{key: np.full(count, 1.0) for key in own_bodies.KEYS},
+        "name": [f"body of number {i}" for i in range(count)],
+    }
+    assert len(own_bodies.read(written(tmp_path / f"long.{kind}", values), "long").day) == count
+
+
+def test_names_without_end_are_refused(tmp_path):
+    for kind, length in (("parquet", 3 << 20), ("fits", 300)):
+        values = {**{key: np.full(2, 1.0) for key in own_bodies.KEYS}, "name": ["x" * length, "y" * length]}
+        with pytest.raises(BadInput, match=r"endless.*: column name "):
+            own_bodies.read(written(tmp_path / f"endless.{kind}", values), "endless")
+
+
+def test_what_no_table_of_ours_looks_like_is_refused(tmp_path):
+    """Parquet of strangers is read by a process of its own, with its bounds."""
+    names = [*own_bodies.KEYS, *(f"c{i}" for i in range(20_000))]
+    file = tmp_path / "wide.parquet"
+    pq.write_table(pa.table([pa.array([1.0])] * len(names), names=names), file)
+    with pytest.raises(BadInput, match=r"wide.parquet: "):
+        own_bodies.read(file, "wide")
+
+
+@pytest.mark.parametrize("kind", ["parquet", "fits"])
+def test_what_is_too_long_is_not_read_to_its_end(tmp_path, monkeypatch, kind):
+    file = written(tmp_path / f"long.{kind}", {key: np.full(300_000, 1.0) for key in own_bodies.KEYS})
+    sizes, pieces = [], foreign_rows.pieces
+
+    def counted(*args, **options):
+        for piece in pieces(*args, **options):
+            sizes.append(len(piece.columns["mjd"]))
+            yield piece
+
+    monkeypatch.setattr(foreign_rows, "pieces", counted)
+    monkeypatch.setattr(own_bodies, "_MOST_ROWS", 1000)
+    with pytest.raises(BadInput, match="has more than 1000 rows"):
+        own_bodies.read(file, "longer")
+    assert len(sizes) == 1
+    assert sizes[0] < 100_000
 
 
 @pytest.mark.parametrize("kind", FORMATS)
