@@ -157,8 +157,9 @@ def _raw(read: Sequence[fits.Image]) -> tuple[npt.NDArray[np.uint16], tuple[int,
     """Quadrants in readout order; prescan, overscan, overscan rows, rows between the halves."""
     header = {keyword: value for keyword, value, _ in read[0].cards}
     raw = np.stack([quadrants.placed(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
-    prescan, overscan, rows, middle = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS"))
-    return raw, (prescan, overscan, rows, middle)
+    prescan, overscan, rows = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS"))
+    # Files of older versions know nothing of rows between the halves.
+    return raw, (prescan, overscan, rows, int(header.get("INJROWS", 0)))
 
 
 def science_cards(rendered: Rendered) -> tuple[Card, ...]:

@@ -63,7 +63,16 @@ def test_it_is_given_back_after_an_error():
     assert held_now() < before + 0.3 * MEGABYTES / 1e3
 
 
-def test_another_library_is_left_alone(monkeypatch):
-    monkeypatch.setattr(heap, "_library", lambda: None)
+def no_such_library(name):
+    raise OSError(f"{name}: not found")
+
+
+@pytest.mark.parametrize("opened", [lambda name: object(), no_such_library])
+def test_another_library_is_left_alone(monkeypatch, opened):
+    """One without GNU's functions, and none at all: memory is asked for as often as ever."""
+    usual = faults_of_new_arrays(4)
+    monkeypatch.setattr(heap.ctypes, "CDLL", opened)
+    monkeypatch.setattr(heap, "_library", heap._library.__wrapped__)
     with heap.kept():
-        assert faults_of_new_arrays(2) > 0
+        faults_of_new_arrays(1)
+        assert faults_of_new_arrays(4) > 0.5 * usual

@@ -181,7 +181,7 @@ def test_an_identifier_twice_is_named(tmp_path):
 def test_a_missing_column_is_named(tmp_path):
     path = synthetic.write(tmp_path, "flagship2")
     pq.write_table(pq.read_table(path).drop_columns(["kappa"]), path)
-    with pytest.raises(BadInput, match=r"synthetic\.parquet: .*'kappa'"):
+    with pytest.raises(BadInput, match=r"synthetic\.parquet: has no column kappa; it has "):
         build(tmp_path, path, 'format = "flagship2"')
 
 

@@ -23,6 +23,7 @@ PAIRS = np.full((4, 4), 1e-4) - 1e-4 * np.eye(4)
 class Case:
     """How an effect is called.
 
+    name      : of the effect, and after a colon what this case of it is
     on, off   : apply(frame, *on, rng=) acts; apply(frame, *off, rng=) does nothing (None: it cannot)
     planes    : [4, ny, nx] is what it wants, not [ny, nx]
     linear    : apply(a x) = a apply(x)
@@ -43,7 +44,7 @@ class Case:
 
     @property
     def apply(self):
-        return EFFECTS[self.name].apply
+        return EFFECTS[self.name.partition(":")[0]].apply
 
 
 def bowl(shape):
@@ -85,6 +86,14 @@ _CASES = (
         (0.0, TRACKS, 4, 1, 3, END_OF_LIFE),
         planes=True,
         zero=False,
+    ),
+    Case(
+        "readout_cosmic_rays: silicon without traps",
+        (5.0, TRACKS, 4, 1, 3, None),
+        (0.0, TRACKS, 4, 1, 3, None),
+        planes=True,
+        zero=False,
+        whole=True,
     ),
     Case("charge_injection", (1e4, 2, 2, 0.03), (0.0, 2, 2, 0.03), zero=False, whole=True),
     Case("injection_noise", (2, 2, 10.0), (2, 2, 0.0), zero=False, whole=True),
