@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
-from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel
 from lake_schema.errors import OutOfRange
 
 
@@ -18,9 +18,7 @@ def apply(frame: Frame, gain: float, bias: float, largest: float, rng: np.random
     """
     if not 0.0 < gain < np.inf:
         raise OutOfRange("gain", gain, 0.0, np.inf)
-    out = np.empty(frame.shape)
-    _convert(np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1), gain, bias + 0.5, largest)
-    return out
+    return by_pixel(_convert, frame, gain, bias + 0.5, largest)
 
 
 @jit

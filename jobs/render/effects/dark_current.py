@@ -9,7 +9,7 @@ import numpy as np
 
 from jobs.compiling import jit
 from jobs.render.effects import dice, poisson
-from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel
 from lake_schema.errors import OutOfRange
 
 # Electrons of a hot pixel in a warm detector: many times what any well holds, so that more makes no difference.
@@ -20,16 +20,14 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> frame + Poisson(electrons) in every pixel."""
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("dark electrons", electrons, 0.0, np.inf)
-    out = np.empty(frame.shape)
-    _add(np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1), electrons, dice.key(rng))
-    return out
+    return by_pixel(_add, frame, electrons, dice.key(rng))
 
 
 @jit
-def _add(frame: Any, out: Any, electrons: float, own: Any) -> None:
+def _add(frame: Any, out: Any, electrons: float, key: Any) -> None:
     none = math.exp(-electrons)
     for i in range(len(frame)):
-        out[i] = frame[i] + poisson.counted(electrons, none, dice.word(own, i))
+        out[i] = frame[i] + poisson.counted(electrons, none, dice.word(key, i))
 
 
 def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Generator) -> Frame:

@@ -1,10 +1,10 @@
 """Dice of pixels: each pixel has random numbers of its own, so that what changes in one of them changes no other.
 
-key       of a frame's dice, from an effect's generator
-word      64 random bits of a pixel
-further   the next 64 of the same pixel
-uniform   in (0, 1] of a word
-normal    standard normal deviate of a word
+key         of a frame's dice, from an effect's generator
+word        64 random bits of a pixel
+next_word   the next 64 of the same pixel
+uniform     in (0, 1] of a word
+normal      standard normal deviate of a word
 
 Compiled; they are called from effects' kernels. A number takes a few ns.
 
@@ -53,22 +53,26 @@ def _mixed(word: Any) -> Any:
 
 
 @jit
-def word(own: Any, pixel: int) -> Any:
-    return _mixed(own + np.uint64(pixel) * _GOLDEN)
+def word(frame_key: Any, pixel: int) -> Any:
+    """64 random bits, uint64, of a pixel of the frame that has the key (uint64); pixel : its number in the frame."""
+    return _mixed(frame_key + np.uint64(pixel) * _GOLDEN)
 
 
 @jit
-def further(before: Any) -> Any:
+def next_word(before: Any) -> Any:
+    """64 more, where a pixel wants more than one number; before : its last ones."""
     return _mixed(before + _GOLDEN)
 
 
 @jit
 def uniform(bits: Any) -> Any:
+    """Uniform in (0, 1], a multiple of 2^-53; bits : of `word` or `next_word`."""
     return (float(bits >> _S11) + 1.0) * 2.0**-53
 
 
 @jit
 def normal(bits: Any) -> Any:
+    """Standard normal deviate; bits : of `word` or `next_word`. Of one in a hundred the ziggurat draws more."""
     while True:
         # Layer, sign and place are of different bits.
         layer = np.int64(bits & _LAYER)
@@ -76,21 +80,21 @@ def normal(bits: Any) -> Any:
         x = part * _ENDS[layer]
         if part >= _INSIDE[layer]:
             sign = bits & _SIGN
-            bits = further(bits)
+            bits = next_word(bits)
             if layer == 0:
                 # Beyond the last layer: Marsaglia's exponential tail.
                 x = -math.log(uniform(bits)) / _TAIL
-                bits = further(bits)
+                bits = next_word(bits)
                 y = -2.0 * math.log(uniform(bits))
                 while y < x * x:
-                    bits = further(bits)
+                    bits = next_word(bits)
                     x = -math.log(uniform(bits)) / _TAIL
-                    bits = further(bits)
+                    bits = next_word(bits)
                     y = -2.0 * math.log(uniform(bits))
                 return -_TAIL - x if sign else _TAIL + x
             low, high = _HEIGHTS[layer], _HEIGHTS[layer + 1]
             if low + uniform(bits) * (high - low) >= math.exp(-0.5 * x * x):
-                bits = further(bits)
+                bits = next_word(bits)
                 continue
             return -x if sign else x
         return -x if bits & _SIGN else x

@@ -174,10 +174,19 @@ class Effect:
         return change / noise if noise > 0.0 else math.inf if change > 0.0 else 0.0
 
     def needed_if(self, scene: Scene) -> bool:
+        """Whether the scene needs it, or no frame can do without it, whatever a request forces."""
         return not self.optional or self.margin(scene) > 1.0
 
     def applied(self, scene: Scene) -> bool:
+        """Whether it is applied to the scene: as its request forces it, else as the scene needs it."""
         return scene.forced.get(self.name, self.needed_if(scene))
+
+
+def by_pixel(kernel: Callable[..., None], frame: Frame, *numbers: Any) -> Frame:
+    """A new frame of the same shape, in which a compiled kernel(before [n], after [n], *numbers) has set each pixel."""
+    out = np.empty(frame.shape)
+    kernel(np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1), *numbers)
+    return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
-from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel
 from lake_schema.errors import OutOfRange
 
 # Newton's rule doubles the digits; the function is smooth and its slope between 1 - b and 1.
@@ -30,10 +30,7 @@ def apply(
     high : a, what is missing at `saturation` e-;  low : b, what is missing of the first electrons;  knee : n0, e-
     """
     _check(high, saturation, low, knee)
-    out = np.empty(frame.shape)
-    light = np.ascontiguousarray(frame, dtype=float).reshape(-1)
-    _respond(light, out.reshape(-1), high / saturation, low * knee, 1.0 / knee)
-    return out
+    return by_pixel(_respond, frame, high / saturation, low * knee, 1.0 / knee)
 
 
 @jit

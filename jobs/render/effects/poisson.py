@@ -9,7 +9,7 @@ import numpy as np
 
 from jobs.compiling import jit
 from jobs.render.effects import dice
-from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel
 
 # Below this the sum of the probabilities is followed, above it the law is inverted by its asymptotic series.
 _SUMMED_BELOW = 10.0
@@ -21,17 +21,15 @@ def apply(frame: Frame, rng: np.random.Generator) -> Frame:
     Error : of the probability of a count: 6e-4 of it at an expectation of 10, 2e-5 at 100
     Ref   : Giles 2016, ACM Trans. Math. Softw. 42, 7: the inverse of Poisson's law to second order in its width
     """
-    out = np.empty(frame.shape)
-    _count(np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1), dice.key(rng))
-    return out
+    return by_pixel(_count, frame, dice.key(rng))
 
 
 @jit
-def _count(light: Any, counts: Any, own: Any) -> None:
+def _count(light: Any, counts: Any, key: Any) -> None:
     for i in range(len(light)):
         mean = max(light[i], 0.0)
         none = math.exp(-mean) if mean < _SUMMED_BELOW else 0.0
-        counts[i] = counted(mean, none, dice.word(own, i))
+        counts[i] = counted(mean, none, dice.word(key, i))
 
 
 @jit

@@ -8,7 +8,7 @@ import numpy as np
 
 from jobs.compiling import jit
 from jobs.render.effects import dice
-from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel
 from lake_schema.errors import OutOfRange
 
 
@@ -16,15 +16,13 @@ def apply(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> frame + N(0, sigma) e-."""
     if not 0.0 <= sigma < np.inf:
         raise OutOfRange("read noise", sigma, 0.0, np.inf)
-    out = np.empty(frame.shape)
-    _add(np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1), sigma, dice.key(rng))
-    return out
+    return by_pixel(_add, frame, sigma, dice.key(rng))
 
 
 @jit
-def _add(frame: Any, out: Any, sigma: float, own: Any) -> None:
+def _add(frame: Any, out: Any, sigma: float, key: Any) -> None:
     for i in range(len(frame)):
-        out[i] = frame[i] + sigma * dice.normal(dice.word(own, i))
+        out[i] = frame[i] + sigma * dice.normal(dice.word(key, i))
 
 
 def _sigma(scene: Scene) -> float:
