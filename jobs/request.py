@@ -106,7 +106,6 @@ class Universe:
     """How deep and how fine.
 
     galaxy_limit, galaxy_band : faintest magnitude (AB, before the Milky Way's dust and intergalactic hydrogen), in
-                               which of the embedded passbands
                                which of the embedded passbands; another limit draws its cells anew: a shallow request
                                has as many bright galaxies as a deep one has, not the same
     star_limit               : H (Vega, as observed);  z_max : highest redshift

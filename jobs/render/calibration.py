@@ -16,7 +16,8 @@ import numpy.typing as npt
 from jobs import rng
 from jobs.observations import Observation
 from jobs.render import focal_plane
-from jobs.render.exposing import NISP_LAMPS, VIS_LAMPS, Exposure, bands_of, exposure_time
+from jobs.render.effects.calibration_lamp import LEDS
+from jobs.render.exposing import NISP_LAMPS, Exposure, bands_of, exposure_time
 from jobs.render.fields import position_angle
 from jobs.render.sequence import FILTERS, RED, offsets
 from lake_schema.errors import BadInput
@@ -63,7 +64,7 @@ def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, 
     elif not block.exposures:
         raise BadInput(f"an observation of image_type {first.image_type} wants exposures = how many frames")
     else:
-        lamps = {"nisp": NISP_LAMPS, "vis": VIS_LAMPS}.get(first.camera, 1)
+        lamps = {"nisp": NISP_LAMPS, "vis": LEDS}.get(first.camera, 1)
         for i in range(block.exposures):
             lamp = i % lamps + 1 if first.image_type == "flat" else None
             yield replace(in_bands[i % len(in_bands)], lamp=lamp)

@@ -25,8 +25,8 @@ from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.exposures import EXPOSURES
 
 SKY_TYPES = ("science", "deep", "self_calibration")
-# Lamps of the calibration units (Serrano et al. 2024).
-NISP_LAMPS, VIS_LAMPS = 5, 6
+# Lamps of NISP's calibration unit (Serrano et al. 2024).
+NISP_LAMPS = 5
 _DARK_TYPES = ("bias", "dark", "charge_injection")
 _EUCLID_BANDS = {
     "VIS": ("euclid_vis",),

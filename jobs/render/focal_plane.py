@@ -68,11 +68,6 @@ class Detector:
         return float(np.cos(np.radians(self.rotation))) < 0.0
 
     @property
-    def half_rows(self) -> int:
-        """Rows that are read through one register, of two."""
-        return (self.ny - self.middle) // 2
-
-    @property
     def half_diagonal(self) -> float:
         """Centre to corner, arcsec."""
         return 0.5 * self.pixel_scale * float(np.hypot(self.nx, self.ny))

@@ -16,7 +16,8 @@ import numpy.typing as npt
 from jobs import rng
 from jobs.observations import Observation
 from jobs.render import focal_plane
-from jobs.render.exposing import VIS_LAMPS, Exposure, exposure_time
+from jobs.render.effects.calibration_lamp import LEDS
+from jobs.render.exposing import Exposure, exposure_time
 from jobs.render.fields import Field
 from lake_schema.mission.configuration import MissionConfiguration
 
@@ -114,7 +115,7 @@ class _At:
         if "VIS" in block.channels and block.flat and last:
             seconds = mission.value("vis.exposure_time_flat", "s")
             # One LED after the other, from field to field and from visit to visit.
-            lamp = (self.field.number + self.field.visit) % VIS_LAMPS + 1
+            lamp = (self.field.number + self.field.visit) % LEDS + 1
             yield self._one("VIS", "euclid_vis", _dither_time(mission), seconds, "flat", lamp=lamp)
 
     def _spectrum(self, after: float) -> Exposure:

@@ -76,7 +76,5 @@ def complete(
     if "saturation" in truth:
         full = raw >= scene.value("adc_max", "adu")
         maps["saturation"] |= full if full.ndim == 2 else quadrants.assembled(full, *quadrants.sizes(scene))
-    if scene.detector is not None:
-        first = scene.detector.half_rows
-        for truth_map in maps.values():
-            truth_map[first : first + scene.detector.middle] = 0
+    for truth_map in maps.values():
+        truth_map[scene.half_rows : scene.half_rows + scene.middle] = 0

@@ -12,6 +12,7 @@ from jobs.render.effects import illumination
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
+# Of the calibration unit (Serrano et al. 2024).
 LEDS = 6
 _BAND = "euclid_vis"
 # Standard deviations in a full width at half maximum.
@@ -36,7 +37,12 @@ def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
 
 
 def seen(scene: Scene, led: int) -> float:
-    """What the band detects of an LED's photons, over what the embedded band would where it sees best."""
+    """What the band detects of an LED's photons, over what the embedded band would where it sees best; no unit.
+
+    led    : its number, from 1
+    Error  : the LED's spectrum is taken as a Gaussian of its central wavelength and width
+    Errors : OutOfRange for a number that no LED has
+    """
     if not 1 <= led <= LEDS:
         raise OutOfRange("LED", led, 1, LEDS)
     usual = passbands.load(_BAND)

@@ -32,7 +32,11 @@ _LEAST = np.float32(1e-30)
 
 
 def heights(frame: Float, notch: float, count: int) -> Float:
-    """Ends of `count` levels, electrons, ascending from the notch to the fullest packet of a frame; [count + 1]."""
+    """Ends of levels, electrons, ascending from the notch to the fullest packet of a frame, at least 1 e- above it.
+
+    count   : of the levels
+    returns : [count + 1], or fewer where ends would coincide, as in a frame of one brightness, or of none above it
+    """
     flat = frame.reshape(-1)
     some = flat[:: max(len(flat) // _SAMPLE, 1)]
     some = some[some > notch]

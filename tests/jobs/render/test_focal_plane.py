@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.render import focal_plane
+from jobs.render.effects.effect import Scene
 from jobs.render.focal_plane import (
     boresight_for,
     detector,
@@ -50,8 +51,12 @@ def test_vis_fills_the_published_field():
 
 def test_between_the_halves_of_a_vis_detector_nothing_is_read():
     """Four rows of charge injection between 2 x 2066: 4136 of them from edge to edge."""
-    assert {(d.nx, d.ny, d.middle, d.half_rows) for d in VIS} == {(4096, 4136, 4, 2066)}
-    assert {(d.middle, d.half_rows) for d in LSST} == {(0, 2002), (0, 2000)}
+
+    def half_rows(detector):
+        return Scene(MISSION, detector.section, 1.0, 0.0, 0.0, detector).half_rows
+
+    assert {(d.nx, d.ny, d.middle, half_rows(d)) for d in VIS} == {(4096, 4136, 4, 2066)}
+    assert {(d.middle, half_rows(d)) for d in LSST} == {(0, 2002), (0, 2000)}
 
 
 @pytest.mark.parametrize("name", ["nx", "ny", "charge_injection_rows"])
