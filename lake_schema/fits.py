@@ -139,7 +139,7 @@ def number_batches(
 ) -> Iterator[tuple[dict[str, npt.NDArray[Any]], dict[str, str]]]:
     """Columns of numbers of a file's first table: (title -> numbers[n], whole numbers as they are; title -> TUNIT).
 
-    texts  : columns of texts or whole numbers, which come as texts[n]; left out where there are none
+    texts  : more columns, of texts or whole numbers; left out where there are none
     Errors : Damaged for a file that is cut short or is none; BadInput names a column that is missing or no number
     """
     with _refusing(path), fits.open(path, memmap=True) as units:
@@ -173,7 +173,9 @@ def _texts_of(path: Path, unit: Any, name: str) -> npt.NDArray[Any]:
 
 
 def _decoded(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    return np.char.decode(values, "ascii") if values.dtype.kind == "S" else values.astype(str)
+    if values.dtype.kind == "S":
+        return np.asarray(np.char.decode(values, "ascii"))
+    return values.astype(values.dtype.newbyteorder("="))
 
 
 def _native(values: Any, null: int | None) -> npt.NDArray[Any]:

@@ -29,6 +29,8 @@ from lake_schema.errors import BadInput
 Array = npt.NDArray[Any]
 
 _BLOCK_BYTES = 8 << 20
+# Of a name, characters.
+_LONGEST_TEXT = 64
 _CSV, _FITS, _PARQUET = (".csv",), (".fits", ".fit"), (".parquet", ".parq")
 _ENDINGS = (*_PARQUET, *_FITS, *_CSV)
 
@@ -73,14 +75,14 @@ def pieces(file: Path, columns: Sequence[str], whole: Sequence[str] = (), texts:
     kind = _format(file)
     if kind == _FITS:
         for arrays, units in fits.number_batches(file, columns, texts):
-            named = {name: np.char.strip(arrays[name]).astype(object) for name in texts if name in arrays}
+            named = {name: _texts(file, first, name, pa.array(arrays[name])) for name in texts if name in arrays}
             yield Piece(file, first, {**arrays, **named}, units)
             first += len(arrays[columns[0]])
         return
     batches = foreign.batches(file, columns, texts) if kind == _PARQUET else _csv_batches(file, columns, whole, texts)
     for batch in batches:
         arrays = {name: _numbers(file, first, name, batch.column(name), whole) for name in columns}
-        named = {name: _texts(file, name, batch.column(name)) for name in texts if name in batch.schema.names}
+        named = {name: _texts(file, first, name, batch.column(name)) for name in texts if name in batch.schema.names}
         units = {field.name: unit for field in batch.schema if (unit := _unit(field))}
         yield Piece(file, first, {**arrays, **named}, units)
         first += batch.num_rows
@@ -165,9 +167,12 @@ def _numbers(file: Path, first: int, name: str, values: pa.Array, whole: Sequenc
     return np.asarray(values.to_numpy(zero_copy_only=False))
 
 
-def _texts(file: Path, name: str, values: pa.Array) -> Array:
+def _texts(file: Path, first: int, name: str, values: pa.Array) -> Array:
     kind = values.type.value_type if pa.types.is_dictionary(values.type) else values.type
     if not (pa.types.is_integer(kind) or pa.types.is_string(kind) or pa.types.is_large_string(kind)):
         raise BadInput(f"{file}: column {name} holds {kind}, wanted texts or whole numbers")
-    texts = pc.utf8_trim_whitespace(values.cast(pa.string()))
-    return np.asarray(pc.fill_null(texts, "").to_numpy(zero_copy_only=False))
+    texts = pc.fill_null(pc.utf8_trim_whitespace(values.cast(pa.string())), "")
+    long = pc.greater(pc.utf8_length(texts), _LONGEST_TEXT)
+    if (row := pc.index(long, True).as_py()) >= 0:
+        raise BadInput(f"{file}: column {name} of row {first + row} is longer than {_LONGEST_TEXT} characters")
+    return np.asarray(texts.to_numpy(zero_copy_only=False))
