@@ -85,7 +85,7 @@ def curvature(shift: float, softening: float) -> float:
 
 @jit
 def _cross(
-    held: Any, most: Any, out: Any, weights: Any, own: Any, down: bool, dim: float, drained: int, between: int
+    held: Any, most: Any, out: Any, weights: Any, key: Any, down: bool, dim: float, drained: int, between: int
 ) -> None:
     """Moves charge over the borders between neighbours in a row (or, `down`, in a column), in place.
 
@@ -115,7 +115,7 @@ def _cross(
                 # The border moves towards the fuller side, on average by half: what falls into the strip changes sides.
                 strip = np.float32(0.25) * some[c] * (here[c] + there[c])
                 # What crosses is a whole number of electrons, right in the mean.
-                moved = np.floor(strip + dice.uniform(dice.word(own, r * nx + first + c)))
+                moved = np.floor(strip + dice.uniform(dice.word(key, r * nx + first + c)))
                 most_moved = np.floor(MOST * (giver[c] if moved > 0.0 else taker[c]))
                 moved = min(max(moved, -most_moved), most_moved)
                 giver[c] -= moved

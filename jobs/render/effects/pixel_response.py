@@ -84,9 +84,9 @@ def _shade(out: Frame, y: float, x: float, size: float, depth: float) -> None:
 
 
 @jit
-def _spread(out: Any, rms: float, own: Any) -> None:
+def _spread(out: Any, rms: float, key: Any) -> None:
     for i in range(len(out)):
-        out[i] = max(1.0 + rms * dice.normal(dice.word(own, i)), 0.0)
+        out[i] = max(1.0 + rms * dice.normal(dice.word(key, i)), 0.0)
 
 
 def parameters(scene: Scene) -> tuple[float, float, float, tuple[float, float, float]]:
