@@ -5,6 +5,7 @@ other side. Charge only changes places. Displacements grow while the exposure la
 
 The rows of charge injection between the halves hold none: what falls there is drained. So the halves do not feel each
 other, and the last row of each loses a strip to them that is the wider the fuller it is: of a flat of 1e5 e- 1 %.
+Beyond its outer borders a detector is taken to go on as it is there.
 
 Ref : Antilogus et al. 2014; Guyonnet et al. 2015
 """
