@@ -3,7 +3,7 @@
 render          the whole of it
 numbers_of      whose random numbers an effect takes
 least_flux      what a source beyond the margin must have to be read;  spike_flux : and a star still farther out
-sources_of      the rows that touch the detector, as what is drawn
+sources_of      the rows that shine onto the detector, as what is drawn
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Rendered:
 
     raw        : uint16[ny, nx] ADU, or [4, ny, nx] quadrants in readout order with pre- and overscan
     maps       : truth [ny, nx] by its name: noise_free, and what was asked for besides
-    sources    : what was drawn, ascending id
+    sources    : what was drawn, ascending id: those whose stamps have light on pixels that are read
     sizes      : int[n] sides of their stamps;  drawn : float64[n] electrons of each stamp on the detector
     zero_point : AB magnitude of one electron per second
     complete   : how far beyond the detector every source was known that may reach it, arcsec
@@ -177,7 +177,8 @@ def render(
                 sources, sizes, exposure, detector, system, passband, scene, spread, settings, seed, bodies
             )
             lights = _lights((galaxies, electrons[0]), (stars, electrons[1]), detector, system).and_those(bright)
-            peak = float(spread.surface[0]) * float(sources.electrons.max(initial=0.0))
+            brightest = sources.electrons[_touching(sources, sizes, detector)].max(initial=0.0)
+            peak = float(spread.surface[0]) * float(brightest)
             scene = replace(scene, lights=lights, peak_electrons=peak)
             decisions = decide((vis.DRAWN,), scene, forced)
             if decisions[0].applied and spread.intra_pixel is not None:
@@ -186,13 +187,19 @@ def render(
         _refuse_too_large(exposure, detector, sources, sizes, spread)
         floors = stamps.floors(sources.electrons, scene.pixel_noise, settings)
         drawn = np.zeros(len(sources))
-        noise_free = stamps.draw(sources, sizes, spread, detector.nx, detector.ny, progress, floors, drawn)
-        scene = replace(scene, peak_electrons=float(noise_free.max()))
+        noise_free = stamps.draw(
+            sources, sizes, spread, detector.nx, detector.ny, progress, floors, drawn, scene.unread
+        )
+        halves = noise_free[: scene.unread[0]], noise_free[scene.unread[1] :]
+        scene = replace(scene, peak_electrons=max(float(half.max(initial=0.0)) for half in halves))
         if "stars" in truth:
             of_stars = kind_of(sources.ids) == _STAR
             maps["stars"] = stamps.draw(
                 sources.take(of_stars), sizes[of_stars], spread, detector.nx, detector.ny, None, floors[of_stars]
             ).astype(np.float32)
+        # What sends in no more than wings is drawn, not listed.
+        listed = drawn > 0.0
+        sources, sizes, drawn = sources.take(listed), sizes[listed], drawn[listed]
     else:
         noise_free = np.zeros((detector.ny, detector.nx))
     # A lamp's light and injected charge are moved and squeezed like a star's.
@@ -262,6 +269,7 @@ def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration,
     """f_nu of the faintest source that reaches the detector from beyond its selection margin, microjansky.
 
     Infinite where no source shows: in the dark, or in no time.
+    Error : of the fainter out there each leaves out less than the settings' `edge` of a pixel's noise
     """
     time = float(exposure["exposure_time_s"])
     if time == 0.0 or not exposing.sees_sky(str(exposure["channel"]), str(exposure["image_type"])):
@@ -288,9 +296,11 @@ def spike_flux(
 
 def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes: stamps.Int, spread: Psf) -> None:
     """Before anything is drawn: a task must fit into its memory, and end."""
-    where = f"exposure {exposure['exposure_id']}, detector {detector.name}: {len(sources)} sources"
+    here = _touching(sources, sizes, detector)
+    where = f"exposure {exposure['exposure_id']}, detector {detector.name}: {int(here.sum())} sources"
     base = costs.of_channel(str(exposure["channel"])).base_gb * 1e9
-    wanted = base + stamps.memory(sources.electrons, sizes, detector.nx, detector.ny, sources.picture)
+    picture = None if sources.picture is None else sources.picture[here]
+    wanted = base + stamps.memory(sources.electrons[here], sizes[here], detector.nx, detector.ny, picture)
     if wanted > _MOST_BYTES:
         raise BadInput(
             f"{where} take {wanted / 1e9:.1f} GB, a task has {_MOST_BYTES / 1e9:g}: "
@@ -302,6 +312,11 @@ def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes
             f"{where} take {seconds / 3600:.1f} h, a task has {_MOST_SECONDS / 3600:g}: "
             "ask for less accuracy, or for fainter sources to be left out"
         )
+
+
+def _touching(sources: Sources, sizes: stamps.Int, detector: Detector) -> npt.NDArray[np.bool_]:
+    """Sources with a stamp on the detector."""
+    return selection.touching(sources.column, sources.row, sizes + sources.length, detector.nx, detector.ny)
 
 
 def scene_of(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> Scene:
@@ -330,7 +345,7 @@ def sources_of(
     stellar: Library | None = None,
     lenses: pa.Table | None = None,
 ) -> tuple[Sources, stamps.Int]:
-    """Everything that shines on the detector, ascending id, and its stamps' sides.
+    """Everything that shines onto the detector, with its stamp or beyond it, ascending id, and the stamps' sides.
 
     galaxies, stars : (rows, expected electrons [n]);  lenses : rows of `strong_lenses`, None = none
     """
@@ -346,14 +361,15 @@ def sources_of(
     picture = np.concatenate([np.full(len(catalogue) + len(points), -1), np.arange(len(arcs.ids))]).astype(np.int64)
     _check(ids, electrons)
     farthest = np.where((shape < 0) & (picture < 0), _spikes(electrons, detector, spread, noise), 0.0)
-    reach = detector.half_diagonal + np.maximum(farthest, stamps.SIZES[-1] * detector.pixel_scale)
+    reach = detector.half_diagonal + np.maximum(farthest, stamps.reach(detector.pixel_scale))
     seen = selection.near(ra, dec, focal_plane.centre(detector, system), reach / 3600.0) & (electrons > 0)
     kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
     column, row = focal_plane.pixel_of_sky(system, ra[kept], dec[kept])
     wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
     sizes = stamps.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings, wide)
-    reaches = stamps.reaches(electrons[kept], sizes, shape[kept], picture[kept], spread, noise)
-    here = selection.touching(column, row, reaches, detector.nx, detector.ny)
+    here = stamps.shone_on(
+        column, row, electrons[kept], sizes, shape[kept], form, picture[kept], spread, noise, detector.nx, detector.ny
+    )
     kept, column, row = kept[here], column[here], row[here]
     jacobian = focal_plane.jacobian(system, column, row)
     # Arcs have the colour of what they are an image of.
@@ -384,7 +400,7 @@ def _with_moving(
     spread: Psf, settings: Settings, seed: int, bodies: Callable[[int], moving.Population] | None,
 ) -> tuple[Sources, stamps.Int, Lights]:  # fmt: skip
     """The sources with those that move, whose identifiers are the largest; and bright ones around, as far as read."""
-    reach = (detector.half_diagonal + stamps.SIZES[-1] * detector.pixel_scale) / 3600.0
+    reach = (detector.half_diagonal + stamps.reach(detector.pixel_scale)) / 3600.0
     found = moving.sources(exposure, detector, system, band, scene.mission, seed, reach, sources.shapes, bodies)
     own = stamps.stamp_sizes(
         found.electrons,

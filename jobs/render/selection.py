@@ -40,12 +40,12 @@ def needed(task: Mapping[str, Any], deflection: float) -> list[int]:
 
 
 def within(task: Mapping[str, Any], deflection: float, reach: float) -> list[int]:
-    """Order-8 cells of every source whose light may be on the detector; reach : of the largest stamp, arcsec."""
+    """Order-8 cells of every source whose light may be on the detector; reach : stamps.reach, arcsec."""
     return _cells(task, deflection + reach / 3600.0)
 
 
 def beyond(task: Mapping[str, Any], deflection: float, farther: float, drawn: Set[int]) -> tuple[list[int], float]:
-    """(the catalogue's order-8 cells outside the needed ones, how far it is complete), out to the largest stamp.
+    """(the catalogue's order-8 cells outside the needed ones, how far it is complete), as far as sources shine.
 
     farther : how far beyond the task's circle a source may be seen and reach the detector, arcsec
     drawn   : order-8 cells that the catalogue has
@@ -75,7 +75,7 @@ def near(ra: Float, dec: Float, centre: tuple[float, float], radius: float) -> B
     return np.asarray(sky.separation(ra, dec, centre[0], centre[1]) <= radius)
 
 
-def touching(column: Float, row: Float, sizes: Int, nx: int, ny: int) -> Bool:
+def touching(column: Float, row: Float, sizes: Int | Float, nx: int, ny: int) -> Bool:
     """[n] True where a stamp of `sizes` pixels about (column, row) overlaps a frame of nx x ny pixels."""
     half = sizes / 2 + 1
     across = (column + half > 0) & (column - half < nx - 1)

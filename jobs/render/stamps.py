@@ -5,12 +5,13 @@ that belongs outside its stamp comes in at the opposite edge. What of it reaches
 it belongs, as are the PSF's wings beyond the stamp (wings.py); the rest stays at the edge, where it is below the noise,
 and where a PSF that has no planes leaves all of its wings (transfer.py).
 A stamp is large enough that all that comes in is below a part of the flux in the source's aperture. Nothing is lost,
-nothing is rescaled.
+nothing is rescaled. A source whose stamp lies beside the frame sends in what is drawn beyond its stamp.
 
 Sources         what is drawn: galaxies (with a shape) and points
 settings_for, seconds_for   what an accuracy takes, from the measured table
 stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 reach, least_electrons   how far a source may show, and what it takes to show there
+shone_on        the square about a source that `draw` puts light on
 draw            sources -> frame
 shining         points that do so beyond their stamps;  reaches : and how far
 work, seconds, memory    what it goes through, and takes
@@ -23,6 +24,7 @@ import csv
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +55,8 @@ _APERTURE = 1.0
 # r^-3 over the square lattice (the PSF's wings), and of the flattest wings of galaxies.
 _LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
 # Logarithmic slope of the light that wraps from which on its response to shear is what counts, not its flux; and the
-# step in which the slope is taken.
-_RESPONSE, _FARTHER = 3.0, 1.05
+# ratio of radii between which the slope is taken.
+_RESPONSE, _SLOPE_RATIO = 3.0, 1.05
 # Of a galaxy's half-light radius, that its stamp is wider than a point's.
 _EXTENT = 4.0
 # Axis ratio of the thinnest sources: discs of the scale height profiles.py draws, seen edge-on.
@@ -76,9 +78,13 @@ _PICTURE_BYTES = 370
 _STAMP_S, _PLANE_S, _FRAME_S, _BLOCK_S, _START_S = 2.0e-8, 2.3e-7, 1.1e-8, 1.5e-8, 0.01
 # A trail is drawn in pieces no longer than this, pixels, each on a stamp of its own.
 _PIECE = 64.0
-# Of a galaxy's light: what leaves its stamp unseen, and what may lie nearer than it should; half stamps, and pixels, as
-# far as which it is drawn.
-_STRAY, _LOST, _STEPS, _FARTHEST = 2e-6, 3e-4, (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0), 2048.0
+# Of a galaxy's light, what may stay where it comes in at the stamp's edges: about what single precision sums to.
+_STRAY = 2e-6
+# Of a galaxy's light, what may lie nearer than it should, beyond the stamp: a tenth of the 3e-3 that circles about it
+# are known to.
+_LOST = 3e-4
+# Half stamps, and pixels, as far as which it is drawn.
+_STEPS, _FARTHEST = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0), 2048.0
 # Pixels of stamps that are transformed together.
 _BATCH = 1 << 17
 # What galsim takes for a point in the reference, arcsec.
@@ -226,12 +232,12 @@ def stamp_sizes(
         psf_light = _beyond_the_table(psf, np.array([size // 2, size]))
         light, body = np.zeros((len(left), 3)), shape[left] >= 0
         if body.any():
-            at = np.array([size // 2, size, _FARTHER * size]) * psf.pixel_scale
+            at = np.array([size // 2, size, _SLOPE_RATIO * size]) * psf.pixel_scale
             light[body] = profiles.surface(shapes.take(shape[left[body]]), at) * psf.pixel_scale**2
         edge, near, far = light.T
         steepness = np.log(np.maximum(near, 1e-300) / np.maximum(far, 1e-300))
         # What shear makes of the light that wraps goes with how steeply it falls.
-        steeper = np.maximum(steepness / (_RESPONSE * np.log(_FARTHER)), 1.0)
+        steeper = np.maximum(steepness / (_RESPONSE * np.log(_SLOPE_RATIO)), 1.0)
         # A PSF in planes is cut to the stamp and does not wrap.
         wings = _LATTICE_PSF * psf_light[1] * (psf.planes is None)
         wrapped = (wings + _LATTICE_GALAXY * steeper * near) * aperture
@@ -247,8 +253,8 @@ def stamp_sizes(
 
 
 def reach(pixel_scale: float) -> float:
-    """Distance from a source to the farthest corner of the largest stamp, arcsec."""
-    return float(SIZES[-1]) / 2.0 * float(np.sqrt(2.0)) * pixel_scale
+    """How far from a source it may shine, arcsec: beyond the corners of the largest stamp. So far sources are read."""
+    return _FARTHEST * pixel_scale
 
 
 def least_electrons(distance: float, pixel_scale: float, noise: float, settings: Settings) -> float:
@@ -282,18 +288,20 @@ def draw(
     progress: Callable[[int], None] | None = None,
     floors: Float | None = None,
     drawn: Float | None = None,
+    unread: tuple[int, int] = (0, 0),
 ) -> Float:
     """Expected electrons of the sources alone.
 
     sizes    : int[n] from stamp_sizes;  floors : float[n] from `floors`, None: nothing is left out
     progress : called now and then with the number of sources drawn
     drawn    : float64[n] to be filled with what of each source's stamp fell onto the frame, electrons
+    unread   : of the frame, the first row that counts for nothing in `drawn`, and the first behind that counts again
     returns  : float64[ny, nx], to 5e-7 electrons a source; the same, bit by bit, in any order of the sources
     """
     pieces, trail, whole = _in_pieces(sources)
     of_piece = np.zeros(len(pieces))
     some_floors = None if floors is None else floors[whole]
-    frame = _draw(pieces, trail, sizes[whole], psf, nx, ny, progress, some_floors, of_piece)
+    frame = _draw(pieces, trail, sizes[whole], psf, nx, ny, progress, some_floors, of_piece, unread)
     if drawn is not None:
         drawn[:] = np.bincount(whole, of_piece, len(sources))
     return frame
@@ -338,6 +346,7 @@ def _draw(
     progress: Callable[[int], None] | None,
     floors: Float | None,
     drawn: Float,
+    unread: tuple[int, int],
 ) -> Float:
     frame = np.zeros((ny, nx), np.int64)
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
@@ -346,7 +355,8 @@ def _draw(
     stray, farthest, most = _strays(sources, some, form, sizes, psf.pixel_scale)
     x0, y0 = (np.rint(position).astype(np.int64) - sizes // 2 for position in (sources.column, sources.row))
     curve = kernel.returning(sizes, sources.column - x0, sources.row - y0, stray, most)
-    taken = np.zeros(len(sources))
+    # Of stamps that are not drawn, what would come in: 5 % from what would be taken off, 0.1 % of many together.
+    taken = curve[:, -1].copy()
     passing = transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
     body, fraction, bulge, disk, _, row, *_ = bodies
@@ -379,7 +389,7 @@ def _draw(
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
             unfold = partial(edges.unfold, **star(int(chosen[0]))) if far[chosen[0]] else None
-            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, curve, taken, unfold)
+            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, curve, taken, unfold, unread)
             drawn[chosen] = added / kernel.FIXED_POINT
             done += len(chosen)
             if progress is not None:
@@ -389,6 +399,25 @@ def _draw(
     layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
     layer += wings.galaxies(sources.column, sources.row, stray, taken, farthest, sizes, nx, ny)
     return np.asarray(kernel.electrons_of(frame, layer, wings.BLOCK, wings.MARGIN))
+
+
+def shone_on(
+    column: Float, row: Float, electrons: Float, sizes: Int, shape: Int, shapes: Shapes, picture: Int | None, psf: Psf,
+    noise: float, nx: int, ny: int,
+) -> npt.NDArray[np.bool_]:  # fmt: skip
+    """[n] True of sources at rest of which light may be noticed on the frame: their stamps', or what is drawn beyond.
+
+    column .. picture : as of Sources;  noise : of a pixel, electrons
+    """
+    wide = reaches(electrons, sizes, shape, picture, psf, noise)
+    here = selection.touching(column, row, wide, nx, ny)
+    # What else of a galaxy may be seen there is looked at closer.
+    most = 2.0 * np.minimum(_STEPS[-1] * sizes / 2, _FARTHEST)
+    more = np.flatnonzero(~here & (shape >= 0))
+    more = more[selection.touching(column[more], row[more], wings.around(most[more]), nx, ny)]
+    beyond, _ = _beyond_stamps(shapes.take(shape[more]), sizes[more], psf.pixel_scale)
+    here[more] = (beyond > 0) & selection.touching(column[more], row[more], wings.around(2.0 * beyond), nx, ny)
+    return here
 
 
 def shining(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: Psf) -> npt.NDArray[np.bool_]:
@@ -408,13 +437,14 @@ def reaches(
 ) -> Int:
     """Sides of the squares about sources outside which none of their light is noticed, pixels: int64[n].
 
-    Of stamps; about points that shine beyond them all that is read of the sky around (`reach`), and for their spikes
-    more: to where no pixel has a tenth of its noise.
+    Of stamps, and of the PSF's wings beyond them; about points that shine beyond these all that is read of the sky
+    around (`reach`), and for their spikes more: to where no pixel has a tenth of its noise. Of a galaxy's own light
+    beyond its stamp `shone_on` knows.
     length : float64[n] of trails, pixels;  noise : of a pixel, electrons
     """
     length = np.zeros(len(sizes)) if length is None else length
     pieces = _pieces(length)
-    sides = sizes.astype(float)
+    sides = np.maximum(sizes, 0.0 if psf.planes is None else 2.0 * wings.MARGIN * wings.BLOCK)
     far = shining(electrons / pieces, sizes, shape, picture, psf)
     if psf.edges is not None and far.any():
         spikes = edges.reach(psf.edges, electrons[far], NOTICEABLE * noise)
@@ -445,8 +475,9 @@ def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
 
     Error : between half and twice of what the machine takes that it was measured on
     """
-    pixels, transformed = work(sources, sizes, psf)
-    _, far, _ = _strays(sources, *_forms(sources), sizes, psf.pixel_scale)
+    here, body = selection.touching(sources.column, sources.row, sizes, nx, ny), sources.shape >= 0
+    pixels, transformed = work(sources.take(here), sizes[here], psf)
+    far, _ = _beyond_stamps(sources.shapes.take(sources.shape[body]), sizes[body], psf.pixel_scale)
     blocks = float(((2 * far / wings.BLOCK) ** 2).sum())
     return _STAMP_S * pixels + _PLANE_S * transformed + _BLOCK_S * blocks + _FRAME_S * nx * ny + _START_S
 
@@ -477,7 +508,8 @@ def _draw_some(
     cut: Float,
     curve: Float,
     taken: Float,
-    unfold: Callable[..., None] | None = None,
+    unfold: Callable[..., None] | None,
+    unread: tuple[int, int],
 ) -> Int:
     """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does.
 
@@ -500,7 +532,7 @@ def _draw_some(
     taken[chosen] = off
     if unfold is not None:
         unfold(stamps[0], int(x0[0]), int(y0[0]), frame.shape[1], frame.shape[0])
-    return kernel.accumulate(frame, stamps, x0, y0)
+    return kernel.accumulate(frame, stamps, x0, y0, unread)
 
 
 def _forms(sources: Sources) -> tuple[Shapes, Forms]:
@@ -530,17 +562,28 @@ def _strays(
               pixels: until no more than _LOST of the light lies farther out; [n] electrons at most)
     """
     body = sources.shape >= 0
-    stray, reach, most = np.zeros((len(sources), 11)), np.zeros(len(sources)), np.zeros(len(sources))
-    half = sizes[body] / 2
-    beyond = np.stack([profiles.outside(shapes, half * step * pixel_scale) for step in _STEPS], 1)
-    leaves = beyond[:, 0] > _STRAY
+    stray, far, most = np.zeros((len(sources), 11)), np.zeros(len(sources)), np.zeros(len(sources))
+    far[body], leaves = _beyond_stamps(shapes, sizes[body], pixel_scale)
     sky = profiles.on_the_sky(shapes, form)
-    sky[:, :2] *= np.where(leaves, sources.electrons[body], 0.0)[:, None]
+    sky[:, [kernel.BULGE, kernel.DISK]] *= np.where(far[body] > 0, sources.electrons[body], 0.0)[:, None]
     stray[body] = sky
-    most[body] = beyond[:, 0] * sources.electrons[body]
-    far = np.array(_STEPS)[np.clip((beyond > _LOST).sum(axis=1), 1, len(_STEPS) - 1)]
-    reach[body] = np.where(leaves, np.maximum(np.minimum(half * far, _FARTHEST), 1.5 * half), 0.0)
-    return stray, reach, most
+    most[body] = leaves * sources.electrons[body]
+    return stray, far, most
+
+
+def _beyond_stamps(shapes: Shapes, sizes: Int, pixel_scale: float) -> tuple[Float, Float]:
+    """Of galaxies [n], (how far their light is drawn, pixels, 0 where none is beyond its stamp; the part of it there).
+
+    Until no more than _LOST of the light lies farther out.
+    """
+    half = sizes / 2
+    leaves = profiles.outside(shapes, half * pixel_scale)
+    far, left = np.full(len(half), _STEPS[0]), np.flatnonzero(leaves > _LOST)
+    for step, next_one in pairwise(_STEPS):
+        left = left[profiles.outside(shapes.take(left), half[left] * step * pixel_scale) > _LOST]
+        far[left] = next_one
+    far = np.maximum(np.minimum(half * far, _FARTHEST), _STEPS[0] * half)
+    return np.where(leaves > _STRAY, far, 0.0), leaves
 
 
 def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4, highest: float = 1e-4) -> Float:

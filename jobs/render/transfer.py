@@ -35,7 +35,7 @@ STEP = 2 * np.pi / 32
 # What passes less than this in single precision passes nothing.
 _NOTHING = 1e-7
 # Frequencies beyond this are not looked at: twice the Nyquist frequency and a half (a plane has three times).
-_FARTHEST = 2.5 * np.pi
+_HIGHEST = 2.5 * np.pi
 # Samples that the kernel takes together: their planes stay in the cache.
 _TOGETHER = 1024
 # Stamp that `passing` is measured on, pixels.
@@ -128,7 +128,7 @@ def plane_count(psf: Psf) -> int:
 
 def passing(psf: Psf) -> Float:
     """float64[m]: the largest modulus of PSF times pixel at k = i STEP radian / pixel; nothing beyond."""
-    probe = grid(_PROBE, _FARTHEST)
+    probe = grid(_PROBE, _HIGHEST)
     if psf.planes is None:
         planes = _planes(psf, probe, np.float32)
     else:

@@ -77,4 +77,4 @@ def complete(
         full = raw >= scene.value("adc_max", "adu")
         maps["saturation"] |= full if full.ndim == 2 else quadrants.assembled(full, *quadrants.sizes(scene))
     for truth_map in maps.values():
-        truth_map[scene.half_rows : scene.half_rows + scene.middle] = 0
+        truth_map[slice(*scene.unread)] = 0

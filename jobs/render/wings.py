@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from jobs.render import kernel
+from jobs.render import kernel, selection
 from jobs.render.psf import SAMPLES, SIDE, Psf
 
 Float = npt.NDArray[np.float64]
@@ -19,8 +19,11 @@ Int = npt.NDArray[np.int64]
 
 # Side of a block, pixels; all stamps are whole numbers of them.
 BLOCK = 8
-# Blocks beyond the frame: a source there sends its wings in.
+# Blocks from a point to where its wings end, and as many are there beyond the frame: who draws has to name the sources
+# that lie so far out.
 MARGIN = SIDE // 2 // BLOCK + 1
+# Pixels by which light on blocks is wider, to each side, than it is said to be: cut and interpolated between them.
+_WIDER = 3.0 * BLOCK
 
 
 def wings(column: Float, row: Float, electrons: Float, sizes: Int, psf: Psf, nx: int, ny: int) -> Float:
@@ -49,19 +52,22 @@ def galaxies(
 ) -> Float:
     """Electrons a pixel of galaxies [n] outside stamps of `sizes`, on the blocks of `wings`.
 
-    stray   : float64[n, 11] profiles.on_the_sky;  light : [n] electrons taken off the stamp;  reach : [n] pixels
+    stray   : float64[n, 11] profiles.on_the_sky;  light : [n] electrons that leave the stamp;  reach : [n] pixels
     returns : float64[blocks, blocks], the same in any order of the galaxies
     Error   : a galaxy's own light, as if the PSF did nothing to it so far out; what is left on the stamp stays there;
               a block has whole 2^-20 electrons a pixel: of the faintest little is seen
     """
     out = _layer(nx, ny)
-    edge = reach + MARGIN * BLOCK
-    near = (column > -edge) & (column < nx + edge) & (row > -edge) & (row < ny + edge)
-    some = (light > 0) & near
+    some = (light > 0) & selection.touching(column, row, around(2.0 * reach), nx, ny)
     kernel.leaving(
         out, BLOCK, MARGIN, sizes[some], reach[some], column[some], row[some], stray[some], light[some]
     )  # fmt: skip
     return out / kernel.FIXED_POINT
+
+
+def around(sides: Float) -> Float:
+    """Sides of the squares, pixels, that light shows in that is drawn on blocks in squares of such sides."""
+    return sides + 2.0 * _WIDER
 
 
 def _cells(plane: Float32) -> Float:

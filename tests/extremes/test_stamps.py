@@ -5,7 +5,7 @@ lensed, spread by the seeing disc, counted in pixels.
 """
 
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 from unittest import mock
 
@@ -17,7 +17,7 @@ from scipy.special import gammaincinv
 
 from jobs.accuracy import DRAFT, SURVEY
 from jobs.fluxes import passbands
-from jobs.render import exposure, profiles, stamps
+from jobs.render import exposure, kernel, profiles, stamps
 from jobs.render.focal_plane import boresight_for, sky_of_pixel, wcs
 from jobs.render.profiles import EXPONENTIAL_RADIUS
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
@@ -332,6 +332,71 @@ def test_what_is_taken_off_slim_galaxies_is_theirs(kind, accuracy):
     least = 1.0 - profiles.outside(source.shapes, np.array([0.5 * side * 0.1]))[0]
     assert 1e5 * (least - 1e-3) < image.sum() < 1e5 * (1 + 2e-6)
     assert image.min() > -accuracy.background * NOISE
+
+
+def test_light_of_a_disc_on_edge_leaves_its_stamp():
+    """It is as thick as it is high: as much leaves a small stamp as a large one has there."""
+    source = source_of("vis", 1e6, inclination=90.0, disk_half_light_radius=0.8, position_angle=33.0)
+    centred(source, 128.0)
+    small, large = (stamps.draw(source, np.array([size]), spread("vis"), SIDE, SIDE) for size in (48, 512))
+    y, x = np.abs(np.mgrid[:SIDE, :SIDE] - 128)
+    outside = np.maximum(x, y) > 24
+    assert large[outside].sum() > 1e4
+    assert small[outside].sum() == pytest.approx(large[outside].sum(), rel=0.15)
+
+
+@pytest.mark.parametrize("index", [1.4, 2.0, 3.0, 4.0])
+def test_a_stamp_gives_no_more_than_what_is_outside(index):
+    """The quadratic that describes what a slim galaxy's images send in may hold more than all of it."""
+    shape = {"bulge_fraction": 1.0, "bulge_sersic_index": index, "bulge_half_light_radius": 3.0}
+    light = 0.0
+    # Its stamp lies beside the frame, left and right, alike on the blocks: there is no more than what leaves it.
+    for column in (-26.0, 2078.0):
+        source = source_of("vis", 1e6, column=column, row=1023.5, bulge_axis_ratio=0.02, position_angle=80.0, **shape)
+        light += stamps.draw(source, np.array([48]), spread("vis"), 2048, 2048).sum()
+    outside = 1e6 * profiles.outside(source.shapes, np.array([2.4]))[0]
+    assert 0.1 * outside < light < outside
+
+
+@cache
+def response(size, q):
+    """Of the ellipticity in a Gaussian window to shear, of a galaxy whose images overlap on small stamps."""
+    shape = {"bulge_fraction": 1.0, "bulge_sersic_index": 3.0, "bulge_half_light_radius": 1.0, "bulge_axis_ratio": q}
+    y, x = np.mgrid[:128, :128] - 64
+    found = []
+    for g in (-0.01, 0.01):
+        source = centred(source_of("vis", 1e5, position_angle=45.0, gamma1=g, **shape), 64.0)
+        light = np.exp(-0.5 * (x**2 + y**2) / 8.0**2) * stamps.draw(source, np.array([size]), spread("vis"), 128, 128)
+        found.append((light * (x**2 - y**2)).sum() / (light * (x**2 + y**2)).sum())
+    return (found[1] - found[0]) / 0.02
+
+
+@pytest.mark.parametrize("q", [0.08, 0.1, 0.12])
+def test_of_steep_light_nothing_is_taken_off(q):
+    """Too slim for a quadratic: it is no worse than a stamp that keeps all of its light."""
+    wrong = abs(response(64, q) - response(512, q))
+    with mock.patch.object(stamps, "_STRAY", 2.0):
+        kept = abs(response.__wrapped__(64, q) - response(512, q))
+    assert wrong < 1.05 * kept + 1e-3
+
+
+def test_what_is_taken_off_ends_by_and_by():
+    """From slim galaxies to round ones: no step that a sheared pair would take for shear."""
+    wrong = [abs(response(64, q) - response(512, q)) for q in np.arange(0.14, 0.22, 0.01).round(2).tolist()]
+    assert max(wrong) < 0.6
+
+
+def test_what_is_taken_off_ends_by_and_by_where_it_cancels():
+    """Along the stamp's own axes the terms of x^2 and of y^2 may take each other off, while both are small."""
+    taken = []
+    for q in np.arange(0.2, 0.3, 0.002):
+        one = source_of("vis", 1e5, bulge_fraction=1.0, bulge_axis_ratio=q, bulge_half_light_radius=1.0)
+        one = replace(centred(one, 64.0), jacobian=0.1 * np.eye(2)[None])
+        stray = stamps._strays(one, *stamps._forms(one), np.array([64]), 0.1)
+        taken.append(kernel.returning(np.array([64]), *np.full((2, 1), 32.0), stray[0], stray[2])[0])
+    level, light = np.array(taken)[:, 0], np.array(taken)[:, -1]
+    assert light[0] < 1.0 < 500.0 < light[-1]
+    assert np.abs(np.diff(level)).max() < 0.15 * level.max()
 
 
 @pytest.mark.parametrize("camera", ["vis", pytest.param("lsstcam", marks=pytest.mark.nightly)])

@@ -112,6 +112,11 @@ class Scene:
         return (self.ny - self.middle) // 2
 
     @property
+    def unread(self) -> tuple[int, int]:
+        """The first row between the halves, and the first of the upper half."""
+        return self.half_rows, self.half_rows + self.middle
+
+    @property
     def sky_electrons(self) -> float:
         return self.sky_rate * self.exposure_time_s
 

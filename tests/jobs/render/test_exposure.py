@@ -267,6 +267,36 @@ def test_a_source_just_outside_still_shines_in():
     assert alone.sum() > 0
 
 
+def test_rows_that_are_not_read_count_for_nothing():
+    """Light on the rows between a detector's halves is not drawn for anybody, nor does it decide on an effect."""
+    detector = replace(small("vis", "3-4", SIDE), ny=SIDE + 4, middle=4)
+    _, exposed, body, _ = field("VIS")
+    system = focal_plane.wcs(detector, exposed["ra"], exposed["dec"], exposed["position_angle"])
+    lon, lat = focal_plane.sky_of_pixel(system, np.array([100.0]), np.array([SIDE / 2 + 1.5]))
+    body, points = body.slice(0, 0), stars(lon, lat)
+    one = render("VIS", body, points, flux=100.0, detector=detector)
+    assert one.noise_free[SIDE // 2 : SIDE // 2 + 4].max() == 0.0
+    total = one.noise_free.sum(dtype=float)
+    assert 0 < total < 0.3 * one.sources.electrons[0]
+    # The map has wings from beyond the stamp besides.
+    assert 0.9 * total < one.drawn[0] < total * (1 + 1e-6)
+    assert one.scene.peak_electrons == pytest.approx(float(one.noise_free.max()), rel=1e-6)
+
+
+def test_what_sends_in_no_more_than_wings_is_not_listed():
+    """A galaxy whose stamp lies beside the detector: its light is there, it is not among what was drawn."""
+    _, exposed, _, points = field("VIS")
+    detector = small("vis", "3-4", SIDE)
+    system = focal_plane.wcs(detector, exposed["ra"], exposed["dec"], exposed["position_angle"])
+    lon, lat = focal_plane.sky_of_pixel(system, np.array([-600.0]), np.array([100.0]))
+    giant = galaxies(lon, lat, bulge_fraction=1.0, bulge_sersic_index=4.0, bulge_half_light_radius=4.0)
+    one = render("VIS", giant, points.slice(0, 0), flux=300.0)
+    assert one.noise_free.sum() > 10.0
+    assert len(one.sources) == len(one.sizes) == len(one.drawn) == 0
+    both = render("VIS")
+    assert (both.drawn > 0).all()
+
+
 def test_sources_of_no_flux_are_left_out():
     assert len(render("VIS", flux=0.0).sources) == 0
     empty = render("EXT", field("EXT")[2].slice(0, 0), field("EXT")[3].slice(0, 0))

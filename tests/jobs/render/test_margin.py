@@ -89,9 +89,12 @@ def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
 
 
 def test_what_lies_beyond_the_reach_or_is_faint_changes_no_byte():
-    empty = rendered(400.0, found=False)
+    # Nobody shines so far.
+    far = stamps.reach(DETECTOR.pixel_scale) + DETECTOR.half_diagonal + 1.0
+    empty = rendered(far, found=False)
     assert len(empty.sources) == 0
-    for distance, flux in ((400.0, 1e6), (190.0, 0.1)):
+    assert not empty.noise_free.any()
+    for distance, flux in ((far, 1e6), (190.0, 0.1)):
         one = rendered(distance, flux)
         np.testing.assert_array_equal(one.science, empty.science)
         np.testing.assert_array_equal(one.noise_free, empty.noise_free)
