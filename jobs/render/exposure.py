@@ -80,7 +80,8 @@ class Rendered:
 
     raw        : uint16[ny, nx] ADU, or [4, ny, nx] quadrants in readout order with pre- and overscan
     maps       : truth [ny, nx] by its name: noise_free, and what was asked for besides
-    sources    : what was drawn, ascending id: those whose stamps have light on pixels that are read
+    sources    : what was drawn, ascending id: those with light of their stamps on pixels that are read, and stars whose
+                 spikes may be noticed
     sizes      : int[n] sides of their stamps;  drawn : float64[n] electrons of each stamp on the detector
     zero_point : AB magnitude of one electron per second
     complete   : how far beyond the detector every source was known that may reach it, arcsec
@@ -197,8 +198,9 @@ def render(
             maps["stars"] = stamps.draw(
                 sources.take(of_stars), sizes[of_stars], spread, detector.nx, detector.ny, None, floors[of_stars]
             ).astype(np.float32)
-        # What sends in no more than wings is drawn, not listed.
-        listed = drawn > 0.0
+        # What sends in no more than faint wings is drawn, not listed.
+        a_piece = sources.electrons / stamps.piece_count(sources.length)
+        listed = (drawn > 0.0) | stamps.shining(a_piece, sizes, sources.shape, sources.picture, spread)
         sources, sizes, drawn = sources.take(listed), sizes[listed], drawn[listed]
     else:
         noise_free = np.zeros((detector.ny, detector.nx))

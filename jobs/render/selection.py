@@ -70,7 +70,7 @@ def _cells(task: Mapping[str, Any], wider: float) -> list[int]:
     return found
 
 
-def near(ra: Float, dec: Float, centre: tuple[float, float], radius: float) -> Bool:
+def near(ra: Float, dec: Float, centre: tuple[float, float], radius: float | Float) -> Bool:
     """[n] True within `radius` deg of a centre; a gnomonic projection is then safe."""
     return np.asarray(sky.separation(ra, dec, centre[0], centre[1]) <= radius)
 

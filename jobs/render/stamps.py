@@ -11,7 +11,7 @@ Sources         what is drawn: galaxies (with a shape) and points
 settings_for, seconds_for   what an accuracy takes, from the measured table
 stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 reach, least_electrons   how far a source may show, and what it takes to show there
-shone_on        the square about a source that `draw` puts light on
+shone_on        sources that `draw` puts light of onto a frame
 draw            sources -> frame
 shining         points that do so beyond their stamps;  reaches : and how far
 work, seconds, memory    what it goes through, and takes
@@ -309,10 +309,11 @@ def draw(
 
 def piece_length(length: Float) -> Float:
     """Of the pieces that trails [n] of a length are drawn in, pixels."""
-    return np.asarray(length / _pieces(length))
+    return np.asarray(length / piece_count(length))
 
 
-def _pieces(length: Float) -> Int:
+def piece_count(length: Float) -> Int:
+    """How many they are [n]."""
     return np.maximum(np.ceil(length / _PIECE), 1.0).astype(np.int64)
 
 
@@ -320,7 +321,7 @@ def _in_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
     """(what is drawn: each piece of a trail as a source [p], its own trail [p, 2] pixels, whose piece it is [p])."""
     if sources.trail is None:
         return sources, np.zeros((len(sources), 2)), np.arange(len(sources))
-    count = _pieces(sources.length)
+    count = piece_count(sources.length)
     whole = np.repeat(np.arange(len(sources)), count)
     number = np.arange(len(whole)) - np.repeat(np.cumsum(count) - count, count)
     # From the middle of the trail to that of the piece, in lengths of the trail.
@@ -443,7 +444,7 @@ def reaches(
     length : float64[n] of trails, pixels;  noise : of a pixel, electrons
     """
     length = np.zeros(len(sizes)) if length is None else length
-    pieces = _pieces(length)
+    pieces = piece_count(length)
     sides = np.maximum(sizes, 0.0 if psf.planes is None else 2.0 * wings.MARGIN * wings.BLOCK)
     far = shining(electrons / pieces, sizes, shape, picture, psf)
     if psf.edges is not None and far.any():

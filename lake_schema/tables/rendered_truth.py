@@ -1,4 +1,8 @@
-"""Table `rendered_truth`: what was drawn where, one row a source of a detector."""
+"""Table `rendered_truth`: what was drawn where, one row a source of a detector.
+
+Of sources beside it that send in no more than the faint wings beyond their stamps there is none, but of stars whose
+spikes may be noticed.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,7 @@ RENDERED_TRUTH = Table(
         Column("x", "float64", "pix", "pos.cartesian.x;instr.det", "column, 0 = centre of the first pixel"),
         Column("y", "float64", "pix", "pos.cartesian.y;instr.det", "row, 0 = centre of the first pixel"),
         Column("expected", "float64", "electron", "phot.count", "in the exposure, on and off the detector", 0.0),
-        Column("drawn", "float64", "electron", "phot.count;instr.det", "of its stamp, on the detector"),
+        Column("drawn", "float64", "electron", "phot.count;instr.det", "of its stamp, on pixels that are read"),
         Column(
             "stamp", "int32", "pix", "phys.angSize;instr.det", "side of the stamp; fainter wings are drawn beyond it", 1
         ),
