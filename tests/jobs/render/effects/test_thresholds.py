@@ -137,7 +137,7 @@ def test_a_pixel_s_own_response_is_left_out_of_faint_stars():
     assert noticed > NOTICEABLE
 
 
-@pytest.mark.parametrize("mag", [14.0, 20.0, 24.0, 27.0])
+@pytest.mark.parametrize("mag", [pytest.param(14.0, marks=pytest.mark.nightly), 20.0, 24.0, 27.0])
 def test_all_that_a_scene_does_without_is_not_noticed_together(mag):
     """Stars so faint that little is needed, or so bright that next to everything is."""
     x, y = nominal.lattice(256, 64)
