@@ -11,7 +11,7 @@ anywhere. They shine like the Sun. At midnight UTC another population takes over
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -61,18 +61,26 @@ class Population:
     mag: Float
     hour: float | Float = 0.0
 
-    def after(self, hours: float) -> tuple[Float, Float]:
+    def after(self, hours: float | Float) -> tuple[Float, Float]:
         """ra, dec [n] deg so many hours after noon."""
         across = np.maximum(np.cos(np.radians(self.lat)), _LEAST_COSINE)
         since = (hours - self.hour) / 3600.0
         return equatorial(self.lon + self.east * since / across, np.clip(self.lat + self.north * since, -90.0, 90.0))
 
+    def take(self, some: npt.NDArray[np.bool_] | Int) -> Population:
+        """Some of the bodies."""
+        return Population(
+            *(np.broadcast_to(getattr(self, field.name), self.ids.shape)[some] for field in fields(Population))
+        )
 
-def population(ra: float, dec: float, radius: float, day: int, mission: MissionConfiguration, seed: int) -> Population:
-    """Everything that is within `radius` deg of a place at some time of a day (MJD)."""
+
+def population(
+    ra: float, dec: float, radius: float, day: int, mission: MissionConfiguration, seed: int, hours: float = 12.0
+) -> Population:
+    """Everything that is within `radius` deg of a place at some time of a day (MJD), so many hours around its noon."""
     fastest = max(mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_max", "fast_rate_max"))
-    # Half a day away from where it is at noon.
-    reach = min(radius + 12.0 * fastest / 3600.0, 180.0)
+    # Away from where it is at noon.
+    reach = min(radius + hours * fastest / 3600.0, 180.0)
     # A database without a faintest magnitude is of a sky without them.
     some = f"{_KEY}.faintest" in mission and mission.value(f"{_KEY}.density") > 0.0
     cells = sky.cells_in_cone(ra, dec, reach, FILE_ORDER).tolist() if some else []
@@ -132,40 +140,56 @@ def sources(
     shapes: Shapes,
     own: Callable[[int], Population] | None = None,
 ) -> Sources:
-    """Bodies within `reach` deg of a detector's centre in the middle of an exposure, ascending id.
+    """Bodies whose trail comes within `reach` deg of a detector's centre, ascending id.
 
+    Of a trail longer than twice `reach` it is as long a part about where it is nearest, with its share of the light.
     exposure : a row of the table `exposures`;  shapes : of the sources that they are drawn with
     own      : a day's (MJD) bodies in place of the embedded population
     """
     start, seconds = float(exposure["mjd"]), float(exposure["exposure_time_s"])
     centre = focal_plane.centre(detector, system)
-    day = int(np.floor(start))
-    found = own(day) if own else population(*centre, reach, day, mission, seed)
     # An exposure belongs to the day that it begins on.
+    day = int(np.floor(start))
+    since = 24.0 * (start - day - 0.5)
+    until = max(12.0, since + seconds / _HOUR_S)
+    found = own(day) if own else population(*centre, reach, day, mission, seed, until)
+    near, first, last = _passing(found.after(since), found.after(since + seconds / _HOUR_S), centre, reach)
+    order = np.argsort(found.ids[near])
+    near, first, last = near[order], first[order], last[order]
+    some = found.take(near)
     begin, middle, end = (
-        found.after(24.0 * (start - day - 0.5) + after / _HOUR_S) for after in (0.0, 0.5 * seconds, seconds)
+        focal_plane.pixel_of_sky(system, *some.after(since + part * seconds / _HOUR_S))
+        for part in (first, 0.5 * (first + last), last)
     )
-    near = np.flatnonzero(sky.separation(*middle, *centre) <= reach)
-    near = near[np.argsort(found.ids[near])]
-    column, row = _pixels(system, middle, near)
-    first, last = (np.stack(_pixels(system, place, near), axis=1) for place in (begin, end))
     rate = 10.0 ** (0.4 * (float(exposure["zero_point"]) - units.AB_UJY)) * seconds
     photons = chromatic.of_spectrum(band, solar(band.wavelength / 10.0, mission))
     return Sources(
-        found.ids[near],
-        column,
-        row,
-        focal_plane.jacobian(system, column, row),
-        rate * flux(found.mag[near], band, mission),
+        some.ids,
+        *middle,
+        focal_plane.jacobian(system, *middle),
+        rate * flux(some.mag, band, mission) * (last - first),
         np.full(len(near), -1),
         shapes,
         np.tile(photons, (len(near), 1)),
-        trail=last - first,
+        trail=np.stack(end, axis=1) - np.stack(begin, axis=1),
     )
 
 
-def _pixels(system: WCS, place: tuple[Float, Float], some: Int) -> tuple[Float, Float]:
-    return focal_plane.pixel_of_sky(system, place[0][some], place[1][some])
+def _passing(
+    begin: tuple[Float, Float], end: tuple[Float, Float], centre: tuple[float, float], reach: float
+) -> tuple[Int, Float, Float]:
+    """(bodies that come within `reach` deg of a centre on their way, parts of it from which to which they are kept)."""
+    there, start, stop = (focal_plane.basis(*place)[2] for place in (np.reshape(centre, (2, 1)), begin, end))
+    way = stop - start
+    length = np.linalg.norm(way, axis=0)
+    nearest = np.sum((there - start) * way, axis=0) / np.maximum(length, 1e-30) ** 2
+    place = start + np.clip(nearest, 0.0, 1.0) * way
+    away = np.linalg.norm(place / np.linalg.norm(place, axis=0) - there, axis=0)
+    radius = 2.0 * np.sin(0.5 * np.radians(min(reach, 180.0)))
+    near = np.flatnonzero(away <= radius)
+    length, nearest, away = length[near], nearest[near], away[near]
+    half = np.where(length > 2.0 * radius, radius / np.maximum(length, 1e-30), np.inf)
+    return near, np.maximum(nearest - half, 0.0), np.minimum(nearest + half, 1.0)
 
 
 def flux(mag: Float, band: Passband, mission: MissionConfiguration) -> Float:

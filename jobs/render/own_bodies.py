@@ -13,7 +13,7 @@ A table : Parquet, CSV or FITS with the columns of KEYS, one row a body and day:
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -53,8 +53,7 @@ class Bodies:
 
     def of_day(self, day: int) -> Population:
         """Those of one day."""
-        here = self.day == day
-        return Population(*(getattr(self.rows, field.name)[here] for field in fields(Population)))
+        return self.rows.take(self.day == day)
 
 
 @lru_cache(maxsize=2)

@@ -12,7 +12,7 @@ from astropy.table import Table
 from jobs import request as requests
 from jobs.fluxes import passbands
 from jobs.render import focal_plane, moving, own_bodies, render_exposures
-from lake_schema import foreign_rows
+from lake_schema import foreign_rows, sky
 from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_of
@@ -330,3 +330,57 @@ def test_a_request_names_it(tmp_path, monkeypatch):
     path.write_text(demo + '\n[solar_system]\nbody = "bodies.csv"\n', encoding="utf-8")
     with pytest.raises(BadInput, match=r"solar_system.body"):
         requests.parse(path)
+
+
+@pytest.mark.parametrize(("rate", "turn"), [(300.0, 0.0), (3000.0, 1.1), (1e5, 0.4)])
+def test_a_fast_body_is_seen_however_far_its_trail_goes(tmp_path, rate, turn):
+    """What it leaves as it passes the detector goes with the time that it takes across."""
+    detector = small("vis", "3-4", 256)
+    system = focal_plane.wcs(detector, *nominal.pointing(detector))
+    lon, lat = (float(x) for x in ecliptic(*focal_plane.centre(detector, system)))
+    # In the middle when a tenth of the exposure is over: the middle of its trail lies elsewhere.
+    when = 60906.0 + 0.1 * nominal.TIME / 86400.0
+    values = {"mjd": [when], "lon": [lon], "lat": [lat], "east": [rate * np.cos(turn)], "north": [rate * np.sin(turn)]}
+    file = written(tmp_path / "fast.parquet", {**values, "mag": [12.0]})
+    quiet = nominal.off(*nominal.COSMIC_RAYS)
+    one = nominal.rendered(detector, [], [], [], forced=quiet, asteroids=own_bodies.read(file, f"{rate}").of_day)
+    assert len(one.sources) == 1
+    # What is far from the detector is cut off.
+    (length,), (trail,) = one.sources.length, one.sources.trail
+    whole = rate * nominal.TIME / 360.0
+    reach = 10.0 * (detector.half_diagonal + 204.8)
+    assert length == pytest.approx(min(0.1 * whole, reach) + min(0.9 * whole, reach), rel=1e-2)
+    # Electrons of a pixel of the trail, times what of it lies on a square: it begins there, or crosses it.
+    bright = nominal.TIME * 10 ** (0.4 * (one.zero_point - 12.0)) / whole
+    assert one.sources.electrons[0] / length == pytest.approx(bright, rel=0.03)
+    half = 28.0 * length / np.abs(trail).max()
+    crossed = half + min(half, 0.1 * whole)
+    square = one.noise_free[100:156, 100:156].astype(float)
+    assert square.sum() == pytest.approx(bright * crossed, rel=0.1)
+    along = np.abs(trail).argmax()
+    assert (square[28] if along else square[:, 28]).argmax() == pytest.approx(28, abs=2)
+
+
+def test_a_body_comes_near_on_its_way():
+    """Of trails past a place those are found that come within the circle, wherever their middles are."""
+    rng, n, reach = np.random.default_rng(1), 4000, 0.3
+    lon, lat, angle = 70.0 + rng.uniform(-2, 2, n), rng.uniform(-2, 2, n), rng.uniform(0, 2 * np.pi, n)
+    rate = 10.0 ** rng.uniform(2, 5, n)
+    bodies = moving.Population(np.arange(n), lon, lat, rate * np.cos(angle), rate * np.sin(angle), np.full(n, 20.0))
+    detector = small("vis", "3-4")
+    row = dict(zip(("ra", "dec", "position_angle"), focal_plane.boresight_for(detector, *PLACE, 0.0), strict=True))
+    system = focal_plane.wcs(detector, *row.values())
+    row |= {"mjd": DAY + 0.5, "exposure_time_s": 600.0, "zero_point": 25.9}
+    found = moving.sources(
+        row, detector, system, passbands.load("euclid_vis"), MISSION, 1, reach, None, lambda day: bodies
+    )
+    hours = np.linspace(0.0, 1 / 6, 501)
+    away = np.min([sky.separation(*bodies.after(hour), *PLACE) for hour in hours], axis=0)
+    sure = np.abs(away - reach) > 1e-3
+    np.testing.assert_array_equal(np.isin(bodies.ids, found.ids)[sure], (away < reach)[sure])
+    assert 100 < len(found) < 1000
+    # No more of a trail is kept than the circle is wide, as bright as the whole.
+    kept = found.length * detector.pixel_scale / 3600.0
+    assert kept.max() <= 2.01 * reach
+    light = found.electrons / found.length * rate[found.ids]
+    np.testing.assert_allclose(light, np.median(light), rtol=0.05)
