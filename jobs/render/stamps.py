@@ -301,7 +301,7 @@ def draw(
     pieces, trail, whole = _in_pieces(sources)
     of_piece = np.zeros(len(pieces))
     some_floors = None if floors is None else floors[whole]
-    frame = _draw(pieces, trail, sizes[whole], psf, nx, ny, progress, some_floors, of_piece, unread)
+    frame = _draw(pieces, trail, whole, sizes[whole], psf, nx, ny, progress, some_floors, of_piece, unread)
     if drawn is not None:
         drawn[:] = np.bincount(whole, of_piece, len(sources))
     return frame
@@ -340,6 +340,7 @@ def _in_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
 def _draw(
     sources: Sources,
     trail: Float,
+    whole: Int,
     sizes: Int,
     psf: Psf,
     nx: int,
@@ -365,11 +366,13 @@ def _draw(
     reach = transfer.STEP * len(passing)
     far = shining(sources.electrons, sizes, sources.shape, sources.picture, psf)
 
-    def star(i: int) -> dict[str, Any]:
-        photons = None if sources.photons is None else sources.photons[i]
+    def star(parts: Int) -> dict[str, Any]:
+        # A point at rest, or pieces of one trail.
+        electrons, first = float(sources.electrons[parts].sum()), parts[0]
         return {
-            "column": sources.column[i], "row": sources.row[i], "electrons": sources.electrons[i], "photons": photons,
-            "size": SIDE, "least": left_out[i] * sources.electrons[i], "edges": psf.edges, "trail": trail[i],
+            "column": float(sources.column[parts].mean()), "row": float(sources.row[parts].mean()),
+            "electrons": electrons, "photons": None if sources.photons is None else sources.photons[first],
+            "size": SIDE, "least": left_out[first] * electrons, "edges": psf.edges, "trail": trail[parts].sum(axis=0),
         }  # fmt: skip
 
     here = selection.touching(sources.column, sources.row, sizes, nx, ny)
@@ -389,14 +392,15 @@ def _draw(
                 share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
-            unfold = partial(edges.unfold, **star(int(chosen[0]))) if far[chosen[0]] else None
+            unfold = partial(edges.unfold, **star(chosen)) if far[chosen[0]] else None
             added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, curve, taken, unfold, unread)
             drawn[chosen] = added / kernel.FIXED_POINT
             done += len(chosen)
             if progress is not None:
                 progress(done)
-    for i in np.flatnonzero(far).tolist():
-        edges.add(frame, **star(i))
+    bright = np.flatnonzero(far)
+    for trailing in np.split(bright, np.flatnonzero(np.diff(whole[bright])) + 1) if len(bright) else []:
+        edges.add(frame, **star(trailing))
     layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
     layer += wings.galaxies(sources.column, sources.row, stray, taken, farthest, sizes, nx, ny)
     return np.asarray(kernel.electrons_of(frame, layer, wings.BLOCK, wings.MARGIN))
@@ -472,15 +476,20 @@ def work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
 
 
 def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
-    """CPU s that `draw` takes, predicted from the sources and their stamps (trails left out).
+    """CPU s that `draw` takes, predicted from the sources and their stamps.
 
     Error : between half and twice of what the machine takes that it was measured on
     """
-    here, body = selection.touching(sources.column, sources.row, sizes, nx, ny), sources.shape >= 0
-    pixels, transformed = work(sources.take(here), sizes[here], psf)
-    far, _ = _beyond_stamps(sources.shapes.take(sources.shape[body]), sizes[body], psf.pixel_scale)
-    blocks = float(((2 * far / wings.BLOCK) ** 2).sum())
-    return _STAMP_S * pixels + _PLANE_S * transformed + _BLOCK_S * blocks + _FRAME_S * nx * ny + _START_S
+    pieces, trail, whole = _in_pieces(sources)
+    sizes = sizes[whole]
+    here, body = selection.touching(pieces.column, pieces.row, sizes, nx, ny), pieces.shape >= 0
+    pixels, transformed = work(pieces.take(here), sizes[here], psf)
+    reach, _ = _beyond_stamps(pieces.shapes.take(pieces.shape[body]), sizes[body], psf.pixel_scale)
+    blocks = float(((2 * reach / wings.BLOCK) ** 2).sum())
+    far = shining(pieces.electrons, sizes, pieces.shape, pieces.picture, psf)
+    shone = edges.seconds(sources.length[np.unique(whole[far])], nx, ny)
+    shone += edges.unfold_seconds(np.hypot(*trail[here & far].T), sizes[here & far])
+    return _STAMP_S * pixels + _PLANE_S * transformed + _BLOCK_S * blocks + shone + _FRAME_S * nx * ny + _START_S
 
 
 def memory(electrons: Float, sizes: Int, nx: int, ny: int, picture: Int | None = None) -> float:

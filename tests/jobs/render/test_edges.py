@@ -180,6 +180,82 @@ def test_a_trail_s_spikes_are_no_comb(vis):
     assert wrong.max() < 0.1
 
 
+@pytest.mark.parametrize(
+    ("x", "y", "trail"),
+    [
+        (150.3, -290.2, (60.0, 10.0)),
+        (150.3, 150.2, (40.0, 25.0)),
+        (-500.0, 40.0, (600.0, 3.0)),
+        (60.0, 700.0, (0.0, 400.0)),
+    ],
+)
+def test_a_line_of_light_is_many_points(vis, x, y, trail):
+    """In the squares' borders, outside them and on the trail's own line: as points closer than any fringe draw it."""
+    side, points = 200, int(np.hypot(*trail))
+    line, many = np.zeros((side, side), np.int64), np.zeros((side, side), np.int64)
+    edges.add(line, x, y, BRIGHT, None, SIDE, 0.0, vis.edges, np.array(trail))
+    for a in (np.arange(points) + 0.5) / points - 0.5:
+        edges.add(many, x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
+    level = BRIGHT * edges.ring(vis.edges, EQUAL) / 400.0**3 * kernel.FIXED_POINT
+    wrong = np.abs(line - many) / np.maximum(many, level)
+    assert np.quantile(wrong, 0.99) < 0.02
+    assert wrong.max() < 0.06
+    assert line.sum() == pytest.approx(many.sum(), rel=2e-3)
+
+
+def test_the_ring_of_a_line_is_the_integral_of_its_law():
+    """Beside it, near it, on its own line on either side, and of next to no length."""
+    for dx, dy, low, high in (
+        (300.0, 40.0, -50.0, 700.0), (900.0, 0.0, -300.0, 300.0), (-900.0, 1e-9, -300.0, 300.0),
+        (20.0, 500.0, -3000.0, 1e5), (5000.0, 5000.0, 0.0, 1e-3), (900.0, 1e-3, -1e5, 500.0),
+    ):  # fmt: skip
+        turn = 0.7
+        ux, uy = np.cos(turn), np.sin(turn)
+        s = np.unique(np.concatenate([np.linspace(low, high, 200001), dx + 1e3 * np.linspace(-1, 1, 200001)]))
+        s = s[(s >= low) & (s <= high)]
+        law = ((s - dx) ** 2 + dy**2) ** -1.5
+        found = edges._ring_of(dx * ux - dy * uy, dx * uy + dy * ux, ux, uy, low, high)
+        assert found == pytest.approx(np.trapezoid(law, s), rel=1e-5)
+
+
+def test_a_trail_is_unfolded_as_its_points_are(vis):
+    """A piece's share of light that belongs elsewhere, from its lines and from points closer than any fringe."""
+    size, corner, trail, points = 640, 160, np.array([50.0, 30.0]), 60
+    along, inner = (np.arange(points) + 0.5) / points - 0.5, SIDE / 2 - 2.0
+    # The corner that has most of it.
+    x, y = 260.2 + along * trail[0], 259.7 + along * trail[1]
+    level = BRIGHT / points * edges.ring(vis.edges, EQUAL)
+    pixels = np.arange(corner)
+    light = np.zeros((corner, corner))
+    for px, py in zip(x, y, strict=True):
+        faded = [[edges._left(float(abs(p - at)), inner) for p in pixels] for at in (px, py)]
+        light += np.outer(faded[1], faded[0]) * level / np.hypot(pixels - px, pixels[:, None] - py) ** 3
+    fast, slow = np.ones((size, size)), light.copy()
+    fast[60 : 60 + corner, 60 : 60 + corner] = light
+    edges.unfold(fast, 0, 0, size, size, 320.2, 319.7, BRIGHT, None, SIDE, 0.0, vis.edges, trail)
+    turned = np.stack([np.cos(vis.edges.bars[:, 0]), np.sin(vis.edges.bars[:, 0])], axis=1)
+    lines = BRIGHT / points * edges.spikes(vis.edges, EQUAL, vis.edges.period)
+    edges._unfold(slow, x, y, 0.0, 0.0, 0.0, inner, level, turned, lines, lines, vis.edges.period)
+    whole = points * level / np.hypot(pixels - 260.2, pixels[:, None] - 259.7) ** 3
+    assert ((light - slow) / whole).max() > 0.05
+    wrong = np.abs(fast[60 : 60 + corner, 60 : 60 + corner] - slow) / whole
+    assert wrong.max() < 0.04
+    assert wrong.mean() < 3e-3
+
+
+def test_the_time_a_bright_trail_takes_is_foreseen(vis):
+    """It goes with the frame, the trail, and its pieces' stamps; exposures that would take hours are refused by it."""
+    field = replace(small("vis", "3-4"), nx=4096, ny=4096)
+    source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), 1e10, 2048.0, 2048.0)
+    sizes = np.array([640])
+    # CPU s that were measured on a full detector.
+    for length, took in ((94.0, 2.5), (470.0, 5.8), (1880.0, 18.0)):
+        moving = replace(source, trail=length * np.array([[1.0, 0.3]]))
+        assert took / 2 < stamps.seconds(moving, sizes, vis, 4096, 4096) < 2 * took
+    faint = replace(moving, electrons=np.array([1e6]))
+    assert stamps.seconds(faint, sizes, vis, 4096, 4096) < 0.5 * took
+
+
 def test_colours_differ(vis):
     """The ring goes with the wavelength: a red star's is brighter."""
     red, blue = np.zeros(len(PARTS)), np.zeros(len(PARTS))
