@@ -144,8 +144,30 @@ def test_what_is_left_out_is_within_the_accuracy(preset):
     )
     growth = (widths(mean) ** 2).sum() / (widths(bright) ** 2).sum() - 1
     assert 0 < growth * dim / 2e5 <= wanted.shape
-    crossed = 0.25 * brighter_fatter.kernel(shift, softening).sum() * dim * 2 * dim
-    assert 4 * crossed <= 1.0001 * wanted.background * scene.pixel_noise
+    # Pixels of as much that lose over four borders, to empty neighbours: so little that it is not noticed.
+    frame = np.zeros((400, 400))
+    frame[2::5, 2::5] = np.floor(dim)
+    left_alone, followed = (
+        brighter_fatter.apply(frame, shift, softening, full, least, 0, np.random.default_rng(6)) for least in (dim, 0.0)
+    )
+    np.testing.assert_array_equal(left_alone, frame)
+    noticed = wanted.background * scene.pixel_noise
+    lost = (frame - followed)[2::5, 2::5].mean()
+    assert 0 < lost <= noticed
+    # Nor is more followed than need be: by the accuracy that a background asks for, or a star's size.
+    assert lost > 0.1 * noticed or growth * dim / 2e5 > 0.3 * wanted.shape
+
+
+def test_a_pixel_never_gives_more_than_it_can_spare():
+    """At the largest shift borders would move past whole pixels: each gives a fifth over each of four."""
+    frame = np.zeros((9, 9))
+    frame[4, 4] = 1e5
+    out = brighter_fatter.apply(frame, 1e-4, SOFT, FULL, 0.0, 0, np.random.default_rng(1))
+    assert out.min() >= 0
+    assert out.sum() == frame.sum()
+    # One border after the other, each of what is left.
+    assert out[4, 4] == pytest.approx(1e5 * (1 - brighter_fatter.MOST) ** 4, abs=4)
+    assert out[4, 3] == brighter_fatter.MOST * 1e5
 
 
 @pytest.mark.parametrize(
