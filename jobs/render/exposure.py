@@ -156,8 +156,7 @@ def render(
         detector = focal_plane.detector(camera, str(task["detector"]), mission)
     system = focal_plane.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
     zero_point, scene = float(exposure["zero_point"]), scene_of(exposure, detector, mission, accuracy)
-    scene = replace(scene, band=passband)
-    forced = forced or {}
+    scene = replace(scene, band=passband, forced=forced or {})
     decisions: tuple[Decision, ...] = ()
     spread: Psf | None = None
     maps: dict[str, npt.NDArray[Any]] = {}
@@ -181,7 +180,7 @@ def render(
             brightest = sources.electrons[_touching(sources, sizes, detector)].max(initial=0.0)
             peak = float(spread.surface[0]) * float(brightest)
             scene = replace(scene, lights=lights, peak_electrons=peak)
-            decisions = decide((vis.DRAWN,), scene, forced)
+            decisions = decide((vis.DRAWN,), scene)
             if decisions[0].applied and spread.intra_pixel is not None:
                 (strength,) = vis.DRAWN.parameters(scene)
                 spread = replace(spread, intra_pixel=strength)
@@ -205,9 +204,9 @@ def render(
     else:
         noise_free = np.zeros((detector.ny, detector.nx))
     # A lamp's light and injected charge are moved and squeezed like a star's.
-    asked = replace(scene, forced=forced)
-    own = sum(effect.contribution(asked) for effect in effects if effect in _LAMPS and forced.get(effect.name, True))
-    rays = [effect for effect in effects if effect in _RAYS and forced.get(effect.name, effect.needed_if(scene))]
+    lamps = [effect for effect in effects if effect in _LAMPS and scene.forced.get(effect.name, True)]
+    own = sum(lamp.contribution(scene) for lamp in lamps)
+    rays = [effect for effect in effects if effect in _RAYS and effect.applied(scene)]
     scene = replace(
         scene,
         peak_electrons=scene.peak_electrons + own,
@@ -222,7 +221,7 @@ def render(
     def stream(effect: Effect) -> np.random.Generator:
         return rng.stream(*numbers_of(effect, exposure, detector.name, seed))
 
-    frame, more = apply_all(light.pop(), effects, scene, stream, forced, truth_maps.watch(maps, scene, truth))
+    frame, more = apply_all(light.pop(), effects, scene, stream, truth_maps.watch(maps, scene, truth))
     raw = frame.astype(np.uint16)
     truth_maps.complete(maps, raw, effects, scene, truth)
     return Rendered(

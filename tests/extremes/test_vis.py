@@ -34,7 +34,7 @@ def through(frame, one, kind="science", forced=None, watch=None):
     """Every effect of a kind of image, wanted or not."""
     effects = vis.EFFECTS[kind]
     forced = {effect.name: True for effect in effects} | (forced or {})
-    return apply_all(frame, effects, one, lambda effect: stream(1, effect.name), forced, watch)[0]
+    return apply_all(frame, effects, replace(one, forced=forced), lambda effect: stream(1, effect.name), watch)[0]
 
 
 @pytest.mark.parametrize("age", [0.0, 1.0])

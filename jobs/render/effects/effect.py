@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -204,18 +204,13 @@ class Decision:
     margin: float
 
 
-def decide(effects: Sequence[Effect], scene: Scene, forced: Mapping[str, bool]) -> tuple[Decision, ...]:
-    """What a scene needs, and what a request forces on or off (name -> bool; those of other channels do nothing)."""
+def decide(effects: Sequence[Effect], scene: Scene) -> tuple[Decision, ...]:
+    """What a scene needs, and what is forced on or off in it (effects of other channels do nothing)."""
     for effect in effects:
-        if not effect.optional and not forced.get(effect.name, True):
+        if not effect.optional and not effect.applied(scene):
             raise BadInput(f"effect {effect.name} cannot be switched off")
     return tuple(
-        Decision(
-            effect.name,
-            forced.get(effect.name, effect.needed_if(scene)),
-            effect.name in forced,
-            effect.margin(scene),
-        )
+        Decision(effect.name, effect.applied(scene), effect.name in scene.forced, effect.margin(scene))
         for effect in effects
     )
 
@@ -225,7 +220,6 @@ def apply_all(
     effects: Sequence[Effect],
     scene: Scene,
     stream: Callable[[Effect], np.random.Generator],
-    forced: Mapping[str, bool] | None = None,
     watch: Callable[[str, Frame, Frame], None] | None = None,
 ) -> tuple[Frame, tuple[Decision, ...]]:
     """Apply a channel's effects in their order.
@@ -233,8 +227,7 @@ def apply_all(
     stream : effect -> its own generator, so that switching one effect off leaves the draws of the others as they were
     watch  : sees the name of an effect that is applied, and the frame before and after it
     """
-    scene = replace(scene, forced=forced or {})
-    decisions = decide(effects, scene, scene.forced)
+    decisions = decide(effects, scene)
     for effect, decision in zip(effects, decisions, strict=True):
         if decision.applied:
             before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))

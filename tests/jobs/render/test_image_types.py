@@ -174,7 +174,9 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
         def stream(effect):
             return rng.stream(*exposure.numbers_of(effect, row, "3-4", 1))
 
-        apply_all(np.full((32, 32), 50.0), [watched(e) for e in vis.EFFECTS[kind]], scene, stream, forced)
+        apply_all(
+            np.full((32, 32), 50.0), [watched(e) for e in vis.EFFECTS[kind]], replace(scene, forced=forced), stream
+        )
         return found
 
     everything = {e.name: True for e in vis.EFFECTS[kind]}

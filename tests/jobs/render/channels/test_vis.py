@@ -74,7 +74,7 @@ def flats(level, side, forced, seconds=10.0):
         def own(effect):
             return stream(1, "vis" if effect.fixed else number, effect.name)
 
-        frame, _ = apply_all(np.zeros((side, side)), effects, one, own, forced)
+        frame, _ = apply_all(np.zeros((side, side)), effects, replace(one, forced=forced), own)
         return frame[:, : side // 2, 51 : 51 + side // 2] * mission.value("vis.gain")
 
     bias = np.mean([read(vis.EFFECTS["bias"], dark, number) for number in (10, 11)], axis=(0, 2), keepdims=True)[0]

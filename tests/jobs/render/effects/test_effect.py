@@ -17,7 +17,8 @@ NAMES = ["background", "poisson", "dark_current", "full_well", "read_noise", "ad
 
 
 def run(effects, frame, scene=SCENE, forced=None, seed=1):
-    return apply_all(frame, effects, scene, lambda effect: stream(seed, 7, "3-4", effect.name), forced)
+    scene = replace(scene, forced=forced or {})
+    return apply_all(frame, effects, scene, lambda effect: stream(seed, 7, "3-4", effect.name))
 
 
 def test_the_order_of_physics():
@@ -75,7 +76,7 @@ def test_numbers_are_the_effects_own(seed):
 
 
 def test_what_a_request_forces_is_recorded():
-    decisions = {d.name: d for d in decide(ext.SKY, SCENE, {"poisson": False, "dark_current": True})}
+    decisions = {d.name: d for d in decide(ext.SKY, replace(SCENE, forced={"poisson": False, "dark_current": True}))}
     assert not decisions["poisson"].applied
     assert decisions["poisson"].forced
     assert decisions["dark_current"].applied
@@ -85,9 +86,9 @@ def test_what_a_request_forces_is_recorded():
 
 def test_strange_or_impossible_wishes_are_refused():
     # Of another channel.
-    assert len(decide(ext.SKY, SCENE, {"ghosts": True})) == len(ext.SKY)
+    assert len(decide(ext.SKY, replace(SCENE, forced={"ghosts": True}))) == len(ext.SKY)
     with pytest.raises(BadInput, match="adc"):
-        decide(ext.SKY, SCENE, {"adc": False})
+        decide(ext.SKY, replace(SCENE, forced={"adc": False}))
 
 
 def test_without_noise_all_is_noticed():
@@ -95,7 +96,7 @@ def test_without_noise_all_is_noticed():
     silent = resolve(overrides={"vis.read_noise": (0.0, "electron")})
     bias = Scene(silent, "vis", 0.0, 0.0, 0.0)
     assert bias.pixel_noise == 0.0
-    margins = {decision.name: decision.margin for decision in decide(vis.EFFECTS["bias"], bias, {})}
+    margins = {decision.name: decision.margin for decision in decide(vis.EFFECTS["bias"], bias)}
     assert margins["bias_structure"] == np.inf
     assert margins["read_noise"] == 0.0
 

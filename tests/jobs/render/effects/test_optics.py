@@ -398,7 +398,7 @@ def test_light_of_a_trail_is_seen_by_the_pixels_that_it_falls_on():
         return rng.stream(*exposure.numbers_of(effect, row, "3-4", 1))
 
     both = (readout_trail.EFFECT, pixel_response.EFFECT)
-    found, _ = apply_all(frame, both, one, stream, {"readout_trail": True, "pixel_response": True})
+    found, _ = apply_all(frame, both, replace(one, forced={"readout_trail": True, "pixel_response": True}), stream)
     seen = pixel_response.response((ny, nx), *pixel_response.parameters(one), stream(pixel_response.EFFECT))
     assert (seen < 0.5).sum() > 20
     share = one.value("readout_time", "s") / 2086 / 10.0
@@ -408,5 +408,5 @@ def test_light_of_a_trail_is_seen_by_the_pixels_that_it_falls_on():
         expected[r] += sum((share * frame[p] * seen[p] for p in passed), np.zeros(nx)) * (seen[r] > 0)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
     # Without a response all are alike, whatever the numbers.
-    alike, _ = apply_all(frame, both, one, stream, {"readout_trail": True, "pixel_response": False})
+    alike, _ = apply_all(frame, both, replace(one, forced={"readout_trail": True, "pixel_response": False}), stream)
     np.testing.assert_array_equal(alike, readout_trail.apply(frame, share, 2))

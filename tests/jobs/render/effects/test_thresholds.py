@@ -147,7 +147,7 @@ def test_all_that_a_scene_does_without_is_not_noticed_together(mag):
 
     def read(forced):
         light = one.noise_free.astype(float)
-        return apply_all(light, effects, one.scene, lambda e: rng.stream(1, e.name), forced)
+        return apply_all(light, effects, replace(one.scene, forced=forced), lambda e: rng.stream(1, e.name))
 
     found, decisions = read({})
     left_out = {decision.name: True for decision in decisions if not decision.applied}
@@ -173,7 +173,9 @@ def test_nothing_is_missing_where_cosmic_rays_alone_are_bright(kind, seconds, sk
     effects = [effect for effect in vis.EFFECTS[kind] if effect.name != "adc"]
 
     def read(forced):
-        return apply_all(np.zeros((256, 256)), effects, one.scene, lambda e: rng.stream(1, kind, e.name), forced)
+        return apply_all(
+            np.zeros((256, 256)), effects, replace(one.scene, forced=forced), lambda e: rng.stream(1, kind, e.name)
+        )
 
     found, decisions = read({})
     assert any(decision.applied for decision in decisions if "cosmic_rays" in decision.name)
