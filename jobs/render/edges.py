@@ -175,17 +175,14 @@ def add(
 
     photons : [w] share of each sub-band, None = equal;  size : of the plane, pixels
     least   : electrons in a pixel that may be left out
-    trail   : [2] pixels that it moves by, with its plane; None: it is at rest
+    trail   : [2] pixels that it moves by, with its plane, (column, row) in its middle; None: it is at rest
     """
     if edges is None:
         return
     photons, turned, length, along = _seen(photons, edges, trail)
     ny, nx = frame.shape
-    ends = (
-        np.array([place - 0.5 * length * step, place + 0.5 * length * step])
-        for place, step in ((column, along[0]), (row, along[1]))
-    )
-    columns, rows = ends
+    ends = np.array([-0.5, 0.5]) * length
+    columns, rows = column + ends * along[0], row + ends * along[1]
     # Beyond the farthest corner's pixel.
     farthest = float(np.hypot(max(columns.max() + 1.0, nx - columns.min()), max(rows.max() + 1.0, ny - rows.min())))
     if length > 0.0:
