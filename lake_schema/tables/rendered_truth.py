@@ -35,10 +35,7 @@ RENDERED_TRUTH = Table(
             "stamp", "int32", "pix", "phys.angSize;instr.det", "side of the stamp; fainter wings are drawn beyond it", 1
         ),
         Column("method", "int8", "", "meta.code", "how it was drawn", codes=METHODS),
-        _trail(
-            "x",
-            "it moves by, with (x, y) in the middle; of very long trails each row is of the part near",
-        ),
+        _trail("x", "it moves by, with (x, y) in the middle; of very long trails each row is of the part near"),
         _trail("y", "the same along the rows' axis"),
     ),
     "Sources of the rendered images: true places and electrons.",
