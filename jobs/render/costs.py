@@ -16,8 +16,8 @@ from jobs.accuracy import SURVEY, Accuracy
 from jobs.render import stamps, truth_maps
 from jobs.render.effects.effect import Effect
 
-# A FITS header and its padding, one an image; s a byte of a truth map, to write and to hash it.
-_HEADER_BYTES, _MAP_S = 8640, 5.2e-9
+# A FITS header and its padding, one an image; s a byte of a truth map, to make, write and hash it.
+_HEADER_BYTES, _MAP_S = 8640, 9e-9
 
 
 @dataclass(frozen=True, slots=True)

@@ -203,16 +203,7 @@ def render(
         sources, sizes, drawn = sources.take(listed), sizes[listed], drawn[listed]
     else:
         noise_free = np.zeros((detector.ny, detector.nx))
-    # A lamp's light and injected charge are moved and squeezed like a star's.
-    lamps = [effect for effect in effects if effect in _LAMPS and scene.forced.get(effect.name, True)]
-    own = sum(lamp.contribution(scene) for lamp in lamps)
-    rays = [effect for effect in effects if effect in _RAYS and effect.applied(scene)]
-    scene = replace(
-        scene,
-        peak_electrons=scene.peak_electrons + own,
-        track_electrons=cosmic_rays.brightest(scene) if rays else 0.0,
-    )
-
+    scene = with_own_light(scene, effects)
     maps["noise_free"] = noise_free.astype(np.float32)
     # Handed over: a frame that nobody looks at any more is freed.
     light = [noise_free]
@@ -228,6 +219,17 @@ def render(
         exposure, detector, system, spread, raw, maps, sources, sizes, drawn, zero_point, scene, (*decisions, *more),
         accuracy, seed, complete,
     )  # fmt: skip
+
+
+def with_own_light(scene: Scene, effects: Sequence[Effect]) -> Scene:
+    """A lamp's light and injected charge are moved and squeezed like a star's, and so are tracks of cosmic rays."""
+    lamps = [effect for effect in effects if effect in _LAMPS and scene.forced.get(effect.name, True)]
+    rays = [effect for effect in effects if effect in _RAYS and effect.applied(scene)]
+    return replace(
+        scene,
+        peak_electrons=scene.peak_electrons + sum(lamp.contribution(scene) for lamp in lamps),
+        track_electrons=cosmic_rays.brightest(scene) if rays else 0.0,
+    )
 
 
 def numbers_of(effect: Effect, exposure: Row, detector: str, seed: int) -> tuple[int | str, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -189,6 +189,7 @@ def _price(row: Row, own: survey.Variant, truth: Sequence[str]) -> Price:
     looks, effects = sees_sky(channel, kind), exposure.EFFECTS.get(channel, {}).get(kind)
     if effects is not None:
         first = focal_plane.detectors(str(row["camera"]), own.mission)[0]
-        scene = exposure.scene_of(row, first, own.mission, own.accuracy)
+        scene = replace(exposure.scene_of(row, first, own.mission, own.accuracy), forced=own.forced)
+        scene = exposure.with_own_light(scene, effects)
         effects = tuple(e for e in effects if own.forced.get(e.name, looks or e.needed_if(scene)))
     return price(channel, looks, effects, own.accuracy, truth)

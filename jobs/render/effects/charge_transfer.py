@@ -6,6 +6,8 @@ SERIAL      along the register, pixel by pixel, into the amplifier
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from jobs.accuracy import Accuracy
@@ -88,6 +90,11 @@ def _over_accuracy(accuracy: Accuracy, passed: float) -> float:
     return passed / _END_OF_LIFE * max(_FLUX / accuracy.flux, _SHIFT / accuracy.position, _SHAPE / accuracy.shape)
 
 
+def _before_readout(scene: Scene) -> Scene:
+    """What lies in the pixels when they are moved: in no time no track has hit them."""
+    return scene if scene.exposure_time_s > 0.0 else replace(scene, track_electrons=0.0)
+
+
 def _parameters(scene: Scene, direction: str, transfers: int) -> tuple[Traps, Sweeps, int]:
     silicon = lattice(scene, direction)
     return silicon, sweeps_for(scene.accuracy, transfers * sum(silicon.density)), transfers
@@ -97,7 +104,7 @@ PARALLEL = Effect(
     "parallel_cti",
     apply_parallel,
     lambda scene: _parameters(scene, "parallel", scene.half_rows),
-    lambda scene: _loss(scene, "parallel", scene.half_rows),
+    lambda scene: _loss(_before_readout(scene), "parallel", scene.half_rows),
     cost=0.11,
 )
 SERIAL = Effect(
