@@ -17,7 +17,7 @@ from jobs.render import stamps, truth_maps
 from jobs.render.effects.effect import Effect
 
 # A FITS header and its padding, one an image; s a byte of a truth map, to make, write and hash it.
-_HEADER_BYTES, _MAP_S = 8640, 9e-9
+_HEADER_BYTES, _MAP_S = 8640, 7.5e-9
 
 
 @dataclass(frozen=True, slots=True)
