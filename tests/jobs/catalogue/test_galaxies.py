@@ -78,18 +78,23 @@ def mean_sky(universe, library):
     return plain + band_ratios.offset(universe.selection, z, sed), plain + i_band, z, weight
 
 
-# Of 12 % allowed; to be taken off when the luminosity function is mended.
-TOO_MANY = pytest.mark.xfail(strict=True, reason="15 % more galaxies than observed to i = 25")
-
-
 @pytest.mark.parametrize(
     ("limit", "observed"),
-    [(20, 0.57), (21, 1.45), (22, 3.7), (23, 9.0), (24, 21.0), pytest.param(25, 44.5, marks=TOO_MANY), (26, 94.0)],
+    [(20, 0.57), (21, 1.45), (22, 3.7), (23, 9.0), (24, 21.0), (26, 94.0)],
 )
 def test_i_band_counts_of_the_mean_sky(mean_sky, limit, observed):
     """Per arcmin2: GAMA (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST Science Book 2009."""
     _, i_band, _, weight = mean_sky
     assert weight[i_band < limit].sum() == pytest.approx(observed, rel=0.12)
+
+
+def test_the_excess_at_i_25_is_what_is_said_of_it(mean_sky):
+    """The mean sky has 15 % more than the 43 to 46 observed (LSST Science Book 2009 and others); others fit to 12 %.
+
+    Known, and said in the README: it may not grow, and where it is mended the line belongs to the test above.
+    """
+    _, i_band, _, weight = mean_sky
+    assert 0.12 < weight[i_band < 25.0].sum() / 44.5 - 1.0 < 0.16
 
 
 def test_vis_counts_of_the_mean_sky(mean_sky):
