@@ -65,4 +65,4 @@ def test_flux_of_a_luminosity():
     one, z = np.ones(1), np.array([1.0])
     flux = emission_lines.fluxes(lines, z, 10.0 * one, one, np.array([False]), 0.0 * one, rng)["flux_halpha"]
     distance = float(cosmology.luminosity_distance(1.0)) / 0.67 * 3.0856775814913673e24
-    assert flux == pytest.approx(10.0 / 7.9e-42 / (4 * np.pi * distance**2), rel=1e-9)
+    assert flux == pytest.approx(10.0 / 7.9e-42 / (4 * np.pi * distance**2), rel=1e-9, abs=0.0)

@@ -20,6 +20,14 @@ def test_prevot_goes_through_its_table(wavelength, ratio):
     assert k(1, wavelength) == pytest.approx(ratio + 2.72, abs=1e-12)
 
 
+def test_prevot_goes_on_into_the_ultraviolet_as_it_ends():
+    """Its last piece, straight in 1 / lambda."""
+    inner = (k(1, 1275.0) - k(1, 1330.0)) / (1.0 / 1275.0 - 1.0 / 1330.0)
+    outer = (k(1, 912.0) - k(1, 1275.0)) / (1.0 / 912.0 - 1.0 / 1275.0)
+    assert outer == pytest.approx(inner, rel=1e-9)
+    assert outer > 0.0
+
+
 def test_calzetti_where_the_paper_evaluates_it():
     # Calzetti et al. 2000: k(V) = R_V = 4.05 at 5500 A; H alpha 3.33, H beta 4.60, [O II] 5.86.
     for wavelength, wanted in ((5500.0, 4.05), (6563.0, 3.33), (4861.0, 4.60), (3727.0, 5.86)):

@@ -52,3 +52,14 @@ def test_spectra_of_others_are_measured_although_the_band_is_known(library, monk
     assert grid_errors.choose([band], SURVEY, library)[0].setting is not None
     # No table is fine enough for them.
     assert grid_errors.choose([band], SURVEY, dataclasses.replace(library, own=True)) == (grid_settings.INTEGRATED,)
+
+
+def test_errors_are_measured_on_every_template_and_law(library):
+    mix = grid_errors.drawn(2000, len(library), np.random.default_rng(3)).mix
+    assert set(mix.sed.ravel()) == set(range(len(library)))
+    assert set(mix.law.ravel()) == set(range(5))
+    assert mix.ebv.shape == mix.frac.shape == (2, 2000)
+    assert mix.frac.sum(0) == pytest.approx(1.0)
+    # Of a uniform distribution's ends, 2000 come this near.
+    for found, first, last in ((mix.frac, 0.0, 1.0), (mix.ebv, 0.0, 0.6), (mix.z_obs, -0.03, 3.03)):
+        assert (found.min() - first, last - found.max()) == pytest.approx((0.0, 0.0), abs=0.01 * (last - first))

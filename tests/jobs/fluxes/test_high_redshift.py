@@ -49,6 +49,16 @@ def test_slopes_and_lyman_alpha(k):
     assert np.sum(much - plain) / level == pytest.approx(50.0, rel=2e-3)
 
 
+def test_the_continuum_of_quasars_breaks_at_5000_angstrom():
+    """Vanden Berk et al. 2001: -1.56 and 0.45 in f_lambda. Lines are as strong again in the next spectrum."""
+    library = high_redshift.quasar_library()
+    half, whole = library.flux[[3, 4]].astype(float)
+    continuum = 2.0 * half - whole
+    for blue, red, slope in ((1400.0, 4500.0, -1.56), (5500.0, 22_000.0, 0.45)):
+        ends = continuum[np.isin(library.wavelength, (blue, red))]
+        assert np.log(ends[1] / ends[0]) / np.log(red / blue) == pytest.approx(slope, abs=2e-3)
+
+
 def test_quasars_have_their_lines():
     library = high_redshift.quasar_library()
     wavelength, flux = library.wavelength, library.flux.astype(float)

@@ -200,3 +200,22 @@ def test_a_library_keeps_the_flux_of_its_files(tmp_path):
     grid = flux_grid.open_grid([passbands.load("euclid_h")], [flux_grid.Setting(0.1, 2, 2)], library)
     assert np.isfinite(grid.tables[0]).all()
     assert SURVEY.flux < 1.0
+
+
+@pytest.mark.parametrize("last", [1500.0, 2600.0])
+def test_bins_of_a_straight_spectrum_hold_its_middles_and_those_beyond_it_go_on(last):
+    grid, at = np.arange(1000.0, 2001.0), np.arange(900.0, last + 1.0, 5.0)
+    found = ingest.resampled(grid, ingest.Curve(at, at / 1000.0))
+    inside = grid < at[-1]
+    np.testing.assert_allclose(found[inside], grid[inside] / 1000.0, rtol=1e-12)
+    wanted = at[-1] / 1000.0 * (grid[~inside] / at[-1]) ** -3.2
+    np.testing.assert_allclose(found[~inside][1:], wanted[1:], rtol=1e-5)
+
+
+def test_a_law_that_is_not_per_colour_excess_is_refused(tmp_path):
+    """The steepest, of the Small Magellanic Cloud, has k = 25 at the Lyman limit."""
+    ascii_file(tmp_path / "steep", value=25.0 * WAVELENGTH[0] / WAVELENGTH)
+    assert ingest.law(tmp_path / "steep", "extinction", np.array([900.0]))[0] == pytest.approx(25.0)
+    ascii_file(tmp_path / "wrong", value=500.0 * WAVELENGTH[0] / WAVELENGTH)
+    with pytest.raises(BadInput, match=r"wrong: row 1 is more than k = 100: is it A / E\(B-V\)"):
+        ingest.law(tmp_path / "wrong", "extinction", np.array([900.0]))

@@ -28,6 +28,11 @@ def test_galaxies_cover_all_that_is_observed(library):
     assert (library.flux[:, library.wavelength >= 182.0] > 0.0).all()
 
 
+def test_a_template_is_named_after_what_it_is_mixed_of(library):
+    named = tuple(f"{k:02d} " + "-".join(templates.anchors_of(k)) for k in range(len(library)))
+    assert library.names == named
+
+
 def test_every_spectrum_is_normalised(library, stars_library):
     for each in (library, stars_library):
         inside = (each.wavelength >= 5450.0) & (each.wavelength <= 5550.0)
