@@ -117,8 +117,13 @@ def ab_flux(band: Passband, wavelength: npt.ArrayLike, f_lambda: npt.ArrayLike) 
 
 
 def _rows() -> dict[str, dict[str, str]]:
+    found: dict[str, dict[str, str]] = {}
     with TABLE.open(newline="", encoding="utf-8") as file:
-        return {row["name"]: row for row in csv.DictReader(file)}
+        for row in csv.DictReader(file):
+            if row["name"] in found:
+                raise BadInput(f"{TABLE.name}: passband {row['name']} stands twice: choose another name")
+            found[row["name"]] = row
+    return found
 
 
 def _curve(source: str, shift: float) -> dict[str, Float]:
