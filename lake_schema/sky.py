@@ -22,6 +22,8 @@ Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 
 DEEPEST = 29
+# Of three neighbouring vertices (unit vectors) the triple product at which healpy sees no corner any more.
+_FLATTEST = 1e-10
 
 
 @cache
@@ -126,12 +128,26 @@ def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
         raise BadInput(f"a polygon wants at least 3 vertices (ra, dec), got shape {corners.shape}")
     ra, dec = checked(corners[:, 0], corners[:, 1])
     vectors = _hp().ang2vec(ra, dec, lonlat=True)
-    sides = np.einsum("ij,ij->i", np.cross(vectors, np.roll(vectors, -1, 0)), np.roll(vectors, -2, 0))
-    if not ((sides > 0).all() or (sides < 0).all()):
-        raise BadInput("a polygon must be convex, with no repeated vertex and no angle of 180 deg")
+    _refuse_not_convex(vectors)
     fine = min(order + 3, DEEPEST)
     inside = _hp().query_polygon(1 << fine, vectors, inclusive=True, fact=4, nest=True)
     return np.unique(parent(inside, fine, order))
+
+
+def _refuse_not_convex(vectors: Float) -> None:
+    sides = np.cross(vectors, np.roll(vectors, -1, 0))
+    flat = np.abs(np.einsum("ij,ij->i", sides, np.roll(vectors, -2, 0))) <= _FLATTEST
+    if flat.any():
+        corner = (int(flat.argmax()) + 1) % len(vectors) + 1
+        raise BadInput(
+            f"a polygon must be convex: vertex {corner} lies on the great circle of its neighbours, or on one of them"
+        )
+    # Every vertex lies on the same side of every side: the turns alone would let a star with crossing sides through.
+    every = sides @ vectors.T
+    ends = np.arange(len(vectors))
+    every[ends, ends] = every[ends, (ends + 1) % len(vectors)] = np.sign(every[0, 2])
+    if not ((every > 0).all() or (every < 0).all()):
+        raise BadInput("a polygon must be convex, with no repeated vertex and no angle of 180 deg")
 
 
 def cells_in_box(west: float, east: float, south: float, north: float, order: int) -> Int:
