@@ -50,15 +50,14 @@ def checked(text: str, known: Collection[str]) -> Query:
     if len(text) > _MOST_CHARACTERS or "\0" in text:
         raise BadInput(f"SQL: a query has at most {_MOST_CHARACTERS} characters and no NUL")
     tree = _parsed(text)
-    named = {
-        str(entry["key"]).lower() for node in _nodes(tree) if "cte_map" in node for entry in node["cte_map"]["map"]
-    }
-    used = set()
-    for node in _nodes(tree):
+    used: set[str] = set()
+    named: set[str] = set()
+    for node, visible in _nodes(tree):
+        named |= visible
         if "cte_map" in node and node.get("type") not in _QUERIES:
             raise BadInput(f"SQL: only SELECT is possible, not {_words(node)}")
         if {"type", "alias", "sample"} <= node.keys():
-            used |= _source(node, known, named)
+            used |= _source(node, known, visible)
         if node.get("class") == "FUNCTION":
             _refuse_function(str(node["function_name"]).lower())
     return Query(text, tuple(sorted(used)), _plain_columns(tree, used - named))
@@ -88,15 +87,23 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:500]
 
 
-def _nodes(tree: Any) -> Iterator[Tree]:
-    waiting = [tree]
+def _nodes(tree: Any) -> Iterator[tuple[Tree, frozenset[str]]]:
+    """Every node, and which names of WITH clauses are to be seen from it: elsewhere DuckDB finds its own tables."""
+    waiting: list[tuple[Any, frozenset[str]]] = [(tree, frozenset())]
     while waiting:
-        node = waiting.pop()
+        node, visible = waiting.pop()
         if isinstance(node, dict):
-            yield node
-            waiting += node.values()
+            yield node, visible
+            rest = {key: value for key, value in node.items() if key != "cte_map"}
+            for entry in node.get("cte_map", {}).get("map", ()):
+                # A query sees those before it, never itself.
+                waiting.append((entry["value"], visible))
+                visible |= {str(entry["key"]).lower()}
+            # But for the second half of a recursive one, and what follows one that is kept.
+            own = visible | {str(node["cte_name"]).lower()} if "cte_name" in node else visible
+            waiting += [(value, own if key in ("right", "child") else visible) for key, value in rest.items()]
         elif isinstance(node, list):
-            waiting += node
+            waiting += [(value, visible) for value in node]
 
 
 def _words(node: Tree) -> str:

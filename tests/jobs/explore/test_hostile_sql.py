@@ -87,6 +87,13 @@ HOSTILE = [
     "SELECT getvariable('x')",
     "SELECT write_log('x')",
     "SELECT setseed(0.5)",
+    # the catalogue of the session, by a name that a WITH clause has given to something else
+    "WITH pg_class AS (SELECT * FROM pg_class) SELECT * FROM pg_class",
+    "WITH a AS (SELECT * FROM pg_class), pg_class AS (SELECT 1) SELECT * FROM a",
+    "SELECT * FROM (WITH pg_class AS (SELECT 1) SELECT 1), pg_class",
+    "SELECT (WITH sqlite_master AS (SELECT 1) SELECT 1), sql FROM sqlite_master",
+    "SELECT * FROM plain UNION ALL (WITH pg_class AS (SELECT 1) SELECT 1, 2) UNION ALL SELECT 1, 2 FROM pg_class",
+    "WITH RECURSIVE pg_class(n) AS (SELECT oid FROM pg_class UNION SELECT n FROM pg_class WHERE n < 0) FROM pg_class",
     # text that becomes code
     "SELECT * FROM query('SELECT * FROM read_text(''{file}'')')",
     "SELECT * FROM query_table('plain')",
@@ -195,6 +202,10 @@ def test_time_and_memory_have_a_limit(explored, text):
 
 
 GOOD = [
+    "WITH a AS (SELECT 1 AS x), b AS (SELECT * FROM a) SELECT * FROM b, (SELECT * FROM a) c WHERE EXISTS (FROM a)",
+    "WITH a AS MATERIALIZED (SELECT 1 AS x) SELECT * FROM a UNION SELECT * FROM a",
+    "WITH RECURSIVE t(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM t WHERE n < 5) SELECT * FROM t",
+    "SELECT (WITH a AS (SELECT 1 AS x) SELECT max(x) FROM a) FROM plain",
     "SELECT count(*) FROM galaxies",
     "FROM plain",
     "TABLE plain",
