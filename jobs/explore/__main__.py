@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jobs.explore import results
-from jobs.explore.explorer import MEMORY, TIMEOUT, Explorer
-from lake_schema import __version__
-from lake_schema.errors import BadInput, LakeError
+from jobs.explore.explorer import Explorer
+from jobs.explore.process import MEMORY, TIMEOUT
+from lake_schema import __version__, command, user_files
 
 _GIGABYTE = 1e9
 _MOST_ROWS_SHOWN = 40
@@ -19,24 +19,23 @@ _MOST_ROWS_SHOWN = 40
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: 0, 1 the lake is damaged, 2 the call or the query is wrong."""
     options = _options(argv)
-    try:
-        with Explorer(options.lake, options.memory * _GIGABYTE, options.timeout) as lake:
-            if options.sql is None:
-                print(lake.tables().to_string())
-                return int(bool(lake.damaged))
-            rows = lake.sql(options.sql, into="arrow")
-        if options.out is None:
-            print(results.converted(rows, "pandas").to_string(max_rows=_MOST_ROWS_SHOWN, index=False))
-            print(f"{rows.num_rows:,} rows")
-        else:
-            results.write(rows, options.out)
-            print(f"{options.out}: {rows.num_rows:,} rows, {options.out.stat().st_size / 1e6:.1f} MB")
-    except (BadInput, OSError) as error:
-        print(f"explore: {error}", file=sys.stderr)
-        return 2
-    except LakeError as error:
-        print(f"explore: {error}", file=sys.stderr)
-        return 1
+    return command.status("explore", lambda: _answer(options))
+
+
+def _answer(options: argparse.Namespace) -> int:
+    if options.out is not None:
+        user_files.target(options.out, results.ENDINGS)
+    with Explorer(options.lake, options.memory * _GIGABYTE, options.timeout) as lake:
+        if options.sql is None:
+            print(lake.tables().to_string())
+            return int(bool(lake.damaged))
+        rows = lake.sql(options.sql, into="arrow")
+    if options.out is None:
+        print(results.converted(rows, "pandas").to_string(max_rows=_MOST_ROWS_SHOWN, index=False))
+        print(f"{rows.num_rows:,} rows")
+    else:
+        results.write(rows, options.out)
+        print(f"{options.out}: {rows.num_rows:,} rows, {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
 
 

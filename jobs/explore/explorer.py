@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
-import selectors
-import subprocess
-import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,23 +9,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
-import pyarrow as pa
 
 from jobs.explore import results
+from jobs.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process, check
 from lake_schema import layout, read, sky
-from lake_schema.errors import BadInput, Damaged, LakeError, OutOfRange
+from lake_schema.errors import BadInput, LakeError
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 Range = tuple[float, float]
 
-_ROOT = Path(__file__).resolve().parents[2]
-# Bytes that a query may take, and s, where nobody says otherwise; and between which bounds anybody may.
-MEMORY, TIMEOUT = 4e9, 300.0
-_MEMORY_LO, _MEMORY_HI = 1e7, 1e15
-_TIMEOUT_HI = 1e6
 _MOST_BINS = 10_000
-_ERRORS = {"BadInput": BadInput, "Damaged": Damaged}
 
 
 class Explorer:
@@ -43,8 +31,6 @@ class Explorer:
     """
 
     def __init__(self, lake: str | Path, memory: float = MEMORY, timeout: float = TIMEOUT) -> None:
-        _check("memory", memory, _MEMORY_LO, _MEMORY_HI)
-        _check("timeout", timeout, 0.0, _TIMEOUT_HI)
         self.root = layout.lake(lake)
         self.versions: dict[str, read.Version] = {}
         self.damaged: dict[str, LakeError] = {}
@@ -55,8 +41,12 @@ class Explorer:
                 self.damaged[name] = error
         if not self.versions and not self.damaged:
             raise BadInput(f"lake {self.root} holds no table")
-        self.memory, self.timeout = int(memory), timeout
-        self._worker: subprocess.Popen[bytes] | None = None
+        versions = [f"{name}={version.key}" for name, version in self.versions.items()]
+        # Whoever asks for one of these is told what is wrong with it.
+        versions += [f"{name}=" for name in self.damaged]
+        self._process = Process(self.root, versions, memory)
+        check("timeout", timeout, 0.0, TIMEOUT_HI)
+        self.timeout = timeout
 
     def __enter__(self) -> Explorer:
         return self
@@ -66,10 +56,7 @@ class Explorer:
 
     def close(self) -> None:
         """End the process; a later query starts another."""
-        if self._worker is not None:
-            self._worker.kill()
-            self._worker.communicate()
-            self._worker = None
+        self._process.close()
 
     # ------------------------------------------------------------------------------------------------ what there is
 
@@ -120,11 +107,7 @@ class Explorer:
         parameters : numbers, texts, booleans or lists of them
         Errors     : BadInput for what is no SELECT of ours, or takes too long or too much; Damaged for a changed byte
         """
-        try:
-            line = json.dumps({"sql": text, "parameters": parameters}, allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise BadInput(f"SQL: a parameter is not a number, text, boolean or list of them: {error}") from None
-        return results.converted(self._ask(line), into)
+        return results.converted(self._process.ask(text, parameters, self.timeout), into)
 
     def cone(
         self, table: str, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None,
@@ -158,7 +141,7 @@ class Explorer:
         x, where, weight : SQL of the table's columns;  span : lowest and highest value, None = all
         returns          : counts[bins], edges[bins + 1]
         """
-        _check("bins", bins, 1, _MOST_BINS)
+        check("bins", bins, 1, _MOST_BINS)
         lo, hi = _ordered(span or self._span(table, x, where))
         text = f"""
             SELECT {_bin("x", "x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x})::DOUBLE AS x, {_weight(weight)}
@@ -177,7 +160,7 @@ class Explorer:
         returns : counts[y bins, x bins], edges of x, edges of y
         """
         for axis in bins:
-            _check("bins", axis, 1, _MOST_BINS)
+            check("bins", axis, 1, _MOST_BINS)
         spans = span or (self._span(table, x, where), self._span(table, y, where))
         (x_lo, x_hi), (y_lo, y_hi) = (_ordered(axis) for axis in spans)
         text = f"""
@@ -210,53 +193,6 @@ class Explorer:
             raise BadInput(f"table {table}: {x} has no finite values here")
         return (lo, hi) if hi > lo else (lo - 0.5, hi + 0.5)
 
-    # ------------------------------------------------------------------------------------------------ the process
-
-    def _ask(self, line: str) -> pa.Table:
-        deadline = time.monotonic() + self.timeout
-        worker = self._running()
-        assert worker.stdin is not None
-        assert worker.stdout is not None
-        whole = False
-        try:
-            worker.stdin.write(line.encode() + b"\n")
-            worker.stdin.flush()
-            if not _readable(worker, deadline):
-                raise BadInput(f"SQL: stopped after {self.timeout:g} s")
-            head = worker.stdout.readline()
-            if not head:
-                raise BadInput("SQL: the query needs more memory than it may have, or brought its process down")
-            answer = json.loads(head)
-            if not answer:
-                with pa.ipc.open_stream(worker.stdout) as stream:
-                    found = stream.read_all()
-            whole = True
-        except BrokenPipeError:
-            raise BadInput("SQL: the process that answers queries has ended; ask again") from None
-        finally:
-            if not whole:
-                self.close()
-        if answer:
-            raise _ERRORS.get(answer["kind"], LakeError)(answer["error"])
-        return found
-
-    def _running(self) -> subprocess.Popen[bytes]:
-        if self._worker is None or self._worker.poll() is not None:
-            versions = [f"{name}={version.key}" for name, version in self.versions.items()]
-            # Whoever asks for one of these is told what is wrong with it.
-            versions += [f"{name}=" for name in self.damaged]
-            command = [sys.executable, "-m", "jobs.explore.worker", str(self.root), str(self.memory), *versions]
-            pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-            # Arrow's other allocators reserve a gigabyte at the start, which would count against the limit.
-            environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
-            self._worker = subprocess.Popen(command, cwd=_ROOT, env=environment, **pipes)
-        return self._worker
-
-
-def _check(name: str, value: float, lo: float, hi: float) -> None:
-    if not lo <= value <= hi:
-        raise OutOfRange(name, value, lo, hi)
-
 
 def _ordered(span: Range) -> Range:
     lo, hi = span
@@ -275,11 +211,3 @@ def _weight(weight: str | None) -> str:
 
 def _counted(weight: str | None) -> str:
     return "count(*)" if weight is None else "sum(w)"
-
-
-def _readable(worker: subprocess.Popen[bytes], deadline: float) -> bool:
-    """Has the process said anything, or ended, before the deadline?"""
-    assert worker.stdout is not None
-    with selectors.DefaultSelector() as selector:
-        selector.register(worker.stdout, selectors.EVENT_READ)
-        return bool(selector.select(max(deadline - time.monotonic(), 0.0)))

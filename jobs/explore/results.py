@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
+from lake_schema import user_files
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
 from lake_schema.fits import table_to_fits
@@ -65,9 +66,7 @@ def write(rows: pa.Table, path: Path) -> None:
     Errors : BadInput for another ending, or names the column that such a file cannot hold; OSError where the disc
              refuses
     """
-    writer = _WRITERS.get(path.suffix.lower())
-    if writer is None:
-        raise BadInput(f"{path}: the ending is not one of {', '.join(_WRITERS)}")
+    writer = _WRITERS[user_files.target(path, ENDINGS).suffix.lower()]
     _refuse_same_names(rows)
     temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
     try:
@@ -126,3 +125,4 @@ def _kind(kind: pa.DataType) -> str:
 
 
 _WRITERS: dict[str, Callable[[pa.Table, Path], None]] = {".csv": _csv, ".parquet": _parquet, ".fits": _fits}
+ENDINGS = tuple(_WRITERS)

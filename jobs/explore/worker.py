@@ -1,4 +1,4 @@
-"""The process that runs queries: python -m jobs.explore.worker LAKE MEMORY TABLE=KEY ...; answers on stdout.
+"""The process that runs queries: python -m jobs.explore.worker LAKE MEMORY TABLE=KEY|@FILE ...; answers on stdout.
 
 DuckDB counts neither the memory of every function nor its result, and some functions do not stop when told to; a
 process has a limit of memory that holds, and can be killed.  A query is a line of JSON on stdin; an answer is a line of
@@ -11,12 +11,13 @@ import json
 import os
 import resource
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeAlias
 
 import duckdb
 import pyarrow as pa
+import pyarrow.dataset as ds
 
 from jobs.explore.guard import Query, checked, one_line
 from lake_schema import layout, read
@@ -40,6 +41,7 @@ _LOCKS = (
     "SET lock_configuration = true",
 )
 _ROWS_A_BATCH = 65_536
+Opened: TypeAlias = read.Version | ds.Dataset
 # What Python and the libraries take before any query, and the part of the rest that DuckDB may fill.
 _BASE_BYTES, _SHARE = 1 << 30, 0.5
 
@@ -47,7 +49,8 @@ _BASE_BYTES, _SHARE = 1 << 30, 0.5
 def main(argv: Sequence[str]) -> int:
     """Answer queries until stdin ends.
 
-    argv : lake, most bytes of memory, TABLE=KEY of each table, without a key where it could not be opened
+    argv : lake, most bytes of memory, TABLE=KEY of each table, without a key where it could not be opened, or
+           TABLE=@FILE of rows in an Arrow file
     """
     root, memory = layout.lake(argv[0]), int(argv[1])
     resource.setrlimit(resource.RLIMIT_DATA, (memory + _BASE_BYTES, memory + _BASE_BYTES))
@@ -64,7 +67,7 @@ def main(argv: Sequence[str]) -> int:
 def _answer(out: IO[bytes], root: Path, versions: dict[str, str], memory: int, question: dict[str, Any]) -> None:
     try:
         query = checked(question["sql"], versions)
-        opened = {name: read.version(root, name, versions[name] or None) for name in query.tables}
+        opened = {name: _table(root, name, versions[name]) for name in query.tables}
         found = _with_units(_run(query, opened, memory, question["parameters"]), query, opened)
     except LakeError as error:
         kind = "Damaged" if isinstance(error, Damaged) else "BadInput"
@@ -78,10 +81,16 @@ def _answer(out: IO[bytes], root: Path, versions: dict[str, str], memory: int, q
     out.flush()
 
 
+def _table(root: Path, name: str, what: str) -> Opened:
+    if what.startswith("@"):
+        return ds.dataset(what[1:], format="ipc")
+    return read.version(root, name, what or None)
+
+
 _TOO_LARGE = "SQL: the query or its result needs more memory than it may have: ask for less"
 
 
-def _run(query: Query, opened: dict[str, read.Version], memory: int, parameters: dict[str, Any]) -> pa.Table:
+def _run(query: Query, opened: Mapping[str, Opened], memory: int, parameters: dict[str, Any]) -> pa.Table:
     most = int(memory * _SHARE)
     config: dict[str, str | bool | int | float | list[str]] = {
         "memory_limit": f"{most // 1_000_000}MB",
@@ -90,7 +99,7 @@ def _run(query: Query, opened: dict[str, read.Version], memory: int, parameters:
     }
     with duckdb.connect(":memory:", config=config) as session:
         for name, version in opened.items():
-            session.register(name, version.dataset())
+            session.register(name, version.dataset() if isinstance(version, read.Version) else version)
         for command in (*_MACROS, *_LOCKS):
             session.execute(command)
         try:
@@ -129,7 +138,7 @@ def _exportable(name: str, column: pa.ChunkedArray) -> pa.ChunkedArray:
         raise BadInput(f"SQL: column {name} holds integers beyond 64 bits; make it {name}::DOUBLE") from None
 
 
-def _with_units(found: pa.Table, query: Query, opened: dict[str, read.Version]) -> pa.Table:
+def _with_units(found: pa.Table, query: Query, opened: Mapping[str, Opened]) -> pa.Table:
     """Give the columns that came unchanged from a table its unit and description."""
     fields = []
     for field in found.schema:

@@ -16,18 +16,27 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from pyarrow import feather
 
+from jobs.explore.process import Process
 from jobs.render import focal_plane
-from lake_schema import layout, read
-from lake_schema.errors import BadInput, LakeError
+from lake_schema import command, layout, read, sky, user_files
+from lake_schema.errors import BadInput, Damaged
 from lake_schema.provenance import code_version, file_sha256
 
+# Bytes and s that a query of the archive may take.
+_MEMORY, _TIMEOUT = 1e9, 60.0
+# What a line of a run's log says of a part.
+_IN_LOGS: dict[str, tuple[type, ...]] = {
+    "part": (str,), "error": (str,), "attempt": (int,), "seconds": (float, int), "peak_gb": (float, int)
+}  # fmt: skip
 _FAILURES = pa.schema(
     [
         pa.field("part", pa.string()),
@@ -79,28 +88,54 @@ def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
 def _lines(root: Path) -> Iterator[dict[str, Any]]:
     """What the runs' logs say of parts of `products`, oldest first."""
     for path in sorted(layout.runs(root).glob("*-products-*.jsonl")):
-        for text in path.read_text(encoding="utf-8").splitlines():
+        with user_files.opened(path, "run log") as stream:
+            lines = stream.read().split(b"\n")
+        for number, text in enumerate(lines, start=1):
             try:
                 line = json.loads(text)
-            except ValueError:
-                # The last line of a run that was killed.
-                continue
-            if "part" in line:
-                yield {**line, "run": path.stem}
+                if _is_of_part(line):
+                    yield {**line, "run": path.stem}
+            except (ValueError, RecursionError, TypeError):
+                # The last line of a run that was killed may be anything.
+                if any(lines[number:]):
+                    raise Damaged(f"{user_files.shown(path)} line {number} is not what a run writes") from None
 
 
-def search(rows: pa.Table, sql: str) -> pa.Table:
-    """The answer to a query of the rows, which it calls `products`; it reaches no file."""
-    import duckdb
+def _is_of_part(line: dict[str, Any]) -> bool:
+    """Whether a line of a log is about a part; TypeError where it is not one that a run writes."""
+    if not isinstance(line, dict):
+        raise TypeError
+    for name, kinds in _IN_LOGS.items():
+        if name in line and type(line[name]) not in kinds:
+            raise TypeError
+    return "part" in line
 
-    with duckdb.connect(
-        config={"enable_external_access": "false", "python_enable_replacements": "false"}
-    ) as connection:
-        connection.register("products", rows)
+
+def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _TIMEOUT) -> pa.Table:
+    """The answer to a query of the rows, which it calls `products`; it reaches no file.
+
+    memory : bytes that the query may take;  timeout : s
+    """
+    with tempfile.TemporaryDirectory(prefix="truesky-") as folder:
+        file = Path(folder) / "products.arrow"
+        feather.write_feather(rows, file, compression="uncompressed")
+        process = Process(Path(folder), [f"products=@{file}"], memory)
         try:
-            return connection.sql(sql).to_arrow_table()
-        except (duckdb.Error, AttributeError) as error:
-            raise BadInput(f"--sql: {' '.join(str(error).split())}") from None
+            return process.ask(sql, {}, timeout)
+        except BadInput as error:
+            raise BadInput(f"--sql: {error}") from None
+        finally:
+            process.close()
+
+
+def _objects(rows: pa.Table) -> list[str]:
+    """The rows as JSON; what JSON has no form for, such as a date or a decimal, as text."""
+    if len(set(rows.column_names)) != rows.num_columns:
+        raise BadInput("--sql: two columns of the result have the same name; give one of them another with AS")
+    try:
+        return [json.dumps(row, default=str) for row in rows.to_pylist()]
+    except (ValueError, OverflowError, TypeError, pa.ArrowException) as error:
+        raise BadInput(f"--sql: the result has no form in JSON: {' '.join(str(error).split())[:300]}") from None
 
 
 def again(root: Path, product: str, out: Path, key: str | None = None) -> str:
@@ -128,7 +163,8 @@ def again(root: Path, product: str, out: Path, key: str | None = None) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Prints the products, one JSON object a line; those of a place or of a query where one is given.
 
-    Exit status: 0, 1 a product came out otherwise when it was rendered again, 2 the call is wrong.
+    Exit status: 0, 1 a product came out otherwise when it was rendered again or the lake is damaged, 2 the call is
+    wrong.
     """
     parser = argparse.ArgumentParser(prog="python -m jobs.render.archive", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lake", required=True, help="folder of the lake")
@@ -143,19 +179,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("failures have no place")
     if (options.again is None) != (options.out is None):
         parser.error("--again and --out belong together")
-    try:
-        if options.again is not None:
-            said = again(layout.lake(options.lake), options.again, options.out, options.version)
-            print(said or f"{options.out} equals {options.again}")
-            return int(bool(said))
-        rows = (failures if options.failures else products)(layout.lake(options.lake))
-        rows = rows if options.at is None else covering(rows, *options.at)
-        rows = rows if options.sql is None else search(rows, options.sql)
-    except (LakeError, OSError) as error:
-        print(f"archive: {error}", file=sys.stderr)
-        return 2
-    for row in rows.to_pylist():
-        print(json.dumps(row))
+    return command.status("archive", lambda: _answered(options))
+
+
+def _answered(options: argparse.Namespace) -> int:
+    root = layout.lake(options.lake)
+    if options.again is not None:
+        said = again(root, options.again, user_files.target(options.out), options.version)
+        print(said or f"{options.out} equals {options.again}")
+        return int(bool(said))
+    if options.at is not None:
+        sky.checked(*([value] for value in options.at))
+    rows = (failures if options.failures else products)(root)
+    rows = rows if options.at is None else covering(rows, *options.at)
+    rows = rows if options.sql is None else search(rows, options.sql)
+    for line in _objects(rows):
+        print(line)
     return 0
 
 

@@ -260,8 +260,8 @@ def test_a_changed_byte_is_damage_not_a_number(lake):
 
 def test_a_killed_process_is_replaced(explorer):
     explorer.sql("SELECT 1")
-    os.kill(explorer._worker.pid, signal.SIGKILL)
-    explorer._worker.wait()
+    os.kill(explorer._process._worker.pid, signal.SIGKILL)
+    explorer._process._worker.wait()
     assert explorer.sql("SELECT 1 AS a")["a"][0] == 1
 
 
