@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema import layout
+from lake_schema import layout, user_files
 from lake_schema.errors import BadInput
 
 Array = npt.NDArray[Any]
@@ -32,9 +32,9 @@ _KEY_LENGTH = 32
 def cache_dir() -> Path:
     """$TRUESKY_CACHE, else $XDG_CACHE_HOME/truesky, else ~/.cache/truesky; it need not exist yet."""
     if own := os.environ.get("TRUESKY_CACHE"):
-        return Path(own).expanduser()
+        return user_files.expanded(own)
     if home := os.environ.get("XDG_CACHE_HOME"):
-        return Path(home).expanduser() / "truesky"
+        return user_files.expanded(home) / "truesky"
     return Path.home() / ".cache" / "truesky"
 
 

@@ -21,8 +21,8 @@ from types import FrameType
 
 from jobs import request as requests
 from jobs.render import plan_exposures
-from lake_schema import __version__, layout, read
-from lake_schema.errors import LakeError
+from lake_schema import __version__, command, layout, read
+from lake_schema.errors import BadInput
 
 _ROOT = Path(__file__).resolve().parents[1]
 JOBS = (
@@ -46,21 +46,22 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     before = {number: signal.signal(number, _stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        # Whatever is wrong with the folder or the pointings is said before the first job runs.
-        root = layout.lake(layout.lake(options.out) / "lake")
-        plan_exposures.plan(root, requests.parse(options.request))
-        status = _run_all(root, options.request)
-        if status == 0:
-            _show(root, options.out)
-    except LakeError as error:
-        print(f"demo: {error}", file=sys.stderr)
-        return 2
+        return command.status("demo", lambda: _demonstrated(options.out, options.request))
     except KeyboardInterrupt as stopped:
         print("demo: stopped; a second run continues where this one ended", file=sys.stderr)
         return 128 + int(stopped.args[0])
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _demonstrated(out: Path, request: Path) -> int:
+    # Whatever is wrong with the folder or the pointings is said before the first job runs.
+    root = layout.lake(layout.lake(out) / "lake")
+    plan_exposures.plan(root, requests.parse(request))
+    status = _run_all(root, request)
+    if status == 0:
+        _show(root, out)
     return status
 
 
@@ -71,14 +72,14 @@ def _stop(number: int, frame: FrameType | None) -> None:
 def _run_all(root: Path, request: Path) -> int:
     submit = shutil.which("spark-submit", path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
     if submit is None:
-        raise LakeError("no spark-submit on PATH: activate the environment that `make` made (. .venv/bin/activate)")
+        raise BadInput("no spark-submit on PATH: activate the environment that `make` made (. .venv/bin/activate)")
     environment = {**os.environ, **_settings()}
     rows, start = [], time.perf_counter()
     for script, tables in JOBS:
         began = time.perf_counter()
         print(f"{Path(script).stem} ...", flush=True)
-        command = [submit, str(_ROOT / script), "--lake", str(root), "--request", str(request)]
-        if status := _call(command, environment):
+        call = [submit, str(_ROOT / script), "--lake", str(root), "--request", str(request)]
+        if status := _call(call, environment):
             return status
         rows.append((Path(script).stem, tables, time.perf_counter() - began))
     _table(root, rows, time.perf_counter() - start)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jobs.toml_values import Toml, boolean, shown, string, strings, table_of
-from lake_schema import layout
+from lake_schema import layout, user_files
 from lake_schema.errors import BadInput
 
 
@@ -74,7 +74,7 @@ class Ingest:
 
 def file_of(folder: Path, name: str) -> Path:
     """A file by its name, found from the request's folder."""
-    return folder / Path(name).expanduser()
+    return user_files.expanded(name, folder)
 
 
 def curves(table: Toml, folder: Path) -> OwnCurves:

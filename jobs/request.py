@@ -48,7 +48,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
@@ -74,14 +73,13 @@ from jobs.toml_values import string as _string
 from jobs.toml_values import strings as _strings
 from jobs.toml_values import table_of as _table
 from jobs.toml_values import value as _value
-from lake_schema import layout
-from lake_schema.errors import BadInput, LakeError
+from lake_schema import command, layout, user_files
+from lake_schema.errors import BadInput
 from lake_schema.tables import mission as database
 from lake_schema.tables import products
 
 __all__ = ["Area", "Override", "Request", "parse"]
 
-_MOST_BYTES = 1 << 20
 _MOST_VARIANTS = 10_000
 STATUSES = tuple(code for code, _ in database.STATUSES)
 LADDER = database.LADDER
@@ -216,21 +214,13 @@ def parse(path: Path) -> Request:
     Errors : BadInput, one line that names the file and the key
     """
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise BadInput(f"is larger than {_MOST_BYTES} bytes")
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise BadInput(f"request {path}: no such file") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, BadInput) as error:
-        raise BadInput(f"request {path}: {_one_line(error)}") from None
+        table = user_files.toml(path, "request")
+    except BadInput as error:
+        raise BadInput(f"request {error}") from None
     try:
         return _with_files_beside(from_table(table, path.resolve().parent), path.parent)
     except BadInput as error:
-        raise BadInput(f"request {path}: {error}") from None
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+        raise BadInput(f"request {user_files.shown(path)}: {error}") from None
 
 
 def from_table(table: Toml, folder: Path = Path()) -> Request:
@@ -345,10 +335,10 @@ def _with_files_beside(request: Request, folder: Path) -> Request:
     for i, block in enumerate(request.observations):
         if block.pointings:
             path = folder / block.pointings
-            if not path.resolve().is_relative_to(folder.resolve()):
-                raise BadInput(f"observation[{i}].pointings = {_shown(block.pointings)} leaves the request's folder")
-            if not path.is_file():
-                raise BadInput(f"observation[{i}].pointings = {_shown(block.pointings)}: no such file")
+            try:
+                user_files.checked(layout.within(folder, path), "table of pointings")
+            except BadInput as error:
+                raise BadInput(f"observation[{i}].pointings: {error}") from None
             block = replace(block, pointings=str(path))
         found.append(block)
     return replace(request, observations=tuple(found))
@@ -436,11 +426,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if len(arguments) != 2 or arguments[0] != "check":
         print("usage: python -m jobs.request check FILE", file=sys.stderr)
         return 2
-    try:
-        request = parse(Path(arguments[1]))
-    except LakeError as error:
-        print(error, file=sys.stderr)
-        return 2
+    return command.status("request", lambda: _check(Path(arguments[1])))
+
+
+def _check(path: Path) -> int:
+    request = parse(path)
     variants = sum(1 for _ in request.variants())
     counts = f"{len(request.pointings)} pointings, {len(request.observations)} observations, {variants} variants"
     print(f"{request.name}: good: {counts}")

@@ -31,8 +31,8 @@ from tqdm import tqdm
 
 from jobs import request as requests
 from jobs.measured import Measured
-from lake_schema import __version__, layout, publish, read
-from lake_schema.errors import BadInput, LakeError, PartsFailed
+from lake_schema import __version__, command, layout, publish, read
+from lake_schema.errors import LakeError, PartsFailed
 from lake_schema.provenance import code_version, git_commit
 from lake_schema.publish import Json, Part, Plan, Work
 
@@ -88,16 +88,14 @@ _AGAIN = "a second run continues where this one ended"
 def main(job: Job, argv: Sequence[str] | None = None) -> int:
     """Run a job from its command line; returns the exit status: 0, 1 a part failed, 2 bad input, 130/143 stopped."""
     options = _options(job, argv)
-    try:
+
+    def made() -> int:
         with _stoppable(job):
-            if job.dry_run is not None and options.dry_run:
-                job = replace(job, steps=job.dry_run)
-            run(job, layout.lake(options.lake), _request(job, options), options.verbose)
-    except BadInput as error:
-        return _say(job, error, 2)
-    except (LakeError, OSError) as error:
-        return _say(job, error, 1)
-    return 0
+            chosen = replace(job, steps=job.dry_run) if job.dry_run is not None and options.dry_run else job
+            run(chosen, layout.lake(options.lake), _request(job, options), options.verbose)
+        return 0
+
+    return command.status(job.name, made)
 
 
 def run(job: Job, root: Path, request: requests.Request, verbose: bool = False) -> None:
@@ -134,17 +132,12 @@ def _request(job: Job, options: argparse.Namespace) -> requests.Request:
     return replace(requests.parse(options.request), **lists)
 
 
-def _say(job: Job, error: object, status: int) -> int:
-    print(f"{job.name}: {error}", file=sys.stderr, flush=True)
-    return status
-
-
 @contextmanager
 def _stoppable(job: Job) -> Iterator[None]:
     """Ctrl-C and SIGTERM end the process at once: whatever it was doing, the lake is whole and the next run goes on."""
 
     def stop(signum: int, frame: FrameType | None) -> None:
-        os._exit(_say(job, f"stopped; {_AGAIN}", 128 + signum))
+        os._exit(command.say(job.name, f"stopped; {_AGAIN}", 128 + signum))
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -208,7 +201,7 @@ class _RunLog:
             folder.mkdir(parents=True, exist_ok=True)
             self.stream: IO[str] = path.open("w")
         except OSError as error:
-            _say(job, f"no log of this run: {error}", 0)
+            command.say(job.name, f"no log of this run: {error}", 0)
             self.stream = io.StringIO()
         about = {"started": now.isoformat(), "request": request.name, "key": step.plan.key}
         self.write({**about, "truesky": __version__, "commit": git_commit(), "parts": len(step.plan.parts)})

@@ -9,8 +9,8 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from lake_schema import __version__, layout, publish, read, tables
-from lake_schema.errors import BadInput, LakeError
+from lake_schema import __version__, command, layout, publish, read, tables
+from lake_schema.errors import BadInput
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -20,28 +20,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _mission(arguments[1:])
     parser = argparse.ArgumentParser(prog="python -m lake_schema", description=__doc__, epilog=f"truesky {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="verify|gc|describe|tables")
-    for command in ("verify", "gc", "describe"):
-        one = commands.add_parser(command)
+    for name in ("verify", "gc", "describe"):
+        one = commands.add_parser(name)
         one.add_argument("lake", help="folder of the lake")
         one.add_argument("table", nargs="?", help="one table (default: all of them)")
         one.set_defaults(deep=False)
-        if command == "verify":
+        if name == "verify":
             one.add_argument("--deep", action="store_true", help="read every byte and compare its sha256")
     commands.add_parser("tables")
     options = parser.parse_args(arguments)
     if options.command == "tables":
         print(tables.markdown(), end="")
         return 0
-    try:
-        root = layout.lake(options.lake)
-        names = [options.table] if options.table else _names(root, options.command)
-        if not names:
-            raise BadInput(f"lake {root} holds no table")
-    except BadInput as error:
-        return _say(error, 2)
-    except OSError as error:
-        return _say(error, 1)
+    return command.status("lake_schema", lambda: _looked_after(options))
+
+
+def _looked_after(options: argparse.Namespace) -> int:
+    root = layout.lake(options.lake)
+    names = [options.table] if options.table else _names(root, options.command)
+    if not names:
+        raise BadInput(f"lake {root} holds no table")
     actions = {"verify": _verify, "gc": _gc, "describe": _describe}
+    # What is wrong with one table is said, and the others are looked at all the same.
     return max(_status(actions[options.command], root, name, options.deep) for name in names)
 
 
@@ -55,13 +55,14 @@ def _mission(argv: Sequence[str]) -> int:
     parser.add_argument("first", help=about)
     parser.add_argument("second", help="the same")
     options = parser.parse_args(argv)
-    try:
+
+    def compared() -> int:
         lines = compare(options.first, options.second)
-    except LakeError as error:
-        return _say(error, 2)
-    for line in lines:
-        print(line)
-    return int(bool(lines))
+        for line in lines:
+            print(line)
+        return int(bool(lines))
+
+    return command.status("lake_schema", compared)
 
 
 def _names(root: Path, command: str) -> list[str]:
@@ -72,17 +73,7 @@ def _names(root: Path, command: str) -> list[str]:
 
 
 def _status(action: Callable[[Path, str, bool], bool], root: Path, name: str, deep: bool) -> int:
-    try:
-        return int(action(root, name, deep))
-    except BadInput as error:
-        return _say(error, 2)
-    except (LakeError, OSError) as error:
-        return _say(error, 1)
-
-
-def _say(error: Exception, status: int) -> int:
-    print(error, file=sys.stderr)
-    return status
+    return command.status("lake_schema", lambda: int(action(root, name, deep)))
 
 
 def _verify(root: Path, name: str, deep: bool) -> bool:

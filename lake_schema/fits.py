@@ -5,6 +5,7 @@ write_images    images -> one file: checksums, the same bytes for the same input
 read_images     a file -> images; checksums are demanded and verified, sizes checked before data
 read_numbers    somebody's binary table -> its columns of numbers
 number_batches  the same, some columns and a bounded piece at a time
+read_table      the same as an astropy table
 read_map        somebody's HEALPix map -> its pixels and header
 read_planes     somebody's image of two or three axes -> its samples and header
 table_to_fits   an Arrow table -> a binary table, units and UCDs from the table's declaration
@@ -14,12 +15,14 @@ fits_unit       a unit as FITS spells it
 from __future__ import annotations
 
 import contextlib
+import gzip
 import io
+import math
 import os
+import re
 import tempfile
 import warnings
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +35,9 @@ from astropy import units
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
 
+from lake_schema import user_files
 from lake_schema.columns import Column, Table
-from lake_schema.errors import BadInput, Damaged
+from lake_schema.errors import BadInput, Damaged, LakeError
 
 Card = tuple[str, str | int | float | bool, str]
 
@@ -42,8 +46,12 @@ _LONGEST_NAME = 68
 # A header that promises more than this is a mistake or an attack; the largest product is far below.
 MOST_BYTES = 8 << 30
 _ROWS_A_BATCH = 65_536
-# Of a file that is packed as a whole.
-_MOST_UNPACKED = 512 << 20
+# Of a file that is packed as a whole; of a map, pixels; of planes, samples.
+_MOST_UNPACKED, _MOST_PIXELS, _MOST_SAMPLES = 512 << 20, 12 << 24, 64 << 20
+# How a file is built, and how much of it there may be: axes of a unit, units, bytes of a header.
+_BLOCK, _CARD = 2880, 80
+_MOST_AXES, _MOST_UNITS, _MOST_HEADER = 9, 1000, 1000 * _BLOCK
+_SIZES = re.compile(rb"(BITPIX|NAXIS\d{0,3}|PCOUNT|GCOUNT) *= *([+-]?\d{1,18})\b")
 # Of a column of texts, bytes.
 _LONGEST_TEXT = 256
 _STRUCTURE = {
@@ -120,46 +128,61 @@ def read_images(path: Path, most_bytes: int = MOST_BYTES) -> list[Image]:
             return [_image(unit) for unit in units[hollow:]]
 
 
-def read_numbers(path: Path) -> dict[str, npt.NDArray[np.float64]]:
+def read_numbers(path: Path, kind: str) -> dict[str, npt.NDArray[np.float64]]:
     """Columns of numbers of a file's first table, title -> float64[n]; NaN where TNULL says that there is none.
 
-    Errors : Damaged for a file that is cut short or is none; BadInput where there is no table
+    kind   : of file, as user_files has it
+    Errors : BadInput for a file that is cut short or is none, and where there is no table
     """
-    with _refusing(path), fits.open(path, memmap=True) as units:
-        # Titles such as "RA(ICRS)" are usual.
-        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
-        for unit in units:
-            if isinstance(unit, fits.BinTableHDU):
-                return _numbers_of(unit)
-    raise BadInput(f"{path}: holds no table")
+    with _foreign(path, kind) as units:
+        return _numbers_of(_first_table(path, units))
 
 
 def number_batches(
-    path: Path, columns: Sequence[str], texts: Sequence[str] = (), rows: int = _ROWS_A_BATCH
+    path: Path, columns: Sequence[str], texts: Sequence[str] = (), rows: int = _ROWS_A_BATCH, kind: str = "catalogue"
 ) -> Iterator[tuple[dict[str, npt.NDArray[Any]], dict[str, str]]]:
     """Columns of numbers of a file's first table: (title -> numbers[n], whole numbers as they are; title -> TUNIT).
 
     texts  : more columns, of texts or whole numbers; left out where there are none
-    Errors : Damaged for a file that is cut short or is none; BadInput names a column that is missing or no number
+    Errors : BadInput for a file that is cut short or is none, and names a column that is missing or no number
     """
-    with _refusing(path), fits.open(path, memmap=True) as units:
-        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
-        unit = next((unit for unit in units if isinstance(unit, fits.BinTableHDU)), None)
-        if unit is None:
-            raise BadInput(f"{path}: holds no table")
-        _whole_file(path, unit)
+    with _foreign(path, kind) as units:
+        unit = _first_table(path, units)
         known = {column.name: column for column in unit.columns}
         for name in columns:
-            if name not in known:
-                raise BadInput(f"{path}: has no column {name}; it has {', '.join(known)}"[:500])
-            if unit.data[name].dtype.kind not in "fiub" or unit.data[name].ndim != 1:
-                raise BadInput(f"{path}: column {name} is {unit.data[name].dtype}, wanted a number a row")
-        said = {name: known[name].unit for name in columns if known[name].unit}
+            _refuse_no_numbers(path, unit, known, name)
+        said = {name: str(known[name].unit) for name in columns if known[name].unit}
         named = {name: _texts_of(path, unit, name) for name in texts if name in known}
         for first in range(0, len(unit.data), rows):
             part = slice(first, first + rows)
             numbers = {name: _native(unit.data[name][part], known[name].null) for name in columns}
             yield {**numbers, **{name: _decoded(stored[part]) for name, stored in named.items()}}, said
+
+
+def read_table(path: Path, kind: str) -> Any:
+    """Somebody's first table as an astropy QTable, units and all; errors as of read_numbers."""
+    # Slow to import, and seldom needed.
+    from astropy.table import QTable
+
+    with _foreign(path, kind) as units:
+        unit = _first_table(path, units)
+        for column in unit.columns:
+            _refuse_lists(path, column)
+        return QTable.read(unit)
+
+
+def _refuse_no_numbers(path: Path, unit: Any, known: Mapping[str, Any], name: str) -> None:
+    if name not in known:
+        raise BadInput(f"{path}: has no column {name}; it has {', '.join(map(str, known))}"[:500])
+    _refuse_lists(path, known[name])
+    if unit.data[name].dtype.kind not in "fiub" or unit.data[name].ndim != 1:
+        raise BadInput(f"{path}: column {name} is {unit.data[name].dtype}, wanted a number a row")
+
+
+def _refuse_lists(path: Path, column: Any) -> None:
+    # Of variable length: each row says where its values are, and what it says is only known when it is read.
+    if any(letter in str(column.format) for letter in "PQ"):
+        raise BadInput(f"{path}: column {column.name} holds lists")
 
 
 def _texts_of(path: Path, unit: Any, name: str) -> npt.NDArray[Any]:
@@ -186,62 +209,51 @@ def _native(values: Any, null: int | None) -> npt.NDArray[Any]:
     return numbers
 
 
-def _whole_file(path: Path, unit: Any) -> None:
-    # A table that is cut short would be mapped beyond the end of its file.
-    end = unit.fileinfo()["datLoc"] + unit.header["NAXIS1"] * unit.header["NAXIS2"]
-    with path.open("rb") as stream:
-        packed = stream.read(2) == b"\x1f\x8b"
-    if packed:
-        # Unpacked into memory, as far as it goes.
-        if end > _MOST_UNPACKED:
-            raise BadInput(f"{path}: unpacks to {end} bytes, more than {_MOST_UNPACKED}")
-    elif end > path.stat().st_size:
-        raise Damaged(f"{path}: is cut short, {end} bytes promised, {path.stat().st_size} there")
-
-
 def read_map(path: Path, column: str) -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
     """A column of a HEALPix map, float64[pixels] in its file's order, and the cards of its header.
 
-    Errors : Damaged for a file that is cut short or is none; BadInput where there is no table or column
+    Errors : BadInput for a file that is cut short or is none, and where there is no table or column
     """
-    with _refusing(path), fits.open(path, memmap=True) as units:
-        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
-        for unit in units:
-            if not isinstance(unit, fits.BinTableHDU):
-                continue
-            _whole_file(path, unit)
-            if column not in unit.columns.names:
-                raise BadInput(f"{path}: has no column {column}; it has {', '.join(unit.columns.names)}")
-            return np.asarray(unit.data[column], np.float64).ravel(), dict(unit.header.items())
-    raise BadInput(f"{path}: holds no table")
+    with _foreign(path, "map of dust") as units:
+        unit = _first_table(path, units)
+        known = {found.name: found for found in unit.columns}
+        if column not in known:
+            raise BadInput(f"{path}: has no column {column}; it has {', '.join(map(str, known))}"[:500])
+        _refuse_lists(path, known[column])
+        values = unit.data[column]
+        if values.dtype.kind not in "fiu" or not values.size <= _MOST_PIXELS:
+            raise BadInput(f"{path}: column {column} is {values.size} of {values.dtype}, wanted numbers of a map")
+        return np.asarray(values, np.float64).ravel(), dict(unit.header.items())
 
 
-def read_planes(
-    path: Path, column: str, most_bytes: int = MOST_BYTES
-) -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
+def read_planes(path: Path, column: str, kind: str = "PSF") -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
     """Somebody's planes, float64[ny, nx] or [n, ny, nx], with the cards of their header.
 
     The first image of two or three axes, or the array that the first row of a table has in `column`.
 
-    Errors : Damaged for a file that is cut short or is none; BadInput where it holds neither, or more than most_bytes
+    Errors : BadInput for a file that is cut short or is none, and where it holds neither, or packed images
     """
-    with _refusing(path), fits.open(path, memmap=False, lazy_load_hdus=True) as units:
-        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
-        _check_size(path, units, most_bytes)
+    with _foreign(path, kind) as units:
         for unit in units:
             found = None
-            if isinstance(unit, fits.BinTableHDU) and column in unit.columns.names and len(unit.data):
-                found = np.asarray(unit.data[column][0])
-            elif unit.is_image and unit.data is not None:
-                found = np.asarray(unit.data)
-            if found is not None and found.ndim in (2, 3) and found.size and found.dtype.kind in "fiu":
-                return found.astype(np.float64), dict(unit.header.items())
+            if isinstance(unit, fits.BinTableHDU):
+                if column in unit.columns.names and len(unit.data):
+                    _refuse_lists(path, unit.columns[column])
+                    found = unit.data[column][0]
+            elif unit.is_image and unit.header["NAXIS"] in (2, 3):
+                found = unit.data
+            if found is not None and np.ndim(found) in (2, 3) and found.size and found.dtype.kind in "fiu":
+                if found.size > _MOST_SAMPLES:
+                    raise BadInput(f"{path}: holds {found.size} samples, a {kind} has at most {_MOST_SAMPLES}")
+                return np.array(found, np.float64), dict(unit.header.items())
     raise BadInput(f"{path}: holds no image of two or three axes and no table with a column {column}")
 
 
 def _numbers_of(unit: Any) -> dict[str, npt.NDArray[np.float64]]:
     found = {}
     for column in unit.columns:
+        if any(letter in str(column.format) for letter in "PQA"):
+            continue
         values = np.asarray(unit.data[column.name])
         if values.dtype.kind not in "fiu" or values.ndim != 1:
             continue
@@ -419,14 +431,101 @@ def fits_unit(text: str) -> str:
 
 @contextmanager
 def _refusing(path: Path) -> Iterator[None]:
+    """Whatever astropy trips over in a file of ours is damage of the file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyUserWarning)
             yield
-    except (
-        OSError, EOFError, zlib.error, AstropyUserWarning, fits.VerifyError, TypeError, ValueError, LookupError
-    ) as error:  # fmt: skip
+    except LakeError:
+        raise
+    except Exception as error:
         raise Damaged(f"{path}: {' '.join(str(error).split())}") from None
+
+
+@contextmanager
+def _foreign(path: Path, kind: str) -> Iterator[fits.HDUList]:
+    """Somebody's file, plain or packed by gzip, its headers looked through before astropy is given it.
+
+    Errors : BadInput, whatever it is that astropy trips over: what its readers raise has no end
+    """
+    with user_files.opened(path, kind) as stream:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", AstropyUserWarning)
+                # Titles such as "RA(ICRS)" are usual.
+                warnings.simplefilter("ignore", fits.verify.VerifyWarning)
+                plain = _unpacked(path, stream)
+                _look_through(path, plain)
+                # What an image is packed in is a table then, and is not unpacked: its codes are not made for strangers.
+                with fits.open(plain, memmap=plain is stream, disable_image_compression=True) as units:
+                    yield units
+        except LakeError:
+            raise
+        except Exception as error:
+            text = " ".join(str(error).split()) or type(error).__name__
+            raise BadInput(f"{user_files.shown(path)}: cannot be read as FITS: {text[:300]}") from None
+
+
+def _first_table(path: Path, units: fits.HDUList) -> Any:
+    for unit in units:
+        if isinstance(unit, fits.BinTableHDU):
+            if not unit.header["NAXIS1"]:
+                raise BadInput(f"{path}: the rows of its table have no bytes")
+            return unit
+    raise BadInput(f"{path}: holds no table")
+
+
+def _unpacked(path: Path, stream: IO[bytes]) -> IO[bytes]:
+    start = stream.read(6)
+    stream.seek(0)
+    if start == b"SIMPLE":
+        return stream
+    if not start.startswith(b"\x1f\x8b"):
+        raise BadInput(f"{user_files.shown(path)}: is no FITS file")
+    with gzip.open(stream) as packed:
+        data = packed.read(_MOST_UNPACKED + 1)
+    if len(data) > _MOST_UNPACKED:
+        raise BadInput(f"{user_files.shown(path)}: unpacks to more than {_MOST_UNPACKED} bytes")
+    return io.BytesIO(data)
+
+
+def _look_through(path: Path, stream: IO[bytes]) -> None:
+    """Refuse headers without end, and data that are not there: they would be mapped beyond the end of the file."""
+    name, size, at = user_files.shown(path), stream.seek(0, io.SEEK_END), 0
+    for _ in range(_MOST_UNITS):
+        stream.seek(at)
+        header = _header(name, stream)
+        if not header:
+            break
+        said: dict[bytes, int] = {}
+        for key, value in _SIZES.findall(header):
+            said.setdefault(key, int(value))
+        axes = [said.get(b"NAXIS%d" % i, 0) for i in range(1, said.get(b"NAXIS", 0) + 1)]
+        if min([*axes, 0]) < 0 or len(axes) > _MOST_AXES:
+            raise BadInput(f"{name}: axes of {axes[:9]} pixels")
+        values = math.prod(axes) + said.get(b"PCOUNT", 0) if axes else 0
+        length = values * said.get(b"GCOUNT", 1) * abs(said.get(b"BITPIX", 8)) // 8
+        if length < 0 or at + len(header) + length > size:
+            raise BadInput(f"{name}: is cut short, {at + len(header) + length} bytes promised, {size} there")
+        at += len(header) + -(-length // _BLOCK) * _BLOCK
+    else:
+        raise BadInput(f"{name}: has more than {_MOST_UNITS} units")
+    stream.seek(0)
+
+
+def _header(name: str, stream: IO[bytes]) -> bytes:
+    """The blocks of a header; nothing where the file has ended."""
+    header = b""
+    while len(header) < _MOST_HEADER:
+        block = stream.read(_BLOCK)
+        if len(block) < _BLOCK:
+            if header:
+                raise BadInput(f"{name}: is cut short in a header")
+            return b""
+        header += block
+        if any(block[i : i + 8] == b"END     " for i in range(0, _BLOCK, _CARD)):
+            return header
+    raise BadInput(f"{name}: has a header of more than {_MOST_HEADER} bytes")
 
 
 def _check_size(path: Path, units: fits.HDUList, most_bytes: int) -> None:

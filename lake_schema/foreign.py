@@ -22,6 +22,7 @@ from typing import IO, Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 
 _MAGIC = b"PAR1"
@@ -74,11 +75,9 @@ def _received(path: Path, reader: subprocess.Popen[bytes]) -> Iterator[pa.Record
 
 
 def _refuse_large_footer(path: Path) -> None:
-    if not path.is_file():
-        raise BadInput(f"{path}: no such file")
-    size = path.stat().st_size
-    with path.open("rb") as stream:
+    with user_files.opened(path, "catalogue") as stream:
         first = stream.read(4)
+        size = stream.seek(0, os.SEEK_END)
         stream.seek(max(size - 8, 0))
         length, last = int.from_bytes(stream.read(4), "little"), stream.read(4)
     if size < 12 or first != _MAGIC or last != _MAGIC:

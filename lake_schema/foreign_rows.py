@@ -23,12 +23,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import csv
 
-from lake_schema import fits, foreign
+from lake_schema import fits, foreign, user_files
 from lake_schema.errors import BadInput
 
 Array = npt.NDArray[Any]
 
-_BLOCK_BYTES = 8 << 20
+_BLOCK_BYTES, _FIRST_LOOK = 8 << 20, 1 << 16
 # Of a name, characters.
 _LONGEST_TEXT = 64
 _CSV, _FITS, _PARQUET = (".csv",), (".fits", ".fit"), (".parquet", ".parq")
@@ -52,34 +52,58 @@ class Piece:
 
 def files(path: Path) -> list[Path]:
     """Errors: BadInput where there is no such file, or none in the folder, or its ending tells nothing"""
-    if path.is_dir():
+    if _is_folder(path):
         found = _of_folder(path)
         if not found:
             raise BadInput(f"{path}: no Parquet file in this folder")
         return found
-    if not path.is_file():
-        raise BadInput(f"{path}: no such file")
     if path.suffix.lower() not in _ENDINGS:
-        raise BadInput(f"{path}: the ending is none of {', '.join(_ENDINGS)}")
-    return [path]
+        raise BadInput(f"{user_files.shown(path)}: the ending is none of {', '.join(_ENDINGS)}")
+    return [looked_at(path)]
 
 
-def pieces(file: Path, columns: Sequence[str], whole: Sequence[str] = (), texts: Sequence[str] = ()) -> Iterator[Piece]:
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:
+        return False
+
+
+def looked_at(file: Path, kind: str = "catalogue") -> Path:
+    """The path of a file whose first bytes are those of its format: a first look, before all of it is read.
+
+    kind : of file, as user_files has it
+    """
+    form = _format(file, kind)
+    with user_files.opened(file, kind) as stream:
+        start = stream.read(_FIRST_LOOK)
+    good = start.startswith(b"PAR1") if form == _PARQUET else start.startswith((b"SIMPLE", b"\x1f\x8b"))
+    if form == _CSV:
+        good = b"\0" not in start
+    if not good:
+        raise BadInput(f"{user_files.shown(file)}: is not a {form[0].removeprefix('.')} file")
+    return file
+
+
+def pieces(
+    file: Path, columns: Sequence[str], whole: Sequence[str] = (), texts: Sequence[str] = (), kind: str = "catalogue"
+) -> Iterator[Piece]:
     """The rows of one file.
 
+    kind   : of file, as user_files has it
     whole  : columns of whole numbers, where an empty place is refused: no float holds 64 bits
     texts  : more columns, of texts or of whole numbers as texts, each left out where the file has none
     Errors : BadInput or Damaged, one line: the file, and the column and row where one is wrong
     """
     first = 1
-    kind = _format(file)
-    if kind == _FITS:
-        for arrays, units in fits.number_batches(file, columns, texts):
+    form = _format(looked_at(file, kind), kind)
+    if form == _FITS:
+        for arrays, units in fits.number_batches(file, columns, texts, kind=kind):
             named = {name: _texts(file, first, name, pa.array(arrays[name])) for name in texts if name in arrays}
             yield Piece(file, first, {**arrays, **named}, units)
             first += len(arrays[columns[0]])
         return
-    batches = foreign.batches(file, columns, texts) if kind == _PARQUET else _csv_batches(file, columns, whole, texts)
+    batches = foreign.batches(file, columns, texts) if form == _PARQUET else _csv_batches(file, columns, whole, texts)
     for batch in batches:
         arrays = {name: _numbers(file, first, name, batch.column(name), whole) for name in columns}
         named = {name: _texts(file, first, name, batch.column(name)) for name in texts if name in batch.schema.names}
@@ -103,7 +127,7 @@ def _of_folder(folder: Path) -> list[Path]:
     """A collection of HATS catalogues names the one with the rows; only its dataset holds rows once each."""
     about = folder / "collection.properties"
     if about.is_file():
-        lines = (line.partition("=") for line in about.read_text(encoding="utf-8", errors="replace").splitlines())
+        lines = (line.partition("=") for line in user_files.text(about, "request").splitlines())
         primary = {key.strip(): value.strip() for key, _, value in lines}.get("hats_primary_table_url", "")
         folder = folder / primary
     inside = folder / "dataset" if (folder / "dataset").is_dir() else folder
@@ -115,17 +139,18 @@ def _unit(field: pa.Field) -> str:
     return str((field.metadata or {}).get(b"unit", b"").decode(errors="replace"))
 
 
-def _format(file: Path) -> tuple[str, ...]:
+def _format(file: Path, kind: str) -> tuple[str, ...]:
     """Its endings."""
     for endings in (_PARQUET, _FITS, _CSV):
         if file.suffix.lower() in endings:
             return endings
     try:
-        with file.open("rb") as stream:
+        with user_files.opened(file, kind) as stream:
             start = stream.read(6)
-        if start.startswith(b"\x1f\x8b"):
-            with gzip.open(file) as packed:
-                start = packed.read(6)
+            if start.startswith(b"\x1f\x8b"):
+                stream.seek(0)
+                with gzip.open(stream) as packed:
+                    start = packed.read(6)
     except (OSError, EOFError, zlib.error) as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
     return _PARQUET if start.startswith(b"PAR1") else _FITS if start == b"SIMPLE" else _CSV

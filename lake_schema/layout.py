@@ -18,6 +18,7 @@ import os
 import re
 from pathlib import Path
 
+from lake_schema import user_files
 from lake_schema.errors import BadInput, Damaged
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
@@ -43,12 +44,16 @@ def lake(text: str | Path) -> Path:
     if _REMOTE.match(str(text)):
         raise BadInput(f"lake {text}: only a POSIX file system can publish by rename; mount it and give the path")
     try:
-        root = Path(text).expanduser().resolve()
-        if os.path.lexists(root) and not root.is_dir():
-            raise BadInput(f"lake {root} is not a folder")
+        root = user_files.expanded(text).resolve()
+        # Not there, or a folder: anything else, and a name that the file system does not hold, is refused.
+        os.lstat(root)
+        if not root.is_dir():
+            raise BadInput(f"lake {user_files.shown(text)} is not a folder")
+    except FileNotFoundError:
+        pass
     except (OSError, RuntimeError, ValueError) as error:
-        # No such user, a circle of links, a path too long.
-        raise BadInput(f"lake {text!r}: {error}") from None
+        # A circle of links, a path too long, a NUL.
+        raise BadInput(f"lake {user_files.shown(text)}: {getattr(error, 'strerror', None) or error}") from None
     return root
 
 
@@ -115,6 +120,10 @@ def cell_of_file(part: str) -> tuple[int, int]:
 
 def within(root: Path, path: Path) -> Path:
     """`path` where, links followed, it lies in `root`; else BadInput."""
-    if not path.resolve().is_relative_to(root.resolve()):
-        raise BadInput(f"path {path} leaves {root}")
+    try:
+        inside = path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError, ValueError) as error:
+        raise BadInput(f"path {user_files.shown(path)}: {getattr(error, 'strerror', None) or error}") from None
+    if not inside:
+        raise BadInput(f"path {user_files.shown(path)} leaves {root}")
     return path

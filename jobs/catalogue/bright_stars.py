@@ -22,7 +22,7 @@ from pyarrow import csv
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
 from jobs.fluxes.stellar import StellarTypes
-from lake_schema import fits, sky
+from lake_schema import fits, sky, user_files
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.provenance import file_sha256
@@ -40,6 +40,7 @@ _TITLES = (
     ("VTmag", "VT"),
 )
 _NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
+_KIND = "catalogue of stars"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,10 +64,7 @@ class BrightStars:
 
 def sha256(files: tuple[Path, ...]) -> list[str]:
     """What the files hold, for the key of what is made from them."""
-    for file in files:
-        if not file.is_file():
-            raise BadInput(f"stars.tycho2: {file}: no such file")
-    return [file_sha256(file) for file in files]
+    return [file_sha256(user_files.checked(file, _KIND, "stars.tycho2")) for file in files]
 
 
 def load(files: tuple[Path, ...], sums: list[str]) -> BrightStars:
@@ -150,7 +148,7 @@ def _records(file: Path) -> tuple[Float, Float, Float]:
 
 
 def _text(file: Path) -> list[Float]:
-    with file.open("rb") as stream:
+    with user_files.opened(file, _KIND) as stream:
         count = stream.readline(1000).count(b"|") + 1
     found = [about for about in _FIELDS.values() if about[0] == count]
     if not found:
@@ -183,7 +181,7 @@ def _floats(file: Path, texts: pa.ChunkedArray) -> Float:
 
 def _fits(file: Path) -> list[Float]:
     mean, observed, bt, vt = _TITLES
-    table = fits.read_numbers(file)
+    table = fits.read_numbers(file, _KIND)
     given = [_first(table, titles) for titles in (*mean, *observed, bt, vt)]
     for titles, values in zip((bt, vt), given[4:], strict=True):
         if values is None:

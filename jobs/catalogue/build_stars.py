@@ -14,7 +14,7 @@ from jobs.catalogue import bright_stars, cells, dust_map, star_catalogue, stars
 from jobs.own_files import DustMap
 from jobs.request import Request, Stars
 from jobs.shell import Job, Step, main
-from lake_schema.errors import BadInput
+from lake_schema import user_files
 from lake_schema.provenance import code_version, file_sha256
 from lake_schema.publish import Json, Output, Plan
 from lake_schema.tables.stars import STARS
@@ -53,9 +53,8 @@ def _files(choice: Stars) -> dict[str, Any]:
     if choice.catalogue:
         columns = dict(choice.columns)
         star_catalogue.checked_columns(columns)
-        if not choice.catalogue.is_file():
-            raise BadInput(f"stars.catalogue.file: {choice.catalogue}: no such file")
-        facts["catalogue"] = {"sha256": file_sha256(choice.catalogue), "columns": columns}
+        file = user_files.checked(choice.catalogue, star_catalogue.KIND, "stars.catalogue.file")
+        facts["catalogue"] = {"sha256": file_sha256(file), "columns": columns}
     return facts
 
 

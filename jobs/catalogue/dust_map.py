@@ -25,6 +25,7 @@ from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
 from jobs.own_files import DustMap
 from jobs.rng import stream
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.fits import read_map
 from lake_schema.provenance import canonical, file_sha256
@@ -111,8 +112,7 @@ def facts(own: DustMap | None) -> dict[str, Any]:
     """Empty without a file; BadInput where it is not there."""
     if own is None:
         return {}
-    if not own.file.is_file():
-        raise BadInput(f"ingest.dust.file: {own.file}: no such file")
+    user_files.checked(own.file, "map of dust", "ingest.dust.file")
     about = {name: value for name, value in asdict(own).items() if name != "file"}
     return {"dust": {"sha256": file_sha256(own.file), **about}}
 
@@ -138,10 +138,10 @@ def read(own: DustMap) -> npt.NDArray[np.float32]:
     where = f"{own.file}: column {own.column}"
     ordering = _agreed(own, "ORDERING", "ordering", cards, {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"})
     frame = _agreed(own, "COORDSYS", "coordinates", cards, {"G": "G", "GALACTIC": "G", "C": "C", "Q": "C"})
-    if not hp.isnpixok(values.size):
+    if not values.size or not hp.isnpixok(values.size):
         raise BadInput(f"{where}: {values.size} pixels are not those of a HEALPix map of the whole sky")
     nside = hp.npix2nside(values.size)
-    if int(cards.get("NSIDE", nside)) != nside:
+    if cards.get("NSIDE", nside) != nside:
         raise BadInput(f"{where}: NSIDE is {cards['NSIDE']}, {values.size} pixels are of {nside}")
     model = cosecant()
     to_a_v = model.r_v if own.quantity == "ebv" else 1.0

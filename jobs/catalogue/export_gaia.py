@@ -14,8 +14,7 @@ import pyarrow.compute as pc
 from pyarrow import csv
 
 from jobs.catalogue import parameters
-from lake_schema import __version__, layout, read
-from lake_schema.errors import BadInput, LakeError
+from lake_schema import __version__, command, layout, read, user_files
 from lake_schema.fits import table_to_fits
 from lake_schema.tables.gaia import EXPORT
 
@@ -26,12 +25,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--lake", required=True, help="folder of the lake")
     parser.add_argument("--out", required=True, type=Path, help="file to write, .csv or .fits")
     options = parser.parse_args(argv)
-    try:
-        rows = export(layout.lake(options.lake), options.out)
-    except LakeError as error:
-        print(f"export_gaia: {error}", file=sys.stderr)
-        return 2 if isinstance(error, BadInput) else 1
-    print(f"{options.out}: {rows:,} stars")
+    return command.status("export_gaia", lambda: _exported(layout.lake(options.lake), options.out))
+
+
+def _exported(lake: Path, out: Path) -> int:
+    rows = export(lake, out)
+    print(f"{out}: {rows:,} stars")
     return 0
 
 
@@ -40,8 +39,7 @@ def export(lake: Path, path: Path) -> int:
 
     Errors : BadInput for another ending than .csv and .fits
     """
-    if path.suffix.lower() not in (".csv", ".fits"):
-        raise BadInput(f"{path}: the ending is not .csv or .fits")
+    user_files.target(path, (".csv", ".fits"))
     version = read.version(lake, "gaia")
     if path.suffix.lower() == ".fits":
         table_to_fits(path, pa.concat_tables([_named(version, part) for part in version.parts]), EXPORT)

@@ -20,8 +20,8 @@ import pyarrow.parquet as pq
 
 from jobs.fluxes import cosmology, passbands
 from jobs.fluxes.extinction import MILKY_WAY_R_V
-from lake_schema import __version__, layout, read, sky
-from lake_schema.errors import BadInput, LakeError
+from lake_schema import __version__, command, layout, read, sky, user_files
+from lake_schema.errors import BadInput
 from lake_schema.fits import table_to_fits
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.units import LIGHT_KM_S, electron_rate
@@ -55,12 +55,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", required=True, type=Path, help="folder to write to (made where it is not there)")
     parser.add_argument("--form", required=True, choices=FORMS)
     options = parser.parse_args(argv)
-    try:
-        written = export(layout.lake(options.lake), options.out, options.form)
-    except (LakeError, OSError) as error:
-        print(f"export_galaxies: {error}", file=sys.stderr)
-        return 2 if isinstance(error, BadInput) else 1
-    print(f"{options.out}: {len(written)} files")
+    return command.status("export_galaxies", lambda: _exported(layout.lake(options.lake), options.out, options.form))
+
+
+def _exported(lake: Path, out: Path, form: str) -> int:
+    written = export(lake, user_files.folder(out), form)
+    print(f"{out}: {len(written)} files")
     return 0
 
 

@@ -69,8 +69,7 @@ def listed(given: Sequence[Path], columns: Columns) -> tuple[list[Path], list[Pa
             raise BadInput(f"{given[0]}: no file whose name begins with {columns.beside[0]}")
     every = found + [mapping.file_beside(file, columns.beside) for file in found if columns.beside]
     for file in every:
-        if not file.is_file():
-            raise BadInput(f"{file}: no such file")
+        foreign_rows.looked_at(file)
     return found, every
 
 

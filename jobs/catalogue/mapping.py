@@ -9,7 +9,6 @@ read        the rows of files by key, checked: a wrong value is refused with its
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema import foreign_rows
+from lake_schema import foreign_rows, user_files
 from lake_schema.errors import BadInput
 from lake_schema.foreign_rows import Piece
 from lake_schema.tables.galaxies import GALAXIES
@@ -118,7 +117,7 @@ class Rows:
 
 def formats() -> dict[str, dict[str, Any]]:
     """Name -> what ingest_formats.toml says of it."""
-    return tomllib.loads(_FILE.read_text(encoding="utf-8"))
+    return user_files.toml_tables(_FILE.read_text(encoding="utf-8"))
 
 
 def galaxies(name: str, own: Mapping[str, str]) -> Columns:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 
 _HERE = Path(__file__).resolve().parent
@@ -16,7 +16,7 @@ def section(file: str, name: str) -> dict[str, Any]:
 
     Errors: BadInput where the table is absent or has no source
     """
-    tables = tomllib.loads((_HERE / file).read_text(encoding="utf-8"))
+    tables = user_files.toml_tables((_HERE / file).read_text(encoding="utf-8"))
     if name not in tables:
         raise BadInput(f"{file} has no table [{name}]")
     numbers = dict(tables[name])

@@ -13,6 +13,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy.typing as npt
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
-from lake_schema import fits, foreign_rows, sky
+from lake_schema import fits, foreign_rows, sky, user_files
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.provenance import canonical
@@ -49,6 +50,7 @@ _NEEDED = (("ra", "l"), ("dec", "b"), ("mag_h", "mag_h_seen"), ("teff", "log_tef
 _COMPONENT = np.array([0] * 8 + [1, 2, 5])
 _STAGE = np.array([0, 1, 1, 1, 0, 0, 2, 0])
 _LONGEST_LINE = 100_000
+KIND = "catalogue of stars"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,10 +133,8 @@ def _h_over_v() -> float:
 
 
 def _table(file: Path, titles: list[str]) -> Mapping[str, Float]:
-    if not file.is_file():
-        raise BadInput(f"stars.catalogue.file: {file}: no such file")
     if file.suffix.lower() in (".fits", ".fit"):
-        found = fits.read_numbers(file)
+        found = fits.read_numbers(file, KIND)
         if absent := [title for title in titles if title not in found]:
             raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(found)}")
         return found
@@ -142,7 +142,7 @@ def _table(file: Path, titles: list[str]) -> Mapping[str, Float]:
 
 
 def _text(file: Path, titles: list[str]) -> Mapping[str, Float]:
-    with file.open(encoding="utf-8", errors="replace") as stream:
+    with user_files.opened(file, KIND) as opened, TextIOWrapper(opened, "utf-8", "replace") as stream:
         lines = iter(lambda: stream.readline(_LONGEST_LINE), "")
         head: list[str] = next((found for line in lines if set(titles) <= set(found := _fields(line))), [])
         if not head:

@@ -5,16 +5,17 @@ read            wavelengths and values of one file
 library         galaxy templates on our grid, from files in the order of a list
 law             an extinction law on the wavelengths of a library
 passband        a user's filter
-check, resampled, text_of   what they are read with
+check, resampled   what they are read with
 
 Every refusal is a BadInput that names the file, and the row where there is one.
 """
 
 from __future__ import annotations
 
-import tomllib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,18 @@ from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.stellar import normalised
 from jobs.fluxes.templates import Library
-from lake_schema.errors import BadInput
+from lake_schema import user_files
+from lake_schema.errors import BadInput, LakeError
+from lake_schema.fits import read_table
 
 Float = npt.NDArray[np.float64]
 
 _FORMATS = Path(__file__).with_name("spectrum_formats.toml")
-_MOST_BYTES = 64 << 20
+# What a header in YAML must not have; of a VOTable its encoding, sizes of its arrays and its count of rows.
+_YAML_REFERENCE = re.compile(r"^#.*?(?:[\s\[{,:-])[&*]\w+", re.MULTILINE)
+_ENCODING = re.compile(r"""encoding\s*=\s*["'](?!(?:utf-8|us-ascii)["'])""", re.IGNORECASE)
+_SIZES = re.compile(r"""\b(?:arraysize|width)\s*=\s*["'][^"'\d]*(\d+)""")
+_COUNT = re.compile(r"""\bnrows\s*=\s*["'][^"']*["']""")
 ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4}
 # f_lambda beyond the red end of a file of galaxies.
 _RED_SLOPE = -3.2
@@ -49,7 +56,7 @@ class Curve:
 
 def formats() -> Mapping[str, Mapping[str, Any]]:
     """The formats by name."""
-    return tomllib.loads(_FORMATS.read_text(encoding="utf-8"))
+    return user_files.toml_tables(_FORMATS.read_text(encoding="utf-8"))
 
 
 def read(path: Path, name: str) -> Curve:
@@ -64,7 +71,10 @@ def read(path: Path, name: str) -> Curve:
     form = known[name]
     try:
         wavelength, value = _columns(path, form)
-    except (OSError, ValueError, KeyError, IndexError, TypeError, UnicodeDecodeError) as error:
+    except LakeError:
+        raise
+    except Exception as error:
+        # What the libraries' readers raise of a stranger's file has no end.
         raise BadInput(f"{path}: cannot be read as {name}: {' '.join(str(error).split())[:200]}") from None
     check(path, wavelength, value, form)
     return Curve(wavelength, value)
@@ -108,23 +118,34 @@ def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
     reader, names = form["reader"], (form["wavelength"], form["value"])
     scale = ANGSTROM[form["unit"]]
     if reader == "ascii":
-        rows = np.loadtxt(text_of(path).splitlines(), comments="#", usecols=[names[0] - 1, names[1] - 1], ndmin=2)
+        lines = user_files.text(path, "curve").splitlines()
+        rows = np.loadtxt(lines, comments="#", usecols=[names[0] - 1, names[1] - 1], ndmin=2)
         return rows[:, 0] * scale, rows[:, 1]
     # Slow to import, and not needed for the form that most files have.
-    from astropy.table import QTable
     from astropy.units import Quantity, dimensionless_unscaled
 
-    text = text_of(path) if reader != "fits" else _sized(path)
-    if reader == "votable" and "<!DOCTYPE" in text:
-        raise ValueError("a VOTable has no DOCTYPE")
-    options: dict[str, Any] = {"csv": {"format": "ascii.csv"}, "ecsv": {"format": "ascii.ecsv"}}.get(
-        reader, {"format": reader}
-    )
-    table = QTable.read(path, **options)
+    table = read_table(path, "curve") if reader == "fits" else _table(path, reader)
     wavelength, value = (table[name] for name in names)
     if isinstance(wavelength, Quantity) and wavelength.unit != dimensionless_unscaled:
         wavelength, scale = wavelength.to_value("Angstrom"), 1.0
     return _plain(wavelength) * scale, _plain(value)
+
+
+def _table(path: Path, reader: str) -> Any:
+    """An astropy table of a text file; given to astropy as text, for a path it would unpack, or fetch."""
+    from astropy.table import QTable
+
+    text = user_files.text(path, "table of a curve")
+    if reader != "votable":
+        if found := _YAML_REFERENCE.search(text):
+            raise ValueError(f"{found[0].strip()!r} in its header refers to another place of it")
+        return QTable.read(text.splitlines(), format=f"ascii.{reader}", guess=False)
+    if "<!DOCTYPE" in text or "\0" in text or _ENCODING.search(text[:200]):
+        raise ValueError("a VOTable here is in UTF-8 and has no DOCTYPE")
+    if any(len(number) > 3 for number in _SIZES.findall(text)) or "<BINARY" in text or "<FITS" in text:
+        # Room is made for as many before there is a row.
+        raise ValueError("a VOTable here has its rows as TABLEDATA, and no arrays")
+    return QTable.read(BytesIO(_COUNT.sub("", text).encode()), format="votable")
 
 
 def _plain(column: Any) -> Float:
@@ -173,15 +194,3 @@ def resampled(grid: Float, curve: Curve) -> Float:
     sampled = np.interp(every, at, value, left=0.0)
     integral = np.append(0.0, np.cumsum(0.5 * (sampled[1:] + sampled[:-1]) * np.diff(every)))
     return np.diff(np.interp(edges, every, integral))
-
-
-def text_of(path: Path) -> str:
-    """A file's text.  Errors: OSError, ValueError where it is too large"""
-    _sized(path)
-    return path.read_text(encoding="utf-8")
-
-
-def _sized(path: Path) -> str:
-    if (size := path.stat().st_size) > _MOST_BYTES:
-        raise ValueError(f"{size} bytes are too many")
-    return ""

@@ -20,10 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs.fluxes import ingest, passbands, stellar, templates
-from jobs.fluxes.ingest import ANGSTROM, Curve, check, resampled, text_of
+from jobs.fluxes.ingest import ANGSTROM, Curve, check, resampled
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.stellar import StellarTypes, normalised
 from jobs.fluxes.templates import Library
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_ANGSTROM_S
 
@@ -106,7 +107,7 @@ def dwarfs(path: Path, types: StellarTypes, grid: Float) -> Float:
 def basel(path: Path) -> BaselModels:
     """All models of a BaSeL file, lcb[mp]NN.cor."""
     try:
-        lines = text_of(path).splitlines()
+        lines = user_files.text(path, "library of spectra").splitlines()
         wavelength, at = _numbers(lines, 0, _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH)
         labels, spectra = [], []
         while at < len(lines) and lines[at].strip():
@@ -114,7 +115,7 @@ def basel(path: Path) -> BaselModels:
             labels.append([float(head[a:b]) for a, b in zip(_BASEL_HEADER[1:], (*_BASEL_HEADER[2:], 30), strict=True)])
             h_nu, at = _numbers(lines, at + 1, _BASEL_COUNT, _BASEL_FLUX_WIDTH)
             spectra.append(h_nu)
-    except (OSError, ValueError, IndexError) as error:
+    except (ValueError, IndexError) as error:
         raise BadInput(f"{path}: cannot be read as BaSeL: {error}") from None
     if not spectra:
         raise BadInput(f"{path}: holds no model")

@@ -23,8 +23,8 @@ import pyarrow.compute as pc
 from jobs.area import Area
 from jobs.render import focal_plane
 from jobs.render.exposing import SKY_TYPES
-from lake_schema import layout, read, sky
-from lake_schema.errors import BadInput, LakeError
+from lake_schema import command, layout, read, sky, user_files
+from lake_schema.errors import BadInput
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
@@ -181,18 +181,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--lake", required=True, help="folder of the lake, with a plan")
     parser.add_argument("--out", type=Path, help="PNG of the maps")
     options = parser.parse_args(argv)
-    try:
-        root = layout.lake(options.lake)
-        exposures, tasks = read.version(root, "exposures"), read.version(root, "tasks")
-        found = depths(exposures.rows(), tasks.rows(), area_of(exposures))
-        for depth in found:
-            print(line(depth))
-        if options.out is not None:
-            picture(found, options.out)
-            print(options.out)
-    except (LakeError, OSError) as error:
-        print(f"coverage: {error}", file=sys.stderr)
-        return 2
+    return command.status("coverage", lambda: _drawn(options.lake, options.out))
+
+
+def _drawn(lake: str, out: Path | None) -> int:
+    if out is not None:
+        user_files.target(out, (".png",))
+    root = layout.lake(lake)
+    exposures, tasks = read.version(root, "exposures"), read.version(root, "tasks")
+    found = depths(exposures.rows(), tasks.rows(), area_of(exposures))
+    for depth in found:
+        print(line(depth))
+    if out is not None:
+        picture(found, out)
+        print(out)
     return 0
 
 

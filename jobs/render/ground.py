@@ -9,6 +9,7 @@ Ref : Serrano et al. 2024, appendix on the survey files of the eighth science ch
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -20,13 +21,14 @@ from jobs.area import Area
 from jobs.observations import CHANNELS, IMAGE_TYPES, Observation
 from jobs.render import focal_plane
 from jobs.render.exposing import Exposure, bands_of, exposure_time
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
 Float = npt.NDArray[np.float64]
 
 _DAY_S, _OVERHEAD_S = 86400.0, 30.0
-_MOST_BYTES, _MOST_ROWS = 64 << 20, 1_000_000
+_MOST_ROWS = 1_000_000
 # Mean midnight of the sites is not modelled: ground exposures follow one another from the earliest date on.
 _COLUMNS = ("channel", "camera", "band", "ra", "dec", "position_angle", "mjd")
 _OPTIONAL = ("exposure_time_s", "sky", "seeing", "zero_point", "psf", "detectors", "image_type")
@@ -170,34 +172,25 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
 
     Errors : BadInput names the file, the line and the column
     """
-    if path.stat().st_size > _MOST_BYTES:
-        raise BadInput(f"{path}: larger than {_MOST_BYTES} bytes")
+    stream = io.StringIO(user_files.text(path, "table of pointings"), newline="")
+    numbered = [(n, line) for n, line in enumerate(stream, start=1) if not line.startswith("#")]
+    lines = csv.DictReader(line for _, line in numbered)
+    found: list[Exposure] = []
     try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            numbered = [(n, line) for n, line in enumerate(stream, start=1) if not line.startswith("#")]
-            lines = csv.DictReader(line for _, line in numbered)
-            names = lines.fieldnames or []
-            for name in _COLUMNS:
-                if name not in names:
-                    raise BadInput(f"{path}: column {name} is missing")
-            for name in names:
-                if name not in (*_COLUMNS, *_OPTIONAL):
-                    raise BadInput(f"{path}: column {name} is not known; known: {', '.join((*_COLUMNS, *_OPTIONAL))}")
-            found: list[Exposure] = []
-            for row in lines:
-                if len(found) >= _MOST_ROWS:
-                    raise BadInput(f"{path}: more than {_MOST_ROWS} pointings")
-                found.append(
-                    _of_row(
-                        row,
-                        f"{path} line {numbered[lines.line_num - 1][0]}",
-                        len(found) + 1,
-                        block,
-                        mission,
-                        path.parent,
-                    )
-                )
-    except (UnicodeDecodeError, csv.Error) as error:
+        names = lines.fieldnames or []
+        for name in _COLUMNS:
+            if name not in names:
+                raise BadInput(f"{path}: column {name} is missing")
+        for name in names:
+            if name not in (*_COLUMNS, *_OPTIONAL):
+                known = ", ".join((*_COLUMNS, *_OPTIONAL))
+                raise BadInput(f"{path}: column {name[:60]} is not known; known: {known}")
+        for row in lines:
+            if len(found) >= _MOST_ROWS:
+                raise BadInput(f"{path}: more than {_MOST_ROWS} pointings")
+            where = f"{path} line {numbered[lines.line_num - 1][0]}"
+            found.append(_of_row(row, where, len(found) + 1, block, mission, path.parent))
+    except csv.Error as error:
         raise BadInput(f"{path}: {' '.join(str(error).split())}") from None
     return found
 
@@ -248,6 +241,6 @@ def _of_row(
         sky=optional("sky", 0.0, 1e6),
         seeing=optional("seeing", 0.01, 10.0) if channel == "EXT" else None,
         zero_point=optional("zero_point", 0.0, 50.0),
-        psf=str(folder / row["psf"]) if row.get("psf") else None,
+        psf=str(user_files.expanded(row["psf"], folder)) if row.get("psf") else None,
         detectors=tuple((row.get("detectors") or "").split()) or block.detectors,
     )

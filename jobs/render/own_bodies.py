@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 from jobs.render.moving import KIND, Population
 from lake_schema import foreign_rows, sky
 from lake_schema.ecliptic import equatorial
-from lake_schema.errors import BadInput, Damaged
+from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER, source_id
 
 Float = npt.NDArray[np.float64]
@@ -82,21 +82,16 @@ def check(bodies: Bodies, file: Path, mjd: Iterable[float]) -> None:
 
 def _table(file: Path) -> tuple[dict[str, Float], pa.ChunkedArray | None]:
     """Columns of KEYS, and names where it has some."""
-    if not file.is_file():
-        raise BadInput(f"{file}: no such file")
     parts: dict[str, list[Float]] = {key: [np.zeros(0)] for key in KEYS}
     names, rows = [], 0
-    try:
-        for piece in foreign_rows.pieces(file, list(KEYS), texts=[_NAME]):
-            rows += len(piece.columns["mjd"])
-            if rows > _MOST_ROWS:
-                raise BadInput(f"{file}: has more than {_MOST_ROWS} rows")
-            for key, column in parts.items():
-                column.append(np.asarray(piece.columns[key], float))
-            if _NAME in piece.columns:
-                names.append(pa.array(piece.columns[_NAME], pa.string()))
-    except Damaged as error:
-        raise BadInput(str(error)) from None
+    for piece in foreign_rows.pieces(file, list(KEYS), texts=[_NAME], kind="table of bodies"):
+        rows += len(piece.columns["mjd"])
+        if rows > _MOST_ROWS:
+            raise BadInput(f"{file}: has more than {_MOST_ROWS} rows")
+        for key, column in parts.items():
+            column.append(np.asarray(piece.columns[key], float))
+        if _NAME in piece.columns:
+            names.append(pa.array(piece.columns[_NAME], pa.string()))
     return {key: np.concatenate(column) for key, column in parts.items()}, pa.chunked_array(names) if names else None
 
 

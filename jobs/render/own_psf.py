@@ -39,8 +39,8 @@ _ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
 _ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4, "m": 1e10}
 # What a plane may sum to: less is no PSF, more is not of flux 1.
 _LEAST_SUM, _MOST_SUM = 0.5, 1.001
-# Largest file; largest and smallest distance of samples, pixels.
-_MOST_BYTES, _SPACING = 4 << 30, (0.02, 2.0)
+# Smallest and largest distance of samples, pixels.
+_SPACING = (0.02, 2.0)
 # Least side of a plane, samples.
 _LEAST_SIDE = 3 * 66 + 1
 # Lobes of the interpolant: PSFEx's models are made for three; of a cube nothing but its samples is known.
@@ -58,9 +58,7 @@ def read(path: Path, detector: Detector, band: Passband) -> Psf:
     Error : of the interpolation, 5e-5 of the peak of a cube whose samples are finer than half its width, 1e-3 of
             PSFEx's (its interpolant rings at frequencies that planes of three samples a pixel do not hold)
     """
-    if not path.is_file():
-        raise BadInput(f"{path}: no such file")
-    data, header = fits.read_planes(path, "PSF_MASK", _MOST_BYTES)
+    data, header = fits.read_planes(path, "PSF_MASK")
     try:
         if not np.isfinite(data).all():
             raise BadInput("holds values that are not numbers")

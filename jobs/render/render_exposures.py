@@ -35,7 +35,7 @@ from jobs.render.exposing import sees_bodies
 from jobs.render.plan_exposures import PARTS, mission_of, own_filters
 from jobs.request import Request
 from jobs.shell import Job, Step, common_facts, main
-from lake_schema import layout, parquet, read, reuse
+from lake_schema import layout, parquet, read, reuse, user_files
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
@@ -149,17 +149,13 @@ def _psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
     """sha256 of the PSFs that the tasks' exposures name, by file."""
     named = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
     pairs = {(named[task["exposure_id"]], task["detector"]) for task in tasks}
-    return {(file := str(own_psf.file_of(psf, detector))): file_sha256(Path(file)) for psf, detector in pairs if psf}
+    files = [own_psf.file_of(psf, detector) for psf, detector in pairs if psf]
+    return {str(file): file_sha256(user_files.checked(file, "PSF")) for file in files}
 
 
 def _bodies(file: Path, exposures: pa.Table) -> dict[str, str]:
     """sha256 of the user's moving bodies, by file; refused before anything is rendered where they cannot be read."""
-    if not file.is_file():
-        raise BadInput(f"solar_system.bodies: {file}: no such file")
-    try:
-        sha256 = file_sha256(file)
-    except OSError as error:
-        raise BadInput(f"solar_system.bodies: {file}: {error.strerror}") from None
+    sha256 = file_sha256(user_files.checked(file, "table of bodies", "solar_system.bodies"))
     kinds = exposures.select(["mjd", "channel", "image_type"]).to_pylist()
     seen = [row["mjd"] for row in kinds if sees_bodies(row["channel"], row["image_type"])]
     own_bodies.check(own_bodies.read(file, sha256), file, seen)

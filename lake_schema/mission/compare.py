@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
-from lake_schema import layout, read
+from lake_schema import layout, read, user_files
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import LADDER, MissionConfiguration, difference, resolve
 from lake_schema.mission.parameter import STATUSES
@@ -26,28 +25,30 @@ def configuration(what: str) -> MissionConfiguration:
     statuses = tuple(what.split(","))
     if all(status in STATUSES for status in statuses):
         return resolve(ladder=statuses)
-    if Path(what).is_file():
-        return _of_request(Path(what))
     root, _, key = what.partition("@")
-    if Path(root).is_dir():
-        return read_back(read.version(layout.lake(root), "mission", key or None))
-    raise BadInput(f"{what} is neither a ladder of {', '.join(STATUSES)}, nor a request file, nor a lake")
+    for lake, version in ((what, None), (root, key or None)):
+        if _is_folder(lake):
+            return read_back(read.version(layout.lake(lake), "mission", version))
+    try:
+        user_files.checked(Path(what), "request")
+    except BadInput as error:
+        raise BadInput(f"{error}, nor a ladder of {', '.join(STATUSES)}, nor a lake") from None
+    return _of_request(Path(what))
+
+
+def _is_folder(what: str) -> bool:
+    try:
+        return Path(what).is_dir()
+    except OSError:
+        return False
 
 
 def _of_request(path: Path) -> MissionConfiguration:
     try:
-        section: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8")).get("mission", {})
+        section: dict[str, Any] = user_files.toml(path, "request").get("mission", {})
         overrides = {
             key: (float(value["value"]), str(value["unit"])) for key, value in section.get("overrides", {}).items()
         }
         return resolve(ladder=tuple(section.get("ladder", LADDER)), overrides=overrides)
-    except (
-        OSError,
-        UnicodeDecodeError,
-        tomllib.TOMLDecodeError,
-        AttributeError,
-        TypeError,
-        KeyError,
-        ValueError,
-    ) as error:
-        raise BadInput(f"request {path}: {' '.join(str(error).split())}") from None
+    except (AttributeError, TypeError, KeyError, ValueError, OverflowError) as error:
+        raise BadInput(f"request {user_files.shown(path)}: {' '.join(str(error).split())[:300]}") from None

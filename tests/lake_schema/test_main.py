@@ -98,7 +98,7 @@ def test_a_disc_that_refuses_is_one_line(filled, capsys, monkeypatch):
 
     monkeypatch.setattr(publish, "gc", refuse)
     assert main(["gc", str(filled), "toy"]) == 1
-    assert capsys.readouterr().err == f"[Errno 30] Read-only file system: '{filled}'\n"
+    assert capsys.readouterr().err == f"lake_schema: [Errno 30] Read-only file system: '{filled}'\n"
 
 
 def test_gc_leaves_what_is_not_its_own(filled, capsys):

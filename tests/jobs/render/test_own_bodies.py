@@ -1,6 +1,7 @@
 """Moving bodies of the user's own: tables in three formats, drawn as ours are; what is wrong is said in a line."""
 
 import gzip
+import os
 
 import numpy as np
 import pyarrow as pa
@@ -301,7 +302,7 @@ def test_a_table_of_other_days_is_refused(tmp_path):
         own_bodies.check(bodies, file, [61000.5])
 
 
-def forbidden(path):
+def forbidden(path, *flags):
     raise PermissionError(13, "Permission denied", str(path))
 
 
@@ -319,7 +320,7 @@ def test_a_request_names_it(tmp_path, monkeypatch):
     request.bodies.write_bytes(b"")
     with monkeypatch.context() as patch:
         # Whoever runs the tests may read everything.
-        patch.setattr(render_exposures, "file_sha256", forbidden)
+        patch.setattr(os, "open", forbidden)
         with pytest.raises(BadInput, match=r"solar_system.bodies: .*bodies.csv: Permission denied"):
             render_exposures._bodies(request.bodies, exposed)
     written(request.bodies, columns(moving.population(*PLACE, 0.1, DAY, MISSION, 1)))

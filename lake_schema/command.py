@@ -1,0 +1,42 @@
+"""How a command ends: bad input in one line and exit status 2, a damaged lake or a disc that refuses in one line and 1.
+
+status    run a command's body and return its exit status
+say       a line on stderr
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import sys
+from collections.abc import Callable
+
+from lake_schema.errors import BadInput, LakeError
+
+_LONGEST = 1000
+
+
+def status(name: str, body: Callable[[], int]) -> int:
+    """What `body` returns; 2 where it refuses what it was given, 1 where the lake or the machine is at fault.
+
+    name : of the command, as it is to be named in the line
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Not every terminal has the letters of every name.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    try:
+        return body()
+    except BadInput as error:
+        return say(name, error, 2)
+    except (LakeError, OSError, MemoryError) as error:
+        return say(name, error, 1)
+
+
+def say(name: str, error: object, code: int) -> int:
+    """Print one line, never longer than anybody reads, and return the exit status."""
+    line = " ".join(str(error).split()) or type(error).__name__
+    text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    shown = text if len(text) <= _LONGEST else text[:_LONGEST] + "..."
+    with contextlib.suppress(BrokenPipeError):
+        print(f"{name}: {shown}", file=sys.stderr, flush=True)
+    return code

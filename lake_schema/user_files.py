@@ -1,0 +1,213 @@
+"""Files and folders that a user names: the one place that opens them, and the one reader of TOML.
+
+checked     a file of a kind, ready for a library that opens it by itself
+opened      the same, as a stream of bytes
+text        its text
+toml        its tables
+target      where a result may be written;  folder : where several may
+expanded    a path as it was typed
+shown       a path as messages name it
+
+Only a regular file is opened: a pipe would never answer, a device never end. Every kind has a largest size.
+Every refusal is a BadInput of one line that names the file.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from lake_schema.errors import BadInput
+
+_MB, _GB = 1 << 20, 1 << 30
+# Largest file of each kind, bytes. Catalogues are read in pieces; of the others all that is of use is held.
+LARGEST = {
+    "request": _MB,
+    "table of pointings": 64 * _MB,
+    "curve": 16 * _MB,
+    "table of a curve": 4 * _MB,
+    "library of spectra": 64 * _MB,
+    "PSF": 512 * _MB,
+    "map of dust": 8 * _GB,
+    "catalogue of stars": 2 * _GB,
+    "table of bodies": 4 * _GB,
+    "catalogue": 1 << 42,
+    "run log": _GB,
+    "manifest": 4 * _GB,
+}
+_LONGEST_SHOWN = 200
+# Parts of a dotted key, depth of brackets, characters of a number or bare key: far more than anything of ours has.
+_MOST_PARTS, _MOST_DEPTH, _LONGEST_WORD = 16, 16, 200
+# Strings and comments are passed over whole, as tomllib does; whatever is wrong with them it says itself.
+_TOKEN = re.compile(
+    r'"""(?:[^"\\]++|\\.|"(?!"")|""(?!"))*+"{3,5}'
+    r"|'''(?:[^']++|'(?!'')|''(?!'))*+'{3,5}"
+    r'|"(?:[^"\\\n]++|\\.)*+"'
+    r"|'[^'\n]*+'"
+    r"|#[^\n]*+|[A-Za-z0-9_+-]++|[ \t\r]++|.",
+    re.DOTALL,
+)
+
+
+def expanded(text: str | Path, folder: Path | None = None) -> Path:
+    """A path as it was typed, ~ replaced, found from a folder."""
+    try:
+        path = Path(text).expanduser()
+    except RuntimeError:
+        raise BadInput(f"{shown(text)}: there is no such user") from None
+    return path if folder is None else folder / path
+
+
+def shown(path: str | Path) -> str:
+    """A path as messages name it: one line, never long."""
+    name = str(path)
+    plain = name if name.isprintable() else ascii(name)[1:-1]
+    return plain if len(plain) <= _LONGEST_SHOWN else f"{plain[:80]}...{plain[-80:]}"
+
+
+def checked(path: Path, kind: str, key: str = "") -> Path:
+    """The path of a regular file that can be read and is not larger than its kind may be.
+
+    key : of the request, to be named in the message
+    """
+    try:
+        os.close(_descriptor(path, kind))
+    except BadInput as error:
+        raise BadInput(f"{key}: {error}" if key else str(error)) from None
+    return path
+
+
+@contextmanager
+def opened(path: Path, kind: str) -> Iterator[IO[bytes]]:
+    """Such a file as a stream of bytes."""
+    with os.fdopen(_descriptor(path, kind), "rb") as stream:
+        yield stream
+
+
+def _descriptor(path: Path, kind: str) -> int:
+    try:
+        # Looked at before it is opened, which some devices act upon; and again, for it may be another by then.
+        _refuse(path, kind, os.stat(path))
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    except (FileNotFoundError, NotADirectoryError):
+        raise BadInput(f"{shown(path)}: no such file") from None
+    except OSError as error:
+        raise BadInput(f"{shown(path)}: {error.strerror}") from None
+    except ValueError as error:
+        # A NUL, or a character that the file system cannot hold.
+        raise BadInput(f"{shown(path)}: {error}") from None
+    try:
+        _refuse(path, kind, os.fstat(descriptor))
+    except BadInput:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _refuse(path: Path, kind: str, about: os.stat_result) -> None:
+    if not stat.S_ISREG(about.st_mode):
+        what = next((word for word, test in _KINDS if test(about.st_mode)), "no regular file")
+        raise BadInput(f"{shown(path)}: is {what}, wanted a file: a {kind}")
+    if about.st_size > LARGEST[kind]:
+        raise BadInput(f"{shown(path)}: is larger than {LARGEST[kind]} bytes, the most of a {kind}")
+
+
+_KINDS = (
+    ("a folder", stat.S_ISDIR),
+    ("a pipe", stat.S_ISFIFO),
+    ("a device", stat.S_ISCHR),
+    ("a device", stat.S_ISBLK),
+    ("a socket", stat.S_ISSOCK),
+)
+
+
+def text(path: Path, kind: str) -> str:
+    """The text of a file, UTF-8."""
+    with opened(path, kind) as stream:
+        # No more than was there when it was looked at: a file can grow.
+        data = stream.read(LARGEST[kind] + 1)
+    if len(data) > LARGEST[kind]:
+        raise BadInput(f"{shown(path)}: is larger than {LARGEST[kind]} bytes, the most of a {kind}")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise BadInput(f"{shown(path)}: {error}") from None
+
+
+def target(path: Path, endings: Sequence[str] = ()) -> Path:
+    """A path at which a file can be written: of one of the endings, in a folder that is there."""
+    if endings and path.suffix.lower() not in endings:
+        raise BadInput(f"{shown(path)}: the ending is not one of {', '.join(endings)}")
+    try:
+        if not path.parent.is_dir():
+            raise BadInput(f"{shown(path)}: its folder is not there")
+        if os.path.lexists(path) and not path.is_file():
+            raise BadInput(f"{shown(path)}: is there, and is no file")
+        os.lstat(path)
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{shown(path)}: {getattr(error, 'strerror', None) or error}") from None
+    return path
+
+
+def folder(path: Path) -> Path:
+    """A path at which a folder is, or can be made."""
+    try:
+        if os.path.lexists(path) and not path.is_dir():
+            raise BadInput(f"{shown(path)}: is there, and is no folder")
+        os.lstat(path)
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{shown(path)}: {getattr(error, 'strerror', None) or error}") from None
+    return path
+
+
+# ------------------------------------------------------------------------------------------------ TOML
+
+
+def toml(path: Path, kind: str) -> dict[str, Any]:
+    """The tables of a TOML file."""
+    try:
+        return toml_tables(text(path, kind).replace("\r\n", "\n"))
+    except ValueError as error:
+        # Of tomllib, and of a date that no calendar has.
+        raise BadInput(f"{shown(path)}: {' '.join(str(error).split())}") from None
+
+
+def toml_tables(source: str) -> dict[str, Any]:
+    """The tables of a TOML text.
+
+    Errors : ValueError where it is none, or has what the parser needs a square of the time for, or no end of depth
+    """
+    _refuse_deep(source)
+    return tomllib.loads(source)
+
+
+def _refuse_deep(source: str) -> None:
+    depth, dots, line = 0, 0, 1
+    for found in _TOKEN.finditer(source):
+        token = found[0]
+        first = token[0]
+        if first == ".":
+            dots += 1
+            if dots >= _MOST_PARTS:
+                raise ValueError(f"a key or number of more than {_MOST_PARTS} parts (at line {line})")
+        elif first in "[{":
+            depth, dots = depth + 1, 0
+            if depth > _MOST_DEPTH:
+                raise ValueError(f"more than {_MOST_DEPTH} brackets within one another (at line {line})")
+        elif first in "]}":
+            depth, dots = depth - 1, 0
+        elif first in ",=\n#":
+            dots = 0
+        elif len(token) > _LONGEST_WORD and first not in "\"' \t\r":
+            raise ValueError(f"a number or key of more than {_LONGEST_WORD} characters (at line {line})")
+        line += token.count("\n")

@@ -1,0 +1,275 @@
+"""Whatever is wrong with what a command is given: one line that names it, exit status 2, nothing written, soon."""
+
+import os
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from jobs import demo, request, shell
+from jobs.catalogue import (
+    build_gaia,
+    build_galaxies,
+    build_stars,
+    build_strong_lenses,
+    dust_map,
+    export_gaia,
+    export_galaxies,
+)
+from jobs.explore import __main__ as explore
+from jobs.fluxes import compute_fluxes, inputs
+from jobs.render import archive, coverage, own_psf, plan_exposures, render_exposures
+from lake_schema import __main__ as lake_schema
+from lake_schema import publish, user_files
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import LADDER
+from tests import requests
+from tests.universe import plain_plan, plain_work
+
+MOST_SECONDS = 2.0
+JOBS = {
+    module.JOB.name: module.JOB
+    for module in (
+        build_galaxies, build_stars, build_strong_lenses, build_gaia, compute_fluxes, plan_exposures, render_exposures,
+    )
+}  # fmt: skip
+
+
+def run(name, lake, path):
+    return shell.main(JOBS[name], ["--lake", lake, "--request", path])
+
+
+# Commands by what they are given: a lake, a request, a file or folder to write to.
+OF_LAKE = {
+    **{name: partial(run, name) for name in JOBS},
+    "explore": lambda lake, good: explore.main(["SELECT 1", "--lake", lake]),
+    "explore, tables": lambda lake, good: explore.main(["--lake", lake]),
+    "archive": lambda lake, good: archive.main(["--lake", lake]),
+    "archive, failures": lambda lake, good: archive.main(["--lake", lake, "--sql", "SELECT 1"]),
+    "coverage": lambda lake, good: coverage.main(["--lake", lake]),
+    "export_gaia": lambda lake, good: export_gaia.main(["--lake", lake, "--out", f"{good}.csv"]),
+    "export_galaxies": lambda lake, good: export_galaxies.main(["--lake", lake, "--out", f"{good}s", "--form", "fits"]),
+    **{name: (lambda lake, good, name=name: lake_schema.main([name, lake])) for name in ("verify", "gc", "describe")},
+    "mission diff": lambda lake, good: lake_schema.main(["mission", "diff", ",".join(LADDER), f"{lake}@{0:016}"]),
+    "demo": lambda lake, good: demo.main(["--out", lake, "--request", good]),
+}
+OF_REQUEST = {
+    **{name: (lambda path, new, name=name: run(name, new, path)) for name in JOBS},
+    "request check": lambda path, new: request.main(["check", path]),
+    "demo": lambda path, new: demo.main(["--request", path, "--out", new]),
+    "mission diff": lambda path, new: lake_schema.main(["mission", "diff", path, ",".join(LADDER)]),
+}
+OF_TARGET = {
+    "explore": lambda out, lake: explore.main(["SELECT 1", "--lake", lake, "--out", out]),
+    "archive": lambda out, lake: archive.main(["--lake", lake, "--again", "images/x.fits", "--out", out]),
+    "coverage": lambda out, lake: coverage.main(["--lake", lake, "--out", out]),
+    "export_gaia": lambda out, lake: export_gaia.main(["--lake", lake, "--out", out]),
+    "export_galaxies": lambda out, lake: export_galaxies.main(["--lake", lake, "--out", out, "--form", "fits"]),
+}
+
+# Names that no file can have, or that nobody would wait for.
+NAMES = {
+    "NUL": "a\0b", "5,000 characters": "x" * 5000, "5,000 folders": "x/" * 5000 + "y", "no such user": "~nosuchuser/x",
+    "a line break": "a\nb/c", "not of this encoding": "\ud800x", "empty": "",
+}  # fmt: skip
+
+
+def sparse(path):
+    with path.open("wb") as stream:
+        stream.truncate(10 << 30)
+
+
+def loop(path):
+    path.symlink_to(path)
+
+
+# Things that are no file, or no end of one: what makes them at a path.
+THINGS = {
+    "a pipe": os.mkfifo, "a device": lambda path: path.symlink_to("/dev/zero"), "a folder": lambda path: path.mkdir(),
+    "10 GB": sparse, "a loop": loop, "nothing": lambda path: None,
+}  # fmt: skip
+
+LONG, DEEP = "1" * 5000, "a" + ".a" * 4000
+TEXTS = {
+    "an integer of 5,000 digits": requests.text(seed=LONG),
+    "a hexadecimal of 5,000 digits": requests.text(seed="0x" + LONG),
+    "a number of 5,000 digits": requests.text(seed="0." + LONG),
+    "a key of thousands of parts": f"{DEEP} = 1\n",
+    "a megabyte of such a key": "a" + ".a" * 500_000 + " = 1\n",
+    "a table of thousands of parts": f"[{DEEP}]\n",
+    "thousands of tables in one another": "x = " + "{ a = " * 5000 + "1" + " }" * 5000,
+    "thousands of lists in one another": "x = " + "[" * 5000 + "]" * 5000,
+    "a date that no calendar has": requests.text(seed="2023-02-30"),
+    "no text": b"\xff\xfe\x00x",
+    "a line of vertices": requests.text(area="polygon = [[0, 0], [1, 0], [2, 0]]"),
+    "a meridian of vertices": requests.text(area="polygon = [[10, 10], [10, 20], [10, 30]]"),
+    "half of the sky": requests.text(area="polygon = [[0, 0], [120, 0], [240, 0]]"),
+    "half of the sky, nearly": requests.text(area="polygon = [[0, 1e-9], [90, 1e-9], [180, 1e-9], [270, 1e-9]]"),
+    "opposite vertices": requests.text(area="polygon = [[0, 0], [180, 0], [90, 45]]"),
+    "a star": requests.text(area="polygon = [[1, 0], [-0.8, 0.6], [0.3, -0.95], [0.3, 0.95], [-0.8, -0.6]]"),
+    "a speck": requests.text(area="polygon = [[0, 0], [1e-5, 0], [0, 1e-5]]"),
+    "no such user": requests.text('[stars]\ncatalogue = { file = "~nosuchuser/x", columns = {} }\n'),
+    "an effect of a list": requests.text('effects = { on = [["adc"]] }\n'),
+}
+# Not what a mission is read from: the comparison does not look at it.
+NO_MISSION = [name for name in TEXTS if "of vertices" in name or "sky" in name or name in (
+    "opposite vertices", "a star", "a speck", "no such user", "an effect of a list",
+)]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch):
+    """Nothing is started, and what waits for a pipe or the end of a device is stopped."""
+
+    def fail(*arguments):
+        raise AssertionError("a session was asked for")
+
+    monkeypatch.setattr(shell, "_spark_map", fail)
+    monkeypatch.setattr(demo, "_run_all", fail)
+    before = signal.signal(signal.SIGALRM, fail)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def tree(folder):
+    return sorted(str(path) for path in folder.rglob("*"))
+
+
+def refused(folder, capsys, call, *arguments):
+    """The one line that a command ends with."""
+    before, started = tree(folder), time.process_time()
+    assert call(*arguments) == 2
+    assert time.process_time() - started < MOST_SECONDS
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert len(err) < 1200
+    assert tree(folder) == before
+    return err
+
+
+@pytest.fixture
+def good(tmp_path):
+    return str(requests.written(tmp_path))
+
+
+@pytest.mark.parametrize("call", OF_LAKE.values(), ids=OF_LAKE)
+def test_a_lake_that_is_none(tmp_path, capsys, good, call):
+    for what in ("NUL", "5,000 characters", "5,000 folders", "no such user", "empty"):
+        name = NAMES[what]
+        refused(tmp_path, capsys, call, f"{tmp_path}/{name}" if name[:1] not in ("", "~") else name, good)
+    for thing in ("a pipe", "a device", "10 GB", "a loop"):
+        path = tmp_path / thing.replace(" ", "_")
+        THINGS[thing](path)
+        assert thing.replace(" ", "_") in refused(tmp_path, capsys, call, str(path), good)
+
+
+@pytest.mark.parametrize("call", OF_REQUEST.values(), ids=OF_REQUEST)
+def test_a_request_that_is_none(tmp_path, capsys, call):
+    for name in NAMES.values():
+        refused(tmp_path, capsys, call, f"{tmp_path}/{name}" if name[:1] != "~" else name, str(tmp_path / "new"))
+    for thing, make in THINGS.items():
+        path = tmp_path / f"{thing.replace(' ', '_')}.toml"
+        make(path)
+        if thing != "a folder" or call is not OF_REQUEST["mission diff"]:
+            assert path.name in refused(tmp_path, capsys, call, str(path), str(tmp_path / "new"))
+
+
+@pytest.mark.parametrize("call", OF_REQUEST.values(), ids=OF_REQUEST)
+def test_a_request_of_bad_contents(tmp_path, capsys, call):
+    for name, text in TEXTS.items():
+        if name in NO_MISSION and call is OF_REQUEST["mission diff"]:
+            continue
+        path = tmp_path / "r.toml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        assert "r.toml: " in refused(tmp_path, capsys, call, str(path), str(tmp_path / "new")), name
+
+
+@pytest.mark.parametrize("call", OF_TARGET.values(), ids=OF_TARGET)
+def test_a_file_that_cannot_be_written(tmp_path, capsys, call):
+    lake = tmp_path / "lake"
+    lake.mkdir()
+    publish.make(lake, plain_plan(), plain_work)
+    for name in ("NUL", "5,000 characters"):
+        refused(tmp_path, capsys, call, f"{tmp_path}/{NAMES[name]}.csv", str(lake))
+    for thing in ("a pipe", "a device", "a loop"):
+        path = tmp_path / f"{thing.replace(' ', '_')}.fits"
+        THINGS[thing](path)
+        refused(tmp_path, capsys, call, str(path), str(lake))
+
+
+# ------------------------------------------------------------------------------------------------ own files
+
+HEAD = '[fluxes.passbands.mine]\nmedium = "air"\n'
+CATALOGUE = 'format = "flagship2"\n'
+POINT = '[[pointing]]\nchannel = "VIS"\nband = "euclid_vis"\nra = 53.1\ndec = -27.8\nmjd = 60905.0\n'
+HALOS = 'columns = { ra = "ra", dec = "dec", z_true = "z", log_mass = "m" }\n'
+SKY = pa.table({"mjd": [60905.0], "channel": ["VIS"], "image_type": ["science"]})
+# A key of the request that names a file, and what reads it.
+OWN = {
+    "fluxes.passbands": (HEAD + 'format = "passband_ascii"\nfile = {}\n', lambda r: inputs.filters(r.curves)),
+    "fluxes.passbands, ECSV": (HEAD + 'format = "passband_ecsv"\nfile = {}\n', lambda r: inputs.filters(r.curves)),
+    "fluxes.passbands, VOTable": (HEAD + 'format = "passband_svo"\nfile = {}\n', lambda r: inputs.filters(r.curves)),
+    "fluxes.templates": ('[fluxes.templates]\nformat = "cosmos"\nfiles = [{}]\n', lambda r: inputs.read(r.curves)),
+    "fluxes.templates, FITS": (
+        '[fluxes.templates]\nformat = "spectrum_fits"\nfiles = [{}]\n', lambda r: inputs.read(r.curves)
+    ),
+    "fluxes.extinction": ('[fluxes.extinction.3]\nformat = "extinction"\nfile = {}\n', lambda r: inputs.read(r.curves)),
+    "fluxes.stars, models": ("[fluxes.stars]\nbasel = {}\n", lambda r: inputs.read(r.curves)),
+    "fluxes.stars, infrared": ("[fluxes.stars]\nirtf = [{}]\n", lambda r: inputs.read(r.curves)),
+    "ingest.galaxies": ("[ingest.galaxies]\n" + CATALOGUE + "files = [{}]\n", lambda r: build_galaxies.steps(None, r)),
+    "ingest.halos": ("[ingest.halos]\n" + HALOS + "files = [{}]\n", lambda r: build_galaxies.steps(None, r)),
+    "ingest.dust": ('[ingest.dust]\ncolumn = "EBV"\nfile = {}\n', lambda r: dust_map.chosen(1, r.ingest.dust)),
+    "stars.tycho2": ("[stars]\ntycho2 = [{}]\n", lambda r: build_stars._files(r.stars)),
+    "stars.catalogue": (
+        '[stars.catalogue]\ncolumns = {{ ra = "ra", dec = "dec", mag_h = "h", teff = "t" }}\nfile = {}\n',
+        lambda r: build_stars._files(r.stars),
+    ),
+    "psf": (POINT + "[psf]\neuclid_vis = {}\n", lambda r: own_psf.read(Path(dict(r.psfs)["euclid_vis"]), None, None)),
+    "solar_system.bodies": (
+        POINT + "[solar_system]\nbodies = {}\n", lambda r: render_exposures._bodies(r.bodies, SKY)
+    ),
+    "observation.pointings": ('[[observation]]\nchannels = ["VIS"]\npointings = {}\n', lambda r: None),
+}  # fmt: skip
+
+
+def quoted(text):
+    """As TOML has it."""
+    return '"' + text.replace("\0", "\\u0000").replace("\n", "\\n") + '"'
+
+
+@pytest.mark.parametrize(("key", "read"), OWN.values(), ids=OWN)
+def test_a_file_of_a_request_that_is_none(tmp_path, key, read):
+    names = [name for what, name in NAMES.items() if what not in ("not of this encoding", "empty")]
+    for suffix in (".fits", ".csv", ".parquet"):
+        for thing, make in THINGS.items():
+            names.append(thing.replace(" ", "_") + suffix)
+            make(tmp_path / names[-1])
+    before = tree(tmp_path)
+    for name in names:
+        folder_of_catalogues = key.startswith("[ingest.") and name.startswith("a_folder")
+        path = requests.written(tmp_path, key.replace("{{", "{").replace("}}", "}").replace("{}", quoted(name)))
+        started = time.process_time()
+        with pytest.raises(BadInput) as caught:
+            read(request.parse(path))
+        assert time.process_time() - started < MOST_SECONDS
+        said = str(caught.value)
+        assert len(said.splitlines()) == 1
+        assert len(said) < 1200
+        if name in before and not folder_of_catalogues:
+            assert name in said
+        path.unlink()
+    assert tree(tmp_path) == before
+
+
+def test_every_kind_of_file_has_a_size_that_is_named(tmp_path):
+    for kind, most in user_files.LARGEST.items():
+        path = tmp_path / "x"
+        with path.open("wb") as stream:
+            stream.truncate(most + 1)
+        with pytest.raises(BadInput, match=f"is larger than {most} bytes, the most of a {kind}"):
+            user_files.checked(path, kind)
