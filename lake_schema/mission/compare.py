@@ -32,7 +32,7 @@ def configuration(what: str) -> MissionConfiguration:
     try:
         user_files.checked(Path(what), "request")
     except BadInput as error:
-        raise BadInput(f"{error}, nor a ladder of {', '.join(STATUSES)}, nor a lake") from None
+        raise BadInput(f"{error}: neither a request, nor a ladder of {', '.join(STATUSES)}, nor a lake") from None
     return _of_request(Path(what))
 
 
@@ -45,7 +45,11 @@ def _is_folder(what: str) -> bool:
 
 def _of_request(path: Path) -> MissionConfiguration:
     try:
-        section: dict[str, Any] = user_files.toml(path, "request").get("mission", {})
+        table = user_files.toml(path, "request")
+    except BadInput as error:
+        raise BadInput(f"request {error}") from None
+    try:
+        section: dict[str, Any] = table.get("mission", {})
         overrides = {
             key: (float(value["value"]), str(value["unit"])) for key, value in section.get("overrides", {}).items()
         }
