@@ -170,8 +170,9 @@ def add(
     least: float,
     edges: Edges | None,
     trail: Float | None = None,
+    unit: float = FIXED_POINT,
 ) -> None:
-    """Adds what a star shines outside its plane, which fades by `left`, to a frame of 1 / FIXED_POINT electrons.
+    """Adds what a star shines outside its plane, which fades by `left`, to a frame that has `unit` of an electron.
 
     photons : [w] share of each sub-band, None = equal;  size : of the plane, pixels
     least   : electrons in a pixel that may be left out
@@ -197,6 +198,7 @@ def add(
     out, across = (np.flatnonzero(shown.any(axis=axes)) for axes in ((0, 2), (0, 1)))
     far = min(inner + _LONG * float(out[-1] + 1) if len(out) else 0.0, farthest)
     wide = _STEP * float(across[-1] + 1) if len(across) else 0.0
+    level, lines = level * unit, lines * unit
     if length > 0.0:
         lines /= length
         fine = length / math.ceil(length / _finest(edges))
@@ -318,7 +320,10 @@ def _outside(
     frame: Any, x: float, y: float, inner: float, level: float, radius: float, turned: Any, lines: Any, far: float,
     wide: float,
 ) -> None:  # fmt: skip
-    """Adds what lies outside a square of half side `inner`: the ring up to `radius`, spikes up to `far`."""
+    """Adds what lies outside a square of half side `inner`: the ring up to `radius`, spikes up to `far`.
+
+    level, lines : in the frame's units, as below
+    """
     ny, nx = frame.shape
     for r in range(ny):
         dy = r - y
@@ -327,7 +332,7 @@ def _outside(
         for c in range(max(0, int(np.ceil(x - chord))), min(nx, int(np.floor(x + chord)) + 1)):
             if not (own and abs(c - x) < inner):
                 square = (c - x) * (c - x) + dy * dy
-                frame[r, c] += np.int64(np.rint(level / (square * np.sqrt(square)) * FIXED_POINT))
+                frame[r, c] += np.int64(np.rint(level / (square * np.sqrt(square))))
         for b in range(len(turned) if wide > 0.0 else 0):
             left, right = 0, nx
             if abs(turned[b, 0]) > 1e-9:
@@ -335,7 +340,7 @@ def _outside(
                 left, right = int(max(middle - half, 0.0)), int(min(max(middle + half, -1.0), nx - 1.0)) + 1
             for c in range(left, right):
                 if not (own and abs(c - x) < inner) and (c - x) * (c - x) + dy * dy < far * far:
-                    frame[r, c] += np.int64(np.rint(_on_spike(turned, lines, b, c - x, dy) * FIXED_POINT))
+                    frame[r, c] += np.int64(np.rint(_on_spike(turned, lines, b, c - x, dy)))
 
 
 @jit
@@ -349,7 +354,7 @@ def _inside(frame: Any, x: float, y: float, inner: float, level: float, turned: 
                 left = _left(abs(dx), inner) * _left(abs(dy), inner)
                 if left < 1.0:
                     frame[r, c] += np.int64(
-                        np.rint((1.0 - left) * _light(dx, dy, level, turned, lines, lines, 0.0, 0.0, 0.0) * FIXED_POINT)
+                        np.rint((1.0 - left) * _light(dx, dy, level, turned, lines, lines, 0.0, 0.0, 0.0))
                     )
 
 
@@ -389,7 +394,7 @@ def _streak(
                         # No trail, its sums are not asked for.
                         light += faded * _light(ax, ay, level, turned, lines, sums, ux, uy, 0.0) * (high - low) / points
             if light > 0.0:
-                frame[r, c] += np.int64(np.rint(light * FIXED_POINT))
+                frame[r, c] += np.int64(np.rint(light))
 
 
 @jit

@@ -66,6 +66,8 @@ EFFECTS: Mapping[str, Mapping[str, tuple[Effect, ...]]] = {"VIS": vis.EFFECTS, "
 _LAMPS = (calibration_lamp.EFFECT, charge_injection.EFFECT, charge_injection.NOISE)
 # What crosses it besides light: its tracks are squeezed, and left behind, in the dark, too.
 _RAYS = (cosmic_rays.EFFECT, cosmic_rays.READOUT)
+# Of a source: more would leave the frame's integers to a tenth of an electron (kernel.units_of).
+_MOST_ELECTRONS = 1e17
 # Electrons of a source that may shine where it is not.
 _LIGHT = 1e6
 # Pixels of a trail that shine around corners as a point.
@@ -452,9 +454,9 @@ def _colours(
 def _check(ids: npt.NDArray[np.int64], electrons: Float) -> None:
     if len(np.unique(ids)) != len(ids):
         raise BadInput("a source is given twice")
-    bad = ~(np.isfinite(electrons) & (electrons >= 0))
+    bad = ~((electrons >= 0) & (electrons <= _MOST_ELECTRONS))
     if bad.any():
-        raise BadInput(f"source {ids[np.argmax(bad)]}: {electrons[np.argmax(bad)]} electrons")
+        raise BadInput(f"source {ids[np.argmax(bad)]}: {electrons[np.argmax(bad)]} electrons, outside 0 .. 1e17")
 
 
 def _fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:

@@ -1,5 +1,6 @@
 """The inner loops of drawing, compiled: a source's Fourier transform on its stamp's grid, and the sum of stamps.
 
+units_of      what an electron is in a frame's integers
 nyquist_zones profile x PSF x pixel x phase on the half plane, wrapped onto the pixels' Nyquist zone
 accumulate    stamps onto the frame, in fixed point
 returning     the light that comes in at the opposite edges of stamps;  take_off : it;  leaving : it where it belongs
@@ -16,6 +17,7 @@ Precision is that of the planes: single, but double for sources so bright that i
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -29,8 +31,8 @@ Float32 = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-# What an electron is in the frame's integers: 2^20. The frame then holds 8e12 electrons a pixel, to 1e-6.
-FIXED_POINT = float(1 << 20)
+# What an electron is in the frame's integers, to 1e-6; and their largest sum, which leaves room for what rings.
+FIXED_POINT, _FULL = float(1 << 20), 61
 _TWO_PI = 2.0 * np.pi
 _FIRST = int(FIRST_BITS)
 # Of a float's bits, those within a sixteenth of an octave; square of the scale lengths at which a disc ends.
@@ -45,6 +47,15 @@ BULGE, DISK, BULGE_FORM, POWER, DISK_FORM = 0, 1, 2, 6, 7
 _EVEN, _STEEP = 1.0, 3.0
 # It fades, too, where the terms cancel: they hold less light than this, of what the middle's level would be.
 _CANCELLED = 0.25
+
+
+def units_of(electrons: Float) -> float:
+    """Units of an electron in a frame of sources [n], a power of two: FIXED_POINT, or what they all fit in, in a pixel.
+
+    Error : of 5e13 electrons, the brightest star of the sky in 560 s, the frame is to 1e-5 of one; of 1e17 to 0.06
+    """
+    _, octave = math.frexp(math.fsum(electrons.tolist()))
+    return min(FIXED_POINT, 2.0 ** (_FULL - octave))
 
 
 @jit
@@ -330,8 +341,10 @@ def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> 
 
 
 @jit
-def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, unread: tuple[int, int]) -> Int:
-    """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, in units of 1 / FIXED_POINT.
+def accumulate(
+    frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, unread: tuple[int, int], unit: float
+) -> Int:  # fmt: skip
+    """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, `unit` to an electron.
 
     Whole numbers: the sum is the same, bit by bit, in any order.
     unread  : first of the rows that count for nothing, and the one behind them
@@ -346,7 +359,7 @@ def accumulate(frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, unread: t
                 some, out = stamps[i, r, left:right], frame[y0[i] + r, x0[i] + left : x0[i] + right]
                 total = np.int64(0)
                 for c in range(len(some)):
-                    units = np.int64(np.rint(np.float64(some[c]) * FIXED_POINT))
+                    units = np.int64(np.rint(np.float64(some[c]) * unit))
                     out[c] += units
                     total += units
                 if not unread[0] <= y0[i] + r < unread[1]:
@@ -448,8 +461,8 @@ def _square(stray: Float, form: int, x: float, y: float) -> Any:
 
 
 @jit
-def spread(blocks: Int, image: Float, x: Float, y: Float, electrons: Float) -> None:
-    """Adds an image about points (x, y) [m], blocks, each shared among the four nearest, in units of 1 / FIXED_POINT.
+def spread(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit: float) -> None:
+    """Adds an image about points (x, y) [m], blocks, each shared among the four nearest, `unit` to an electron.
 
     image : electrons a pixel of one electron, on blocks, its middle one the point's, with a border of nothing
     """
@@ -458,7 +471,7 @@ def spread(blocks: Int, image: Float, x: Float, y: Float, electrons: Float) -> N
     for i in range(len(x)):
         left, low = int(np.floor(x[i])), int(np.floor(y[i]))
         right, up = x[i] - left, y[i] - low
-        light = electrons[i] * FIXED_POINT
+        light = electrons[i] * unit
         w0, w1 = light * (1.0 - right) * (1.0 - up), light * right * (1.0 - up)
         w2, w3 = light * (1.0 - right) * up, light * right * up
         left, low = left - (side - 1) // 2, low - (side - 1) // 2
@@ -475,9 +488,10 @@ def spread(blocks: Int, image: Float, x: Float, y: Float, electrons: Float) -> N
 
 @jit
 def leaving(
-    blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, stray: Float, light: Float
-) -> None:
-    """Adds what is taken off galaxies' stamps to blocks of `side` pixels outside, in units of 1 / FIXED_POINT.
+    blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, stray: Float, light: Float,
+    unit: float,
+) -> None:  # fmt: skip
+    """Adds what is taken off galaxies' stamps to blocks of `side` pixels outside, `unit` to an electron.
 
     margin : blocks before the frame's first;  size, reach : [m] side of the stamp, and as far as it goes, pixels
     column, row : [m] pixels;  stray : [m, 11] profiles.on_the_sky;  light : [m] electrons to be shared among the blocks
@@ -510,7 +524,7 @@ def leaving(
                     image[r, c] = outside * some
         whole = np.sum(image) * side**2
         if whole > 0.0:
-            _add(blocks, image, left + margin, low + margin, light[i] / whole * FIXED_POINT)
+            _add(blocks, image, left + margin, low + margin, light[i] / whole * unit)
 
 
 @jit
@@ -538,14 +552,14 @@ def _by_square(stray: Float, least: float, most: float) -> tuple[Float, int]:
 
 
 @jit
-def electrons_of(frame: Int, blocks: Float, side: int, margin: int) -> Float:
-    """The frame's electrons, with those of blocks of `side` pixels, `margin` of them before the frame's first.
+def electrons_of(frame: Int, unit: float, blocks: Float, side: int, margin: int) -> Float:
+    """The electrons of a frame of `unit` to each, with those of blocks of `side` pixels, `margin` before its first.
 
     blocks : electrons a pixel, interpolated linearly between the blocks' centres
     returns : float64[ny, nx] in the place of the frame, which is lost
     """
     ny, nx = frame.shape
-    out = frame.view(np.float64)
+    out, one = frame.view(np.float64), 1.0 / unit
     middle = 0.5 * (side - 1)
     left, part = np.empty(nx, np.int64), np.empty(nx)
     for c in range(nx):
@@ -558,7 +572,7 @@ def electrons_of(frame: Int, blocks: Float, side: int, margin: int) -> Float:
         up = y - low
         line = (1.0 - up) * blocks[low] + up * blocks[low + 1]
         for c in range(nx):
-            out[r, c] = frame[r, c] / FIXED_POINT + line[left[c]] + part[c] * (line[left[c] + 1] - line[left[c]])
+            out[r, c] = frame[r, c] * one + line[left[c]] + part[c] * (line[left[c] + 1] - line[left[c]])
     return out
 
 

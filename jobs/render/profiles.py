@@ -32,7 +32,8 @@ EXPONENTIAL_RADIUS = 1.6783469900166605
 # ellipse.
 _MOST_SHEAR = 0.9
 _LEAST_DETERMINANT = 1e-3
-_SLIMMEST = 0.02
+# An ellipse has an area: thinner than this is a line.
+_SLIMMEST = 1e-4
 # Square pixels of a component that has no light to speak of outside any stamp.
 _NO_AREA = 1e-8
 

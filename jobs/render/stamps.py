@@ -4,8 +4,9 @@ A stamp's image is the inverse transform of profile(k) PSF(k) pixel(k) on the st
 that belongs outside its stamp comes in at the opposite edge. What of it reaches the middle is taken off and drawn where
 it belongs, as are the PSF's wings beyond the stamp (wings.py); the rest stays at the edge, where it is below the noise,
 and where a PSF that has no planes leaves all of its wings (transfer.py).
-A stamp is large enough that all that comes in is below a part of the flux in the source's aperture. Nothing is lost,
-nothing is rescaled. A source whose stamp lies beside the frame sends in what is drawn beyond its stamp.
+A stamp is large enough that all that comes in is below a part of the flux in the source's aperture. A galaxy that the
+largest does not hold has its outer light from real space (outskirts.py). Nothing is lost, nothing is rescaled. A source
+whose stamp lies beside the frame sends in what is drawn beyond its stamp.
 
 Sources         what is drawn: galaxies (with a shape) and points
 settings_for, seconds_for   what an accuracy takes, from the measured table
@@ -34,7 +35,7 @@ import numpy.typing as npt
 import scipy.fft
 
 from jobs.accuracy import Accuracy
-from jobs.render import edges, kernel, pictures, profiles, selection, sersic, transfer, wings
+from jobs.render import edges, kernel, outskirts, pictures, profiles, selection, sersic, transfer, wings
 from jobs.render.effects.effect import NOTICEABLE
 from jobs.render.pictures import Picture
 from jobs.render.profiles import Forms, Shapes
@@ -63,14 +64,19 @@ _EXTENT = 4.0
 _THINNEST = 0.1
 # Above this many electrons the rounding of single precision would show.
 _BRIGHT = 1e7
+# In Fourier space such sources are followed to so many times what may be left out of them: a tenth of that rings.
+_RINGS = 1e3
+# Larger stamps are followed no farther than others.
+_DEEP = 1024
 # Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
 _SHARED = 512
 # For fewer than this a plane the planes are not worth their transforms.
 _FEW = 0.5
 # Bytes while drawing, measured, of what is drawn to the PSF's last frequency: of a frame's pixel (integers and result),
-# of a pixel of the largest stamp (its plane and transforms) in single and double precision, of a source (its form and
+# of a pixel of the largest stamp (its plane and transforms) in single and double precision, and where it is followed
+# farther, of a source (its form and
 # weights), of all else (planes of the small stamps).
-_FRAME_BYTES, _STAMP_BYTES, _DOUBLE_BYTES, _SOURCE_BYTES, _OTHER_BYTES = 16, 160, 190, 900, 40_000_000
+_FRAME_BYTES, _STAMP_BYTES, _DOUBLE_BYTES, _DEEP_BYTES, _SOURCE_BYTES, _OTHER_BYTES = 16, 160, 190, 470, 900, 40_000_000
 # The same of a pixel of the largest stamp of a picture.
 _PICTURE_BYTES = 370
 # CPU s while drawing, measured (2.5 GHz, one core): of a pixel of a stamp, of a plane of the PSF on a stamp's grid and
@@ -350,7 +356,7 @@ def _draw(
     drawn: Float,
     unread: tuple[int, int],
 ) -> Float:
-    frame = np.zeros((ny, nx), np.int64)
+    frame, unit = np.zeros((ny, nx), np.int64), kernel.units_of(sources.electrons)
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
     some, form = _forms(sources)
     bodies, table = (*_bodies(sources, some, form), trail), sersic.table()
@@ -362,9 +368,12 @@ def _draw(
     passing = transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
     body, fraction, bulge, disk, _, row, *_ = bodies
-    cut = kernel.reaches(passing, transfer.STEP, body, fraction, bulge, disk, table, row, left_out)
+    bodied = body, fraction, bulge, disk, table, row
+    cut = kernel.reaches(passing, transfer.STEP, *bodied, left_out)
     reach = transfer.STEP * len(passing)
+    deep = _ringing(cut, sources.electrons, sizes, left_out, psf, bodied)
     far = shining(sources.electrons, sizes, sources.shape, sources.picture, psf)
+    largest = _largest(sources.shape, sizes)
 
     def star(parts: Int) -> dict[str, Any]:
         # A point at rest, or pieces of one trail.
@@ -374,6 +383,9 @@ def _draw(
             "electrons": electrons, "photons": None if sources.photons is None else sources.photons[first],
             "size": SIDE, "least": left_out[first] * electrons, "edges": psf.edges, "trail": trail[parts].sum(axis=0),
         }  # fmt: skip
+
+    def of_largest(i: int) -> outskirts.Outskirts:
+        return _outskirts(sources, i, some, form, psf, weights, nx, ny)
 
     here = selection.touching(sources.column, sources.row, sizes, nx, ny)
     done = int(np.sum(~here))
@@ -386,24 +398,54 @@ def _draw(
         for number, chosen in enumerate([*groups, *alone[:, None]]):
             if own is not None and number >= len(groups):
                 dtype = np.float64 if sources.electrons[chosen[0]] > _BRIGHT else np.float32
-                passed = transfer.collapsed(psf, weights[chosen[0]], own, dtype, bool(far[chosen[0]]))
+                seen = transfer.grid(int(size), float(cut[chosen[0]])) if deep[chosen[0]] else own
+                passed = transfer.collapsed(psf, weights[chosen[0]], seen, dtype, bool(far[chosen[0]]))
                 if (picture := sources.picture_of(int(chosen[0]))) is not None:
                     passed = pictures.through(passed, picture, sources.jacobian[chosen[0]])
                 share = np.ones((1, 1), dtype)
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
-            unfold = partial(edges.unfold, **star(chosen)) if far[chosen[0]] else None
-            added = _draw_some(frame, sources, chosen, passed, share, bodies, table, cut, curve, taken, unfold, unread)
-            drawn[chosen] = added / kernel.FIXED_POINT
+            finish = partial(edges.unfold, **star(chosen)) if far[chosen[0]] else None
+            if largest[chosen[0]]:
+                finish = partial(_finish_largest, sources, int(chosen[0]), of_largest)
+            added = _draw_some(
+                frame, sources, chosen, passed, share, bodies, table, cut, curve, taken, finish, unread, unit
+            )
+            drawn[chosen] = added / unit
             done += len(chosen)
             if progress is not None:
                 progress(done)
+    for i in np.flatnonzero(largest).tolist():
+        hole, place = (int(x0[i]), int(y0[i]), int(sizes[i])), (float(sources.column[i]), float(sources.row[i]))
+        drawn[i] += outskirts.add(of_largest(i), frame, *place, hole, unread, unit) / unit
     bright = np.flatnonzero(far)
     for trailing in np.split(bright, np.flatnonzero(np.diff(whole[bright])) + 1) if len(bright) else []:
-        edges.add(frame, **star(trailing))
-    layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny)
-    layer += wings.galaxies(sources.column, sources.row, stray, taken, farthest, sizes, nx, ny)
-    return np.asarray(kernel.electrons_of(frame, layer, wings.BLOCK, wings.MARGIN))
+        edges.add(frame, **star(trailing), unit=unit)
+    layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny, unit)
+    layer += wings.galaxies(sources.column, sources.row, stray, taken, farthest, sizes, nx, ny, unit)
+    return np.asarray(kernel.electrons_of(frame, unit, layer, wings.BLOCK, wings.MARGIN))
+
+
+def _ringing(
+    cut: Float, electrons: Float, sizes: Int, left_out: Float, psf: Psf, bodied: tuple[Array, ...]
+) -> npt.NDArray[np.bool_]:
+    """[n] True of sources that are followed so far, in `cut`, that what is cut off behind is not seen to ring.
+
+    A hard edge in Fourier space rings by a ten-thousandth of what it cuts off. Planes end by themselves.
+    left_out : of `floors`, what may be left out of a source, 0 = as of others;  bodied : arguments of kernel.reaches
+    """
+    floor = np.where(left_out > 0.0, np.clip(_RINGS * left_out, transfer.LEAST, transfer.NOTHING), transfer.NOTHING)
+    deep = (electrons > _BRIGHT) & (floor < transfer.NOTHING) & (psf.planes is None)
+    some = np.flatnonzero(deep)
+    if len(some):
+        farther = transfer.passing(psf, float(floor[some].min()))
+        body, fraction, bulge, disk, table, row = bodied
+        own = body[some], fraction[some], bulge[some], disk[some], table, row[some]
+        found = kernel.reaches(farther, transfer.STEP, *own, floor[some])
+        # What memory holds: the largest stamps are followed as far as any.
+        found[sizes[some] > _DEEP] = np.minimum(found[sizes[some] > _DEEP], transfer.HIGHEST)
+        cut[some] = np.maximum(cut[some], found)
+    return deep
 
 
 def shone_on(
@@ -415,10 +457,15 @@ def shone_on(
     column .. picture : as of Sources;  noise : of a pixel, electrons
     """
     wide = reaches(electrons, sizes, shape, picture, psf, noise)
+    largest = _largest(shape, sizes)
+    farthest = outskirts.reach(
+        electrons[largest], shapes.take(shape[largest]), psf.pixel_scale, noise, 0.5 * SIZES[-1] * psf.pixel_scale
+    )
+    wide[largest] = np.ceil(2.0 * farthest / psf.pixel_scale).astype(np.int64)
     here = selection.touching(column, row, wide, nx, ny)
     # What else of a galaxy may be seen there is looked at closer.
     most = 2.0 * np.minimum(_STEPS[-1] * sizes / 2, _FARTHEST)
-    more = np.flatnonzero(~here & (shape >= 0))
+    more = np.flatnonzero(~here & (shape >= 0) & ~largest)
     more = more[selection.touching(column[more], row[more], wings.around(most[more]), nx, ny)]
     beyond, _ = _beyond_stamps(shapes.take(shape[more]), sizes[more], psf.pixel_scale)
     here[more] = (beyond > 0) & selection.touching(column[more], row[more], wings.around(2.0 * beyond), nx, ny)
@@ -457,12 +504,37 @@ def reaches(
     return np.ceil(sides + length).astype(np.int64)
 
 
+def _largest(shape: Int, sizes: Int) -> npt.NDArray[np.bool_]:
+    """[n] True of galaxies that no stamp holds."""
+    return np.asarray((shape >= 0) & (sizes >= SIZES[-1]))
+
+
+def _outskirts(
+    sources: Sources, i: int, shapes: Shapes, form: Forms, psf: Psf, weights: Float, nx: int, ny: int
+) -> outskirts.Outskirts:
+    """Of galaxy i; shapes, form : of the sources that have one;  weights : of `transfer.basis_weights`."""
+    own = np.array([np.count_nonzero(sources.shape[:i] >= 0)])
+    x, y = sources.column[i], sources.row[i]
+    # The corners of the stamps about its own, and of the frame.
+    farthest = max(1.5 * SIZES[-1] + 1.0, x, nx - x, y, ny - y)
+    one = Forms(*(getattr(form, part.name)[own] for part in fields(Forms)))
+    return outskirts.of_galaxy(shapes.take(own), one, float(sources.electrons[i]), psf, weights[i], farthest)
+
+
+def _finish_largest(
+    sources: Sources, i: int, of_largest: Callable[[int], outskirts.Outskirts], stamp: Array, left: int, low: int,
+    *_: int,
+) -> None:  # fmt: skip
+    """Takes off galaxy i's stamp, whose first pixel is (left, low) of the frame, what came in at its edges."""
+    outskirts.take_in(of_largest(i), stamp, float(sources.column[i]) - left, float(sources.row[i]) - low)
+
+
 def _split(sources: Sources, sizes: Int, psf: Psf, size: int) -> tuple[Int, Int]:
     """Sources of a size that are drawn each through a PSF of its own, and those that share planes."""
     of_size = sizes == size
     few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW * transfer.plane_count(psf))
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
-    alone = of_size & (few | (sources.electrons > _BRIGHT) | pictured)
+    alone = of_size & (few | (sources.electrons > _BRIGHT) | pictured | _largest(sources.shape, sizes))
     return np.flatnonzero(alone), np.flatnonzero(of_size & ~alone)
 
 
@@ -489,6 +561,9 @@ def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
     far = shining(pieces.electrons, sizes, pieces.shape, pieces.picture, psf)
     shone = edges.seconds(sources.length[np.unique(whole[far])], nx, ny)
     shone += edges.unfold_seconds(np.hypot(*trail[here & far].T), sizes[here & far])
+    largest = _largest(pieces.shape, sizes)
+    shone += outskirts.FRAME_S * nx * ny * float(largest.sum())
+    shone += outskirts.STAMP_S * float(SIZES[-1]) ** 2 * float((largest & here).sum())
     return _STAMP_S * pixels + _PLANE_S * transformed + _BLOCK_S * blocks + shone + _FRAME_S * nx * ny + _START_S
 
 
@@ -502,7 +577,12 @@ def memory(electrons: Float, sizes: Int, nx: int, ny: int, picture: Int | None =
     pictured = np.zeros(len(sizes), bool) if picture is None else picture >= 0
     largest = [
         of * float(sizes[chosen].max(initial=0)) ** 2
-        for of, chosen in ((_STAMP_BYTES, ~bright), (_DOUBLE_BYTES, bright), (_PICTURE_BYTES, pictured))
+        for of, chosen in (
+            (_STAMP_BYTES, ~bright),
+            (_DOUBLE_BYTES, bright),
+            (_DEEP_BYTES, bright & (sizes <= _DEEP)),
+            (_PICTURE_BYTES, pictured),
+        )
     ]
     return _FRAME_BYTES * nx * ny + max(largest) + _SOURCE_BYTES * len(sizes) + _OTHER_BYTES
 
@@ -518,13 +598,14 @@ def _draw_some(
     cut: Float,
     curve: Float,
     taken: Float,
-    unfold: Callable[..., None] | None,
+    finish: Callable[..., None] | None,
     unread: tuple[int, int],
+    unit: float,
 ) -> Int:
     """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does.
 
     bodies, cut, curve : arrays by source: of `_bodies` and trails; of kernel.reaches; of kernel.returning
-    taken : filled at the chosen with what kernel.take_off took;  unfold : edges.unfold of a star that shines so far
+    taken : filled at the chosen with what kernel.take_off took;  finish : what is still done to a stamp of one source
     """
     size = passed.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
@@ -540,9 +621,9 @@ def _draw_some(
     off = np.zeros(len(chosen))
     kernel.take_off(stamps, column - x0, row - y0, curve[chosen], off)
     taken[chosen] = off
-    if unfold is not None:
-        unfold(stamps[0], int(x0[0]), int(y0[0]), frame.shape[1], frame.shape[0])
-    return kernel.accumulate(frame, stamps, x0, y0, unread)
+    if finish is not None:
+        finish(stamps[0], int(x0[0]), int(y0[0]), frame.shape[1], frame.shape[0])
+    return kernel.accumulate(frame, stamps, x0, y0, unread, unit)
 
 
 def _forms(sources: Sources) -> tuple[Shapes, Forms]:
@@ -574,6 +655,8 @@ def _strays(
     body = sources.shape >= 0
     stray, far, most = np.zeros((len(sources), 11)), np.zeros(len(sources)), np.zeros(len(sources))
     far[body], leaves = _beyond_stamps(shapes, sizes[body], pixel_scale)
+    # The largest have outskirts.
+    far[_largest(sources.shape, sizes)] = 0.0
     sky = profiles.on_the_sky(shapes, form)
     sky[:, [kernel.BULGE, kernel.DISK]] *= np.where(far[body] > 0, sources.electrons[body], 0.0)[:, None]
     stray[body] = sky

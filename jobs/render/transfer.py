@@ -32,10 +32,11 @@ Array = npt.NDArray[Any]
 
 # radian / pixel between the samples of `passing`: those of a stamp of 32 pixels.
 STEP = 2 * np.pi / 32
-# What passes less than this in single precision passes nothing.
-_NOTHING = 1e-7
-# Frequencies beyond this are not looked at: twice the Nyquist frequency and a half (a plane has three times).
-_HIGHEST = 2.5 * np.pi
+# What passes less than this in single precision passes nothing; in double precision that is less than this.
+NOTHING, LEAST = 1e-7, 1e-14
+# Frequencies beyond this are not looked at: twice the Nyquist frequency and a half (a plane has three times); of bright
+# sources through a PSF without planes, which has no last frequency, four times.
+HIGHEST, _HIGHEST_BRIGHT = 2.5 * np.pi, 4.0 * np.pi
 # Samples that the kernel takes together: their planes stay in the cache.
 _TOGETHER = 1024
 # Stamp that `passing` is measured on, pixels.
@@ -126,11 +127,15 @@ def plane_count(psf: Psf) -> int:
     return 1 if psf.planes is None else len(psf.planes.images) + len(psf.planes.drift)
 
 
-def passing(psf: Psf) -> Float:
-    """float64[m]: the largest modulus of PSF times pixel at k = i STEP radian / pixel; nothing beyond."""
-    probe = grid(_PROBE, _HIGHEST)
+def passing(psf: Psf, least: float = NOTHING) -> Float:
+    """float64[m]: the largest modulus of PSF times pixel at k = i STEP radian / pixel; less than `least` beyond.
+
+    least : below NOTHING of a PSF without planes, for what is drawn in double precision
+    """
+    bright = least < NOTHING
+    probe = grid(_PROBE, _HIGHEST_BRIGHT if bright else HIGHEST)
     if psf.planes is None:
-        planes = _planes(psf, probe, np.float32)
+        planes = _planes(psf, probe, np.float64 if bright else np.float32)
     else:
         # A smooth edge: a sharp one passes some of every frequency.
         window = np.hanning(SAMPLES * _PROBE + 1).astype(np.float32)
@@ -139,7 +144,7 @@ def passing(psf: Psf) -> Float:
     modulus = np.hypot(planes[:, 0], planes[:, 1]).max(axis=0)
     ring = (np.hypot(probe.kx, probe.ky) / STEP).astype(int)
     rings = np.asarray(maximum(modulus, ring, np.arange(ring.max() + 1)), float)
-    something = np.flatnonzero(rings > _NOTHING)
+    something = np.flatnonzero(rings > least)
     return rings[: something[-1] + 1]
 
 

@@ -26,21 +26,24 @@ MARGIN = SIDE // 2 // BLOCK + 1
 _WIDER = 3.0 * BLOCK
 
 
-def wings(column: Float, row: Float, electrons: Float, sizes: Int, psf: Psf, nx: int, ny: int) -> Float:
+def wings(
+    column: Float, row: Float, electrons: Float, sizes: Int, psf: Psf, nx: int, ny: int, unit: float
+) -> Float:  # fmt: skip
     """Electrons a pixel of sources [n] beyond stamps of `sizes`, on blocks, MARGIN of them before the frame's first.
 
+    unit    : of the blocks' integers to an electron
     returns : float64[blocks, blocks], the same in any order of the sources
     Error   : the PSF of mean colour at the detector's centre, on blocks: a few per cent of what is beyond the stamp
     """
     out = _layer(nx, ny)
     if psf.planes is None:
-        return out / kernel.FIXED_POINT
+        return out / unit
     cells = _cells(psf.planes.images.mean(axis=0))
     x, y = ((at - (BLOCK - 1) / 2) / BLOCK + MARGIN for at in (column, row))
     for size in np.unique(sizes[sizes < SIDE]):
         some = sizes == size
-        kernel.spread(out, _beyond(cells, int(size)) / BLOCK**2, x[some], y[some], electrons[some])
-    return out / kernel.FIXED_POINT
+        kernel.spread(out, _beyond(cells, int(size)) / BLOCK**2, x[some], y[some], electrons[some], unit)
+    return out / unit
 
 
 def _layer(nx: int, ny: int) -> Int:
@@ -48,21 +51,21 @@ def _layer(nx: int, ny: int) -> Int:
 
 
 def galaxies(
-    column: Float, row: Float, stray: Float, light: Float, reach: Float, sizes: Int, nx: int, ny: int
+    column: Float, row: Float, stray: Float, light: Float, reach: Float, sizes: Int, nx: int, ny: int, unit: float
 ) -> Float:
     """Electrons a pixel of galaxies [n] outside stamps of `sizes`, on the blocks of `wings`.
 
     stray   : float64[n, 11] profiles.on_the_sky;  light : [n] electrons that leave the stamp;  reach : [n] pixels
     returns : float64[blocks, blocks], the same in any order of the galaxies
     Error   : a galaxy's own light, as if the PSF did nothing to it so far out; what is left on the stamp stays there;
-              a block has whole 2^-20 electrons a pixel: of the faintest little is seen
+              a block has whole units a pixel: of the faintest little is seen
     """
     out = _layer(nx, ny)
     some = (light > 0) & selection.touching(column, row, around(2.0 * reach), nx, ny)
     kernel.leaving(
-        out, BLOCK, MARGIN, sizes[some], reach[some], column[some], row[some], stray[some], light[some]
+        out, BLOCK, MARGIN, sizes[some], reach[some], column[some], row[some], stray[some], light[some], unit
     )  # fmt: skip
-    return out / kernel.FIXED_POINT
+    return out / unit
 
 
 def around(sides: Float) -> Float:

@@ -1,0 +1,110 @@
+"""The brightest sources in the longest exposures: as much light as they have, no pixel below none, none left out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from jobs.accuracy import DRAFT, SURVEY
+from jobs.render import kernel, psf, stamps
+from lake_schema import validate
+from lake_schema.errors import BadInput
+from lake_schema.tables.galaxies import GALAXIES
+from tests.extremes.test_stamps import source_of
+from tests.jobs.render import nominal
+from tests.jobs.render.fields import small, spread
+
+NOISE = {"vis": 12.0, "lsstcam": 38.0}
+# Magnitudes from the Moon's to faint stars', in no time and in eleven days: electrons.
+LIGHT = st.floats(0.0, 16.9).map(lambda x: 10.0**x)
+
+
+def drawn(camera, electrons, seeing=None, side=256, accuracy=SURVEY, most=1024, **shape):
+    """(frame, size, light of the stamp on it): of one source whose stamp is at most so large."""
+    source = source_of(camera, electrons, column=side / 2 + 0.3, row=side / 2 - 0.4, **shape)
+    beam = spread(camera) if seeing is None else psf.ground_psf(seeing, 3.0, 0.2)
+    settings, noise = stamps.settings_for(accuracy), NOISE[camera]
+    sizes = stamps.stamp_sizes(source.electrons, source.shape, source.shapes, beam, noise, settings)
+    light = np.zeros(1)
+    sizes, floors = np.minimum(sizes, most), stamps.floors(source.electrons, noise, settings)
+    return stamps.draw(source, sizes, beam, side, side, floors=floors, drawn=light), sizes[0], light[0]
+
+
+@given(
+    LIGHT,
+    st.sampled_from(["vis", "lsstcam"]),
+    st.sampled_from([DRAFT, SURVEY]),
+    st.sampled_from([{}, {"bulge_fraction": 0.5}]),
+)
+@example(5e13, "vis", SURVEY, {})
+@example(1e17, "lsstcam", SURVEY, {"inclination": 80.0})
+def test_no_pixel_overflows(electrons, camera, accuracy, shape):
+    image, _, light = drawn(camera, electrons, accuracy=accuracy, most=256, **shape)
+    rounding = image.size / kernel.units_of(np.array([electrons]))
+    assert image.sum() == pytest.approx(electrons, rel=2e-3, abs=rounding)
+    assert light == pytest.approx(electrons, rel=2e-3, abs=rounding)
+    assert image.max() > 0.01 * electrons - rounding
+
+
+@given(LIGHT, st.floats(0.4, 1.4), st.sampled_from([DRAFT, SURVEY]))
+@example(30.0 * 10 ** (0.4 * (28.17 + 1.0)), 0.73, SURVEY)
+@example(30.0 * 10 ** (0.4 * 28.17), 0.73, SURVEY)
+def test_nothing_rings_about_a_bright_star(electrons, seeing, accuracy):
+    """Behind any seeing, where a pixel samples it: no pixel of the frame is below none by a tenth of its noise."""
+    image, *_ = drawn("lsstcam", electrons, seeing, accuracy=accuracy)
+    unit = kernel.units_of(np.array([electrons]))
+    assert image.min() > -0.1 * NOISE["lsstcam"] - 1.0 / unit - 1e-12 * electrons * (electrons > 1e14)
+
+
+def test_what_fits_is_as_fine_as_ever():
+    """The frame's integers are as fine as their sum allows, whatever the order."""
+    assert kernel.units_of(np.array([])) == kernel.units_of(np.full(10, 1e11)) == kernel.FIXED_POINT
+    light = 10.0 ** np.random.default_rng(1).uniform(0, 17, 1000)
+    unit = kernel.units_of(light)
+    assert unit == kernel.units_of(light[::-1])
+    assert 2.0**60 <= unit * light.sum() * 2.0 <= 2.0**62
+    assert np.log2(unit) == np.rint(np.log2(unit))
+
+
+@pytest.mark.parametrize(("mag", "seconds"), [(-1.46, 560.5), (8.0, 1e6)])
+def test_the_brightest_star_in_the_longest_exposure(mag, seconds):
+    """From the catalogue to the file: in the truth, full wells, no dark hole."""
+    quiet = nominal.off("cosmic_rays", "readout_cosmic_rays")
+    one = nominal.rendered(
+        small("vis", "3-4", 256), [mag, 20.0], [100.2, 30.0], [110.7, 220.0], seconds=seconds, forced=quiet
+    )
+    assert len(one.sources) == 2
+    assert one.noise_free.min() >= 0.0
+    bright = int(np.argmax(one.sources.electrons))
+    assert one.drawn[bright] == pytest.approx(one.sources.electrons[bright], rel=0.02)
+    assert one.noise_free[111, 100] == one.noise_free.max() > 0.05 * one.sources.electrons[bright]
+    # Its column is full.
+    full = one.science[:128, 100].astype(float)
+    assert full.min() > 0.9 * full.max()
+
+
+def test_more_than_a_frame_counts_is_refused():
+    with pytest.raises(BadInput, match="electrons"):
+        nominal.rendered(small("vis", "3-4", 64), [-20.0], [30.0], [30.0], seconds=1e6)
+
+
+@pytest.mark.parametrize("ratio", [0.01, pytest.param(0.02, marks=pytest.mark.nightly)])
+def test_an_axis_ratio_is_drawn_as_it_is_given(ratio):
+    """Slimmer than the table of galaxies allows, too, against galsim's ellipse."""
+    source = source_of(
+        "vis", 1e6, column=64.0, row=64.0, bulge_fraction=1.0, bulge_sersic_index=1.0, bulge_axis_ratio=ratio
+    )
+    asked = replace(source, shapes=replace(source.shapes, bulge_axis_ratio=np.array([ratio])))
+    image = stamps.draw(source, np.array([128]), spread("vis"), 128, 128)
+    expected = stamps.reference(asked, 0, spread("vis"), 128)
+    np.testing.assert_allclose(image[34:94, 34:94], expected[34:94, 34:94], atol=1e-3 * expected.max())
+
+
+def test_a_slimmer_bulge_than_the_table_allows_is_no_galaxy():
+    (column,) = (c for c in GALAXIES.columns if c.name == "bulge_axis_ratio")
+    for ratio, wrong in ((0.01, 1), (0.02, 0)):
+        values = pa.chunked_array([pa.array([1.0, ratio], pa.float32())])
+        assert len(validate._content_violations(values, column, "galaxies")) == wrong
