@@ -17,7 +17,7 @@ from jobs.render.focal_plane import boresight_for
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_of
-from tests.jobs.render import calibrated
+from tests.jobs.render import calibrated, nominal
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
 
 SIDE = 256
@@ -193,11 +193,45 @@ def test_switching_one_effect_off_changes_nobody_else_s_numbers():
     np.testing.assert_array_equal(base.science[~hit], without.science[~hit])
 
 
-@pytest.mark.parametrize("name", ["ghosts", "parallel_cti", "bleeding", "dark_current", "read_noise", "intra_pixel"])
+GHOSTS_STAR = 5.0
+# What shows that an effect is in the first image of a detector and not in the second: on both are a saturated star, in
+# column 60, a faint one, and the ghost of one that lies beside the detector.
+SHOWS = {
+    "ghosts": lambda on, off: change(on, off).sum() == pytest.approx(ghost_of(GHOSTS_STAR), rel=0.05),
+    # Charge is held back, and let go of later, or not before the last row is read.
+    "parallel_cti": lambda on, off: change(on, off).min() < 0 < change(on, off).max() and change(on, off).sum() < 0,
+    "bleeding": lambda on, off: (on.science[:, 60] > 50_000).sum() > 100 + (off.science[:, 60] > 50_000).sum(),
+    "dark_current": lambda on, off: change(on, off).mean() == pytest.approx(on.scene.dark_electrons, abs=0.015),
+    # Twice rounded to 3.48 e-.
+    "read_noise": lambda on, off: change(on, off).std() == pytest.approx(np.hypot(4.4, 3.48 / 6**0.5), rel=0.03),
+    "intra_pixel": lambda on, off: (
+        change(on, off)[50:70, 180:200].min() < -20 < 20 < change(on, off)[50:70, 180:200].max()
+    ),
+}
+
+
+def change(on, off):
+    """e- of pixels that are not full."""
+    difference = on.scene.value("gain", "electron / adu") * (on.science.astype(float) - off.science)
+    return np.where(np.maximum(on.science, off.science) < 40_000, difference, 0.0)
+
+
+def ghost_of(mag):
+    rate = 10 ** (0.4 * (exposing.zero_point_of("vis", "euclid_vis", MISSION) - mag))
+    return MISSION.value("vis.ghost.flux_ratio") * rate * nominal.TIME
+
+
+@pytest.mark.parametrize("name", SHOWS)
 def test_each_effect_can_be_forced_on_and_off(name):
-    for on in (False, True):
-        (decision,) = (d for d in render("VIS", forced={name: on}).decisions if d.name == name)
-        assert (decision.applied, decision.forced) == (on, True)
+    detector = small("vis", "3-4", SIDE)
+    beside = SIDE / 2 - 750.0 * (-1 if detector.upside_down else 1)
+    mags, x, y = [GHOSTS_STAR, 12.0, 18.0], [SIDE / 2, 60.3, 190.2], [beside, 100.4, 60.7]
+    off, on = (nominal.rendered(detector, mags, x, y, forced={name: wish}) for wish in (False, True))
+    for one, wish in ((off, False), (on, True)):
+        (decision,) = (d for d in one.decisions if d.name == name)
+        assert (decision.applied, decision.forced) == (wish, True)
+    assert SHOWS[name](on, off)
+    assert not SHOWS[name](on, on)
 
 
 @pytest.mark.parametrize("kind", ["bias", "dark", "flat", "charge_injection", "self_calibration"])
