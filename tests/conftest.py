@@ -11,6 +11,10 @@ os.environ.setdefault("TRUESKY_CACHE", str(Path(tempfile.gettempdir()) / f"trues
 import pytest
 from hypothesis import settings
 
+from tests import tolerances
+
+pytest.approx = tolerances.approx
+
 settings.register_profile("default", max_examples=30, deadline=None)
 settings.register_profile("ci", max_examples=60, deadline=None, derandomize=True)
 settings.register_profile("nightly", max_examples=5000, deadline=None)

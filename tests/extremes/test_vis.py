@@ -18,8 +18,8 @@ from tests.jobs.render import nominal
 from tests.jobs.render.fields import small
 
 SIDE = 128
-# Seconds of processor time that a frame of SIDE x SIDE may take through all of a channel, compiled.
-BOUND = 3.0
+# Seconds of processor time: a frame of SIDE x SIDE takes 0.1 through all of a channel, an endless one any number.
+HANGS = 120.0
 END = {"vis.cti.age": (1.0, "")}
 
 
@@ -48,7 +48,7 @@ def test_every_effect_on_every_frame(shape, age):
         for kind in vis.EFFECTS:
             started = time.process_time()
             raw = through(frame if kind != "bias" else np.zeros(shape), one, kind)
-            assert time.process_time() - started < BOUND
+            assert time.process_time() - started < HANGS
             assert raw.min() >= 0
             assert raw.max() <= 65535
             np.testing.assert_array_equal(raw, np.rint(raw))
@@ -109,7 +109,7 @@ def test_exposures_of_no_time_and_of_a_day(kind, seconds):
     through(np.zeros((2, 2)), scene_of((2, 2), seconds, peak=0.0), kind)
     started = time.process_time()
     raw = through(np.zeros((SIDE, SIDE)), one, kind, quiet)
-    assert time.process_time() - started < BOUND
+    assert time.process_time() - started < HANGS
     pixels = (raw[:, : SIDE // 2, 51 : 51 + SIDE // 2] - one.value("bias", "adu")) * one.value("gain", "electron / adu")
     assert np.isfinite(raw).all()
     if kind in ("science", "deep", "self_calibration"):
@@ -128,7 +128,7 @@ def test_sources_in_no_time_and_in_a_day(seconds):
     one = nominal.rendered(
         small("vis", "3-4", 256), [10.0, 18.0, 24.0], *places, seconds=seconds, truth=("saturation", "ghosts", "stars")
     )
-    assert time.process_time() - started < 20
+    assert time.process_time() - started < HANGS
     assert len(one.sources) == 3 * (seconds > 0)
     assert np.isfinite(one.noise_free).all()
     assert one.noise_free.any() == (seconds > 0)
@@ -172,7 +172,7 @@ def test_the_brightest_star_is_rendered():
     mag = 25.93 + 2.5 * np.log10(nominal.TIME / 1e11)
     started = time.process_time()
     one = nominal.rendered(detector, [mag, 20.0], [100.2, 30.0], [110.7, 220.0], truth=("saturation", "ghosts"))
-    assert time.process_time() - started < 20
+    assert time.process_time() - started < HANGS
     assert np.isfinite(one.noise_free).all()
     assert one.noise_free.sum(dtype=float) == pytest.approx(1e11, rel=0.1)
     assert one.sources.electrons.max() == pytest.approx(1e11, rel=0.01)

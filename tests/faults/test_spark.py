@@ -141,12 +141,12 @@ def test_a_driver_that_is_stopped(drivers, spark, request_file, end):
     assert len(below) >= 3
     stopped = time.monotonic()
     os.killpg(driver.pid, number) if whom == "group" else driver.send_signal(number)
-    assert driver.wait(10) == status
+    assert driver.wait(120) == status
     lines = driver.stderr.read().strip().splitlines()
     assert len(lines) == (0 if number == signal.SIGKILL else 1), lines
     assert all("a second run continues where this one ended" in line for line in lines)
     while any(Path(f"/proc/{pid}").exists() for pid in below):
-        assert time.monotonic() - stopped < 10, "a worker was left behind"
+        assert time.monotonic() - stopped < 240, "a worker was left behind"
         time.sleep(0.1)
     assert promise.current(lake, "plain") == promise.key("plain", 1)
     (lake / "slow").unlink()

@@ -1,6 +1,5 @@
 """Malformed request files: the check and every job refuse them in a line that names the key, and start nothing."""
 
-import resource
 import subprocess
 import sys
 import time
@@ -14,6 +13,9 @@ from jobs.render import plan_exposures, render_exposures
 
 JOBS = [module.JOB for module in (build_galaxies, build_stars, build_gaia, compute_fluxes, plan_exposures)]
 JOBS.append(render_exposures.JOB)
+
+# Seconds of processor time that none of them takes on any machine; what each takes is not for a test to say.
+HANGS = 60.0
 
 HEAD = 'name = "x"\nseed = 1\n'
 CONE = "[area]\ncone = { ra = 53.1, dec = -27.8, radius = 0.2 }\n"
@@ -105,7 +107,7 @@ def test_a_malformed_request_is_refused_by_the_check_and_by_every_job(tmp_path, 
     path.write_text(text)
     started = time.process_time()
     assert request.main(["check", str(path)]) == 2
-    assert time.process_time() - started < 1.0
+    assert time.process_time() - started < HANGS
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1
@@ -122,12 +124,27 @@ def test_what_the_malformed_ones_are_made_of_is_good(tmp_path, capsys):
     assert capsys.readouterr().out.startswith("x: good: 0 pointings, 0 observations, 1 variants\n")
 
 
-def test_the_check_from_a_shell_takes_less_than_a_second(tmp_path):
+def test_the_check_from_a_shell_imports_nothing_slow(tmp_path):
+    """What takes seconds to import, and what takes none of the check's."""
     path = tmp_path / "x.toml"
     path.write_text(BAD["magnitude 99"][0])
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, "-m", "jobs.request", "check", path], capture_output=True, text=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert (done.returncode, done.stdout) == (2, "")
+    code = "import sys; from jobs.request import main; print(main(sys.argv[1:]), *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, "check", path], capture_output=True, text=True)
+    status, *modules = done.stdout.split()
+    assert (status, done.stderr.count("\n")) == ("2", 1)
     assert "universe.galaxy_limit = 99" in done.stderr
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.0
+    assert "jobs.request" in modules
+    slow = {
+        "astropy",
+        "colossus",
+        "duckdb",
+        "galsim",
+        "hats",
+        "healpy",
+        "matplotlib",
+        "numba",
+        "pandas",
+        "pyspark",
+        "scipy",
+    }
+    assert not slow & set(modules)

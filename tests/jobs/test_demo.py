@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # A job that says who it is, and waits.
 _JOB = """#!/bin/sh
 echo "$$ $SPARK_CONF_DIR"
-exec sleep 60
+exec sleep 600
 """
 _STOPPED = """
 import sys
@@ -40,9 +40,9 @@ def test_a_demo_that_is_stopped_stops_its_job(tmp_path, number):
         assert running.stdout.readline() == "build_galaxies ...\n"
         pid, *conf = running.stdout.readline().split()
         running.send_signal(number)
-        assert running.wait(10) == 128 + number
+        assert running.wait(120) == 128 + number
         assert running.stderr.read() == "demo: stopped; a second run continues where this one ended\n"
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 120
     while Path(f"/proc/{pid}").exists():
         assert time.monotonic() < deadline, "the job was left behind"
         time.sleep(0.05)

@@ -1,66 +1,113 @@
-"""Memory that is kept while arrays come and go, and given back."""
+"""Memory that is kept while arrays come and go, and given back: as the C library counts it, not as a machine does."""
 
+import ctypes
 import platform
-import resource
 
 import numpy as np
 import pytest
 
 from jobs import heap
-from jobs.measured import forget_peak, peak_gb
 
-MEGABYTES = 64
+# More than the 32 MB up to which the library may learn to keep memory by itself.
+SIZE = 64 << 20
 
+
+class Counted(ctypes.Structure):
+    """mallinfo2 of malloc.h.
+
+    arena    : bytes of the heap, of which uordblks are in use and fordblks are free
+    hblkhd   : bytes that the operating system was asked for directly
+    """
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
+        )
+    )  # fmt: skip
+
+
+def counts():
+    """mallinfo2, or nothing where the C library has none."""
+    try:
+        function = ctypes.CDLL(None).mallinfo2
+    except (AttributeError, OSError, TypeError):
+        return None
+    function.restype = Counted
+    return function
+
+
+COUNTS = counts()
 # Told by the system, not by what is tested: a `heap` that no longer finds the library fails here.
 on_gnu = pytest.mark.skipif(
-    platform.libc_ver()[0] != "glibc",
-    reason="only GNU's C library can be told to keep memory; that others are left alone is tested below, everywhere",
+    platform.libc_ver()[0] != "glibc" or COUNTS is None,
+    reason="only GNU's C library, from 2.33 on, says where memory is; that others are left alone is tested below",
 )
 
 
-def faults_of_new_arrays(count):
-    """How often memory had to be asked for, for arrays that live one after the other."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(count):
-        np.ones(MEGABYTES << 17)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+def heap_and_mapped():
+    now = COUNTS()
+    return now.arena, now.hblkhd
 
 
-def held_now():
-    forget_peak()
-    return peak_gb()
+@on_gnu
+def test_without_it_each_array_is_asked_for():
+    heap_before, mapped_before = heap_and_mapped()
+    array = np.ones(SIZE, np.uint8)
+    size, mapped = heap_and_mapped()
+    assert size < heap_before + SIZE // 8
+    assert mapped >= mapped_before + SIZE
+    del array
+    assert heap_and_mapped()[1] == mapped_before
 
 
 @on_gnu
 def test_later_arrays_find_the_memory_of_those_before():
-    usual = faults_of_new_arrays(10)
+    mapped_before = heap_and_mapped()[1]
     with heap.kept():
-        faults_of_new_arrays(1)
-        assert faults_of_new_arrays(10) < 0.2 * usual
-    assert faults_of_new_arrays(10) > 0.5 * usual
+        places, sizes = set(), set()
+        for _ in range(5):
+            array = np.ones(SIZE, np.uint8)
+            places.add(array.ctypes.data)
+            del array
+            # It stays with the process when the array is gone; nothing comes from elsewhere.
+            assert COUNTS().fordblks >= SIZE
+            size, mapped = heap_and_mapped()
+            assert mapped == mapped_before
+            sizes.add(size)
+        assert len(places) == len(sizes) == 1
 
 
 @on_gnu
 def test_it_is_given_back():
-    before = held_now()
+    before, mapped = heap_and_mapped()
     with heap.kept():
-        faults_of_new_arrays(4)
-        assert held_now() > before + 0.8 * MEGABYTES / 1e3
-    assert held_now() < before + 0.3 * MEGABYTES / 1e3
+        np.ones(SIZE, np.uint8)
+        assert COUNTS().fordblks >= SIZE
+    assert heap_and_mapped()[0] < before + SIZE // 8
+    # As the library is used to: the next array is asked for, and given back.
+    array = np.ones(SIZE, np.uint8)
+    assert heap_and_mapped()[1] >= mapped + SIZE
+    del array
+    # And smaller ones, which are in the heap, leave it as they came.
+    many = [np.ones(100_000, np.uint8) for _ in range(SIZE // 100_000)]
+    assert COUNTS().uordblks >= SIZE - 100_000
+    del many
+    assert heap_and_mapped()[0] < before + SIZE // 8
 
 
 @on_gnu
 def test_it_is_given_back_after_an_error():
-    before = held_now()
+    before = heap_and_mapped()[0]
 
     @heap.kept()
     def fails():
-        faults_of_new_arrays(1)
-        raise KeyError
+        np.ones(SIZE, np.uint8)
+        raise KeyError("of the work")
 
-    with pytest.raises(KeyError):
+    with pytest.raises(KeyError, match="of the work"):
         fails()
-    assert held_now() < before + 0.3 * MEGABYTES / 1e3
+    assert heap_and_mapped()[0] < before + SIZE // 8
 
 
 def no_such_library(name):
@@ -69,10 +116,12 @@ def no_such_library(name):
 
 @pytest.mark.parametrize("opened", [lambda name: object(), no_such_library])
 def test_another_library_is_left_alone(monkeypatch, opened):
-    """One without GNU's functions, and none at all: memory is asked for as often as ever."""
-    usual = faults_of_new_arrays(4)
+    """One without GNU's functions, and none at all."""
     monkeypatch.setattr(heap.ctypes, "CDLL", opened)
     monkeypatch.setattr(heap, "_library", heap._library.__wrapped__)
     with heap.kept():
-        faults_of_new_arrays(1)
-        assert faults_of_new_arrays(4) > 0.5 * usual
+        assert heap._library() is None
+        array = np.ones(SIZE, np.uint8)
+        if COUNTS is not None:
+            assert heap_and_mapped()[1] >= SIZE
+        del array

@@ -14,8 +14,8 @@ from lake_schema import foreign, parquet
 from lake_schema.errors import BadInput
 
 GOOD = pa.table({"ra": np.linspace(0, 359, 1000), "name": ["a", "b"] * 500, "flag": [True, False] * 500})
-# The reading process starts in half a second; the machine may be doing other things.
-MOST_SECONDS, MOST_BYTES = 6.0, 512 << 20
+# The reading process has a limit of its own, in processor time; the machine may be doing other things.
+HANGS, MOST_BYTES = 120.0, 512 << 20
 
 
 def read(path, columns=("ra",)):
@@ -25,7 +25,7 @@ def read(path, columns=("ra",)):
     try:
         return pa.Table.from_batches(foreign.batches(path, columns))
     finally:
-        assert time.perf_counter() - started < MOST_SECONDS
+        assert time.perf_counter() - started < HANGS
         assert pool.max_memory() <= max(before, MOST_BYTES)
 
 

@@ -32,7 +32,7 @@ def test_constants_are_those_that_are_computed_with():
         ("boltzmann", "erg / K", BOLTZMANN_ERG_K),
         ("ab_zero_flux", "erg / (s cm2 Hz)", 10 ** (-0.4 * AB_CGS)),
     ):
-        assert MISSION.value(f"env.constants.{key}", unit) == pytest.approx(value, rel=1e-8)
+        assert MISSION.value(f"env.constants.{key}", unit) == pytest.approx(value, rel=1e-8, abs=0.0)
 
 
 # ------------------------------------------------------------------------------------------------ faults

@@ -195,7 +195,7 @@ def test_time_and_memory_have_a_limit(explored, text):
         started = time.monotonic()
         with pytest.raises(BadInput, match=rf"stopped after {explorer.timeout:g} s|more memory"):
             explorer.sql(text)
-        assert time.monotonic() - started < explorer.timeout + 5.0
+        assert time.monotonic() - started < explorer.timeout + 60.0
         # The next question is answered by a new process, or by the same.
         explorer.timeout = 30.0
         assert explorer.sql("SELECT count(*) AS n FROM plain")["n"][0] == 60

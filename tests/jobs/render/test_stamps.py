@@ -317,12 +317,19 @@ def test_what_is_drawn_through_was_counted_before(monkeypatch):
 
 
 def test_seconds_follow_the_stamps():
+    """Nine times the pixels: in proportion, whatever the machine; the planes, of one size each, are the rest."""
     sources, psf = many(400), spread("lsstcam")
-    small, large = np.full(400, 64), np.full(400, 192)
-    start = time.process_time()
-    stamps.draw(sources, large, psf, 160, 160)
-    spent = time.process_time() - start
-    predicted = stamps.seconds(sources, large, psf, 160, 160)
-    # Machines differ, and are shared: only a wrong power of the sizes would show.
-    assert 0.1 * predicted < spent < 10 * predicted
-    assert 4 * stamps.seconds(sources, small, psf, 160, 160) < predicted
+    spent, predicted = [], []
+    for size in (64, 192):
+        sizes = np.full(400, size)
+        predicted.append(stamps.seconds(sources, sizes, psf, 160, 160))
+        stamps.draw(sources, sizes, psf, 160, 160)
+        best = np.inf
+        for _ in range(3):
+            start = time.process_time()
+            stamps.draw(sources, sizes, psf, 160, 160)
+            best = min(best, time.process_time() - start)
+        spent.append(best)
+    assert 4 < predicted[1] / predicted[0] < 10
+    # Only a wrong power of the sizes shows through what else a machine does.
+    assert spent[1] / spent[0] == pytest.approx(predicted[1] / predicted[0], rel=0.6)

@@ -1,0 +1,41 @@
+"""A relative tolerance that is what it says.
+
+pytest.approx passes what lies within the larger of its two tolerances, and the absolute one is 1e-12 where none is
+given: of a flux of 1e-30 W/m2, every other flux of that size is "within 1e-9".
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+DEFAULT_REL, DEFAULT_ABS = 1e-6, 1e-12
+_approx = pytest.approx
+
+
+def approx(expected, rel=None, abs=None, nan_ok=False):
+    """pytest.approx, which refuses numbers whose relative tolerance would be overruled by the absolute one not given.
+
+    Zero has no relative tolerance, so it is let pass: it is compared within 1e-12.
+    """
+    if abs is None:
+        least = smallest(expected)
+        if least * (DEFAULT_REL if rel is None else rel) < DEFAULT_ABS:
+            raise ValueError(
+                f"approx of {least:g} within {DEFAULT_ABS:g}, which is pytest's absolute tolerance, not the relative "
+                "one: give rel and abs=0.0"
+            )
+    return _approx(expected, rel=rel, abs=abs, nan_ok=nan_ok)
+
+
+def smallest(expected):
+    """The smallest size of the numbers in a number, array, sequence or mapping; zeros and what is not finite aside."""
+    if isinstance(expected, Mapping):
+        expected = list(expected.values())
+    if isinstance(expected, (list, tuple)):
+        return min(map(smallest, expected), default=np.inf)
+    try:
+        sizes = np.abs(np.asarray(expected, dtype=complex))
+    except (TypeError, ValueError):
+        return np.inf
+    return float(np.min(sizes[np.isfinite(sizes) & (sizes > 0)], initial=np.inf))
