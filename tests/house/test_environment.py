@@ -240,6 +240,63 @@ def test_spark_submit_says_only_what_the_job_says(prepare, environment, tmp_path
     assert done.returncode == 2
 
 
+def test_spark_submit_knows_its_spark_where_nothing_is_activated(prepare, environment, tmp_path):
+    """No Python on PATH could say where it is."""
+    program(tmp_path / "path" / "python3", "exit 1")
+    spark_home = environment / "lib" / "its spark"
+    program(spark_home / "bin" / "spark-submit", 'echo "$SPARK_HOME" "$@"')
+    prepare.prepare(environment, prepare.Java(fake_java(tmp_path / "home", "21"), 21, "PATH"), spark_home)
+    submit = f'"{environment}/bin/spark-submit" "a b" c'
+    path = f"{tmp_path / 'path'}:/usr/bin:/bin"
+    assert shell(submit, PATH=path).stdout == f"{spark_home} a b c\n"
+    assert (spark_home / "conf" / "spark-env.sh").is_file()
+    other = program(tmp_path / "other" / "bin" / "spark-submit", "echo another").parents[1]
+    assert shell(submit, PATH=path, SPARK_HOME=str(other)).stdout == "another\n"
+
+
+# A session of ours, then who listens where among all processes that it began.
+LISTENING = """
+import os, sys
+sys.path[0] = sys.argv[1]
+import psutil
+import pyarrow as pa
+from jobs.session import session
+spark = session("listening")
+
+def pythons(batches):
+    for batch in batches:
+        yield pa.RecordBatch.from_pydict({"python": [sys.executable] * len(batch)})
+
+found = spark.range(0, 4, 1, numPartitions=2).mapInArrow(pythons, "python string").collect()
+processes = [psutil.Process(), psutil.Process().parent()]
+processes += [child for process in processes for child in process.children(recursive=True)]
+ends = {end.laddr.ip for p in processes for end in p.net_connections("inet") if end.status == psutil.CONN_LISTEN}
+conf = spark.sparkContext.getConf()
+print({row.python for row in found} == {sys.executable}, len(processes) > 3)
+print(*sorted(end.removeprefix("::ffff:") for end in ends))
+print(conf.get("spark.authenticate"), conf.get("spark.ui.enabled"))
+"""
+
+
+@pytest.mark.spark
+def test_a_session_is_closed_to_others_and_finds_its_python_without_any_configuration(tmp_path):
+    """spark-submit as pip installs it, and a python3 on PATH that is not ours."""
+    spark_home = Path(importlib.util.find_spec("pyspark").origin).parent
+    program(tmp_path / "path" / "python3", "exit 1")
+    (tmp_path / "conf").mkdir()
+    (script := tmp_path / "listening.py").write_text(LISTENING)
+    done = shell(
+        f'"{spark_home}/bin/spark-submit" --conf spark.pyspark.driver.python={sys.executable} "{script}" "{ROOT}"',
+        PATH=f"{tmp_path / 'path'}:{os.environ['PATH']}",
+        SPARK_CONF_DIR=str(tmp_path / "conf"),
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    own, addresses, closed = done.stdout.splitlines()
+    assert own == "True True"
+    assert set(addresses.split()) == {"127.0.0.1"}
+    assert closed == "true false"
+
+
 @pytest.mark.spark
 def test_submitted_files_answer_from_anywhere(environment):
     if (Path(sys.prefix) / "spark-conf").is_dir():

