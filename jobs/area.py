@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.toml_values import Toml, boolean, checked_number, integer, number, pair, table_of
 from lake_schema import sky
 from lake_schema.ecliptic import ecliptic, tile_corners, tile_count
@@ -111,12 +112,12 @@ def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Floa
     lon, lat = np.radians(np.array(vertices)).T
     corners = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
     sides = np.cross(corners, np.roll(corners, -1, 0))
-    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    sides /= np.sqrt(np.sum(sides**2, axis=1, keepdims=True))
     # Vertices may run either way round.
-    sides *= np.sign(sides[0] @ corners[2])
+    sides *= np.sign(sums.product(sides[0], corners[2]))
     x, y = np.radians(ra), np.radians(dec)
     place = np.stack([np.cos(y) * np.cos(x), np.cos(y) * np.sin(x), np.sin(y)])
-    depth = np.degrees(np.arcsin(np.clip(sides @ place.reshape(3, -1), -1.0, 1.0))).min(axis=0)
+    depth = np.degrees(np.arcsin(np.clip(sums.product(sides, place.reshape(3, -1)), -1.0, 1.0))).min(axis=0)
     return np.asarray(depth.reshape(np.shape(ra)))
 
 

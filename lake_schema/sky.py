@@ -201,7 +201,7 @@ def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     """ICRS ra, dec [n] deg -> Galactic l, b [n] deg (matrix of the Hipparcos catalogue, ESA 1997, eq. 1.5.11)."""
     ra_rad, dec_rad = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     vector = np.stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)])
-    x, y, z = np.tensordot(_TO_GALACTIC, vector, 1)
+    x, y, z = _turned(_TO_GALACTIC, vector)
     return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
@@ -209,8 +209,13 @@ def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
     """Galactic l, b [n] deg -> ICRS ra, dec [n] deg; the inverse of `galactic`."""
     l_rad, b_rad = np.radians(np.asarray(lon, float)), np.radians(np.asarray(lat, float))
     vector = np.stack([np.cos(b_rad) * np.cos(l_rad), np.cos(b_rad) * np.sin(l_rad), np.sin(b_rad)])
-    x, y, z = np.tensordot(_TO_GALACTIC.T, vector, 1)
+    x, y, z = _turned(_TO_GALACTIC.T, vector)
     return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+
+
+def _turned(matrix: Float, vector: Float) -> Float:
+    """[3, 3] by [3, ...], added in the order written: a library's product has other last bits on another processor."""
+    return np.stack([row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2] for row in matrix])
 
 
 _TO_GALACTIC = np.array(

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.cache import cached_arrays, content_key
 from jobs.fluxes import extinction, passbands
 from jobs.fluxes.templates import Library
@@ -92,7 +93,7 @@ def _nodes(library: Library, band: str, z_max: float, ebv_max: float) -> Float:
         if count == _EBV_NODES[-1]:
             break
         found = _ln_ratios(library, band, z, finer)
-        off = found[..., ::2] @ ebv_weights(finer[::2], finer[1::2]).T - found[..., 1::2]
+        off = sums.product(found[..., ::2], ebv_weights(finer[::2], finer[1::2]).T) - found[..., 1::2]
         if 2.5 / np.log(10.0) * np.abs(off).max() < _EBV_ERROR:
             break
     return np.ascontiguousarray(finer[::2])
@@ -155,7 +156,7 @@ def _band_flux(library: Library, dust: Float, spectra: Float, weights: Float) ->
     """[4, e, template]"""
     used = np.flatnonzero(weights)
     cut = slice(used[0], used[-1] + 1)
-    return np.asarray((dust[:, :, cut] * weights[cut]) @ spectra[cut])
+    return np.asarray(sums.product(dust[:, :, cut] * weights[cut], spectra[cut]))
 
 
 def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -> Float:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.catalogue import milky_way, parameters
 from jobs.catalogue.density_laws import Exponential, density
 from jobs.catalogue.milky_way import MilkyWay
@@ -73,7 +74,7 @@ def numbers(dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area:
         chosen = np.flatnonzero(h_limit == limit)
         per_shell = (_seen(dwarfs, galaxy, float(limit)) * dwarfs.local[:, None]).sum(0)
         r, z = milky_way.cylindrical(galaxy, lon[chosen, None], lat[chosen, None], milky_way.middles(galaxy))
-        total[chosen] = density(dwarfs.law, galaxy.sun, r, z) @ (per_shell * milky_way.volumes(galaxy, area))
+        total[chosen] = sums.product(density(dwarfs.law, galaxy.sun, r, z), per_shell * milky_way.volumes(galaxy, area))
     return dwarfs.boost * total
 
 

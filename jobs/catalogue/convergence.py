@@ -19,6 +19,7 @@ from itertools import groupby
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.catalogue import density_box, lightcone
 from jobs.catalogue.density_box import Box, BoxModel
 from jobs.compiling import exact_jit
@@ -124,7 +125,7 @@ def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stre
     for far in chi:
         lens = slabs.weight * slabs.now * np.maximum(1.0 - slabs.middle / far, 0.0)
         share = lens**2 / (slabs.middle**2 * slabs.factor)
-        ratio = np.sqrt((linear @ share) / (seen @ share))
+        ratio = np.sqrt(sums.product(linear, share) / sums.product(seen, share))
         rows.append(np.interp(np.arange(l_max + 1), ell, np.minimum(ratio, _MOST_TRANSFER)))
     return np.array(rows)
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.catalogue import parameters
 from jobs.fluxes import cosmology
 from lake_schema.units import LIGHT_KM_S
@@ -206,7 +207,7 @@ def _nitrogen(ratios: Ratios, log_mass: Float, log_sfr: Float, rng: np.random.Ge
     """log10 [N II] 6585 / H alpha, from the metallicity that mass and star formation give."""
     m, s = log_mass - 10.0, log_sfr + ratios.chabrier
     terms = np.stack([np.ones(m.size), m, s, m**2, m * s, s**2])
-    metals = np.clip(np.tensordot(np.array(ratios.fundamental), terms, 1), *ratios.metal_limits)
+    metals = np.clip(sums.product(np.array(ratios.fundamental), terms), *ratios.metal_limits)
     n2 = np.clip((metals - ratios.nii_zero) / ratios.nii_slope, *ratios.nii_limits)
     return np.asarray(n2 + ratios.nii_scatter * rng.standard_normal(m.size))
 

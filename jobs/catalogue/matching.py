@@ -14,7 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 
+from jobs import sums
 from jobs.catalogue import linear_theory, luminosity_function, parameters
 from jobs.catalogue.luminosity_function import Inverse
 from jobs.fluxes import cosmology
@@ -147,7 +149,7 @@ def proxies(halos: Masses, occupation: Occupation) -> Float:
     """n_tot(> m'), [z, m] comoving (Mpc/h)^-3: centrals and satellites, scattered."""
     step = halos.log_mass[1] - halos.log_mass[0]
     number = np.exp(halos.ln_density) * step
-    satellites = number @ satellites_above(halos.log_mass, occupation).T
+    satellites = sums.product(number, satellites_above(halos.log_mass, occupation).T)
     # Of the cumulative count of satellites, what lies in each interval.
     inside = number + np.concatenate([satellites[:, :-1] - satellites[:, 1:], satellites[:, -1:]], axis=1)
     half = int(np.ceil(6.0 * occupation.scatter / step))
@@ -155,7 +157,7 @@ def proxies(halos: Masses, occupation: Occupation) -> Float:
     kernel /= kernel.sum()
     padded = np.pad(inside, ((0, 0), (half, half)), mode="reflect", reflect_type="odd")
     padded = np.maximum(padded, 0.0)
-    smooth = np.array([np.convolve(row, kernel, mode="valid") for row in padded])
+    smooth: Float = sums.product(sliding_window_view(padded, kernel.size, axis=1), kernel)
     above = np.cumsum(smooth[:, ::-1], axis=1)[:, ::-1]
     return np.maximum(above - 0.5 * smooth, 1e-30)
 

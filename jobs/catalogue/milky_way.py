@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.catalogue import parameters
 from jobs.catalogue.density_laws import (
     Aged,
@@ -158,12 +159,12 @@ def numbers(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Floa
     total = np.zeros(lon.size)
     for limit in np.unique(h_limit):
         chosen = np.flatnonzero(h_limit == limit)
-        per_shell = _seen(galaxy, float(limit)) @ galaxy.local.T * volumes(galaxy, area)[:, None]
+        per_shell = sums.product(_seen(galaxy, float(limit)), galaxy.local.T) * volumes(galaxy, area)[:, None]
         weight = per_shell.reshape(per_shell.shape[0], _STAGES, -1).sum(1)
         for some in np.array_split(chosen, -(-chosen.size // _CELLS_AT_A_TIME)):
             r, z = cylindrical(galaxy, lon[some, None], lat[some, None], middles(galaxy))
             for component, weights in zip(galaxy.components, weight.T, strict=True):
-                total[some] += density(component.law, galaxy.sun, r, z) @ weights
+                total[some] += sums.product(density(component.law, galaxy.sun, r, z), weights)
     return total
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.catalogue import band_ratios, parameters
 from jobs.catalogue.band_ratios import Sed
 from jobs.fluxes.cosmology import HUBBLE
@@ -77,10 +78,10 @@ def light(library: Library, ebv: Float) -> Light:
     law = StarFormation(**parameters.section(_FILE, "star_formation"))
     spectra = library.flux.astype(np.float64)
     weights = band_ratios.band_weights(library, band_ratios.REFERENCE_BAND, 0.0)
-    reference = spectra @ weights
+    reference = sums.product(spectra, weights)
     inside = (library.wavelength >= law.first) & (library.wavelength <= law.last)
     f_nu = spectra[:, inside] * library.wavelength[inside] ** 2 / LIGHT_ANGSTROM_S
-    through = (band_ratios.dusty(library, ebv) * weights) @ spectra.T
+    through = sums.product(band_ratios.dusty(library, ebv) * weights, spectra.T)
     dimming = np.log(through / reference).transpose(0, 2, 1)
     return Light(law, f_nu.mean(1) / reference, ebv, np.ascontiguousarray(dimming))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.sources import Stars
@@ -42,7 +43,7 @@ def star_scale(stars: Stars, library: Library) -> Float:
     """
     band = passbands.load(STAR_BAND)
     seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
-    template = seen @ passbands.weights(band)
+    template = sums.product(seen, passbands.weights(band))
     mag_ab = stars.mag_h + vega_magnitude(band)
     return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_ab)) / template[stars.sed])
 

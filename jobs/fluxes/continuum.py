@@ -18,6 +18,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.fluxes import extinction, intergalactic, passbands
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.templates import Library
@@ -114,7 +115,7 @@ def rest_flux(sed: Int, law: Int, ebv: Float, band: Passband, library: Library, 
     ebv32 = ebv.astype(np.float32)[:, None]
     spectra = library.flux[:, stretch][sed] * extinction.transmitted(dust[:, stretch][law], ebv32)
     # Summed in double precision: the rounding then averages out, and no sum depends on its neighbours.
-    return np.asarray(spectra.astype(float) @ passbands.weights(band))
+    return np.asarray(sums.product(spectra, passbands.weights(band)))
 
 
 def amplitudes(mix: Mix, band: Passband, library: Library, dust: Float32) -> Float:

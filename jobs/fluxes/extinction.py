@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
+
 Float = npt.NDArray[np.float64]
 
 LAW_COUNT = 5
@@ -93,8 +95,8 @@ def _prevot(lam: Float) -> Float:
 def _calzetti(lam: Float) -> Float:
     x = 1e4 / np.maximum(lam, _CALZETTI_FIRST)
     powers = x[None, :] ** np.arange(4)[:, None]
-    blue = _CALZETTI_SLOPE * (np.array(_CALZETTI_BLUE) @ powers) + _CALZETTI_R_V
-    red = _CALZETTI_SLOPE * (np.array(_CALZETTI_RED) @ powers[:2]) + _CALZETTI_R_V
+    blue = _CALZETTI_SLOPE * sums.product(np.array(_CALZETTI_BLUE), powers) + _CALZETTI_R_V
+    red = _CALZETTI_SLOPE * sums.product(np.array(_CALZETTI_RED), powers[:2]) + _CALZETTI_R_V
     # Below its first wavelength the law goes on along its tangent.
     x0 = 1e4 / _CALZETTI_FIRST
     tangent = -_CALZETTI_SLOPE * np.polyval(np.polyder(np.array(_CALZETTI_BLUE[::-1])), x0) * x0 / _CALZETTI_FIRST

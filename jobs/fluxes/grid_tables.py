@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from jobs import cache
+from jobs import cache, sums
 from jobs.fluxes import extinction, intergalactic, lines, passbands
 from jobs.fluxes.continuum import REFERENCE_BAND, dust_of, rest_flux
 from jobs.fluxes.passbands import Passband
@@ -136,6 +136,8 @@ def _galaxies(library: Library, band: Passband, reference: Passband, setting: Se
     last = int(band.wavelength[-1] / np.exp(nearest) - library.wavelength[0]) + 2
     spectra = library.flux[sed, first:last]
     spectra *= extinction.transmitted(dust[law, first:last], ebv[node].astype(np.float32)[:, None])
+    # By wavelength, as the sums go.
+    spectra = np.ascontiguousarray(spectra.T)
     weights = passbands.weights(band)
     total = float(weights.sum())
     dimmed = weights / total * extinction.transmitted(extinction.milky_way(band.wavelength), a_v[:, None])
@@ -146,13 +148,14 @@ def _galaxies(library: Library, band: Passband, reference: Passband, setting: Se
         if library.intergalactic:
             left = left * intergalactic.transmission(band.wavelength, stretch - 1.0)
         low, moved = _moved(band.wavelength / stretch - library.wavelength[first], left)
-        observed[i] = spectra[:, low : low + moved.shape[1]] @ moved.T.astype(np.float32)
+        observed[i] = sums.product(moved, spectra[low : low + moved.shape[1]]).T
     # A template without flux that far in the ultraviolet: as faint as single precision goes.
     np.maximum(observed, np.finfo(np.float32).tiny, out=observed)
     observed *= (total / at_rest)[:, None]
     log_ratio = np.log(observed).reshape(setting.z_count, *shape, setting.n_av)
     to_ebv, to_av = _to_coefficients(setting.n_ebv), _to_coefficients(setting.n_av)
-    table = np.einsum("ztlem,pe,qm->tlzpq", log_ratio, to_ebv, to_av, optimize=True)
+    in_av = np.moveaxis(sums.product(log_ratio, to_av.T), 3, 4)
+    table = np.moveaxis(sums.product(in_av, to_ebv.T), (0, 4), (2, 3))
     return np.ascontiguousarray(table.reshape(*shape[:2], setting.z_count, -1), np.float32)
 
 
@@ -160,10 +163,10 @@ def _stars(library: Library, band: Passband) -> Float32:
     a_v = nodes(STAR_COEFFICIENTS, STAR_A_V_LAST)
     inside = slice(band.first, band.first + len(band.wavelength))
     dimmed = passbands.weights(band) * extinction.transmitted(extinction.milky_way(band.wavelength), a_v[:, None])
-    f_nu = library.flux[:, inside].astype(float) @ dimmed.T
+    f_nu = sums.product(library.flux[:, inside], dimmed.T)
     # Cool stars have nothing left in the ultraviolet.
     f_nu = np.maximum(f_nu, np.finfo(float).tiny)
-    return np.asarray(np.log(f_nu) @ _to_coefficients(STAR_COEFFICIENTS).T, np.float32)
+    return np.asarray(sums.product(np.log(f_nu), _to_coefficients(STAR_COEFFICIENTS).T), np.float32)
 
 
 def _lines(band: Passband) -> dict[str, npt.NDArray[np.generic]]:
@@ -202,5 +205,7 @@ def _moved(position: Float, weights: Float) -> tuple[int, Float]:
 
 
 def _to_coefficients(count: int) -> Float:
-    """Matrix from values at the nodes to coefficients."""
-    return np.asarray(np.linalg.inv(chebyshev(nodes(count, 1.0), 1.0, count)), float)
+    """Matrix from values at the nodes to coefficients: at the nodes the polynomials are orthogonal."""
+    return np.asarray(
+        chebyshev(nodes(count, 1.0), 1.0, count).T * np.where(np.arange(count) > 0, 2.0, 1.0)[:, None] / count
+    )

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from jobs import sums
 from jobs.fluxes import cosmology, extinction, passbands
 from jobs.fluxes.continuum import within
 from jobs.fluxes.passbands import Passband
@@ -88,7 +89,7 @@ def fluxes(galaxies: pa.Table, bands: Sequence[Passband]) -> Float:
         f_lambda = spectra(galaxies.slice(start, _BLOCK))
         for k, band in enumerate(bands):
             seen = f_lambda[:, band.first : band.first + len(band.wavelength)]
-            out[start : start + _BLOCK, k] = seen @ passbands.weights(band)
+            out[start : start + _BLOCK, k] = sums.product(seen, passbands.weights(band))
     return units.ujy_of_cgs(out)
 
 

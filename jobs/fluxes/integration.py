@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.fluxes import extinction, lines, passbands
 from jobs.fluxes.calibration import continuum_scale, star_scale
 from jobs.fluxes.continuum import REFERENCE_BAND, amplitudes, dust_of, observed_shape
@@ -75,9 +76,9 @@ def galaxies(rows: Galaxies, bands: Sequence[Passband], library: Library) -> Flo
                 shape = observed_shape(mix, amplitude[:, inner], library, dust, stretch.first, len(stretch))
                 if stretch.reference is not None:
                     low, high = stretch.reference
-                    observed[part[inner]] = shape[:, low:high].astype(float) @ reference_weights
+                    observed[part[inner]] = sums.product(shape[:, low:high], reference_weights)
                 shape *= extinction.transmitted(stretch.milky_way, a_v.astype(np.float32)[:, None])
-                seen[part[inner]] += shape.astype(float) @ stretch.weights
+                seen[part[inner]] += sums.product(shape, stretch.weights)
     scale = continuum_scale(rows.mag_r01, observed)
     f_nu = units.ujy_of_cgs(seen * scale[:, None]) + _line_fluxes(rows, order, bands)
     return np.asarray(f_nu * rows.magnification[:, None])
@@ -93,7 +94,7 @@ def stars(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
         for part in _blocks(np.arange(len(rows)), len(stretch)):
             dimmed = extinction.transmitted(stretch.milky_way, rows.a_v[part].astype(np.float32)[:, None])
             dimmed *= spectra[rows.sed[part]]
-            f_nu[part] += dimmed.astype(float) @ stretch.weights
+            f_nu[part] += sums.product(dimmed, stretch.weights)
     return units.ujy_of_cgs(f_nu * scale[:, None])
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from jobs import cache
+from jobs import cache, sums
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_ANGSTROM_S
 
@@ -113,7 +113,8 @@ def ab_flux(band: Passband, wavelength: npt.ArrayLike, f_lambda: npt.ArrayLike) 
         raise BadInput(f"spectrum {at[0]:g}-{at[-1]:g} A does not cover passband {band.name}")
     index = np.clip(np.searchsorted(at, band.wavelength, "right") - 1, 0, len(at) - 2)
     part = (band.wavelength - at[index]) / (at[index + 1] - at[index])
-    return np.asarray((spectra[..., index] * (1.0 - part) + spectra[..., index + 1] * part) @ weights(band))
+    between = spectra[..., index] * (1.0 - part) + spectra[..., index + 1] * part
+    return np.asarray(sums.product(between, weights(band)))
 
 
 def _rows() -> dict[str, dict[str, str]]:

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from jobs import sums
 from jobs.accuracy import REFERENCE, Accuracy
 from jobs.fluxes import extinction, flux_grid, grid_errors, grid_settings, high_redshift, integration, lines, passbands
 from jobs.fluxes.calibration import continuum_scale, star_scale
@@ -56,7 +57,7 @@ def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum")
     shape = observed_shape(rows.mix, amplitude, library, dust, passbands.GRID_FIRST, len(grid))
     spectra = shape.astype(float)
     inside = slice(reference.first, reference.first + len(reference.wavelength))
-    observed = spectra[:, inside] @ passbands.weights(reference)
+    observed = sums.product(spectra[:, inside], passbands.weights(reference))
     spectra *= continuum_scale(rows.mag_r01, observed)[:, None]
     sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
     found = lines.profiles(rows.lines, rows.mix.z_obs, sigma, medium)
@@ -77,7 +78,8 @@ def band_fluxes(spectra: Float, bands: Sequence[Passband]) -> Float:
     """Band-averaged f_nu, float64[n, n_band] microjansky, of spectra [n, 23401] on the grid."""
     out = np.empty((len(spectra), len(bands)))
     for k, band in enumerate(bands):
-        out[:, k] = spectra[:, band.first : band.first + len(band.wavelength)] @ passbands.weights(band)
+        inside = slice(band.first, band.first + len(band.wavelength))
+        out[:, k] = sums.product(spectra[:, inside], passbands.weights(band))
     return units.ujy_of_cgs(out)
 
 

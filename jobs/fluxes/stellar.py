@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from jobs import cache
+from jobs import cache, sums
 from jobs.fluxes import passbands
 from lake_schema.errors import BadInput
 from lake_schema.units import BOLTZMANN_ERG_K, LIGHT_ANGSTROM_S, PLANCK_ERG_S
@@ -192,7 +192,8 @@ def matching(
     """
     correction = np.zeros(len(pivots)) if first is None else first
     for _ in range(passes):
-        mags = -2.5 * np.log10(corrected(log_wavelength, start, pivots, correction) @ response)
+        seen = sums.product(corrected(log_wavelength, start, pivots, correction), response)
+        mags = -2.5 * np.log10(seen)
         missing = colors - (mags - mags[tied])
         if np.abs(missing).max() < error:
             break

@@ -25,6 +25,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
+from jobs import sums
 from jobs.explore.process import Process
 from jobs.render import focal_plane
 from lake_schema import command, layout, read, sky, user_files
@@ -80,9 +81,9 @@ def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
     edges = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
     place = focal_plane.basis(ra, dec)[2]
     # A place is inside where it is on one side of the great circles through all edges, and not at the antipode.
-    side = np.cross(edges, np.roll(edges, -1, axis=1)) @ place
+    side = sums.product(np.cross(edges, np.roll(edges, -1, axis=1)), place)
     inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
-    return rows.filter(pa.array(inside & (edges.sum(axis=1) @ place > 0)))
+    return rows.filter(pa.array(inside & (sums.product(edges.sum(axis=1), place) > 0)))
 
 
 def _lines(root: Path) -> Iterator[dict[str, Any]]:

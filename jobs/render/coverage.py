@@ -20,6 +20,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from jobs import sums
 from jobs.area import Area
 from jobs.render import focal_plane
 from jobs.render.exposing import SKY_TYPES
@@ -69,7 +70,7 @@ def counts(tasks: pa.Table, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
         if near:
             corners = np.array(region.split()[2:], float).reshape(-1, 2)
             edges = focal_plane.basis(corners[:, 0], corners[:, 1])[2].T
-            side = places[near] @ np.cross(edges, np.roll(edges, -1, axis=0)).T
+            side = sums.product(places[near], np.cross(edges, np.roll(edges, -1, axis=0)).T)
             found[near] += (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
     return found
 

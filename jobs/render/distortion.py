@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import polynomial
 
+from jobs import sums
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
@@ -69,11 +70,12 @@ def sip(some: Terms, matrix: Float) -> tuple[Float, Float]:
         power = np.zeros((order + 1, order + 1))
         # (m00 u + m01 v)^i (m10 u + m11 v)^j, each factor a homogeneous polynomial: a row of binomials.
         across, along = (_binomial(line, n) for line, n in ((matrix[0], i), (matrix[1], j)))
-        for p, coefficient in enumerate(np.convolve(across, along)):
-            power[p, i + j - p] = coefficient
+        for p, coefficient in enumerate(across):
+            for q, another in enumerate(along):
+                power[p + q, i + j - p - q] += coefficient * another
         to_x += a * power
         to_y += b * power
-    inverse = np.linalg.inv(matrix)
+    inverse = sums.inverse(matrix)
     return inverse[0, 0] * to_x + inverse[0, 1] * to_y, inverse[1, 0] * to_x + inverse[1, 1] * to_y
 
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.compiling import jit
 from jobs.fluxes.passbands import Passband
 from jobs.render.kernel import FIXED_POINT
@@ -110,7 +111,7 @@ def ring(edges: Edges, photons: Float) -> float:
     photons : [w] share of each sub-band
     Error   : 3 % beyond 5", 1 % of it where the bars hide the circles
     """
-    wavelength = float(photons @ edges.wavelength.mean(axis=1)) * 1e-7
+    wavelength = float(sums.product(photons, edges.wavelength.mean(axis=1))) * 1e-7
     return wavelength * edges.round / (4.0 * np.pi**3 * edges.area) / (edges.pixel_scale * _ARCSEC)
 
 
@@ -157,7 +158,7 @@ def _blurred(lines: Float, blur: float, along: Float) -> Float:
     k = 2.0 * np.pi * np.fft.rfftfreq(both.shape[1], _STEP)
     passed = np.fft.rfft(both, axis=1) * np.exp(-0.5 * (blur * k) ** 2) * np.sinc(k / (2.0 * np.pi))
     smooth = np.fft.irfft(passed, both.shape[1], axis=1)[:, lines.shape[1] - 1 :]
-    return np.asarray(along @ np.maximum(smooth[:, : round(_WIDE / _STEP) + 2], 0.0))
+    return np.asarray(sums.product(along, np.maximum(smooth[:, : round(_WIDE / _STEP) + 2], 0.0)))
 
 
 def add(

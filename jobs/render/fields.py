@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.area import Area
 from jobs.render import focal_plane
 from jobs.render.sky import sun_longitude
@@ -55,18 +56,18 @@ def sun_vector(mjd: float) -> Float:
 
 def solar_aspect(ra: float, dec: float, mjd: float) -> float:
     """Angle between a pointing and the Sun, deg."""
-    return float(np.degrees(np.arccos(np.clip(_vector(ra, dec) @ sun_vector(mjd), -1.0, 1.0))))
+    return float(np.degrees(np.arccos(np.clip(sums.product(_vector(ra, dec), sun_vector(mjd)), -1.0, 1.0))))
 
 
 def position_angle(ra: float, dec: float, mjd: float) -> float:
     """Of the focal plane's y axis, deg, north through east: across the direction of the Sun, z x p."""
     p, s = _vector(ra, dec), sun_vector(mjd)
-    towards = s - (s @ p) * p
-    if np.linalg.norm(towards) < 1e-6:
+    towards = s - sums.product(s, p) * p
+    if sums.product(towards, towards) < 1e-12:
         raise BadInput(f"a pointing at ra {ra:g}, dec {dec:g} on MJD {mjd:g} looks along the Sun's direction")
     y = np.cross(towards, p)
     east, north, _ = focal_plane.basis(ra, dec)
-    return float(np.degrees(np.arctan2(y @ east, y @ north)))
+    return float(np.degrees(np.arctan2(sums.product(y, east), sums.product(y, north))))
 
 
 def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguration, where: str) -> None:

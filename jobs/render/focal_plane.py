@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from astropy.wcs import WCS, Sip
 
+from jobs import sums
 from jobs.render import distortion
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -190,12 +191,12 @@ def boresight_for(detector: Detector, ra: float, dec: float, position_angle: flo
     east, north, out = basis(ra, dec)
     angle = np.radians(position_angle)
     sky = _triad(out, np.sin(angle) * east + np.cos(angle) * north)
-    rotation = sky @ camera.T
+    rotation = sums.product(sky, camera.T)
     boresight, up = rotation[:, 2], rotation[:, 1]
     ra0 = float(np.degrees(np.arctan2(boresight[1], boresight[0])) % 360.0)
     dec0 = float(np.degrees(np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1]))))
     east0, north0, _ = basis(ra0, dec0)
-    return ra0, dec0, float(np.degrees(np.arctan2(up @ east0, up @ north0)))
+    return ra0, dec0, float(np.degrees(np.arctan2(sums.product(up, east0), sums.product(up, north0))))
 
 
 def sky_of_plane(
@@ -242,9 +243,9 @@ def basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
 def _triad(direction: Float, along: Float) -> Float:
     """Orthonormal columns: direction, `along` made perpendicular to it, their cross product."""
-    first = direction / np.linalg.norm(direction)
-    second = along - first * (first @ along)
-    second = second / np.linalg.norm(second)
+    first = direction / np.sqrt(sums.product(direction, direction))
+    second = along - first * sums.product(first, along)
+    second = second / np.sqrt(sums.product(second, second))
     return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
@@ -261,14 +262,14 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     # Columns: the directions (east, north) of the focal plane's x and y axes.
     axes = np.array([[-np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    from_centre = rotation.T @ np.array([-detector.x, -detector.y]) / detector.pixel_scale
+    from_centre = sums.product(rotation.T, np.array([-detector.x, -detector.y])) / detector.pixel_scale
     system = WCS(naxis=2)
     bends = bool(detector.bending)
     system.wcs.ctype = [f"{axis}{_PROJECTIONS[bends]}" for axis in ("RA---", "DEC--")]
     system.wcs.cunit = ["deg", "deg"]
     system.wcs.crval = [ra, dec]
     system.wcs.crpix = [(detector.nx + 1) / 2 + from_centre[0], (detector.ny + 1) / 2 + from_centre[1]]
-    system.wcs.cd = axes @ rotation * detector.pixel_scale / 3600.0
+    system.wcs.cd = sums.product(axes, rotation) * detector.pixel_scale / 3600.0
     system.wcs.radesys = "ICRS"
     # Else north would be turned by 180 deg for a boresight at the pole itself.
     system.wcs.lonpole = 180.0

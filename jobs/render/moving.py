@@ -181,10 +181,10 @@ def _passing(
     """(bodies that come within `reach` deg of a centre on their way, parts of it from which to which they are kept)."""
     there, start, stop = (focal_plane.basis(*place)[2] for place in (np.reshape(centre, (2, 1)), begin, end))
     way = stop - start
-    length = np.linalg.norm(way, axis=0)
+    length = np.sqrt(np.sum(way**2, axis=0))
     nearest = np.sum((there - start) * way, axis=0) / np.maximum(length, 1e-30) ** 2
     place = start + np.clip(nearest, 0.0, 1.0) * way
-    away = np.linalg.norm(place / np.linalg.norm(place, axis=0) - there, axis=0)
+    away = np.sqrt(np.sum((place / np.sqrt(np.sum(place**2, axis=0)) - there) ** 2, axis=0))
     radius = 2.0 * np.sin(0.5 * np.radians(min(reach, 180.0)))
     near = np.flatnonzero(away <= radius)
     length, nearest, away = length[near], nearest[near], away[near]

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render import focal_plane
@@ -98,7 +99,7 @@ def _cube(data: Float, header: Mapping[str, Any], detector: Detector, band: Pass
         _number(header, f"CRPIX{axis}", (n + 1) / 2) - 1 for axis, n in ((2, data.shape[-2]), (1, data.shape[-1]))
     ]
     waves, weights = _colours(header, len(planes), band)
-    spaced = np.tensordot(weights, planes, 1)
+    spaced = sums.product(weights, planes.reshape(len(planes), -1)).reshape(-1, *planes.shape[1:])
     turns = round(detector.rotation / 90.0)
     images = np.stack([np.rot90(_resampled(p, step / detector.pixel_scale, middle, _OF_CUBES), turns) for p in spaced])
     return Planes(waves, images.astype(np.float32), np.zeros((0, *images.shape[1:]), np.float32), _half(detector))
@@ -191,7 +192,7 @@ def _resampled(plane: Float, spacing: float, middle: list[float], lobes: int) ->
     half = max(min(int(reach * spacing * SAMPLES), SIDE * SAMPLES // 2), _LEAST_SIDE // 2)
     at = np.arange(-half, half + 1) / (SAMPLES * spacing)
     rows, columns = (_interpolant(at + m, n, lobes) for m, n in zip(middle, plane.shape, strict=True))
-    return np.asarray(rows @ plane @ columns.T / (SAMPLES * spacing) ** 2)
+    return np.asarray(sums.product(rows, sums.product(plane, columns.T)) / (SAMPLES * spacing) ** 2)
 
 
 def _interpolant(at: Float, count: int, lobes: int) -> Float:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import scipy.fft
 
+from jobs import sums
 from jobs.render import kernel
 from jobs.render.transfer import Grid, Transfer
 from lake_schema.errors import BadInput
@@ -66,7 +67,7 @@ def transform(picture: Picture, jacobian: Float, kx: Array, ky: Array) -> Array:
     jacobian : [2, 2] d(u, v) / d(column, row), arcsec, u to the west
     Error    : 1e-6 of the flux (tests/jobs/render/test_pictures)
     """
-    west, north = (np.linalg.inv(jacobian).T @ np.stack([kx, ky]).astype(float)) * picture.scale
+    west, north = sums.product(sums.inverse(jacobian).T, np.stack([kx, ky]).astype(float)) * picture.scale
     across, up = -west, north
     rows, columns = picture.image.shape
     found = np.empty(len(kx), complex)
@@ -144,7 +145,7 @@ def _spectrum(image: Array) -> Array:
 
 def _window_transform(place: Array, period: int) -> Array:
     """What the window about a frequency makes of a pixel at `place`."""
-    z, weights = np.polynomial.legendre.leggauss(_NODES)
+    z, weights = sums.gauss_legendre(_NODES)
     window = weights * np.exp(_SLOPE * (np.sqrt((1 - z) * (1 + z)) - 1.0))
     half = 0.5 * _WIDTH
-    return np.asarray(half * np.cos(np.outer(2 * np.pi * place / period, half * z)) @ window)
+    return np.asarray(sums.product(half * np.cos(np.outer(2 * np.pi * place / period, half * z)), window))

@@ -16,6 +16,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from astropy.wcs import WCS
 
+from jobs import sums
 from jobs.render import fits_product, focal_plane
 from lake_schema import fits, read, sky, units
 from lake_schema.fits import Card
@@ -277,12 +278,12 @@ def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: f
 def _compass(axes: Any, system: WCS, shape: tuple[int, ...]) -> None:
     """North and east as they are at the centre, lower right."""
     x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
-    inverse = np.linalg.inv(focal_plane.jacobian(system, [x], [y])[0])
+    inverse = sums.inverse(focal_plane.jacobian(system, [x], [y])[0])
     flip = np.array([1 if lim[0] < lim[1] else -1 for lim in (axes.get_xlim(), axes.get_ylim())])
     origin = np.array([0.93, 0.05])
     # u points west.
     for name, world in (("N", (0.0, 1.0)), ("E", (-1.0, 0.0))):
-        step = inverse @ np.array(world) * flip
+        step = sums.product(inverse, np.array(world)) * flip
         step = step / np.hypot(*step) * 0.055
         axes.annotate(
             "",

@@ -21,6 +21,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from scipy.special import gammaincc, gammaln
 
+from jobs import sums
 from jobs.render import sersic
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 
@@ -133,7 +134,7 @@ def forms(shape: Shapes, jacobian: Float) -> Forms:
     turn = _matrices(cos_beta, -sin_beta, sin_beta, cos_beta)
     scale = np.sqrt(shape.magnification / ((1 - shape.g1) * (1 + shape.g1) - shape.g2**2))
     lens = _matrices(1 + shape.g1, shape.g2, shape.g2, 1 - shape.g1) * scale[:, None, None]
-    to_pixels = np.linalg.inv(jacobian) @ lens @ turn
+    to_pixels = sums.product(sums.product(sums.inverse(jacobian), lens), turn)
     one = np.ones(len(shape))
     bulge = to_pixels * (shape.bulge_radius[:, None] * np.stack([one, shape.bulge_axis_ratio], 1))[:, None]
     disk = to_pixels * (shape.disk_radius / EXPONENTIAL_RADIUS)[:, None, None]
@@ -232,7 +233,9 @@ def on_the_sky(shape: Shapes, form: Forms) -> Float:
     # A disc on edge is as thick as it is high.
     across = form.disk[:, :, 1], form.thick * (2 / np.pi)
     disk = np.stack([form.disk[:, :, 0], np.copysign(np.hypot(*across), across[0] + across[1])], -1)
-    areas = [np.abs(np.linalg.det(matrix)) for matrix in (form.bulge, disk)]
+    areas = [
+        np.abs(matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] * matrix[:, 1, 0]) for matrix in (form.bulge, disk)
+    ]
     some = [area > _NO_AREA for area in areas]
     areas = [np.where(kept, area, 1.0) for kept, area in zip(some, areas, strict=True)]
     middles = (
@@ -240,7 +243,7 @@ def on_the_sky(shape: Shapes, form: Forms) -> Float:
         (1 - shape.bulge_fraction) / (2 * np.pi) / areas[1],
     )
     inverse = [
-        np.linalg.inv(np.where(kept[:, None, None], m, np.eye(2)))
+        sums.inverse(np.where(kept[:, None, None], m, np.eye(2)))
         for kept, m in zip(some, (form.bulge, disk), strict=True)
     ]
     return np.column_stack(

@@ -23,7 +23,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy.ndimage import uniform_filter
 
-from jobs import cache
+from jobs import cache, sums
 from jobs.compiling import jit
 from jobs.fluxes.passbands import Passband
 from jobs.render import edges
@@ -336,7 +336,8 @@ def _drift(
     for order, images in enumerate((mean, slope)):
         terms = [x**i * y**j for i, j, colour in powers if colour == order]
         if terms:
-            change = np.tensordot(np.linalg.pinv(np.stack(terms, axis=1)), images[1:] - images[0], 1)
+            from_nodes = sums.least_squares(np.stack(terms, axis=1), np.eye(len(x)))
+            change = sums.product(from_nodes, (images[1:] - images[0]).reshape(len(x), -1)).reshape(-1, side, side)
             # The blur is the same for all, and linear.
             changes += [_blurred(image, weights) for image in change]
     return np.stack(changes)
@@ -400,8 +401,8 @@ def _weights(sigma: float) -> Float:
     while True:
         half += 1
         basis = 1.0 - np.cos(k[:, None] * np.arange(1, half + 1))
-        outer = np.linalg.lstsq(basis, lost)[0]
-        if np.abs(basis @ outer - lost).max() < 1e-7:
+        outer = sums.least_squares(basis, lost)
+        if np.abs(sums.product(basis, outer) - lost).max() < 1e-7:
             return np.concatenate([outer[::-1] / 2, [1.0 - outer.sum()], outer / 2])
 
 

@@ -16,6 +16,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from jobs import sums
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.focal_plane import Detector
@@ -131,7 +132,7 @@ def zodiacal_intensity(from_sun: float, latitude: float, mission: MissionConfigu
     s = (distance - longitudes[i]) / (longitudes[i + 1] - longitudes[i])
     t = (beta - _LATITUDES[j]) / (_LATITUDES[j + 1] - _LATITUDES[j])
     corner = np.log(values[i : i + 2, j : j + 2])
-    mean = np.array([1 - s, s]) @ corner @ np.array([1 - t, t])
+    mean = sums.product(sums.product(np.array([1 - s, s]), corner), np.array([1 - t, t]))
     return float(np.exp(mean)) * _TABLE_UNIT
 
 

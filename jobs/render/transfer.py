@@ -21,6 +21,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy.ndimage import maximum
 
+from jobs import sums
 from jobs.render import edges, kernel
 from jobs.render.effects import intra_pixel
 from jobs.render.psf import SAMPLES, SIDE, Planes, Psf, galsim_profile, spectrum_of
@@ -58,7 +59,7 @@ def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) ->
     # Beyond the border the polynomial is held.
     x = np.clip((column - planes.half[0]) / (planes.half[0] + 0.5), -1.0, 1.0)
     y = np.clip((row - planes.half[1]) / (planes.half[1] + 0.5), -1.0, 1.0)
-    redder = photons @ waves - waves.mean()
+    redder = sums.product(photons, waves) - waves.mean()
     drift = [x**i * y**j * redder**colour for i, j, colour in planes.powers]
     return np.column_stack([photons, *drift])
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial import polynomial
 
+from jobs import sums
 from jobs.render import distortion
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
@@ -34,7 +35,7 @@ def change(u: Frame, v: Frame, stretch: Frame) -> Frame:
     Error          : 2e-4, of the projection: a tangent plane is not the sky
     """
     across, along = (polynomial.polyvander(at, n - 1) for at, n in zip((u, v), stretch.shape, strict=True))
-    return np.asarray(along @ stretch.T @ across.T)
+    return np.asarray(sums.product(along, sums.product(stretch.T, across.T)))
 
 
 def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:

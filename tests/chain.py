@@ -1,0 +1,120 @@
+"""What the chain makes, in this process, as digests: python -m tests.chain quick|whole FOLDER prints them as JSON.
+
+quick  tables of fluxes, of the PSF, of shapes; products and solutions as they occur; a small frame
+whole  besides, a small lake by the jobs' own plans: galaxies, stars, fluxes, two CCDs; every array in the cache
+
+With --keep the arrays themselves are written beside the digests, to be compared number by number.
+"""
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from jobs import cache, request, sums
+from jobs.accuracy import DRAFT
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes, cosmology, grid_settings, grid_tables, integration, passbands, templates
+from jobs.fluxes.sources import galaxies_of
+from jobs.render import plan_exposures, profiles, psf, render_exposures, sersic
+from lake_schema import layout, publish, read, sky
+from lake_schema.fits import read_images
+from tests.jobs.render import fields
+
+BANDS = ("euclid_vis", "lsst_r")
+REQUEST = {
+    "name": "chain",
+    "seed": 7,
+    "accuracy": "draft",
+    "area": {"cone": {"ra": 53.4375, "dec": -27.279613, "radius": 0.05}},
+    "universe": {"galaxy_limit": 22.0, "star_limit": 20.0, "box_cells": 192, "lensing_nside": 64},
+    "fluxes": {"bands": list(BANDS)},
+    "pointing": [
+        {"channel": channel, "camera": camera, "band": band, "detectors": [ccd], "ra": 53.4375, "dec": -27.279613,
+         "mjd": 60950.0, "exposure_time_s": 60.0}
+        for channel, camera, band, ccd in (("EXT", "lsstcam", "lsst_r", "R22_S11"), ("VIS", "vis", "euclid_vis", "3-4"))
+    ],
+}  # fmt: skip
+
+
+def random_galaxies(n):
+    """Rows that integration and the tables read."""
+    from benchmarks.fluxes import sample
+
+    return galaxies_of(sample(n, 1), templates.galaxy_library())
+
+
+def quick():
+    """Arrays by name, of a few seconds."""
+    rng = np.random.default_rng(1)
+    library, vis = templates.galaxy_library(), passbands.load("euclid_vis")
+    setting = min((choice.setting for choice in grid_settings.choose(["euclid_vis"], DRAFT)), key=lambda s: s.size)
+    yield "templates", library.flux
+    yield "galaxy_table", grid_tables.galaxy_table(vis, library, setting, grid_tables.library_key(library))
+    stellar = templates.stellar_library()
+    yield "stellar_templates", stellar.flux
+    yield "star_table", grid_tables.star_table(vis, stellar, grid_tables.library_key(stellar))
+    yield "line_table", grid_tables.line_table(vis)[1]
+    yield "integrated", integration.galaxies(random_galaxies(20), [vis], library)
+    yield "distances", cosmology.comoving_separation(0.0, np.linspace(0.0, 6.0, 50))
+    yield "galactic", np.stack(sky.galactic(*rng.uniform(-80.0, 80.0, (2, 1000))))
+    planes = psf._vis_planes(fields.small("vis", "3-4"), vis, fields.MISSION, 4)
+    yield "psf", planes.images
+    yield "psf_drift", planes.drift
+    yield "sersic", sersic.table()
+    shapes = profiles.shapes(fields.galaxies(np.zeros(50), np.zeros(50), inclination=80 * rng.random(50), gamma1=0.02))
+    form = profiles.forms(shapes, rng.normal(size=(50, 2, 2)))
+    yield "forms", np.concatenate([part.ravel() for part in (form.bulge, form.disk, form.thick)])
+    yield "least_squares", sums.least_squares(rng.normal(size=(30, 6)), rng.normal(size=(30, 3)))
+
+
+def whole(folder):
+    """Of the lake, column by column and image by image; then all that lies in the cache."""
+    yield from quick()
+    root = layout.lake(folder / "lake")
+    root.mkdir(parents=True)
+    wanted = request.from_table(REQUEST)
+    for job in (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.JOB, render_exposures.JOB):
+        for step in job.steps(root, wanted):
+            publish.make(root, step.plan, step.work)
+    for name in read.tables(root):
+        version = read.version(root, name)
+        if name != "products":
+            rows = version.rows()
+            yield from ((f"{name}.{column}", values_of(rows[column])) for column in rows.column_names)
+        for entry in version.manifest["files"]:
+            if entry["path"].endswith(".fits"):
+                for number, image in enumerate(read_images(version.folder / entry["path"])):
+                    yield f"{entry['path']}[{number}]", np.asarray(image.data)
+    for path in sorted(cache.cache_dir().rglob("*.npy")):
+        yield path.relative_to(cache.cache_dir()).as_posix(), np.load(path)
+
+
+def values_of(column):
+    """A column's numbers; of text and lists their form in JSON."""
+    if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
+        return column.to_numpy()
+    return np.frombuffer(json.dumps(column.to_pylist(), default=str).encode(), np.uint8)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=("quick", "whole"))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--keep", action="store_true")
+    options = parser.parse_args()
+    found = {}
+    for number, (name, values) in enumerate(quick() if options.what == "quick" else whole(options.folder)):
+        values = np.ascontiguousarray(values)
+        found[name] = hashlib.sha256(values.tobytes()).hexdigest()
+        if options.keep:
+            options.folder.mkdir(parents=True, exist_ok=True)
+            np.save(options.folder / f"{number:04d}.npy", values)
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""Nothing of ours adds up as a library of linear algebra does: that changes with threads and processor."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = sorted(path for folder in ("jobs", "lake_schema") for path in (ROOT / folder).rglob("*.py"))
+# What numpy and scipy hand to BLAS or LAPACK.
+NAMES = {
+    "dot", "vdot", "matmul", "matvec", "vecmat", "tensordot", "linalg", "convolve", "correlate", "cov", "corrcoef",
+    "polyfit", "leggauss", "hermgauss", "laggauss", "roots_legendre", "lstsq", "pinv", "eigh", "svd", "cholesky",
+}  # fmt: skip
+
+
+def faults(tree):
+    for node in ast.walk(tree):
+        operator = isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult)
+        named = isinstance(node, ast.Attribute) and node.attr in NAMES
+        imported = isinstance(node, ast.ImportFrom) and bool(
+            {*(node.module or "").split("."), *(n.name for n in node.names)} & NAMES
+        )
+        optimised = isinstance(node, ast.Call) and any(k.arg == "optimize" for k in node.keywords)
+        parallel = isinstance(node, ast.keyword) and node.arg == "parallel"
+        if operator or named or imported or optimised or parallel:
+            yield getattr(node, "lineno", 0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a @ b", "a @= b", "np.dot(a, b)", "a.dot(b)", "np.linalg.inv(a)", "from numpy.linalg import inv",
+     "np.einsum('i,i', a, b, optimize=True)", "from scipy.linalg import svd", "numba.njit(parallel=True)"],
+)  # fmt: skip
+def test_what_would_be_found(text):
+    assert list(faults(ast.parse(text)))
+
+
+def test_products_are_those_of_sums():
+    found = [f"{p.relative_to(ROOT)}:{line}" for p in SOURCES for line in faults(ast.parse(p.read_text()))]
+    assert found == [], "jobs/sums.py has products and solutions whose last bit is the same everywhere"
