@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from lake_schema import layout, user_files
 from lake_schema.errors import BadInput
+from lake_schema.provenance import machine
 
 Array = npt.NDArray[Any]
 
@@ -84,7 +85,9 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) 
     name : legible beginning of the folder's name;  key : from content_key
     make : called only if nothing usable is stored; of processes that race, all use what the first published
     """
-    folder = cache_dir() / f"{layout.name(name)}-{layout.name(key[:_KEY_LENGTH])}"
+    # A folder that machines of several kinds share keeps each kind's: what is kept changes no result.
+    own = content_key(key, machine())[:_KEY_LENGTH]
+    folder = cache_dir() / f"{layout.name(name)}-{own}"
     stored = _load(folder)
     if stored is not None:
         return stored

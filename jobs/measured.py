@@ -1,4 +1,4 @@
-"""What a part took, beside its receipt: seconds, and the largest memory of its own time in the process."""
+"""What a part took, beside its receipt: seconds, those of the processor, the largest memory of its own time."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ _CLEAR, _RESET, _STATUS = Path("/proc/self/clear_refs"), "5", Path("/proc/self/s
 
 
 class Measured:
-    """A part's function with the clock and the memory beside its receipt; crosses to the workers."""
+    """A part's function with the clocks and the memory beside its receipt; crosses to the workers."""
 
     def __init__(self, function: Callable[[Part], Json]) -> None:
         self.function = function
 
     def __call__(self, part: Part) -> dict[str, Any]:
         forget_peak()
-        started = time.perf_counter()
+        started, cpu = time.perf_counter(), time.process_time()
         result = self.function(part)
-        return {**result, "seconds": time.perf_counter() - started, "peak_gb": peak_gb()}
+        took = {"seconds": time.perf_counter() - started, "cpu_s": time.process_time() - cpu}
+        return {**result, **took, "peak_gb": peak_gb()}
 
 
 def forget_peak() -> None:

@@ -74,7 +74,9 @@ _RESULT = pa.schema(
         pa.field("part", pa.string()),
         pa.field("rows", pa.int64()),
         pa.field("seconds", pa.float64()),
+        pa.field("cpu_s", pa.float64()),
         pa.field("peak_gb", pa.float64()),
+        pa.field("machine", pa.string()),
         pa.field("attempt", pa.int64()),
         pa.field("error", pa.string()),
         pa.field("traceback", pa.string()),
@@ -177,6 +179,10 @@ def _run(job: Job, step: Step, root: Path, request: requests.Request, verbose: b
     log.close(time.time() - started)
     version = read.version(root, plan.table.name, plan.key)
     _summary(version, len(results), time.time() - started, before)
+    machines = version.manifest.get("machines", [])
+    if len(machines) > 1:
+        about = f"table {plan.table.name}: the machines that it was made on differ, and so may last bits"
+        command.say(job.name, f"{about}: {'; '.join(machines)}", 0)
 
 
 def _summary(version: read.Version, made: int, seconds: float, before: bool) -> None:
@@ -308,7 +314,8 @@ def _collect(spark: SparkSession, function: Callable[[Part], Json], parts: Seque
                 row = {field.name: [{**result, "attempt": attempt}.get(field.name)] for field in _RESULT}
                 yield pa.RecordBatch.from_pydict(row, _RESULT)
 
-    schema = "part string, rows long, seconds double, peak_gb double, attempt long, error string, traceback string"
+    types = {pa.int64(): "long", pa.float64(): "double", pa.string(): "string"}
+    schema = ", ".join(f"{field.name} {types[field.type]}" for field in _RESULT)
     frame = spark.range(0, len(todo), 1, numPartitions=len(todo)).mapInArrow(run, schema)
     return [{k: v for k, v in row.asDict().items() if v is not None} for row in frame.collect()]
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 import subprocess
 from collections.abc import Mapping
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -62,6 +64,21 @@ def code_version(root: Path = _ROOT) -> str:
 def libraries() -> Mapping[str, str]:
     """Python and the libraries that shape the bytes, with their versions."""
     return {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}
+
+
+@cache
+def machine() -> str:
+    """What of this machine may change the last bit of a number: its kind, its processor as numba compiles for it, the
+    instruction sets that numpy chose among, the C library; recorded, never part of a version's key.
+    """
+    import llvmlite.binding
+    from numpy.lib import introspect
+
+    chosen = {kind["current"] for kinds in introspect.opt_func_info().values() for kind in kinds.values()}
+    processor = os.environ.get("NUMBA_CPU_NAME") or llvmlite.binding.get_host_cpu_name()
+    features = os.environ.get("NUMBA_CPU_FEATURES", "")
+    words = [platform.machine(), processor, features, *sorted(chosen), *platform.libc_ver()]
+    return " ".join(word for word in words if word)
 
 
 def git_commit(root: Path = _ROOT) -> str:

@@ -135,6 +135,8 @@ def _finish(stage: Path, plan: Plan) -> None:
                 for part, receipt in zip(plan.parts, made, strict=True)
             ],
             "rows": sum(rows.values()),
+            # Whoever reads it can tell which last bits may differ where it is made again.
+            "machines": sorted({str(r["machine"]) for r in made if r.get("machine")}),
             "files": files,
             **deflections,
         },

@@ -22,7 +22,9 @@ PRODUCT = "product"
 
 def files_of(part: Part, receipt: Json) -> Json:
     """What the manifest says of a part that can be used again: its rows and files."""
-    return {"rows": receipt["rows"], "files": [f["path"] for f in receipt["files"]]} if PRODUCT in part.facts else {}
+    if PRODUCT not in part.facts:
+        return {}
+    return {"rows": receipt["rows"], "files": [f["path"] for f in receipt["files"]], "machine": receipt.get("machine")}
 
 
 def take(stage: Path, current: Path, table: str, parts: Sequence[Part]) -> None:
@@ -43,7 +45,8 @@ def take(stage: Path, current: Path, table: str, parts: Sequence[Part]) -> None:
         if all(_is_whole(current, entry) for entry in files):
             for entry in files:
                 _link(current / entry["path"], stage / entry["path"])
-            write_receipt(stage, {"part": part.name, "rows": found["rows"], "files": files})
+            receipt = {"part": part.name, "rows": found["rows"], "files": files, "machine": found.get("machine")}
+            write_receipt(stage, receipt)
 
 
 def _is_whole(folder: Path, entry: Json) -> bool:

@@ -143,7 +143,7 @@ def _refuse_not_convex(vectors: Float) -> None:
             f"a polygon must be convex: vertex {corner} lies on the great circle of its neighbours, or on one of them"
         )
     # Every vertex lies on the same side of every side: the turns alone would let a star with crossing sides through.
-    every = sides @ vectors.T
+    every = np.einsum("ij,kj->ik", sides, vectors)
     ends = np.arange(len(vectors))
     every[ends, ends] = every[ends, (ends + 1) % len(vectors)] = np.sign(every[0, 2])
     if not ((every > 0).all() or (every < 0).all()):

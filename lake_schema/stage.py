@@ -21,7 +21,7 @@ from lake_schema.columns import Table
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.ids import BLOCK_BITS, kind_of
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
-from lake_schema.provenance import file_sha256
+from lake_schema.provenance import file_sha256, machine
 from lake_schema.validate import check
 
 # A part whose identifiers spread over more blocks than this has none worth noting (order 3 has 1024 of a kind).
@@ -60,7 +60,8 @@ def write_part(stage: Path, table: Table, part: Part, output: Output) -> Json:
     path = data_path(table, part.name)
     writers = {path: lambda target: parquet.write(target, rows, table), **output.files}
     files = [_write_file(stage, relative, writer) for relative, writer in writers.items()]
-    receipt: dict[str, Any] = {"part": part.name, "rows": rows.num_rows, "files": files, **_row_facts(rows, table)}
+    receipt: dict[str, Any] = {"part": part.name, "rows": rows.num_rows, "files": files, "machine": machine()}
+    receipt |= _row_facts(rows, table)
     if table.is_catalogue:
         kept = hats_files.border(rows, part.name)
         receipt["border"] = _write_file(

@@ -34,7 +34,7 @@ REQUEST = {
     "fluxes": {"bands": list(BANDS)},
     "pointing": [
         {"channel": channel, "camera": camera, "band": band, "detectors": [ccd], "ra": 53.4375, "dec": -27.279613,
-         "mjd": 60950.0, "exposure_time_s": 60.0}
+         "mjd": 60905.0, "exposure_time_s": 60.0}
         for channel, camera, band, ccd in (("EXT", "lsstcam", "lsst_r", "R22_S11"), ("VIS", "vis", "euclid_vis", "3-4"))
     ],
 }  # fmt: skip

@@ -12,6 +12,8 @@ from typing import Any
 
 import pyarrow as pa
 
+from jobs.render.speed import Speed
+
 
 @dataclass(frozen=True, slots=True)
 class Line:
@@ -28,8 +30,11 @@ class Line:
     memory_gb: float
 
 
-def rows(exposures: pa.Table, tasks: pa.Table) -> list[Line]:
-    """Sums by channel, survey and image type, in that order; by channel; of everything."""
+def rows(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line]:
+    """Sums by channel, survey and image type, in that order; by channel; of everything.
+
+    factor : CPU s of the machine that is asked about over those of `tasks` (speed.of_machine)
+    """
     about = exposures.select(["exposure_id", "survey", "image_type"])
     joined = tasks.drop_columns(["cells", "s_region"]).join(about, "exposure_id")
     keys = ["channel", "survey", "image_type"]
@@ -43,7 +48,7 @@ def rows(exposures: pa.Table, tasks: pa.Table) -> list[Line]:
             ("memory", "max"),
         ]
     )
-    kinds = [_line(row) for row in sums.sort_by([(key, "ascending") for key in keys]).to_pylist()]
+    kinds = [_line(row, factor) for row in sums.sort_by([(key, "ascending") for key in keys]).to_pylist()]
     channels = sorted({line.channel for line in kinds})
     own = [[line for line in kinds if line.channel == channel] for channel in channels]
     return [*kinds, *(_sum(channel, lines) for channel, lines in zip(channels, own, strict=True)), _sum("all", kinds)]
@@ -63,7 +68,7 @@ def _sum(name: str, lines: list[Line]) -> Line:
     )
 
 
-def _line(row: dict[str, Any]) -> Line:
+def _line(row: dict[str, Any], factor: float) -> Line:
     return Line(
         row["channel"],
         row["survey"],
@@ -71,14 +76,14 @@ def _line(row: dict[str, Any]) -> Line:
         row["exposure_id_count_distinct"],
         row["detector_count"],
         row["sources_sum"],
-        row["seconds_sum"] / 3600.0,
+        row["seconds_sum"] * factor / 3600.0,
         row["bytes_sum"] / 1e9,
         row["memory_max"],
     )
 
 
-def text(lines: list[Line]) -> Iterator[str]:
-    """The forecast as lines of text."""
+def text(lines: list[Line], speed: Speed) -> Iterator[str]:
+    """The forecast as lines of text; the last says whose core-hours they are."""
     yield (
         f"{'channel':8} {'survey':12} {'image type':17} {'exposures':>10} {'detectors':>10} {'sources':>14} "
         f"{'core-hours':>11} {'GB':>10} {'peak GB':>8}"
@@ -88,3 +93,4 @@ def text(lines: list[Line]) -> Iterator[str]:
             f"{line.channel:8} {line.survey:12} {line.image_type:17} {line.exposures:10,} {line.detectors:10,} "
             f"{line.sources:14,} {line.core_hours:11,.2f} {line.gigabytes:10,.2f} {line.memory_gb:8.2f}"
         )
+    yield f"core-hours are of this machine, {speed.source}: {speed.factor:.2f} of those in costs.csv"

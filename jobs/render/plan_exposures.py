@@ -14,7 +14,7 @@ import pyarrow as pa
 from jobs.fluxes import inputs
 from jobs.fluxes.passbands import Passband
 from jobs.own_files import OwnCurves
-from jobs.render import exposing, forecast, own_psf, survey, tasks
+from jobs.render import exposing, forecast, own_psf, speed, survey, tasks
 from jobs.request import MissionChoice, Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema import layout, read
@@ -77,8 +77,7 @@ def _catalogues(lake: Path) -> list[read.Version]:
 def steps(lake: Path, request: Request) -> list[Step]:
     """The mission configuration, the exposures, and a task for each of their detectors; prints the forecast."""
     mission, exposures, rows = plan(lake, request)
-    for line in forecast.text(forecast.rows(exposures, rows)):
-        print(line)
+    _print_forecast(lake, exposures, rows)
     facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **own_filters(request)[1]}
     # What they cost depends on more than which they are.
     counts = {v.table: v.key for v in _catalogues(lake)}
@@ -102,9 +101,14 @@ def _step(table: Table, output: Output, facts: Json) -> Step:
 def dry_run(lake: Path, request: Request) -> Sequence[Step]:
     """The forecast alone."""
     _, exposures, rows = plan(lake, request)
-    for line in forecast.text(forecast.rows(exposures, rows)):
-        print(line)
+    _print_forecast(lake, exposures, rows)
     return ()
+
+
+def _print_forecast(lake: Path, exposures: pa.Table, rows: pa.Table) -> None:
+    machine = speed.of_machine(lake)
+    for line in forecast.text(forecast.rows(exposures, rows, machine.factor), machine):
+        print(line)
 
 
 JOB = Job(

@@ -110,3 +110,13 @@ def test_names_stay_inside(name):
         cache.cached_arrays(name, "3" * 64, lambda: {"a": np.zeros(1)})
     with pytest.raises(BadInput):
         cache.cached_arrays("fine", "3" * 64, lambda: {name: np.zeros(1)})
+
+
+def test_another_kind_of_machine_makes_its_own(monkeypatch):
+    def made(value):
+        return cache.cached_arrays("toy", "k" * 32, lambda: {"a": np.array([value])})["a"][0]
+
+    assert [made(1), made(2)] == [1, 1]
+    monkeypatch.setattr(cache, "machine", lambda: "another")
+    assert [made(3), made(4)] == [3, 3]
+    monkeypatch.undo()

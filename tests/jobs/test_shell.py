@@ -14,7 +14,7 @@ from py4j.protocol import Py4JNetworkError
 
 from jobs import shell
 from jobs.shell import Job, Step
-from lake_schema import __version__, layout, publish, read
+from lake_schema import __version__, layout, publish, read, stage
 from lake_schema.publish import Part, Plan
 from tests import requests
 from tests.universe import PLAIN, plain_plan, plain_work
@@ -69,6 +69,17 @@ def test_the_summary_says_what_was_made(run, capsys):
     assert run(None) == 0
     (line,) = capsys.readouterr().out.splitlines()
     assert "already there, 0 of 3 parts made" in line
+
+
+def test_a_table_of_several_kinds_of_machine_is_named(run, lake, monkeypatch, capsys):
+    def elsewhere(root, facts):
+        monkeypatch.setattr(stage, "machine", lambda: f"kind {facts['part']}")
+        return plain_work(root, facts)
+
+    assert run(elsewhere) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "table plain" in line
+    assert "kind 0; kind 1; kind 2" in line
 
 
 def raising(root, facts):

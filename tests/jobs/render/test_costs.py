@@ -6,7 +6,7 @@ import pytest
 
 from jobs import shell
 from jobs.accuracy import DRAFT, REFERENCE, SURVEY
-from jobs.render import costs, exposure, forecast, plan_exposures, truth_maps
+from jobs.render import costs, exposure, forecast, plan_exposures, speed, truth_maps
 from tests.jobs.render.test_survey import VIS, planned
 
 DEMO = Path(__file__).parents[3] / "requests" / "demo.toml"
@@ -71,7 +71,12 @@ def test_the_forecast_adds_up(tmp_path):
     assert lines[-1].detectors == len(tasks)
     assert lines[-1].core_hours * 3600 == pytest.approx(sum(tasks["seconds"].to_pylist()))
     assert lines[-1].gigabytes * 1e9 == pytest.approx(sum(tasks["bytes"].to_pylist()))
-    assert len(list(forecast.text(lines))) == 8
+    *_, said = text = list(forecast.text(lines, speed.Speed(0.5, "as a test says")))
+    assert len(text) == 9
+    assert "as a test says: 0.50" in said
+    assert [line.core_hours for line in forecast.rows(exposures, tasks, 0.5)] == [
+        0.5 * line.core_hours for line in lines
+    ]
 
 
 def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
@@ -79,5 +84,6 @@ def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
     assert shell.main(plan_exposures.JOB, ["--lake", str(lake), "--request", str(DEMO), "--dry-run"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("channel")
-    assert lines[-1].split()[:2] == ["all", "all"]
+    assert lines[-2].split()[:2] == ["all", "all"]
+    assert lines[-1].startswith("core-hours are of this machine, from a calibration")
     assert not lake.exists()
