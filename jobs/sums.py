@@ -1,7 +1,7 @@
 """Products and solutions whose last bit is the same everywhere: no BLAS, which adds as threads and processor have it.
 
 product         of matrices: every sum runs upwards, each product and each sum rounded to float64 as it is made
-inverse         of 2 x 2 matrices
+inverse         of 2 x 2 matrices;  determinant : theirs
 least_squares   by Householder's reflections
 gauss_legendre  nodes and weights of quadrature
 
@@ -73,7 +73,13 @@ def inverse(matrix: npt.ArrayLike) -> Float:
     m = np.asarray(matrix, float)
     a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
     turned = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
-    return np.asarray(turned / (a * d - b * c)[..., None, None])
+    return np.asarray(turned / determinant(m)[..., None, None])
+
+
+def determinant(matrix: npt.ArrayLike) -> Float:
+    """[..., 2, 2] -> [...]."""
+    m = np.asarray(matrix, float)
+    return np.asarray(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
 
 
 def least_squares(basis: Float, values: Float) -> Float:

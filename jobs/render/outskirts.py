@@ -24,6 +24,7 @@ import numpy.typing as npt
 from scipy.signal import fftconvolve
 from scipy.special import gammaincc, gammaln
 
+from jobs import sums
 from jobs.compiling import jit
 from jobs.render import profiles, transfer
 from jobs.render.kernel import BULGE, BULGE_FORM, DISK, DISK_FORM, POWER
@@ -81,10 +82,10 @@ def of_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: F
     cosine, sine = np.cos(np.radians(inclination)), np.sin(np.radians(inclination))
     across = form.disk[0, :, 1] * cosine + form.thick[0] / (0.5 * np.pi * DISK_SCALE_HEIGHT) * sine
     matrix = np.column_stack([form.disk[0, :, 0], across])
-    area = abs(float(np.linalg.det(matrix)))
+    area = abs(float(sums.determinant(matrix)))
     if light[DISK] > 0.0:
         light[DISK] = (1.0 - shape.bulge_fraction[0]) / area
-        light[DISK_FORM : DISK_FORM + 4] = np.linalg.inv(matrix).ravel()
+        light[DISK_FORM : DISK_FORM + 4] = sums.inverse(matrix).ravel()
     light[[BULGE, DISK]] *= electrons
     disk, wide = surface_disk(inclination)
     cells = _cells(psf, weights)
@@ -133,7 +134,7 @@ def _cells(psf: Psf, weights: Float) -> Float:
     else:
         image = np.asarray(transfer.image_of(psf.planes, weights), float)
     sides = [_shares(length) for length in image.shape]
-    out = sides[0].T @ image @ sides[1]
+    out: Float = sums.product(sides[0].T, sums.product(image, sides[1]))
     out[len(out) // 2, len(out) // 2] -= 1.0
     return np.asarray(out)
 
@@ -197,13 +198,13 @@ def _beyond(light: Float, across: float, half: float) -> float:
     total = 0.0
     if light[BULGE] > 0.0:
         n, inverse = 0.5 / light[POWER], light[BULGE_FORM : BULGE_FORM + 4].reshape(2, 2)
-        edge = half / np.abs(np.linalg.solve(inverse, ray)).max(axis=0)
-        whole = light[BULGE] * np.exp(_log_whole(n)) / abs(np.linalg.det(inverse))
+        edge = half / np.abs(sums.product(sums.inverse(inverse), ray)).max(axis=0)
+        whole = light[BULGE] * np.exp(_log_whole(n)) / abs(float(sums.determinant(inverse)))
         total += whole * float(gammaincc(2 * n, edge ** (1.0 / n)).mean())
     if light[DISK] > 0.0:
         inverse = light[DISK_FORM : DISK_FORM + 4].reshape(2, 2)
-        edge = half / np.abs(np.linalg.solve(inverse, ray * [[1.0], [across]])).max(axis=0)
-        total += light[DISK] / abs(np.linalg.det(inverse)) * float(((1.0 + edge) * np.exp(-edge)).mean())
+        edge = half / np.abs(sums.product(sums.inverse(inverse), ray * [[1.0], [across]])).max(axis=0)
+        total += light[DISK] / abs(float(sums.determinant(inverse))) * float(((1.0 + edge) * np.exp(-edge)).mean())
     return total
 
 
