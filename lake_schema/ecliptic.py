@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lake_schema.errors import OutOfRange
+from lake_schema.sky import wrapped
 
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
@@ -37,7 +38,7 @@ def _turned(lon: npt.ArrayLike, lat: npt.ArrayLike, angle: float) -> tuple[Float
     x, y, z = np.cos(lat_rad) * np.cos(lon_rad), np.cos(lat_rad) * np.sin(lon_rad), np.sin(lat_rad)
     across = np.cos(tilt) * y + np.sin(tilt) * z
     up = np.cos(tilt) * z - np.sin(tilt) * y
-    return np.degrees(np.arctan2(across, x)) % 360.0, np.degrees(np.arctan2(up, np.hypot(x, across)))
+    return wrapped(np.degrees(np.arctan2(across, x))), np.degrees(np.arctan2(up, np.hypot(x, across)))
 
 
 # ------------------------------------------------------------------------------------------------ tiles

@@ -1,6 +1,7 @@
 """The sphere: HEALPix cells (nested), cones and polygons, separations, Galactic coordinates.
 
 healpix_29          sky -> order-29 index
+wrapped             angles in [0, 360)
 cell_of             sky -> cell of an order
 cells_in_cone       cells that a circle touches (never misses one)
 cells_in_polygon    cells that a spherical polygon touches
@@ -42,9 +43,15 @@ def checked(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     bad = ~(np.abs(dec_deg) <= 90.0)
     if bad.any():
         raise OutOfRange("dec", _first(dec_deg[bad]), -90.0, 90.0)
-    wrapped = np.mod(ra_deg, 360.0)
+    return wrapped(ra_deg), dec_deg
+
+
+def wrapped(angle: npt.ArrayLike) -> Float:
+    """Angles [any shape] deg -> the same in [0, 360)."""
+    turned = np.mod(np.asarray(angle, float), 360.0)
     # A tiny negative angle rounds up to exactly 360.
-    return np.where(wrapped >= 360.0, 0.0, wrapped), dec_deg
+    within: Float = np.where(turned >= 360.0, 0.0, turned)[()]
+    return within
 
 
 def _first(values: Float) -> float:
@@ -202,7 +209,7 @@ def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     ra_rad, dec_rad = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     vector = np.stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)])
     x, y, z = _turned(_TO_GALACTIC, vector)
-    return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+    return wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
 def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
@@ -210,7 +217,7 @@ def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
     l_rad, b_rad = np.radians(np.asarray(lon, float)), np.radians(np.asarray(lat, float))
     vector = np.stack([np.cos(b_rad) * np.cos(l_rad), np.cos(b_rad) * np.sin(l_rad), np.sin(b_rad)])
     x, y, z = _turned(_TO_GALACTIC.T, vector)
-    return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+    return wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
 def _turned(matrix: Float, vector: Float) -> Float:

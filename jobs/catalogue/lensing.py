@@ -26,6 +26,7 @@ from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
 from jobs.catalogue.density_box import Box
 from jobs.fluxes import cosmology, sources
+from lake_schema import sky
 from lake_schema.errors import BadInput
 
 Float = npt.NDArray[np.float64]
@@ -132,7 +133,7 @@ def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, 
     up = np.cos(angle) * np.sin(lat) + ratio * north * np.cos(lat)
     sideways = ratio * east
     moved = lon + np.arctan2(sideways, forward)
-    return np.degrees(moved) % 360.0, np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
+    return sky.wrapped(np.degrees(moved)), np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
 
 
 def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> npt.NDArray[np.bool_]:

@@ -102,7 +102,7 @@ def _moved(hosts: Halos, host: Int, offset: Float) -> tuple[Float, Float, Float]
     unit = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], 1)
     x, y, z = ((unit * hosts.chi[:, None])[host] + offset).T
     flat = np.hypot(x, y)
-    return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, flat)), np.hypot(flat, z)
+    return sky.wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, flat)), np.hypot(flat, z)
 
 
 def _bracket(nodes: Float, values: Float) -> tuple[Int, Float]:

@@ -104,6 +104,27 @@ def test_only_float32_may_be_rounded(kind, bits):
         Column("x", kind, mantissa_bits=bits)
 
 
+@pytest.mark.parametrize("bits", [1, 23])
+def test_the_fewest_and_the_most_bits_are_legal(bits):
+    assert Column("x", "float32", mantissa_bits=bits).metadata()["mantissa_bits"] == str(bits)
+    assert "mantissa_bits" not in Column("x", "float32").metadata()
+
+
+def test_columns_are_encoded_by_their_kind(tmp_path):
+    """Bytes of floats apart, differences of whole numbers, dictionaries of what has few values."""
+    columns = Column("id", "int64"), Column("x", "float32"), Column("kind", "int8", codes=((0, "a"), (1, "b")))
+    table = Table("t", 1, (*columns, Column("name", "string"), Column("good", "bool")), "t")
+    rows = {"id": np.arange(9), "x": np.ones(9), "kind": np.arange(9) % 2, "name": ["n"] * 9, "good": [True] * 9}
+    parquet.write(tmp_path / "x.parquet", table.build(rows), table)
+    group = pq.ParquetFile(tmp_path / "x.parquet").metadata.row_group(0)
+    found = {group.column(k).path_in_schema: set(group.column(k).encodings) for k in range(group.num_columns)}
+    assert "DELTA_BINARY_PACKED" in found["id"]
+    assert "BYTE_STREAM_SPLIT" in found["x"]
+    for name in ("kind", "name"):
+        assert "RLE_DICTIONARY" in found[name]
+    assert not {"RLE_DICTIONARY", "DELTA_BINARY_PACKED", "BYTE_STREAM_SPLIT"} & found["good"]
+
+
 def test_a_rounded_column_is_rounded_when_it_is_built_and_says_so():
     table = Table("t", 1, (Column("id", "int64"), Column("x", "float32", mantissa_bits=8)), "t")
     rows = table.build({"id": [1], "x": np.array([np.pi])})

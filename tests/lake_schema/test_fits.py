@@ -265,3 +265,84 @@ def test_units_are_spelled_as_fits_wants():
     assert fits.fits_unit("GB") == "Gbyte"
     assert fits.fits_unit("erg s-1 cm-2") == "erg s-1 cm-2"
     assert fits.fits_unit("electron pix-1 s-1") == "electron pix-1 s-1"
+
+
+def somebodys(path):
+    """A table of others: whole numbers, one of them none, numbers, a flag, texts, and lists of two lengths."""
+    columns = [
+        astropy_fits.Column("number", "J", null=-9, array=np.array([3, -9, 5])),
+        astropy_fits.Column("id", "K", array=np.array([2**60, 2, 3])),
+        astropy_fits.Column("flux", "D", unit="mJy", array=np.array([0.5, np.nan, 2.5])),
+        astropy_fits.Column("good", "L", array=np.array([True, False, True])),
+        astropy_fits.Column("name", "4A", array=np.array(["a", "bc", "def"])),
+        astropy_fits.Column("pair", "2E", array=np.arange(6.0).reshape(3, 2)),
+        astropy_fits.Column("list", "PE()", array=np.array([[1.0], [1.0, 2.0], []], dtype=object)),
+    ]
+    table = astropy_fits.BinTableHDU.from_columns(columns)
+    table.header["ORDERING"] = "NESTED"
+    astropy_fits.HDUList([astropy_fits.PrimaryHDU(np.ones((2, 2))), table]).writeto(path)
+    return path
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 100])
+def test_numbers_of_others_are_read_in_batches(tmp_path, rows):
+    path = somebodys(tmp_path / "a.fits")
+    names = ("number", "id", "flux", "good")
+    batches = list(fits.number_batches(path, names, ("name", "absent"), rows))
+    assert [len(numbers["id"]) for numbers, _ in batches] == [min(rows, 3 - k) for k in range(0, 3, rows)]
+    whole = {name: np.concatenate([numbers[name] for numbers, _ in batches]) for name in (*names, "name")}
+    assert whole["id"].tolist() == [2**60, 2, 3]
+    assert whole["id"].dtype == np.int64
+    np.testing.assert_array_equal(whole["number"], [3.0, np.nan, 5.0])
+    np.testing.assert_array_equal(whole["flux"], [0.5, np.nan, 2.5])
+    assert whole["good"].tolist() == [1, 0, 1]
+    assert whole["name"].tolist() == ["a", "bc", "def"]
+    assert all(said == {"flux": "mJy"} for _, said in batches)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("absent", "has no column absent; it has number, id"), ("name", "wanted a number a row"),
+     ("pair", "wanted a number a row"), ("list", "column list holds lists")],
+)  # fmt: skip
+def test_what_is_no_number_a_row_is_refused(tmp_path, name, words):
+    path = somebodys(tmp_path / "a.fits")
+    with pytest.raises(BadInput, match=words):
+        list(fits.number_batches(path, [name]))
+
+
+def test_a_map_is_read_in_the_order_of_its_file(tmp_path):
+    """A pixel a row, or many; of a table only."""
+    path = somebodys(tmp_path / "a.fits")
+    for name, wanted in (("id", [2**60, 2, 3]), ("pair", [0, 1, 2, 3, 4, 5])):
+        values, header = fits.read_map(path, name)
+        assert values.dtype == np.float64
+        assert values.tolist() == wanted
+        assert header["ORDERING"] == "NESTED"
+    for name, words in (("absent", "no column absent"), ("name", "numbers of a map"), ("list", "holds lists")):
+        with pytest.raises(BadInput, match=words):
+            fits.read_map(path, name)
+    astropy_fits.PrimaryHDU(np.ones((2, 2))).writeto(tmp_path / "image.fits")
+    with pytest.raises(BadInput, match="holds no table"):
+        fits.read_map(tmp_path / "image.fits", "id")
+
+
+def test_planes_are_an_image_s_or_those_of_a_table_s_first_row(tmp_path):
+    cube = np.arange(24.0).reshape(2, 3, 4)
+    astropy_fits.PrimaryHDU(cube).writeto(tmp_path / "image.fits")
+    column = astropy_fits.Column("psf", "24D", dim="(4,3,2)", array=np.stack([cube, 2 * cube]))
+    astropy_fits.BinTableHDU.from_columns([column]).writeto(tmp_path / "table.fits")
+    for name in ("image.fits", "table.fits"):
+        np.testing.assert_array_equal(fits.read_planes(tmp_path / name, "psf")[0], cube)
+    with pytest.raises(BadInput, match="no image of two or three axes and no table with a column other"):
+        fits.read_planes(tmp_path / "table.fits", "other")
+
+
+def test_bytes_are_on_the_disc_before_the_file_has_its_name(tmp_path, monkeypatch):
+    done = []
+    for name in ("fsync", "replace"):
+        real = getattr(fits.os, name)
+        monkeypatch.setattr(fits.os, name, lambda *args, name=name, real=real: (done.append(name), real(*args))[1])
+    fits.write_images(tmp_path / "a.fits", [fits.Image(science(), CARDS)])
+    assert done[:2] == ["fsync", "replace"]
+    assert (tmp_path / "a.fits").stat().st_mode & 0o777 == 0o666 & ~fits._umask()

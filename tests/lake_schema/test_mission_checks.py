@@ -1,5 +1,7 @@
 """The package's own configuration keeps what its numbers must keep, and a broken one is refused by name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -88,7 +90,7 @@ def test_faults_are_named(key, change, words):
     ("change", "words"),
     [
         (lambda rows: rows[::-1], "do not ascend"),
-        (with_first("throughput", "1.2"), "outside"),
+        (with_first("throughput", "1.001"), "outside 0 to 1"),
         (with_first("throughput", "-0.1"), "outside"),
     ],
 )
@@ -108,6 +110,16 @@ def test_worse_than_required_is_a_fault():
     ]
     with pytest.raises(BadInput, match=r"vis\.read_noise .*worse than required: 4.5"):
         checks.check(MissionConfiguration(tuple(worse), models=MISSION.models))
+    # Of a well, more is better.
+    small = [p if p.key != "vis.full_well" else replace(p, value=1.9e5) for p in MISSION.parameters]
+    with pytest.raises(BadInput, match=r"vis\.full_well .*worse than required: 200000"):
+        checks.check(MissionConfiguration(tuple(small), models=MISSION.models))
+    checks.check(
+        MissionConfiguration(
+            tuple(p if p.key != "vis.full_well" else replace(p, value=2.1e5) for p in MISSION.parameters),
+            models=MISSION.models,
+        )
+    )
     # What a request asks for is as simulated, whatever it is.
     checks.check(resolve(overrides={"vis.read_noise": (9.0, "electron")}))
 

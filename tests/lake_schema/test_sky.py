@@ -96,6 +96,20 @@ def test_galactic_agrees_with_astropy(ra, dec):
     assert ours.separation(SkyCoord(ra, dec, unit="deg").galactic).arcsec < 0.05
 
 
+@given(st.floats(-1e6, 1e6))
+def test_a_wrapped_angle_is_below_a_full_turn(angle):
+    for given_angle in (angle, -1e-300, np.float64(-1e-14)):
+        assert 0.0 <= sky.wrapped(given_angle) < 360.0
+    assert np.sin(np.radians(sky.wrapped(angle))) == pytest.approx(np.sin(np.radians(angle)), abs=1e-9)
+
+
+@given(RA, DEC)
+def test_equatorial_is_the_inverse_of_galactic(ra, dec):
+    there = sky.equatorial(*sky.galactic(ra, dec))
+    assert sky.separation(*there, ra, dec) * 3600 < 1e-6
+    assert 0.0 <= there[0] < 360.0
+
+
 @pytest.mark.parametrize(("ra", "dec"), [(np.nan, 0), (np.inf, 0), (0, np.nan), (0, 90.0000001), (0, -91)])
 def test_positions_that_are_none_are_refused(ra, dec):
     with pytest.raises(OutOfRange):
