@@ -72,6 +72,7 @@ def test_least_squares(shape):
 def test_quadrature(count):
     nodes, weights = sums.gauss_legendre(count)
     assert nodes == pytest.approx(np.polynomial.legendre.leggauss(count)[0], rel=1e-13, abs=1e-15)
-    assert weights == pytest.approx(np.polynomial.legendre.leggauss(count)[1], rel=1e-12, abs=0.0)
+    # Of 101, by 60 digits: ours are right within 2e-13, numpy's within 8.4e-12.
+    assert weights == pytest.approx(np.polynomial.legendre.leggauss(count)[1], rel=1e-11, abs=0.0)
     for power in range(min(2 * count, 40)):
         assert np.sum(weights * nodes**power) == pytest.approx((1 + (-1) ** power) / (power + 1), rel=1e-13, abs=1e-15)
