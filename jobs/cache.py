@@ -1,32 +1,41 @@
 """Arrays that are costly to make and the same for everybody: kept on disc, keyed by what they were made from.
 
+A process compares a file with its checksum before it first maps it; what differs is made again, and said so.
+
 cache_dir        where they lie
 machine_code_dir where compiled functions lie
 content_key      the key: sha256 of everything that goes into the making
 cached_arrays    load, or make and load
+seal, sealed     what lists a folder's files, with the checksum of each
+is_whole         is a file what it was when it was sealed?
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import json
+import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema import layout, user_files
+from lake_schema import blocks, layout, manifest, user_files
 from lake_schema.errors import BadInput
-from lake_schema.provenance import machine
+from lake_schema.provenance import digest, machine
 
 Array = npt.NDArray[Any]
 
-# Lists a folder's arrays, so that one that went missing is noticed.
-_NAMES = "arrays.txt"
+_SEAL, _ARRAY = "sums.json", ".npy"
+# Another process may remove what it found damaged at the moment when this one has made it again.
+_TRIES = 3
 _KEY_LENGTH = 32
 
 
@@ -88,24 +97,88 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) 
     # A folder that machines of several kinds share keeps each kind's: what is kept changes no result.
     own = content_key(key, machine())[:_KEY_LENGTH]
     folder = cache_dir() / f"{layout.name(name)}-{own}"
-    stored = _load(folder)
-    if stored is not None:
-        return stored
-    _publish(make(), folder)
-    stored = _load(folder)
-    if stored is None:
-        raise BadInput(f"cache {folder}: what was just written cannot be read")
-    return stored
+    made: Mapping[str, Array] | None = None
+    for _ in range(_TRIES):
+        stored = _load(folder)
+        if stored is not None:
+            return stored
+        made = make() if made is None else made
+        _publish(made, folder)
+    raise BadInput(f"cache {folder}: what was just written cannot be read")
 
 
 def _load(folder: Path) -> dict[str, Array] | None:
-    try:
-        names = (folder / _NAMES).read_text(encoding="utf-8").split()
-        return {name: _map(folder / f"{name}.npy") for name in names}
-    except (ValueError, EOFError, OSError):
-        # Cut short by a crash of the machine: make it again.
-        shutil.rmtree(folder, ignore_errors=True)
+    sums = sealed(folder)
+    if sums is None:
         return None
+    if broken := [name for name, crc in sums.items() if not is_whole(folder / name, crc)]:
+        discard(folder, f"{broken[0]} is not what was written")
+        return None
+    try:
+        return {name.removesuffix(_ARRAY): _map(folder / name) for name in sums}
+    except (ValueError, EOFError, OSError) as error:
+        # Removed meanwhile by another process.
+        discard(folder, str(error))
+        return None
+
+
+def seal(folder: Path, names: Iterable[str]) -> None:
+    """Write the checksums of a folder's files beside them, everything synced."""
+    sums = {}
+    for name in names:
+        manifest.sync(folder / name)
+        sums[name] = blocks.crc32(folder / name)
+    manifest.write_json(folder / _SEAL, {"sums": sums, "digest": digest(sums)})
+    for path in {(folder / name).parent for name in sums}:
+        manifest.sync(path)
+
+
+def sealed(folder: Path) -> dict[str, int] | None:
+    """Name -> CRC-32 of the files that were sealed; None where nothing usable is stored, what there was is removed."""
+    if not (folder / _SEAL).exists():
+        # Not made yet, or by an older truesky.
+        _remove(folder)
+        return None
+    try:
+        found = json.loads((folder / _SEAL).read_bytes())
+        sums: dict[str, int] = found["sums"]
+        if digest(sums) == found["digest"]:
+            return sums
+        why = f"{_SEAL} is not what was written"
+    except (ValueError, LookupError, TypeError, OSError, RecursionError) as error:
+        why = str(error)
+    discard(folder, why)
+    return None
+
+
+def is_whole(path: Path, crc: int) -> bool:
+    """Is the file what it was when it was sealed?  Compared once a process, and again where the file has changed."""
+    try:
+        about = path.stat()
+        return _crc32(path, about.st_ino, about.st_size, about.st_mtime_ns) == crc
+    except OSError:
+        return False
+
+
+@lru_cache(maxsize=65_536)
+def _crc32(path: Path, *which: int) -> int:
+    return blocks.crc32(path)
+
+
+def discard(folder: Path, why: str) -> None:
+    """Remove a folder, and say so."""
+    logging.getLogger(__name__).warning("cache %s: %s: made again", folder, " ".join(why.split()))
+    _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    if not folder.exists():
+        return
+    # In one rename, so that nobody meets half of it.
+    gone = Path(tempfile.mkdtemp(prefix=".gone-", dir=folder.parent))
+    with contextlib.suppress(OSError):
+        folder.rename(gone / folder.name)
+    shutil.rmtree(gone, ignore_errors=True)
 
 
 def _map(file: Path) -> Array:
@@ -121,12 +194,13 @@ def _publish(arrays: Mapping[str, Array], folder: Path) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     staged = Path(tempfile.mkdtemp(prefix=".making-", dir=folder.parent))
     try:
-        (staged / _NAMES).write_text("\n".join(arrays), encoding="utf-8")
         for stem, array in arrays.items():
-            np.save(staged / f"{layout.name(stem)}.npy", np.ascontiguousarray(array), allow_pickle=False)
+            np.save(staged / f"{layout.name(stem)}{_ARRAY}", np.ascontiguousarray(array), allow_pickle=False)
+        seal(staged, [f"{stem}{_ARRAY}" for stem in arrays])
         staged.chmod(0o755)
         try:
             staged.rename(folder)
+            manifest.sync(folder.parent)
         except OSError:
             if not folder.is_dir():
                 raise

@@ -110,11 +110,16 @@ def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> Non
 def read_images(path: Path, most_bytes: int = MOST_BYTES) -> list[Image]:
     """Read every image of a file that `write_images` wrote.
 
+    What is checked is what the file says of itself, CHECKSUM and DATASUM of each unit: any one changed byte is found,
+    bytes that changed places may not be. Of a file of a lake, Version.file compares the sha256.
+
     most_bytes : refuse a file whose headers promise more data
     Errors     : Damaged for a bad or missing checksum and for a file that is cut short; BadInput for one too
                  large
     """
     with _refusing(path):
+        # Of the arithmetic of astropy's unpacking.
+        warnings.simplefilter("error", RuntimeWarning)
         with fits.open(path, memmap=False, lazy_load_hdus=True, disable_image_compression=True) as units:
             _check_size(path, units, most_bytes)
         with fits.open(path, memmap=False, checksum=True, disable_image_compression=True) as units:

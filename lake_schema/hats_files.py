@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import pyarrow as pa
 
 from lake_schema import layout, parquet, sky
 from lake_schema.columns import Table
+from lake_schema.plan import Json
 
 MARGIN_ARCSEC = 10.0
 # Cells of order 13 are 26" wide: the rim of them about a cell holds everything within 10" of it.
@@ -36,27 +37,28 @@ def border(rows: pa.Table, part: str) -> pa.Table:
     return rows.filter(pa.array(np.isin(fine, sky.border_cells(order, cell, _MARGIN_ORDER))))
 
 
-def write(version: Path, table: Table, parts: Sequence[tuple[str, int]], borders: Sequence[Path]) -> None:
+def write(version: Path, table: Table, made: Sequence[Json], borders: Path) -> None:
     """Write the metadata of a catalogue whose cells lie in `version`/<table>/dataset.
 
-    parts : (HATS path below dataset/, rows) of each cell;  borders : files of their border rows
+    made : receipts of the cells;  borders : folder of their border rows
     """
-    cells = [layout.cell_of_file(name) for name, _ in parts]
+    cells = [layout.cell_of_file(receipt["part"]) for receipt in made]
     root, margin = version / table.name, version / f"{table.name}_margin"
-    margin_rows = _write_margin(margin, table, dict(zip(cells, borders, strict=True)))
-    files = [root / "dataset" / name for name, _ in parts]
-    _write_catalogue(root, table, cells, sum(rows for _, rows in parts), files)
+    along = {cell: receipt["border"] for cell, receipt in zip(cells, made, strict=True)}
+    margin_rows = _write_margin(margin, table, borders, along)
+    counts = _skymap(version, [receipt["files"][0] for receipt in made])
+    _write_catalogue(root, table, cells, sum(receipt["rows"] for receipt in made), counts)
     _write_catalogue(margin, table, cells, margin_rows, None)
     _write_collection(version, table)
 
 
-def _write_margin(folder: Path, table: Table, borders: dict[Cell, Path]) -> int:
-    orders = sorted({order for order, _ in borders})
+def _write_margin(folder: Path, table: Table, borders: Path, along: Mapping[Cell, Json]) -> int:
+    orders = sorted({order for order, _ in along})
     total = 0
-    for order, cell in borders:
+    for order, cell in along:
         rim = sky.margin_cells(order, cell, _MARGIN_ORDER)
         around = [(o, int(c)) for o in orders for c in np.unique(sky.parent(rim, _MARGIN_ORDER, o))]
-        pieces = [_rows_in(borders[other], rim) for other in around if other in borders]
+        pieces = [_rows_in(borders, along[other], rim) for other in around if other in along]
         rows = pa.concat_tables([table.empty(), *pieces]).sort_by([("_healpix_29", "ascending"), ("id", "ascending")])
         target = folder / "dataset" / layout.cell_file(order, cell)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -65,13 +67,13 @@ def _write_margin(folder: Path, table: Table, borders: dict[Cell, Path]) -> int:
     return total
 
 
-def _rows_in(path: Path, rim: sky.Int) -> pa.Table:
-    rows = parquet.read(path)
+def _rows_in(folder: Path, entry: Json, rim: sky.Int) -> pa.Table:
+    rows = parquet.read(folder, entry)
     fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, _MARGIN_ORDER)
     return rows.filter(pa.array(np.isin(fine, rim)))
 
 
-def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, files: list[Path] | None) -> None:
+def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, counts: sky.Int | None) -> None:
     from hats.catalog.dataset.table_properties import TableProperties
     from hats.catalog.partition_info import PartitionInfo
     from hats.io.file_io.file_io import write_fits_image
@@ -89,11 +91,11 @@ def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, fil
         "healpix_order": sky.DEEPEST,
         "npix_suffix": ".parquet",
     }
-    if files is None:
+    if counts is None:
         facts |= {"catalog_name": f"{table.name}_margin", "catalog_type": "margin"}
         facts |= {"primary_catalog": f"../{table.name}", "margin_threshold": MARGIN_ARCSEC}
     else:
-        write_fits_image(_skymap(files), get_skymap_file_pointer(root))
+        write_fits_image(counts, get_skymap_file_pointer(root))
         facts |= {"catalog_name": table.name, "catalog_type": "object", "skymap_order": _SKYMAP_ORDER}
     about = TableProperties.new_provenance_dict(root, builder="truesky")
     about["hats_creation_date"] = _DATE
@@ -102,10 +104,10 @@ def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, fil
     TableProperties(**facts, **about).to_properties_file(root)
 
 
-def _skymap(files: list[Path]) -> sky.Int:
+def _skymap(folder: Path, entries: Sequence[Json]) -> sky.Int:
     counts = np.zeros(12 << (2 * _SKYMAP_ORDER), np.int64)
-    for path in files:
-        index = parquet.read(path, ["_healpix_29"])["_healpix_29"].to_numpy()
+    for entry in entries:
+        index = parquet.read(folder, entry, ["_healpix_29"])["_healpix_29"].to_numpy()
         counts += np.bincount(sky.parent(index, sky.DEEPEST, _SKYMAP_ORDER), minlength=counts.size)
     return counts
 

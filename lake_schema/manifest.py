@@ -14,9 +14,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from lake_schema import layout, parquet, sky
+from lake_schema import blocks, layout, parquet, sky
 from lake_schema.errors import Damaged
 from lake_schema.plan import Json
 from lake_schema.provenance import canonical, digest, file_sha256
@@ -65,9 +64,12 @@ def _is_manifest(facts: Any) -> bool:
 def _is_entry(entry: Any) -> bool:
     if not _has(entry, _FILE) or type(entry.get("rows", 0)) is not int:
         return False
-    path, tail = PurePosixPath(entry["path"]), entry.get("tail", [0, ""])
-    inside = not path.is_absolute() and ".." not in path.parts
-    return inside and isinstance(tail, list) and [type(value) for value in tail] == [int, str]
+    path = PurePosixPath(entry["path"])
+    try:
+        blocks.listed(entry)
+    except (TypeError, ValueError):
+        return False
+    return not path.is_absolute() and ".." not in path.parts
 
 
 def _has(value: Any, kinds: dict[str, type]) -> bool:
@@ -75,24 +77,32 @@ def _has(value: Any, kinds: dict[str, type]) -> bool:
 
 
 def file_facts(path: Path, relative: str) -> dict[str, Any]:
-    """A file's entry in the manifest.
+    """A file's entry in the manifest: path, bytes, sha256, and of a Parquet file the checksums of its blocks.
 
-    tail : of a Parquet file: where its pages end, and the sha256 from there on.  Pages carry checksums; what tells how
-           to read them does not, and a reader that checks both never takes a changed byte for a number
+    The blocks cover the file from its first byte to its last, so that whatever part of it is read can be compared.
     """
-    facts: dict[str, Any] = {"path": relative, "bytes": path.stat().st_size, "sha256": file_sha256(path)}
     if relative.endswith(".parquet"):
-        start = parquet.tail_start(path)
-        facts["tail"] = [start, parquet.tail_sha256(path, start)]
-    return facts
+        return {"path": relative, **parquet.facts(path)}
+    return {"path": relative, "bytes": path.stat().st_size, "sha256": file_sha256(path)}
 
 
 def checked(folder: Path, entry: Json) -> Path:
-    """A listed file, ready to be read.  Errors: Damaged where its size or its tail is not what the manifest says."""
+    """A listed file that has the size that the manifest says; what is in it is not looked at.  Errors: Damaged"""
     path: Path = folder / entry["path"]
     if fault := _misfit(path, entry):
         raise Damaged(fault)
     return path
+
+
+def whole(folder: Path, entry: Json) -> Path:
+    """A listed file whose every byte is what was written, by its sha256.  Errors: Damaged"""
+    path = checked(folder, entry)
+    try:
+        if file_sha256(path) == entry["sha256"]:
+            return path
+    except OSError as error:
+        raise Damaged(f"{path} cannot be read: {error.strerror}") from None
+    raise Damaged(f"{path} has other contents than the manifest says")
 
 
 def _misfit(path: Path, entry: Json) -> str:
@@ -111,8 +121,6 @@ def _difference(path: Path, entry: Json) -> str:
     size = path.stat().st_size
     if size != entry["bytes"]:
         return f"{path} has {size} bytes, the manifest says {entry['bytes']}"
-    if "tail" in entry and parquet.tail_sha256(path, entry["tail"][0]) != entry["tail"][1]:
-        return f"{path} has another footer than the manifest says"
     return ""
 
 
@@ -128,7 +136,7 @@ def faults(folder: Path, facts: Json, deep: bool = False) -> list[str]:
     found = [f"{folder / extra} is not in the manifest" for extra in sorted(here - names - {MANIFEST})]
     # Hashing lets go of the interpreter: as many files at a time as there are cores.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for wrong in pool.map(lambda entry: _file_faults(folder / entry["path"], entry, deep), listed):
+        for wrong in pool.map(lambda entry: _file_faults(folder, entry, deep), listed):
             found += wrong
     total = sum(entry.get("rows", 0) for entry in listed)
     if total != facts["rows"]:
@@ -136,26 +144,29 @@ def faults(folder: Path, facts: Json, deep: bool = False) -> list[str]:
     return found
 
 
-def _file_faults(path: Path, entry: Json, deep: bool) -> list[str]:
-    if fault := _misfit(path, entry):
-        return [fault]
-    if not deep:
-        return []
+def _file_faults(folder: Path, entry: Json, deep: bool) -> list[str]:
     try:
-        if file_sha256(path) != entry["sha256"]:
-            return [f"{path} has other contents than the manifest says"]
-        return _row_faults(path, entry) if "rows" in entry else []
+        if deep:
+            whole(folder, entry)
+            return _row_faults(folder, entry) if "rows" in entry else []
+        checked(folder, entry)
+        if "blocks" in entry:
+            # The footer; a file without blocks would be read as a whole.
+            parquet.schema(folder, entry)
+    except Damaged as error:
+        return [str(error)]
     except (OSError, pa.ArrowInvalid) as error:
-        return [f"{path}: {error}"]
+        return [f"{folder / entry['path']}: {error}"]
+    return []
 
 
-def _row_faults(path: Path, entry: Json) -> list[str]:
-    with pq.ParquetFile(path, page_checksum_verification=True) as file:
-        if file.metadata.num_rows != entry["rows"]:
-            return [f"{path} has {file.metadata.num_rows} rows, the manifest says {entry['rows']}"]
-        if "_healpix_29" not in file.schema_arrow.names or "Npix=" not in path.name:
-            return []
-        index = file.read(columns=["_healpix_29"])["_healpix_29"].to_numpy()
+def _row_faults(folder: Path, entry: Json) -> list[str]:
+    path, schema = folder / entry["path"], parquet.schema(folder, entry)
+    # Refuses another number of rows.
+    rows = parquet.dataset(folder, [entry], schema)
+    if "_healpix_29" not in schema.names or "Npix=" not in path.name:
+        return []
+    index = rows.to_table(columns=["_healpix_29"])["_healpix_29"].to_numpy()
     first, last = sky.cell_range(*layout.cell_of_file("/".join(path.parts[-3:])))
     if index.size and (index.min() < first or index.max() >= last):
         return [f"{path} holds rows of another cell"]

@@ -30,7 +30,7 @@ from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
 from lake_schema.layout import current_key
 from lake_schema.manifest import sync
 from lake_schema.plan import Json, Output, Part, Plan, Work, data_path
-from lake_schema.stage import attempt, border_path, forget_damaged, is_done, missing, receipt_of, receipts, write_part
+from lake_schema.stage import attempt, forget_damaged, is_done, missing, receipt_of, receipts, write_part
 from lake_schema.uniqueness import refuse_duplicates
 
 __all__ = [
@@ -107,8 +107,7 @@ def _finish(stage: Path, plan: Plan) -> None:
     listed = {f["path"]: f for receipt in made for f in receipt["files"]}
     _sweep(stage, set(listed))
     if plan.table.is_catalogue:
-        borders = [border_path(stage, receipt["part"]) for receipt in made]
-        hats_files.write(stage, plan.table, [(r["part"], r["rows"]) for r in made], borders)
+        hats_files.write(stage, plan.table, made, receipts(stage))
     rows = {data_path(plan.table, r["part"]): r["rows"] for r in made}
     files = []
     for path in sorted(stage.rglob("*")):

@@ -1,8 +1,10 @@
-"""How a published table is read: through its manifest, never a glob, with every checksum verified.
+"""How a published table is read: through its manifest, never a glob, every byte compared before it is decoded.
 
 version(root, name)     the published version (resolved once: a later publication does not mix in)
 Version.dataset         its files as an Arrow dataset
 Version.rows            rows of some columns or parts
+Version.beside          rows of a Parquet file that belongs to the version, though not to its table
+Version.file            any other file, such as an image
 Version.margin          rows just outside a part's cell
 Version.in_cells        rows inside HEALPix cells
 Version.cone            rows inside a circle, by true or lensed position
@@ -11,7 +13,8 @@ verify                  is a version what its manifest says?
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -21,7 +24,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
-import pyarrow.parquet as pq
 
 from lake_schema import layout, manifest, parquet, sky
 from lake_schema import tables as declarations
@@ -73,7 +75,7 @@ class Version:
         return [str(part["name"]) for part in self.manifest["parts"]]
 
     def path(self, part: str) -> Path:
-        """A part's Parquet file; Damaged where its size or footer is not what the manifest says."""
+        """A part's Parquet file, for a reader of somebody else's: nothing but its size is compared, see `verify`."""
         return manifest.checked(self.folder, self._entry(part))
 
     def part_sha256(self, part: str) -> str:
@@ -92,19 +94,36 @@ class Version:
         raise BadInput(f"table {self.table}: version {self.key} has no part {part}")
 
     def file(self, relative: str) -> Path:
-        """Any other file of the version, such as an image."""
+        """Any other file of the version, such as an image; Damaged where its sha256 is not what the manifest says."""
+        return manifest.whole(self.folder, self._file(relative))
+
+    def _file(self, relative: str) -> dict[str, Any]:
         entry = self._files().get(relative)
         if entry is None:
             raise BadInput(f"table {self.table}: version {self.key} has no file {relative}")
-        return manifest.checked(self.folder, entry)
+        return entry
 
     def _files(self) -> dict[str, dict[str, Any]]:
         return {entry["path"]: entry for entry in self.manifest["files"]}
 
-    def dataset(self, parts: Iterable[str] | None = None) -> ds.FileSystemDataset:
-        """The version's files (or those parts') as an Arrow dataset with verified pages."""
-        names = self.parts if parts is None else list(parts)
-        return parquet.dataset([self.path(name) for name in names], self.schema)
+    def dataset(self, parts: Iterable[str] | None = None) -> parquet.Dataset:
+        """The version's files (or those parts') as an Arrow dataset that refuses what is not as it was written."""
+        entries = [self._entry(name) for name in (self.parts if parts is None else parts)]
+        return self._opened(entries, self.schema)
+
+    def _opened(self, entries: Sequence[dict[str, Any]], schema: pa.Schema) -> parquet.Dataset:
+        for entry in entries:
+            manifest.checked(self.folder, entry)
+        with self._refusing():
+            return parquet.dataset(self.folder, entries, schema)
+
+    @contextmanager
+    def _refusing(self) -> Iterator[None]:
+        """What Arrow cannot read although it is as it was written."""
+        try:
+            yield
+        except (OSError, pa.ArrowInvalid) as error:
+            raise Damaged(f"table {self.table}: version {self.key}: {error}") from None
 
     def rows(
         self,
@@ -118,19 +137,23 @@ class Version:
         """
         names = list(columns) if columns is not None else None
         self._refuse_unknown(names or [])
-        try:
+        with self._refusing():
             return self.dataset(parts).to_table(columns=names, filter=where)
-        except (OSError, pa.ArrowInvalid) as error:
-            raise Damaged(f"table {self.table}: version {self.key}: {error}") from None
 
     def margin(self, part: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows of a catalogue beside a part's cell, within 10" of it and a little farther."""
-        self._refuse_unknown(list(columns or []))
-        path = self.file(f"{self.table}_margin/dataset/{part}")
-        try:
-            return parquet.dataset([path], self.schema).to_table(columns=None if columns is None else list(columns))
-        except (OSError, pa.ArrowInvalid) as error:
-            raise Damaged(f"table {self.table}: version {self.key}: {error}") from None
+        names = list(columns) if columns is not None else None
+        self._refuse_unknown(names or [])
+        entry = self._file(f"{self.table}_margin/dataset/{part}")
+        with self._refusing():
+            return self._opened([entry], self.schema).to_table(columns=names)
+
+    def beside(self, relative: str) -> pa.Table:
+        """Rows of a Parquet file of the version that is no part of its table."""
+        entry = self._file(relative)
+        manifest.checked(self.folder, entry)
+        with self._refusing():
+            return parquet.read(self.folder, entry)
 
     def _refuse_unknown(self, names: Sequence[str]) -> None:
         for name in names:
@@ -237,11 +260,10 @@ def version(root: Path, name: str, key: str | None = None) -> Version:
     about = manifest.load(folder, name)
     opened = Version(folder, about, pa.schema([]))
     if opened.parts:
-        first = opened.path(opened.parts[0])
-        try:
-            opened = replace(opened, schema=pq.read_schema(first))
-        except (OSError, pa.ArrowInvalid) as error:
-            raise Damaged(f"{first}: {error}") from None
+        first = opened._entry(opened.parts[0])
+        manifest.checked(folder, first)
+        with opened._refusing():
+            opened = replace(opened, schema=parquet.schema(folder, first))
     known = declarations.find(name, opened.schema.names)
     return opened if known is None else as_declared(opened, known)
 

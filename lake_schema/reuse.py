@@ -41,19 +41,26 @@ def take(stage: Path, current: Path, table: str, parts: Sequence[Part]) -> None:
         found = there.get(part.name)
         if found is None or PRODUCT not in part.facts or found["facts"] != part.facts:
             continue
-        files = [{k: v for k, v in entries[path].items() if k != "rows"} for path in found["files"]]
-        if all(_is_whole(current, entry) for entry in files):
+        files = [entry for path in found["files"] if (entry := _whole(current, entries[path])) is not None]
+        if len(files) == len(found["files"]):
             for entry in files:
                 _link(current / entry["path"], stage / entry["path"])
             receipt = {"part": part.name, "rows": found["rows"], "files": files, "machine": found.get("machine")}
             write_receipt(stage, receipt)
 
 
-def _is_whole(folder: Path, entry: Json) -> bool:
+def _whole(folder: Path, entry: Json) -> Json | None:
+    """The entry of a file that is as it was published, None of another."""
+    path = str(entry["path"])
     try:
-        return file_sha256(folder / entry["path"]) == str(entry["sha256"])
+        if file_sha256(folder / path) != str(entry["sha256"]):
+            return None
+        if path.endswith(".parquet") and "blocks" not in entry:
+            # An older truesky published it.
+            return manifest.file_facts(folder / path, path)
     except OSError:
-        return False
+        return None
+    return {key: value for key, value in entry.items() if key != "rows"}
 
 
 def _link(source: Path, target: Path) -> None:

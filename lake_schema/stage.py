@@ -139,11 +139,6 @@ def _receipt_path(stage: Path, part: str) -> Path:
     return receipts(stage) / f"{_flat(part)}.json"
 
 
-def border_path(stage: Path, part: str) -> Path:
-    """A cell's rows along its border, kept until the margins are made."""
-    return receipts(stage) / _flat(part)
-
-
 def _flat(part: str) -> str:
     return part.replace("/", "+")
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import numpy.typing as npt
 
 from lake_schema import parquet
+from lake_schema.columns import Table
 from lake_schema.errors import BadInput
 from lake_schema.ids import BLOCK_BITS
-from lake_schema.plan import Json, Plan, data_path
+from lake_schema.plan import Json, Plan
 from lake_schema.stage import is_numbered
 
 Int = npt.NDArray[np.int64]
@@ -25,30 +26,31 @@ def refuse_duplicates(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
     made : receipts.  Only parts that share a block of identifiers are read, so a catalogue costs little
     """
     table = plan.table
-    paths = [stage / data_path(table, receipt["part"]) for receipt in made]
+    # A part's table is the first of its files.
+    entries = {receipt["files"][0]["path"]: receipt["files"][0] for receipt in made}
     if not is_numbered(table):
-        return _refuse_any(table.name, table.key, paths)
+        return _refuse_any(stage, table, list(entries.values()))
 
     @lru_cache(maxsize=16)
-    def ids(path: Path) -> Int:
-        return np.sort(parquet.read(path, table.key).column(0).to_numpy())
+    def ids(path: str) -> Int:
+        return np.sort(parquet.read(stage, entries[path], table.key).column(0).to_numpy())
 
-    for block, sharers in _shared_blocks(made, paths).items():
+    for block, sharers in _shared_blocks(made, list(entries)).items():
         _refuse_within(f"table {table.name}: {table.key[0]}", block, sharers, ids)
 
 
-def _shared_blocks(made: Sequence[Json], paths: Sequence[Path]) -> dict[int | None, list[Path]]:
+def _shared_blocks(made: Sequence[Json], paths: Sequence[str]) -> dict[int | None, list[str]]:
     """Block of identifiers -> the files that hold some of it, where there are two or more; None = all of them."""
     if any(receipt["blocks"] is None for receipt in made):
         return {None: list(paths)}
-    holders: dict[int | None, list[Path]] = defaultdict(list)
+    holders: dict[int | None, list[str]] = defaultdict(list)
     for receipt, path in zip(made, paths, strict=True):
         for block in receipt["blocks"]:
             holders[block].append(path)
     return {block: files for block, files in holders.items() if len(files) > 1}
 
 
-def _refuse_within(what: str, block: int | None, files: Sequence[Path], ids: Callable[[Path], Int]) -> None:
+def _refuse_within(what: str, block: int | None, files: Sequence[str], ids: Callable[[str], Int]) -> None:
     pieces = [ids(path) for path in files]
     if block is not None:
         edges = np.array([block, block + 1]) << BLOCK_BITS
@@ -58,15 +60,15 @@ def _refuse_within(what: str, block: int | None, files: Sequence[Path], ids: Cal
     same = np.flatnonzero(np.diff(together[order]) == 0)
     if same.size:
         source = np.repeat(np.arange(len(files)), [piece.size for piece in pieces])
-        first, second = (files[source[order[same[0] + i]]].name for i in (0, 1))
+        first, second = (PurePosixPath(files[source[order[same[0] + i]]]).name for i in (0, 1))
         raise BadInput(f"{what} {together[order[same[0]]]} stands in {first} and in {second}")
 
 
-def _refuse_any(name: str, key: Sequence[str], paths: Sequence[Path]) -> None:
+def _refuse_any(stage: Path, table: Table, entries: Sequence[Json]) -> None:
     seen: dict[tuple[object, ...], str] = {}
-    for path in paths:
-        columns = parquet.read(path, key)
-        for value in zip(*(columns[k].to_pylist() for k in key), strict=True):
+    for entry in entries:
+        columns, here = parquet.read(stage, entry, table.key), PurePosixPath(entry["path"]).name
+        for value in zip(*(columns[k].to_pylist() for k in table.key), strict=True):
             if value in seen:
-                raise BadInput(f"table {name}: key {value} stands in {seen[value]} and in {path.name}")
-            seen[value] = path.name
+                raise BadInput(f"table {table.name}: key {value} stands in {seen[value]} and in {here}")
+            seen[value] = here

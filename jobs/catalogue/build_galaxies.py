@@ -14,7 +14,6 @@ if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from jobs.catalogue import (
     cells,
@@ -107,7 +106,7 @@ def quarantine_work(lake: Path, facts: Json) -> Output:
     version = read.version(lake, GALAXIES.name, facts["galaxies"])
     there = {entry["path"] for entry in version.manifest["files"]}
     names = (quarantine_file(part["facts"]["generation_cells"]) for part in version.manifest["parts"])
-    found = [pq.read_table(version.file(name)) for name in names if name in there]
+    found = [version.beside(name) for name in names if name in there]
     return Output(pa.concat_tables([QUARANTINE.empty(), *found]))
 
 

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,12 @@ import numpy.typing as npt
 import pyarrow as pa
 from pyarrow import feather
 
+from jobs import cache
 from jobs.cache import cache_dir, content_key
 from jobs.catalogue import mapping
 from jobs.catalogue.mapping import Columns, Rows
 from lake_schema import foreign_rows, sky
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, Damaged
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.provenance import file_sha256
 
@@ -43,10 +44,11 @@ _ABOUT = "about.json"
 class Split:
     """A catalogue laid out by cell.
 
-    folder : of the pieces;  rows : of all files;  z_max, ebv_max : the largest
+    folder : of the pieces;  sums : their CRC-32 by name;  rows : of all files;  z_max, ebv_max : the largest
     """
 
     folder: Path
+    sums: Mapping[str, int]
     rows: int
     z_max: float
     ebv_max: float
@@ -81,24 +83,44 @@ def split(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Spl
     code = [Path(__file__).read_bytes(), Path(mapping.__file__).read_bytes()]
     about = json.dumps([sorted((key, repr(field)) for key, field in columns.fields.items()), columns.beside])
     folder = cache_dir() / f"ingest-{content_key(*code, about, *sha256)[:32]}"
-    if not (folder / _ABOUT).is_file():
+    sums = _usable(folder)
+    if sums is None:
         folder.parent.mkdir(parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         try:
             facts = _made(made, found, columns)
             (made / _ABOUT).write_text(json.dumps(facts))
+            cache.seal(made, sorted(path.relative_to(made).as_posix() for path in made.rglob("*") if path.is_file()))
             _publish(made, folder)
         finally:
             shutil.rmtree(made, ignore_errors=True)
-    return Split(folder, **json.loads((folder / _ABOUT).read_text()))
+        sums = _usable(folder)
+    if sums is None:
+        raise BadInput(f"cache {folder}: what was just written cannot be read")
+    return Split(folder, sums, **json.loads((folder / _ABOUT).read_text()))
+
+
+def _usable(folder: Path) -> dict[str, int] | None:
+    sums = cache.sealed(folder)
+    if sums is not None and not cache.is_whole(folder / _ABOUT, sums.get(_ABOUT, -1)):
+        cache.discard(folder, f"{_ABOUT} is not what was written")
+        return None
+    return sums
 
 
 def rows(given: Split, cell: int) -> dict[str, Array]:
-    """Values by key of a generation cell's galaxies, with `index` (order-29), sorted by it, then by origin_id."""
-    pieces = sorted((given.folder / str(cell >> 2 * (GENERATION_ORDER - FILE_ORDER))).glob("*.arrow"))
+    """Values by key of a generation cell's galaxies, with `index` (order-29), sorted by it, then by origin_id.
+
+    Errors : Damaged where a piece is not what was written; they are made again by whoever next asks for the split
+    """
+    here = f"{cell >> 2 * (GENERATION_ORDER - FILE_ORDER)}/"
+    pieces = [given.folder / name for name in sorted(given.sums) if name.startswith(here)]
     first, last = sky.cell_range(GENERATION_ORDER, cell)
     tables = []
     for piece in pieces:
+        if not cache.is_whole(piece, given.sums[piece.relative_to(given.folder).as_posix()]):
+            cache.discard(given.folder, f"{piece.name} is not what was written")
+            raise Damaged(f"{piece} is not what was written; run again to have it made again")
         # Sorted by index: only what the cell wants is copied.
         table = feather.read_table(piece, memory_map=True)
         index = table["index"].to_numpy()
@@ -123,8 +145,7 @@ def _publish(made: Path, folder: Path) -> None:
         os.rename(made, folder)
     except OSError:
         # Another process was as fast, or an older one died before it was done.
-        if not (folder / _ABOUT).is_file():
-            shutil.rmtree(folder, ignore_errors=True)
+        if _usable(folder) is None:
             os.rename(made, folder)
 
 

@@ -97,9 +97,10 @@ def _run(query: Query, opened: Mapping[str, Opened], memory: int, parameters: di
         "temp_directory": "",
         "threads": os.cpu_count() or 1,
     }
+    datasets = {n: rows.dataset() if isinstance(rows, read.Version) else rows for n, rows in opened.items()}
     with duckdb.connect(":memory:", config=config) as session:
-        for name, version in opened.items():
-            session.register(name, version.dataset() if isinstance(version, read.Version) else version)
+        for name, rows in datasets.items():
+            session.register(name, rows)
         for command in (*_MACROS, *_LOCKS):
             session.execute(command)
         try:
@@ -110,10 +111,10 @@ def _run(query: Query, opened: Mapping[str, Opened], memory: int, parameters: di
         except duckdb.OutOfMemoryException:
             raise BadInput(_TOO_LARGE) from None
         except (duckdb.Error, OSError, pa.ArrowException) as error:
-            text = one_line(error)
-            if "CRC" in text or isinstance(error, OSError):
-                raise Damaged(f"table {', '.join(opened)}: {text}") from None
-            raise BadInput(f"SQL: {text}") from None
+            # Arrow and DuckDB pass the refusal of a file on as an error of their own.
+            if fault := next((fault for rows in datasets.values() if (fault := getattr(rows, "fault", ""))), ""):
+                raise Damaged(fault) from None
+            raise BadInput(f"SQL: {one_line(error)}") from None
 
 
 def _collected(batches: pa.RecordBatchReader, most: int) -> pa.Table:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from jobs import heap
 from jobs.accuracy import Accuracy
@@ -339,7 +338,7 @@ def truth_work(lake: Path, facts: Json) -> Output:
     """What was drawn on one detector, from beside its images."""
     products = read.version(lake, "products", facts["products"])
     (row, *_) = products.rows(["exposure_id", "detector"], [facts["part"]]).to_pylist()
-    return Output(pq.read_table(products.file(truth_file(row["exposure_id"], row["detector"]))))
+    return Output(products.beside(truth_file(row["exposure_id"], row["detector"])))
 
 
 def truth_file(exposure_id: int, detector: str) -> str:

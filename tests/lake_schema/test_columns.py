@@ -9,7 +9,7 @@ from astropy.io.votable.ucd import check_ucd
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lake_schema import parquet
+from lake_schema import manifest, parquet
 from lake_schema.columns import Column, Table, round_mantissa
 from lake_schema.errors import BadInput
 from lake_schema.fits import fits_unit
@@ -40,7 +40,8 @@ def test_metadata_survives_into_the_file(table, tmp_path):
 def test_values_survive_the_encodings(table, tmp_path):
     rows = rows_of(table, 1000)
     parquet.write(tmp_path / "x.parquet", rows, table)
-    assert parquet.dataset([tmp_path / "x.parquet"], table.arrow()).to_table().equals(rows)
+    entry = manifest.file_facts(tmp_path / "x.parquet", "x.parquet")
+    assert parquet.dataset(tmp_path, [entry], table.arrow()).to_table().equals(rows)
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)

@@ -38,12 +38,12 @@ def test_verify_says_sound_and_ends_with_0(filled, capsys):
 
 def test_verify_finds_what_it_is_told_to_look_for(filled, capsys):
     version = read.version(filled, "toy")
-    flip(version.path(version.parts[0]), 100)
+    flip(version.file("toy/partition_info.csv"), 5)
     assert main(["verify", str(filled), "toy"]) == 0
     capsys.readouterr()
     assert main(["verify", str(filled), "--deep"]) == 1
     out = capsys.readouterr().out
-    assert "Npix=1607.parquet has other contents" in out
+    assert "partition_info.csv has other contents" in out
     assert "1 faults" in out
     assert "plain" in out
 
@@ -73,12 +73,12 @@ def test_verify_goes_on_after_a_file_that_cannot_be_read(filled, capsys, monkeyp
         return real(path)
 
     version = read.version(filled, "toy")
-    flip(version.path(version.parts[0]), 100)
+    flip(version.path(version.parts[2]), 100)
     monkeypatch.setattr(manifest, "file_sha256", sha256)
     assert main(["verify", str(filled), "toy", "--deep"]) == 1
     out = capsys.readouterr().out
-    assert "Npix=1607.parquet has other contents" in out
-    assert "Npix=1608.parquet: [Errno 5] Input/output error" in out
+    assert "Npix=1610.parquet has other contents" in out
+    assert "Npix=1608.parquet cannot be read: Input/output error" in out
     monkeypatch.setattr(manifest, "_difference", lambda path, entry: sha256(path) and "")
     assert [line for line in read.verify(version) if "Npix=1608.parquet cannot be read: Input/output error" in line]
 

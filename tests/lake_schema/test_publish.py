@@ -234,7 +234,9 @@ CHANGES = {
     "a file is a text": lambda facts: facts["files"].append("x"),
     "a file above the version": lambda facts: facts["files"][0].update(path="../x"),
     "a file elsewhere": lambda facts: facts["files"][0].update(path="/etc/hosts"),
-    "a tail of another form": lambda facts: facts["files"][0].update(tail=["x"]),
+    "blocks of another form": lambda facts: facts["files"][0].update(blocks=["x"]),
+    "blocks that are no base64": lambda facts: facts["files"][0].update(blocks="x"),
+    "blocks of a file of another size": lambda facts: facts["files"][0].update(blocks="AAAAAAAAAAA="),
     "a deflection in words": lambda facts: facts.update(deflection_deg="far"),
 }
 
@@ -254,12 +256,13 @@ def test_a_manifest_of_another_form_is_damage(lake, change):
 def test_a_changed_page_is_not_read_while_a_version_is_made(lake):
     version = read.version(lake, "toy", publish.make(lake, toy_plan(), toy_work).name[2:])
     path = version.path(version.parts[0])
-    assert parquet.read(path, ["id"])["id"].equals(version.rows(["id"], [version.parts[0]])["id"])
+    entry = manifest.file_facts(path, path.relative_to(lake).as_posix())
+    assert parquet.read(lake, entry, ["id"])["id"].equals(version.rows(["id"], [version.parts[0]])["id"])
     data = bytearray(path.read_bytes())
     data[100] ^= 1
     path.write_bytes(data)
     with pytest.raises(Damaged, match=r"Npix=1607"):
-        parquet.read(path)
+        parquet.read(lake, entry)
 
 
 def test_a_broken_manifest_is_named(lake):

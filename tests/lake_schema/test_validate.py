@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lake_schema import parquet, validate
+from lake_schema import manifest, parquet, validate
 from lake_schema.errors import BadInput
 from lake_schema.tables import declared
 from tests.universe import TOY, rows_of, toy_rows
@@ -146,7 +146,8 @@ def test_an_odd_number_is_kept_or_refused_but_never_changed(table, column, numbe
         return
     assert validate.violations(rows, table) == []
     parquet.write(tmp_path / "x.parquet", rows, table)
-    back = parquet.dataset([tmp_path / "x.parquet"], table.arrow()).to_table()[column.name].to_numpy()
+    entry = manifest.file_facts(tmp_path / "x.parquet", "x.parquet")
+    back = parquet.dataset(tmp_path, [entry], table.arrow()).to_table()[column.name].to_numpy()
     assert back[1].tobytes() == value.tobytes()
 
 

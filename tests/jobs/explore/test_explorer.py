@@ -12,7 +12,7 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 
 from jobs.explore.explorer import Explorer
-from lake_schema import parquet, publish, read, sky
+from lake_schema import publish, read, sky
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.tables.galaxies import GALAXIES
 from tests.universe import plain_plan, plain_work
@@ -252,7 +252,7 @@ def test_a_changed_byte_is_damage_not_a_number(lake):
     data = bytearray(path.read_bytes())
     with Explorer(lake) as explorer:
         assert explorer.sql("SELECT sum(value) AS s FROM plain")["s"][0] == 60.0
-        data[parquet.tail_start(path) - 5] ^= 1
+        data[100] ^= 1
         path.write_bytes(data)
         with pytest.raises(Damaged):
             explorer.sql("SELECT sum(value), sum(id) FROM plain")

@@ -1,0 +1,165 @@
+"""Files that are read through their manifest entry: no byte is handed out before it was compared with what was written.
+
+facts    a file's entry: its size, its sha256, and its blocks, each with a checksum
+crc32    checksum of a file as a whole
+Checked  the file, to be read by whatever reads an open file; refuses the first block that is not what was written
+
+A block's checksum is its CRC-32: one flipped bit never passes, nor does a burst of up to 32; of any other change one in
+4e9 does. It costs less than the checksums of Parquet's pages, and unlike them it covers page headers too, and a block
+in the place of another. The sha256 of whole files is what `verify --deep` compares.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import os
+import zlib
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lake_schema.errors import Damaged
+from lake_schema.plan import Json
+from lake_schema.provenance import file_sha256
+
+# Smaller pieces share a block, larger ones are cut.
+_LEAST_BYTES, _MOST_BYTES = 16 << 10, 8 << 20
+_RECORD = np.dtype([("bytes", "<u4"), ("crc", "<u4")])
+
+
+def facts(path: Path, cuts: Sequence[int]) -> dict[str, Any]:
+    """What the manifest says of a file of which parts are read.
+
+    cuts    : ascending, where one may be read without what comes before; the last begins what every reader wants
+    returns : bytes, sha256 (hexadecimal), blocks: base64 of (bytes, CRC-32) of each, as 4-byte integers, low byte first
+    """
+    whole, found, size = hashlib.sha256(), [], path.stat().st_size
+    ends = _ends(cuts, size)
+    with path.open("rb") as stream:
+        for start, end in zip([0, *ends[:-1]], ends, strict=True):
+            data = stream.read(end - start)
+            whole.update(data)
+            found.append((len(data), zlib.crc32(data)))
+    blocks = base64.b64encode(np.array(found, _RECORD).tobytes()).decode()
+    return {"bytes": size, "sha256": whole.hexdigest(), "blocks": blocks}
+
+
+def crc32(path: Path) -> int:
+    """CRC-32 of a file's bytes, read a piece at a time."""
+    found = 0
+    with path.open("rb") as stream:
+        while data := stream.read(_MOST_BYTES):
+            found = zlib.crc32(data, found)
+    return found
+
+
+def _ends(cuts: Sequence[int], size: int) -> list[int]:
+    ends, last = [], 0
+    for cut in [*cuts, size]:
+        if cut - last >= _LEAST_BYTES or cut in (cuts[-1], size):
+            ends += [*range(last + _MOST_BYTES, cut, _MOST_BYTES), cut]
+            last = cut
+    return ends
+
+
+def listed(entry: Json) -> list[tuple[int, int]]:
+    """(end, CRC-32) of each block of an entry; none where an older truesky wrote it.
+
+    Errors : ValueError where they are not the blocks of a file of that size
+    """
+    found = np.frombuffer(base64.b64decode(entry.get("blocks", ""), validate=True), _RECORD)
+    ends = np.cumsum(found["bytes"], dtype=np.int64)
+    if "blocks" in entry and (not ends.size or ends[-1] != entry["bytes"]):
+        raise ValueError("the blocks are not those of a file of this size")
+    return list(zip(ends.tolist(), found["crc"].tolist(), strict=True))
+
+
+class Checked(io.RawIOBase):
+    """A file of a lake, open for reading; a block is compared when something of it is read for the first time.
+
+    A file that an older truesky wrote has no blocks: then the sha256 of all of it is compared before the first byte.
+
+    fault  : why it was refused, "" where it was not; for whoever meets the refusal through somebody else's code
+    Errors : Damaged names the file
+    """
+
+    fault = ""
+
+    def __init__(self, path: Path, entry: Json) -> None:
+        super().__init__()
+        self.path, self._entry = path, entry
+        blocks = listed(entry)
+        self._ends, self._sums = [end for end, _ in blocks], [crc for _, crc in blocks]
+        self._sound: set[int] = set()
+        self._at = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: int(self._entry["bytes"])}[whence]
+        self._at = max(start + offset, 0)
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def read(self, size: int | None = -1) -> bytes:
+        first, length = self._at, int(self._entry["bytes"])
+        last = length if size is None or size < 0 else min(first + size, length)
+        if last <= first:
+            return b""
+        data = self._bytes(first, last)
+        self._compare(first, last, data)
+        self._at = last
+        return data
+
+    def _compare(self, first: int, last: int, data: bytes) -> None:
+        if not self._ends:
+            return self._compare_whole()
+        for number in range(bisect_right(self._ends, first), bisect_left(self._ends, last) + 1):
+            if number in self._sound:
+                continue
+            start, end = self._ends[number - 1] if number else 0, self._ends[number]
+            inside = first <= start and end <= last
+            block = memoryview(data)[start - first : end - first] if inside else self._bytes(start, end)
+            if zlib.crc32(block) != self._sums[number]:
+                raise self._refusal(f"has other bytes from {start} to {end} than the manifest says")
+            self._sound.add(number)
+
+    def _compare_whole(self) -> None:
+        if not self._sound and file_sha256(self.path) != self._entry["sha256"]:
+            raise self._refusal("has other contents than the manifest says")
+        self._sound.add(0)
+
+    def _refusal(self, why: str) -> Damaged:
+        self.fault = f"{self.path} {why}"
+        return Damaged(self.fault)
+
+    def _bytes(self, first: int, last: int) -> bytes:
+        """Opened each time: a lake has more files than a process may hold open."""
+        try:
+            descriptor = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                pieces, at = [], first
+                while at < last and (piece := os.pread(descriptor, last - at, at)):
+                    pieces.append(piece)
+                    at += len(piece)
+            finally:
+                os.close(descriptor)
+        except FileNotFoundError:
+            # Removed since, with its whole version.
+            raise self._refusal("is missing") from None
+        except OSError as error:
+            raise self._refusal(f"cannot be read: {error.strerror}") from None
+        if at < last:
+            raise self._refusal(f"has {at} bytes, the manifest says {self._entry['bytes']}")
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)

@@ -1,0 +1,303 @@
+"""Every bit of a small file of every table: the readers refuse the file by name, or give the same numbers.
+
+Small files are one or two blocks, which any reading compares as a whole; of large ones only those blocks are compared
+that hold what is asked for.
+"""
+
+import os
+import shutil
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+
+from jobs.explore import worker
+from jobs.explore.guard import checked
+from lake_schema import blocks, fits, layout, manifest, parquet, publish, read
+from lake_schema.errors import Damaged
+from lake_schema.plan import Output, Part, Plan
+from lake_schema.tables import declared
+from tests.make_old_lake import OLD_LAKE
+from tests.universe import PLAIN, TOY, plain_plan, plain_work, rows_of, toy_rows
+
+TABLES = declared(["vis"])
+CELL = layout.cell_file(5, 1607)
+ROWS = 2
+# Bits of each file: a sample, or all of them.
+BITS = [pytest.param(24, id="some"), pytest.param(None, id="every", marks=pytest.mark.nightly)]
+MEMORY = 1_000_000_000
+
+
+def published(root, table, rows, name="a"):
+    """A version of a table that holds these rows in one file, and the same rows beside it, as jobs keep some."""
+    part = Part(CELL if table.is_catalogue else "all.parquet", {})
+    beside = {"beside/x.parquet": lambda path: parquet.write(path, rows, table)}
+    publish.make(root, Plan(table, {"name": name}, (part,)), lambda lake, facts: Output(rows, beside))
+    return read.version(root, table.name)
+
+
+def asked(version, text):
+    """What the explorer's process answers."""
+    query = checked(text, {version.table: version.key})
+    return worker._run(query, {version.table: version}, MEMORY, {})
+
+
+def readers(version, table):
+    """Name -> a function of the open version that reads it as `rows`, the jobs, the explorer and cones do."""
+    names = [column.name for column in table.columns]
+    some = [names[0], names[-1]]
+    found = {
+        "open": lambda v: pa.table({"x": read.version(v.folder.parents[1], v.table).schema.names}),
+        "rows": lambda v: v.rows(),
+        "columns": lambda v: v.rows(some, where=pc.field(names[0]).is_valid()),
+        "explorer": lambda v: asked(v, f'SELECT "{names[-1]}" FROM {v.table}'),
+    }
+    if table.is_catalogue:
+        ra, dec = (version.rows()[name].to_numpy()[0] for name in ("ra", "dec"))
+        found["cone"] = lambda v: v.cone(ra, dec, 0.5, ["id"])
+        found["cells"] = lambda v: v.in_cells([1607], 5, some)
+        if "ra_lensed" in names:
+            found["lensed cone"] = lambda v: v.cone(ra, dec, 180.0, ["id"], on="lensed")
+    return found
+
+
+def flip(path, bit):
+    """Turn one bit of a file over, without a new time of change or a new file: twice is not at all."""
+    with path.open("r+b", buffering=0) as stream:
+        (byte,) = os.pread(stream.fileno(), 1, bit // 8)
+        os.pwrite(stream.fileno(), bytes([byte ^ 1 << bit % 8]), bit // 8)
+
+
+def answer(reader):
+    """What a reader gives: (rows, None) or (None, why it refused)."""
+    try:
+        return reader(), None
+    except Damaged as error:
+        return None, str(error)
+
+
+def harmed(path, bits, reader):
+    """(bits with which a reader refused the file by name, bits tried); with any other it must give the same rows."""
+    good, size, refused = reader(), 8 * path.stat().st_size, 0
+    chosen = range(size) if bits is None else np.random.default_rng(1).choice(size, bits, replace=False).tolist()
+    for bit in chosen:
+        flip(path, bit)
+        rows, why = answer(reader)
+        flip(path, bit)
+        assert path.name in why if why else rows.equals(good), f"bit {bit} of {path}"
+        refused += bool(why)
+    return refused, len(chosen)
+
+
+@pytest.mark.parametrize("bits", BITS)
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+def test_a_flipped_bit_of_any_table_is_refused_by_name(lake, table, bits, record_property):
+    version = published(lake, table, rows_of(table, ROWS))
+    path = version.path(version.parts[0])
+    for name, reader in readers(version, table).items():
+        refused, tried = harmed(path, bits, partial(reader, version))
+        assert refused == tried, name
+        record_property(f"{table.name} {name}", tried)
+
+
+@pytest.mark.parametrize("bits", BITS)
+@pytest.mark.parametrize("name", ["quarantine", "rendered_truth", "gaia"])
+def test_a_flipped_bit_beside_a_table_is_refused_by_name(lake, name, bits, record_property):
+    """What other tables are made from: rows beside a part, rows of a margin."""
+    (table,) = (table for table in TABLES if table.name == name)
+    version = published(lake, table, rows_of(table, ROWS))
+    files = {"beside/x.parquet": lambda: version.beside("beside/x.parquet")}
+    if table.is_catalogue:
+        files[f"{name}_margin/dataset/{CELL}"] = lambda: version.margin(CELL)
+    for relative, reader in files.items():
+        refused, tried = harmed(version.folder / relative, bits, reader)
+        assert refused == tried
+        record_property(f"{name} {relative}", tried)
+
+
+# ------------------------------------------------------------------------------------------------ larger than a read
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory):
+    """A file of several row groups, whose columns lie in blocks of their own."""
+    root = tmp_path_factory.mktemp("large")
+    rows = toy_rows(1607, 3 * parquet.ROWS_A_GROUP)
+    # Identifiers in no order, whose pages are not small.
+    ids = np.random.default_rng(4).permutation(1 << 20)[: rows.num_rows]
+    return published(root, TOY, rows.set_column(0, rows.schema.field(0), pa.array(ids)))
+
+
+def spans(version, part):
+    """(column or "", row group, first byte, last byte + 1) of all that the file holds, the footer last."""
+    path = version.path(part)
+    about = pq.read_metadata(path)
+    found = []
+    for group in range(about.num_row_groups):
+        for column in range(about.num_columns):
+            chunk = about.row_group(group).column(column)
+            start = chunk.dictionary_page_offset if chunk.has_dictionary_page else chunk.data_page_offset
+            found.append((chunk.path_in_schema, group, start, start + chunk.total_compressed_size))
+    return [*found, ("", 0, found[-1][3], path.stat().st_size)]
+
+
+@pytest.mark.parametrize("flips", [4, pytest.param(300, marks=pytest.mark.nightly)])
+def test_of_a_large_file_what_is_read_is_compared(large, flips):
+    """A flip in what is asked for is refused, also where a page's own checksum does not reach; others are not seen."""
+    part = large.parts[0]
+    index = large.rows(["_healpix_29"])["_healpix_29"].to_numpy()
+    ra, dec = (large.rows([name])[name].to_numpy()[parquet.ROWS_A_GROUP + 1000] for name in ("ra", "dec"))
+    where = pc.field("_healpix_29") == int(index[parquet.ROWS_A_GROUP + 1000])
+    every, second = {0, 1, 2}, {1}
+    wanted = {
+        "flux": (lambda: large.rows(["flux"]), {"flux"}, every),
+        "where": (lambda: large.rows(["flux"], where=where), {"flux", "_healpix_29"}, second),
+        "cone": (lambda: large.cone(ra, dec, 0.003, ["flux"]), {"flux", "_healpix_29", "ra", "dec"}, second),
+        "explorer": (lambda: asked(large, "SELECT max(flux), min(flux) FROM toy"), {"flux"}, every),
+    }
+    path = large.path(part)
+    rng = np.random.default_rng(2)
+    for reader, columns, groups in wanted.values():
+        good = reader()
+        assert good.num_rows
+        for column, group, start, end in spans(large, part):
+            needed = not column or (column in columns and group in groups)
+            # What is read with the footer.
+            with_footer = end > path.stat().st_size - (64 << 10)
+            # A page's header is where its chunk begins.
+            for bit in [8 * start, 8 * start + 60, *rng.integers(8 * start, 8 * end, flips).tolist()]:
+                flip(path, bit)
+                rows, why = answer(reader)
+                flip(path, bit)
+                assert why or not needed, (column, group, bit)
+                assert path.name in why if why else rows.equals(good)
+                assert needed or with_footer or not why
+
+
+def test_a_column_costs_the_bytes_of_a_column(large, monkeypatch):
+    """A reading of one column in one row group asks for few bytes beside those."""
+    read_bytes = []
+    one = blocks.Checked._bytes
+
+    def counted(self, first, last):
+        read_bytes.append(last - first)
+        return one(self, first, last)
+
+    monkeypatch.setattr(blocks.Checked, "_bytes", counted)
+    index = large.rows(["_healpix_29"])["_healpix_29"].to_numpy()
+    read_bytes.clear()
+    large.rows(["flux"], where=pc.field("_healpix_29") == int(index[5]))
+    chunk = {(column, group): end - start for column, group, start, end in spans(large, large.parts[0])}
+    last = chunk["flux", 2]
+    assert sum(read_bytes) < chunk["flux", 0] + chunk["_healpix_29", 0] + last + 2 * (64 << 10)
+
+
+@pytest.mark.parametrize("what", ["columns", "row groups"])
+def test_pieces_of_equal_length_that_changed_places_are_refused(lake, what):
+    """Each piece carries a checksum that is right, wherever it stands."""
+    n = 2 * parquet.ROWS_A_GROUP
+    rows = replace(PLAIN, name="wide", columns=tuple(replace(PLAIN.columns[1], name=c) for c in "ab"), key=("a",))
+    rng = np.random.default_rng(3)
+    # Noise is stored as it is: pieces of one length.
+    version = published(lake, rows, rows.build({c: rng.random(n) for c in "ab"}))
+    path, part = version.path(version.parts[0]), version.parts[0]
+    a0, b0, a1, *_ = ((start, end) for _, _, start, end in spans(version, part))
+    first, second = (a0, b0) if what == "columns" else (a0, a1)
+    length = min(first[1] - first[0], second[1] - second[0])
+    whole = path.read_bytes()
+    data = bytearray(whole)
+    data[first[0] : first[0] + length], data[second[0] : second[0] + length] = (
+        whole[second[0] : second[0] + length],
+        whole[first[0] : first[0] + length],
+    )
+    path.write_bytes(data)
+    for reader in (lambda: version.rows(["a"]), lambda: asked(version, "SELECT max(a) FROM wide")):
+        with pytest.raises(Damaged, match=path.name):
+            reader()
+    assert read.verify(version, deep=True) == [f"{path} has other contents than the manifest says"]
+
+
+def test_another_number_of_rows_than_the_manifest_s_is_refused(lake):
+    """A hand that rewrites a file and its entry, but not how many rows there were."""
+    folder = publish.make(lake, plain_plan(), plain_work)
+    version = read.version(lake, "plain")
+    path = version.path("1.parquet")
+    parquet.write(path, version.rows(parts=["1.parquet"]).slice(0, 19), PLAIN)
+    facts = {key: value for key, value in version.manifest.items() if key != "files"}
+    new = manifest.file_facts(path, "dataset/1.parquet")
+    files = [{**entry, **(new if entry["path"] == new["path"] else {})} for entry in version.manifest["files"]]
+    manifest.write(folder, {**facts, "files": files})
+    changed = read.version(lake, "plain")
+    for reader in (changed.rows, lambda: changed.rows(["id"], ["1.parquet"]), lambda: asked(changed, "FROM plain")):
+        with pytest.raises(Damaged, match=r"1\.parquet has 19 rows, the manifest says 20"):
+            reader()
+
+
+# ------------------------------------------------------------------------------------------------ older lakes, images
+
+
+def test_a_file_without_blocks_is_compared_as_a_whole(lake):
+    """As an older truesky published it."""
+    old = read.version(OLD_LAKE, "plain")
+    assert all("blocks" not in entry for entry in old.manifest["files"])
+    shutil.copytree(OLD_LAKE / "plain", lake / "plain", symlinks=True)
+    version = read.version(lake, "plain")
+    assert harmed(version.path("1.parquet"), 200, lambda: version.rows(["id"])) == (200, 200)
+
+
+def picture(path):
+    rng = np.random.default_rng(5)
+    fits.write_images(path, [fits.Image(rng.poisson(300, (80, 50)).astype(np.uint16), (("EXPTIME", 560.5, "s"),))])
+
+
+def packed(path):
+    rng = np.random.default_rng(5)
+    fits.write_images(path, [fits.Image(rng.poisson(300, (80, 50)).astype(np.uint16))], rice=True)
+
+
+def swapped(whole, rng):
+    """The bytes of a file with two stretches of its 4-byte words in each other's places, and not the same words."""
+    words = np.frombuffer(whole, ">u4")
+    while True:
+        n = int(rng.integers(1, 40))
+        first, second = np.sort(rng.integers(0, words.size - n, 2)).tolist()
+        if first + n <= second and (words[first : first + n] != words[second : second + n]).any():
+            changed = words.copy()
+            changed[first : first + n], changed[second : second + n] = (
+                words[second : second + n],
+                words[first : first + n],
+            )
+            return changed.tobytes()
+
+
+@pytest.mark.parametrize("writer", [picture, packed])
+def test_pieces_of_an_image_that_changed_places_are_refused(lake, writer):
+    """The sums that FITS keeps do not see it; the manifest's sha256 does."""
+    publish.make(
+        lake, plain_plan(parts=1), lambda root, facts: Output(plain_work(root, facts).rows, {"images/a.fits": writer})
+    )
+    version = read.version(lake, "plain")
+    path = version.file("images/a.fits")
+    whole, rng = path.read_bytes(), np.random.default_rng(6)
+    for _ in range(100):
+        path.write_bytes(swapped(whole, rng))
+        with pytest.raises(Damaged, match=r"a\.fits has other contents than the manifest says"):
+            fits.read_images(version.file("images/a.fits"))
+
+
+@pytest.mark.parametrize("trials", [300, pytest.param(20_000, marks=pytest.mark.nightly)])
+def test_a_packed_image_whose_pieces_changed_places_is_read_or_refused_in_one_line(tmp_path, trials):
+    """Outside a lake: its checksums are right, so what is unpacked may be anything."""
+    path = tmp_path / "a.fits"
+    packed(path)
+    whole, rng, refused = path.read_bytes(), np.random.default_rng(7), 0
+    for _ in range(trials):
+        path.write_bytes(swapped(whole, rng))
+        _, why = answer(lambda: fits.read_images(path))
+        assert why is None or (path.name in why and "\n" not in why)
+        refused += bool(why)
+    assert refused > 0.9 * trials
