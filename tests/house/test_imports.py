@@ -56,6 +56,38 @@ def unsafe(tree: ast.AST) -> list[str]:
     return found
 
 
+# Modules that read Parquet; what they have that writes, or is of no file.
+PARQUET = ("pyarrow.parquet", "pyarrow.dataset", "pyarrow.orc")
+NO_READING = {"write_table", "ParquetWriter", "Expression", "field", "scalar"}
+# The one door; Parquet of strangers, in a process of its own.
+PARQUET_READERS = {"lake_schema/parquet.py", "lake_schema/foreign.py"}
+# Spark's own reader, after every byte was compared.
+SPARK_READERS = {"jobs/session.py"}
+
+
+def parquet_readings(tree: ast.AST) -> list[str]:
+    """What the file does to read Parquet: of pyarrow, pandas, polars, DuckDB's SQL, Spark."""
+    names = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.asname or alias.name: alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    found = [name for name in names.values() if name.startswith(PARQUET) and name not in PARQUET]
+    found = [name for name in found if name.rpartition(".")[2] not in NO_READING]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            module, _, rest = ast.unparse(node.value).partition(".")
+            module = ".".join([names.get(module, module), rest]).rstrip(".")
+            if module in PARQUET and node.attr not in NO_READING:
+                found.append(f"{module}.{node.attr}")
+            elif node.attr in ("read_parquet", "scan_parquet", "parquet") and isinstance(node.ctx, ast.Load):
+                found.append(ast.unparse(node))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and "read_parquet(" in node.value:
+            found.append(node.value)
+    return found
+
+
 def test_contracts():
     """The floors as pyproject.toml states them."""
     command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
@@ -66,6 +98,32 @@ def test_contracts():
 def test_one_file_knows_fits():
     users = {path.relative_to(ROOT).as_posix() for path in SOURCES if touches_fits(ast.parse(path.read_text()))}
     assert users == {"lake_schema/fits.py"}
+
+
+def test_parquet_is_read_through_one_door():
+    """Whoever else read it would take a changed byte for a number."""
+    files = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in SOURCES}
+    assert {name for name, tree in files.items() if parquet_readings(tree)} == PARQUET_READERS | SPARK_READERS
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("import pyarrow.parquet as pq\npq.read_table('x')", True),
+        ("import pyarrow.parquet\npyarrow.parquet.ParquetFile('x')", True),
+        ("import pyarrow.parquet as pq\nread = pq.read_schema", True),
+        ("from pyarrow import parquet\nparquet.read_table('x')", True),
+        ("from pyarrow import dataset as ds\nds.dataset('x')", True),
+        ("def f():\n    from pyarrow.parquet import read_table", True),
+        ("import pandas as pd\npd.read_parquet('x')", True),
+        ("connection.sql('SELECT * FROM read_parquet($files)')", True),
+        ("spark.read.parquet('x')", True),
+        ("import pyarrow.parquet as pq\npq.write_table(rows, 'x')", False),
+        ("from lake_schema import parquet\nparquet.read(folder, entry)", False),
+    ],
+)
+def test_a_reading_of_parquet_is_recognised(text, expected):
+    assert bool(parquet_readings(ast.parse(text))) is expected
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(ROOT).as_posix())

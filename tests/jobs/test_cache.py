@@ -104,6 +104,95 @@ def test_an_array_cut_short_is_made_again():
     assert cache.cached_arrays("thing", key, lambda: {"a": np.zeros(3)})["a"].tolist() == [0.0] * 3
 
 
+def made_again(key, value):
+    """The arrays of a key, made of this value where they are made."""
+    return cache.cached_arrays("thing", key, lambda: {"a": np.full(1000, value), "b": np.full(3, value)})
+
+
+@pytest.mark.parametrize("step", [1009, pytest.param(7, marks=pytest.mark.nightly)])
+def test_a_changed_bit_is_made_again_and_said(caplog, monkeypatch, step):
+    """Of the arrays, their headers, and the list of their checksums."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
+    key, files = "4" * 64, 0
+    made_again(key, 1.0)
+    for path in sorted(cache.cache_dir().glob("*/*")):
+        whole = path.read_bytes()
+        for bit in range(0, 8 * len(whole), step):
+            data = bytearray(whole)
+            data[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(data)
+            caplog.clear()
+            found = made_again(key, 2.0)
+            if path.suffix == ".npy" or found["a"][0] == 2.0:
+                assert set(found["a"].tolist()) == set(found["b"].tolist()) == {2.0}, f"bit {bit} of {path}"
+                (line,) = (record.getMessage() for record in caplog.records)
+                assert str(path.parent) in line
+                assert line.endswith(": made again")
+                assert "\n" not in line
+            else:
+                # White space of the list.
+                assert set(found["a"].tolist()) == set(found["b"].tolist()) == {1.0}
+            made = cache.cache_dir() / path.parent.name
+            assert sorted(os.listdir(cache.cache_dir())) == [made.name]
+            if found["a"][0] == 2.0:
+                for file in made.iterdir():
+                    file.unlink()
+                made.rmdir()
+            else:
+                path.write_bytes(whole)
+            made_again(key, 1.0)
+        files += 1
+    assert files == 3
+
+
+def test_zeroed_blocks_are_made_again():
+    key = "5" * 64
+    cache.cached_arrays("thing", key, lambda: {"a": np.arange(1e5)})
+    (file,) = cache.cache_dir().glob("*/a.npy")
+    with file.open("r+b") as stream:
+        stream.seek(4096 * 20)
+        stream.write(bytes(4096))
+    again = cache.cached_arrays("thing", key, lambda: {"a": np.arange(1e5)})
+    np.testing.assert_array_equal(again["a"], np.arange(1e5))
+
+
+def test_a_process_compares_a_file_once(monkeypatch):
+    key, seen = "6" * 64, []
+    made_again(key, 1.0)
+    real = cache.blocks.crc32
+    monkeypatch.setattr(cache.blocks, "crc32", lambda path: seen.append(path.name) or real(path))
+    for _ in range(3):
+        made_again(key, 2.0)
+    assert seen == []
+    for path in cache.cache_dir().glob("*/*.npy"):
+        os.utime(path)
+    for _ in range(3):
+        assert made_again(key, 2.0)["a"][0] == 1.0
+    assert sorted(seen) == ["a.npy", "b.npy"]
+
+
+def test_what_is_stored_is_synced_before_it_has_its_name(monkeypatch):
+    calls = []
+    rename, fsync = os.rename, os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: calls.append(os.readlink(f"/proc/self/fd/{fd}")) or fsync(fd))
+    monkeypatch.setattr(os, "rename", lambda a, b: calls.append(f"rename {b}") or rename(a, b))
+    made_again("7" * 64, 1.0)
+    (last,) = (i for i, call in enumerate(calls) if call.startswith("rename"))
+    synced = {os.path.basename(call) for call in calls[:last]}
+    assert {"a.npy", "b.npy"} <= synced
+    assert any(call.endswith((".tmp", "sums.json")) for call in calls[:last])
+    assert str(cache.cache_dir()) in calls[last:]
+
+
+def test_arrays_of_an_older_version_are_made_again_in_silence(caplog):
+    folder = cache.cache_dir() / f"thing-{'8' * 32}"
+    folder.mkdir(parents=True)
+    np.save(folder / "a.npy", np.zeros(3))
+    (folder / "arrays.txt").write_text("a")
+    assert made_again("8" * 64, 1.0)["a"][0] == 1.0
+    assert caplog.records == []
+
+
 @pytest.mark.parametrize("name", ["../evil", "a/b", "", ".hidden"])
 def test_names_stay_inside(name):
     with pytest.raises(BadInput):
