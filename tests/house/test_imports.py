@@ -103,7 +103,11 @@ def test_one_file_knows_fits():
 def test_parquet_is_read_through_one_door():
     """Whoever else read it would take a changed byte for a number."""
     files = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in SOURCES}
-    assert {name for name, tree in files.items() if parquet_readings(tree)} == PARQUET_READERS | SPARK_READERS
+    found = {name: set(readings) for name, tree in files.items() if (readings := parquet_readings(tree))}
+    # Rows that a process was handed in a file of Arrow's own, which is removed with it.
+    handed = found.pop("jobs/explore/worker.py")
+    assert handed == {"pyarrow.dataset.dataset", "pyarrow.dataset.Dataset"}
+    assert found.keys() == PARQUET_READERS | SPARK_READERS
 
 
 @pytest.mark.parametrize(
