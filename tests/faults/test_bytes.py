@@ -7,7 +7,6 @@ that hold what is asked for.
 import os
 import shutil
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -40,28 +39,28 @@ def published(root, table, rows, name="a"):
     return read.version(root, table.name)
 
 
-def asked(version, text):
-    """What the explorer's process answers."""
+def asking(version, text):
+    """What the explorer's process does with a query that it let through."""
     query = checked(text, {version.table: version.key})
-    return worker._run(query, {version.table: version}, MEMORY, {})
+    return lambda: worker._run(query, {version.table: version}, MEMORY, {})
 
 
 def readers(version, table):
-    """Name -> a function of the open version that reads it as `rows`, the jobs, the explorer and cones do."""
+    """Name -> a function that reads the version, once open, as `rows`, the jobs, the explorer and cones do."""
     names = [column.name for column in table.columns]
     some = [names[0], names[-1]]
     found = {
-        "open": lambda v: pa.table({"x": read.version(v.folder.parents[1], v.table).schema.names}),
-        "rows": lambda v: v.rows(),
-        "columns": lambda v: v.rows(some, where=pc.field(names[0]).is_valid()),
-        "explorer": lambda v: asked(v, f'SELECT "{names[-1]}" FROM {v.table}'),
+        "open": lambda: pa.table({"x": read.version(version.folder.parents[1], version.table).schema.names}),
+        "rows": lambda: version.rows(),
+        "columns": lambda: version.rows(some, where=pc.field(names[0]).is_valid()),
+        "explorer": asking(version, f'SELECT "{names[-1]}" FROM {version.table}'),
     }
     if table.is_catalogue:
         ra, dec = (version.rows()[name].to_numpy()[0] for name in ("ra", "dec"))
-        found["cone"] = lambda v: v.cone(ra, dec, 0.5, ["id"])
-        found["cells"] = lambda v: v.in_cells([1607], 5, some)
+        found["cone"] = lambda: version.cone(ra, dec, 0.5, ["id"])
+        found["cells"] = lambda: version.in_cells([1607], 5, some)
         if "ra_lensed" in names:
-            found["lensed cone"] = lambda v: v.cone(ra, dec, 180.0, ["id"], on="lensed")
+            found["lensed cone"] = lambda: version.cone(ra, dec, 180.0, ["id"], on="lensed")
     return found
 
 
@@ -99,7 +98,7 @@ def test_a_flipped_bit_of_any_table_is_refused_by_name(lake, table, bits, record
     version = published(lake, table, rows_of(table, ROWS))
     path = version.path(version.parts[0])
     for name, reader in readers(version, table).items():
-        refused, tried = harmed(path, bits, partial(reader, version))
+        refused, tried = harmed(path, bits, reader)
         assert refused == tried, name
         record_property(f"{table.name} {name}", tried)
 
@@ -157,7 +156,7 @@ def test_of_a_large_file_what_is_read_is_compared(large, flips):
         "flux": (lambda: large.rows(["flux"]), {"flux"}, every),
         "where": (lambda: large.rows(["flux"], where=where), {"flux", "_healpix_29"}, second),
         "cone": (lambda: large.cone(ra, dec, 0.003, ["flux"]), {"flux", "_healpix_29", "ra", "dec"}, second),
-        "explorer": (lambda: asked(large, "SELECT max(flux), min(flux) FROM toy"), {"flux"}, every),
+        "explorer": (asking(large, "SELECT max(flux), min(flux) FROM toy"), {"flux"}, every),
     }
     path = large.path(part)
     rng = np.random.default_rng(2)
@@ -215,7 +214,7 @@ def test_pieces_of_equal_length_that_changed_places_are_refused(lake, what):
         whole[first[0] : first[0] + length],
     )
     path.write_bytes(data)
-    for reader in (lambda: version.rows(["a"]), lambda: asked(version, "SELECT max(a) FROM wide")):
+    for reader in (lambda: version.rows(["a"]), asking(version, "SELECT max(a) FROM wide")):
         with pytest.raises(Damaged, match=path.name):
             reader()
     assert read.verify(version, deep=True) == [f"{path} has other contents than the manifest says"]
@@ -232,7 +231,7 @@ def test_another_number_of_rows_than_the_manifest_s_is_refused(lake):
     files = [{**entry, **(new if entry["path"] == new["path"] else {})} for entry in version.manifest["files"]]
     manifest.write(folder, {**facts, "files": files})
     changed = read.version(lake, "plain")
-    for reader in (changed.rows, lambda: changed.rows(["id"], ["1.parquet"]), lambda: asked(changed, "FROM plain")):
+    for reader in (changed.rows, lambda: changed.rows(["id"], ["1.parquet"]), asking(changed, "FROM plain")):
         with pytest.raises(Damaged, match=r"1\.parquet has 19 rows, the manifest says 20"):
             reader()
 
