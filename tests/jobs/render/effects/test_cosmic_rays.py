@@ -65,6 +65,21 @@ def test_a_track_is_one_pixel_thin_and_straight():
     np.testing.assert_allclose(by_column, 10_001 / 20 / np.cos(0.3), atol=2)
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.4, 1.9, np.pi, 3.6, 5.2])
+def test_a_pixel_holds_what_the_path_within_it_left(angle):
+    """From anywhere in a pixel, in any direction: against the same path in a million steps."""
+    x, y, length, electrons = 15.2, 18.7, 9.3, 1e6
+    one = tuple(np.array([value]) for value in (x, y, np.cos(angle), np.sin(angle), length, electrons))
+    _, columns, rows, charge = cosmic_rays._hits(one)
+    image = np.zeros((40, 40))
+    np.add.at(image, (rows, columns), charge)
+    along = length * (np.arange(1_000_000) + 0.5) / 1_000_000
+    places = np.floor(y + along * np.sin(angle)).astype(int), np.floor(x + along * np.cos(angle)).astype(int)
+    wanted = np.zeros((40, 40))
+    np.add.at(wanted, places, 1.0)
+    np.testing.assert_allclose(image, wanted, atol=3.0)
+
+
 def test_even_over_the_frame():
     image = cosmic_rays.tracks((200, 200), 40_000.0, TRACKS, np.random.default_rng(2)) > 0
     border = np.concatenate([image[:5].ravel(), image[-5:].ravel(), image[:, :5].ravel(), image[:, -5:].ravel()])
