@@ -283,6 +283,7 @@ def test_fluxes_lie_beside_their_catalogues(field):
 
 
 def test_every_table_is_sound(field):
+    assert {"galaxies", "galaxy_fluxes", "stars", "products", "rendered_truth"} <= set(read.tables(field))
     for name in read.tables(field):
         assert read.verify(read.version(field, name), deep=True) == []
 

@@ -14,6 +14,7 @@ ZODI = next(m for m in read_models() if m.key == "env.zodi.map")
 
 
 def test_every_file_is_the_one_that_is_named():
+    assert ZODI in read_models()
     for one in read_models():
         assert hashlib.sha256(content(one)).hexdigest() == one.sha256
 

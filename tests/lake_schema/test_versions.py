@@ -26,6 +26,7 @@ def later(*columns, version=2):
 
 
 def test_the_old_lake_is_whole():
+    assert sorted(read.tables(OLD_LAKE)) == ["galaxies", "plain"]
     for name in read.tables(OLD_LAKE):
         assert read.verify(read.version(OLD_LAKE, name), deep=True) == []
 

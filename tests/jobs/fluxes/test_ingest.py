@@ -41,6 +41,7 @@ def votable(path, wavelength=BAND, value=RESPONSE):
 
 
 def test_every_format_names_its_source_and_reader():
+    assert {"cosmos", "extinction", "irtf"} <= set(ingest.formats())
     for name, form in ingest.formats().items():
         assert form["source"], name
         assert form["reader"] in ("ascii", "csv", "ecsv", "fits", "votable")

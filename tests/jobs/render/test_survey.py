@@ -327,6 +327,8 @@ def test_the_main_and_the_deep_run_count_by_their_fields(name, fields):
 
 
 def test_other_requests_are_good():
-    for path in sorted(DEMO.parent.glob("*.toml")):
+    files = sorted(DEMO.parent.glob("*.toml"))
+    assert DEMO in files
+    for path in files:
         assert requests.parse(path).name == path.stem
         assert tomllib.loads(path.read_text())["name"] == path.stem
