@@ -2,7 +2,8 @@
 
 render          the whole of it
 numbers_of      whose random numbers an effect takes
-least_flux      what a source beyond the margin must have to be read;  spike_flux : and a star still farther out
+least_flux      what a source beyond the margin must have to be read
+spike_flux, outer_flux   and a star, a galaxy still farther out
 sources_of      the rows that shine onto the detector, as what is drawn
 """
 
@@ -29,6 +30,7 @@ from jobs.render import (
     exposing,
     focal_plane,
     moving,
+    outskirts,
     own_psf,
     pictures,
     profiles,
@@ -299,6 +301,15 @@ def spike_flux(
     return float((stamps.reach(1.0) / one) ** 2 / (_rate(exposure) * time))
 
 
+def outer_flux(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
+    """f_nu of the faintest galaxy that may be noticed from beyond what else is read, microjansky; or infinite."""
+    time = float(exposure["exposure_time_s"])
+    if time == 0.0 or not exposing.sees_sky(str(exposure["channel"]), str(exposure["image_type"])):
+        return float("inf")
+    noise, scale = scene_of(exposure, detector, mission, accuracy).pixel_noise, detector.pixel_scale
+    return outskirts.least_electrons(stamps.reach(scale), scale, noise) / (_rate(exposure) * time)
+
+
 def _refuse_too_large(exposure: Row, detector: Detector, sources: Sources, sizes: stamps.Int, spread: Psf) -> None:
     """Before anything is drawn: a task must fit into its memory, and end."""
     here = _touching(sources, sizes, detector)
@@ -366,6 +377,7 @@ def sources_of(
     picture = np.concatenate([np.full(len(catalogue) + len(points), -1), np.arange(len(arcs.ids))]).astype(np.int64)
     _check(ids, electrons)
     farthest = np.where((shape < 0) & (picture < 0), _spikes(electrons, detector, spread, noise), 0.0)
+    farthest[: len(catalogue)] = _outskirts(electrons[: len(catalogue)], form, detector, noise)
     reach = detector.half_diagonal + np.maximum(farthest, stamps.reach(detector.pixel_scale))
     seen = selection.near(ra, dec, focal_plane.centre(detector, system), reach / 3600.0) & (electrons > 0)
     kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
@@ -392,6 +404,14 @@ def _spikes(electrons: Float, detector: Detector, spread: Psf, noise: float) -> 
     if spread.edges is None:
         return np.zeros(len(electrons))
     return edges.reach(spread.edges, electrons, NOTICEABLE * noise) * detector.pixel_scale
+
+
+def _outskirts(electrons: Float, form: profiles.Shapes, detector: Detector, noise: float) -> Float:
+    """[n] arcsec as far as which galaxies are noticed that may be from beyond what else is read, 0 of others."""
+    out, least = np.zeros(len(electrons)), stamps.reach(detector.pixel_scale)
+    some = np.flatnonzero(electrons > outskirts.least_electrons(least, detector.pixel_scale, noise))
+    out[some] = outskirts.reach(electrons[some], form.take(some), detector.pixel_scale, noise, least)
+    return out
 
 
 def _arcs(lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: profiles.Shapes) -> pictures.Arcs:

@@ -8,7 +8,7 @@ sight). What the PSF does to it is small and smoother still: on blocks of pixels
 Outskirts     of one galaxy;  of_galaxy : the profile, PSF and all
 take_in       what came into its stamp, taken off;  add : what belongs outside, onto a frame
 surface_disk  light of an inclined disc of finite thickness
-reach         how far out a galaxy is noticed
+reach         how far out a galaxy is noticed;  least_electrons : and what it takes
 
 Ref : van der Kruit & Searle 1981 (the disc's scale height)
 """
@@ -52,6 +52,8 @@ _MOFFAT = 128
 _NODES, _STEP, _POINTS, _LENGTHS, _HEIGHTS, _DARK = 76, 1.0 / 16.0, 512, 45.0, 20.0, 1e-40
 # Light that is less than this, electrons a pixel, is left out.
 _NONE = 1e-4
+# Axis ratio of the thinnest sources, bulges.
+_THINNEST = 0.02
 # Directions in which a profile is summed beyond a square.
 _DIRECTIONS = 1440
 
@@ -186,6 +188,11 @@ def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, le
         left = left[(found > _NOTICED * noise) & (out[left] < FARTHEST)]
         out[left] = np.minimum(1.1 * out[left], FARTHEST)
     return out
+
+
+def least_electrons(distance: float, pixel_scale: float, noise: float) -> float:
+    """Electrons of a galaxy that may be noticed at a distance, arcsec: no profile rises outward."""
+    return float(_NOTICED * noise * np.pi * _THINNEST * (distance / pixel_scale) ** 2)
 
 
 def _beyond(light: Float, across: float, half: float) -> float:

@@ -23,6 +23,7 @@ from jobs.render import (
     exposure,
     fits_product,
     focal_plane,
+    outskirts,
     own_bodies,
     own_psf,
     pictures,
@@ -115,6 +116,7 @@ def product_keys(
         reach = stamps.reach(focal_plane.detector(camera, detector, mission).pixel_scale)
         # Of the cameras VIS alone has spikes, of stars.
         reaches = {name: reach for name in files}
+        reaches["galaxies"] = max(outskirts.FARTHEST, reach)
         if rows[task["exposure_id"]]["channel"] == "VIS":
             reaches["stars"] = max(edges.FARTHEST, reach)
         return [
@@ -235,13 +237,13 @@ def sources(
     band: str,
     farther: float,
     least: float,
-    spikes: float = float("inf"),
+    bright: float = float("inf"),
 ) -> tuple[pa.Table, pa.Table, float]:
     """(rows of a catalogue that a task may draw, their fluxes, how far beyond the task's circle they are complete).
 
     farther : how far beyond the circle a source may be seen and reach the detector, arcsec
     least   : microjansky, of sources beyond the cells of the circle; infinite where no source at all shows
-    spikes  : microjansky, of sources still farther out, as far as spikes are followed; infinite where none are
+    bright  : microjansky, of sources still farther out, as far as spikes and outskirts go; infinite where none do
     """
     deflection, flux = _deflection(catalogue), ["id", f"f_nu_{band}"]
     near: list[int] = []
@@ -251,16 +253,16 @@ def sources(
     if np.isfinite(least):
         near = selection.needed(task, deflection)
         far, complete = selection.beyond(task, deflection, farther, _drawn(catalogue))
-    if np.isfinite(spikes):
+    if np.isfinite(bright):
         around, _ = selection.beyond(task, deflection, max(edges.FARTHEST, farther), _drawn(catalogue))
         farthest = sorted(set(around) - set(far))
     rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
-    for cells, limit in ((far, least), (farthest, spikes)):
+    for cells, limit in ((far, least), (farthest, bright)):
         if not cells:
             continue
-        more, bright = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
-        shows = pc.greater_equal(bright[flux[1]], limit)
-        rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, more), (light, bright)))
+        more, shining = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
+        shows = pc.greater_equal(shining[flux[1]], limit)
+        rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, more), (light, shining)))
     return rows, light, complete
 
 
@@ -303,10 +305,11 @@ def work(lake: Path, facts: Json) -> Output:
     least = exposure.least_flux(exposed, detector, own.mission, own.accuracy)
     band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], str(exposed["band"]))
     spikes = exposure.spike_flux(exposed, detector, own.mission, own.accuracy, band)
+    outer = exposure.outer_flux(exposed, detector, own.mission, own.accuracy)
     found = [
         sources(inputs[rows], inputs[fluxes], task, columns, exposed["band"], farther, least, limit)
         for rows, fluxes, columns, limit in (
-            ("galaxies", "galaxy_fluxes", exposure.GALAXY_COLUMNS, np.inf),
+            ("galaxies", "galaxy_fluxes", exposure.GALAXY_COLUMNS, outer),
             ("stars", "star_fluxes", exposure.STAR_COLUMNS, spikes),
         )
     ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects.effect import Effect, Frame, Scene, nothing
 from lake_schema.errors import OutOfRange
 
 
@@ -63,4 +63,11 @@ def _noise(scene: Scene) -> float:
 
 
 EFFECT = Effect("charge_injection", apply, _parameters, lambda scene: _parameters(scene)[0], fixed=True, cost=6e-3)
-NOISE = Effect("injection_noise", apply_noise, lambda scene: (*_blocks(scene), _noise(scene)), _noise, cost=1.5e-2)
+NOISE = Effect(
+    "injection_noise",
+    apply_noise,
+    lambda scene: (*_blocks(scene), _noise(scene)),
+    _noise,
+    cost=1.5e-2,
+    repeated=nothing,
+)

@@ -79,10 +79,21 @@ def _loss(scene: Scene, direction: str, transfers: int) -> float:
 
     Where sources change by less than the accuracy allows, that tells the margin.
     """
-    silicon = lattice(scene, direction)
-    lost = transfers * sum(silicon.density) * float(silicon.volume(scene.brightest_electrons))
-    over = _over_accuracy(scene.accuracy, transfers * sum(silicon.density))
+    lost, over = _lost(scene, direction, transfers)
     return lost if over > 1.0 else min(lost, over * NOTICEABLE * scene.pixel_noise)
+
+
+def _repeated(scene: Scene, direction: str, transfers: int) -> float:
+    """The same of a mean of frames, which keeps all; what the accuracy allows is allowed in the mean, too."""
+    lost, over = _lost(scene, direction, transfers)
+    return lost if over > 1.0 else 0.0
+
+
+def _lost(scene: Scene, direction: str, transfers: int) -> tuple[float, float]:
+    """Electrons, and what that does to sources over what the accuracy allows."""
+    silicon = lattice(scene, direction)
+    passed = transfers * sum(silicon.density)
+    return passed * float(silicon.volume(scene.brightest_electrons)), _over_accuracy(scene.accuracy, passed)
 
 
 def _over_accuracy(accuracy: Accuracy, passed: float) -> float:
@@ -106,6 +117,7 @@ PARALLEL = Effect(
     lambda scene: _parameters(scene, "parallel", scene.half_rows),
     lambda scene: _loss(_before_readout(scene), "parallel", scene.half_rows),
     cost=0.11,
+    repeated=lambda scene: _repeated(_before_readout(scene), "parallel", scene.half_rows),
 )
 SERIAL = Effect(
     "serial_cti",
@@ -113,4 +125,5 @@ SERIAL = Effect(
     lambda scene: _parameters(scene, "serial", _columns(scene)),
     lambda scene: _loss(scene, "serial", _columns(scene)),
     cost=0.082,
+    repeated=lambda scene: _repeated(scene, "serial", _columns(scene)),
 )

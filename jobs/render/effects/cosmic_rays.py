@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from jobs.compiling import jit
 from jobs.render.effects import charge_transfer
-from jobs.render.effects.effect import Effect, Frame, Scene
+from jobs.render.effects.effect import Effect, Frame, Scene, nothing
 from jobs.render.effects.traps import Traps
 from lake_schema.errors import OutOfRange
 
@@ -231,6 +231,7 @@ EFFECT = Effect(
     lambda scene: (_expected(scene), _quantiles(scene)),
     lambda scene: _in_a_pixel(scene, _expected(scene)),
     cost=4e-3,
+    repeated=nothing,
 )
 READOUT = Effect(
     "readout_cosmic_rays",
@@ -238,4 +239,5 @@ READOUT = Effect(
     _readout,
     lambda scene: _in_a_pixel(scene, _expected_readout(scene)),
     cost=6.5e-3,
+    repeated=nothing,
 )

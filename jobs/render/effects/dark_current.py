@@ -14,6 +14,8 @@ from lake_schema.errors import OutOfRange
 
 # Electrons of a hot pixel in a warm detector: many times what any well holds, so that more makes no difference.
 _OVERFLOWING = 1e11
+# Means below this are counted in runs of so many pixels, to counts of which a pixel has no more with this certainty.
+_FEW, _RUN, _CERTAIN = 2.0, 512, 1.0 - 2e-16
 
 
 def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
@@ -26,8 +28,23 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
 @jit
 def _add(frame: Any, out: Any, electrons: float, key: Any) -> None:
     none = math.exp(-electrons)
-    for i in range(len(frame)):
-        out[i] = frame[i] + poisson.counted(electrons, none, dice.word(key, i))
+    if electrons >= _FEW:
+        for i in range(len(frame)):
+            out[i] = frame[i] + poisson.counted(electrons, none, dice.word(key, i))
+        return
+    # Few electrons: of each count, all pixels of a run together.
+    u = np.empty(_RUN)
+    for first in range(0, len(frame), _RUN):
+        some, before = out[first : first + _RUN], frame[first : first + _RUN]
+        for j in range(len(some)):
+            u[j], some[j] = dice.uniform(dice.word(key, first + j)), before[j]
+        term, below, count = none, none, 0.0
+        while below < _CERTAIN and term > 0.0:
+            for j in range(len(some)):
+                some[j] += 1.0 if u[j] > below else 0.0
+            count += 1.0
+            term *= electrons / count
+            below += term
 
 
 def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Generator) -> Frame:
@@ -57,5 +74,12 @@ def _rms(scene: Scene) -> float:
     return float(np.sqrt(scene.dark_electrons * (1.0 + scene.dark_electrons)))
 
 
-EFFECT = Effect("dark_current", apply, lambda scene: (scene.dark_electrons,), _rms, cost=1e-2)
+EFFECT = Effect(
+    "dark_current",
+    apply,
+    lambda scene: (scene.dark_electrons,),
+    _rms,
+    cost=2e-3,
+    repeated=lambda scene: scene.dark_electrons,
+)
 HOT = Effect("hot_pixels", apply_hot, _hot, lambda scene: _hot(scene)[1] * (_hot(scene)[0] > 0), fixed=True, cost=2e-3)

@@ -18,8 +18,10 @@ from lake_schema.mission.configuration import MissionConfiguration
 
 Frame = npt.NDArray[np.float64]
 
-# An effect is needed where its largest contribution exceeds this part of a pixel's noise.
-NOTICEABLE = 0.1
+# An effect is needed where its largest contribution exceeds this part of a pixel's noise; and what comes back in every
+# frame, or in every pixel, where it exceeds this part of the noise that is left in the mean of so many: 32 x 32 pixels
+# of the sky, or of one in a stack of 1024 frames.
+NOTICEABLE, STACK = 0.1, 1024
 
 
 # Boltzmann's constant, eV / K (CODATA 2018).
@@ -156,7 +158,8 @@ class Effect:
 
     apply        : (frame, *parameters, rng) -> frame; never writes its argument
     parameters   : scene -> the numbers that `apply` wants
-    contribution : scene -> its largest change of a pixel, electrons
+    contribution : scene -> its largest change of a pixel, electrons; rms, of what is random
+    repeated     : scene -> the part of it that a mean over frames or pixels keeps, electrons; None = all of it
     optional     : False where the frame is no product without it
     fixed        : a pattern of the detector itself: its random numbers are the same in every exposure
     numbers      : the effect whose random numbers it takes, "" = its own
@@ -171,10 +174,13 @@ class Effect:
     fixed: bool = False
     numbers: str = ""
     cost: float = 0.0
+    repeated: Callable[[Scene], float] | None = None
 
     def margin(self, scene: Scene) -> float:
-        """Contribution over what would be noticed: above 1 the effect is needed."""
-        change, noise = float(self.contribution(scene)), NOTICEABLE * scene.pixel_noise
+        """Contribution over what would be noticed, in a pixel or in a mean: above 1 the effect is needed."""
+        repeated = float((self.repeated or self.contribution)(scene))
+        change = max(float(self.contribution(scene)), math.sqrt(STACK) * repeated)
+        noise = NOTICEABLE * scene.pixel_noise
         # Without any noise everything is noticed.
         return change / noise if noise > 0.0 else math.inf if change > 0.0 else 0.0
 
@@ -185,6 +191,11 @@ class Effect:
     def applied(self, scene: Scene) -> bool:
         """Whether it is applied to the scene: as its request forces it, else as the scene needs it."""
         return scene.forced.get(self.name, self.needed_if(scene))
+
+
+def nothing(scene: Scene) -> float:
+    """Of a contribution what a mean keeps, where it is noise."""
+    return 0.0
 
 
 def by_pixel(kernel: Callable[..., None], frame: Frame, *numbers: Any) -> Frame:

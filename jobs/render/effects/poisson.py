@@ -9,7 +9,7 @@ import numpy as np
 
 from jobs.compiling import jit
 from jobs.render.effects import dice
-from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel
+from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel, nothing
 
 # Below this the sum of the probabilities is followed, above it the law is inverted by its asymptotic series.
 _SUMMED_BELOW = 10.0
@@ -53,4 +53,4 @@ def _contribution(scene: Scene) -> float:
     return float(np.sqrt(max(scene.peak_electrons, 0.0) + scene.sky_electrons))
 
 
-EFFECT = Effect("poisson", apply, lambda scene: (), _contribution, cost=1.1e-2)
+EFFECT = Effect("poisson", apply, lambda scene: (), _contribution, cost=1.1e-2, repeated=nothing)

@@ -8,7 +8,7 @@ import numpy as np
 
 from jobs.compiling import jit
 from jobs.render.effects import dice
-from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel
+from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel, nothing
 from lake_schema.errors import OutOfRange
 
 
@@ -29,4 +29,4 @@ def _sigma(scene: Scene) -> float:
     return scene.value("read_noise", "electron")
 
 
-EFFECT = Effect("read_noise", apply, lambda scene: (_sigma(scene),), _sigma, cost=9e-3)
+EFFECT = Effect("read_noise", apply, lambda scene: (_sigma(scene),), _sigma, cost=9e-3, repeated=nothing)

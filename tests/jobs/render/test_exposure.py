@@ -164,13 +164,14 @@ def test_the_image_is_the_truth_with_the_predicted_noise(channel):
     # In 100 s the ground's sky drowns the reading.
     assert applied == {
         "VIS": {
-            "intra_pixel", "background", "illumination", "shutter", "pixel_response", "poisson", "hot_pixels",
-            "cosmic_rays", "quadrants", "readout_cosmic_rays", "nonlinearity", "bias_structure", "read_noise", "adc",
+            "intra_pixel", "background", "pixel_area", "illumination", "shutter", "pixel_response", "poisson",
+            "brighter_fatter", "dark_current", "hot_pixels", "cosmic_rays", "quadrants", "readout_cosmic_rays",
+            "nonlinearity", "crosstalk", "bias_structure", "read_noise", "adc",
         },
-        "EXT": {"background", "poisson", "adc"},
+        "EXT": {"background", "poisson", "dark_current", "adc"},
     }[channel]  # fmt: skip
     read_noise = scene.value("read_noise", "electron") * ("read_noise" in applied)
-    expected = one.noise_free + scene.sky_electrons
+    expected = one.noise_free + scene.sky_electrons + scene.dark_electrons * ("dark_current" in applied)
     variance = expected + read_noise**2 + scene.value("gain", "electron / adu") ** 2 / 12
     found = calibrated.electrons(one.raw, scene, 1, applied)
     if channel == "VIS":
@@ -184,7 +185,7 @@ def test_the_image_is_the_truth_with_the_predicted_noise(channel):
 
 def test_switching_one_effect_off_changes_nobody_else_s_numbers():
     """Without cosmic rays, pixels that none hit are the same, bit by bit."""
-    base = render("VIS", truth=("cosmic_rays",))
+    base = render("VIS", forced={"crosstalk": False}, truth=("cosmic_rays",))
     hit = base.maps["cosmic_rays"] > 0
     off = {"cosmic_rays": False, "readout_cosmic_rays": False, "crosstalk": False}
     without = render("VIS", forced=off, truth=("cosmic_rays",))
@@ -245,8 +246,9 @@ def test_image_types(kind):
     if looks:
         # With the starlight that strays, where that is noticed.
         stray = any(d.applied for d in one.decisions if d.name == "straylight") * one.scene.lights.electrons.sum()
-        assert one.maps["sky"].min() >= one.scene.sky_electrons * (1 - 1e-6)
-        assert one.maps["sky"].max() <= one.scene.sky_electrons * (1 + 1e-6) + stray
+        assert one.maps["sky"].min() >= one.scene.sky_electrons * (1 - 5e-3)
+        # And by as much as a pixel sees more of the sky than at the boresight.
+        assert one.maps["sky"].max() <= one.scene.sky_electrons * (1 + 5e-3) + stray
     applied = {d.name for d in one.decisions if d.applied}
     found = calibrated.electrons(one.raw, one.scene, 1, applied - {"pixel_response"})
     found = np.where(one.maps["cosmic_rays"] > 0, np.nan, found)
@@ -394,13 +396,15 @@ def test_a_lamp_s_light_is_moved_and_squeezed_like_a_star_s():
     # As many rows as there are: of fewer traps less is seen than the accuracy allows to leave out.
     tall = replace(focal_plane.detector("vis", "3-4", MISSION), nx=16)
 
-    def applied(kind, **forced):
+    def margins(kind, **forced):
         # Tracks are bright, too: without them the lamp alone is.
         forced |= {"cosmic_rays": False, "readout_cosmic_rays": False}
         one = render("VIS", body, points, kind=kind, detector=tall, forced=forced)
-        return {d.name for d in one.decisions if d.applied}
+        assert all(d.applied for d in one.decisions if d.margin > 1.0 and not d.forced)
+        return {d.name: d.margin for d in one.decisions}
 
     for kind, named in (("flat", "calibration_lamp"), ("charge_injection", "charge_injection")):
-        assert {"nonlinearity", "crosstalk", "parallel_cti", named} <= applied(kind)
-        without = applied(kind, **{named: False})
-        assert not {"nonlinearity", "crosstalk", "parallel_cti", named} & without
+        lit, dark = margins(kind), margins(kind, **{named: False})
+        assert min(lit[name] for name in ("nonlinearity", "crosstalk", "parallel_cti", named)) > 1.0
+        # A flat is open to the sky.
+        assert all(lit[name] > 10.0 * dark[name] for name in ("nonlinearity", "crosstalk", "parallel_cti"))

@@ -74,8 +74,8 @@ def test_the_header_calibrates_the_image(rendered, written):
     assert header["MISSION"] == rendered.scene.mission.fingerprint
     names = [d.name for d in rendered.decisions]
     assert [header[f"EFFECT{i}"].split(":")[0] for i in range(1, len(names) + 1)] == names
-    assert header["DARKRATE"] == 0.0
-    assert "dark_current: off" in header[f"EFFECT{names.index('dark_current') + 1}"]
+    assert header["DARKRATE"] == rendered.scene.dark_rate > 0.0
+    assert "dark_current: on" in header[f"EFFECT{names.index('dark_current') + 1}"]
 
 
 @pytest.mark.parametrize("forced", [{}, nominal.off("nonlinearity"), {"parallel_cti": True, "serial_cti": True}])

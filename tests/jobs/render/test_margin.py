@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from jobs.accuracy import SURVEY
 from jobs.fluxes import passbands
-from jobs.render import exposure, focal_plane, render_exposures, selection, stamps
+from jobs.render import exposure, focal_plane, outskirts, render_exposures, selection, stamps
 from lake_schema import sky
-from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
+from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, spread, stars
 from tests.jobs.render.test_exposure import field as field_of
 
 BAND, DETECTOR = "lsst_r", small("lsstcam", "R22_S11")
@@ -90,7 +90,7 @@ def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
 
 def test_what_lies_beyond_the_reach_or_is_faint_changes_no_byte():
     # Nobody shines so far.
-    far = stamps.reach(DETECTOR.pixel_scale) + DETECTOR.half_diagonal + 1.0
+    far = outskirts.FARTHEST + DETECTOR.half_diagonal + 1.0
     empty = rendered(far, found=False)
     assert len(empty.sources) == 0
     assert not empty.noise_free.any()
@@ -206,8 +206,37 @@ class Files:
         return self.sums[name]
 
 
-def test_a_product_is_of_the_stars_whose_spikes_it_may_show():
-    """A file of stars that changes a quarter of a degree away: VIS is rendered again, where no spikes are is not."""
+@pytest.mark.parametrize(("channel", "camera", "name"), [("VIS", "vis", "3-4"), ("EXT", "lsstcam", "R22_S11")])
+def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel, camera, name):
+    """One of m 7 and two minutes of arc, a third of a degree away; a small one, and a faint one, are not drawn."""
+    detector, task = small(camera, name), place()
+    exposed = {**field_of(channel)[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
+    limit = exposure.outer_flux(exposed, detector, MISSION, SURVEY)
+    form = {"bulge_sersic_index": [4.0, 1.0, 4.0], "bulge_half_light_radius": [120.0, 2.0, 120.0]}
+    rows = galaxies([task["ra"]] * 3, [task["dec"] - 0.3] * 3, bulge_fraction=1.0, **form)
+    mags = np.array([7.0, 7.0, 27.0])
+    light = fluxes(rows, "euclid_vis", 10 ** (-0.4 * (mags - 23.9)))
+    cells = sky.cell_of(np.full(3, task["ra"]), np.full(3, task["dec"] - 0.3), 8)
+    drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
+    catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
+    found, shining, _ = render_exposures.sources(*catalogues, task, [], "euclid_vis", 85.0, limit, limit)
+    assert found["id"].to_pylist() == rows["id"].to_pylist()[:2]
+    assert shining["id"].equals(found["id"])
+    system = focal_plane.wcs(detector, *focal_plane.boresight_for(detector, task["ra"], task["dec"], 0.0))
+    electrons = shining["f_nu_euclid_vis"].to_numpy() * 560.53 * 10 ** (0.4 * (25.93 - 23.9))
+    noise, settings = 12.0, stamps.settings_for(SURVEY)
+    seen, sizes = exposure.sources_of(
+        (found, electrons), (stars([], []), np.zeros(0)), detector, system, spread(camera), noise, settings,
+        passbands.load("euclid_vis" if channel == "VIS" else "lsst_r"),
+    )  # fmt: skip
+    assert seen.ids.tolist() == rows["id"].to_pylist()[:1]
+    image = stamps.draw(seen, sizes, spread(camera), detector.nx, detector.ny)
+    assert image.min() > 0.1 * noise
+    assert exposure.outer_flux({**exposed, "image_type": "bias"}, detector, MISSION, SURVEY) == np.inf
+
+
+def test_a_product_is_of_what_it_may_show_from_far_away():
+    """A file that changes a quarter of a degree away: of galaxies for all, of stars where there are spikes."""
     task = place()
     cells = {"near": selection.needed(task, 0.0)}
     cells["far"] = [int(sky.cell_of([task["ra"]], [task["dec"] - 0.3], 8)[0])]
@@ -227,7 +256,8 @@ def test_a_product_is_of_the_stars_whose_spikes_it_may_show():
             inputs[name] = Files(columns, cells, {"near": "a", "far": "b" if name == changed else "a"})
         facts = {"request": {}, "mission": "m", "code": "c"}
         found.append(render_exposures.product_keys(facts, pa.Table.from_pylist(some), tasks, inputs, MISSION))
-    (vis, ext), (vis_stars, ext_stars), others = found
+    (vis, ext), (vis_stars, ext_stars), (vis_galaxies, ext_galaxies) = found
     assert vis_stars != vis
     assert ext_stars == ext
-    assert others == [vis, ext]
+    assert vis_galaxies != vis
+    assert ext_galaxies != ext

@@ -98,9 +98,12 @@ def test_galaxies_of_the_weak_lensing_sample_are_as_clear_as_stated():
     x, y = nominal.lattice(512, 32)
     stack = []
     for number in range(1, 5):
-        one = nominal.rendered(detector, np.full(len(x), 24.5), x, y, BODY, forced=forced, number=number)
+        one = nominal.rendered(
+            detector, np.full(len(x), 24.5), x, y, BODY, forced=forced, number=number, truth=("sky",)
+        )
         applied = {decision.name for decision in one.decisions if decision.applied}
-        stack.append(calibrated.electrons(one.raw, one.scene, nominal.SEED, applied) - one.scene.sky_electrons)
+        diffuse = one.maps["sky"] + one.scene.dark_electrons * ("dark_current" in applied)
+        stack.append(calibrated.electrons(one.raw, one.scene, nominal.SEED, applied) - diffuse)
     image = np.mean(stack, axis=0)
     bad = ~np.isfinite(image)
     # An aperture 1.3" across.

@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs.render.effects import bias_structure, charge_injection, crosstalk, dark_current, nonlinearity, quadrants
+from jobs.render.effects import (
+    bias_structure,
+    charge_injection,
+    crosstalk,
+    dark_current,
+    nonlinearity,
+    poisson,
+    quadrants,
+)
 from jobs.render.effects.effect import Scene, apply_all, warmth
 from jobs.render.exposure import numbers_of
 from jobs.rng import stream
@@ -156,6 +164,13 @@ def test_columns_take_the_same_charge_in_every_exposure():
     change = columns["1-1", 60905.0] - columns["1-1", 60906.0]
     assert 0.0 < change.std() < noise
     assert (columns["1-1", 60905.0] - columns["3-4", 60905.0]).std() > 5 * noise
+
+
+@pytest.mark.parametrize("electrons", [0.0, 1e-3, 0.31, 1.999, 2.0, 9.0])
+def test_few_dark_electrons_are_counted_as_many_are(electrons):
+    """In runs of pixels: what each counts by itself."""
+    counts = dark_current.apply(np.full((37, 41), 5.0), electrons, np.random.default_rng(7))
+    np.testing.assert_array_equal(counts - 5.0, poisson.apply(np.full((37, 41), electrons), np.random.default_rng(7)))
 
 
 def test_dark_current_doubles_in_a_few_kelvin():

@@ -9,7 +9,7 @@ from jobs import rng
 from jobs.render import focal_plane
 from jobs.render.channels import vis
 from jobs.render.effects import cosmic_rays
-from jobs.render.effects.effect import NOTICEABLE, Lights, Scene, apply_all
+from jobs.render.effects.effect import NOTICEABLE, STACK, Lights, Scene, apply_all
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render import nominal
 from tests.jobs.render.effects.battery import EFFECTS
@@ -64,6 +64,8 @@ CASES = {
     "ghosts": lambda x: scene(lights=star(1e8 * x)),
     "straylight": lambda x: scene(lights=star(1e9 * x)),
 }
+# What has another value in every frame; and dark current, which has a mean, too.
+RANDOM = ("poisson", "read_noise", "injection_noise", "dark_current")
 QUADRANTS = ("parallel_cti", "serial_cti", "crosstalk", "bias_structure", "readout_cosmic_rays")
 
 
@@ -89,7 +91,7 @@ def test_no_effect_is_left_out_here():
 def test_what_is_left_out_is_not_noticed(name):
     effect = EFFECTS[name]
     needed = []
-    for size in np.geomspace(1e-2, 1e4, 13):
+    for size in np.geomspace(1e-5, 1e4, 19):
         one = CASES[name](size)
         needed.append(effect.needed_if(one))
         if needed[-1]:
@@ -105,6 +107,12 @@ def test_what_is_left_out_is_not_noticed(name):
         change = effect.apply(before, *parameters, rng=np.random.default_rng(1)) - before
         assert np.sqrt(np.mean(change**2)) < NOTICEABLE * one.pixel_noise
         assert np.abs(change).max() < one.pixel_noise
+        # A mean of so many frames or pixels is not biased by a tenth of the noise that it has left.
+        left = NOTICEABLE * one.pixel_noise / np.sqrt(STACK)
+        chance = 5.0 * change.std() / np.sqrt(change.size) if name in RANDOM else 0.0
+        assert abs(change.mean()) < left + chance
+        if name not in RANDOM:
+            assert np.sqrt(np.mean(change**2)) < left
     # Both sides were seen, and the larger side is the needed one.
     assert sorted(needed) == needed
     assert len(set(needed)) == 2
@@ -121,7 +129,7 @@ def test_cosmic_rays_are_always_needed_but_without_time(name):
 def test_a_pixel_s_own_response_is_left_out_of_faint_stars():
     """It is part of how they are drawn: five times five pixels of each."""
     detector, needed = small("vis", "3-4", 256), []
-    for mag in (25.3, 24.0, 22.0):
+    for mag in (29.5, 26.0, 22.0):
         with_it, without = (
             nominal.rendered(detector, [mag], [31.8], [32.3], forced={**nominal.off(*nominal.COSMIC_RAYS), **forced})
             for forced in ({vis.DRAWN.name: True}, {vis.DRAWN.name: False})
@@ -131,7 +139,7 @@ def test_a_pixel_s_own_response_is_left_out_of_faint_stars():
         noticed = np.sqrt(np.mean(change**2)) / with_it.scene.pixel_noise
         assert noticed > 0.0
         if not needed[-1]:
-            assert noticed < NOTICEABLE
+            assert noticed < NOTICEABLE / np.sqrt(STACK)
     assert sorted(needed) == needed
     assert len(set(needed)) == 2
     assert noticed > NOTICEABLE
@@ -154,6 +162,18 @@ def test_all_that_a_scene_does_without_is_not_noticed_together(mag):
     assert left_out
     change = read(left_out)[0] - found
     assert 0.0 < np.sqrt(np.mean(change**2)) < NOTICEABLE * one.scene.pixel_noise, left_out
+    # Nor in the mean of the sky: what is left out of every pixel is seen there.
+    biased = NOTICEABLE * one.scene.pixel_noise / np.sqrt(STACK)
+    assert abs(change.mean()) < biased + 5.0 * change.std() / np.sqrt(change.size), left_out
+
+
+@pytest.mark.parametrize("seconds", [1.0, 100.0, 565.0])
+def test_a_stack_of_darks_has_its_dark_current(seconds):
+    """However little a frame has of it: left out, a thousand frames would show it."""
+    one = Scene(MISSION, "vis", seconds, 0.0, 0.0, DETECTOR)
+    bias = one.dark_electrons * np.sqrt(STACK) / one.pixel_noise
+    assert EFFECTS["dark_current"].needed_if(one) == (bias > NOTICEABLE)
+    assert (bias > NOTICEABLE) == (seconds > 50.0)
 
 
 def test_tracks_bleed_where_they_do_not_fit():
