@@ -125,4 +125,9 @@ def _contribution(scene: Scene) -> float:
     return ratio * brightest / float(np.sqrt(np.pi) * radius)
 
 
-EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=4.5e-3)
+def _level(scene: Scene) -> float:
+    """In a pixel: a mean over as many as share it is what it is judged by already."""
+    return _contribution(scene) / float(np.sqrt(np.pi) * scene.value("ghost.radius_out", "pix"))
+
+
+EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=4.5e-3, repeated=_level)

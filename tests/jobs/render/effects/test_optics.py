@@ -20,7 +20,7 @@ from jobs.render.effects import (
     readout_trail,
     straylight,
 )
-from jobs.render.effects.effect import NOTICEABLE, Lights, Scene, apply_all
+from jobs.render.effects.effect import NOTICEABLE, STACK, Lights, Scene, apply_all
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
 
@@ -185,7 +185,10 @@ def test_a_pixel_sees_of_the_sky_what_the_jacobian_says(name):
     # The tangent plane is 1.2e-4 larger than the sky at the corners of the field.
     np.testing.assert_allclose(found, area - 1.0, atol=2e-4)
     assert np.abs(pixel_area.change(np.zeros(1), np.zeros(1), stretch)).max() == 0
-    assert pixel_area.EFFECT.needed_if(one) == (name == "1-1")
+    # In a mean of many pixels, everywhere in the field; in one pixel, in its corner.
+    assert pixel_area.EFFECT.needed_if(one)
+    assert (pixel_area.EFFECT.margin(one) > np.sqrt(STACK)) == (name == "1-1")
+    assert not pixel_area.EFFECT.needed_if(replace(one, sky_rate=1e-4))
 
 
 def test_without_distortion_all_pixels_see_the_same():
