@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import io
 import json
+import locale
 import logging
 import os
 import re
@@ -31,8 +32,8 @@ from tqdm import tqdm
 
 from jobs import request as requests
 from jobs.measured import Measured
-from lake_schema import __version__, command, layout, publish, read
-from lake_schema.errors import LakeError, PartsFailed
+from lake_schema import __version__, command, layout, publish, read, user_files
+from lake_schema.errors import BadInput, LakeError, PartsFailed
 from lake_schema.provenance import code_version, git_commit
 from lake_schema.publish import Json, Part, Plan, Work
 
@@ -84,6 +85,8 @@ _RESULT = pa.schema(
 )
 
 
+# What the C library calls an encoding of ASCII alone.
+_ASCII = ("ANSI_X3.4-1968", "US-ASCII", "646")
 _AGAIN = "a second run continues where this one ended"
 
 
@@ -93,6 +96,7 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
 
     def made() -> int:
         with _stoppable(job):
+            _refuse_mangled(options.lake, str(options.request))
             chosen = replace(job, steps=job.dry_run) if job.dry_run is not None and options.dry_run else job
             run(chosen, layout.lake(options.lake), _request(job, options), options.verbose)
         return 0
@@ -126,6 +130,14 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
         parser.add_argument("--dry-run", action="store_true", help="print the forecast, write nothing")
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and Spark's own messages")
     return parser.parse_args(argv)
+
+
+def _refuse_mangled(*paths: str) -> None:
+    """Refuse paths that lost letters on their way through Java, rather than make a lake of another name."""
+    if locale.nl_langinfo(locale.CODESET) in _ASCII:
+        for path in paths:
+            if "?" in path:
+                raise BadInput(f"{user_files.shown(path)}: this locale has no letters but ASCII: export LC_ALL=C.UTF-8")
 
 
 def _request(job: Job, options: argparse.Namespace) -> requests.Request:

@@ -50,7 +50,7 @@ _ROWS_A_BATCH = 65_536
 _MOST_UNPACKED, _MOST_PIXELS, _MOST_SAMPLES = 512 << 20, 12 << 24, 64 << 20
 # How a file is built, and how much of it there may be: axes of a unit, units, bytes of a header.
 _BLOCK, _CARD = 2880, 80
-_MOST_AXES, _MOST_UNITS, _MOST_HEADER = 9, 1000, 1000 * _BLOCK
+_MOST_AXES, _MOST_UNITS, _MOST_HEADER = 9, 1000, 64 * _BLOCK
 _SIZES = re.compile(rb"(BITPIX|NAXIS\d{0,3}|PCOUNT|GCOUNT) *= *([+-]?\d{1,18})\b")
 # Of a column of texts, bytes.
 _LONGEST_TEXT = 256
@@ -505,9 +505,11 @@ def _look_through(path: Path, stream: IO[bytes]) -> None:
         said: dict[bytes, int] = {}
         for key, value in _SIZES.findall(header):
             said.setdefault(key, int(value))
-        axes = [said.get(b"NAXIS%d" % i, 0) for i in range(1, said.get(b"NAXIS", 0) + 1)]
-        if min([*axes, 0]) < 0 or len(axes) > _MOST_AXES:
-            raise BadInput(f"{name}: axes of {axes[:9]} pixels")
+        if not 0 <= (count := said.get(b"NAXIS", 0)) <= _MOST_AXES:
+            raise BadInput(f"{name}: has {count} axes")
+        axes = [said.get(b"NAXIS%d" % i, 0) for i in range(1, count + 1)]
+        if min([*axes, 0]) < 0:
+            raise BadInput(f"{name}: axes of {axes} pixels")
         values = math.prod(axes) + said.get(b"PCOUNT", 0) if axes else 0
         length = values * said.get(b"GCOUNT", 1) * abs(said.get(b"BITPIX", 8)) // 8
         if length < 0 or at + len(header) + length > size:

@@ -98,18 +98,23 @@ def main(argv: Sequence[str]) -> int:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     pa.set_cpu_count(1)
     try:
-        with (
-            _opened(path, columns[:needed], columns[needed:]) as (file, found),
-            os.fdopen(1, "wb", closefd=False) as out,
-        ):
-            _send(path, file, found, out)
+        with os.fdopen(1, "wb", closefd=False) as out:
+            send(path, columns[:needed], columns[needed:], out)
     except BadInput as error:
         print(error, file=sys.stderr)
         return _REFUSED
-    except (OSError, pa.ArrowException, UnicodeDecodeError, OverflowError, RecursionError, MemoryError) as error:
-        print(f"{path}: {' '.join(str(error).split())[:300]}", file=sys.stderr)
-        return _REFUSED
     return 0
+
+
+def send(path: Path, needed: Sequence[str], texts: Sequence[str], out: IO[bytes]) -> None:
+    """Write the batches of a file as an Arrow stream; BadInput, whatever Arrow's reader trips over."""
+    try:
+        with _opened(path, needed, texts) as (file, found):
+            _send(path, file, found, out)
+    except BadInput:
+        raise
+    except Exception as error:
+        raise BadInput(f"{path}: {' '.join(str(error).split())[:300] or type(error).__name__}") from None
 
 
 def _send(path: Path, file: pq.ParquetFile, columns: list[str], out: IO[bytes]) -> None:

@@ -30,7 +30,7 @@ _REMOTE = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+:/")
 def name(text: str) -> str:
     """`text` where it is a legal name of a table, request or file stem; else BadInput."""
     if not isinstance(text, str) or _NAME.fullmatch(text) is None:
-        raise BadInput(f"name {text!r} is not of the form [a-z0-9][a-z0-9_-]* with at most 64 characters")
+        raise BadInput(f"name {str(text)[:100]!r} is not of the form [a-z0-9][a-z0-9_-]* with at most 64 characters")
     return text
 
 
@@ -42,7 +42,9 @@ def lake(text: str | Path) -> Path:
     if not str(text):
         raise BadInput("lake: its path is empty")
     if _REMOTE.match(str(text)):
-        raise BadInput(f"lake {text}: only a POSIX file system can publish by rename; mount it and give the path")
+        raise BadInput(
+            f"lake {user_files.shown(text)}: only a POSIX file system can publish by rename; mount it and give the path"
+        )
     try:
         root = user_files.expanded(text).resolve()
         # Not there, or a folder: anything else, and a name that the file system does not hold, is refused.

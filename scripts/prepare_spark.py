@@ -163,6 +163,8 @@ PYSPARK_PYTHON={shlex.quote(str(environment / "bin" / "python"))}
 PYSPARK_DRIVER_PYTHON={shlex.quote(str(environment / "spark-conf" / "driver-python"))}
 unset PYSPARK_DRIVER_PYTHON_OPTS
 SPARK_LOCAL_IP=127.0.0.1
+# Where the locale has no letters but ASCII, Java hands every other one of a file's name on as a question mark.
+case $(locale charmap 2>/dev/null) in ANSI_X3.4-1968 | US-ASCII | 646) LC_ALL=C.UTF-8 ;; esac
 SPARK_LAUNCHER_OPTS="-XX:+UseSerialGC -XX:TieredStopAtLevel=1"
 # One thread a worker: Spark starts a worker a core.
 OMP_NUM_THREADS="${{OMP_NUM_THREADS:-1}}"

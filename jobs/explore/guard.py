@@ -49,6 +49,10 @@ def checked(text: str, known: Collection[str]) -> Query:
     """
     if len(text) > _MOST_CHARACTERS or "\0" in text:
         raise BadInput(f"SQL: a query has at most {_MOST_CHARACTERS} characters and no NUL")
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise BadInput(f"SQL: {one_line(error)}") from None
     tree = _parsed(text)
     used: set[str] = set()
     named: set[str] = set()

@@ -38,6 +38,7 @@ _MEMORY, _TIMEOUT = 1e9, 60.0
 _IN_LOGS: dict[str, tuple[type, ...]] = {
     "part": (str,), "error": (str,), "attempt": (int,), "seconds": (float, int), "peak_gb": (float, int)
 }  # fmt: skip
+_MOST_IN_LOGS = 1e15
 _FAILURES = pa.schema(
     [
         pa.field("part", pa.string()),
@@ -107,7 +108,8 @@ def _is_of_part(line: dict[str, Any]) -> bool:
     if not isinstance(line, dict):
         raise TypeError
     for name, kinds in _IN_LOGS.items():
-        if name in line and type(line[name]) not in kinds:
+        value = line.get(name, kinds[0]())
+        if type(value) not in kinds or (kinds != (str,) and not 0 <= value < _MOST_IN_LOGS):
             raise TypeError
     return "part" in line
 

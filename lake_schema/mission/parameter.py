@@ -8,6 +8,7 @@ read_all      every section of the package
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,9 @@ CONFIDENCES = tuple(code for code, _ in table.CONFIDENCES)
 CAMERAS = ("decam", "lsstcam", "megacam", "jpcam", "gpc1", "hsc")
 SECTIONS = ("environment", "spacecraft", "vis", "nisp", *(f"ext_{camera}" for camera in CAMERAS), "survey")
 _COLUMNS = ("key", "status", "value", "unit", "version", "valid_from", "confidence", "source")
+
+# Of a text in a record, characters.
+_LONGEST = 1000
 
 Identity = tuple[str, str, int, float]
 Record = TypeVar("Record")
@@ -145,16 +149,23 @@ def read_rows(
     record: Callable[[Mapping[str, str], int, float | None], Record],
 ) -> Iterator[Record]:
     """Records of a CSV file of exactly these columns: record(row, version, valid_from) of each line."""
-    with file.open(encoding="utf-8") as stream:
-        lines = csv.DictReader(stream)
+    try:
+        lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8"), newline=""))
         if tuple(lines.fieldnames or ()) != tuple(columns):
             raise BadInput(f"{file.name}: columns are not {', '.join(columns)}")
         for row in lines:
-            try:
-                valid_from = float(row["valid_from"]) if row["valid_from"] else None
-                yield record(row, int(row["version"]), valid_from)
-            except (ValueError, TypeError) as error:
-                raise BadInput(f"{file.name} line {lines.line_num}: {error}") from None
+            if not all(_is_plain(value) for value in row.values()):
+                raise BadInput(f"{file.name} line {lines.line_num}: a text is too long, or of several lines")
+            valid_from = float(row["valid_from"]) if row["valid_from"] else None
+            yield record(row, int(row["version"]), valid_from)
+    except UnicodeDecodeError as error:
+        raise BadInput(f"{file.name}: {error}") from None
+    except (ValueError, TypeError, csv.Error) as error:
+        raise BadInput(f"{file.name} line {lines.line_num}: {error}") from None
+
+
+def _is_plain(value: object) -> bool:
+    return value is None or (isinstance(value, str) and value.isprintable() and len(value) <= _LONGEST)
 
 
 @cache

@@ -273,3 +273,11 @@ def test_every_kind_of_file_has_a_size_that_is_named(tmp_path):
             stream.truncate(most + 1)
         with pytest.raises(BadInput, match=f"is larger than {most} bytes, the most of a {kind}"):
             user_files.checked(path, kind)
+
+
+@pytest.mark.parametrize("name", JOBS)
+def test_names_that_lost_their_letters_are_refused(tmp_path, capsys, monkeypatch, good, name):
+    """In a locale of ASCII alone Java hands a question mark on for any other letter."""
+    monkeypatch.setattr("locale.nl_langinfo", lambda item: "ANSI_X3.4-1968")
+    for lake, path in ((f"{tmp_path}/??", good), (f"{tmp_path}/lake", f"{tmp_path}/??.toml")):
+        assert "export LC_ALL=C.UTF-8" in refused(tmp_path, capsys, run, name, lake, path)

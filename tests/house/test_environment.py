@@ -336,3 +336,11 @@ def test_make_refuses_a_folder_that_spark_cannot_read(tmp_path):
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert "space in its name" in line
+
+
+@pytest.mark.parametrize(("given", "taken"), [("C", "C.UTF-8"), ("POSIX", "C.UTF-8"), ("C.UTF-8", "C.UTF-8")])
+def test_names_of_files_keep_their_letters(prepare, environment, given, taken):
+    """Java would hand on a question mark for each that is not ASCII."""
+    command = f"set -a; {prepare.spark_env(environment)}\necho $LC_ALL"
+    told = subprocess.run(["bash", "-c", command], env={**os.environ, "LC_ALL": given}, capture_output=True, text=True)
+    assert told.stdout.split() == [taken]

@@ -100,3 +100,20 @@ def test_statuses_and_sections_have_no_strangers():
     assert {record.status for record in records} <= set(parameter.STATUSES)
     prefixes = {record.key.split(".")[0] for record in records}
     assert prefixes == {"env", "plm", "svm", "vis", "nisp", "ext", "survey"}
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (b"a.b,CBE,1,m,1,,assumed,\xff", "codec"),
+        (b"a.b,CBE,1,m,1,,assumed," + b"x" * 2000, "line 2: a text is too long"),
+        (b'a.b,CBE,1,m,1,,assumed,"x\ny"', "line 3: a text is too long, or of several lines"),
+        (b"a.b,CBE,1,m,1,,assumed,x,y", "line 2: a text is too long"),
+        (b"a.b,CBE,1,m,1,,assumed," + b"x" * 200_000, "field larger than"),
+    ],
+)
+def test_a_text_that_is_none_is_named(tmp_path, line, words):
+    path = tmp_path / "vis.csv"
+    path.write_bytes(b"key,status,value,unit,version,valid_from,confidence,source\n" + line + b"\n")
+    with pytest.raises(BadInput, match=rf"^vis.csv.*{words}"):
+        read(path)

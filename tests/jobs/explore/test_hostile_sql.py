@@ -110,6 +110,7 @@ HOSTILE = [
     "SELECT 1" + "+1" * 40_000,
     "SELECT '" + "x" * 200_000 + "'",
     "SELECT 1\0; DROP VIEW plain",
+    "SELECT '\ud800'",
     "SELEC 1",
     "SELECT",
     "\u0000",

@@ -71,6 +71,7 @@ def test_the_last_line_of_a_log_may_be_cut(lake):
     [
         b"\0", b"\xff", b"{", b"3", b"null", b'"part"', b'["part"]', b"[" * 100_000, b'{"part": ["a"]}',
         {**LINE, "error": 3}, {**LINE, "seconds": "2"}, {**LINE, "peak_gb": None}, {**LINE, "attempt": 1.5},
+        {**LINE, "seconds": -(2**63)},
     ],
 )  # fmt: skip
 def test_any_other_line_that_is_damaged_is_named(lake, capsys, line):

@@ -1,0 +1,78 @@
+"""Mutations of what users give: a line or a result, in bounded time and memory, and nothing left behind."""
+
+import pytest
+
+from tests.faults import fuzz
+
+RUNS, MANY_RUNS = 30, 20_000
+# Each mutation of a query asks DuckDB's parser, in a session of its own.
+SLOW = {"SQL": 10}
+
+
+@pytest.mark.parametrize("name", fuzz.TARGETS)
+def test_mutations_are_read_or_refused(name):
+    assert fuzz.run(name, 0, SLOW.get(name, RUNS)) == []
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", fuzz.TARGETS)
+def test_many_mutations_are_read_or_refused(name, tmp_path):
+    assert fuzz.run(name, 0, MANY_RUNS, tmp_path) == []
+
+
+class Faulty:
+    """Readers that break each of the rules."""
+
+    @staticmethod
+    def raises(path):
+        raise AttributeError("x")
+
+    @staticmethod
+    def leaves(path):
+        path.with_name("y").touch()
+
+    @staticmethod
+    def dies(path):
+        import os
+
+        os.kill(os.getpid(), 11)
+
+    @staticmethod
+    def lingers(path):
+        while True:
+            pass
+
+    @staticmethod
+    def says_much(path):
+        from lake_schema.errors import BadInput
+
+        raise BadInput("a\nb")
+
+
+@pytest.mark.parametrize(
+    ("reader", "words"),
+    [
+        ("raises", "AttributeError: x"), ("leaves", "leaves"), ("dies", "died"), ("says_much", "says 2 lines"),
+        ("lingers", "TimeoutError"),
+    ],
+)  # fmt: skip
+def test_what_breaks_a_rule_is_found(monkeypatch, reader, words):
+    calls = []
+
+    def read(path):
+        # The first is the seed, which is good.
+        calls.append(path)
+        if len(calls) > 1:
+            getattr(Faulty, reader)(path)
+
+    monkeypatch.setattr(fuzz, "MOST_SECONDS", 0.1)
+    monkeypatch.setitem(fuzz.TARGETS, "faulty", fuzz.Target(lambda: [b"seed"], read))
+    (found,) = fuzz.run("faulty", 0, 1)
+    assert found[0] == 0
+    assert words in found[1]
+
+
+def test_a_number_is_always_the_same_mutation():
+    seeds = [b"one = 1", b"two = [2, 3]"]
+    assert [fuzz.mutated(seeds, n) for n in range(50)] == [fuzz.mutated(seeds, n) for n in range(50)]
+    assert len({fuzz.mutated(seeds, n) for n in range(500)}) > 300

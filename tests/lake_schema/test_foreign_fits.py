@@ -1,0 +1,129 @@
+"""FITS files of others: whatever is wrong in one is a sentence, soon, and in little memory."""
+
+import gzip
+import resource
+import time
+
+import numpy as np
+import pytest
+from astropy.io import fits as astropy_fits
+
+from lake_schema import fits
+from lake_schema.errors import BadInput
+
+READERS = {
+    "read_numbers": lambda path: fits.read_numbers(path, "catalogue of stars"),
+    "number_batches": lambda path: list(fits.number_batches(path, ["a", "b"], ["name"])),
+    "read_table": lambda path: fits.read_table(path, "curve"),
+    "read_map": lambda path: fits.read_map(path, "a"),
+    "read_planes": lambda path: fits.read_planes(path, "a"),
+}
+MOST_SECONDS, MOST_BYTES = 2.0, 512 << 20
+
+
+def table(*columns):
+    columns = columns or (
+        astropy_fits.Column("a", "D", array=np.arange(48.0)), astropy_fits.Column("b", "J", array=np.arange(48)),
+        astropy_fits.Column("name", "8A", array=[f"n{i}" for i in range(48)]),
+    )  # fmt: skip
+    return astropy_fits.HDUList([astropy_fits.PrimaryHDU(), astropy_fits.BinTableHDU.from_columns(columns)])
+
+
+@pytest.fixture
+def good(tmp_path):
+    path = tmp_path / "x.fits"
+    table().writeto(path)
+    return path
+
+
+def card(name, value):
+    """The same file with a card of its table changed."""
+
+    def change(data):
+        start = data.index(f"{name:8}= ".encode(), 2880)
+        return data[:start] + f"{name:8}= {value:>20}".ljust(80).encode() + data[start + 80 :]
+
+    return change
+
+
+def first_card(name, value):
+    def change(data):
+        start = data.index(f"{name:8}= ".encode())
+        return data[:start] + f"{name:8}= {value:>20}".ljust(80).encode() + data[start + 80 :]
+
+    return change
+
+
+def without_end(data):
+    return data[:2880].replace(b"END     ", b"COMMENT ") + b"COMMENT".ljust(80) * 72_000
+
+
+BROKEN = {
+    "nothing": lambda data: b"",
+    "text": lambda data: b"a,b\n1,2\n",
+    "a header alone, cut": lambda data: data[:1000],
+    "cut in its table": lambda data: data[:5800],
+    "no end of a header": without_end,
+    "axes without end": first_card("NAXIS", 2147483648),
+    "a table of many axes": card("NAXIS", 999),
+    "a negative axis": card("NAXIS2", -48),
+    "an axis of 18 digits": card("NAXIS2", "9" * 18),
+    "a heap of 18 digits": card("PCOUNT", "9" * 18),
+    "rows of no bytes": lambda data: card("NAXIS1", 0)(card("NAXIS2", 10**15)(data)),
+    "no bits": card("BITPIX", "'x'"),
+    "columns without end": card("TFIELDS", 10**9),
+    "no number of columns": card("TFIELDS", "'x'"),
+    "a form of nothing": card("TFORM1", "'0D'"),
+    "a form that is none": card("TFORM1", "'?'"),
+    "a form that is a number": card("TFORM1", 3),
+    "a title that is a number": card("TTYPE1", 3),
+    "no title": card("TTYPE1", "''"),
+    "another kind of extension": card("XTENSION", "'DUMP'"),
+    "a bomb": lambda data: gzip.compress(data[:2880]) + gzip.compress(bytes(30 << 20), 1) * 20,
+    "half of an archive": lambda data: gzip.compress(data)[:700],
+}
+
+UNSEEN = [BROKEN[name] for name in ("no title", "a title that is a number", "a form of nothing")]
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("change", BROKEN.values(), ids=BROKEN)
+def test_what_is_broken_is_refused_in_a_line(good, name, change):
+    good.write_bytes(change(good.read_bytes()))
+    before, started = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10, time.process_time()
+    # What one of them does not look at may be wrong.
+    said = f"{good}: a line" if change in UNSEEN else ""
+    try:
+        READERS[name](good)
+    except BadInput as error:
+        said = str(error)
+    assert time.process_time() - started < MOST_SECONDS
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10) - before < 2 * MOST_BYTES
+    assert said.startswith(str(good))
+    assert len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["number_batches", "read_map", "read_table"])
+def test_lists_are_refused_before_they_are_read(tmp_path, name):
+    rows = np.empty(3, object)
+    rows[:] = [np.arange(2.0)] * 3
+    lists = table(astropy_fits.Column("a", "PD()", array=rows), astropy_fits.Column("b", "J", array=np.arange(3)))
+    lists.writeto(tmp_path / "x.fits")
+    with pytest.raises(BadInput, match="column a holds lists"):
+        READERS[name](tmp_path / "x.fits")
+
+
+def test_packed_images_are_not_unpacked(tmp_path):
+    unit = astropy_fits.CompImageHDU(np.ones((30, 30), np.int16), compression_type="RICE_1")
+    astropy_fits.HDUList([astropy_fits.PrimaryHDU(), unit]).writeto(tmp_path / "x.fits")
+    with pytest.raises(BadInput, match="holds no image"):
+        fits.read_planes(tmp_path / "x.fits", "a")
+
+
+def test_good_ones_are_read_plain_or_packed(good):
+    for _ in range(2):
+        ((numbers, _),) = fits.number_batches(good, ["a", "b"], ["name"])
+        assert (numbers["b"].tolist(), numbers["name"][3]) == (list(range(48)), "n3")
+        assert fits.read_numbers(good, "catalogue of stars")["a"].sum() == fits.read_map(good, "a")[0].sum() == 1128.0
+        assert fits.read_table(good, "curve")["a"][2] == 2.0
+        good.write_bytes(gzip.compress(good.read_bytes()))
