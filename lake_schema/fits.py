@@ -51,7 +51,8 @@ _MOST_UNPACKED, _MOST_PIXELS, _MOST_SAMPLES = 512 << 20, 12 << 24, 64 << 20
 # How a file is built, and how much of it there may be: axes of a unit, units, bytes of a header.
 _BLOCK, _CARD = 2880, 80
 _MOST_AXES, _MOST_UNITS, _MOST_HEADER = 9, 1000, 64 * _BLOCK
-_SIZES = re.compile(rb"(BITPIX|NAXIS\d{0,3}|PCOUNT|GCOUNT) *= *([+-]?\d{1,18})\b")
+_MOST_COLUMNS = 999
+_SIZES = re.compile(rb"(?:HIERARCH +)?(BITPIX|NAXIS\d{0,3}|PCOUNT|GCOUNT|TFIELDS) *= *([+-]?\d+)")
 # Of a column of texts, bytes.
 _LONGEST_TEXT = 256
 _STRUCTURE = {
@@ -503,8 +504,11 @@ def _look_through(path: Path, stream: IO[bytes]) -> None:
         if not header:
             break
         said: dict[bytes, int] = {}
-        for key, value in _SIZES.findall(header):
-            said.setdefault(key, int(value))
+        for start in range(0, len(header), _CARD):
+            if card := _SIZES.match(header, start, start + _CARD):
+                said.setdefault(card[1], int(card[2]))
+        if not 0 <= said.get(b"TFIELDS", 0) <= _MOST_COLUMNS:
+            raise BadInput(f"{name}: has {said[b'TFIELDS']} columns")
         if not 0 <= (count := said.get(b"NAXIS", 0)) <= _MOST_AXES:
             raise BadInput(f"{name}: has {count} axes")
         axes = [said.get(b"NAXIS%d" % i, 0) for i in range(1, count + 1)]

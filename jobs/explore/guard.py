@@ -14,7 +14,7 @@ import duckdb
 
 from lake_schema.errors import BadInput
 
-_MOST_CHARACTERS = 100_000
+_MOST_CHARACTERS, _LONGEST = 100_000, 500
 _QUERIES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
 _SOURCES = {"BASE_TABLE", "JOIN", "SUBQUERY", "EMPTY", "EXPRESSION_LIST", "TABLE_FUNCTION"}
 _TABLE_FUNCTIONS = {"range", "generate_series", "unnest"}
@@ -82,13 +82,13 @@ def _parsed(text: str) -> Tree:
     except RecursionError:
         raise BadInput("SQL: nested too deeply") from None
     if answer.get("error") or len(answer["statements"]) != 1:
-        raise BadInput(f"SQL: {answer.get('error_message', 'cannot be parsed')}")
+        raise BadInput(f"SQL: {one_line(answer.get('error_message', 'cannot be parsed'))}")
     return answer["statements"][0]["node"]  # type: ignore[no-any-return]
 
 
-def one_line(error: BaseException) -> str:
-    """An error's text without its line breaks and pointers."""
-    return " ".join(str(error).split())[:500]
+def one_line(error: BaseException | str) -> str:
+    """An error's text, or a name, without its line breaks and pointers."""
+    return " ".join(str(error).split())[:_LONGEST]
 
 
 def _nodes(tree: Any) -> Iterator[tuple[Tree, frozenset[str]]]:
@@ -121,7 +121,7 @@ def _source(node: Tree, known: Collection[str], named: Collection[str]) -> set[s
         raise BadInput(f"SQL: {_words(node)} is not possible here")
     if kind == "TABLE_FUNCTION" and node["function"].get("function_name", "").lower() not in _TABLE_FUNCTIONS:
         name = node["function"].get("function_name", "this")
-        raise BadInput(f"SQL: {name}() is not a table of the lake ({', '.join(sorted(known))})")
+        raise BadInput(f"SQL: {one_line(name)}() is not a table of the lake ({', '.join(sorted(known))})")
     if kind != "BASE_TABLE":
         return set()
     name, qualified = str(node["table_name"]).lower(), node.get("schema_name") or node.get("catalog_name")
@@ -129,12 +129,12 @@ def _source(node: Tree, known: Collection[str], named: Collection[str]) -> set[s
         return {name}
     if not qualified and name in named:
         return set()
-    raise BadInput(f"SQL: {node['table_name']!r} is not a table of the lake ({', '.join(sorted(known))})")
+    raise BadInput(f"SQL: {one_line(repr(node['table_name']))} is not a table of the lake ({', '.join(sorted(known))})")
 
 
 def _refuse_function(name: str) -> None:
     if name in _FUNCTIONS or name.startswith(_FUNCTION_PREFIXES):
-        raise BadInput(f"SQL: the function {name} is not possible here")
+        raise BadInput(f"SQL: the function {one_line(name)} is not possible here")
 
 
 def _plain_columns(tree: Tree, tables: Collection[str]) -> frozenset[str] | None:
