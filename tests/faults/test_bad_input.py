@@ -130,7 +130,7 @@ def _soon(monkeypatch):
     monkeypatch.setattr(shell, "_spark_map", fail)
     monkeypatch.setattr(demo, "_run_all", fail)
     before = signal.signal(signal.SIGALRM, fail)
-    signal.alarm(60)
+    signal.alarm(300)
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
