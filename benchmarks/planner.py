@@ -24,7 +24,7 @@ from jobs import request as requests
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.measured import forget_peak, peak_gb
-from jobs.render import exposure, plan_exposures, render_exposures, truth_maps
+from jobs.render import exposure, plan_exposures, render_exposures, speed, truth_maps
 from jobs.request import Request
 from lake_schema import layout, publish, read, sky
 from lake_schema.ids import GENERATION_ORDER
@@ -95,6 +95,7 @@ def planning(folder: Path, quick: bool) -> dict[str, float]:
 def rendering(root: Path, wanted: Request, name: str) -> dict[str, float]:
     """What each detector takes, written and hashed, and by how much the forecast was wrong."""
     step = render_exposures.steps(root, wanted)[0]
+    factor = speed.of_machine(root).factor
     out: dict[str, float] = {}
     tasks = {(row["exposure_id"], row["detector"]): row for row in read.version(root, "tasks").rows().to_pylist()}
     kinds = {row["exposure_id"]: row["image_type"] for row in read.version(root, "exposures").rows().to_pylist()}
@@ -107,7 +108,7 @@ def rendering(root: Path, wanted: Request, name: str) -> dict[str, float]:
                 size = sum(file["bytes"] for file in result["files"] if file["path"].endswith(".fits"))
                 out[f"{key}_sources"] = task["sources"]
                 took = {"s": seconds, "gb": peak, "mb": size / 1e6}
-                said = {"s": task["seconds"], "gb": task["memory"], "mb": task["bytes"] / 1e6}
+                said = {"s": factor * task["seconds"], "gb": task["memory"], "mb": task["bytes"] / 1e6}
                 out.update({f"{key}_{unit}": value for unit, value in took.items()})
                 out.update({f"{key}_{unit}_error": said[unit] / took[unit] - 1.0 for unit in took})
                 yield result
