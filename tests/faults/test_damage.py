@@ -49,22 +49,15 @@ def flipped(path, bit):
 @pytest.mark.parametrize("flips", FLIPS)
 def test_a_flipped_bit_of_a_table_is_never_a_wrong_number(toy, flips):
     part = toy.parts[0]
-    path, good = toy.path(part), toy.rows(parts=[toy.parts[0]])
+    path = toy.path(part)
     whole = path.read_bytes()
     rng = np.random.default_rng(3)
-    refused = 0
     for bit in rng.choice(8 * len(whole), flips, replace=False):
         flipped(path, bit)
-        assert read.verify(toy, deep=True) == [f"{path} has other contents than the manifest says"] or read.verify(
-            toy
-        ) == [f"{path} has another footer than the manifest says"]
-        try:
-            # A bit that means nothing to the reader (a statistic of a page) may change; the numbers may not.
-            assert toy.rows(parts=[part]).equals(good), f"bit {bit}"
-        except Damaged:
-            refused += 1
+        assert read.verify(toy, deep=True) == [f"{path} has other contents than the manifest says"]
+        with pytest.raises(Damaged, match=path.name):
+            toy.rows(parts=[part])
         path.write_bytes(whole)
-    assert refused >= 0.9 * flips
 
 
 @pytest.mark.parametrize("flips", FLIPS)
@@ -77,9 +70,11 @@ def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
     for bit in rng.choice(8 * len(whole), flips, replace=False):
         flipped(path, bit)
         assert len(read.verify(images, deep=True)) == 1
+        with pytest.raises(Damaged, match=r"0\.fits has other contents"):
+            images.file("images/0.fits")
         try:
-            # The blanks after a header's end may change.
-            (found,) = fits.read_images(images.file("images/0.fits"))
+            # Outside a lake the blanks after a header's end may change.
+            (found,) = fits.read_images(path)
             assert np.array_equal(found.data, good.data), f"bit {bit}"
             assert found.cards == good.cards, f"bit {bit}"
         except Damaged:
