@@ -86,7 +86,7 @@ def whole(folder):
             rows = version.rows()
             yield from ((f"{name}.{column}", values_of(rows[column])) for column in rows.column_names)
         for entry in version.manifest["files"]:
-            if entry["path"].endswith(".fits"):
+            if name == "products" and entry["path"].endswith(".fits"):
                 for number, image in enumerate(read_images(version.folder / entry["path"])):
                     yield f"{entry['path']}[{number}]", np.asarray(image.data)
     for path in sorted(cache.cache_dir().rglob("*.npy")):
