@@ -157,6 +157,8 @@ def _plain(column: Any) -> Float:
 def check(path: Path, wavelength: Float, value: Float, form: Mapping[str, Any]) -> None:
     """Refuse what is no curve, naming the row; form : bounds, largest_gap and covers as in the formats."""
     lo, hi = form["bounds"]
+    if wavelength.ndim != 1 or wavelength.shape != value.shape:
+        raise BadInput(f"{path}: {list(wavelength.shape)} wavelengths and {list(value.shape)} values are no curve")
     if len(wavelength) < 2:
         raise BadInput(f"{path}: {len(wavelength)} rows are no curve")
     _refuse(path, ~(np.isfinite(wavelength) & np.isfinite(value)), "is not a number")

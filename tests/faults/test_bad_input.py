@@ -21,6 +21,7 @@ from jobs.catalogue import (
 )
 from jobs.explore import __main__ as explore
 from jobs.fluxes import compute_fluxes, inputs
+from jobs.own_files import OwnCurves
 from jobs.render import archive, coverage, own_psf, plan_exposures, render_exposures
 from lake_schema import __main__ as lake_schema
 from lake_schema import publish, user_files
@@ -242,6 +243,13 @@ def quoted(text):
     return '"' + text.replace("\0", "\\u0000").replace("\n", "\\n") + '"'
 
 
+@pytest.fixture(scope="module")
+def warm():
+    """What is made once a machine, and costs more than a refusal may."""
+    inputs.read(OwnCurves())
+
+
+@pytest.mark.usefixtures("warm")
 @pytest.mark.parametrize(("key", "read"), OWN.values(), ids=OWN)
 def test_a_file_of_a_request_that_is_none(tmp_path, key, read):
     names = [name for what, name in NAMES.items() if what not in ("not of this encoding", "empty")]

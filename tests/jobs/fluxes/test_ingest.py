@@ -221,3 +221,11 @@ def test_a_law_that_is_not_per_colour_excess_is_refused(tmp_path):
     ascii_file(tmp_path / "wrong", value=500.0 * WAVELENGTH[0] / WAVELENGTH)
     with pytest.raises(BadInput, match=r"wrong: row 1 is more than k = 100: is it A / E\(B-V\)"):
         ingest.law(tmp_path / "wrong", "extinction", np.array([900.0]))
+
+
+@pytest.mark.parametrize("shape", [(len(WAVELENGTH), 0), (len(WAVELENGTH), 1), (len(WAVELENGTH), 3)])
+def test_a_column_of_lists_is_no_curve(tmp_path, shape):
+    path = tmp_path / "x.fits"
+    Table({"WAVELENGTH": WAVELENGTH, "FLUX": np.ones(shape)}).write(path, format="fits")
+    with pytest.raises(BadInput, match=r"x\.fits: "):
+        ingest.read(path, "spectrum_fits")
