@@ -41,9 +41,10 @@ def load(folder: Path, table: str) -> dict[str, Any]:
     try:
         facts = json.loads(path.read_bytes())
         seal = facts.pop("digest")
+        sealed = digest(facts)
     except (OSError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
-    if digest(facts) != seal:
+    if sealed != seal:
         raise Damaged(f"{path} is not what was written: its digest differs")
     if not _is_manifest(facts):
         raise Damaged(f"{path} is not a manifest of this form")

@@ -42,6 +42,8 @@ _ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4, "m": 1e10}
 _LEAST_SUM, _MOST_SUM = 0.5, 1.001
 # Smallest and largest distance of samples, pixels.
 _SPACING = (0.02, 2.0)
+# Largest number in a card, and degree of polynomials.
+_LARGEST, _MOST_DEGREE = 1e300, 20
 # Least side of a plane, samples.
 _LEAST_SIDE = 3 * 66 + 1
 # Lobes of the interpolant: PSFEx's models are made for three; of a cube nothing but its samples is known.
@@ -149,6 +151,8 @@ def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes
     places = all(n.startswith(axis) and n.endswith("IMAGE") for n, axis in zip(names, "XY", strict=True))
     if int(_card(header, "POLNAXIS")) != 2 or groups != 1 or not places:
         raise BadInput(f"its polynomials are of {', '.join(names)} in {groups} groups, wanted X and Y of the image")
+    if not 0 <= degree <= _MOST_DEGREE:
+        raise BadInput(f"its polynomials are of degree {degree}, wanted 0 to {_MOST_DEGREE}")
     powers = [(i, j) for j in range(degree + 1) for i in range(degree + 1 - j)]
     if data.ndim != 3 or len(data) != len(powers):
         raise BadInput(f"PSF_MASK has {list(data.shape)} samples, wanted {len(powers)} planes of degree {degree}")
@@ -217,7 +221,7 @@ def _card(header: Mapping[str, Any], key: str) -> float:
 
 def _number(header: Mapping[str, Any], key: str, default: float) -> float:
     found = header.get(key, default)
-    if isinstance(found, bool) or not isinstance(found, (int, float)) or not np.isfinite(found):
+    if isinstance(found, bool) or not isinstance(found, (int, float)) or not abs(found) < _LARGEST:
         raise BadInput(f"{key} = {found!r} is not a number")
     return float(found)
 

@@ -76,3 +76,12 @@ def test_a_number_is_always_the_same_mutation():
     seeds = [b"one = 1", b"two = [2, 3]"]
     assert [fuzz.mutated(seeds, n) for n in range(50)] == [fuzz.mutated(seeds, n) for n in range(50)]
     assert len({fuzz.mutated(seeds, n) for n in range(500)}) > 300
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [("spectrum, FITS", 3610), ("PSF, cube", 3633), ("PSF, PSFEx", 3153), ("manifest", 481), ("bodies, FITS", 4175)],
+)
+def test_what_once_broke_is_refused(name, number):
+    """A column without numbers, a number of 40 digits, a degree, a seal or axes without end."""
+    assert fuzz.run(name, number, 1) == []
