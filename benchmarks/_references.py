@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs import cache
-from jobs.render import psf, stamps
+from jobs.render import profiles, psf, stamps
 from jobs.render.stamps import Sources
 
 Float = npt.NDArray[np.float64]
@@ -17,12 +17,15 @@ Float = npt.NDArray[np.float64]
 ACCURACY = 1e-4
 
 
-def image(one: Sources, spread: psf.Psf, side: int, highest: float = ACCURACY) -> Float | None:
+def image(
+    one: Sources, spread: psf.Psf, side: int, highest: float = ACCURACY, folding: float = ACCURACY
+) -> Float | None:
     """The only source, through a PSF that is its own, on a frame [side, side]; None where memory does not suffice.
 
-    highest : threshold of the largest frequency
+    highest, folding : thresholds of the largest frequency, and of what folds
     """
-    shapes = one.shapes.take(one.shape)
+    # A point has no form.
+    shapes = one.shapes.take(one.shape[one.shape >= 0])
     seen = [
         one.column,
         one.row,
@@ -32,14 +35,42 @@ def image(one: Sources, spread: psf.Psf, side: int, highest: float = ACCURACY) -
     ]
     through = [repr(spread.profile)] if spread.planes is None else ["Lanczos 31", spread.planes.images]
     key = cache.content_key(
-        galsim.__version__, highest, side, spread.pixel_scale, spread.intra_pixel, *seen, *through
+        galsim.__version__, highest, folding, side, spread.pixel_scale, spread.intra_pixel, *seen, *through
     )  # fmt: skip
 
     def make() -> dict[str, Float]:
         try:
-            return {"image": stamps.reference(one, 0, spread, side, ACCURACY, highest)}
+            return {"image": stamps.reference(one, 0, spread, side, folding, highest)}
         except (MemoryError, RuntimeError):
             return {"image": np.zeros((0, 0))}
 
     found = cache.cached_arrays("reference", key, make)["image"]
     return found if found.size else None
+
+
+def by_series(one: Sources, spread: psf.Psf, side: int) -> Float:
+    """The same through planes, all but their Fourier series between samples: moved, averaged over pixels, sampled.
+
+    A galaxy's own transform is galsim's, at its tightest. galsim knows a PSF between its samples by Lanczos' kernel of
+    31 of these, ten pixels away from which it is wrong by 6e-7 of the flux: a sigma of a star of 15 mag, and 4e-5 of
+    its R2. A galaxy that is not small beside the frame folds: for those `image` is the better one.
+    """
+    assert spread.planes is not None
+    plane = spread.planes.images[0].astype(float)
+    wide = psf.SAMPLES * 2 * -(-(len(plane) + psf.SAMPLES * side) // (2 * psf.SAMPLES))
+    padded = np.zeros((wide, wide))
+    padded[: len(plane), : len(plane)] = plane
+    middle, frequency = len(plane) // 2, np.fft.fftfreq(wide)
+    out = np.fft.fft2(padded)
+    for axis, position in ((1, one.column[0]), (0, one.row[0])):
+        moved = np.exp(-2j * np.pi * frequency * (psf.SAMPLES * position - middle)) * np.sinc(psf.SAMPLES * frequency)
+        out *= np.expand_dims(moved, 1 - axis)
+    if one.shape[0] >= 0:
+        body = galsim.JacobianWCS(*one.jacobian[0].ravel()).toImage(
+            profiles.profile(one.shapes, int(one.shape[0]), 1e-6)
+        )
+        tight = body.withGSParams(folding_threshold=ACCURACY, maxk_threshold=1e-6, kvalue_accuracy=1e-8)
+        drawn = tight.drawKImage(nx=wide, ny=wide, scale=2 * np.pi * psf.SAMPLES / wide).array
+        out *= np.fft.ifftshift(drawn) / tight.flux
+    image = np.fft.ifft2(out).real[:: psf.SAMPLES, :: psf.SAMPLES][:side, :side]
+    return np.asarray(one.electrons[0] * psf.SAMPLES**2 * image)

@@ -24,6 +24,8 @@ from lake_schema.mission.configuration import resolve
 Float = npt.NDArray[np.float64]
 # Edges of the magnitude bins that errors are told by.
 BINS = (17.0, 20.0, 22.0, 23.0, 24.0, 25.0, 26.0)
+# Edges of the layers of magnitude of a stratified sample.
+LAYERS = (14.5, 16.0, 18.0, 20.0, 22.0, 24.0, 26.0)
 # The seeing disc of the LSST scene: FWHM in arcsec, exponent.
 SEEING, BETA = 0.7, 3.0
 
@@ -47,12 +49,13 @@ VIS = Scene("vis", 4096, 4132, 0.1, 565.0, 25.7, 12.45, 4701, 300)
 LSST = Scene("lsst", 4096, 4004, 0.2, 30.0, 28.17, 38.3, 18223, 1160)
 
 
-def spread(scene: Scene, positions: int = 9) -> psf.Psf:
+def spread(scene: Scene, positions: int = 9, colours: int = chromatic.PARTS) -> psf.Psf:
     """The scene's PSF."""
     if scene.name == "lsst":
         return psf.ground_psf(SEEING, BETA, scene.scale)
     mission = resolve()
-    return psf.vis_psf(focal_plane.detector("vis", "3-4", mission), passbands.load("euclid_vis"), mission, positions)
+    detector = focal_plane.detector("vis", "3-4", mission)
+    return psf.of_colours(psf.vis_psf(detector, passbands.load("euclid_vis"), mission, positions), colours)
 
 
 def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | None = None) -> Sources:
@@ -134,6 +137,20 @@ def sample(scene: Scene, seed: int, n: int) -> Sources:
     return some.take(np.sort(np.concatenate(chosen)))
 
 
+def stratified(scene: Scene, seed: int, each: int) -> Sources:
+    """Galaxies and stars, `each` of either in every one of LAYERS: what is bright, or faint, is among them."""
+    layers, n = len(LAYERS) - 1, each * (len(LAYERS) - 1)
+    some, rng = sources(scene, seed, galaxies=n, stars=n), np.random.default_rng([seed, 1])
+    low, high = np.array(LAYERS[:-1]), np.array(LAYERS[1:])
+    layer = np.tile(np.arange(layers), 2 * each)
+    mag = low[layer] + (high - low)[layer] * rng.random(2 * n)
+    # The size goes with the magnitude.
+    size = 10 ** (-0.14 * (mag - magnitudes(some, scene)))[:n]
+    shapes = some.shapes
+    shapes = replace(shapes, bulge_radius=shapes.bulge_radius * size, disk_radius=shapes.disk_radius * size)
+    return replace(some, shapes=shapes, electrons=scene.exposure * 10 ** (0.4 * (scene.zero_point - mag)))
+
+
 def draw(some: Sources, spread_: psf.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
     """The whole of drawing, as for an exposure; `side`: on a small frame instead of the scene's."""
     sizes = stamps.stamp_sizes(some.electrons, some.shape, some.shapes, spread_, scene.noise, settings)
@@ -143,14 +160,14 @@ def draw(some: Sources, spread_: psf.Psf, scene: Scene, settings: Settings, side
 
 
 def own(spread_: psf.Psf, some: Sources, i: int) -> psf.Psf:
-    """The PSF of source i everywhere on a frame."""
+    """The PSF of source i everywhere on a frame, and nothing beyond its planes."""
     planes = spread_.planes
     if planes is None:
         return spread_
     weights = transfer.basis_weights(spread_, some.photons, some.column, some.row)[i]
     image = transfer.image_of(planes, weights)
     alone = psf.Planes(planes.wavelength[:1], image[None], planes.drift[:0], planes.half)
-    return replace(spread_, planes=alone)
+    return replace(spread_, planes=alone, edges=None)
 
 
 def moved(some: Sources, i: int, side: int) -> Sources:

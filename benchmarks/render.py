@@ -19,7 +19,7 @@ from benchmarks import _scenes as scenes
 from benchmarks import report
 from benchmarks._scenes import LSST, VIS, Scene
 from jobs import accuracy
-from jobs.render import stamps
+from jobs.render import psf, stamps
 from jobs.render.stamps import Settings
 
 # Galaxies whose errors are quoted, by a seed of their own, of them sheared in pairs; galsim's, a magnitude bin.
@@ -29,6 +29,7 @@ _SEED = 16
 _NOTES = {
     "vis_survey_s": "CPU, every source of a VIS detector, each with its own chromatic PSF (target 4.2)",
     "vis_draft_s": "(target 1.5)",
+    "vis_quicklook_s": "half of a draft's at most",
     "lsst_survey_s": "(target 2.2)",
     "psf_planes_cold_s": "the optics of a detector at 9 places and 8 wavelengths",
     "psf_planes_warm_s": "the same from the cache",
@@ -52,7 +53,7 @@ _NOTES = {
 
 def seconds(scene: Scene, settings: Settings, repeats: int, stars: bool = True, shared: bool = False) -> float:
     """CPU s of all sources, or of the galaxies alone; `shared`: one PSF for all."""
-    some, spread = scenes.sources(scene, 1, stars=None if stars else 0), scenes.spread(scene, settings.positions)
+    some, spread = scenes.sources(scene, 1, stars=None if stars else 0), _spread(scene, settings)
     if shared and spread.planes is not None:
         spread = scenes.own(spread, some, 0)
         some = replace(some, photons=None)
@@ -60,6 +61,10 @@ def seconds(scene: Scene, settings: Settings, repeats: int, stars: bool = True, 
     bright = some.electrons >= np.sort(some.electrons)[-3]
     scenes.draw(some.take(bright | (np.arange(len(some)) % 500 == 0)), spread, scene, settings)
     return report.best(lambda: scenes.draw(some, spread, scene, settings), repeats, time.process_time)
+
+
+def _spread(scene: Scene, settings: Settings) -> psf.Psf:
+    return scenes.spread(scene, settings.positions, settings.colours)
 
 
 def planes_seconds() -> tuple[float, float]:
@@ -75,7 +80,7 @@ def planes_seconds() -> tuple[float, float]:
 
 def times(quick: bool, repeats: int) -> dict[str, float]:
     """All seconds, and the ratios of those that one run measured."""
-    tiers = {name: stamps.settings_for(accuracy.preset(name)) for name in ("draft", "survey", "reference")}
+    tiers = {name: stamps.settings_for(wanted) for name, wanted in accuracy.PRESETS.items()}
     out = {}
     for scene in (VIS, LSST):
         for name, settings in tiers.items():
@@ -102,7 +107,7 @@ def times(quick: bool, repeats: int) -> dict[str, float]:
 def accuracies(quick: bool, galaxies: int) -> dict[str, float]:
     """All errors: of survey by their plain names, of others by scene and accuracy."""
     compared, pairs = (6, 2) if quick else (galaxies, max(round(PAIRED * galaxies), 1))
-    names = ("survey",) if quick else ("draft", "survey", "reference")
+    names = ("survey",) if quick else ("quicklook", "draft", "survey", "reference")
     tiers = {name: stamps.settings_for(accuracy.preset(name)) for name in names}
     out: dict[str, float] = {}
     for scene in (VIS,) if quick else (VIS, LSST):

@@ -34,7 +34,9 @@ from lake_schema.plan import Json
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "vis.json"
-_PRESETS = ("draft", "survey", "reference")
+_PRESETS = ("draft", "survey", "quicklook", "reference")
+# Which take what effects they ask for themselves, and all of them besides.
+_FAST = ("quicklook", "draft")
 # Takes as long as all others together, and no other time depends on it.
 _ONCE = "reference"
 # Where a detector's sources may lie, deg from the exposure's centre.
@@ -43,6 +45,9 @@ _NOTES = {
     "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed (target 15)",
     "survey_warm_s": "the same, PSF planes from the cache",
     "draft_warm_s": "the same at draft accuracy, its own choice of effects (target 4)",
+    "draft_full_s": "the same with everything on",
+    "quicklook_warm_s": "at quicklook accuracy, its own choice of effects",
+    "quicklook_full_s": "the same with everything on, as draft_full_s",
     "reference_cold_s": "at reference accuracy, everything on (target 60)",
     "survey_needed_s": "warm, with the effects that the scene asks for",
     "survey_cold_peak_gb": "largest memory of the process (target 2)",
@@ -145,7 +150,7 @@ def detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
     rendered(root, everything, folder)  # Compiles, and fills the other caches.
     for name in _PRESETS[:2] if quick else _PRESETS:
         wanted = replace(plain, accuracy=preset(name))
-        facts = prepared(root, wanted if name == "draft" else full(wanted))
+        facts = prepared(root, wanted if name in _FAST else full(wanted))
         for state in ("cold", "warm"):
             seconds, peaks = [], []
             for _ in range(1 if name == _ONCE else repeats):
@@ -155,6 +160,8 @@ def detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
                 seconds.append(used)
                 peaks.append(peak)
             out |= {f"{name}_{state}_s": min(seconds), f"{name}_{state}_peak_gb": max(peaks)}
+        if name in _FAST:
+            out[f"{name}_full_s"] = rendered(root, prepared(root, full(wanted)), folder)[0]
         if name == "survey":
             # With its planes still in the cache.
             out["survey_needed_s"] = rendered(root, prepared(root, plain), folder)[0]

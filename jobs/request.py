@@ -1,6 +1,6 @@
 """The simulation request: a TOML file of at most a screen, read into frozen records; every number has bounds.
 
-    name = "demo"      seed = 2024      accuracy = "survey" | "draft" | "reference" | {flux = .., shape = .., ..}
+    name = "demo"      seed = 2024      accuracy = "survey" | "quicklook" | "draft" | "reference" | {flux = ..}
     [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
     [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
@@ -56,7 +56,7 @@ from typing import Any
 
 from jobs import area as areas
 from jobs import observations, own_files
-from jobs.accuracy import SURVEY, Accuracy, preset
+from jobs.accuracy import SURVEY, Accuracy, preset, row_for
 from jobs.area import Area
 from jobs.observations import Observation, Pointing
 from jobs.own_files import Ingest, OwnCurves
@@ -283,7 +283,10 @@ def _accuracy(value: object, path: str) -> Accuracy:
     if isinstance(value, str):
         return preset(value)
     table = _table(value, path, {"flux", "shape", "position", "background"})
-    return Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
+    own = Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
+    # What cannot be had is refused before anything is made.
+    row_for(own)
+    return own
 
 
 def _universe(table: Toml) -> Universe:

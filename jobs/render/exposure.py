@@ -171,7 +171,7 @@ def render(
             for rows, fluxes in ((galaxies, galaxy_fluxes), (stars, star_fluxes))
         ]
         settings = stamps.settings_for(accuracy)
-        spread = _psf(exposure, detector, passband, mission, settings.positions)
+        spread = psf.of_colours(_psf(exposure, detector, passband, mission, settings.positions), settings.colours)
         sources, sizes = sources_of(
             (galaxies, electrons[0]), (stars, electrons[1]), detector, system, spread, scene.pixel_noise, settings,
             passband, library, stellar, lenses,

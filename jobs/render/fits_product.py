@@ -12,8 +12,9 @@ science_cards, truth_cards
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from jobs import rng
+from jobs import accuracy, rng
 from jobs.render import focal_plane
 from jobs.render.effects import bias_structure, charge_transfer, nonlinearity, quadrants, read_noise
 from jobs.render.exposure import Rendered, effects_of, numbers_of
@@ -36,6 +37,13 @@ from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 POINT, PROFILE, PICTURE, TRAIL = 0, 1, 2, 3
 # Of an amplifier's offset, a column's stripe and a reading: what next to no pixel is below.
 _SURE = 5.0
+# Of each number of an accuracy: the end of its keywords, and what it is of.
+_ERRORS = {
+    "flux": ("FLUX", "fraction of a source's flux"),
+    "shape": ("SHAPE", "reduced-shear component"),
+    "position": ("POS", "[pix]"),
+    "background": ("BACK", "fraction of a sky pixel's noise"),
+}
 _MJD_ZERO = datetime(1858, 11, 17)
 
 Writer = Callable[[Path], None]
@@ -200,7 +208,7 @@ def truth_cards(rendered: Rendered, content: str) -> tuple[Card, ...]:
 
 
 def _common(rendered: Rendered) -> tuple[Card, ...]:
-    exposure, scene, accuracy = rendered.exposure, rendered.scene, rendered.accuracy
+    exposure, scene = rendered.exposure, rendered.scene
     return (
         ("INSTRUME", str(exposure["camera"]), "camera"),
         ("CHANNEL", str(exposure["channel"]), "channel"),
@@ -224,8 +232,23 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("SEED", str(rendered.seed), "of the random numbers"),
         ("MISSION", rendered.scene.mission.fingerprint, ""),
         ("TRUESKY", __version__, "version of the simulator"),
-        ("ACCFLUX", accuracy.flux, "allowed error: fraction of a source's flux"),
-        ("ACCBACK", accuracy.background, "allowed error: fraction of a pixel's noise"),
+        *_accuracy_cards(rendered),
+    )
+
+
+def _accuracy_cards(rendered: Rendered) -> tuple[Card, ...]:
+    """ACC*: errors that were allowed; ERR*: as measured, of drawing and of charge transfer where that is applied.
+
+    Independent causes: the root of the sum of their squares.
+    """
+    causes = [] if rendered.psf is None else [asdict(accuracy.reached(rendered.accuracy))]
+    applied = [decision.name for decision in rendered.decisions if decision.applied]
+    causes += [charge_transfer.errors(rendered.scene, name) for name in applied]
+    made = {name: math.hypot(*(cause.get(name, 0.0) for cause in causes)) for name in _ERRORS}
+    allowed = asdict(rendered.accuracy)
+    return (
+        *((f"ACC{short}", allowed[name], f"allowed error: {text}") for name, (short, text) in _ERRORS.items()),
+        *((f"ERR{short}", made[name], f"largest error: {text}") for name, (short, text) in _ERRORS.items()),
     )
 
 

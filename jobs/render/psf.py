@@ -21,7 +21,7 @@ import galsim
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import maximum, uniform_filter
 
 from jobs import cache, sums
 from jobs.compiling import jit
@@ -30,6 +30,7 @@ from jobs.render import edges
 from jobs.render.chromatic import sub_bands
 from jobs.render.edges import Edges
 from jobs.render.focal_plane import Detector, detectors
+from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
 Float = npt.NDArray[np.float64]
@@ -81,6 +82,8 @@ class Psf:
                   flux is what the model keeps of 1
     pixel_scale : arcsec
     surface     : float64[SIDE / 2] fraction of the flux in a pixel at a distance of r pixels (azimuthal mean)
+    rim         : float64[SIDE / 2] the largest fraction in a pixel at r pixels or more along columns or rows: spikes of
+                  the pupil's bars rise above the mean
     outside     : float64[SIDE / 2] fraction of the flux beyond r pixels
     fwhm        : arcsec, pixel included
     planes      : by wavelength and place; None where `profile` is all
@@ -92,6 +95,7 @@ class Psf:
     profile: galsim.GSObject
     pixel_scale: float
     surface: Float
+    rim: Float
     outside: Float
     fwhm: float
     planes: Planes | None = None
@@ -108,6 +112,18 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
     """
     found = sampled(_vis_planes(detector, band, mission, positions), detector.pixel_scale, has_pixel=False)
     return replace(found, edges=vis_edges(detector, band, mission))
+
+
+def of_colours(spread: Psf, colours: int) -> Psf:
+    """The same PSF of so many wavelengths at most: each the mean of neighbours, which are of as many photons."""
+    planes = spread.planes
+    if planes is None or len(planes.wavelength) <= colours:
+        return spread
+    if len(planes.wavelength) % colours:
+        raise BadInput(f"{len(planes.wavelength)} wavelengths of a PSF are not a multiple of {colours}")
+    wavelength = planes.wavelength.reshape(colours, -1).mean(axis=1)
+    images = planes.images.reshape(colours, -1, *planes.images.shape[1:]).mean(axis=1)
+    return replace(spread, planes=replace(planes, wavelength=wavelength, images=images))
 
 
 def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
@@ -155,13 +171,16 @@ def sampled(planes: Planes, pixel_scale: float, has_pixel: bool) -> Psf:
 def _tabulated(
     profile: galsim.GSObject, pixel_scale: float, planes: Planes | None = None, has_pixel: bool = False
 ) -> Psf:
-    """With azimuthal means of the profile sampled on pixels."""
+    """With azimuthal means, and the largest values, of the profile sampled on pixels."""
     image = profile.drawImage(nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
     grid = np.arange(SIDE + 1) - SIDE // 2
     ring = np.rint(np.hypot(*np.meshgrid(grid, grid))).astype(int)
     inside = ring < SIDE // 2
     total = np.bincount(ring[inside], image[inside])
     surface = np.maximum(total / np.bincount(ring[inside]), 0.0)
+    square = np.maximum(*np.meshgrid(np.abs(grid), np.abs(grid)))
+    around = np.asarray(maximum(image, square, np.arange(SIDE // 2)))
+    rim = np.maximum(np.maximum.accumulate(around[::-1])[::-1], 0.0)
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
     core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / _FINE, method="no_pixel", dtype=float)
     with_pixel = core.array if has_pixel else uniform_filter(core.array, _FINE)
@@ -169,7 +188,7 @@ def _tabulated(
     bright = with_pixel > 0.5 * with_pixel.max()
     y, x = (float(at[bright].mean()) + 1.0 for at in np.indices(with_pixel.shape))
     fwhm = float(galsim.Image(with_pixel, scale=pixel_scale / _FINE).calculateFWHM(center=galsim.PositionD(x, y)))
-    return Psf(profile, pixel_scale, surface, outside, fwhm, planes, None if has_pixel else 0.0)
+    return Psf(profile, pixel_scale, surface, rim, outside, fwhm, planes, None if has_pixel else 0.0)
 
 
 def spectrum_of(psf: Psf, size: int, reach: int) -> Array:

@@ -21,12 +21,10 @@ reference       one source by galsim's own drawImage: what `draw` is held agains
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cache, partial
+from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import galsim
@@ -34,6 +32,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
+from jobs import accuracy
 from jobs.accuracy import Accuracy
 from jobs.render import edges, kernel, outskirts, pictures, profiles, selection, sersic, transfer, wings
 from jobs.render.effects.effect import NOTICEABLE
@@ -62,8 +61,9 @@ _RESPONSE, _SLOPE_RATIO = 3.0, 1.05
 _EXTENT = 4.0
 # Axis ratio of the thinnest sources: discs of the scale height profiles.py draws, seen edge-on.
 _THINNEST = 0.1
-# Above this many electrons the rounding of single precision would show.
-_BRIGHT = 1e7
+# Above this many electrons the rounding of single precision would show; and where no pixel may miss more than this of a
+# source's flux.
+_BRIGHT, _ROUNDING = 1e7, 2.5e-8
 # In Fourier space such sources are followed to so many times what may be left out of them: a tenth of that rings.
 _RINGS = 1e3
 # Larger stamps are followed no farther than others.
@@ -167,11 +167,12 @@ class Sources:
 class Settings:
     """What decides how much of a source is drawn.
 
-    edge  : largest surface brightness at a stamp's edge, of a pixel's noise
+    edge  : largest light at a stamp's edge, of a pixel's noise: the source's own, and of the PSF's spikes there
     ghost : largest part of a source's flux that wraps into its own aperture
     floor : Fourier samples of less than this are left out, 1 at k = 0
     least : smallest side of a stamp, arcsec: what of the PSF a source keeps
     positions : of the PSF on a detector, one of psf.DEGREES
+    colours : that the PSF is made of, a divisor of chromatic.PARTS
     """
 
     edge: float
@@ -179,38 +180,23 @@ class Settings:
     floor: float
     least: float
     positions: int
+    colours: int = 8
 
 
-def settings_for(accuracy: Accuracy) -> Settings:
-    """The cheapest settings whose measured errors are within an accuracy (settings.csv), or the most accurate."""
-    row = _row_for(accuracy)
-    return Settings(row["edge"], row["ghost"], row["floor"], row["least"], _positions(accuracy.shape))
+def settings_for(wanted: Accuracy) -> Settings:
+    """The cheapest settings whose measured errors are within an accuracy; BadInput where none are."""
+    return of_row(accuracy.row_for(wanted))
 
 
-def seconds_for(accuracy: Accuracy) -> float:
+def of_row(row: Mapping[str, float]) -> Settings:
+    """Settings of a row of the measured table."""
+    whole = {name: int(row[name]) for name in ("positions", "colours")}
+    return Settings(row["edge"], row["ghost"], row["floor"], row["least"], **whole)
+
+
+def seconds_for(wanted: Accuracy) -> float:
     """CPU s of the sources of a VIS detector, measured with these settings."""
-    return _row_for(accuracy)["seconds"]
-
-
-@cache
-def _row_for(accuracy: Accuracy) -> dict[str, float]:
-    rows = _table("settings.csv")
-    good = [row for row in rows if all(row[f"{f.name}_error"] <= getattr(accuracy, f.name) for f in fields(accuracy))]
-    return min(good, key=lambda row: row["seconds"]) if good else max(rows, key=lambda row: row["seconds"])
-
-
-@cache
-def _positions(shape: float) -> int:
-    """The fewest positions whose R2 (rms) and ellipticity (largest error) are within `shape` (psf_positions.csv)."""
-    rows = [row for row in _table("psf_positions.csv") if not row["nearest"]]
-    good = [row["positions"] for row in rows if max(row["r2_rms"], row["ellipticity_error"]) <= shape]
-    return int(min(good, default=max(row["positions"] for row in rows)))
-
-
-def _table(name: str) -> list[dict[str, float]]:
-    with Path(__file__).with_name(name).open(newline="", encoding="utf-8") as file:
-        lines = [line for line in file if not line.startswith("#")]
-    return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(lines)]
+    return accuracy.row_for(wanted)["seconds"]
 
 
 def stamp_sizes(
@@ -232,10 +218,15 @@ def stamp_sizes(
     least = np.full(len(shape), float(settings.least))
     body = shape >= 0
     least[body] += _EXTENT * profiles.half_light(shapes)[shape[body]]
+    # Of a galaxy the PSF's spikes, as wide as its core, are smeared over its width.
+    smeared, core = np.ones(len(shape)), psf.fwhm / psf.pixel_scale
+    smeared[body] = core / (core + 2.0 * profiles.half_light(shapes)[shape[body]] / psf.pixel_scale)
     aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
     found, left = np.full(len(shape), SIZES[-1]), np.arange(len(shape))
     for size in SIZES[:-1]:
-        psf_light = _beyond_the_table(psf, np.array([size // 2, size]))
+        psf_light = _beyond_the_table(psf, psf.surface, np.array([size // 2, size]))
+        (rim,) = _beyond_the_table(psf, psf.rim, np.array([size // 2]))
+        psf_edge = psf_light[0] + smeared[left] * (rim - psf_light[0])
         light, body = np.zeros((len(left), 3)), shape[left] >= 0
         if body.any():
             at = np.array([size // 2, size, _SLOPE_RATIO * size]) * psf.pixel_scale
@@ -247,7 +238,7 @@ def stamp_sizes(
         # A PSF in planes is cut to the stamp and does not wrap.
         wings = _LATTICE_PSF * psf_light[1] * (psf.planes is None)
         wrapped = (wings + _LATTICE_GALAXY * steeper * near) * aperture
-        enough = (electrons[left] * (psf_light[0] + edge) < settings.edge * noise) & (wrapped < settings.ghost)
+        enough = (electrons[left] * (psf_edge + edge) < settings.edge * noise) & (wrapped < settings.ghost)
         enough &= size * psf.pixel_scale >= least[left]
         # A point has no light beyond the PSF's planes.
         enough |= ~body & (psf.planes is not None) & (size >= SIDE)
@@ -273,10 +264,10 @@ def least_electrons(distance: float, pixel_scale: float, noise: float, settings:
     return float(settings.edge * noise * pixels)
 
 
-def _beyond_the_table(psf: Psf, radius: Int) -> Float:
-    """psf.surface at any radius, pixels: wings of r^-3 beyond the table, nothing beyond planes."""
-    last = len(psf.surface) - 1
-    wing = psf.surface[np.minimum(radius, last)] * (np.minimum(radius, last) / radius) ** 3
+def _beyond_the_table(psf: Psf, light: Float, radius: Int) -> Float:
+    """psf.surface or psf.rim at any radius, pixels: wings of r^-3 beyond the table, nothing beyond planes."""
+    last = len(light) - 1
+    wing = light[np.minimum(radius, last)] * (np.minimum(radius, last) / radius) ** 3
     return np.where((radius < SIDE) | (psf.planes is None), wing, 0.0)
 
 
@@ -387,17 +378,17 @@ def _draw(
     def of_largest(i: int) -> outskirts.Outskirts:
         return _outskirts(sources, i, some, form, psf, weights, nx, ny)
 
-    here = selection.touching(sources.column, sources.row, sizes, nx, ny)
+    here, precise = selection.touching(sources.column, sources.row, sizes, nx, ny), _precise(sources, floors)
     done = int(np.sum(~here))
     for size in np.unique(sizes):
-        alone, together = (found[here[found]] for found in _split(sources, sizes, psf, int(size)))
+        alone, together = (found[here[found]] for found in _split(sources, sizes, psf, int(size), precise))
         shared = transfer.transfer(psf, int(size), reach) if len(together) else None
         own = transfer.grid(int(size), float(cut[alone].max()) if size > SIDE else reach) if len(alone) else None
         batch = max(_BATCH // int(size) ** 2, 2)
         groups = [together[i : i + batch] for i in range(0, len(together), batch)]
         for number, chosen in enumerate([*groups, *alone[:, None]]):
             if own is not None and number >= len(groups):
-                dtype = np.float64 if sources.electrons[chosen[0]] > _BRIGHT else np.float32
+                dtype = np.float64 if precise[chosen[0]] else np.float32
                 seen = transfer.grid(int(size), float(cut[chosen[0]])) if deep[chosen[0]] else own
                 passed = transfer.collapsed(psf, weights[chosen[0]], seen, dtype, bool(far[chosen[0]]))
                 if (picture := sources.picture_of(int(chosen[0]))) is not None:
@@ -529,12 +520,18 @@ def _finish_largest(
     outskirts.take_in(of_largest(i), stamp, float(sources.column[i]) - left, float(sources.row[i]) - low)
 
 
-def _split(sources: Sources, sizes: Int, psf: Psf, size: int) -> tuple[Int, Int]:
+def _precise(sources: Sources, floors: Float | None) -> npt.NDArray[np.bool_]:
+    """[n] True of those that are drawn in double precision; floors : of `draw`."""
+    wanted = np.zeros(len(sources), bool) if floors is None else floors < _ROUNDING
+    return np.asarray(wanted | (sources.electrons > _BRIGHT))
+
+
+def _split(sources: Sources, sizes: Int, psf: Psf, size: int, precise: npt.NDArray[np.bool_]) -> tuple[Int, Int]:
     """Sources of a size that are drawn each through a PSF of its own, and those that share planes."""
     of_size = sizes == size
     few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW * transfer.plane_count(psf))
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
-    alone = of_size & (few | (sources.electrons > _BRIGHT) | pictured | _largest(sources.shape, sizes))
+    alone = of_size & (few | precise | pictured | _largest(sources.shape, sizes))
     return np.flatnonzero(alone), np.flatnonzero(of_size & ~alone)
 
 
@@ -542,7 +539,7 @@ def work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
     """(pixels of stamps, samples' places of the PSF's planes) that `draw` goes through, before anything is drawn."""
     planes, transformed = transfer.plane_count(psf), 0
     for size in np.unique(sizes).tolist():
-        alone, together = _split(sources, sizes, psf, size)
+        alone, together = _split(sources, sizes, psf, size, _precise(sources, None))
         transformed += size**2 * (len(alone) + planes * (len(together) > 0))
     return int((sizes.astype(np.int64) ** 2).sum()), transformed
 
@@ -679,15 +676,15 @@ def _beyond_stamps(shapes: Shapes, sizes: Int, pixel_scale: float) -> tuple[Floa
     return np.where(leaves > _STRAY, far, 0.0), leaves
 
 
-def reference(sources: Sources, i: int, psf: Psf, size: int, accuracy: float = 1e-4, highest: float = 1e-4) -> Float:
+def reference(sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e-4, highest: float = 1e-4) -> Float:
     """Source i by galsim.Convolve and drawImage, tight thresholds: slow, with none of `draw`'s transforms.
 
-    accuracy, highest : galsim's folding_threshold and maxk_threshold; what is cut at 1e-4 shows as 3e-3 of the noise in
+    folding, highest : galsim's folding_threshold and maxk_threshold; what is cut at 1e-4 shows as 3e-3 of the noise in
                         the middle of bright discs
     returns : float64[size, size], lower left pixel at round(position) - size / 2
     """
     settings = galsim.GSParams(
-        folding_threshold=accuracy, maxk_threshold=highest, kvalue_accuracy=1e-7, maximum_fft_size=16384
+        folding_threshold=folding, maxk_threshold=highest, kvalue_accuracy=1e-7, maximum_fft_size=16384
     )
     weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)[i]
     pixel = [] if psf.intra_pixel is None else [galsim.Pixel(1.0)]

@@ -26,6 +26,11 @@ BAD = [
     ("accuracy", {"flux": -1.0, "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
     ("accuracy", {"flux": float("nan"), "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
     ("accuracy", {"flux": 1e-3}, "accuracy.shape is missing"),
+    (
+        "accuracy",
+        {"flux": 1e-3, "shape": 1e-9, "position": 1e-3, "background": 1e-3},
+        "accuracy.shape = 1e-09 is beyond reach, the best is",
+    ),
     ("area", {}, "area wants exactly one"),
     ("area", {"cone": {"ra": 0, "dec": 0, "radius": 1}, "box": {"ra": [0, 1], "dec": [0, 1]}}, "area wants"),
     ("area", {"cone": {"ra": 0, "dec": 95, "radius": 1}}, "area.cone.dec"),

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jobs.accuracy import Accuracy
+from jobs.accuracy import DRAFT, Accuracy
 from jobs.render.effects import traps
 from jobs.render.effects.effect import NOTICEABLE, Effect, Frame, Scene
 from jobs.render.effects.traps import Sweeps, Traps
@@ -50,9 +50,30 @@ def sweeps_for(accuracy: Accuracy, passed: float) -> Sweeps:
 
     Losses grow with the traps, and so does the error: what is left out is the next order in them.
     """
+    return _followed(accuracy, passed)[1]
+
+
+def errors(scene: Scene, name: str) -> dict[str, float]:
+    """What following charge no closer than that leaves in a source at the far end; nothing for another effect's name.
+
+    returns : by number of an accuracy: fraction of its flux, reduced shear, pixels
+    """
+    if name == PARALLEL.name:
+        direction, transfers = "parallel", scene.half_rows
+    elif name == SERIAL.name:
+        direction, transfers = "serial", _columns(scene)
+    else:
+        return {}
+    left, _ = _followed(scene.accuracy, transfers * sum(lattice(scene, direction).density))
+    return {"flux": left * _FLUX, "shape": left * _SHAPE, "position": left * _SHIFT}
+
+
+def _followed(accuracy: Accuracy, passed: float) -> tuple[float, Sweeps]:
+    """(of the damage, what is wrong; how charge is followed)."""
     damage = passed / _END_OF_LIFE
     allowed = min(accuracy.flux / _FLUX, accuracy.position / _SHIFT, accuracy.shape / _SHAPE)
-    return next((sweeps for error, power, sweeps in _SWEEPS if error * damage**power <= allowed), _SWEEPS[-1][-1])
+    left = [(error * damage**power, sweeps) for error, power, sweeps in _SWEEPS]
+    return next((some for some in left if some[0] <= allowed), left[-1])
 
 
 def lattice(scene: Scene, direction: str) -> Traps:
@@ -97,8 +118,11 @@ def _lost(scene: Scene, direction: str, transfers: int) -> tuple[float, float]:
 
 
 def _over_accuracy(accuracy: Accuracy, passed: float) -> float:
-    """What so many traps do to a source, over what is allowed."""
-    return passed / _END_OF_LIFE * max(_FLUX / accuracy.flux, _SHIFT / accuracy.position, _SHAPE / accuracy.shape)
+    """What so many traps do to a source, over what is allowed; a quicklook leaves out nothing that a draft has."""
+    flux, shift, shape = (
+        min(accuracy.flux, DRAFT.flux), min(accuracy.position, DRAFT.position), min(accuracy.shape, DRAFT.shape)
+    )  # fmt: skip
+    return passed / _END_OF_LIFE * max(_FLUX / flux, _SHIFT / shift, _SHAPE / shape)
 
 
 def _before_readout(scene: Scene) -> Scene:

@@ -1,14 +1,18 @@
 """Products: files that stand alone, and rows that say what they are."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from astropy.io import fits as astropy_fits
 from astropy.wcs import WCS
 
+from jobs import accuracy
 from jobs.render import fits_product, focal_plane
+from jobs.render.effects import charge_transfer
+from jobs.render.effects.effect import Scene
 from lake_schema import fits, validate
+from lake_schema.mission.configuration import resolve
 from lake_schema.tables.products import PRODUCTS
 from tests.jobs.render import nominal
 from tests.jobs.render.fields import small
@@ -76,6 +80,34 @@ def test_the_header_calibrates_the_image(rendered, written):
     assert [header[f"EFFECT{i}"].split(":")[0] for i in range(1, len(names) + 1)] == names
     assert header["DARKRATE"] == rendered.scene.dark_rate > 0.0
     assert "dark_current: on" in header[f"EFFECT{names.index('dark_current') + 1}"]
+
+
+def test_the_header_tells_what_was_allowed_and_what_was_reached(rendered, written):
+    """All four numbers, of drawing and of charge transfer."""
+    folder, rows = written
+    header = astropy_fits.getheader(folder / rows["path"][0].as_py())
+    applied = [decision.name for decision in rendered.decisions if decision.applied]
+    made = [asdict(accuracy.reached(rendered.accuracy))]
+    made += [charge_transfer.errors(rendered.scene, name) for name in applied]
+    short = {"flux": "FLUX", "shape": "SHAPE", "position": "POS", "background": "BACK"}
+    for name, value in asdict(rendered.accuracy).items():
+        assert header[f"ACC{short[name]}"] == value
+        reached = sum(cause.get(name, 0.0) ** 2 for cause in made) ** 0.5
+        assert header[f"ERR{short[name]}"] == pytest.approx(reached, abs=0.0)
+        assert 0.0 < header[f"ERR{short[name]}"] <= value
+
+
+@pytest.mark.parametrize("preset", accuracy.PRESETS)
+def test_drawing_and_charge_transfer_together_are_within_what_is_allowed(preset):
+    """On a whole detector at its age, with both directions of transfer."""
+    wanted = accuracy.PRESETS[preset]
+    mission = resolve()
+    scene = Scene(mission, "vis", 560.0, 0.25, 1e5, focal_plane.detector("vis", "3-4", mission), accuracy=wanted)
+    made = [asdict(accuracy.reached(wanted))]
+    made += [charge_transfer.errors(scene, name) for name in ("parallel_cti", "serial_cti")]
+    for name, value in asdict(wanted).items():
+        assert sum(cause.get(name, 0.0) ** 2 for cause in made) ** 0.5 <= value, name
+    assert charge_transfer.errors(scene, "bleeding") == {}
 
 
 @pytest.mark.parametrize("forced", [{}, nominal.off("nonlinearity"), {"parallel_cti": True, "serial_cti": True}])
