@@ -57,7 +57,7 @@ def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) ->
     if photons is None:
         photons = np.full((n, len(waves)), 1.0 / len(waves))
     # Of neighbouring sub-bands the PSF may have one plane.
-    photons = photons.reshape(n, len(waves), -1).sum(axis=2)
+    photons = photons.reshape(n, len(waves), photons.shape[1] // len(waves)).sum(axis=2)
     # Beyond the border the polynomial is held.
     x = np.clip((column - planes.half[0]) / (planes.half[0] + 0.5), -1.0, 1.0)
     y = np.clip((row - planes.half[1]) / (planes.half[1] + 0.5), -1.0, 1.0)

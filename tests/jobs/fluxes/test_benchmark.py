@@ -62,7 +62,7 @@ def test_the_notebook_draws_the_figures(tmp_path, monkeypatch):
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(NOTEBOOK.parent)}}).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert [output for output in outputs if output.output_type == "error"] == []
-    assert sum("image/png" in output.get("data", {}) for output in outputs) == 8
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 12
     printed = "".join(output.text for output in outputs if output.output_type == "stream")
     assert "galaxies_per_s_core          1.234e+05" in printed
     assert "vis_survey_s                 12.34" in printed
