@@ -229,7 +229,7 @@ def test_an_exposure_is_drawn_through_it(tmp_path, monkeypatch, channel):
     monkeypatch.setattr(
         "tests.jobs.render.test_exposure.field", lambda channel: (task, {**exposed, "psf": str(path)}, body, points)
     )
-    found = render(channel, body.slice(0, 0), points.slice(20, 1), accuracy=REFERENCE)
+    found = render(channel, body.slice(0, 0), points.slice(20, 20), accuracy=REFERENCE)
     pixel = found.detector.pixel_scale
     assert found.psf.fwhm == pytest.approx(2.355 * np.hypot(0.5, pixel / 12**0.5), rel=0.01)
     assert found.sources.electrons.sum() > 0
