@@ -16,7 +16,7 @@ from tests.jobs.render.fields import MISSION, galaxies, small, spread, stars
 SIDE, NOISE = 256, 12.0
 BAND = passbands.load("euclid_vis")
 BULGE = {"bulge_fraction": 1.0, "bulge_sersic_index": 4.0, "bulge_half_light_radius": 4.0}
-SETTINGS = stamps.settings_for(SURVEY)
+SETTINGS = stamps.Settings(edge=0.01, ghost=1e-4, floor=3e-4, least=6.4, positions=9)
 
 
 @pytest.fixture(scope="module")
