@@ -41,7 +41,7 @@ LARGEST = {
     "run log": _GB,
     "manifest": 4 * _GB,
 }
-_LONGEST_SHOWN = 200
+_LONGEST_SHOWN, _LONGEST_PATH = 200, 4096
 # Parts of a dotted key, depth of brackets, characters of a number or bare key: far more than anything of ours has.
 _MOST_PARTS, _MOST_DEPTH, _LONGEST_WORD = 16, 16, 200
 # Strings and comments are passed over whole, as tomllib does; whatever is wrong with them it says itself.
@@ -57,10 +57,15 @@ _TOKEN = re.compile(
 
 def expanded(text: str | Path, folder: Path | None = None) -> Path:
     """A path as it was typed, ~ replaced, found from a folder."""
+    if len(str(text)) > _LONGEST_PATH:
+        # Following its links, were there any, takes a square of the time.
+        raise BadInput(f"{shown(text)}: File name too long")
     try:
         path = Path(text).expanduser()
     except RuntimeError:
         raise BadInput(f"{shown(text)}: there is no such user") from None
+    except ValueError as error:
+        raise BadInput(f"{shown(text)}: {error}") from None
     return path if folder is None else folder / path
 
 

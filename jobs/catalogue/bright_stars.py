@@ -163,7 +163,7 @@ def _text(file: Path) -> list[Float]:
             csv.ParseOptions(delimiter="|", quote_char=False),
             csv.ConvertOptions(include_columns=wanted, column_types=dict.fromkeys(wanted, pa.string())),
         )
-    except pa.ArrowInvalid as error:
+    except pa.ArrowException as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())[:200]}") from None
     return [_floats(file, rows[name]) for name in names]
 

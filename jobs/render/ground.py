@@ -28,7 +28,7 @@ from lake_schema.mission.configuration import MissionConfiguration
 Float = npt.NDArray[np.float64]
 
 _DAY_S, _OVERHEAD_S = 86400.0, 30.0
-_MOST_ROWS = 1_000_000
+_MOST_ROWS, _LONGEST = 1_000_000, 1000
 # Mean midnight of the sites is not modelled: ground exposures follow one another from the earliest date on.
 _COLUMNS = ("channel", "camera", "band", "ra", "dec", "position_angle", "mjd")
 _OPTIONAL = ("exposure_time_s", "sky", "seeing", "zero_point", "psf", "detectors", "image_type")
@@ -184,11 +184,13 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
         for name in names:
             if name not in (*_COLUMNS, *_OPTIONAL):
                 known = ", ".join((*_COLUMNS, *_OPTIONAL))
-                raise BadInput(f"{path}: column {name[:60]} is not known; known: {known}")
+                raise BadInput(f"{path}: column {user_files.shown(name)} is not known; known: {known}")
         for row in lines:
             if len(found) >= _MOST_ROWS:
                 raise BadInput(f"{path}: more than {_MOST_ROWS} pointings")
             where = f"{path} line {numbered[lines.line_num - 1][0]}"
+            if not all(isinstance(text, str) and len(text) <= _LONGEST for text in row.values() if text is not None):
+                raise BadInput(f"{where}: a text is too long, or there are more than columns")
             found.append(_of_row(row, where, len(found) + 1, block, mission, path.parent))
     except csv.Error as error:
         raise BadInput(f"{path}: {' '.join(str(error).split())}") from None

@@ -80,7 +80,18 @@ def test_a_number_is_always_the_same_mutation():
 
 @pytest.mark.parametrize(
     ("name", "number"),
-    [("spectrum, FITS", 3610), ("PSF, cube", 3633), ("PSF, PSFEx", 3153), ("manifest", 481), ("bodies, FITS", 4175)],
+    [
+        ("spectrum, FITS", 3610),
+        ("PSF, cube", 3633),
+        ("PSF, PSFEx", 3153),
+        ("manifest", 481),
+        ("bodies, FITS", 4175),
+        ("path", 816),
+        ("path", 9385),
+        ("pointings", 865),
+        ("pointings", 1436),
+        ("Tycho-2", 17636),
+    ],
 )
 def test_what_once_broke_is_refused(name, number):
     """A column without numbers, a number of 40 digits, a degree, a seal or axes without end."""
