@@ -18,7 +18,7 @@ from jobs import request, shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import archive, exposure, fits_product, focal_plane, plan_exposures, preview, render_exposures
-from jobs.render.effects import charge_transfer, quadrants
+from jobs.render.effects import charge_transfer, pixel_area, quadrants
 from jobs.render.effects.effect import Scene
 from lake_schema import layout, read, sky
 from lake_schema.mission.configuration import resolve
@@ -81,7 +81,7 @@ def image(request, field):
     path = product(field, channel, "science")
     header = fits.getheader(path)
     noise_free = fits.getdata(product(field, channel, "noise_free")).astype(float)
-    diffuse = (header["SKYRATE"] + header["DARKRATE"]) * header["EXPTIME"]
+    diffuse = diffuse_electrons(header)
     electrons = calibrated_electrons(path, header) - diffuse
     hit, delayed = np.zeros(noise_free.shape, bool), 0.0
     if channel == "VIS":
@@ -126,9 +126,22 @@ def calibrated_electrons(path, header):
             return (units[0].data.astype(float) - header["BIAS"]) * header["GAIN"]
         raw = np.stack([quadrants.placed(unit.data.astype(np.uint16), i) for i, unit in enumerate(units[1:])])
     scene = scene_of(header)
+    return calibrated.electrons(raw, scene, int(header["SEED"]), applied(header))
+
+
+def applied(header):
+    """Names of the effects that are in an image."""
     states = [header[key].split(":") for key in header if key.startswith("EFFECT")]
-    applied = {name for name, state in states if state.split(",")[0].split()[0] == "on"}
-    return calibrated.electrons(raw, scene, int(header["SEED"]), applied)
+    return {name for name, state in states if state.split(",")[0].split()[0] == "on"}
+
+
+def diffuse_electrons(header):
+    """What every pixel has of the sky, by its area, and of the dark current."""
+    electrons = (header["SKYRATE"] + header["DARKRATE"]) * header["EXPTIME"]
+    if "pixel_area" not in applied(header):
+        return electrons
+    scene = scene_of(header)
+    return pixel_area.apply(np.full((scene.ny, scene.nx), electrons), *pixel_area.parameters(scene))
 
 
 def sources(field, header):

@@ -64,8 +64,9 @@ _THINNEST = 0.1
 # Above this many electrons the rounding of single precision would show; and where no pixel may miss more than this of a
 # source's flux.
 _BRIGHT, _ROUNDING = 1e7, 2.5e-8
-# In Fourier space such sources are followed to so many times what may be left out of them: a tenth of that rings.
-_RINGS = 1e3
+# In Fourier space such sources are followed to so many times what may be left out of them: at the most three
+# thousandths of what is cut off ring (seeing of two pixels).
+_RINGS = 1e2
 # Larger stamps are followed no farther than others.
 _DEEP = 1024
 # Larger stamps collapse the PSF's planes first: their planes would not fit into memory.
@@ -422,7 +423,7 @@ def _ringing(
 ) -> npt.NDArray[np.bool_]:
     """[n] True of sources that are followed so far, in `cut`, that what is cut off behind is not seen to ring.
 
-    A hard edge in Fourier space rings by a ten-thousandth of what it cuts off. Planes end by themselves.
+    A hard edge in Fourier space rings by up to three thousandths of what it cuts off. Planes end by themselves.
     left_out : of `floors`, what may be left out of a source, 0 = as of others;  bodied : arguments of kernel.reaches
     """
     floor = np.where(left_out > 0.0, np.clip(_RINGS * left_out, transfer.LEAST, transfer.NOTHING), transfer.NOTHING)
