@@ -58,6 +58,7 @@ spark: .venv/installed
 	$(INSTALL) --editable .
 	@touch $@
 
+.venv/installed-test: requirements/java.txt
 .venv/installed-%: .venv/installed requirements/%.txt
 	$(KNOWN) requirements/$*.txt
 	@touch $@

@@ -116,7 +116,7 @@ def _load(folder: Path) -> dict[str, Array] | None:
         return None
     try:
         return {name.removesuffix(_ARRAY): _map(folder / name) for name in sums}
-    except (ValueError, EOFError, OSError) as error:
+    except (ValueError, EOFError, FileNotFoundError) as error:
         # Removed meanwhile by another process.
         discard(folder, str(error))
         return None
@@ -135,8 +135,11 @@ def seal(folder: Path, names: Iterable[str]) -> None:
 
 def sealed(folder: Path) -> dict[str, int] | None:
     """Name -> CRC-32 of the files that were sealed; None where nothing usable is stored, what there was is removed."""
+    if not folder.exists():
+        # Looked for before its seal: another process may publish the whole of it at any time.
+        return None
     if not (folder / _SEAL).exists():
-        # Not made yet, or by an older truesky.
+        # By an older truesky.
         _remove(folder)
         return None
     try:
@@ -145,7 +148,7 @@ def sealed(folder: Path) -> dict[str, int] | None:
         if digest(sums) == found["digest"]:
             return sums
         why = f"{_SEAL} is not what was written"
-    except (ValueError, LookupError, TypeError, OSError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError, FileNotFoundError, RecursionError) as error:
         why = str(error)
     discard(folder, why)
     return None
@@ -156,7 +159,7 @@ def is_whole(path: Path, crc: int) -> bool:
     try:
         about = path.stat()
         return _crc32(path, about.st_ino, about.st_size, about.st_mtime_ns) == crc
-    except OSError:
+    except FileNotFoundError:
         return False
 
 

@@ -26,7 +26,8 @@ from lake_schema.errors import Damaged
 
 # What nobody from outside may reach, wherever the configuration says nothing else.
 _CLOSED = {"spark.ui.enabled": "false"}
-# Spark makes a secret of its own for a local master; a cluster's is told to all of its machines.
+# Spark makes a secret of its own for a local master; a cluster's is told to all of its machines (docs/cluster.md).
+_LOCAL = re.compile(r"local(\[[^\]]*\])?")
 _CLOSED_LOCAL = {
     "spark.driver.bindAddress": "127.0.0.1",
     "spark.driver.host": "127.0.0.1",
@@ -46,7 +47,7 @@ def session(name: str) -> SparkSession:
     conf = SparkConf()
     builder = SparkSession.builder.appName(name)
     wanted = dict(_CLOSED)
-    if conf.get("spark.master", "local").startswith("local"):
+    if _LOCAL.fullmatch(conf.get("spark.master", "local")):
         wanted |= {**_CLOSED_LOCAL, "spark.executorEnv.PYTHONPATH": str(Path(__file__).resolve().parents[1])}
         # PySpark looks for its workers' Python in this variable alone, and would take any `python3` that is on PATH.
         os.environ.setdefault("PYSPARK_PYTHON", conf.get("spark.pyspark.python") or sys.executable)

@@ -80,7 +80,7 @@ def listed(entry: Json) -> list[tuple[int, int]]:
 
 
 class Checked(io.RawIOBase):
-    """A file of a lake, open for reading; a block is compared when something of it is read for the first time.
+    """A file of a lake, open for reading; a block is compared once, when something of it is read for the first time.
 
     A file that an older truesky wrote has no blocks: then the sha256 of all of it is compared before the first byte.
 
@@ -117,23 +117,26 @@ class Checked(io.RawIOBase):
         last = length if size is None or size < 0 else min(first + size, length)
         if last <= first:
             return b""
-        data = self._bytes(first, last)
-        self._compare(first, last, data)
-        self._at = last
-        return data
-
-    def _compare(self, first: int, last: int, data: bytes) -> None:
         if not self._ends:
-            return self._compare_whole()
-        for number in range(bisect_right(self._ends, first), bisect_left(self._ends, last) + 1):
-            if number in self._sound:
-                continue
-            start, end = self._ends[number - 1] if number else 0, self._ends[number]
-            inside = first <= start and end <= last
-            block = memoryview(data)[start - first : end - first] if inside else self._bytes(start, end)
-            if zlib.crc32(block) != self._sums[number]:
-                raise self._refusal(f"has other bytes from {start} to {end} than the manifest says")
-            self._sound.add(number)
+            self._compare_whole()
+        numbers = range(bisect_right(self._ends, first), bisect_left(self._ends, last) + 1) if self._ends else range(0)
+        new = [number for number in numbers if number not in self._sound]
+        # Whole blocks, once: what is handed out is what was compared.
+        start, end = (min(first, self._start(new[0])), max(last, self._ends[new[-1]])) if new else (first, last)
+        data = self._bytes(start, end)
+        for number in new:
+            self._compare(number, memoryview(data)[self._start(number) - start : self._ends[number] - start])
+        self._at = last
+        return data[first - start : last - start]
+
+    def _start(self, number: int) -> int:
+        return self._ends[number - 1] if number else 0
+
+    def _compare(self, number: int, block: memoryview) -> None:
+        if zlib.crc32(block) != self._sums[number]:
+            place = f"from {self._start(number)} to {self._ends[number]}"
+            raise self._refusal(f"has other bytes {place} than the manifest says")
+        self._sound.add(number)
 
     def _compare_whole(self) -> None:
         if not self._sound and file_sha256(self.path) != self._entry["sha256"]:

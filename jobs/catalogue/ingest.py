@@ -7,6 +7,7 @@ rows     what is there of a generation cell
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -141,12 +142,17 @@ def _columns(table: pa.Table) -> tuple[list[str], list[pa.ChunkedArray]]:
 
 
 def _publish(made: Path, folder: Path) -> None:
-    try:
-        os.rename(made, folder)
-    except OSError:
-        # Another process was as fast, or an older one died before it was done.
-        if _usable(folder) is None:
-            os.rename(made, folder)
+    while True:
+        try:
+            return os.rename(made, folder)
+        except FileExistsError:
+            pass
+        except OSError as error:
+            if error.errno != errno.ENOTEMPTY:
+                raise
+        # Another process was as fast, or an older one died before it was done; then what is there is removed.
+        if _usable(folder) is not None:
+            return None
 
 
 def _made(folder: Path, found: Sequence[Path], columns: Columns) -> dict[str, Any]:

@@ -136,7 +136,7 @@ def _objects(rows: pa.Table) -> list[str]:
     if len(set(rows.column_names)) != rows.num_columns:
         raise BadInput("--sql: two columns of the result have the same name; give one of them another with AS")
     try:
-        return [json.dumps(row, default=str) for row in rows.to_pylist()]
+        return [json.dumps(row, default=str, allow_nan=False) for row in rows.to_pylist()]
     except (ValueError, OverflowError, TypeError, pa.ArrowException) as error:
         raise BadInput(f"--sql: the result has no form in JSON: {' '.join(str(error).split())[:300]}") from None
 

@@ -50,6 +50,8 @@ CATALOGUES = (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes"))
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 # Drawn where the lake has it.
 LENSES = "strong_lenses"
+# How far beyond a detector sources are looked for that shine so far, arcsec: spikes of stars, outskirts of galaxies.
+FARTHEST = max(edges.FARTHEST, outskirts.FARTHEST)
 # What the parts of catalogues say of themselves.
 _CELLS = "generation_cells"
 
@@ -116,9 +118,9 @@ def product_keys(
         reach = stamps.reach(focal_plane.detector(camera, detector, mission).pixel_scale)
         # Of the cameras VIS alone has spikes, of stars.
         reaches = {name: reach for name in files}
-        reaches["galaxies"] = max(outskirts.FARTHEST, reach)
+        reaches["galaxies"] = max(FARTHEST, reach)
         if rows[task["exposure_id"]]["channel"] == "VIS":
-            reaches["stars"] = max(edges.FARTHEST, reach)
+            reaches["stars"] = max(FARTHEST, reach)
         return [
             sorted({sums for cell in selection.within(task, deflection, reaches[name]) for sums in found.get(cell, ())})
             for name, (deflection, found) in files.items()
@@ -254,7 +256,7 @@ def sources(
         near = selection.needed(task, deflection)
         far, complete = selection.beyond(task, deflection, farther, _drawn(catalogue))
     if np.isfinite(bright):
-        around, _ = selection.beyond(task, deflection, max(edges.FARTHEST, farther), _drawn(catalogue))
+        around, _ = selection.beyond(task, deflection, max(FARTHEST, farther), _drawn(catalogue))
         farthest = sorted(set(around) - set(far))
     rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
     for cells, limit in ((far, least), (farthest, bright)):

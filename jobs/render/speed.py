@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -76,10 +77,10 @@ def _measured(lake: Path) -> Iterator[float]:
     foreseen = {(row["exposure_id"], row["detector"]): row["seconds"] for row in tasks.to_pylist()}
     parts = {part["name"]: part["facts"] for part in version.manifest["parts"]}
     for line in _lines(lake, version.key):
-        facts = parts.get(line.get("part", ""), {})
+        facts = parts.get(str(line.get("part", "")), {})
         place = facts.get("exposure_id"), facts.get("detector")
         took, mine = line.get("cpu_s"), line.get("machine") == machine()
-        if mine and "error" not in line and isinstance(took, float) and took > 0 and foreseen.get(place):
+        if mine and "error" not in line and isinstance(took, float) and 0 < took < math.inf and foreseen.get(place):
             yield took / foreseen[place]
 
 

@@ -294,7 +294,8 @@ def draw(
     progress : called now and then with the number of sources drawn
     drawn    : float64[n] to be filled with what of each source's stamp fell onto the frame, electrons
     unread   : of the frame, the first row that counts for nothing in `drawn`, and the first behind that counts again
-    returns  : float64[ny, nx], to 5e-7 electrons a source; the same, bit by bit, in any order of the sources
+    returns  : float64[ny, nx], to half a unit of `kernel.units_of` a source (5e-7 electrons for all but the brightest);
+               the same, bit by bit, in any order of the sources
     """
     pieces, trail, whole = _in_pieces(sources)
     of_piece = np.zeros(len(pieces))

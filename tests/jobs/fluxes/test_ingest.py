@@ -229,3 +229,19 @@ def test_a_column_of_lists_is_no_curve(tmp_path, shape):
     Table({"WAVELENGTH": WAVELENGTH, "FLUX": np.ones(shape)}).write(path, format="fits")
     with pytest.raises(BadInput, match=r"x\.fits: "):
         ingest.read(path, "spectrum_fits")
+
+
+def test_no_word_asks_for_more_memory_than_its_file(tmp_path):
+    """A type of 10 MB a row, and a word that would be as wide in every row."""
+    path = tmp_path / "x.ecsv"
+    wavelength = np.linspace(4000.0, 5000.0, 21)
+    Table({"wavelength": wavelength, "throughput": np.ones(21)}).write(path, format="ascii.ecsv")
+    text = path.read_text()
+    path.write_text(text.replace("datatype: float64", "datatype: 9999999D", 1))
+    with pytest.raises(BadInput, match="'9999999D' is no datatype of ECSV"):
+        ingest.read(path, "passband_ecsv")
+    path.write_text(text + "9" * 5000 + " 1\n")
+    with pytest.raises(BadInput, match="more than 4096 characters"):
+        ingest.read(path, "passband_ecsv")
+    path.write_text(text.replace("datatype: float64", 'datatype: "float64"', 1))
+    assert len(ingest.read(path, "passband_ecsv").value) == 21

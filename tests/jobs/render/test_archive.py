@@ -16,8 +16,8 @@ LINE = {"job": "render_exposures", "table": "products", "part": "a", "seconds": 
 @pytest.mark.parametrize(
     ("sql", "words"),
     [
-        ("SELECT count(*) FROM range(1000000000) a, range(1000000000) b", "memory|stopped after 4 s"),
-        ("SELECT repeat('x', 2000000000) FROM products", "memory|stopped after 4 s"),
+        ("SELECT count(*) FROM range(1000000000) a, range(1000000000) b", "memory|stopped after 15 s"),
+        ("SELECT repeat('x', 2000000000) FROM products", "memory|stopped after 15 s"),
         ("WITH pg_class AS (SELECT * FROM pg_class) SELECT * FROM pg_class", "is not a table of the lake"),
         ("SELECT * FROM products; DROP VIEW products", "exactly one SELECT"),
         ("SELECT nothing FROM products", "nothing"),
@@ -26,8 +26,9 @@ LINE = {"job": "render_exposures", "table": "products", "part": "a", "seconds": 
 def test_what_is_no_question_or_has_no_end_is_refused(sql, words):
     started = time.monotonic()
     with pytest.raises(BadInput, match=f"^--sql: SQL: .*({words})") as caught:
-        archive.search(ROWS, sql, 512e6, 4.0)
-    assert time.monotonic() - started < 12.0
+        archive.search(ROWS, sql, 512e6, 15.0)
+    # It may be a busy machine; without a bound it takes hours.
+    assert time.monotonic() - started < 120.0
     assert len(str(caught.value).splitlines()) == 1
 
 
