@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import stars as benchmark
 from jobs.catalogue import stars
+from tests.benchmarks import run
 
 KEYS = ("stars_per_s_core", "cell_peak_gb")
 
@@ -39,7 +40,7 @@ def test_stars_at_the_pole(dust):
 @pytest.mark.nightly
 def test_the_benchmark(tmp_path):
     file = tmp_path / "stars.json"
-    assert benchmark.main(["--quick", "--json", str(file)]) == 0
+    run("stars", "--quick", "--json", file)
     figures = json.loads(file.read_text())
     assert set(KEYS) <= set(figures)
     assert {"name", "commit", "machine", "repeats"} <= set(figures)

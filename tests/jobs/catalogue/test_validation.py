@@ -12,11 +12,12 @@ import pytest
 from benchmarks import _census as census
 from benchmarks import _clustering as clustering
 from benchmarks import _shear as shear
-from benchmarks import catalogue, validate_universe
+from benchmarks import validate_universe
 from jobs.catalogue import luminosity_function
 from jobs.fluxes import cosmology
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
+from tests.benchmarks import run
 
 from .test_lensing import limber
 
@@ -161,7 +162,7 @@ def test_the_fuller_report(tmp_path):
 @pytest.mark.nightly
 def test_the_benchmark(tmp_path):
     file = tmp_path / "catalogue.json"
-    assert catalogue.main(["--quick", "--json", str(file)]) == 0
+    run("catalogue", "--quick", "--json", file)
     figures = json.loads(file.read_text())
     keys = (
         "cell_rows", "cell_s", "cell_peak_gb", "speedup_2_cores", "galaxies_per_s_core", "schechter_per_s_core",

@@ -13,6 +13,7 @@ from benchmarks._scenes import VIS
 from jobs import accuracy
 from jobs.accuracy import SURVEY
 from jobs.render import profiles, stamps
+from tests.benchmarks import run
 
 RESULTS = Path(trade.__file__).with_name("results")
 BY_NAME = {each.name: each for each in approximations.ALL}
@@ -98,7 +99,7 @@ def test_sampling_down_and_up_keeps_a_plane():
 
 @pytest.mark.nightly
 def test_the_walk_in_haste(tmp_path):
-    assert trade.main(["--quick", "--csv", str(tmp_path / "t.csv"), "--figure", str(tmp_path / "t.png")]) == 0
+    run("trade", "--quick", "--csv", tmp_path / "t.csv", "--figure", tmp_path / "t.png")
     assert (tmp_path / "t.png").stat().st_size > 10_000
     with (tmp_path / "t.csv").open() as file:
         found = {row["kind"]: row for row in csv.DictReader(file)}
