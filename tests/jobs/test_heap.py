@@ -1,7 +1,10 @@
 """Memory that is kept while arrays come and go, and given back: as the C library counts it, not as a machine does."""
 
 import ctypes
+import functools
 import platform
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -45,12 +48,28 @@ on_gnu = pytest.mark.skipif(
 )
 
 
+def alone(test):
+    """The test in a process of its own: in a heap that others left, even a large array may find room."""
+
+    @functools.wraps(test)
+    def in_a_process():
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            pool.submit(_called, test.__name__).result(300)
+
+    return in_a_process
+
+
+def _called(name):
+    globals()[name].__wrapped__()
+
+
 def heap_and_mapped():
     now = COUNTS()
     return now.arena, now.hblkhd
 
 
 @on_gnu
+@alone
 def test_without_it_each_array_is_asked_for():
     heap_before, mapped_before = heap_and_mapped()
     array = np.ones(SIZE, np.uint8)
@@ -62,6 +81,7 @@ def test_without_it_each_array_is_asked_for():
 
 
 @on_gnu
+@alone
 def test_later_arrays_find_the_memory_of_those_before():
     mapped_before = heap_and_mapped()[1]
     with heap.kept():
@@ -79,6 +99,7 @@ def test_later_arrays_find_the_memory_of_those_before():
 
 
 @on_gnu
+@alone
 def test_it_is_given_back():
     before, mapped = heap_and_mapped()
     with heap.kept():
@@ -97,6 +118,7 @@ def test_it_is_given_back():
 
 
 @on_gnu
+@alone
 def test_it_is_given_back_after_an_error():
     before = heap_and_mapped()[0]
 
