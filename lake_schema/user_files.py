@@ -145,33 +145,35 @@ def text(path: Path, kind: str) -> str:
         raise BadInput(f"{shown(path)}: {error}") from None
 
 
-def target(path: Path, endings: Sequence[str] = ()) -> Path:
-    """A path at which a file can be written: of one of the endings, in a folder that is there."""
-    if endings and path.suffix.lower() not in endings:
-        raise BadInput(f"{shown(path)}: the ending is not one of {', '.join(endings)}")
+@contextmanager
+def _reachable(path: Path) -> Iterator[None]:
+    """Refuses a path that the system does not take; one that is not there yet is well."""
     try:
-        if not path.parent.is_dir():
-            raise BadInput(f"{shown(path)}: its folder is not there")
-        if os.path.lexists(path) and not path.is_file():
-            raise BadInput(f"{shown(path)}: is there, and is no file")
+        yield
         os.lstat(path)
     except FileNotFoundError:
         pass
     except (OSError, ValueError) as error:
         raise BadInput(f"{shown(path)}: {getattr(error, 'strerror', None) or error}") from None
+
+
+def target(path: Path, endings: Sequence[str] = ()) -> Path:
+    """A path at which a file can be written: of one of the endings, in a folder that is there."""
+    if endings and path.suffix.lower() not in endings:
+        raise BadInput(f"{shown(path)}: the ending is not one of {', '.join(endings)}")
+    with _reachable(path):
+        if not path.parent.is_dir():
+            raise BadInput(f"{shown(path)}: its folder is not there")
+        if os.path.lexists(path) and not path.is_file():
+            raise BadInput(f"{shown(path)}: is there, and is no file")
     return path
 
 
 def folder(path: Path) -> Path:
     """A path at which a folder is, or can be made."""
-    try:
+    with _reachable(path):
         if os.path.lexists(path) and not path.is_dir():
             raise BadInput(f"{shown(path)}: is there, and is no folder")
-        os.lstat(path)
-    except FileNotFoundError:
-        pass
-    except (OSError, ValueError) as error:
-        raise BadInput(f"{shown(path)}: {getattr(error, 'strerror', None) or error}") from None
     return path
 
 
