@@ -1,7 +1,8 @@
 """Memory of large arrays, kept by the process while it makes many of them.
 
 The C library asks the operating system for each large array, and gives it back with the array: each then begins with
-pages that must be found and cleared, which takes as long as a simple effect of a detector does.
+pages that must be found and cleared, which takes as long as a simple effect of a detector does. A VIS detector at
+draft takes 0.86 of the CPU time so, at survey 0.99 (medians of 12 pairs), and 0.07 GB more.
 """
 
 from __future__ import annotations
