@@ -11,9 +11,7 @@ import io
 import sys
 from collections.abc import Callable
 
-from lake_schema.errors import BadInput, LakeError
-
-_LONGEST = 1000
+from lake_schema.errors import BadInput, LakeError, one_line
 
 
 def status(name: str, body: Callable[[], int]) -> int:
@@ -34,9 +32,6 @@ def status(name: str, body: Callable[[], int]) -> int:
 
 def say(name: str, error: object, code: int) -> int:
     """Print one line, never longer than anybody reads, and return the exit status."""
-    line = " ".join(str(error).split()) or type(error).__name__
-    text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
-    shown = text if len(text) <= _LONGEST else text[:_LONGEST] + "..."
     with contextlib.suppress(BrokenPipeError):
-        print(f"{name}: {shown}", file=sys.stderr, flush=True)
+        print(f"{name}: {one_line(error).strip() or type(error).__name__}", file=sys.stderr, flush=True)
     return code

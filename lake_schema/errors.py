@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+# Characters of a refusal: it names what is wrong and where, it does not repeat what it was given.
+_LONGEST = 1000
+
+
+def one_line(said: object) -> str:
+    """A text as messages give it: one line of printable characters, of a long one its begin and its end."""
+    text = str(said)
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.split()))
+    half = _LONGEST // 2
+    return text if len(text) <= _LONGEST else f"{text[: half - 3]}...{text[-half:]}"
+
 
 class LakeError(Exception):
-    """Root of everything that truesky refuses; its text is one line."""
+    """Root of everything that truesky refuses; its text is one line of at most 1000 characters, whatever it names."""
+
+    def __init__(self, said: object = "") -> None:
+        super().__init__(one_line(said))
 
 
 class BadInput(LakeError):

@@ -85,6 +85,8 @@ def test_a_number_is_always_the_same_mutation():
         ("PSF, cube", 3633),
         ("PSF, PSFEx", 3153),
         ("manifest", 481),
+        ("manifest", 4206),
+        ("manifest", 9229),
         ("bodies, FITS", 4175),
         ("path", 816),
         ("path", 9385),
@@ -94,5 +96,5 @@ def test_a_number_is_always_the_same_mutation():
     ],
 )
 def test_what_once_broke_is_refused(name, number):
-    """A column without numbers, a number of 40 digits, a degree, a seal or axes without end."""
+    """A column without numbers, a number of 40 digits, a degree, a seal, a key or axes without end."""
     assert fuzz.run(name, number, 1) == []

@@ -1,0 +1,31 @@
+"""Refusals: one line that anybody can print, however long and strange what it names."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema import errors
+
+KINDS = [errors.BadInput, errors.Damaged, errors.Superseded, errors.VersionMismatch, errors.PartsFailed]
+
+
+@given(st.text() | st.text(st.characters(), min_size=1).map(lambda text: text * 2000), st.sampled_from(KINDS))
+def test_a_refusal_is_one_printable_line(text, kind):
+    said = str(kind(text))
+    assert said.isprintable()
+    assert len(said) <= 1000
+
+
+def test_a_long_refusal_keeps_where_and_what():
+    said = str(errors.Damaged(f"lake/manifest.json is that of version {'9' * 5000}, wanted another"))
+    assert said.startswith("lake/manifest.json is that")
+    assert said.endswith("9, wanted another")
+
+
+@pytest.mark.parametrize("text", ["x", "row 3  of [1, 2]", "\u00e9 \u03bb", ""])
+def test_a_short_refusal_says_what_it_was_given(text):
+    assert str(errors.BadInput(text)) == text
+
+
+def test_line_breaks_and_what_no_terminal_shows_are_spelt():
+    assert str(errors.BadInput("a\n  b\x1b[0m \ud800")) == r"a b\x1b[0m \ud800"
