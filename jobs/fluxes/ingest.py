@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from jobs.fluxes import passbands
+from jobs.fluxes import passbands, text_tables, votable
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.stellar import normalised
 from jobs.fluxes.templates import Library
@@ -33,17 +33,7 @@ from lake_schema.fits import read_table
 Float = npt.NDArray[np.float64]
 
 _FORMATS = Path(__file__).with_name("spectrum_formats.toml")
-# What a header in YAML must not have; of a VOTable its encoding, sizes of its arrays and its count of rows.
-_YAML_REFERENCE = re.compile(r"^#.*?(?:[\s\[{,:-])[&*]\w+", re.MULTILINE)
-_DATATYPE = re.compile(r"""\bdatatype["']?:[ \t]*["']?([^\s,"'}]+)""")
-# What ECSV names, and no type of numpy's besides: 9999999D is one, of 80 MB a row.
-_DATATYPES = {"bool", "string"} | {
-    f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64, 128)
-}
-# Characters of a line: room is made in every row for a column's longest word.
-_LONGEST_LINE = 4096
-_ENCODING = re.compile(r"""encoding\s*=\s*["'](?!(?:utf-8|us-ascii)["'])""", re.IGNORECASE)
-_SIZES = re.compile(r"""\b(?:arraysize|width)\s*=\s*["'][^"'\d]*(\d+)""")
+# Of a VOTable; room would be made for as many rows.
 _COUNT = re.compile(r"""\bnrows\s*=\s*["'][^"']*["']""")
 ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4}
 # f_lambda beyond the red end of a file of galaxies.
@@ -144,19 +134,10 @@ def _table(path: Path, reader: str) -> Any:
 
     text = user_files.text(path, "table of a curve")
     if reader != "votable":
-        if found := _YAML_REFERENCE.search(text):
-            raise ValueError(f"{found[0].strip()!r} in its header refers to another place of it")
-        if unknown := set(_DATATYPE.findall(text)) - _DATATYPES:
-            raise ValueError(f"{min(unknown)[:40]!r} is no datatype of ECSV")
         lines = text.splitlines()
-        if max(map(len, lines), default=0) > _LONGEST_LINE:
-            raise ValueError(f"a line has more than {_LONGEST_LINE} characters")
+        text_tables.refuse_large(lines, has_header=reader == "ecsv")
         return QTable.read(lines, format=f"ascii.{reader}", guess=False)
-    if "<!DOCTYPE" in text or "\0" in text or _ENCODING.search(text[:200]):
-        raise ValueError("a VOTable here is in UTF-8 and has no DOCTYPE")
-    if any(len(number) > 3 for number in _SIZES.findall(text)) or "<BINARY" in text or "<FITS" in text:
-        # Room is made for as many before there is a row.
-        raise ValueError("a VOTable here has its rows as TABLEDATA, and no arrays")
+    votable.refuse_large(text)
     return QTable.read(BytesIO(_COUNT.sub("", text).encode()), format="votable")
 
 
