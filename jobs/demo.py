@@ -15,7 +15,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 
@@ -32,6 +31,7 @@ JOBS = (
     ("jobs/render/plan_exposures.py", ("exposures", "tasks")),
     ("jobs/render/render_exposures.py", ("products",)),
 )
+_STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -44,7 +44,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--request", type=Path, default=_ROOT / "requests" / "demo.toml", help="simulation request")
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the lake and the pictures")
     options = parser.parse_args(argv)
-    before = {number: signal.signal(number, _stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, _stop) for number in _STOPPING}
     try:
         return command.status("demo", lambda: _demonstrated(options.out, options.request))
     except KeyboardInterrupt as stopped:
@@ -73,31 +73,29 @@ def _run_all(root: Path, request: Path) -> int:
     submit = shutil.which("spark-submit", path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
     if submit is None:
         raise BadInput("no spark-submit on PATH: activate the environment that `make` made (. .venv/bin/activate)")
-    environment = {**os.environ, **_settings()}
     rows, start = [], time.perf_counter()
     for script, tables in JOBS:
         began = time.perf_counter()
         print(f"{Path(script).stem} ...", flush=True)
         call = [submit, str(_ROOT / script), "--lake", str(root), "--request", str(request)]
-        if status := _call(call, environment):
+        if status := _call(call):
             return status
         rows.append((Path(script).stem, tables, time.perf_counter() - began))
     _table(root, rows, time.perf_counter() - start)
     return 0
 
 
-def _settings() -> dict[str, str]:
-    """What an activated environment tells spark-submit."""
-    conf, found = Path(sys.prefix) / "spark-conf", find_spec("pyspark")
-    if not conf.is_dir() or found is None or found.origin is None:
-        return {}
-    return {"SPARK_HOME": str(Path(found.origin).parent), "SPARK_CONF_DIR": str(conf)}
-
-
-def _call(command: Sequence[str], environment: dict[str, str]) -> int:
+def _call(command: Sequence[str]) -> int:
     """Exit status of a job; it is stopped where we are."""
-    with subprocess.Popen(command, env=environment) as job:
+    # A signal that arrives while the job is started is answered when there is a job to stop.
+    early: list[int] = []
+    handlers = {number: signal.signal(number, lambda n, _: early.append(n)) for number in _STOPPING}
+    with subprocess.Popen(command) as job:
         try:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+            if early:
+                raise KeyboardInterrupt(early[0])
             return job.wait()
         except BaseException:
             job.terminate()

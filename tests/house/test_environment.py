@@ -153,22 +153,6 @@ def test_wrapper_passes_all_but_what_java_cannot_digest(prepare, tmp_path, major
     assert said(java, *arguments) == ["-cp", "a b:*", *kept, "", "$x", "--", "*"]
 
 
-def test_wrapper_uses_an_archive_of_classes_where_there_is_one(prepare, tmp_path):
-    environment, java = wrapped(prepare, tmp_path, 17)
-    arguments = ["-cp", f"{environment}/spark-conf/:/jars/*", "Main"]
-    logging = f"-Dlog4j2.configurationFile={environment}/spark-conf/log4j2.properties"
-    without = ["-cp", "/jars/*", logging, "Main"]
-    assert said(java, *arguments) == without
-    archive = environment / "java" / "spark.jsa"
-    archive.touch()
-    assert said(java, *arguments) == without
-    archive.write_text("classes")
-    sharing, *rest = said(java, *arguments)
-    assert sharing == f"-XX:SharedArchiveFile={environment}/java/java.jsa:{archive}"
-    assert rest[-len(without) :] == without
-    assert "-Xshare:auto" in rest
-
-
 def test_wrapper_of_a_java_that_is_gone(prepare, tmp_path):
     _, java = wrapped(prepare, tmp_path, 17)
     shutil.rmtree(tmp_path / "a java's home")
@@ -184,21 +168,6 @@ def prepared(environment: Path, **variables: str) -> None:
     """Prepare an environment as make does it."""
     command = [sys.executable, str(SCRIPT), "--no-install", "--environment", str(environment)]
     subprocess.run(command, env={**os.environ, **variables}, check=True)
-
-
-def test_activating_and_leaving(environment, tmp_path):
-    prepared(environment, JAVA_HOME=str(fake_java(tmp_path / "home", "21")))
-    show = 'echo "${SPARK_CONF_DIR-none} ${SPARK_HOME-none}"'
-    activate = f'. "{environment}/bin/activate"'
-    steps = f"{show}; {activate}; {show}; {activate}; {show}; deactivate; {show}"
-    for variables, before in (({}, "none none"), ({"SPARK_CONF_DIR": "/c", "SPARK_HOME": "/h"}, "/c /h")):
-        done = shell(steps, **variables)
-        assert done.stderr == ""
-        first, active, twice, left = done.stdout.splitlines()
-        assert first == left == before
-        assert active == twice
-        assert active.split()[0] == str(environment / "spark-conf")
-        assert active.split()[1].endswith("/pyspark")
 
 
 def test_preparing_again_changes_nothing(environment, tmp_path):
@@ -240,18 +209,51 @@ def test_spark_submit_says_only_what_the_job_says(prepare, environment, tmp_path
     assert done.returncode == 2
 
 
-def test_spark_submit_knows_its_spark_where_nothing_is_activated(prepare, environment, tmp_path):
-    """No Python on PATH could say where it is."""
+def test_spark_submit_is_this_environments(prepare, environment, tmp_path):
+    """Whether or not it is activated, whatever Spark is named elsewhere, and without a Python on PATH that knows it."""
     program(tmp_path / "path" / "python3", "exit 1")
     spark_home = environment / "lib" / "its spark"
-    program(spark_home / "bin" / "spark-submit", 'echo "$SPARK_HOME" "$@"')
+    program(spark_home / "bin" / "spark-submit", 'echo "$SPARK_HOME" "$SPARK_CONF_DIR" "$@"')
     prepare.prepare(environment, prepare.Java(fake_java(tmp_path / "home", "21"), 21, "PATH"), spark_home)
-    submit = f'"{environment}/bin/spark-submit" "a b" c'
-    path = f"{tmp_path / 'path'}:/usr/bin:/bin"
-    assert shell(submit, PATH=path).stdout == f"{spark_home} a b c\n"
     assert (spark_home / "conf" / "spark-env.sh").is_file()
-    other = program(tmp_path / "other" / "bin" / "spark-submit", "echo another").parents[1]
-    assert shell(submit, PATH=path, SPARK_HOME=str(other)).stdout == "another\n"
+    variables = {"PATH": f"{tmp_path / 'path'}:/usr/bin:/bin"}
+    for other in ({}, {"SPARK_HOME": str(tmp_path / "other"), "SPARK_CONF_DIR": str(tmp_path / "other" / "conf")}):
+        for submit in (f'"{environment}/bin/spark-submit"', f'. "{environment}/bin/activate" && spark-submit'):
+            done = shell(f'{submit} "a b" c', **variables, **other)
+            assert (done.stdout, done.stderr) == (f"{spark_home} {environment}/spark-conf a b c\n", "")
+
+
+# As Spark runs a job: its stderr is joined to its stdout, and passed on in pieces.
+LAUNCHER = """
+import subprocess, sys
+with subprocess.Popen(sys.argv[1:], stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as job:
+    for line in job.stdout:
+        sys.stdout.buffer.write(line)
+        sys.stdout.flush()
+"""
+TALKING = """
+import sys
+for n in range(50):
+    print("said", n, flush=True)
+    print("complained", n, file=sys.stderr)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="stderr stays joined to stdout")
+def test_a_log_that_both_streams_go_to_loses_no_line(prepare, environment, tmp_path):
+    """Under nohup, or > log 2>&1, a file has one position for all who write to it."""
+    (talking := tmp_path / "talking.py").write_text(TALKING)
+    driver = environment / "spark-conf" / "driver-python"
+    launch = shlex.join([sys.executable, "-c", LAUNCHER, str(driver), str(talking)])
+    home = fake_java(tmp_path / "home", "21")
+    prepare.prepare(environment, prepare.Java(home, 21, "PATH"), tmp_path / "spark")
+    program(home / "bin" / "java", f"exec {launch}")
+    log = tmp_path / "log"
+    done = shell(f'{{ echo before; "{environment}/java/bin/java"; echo after; }} >"{log}" 2>&1')
+    assert done.returncode == 0
+    lines = log.read_text().splitlines()
+    assert (lines[0], lines[-1]) == ("before", "after")
+    assert sorted(lines[1:-1]) == sorted(f"{verb} {n}" for verb in ("said", "complained") for n in range(50))
 
 
 # A session of ours, then who listens where among all processes that it began.

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 # A job that says who it is, and waits.
 _JOB = """#!/bin/sh
-echo "$$ $SPARK_CONF_DIR"
+echo "$$"
 exec sleep 600
 """
 _STOPPED = """
@@ -25,6 +25,22 @@ from pathlib import Path
 from jobs import demo
 demo.shutil.which = lambda *args, **kwargs: sys.argv[1]
 sys.exit(demo.main(["--out", sys.argv[2]]))
+"""
+# A signal arrives when the job runs and Popen has not returned.
+_EARLY = """
+import os, signal, subprocess, sys
+from jobs import demo
+start = subprocess.Popen._execute_child
+def started(job, *rest):
+    start(job, *rest)
+    print(job.pid, flush=True)
+    os.kill(os.getpid(), signal.SIGTERM)
+subprocess.Popen._execute_child = started
+signal.signal(signal.SIGTERM, demo._stop)
+try:
+    demo._call(["sleep", "600"])
+except KeyboardInterrupt as stopped:
+    sys.exit(int(stopped.args[0]))
 """
 
 
@@ -38,7 +54,7 @@ def test_a_demo_that_is_stopped_stops_its_job(tmp_path, number):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, cwd=ROOT, env=environment, **pipes) as running:
         assert running.stdout.readline() == "build_galaxies ...\n"
-        pid, *conf = running.stdout.readline().split()
+        pid = running.stdout.readline().strip()
         running.send_signal(number)
         assert running.wait(120) == 128 + number
         assert running.stderr.read() == "demo: stopped; a second run continues where this one ended\n"
@@ -46,8 +62,17 @@ def test_a_demo_that_is_stopped_stops_its_job(tmp_path, number):
     while Path(f"/proc/{pid}").exists():
         assert time.monotonic() < deadline, "the job was left behind"
         time.sleep(0.05)
-    expected = Path(sys.prefix) / "spark-conf"
-    assert conf == ([str(expected)] if expected.is_dir() else [])
+
+
+def test_a_job_is_stopped_by_a_signal_that_arrives_while_it_starts():
+    done = subprocess.run(
+        [sys.executable, "-c", _EARLY], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    pid = int(done.stdout)
+    left = Path(f"/proc/{pid}").exists()
+    if left:
+        os.kill(pid, signal.SIGKILL)
+    assert (done.returncode, left) == (signal.SIGTERM, False)
 
 
 def test_a_folder_that_is_none_is_refused_before_the_first_job(tmp_path, capsys, monkeypatch):
