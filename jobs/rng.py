@@ -7,18 +7,23 @@ and leaves the numbers of the others as they were.
 stream     a generator of one identity
 name_of    its key, for a header
 uniforms   a few numbers for each of many sources, whichever others they are drawn with
+mixed      SplitMix64's mixer, of which numbers that are keyed one by one are made
 """
 
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lake_schema.errors import BadInput
 
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+# SplitMix64's step.
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_S30, _S27, _S31 = np.uint64(30), np.uint64(27), np.uint64(31)
 
 
 def name_of(*identity: int | str) -> str:
@@ -42,18 +47,22 @@ def uniforms(ids: npt.NDArray[np.int64], count: int, *identity: int | str) -> np
     Ref : Steele, Lea & Flood 2014 (SplitMix64: a counter through a mixer that changes half of the bits)
     """
     first, second = _key(identity)
-    own = _mixed(ids.astype(np.uint64) ^ first)
+    own = mixed(ids.astype(np.uint64) ^ first)
     # Arithmetic is modulo 2^64.
-    counters = (np.arange(count, dtype=np.uint64) + np.uint64(1)) * _GOLDEN
-    bits = _mixed((own[None, :] ^ second) + counters[:, None])
+    counters = (np.arange(count, dtype=np.uint64) + np.uint64(1)) * GOLDEN
+    bits = mixed((own[None, :] ^ second) + counters[:, None])
     # 52 bits and a half: neither 0 nor, rounded, 1.
     return np.asarray(((bits >> np.uint64(12)) + 0.5) * 2.0**-52)
 
 
-def _mixed(words: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(words ^ (words >> np.uint64(31)), np.uint64)
+def mixed(words: Any) -> Any:
+    """uint64 words, each through a mixer that changes half of the bits.
+
+    Arrays, or single ones where jobs.compiling compiles it (by that name this file is in the key of machine code).
+    """
+    words = (words ^ (words >> _S30)) * _FIRST
+    words = (words ^ (words >> _S27)) * _SECOND
+    return words ^ (words >> _S31)
 
 
 def _key(identity: tuple[int | str, ...]) -> npt.NDArray[np.uint64]:

@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
+from jobs.rng import GOLDEN, mixed
 
-_GOLDEN, _FIRST, _SECOND = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
-_LAYER, _SIGN = np.uint64(255), np.uint64(256)
+_S11, _LAYER, _SIGN = np.uint64(11), np.uint64(255), np.uint64(256)
 # Of 256 layers of equal area under exp(-x^2 / 2): where the tail begins, and the area (Doornik 2005).
 _TAIL, _AREA = 3.6541528853610088, 4.92867323399e-3
 
@@ -45,23 +44,19 @@ _INSIDE = _ENDS[1:] / _ENDS[:-1]
 _HEIGHTS = np.exp(-0.5 * _ENDS**2)
 
 
-@jit
-def _mixed(word: Any) -> Any:
-    word = (word ^ (word >> _S30)) * _FIRST
-    word = (word ^ (word >> _S27)) * _SECOND
-    return word ^ (word >> _S31)
+_mixed = jit(mixed)
 
 
 @jit
 def word(frame_key: Any, pixel: int) -> Any:
     """64 random bits, uint64, of a pixel of the frame that has the key (uint64); pixel : its number in the frame."""
-    return _mixed(frame_key + np.uint64(pixel) * _GOLDEN)
+    return _mixed(frame_key + np.uint64(pixel) * GOLDEN)
 
 
 @jit
 def next_word(before: Any) -> Any:
     """64 more, where a pixel wants more than one number; before : its last ones."""
-    return _mixed(before + _GOLDEN)
+    return _mixed(before + GOLDEN)
 
 
 @jit

@@ -1,9 +1,13 @@
 """Dice of pixels: the laws that they promise, to their tails; and that each pixel's are its own."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy import stats
 
+from jobs import rng
+from jobs.cache import sources_key
 from jobs.compiling import jit
 from jobs.render.effects import dice, read_noise
 
@@ -48,6 +52,15 @@ def test_words_are_those_of_splitmix():
     assert rolled(np.uint64(1234567), pixels, 0)[0].tolist() == [
         6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431, 16408922859458223821,
     ]  # fmt: skip
+
+
+def test_machine_code_is_made_anew_when_the_mixer_changes(tmp_path):
+    """It stands in a file that compiles nothing itself."""
+    copy = tmp_path / "rng.py"
+    copy.write_text(Path(rng.__file__).read_text())
+    before = sources_key(tmp_path)
+    copy.write_text(copy.read_text().replace("30", "29"))
+    assert sources_key(tmp_path) != before
 
 
 def test_uniform(many):
