@@ -2,7 +2,7 @@
 
     python scripts/pin_packages.py [--upgrade]
 
-Versions stay as they are unless asked for newer ones.
+Versions stay as they are unless asked for newer ones. A package has one version in all of the lists.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import argparse
 import re
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -32,15 +33,32 @@ def read(text: str) -> Pins:
     found: Pins = {}
     for line in text.splitlines():
         if match := re.match(r"([\w.-]+)==", line):
-            found[(name := match[1])] = []
+            name = match[1]
+            if name in found:
+                raise SystemExit(f"{name} has two versions, on machines or Pythons of different kinds: bound it")
+            found[name] = []
         if line and line[0] not in "#-":
             found[name].append(line)
     return found
 
 
-def compiled(wanted: Path, known: Path, *options: str) -> Pins:
-    """What uv makes of a list or of pyproject.toml, at the versions of `known` where it has them."""
-    command = ["uv", "pip", "compile", str(wanted), "--constraint", str(known), "--generate-hashes", "--universal"]
+def versions(pins: Pins) -> list[str]:
+    """name==version of each package."""
+    return [lines[0].split()[0] for lines in pins.values()]
+
+
+def compiled(wanted: Sequence[Path], known: Path, *options: str) -> Pins:
+    """What uv makes of lists and of pyproject.toml, at the versions of `known` where it has them."""
+    command = [
+        "uv",
+        "pip",
+        "compile",
+        *map(str, wanted),
+        "--constraint",
+        str(known),
+        "--generate-hashes",
+        "--universal",
+    ]
     command += ["--python-version", "3.11.7", "--quiet", "--no-annotate", "--no-header", *options]
     return read(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
@@ -52,14 +70,16 @@ def main() -> None:
     here = {name: read((FOLDER / f"{name}.txt").read_text()) for name in ABOUT}
     with tempfile.TemporaryDirectory() as name:
         known, builders = Path(name) / "known.txt", Path(name) / "builders.in"
-        pins = [] if upgrade else [lines[0].split()[0] for some in here.values() for lines in some.values()]
-        known.write_text("\n".join(sorted(set(pins))))
-        builders.write_text("\n".join(BUILDERS))
         project = ROOT / "pyproject.toml"
-        made = {"run": compiled(project, known), "build": compiled(builders, known)}
+        builders.write_text("\n".join(BUILDERS))
+        known.write_text("" if upgrade else "\n".join(pin for some in here.values() for pin in versions(some)))
+        # All together decide the versions, once; each list then takes its own of them.
+        every = compiled([project, builders], known, "--all-extras")
+        known.write_text("\n".join(versions(every)))
+        made = {"run": compiled([project], known), "build": compiled([builders], known)}
         for extra in ("test", "bench"):
-            every = compiled(project, known, "--extra", extra)
-            made[extra] = {name: lines for name, lines in every.items() if name not in made["run"]}
+            wanted = compiled([project], known, "--extra", extra)
+            made[extra] = {name: lines for name, lines in wanted.items() if name not in made["run"]}
         made["java"] = {JAVA: made["test"].pop(JAVA)}
     for name, some in made.items():
         head = [f"# {ABOUT[name]}", "# Made by scripts/pin_packages.py.", ""]

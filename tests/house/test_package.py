@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import email
+import importlib
 import importlib.metadata
 import re
 import shutil
@@ -121,3 +122,33 @@ def test_what_is_wanted_is_pinned_within_its_range():
     for line in wanted:
         requirement = Requirement(line)
         assert requirement.specifier.contains(pins()[canonicalize_name(requirement.name)]), line
+
+
+# Of numba and of pyspark, which want one version of them each and are nothing without.
+PARTS = {"llvmlite", "py4j"}
+
+
+@pytest.mark.parametrize(("folders", "extras"), [(("lake_schema", "jobs"), ()), (("tests",), ("test",))])
+def test_what_is_imported_is_named(folders, extras):
+    """Not only what comes with another package, which may do without it tomorrow; in programs kept as text, too."""
+    project = PROJECT["project"]
+    lines = [*project["dependencies"], *(line for extra in extras for line in project["optional-dependencies"][extra])]
+    named = {canonicalize_name(Requirement(line).name) for line in lines} | PARTS
+    whose = importlib.metadata.packages_distributions()
+    missing = {}
+    for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
+        for module in re.findall(
+            r"^ *(?:import|from) (\w+)[\w.]*(?:$| import | as |,)", path.read_text(), re.MULTILINE
+        ):
+            sources = {canonicalize_name(name) for name in whose.get(module, ())} - {"truesky"}
+            if sources and not sources & named:
+                missing[module] = path.relative_to(ROOT).as_posix()
+    assert missing == {}
+
+
+def test_a_package_of_two_versions_is_not_pinned(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    pin_packages = importlib.import_module("pin_packages")
+    assert pin_packages.read("a==1 \\\n    --hash=x\nb==2\n") == {"a": ["a==1 \\", "    --hash=x"], "b": ["b==2"]}
+    with pytest.raises(SystemExit, match="a has two versions"):
+        pin_packages.read("a==1 ; python_version < '3.12'\na==2 ; python_version >= '3.12'\n")
