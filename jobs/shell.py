@@ -87,6 +87,8 @@ _RESULT = pa.schema(
 
 # What the C library calls an encoding of ASCII alone.
 _ASCII = ("ANSI_X3.4-1968", "US-ASCII", "646")
+# Set where Java started Python.
+_GATEWAY = "PYSPARK_GATEWAY_PORT"
 _AGAIN = "a second run continues where this one ended"
 
 
@@ -133,10 +135,16 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _refuse_mangled(*paths: str) -> None:
-    """Refuse paths that lost letters on their way through Java, rather than make a lake of another name."""
+    """Refuse paths that lost letters on their way here, rather than make a lake of another name.
+
+    Where the locale is of ASCII alone Java hands a question mark on for any other letter, and nobody can tell it from
+    one that was typed: spark-submit is two processes, the first ends and took the letters with it. Python, started
+    without Java, keeps each byte of such a letter as a surrogate.
+    """
     if locale.nl_langinfo(locale.CODESET) in _ASCII:
+        lost = re.compile("[?]" if _GATEWAY in os.environ else "[\ud800-\udfff]")
         for path in paths:
-            if "?" in path:
+            if lost.search(path):
                 raise BadInput(f"{user_files.shown(path)}: this locale has no letters but ASCII: export LC_ALL=C.UTF-8")
 
 

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -275,18 +277,37 @@ def test_a_file_of_a_request_that_is_none(tmp_path, key, read):
     assert tree(tmp_path) == before
 
 
-def test_every_kind_of_file_has_a_size_that_is_named(tmp_path):
-    for kind, most in user_files.LARGEST.items():
+def test_every_kind_of_file_has_a_size_that_is_named(tmp_path, monkeypatch):
+    for size, kind in enumerate(user_files.LARGEST):
+        monkeypatch.setitem(user_files.LARGEST, kind, size)
+    for size, kind in enumerate(user_files.LARGEST):
         path = tmp_path / "x"
-        with path.open("wb") as stream:
-            stream.truncate(most + 1)
-        with pytest.raises(BadInput, match=f"is larger than {most} bytes, the most of a {kind}"):
+        path.write_bytes(b"x" * size)
+        assert user_files.checked(path, kind) == path
+        path.write_bytes(b"x" * (size + 1))
+        with pytest.raises(BadInput, match=f"is larger than {size} bytes, the most of a {kind}"):
             user_files.checked(path, kind)
 
 
+@pytest.mark.parametrize(("lost", "gateway"), [("??", "25333"), ("\udcc3\udca9", "")])
 @pytest.mark.parametrize("name", JOBS)
-def test_names_that_lost_their_letters_are_refused(tmp_path, capsys, monkeypatch, good, name):
-    """In a locale of ASCII alone Java hands a question mark on for any other letter."""
+def test_names_that_lost_their_letters_are_refused(tmp_path, capsys, monkeypatch, good, name, lost, gateway):
+    """In a locale of ASCII alone Java hands a question mark on for any other letter, and Python surrogates."""
     monkeypatch.setattr("locale.nl_langinfo", lambda item: "ANSI_X3.4-1968")
-    for lake, path in ((f"{tmp_path}/??", good), (f"{tmp_path}/lake", f"{tmp_path}/??.toml")):
+    if gateway:
+        monkeypatch.setenv("PYSPARK_GATEWAY_PORT", gateway)
+    for lake, path in ((f"{tmp_path}/{lost}", good), (f"{tmp_path}/lake", f"{tmp_path}/{lost}.toml")):
         assert "export LC_ALL=C.UTF-8" in refused(tmp_path, capsys, run, name, lake, path)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [(b"is it?", b"is it?: no such file"), (b"caf\xc3\xa9", b"export LC_ALL=C.UTF-8")]
+)
+def test_a_question_mark_is_a_letter_where_no_java_was(tmp_path, name, words):
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
+    environment.pop("PYSPARK_GATEWAY_PORT", None)
+    asked = [sys.executable, "-m", "jobs.render.plan_exposures", "--lake", tmp_path / "lake"]
+    done = subprocess.run([*asked, "--request", bytes(tmp_path / "x") + name], env=environment, capture_output=True)
+    assert (done.returncode, done.stderr.count(b"\n")) == (2, 1)
+    assert words in done.stderr
+    assert list(tmp_path.iterdir()) == []
