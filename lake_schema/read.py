@@ -97,6 +97,10 @@ class Version:
         """Any other file of the version, such as an image; Damaged where its sha256 is not what the manifest says."""
         return manifest.whole(self.folder, self._file(relative))
 
+    def sha256(self, relative: str) -> str:
+        """sha256 of such a file, as it was published."""
+        return str(self._file(relative)["sha256"])
+
     def _file(self, relative: str) -> dict[str, Any]:
         entry = self._files().get(relative)
         if entry is None:

@@ -27,18 +27,13 @@ from pyarrow import feather
 
 from jobs import sums
 from jobs.explore.process import Process
-from jobs.render import focal_plane
+from jobs.render import focal_plane, run_log
 from lake_schema import command, layout, read, sky, user_files
-from lake_schema.errors import BadInput, Damaged
+from lake_schema.errors import BadInput
 from lake_schema.provenance import code_version, file_sha256
 
 # Bytes and s that a query of the archive may take.
 _MEMORY, _TIMEOUT = 1e9, 60.0
-# What a line of a run's log says of a part.
-_IN_LOGS: dict[str, tuple[type, ...]] = {
-    "part": (str,), "error": (str,), "attempt": (int,), "seconds": (float, int), "peak_gb": (float, int)
-}  # fmt: skip
-_MOST_IN_LOGS = 1e15
 _FAILURES = pa.schema(
     [
         pa.field("part", pa.string()),
@@ -55,7 +50,7 @@ def products(root: Path) -> pa.Table:
     """Rows of the table `products` with sha256, bytes, seconds (s) and peak_gb (GB), null where no log says so."""
     version = read.version(root, "products")
     files = {entry["path"]: entry for entry in version.manifest["files"]}
-    made = {line["part"]: line for line in _lines(root) if "error" not in line}
+    made = {line["part"]: line for line in _parts(root) if "error" not in line}
     rows = []
     for part in version.manifest["parts"]:
         about = made.get(part["name"], {})
@@ -68,7 +63,7 @@ def products(root: Path) -> pa.Table:
 
 def failures(root: Path) -> pa.Table:
     """Detectors whose last attempt failed: error, attempt, seconds, peak_gb (GB), and the run."""
-    last = {line["part"]: line for line in _lines(root)}
+    last = {line["part"]: line for line in _parts(root)}
     failed = [line for _, line in sorted(last.items()) if "error" in line]
     return pa.Table.from_pylist([{k: line.get(k) for k in _FAILURES.names} for line in failed], _FAILURES)
 
@@ -87,31 +82,10 @@ def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
     return rows.filter(pa.array(inside & (sums.product(edges.sum(axis=1), place) > 0)))
 
 
-def _lines(root: Path) -> Iterator[dict[str, Any]]:
-    """What the runs' logs say of parts of `products`, oldest first."""
-    for path in sorted(layout.runs(root).glob("*-products-*.jsonl")):
-        with user_files.opened(path, "run log") as stream:
-            lines = stream.read().split(b"\n")
-        for number, text in enumerate(lines, start=1):
-            try:
-                line = json.loads(text)
-                if _is_of_part(line):
-                    yield {**line, "run": path.stem}
-            except (ValueError, RecursionError, TypeError):
-                # The last line of a run that was killed may be anything.
-                if any(lines[number:]):
-                    raise Damaged(f"{user_files.shown(path)} line {number} is not what a run writes") from None
-
-
-def _is_of_part(line: dict[str, Any]) -> bool:
-    """Whether a line of a log is about a part; TypeError where it is not one that a run writes."""
-    if not isinstance(line, dict):
-        raise TypeError
-    for name, kinds in _IN_LOGS.items():
-        value = line.get(name, kinds[0]())
-        if type(value) not in kinds or (kinds != (str,) and not 0 <= value < _MOST_IN_LOGS):
-            raise TypeError
-    return "part" in line
+def _parts(root: Path) -> Iterator[dict[str, Any]]:
+    """What the runs' logs say of parts of `products`, oldest first, each with its run."""
+    for path in run_log.of_products(root):
+        yield from ({**line, "run": path.stem} for line in run_log.lines(path) if "part" in line)
 
 
 def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _TIMEOUT) -> pa.Table:
@@ -157,7 +131,9 @@ def again(root: Path, product: str, out: Path, key: str | None = None) -> str:
     (part,) = (part for part in version.manifest["parts"] if place.items() <= part["facts"].items())
     facts = version.manifest["facts"]
     render_exposures.work(root, {**facts, **part["facts"]}).files[product](out)
-    if file_sha256(out) == file_sha256(version.file(product)):
+    # Refused where it is no longer what was published.
+    version.file(product)
+    if file_sha256(out) == version.sha256(product):
         return ""
     code = "" if facts["code"] == code_version() else ": it was made by another version of the code"
     return f"{out} differs from {product}{code}"

@@ -7,7 +7,6 @@ of_machine   from the detectors that the lake holds, else from a calibration of 
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import time
 from collections.abc import Iterator
@@ -19,8 +18,9 @@ import numpy as np
 import scipy.fft
 
 from jobs import cache
-from lake_schema import layout, read, user_files
-from lake_schema.errors import BadInput, LakeError
+from jobs.render import run_log
+from lake_schema import read
+from lake_schema.errors import LakeError
 from lake_schema.provenance import machine
 
 # CPU s of a pass of `calibration` on the machine of costs.csv: found on another (AMD EPYC, znver5), which takes 0.13 s
@@ -85,16 +85,9 @@ def _measured(lake: Path) -> Iterator[float]:
 
 
 def _lines(lake: Path, key: str) -> Iterator[dict[str, Any]]:
-    """What was written of the parts of a version of `products`; what cannot be read teaches nothing."""
-    for path in sorted(layout.runs(lake).glob("*-products-*.jsonl")):
-        lines = []
-        with (
-            contextlib.suppress(BadInput, OSError, ValueError, RecursionError),
-            user_files.opened(path, "run log") as log,
-        ):
-            # The last line of a run that was killed may be anything.
-            for text in log:
-                lines.append(json.loads(text))
-        lines = [line for line in lines if isinstance(line, dict)]
-        if lines and lines[0].get("key") == key:
-            yield from lines
+    """What was written of the parts of a version of `products`; a log that cannot be read teaches nothing."""
+    for path in run_log.of_products(lake):
+        with contextlib.suppress(LakeError, OSError):
+            first, *parts = run_log.lines(path) or [{}]
+            if first.get("key") == key:
+                yield from parts

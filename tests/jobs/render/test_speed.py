@@ -5,8 +5,9 @@ import json
 import pytest
 
 from jobs.measured import Measured
-from jobs.render import speed
+from jobs.render import archive, speed
 from lake_schema import layout, publish
+from lake_schema.errors import Damaged
 from lake_schema.provenance import machine
 from lake_schema.publish import Output, Part, Plan
 from lake_schema.tables.products import PRODUCTS
@@ -65,6 +66,17 @@ def test_what_says_nothing_of_this_machine_is_left_out(lake, rendered):
     log(lake, "of another version", [9.0] * 4)
     log(lake, rendered, [9.0] * 4, error="it failed")
     assert "calibration" in speed.of_machine(lake).source
+
+
+def test_a_log_that_is_damaged_teaches_nothing(lake, rendered):
+    """Nor does it keep others from it; the archive names it."""
+    log(lake, rendered, [9.0] * 4)
+    (path,) = layout.runs(lake).iterdir()
+    path.write_text(path.read_text().replace('"2.parquet"', "2"))
+    log(lake, rendered, [2.0, 0.5, 0.4, 0.3])
+    assert "4 detectors" in speed.of_machine(lake).source
+    with pytest.raises(Damaged, match=f"{path.name} line 3 is not what a run writes"):
+        archive.failures(lake)
 
 
 def test_a_calibration_is_made_once(lake, monkeypatch):
