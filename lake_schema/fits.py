@@ -462,7 +462,7 @@ def _foreign(path: Path, kind: str) -> Iterator[fits.HDUList]:
                 warnings.simplefilter("ignore", fits.verify.VerifyWarning)
                 plain = _unpacked(path, stream)
                 _look_through(path, plain)
-                # What an image is packed in is a table then, and is not unpacked: its codes are not made for strangers.
+                # What an image is packed in is a table then, and is not unpacked: that code trusts what it is given.
                 with fits.open(plain, memmap=plain is stream, disable_image_compression=True) as units:
                     yield units
         except LakeError:

@@ -1,4 +1,4 @@
-"""Parquet files from strangers: nothing in them is believed, everything is bounded before and while it is read.
+"""Parquet files of other programs: nothing in them is believed, everything is bounded before and while it is read.
 
 batches     the rows of some flat columns, a bounded piece at a time
 

@@ -1,4 +1,4 @@
-"""Tables of numbers from strangers, whatever they are kept in: a bounded piece at a time, in the order of the files.
+"""Tables of numbers from other programs, whatever their form: a bounded piece at a time, in the order of the files.
 
 files    a path -> the files that it stands for: itself, or the Parquet files of a folder such as a HATS catalogue
 pieces   the rows of some columns of a Parquet, FITS or CSV file

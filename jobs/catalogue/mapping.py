@@ -1,4 +1,4 @@
-"""Whose column is which: from a stranger's table to keys that we know, by a mapping that is data.
+"""Whose column is which: from a user's table to keys that we know, by a mapping that is data.
 
 formats     the mappings that are shipped (ingest_formats.toml)
 galaxies    a shipped mapping with a request's own entries over it, checked

@@ -71,7 +71,7 @@ def read(path: Path, name: str) -> Curve:
     except LakeError:
         raise
     except Exception as error:
-        # What the libraries' readers raise of a stranger's file has no end.
+        # What the libraries' readers raise of a user's file has no end.
         raise BadInput(f"{path}: cannot be read as {name}: {' '.join(str(error).split())[:200]}") from None
     check(path, wavelength, value, form)
     return Curve(wavelength, value)

@@ -45,8 +45,8 @@ def table(configuration: MissionConfiguration) -> pa.Table:
     own = [record for record in chosen if record.key in configuration.overridden]
     known: list[Parameter | Model] = [*read_all(), *read_models()]
     # A configuration that was read back may hold records that the package no longer has.
-    strangers = [record for record in chosen if record not in known and record not in own]
-    every = [*known, *strangers, *own]
+    gone = [record for record in chosen if record not in known and record not in own]
+    every = [*known, *gone, *own]
     wanted = set(chosen)
     dates = [math.nan if record.valid_from is None else record.valid_from for record in every]
     values = [record.value if isinstance(record, Parameter) else math.nan for record in every]

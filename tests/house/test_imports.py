@@ -59,7 +59,7 @@ def unsafe(tree: ast.AST) -> list[str]:
 # Modules that read Parquet; what they have that writes, or is of no file.
 PARQUET = ("pyarrow.parquet", "pyarrow.dataset", "pyarrow.orc")
 NO_READING = {"write_table", "ParquetWriter", "Expression", "field", "scalar"}
-# The one door; Parquet of strangers, in a process of its own.
+# The one door; Parquet of other programs, in a process of its own.
 PARQUET_READERS = {"lake_schema/parquet.py", "lake_schema/foreign.py"}
 # Spark's own reader, after every byte was compared.
 SPARK_READERS = {"jobs/session.py"}

@@ -36,7 +36,7 @@ def test_machine_code_is_of_the_sources_as_they_are(tmp_path):
     """Also of those that are compiled into others."""
     assert cache.machine_code_dir().name == cache.sources_key()[:16]
     (tmp_path / "effects").mkdir()
-    inner, plain = tmp_path / "effects" / "dice.py", tmp_path / "units.py"
+    inner, plain = tmp_path / "effects" / "pixel_random.py", tmp_path / "units.py"
     inner.write_text("from jobs.compiling import jit\n")
     plain.write_text("")
     first = cache.sources_key(tmp_path)

@@ -1,4 +1,4 @@
-"""Parquet from strangers: read as it is, or refused in one line, in little time and memory."""
+"""Parquet of other programs: read as it is, or refused in one line, in little time and memory."""
 
 import base64
 import pickle
@@ -116,9 +116,9 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_refused_in_one_line(name, tmp_path):
-    path = tmp_path / "stranger.parquet"
+    path = tmp_path / "theirs.parquet"
     BAD[name](path)
-    with pytest.raises(BadInput, match="stranger") as caught:
+    with pytest.raises(BadInput, match="theirs") as caught:
         read(path)
     assert len(str(caught.value).splitlines()) == 1
     assert len(str(caught.value)) < 600
@@ -164,7 +164,7 @@ def test_statistics_are_not_believed(tmp_path):
 
 @pytest.mark.parametrize("trials", [25, pytest.param(600, marks=pytest.mark.nightly)])
 def test_changed_bytes_end_in_rows_or_in_one_line(trials, tmp_path):
-    path = tmp_path / "stranger.parquet"
+    path = tmp_path / "theirs.parquet"
     write(path, GOOD)
     whole = np.frombuffer(path.read_bytes(), np.uint8)
     rng = np.random.default_rng(5)

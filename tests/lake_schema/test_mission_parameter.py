@@ -95,7 +95,7 @@ def test_the_zodiacal_table_is_the_published_one():
     assert all(table[90.0][i] >= table[90.0][i + 1] for i in range(10))
 
 
-def test_statuses_and_sections_have_no_strangers():
+def test_statuses_and_sections_are_those_that_are_known():
     records = read_all()
     assert {record.status for record in records} <= set(parameter.STATUSES)
     prefixes = {record.key.split(".")[0] for record in records}

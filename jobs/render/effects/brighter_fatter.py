@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
-from jobs.render.effects import dice
+from jobs.render.effects import pixel_random
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
@@ -64,7 +64,7 @@ def apply(
     most = np.zeros((len(held), -(-held.shape[1] // _RUN) + 1), np.float32)
     _highest(held.view(np.int32), most.view(np.int32))
     for down in (False, True):
-        _cross(held, most, out, weights, dice.key(rng), down, dim, first, between)
+        _cross(held, most, out, weights, pixel_random.key(rng), down, dim, first, between)
     return out
 
 
@@ -117,7 +117,7 @@ def _cross(
                 # The border moves towards the fuller side, on average by half: what falls into the strip changes sides.
                 strip = np.float32(0.25) * some[c] * (here[c] + there[c])
                 # What crosses is a whole number of electrons, right in the mean.
-                moved = np.floor(strip + dice.uniform(dice.word(key, r * nx + first + c)))
+                moved = np.floor(strip + pixel_random.uniform(pixel_random.word(key, r * nx + first + c)))
                 most_moved = np.floor(MOST * (giver[c] if moved > 0.0 else taker[c]))
                 moved = min(max(moved, -most_moved), most_moved)
                 giver[c] -= moved

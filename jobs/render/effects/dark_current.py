@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
-from jobs.render.effects import dice, poisson
+from jobs.render.effects import pixel_random, poisson
 from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel
 from lake_schema.errors import OutOfRange
 
@@ -22,7 +22,7 @@ def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> frame + Poisson(electrons) in every pixel."""
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("dark electrons", electrons, 0.0, np.inf)
-    return by_pixel(_add, frame, electrons, dice.key(rng))
+    return by_pixel(_add, frame, electrons, pixel_random.key(rng))
 
 
 @jit
@@ -30,14 +30,14 @@ def _add(frame: Any, out: Any, electrons: float, key: Any) -> None:
     none = math.exp(-electrons)
     if electrons >= _FEW:
         for i in range(len(frame)):
-            out[i] = frame[i] + poisson.counted(electrons, none, dice.word(key, i))
+            out[i] = frame[i] + poisson.counted(electrons, none, pixel_random.word(key, i))
         return
     # Few electrons: of each count, all pixels of a run together.
     u = np.empty(_RUN)
     for first in range(0, len(frame), _RUN):
         some, before = out[first : first + _RUN], frame[first : first + _RUN]
         for j in range(len(some)):
-            u[j], some[j] = dice.uniform(dice.word(key, first + j)), before[j]
+            u[j], some[j] = pixel_random.uniform(pixel_random.word(key, first + j)), before[j]
         term, below, count = none, none, 0.0
         while below < _CERTAIN and term > 0.0:
             for j in range(len(some)):

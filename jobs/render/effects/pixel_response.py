@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
-from jobs.render.effects import dice
+from jobs.render.effects import pixel_random
 from jobs.render.effects.effect import Effect, Frame, Scene
 from lake_schema.errors import OutOfRange
 
@@ -53,7 +53,7 @@ def response(
         if not 0.0 <= value <= most:
             raise OutOfRange(name, value, 0.0, most)
     out = np.empty(shape)
-    _spread(out.reshape(-1), rms, dice.key(rng))
+    _spread(out.reshape(-1), rms, pixel_random.key(rng))
     ny, nx = shape[-2:]
     count = int(rng.binomial(ny * nx, dead))
     rows, columns = rng.integers(0, max(ny, 1), count), rng.integers(0, max(nx, 1), count)
@@ -86,7 +86,7 @@ def _shade(out: Frame, y: float, x: float, size: float, depth: float) -> None:
 @jit
 def _spread(out: Any, rms: float, key: Any) -> None:
     for i in range(len(out)):
-        out[i] = max(1.0 + rms * dice.normal(dice.word(key, i)), 0.0)
+        out[i] = max(1.0 + rms * pixel_random.normal(pixel_random.word(key, i)), 0.0)
 
 
 def parameters(scene: Scene) -> tuple[float, float, float, tuple[float, float, float]]:

@@ -1,4 +1,4 @@
-"""Shot noise: expected electrons become whole electrons, each pixel by dice of its own."""
+"""Shot noise: expected electrons become whole electrons, each pixel by random numbers of its own."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
-from jobs.render.effects import dice
+from jobs.render.effects import pixel_random
 from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel, nothing
 
 # Below this the sum of the probabilities is followed, above it the law is inverted by its asymptotic series.
@@ -21,7 +21,7 @@ def apply(frame: Frame, rng: np.random.Generator) -> Frame:
     Error : of the probability of a count: 6e-4 of it at an expectation of 10, 2e-5 at 100
     Ref   : Giles 2016, ACM Trans. Math. Softw. 42, 7: the inverse of Poisson's law to second order in its width
     """
-    return by_pixel(_count, frame, dice.key(rng))
+    return by_pixel(_count, frame, pixel_random.key(rng))
 
 
 @jit
@@ -29,20 +29,20 @@ def _count(light: Any, counts: Any, key: Any) -> None:
     for i in range(len(light)):
         mean = max(light[i], 0.0)
         none = math.exp(-mean) if mean < _SUMMED_BELOW else 0.0
-        counts[i] = counted(mean, none, dice.word(key, i))
+        counts[i] = counted(mean, none, pixel_random.word(key, i))
 
 
 @jit
 def counted(mean: float, none: float, bits: Any) -> Any:
-    """A count of an expectation >= 0, by a pixel's dice; none : exp(-mean) where that is below 10."""
+    """A count of an expectation >= 0, by a pixel's random bits; none : exp(-mean) where that is below 10."""
     if mean < _SUMMED_BELOW:
-        u, term, count = dice.uniform(bits), none, 0.0
+        u, term, count = pixel_random.uniform(bits), none, 0.0
         while u > term and count < 200.0:
             u -= term
             count += 1.0
             term *= mean / count
         return count
-    w, root = dice.normal(bits), math.sqrt(mean)
+    w, root = pixel_random.normal(bits), math.sqrt(mean)
     square, inverse = w * w, 1.0 / root
     third = inverse * (-8.0 / 405.0 + square * (7.0 / 810.0 + square / 270.0))
     second = inverse * (w * (-1.0 / 36.0 - square / 72.0) + third)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
-from jobs.render.effects import dice
+from jobs.render.effects import pixel_random
 from jobs.render.effects.effect import Effect, Frame, Scene, by_pixel, nothing
 from lake_schema.errors import OutOfRange
 
@@ -16,13 +16,13 @@ def apply(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] e- -> frame + N(0, sigma) e-."""
     if not 0.0 <= sigma < np.inf:
         raise OutOfRange("read noise", sigma, 0.0, np.inf)
-    return by_pixel(_add, frame, sigma, dice.key(rng))
+    return by_pixel(_add, frame, sigma, pixel_random.key(rng))
 
 
 @jit
 def _add(frame: Any, out: Any, sigma: float, key: Any) -> None:
     for i in range(len(frame)):
-        out[i] = frame[i] + sigma * dice.normal(dice.word(key, i))
+        out[i] = frame[i] + sigma * pixel_random.normal(pixel_random.word(key, i))
 
 
 def _sigma(scene: Scene) -> float:

@@ -128,7 +128,7 @@ def test_no_two_detectors_overlap(layout):
     assert apart[~np.eye(len(layout), dtype=bool)].all()
 
 
-def test_strangers_are_refused():
+def test_unknown_cameras_and_detectors_are_refused():
     with pytest.raises(BadInput, match="wfc"):
         detectors("wfc", MISSION)
     with pytest.raises(BadInput, match="7-1"):

@@ -244,7 +244,7 @@ def test_names_without_end_are_refused(tmp_path):
 
 
 def test_what_no_table_of_ours_looks_like_is_refused(tmp_path):
-    """Parquet of strangers is read by a process of its own, with its bounds."""
+    """Parquet of users is read by a process of its own, with its bounds."""
     names = [*own_bodies.KEYS, *(f"c{i}" for i in range(6000))]
     file = tmp_path / "wide.parquet"
     pq.write_table(pa.table([pa.array([1.0])] * len(names), names=names), file)

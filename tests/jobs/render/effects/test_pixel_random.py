@@ -1,4 +1,4 @@
-"""Dice of pixels: the laws that they promise, to their tails; and that each pixel's are its own."""
+"""Random numbers per pixel: the laws that they promise, to their tails; and that each pixel's are its own."""
 
 from pathlib import Path
 
@@ -9,11 +9,11 @@ from scipy import stats
 from jobs import rng
 from jobs.cache import sources_key
 from jobs.compiling import jit
-from jobs.render.effects import dice, read_noise
+from jobs.render.effects import pixel_random, read_noise
 
 COUNT = 1 << 22
-KEY = dice.key(np.random.default_rng(5))
-# One in a thousand good dice would be refused.
+KEY = pixel_random.key(np.random.default_rng(5))
+# One in a thousand good generators would be refused.
 LEAST = 1e-3
 
 
@@ -22,10 +22,10 @@ def rolled(key, pixels, again):
     """Words, uniform and normal deviates of pixels; again : how many words later."""
     words, uniform, normal = np.empty(len(pixels), np.uint64), np.empty(len(pixels)), np.empty(len(pixels))
     for i in range(len(pixels)):
-        bits = dice.word(key, pixels[i])
+        bits = pixel_random.word(key, pixels[i])
         for _ in range(again):
-            bits = dice.next_word(bits)
-        words[i], uniform[i], normal[i] = bits, dice.uniform(bits), dice.normal(bits)
+            bits = pixel_random.next_word(bits)
+        words[i], uniform[i], normal[i] = bits, pixel_random.uniform(bits), pixel_random.normal(bits)
     return words, uniform, normal
 
 
@@ -34,7 +34,7 @@ def far_out(key, count, least):
     """Those of many normal deviates that are this far from 0."""
     found, n = np.empty(count // 1000), 0
     for i in range(count):
-        deviate = dice.normal(dice.word(key, i))
+        deviate = pixel_random.normal(pixel_random.word(key, i))
         if abs(deviate) > least:
             found[n] = deviate
             n += 1
@@ -68,8 +68,8 @@ def test_uniform(many):
     assert stats.kstest(uniform, "uniform").pvalue > LEAST
     assert stats.chisquare(np.bincount((uniform * 4096).astype(int), minlength=4097)[:4096]).pvalue > LEAST
     # Its logarithm is taken.
-    assert dice.uniform(np.uint64(0)) == 2.0**-53
-    assert dice.uniform(np.uint64(2**64 - 1)) == 1.0
+    assert pixel_random.uniform(np.uint64(0)) == 2.0**-53
+    assert pixel_random.uniform(np.uint64(2**64 - 1)) == 1.0
 
 
 def test_normal(many):

@@ -1,6 +1,6 @@
-"""Dice of pixels: each pixel has random numbers of its own, so that what changes in one of them changes no other.
+"""Random numbers per pixel: each has its own, so that what changes in one pixel changes no other.
 
-key         of a frame's dice, from an effect's generator
+key         of a frame's random numbers, from an effect's generator
 word        64 random bits of a pixel
 next_word   the next 64 of the same pixel
 uniform     in (0, 1] of a word
@@ -27,7 +27,7 @@ _TAIL, _AREA = 3.6541528853610088, 4.92867323399e-3
 
 
 def key(rng: np.random.Generator) -> np.uint64:
-    """What a frame's dice count on from."""
+    """What a frame's random numbers count on from."""
     return rng.integers(0, 2**64, dtype=np.uint64)
 
 
