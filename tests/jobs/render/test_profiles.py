@@ -3,9 +3,9 @@
 import galsim
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
-from scipy.special import gammaincinv
+from scipy.special import gammaincinv, gammaln
 
 from jobs.render import profiles
 from tests.jobs.render.fields import galaxies
@@ -131,9 +131,16 @@ def test_critical_lines_do_no_harm(kappa, gamma1, gamma2):
 # ------------------------------------------------------------------------------------------------ extent
 
 
-@given(st.floats(0.5, 6.2))
-def test_the_series_of_b_n(index):
-    assert profiles._b(np.array([index]))[0] == pytest.approx(gammaincinv(2 * index, 0.5), rel=1e-3)
+@given(st.floats(0.3, 6.2))
+@example(0.3)
+def test_half_of_the_light_lies_inside_the_half_light_radius(index):
+    assert profiles._b(np.array([index]))[0] == pytest.approx(gammaincinv(2 * index, 0.5), rel=4e-5)
+    one = shape(bulge_fraction=1.0, bulge_sersic_index=index, bulge_half_light_radius=2.0)
+    assert profiles.outside(one, np.array([2.0]))[0] == pytest.approx(0.5, abs=1e-4)
+    sky = profiles.on_the_sky(one, profiles.forms(one, np.eye(2)[None]))[0]
+    # The light in the middle and the area of exp(-r^(1 / n)) make up all of the flux.
+    whole = sky[0] * 2 * np.pi * index * np.exp(gammaln(2 * index)) / np.linalg.det(sky[2:6].reshape(2, 2))
+    assert (abs(whole), sky[6]) == pytest.approx((1.0, 0.5 / index), rel=1e-5)
 
 
 @pytest.mark.parametrize("kind", [{"bulge_fraction": 1.0, "bulge_axis_ratio": 0.5}, {"inclination": 50.0}])
