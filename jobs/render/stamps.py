@@ -380,6 +380,10 @@ def _draw(
     def of_largest(i: int) -> outskirts.Outskirts:
         return _outskirts(sources, i, some, form, psf, weights, nx, ny)
 
+    def add_outskirts(i: int, of: outskirts.Outskirts) -> None:
+        hole, place = (int(x0[i]), int(y0[i]), int(sizes[i])), (float(sources.column[i]), float(sources.row[i]))
+        drawn[i] += outskirts.add(of, frame, *place, hole, unread, unit) / unit
+
     here, precise = selection.touching(sources.column, sources.row, sizes, nx, ny), _precise(sources, floors)
     done = int(np.sum(~here))
     for size in np.unique(sizes):
@@ -399,18 +403,20 @@ def _draw(
             elif shared is not None:
                 passed, share = shared, weights[chosen].astype(np.float32)
             finish = partial(edges.unfold, **star(chosen)) if far[chosen[0]] else None
-            if largest[chosen[0]]:
-                finish = partial(_finish_largest, sources, int(chosen[0]), of_largest)
+            outer = of_largest(int(chosen[0])) if largest[chosen[0]] else None
+            if outer is not None:
+                finish = partial(_finish_largest, sources, int(chosen[0]), outer)
             added = _draw_some(
                 frame, sources, chosen, passed, share, bodies, table, cut, curve, taken, finish, unread, unit
             )
             drawn[chosen] = added / unit
+            if outer is not None:
+                add_outskirts(int(chosen[0]), outer)
             done += len(chosen)
             if progress is not None:
                 progress(done)
-    for i in np.flatnonzero(largest).tolist():
-        hole, place = (int(x0[i]), int(y0[i]), int(sizes[i])), (float(sources.column[i]), float(sources.row[i]))
-        drawn[i] += outskirts.add(of_largest(i), frame, *place, hole, unread, unit) / unit
+    for i in np.flatnonzero(largest & ~here).tolist():
+        add_outskirts(i, of_largest(i))
     bright = np.flatnonzero(far)
     for trailing in np.split(bright, np.flatnonzero(np.diff(whole[bright])) + 1) if len(bright) else []:
         edges.add(frame, **star(trailing), unit=unit)
@@ -515,11 +521,10 @@ def _outskirts(
 
 
 def _finish_largest(
-    sources: Sources, i: int, of_largest: Callable[[int], outskirts.Outskirts], stamp: Array, left: int, low: int,
-    *_: int,
-) -> None:  # fmt: skip
+    sources: Sources, i: int, outer: outskirts.Outskirts, stamp: Array, left: int, low: int, *_: int
+) -> None:
     """Takes off galaxy i's stamp, whose first pixel is (left, low) of the frame, what came in at its edges."""
-    outskirts.take_in(of_largest(i), stamp, float(sources.column[i]) - left, float(sources.row[i]) - low)
+    outskirts.take_in(outer, stamp, float(sources.column[i]) - left, float(sources.row[i]) - low)
 
 
 def _precise(sources: Sources, floors: Float | None) -> npt.NDArray[np.bool_]:

@@ -3,7 +3,9 @@
 The profile is integrated along the line of sight here, and spread by the PSF sum by sum: nothing of the drawing's.
 """
 
+from dataclasses import replace
 from itertools import pairwise
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -51,7 +53,9 @@ def profile(shape, jacobian, dx, dy):
         scale = shape["disk_half_light_radius"] / EXPONENTIAL_RADIUS
         u, v = along / scale, across / scale
         if shape["inclination"] == 90.0:
-            light = 2.0 * np.abs(u) * k1(np.abs(u) + 1e-9) / np.cosh(np.minimum(v / DISK_SCALE_HEIGHT, 300.0)) ** 2
+            light = (
+                2.0 * np.abs(u) * k1(np.abs(u) + 1e-9) / np.cosh(np.minimum(np.abs(v) / DISK_SCALE_HEIGHT, 300.0)) ** 2
+            )
             return light / (4.0 * np.pi * DISK_SCALE_HEIGHT) / scale**2 * pixel
         return disk(u, v, shape["inclination"]) / scale**2 * pixel
     n, q, radius = (shape[f"bulge_{key}"] for key in ("sersic_index", "axis_ratio", "half_light_radius"))
@@ -166,6 +170,36 @@ def test_many_large_galaxies_are_drawn_to_their_outskirts(shape, mag, place, cam
     test_any_large_galaxy_is_drawn_to_its_outskirts.hypothesis.inner_test(shape, mag, place, camera)
 
 
+@settings(max_examples=10)
+@given(st.floats(0.5, 6.2), st.floats(0.02, 1.0), st.floats(0.0, 179.0), st.none() | st.floats(0.0, 90.0))
+@example(4.0, 0.02, 10.0, None)
+@example(6.2, 0.02, 0.0, None)
+@example(1.0, 1.0, 57.0, 90.0)
+def test_what_comes_into_a_stamp_is_the_light_of_all_images(index, ratio, angle, inclination):
+    """Of a bulge, or of a disc at an inclination; where 2 % of the light of slim ones was taken for even."""
+    side, electrons, disc = 512, 1e8, inclination is not None
+    shape = shape_of(0.0 if disc else 1.0, 12.0 if disc else 24.0, index, ratio, inclination or 0.0, angle)
+    detector = small("vis", "3-4", side)
+    source = one_source(detector, wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0)), electrons, **shape)
+    psf = spread("vis")
+    form = profiles.forms(source.shapes, source.jacobian)
+    weights = transfer.basis_weights(psf, None, source.column, source.row)[0]
+    some = replace(
+        outskirts.of_galaxy(source.shapes, form, electrons, psf, weights, 1.0), blurred=np.zeros((1, 1))
+    )  # fmt: skip
+    stamp = np.zeros((side, side))
+    outskirts.take_in(some, stamp, side / 2 + 0.3, side / 2 - 0.2)
+    rings = 8 if disc else 200
+    image = side * np.mgrid[-rings : rings + 1, -rings : rings + 1].reshape(2, -1)
+    image = image[:, image.any(axis=0)]
+    y, x = np.random.default_rng(3).integers(0, side, (2, 8))
+    expected = [
+        profile(shape, source.jacobian[0], a - side / 2 - 0.3 - image[0], b - side / 2 + 0.2 - image[1]).sum()
+        for a, b in zip(x, y, strict=True)
+    ]
+    np.testing.assert_allclose(-stamp[y, x], electrons * np.array(expected), rtol=2e-3, atol=0.1)
+
+
 @given(st.floats(0.0, 90.0), st.floats(0.0, 8.0), st.floats(0.0, 4.0))
 def test_the_disc_in_real_space(inclination, u, v):
     """An independent quadrature; closed forms face-on and edge-on."""
@@ -188,7 +222,9 @@ def test_all_light_is_somewhere():
     detector = small("lsstcam", "R22_S11", 3000)
     system, drawn = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0)), np.zeros(1)
     source = one_source(detector, system, 1e9, **shape)
-    image = stamps.draw(source, stamps.SIZES[-1:], spread("lsstcam"), 3000, 3000, drawn=drawn)
+    with mock.patch.object(outskirts, "of_galaxy", wraps=outskirts.of_galaxy) as made:
+        image = stamps.draw(source, stamps.SIZES[-1:], spread("lsstcam"), 3000, 3000, drawn=drawn)
+    made.assert_called_once()
     y, x = np.mgrid[-4499:4500:3, -4499:4500:3]
     light = profile(shape, source.jacobian[0], x, y) * 9.0
     inside = light[(abs(x) < 1500) & (abs(y) < 1500)].sum() / light.sum()
