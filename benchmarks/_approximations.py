@@ -10,17 +10,18 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import zoom
 from scipy.special import gammaincinv
 
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import Scene
-from jobs.render import profiles, psf, stamps
-from jobs.render.stamps import Settings, Sources
+from jobs.render.drawing import stamp_sizes, stamps
+from jobs.render.drawing.settings import Settings
+from jobs.render.psf import model
+from jobs.render.sources import galaxy_shapes
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float, Int
 
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
 # The paper's: folding threshold; half-light radii below which galaxies are exponential, above which they are sampled
 # down, arcsec. The magnitude that a galaxy is fainter than to have one component is VIS's limit there; ours has half
 # of the scene beyond it.
@@ -34,8 +35,8 @@ def _as_it_is(what: Anything) -> Anything:
     return what
 
 
-def _sizes(some: Sources, spread: psf.Psf, scene: Scene, settings: Settings) -> Int:
-    return stamps.stamp_sizes(some.electrons, some.shape, some.shapes, spread, scene.noise, settings)
+def _sizes(some: Sources, spread: model.Psf, scene: Scene, settings: Settings) -> Int:
+    return stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, spread, scene.noise, settings)
 
 
 @dataclass(frozen=True)
@@ -50,21 +51,23 @@ class Approximation:
     name: str
     concerned: Callable[[Scene, int, int], Sources] = scenes.sample
     simplified: Callable[[Sources], Sources] = _as_it_is
-    spread: Callable[[psf.Psf], psf.Psf] = _as_it_is
-    sizes: Callable[[Sources, psf.Psf, Scene, Settings], Int] = _sizes
+    spread: Callable[[model.Psf], model.Psf] = _as_it_is
+    sizes: Callable[[Sources, model.Psf, Scene, Settings], Int] = _sizes
     after: Callable[[Float], Float] = _as_it_is
     numbers: tuple[int, int, int] = (24, 6, 0)
     timed: Approximation | None = None
 
-    def draw(self, some: Sources, spread: psf.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
+    def draw(
+        self, some: Sources, spread: model.Psf, scene: Scene, settings: Settings, side: int | None = None
+    ) -> Float:
         """Sources that are simplified, through a PSF that is."""
-        floors = stamps.floors(some.electrons, scene.noise, settings)
+        floors = stamp_sizes.floors(some.electrons, scene.noise, settings)
         nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
         sizes = self.sizes(some, spread, scene, settings)
         return self.after(stamps.draw(some, sizes, spread, nx, ny, None, floors))
 
 
-def _folded(some: Sources, spread: psf.Psf, scene: Scene, settings: Settings) -> Int:
+def _folded(some: Sources, spread: model.Psf, scene: Scene, settings: Settings) -> Int:
     """Stamps as wide as galsim's folding_threshold asks for: all but that of the light."""
     shapes = some.shapes.take(some.shape)
     stretch = np.sqrt(shapes.magnification)
@@ -78,7 +81,9 @@ def _folded(some: Sources, spread: psf.Psf, scene: Scene, settings: Settings) ->
     light = spread.outside / (spread.outside[0] + spread.surface[0])
     of_psf = np.argmax(light < FOLDING) if (light < FOLDING).any() else len(light)
     wanted = 2 * np.hypot(radius / spread.pixel_scale, of_psf)
-    return np.asarray(stamps.SIZES[np.minimum(np.searchsorted(stamps.SIZES, wanted), len(stamps.SIZES) - 1)])
+    return np.asarray(
+        stamp_sizes.SIZES[np.minimum(np.searchsorted(stamp_sizes.SIZES, wanted), len(stamp_sizes.SIZES) - 1)]
+    )
 
 
 def _rounded(some: Sources) -> Sources:
@@ -109,7 +114,7 @@ def _faint(scene: Scene, seed: int, n: int) -> Sources:
 def _sized(scene: Scene, seed: int, n: int, radius: float, magnitude: float) -> Sources:
     some = scenes.sources(scene, seed, galaxies=n, stars=0)
     shapes = some.shapes
-    scale = radius / profiles.half_light(shapes)
+    scale = radius / galaxy_shapes.half_light(shapes)
     shapes = replace(shapes, bulge_radius=shapes.bulge_radius * scale, disk_radius=shapes.disk_radius * scale)
     electrons = np.full(n, scene.exposure * 10 ** (0.4 * (scene.zero_point - magnitude)))
     return replace(some, shapes=shapes, electrons=electrons)
@@ -134,9 +139,9 @@ def _down_and_up(image: Float) -> Float:
     return np.asarray(zoom(coarse, 2, order=2, mode="nearest", grid_mode=True)) / 4
 
 
-def _half(some: Sources, spread: psf.Psf, scene: Scene, settings: Settings) -> Int:
+def _half(some: Sources, spread: model.Psf, scene: Scene, settings: Settings) -> Int:
     sizes = _sizes(some, spread, scene, settings)
-    return np.asarray(stamps.SIZES[np.searchsorted(stamps.SIZES, sizes // 2)])
+    return np.asarray(stamp_sizes.SIZES[np.searchsorted(stamp_sizes.SIZES, sizes // 2)])
 
 
 def _up(image: Float) -> Float:
@@ -149,7 +154,7 @@ def _grey(some: Sources) -> Sources:
     return replace(some, photons=None)
 
 
-def _grey_planes(spread: psf.Psf) -> psf.Psf:
+def _grey_planes(spread: model.Psf) -> model.Psf:
     """One plane for all colours; its drift across the detector stays."""
     planes = spread.planes
     assert planes is not None
@@ -157,10 +162,10 @@ def _grey_planes(spread: psf.Psf) -> psf.Psf:
     mean = planes.images.mean(axis=0, keepdims=True)
     powers = tuple(planes.powers[i] for i in kept)
     waves = planes.wavelength.mean(keepdims=True)
-    return replace(spread, planes=psf.Planes(waves, mean, planes.drift[kept], planes.half, powers))
+    return replace(spread, planes=model.Planes(waves, mean, planes.drift[kept], planes.half, powers))
 
 
-def _still(spread: psf.Psf) -> psf.Psf:
+def _still(spread: model.Psf) -> model.Psf:
     """The detector's centre everywhere."""
     planes = spread.planes
     assert planes is not None

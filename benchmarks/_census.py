@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from jobs.catalogue import band_ratios, emission_lines, galaxies, luminosity_function, morphology, population
-from jobs.catalogue.galaxies import GalaxyModel
-from jobs.fluxes import cosmology, templates
+from jobs.catalogue.galaxies import band_ratios, emission_lines, galaxies, morphology
+from jobs.catalogue.galaxies.galaxies import GalaxyModel
+from jobs.catalogue.halos import luminosity_function, population
+from jobs.fluxes import cosmology
+from jobs.fluxes.libraries import templates
 from lake_schema import sky
+from lake_schema.arrays import Float, Float32
 from lake_schema.ids import GENERATION_ORDER
-
-Float = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
 
 ARCMIN2 = 3600.0
 AREA = sky.cell_area(GENERATION_ORDER)

@@ -20,25 +20,15 @@ import numpy.typing as npt
 from scipy import fft
 from scipy.special import j0
 
-from jobs.catalogue import (
-    convergence,
-    density_box,
-    halos,
-    lightcone,
-    luminosity_function,
-    matching,
-    population,
-    satellites,
-)
-from jobs.catalogue.density_box import Box
-from jobs.catalogue.luminosity_function import Volume
-from jobs.catalogue.population import Population
+from jobs.catalogue.halos import halos, luminosity_function, matching, population, satellites
+from jobs.catalogue.halos.luminosity_function import Volume
+from jobs.catalogue.halos.population import Population
+from jobs.catalogue.matter import convergence, density_box, lightcone
+from jobs.catalogue.matter.density_box import Box
 from jobs.fluxes import cosmology
 from jobs.rng import stream
 from lake_schema import sky
-
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
+from lake_schema.arrays import Float, Int
 
 # Blocks are cells of this order (53.7 deg2), in pixels of 6.9 arcmin; small separations are counted in one piece of
 # each, in pixels of 0.9 arcmin: DEPTH orders finer.

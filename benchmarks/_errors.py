@@ -16,10 +16,12 @@ import numpy.typing as npt
 from benchmarks import _references as references
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import BINS, Scene
-from jobs.render import profiles, psf
-from jobs.render.stamps import Settings, Sources
+from jobs.render.drawing.settings import Settings
+from jobs.render.psf import model
+from jobs.render.sources import galaxy_shapes
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float
 
-Float = npt.NDArray[np.float64]
 Found = TypeVar("Found")
 # galsim asks for more than any machine has where a bulge is steep: bytes of address space.
 MEMORY = 4 << 30
@@ -122,7 +124,7 @@ def shear_response(
     return {name: np.array(rows) for name, rows in out.items()}, some
 
 
-def drawing(spread: psf.Psf, scene: Scene, settings: Settings) -> Callable[[Sources], Float]:
+def drawing(spread: model.Psf, scene: Scene, settings: Settings) -> Callable[[Sources], Float]:
     """A way to draw a galaxy: ours, on a frame of twice COMPARED."""
     return lambda one: scenes.draw(one, spread, scene, settings, 2 * COMPARED)
 
@@ -156,7 +158,7 @@ def bias(found: Float, truth: Float) -> tuple[float, float]:
 def worst_by_kind(biases: Float, some: Sources, scene: Scene) -> dict[str, tuple[int, float, float]]:
     """Largest |m| and |c| of biases [n, 2], with the number of galaxies: by magnitude, size and index of the bulge."""
     shapes = some.shapes.take(some.shape)
-    size, index = profiles.half_light(shapes), np.where(shapes.bulge_fraction > 0, shapes.sersic_index, 1.0)
+    size, index = galaxy_shapes.half_light(shapes), np.where(shapes.bulge_fraction > 0, shapes.sersic_index, 1.0)
     kinds = (
         ("m", scenes.magnitudes(some, scene), BINS),
         ("r", size, (0.0, 0.2, 0.4, 0.8, np.inf)),

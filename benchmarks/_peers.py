@@ -9,8 +9,11 @@ import numpy as np
 
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import BINS, Scene
-from jobs.render import profiles, psf, transfer
-from jobs.render.stamps import Sources
+from jobs.render.drawing import transfer
+from jobs.render.psf import model
+from jobs.render.sources import galaxy_shapes
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float
 
 # Side of a PSF's image for galsim, samples: 10".
 _SIDE = 301
@@ -45,27 +48,29 @@ def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float
     )
 
 
-def _image(full: psf.Psf, weights: scenes.Float) -> galsim.GSObject:
+def _image(full: model.Psf, weights: Float) -> galsim.GSObject:
     """The PSF in pixels."""
     if full.planes is None:
         return galsim.Moffat(beta=scenes.BETA, fwhm=scenes.SEEING / full.pixel_scale)
     whole = transfer.image_of(full.planes, weights)
     middle = slice((len(whole) - _SIDE) // 2, (len(whole) + _SIDE) // 2)
-    return galsim.InterpolatedImage(galsim.Image(whole[middle, middle], scale=1.0 / psf.SAMPLES))
+    return galsim.InterpolatedImage(galsim.Image(whole[middle, middle], scale=1.0 / model.SAMPLES))
 
 
 def _draw(some: Sources, i: int, spread: galsim.GSObject, index: float) -> None:
     shape = some.shapes.take(some.shape[i : i + 1])
     shape.sersic_index[0] = index
-    body = galsim.JacobianWCS(*some.jacobian[i].ravel()).toImage(profiles.profile(shape, 0, 1e-6))
+    body = galsim.JacobianWCS(*some.jacobian[i].ravel()).toImage(galaxy_shapes.profile(shape, 0, 1e-6))
     whole = galsim.Convolve([body.withFlux(some.electrons[i]), spread])
     whole.drawImage(scale=1.0, offset=(some.column[i] % 1, some.row[i] % 1))
 
 
-def galsim_image(one: Sources, own: psf.Psf, side: int) -> scenes.Float:
+def galsim_image(one: Sources, own: model.Psf, side: int) -> Float:
     """The only source by galsim's defaults, on a stamp that galsim chooses, on a frame [side, side]."""
     assert own.planes is not None
-    body = galsim.JacobianWCS(*one.jacobian[0].ravel()).toImage(profiles.profile(one.shapes, int(one.shape[0]), 1e-6))
+    body = galsim.JacobianWCS(*one.jacobian[0].ravel()).toImage(
+        galaxy_shapes.profile(one.shapes, int(one.shape[0]), 1e-6)
+    )
     whole = galsim.Convolve([body.withFlux(one.electrons[0]), _image(own, np.ones(1))])
     drawn = whole.drawImage(scale=1.0, center=galsim.PositionD(one.column[0], one.row[0]), dtype=float)
     frame = galsim.ImageD(galsim.BoundsI(0, side - 1, 0, side - 1), init_value=0.0)

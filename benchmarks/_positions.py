@@ -10,15 +10,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks import _errors as errors
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import VIS
-from jobs.render import chromatic, focal_plane, psf
+from jobs.render.camera import detectors
+from jobs.render.psf import euclid, model, sub_bands
+from lake_schema.arrays import Float
 from lake_schema.mission.configuration import resolve
 
-Float = npt.NDArray[np.float64]
 # Stars that the errors are of, by a seed of their own.
 STARS, _SEED = 24, 5
 # Stars that others' errors are quoted of.
@@ -53,16 +53,18 @@ class Star:
 def optics() -> Callable[[tuple[float, float]], Float]:
     """The PSF at a place, computed: (x, y) in half sides -> [wavelengths, t, t], in the detector's axes."""
     mission = resolve()
-    detector = focal_plane.detector("vis", "3-4", mission)
+    detector = detectors.detector("vis", "3-4", mission)
     waves = scenes.spread(VIS, 1).planes.wavelength  # type: ignore[union-attr]
-    blurs = [psf._blur_variances(detector, float(waves[w]), mission) for w in range(len(waves))]
+    blurs = [euclid._blur_variances(detector, float(waves[w]), mission) for w in range(len(waves))]
     sign = -1 if detector.upside_down else 1
 
     def at(place: tuple[float, float]) -> Float:
-        nm = psf.wavefront(*psf._field(detector, sign * place[0], sign * place[1], mission), mission)
-        scale = detector.pixel_scale / psf.SAMPLES
-        size = psf._CORE_TRANSFORM, psf._CORE_SIDE
-        planes = [psf._plane(nm, float(w), *size, scale, blur, mission) for w, blur in zip(waves, blurs, strict=True)]
+        nm = euclid.wavefront(*euclid._field(detector, sign * place[0], sign * place[1], mission), mission)
+        scale = detector.pixel_scale / model.SAMPLES
+        size = euclid._CORE_TRANSFORM, euclid._CORE_SIDE
+        planes = [
+            euclid._plane(nm, float(w), *size, scale, blur, mission) for w, blur in zip(waves, blurs, strict=True)
+        ]
         return np.stack(planes).astype(float)[:, ::sign, ::sign]
 
     return at
@@ -74,10 +76,10 @@ def rows(stars: int, nearest: tuple[int, ...] = _NEAREST) -> list[dict[str, floa
     at((0.0, 0.0))
     start = time.process_time()
     centre = at((0.0, 0.0))
-    plane_s = (time.process_time() - start) / chromatic.PARTS
+    plane_s = (time.process_time() - start) / sub_bands.PARTS
     some = [star(at, rng) for _ in range(stars)]
     out = []
-    for positions in psf.DEGREES:
+    for positions in euclid.DEGREES:
         cold, spread = _cold(positions)
         found = np.array([errors_of(centre + drift(spread, one), one) for one in some])
         out.append(_row(positions, False, found, cold, (spread.images.nbytes + spread.drift.nbytes) / 1e6))
@@ -133,10 +135,10 @@ def largest(seed: int, n: int, kinds: Sequence[tuple[int, int]]) -> dict[tuple[i
 
 def _moments(image: Float) -> Float:
     middle = image.shape[0] // 2
-    return errors.measured(image, VIS.scale / psf.SAMPLES, middle, middle)
+    return errors.measured(image, VIS.scale / model.SAMPLES, middle, middle)
 
 
-def drift(spread: psf.Planes, star: Star) -> Float:
+def drift(spread: model.Planes, star: Star) -> Float:
     """What the polynomials add to the centre's planes: [wavelengths, t, t]."""
     out = []
     for wavelength in spread.wavelength:
@@ -151,7 +153,7 @@ def _nearest(middles: Float, place: tuple[float, float]) -> tuple[float, float]:
     return x, y
 
 
-def _cold(positions: int) -> tuple[float, psf.Planes]:
+def _cold(positions: int) -> tuple[float, model.Planes]:
     """CPU s to compute the planes, and they."""
     with scenes.empty_cache():
         start = time.process_time()

@@ -6,19 +6,20 @@ from dataclasses import fields
 
 import galsim
 import numpy as np
-import numpy.typing as npt
 
 from jobs import cache
-from jobs.render import profiles, psf, stamps
-from jobs.render.stamps import Sources
+from jobs.render.drawing import reference
+from jobs.render.psf import model
+from jobs.render.sources import galaxy_shapes
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float
 
-Float = npt.NDArray[np.float64]
 # Thresholds of folding and of the largest frequency.
 ACCURACY = 1e-4
 
 
 def image(
-    one: Sources, spread: psf.Psf, side: int, highest: float = ACCURACY, folding: float = ACCURACY
+    one: Sources, spread: model.Psf, side: int, highest: float = ACCURACY, folding: float = ACCURACY
 ) -> Float | None:
     """The only source, through a PSF that is its own, on a frame [side, side]; None where memory does not suffice.
 
@@ -40,7 +41,7 @@ def image(
 
     def make() -> dict[str, Float]:
         try:
-            return {"image": stamps.reference(one, 0, spread, side, folding, highest)}
+            return {"image": reference.reference(one, 0, spread, side, folding, highest)}
         except (MemoryError, RuntimeError):
             return {"image": np.zeros((0, 0))}
 
@@ -48,7 +49,7 @@ def image(
     return found if found.size else None
 
 
-def by_series(one: Sources, spread: psf.Psf, side: int) -> Float:
+def by_series(one: Sources, spread: model.Psf, side: int) -> Float:
     """The same through planes, all but their Fourier series between samples: moved, averaged over pixels, sampled.
 
     A galaxy's own transform is galsim's, at its tightest. galsim knows a PSF between its samples by Lanczos' kernel of
@@ -57,20 +58,22 @@ def by_series(one: Sources, spread: psf.Psf, side: int) -> Float:
     """
     assert spread.planes is not None
     plane = spread.planes.images[0].astype(float)
-    wide = psf.SAMPLES * 2 * -(-(len(plane) + psf.SAMPLES * side) // (2 * psf.SAMPLES))
+    wide = model.SAMPLES * 2 * -(-(len(plane) + model.SAMPLES * side) // (2 * model.SAMPLES))
     padded = np.zeros((wide, wide))
     padded[: len(plane), : len(plane)] = plane
     middle, frequency = len(plane) // 2, np.fft.fftfreq(wide)
     out = np.fft.fft2(padded)
     for axis, position in ((1, one.column[0]), (0, one.row[0])):
-        moved = np.exp(-2j * np.pi * frequency * (psf.SAMPLES * position - middle)) * np.sinc(psf.SAMPLES * frequency)
+        moved = np.exp(-2j * np.pi * frequency * (model.SAMPLES * position - middle)) * np.sinc(
+            model.SAMPLES * frequency
+        )
         out *= np.expand_dims(moved, 1 - axis)
     if one.shape[0] >= 0:
         body = galsim.JacobianWCS(*one.jacobian[0].ravel()).toImage(
-            profiles.profile(one.shapes, int(one.shape[0]), 1e-6)
+            galaxy_shapes.profile(one.shapes, int(one.shape[0]), 1e-6)
         )
         tight = body.withGSParams(folding_threshold=ACCURACY, maxk_threshold=1e-6, kvalue_accuracy=1e-8)
-        drawn = tight.drawKImage(nx=wide, ny=wide, scale=2 * np.pi * psf.SAMPLES / wide).array
+        drawn = tight.drawKImage(nx=wide, ny=wide, scale=2 * np.pi * model.SAMPLES / wide).array
         out *= np.fft.ifftshift(drawn) / tight.flux
-    image = np.fft.ifft2(out).real[:: psf.SAMPLES, :: psf.SAMPLES][:side, :side]
-    return np.asarray(one.electrons[0] * psf.SAMPLES**2 * image)
+    image = np.fft.ifft2(out).real[:: model.SAMPLES, :: model.SAMPLES][:side, :side]
+    return np.asarray(one.electrons[0] * model.SAMPLES**2 * image)

@@ -16,12 +16,15 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs.fluxes import passbands
-from jobs.render import chromatic, focal_plane, psf, stamps, transfer
-from jobs.render.profiles import Shapes
-from jobs.render.stamps import Settings, Sources
+from jobs.render.camera import detectors
+from jobs.render.drawing import stamp_sizes, stamps, transfer
+from jobs.render.drawing.settings import Settings
+from jobs.render.psf import euclid, model, seeing, sub_bands
+from jobs.render.sources.galaxy_shapes import Shapes
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float
 from lake_schema.mission.configuration import resolve
 
-Float = npt.NDArray[np.float64]
 # Edges of the magnitude bins that errors are told by.
 BINS = (17.0, 20.0, 22.0, 23.0, 24.0, 25.0, 26.0)
 # Edges of the layers of magnitude of a stratified sample.
@@ -49,13 +52,13 @@ VIS = Scene("vis", 4096, 4132, 0.1, 565.0, 25.7, 12.45, 4701, 300)
 LSST = Scene("lsst", 4096, 4004, 0.2, 30.0, 28.17, 38.3, 18223, 1160)
 
 
-def spread(scene: Scene, positions: int = 9, colours: int = chromatic.PARTS) -> psf.Psf:
+def spread(scene: Scene, positions: int = 9, colours: int = sub_bands.PARTS) -> model.Psf:
     """The scene's PSF."""
     if scene.name == "lsst":
-        return psf.ground_psf(SEEING, BETA, scene.scale)
+        return seeing.ground_psf(SEEING, BETA, scene.scale)
     mission = resolve()
-    detector = focal_plane.detector("vis", "3-4", mission)
-    return psf.of_colours(psf.vis_psf(detector, passbands.load("euclid_vis"), mission, positions), colours)
+    detector = detectors.detector("vis", "3-4", mission)
+    return model.of_colours(euclid.vis_psf(detector, passbands.load("euclid_vis"), mission, positions), colours)
 
 
 def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | None = None) -> Sources:
@@ -95,7 +98,7 @@ def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | N
 
 def colours(n: int, rng: np.random.Generator) -> Float:
     """Photons in each of the PSF's wavelengths, [n, PARTS]: power laws."""
-    waves = np.linspace(-0.25, 0.25, chromatic.PARTS)
+    waves = np.linspace(-0.25, 0.25, sub_bands.PARTS)
     return np.asarray(np.exp(np.outer(rng.normal(0.5, 1.5, n), waves)))
 
 
@@ -151,22 +154,22 @@ def stratified(scene: Scene, seed: int, each: int) -> Sources:
     return replace(some, shapes=shapes, electrons=scene.exposure * 10 ** (0.4 * (scene.zero_point - mag)))
 
 
-def draw(some: Sources, spread_: psf.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
+def draw(some: Sources, spread_: model.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
     """The whole of drawing, as for an exposure; `side`: on a small frame instead of the scene's."""
-    sizes = stamps.stamp_sizes(some.electrons, some.shape, some.shapes, spread_, scene.noise, settings)
-    floors = stamps.floors(some.electrons, scene.noise, settings)
+    sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, spread_, scene.noise, settings)
+    floors = stamp_sizes.floors(some.electrons, scene.noise, settings)
     nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
     return stamps.draw(some, sizes, spread_, nx, ny, None, floors)
 
 
-def own(spread_: psf.Psf, some: Sources, i: int) -> psf.Psf:
+def own(spread_: model.Psf, some: Sources, i: int) -> model.Psf:
     """The PSF of source i everywhere on a frame, and nothing beyond its planes."""
     planes = spread_.planes
     if planes is None:
         return spread_
     weights = transfer.basis_weights(spread_, some.photons, some.column, some.row)[i]
     image = transfer.image_of(planes, weights)
-    alone = psf.Planes(planes.wavelength[:1], image[None], planes.drift[:0], planes.half)
+    alone = model.Planes(planes.wavelength[:1], image[None], planes.drift[:0], planes.half)
     return replace(spread_, planes=alone, edges=None)
 
 

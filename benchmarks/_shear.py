@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks._clustering import Tracers
-from jobs.catalogue import convergence, density_box, lensing, lightcone
-from jobs.catalogue.density_box import Box
-from jobs.catalogue.lensing import Planes
+from jobs.catalogue.galaxies import lensing
+from jobs.catalogue.galaxies.lensing import Planes
+from jobs.catalogue.matter import convergence, density_box, lightcone
+from jobs.catalogue.matter.density_box import Box
 from jobs.fluxes import cosmology
-
-Float = npt.NDArray[np.float64]
+from lake_schema.arrays import Float
 
 # Patches of the sky whose scatter gives the error of a mean: cells of this nside.
 _PATCHES = 2

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks import _census as census
-from jobs.catalogue import luminosity_function
+from jobs.catalogue.halos import luminosity_function
 from jobs.fluxes import cosmology
-
-Float = npt.NDArray[np.float64]
+from lake_schema.arrays import Float
 
 # Galaxies an arcmin2 brighter than i: GAMA and zCOSMOS (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST Science
 # Book (2009).

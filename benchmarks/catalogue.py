@@ -25,11 +25,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks import report
-from jobs.catalogue import build_galaxies, galaxies, luminosity_function, population
+from jobs.catalogue import build_galaxies
+from jobs.catalogue.galaxies import galaxies
+from jobs.catalogue.halos import luminosity_function, population
 from jobs.fluxes import cosmology
 from jobs.measured import forget_peak, peak_gb
-from jobs.request import Universe
-from lake_schema import layout, parquet, sky
+from jobs.request.schema import Universe
+from lake_schema import sky
+from lake_schema.store import layout, parquet
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
 

@@ -16,13 +16,18 @@ import numpy as np
 
 from benchmarks import _scenes, report
 from jobs.fluxes import passbands
-from jobs.render import chromatic, focal_plane, psf, stamps
+from jobs.render.camera import detectors
+from jobs.render.camera.detectors import Detector
 from jobs.render.channels import vis
-from jobs.render.effects import cosmic_rays, ghosts, quadrants
-from jobs.render.effects.effect import Effect, Frame, Lights, Scene
-from jobs.render.focal_plane import Detector
-from jobs.render.profiles import Shapes
-from jobs.render.stamps import Sources
+from jobs.render.drawing import stamps
+from jobs.render.effects.charge import cosmic_rays
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.light import ghosts
+from jobs.render.effects.readout import quadrants, readout_cosmic_rays
+from jobs.render.effects.scene import Frame, Lights, Scene
+from jobs.render.psf import euclid, model, sub_bands
+from jobs.render.sources.galaxy_shapes import Shapes
+from jobs.render.sources.source_list import Sources
 from jobs.rng import stream
 from lake_schema.mission.configuration import resolve
 
@@ -52,7 +57,7 @@ def light(ny: int, nx: int) -> Frame:
 def measured(side: int | None, repeats: int) -> dict[str, float]:
     """Of each effect: CPU s of a detector, margin, rms and largest change of a pixel over its noise."""
     mission = resolve()
-    detector = focal_plane.detector("vis", "3-4", mission)
+    detector = detectors.detector("vis", "3-4", mission)
     if side is not None:
         detector = type(detector)("3-4", "vis", side, side, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = light(detector.ny, detector.nx)
@@ -110,7 +115,7 @@ def standard(detector: Detector, pitch: int) -> Sources:
     shift = rng.uniform(-0.5, 0.5, (2, n))
     return Sources(
         np.arange(n), column + shift[0], row + shift[1], jacobian, light, np.where(star, -1, 0), disc,
-        np.full((n, chromatic.PARTS), 1.0 / chromatic.PARTS),
+        np.full((n, sub_bands.PARTS), 1.0 / sub_bands.PARTS),
     )  # fmt: skip
 
 
@@ -142,7 +147,7 @@ def changes(scene: Scene, some: Sources, frame: Frame, radius: float = APERTURE)
     sizes = quadrants.sizes(scene)
     before = forms(frame, some, radius)
     for effect in vis.SKY[:-1]:
-        if effect in (cosmic_rays.EFFECT, cosmic_rays.READOUT):
+        if effect in (cosmic_rays.EFFECT, readout_cosmic_rays.READOUT):
             continue
         frame = effect.apply(frame, *effect.parameters(scene), rng=stream(1, effect.name))
         after = forms(frame if frame.ndim == 2 else quadrants.assembled(frame, *sizes), some, radius)
@@ -154,10 +159,10 @@ def changes(scene: Scene, some: Sources, frame: Frame, radius: float = APERTURE)
 def sources_changed(side: int | None, repeats: int) -> dict[str, float]:
     """Medians over the standard set of what each effect changes; shear is half an ellipticity."""
     mission = resolve()
-    detector = focal_plane.detector("vis", "3-4", mission)
+    detector = detectors.detector("vis", "3-4", mission)
     detector = detector if side is None else replace(detector, nx=side, ny=side)
     some = standard(detector, _PITCH)
-    spread = psf.vis_psf(detector, passbands.load("euclid_vis"), mission)
+    spread = euclid.vis_psf(detector, passbands.load("euclid_vis"), mission)
     light = stamps.draw(some, np.full(len(some), _STAMP), spread, detector.nx, detector.ny)
     lights = Lights(np.array([100.0]), np.array([100.0]), np.array([_LIGHT]))
     scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(light.max()), detector, lights)
@@ -172,7 +177,7 @@ def sources_changed(side: int | None, repeats: int) -> dict[str, float]:
 
 
 def _drawn(
-    some: Sources, spread: psf.Psf, light: Frame, scene: Scene, repeats: int, out: dict[str, float]
+    some: Sources, spread: model.Psf, light: Frame, scene: Scene, repeats: int, out: dict[str, float]
 ) -> Frame:  # fmt: skip
     """Adds the figures of what is part of drawing: what that takes more with it; what it does to sources, [n, 4]."""
     (strength,) = vis.DRAWN.parameters(scene)

@@ -1,6 +1,7 @@
 """How fast and how right the band fluxes are: python -m benchmarks.fluxes [--quick] [--json FILE] [--measure FILE].
 
---measure  writes the errors of all settings in all bands, jobs/fluxes/flux_errors.csv, from which the job chooses
+--measure  writes the errors of all settings in all bands, jobs/fluxes/tables/flux_errors.csv, from which the job
+chooses
 
 Galaxies in two components with their lines, over the whole of the parameter space that the tables cover, in the 22
 bands of Serrano et al. 2024; the truth is direct integration in steps of 1 A, in the same run. CPU seconds of one core.
@@ -22,17 +23,19 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from benchmarks.report import best, machine
 from jobs.accuracy import DRAFT, SURVEY, Accuracy
-from jobs.fluxes import flux_grid, grid_settings, grid_tables, integration, lines, passbands, spectra, templates
+from jobs.fluxes import band_fluxes, integration, passbands
+from jobs.fluxes.libraries import templates
+from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.sources import Galaxies, galaxies_of
-from jobs.fluxes.templates import Library
-from lake_schema.provenance import git_commit
-
-Float = npt.NDArray[np.float64]
+from jobs.fluxes.spectra import lines
+from jobs.fluxes.tables import build_tables, flux_tables
+from jobs.fluxes.tables.settings import CANDIDATES, choose
+from lake_schema.arrays import Float
+from lake_schema.store.provenance import git_commit
 
 BANDS = (
     "euclid_vis", "euclid_y", "euclid_j", "euclid_h", "gaia_g", "gaia_bp", "gaia_rp", "des_g", "des_r", "des_i",
@@ -53,7 +56,7 @@ def sample(n: int, seed: int) -> pa.Table:
     """n random rows of `galaxies`, uniform over all that the tables cover."""
     rng = np.random.default_rng(seed)
     frac = rng.uniform(0.0, 1.0, n)
-    z = rng.uniform(grid_tables.Z_FIRST + 0.001, grid_tables.Z_LAST - 0.01, n)
+    z = rng.uniform(build_tables.Z_FIRST + 0.001, build_tables.Z_LAST - 0.01, n)
     columns: dict[str, Any] = {
         "id": np.arange(n),
         "ra": rng.uniform(0.0, 360.0, n),
@@ -69,12 +72,12 @@ def sample(n: int, seed: int) -> pa.Table:
         "kappa": rng.normal(0.0, 0.02, n),
         "gamma1": rng.normal(0.0, 0.02, n),
         "gamma2": rng.normal(0.0, 0.02, n),
-        "a_v": rng.uniform(0.0, grid_tables.A_V_LAST, n),
+        "a_v": rng.uniform(0.0, build_tables.A_V_LAST, n),
     }
     for k in (1, 2):
         columns[f"sed_{k}"] = rng.integers(0, templates.GALAXY_LIBRARY_SIZE, n).astype(np.int16)
         columns[f"ext_law_{k}"] = rng.integers(0, 5, n).astype(np.int8)
-        columns[f"ebv_{k}"] = rng.uniform(0.0, grid_tables.EBV_LAST, n)
+        columns[f"ebv_{k}"] = rng.uniform(0.0, build_tables.EBV_LAST, n)
     for name in lines.columns():
         columns[name] = 10.0 ** rng.uniform(-18.0, -15.5, n)
     return pa.table(columns)
@@ -90,9 +93,9 @@ def measure(file: Path, n: int = _SAMPLE, bands: Sequence[str] = ()) -> None:
         for name in bands or passbands.names():
             band = passbands.load(name)
             truth = integration.galaxies(rows, [band], library)
-            for setting in grid_settings.CANDIDATES:
-                grid = flux_grid.open_grid([band], [setting], library)
-                error = np.abs(flux_grid.galaxies(rows, grid) / truth - 1.0)
+            for setting in CANDIDATES:
+                grid = flux_tables.open_grid([band], [setting], library)
+                error = np.abs(flux_tables.galaxies(rows, grid) / truth - 1.0)
                 rms, largest = float(np.sqrt(np.mean(error**2))), float(error.max())
                 writer.writerow((name, setting.step, setting.n_ebv, setting.n_av, f"{rms:.2e}", f"{largest:.2e}"))
             stream.flush()
@@ -105,13 +108,13 @@ def accuracy_of(rows: Galaxies, truth: Float, library: Library, accuracy: Accura
     return np.asarray(-_MAG * np.log(f_nu / truth))
 
 
-def _interpolated(rows: Galaxies, library: Library, accuracy: Accuracy) -> tuple[Float, flux_grid.Grid]:
+def _interpolated(rows: Galaxies, library: Library, accuracy: Accuracy) -> tuple[Float, flux_tables.Grid]:
     curves = [passbands.load(name) for name in BANDS]
-    settings = [choice.setting for choice in grid_settings.choose(BANDS, accuracy)]
+    settings = [choice.setting for choice in choose(BANDS, accuracy)]
     if missing := [name for name, setting in zip(BANDS, settings, strict=True) if setting is None]:
         raise SystemExit(f"no table is fine enough for {', '.join(missing)}")
-    grid = flux_grid.open_grid(curves, [setting for setting in settings if setting], library)
-    return flux_grid.galaxies(rows, grid), grid
+    grid = flux_tables.open_grid(curves, [setting for setting in settings if setting], library)
+    return flux_tables.galaxies(rows, grid), grid
 
 
 def oracle(n: int, library: Library) -> float:
@@ -124,7 +127,7 @@ def oracle(n: int, library: Library) -> float:
     worst, grid = 0.0, passbands.grid()
     with (Path(passbands.__file__).with_suffix(".csv")).open(newline="", encoding="utf-8") as stream:
         published = {row["name"]: row["source"] for row in csv.DictReader(stream)}
-    made = {medium: spectra.galaxy_spectra(table, library, medium) for medium in ("air", "vacuum")}
+    made = {medium: band_fluxes.galaxy_spectra(table, library, medium) for medium in ("air", "vacuum")}
     for name in BANDS:
         kind, _, source = published[name].partition(":")
         if kind != "speclite":
@@ -133,16 +136,17 @@ def oracle(n: int, library: Library) -> float:
         seen = made[band.medium]
         unit = u.erg / u.s / u.cm**2 / u.AA
         wanted = np.array(load_filter(source).get_ab_maggies(seen * unit, grid * u.AA), float) * _AB_UJY
-        ours = spectra.band_fluxes(seen, [band])[:, 0]
+        ours = band_fluxes.band_fluxes(seen, [band])[:, 0]
         worst = max(worst, float(np.abs(_MAG * np.log(ours / wanted)).max()))
     return worst
 
 
 def job(n: int) -> float:
     """Galaxies a second of a core, from Parquet to published Parquet, 22 bands, without Spark."""
-    from jobs import request
     from jobs.fluxes import compute_fluxes
-    from lake_schema import ids, layout, publish, sky
+    from jobs.request import from_toml
+    from lake_schema import ids, sky
+    from lake_schema.store import layout, plan, publish
     from lake_schema.tables.galaxies import GALAXIES
 
     drawn = sample(n, _SEED_SPEED)
@@ -153,12 +157,12 @@ def job(n: int) -> float:
     columns |= {"id": ids.source_id(0, 1607 << 6, np.arange(n)), "density_boost": np.ones(n)}
     fitting = {c.name: np.asarray(columns[c.name]).astype(c.type) for c in GALAXIES.columns if c.name in columns}
     rows = GALAXIES.build(fitting)
-    part = publish.Part(layout.cell_file(5, 1607), {})
+    part = plan.Part(layout.cell_file(5, 1607), {})
     with tempfile.TemporaryDirectory() as folder:
         lake = layout.lake(Path(folder) / "lake")
         lake.mkdir()
-        publish.make(lake, publish.Plan(GALAXIES, {}, (part,)), lambda root, facts: publish.Output(rows))
-        wanted = request.from_table(
+        publish.make(lake, plan.Plan(GALAXIES, {}, (part,)), lambda root, facts: plan.Output(rows))
+        wanted = from_toml.from_table(
             {
                 "name": "bench",
                 "seed": 1,
@@ -178,11 +182,11 @@ def stars(n: int) -> dict[str, float]:
     library = templates.stellar_library()
     rng = np.random.default_rng(_SEED_TEST)
     rows = Stars(
-        rng.integers(0, len(library), n), rng.uniform(5.0, 26.0, n), rng.uniform(0.0, grid_tables.STAR_A_V_LAST, n)
+        rng.integers(0, len(library), n), rng.uniform(5.0, 26.0, n), rng.uniform(0.0, build_tables.STAR_A_V_LAST, n)
     )
     curves = [passbands.load(name) for name in BANDS]
-    found, truth = flux_grid.stars(rows, curves, library), integration.stars(rows, curves, library)
-    seconds = _cpu(lambda: flux_grid.stars(rows, curves, library), 3)
+    found, truth = flux_tables.stars(rows, curves, library), integration.stars(rows, curves, library)
+    seconds = _cpu(lambda: flux_tables.stars(rows, curves, library), 3)
     return {"stars_max_mag": float(np.abs(_MAG * np.log(found / truth)).max()), "stars_per_s_core": n / seconds}
 
 
@@ -191,10 +195,10 @@ def curve(rows: Galaxies, truth: Float, library: Library) -> dict[str, list[floa
     curves = [passbands.load(name) for name in BANDS]
     names = ("curve_us", "curve_rms_mag", "curve_max_mag", "curve_mb")
     out: dict[str, list[float]] = {name: [] for name in names}
-    for setting in grid_settings.CANDIDATES:
-        grid = flux_grid.open_grid(curves, [setting] * len(curves), library)
-        error = -_MAG * np.log(flux_grid.galaxies(rows, grid) / truth)
-        out["curve_us"].append(1e6 * _cpu(lambda grid=grid: flux_grid.galaxies(rows, grid), 3) / len(rows))  # type: ignore[misc]
+    for setting in CANDIDATES:
+        grid = flux_tables.open_grid(curves, [setting] * len(curves), library)
+        error = -_MAG * np.log(flux_tables.galaxies(rows, grid) / truth)
+        out["curve_us"].append(1e6 * _cpu(lambda grid=grid: flux_tables.galaxies(rows, grid), 3) / len(rows))  # type: ignore[misc]
         out["curve_rms_mag"].append(_rms(error))
         out["curve_max_mag"].append(float(np.abs(error).max()))
         out["curve_mb"].append(grid.tables[0].nbytes / 1e6)
@@ -215,7 +219,7 @@ def run(quick: bool) -> dict[str, Any]:
     survey, draft = (accuracy_of(rows, truth, library, accuracy) for accuracy in (SURVEY, DRAFT))
     many = rows if quick else galaxies_of(sample(_SPEED_SAMPLE, _SEED_SPEED), library)
     _, grid = _interpolated(many, library, SURVEY)
-    speed = len(many) / _cpu(lambda: flux_grid.galaxies(many, grid), 1 if quick else 5)
+    speed = len(many) / _cpu(lambda: flux_tables.galaxies(many, grid), 1 if quick else 5)
     figures: dict[str, Any] = {
         "objects": n,
         "rms_mag_all": _rms(survey),
@@ -237,7 +241,7 @@ def run(quick: bool) -> dict[str, Any]:
     figures |= {f"rms_mag_{name}": _rms(error) for name, error in zip(BANDS, survey.T, strict=True)}
     for name, accuracy in (("draft", DRAFT), ("survey", SURVEY)):
         _, chosen = _interpolated(rows, library, accuracy)
-        seconds = _cpu(lambda chosen=chosen: flux_grid.galaxies(rows, chosen), 1 if quick else 5)  # type: ignore[misc]
+        seconds = _cpu(lambda chosen=chosen: flux_tables.galaxies(rows, chosen), 1 if quick else 5)  # type: ignore[misc]
         figures[f"{name}_us"] = 1e6 * seconds / n
     return figures if quick else figures | curve(rows, truth, library)
 
@@ -246,12 +250,12 @@ def _build_seconds(library: Library, quick: bool) -> float:
     """Making the tables of the 22 bands (two, if in haste), in an empty cache."""
     bands = BANDS[:2] if quick else BANDS
     curves = [passbands.load(name) for name in bands]
-    settings = [setting for choice in grid_settings.choose(bands, SURVEY) if (setting := choice.setting) is not None]
+    settings = [setting for choice in choose(bands, SURVEY) if (setting := choice.setting) is not None]
     before = os.environ.get("TRUESKY_CACHE")
     with tempfile.TemporaryDirectory() as folder:
         os.environ["TRUESKY_CACHE"] = folder
         try:
-            return _cpu(lambda: flux_grid.open_grid(curves, settings, library), 1)
+            return _cpu(lambda: flux_tables.open_grid(curves, settings, library), 1)
         finally:
             os.environ.pop("TRUESKY_CACHE")
             if before is not None:
@@ -265,8 +269,8 @@ def _whole_seconds(n: int, library: Library) -> float:
     def work() -> None:
         for start in range(0, n, 50):
             for medium in ("vacuum", "air"):
-                f_lambda = spectra.galaxy_spectra(table.slice(start, 50), library, medium)
-                spectra.band_fluxes(f_lambda, [band for band in curves if band.medium == medium])
+                f_lambda = band_fluxes.galaxy_spectra(table.slice(start, 50), library, medium)
+                band_fluxes.band_fluxes(f_lambda, [band for band in curves if band.medium == medium])
 
     return _cpu(work, 1) / n
 

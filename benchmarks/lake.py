@@ -25,10 +25,11 @@ import pyarrow.parquet as pq
 
 from benchmarks import report
 from jobs.explore.explorer import Explorer
-from lake_schema import layout, parquet, publish, read, sky
+from lake_schema import sky
 from lake_schema.columns import Column, Table
-from lake_schema.publish import Json, Output, Part, Plan
-from lake_schema.stage import write_part
+from lake_schema.store import layout, parquet, publish, read
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.stage import write_part
 from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
 
 # Nested neighbours of order 5: about the Chandra Deep Field South.
@@ -65,7 +66,7 @@ NOTES = {
     "bytes_per_row": "in the file",
     "bytes_per_row_defaults": "pyarrow's default settings",
     "finish_s": "metadata, margin, skymap, manifest and rename of the whole catalogue",
-    "cone_ms": '60" cone, 5 columns, warm, as lake_schema.read gives it',
+    "cone_ms": '60" cone, 5 columns, warm, as lake_schema.store.read gives it',
     "cone_cold_ms": "the same, a version just opened",
     "cone_vs_lsdb": "times faster than lsdb's cone_search",
     "cone_vs_scan": "times faster than a scan of all positions",

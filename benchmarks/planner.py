@@ -1,7 +1,7 @@
 """Planning and what surrounds a render: seconds of a plan, overhead of a task, errors of the forecast, two cores.
 
 Detectors of VIS and LSST are rendered as a job renders them, of three skies: the demo's, one of few sources and one of
-many stars. What they take is what jobs/render/costs.csv says.
+many stars. What they take is what jobs/render/channels/costs.csv says.
 """
 
 from __future__ import annotations
@@ -20,19 +20,22 @@ from typing import Any
 
 from benchmarks import lake as bulk
 from benchmarks import report
-from jobs import request as requests
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.measured import forget_peak, peak_gb
-from jobs.render import exposure, plan_exposures, render_exposures, speed, truth_maps
-from jobs.request import Request
-from lake_schema import layout, publish, read, sky
+from jobs.render import plan_exposures, render_exposures
+from jobs.render.exposure import render, rendered, truth_maps, visible_sources
+from jobs.render.planning import speed
+from jobs.request.from_toml import from_table, parse
+from jobs.request.schema import Request
+from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
-from lake_schema.plan import Json, Part
+from lake_schema.store import layout, publish, read
+from lake_schema.store.plan import Json, Part
 
 ROOT = Path(__file__).resolve().parents[1]
 # Rows of a crowded cell, and those of its columns that a detector reads.
-CELL_ROWS, CELL_COLUMNS = 1_200_000, len(exposure.GALAXY_COLUMNS)
+CELL_ROWS, CELL_COLUMNS = 1_200_000, len(visible_sources.GALAXY_COLUMNS)
 # What is changed of the demo: its sky is high above the Milky Way, with sources to I_E = 26.
 SKIES: dict[str, dict[str, Any]] = {
     "field": {},
@@ -69,7 +72,7 @@ def request(sky_name: str, quick: bool) -> Request:
     elif sky_name == "field":
         one = {"channels": ["VIS"], "exposures": 1, "detectors": ["3-4"]}
         table["observation"] = [{**one, "image_type": kind} for kind in CALIBRATIONS]
-    return requests.from_table(table)
+    return from_table(table)
 
 
 def lake(folder: Path, sky_name: str, quick: bool) -> tuple[Path, Request]:
@@ -83,7 +86,7 @@ def lake(folder: Path, sky_name: str, quick: bool) -> tuple[Path, Request]:
 
 def planning(folder: Path, quick: bool) -> dict[str, float]:
     """Seconds of the plan of the wide survey's fields."""
-    wanted = requests.parse(ROOT / "requests" / "sc8_main.toml")
+    wanted = parse(ROOT / "requests" / "sc8_main.toml")
     block = replace(wanted.observations[0], fields=20 if quick else 331)
     wanted = replace(wanted, observations=(block,))
     started, cpu = time.perf_counter(), time.process_time()
@@ -141,8 +144,8 @@ def compile_all(root: Path, wanted: Request) -> None:
 
 def _overhead(root: Path, facts: Json) -> float:
     """CPU s of a task whose render takes none, nor the reading of its sources, which has a figure of its own."""
-    kept: list[exposure.Rendered] = []
-    draw = exposure.render
+    kept: list[rendered.Rendered] = []
+    draw = render.render
     _with_render(lambda *a, **k: kept.append(draw(*a, **k)) or kept[0], root, facts)  # type: ignore[func-returns-value]
     read_rows, rows = read.Version.in_cells, {}
 
@@ -159,11 +162,11 @@ def _overhead(root: Path, facts: Json) -> float:
 
 
 def _with_render(function, root: Path, facts: Json) -> None:  # type: ignore[no-untyped-def]
-    before, exposure.render = exposure.render, function
+    before, render.render = render.render, function
     try:
         render_exposures.work(root, facts)
     finally:
-        exposure.render = before
+        render.render = before
 
 
 def two_cores(root: Path, wanted: Request, tasks: int) -> dict[str, float]:

@@ -19,8 +19,8 @@ from benchmarks import _scenes as scenes
 from benchmarks import report
 from benchmarks._scenes import LSST, VIS, Scene
 from jobs import accuracy
-from jobs.render import psf, stamps
-from jobs.render.stamps import Settings
+from jobs.render.drawing.settings import Settings, settings_for
+from jobs.render.psf import model
 
 # Galaxies whose errors are quoted, by a seed of their own, of them sheared in pairs; galsim's, a magnitude bin.
 HOLD_OUT, PAIRED, PEERS = 204, 0.25, 8
@@ -41,7 +41,7 @@ _NOTES = {
     "aperture_mag_rms": '1" aperture (target 1e-4)',
     "aperture_mag_worst": "(target 1e-3)",
     "centroid_mas_rms": "(target 0.002)",
-    "r2_rms": "(target 1e-4), through the same PSF: how well that is known, jobs/render/psf_positions.csv",
+    "r2_rms": "(target 1e-4), through the same PSF: how well that is known, jobs/render/drawing/psf_positions.csv",
     "r2_worst": "(target 1e-3)",
     "ellipticity_rms": "(target 2e-5)",
     "ellipticity_worst": "(target 1e-4)",
@@ -63,7 +63,7 @@ def seconds(scene: Scene, settings: Settings, repeats: int, stars: bool = True, 
     return report.best(lambda: scenes.draw(some, spread, scene, settings), repeats, time.process_time)
 
 
-def _spread(scene: Scene, settings: Settings) -> psf.Psf:
+def _spread(scene: Scene, settings: Settings) -> model.Psf:
     return scenes.spread(scene, settings.positions, settings.colours)
 
 
@@ -80,7 +80,7 @@ def planes_seconds() -> tuple[float, float]:
 
 def times(quick: bool, repeats: int) -> dict[str, float]:
     """All seconds, and the ratios of those that one run measured."""
-    tiers = {name: stamps.settings_for(wanted) for name, wanted in accuracy.PRESETS.items()}
+    tiers = {name: settings_for(wanted) for name, wanted in accuracy.PRESETS.items()}
     out = {}
     for scene in (VIS, LSST):
         for name, settings in tiers.items():
@@ -108,7 +108,7 @@ def accuracies(quick: bool, galaxies: int) -> dict[str, float]:
     """All errors: of survey by their plain names, of others by scene and accuracy."""
     compared, pairs = (6, 2) if quick else (galaxies, max(round(PAIRED * galaxies), 1))
     names = ("survey",) if quick else ("quicklook", "draft", "survey", "reference")
-    tiers = {name: stamps.settings_for(accuracy.preset(name)) for name in names}
+    tiers = {name: settings_for(accuracy.preset(name)) for name in names}
     out: dict[str, float] = {}
     for scene in (VIS,) if quick else (VIS, LSST):
         found, bins, refused = errors.capped(errors.against_galsim, scene, tiers, _SEED, compared)

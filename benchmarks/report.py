@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lake_schema.provenance import git_commit
+from lake_schema.store.provenance import git_commit
 
 
 def options(name: str, doc: str, argv: Sequence[str] | None = None) -> argparse.Namespace:

@@ -23,16 +23,18 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from benchmarks import report
-from jobs import request
-from jobs.catalogue import brown_dwarfs, build_stars, dust_map, gaia, milky_way, stars
-from jobs.fluxes import brown_dwarfs as spectra_of_dwarfs
-from jobs.fluxes import compute_fluxes, passbands, spectra, templates
-from jobs.fluxes.calibration import vega_magnitude
+from jobs.catalogue import build_stars, dust_map
+from jobs.catalogue.stars import brown_dwarfs, gaia, milky_way, stars
+from jobs.fluxes import band_fluxes, compute_fluxes, passbands
+from jobs.fluxes.libraries import brown_dwarfs as spectra_of_dwarfs
+from jobs.fluxes.libraries import templates
+from jobs.fluxes.libraries.vega import vega_magnitude
+from jobs.request.from_toml import from_table
 from jobs.rng import stream
-from lake_schema import layout, publish, read, sky, units
+from lake_schema import sky, units
+from lake_schema.arrays import Float
 from lake_schema.ids import GENERATION_ORDER
-
-Float = npt.NDArray[np.float64]
+from lake_schema.store import layout, publish, read
 
 SEED = 7
 AREA = sky.cell_area(GENERATION_ORDER)
@@ -138,7 +140,7 @@ def pole(cells: int, dust: npt.NDArray[np.float32]) -> dict[str, float]:
     found = {band: [] for band in zero}
     for cell in drawn:
         rows = stars.draw(cell, SEED, universe, dust)
-        fluxes = spectra.star_fluxes(rows, list(zero), library)
+        fluxes = band_fluxes.star_fluxes(rows, list(zero), library)
         for band, offset in zero.items():
             found[band].append(units.mag_of_f_nu(fluxes[f"f_nu_{band}"].to_numpy().astype(float)) - offset)
     v, g = (np.concatenate(found[band]) for band in zero)
@@ -160,11 +162,11 @@ def speed(radius: float) -> dict[str, float]:
     """CPU seconds of the two jobs at b = 30 deg, without Spark."""
     ra, dec = (float(x) for x in sky.equatorial(90.0, 30.0))
     table = {"name": "benchmark", "seed": SEED, "area": {"cone": {"ra": ra, "dec": dec, "radius": radius}}}
-    wanted = request.from_table({**table, "fluxes": {"bands": BANDS}})
+    wanted = from_table({**table, "fluxes": {"bands": BANDS}})
     # Libraries and machine code are made once, whatever is asked for.
     curves = [passbands.load(band) for band in BANDS]
     libraries = templates.galaxy_library(), templates.stellar_library()
-    spectra.prepare(curves, [None] * len(curves), *libraries, wanted.accuracy)
+    band_fluxes.prepare(curves, [None] * len(curves), *libraries, wanted.accuracy)
     dust_map.load(SEED)
     with tempfile.TemporaryDirectory() as folder:
         lake = layout.lake(folder)
@@ -202,7 +204,7 @@ def crowded(limit: float) -> int:
     near = cells[(np.abs(lat) >= stars.PLANE) & (np.abs(lat) < stars.PLANE + 0.3)]
     (ra,), (dec,) = sky.cell_centres(GENERATION_ORDER, near[[stars.numbers(near, stars.model()).argmax()]])
     area = {"cone": {"ra": float(ra), "dec": float(dec), "radius": 0.0}}
-    wanted = request.from_table({"name": "x", "seed": SEED, "area": area, "universe": {"star_limit": limit}})
+    wanted = from_table({"name": "x", "seed": SEED, "area": area, "universe": {"star_limit": limit}})
     with tempfile.TemporaryDirectory() as folder:
         lake = layout.lake(folder)
         (step,) = build_stars.steps(lake, wanted)

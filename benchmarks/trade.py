@@ -31,10 +31,11 @@ from benchmarks import _scenes as scenes
 from benchmarks import report
 from benchmarks._approximations import NONE, Approximation
 from benchmarks._scenes import VIS
-from jobs.render import psf
-from jobs.render.stamps import Settings, Sources
+from jobs.render.drawing.settings import Settings
+from jobs.render.psf import model
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float
 
-Float = npt.NDArray[np.float64]
 Row = dict[str, str | float]
 # From quicklook to reference; then the survey's with one setting changed at a time.
 _CHAIN = (
@@ -84,7 +85,7 @@ class Known:
     """One of a sample: itself, on frames that it is in the middle of, and its PSF; its image and response to shear."""
 
     sources: Sources
-    spread: psf.Psf
+    spread: model.Psf
     image: Float
     response: Float | None
 
@@ -115,14 +116,14 @@ def sample(some: Sources, pairs: int, highest: float = 0.0) -> list[Known]:
     return out
 
 
-def _truth(one: Sources, own: psf.Psf, highest: float) -> Float | None:
+def _truth(one: Sources, own: model.Psf, highest: float) -> Float | None:
     """Of a galaxy galsim's; a point has no profile that it would be needed for."""
     if one.shape[0] < 0:
         return references.by_series(one, own, errors.COMPARED)
     return references.image(one, own, errors.COMPARED, highest)
 
 
-def _response(one: Sources, spread: psf.Psf, approximation: Approximation, settings: Settings) -> Float:
+def _response(one: Sources, spread: model.Psf, approximation: Approximation, settings: Settings) -> Float:
     return errors.response(
         lambda each: approximation.draw(each, spread, VIS, settings, errors.COMPARED), one, VIS.scale
     )
@@ -193,7 +194,7 @@ def approximated(approximation: Approximation, settings: Settings, repeats: int,
     return {**row, **_summary(*compared(wide, galaxies, others, approximation))}
 
 
-def _changed(galaxy: Known, some: Sources, less: psf.Psf, approximation: Approximation) -> Known:
+def _changed(galaxy: Known, some: Sources, less: model.Psf, approximation: Approximation) -> Known:
     """A galaxy of `some` as it is approximated; `less`: the detector's PSF as it is."""
     one = replace(approximation.simplified(galaxy.sources), photons=None)
     if approximation.spread is NONE.spread:
@@ -203,7 +204,7 @@ def _changed(galaxy: Known, some: Sources, less: psf.Psf, approximation: Approxi
 
 
 def _seconds(
-    some: Sources, spread: psf.Psf, settings: Settings, repeats: int, approximation: Approximation = NONE
+    some: Sources, spread: model.Psf, settings: Settings, repeats: int, approximation: Approximation = NONE
 ) -> float:
     """CPU s of sources on the scene's frame."""
     # The brightest are drawn in double precision, which is compiled on its own.

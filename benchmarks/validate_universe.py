@@ -25,19 +25,24 @@ from unittest import mock
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks import _census as census
 from benchmarks import _clustering as clustering
 from benchmarks import _shear as shear
 from benchmarks import _universe_figures as pictures
 from benchmarks import report, stars
-from jobs.catalogue import band_ratios, density_box, dust_map, gaia, galaxies, luminosity_function
-from jobs.catalogue import stars as milky_way_stars
-from jobs.fluxes import cosmology, templates
-from jobs.request import Universe
-
-Float = npt.NDArray[np.float64]
+from jobs.catalogue import dust_map
+from jobs.catalogue.galaxies import band_ratios, galaxies, lensing
+from jobs.catalogue.halos import luminosity_function, matching
+from jobs.catalogue.matter import density_box
+from jobs.catalogue.stars import gaia
+from jobs.catalogue.stars import stars as milky_way_stars
+from jobs.fluxes import cosmology
+from jobs.fluxes.libraries import rest_grid, templates
+from jobs.request.schema import Universe
+from lake_schema import sky
+from lake_schema.arrays import Float
+from lake_schema.store import provenance
 
 SEED = 7
 EXPECTED = Path(__file__).with_suffix(".csv")
@@ -127,7 +132,7 @@ def theory() -> dict[str, float]:
     figures = {"sigma_8": float(np.sqrt(variance)), "chi_2.3": float(cosmology.comoving_distance(2.3))}
     # The numbers are of the observed spectra with their weak lines, which the library bridges.
     with mock.patch.object(templates, "_LINE_MASK", -1.0):
-        wavelength = templates.rest_grid()
+        wavelength = rest_grid.rest_grid()
         kinds = list(K_CORRECTIONS["sdss_r01"])
         flux = templates._galaxies(wavelength)[kinds].astype(np.float32)
     library = templates.Library(wavelength, flux, tuple(map(str, kinds)))
@@ -152,7 +157,7 @@ def matter(size: Size) -> dict[str, float]:
         figures = _named("box_power_k{:.2f}", POWER_EDGES, power.mean(0), power.std(0, ddof=1) / np.sqrt(len(boxes)))
     bias = clustering.halo_bias(box, BIASES, BIAS_EDGES)[:, 0]
     figures |= {f"halo_bias_x{x}": float(value) for x, value in zip(BIASES, bias, strict=True)}
-    masses = galaxies.matching.masses()
+    masses = matching.masses()
     of_12 = float(masses.at(masses.bias, np.zeros(1), np.full(1, 12.0))[0])
     return figures | {"velocity_rms": clustering.velocities(box, of_12)}
 
@@ -165,7 +170,7 @@ def _named(pattern: str, edges: Sequence[float] | Float, values: Float, errors: 
 
 def published_halos() -> Callable[[float, float], float]:
     """Halos above a mass at z, (Mpc/h)^-3: the mass function itself, without what the draw makes of it."""
-    masses = galaxies.matching.masses()
+    masses = matching.masses()
 
     def number(least: float, z: float) -> float:
         log_mass = np.linspace(least, 16.0, 501)
@@ -241,14 +246,14 @@ def clustered(size: Size) -> tuple[dict[str, float], dict[str, Any], clustering.
         for edge in WIDE_EDGES[:-1]:
             alone = figures[f"w_structure_{edge:g}"]
             figures[f"w_{name}_{edge:g}_to_structure"] = figures[f"w_{name}_{edge:g}"] / alone
-    figures["clustering_deg2"] = len(whole) * clustering.sky.cell_area(clustering.BLOCK_ORDER)
+    figures["clustering_deg2"] = len(whole) * sky.cell_area(clustering.BLOCK_ORDER)
     return figures, curves, clustering.joined([kinds[0] for _, kinds in whole[: size.wide]])
 
 
 def abundances(size: Size) -> dict[str, float]:
     """Halos above a mass / the mass function, in thin shells of order-5 cells; the error from their scatter."""
     number, cells = published_halos(), ((np.arange(size.pixels) + 0.43) * (12 << 10) / size.pixels).astype(int).tolist()
-    figures, area = {}, clustering.sky.cell_area(5) * np.radians(1.0) ** 2
+    figures, area = {}, sky.cell_area(5) * np.radians(1.0) ** 2
     for at, half in census.HALO_SHELLS:
         universe = clustering.people(SEED, size.settings.box_cells, at - half, at + half, census.HALO_MASSES[0])
         found = [clustering.tracers(universe, 5, cell) for cell in cells]
@@ -278,7 +283,7 @@ def lensed(size: Size, halos: clustering.Tracers) -> tuple[dict[str, float], Flo
     """Maps, their power in several boxes, shear about halos; C_l over theory [plane, band]."""
     cells, nside = size.settings.box_cells, size.settings.lensing_nside
     box = density_box.load(SEED, cells)
-    planes = galaxies.lensing.load(box, nside, far=True)
+    planes = lensing.load(box, nside, far=True)
     figures: dict[str, float] = {}
     for number, z in PLANES:
         figures |= shear.maps(planes, number, f"z{z}")
@@ -359,7 +364,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     results = checks(figures)
     failed = report_of(figures, results)
     if options.json:
-        about = {"name": "validate_universe", "commit": report.git_commit(), "machine": report.machine(), "repeats": 1}
+        about = {
+            "name": "validate_universe",
+            "commit": provenance.git_commit(),
+            "machine": report.machine(),
+            "repeats": 1,
+        }
         summary = {"checks": len(results), "failed": ", ".join(failed), "load_average": round(os.getloadavg()[0], 2)}
         options.json.write_text(json.dumps({**about, **summary, **figures}, indent=1) + "\n")
     return 0

@@ -21,16 +21,18 @@ from typing import Any
 
 from benchmarks import report
 from jobs import cache
-from jobs import request as requests
 from jobs.accuracy import preset
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.measured import forget_peak, peak_gb
-from jobs.render import exposure, plan_exposures, render_exposures, stamps
-from jobs.render.channels import vis
-from jobs.request import Effects, Request
-from lake_schema import layout, publish
-from lake_schema.plan import Json
+from jobs.render import plan_exposures, render_exposures
+from jobs.render.channels import registry, vis
+from jobs.render.drawing import stamps
+from jobs.render.exposure import render
+from jobs.request.from_toml import parse
+from jobs.request.schema import Effects, Request
+from lake_schema.store import layout, publish
+from lake_schema.store.plan import Json
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "vis.json"
@@ -66,7 +68,7 @@ def lake(folder: Path, wanted: Request) -> Path:
 
 def request(quick: bool) -> Request:
     """The demo's VIS detector; of a brighter universe where it must be quick."""
-    wanted = requests.parse(ROOT / "requests" / "demo.toml")
+    wanted = parse(ROOT / "requests" / "demo.toml")
     wanted = replace(wanted, pointings=wanted.pointings[:1], bands=wanted.bands[:1], truth=())
     if quick:
         universe = replace(wanted.universe, galaxy_limit=20.0, star_limit=16.0, lensing_nside=64)
@@ -113,20 +115,20 @@ def stages(seconds: dict[str, float]) -> Iterator[None]:
     """Adds up the CPU seconds of a render's stages and effects while it is open."""
     places: tuple[tuple[Any, str, str], ...] = (
         (render_exposures, "sources", "read"),
-        (exposure, "_psf", "psf"),
-        (exposure, "sources_of", "choose"),
+        (render, "_psf", "psf"),
+        (render, "sources_of", "choose"),
         (stamps, "draw", "draw"),
     )
     kept = [(module, name, getattr(module, name)) for module, name, _ in places]
-    effects = exposure.EFFECTS["VIS"]["science"]
+    effects = registry.EFFECTS["VIS"]["science"]
     for module, name, stage in places:
         setattr(module, name, _timed(getattr(module, name), f"stage_{stage}_s", seconds))
     timed = tuple(replace(e, apply=_timed(e.apply, f"effect_{e.name}_s", seconds)) for e in effects)
-    exposure.EFFECTS["VIS"]["science"] = timed  # type: ignore[index]
+    registry.EFFECTS["VIS"]["science"] = timed  # type: ignore[index]
     try:
         yield
     finally:
-        exposure.EFFECTS["VIS"]["science"] = effects  # type: ignore[index]
+        registry.EFFECTS["VIS"]["science"] = effects  # type: ignore[index]
         for module, name, function in kept:
             setattr(module, name, function)
 
@@ -185,7 +187,7 @@ def whole_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
         pointing += '\ndetectors = ["3-3", "3-4"]'
     file = folder / "exposure.toml"
     file.write_text(f"{head}[[pointing]]{pointing}\n", encoding="utf-8")
-    wanted = requests.parse(file)
+    wanted = parse(file)
     root = lake(folder / "exposure", wanted)
     prepared(root, wanted)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -13,12 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import j0
 
-from jobs.catalogue import density_box, galaxies, halos, luminosity_function, population
-from jobs.catalogue.population import Population
+from jobs.catalogue.galaxies import galaxies
+from jobs.catalogue.halos import halos, luminosity_function, population
+from jobs.catalogue.halos.population import Population
+from jobs.catalogue.matter import density_box
 from jobs.fluxes import cosmology
 from lake_schema import sky
-
-Float = npt.NDArray[np.float64]
+from lake_schema.arrays import Float
 
 BLOCK_ORDER, PIXEL_ORDER = 4, 9
 LIMIT = 22.0

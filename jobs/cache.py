@@ -22,16 +22,14 @@ import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from lake_schema import blocks, layout, manifest, user_files
+from lake_schema import blocks, user_files
+from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
-from lake_schema.provenance import digest, machine
-
-Array = npt.NDArray[Any]
+from lake_schema.store import layout, manifest
+from lake_schema.store.provenance import digest, machine
 
 _SEAL, _ARRAY = "sums.json", ".npy"
 # Another process may remove what it found damaged at the moment when this one has made it again.

@@ -18,10 +18,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
-from jobs import request as requests
 from jobs.render import plan_exposures
-from lake_schema import __version__, command, layout, read
+from jobs.request.from_toml import parse
+from lake_schema import __version__, command
 from lake_schema.errors import BadInput
+from lake_schema.store import layout, read
 
 _ROOT = Path(__file__).resolve().parents[1]
 JOBS = (
@@ -58,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
 def _demonstrated(out: Path, request: Path) -> int:
     # Whatever is wrong with the folder or the pointings is said before the first job runs.
     root = layout.lake(layout.lake(out) / "lake")
-    plan_exposures.plan(root, requests.parse(request))
+    plan_exposures.plan(root, parse(request))
     status = _run_all(root, request)
     if status == 0:
         _show(root, out)
@@ -116,7 +117,7 @@ def _table(root: Path, stages: Sequence[tuple[str, Sequence[str], float]], total
 
 def _show(root: Path, out: Path) -> None:
     # All that renders: seconds that the first job need not wait for.
-    from jobs.render import preview
+    from jobs.render.products import preview
 
     for picture in preview.previews(root, out):
         print(picture)

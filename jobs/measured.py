@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lake_schema.plan import Json, Part
+from lake_schema.store.plan import Json, Part
 
 # Linux: a 5 written here makes the process's largest memory start again from what it holds now.
 _CLEAR, _RESET, _STATUS = Path("/proc/self/clear_refs"), "5", Path("/proc/self/status")

@@ -21,8 +21,8 @@ from pyspark.sql import SparkSession
 from pyspark.sql.pandas.types import from_arrow_type
 from pyspark.sql.types import StructField, StructType
 
-from lake_schema import read
 from lake_schema.errors import Damaged
+from lake_schema.store import read
 
 # What nobody from outside may reach, wherever the configuration says nothing else.
 _CLOSED = {"spark.ui.enabled": "false"}

@@ -30,12 +30,14 @@ from typing import IO, TYPE_CHECKING, Any
 import pyarrow as pa
 from tqdm import tqdm
 
-from jobs import request as requests
 from jobs.measured import Measured
-from lake_schema import __version__, command, layout, publish, read, user_files
+from jobs.request.from_toml import parse
+from jobs.request.schema import Request
+from lake_schema import __version__, command, user_files
 from lake_schema.errors import BadInput, LakeError, PartsFailed
-from lake_schema.provenance import code_version, git_commit
-from lake_schema.publish import Json, Part, Plan, Work
+from lake_schema.store import layout, publish, read, stage
+from lake_schema.store.plan import Json, Part, Plan, Work
+from lake_schema.store.provenance import code_version, git_commit
 
 if TYPE_CHECKING:
     from pyspark.sql import SparkSession
@@ -65,9 +67,9 @@ class Job:
 
     name: str
     doc: str
-    steps: Callable[[Path, requests.Request], Sequence[Step]]
+    steps: Callable[[Path, Request], Sequence[Step]]
     options: tuple[tuple[str, str], ...] = ()
-    dry_run: Callable[[Path, requests.Request], Sequence[Step]] | None = None
+    dry_run: Callable[[Path, Request], Sequence[Step]] | None = None
 
 
 _RESULT = pa.schema(
@@ -106,13 +108,13 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
     return command.status(job.name, made)
 
 
-def run(job: Job, root: Path, request: requests.Request, verbose: bool = False) -> None:
+def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
     """Make and publish every table of a job that is not there yet; raises what `publish.make` raises."""
     for step in job.steps(root, request):
         _run(job, step, root, request, verbose)
 
 
-def common_facts(request: requests.Request, *parts: str) -> dict[str, Any]:
+def common_facts(request: Request, *parts: str) -> dict[str, Any]:
     """What every plan of a request holds: the named parts of the request, and the code."""
     return {"request": request.facts(*parts), "code": code_version()}
 
@@ -148,10 +150,10 @@ def _refuse_mangled(*paths: str) -> None:
                 raise BadInput(f"{user_files.shown(path)}: this locale has no letters but ASCII: export LC_ALL=C.UTF-8")
 
 
-def _request(job: Job, options: argparse.Namespace) -> requests.Request:
+def _request(job: Job, options: argparse.Namespace) -> Request:
     given = {name: getattr(options, name) for name, _ in job.options}
     lists: dict[str, Any] = {name: tuple(dict.fromkeys(value)) for name, value in given.items() if value is not None}
-    return replace(requests.parse(options.request), **lists)
+    return replace(parse(options.request), **lists)
 
 
 @contextmanager
@@ -172,7 +174,7 @@ def _stoppable(job: Job) -> Iterator[None]:
 # ------------------------------------------------------------------------------------------------ one step
 
 
-def _run(job: Job, step: Step, root: Path, request: requests.Request, verbose: bool) -> None:
+def _run(job: Job, step: Step, root: Path, request: Request, verbose: bool) -> None:
     plan, started = step.plan, time.time()
     log = _RunLog(root, job, step, request)
     results: list[Json] = []
@@ -218,7 +220,7 @@ class _RunLog:
     A run goes on where it cannot be written.
     """
 
-    def __init__(self, root: Path, job: Job, step: Step, request: requests.Request) -> None:
+    def __init__(self, root: Path, job: Job, step: Step, request: Request) -> None:
         folder = layout.runs(root)
         now = datetime.now(UTC)
         self.common = {"job": job.name, "table": step.plan.table.name}
@@ -248,7 +250,7 @@ class _RunLog:
 @contextmanager
 def _bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
     """A progress bar that counts receipts, so that it is right after a resume and under any scheduler."""
-    folder = publish.receipts(layout.stage(root, plan.table.name, plan.key))
+    folder = stage.receipts(layout.stage(root, plan.table.name, plan.key))
 
     def count() -> int:
         return sum(1 for path in folder.glob("*.json") if not path.name.startswith("."))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-Float = npt.NDArray[np.float64]
+from lake_schema.arrays import Float
 
 # Up to so many terms a sum is made of whole arrays, without compiled code.
 _FEW = 8

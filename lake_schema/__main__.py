@@ -9,8 +9,9 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from lake_schema import __version__, command, layout, publish, read, tables
+from lake_schema import __version__, command, tables
 from lake_schema.errors import BadInput
+from lake_schema.store import layout, publish, read
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from lake_schema.errors import Damaged
-from lake_schema.plan import Json
-from lake_schema.provenance import file_sha256
+from lake_schema.store.plan import Json
+from lake_schema.store.provenance import file_sha256
 
 # Smaller pieces share a block, larger ones are cut.
 _LEAST_BYTES, _MOST_BYTES = 16 << 10, 8 << 20

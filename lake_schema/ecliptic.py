@@ -11,11 +11,9 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import OutOfRange
 from lake_schema.sky import wrapped
-
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
 
 # IAU 1976 obliquity at J2000, deg.
 OBLIQUITY = 23.4392911

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from lake_schema.arrays import Int
 from lake_schema.errors import BadInput
 
 GENERATION_ORDER = 8
@@ -20,10 +21,8 @@ _FILE_BITS = _MEMBER_BITS + _NUMBER_BITS + _SUB_BITS
 # Identifiers that differ above these bits stand for another kind or another generation cell.
 BLOCK_BITS = _MEMBER_BITS + _NUMBER_BITS
 
-Int64 = npt.NDArray[np.int64]
 
-
-def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, member: npt.ArrayLike = 0) -> Int64:
+def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, member: npt.ArrayLike = 0) -> Int:
     """Identifiers of sources.
 
     kind : int[n]; cell : int or int[n], order-8 nested cell that the halo lies in
@@ -47,11 +46,11 @@ def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, m
     return np.asarray(kinds << 60 | file_cells << _FILE_BITS | index << _MEMBER_BITS | members)
 
 
-def halo_of(ids: Int64) -> Int64:
+def halo_of(ids: Int) -> Int:
     """int64[n] -> identifier of each source's halo: the kind and member bits cleared."""
     return ids & np.int64((1 << 60) - 1) & ~np.int64((1 << _MEMBER_BITS) - 1)
 
 
-def kind_of(ids: Int64) -> Int64:
+def kind_of(ids: Int) -> Int:
     """int64[n] -> kind code of each source."""
     return ids >> 60

@@ -17,10 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, OutOfRange
-
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
 
 DEEPEST = 29
 # Of three neighbouring vertices (unit vectors) the triple product at which healpy sees no corner any more.

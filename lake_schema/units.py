@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
-
-Float = npt.NDArray[np.float64]
 
 # SI Brochure (BIPM 2019): exact by definition.
 LIGHT_KM_S = 299_792.458

@@ -1,4 +1,4 @@
-"""Make jobs/catalogue/halpha_matching.csv: which H alpha luminosity a star formation rate's stands for.
+"""Make jobs/catalogue/galaxies/halpha_matching.csv: which H alpha luminosity a star formation rate's stands for.
 
     python scripts/match_halpha.py [--cells 120]
 
@@ -18,7 +18,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from jobs.catalogue import emission_lines, galaxies, halos, population, satellites, sed_assignment, stellar_mass
+
+from jobs.catalogue.galaxies import emission_lines, galaxies, sed_assignment, stellar_mass
+from jobs.catalogue.halos import halos, population, satellites
 from jobs.fluxes import cosmology
 from jobs.rng import stream
 from lake_schema import sky

@@ -14,14 +14,20 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from jobs import cache, request, sums
+from jobs import cache, sums
 from jobs.accuracy import DRAFT
 from jobs.catalogue import build_galaxies, build_stars
-from jobs.fluxes import compute_fluxes, cosmology, grid_settings, grid_tables, integration, passbands, templates
+from jobs.fluxes import compute_fluxes, cosmology, integration, passbands
+from jobs.fluxes.libraries import templates
 from jobs.fluxes.sources import galaxies_of
-from jobs.render import plan_exposures, profiles, psf, render_exposures, sersic
-from lake_schema import layout, publish, read, sky
-from lake_schema.fits import read_images
+from jobs.fluxes.tables import build_tables, settings
+from jobs.render import plan_exposures, render_exposures
+from jobs.render.psf import euclid
+from jobs.render.sources import galaxy_shapes, sersic
+from jobs.request.from_toml import from_table
+from lake_schema import sky
+from lake_schema.fits.images import read_images
+from lake_schema.store import layout, publish, read
 from tests.jobs.render import fields
 
 BANDS = ("euclid_vis", "lsst_r")
@@ -51,22 +57,24 @@ def quick():
     """Arrays by name, of a few seconds."""
     rng = np.random.default_rng(1)
     library, vis = templates.galaxy_library(), passbands.load("euclid_vis")
-    setting = min((choice.setting for choice in grid_settings.choose(["euclid_vis"], DRAFT)), key=lambda s: s.size)
+    setting = min((choice.setting for choice in settings.choose(["euclid_vis"], DRAFT)), key=lambda s: s.size)
     yield "templates", library.flux
-    yield "galaxy_table", grid_tables.galaxy_table(vis, library, setting, grid_tables.library_key(library))
+    yield "galaxy_table", build_tables.galaxy_table(vis, library, setting, build_tables.library_key(library))
     stellar = templates.stellar_library()
     yield "stellar_templates", stellar.flux
-    yield "star_table", grid_tables.star_table(vis, stellar, grid_tables.library_key(stellar))
-    yield "line_table", grid_tables.line_table(vis)[1]
+    yield "star_table", build_tables.star_table(vis, stellar, build_tables.library_key(stellar))
+    yield "line_table", build_tables.line_table(vis)[1]
     yield "integrated", integration.galaxies(random_galaxies(20), [vis], library)
     yield "distances", cosmology.comoving_separation(0.0, np.linspace(0.0, 6.0, 50))
     yield "galactic", np.stack(sky.galactic(*rng.uniform(-80.0, 80.0, (2, 1000))))
-    planes = psf._vis_planes(fields.small("vis", "3-4"), vis, fields.MISSION, 4)
+    planes = euclid._vis_planes(fields.small("vis", "3-4"), vis, fields.MISSION, 4)
     yield "psf", planes.images
     yield "psf_drift", planes.drift
     yield "sersic", sersic.table()
-    shapes = profiles.shapes(fields.galaxies(np.zeros(50), np.zeros(50), inclination=80 * rng.random(50), gamma1=0.02))
-    form = profiles.forms(shapes, rng.normal(size=(50, 2, 2)))
+    shapes = galaxy_shapes.shapes(
+        fields.galaxies(np.zeros(50), np.zeros(50), inclination=80 * rng.random(50), gamma1=0.02)
+    )
+    form = galaxy_shapes.forms(shapes, rng.normal(size=(50, 2, 2)))
     yield "forms", np.concatenate([part.ravel() for part in (form.bulge, form.disk, form.thick)])
     yield "least_squares", sums.least_squares(rng.normal(size=(30, 6)), rng.normal(size=(30, 3)))
 
@@ -76,7 +84,7 @@ def whole(folder):
     yield from quick()
     root = layout.lake(folder / "lake")
     root.mkdir(parents=True)
-    wanted = request.from_table(REQUEST)
+    wanted = from_table(REQUEST)
     for job in (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.JOB, render_exposures.JOB):
         for step in job.steps(root, wanted):
             publish.make(root, step.plan, step.work)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 # Before numpy, numba, astropy or colossus are imported by anything.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 os.environ.setdefault("TRUESKY_CACHE", str(Path(tempfile.gettempdir()) / f"truesky-tests-{os.getuid()}"))
 
 import pytest

@@ -6,8 +6,8 @@ Run it when a table's declaration changes before it was ever released; afterward
 import sys
 from pathlib import Path
 
-from lake_schema import layout, publish
-from lake_schema.publish import Output, Part, Plan
+from lake_schema.store import layout, publish
+from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.galaxies import GALAXIES
 from tests.universe import plain_plan, plain_work, rows_of
 

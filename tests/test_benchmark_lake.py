@@ -27,7 +27,7 @@ def test_a_row_is_smaller_than_with_defaults(tmp_path):
     """Bytes depend on no other load: the goal is 170 for these 50 columns."""
     import pyarrow.parquet as pq
 
-    from lake_schema import parquet
+    from lake_schema.store import parquet
 
     rows = benchmark.rows_of(benchmark.FIRST_CELL, 100_000)
     assert rows.nbytes == 228 * rows.num_rows

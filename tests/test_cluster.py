@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from jobs import demo
-from lake_schema import layout, read
+from lake_schema.store import layout, read
 
 pytestmark = [pytest.mark.spark, pytest.mark.nightly]
 

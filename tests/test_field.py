@@ -14,16 +14,22 @@ from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 from scipy.spatial import cKDTree
 
-from jobs import request, shell
+from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import archive, exposure, fits_product, focal_plane, plan_exposures, preview, render_exposures
-from jobs.render.effects import charge_transfer, pixel_area, quadrants
-from jobs.render.effects.effect import Scene
-from lake_schema import layout, read, sky
+from jobs.render import archive, plan_exposures, render_exposures
+from jobs.render.camera import detectors
+from jobs.render.channels import registry
+from jobs.render.effects.light import pixel_area
+from jobs.render.effects.readout import charge_transfer, quadrants
+from jobs.render.effects.scene import Scene
+from jobs.render.products import preview_labels, read_back
+from jobs.request.from_toml import parse
+from lake_schema import sky
 from lake_schema.mission.configuration import resolve
+from lake_schema.store import layout, read
 from tests.jobs.render import calibrated
-from tests.jobs.render.test_exposure import render as small
+from tests.jobs.render.exposure.test_render import render as small
 
 pytestmark = pytest.mark.spark
 
@@ -58,10 +64,10 @@ class Image:
 def field(spark, tmp_path_factory):
     """The lake of the demo."""
     root = layout.lake(tmp_path_factory.mktemp("field") / "lake")
-    wanted = request.parse(DEMO)
+    wanted = parse(DEMO)
     # Compiled here, so that no worker's memory is the compiler's.
     for channel in ("VIS", "EXT"):
-        small(channel, forced={effect.name: True for effect in exposure.EFFECTS[channel]["science"]})
+        small(channel, forced={effect.name: True for effect in registry.EFFECTS[channel]["science"]})
     for job in JOBS:
         shell.run(job, root, wanted)
     return root
@@ -105,7 +111,7 @@ def image(request, field):
 
 def scene_of(header):
     mission = resolve()
-    detector = focal_plane.detector("vis", header["DETECTOR"], mission)
+    detector = detectors.detector("vis", header["DETECTOR"], mission)
     return Scene(mission, "vis", header["EXPTIME"], header["SKYRATE"], 0.0, detector)
 
 
@@ -271,7 +277,7 @@ def test_a_picture_names_the_brightest_of_the_frame(field, image):
     channel = image.header["CHANNEL"]
     products = read.version(field, "products").rows().to_pylist()
     (row,) = (row for row in products if (row["channel"], row["content"]) == (channel, "science"))
-    names = preview.labels(field, row, fits_product.electrons(product(field, channel, "science")))
+    names = preview_labels.labels(field, row, read_back.electrons(product(field, channel, "science")))
     for kind in ("galaxy", "star"):
         flux = np.sort(image.expected[image.is_star == (kind == "star")])[-16:] / image.header["EXPTIME"]
         brightest = image.header["ZEROPNT"] - 2.5 * np.log10(flux[::-1])
@@ -304,14 +310,14 @@ def test_every_table_is_sound(field):
 def test_the_demo_covers_only_what_its_detectors_touch(field):
     tasks = read.version(field, "tasks").rows(["cells"])["cells"].to_pylist()
     touched = sorted({cell for cells in tasks for cell in cells})
-    drawn = request.parse(DEMO).area.cells()
+    drawn = parse(DEMO).area.cells()
     assert set(touched) <= set(drawn)
     assert len(drawn) * sky.cell_area(8) <= 0.6
 
 
 def test_counts_are_those_of_the_sky(field):
     """102 galaxies an arcmin2 with I_E < 26, as deep surveys and the Flagship mock have, within 15 %."""
-    area = len(request.parse(DEMO).area.cells()) * sky.cell_area(8) * 3600
+    area = len(parse(DEMO).area.cells()) * sky.cell_area(8) * 3600
     galaxies = read.version(field, "galaxies")
     assert galaxies.num_rows / area == pytest.approx(102, rel=0.15)
     flux = read.version(field, "galaxy_fluxes").rows(["f_nu_euclid_vis"]).column(0).to_numpy()

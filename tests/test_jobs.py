@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from jobs import demo, request, shell
+from jobs import demo, shell
 from jobs.catalogue import build_gaia, build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
-from lake_schema import layout, read
+from jobs.request.from_toml import from_table
+from lake_schema.store import layout, read
 from tests import requests
 
 ROOT = Path(__file__).parents[1]
@@ -139,7 +140,7 @@ def test_spark_submit_passes_on_the_line_and_the_status(tmp_path):
 
 def test_a_generation_cell_is_the_same_in_every_request(tmp_path):
     """Whatever else is asked for, a cell's rows are the same bytes."""
-    wanted = request.from_table(tomllib.loads(SMALL))
+    wanted = from_table(tomllib.loads(SMALL))
     for module in (build_galaxies, build_stars):
         for step in module.steps(tmp_path, wanted):
             if step.on_driver:

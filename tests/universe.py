@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from lake_schema import ids, layout, sky
+from lake_schema import ids, sky
 from lake_schema.columns import Column, Table
-from lake_schema.publish import Output, Part, Plan
+from lake_schema.store import layout
+from lake_schema.store.plan import Output, Part, Plan
 
 TOY = Table(
     "toy",

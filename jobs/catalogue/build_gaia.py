@@ -13,13 +13,14 @@ if __name__ == "__main__":
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from jobs.catalogue import gaia
-from jobs.request import Request
+from jobs.catalogue.stars import gaia
+from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
-from lake_schema import layout, read, sky
+from lake_schema import sky
 from lake_schema.errors import BadInput
-from lake_schema.provenance import code_version
-from lake_schema.publish import Json, Output, Part, Plan
+from lake_schema.store import layout, read
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.provenance import code_version
 from lake_schema.tables.gaia import GAIA
 
 

@@ -15,30 +15,22 @@ if __name__ == "__main__":
 
 import pyarrow as pa
 
-from jobs.catalogue import (
-    cells,
-    dust_map,
-    galaxies,
-    halo_catalogue,
-    ingest,
-    ingested_galaxies,
-    lensing,
-    mapping,
-    nearest_sed,
-    population,
-)
-from jobs.catalogue.galaxies import GalaxyModel
-from jobs.catalogue.halo_catalogue import LightCone
-from jobs.catalogue.nearest_sed import Training
+from jobs.catalogue import cells, dust_map
+from jobs.catalogue.external import ingest, mapping
+from jobs.catalogue.galaxies import from_catalogue, galaxies, lensing, nearest_sed
+from jobs.catalogue.galaxies.galaxies import GalaxyModel
+from jobs.catalogue.galaxies.nearest_sed import Training
+from jobs.catalogue.halos import halo_catalogue, population
+from jobs.catalogue.halos.halo_catalogue import LightCone
 from jobs.fluxes import passbands, sources
-from jobs.own_files import Catalogue, DustMap, Ingest
-from jobs.request import Request
+from jobs.request.files import Catalogue, DustMap, Ingest
+from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
-from lake_schema import layout, parquet, read
 from lake_schema.errors import BadInput
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
-from lake_schema.provenance import code_version
-from lake_schema.publish import Json, Output, Part, Plan
+from lake_schema.store import layout, parquet, read
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.provenance import code_version
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
 from lake_schema.tables.quarantine import QUARANTINE
@@ -166,11 +158,11 @@ def ingested_work(lake: Path, facts: Json, given: Catalogue, dust: DustMap | Non
     columns = mapping.galaxies(given.format, dict(given.columns))
     found, _ = ingest.listed(given.files, columns)
     laid_out = ingest.split(found, facts["ingest"]["sha256"], columns)
-    model = ingested_galaxies.model(facts["seed"], columns, laid_out)
+    model = from_catalogue.model(facts["seed"], columns, laid_out)
     sky_map = dust_map.chosen(facts["seed"], dust)
 
     def draw(cell: int) -> pa.Table:
-        return ingested_galaxies.draw(cell, ingest.rows(laid_out, cell), model, sky_map)
+        return from_catalogue.draw(cell, ingest.rows(laid_out, cell), model, sky_map)
 
     return _parted(facts, cells.rows(facts, GALAXIES, draw))
 

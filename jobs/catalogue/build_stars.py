@@ -10,13 +10,14 @@ if __name__ == "__main__":
 from functools import partial
 from typing import Any
 
-from jobs.catalogue import bright_stars, cells, dust_map, star_catalogue, stars
-from jobs.own_files import DustMap
-from jobs.request import Request, Stars
+from jobs.catalogue import cells, dust_map
+from jobs.catalogue.stars import bright_stars, from_catalogue, stars
+from jobs.request.files import DustMap
+from jobs.request.schema import Request, Stars
 from jobs.shell import Job, Step, main
 from lake_schema import user_files
-from lake_schema.provenance import code_version, file_sha256
-from lake_schema.publish import Json, Output, Plan
+from lake_schema.store.plan import Json, Output, Plan
+from lake_schema.store.provenance import code_version, file_sha256
 from lake_schema.tables.stars import STARS
 
 # Lowest order of a file: 54 deg2, what a bright limit leaves in them is soon drawn.
@@ -52,8 +53,8 @@ def _files(choice: Stars) -> dict[str, Any]:
         facts["tycho2"] = {"sha256": sums, "brighter": read.ra.size, **counts}
     if choice.catalogue:
         columns = dict(choice.columns)
-        star_catalogue.checked_columns(columns)
-        file = user_files.checked(choice.catalogue, star_catalogue.KIND, "stars.catalogue.file")
+        from_catalogue.checked_columns(columns)
+        file = user_files.checked(choice.catalogue, from_catalogue.KIND, "stars.catalogue.file")
         facts["catalogue"] = {"sha256": file_sha256(file), "columns": columns}
     return facts
 
@@ -69,7 +70,7 @@ def _model(facts: Json, choice: Stars) -> stars.StarModel:
     catalogue = bright = None
     if choice.catalogue:
         given = facts["catalogue"]
-        catalogue = star_catalogue.load(choice.catalogue, given["sha256"], given["columns"])
+        catalogue = from_catalogue.load(choice.catalogue, given["sha256"], given["columns"])
     if choice.tycho2:
         bright = bright_stars.load(choice.tycho2, facts["tycho2"]["sha256"])
     limits = facts["star_limit"], facts["plane_limit"]

@@ -13,13 +13,15 @@ if __name__ == "__main__":
 import numpy as np
 import pyarrow as pa
 
-from jobs.catalogue import cells, strong_lenses
-from jobs.request import Request
+from jobs.catalogue import cells
+from jobs.catalogue.galaxies import strong_lenses
+from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
-from lake_schema import layout, read, sky
+from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
-from lake_schema.provenance import code_version
-from lake_schema.publish import Json, Output, Part, Plan
+from lake_schema.store import layout, read
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.provenance import code_version
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 
 

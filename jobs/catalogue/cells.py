@@ -18,11 +18,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from jobs.request import Area
-from lake_schema import layout, sky
+from jobs.request.area import Area
+from lake_schema import sky
 from lake_schema.columns import Table
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
-from lake_schema.publish import Json, Part
+from lake_schema.store import layout
+from lake_schema.store.plan import Json, Part
 
 
 def parts(area: Area) -> tuple[Part, ...]:

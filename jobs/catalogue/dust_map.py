@@ -23,15 +23,14 @@ import numpy.typing as npt
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
-from jobs.own_files import DustMap
+from jobs.request.files import DustMap
 from jobs.rng import stream
 from lake_schema import user_files
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
-from lake_schema.fits import read_map
-from lake_schema.provenance import canonical, file_sha256
+from lake_schema.fits.external import read_map
 from lake_schema.sky import equatorial, galactic
-
-Float = npt.NDArray[np.float64]
+from lake_schema.store.provenance import canonical, file_sha256
 
 # Table `galaxies` holds no more.
 _MOST_A_V = 40.0

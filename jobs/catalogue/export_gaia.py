@@ -14,8 +14,9 @@ import pyarrow.compute as pc
 from pyarrow import csv
 
 from jobs.catalogue import parameters
-from lake_schema import __version__, command, layout, read, user_files
-from lake_schema.fits import table_to_fits
+from lake_schema import __version__, command, user_files
+from lake_schema.fits.tables import table_to_fits
+from lake_schema.store import layout, read
 from lake_schema.tables.gaia import EXPORT
 
 

@@ -19,10 +19,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from jobs.fluxes import cosmology, passbands
-from jobs.fluxes.extinction import MILKY_WAY_R_V
-from lake_schema import __version__, command, layout, read, sky, user_files
+from jobs.fluxes.spectra.extinction import MILKY_WAY_R_V
+from lake_schema import __version__, command, sky, user_files
 from lake_schema.errors import BadInput
-from lake_schema.fits import table_to_fits
+from lake_schema.fits.tables import table_to_fits
+from lake_schema.store import layout, read
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.units import LIGHT_KM_S, electron_rate
 

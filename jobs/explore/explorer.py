@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from jobs.explore import results
 from jobs.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process, check
-from lake_schema import layout, read, sky
+from lake_schema import sky
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.store import layout, read
 
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
 Range = tuple[float, float]
 
 _MOST_BINS = 10_000

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lake_schema import sky
-
-Float = npt.NDArray[np.float64]
+from lake_schema.arrays import Float
 
 
 def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:

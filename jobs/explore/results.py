@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from lake_schema import user_files
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
-from lake_schema.fits import table_to_fits
+from lake_schema.fits.tables import table_to_fits
 
 INTO = ("pandas", "astropy", "arrow")
 # Where some are missing: pandas' own way is to make floats of integers, which rounds an identifier.

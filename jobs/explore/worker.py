@@ -20,8 +20,8 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 
 from jobs.explore.guard import Query, checked, one_line
-from lake_schema import layout, read
 from lake_schema.errors import BadInput, Damaged, LakeError
+from lake_schema.store import layout, read
 
 _MACROS = (
     # Great-circle distance by the haversine, deg.

@@ -2,23 +2,20 @@
 
 continuum_scale   galaxies: apparent AB magnitude in the reference band
 star_scale        stars: Vega magnitude in 2MASS H
-vega_magnitude    AB magnitude of Vega
 """
 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs import sums
 from jobs.fluxes import passbands
-from jobs.fluxes.passbands import Passband
+from jobs.fluxes.libraries import vega
+from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.sources import Stars
-from jobs.fluxes.templates import Library, vega
 from lake_schema import units
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
-
-Float = npt.NDArray[np.float64]
 
 STAR_BAND = "twomass_h"
 # f_nu of a normalised template is 1e-11; 30 decades below, single precision has run out of digits.
@@ -44,10 +41,5 @@ def star_scale(stars: Stars, library: Library) -> Float:
     band = passbands.load(STAR_BAND)
     seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
     template = sums.product(seen, passbands.weights(band))
-    mag_ab = stars.mag_h + vega_magnitude(band)
+    mag_ab = stars.mag_h + vega.vega_magnitude(band)
     return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_ab)) / template[stars.sed])
-
-
-def vega_magnitude(band: Passband) -> float:
-    """AB magnitude of Vega: m_AB = m_Vega + this (J 0.90, H 1.37, Ks 1.85)."""
-    return float(units.mag_of_f_nu(units.ujy_of_cgs(passbands.ab_flux(band, *vega()))))

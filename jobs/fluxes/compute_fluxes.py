@@ -21,16 +21,17 @@ from typing import Any
 import pyarrow as pa
 
 from jobs.accuracy import Accuracy
-from jobs.fluxes import grid_errors, grid_settings, inputs, spectra
-from jobs.fluxes.grid_settings import Choice
-from jobs.fluxes.grid_tables import Setting
+from jobs.fluxes import band_fluxes, inputs
 from jobs.fluxes.inputs import Own
-from jobs.request import Request
+from jobs.fluxes.tables import errors_measured
+from jobs.fluxes.tables.build_tables import Setting
+from jobs.fluxes.tables.settings import COVERED, Choice, of_stars
+from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
-from lake_schema import layout, read
 from lake_schema.columns import Table
-from lake_schema.provenance import code_version
-from lake_schema.publish import Json, Output, Part, Plan
+from lake_schema.store import layout, read
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.provenance import code_version
 from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.passbands import PASSBANDS
@@ -45,18 +46,18 @@ def steps(lake: Path, request: Request) -> list[Step]:
     curves = inputs.curves(request.bands, own.passbands)
     catalogues = [(kind, read.version(lake, name)) for kind, name in CATALOGUES]
     sources = source_steps(own)
-    chosen = grid_errors.choose(curves, request.accuracy, own.library)
+    chosen = errors_measured.choose(curves, request.accuracy, own.library)
     made = [_step(catalogue, kind, request, own, chosen, sources) for kind, catalogue in catalogues]
     if not all(layout.version(lake, step.plan.table.name, step.plan.key).exists() for step in made):
         # Here once, and not in every worker at the same time.
-        spectra.prepare(curves, [choice.setting for choice in chosen], own.library, own.stars, request.accuracy)
+        band_fluxes.prepare(curves, [choice.setting for choice in chosen], own.library, own.stars, request.accuracy)
     return [*sources, *made]
 
 
 def step_of(kind: str, lake: Path, request: Request) -> Step:
     """The step of the galaxies or of the stars alone."""
     own = inputs.read(request.curves)
-    chosen = grid_errors.choose(inputs.curves(request.bands, own.passbands), request.accuracy, own.library)
+    chosen = errors_measured.choose(inputs.curves(request.bands, own.passbands), request.accuracy, own.library)
     return _step(read.version(lake, dict(CATALOGUES)[kind]), kind, request, own, chosen, source_steps(own))
 
 
@@ -91,9 +92,9 @@ def _step(
 
 def _errors(kind: str, request: Request, chosen: Sequence[Choice]) -> dict[str, Any]:
     if kind == "star":
-        return {"errors": {band: grid_settings.of_stars(request.accuracy) for band in request.bands}}
+        return {"errors": {band: of_stars(request.accuracy) for band in request.bands}}
     errors = {band: choice.facts() for band, choice in zip(request.bands, chosen, strict=True)}
-    return {"errors": errors, "covered": grid_settings.COVERED}
+    return {"errors": errors, "covered": COVERED}
 
 
 def work(lake: Path, facts: Json) -> Output:
@@ -103,8 +104,8 @@ def work(lake: Path, facts: Json) -> Output:
     if facts["catalogue"] == "galaxies":
         chosen = [facts["errors"][band]["setting"] for band in facts["bands"]]
         settings = [Setting(*numbers) if numbers else None for numbers in chosen]
-        return Output(spectra.galaxy_fluxes_by(rows, curves, settings, inputs.library_of(lake, facts)))
-    return Output(spectra.star_fluxes(rows, curves, inputs.stars_of(lake, facts), Accuracy(**facts["accuracy"])))
+        return Output(band_fluxes.galaxy_fluxes_by(rows, curves, settings, inputs.library_of(lake, facts)))
+    return Output(band_fluxes.star_fluxes(rows, curves, inputs.stars_of(lake, facts), Accuracy(**facts["accuracy"])))
 
 
 JOB = Job(

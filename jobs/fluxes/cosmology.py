@@ -18,10 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs import sums
+from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from lake_schema.units import LIGHT_KM_S
-
-Float = npt.NDArray[np.float64]
 
 # Flagship simulation: Potter, Stadel & Teyssier 2017; Serrano et al. 2024, section 4.1. No radiation,
 # no massive neutrinos.

@@ -21,16 +21,16 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from jobs import sums
-from jobs.fluxes import cosmology, extinction, passbands
-from jobs.fluxes.continuum import within
+from jobs.fluxes import cosmology, passbands
+from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.sources import column, ids_of, magnification_of
-from jobs.fluxes.templates import Library
+from jobs.fluxes.spectra import extinction
+from jobs.fluxes.spectra.continuum import within
 from lake_schema import units
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_ANGSTROM_S
-
-Float = npt.NDArray[np.float64]
 
 QUASAR, HIGH_REDSHIFT = 2, 3
 # Rest-frame wavelength of the magnitude, A.

@@ -23,24 +23,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs import cache
-from jobs.fluxes import (
-    brown_dwarfs,
-    extinction,
-    high_redshift,
-    ingest,
-    own_stars,
-    passbands,
-    standards,
-    stellar,
-    templates,
-)
-from jobs.fluxes.continuum import dust_of
+from jobs.fluxes import high_redshift, passbands
+from jobs.fluxes.libraries import brown_dwarfs, from_files, standards, stars_from_files, stellar, templates
+from jobs.fluxes.libraries.templates import Library
+from jobs.fluxes.libraries.vega import spectrum_file
 from jobs.fluxes.passbands import Passband
-from jobs.fluxes.templates import Library
-from jobs.own_files import Curves, OwnCurves
-from lake_schema import read as lake_read
+from jobs.fluxes.spectra import extinction
+from jobs.fluxes.spectra.continuum import dust_of
+from jobs.request.files import Curves, OwnCurves
+from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
-from lake_schema.provenance import file_sha256
+from lake_schema.store import read as lake_read
+from lake_schema.store.provenance import file_sha256
 from lake_schema.tables import extinction_laws
 from lake_schema.tables import passbands as passband_table
 from lake_schema.tables import templates as template_table
@@ -77,7 +71,7 @@ def read(given: OwnCurves) -> Own:
     library = templates.galaxy_library()
     if given.templates is not None:
         with _named("fluxes.templates"):
-            library = ingest.library(given.templates.files, given.templates.format)
+            library = from_files.library(given.templates.files, given.templates.format)
             each = (replace(given.templates, files=(file,)) for file in given.templates.files)
             origins |= {f"{_TEMPLATES}{k}": _origin_of(curves) for k, curves in enumerate(each)}
     if given.extinction:
@@ -85,7 +79,7 @@ def read(given: OwnCurves) -> Own:
         for code, curves in given.extinction:
             key = f"{_LAWS}{code}"
             with _named(key):
-                dust[code] = ingest.law(curves.files[0], curves.format, library.wavelength)
+                dust[code] = from_files.law(curves.files[0], curves.format, library.wavelength)
                 origins[key] = _origin_of(curves)
         library = replace(library, dust=dust, own=True)
     if given.intergalactic:
@@ -102,7 +96,7 @@ def filters(given: OwnCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
         if name in passbands.names():
             raise BadInput(f"{key}: there is a passband of this name: choose another")
         with _named(key):
-            found[name] = ingest.passband(curves.files[0], name, curves.medium, curves.format)
+            found[name] = from_files.passband(curves.files[0], name, curves.medium, curves.format)
             origins[key] = _origin_of(curves)
     return found, origins
 
@@ -113,7 +107,7 @@ def _stars(given: OwnCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
         return templates.stellar_library(), {}, []
     low, how, origins = stellar.table_file(), "Pecaut & Mamajek 2013, as MeanStars has them", {}
     with _named("fluxes.stars"):
-        library, infrared = own_stars.library(given.basel, given.irtf)
+        library, infrared = stars_from_files.library(given.basel, given.irtf)
         if given.basel is not None:
             low, how = given.basel, "read as basel"
             origins[f"{_STARS}basel"] = _origin(how, low)
@@ -199,7 +193,7 @@ def passband_of(lake: Path, facts: Mapping[str, Any], name: str) -> Passband:
 def published_library(lake: Path, templates_key: str, laws_key: str) -> Library:
     """The galaxies of published versions of `templates` and `extinction_laws`, kept in the cache and mapped."""
 
-    def read_rows() -> dict[str, cache.Array]:
+    def read_rows() -> dict[str, Array]:
         rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "galaxy")
         rows = rows.sort_by("sed")
         laws = lake_read.version(lake, "extinction_laws", laws_key).rows().sort_by("law")
@@ -217,7 +211,7 @@ def published_library(lake: Path, templates_key: str, laws_key: str) -> Library:
 def published_stars(lake: Path, templates_key: str) -> Library:
     """The stars of a published version of `templates`, kept in the cache and mapped."""
 
-    def read_rows() -> dict[str, cache.Array]:
+    def read_rows() -> dict[str, Array]:
         rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "star")
         return {"flux": np.stack(rows.sort_by("sed")["flux"].to_numpy()).astype(np.float32)}
 
@@ -256,17 +250,14 @@ def _origin(reference: str, *files: Path) -> Origin:
 
 def _galaxy_origin(template: int) -> Origin:
     code, young = Path(templates.__file__), templates.YOUNG
-    files = [
-        code if name == young else templates.spectrum_file(f"CWW_{name}_ext.sed")
-        for name in templates.anchors_of(template)
-    ]
+    files = [code if name == young else spectrum_file(f"CWW_{name}_ext.sed") for name in templates.anchors_of(template)]
     return _origin("Coleman, Wu & Weedman 1980, as GalSim has them" + ", and a burst" * (code in files), *files)
 
 
 def _star_origins() -> list[Origin]:
     dwarfs = _origin("Pecaut & Mamajek 2013, as MeanStars has them", stellar.table_file())
     count = len(stellar.types().names) + len(brown_dwarfs.template_names())
-    vega = _origin("CALSPEC, as GalSim has it", templates.spectrum_file("vega.txt"))
+    vega = _origin("CALSPEC, as GalSim has it", spectrum_file("vega.txt"))
     white_dwarf = _origin("Bohlin, Hubeny & Rauch 2020", Path(standards.__file__))
     return [dwarfs] * count + [vega, white_dwarf, _origin("the references in the file", standards.NEBULA)]
 

@@ -12,21 +12,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs import sums
-from jobs.fluxes import extinction, lines, passbands
+from jobs.fluxes import passbands
 from jobs.fluxes.calibration import continuum_scale, star_scale
-from jobs.fluxes.continuum import REFERENCE_BAND, amplitudes, dust_of, observed_shape
+from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.sources import Galaxies, Stars
-from jobs.fluxes.templates import Library
+from jobs.fluxes.spectra import extinction, lines
+from jobs.fluxes.spectra.continuum import REFERENCE_BAND, amplitudes, dust_of, observed_shape
 from lake_schema import units
+from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import BadInput
-
-Float = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-Int = npt.NDArray[np.int64]
 
 # Samples (rows times wavelengths) of a block: half a MB a temporary array, which the allocator then keeps.
 _BLOCK = 60_000

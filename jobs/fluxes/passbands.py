@@ -18,10 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs import cache, sums
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_ANGSTROM_S
-
-Float = npt.NDArray[np.float64]
 
 # Serrano et al. 2024, appendix B: every spectrum and response is homogenised to this range and step.
 GRID_FIRST, GRID_LAST = 600, 24000

@@ -16,15 +16,13 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from jobs.fluxes import lines
-from jobs.fluxes.continuum import COMPONENTS, Mix, mix_of, picked, within
-from jobs.fluxes.templates import Library
+from jobs.fluxes.libraries.templates import Library
+from jobs.fluxes.spectra import lines
+from jobs.fluxes.spectra.continuum import COMPONENTS, Mix, mix_of, picked, within
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
-
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
 
 MAGNIFICATION_MAX = 100.0
 # Kinds whose templates are in the galaxy library: central, satellite, strong lens.

@@ -27,10 +27,12 @@ from pyarrow import feather
 
 from jobs import sums
 from jobs.explore.process import Process
-from jobs.render import focal_plane, run_log
-from lake_schema import command, layout, read, sky, user_files
+from jobs.render.camera import pointing
+from jobs.render.products import run_log
+from lake_schema import command, sky, user_files
 from lake_schema.errors import BadInput
-from lake_schema.provenance import code_version, file_sha256
+from lake_schema.store import layout, read
+from lake_schema.store.provenance import code_version, file_sha256
 
 # Bytes and s that a query of the archive may take.
 _MEMORY, _TIMEOUT = 1e9, 60.0
@@ -75,7 +77,7 @@ def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
     corners = np.array([region.split()[2:] for region in rows["s_region"].to_pylist()], float).reshape(-1, 4, 2)
     lon, lat = np.radians(corners[..., 0]), np.radians(corners[..., 1])
     edges = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
-    place = focal_plane.basis(ra, dec)[2]
+    place = pointing.basis(ra, dec)[2]
     # A place is inside where it is on one side of the great circles through all edges, and not at the antipode.
     side = sums.product(np.cross(edges, np.roll(edges, -1, axis=1)), place)
     inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)

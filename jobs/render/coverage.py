@@ -21,14 +21,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs import sums
-from jobs.area import Area
-from jobs.render import focal_plane
-from jobs.render.exposing import SKY_TYPES
-from lake_schema import command, layout, read, sky, user_files
+from jobs.render.camera import pointing
+from jobs.render.channels.image_types import SKY_TYPES
+from jobs.request.area import Area
+from lake_schema import command, sky, user_files
+from lake_schema.arrays import Int
 from lake_schema.errors import BadInput
-
-Float = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int64]
+from lake_schema.store import layout, read
 
 # Places along a side of a map; the widest map, and how far inside an area its edge is no longer felt, deg.
 _SIDE, _WIDEST, _INSIDE = 500, 60.0, 0.5
@@ -61,15 +60,15 @@ def counts(tasks: pa.Table, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
     """[n] How many footprints of the tasks hold each place, gaps between detectors left out; ra, dec : [n] deg."""
     from scipy.spatial import cKDTree
 
-    places = focal_plane.basis(np.asarray(ra, float), np.asarray(dec, float))[2].T
+    places = pointing.basis(np.asarray(ra, float), np.asarray(dec, float))[2].T
     found = np.zeros(len(places), np.int64)
-    centres = focal_plane.basis(tasks["ra"].to_numpy(), tasks["dec"].to_numpy())[2].T
+    centres = pointing.basis(tasks["ra"].to_numpy(), tasks["dec"].to_numpy())[2].T
     chords = 2.0 * np.sin(np.radians(tasks["radius"].to_numpy()) / 2.0)
     nearby = cKDTree(places).query_ball_point(centres, chords) if len(tasks) else []
     for near, region in zip(nearby, tasks["s_region"].to_pylist(), strict=True):
         if near:
             corners = np.array(region.split()[2:], float).reshape(-1, 2)
-            edges = focal_plane.basis(corners[:, 0], corners[:, 1])[2].T
+            edges = pointing.basis(corners[:, 0], corners[:, 1])[2].T
             side = sums.product(places[near], np.cross(edges, np.roll(edges, -1, axis=0)).T)
             found[near] += (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
     return found
@@ -91,7 +90,7 @@ def depths(exposures: pa.Table, tasks: pa.Table, area: Area, side: int = _SIDE) 
     # Square on the tangent plane; x to the west.
     grid = np.tan(np.radians(extent)) * np.degrees(1.0) * 3600.0 * np.linspace(-1.0, 1.0, side)
     x, y = np.meshgrid(grid, grid)
-    ra, dec = (a.ravel() for a in focal_plane.sky_of_plane(x, y, ra0, dec0, 0.0))
+    ra, dec = (a.ravel() for a in pointing.sky_of_plane(x, y, ra0, dec0, 0.0))
     inside = area.depth(ra, dec)
     interior = (inside > min(_INSIDE, 0.5 * float(inside.max()))).reshape(side, side)
     found = []
@@ -104,7 +103,7 @@ def depths(exposures: pa.Table, tasks: pa.Table, area: Area, side: int = _SIDE) 
 
 
 def _centre(exposures: pa.Table) -> tuple[float, float]:
-    x, y, z = focal_plane.basis(exposures["ra"].to_numpy(), exposures["dec"].to_numpy())[2].sum(axis=1)
+    x, y, z = pointing.basis(exposures["ra"].to_numpy(), exposures["dec"].to_numpy())[2].sum(axis=1)
     return float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 

@@ -11,45 +11,22 @@ from collections.abc import Sequence
 
 import pyarrow as pa
 
-from jobs.fluxes import inputs
-from jobs.fluxes.passbands import Passband
-from jobs.own_files import OwnCurves
-from jobs.render import exposing, forecast, own_psf, speed, survey, tasks
-from jobs.request import MissionChoice, Request
+from jobs.render.planning import forecast, planned_exposures, psf_files, source_counts, speed, survey, tasks, variants
+from jobs.render.planning.mission import PARTS, mission_of, own_filters
+from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
-from lake_schema import layout, read
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput
-from lake_schema.mission import checks, configuration, published
+from lake_schema.mission import checks, published
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.model import read_models
 from lake_schema.mission.parameter import read_all
-from lake_schema.provenance import digest
-from lake_schema.publish import Json, Output, Part, Plan
+from lake_schema.store import layout, read
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.provenance import digest
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
-
-# What of a request decides which exposures are taken and what they cost.
-PARTS = ("seed", "area", "universe", "pointings", "observations", "explore", "truth", "psfs")
-
-
-def mission_of(choice: MissionChoice) -> MissionConfiguration:
-    """The mission configuration that a request chooses."""
-    overrides = {key: (override.value, override.unit) for key, override in choice.overrides}
-    return configuration.resolve(ladder=choice.ladder, overrides=overrides)
-
-
-def own_filters(request: Request) -> tuple[dict[str, Passband], Json]:
-    """The request's own passbands that it points in, by name, and their sha256 as facts of a plan."""
-    wanted = {pointing.band for pointing in request.pointings}
-    given = OwnCurves(tuple(own for own in request.curves.passbands if own[0] in wanted))
-    found, origins = inputs.filters(given)
-    for name, band in found.items():
-        if band.response.max() > 1.0:
-            what = f"responds with {band.response.max():.4g}: a pointing wants the fraction of photons detected"
-            raise BadInput(f"{inputs.FILTER}{name}: {what}")
-    return found, {"files": {key: origin.sha256 for key, origin in origins.items()}} if found else {}
 
 
 def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
@@ -60,11 +37,11 @@ def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, 
     checks.check(mission)
     found = survey.exposures(request, mission)
     filters, _ = own_filters(request)
-    exposures = exposing.table([exposure for exposure, _ in found], [own for _, own in found], filters)
-    own_psf.check([(exposure, own) for exposure, own in found], filters)
-    densities = tasks.Densities(mission, request.universe, _catalogues(lake))
+    exposures = planned_exposures.table([exposure for exposure, _ in found], [own for _, own in found], filters)
+    psf_files.check([(exposure, own) for exposure, own in found], filters)
+    densities = source_counts.Densities(mission, request.universe, _catalogues(lake))
     wanted = [exposure.detectors for exposure, _ in found]
-    rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, survey.forced(request))
+    rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, variants.forced(request))
     return mission, exposures, rows
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lake_schema import layout, read, user_files
+from lake_schema import user_files
 from lake_schema.errors import BadInput
-from lake_schema.mission.configuration import LADDER, MissionConfiguration, difference, resolve
+from lake_schema.mission.configuration import MissionConfiguration, difference, resolve
 from lake_schema.mission.parameter import STATUSES
 from lake_schema.mission.published import read_back
+from lake_schema.store import layout, read
+from lake_schema.tables.mission import LADDER
 
 
 def compare(first: str, second: str) -> list[str]:

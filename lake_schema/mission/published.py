@@ -18,8 +18,8 @@ from lake_schema.mission import model
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import Parameter, read_all
-from lake_schema.plan import Output
-from lake_schema.read import Version
+from lake_schema.store.plan import Output
+from lake_schema.store.read import Version
 from lake_schema.tables.mission import MISSION
 
 # Beside the table's dataset/, each file under its sha256: an old product can be rendered with what it was made from.

@@ -9,9 +9,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from jobs.accuracy import DRAFT, SURVEY
-from jobs.render import kernel, psf, stamps
-from lake_schema import validate
+from jobs.render.drawing import reference, stamp_sizes, stamps
+from jobs.render.drawing.kernels import fourier, frame
+from jobs.render.drawing.settings import settings_for
+from jobs.render.psf.seeing import ground_psf
 from lake_schema.errors import BadInput
+from lake_schema.store import validate
 from lake_schema.tables.galaxies import GALAXIES
 from tests.extremes.test_stamps import source_of
 from tests.jobs.render import nominal
@@ -25,11 +28,11 @@ LIGHT = st.floats(0.0, 16.9).map(lambda x: 10.0**x)
 def drawn(camera, electrons, seeing=None, side=256, accuracy=SURVEY, most=1024, **shape):
     """(frame, size, light of the stamp on it): of one source whose stamp is at most so large."""
     source = source_of(camera, electrons, column=side / 2 + 0.3, row=side / 2 - 0.4, **shape)
-    beam = spread(camera) if seeing is None else psf.ground_psf(seeing, 3.0, 0.2)
-    settings, noise = stamps.settings_for(accuracy), NOISE[camera]
-    sizes = stamps.stamp_sizes(source.electrons, source.shape, source.shapes, beam, noise, settings)
+    beam = spread(camera) if seeing is None else ground_psf(seeing, 3.0, 0.2)
+    settings, noise = settings_for(accuracy), NOISE[camera]
+    sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, beam, noise, settings)
     light = np.zeros(1)
-    sizes, floors = np.minimum(sizes, most), stamps.floors(source.electrons, noise, settings)
+    sizes, floors = np.minimum(sizes, most), stamp_sizes.floors(source.electrons, noise, settings)
     return stamps.draw(source, sizes, beam, side, side, floors=floors, drawn=light), sizes[0], light[0]
 
 
@@ -43,7 +46,7 @@ def drawn(camera, electrons, seeing=None, side=256, accuracy=SURVEY, most=1024, 
 @example(1e17, "lsstcam", SURVEY, {"inclination": 80.0})
 def test_no_pixel_overflows(electrons, camera, accuracy, shape):
     image, _, light = drawn(camera, electrons, accuracy=accuracy, most=256, **shape)
-    rounding = image.size / kernel.units_of(np.array([electrons]))
+    rounding = image.size / fourier.units_of(np.array([electrons]))
     assert image.sum() == pytest.approx(electrons, rel=2e-3, abs=rounding)
     assert light == pytest.approx(electrons, rel=2e-3, abs=rounding)
     assert image.max() > 0.01 * electrons - rounding
@@ -56,16 +59,16 @@ def test_no_pixel_overflows(electrons, camera, accuracy, shape):
 def test_nothing_rings_about_a_bright_star(electrons, seeing, accuracy):
     """Behind any seeing, where a pixel samples it: no pixel of the frame is below none by a tenth of its noise."""
     image, *_ = drawn("lsstcam", electrons, seeing, accuracy=accuracy)
-    unit = kernel.units_of(np.array([electrons]))
+    unit = fourier.units_of(np.array([electrons]))
     assert image.min() > -0.1 * NOISE["lsstcam"] - 1.0 / unit - 1e-12 * electrons * (electrons > 1e14)
 
 
 def test_what_fits_is_as_fine_as_ever():
     """The frame's integers are as fine as their sum allows, whatever the order."""
-    assert kernel.units_of(np.array([])) == kernel.units_of(np.full(10, 1e11)) == kernel.FIXED_POINT
+    assert fourier.units_of(np.array([])) == fourier.units_of(np.full(10, 1e11)) == frame.FIXED_POINT
     light = 10.0 ** np.random.default_rng(1).uniform(0, 17, 1000)
-    unit = kernel.units_of(light)
-    assert unit == kernel.units_of(light[::-1])
+    unit = fourier.units_of(light)
+    assert unit == fourier.units_of(light[::-1])
     assert 2.0**60 <= unit * light.sum() * 2.0 <= 2.0**62
     assert np.log2(unit) == np.rint(np.log2(unit))
 
@@ -100,7 +103,7 @@ def test_an_axis_ratio_is_drawn_as_it_is_given(ratio):
     )
     asked = replace(source, shapes=replace(source.shapes, bulge_axis_ratio=np.array([ratio])))
     image = stamps.draw(source, np.array([128]), spread("vis"), 128, 128)
-    expected = stamps.reference(asked, 0, spread("vis"), 128)
+    expected = reference.reference(asked, 0, spread("vis"), 128)
     np.testing.assert_allclose(image[34:94, 34:94], expected[34:94, 34:94], atol=1e-3 * expected.max())
 
 

@@ -5,9 +5,10 @@ import time
 import numpy as np
 import pytest
 
-from jobs.render.effects import bleeding, charge_transfer, cosmic_rays, poisson, traps
-from jobs.render.effects.effect import Scene
-from jobs.render.effects.traps import Sweeps
+from jobs.render.effects.charge import bleeding, cosmic_rays, poisson
+from jobs.render.effects.readout import charge_transfer, readout_cosmic_rays, traps
+from jobs.render.effects.readout.traps import Sweeps
+from jobs.render.effects.scene import Scene
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render.effects.battery import CASES, END_OF_LIFE, call
 
@@ -87,7 +88,7 @@ def test_no_traps_and_far_beyond_the_end_of_life(age):
 @pytest.mark.parametrize("seconds", [0.0, 1e5])
 def test_exposure_times_from_nothing_to_a_day(seconds):
     scene = Scene(resolve(), "vis", seconds, 0.25, 1e4)
-    assert np.isfinite([effect.margin(scene) for effect in (cosmic_rays.EFFECT, cosmic_rays.READOUT)]).all()
+    assert np.isfinite([effect.margin(scene) for effect in (cosmic_rays.EFFECT, readout_cosmic_rays.READOUT)]).all()
     expected, quantiles = cosmic_rays.EFFECT.parameters(scene)
     started = time.process_time()
     image = cosmic_rays.tracks((SIDE, SIDE), expected * (SIDE / 4096) ** 2, quantiles, np.random.default_rng(1))

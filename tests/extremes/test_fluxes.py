@@ -9,8 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jobs.accuracy import REFERENCE, SURVEY
-from jobs.fluxes import cosmology, extinction, high_redshift, lines, passbands, sources, spectra, templates
+from jobs.fluxes import band_fluxes, cosmology, high_redshift, passbands, sources
+from jobs.fluxes.libraries import templates
 from jobs.fluxes.passbands import Passband
+from jobs.fluxes.spectra import extinction, lines
 from lake_schema import units
 from lake_schema.errors import BadInput, OutOfRange
 
@@ -34,7 +36,7 @@ def galaxies(**columns):
 
 
 def fluxes(library, accuracy=SURVEY, **columns):
-    made = spectra.galaxy_fluxes(galaxies(**columns), BANDS, library, accuracy)
+    made = band_fluxes.galaxy_fluxes(galaxies(**columns), BANDS, library, accuracy)
     return np.stack([made[f"f_nu_{band}"].to_numpy().astype(float) for band in BANDS], 1)
 
 

@@ -17,9 +17,14 @@ from scipy.special import gammaincinv
 
 from jobs.accuracy import DRAFT, SURVEY
 from jobs.fluxes import passbands
-from jobs.render import exposure, kernel, profiles, stamps
-from jobs.render.focal_plane import boresight_for, sky_of_pixel, wcs
-from jobs.render.profiles import EXPONENTIAL_RADIUS
+from jobs.render.camera.astrometry import sky_of_pixel, wcs
+from jobs.render.camera.pointing import boresight_for
+from jobs.render.drawing import cost, stamp_sizes, stamps
+from jobs.render.drawing.kernels import frame
+from jobs.render.drawing.settings import settings_for
+from jobs.render.exposure import visible_sources
+from jobs.render.sources import galaxy_shapes, source_list
+from jobs.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 from tests.jobs.render.fields import galaxies, moments, one_source, small, spread, stars
 
@@ -51,9 +56,9 @@ HUGE = {
 
 
 def drawn(source, psf, side=SIDE, accuracy=SURVEY):
-    settings = stamps.settings_for(accuracy)
-    sizes = stamps.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
-    floors = stamps.floors(source.electrons, NOISE, settings)
+    settings = settings_for(accuracy)
+    sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
+    floors = stamp_sizes.floors(source.electrons, NOISE, settings)
     return stamps.draw(source, sizes, psf, side, side, floors=floors), int(sizes[0])
 
 
@@ -87,7 +92,7 @@ def test_the_largest_are_bounded_in_time(kind):
     compiled()
     start = time.process_time()
     image, size = drawn(source_of("vis", 1e6, **HUGE[kind]), spread("vis"))
-    assert size <= stamps.SIZES[-1]
+    assert size <= stamp_sizes.SIZES[-1]
     assert time.process_time() - start < HANGS
     assert np.isfinite(image).all()
     assert 0 < image.sum() <= 1e6 * (1 + 1e-4)
@@ -97,9 +102,9 @@ def test_the_largest_are_bounded_in_time(kind):
 def test_linear_in_flux(electrons):
     """Single and double precision alike."""
     whole, _ = drawn(source_of("lsstcam", electrons), spread("lsstcam"))
-    settings = stamps.settings_for(SURVEY)
+    settings = settings_for(SURVEY)
     one = source_of("lsstcam", 1e5)
-    sizes = stamps.stamp_sizes(np.array([electrons]), one.shape, one.shapes, spread("lsstcam"), NOISE, settings)
+    sizes = stamp_sizes.stamp_sizes(np.array([electrons]), one.shape, one.shapes, spread("lsstcam"), NOISE, settings)
     unit = stamps.draw(one, sizes, spread("lsstcam"), SIDE, SIDE) / 1e5
     np.testing.assert_allclose(whole, electrons * unit, atol=3e-6 * electrons * unit.max() + 1e-6)
 
@@ -141,7 +146,7 @@ def test_whole_pixels_move_the_image(dx, dy):
     args = {"inclination": 50.0, "bulge_fraction": 0.3}
     base, _ = drawn(source_of("vis", 1e4, column=120.3, row=125.8, **args), spread("vis"))
     source = source_of("vis", 1e4, column=120.3, row=125.8, **args)
-    other = stamps.Sources(
+    other = source_list.Sources(
         source.ids, source.column + dx, source.row + dy, source.jacobian, source.electrons, source.shape, source.shapes
     )
     np.testing.assert_allclose(drawn(other, spread("vis"))[0], np.roll(base, (dy, dx), (0, 1)), atol=1e-5 * base.max())
@@ -157,10 +162,10 @@ def test_a_face_on_disc_is_symmetric():
 def test_any_order_gives_the_same_bits(seed):
     rng = np.random.default_rng(seed)
     n = 60
-    form = profiles.shapes(
+    form = galaxy_shapes.shapes(
         galaxies(rng.random(n), rng.random(n), bulge_fraction=rng.random(n), gamma1=0.1 * rng.random(n))
     )
-    source = stamps.Sources(
+    source = source_list.Sources(
         np.arange(n), SIDE * rng.random(n), SIDE * rng.random(n), np.tile(0.1 * np.eye(2), (n, 1, 1)),
         10 ** rng.uniform(1, 7.5, n), np.where(rng.random(n) < 0.3, -1, np.arange(n)), form,
     )  # fmt: skip
@@ -206,16 +211,16 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     before anything is drawn."""
     shape, electrons = what
     source, psf = source_of(camera, electrons, **shape), spread(camera)
-    settings = stamps.settings_for(accuracy)
-    sizes = stamps.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
-    assert stamps.memory(source.electrons, sizes, 4096, 4132) < 1.4e9
+    settings = settings_for(accuracy)
+    sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
+    assert cost.memory(source.electrons, sizes, 4096, 4132) < 1.4e9
     # The largest have tests of their own.
     if sizes[0] > 1024:
         return
     side = int(sizes[0])
     source.column[:], source.row[:] = side // 2, side // 2
     compiled()
-    floors = stamps.floors(source.electrons, NOISE, settings)
+    floors = stamp_sizes.floors(source.electrons, NOISE, settings)
     start = time.process_time()
     image = stamps.draw(source, sizes, psf, side, side, floors=floors)
     assert time.process_time() - start < HANGS
@@ -223,11 +228,11 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     # A pixel is rounded to 2^-20 electrons; single precision sums to 1e-6.
     least, rounding = 1.0, image.size * 2.0**-21 + 2e-6 * electrons
     if len(source.shapes):
-        least -= profiles.outside(source.shapes, np.array([0.5 * side * psf.pixel_scale]))[0]
+        least -= galaxy_shapes.outside(source.shapes, np.array([0.5 * side * psf.pixel_scale]))[0]
     assert least * electrons - rounding <= image.sum() <= electrons + rounding
     assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
     # Where nothing is taken off the stamp all of its light is on it.
-    with mock.patch.object(stamps, "_STRAY", 2.0):
+    with mock.patch.object(stamp_sizes, "_STRAY", 2.0):
         image = stamps.draw(source, sizes, psf, side, side, floors=floors)
     assert image.sum() == pytest.approx(electrons, rel=2e-6, abs=image.size * 2.0**-21)
     assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
@@ -260,7 +265,7 @@ def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
     # Of a stamp that nothing is taken off, half as large, too.
     source.column[:] -= 32.0
     source.row[:] -= 32.0
-    with mock.patch.object(stamps, "_STRAY", 2.0):
+    with mock.patch.object(stamp_sizes, "_STRAY", 2.0):
         moved = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
         source.column[:] -= dx
         source.row[:] -= dy
@@ -278,7 +283,7 @@ def test_a_galaxy_turned_by_half_a_turn_is_itself(kind, angle):
     inside = image[17:80, 17:80]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
     # A stamp that nothing is taken off is so to its edges.
-    with mock.patch.object(stamps, "_STRAY", 2.0):
+    with mock.patch.object(stamp_sizes, "_STRAY", 2.0):
         image = stamps.draw(centred(source), np.array([64]), spread("vis"), 65, 65)
     inside = image[1:64, 1:64]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
@@ -290,12 +295,12 @@ def test_a_galaxy_turned_by_half_a_turn_is_itself(kind, angle):
 )
 def test_any_sources_in_any_order_give_the_same_bits(several, shuffled):
     some = [source_of("vis", 10.0**e, column=x, row=84 - x, **SHAPES[kind]) for kind, x, e in several]
-    many = profiles.Shapes(
-        *(np.concatenate([getattr(one.shapes, f.name) for one in some]) for f in fields(profiles.Shapes))
+    many = galaxy_shapes.Shapes(
+        *(np.concatenate([getattr(one.shapes, f.name) for one in some]) for f in fields(galaxy_shapes.Shapes))
     )
     names = ("column", "row", "jacobian", "electrons")
     one_by_one = (np.concatenate([getattr(one, name) for one in some]) for name in names)
-    together = stamps.Sources(np.arange(len(some)), *one_by_one, np.arange(len(some)), many)
+    together = source_list.Sources(np.arange(len(some)), *one_by_one, np.arange(len(some)), many)
     order = np.arange(len(some))
     shuffled.shuffle(order)
     sizes = np.array([56, 64])[np.arange(len(some)) % 2]
@@ -345,7 +350,7 @@ def test_what_is_taken_off_slim_galaxies_is_theirs(kind, accuracy):
     side = 2 * size
     source = source_of("vis", 1e5, column=side / 2 + 0.3, row=side / 2 - 0.4, **shape)
     image, _ = drawn(source, spread("vis"), side, accuracy)
-    least = 1.0 - profiles.outside(source.shapes, np.array([0.5 * side * 0.1]))[0]
+    least = 1.0 - galaxy_shapes.outside(source.shapes, np.array([0.5 * side * 0.1]))[0]
     assert 1e5 * (least - 1e-3) < image.sum() < 1e5 * (1 + 2e-6)
     assert image.min() > -accuracy.background * NOISE
 
@@ -370,7 +375,7 @@ def test_a_stamp_gives_no_more_than_what_is_outside(index):
     for column in (-26.0, 2078.0):
         source = source_of("vis", 1e6, column=column, row=1023.5, bulge_axis_ratio=0.02, position_angle=80.0, **shape)
         light += stamps.draw(source, np.array([48]), spread("vis"), 2048, 2048).sum()
-    outside = 1e6 * profiles.outside(source.shapes, np.array([2.4]))[0]
+    outside = 1e6 * galaxy_shapes.outside(source.shapes, np.array([2.4]))[0]
     assert 0.1 * outside < light < outside
 
 
@@ -391,7 +396,7 @@ def response(size, q):
 def test_of_steep_light_nothing_is_taken_off(q):
     """Too slim for a quadratic: it is no worse than a stamp that keeps all of its light."""
     wrong = abs(response(64, q) - response(512, q))
-    with mock.patch.object(stamps, "_STRAY", 2.0):
+    with mock.patch.object(stamp_sizes, "_STRAY", 2.0):
         kept = abs(response.__wrapped__(64, q) - response(512, q))
     assert wrong < 1.05 * kept + 1e-3
 
@@ -409,7 +414,7 @@ def test_what_is_taken_off_ends_by_and_by_where_it_cancels():
         one = source_of("vis", 1e5, bulge_fraction=1.0, bulge_axis_ratio=q, bulge_half_light_radius=1.0)
         one = replace(centred(one, 64.0), jacobian=0.1 * np.eye(2)[None])
         stray = stamps._strays(one, *stamps._forms(one), np.array([64]), 0.1)
-        taken.append(kernel.returning(np.array([64]), *np.full((2, 1), 32.0), stray[0], stray[2])[0])
+        taken.append(frame.returning(np.array([64]), *np.full((2, 1), 32.0), stray[0], stray[2])[0])
     level, light = np.array(taken)[:, 0], np.array(taken)[:, -1]
     assert light[0] < 1.0 < 500.0 < light[-1]
     assert np.abs(np.diff(level)).max() < 0.15 * level.max()
@@ -420,7 +425,7 @@ def test_what_is_taken_off_ends_by_and_by_where_it_cancels():
 def test_single_precision_is_as_good_as_double(camera, kind, monkeypatch):
     source, sizes = source_of(camera, 9e6, **SHAPES[kind]), np.array([96])
     single = stamps.draw(source, sizes, spread(camera), SIDE, SIDE)
-    monkeypatch.setattr(stamps, "_BRIGHT", 0.0)
+    monkeypatch.setattr(stamp_sizes, "BRIGHT", 0.0)
     double = stamps.draw(source, sizes, spread(camera), SIDE, SIDE)
     assert np.abs(single - double).max() < 5e-7 * double.max()
 
@@ -487,16 +492,18 @@ def test_poles_and_the_seam_are_as_good_as_any_place(camera, ra, dec):
     system = wcs(detector, *boresight_for(detector, ra, dec, 33.0))
     places = np.array([[40.2, 90.7], [88.4, 31.9]])
     lon, lat = sky_of_pixel(system, *places.T)
-    settings, band = stamps.settings_for(SURVEY), passbands.load("euclid_vis" if camera == "vis" else "lsst_r")
+    settings, band = settings_for(SURVEY), passbands.load("euclid_vis" if camera == "vis" else "lsst_r")
     body = galaxies(lon[:1], lat[:1], inclination=75.0, disk_half_light_radius=0.3)
-    found, sizes = exposure.sources_of(
+    found, sizes = visible_sources.sources_of(
         (body, np.array([1e5])), (stars(lon[1:], lat[1:]), np.array([1e5])), detector, system, spread(camera), NOISE,
         settings, band,
     )  # fmt: skip
     np.testing.assert_allclose(np.stack([found.column, found.row], 1), places, atol=2e-6)
     # The telescope's distortion aside.
     np.testing.assert_allclose(np.linalg.det(found.jacobian), detector.pixel_scale**2, rtol=0.02)
-    image = stamps.draw(found, sizes, spread(camera), 128, 128, floors=stamps.floors(found.electrons, NOISE, settings))
+    image = stamps.draw(
+        found, sizes, spread(camera), 128, 128, floors=stamp_sizes.floors(found.electrons, NOISE, settings)
+    )
     assert np.isfinite(image).all()
     assert image.sum() == pytest.approx(2e5, rel=1e-3)
     cut = image[60:121, 10:71]

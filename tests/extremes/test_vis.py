@@ -8,8 +8,10 @@ import pytest
 
 from jobs.accuracy import SURVEY
 from jobs.render.channels import vis
-from jobs.render.effects import bleeding, quadrants, traps
-from jobs.render.effects.effect import Lights, Scene, apply_all
+from jobs.render.effects.charge import bleeding
+from jobs.render.effects.effect import apply_all
+from jobs.render.effects.readout import quadrants, traps
+from jobs.render.effects.scene import Lights, Scene
 from jobs.rng import stream
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import bounds_of, resolve

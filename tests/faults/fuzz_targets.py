@@ -12,17 +12,27 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from astropy.io import fits
 
-from jobs import area, own_files, request
-from jobs.catalogue import bright_stars, dust_map, mapping, star_catalogue
+from jobs.catalogue import dust_map
+from jobs.catalogue.external import mapping
+from jobs.catalogue.stars import bright_stars, from_catalogue
 from jobs.explore import guard
-from jobs.fluxes import ingest, own_stars, passbands
-from jobs.render import archive, focal_plane, ground, own_bodies, own_psf
-from jobs.request import Observation
-from lake_schema import foreign, layout, publish, read, user_files
+from jobs.fluxes import passbands
+from jobs.fluxes.libraries import from_files, stars_from_files
+from jobs.render import archive
+from jobs.render.camera import detectors
+from jobs.render.planning import ground_surveys
+from jobs.render.psf import from_file
+from jobs.render.sources import ephemerides
+from jobs.request import area, files
+from jobs.request.from_toml import parse
+from jobs.request.observations import Observation
+from lake_schema import user_files
 from lake_schema.errors import BadInput
+from lake_schema.external import files as external_files
 from lake_schema.mission import model, parameter
 from lake_schema.mission.configuration import resolve
-from lake_schema.provenance import digest
+from lake_schema.store import layout, publish, read
+from lake_schema.store.provenance import digest
 from tests import requests
 from tests.jobs.explore.test_hostile_sql import GOOD
 from tests.universe import plain_plan, plain_work
@@ -164,7 +174,7 @@ def of_area(path):
 
 
 def curve(form):
-    return lambda path: ingest.passband(path, "x", "air", form)
+    return lambda path: from_files.passband(path, "x", "air", form)
 
 
 def rows_of(columns):
@@ -173,20 +183,20 @@ def rows_of(columns):
 
 @cache
 def detector():
-    return focal_plane.detectors("vis", resolve())[0]
+    return detectors.detectors("vis", resolve())[0]
 
 
 def of_psf(path):
-    own_psf.read(path, detector(), passbands.load("euclid_vis"))
+    from_file.read(path, detector(), passbands.load("euclid_vis"))
 
 
 def of_pointings(path):
-    ground.read(path, Observation(("EXT",), survey="lsst"), resolve())
+    ground_surveys.read(path, Observation(("EXT",), survey="lsst"), resolve())
 
 
 def of_parquet(path):
-    foreign._refuse_large_footer(path)
-    foreign.send(path, ["ra", "dec", "id"], ["name"], io.BytesIO())
+    external_files._refuse_large_footer(path)
+    external_files.send(path, ["ra", "dec", "id"], ["name"], io.BytesIO())
 
 
 def of_query(path):
@@ -196,7 +206,7 @@ def of_query(path):
 
 def of_path(path):
     text = path.read_bytes().decode("utf-8", "surrogateescape")
-    for ask in (layout.lake, layout.name, user_files.expanded, lambda name: own_files.file_of(Path("."), name)):
+    for ask in (layout.lake, layout.name, user_files.expanded, lambda name: files.file_of(Path("."), name)):
         try:
             user_files.checked(Path(ask(text)), "request")
         except BadInput as error:
@@ -245,11 +255,11 @@ LOG[1]["error"], LOG[2]["traceback"] = "BadInput: no", "x\n"
 
 
 def of_stars(path):
-    star_catalogue._read(path, STARS)
+    from_catalogue._read(path, STARS)
 
 
 def of_map(path):
-    dust_map.read(own_files.DustMap(path, "EBV"))
+    dust_map.read(files.DustMap(path, "EBV"))
 
 
 def of_mission(path):
@@ -310,17 +320,17 @@ def curve_targets():
         "passband, VOTable": (lambda: [VOTABLE.format(rows=table).encode()], curve("passband_svo"), ".xml"),
         "spectrum, CSV": (
             lambda: [("wavelength,flux\n" + lines(WAVELENGTH, CURVE, ",")).encode()],
-            lambda path: ingest.read(path, "spectrum_csv"), ".csv",
+            lambda path: from_files.read(path, "spectrum_csv"), ".csv",
         ),
         "spectrum, FITS": (
             lambda: [as_fits(light, units={"WAVELENGTH": "Angstrom"}), as_fits(light)],
-            lambda path: ingest.read(path, "spectrum_fits"), ".fits",
+            lambda path: from_files.read(path, "spectrum_fits"), ".fits",
         ),
         "extinction law": (
             lambda: [lines(np.linspace(900.0, 24_000.0, 100), np.linspace(10.0, 0.1, 100)).encode()],
-            lambda path: ingest.law(path, "extinction", WAVELENGTH), ".dat",
+            lambda path: from_files.law(path, "extinction", WAVELENGTH), ".dat",
         ),
-        "models of stars": (basel, own_stars.basel, ".cor"),
+        "models of stars": (basel, stars_from_files.basel, ".cor"),
     }  # fmt: skip
 
 
@@ -329,7 +339,7 @@ TARGETS = {
         lambda: [
             *(path.read_bytes() for path in sorted((ROOT / "requests").glob("*.toml"))),
             requests.text(OWN_SECTIONS).replace("b.txt", "~/b.txt").encode(),
-        ], request.parse, ".toml",
+        ], parse, ".toml",
     ),
     "area": (lambda: [text.encode() for text in AREAS], of_area, ".toml"),
     **curve_targets(),
@@ -337,7 +347,7 @@ TARGETS = {
         lambda: [as_image(PLANES, SCALE), as_image(PLANES[0], SCALE), packed(as_image(PLANES, SCALE))], of_psf, ".fits",
     ),
     "PSF, PSFEx": (lambda: [psfex()], of_psf, ".psf"),
-    **table_targets("bodies", {**BODIES, "name": MANY["name"]}, lambda path: own_bodies.read.__wrapped__(path, "")),
+    **table_targets("bodies", {**BODIES, "name": MANY["name"]}, lambda path: ephemerides.read.__wrapped__(path, "")),
     **table_targets("catalogue", MANY, rows_of(mapping.halos(HALOS)), units={"ra": "deg"}),
     "catalogue, Parquet": (
         lambda: [as_parquet(MANY, write_page_checksum=True), as_parquet(MANY, compression="zstd", row_group_size=20)],

@@ -2,8 +2,8 @@
 
 from functools import partial
 
-from lake_schema import layout, publish, read
 from lake_schema.errors import BadInput
+from lake_schema.store import layout, publish, read
 from tests.universe import CELLS, plain_plan, plain_work, toy_plan, toy_work
 
 # kind of table -> plan of a seed, and its work

@@ -7,6 +7,7 @@ from pathlib import Path
 if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
+
 from jobs.shell import Job, Step, main
 from tests.universe import plain_plan, plain_work
 

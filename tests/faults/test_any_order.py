@@ -9,8 +9,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule, run_state_machine_as_test
 
-from lake_schema import publish, read
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.store import publish, read
 from tests.faults import promise
 from tests.faults.disc import Disc, Killed
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from jobs import demo, request, shell
+from jobs import demo, shell
 from jobs.catalogue import (
     build_gaia,
     build_galaxies,
@@ -23,12 +23,17 @@ from jobs.catalogue import (
 )
 from jobs.explore import __main__ as explore
 from jobs.fluxes import compute_fluxes, inputs
-from jobs.own_files import OwnCurves
-from jobs.render import archive, coverage, own_psf, plan_exposures, render_exposures
+from jobs.render import archive, coverage, plan_exposures, render_exposures
+from jobs.render.products import keys
+from jobs.render.psf import from_file
+from jobs.request import __main__
+from jobs.request.files import OwnCurves
+from jobs.request.from_toml import parse
 from lake_schema import __main__ as lake_schema
-from lake_schema import publish, user_files
+from lake_schema import user_files
 from lake_schema.errors import BadInput
-from lake_schema.mission.configuration import LADDER
+from lake_schema.store import publish
+from lake_schema.tables.mission import LADDER
 from tests import requests
 from tests.universe import plain_plan, plain_work
 
@@ -62,7 +67,7 @@ OF_LAKE = {
 }
 OF_REQUEST = {
     **{name: (lambda path, new, name=name: run(name, new, path)) for name in JOBS},
-    "request check": lambda path, new: request.main(["check", path]),
+    "request check": lambda path, new: __main__.main(["check", path]),
     "demo": lambda path, new: demo.main(["--request", path, "--out", new]),
     "mission diff": lambda path, new: lake_schema.main(["mission", "diff", path, ",".join(LADDER)]),
 }
@@ -233,9 +238,9 @@ OWN = {
         '[stars.catalogue]\ncolumns = {{ ra = "ra", dec = "dec", mag_h = "h", teff = "t" }}\nfile = {}\n',
         lambda r: build_stars._files(r.stars),
     ),
-    "psf": (POINT + "[psf]\neuclid_vis = {}\n", lambda r: own_psf.read(Path(dict(r.psfs)["euclid_vis"]), None, None)),
+    "psf": (POINT + "[psf]\neuclid_vis = {}\n", lambda r: from_file.read(Path(dict(r.psfs)["euclid_vis"]), None, None)),
     "solar_system.bodies": (
-        POINT + "[solar_system]\nbodies = {}\n", lambda r: render_exposures._bodies(r.bodies, SKY)
+        POINT + "[solar_system]\nbodies = {}\n", lambda r: keys.ephemeris_files(r.bodies, SKY)
     ),
     "observation.pointings": ('[[observation]]\nchannels = ["VIS"]\npointings = {}\n', lambda r: None),
 }  # fmt: skip
@@ -266,7 +271,7 @@ def test_a_file_of_a_request_that_is_none(tmp_path, key, read):
         path = requests.written(tmp_path, key.replace("{{", "{").replace("}}", "}").replace("{}", quoted(name)))
         started = time.process_time()
         with pytest.raises(BadInput) as caught:
-            read(request.parse(path))
+            read(parse(path))
         assert time.process_time() - started < MOST_SECONDS
         said = str(caught.value)
         assert len(said.splitlines()) == 1

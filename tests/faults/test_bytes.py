@@ -17,10 +17,13 @@ import pytest
 from jobs.catalogue.build_galaxies import quarantine_file, quarantine_work
 from jobs.explore import worker
 from jobs.explore.guard import checked
-from jobs.render.render_exposures import truth_file, truth_work
-from lake_schema import blocks, fits, layout, manifest, parquet, publish, read
+from jobs.render.products.keys import truth_file
+from jobs.render.render_exposures import truth_work
+from lake_schema import blocks
 from lake_schema.errors import Damaged
-from lake_schema.plan import Output, Part, Plan
+from lake_schema.fits import images
+from lake_schema.store import layout, manifest, parquet, publish, read
+from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables import declared
 from tests.make_old_lake import OLD_LAKE
 from tests.universe import PLAIN, TOY, plain_plan, plain_work, rows_of, toy_rows
@@ -288,12 +291,12 @@ def test_a_file_without_blocks_is_compared_as_a_whole(lake):
 
 def picture(path):
     rng = np.random.default_rng(5)
-    fits.write_images(path, [fits.Image(rng.poisson(300, (80, 50)).astype(np.uint16), (("EXPTIME", 560.5, "s"),))])
+    images.write_images(path, [images.Image(rng.poisson(300, (80, 50)).astype(np.uint16), (("EXPTIME", 560.5, "s"),))])
 
 
 def packed(path):
     rng = np.random.default_rng(5)
-    fits.write_images(path, [fits.Image(rng.poisson(300, (80, 50)).astype(np.uint16))], rice=True)
+    images.write_images(path, [images.Image(rng.poisson(300, (80, 50)).astype(np.uint16))], rice=True)
 
 
 def swapped(whole, rng):
@@ -323,7 +326,7 @@ def test_pieces_of_an_image_that_changed_places_are_refused(lake, writer):
     for _ in range(100):
         path.write_bytes(swapped(whole, rng))
         with pytest.raises(Damaged, match=r"a\.fits has other contents than the manifest says"):
-            fits.read_images(version.file("images/a.fits"))
+            images.read_images(version.file("images/a.fits"))
 
 
 @pytest.mark.parametrize("trials", [300, pytest.param(20_000, marks=pytest.mark.nightly)])
@@ -334,7 +337,7 @@ def test_a_packed_image_whose_pieces_changed_places_is_read_or_refused_in_one_li
     whole, rng, refused = path.read_bytes(), np.random.default_rng(7), 0
     for _ in range(trials):
         path.write_bytes(swapped(whole, rng))
-        _, why = answer(lambda: fits.read_images(path))
+        _, why = answer(lambda: images.read_images(path))
         assert why is None or (path.name in why and "\n" not in why)
         refused += bool(why)
     assert refused > 0.9 * trials

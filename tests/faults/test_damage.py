@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lake_schema import fits, publish, read
 from lake_schema.errors import Damaged
-from lake_schema.plan import Output
+from lake_schema.fits.images import Image, read_images, write_images
+from lake_schema.store import publish, read
+from lake_schema.store.plan import Output
 from tests.faults import promise
 from tests.universe import plain_plan, plain_work, toy_plan, toy_rows, toy_work
 
@@ -25,12 +26,12 @@ def toy(lake):
 
 def image(part, seed=1):
     rng = np.random.default_rng([seed, part])
-    return fits.Image(rng.integers(0, 60_000, (80, 50)).astype(np.uint16), (("EXPTIME", 560.5, "s"),))
+    return Image(rng.integers(0, 60_000, (80, 50)).astype(np.uint16), (("EXPTIME", 560.5, "s"),))
 
 
 def image_work(root, facts):
     part, seed = facts["part"], facts["seed"]
-    files = {f"images/{part}.fits": lambda path: fits.write_images(path, [image(part, seed)])}
+    files = {f"images/{part}.fits": lambda path: write_images(path, [image(part, seed)])}
     return Output(plain_work(root, facts).rows, files)
 
 
@@ -64,7 +65,7 @@ def test_a_flipped_bit_of_a_table_is_never_a_wrong_number(toy, flips):
 def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
     path = images.file("images/0.fits")
     whole = path.read_bytes()
-    (good,) = fits.read_images(path)
+    (good,) = read_images(path)
     rng = np.random.default_rng(4)
     refused = 0
     for bit in rng.choice(8 * len(whole), flips, replace=False):
@@ -74,7 +75,7 @@ def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
             images.file("images/0.fits")
         try:
             # Outside a lake the blanks after a header's end may change.
-            (found,) = fits.read_images(path)
+            (found,) = read_images(path)
             assert np.array_equal(found.data, good.data), f"bit {bit}"
             assert found.cards == good.cards, f"bit {bit}"
         except Damaged:
@@ -172,7 +173,7 @@ def test_verify_finds_any_one_change(tmp_path_factory, data):
 
 def test_rows_of_another_cell_are_found_by_verify(lake):
     """A hand that rewrites a file and its manifest is still found out by the rows themselves."""
-    from lake_schema import manifest, parquet
+    from lake_schema.store import manifest, parquet
 
     folder = publish.make(lake, toy_plan(), toy_work)
     version = read.version(lake, "toy")

@@ -2,9 +2,9 @@
 
 import pytest
 
-from lake_schema import layout, publish, read
 from lake_schema.errors import LakeError, PartsFailed
-from lake_schema.publish import Plan
+from lake_schema.store import layout, publish, read
+from lake_schema.store.plan import Plan
 from tests.faults import promise, victims
 from tests.faults.disc import Disc, Killed
 from tests.universe import plain_plan, plain_work

@@ -8,8 +8,8 @@ import signal
 import pyarrow.parquet as pq
 import pytest
 
-from lake_schema import parquet, publish, read
 from lake_schema.errors import BadInput, Damaged, Superseded
+from lake_schema.store import layout, parquet, publish, read
 from tests.faults import promise, victims
 from tests.faults.disc import Disc
 
@@ -129,7 +129,7 @@ def test_gc_leaves_a_running_publisher_alone(lake, plain_phases, monkeypatch):
         reached, go = victims.CONTEXT.Event(), victims.CONTEXT.Event()
         seed = 10 + n
         child = victims.start(
-            victims.stop_at, lake, "plain", seed, n, publish.current_key(lake, "plain"), reached, go, answers
+            victims.stop_at, lake, "plain", seed, n, layout.current_key(lake, "plain"), reached, go, answers
         )
         assert reached.wait(60)
         try:

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lake_schema import publish, read
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput, PartsFailed
-from lake_schema.provenance import code_version
-from lake_schema.publish import Output, Part, Plan
+from lake_schema.store import publish, read
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.provenance import code_version
 from tests.faults import promise
 from tests.faults.disc import Disc, Killed
 from tests.universe import CELLS, PLAIN, TOY, plain_plan, plain_work, toy_plan, toy_rows, toy_work

@@ -13,7 +13,7 @@ import pytest
 
 from jobs import shell
 from jobs.shell import Job, Step
-from lake_schema import layout
+from lake_schema.store import layout
 from tests import requests
 from tests.faults import promise, slow_job
 from tests.universe import plain_plan, plain_work

@@ -7,9 +7,10 @@ import signal
 
 import numpy as np
 
-from lake_schema import fits, publish
 from lake_schema.errors import LakeError
-from lake_schema.publish import Output
+from lake_schema.fits import images
+from lake_schema.store import publish
+from lake_schema.store.plan import Output
 from tests.faults import promise
 from tests.faults.disc import Disc
 from tests.universe import plain_plan, plain_work
@@ -81,9 +82,9 @@ def publish_many(root, kind, versions, stop):
 
 
 def with_image(root, facts):
-    image = fits.Image(np.zeros((200, 200), np.float32))
+    image = images.Image(np.zeros((200, 200), np.float32))
     name = f"images/{facts['part']}.fits"
-    return Output(plain_work(root, facts).rows, {name: lambda path: fits.write_images(path, [image])})
+    return Output(plain_work(root, facts).rows, {name: lambda path: images.write_images(path, [image])})
 
 
 def on_a_small_disc(root, work, most_bytes, answers):

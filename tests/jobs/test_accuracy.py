@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from jobs import accuracy, request
+from jobs import accuracy
 from jobs.accuracy import DRAFT, PRESETS, QUICKLOOK, SURVEY, Accuracy
+from jobs.request.from_toml import from_table
 from lake_schema.errors import BadInput
 
 NUMBERS = [field.name for field in fields(Accuracy)]
@@ -83,7 +84,7 @@ def test_a_request_is_refused_before_anything_is_made(where):
     own = asdict(SURVEY) | {"shape": 1e-9}
     wanted = {**GOOD, "accuracy": own} if where == "accuracy" else {**GOOD, "explore": {"accuracy": [own]}}
     with pytest.raises(BadInput, match=r"accuracy\.shape = 1e-09 is beyond reach, the best is"):
-        request.from_table(wanted)
+        from_table(wanted)
 
 
 def test_the_best_is_rounded_so_that_it_can_be_asked_for():

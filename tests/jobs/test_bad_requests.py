@@ -6,10 +6,11 @@ import time
 
 import pytest
 
-from jobs import request, shell
+from jobs import shell
 from jobs.catalogue import build_gaia, build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
+from jobs.request import __main__
 
 JOBS = [module.JOB for module in (build_galaxies, build_stars, build_gaia, compute_fluxes, plan_exposures)]
 JOBS.append(render_exposures.JOB)
@@ -106,7 +107,7 @@ def test_a_malformed_request_is_refused_by_the_check_and_by_every_job(tmp_path, 
     path, lake = tmp_path / "x.toml", tmp_path / "lake"
     path.write_text(text)
     started = time.process_time()
-    assert request.main(["check", str(path)]) == 2
+    assert __main__.main(["check", str(path)]) == 2
     assert time.process_time() - started < HANGS
     said = capsys.readouterr().err
     assert words in said
@@ -120,7 +121,7 @@ def test_a_malformed_request_is_refused_by_the_check_and_by_every_job(tmp_path, 
 def test_what_the_malformed_ones_are_made_of_is_good(tmp_path, capsys):
     for number, text in enumerate((GOOD, GOOD + POINT, GOOD + BLOCK)):
         (tmp_path / f"{number}.toml").write_text(text)
-        assert request.main(["check", str(tmp_path / f"{number}.toml")]) == 0
+        assert __main__.main(["check", str(tmp_path / f"{number}.toml")]) == 0
     assert capsys.readouterr().out.startswith("x: good: 0 pointings, 0 observations, 1 variants\n")
 
 
@@ -128,7 +129,7 @@ def test_the_check_from_a_shell_imports_nothing_slow(tmp_path):
     """What takes seconds to import, and what takes none of the check's."""
     path = tmp_path / "x.toml"
     path.write_text(BAD["magnitude 99"][0])
-    code = "import sys; from jobs.request import main; print(main(sys.argv[1:]), *sys.modules)"
+    code = "import sys; from jobs.request.__main__ import main; print(main(sys.argv[1:]), *sys.modules)"
     done = subprocess.run([sys.executable, "-c", code, "check", path], capture_output=True, text=True)
     status, *modules = done.stdout.split()
     assert (status, done.stderr.count("\n")) == ("2", 1)

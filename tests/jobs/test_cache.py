@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jobs import cache
+from lake_schema import blocks
 from lake_schema.errors import BadInput
 
 
@@ -159,8 +160,8 @@ def test_zeroed_blocks_are_made_again():
 def test_a_process_compares_a_file_once(monkeypatch):
     key, seen = "6" * 64, []
     made_again(key, 1.0)
-    real = cache.blocks.crc32
-    monkeypatch.setattr(cache.blocks, "crc32", lambda path: seen.append(path.name) or real(path))
+    real = blocks.crc32
+    monkeypatch.setattr(blocks, "crc32", lambda path: seen.append(path.name) or real(path))
     for _ in range(3):
         made_again(key, 2.0)
     assert seen == []

@@ -12,7 +12,7 @@ from jobs import cache
 SCRIPT = """
 import hashlib
 import numpy as np
-from jobs.render.effects.traps import Sweeps, Traps, shifted
+from jobs.render.effects.readout.traps import Sweeps, Traps, shifted
 frame = np.random.default_rng(1).poisson(100, (2000, 300)).astype(float)
 moved, held = shifted(frame, Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58), Sweeps(1, 2), -2)
 print(hashlib.sha256(moved.tobytes()).hexdigest(), held.hex())

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jobs.measured import Measured, forget_peak, peak_gb
-from lake_schema.plan import Part
+from lake_schema.store.plan import Part
 
 
 def test_the_peak_is_that_of_the_part():

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from jobs.session import session, struct, views
-from lake_schema import publish, read
 from lake_schema.errors import Damaged
-from lake_schema.publish import Output, Part, Plan
+from lake_schema.store import publish, read
+from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables import declared
 from tests.universe import CELLS, plain_plan, plain_work, rows_of, toy_plan, toy_work
 

@@ -14,8 +14,9 @@ from py4j.protocol import Py4JNetworkError
 
 from jobs import shell
 from jobs.shell import Job, Step
-from lake_schema import __version__, layout, publish, read, stage
-from lake_schema.publish import Part, Plan
+from lake_schema import __version__
+from lake_schema.store import layout, publish, read, stage
+from lake_schema.store.plan import Part, Plan
 from tests import requests
 from tests.universe import PLAIN, plain_plan, plain_work
 

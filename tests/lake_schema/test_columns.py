@@ -9,10 +9,10 @@ from astropy.io.votable.ucd import check_ucd
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lake_schema import manifest, parquet
 from lake_schema.columns import Column, Table, round_mantissa
 from lake_schema.errors import BadInput
-from lake_schema.fits import fits_unit
+from lake_schema.fits.tables import fits_unit
+from lake_schema.store import manifest, parquet
 from lake_schema.tables import declared
 from tests.universe import TOY, rows_of
 

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lake_schema import layout, publish, read, sky
+from lake_schema import sky
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
-from lake_schema.publish import Output, Part, Plan
+from lake_schema.store import layout, publish, read
+from lake_schema.store.plan import Output, Part, Plan
 from tests.universe import TOY, toy_plan, toy_work
 
 LENSED = Table(

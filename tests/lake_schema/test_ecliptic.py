@@ -7,7 +7,7 @@ from astropy.coordinates import BarycentricMeanEcliptic, SkyCoord
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs import area
+from jobs.request import area
 from lake_schema import sky
 from lake_schema.ecliptic import ecliptic, equatorial, tile_corners, tile_count, tile_of
 from lake_schema.errors import BadInput, OutOfRange

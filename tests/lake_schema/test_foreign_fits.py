@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from astropy.io import fits as astropy_fits
 
-from lake_schema import fits
 from lake_schema.errors import BadInput
+from lake_schema.fits import external
 
 READERS = {
-    "read_numbers": lambda path: fits.read_numbers(path, "catalogue of stars"),
-    "number_batches": lambda path: list(fits.number_batches(path, ["a", "b"], ["name"])),
-    "read_table": lambda path: fits.read_table(path, "curve"),
-    "read_map": lambda path: fits.read_map(path, "a"),
-    "read_planes": lambda path: fits.read_planes(path, "a"),
+    "read_numbers": lambda path: external.read_numbers(path, "catalogue of stars"),
+    "number_batches": lambda path: list(external.number_batches(path, ["a", "b"], ["name"])),
+    "read_table": lambda path: external.read_table(path, "curve"),
+    "read_map": lambda path: external.read_map(path, "a"),
+    "read_planes": lambda path: external.read_planes(path, "a"),
 }
 # What has no bound takes minutes; a slow machine's imports take seconds.
 MOST_SECONDS, MOST_BYTES = 30.0, 512 << 20
@@ -118,13 +118,17 @@ def test_packed_images_are_not_unpacked(tmp_path):
     unit = astropy_fits.CompImageHDU(np.ones((30, 30), np.int16), compression_type="RICE_1")
     astropy_fits.HDUList([astropy_fits.PrimaryHDU(), unit]).writeto(tmp_path / "x.fits")
     with pytest.raises(BadInput, match="holds no image"):
-        fits.read_planes(tmp_path / "x.fits", "a")
+        external.read_planes(tmp_path / "x.fits", "a")
 
 
 def test_good_ones_are_read_plain_or_packed(good):
     for _ in range(2):
-        ((numbers, _),) = fits.number_batches(good, ["a", "b"], ["name"])
+        ((numbers, _),) = external.number_batches(good, ["a", "b"], ["name"])
         assert (numbers["b"].tolist(), numbers["name"][3]) == (list(range(48)), "n3")
-        assert fits.read_numbers(good, "catalogue of stars")["a"].sum() == fits.read_map(good, "a")[0].sum() == 1128.0
-        assert fits.read_table(good, "curve")["a"][2] == 2.0
+        assert (
+            external.read_numbers(good, "catalogue of stars")["a"].sum()
+            == external.read_map(good, "a")[0].sum()
+            == 1128.0
+        )
+        assert external.read_table(good, "curve")["a"][2] == 2.0
         good.write_bytes(gzip.compress(good.read_bytes()))

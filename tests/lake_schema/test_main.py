@@ -8,9 +8,10 @@ import sys
 
 import pytest
 
-from lake_schema import __version__, layout, manifest, publish, read
+from lake_schema import __version__
 from lake_schema.__main__ import main
 from lake_schema.errors import Damaged, PartsFailed
+from lake_schema.store import layout, manifest, provenance, publish, read
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
 
 
@@ -65,7 +66,7 @@ def test_verify_names_a_version_that_is_gone(filled, capsys):
 
 
 def test_verify_goes_on_after_a_file_that_cannot_be_read(filled, capsys, monkeypatch):
-    real = manifest.file_sha256
+    real = provenance.file_sha256
 
     def sha256(path):
         if path.name == "Npix=1608.parquet":

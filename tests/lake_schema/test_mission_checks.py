@@ -7,8 +7,9 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.mission import checks
-from lake_schema.mission.configuration import LADDER, MissionConfiguration, bounds_of, resolve
+from lake_schema.mission.configuration import MissionConfiguration, bounds_of, resolve
 from lake_schema.mission.parameter import CAMERAS, STATUSES, read_all
+from lake_schema.tables.mission import LADDER
 from lake_schema.units import AB_CGS, BOLTZMANN_ERG_K, LIGHT_KM_S, PLANCK_ERG_S
 
 MISSION = resolve()

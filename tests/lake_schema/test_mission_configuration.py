@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lake_schema.errors import BadInput, OutOfRange
-from lake_schema.mission.configuration import LADDER, resolve
+from lake_schema.mission.configuration import resolve
 from lake_schema.mission.parameter import STATUSES, Parameter, read_all
+from lake_schema.tables.mission import LADDER
 
 RECORDS = (
     Parameter("a.gain", "REQ", 3.1, "electron / adu", source="x"),

@@ -5,14 +5,15 @@ import json
 
 import pytest
 
-from lake_schema import __main__, publish, read
+from lake_schema import __main__
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.mission import compare, published
-from lake_schema.mission.configuration import LADDER, MissionConfiguration, difference, resolve
+from lake_schema.mission.configuration import MissionConfiguration, difference, resolve
 from lake_schema.mission.model import Model
 from lake_schema.mission.parameter import Parameter
-from lake_schema.publish import Part, Plan
-from lake_schema.tables.mission import MISSION
+from lake_schema.store import publish, read
+from lake_schema.store.plan import Part, Plan
+from lake_schema.tables.mission import LADDER, MISSION
 
 CHANGED = resolve(ladder=("SIM", *LADDER[:-1]), overrides={"vis.gain": (3.3, "electron / adu")})
 

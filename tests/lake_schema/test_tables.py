@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 
 from jobs.fluxes import passbands as responses
-from lake_schema import __main__, publish, read, tables
+from lake_schema import __main__, tables
 from lake_schema.errors import BadInput
 from lake_schema.mission import published
 from lake_schema.mission.configuration import resolve
 from lake_schema.mission.model import read_models
 from lake_schema.mission.parameter import read_all
-from lake_schema.publish import Output, Part, Plan
+from lake_schema.store import publish, read
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.validate import check
 from lake_schema.tables import mission, passbands, templates
 from lake_schema.tables.common import Origin
-from lake_schema.validate import check
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tables.md"
 

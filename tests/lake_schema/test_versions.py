@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from lake_schema import publish, read
 from lake_schema.columns import Column
 from lake_schema.errors import VersionMismatch
+from lake_schema.store import publish, read
 from lake_schema.tables.galaxies import GALAXIES
 from tests.make_old_lake import OLD_LAKE
 from tests.universe import PLAIN, plain_plan, plain_work, rows_of

@@ -8,31 +8,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from jobs.render.effects import (
-    adc,
-    background,
-    bias_structure,
+from jobs.render.effects.charge import (
     bleeding,
     brighter_fatter,
-    calibration_lamp,
     charge_injection,
-    charge_transfer,
     cosmic_rays,
-    crosstalk,
     dark_current,
+    pixel_response,
+    poisson,
+)
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.light import (
+    background,
+    calibration_lamp,
     ghosts,
     illumination,
     intra_pixel,
-    nonlinearity,
     pixel_area,
-    pixel_response,
-    poisson,
-    quadrants,
-    read_noise,
-    readout_trail,
     straylight,
 )
-from jobs.render.effects.effect import Effect
+from jobs.render.effects.readout import (
+    adc,
+    bias_structure,
+    charge_transfer,
+    crosstalk,
+    nonlinearity,
+    quadrants,
+    read_noise,
+    readout_cosmic_rays,
+    readout_trail,
+)
 
 # What the pixels do to the light while sources are drawn: part of their transfer function.
 DRAWN = intra_pixel.EFFECT
@@ -58,7 +63,7 @@ _CHARGE = (
 _READOUT = (
     quadrants.EFFECT,
     charge_transfer.PARALLEL,
-    cosmic_rays.READOUT,
+    readout_cosmic_rays.READOUT,
     charge_transfer.SERIAL,
     nonlinearity.EFFECT,
     crosstalk.EFFECT,

@@ -6,8 +6,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from jobs.catalogue import band_ratios, density_box, dust_map, galaxies, population
-from jobs.fluxes import cosmology, templates
+from jobs.catalogue import dust_map
+from jobs.catalogue.galaxies import band_ratios, galaxies
+from jobs.catalogue.halos import population
+from jobs.catalogue.matter import density_box
+from jobs.fluxes import cosmology
+from jobs.fluxes.libraries import templates
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 

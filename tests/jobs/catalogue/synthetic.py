@@ -5,7 +5,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from astropy.table import Table
 
-from jobs.catalogue import mapping
+from jobs.catalogue.external import mapping
 
 RA, DEC = 53.1, -27.8
 

@@ -6,10 +6,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from jobs import shell
-from jobs.catalogue import build_galaxies
+from jobs.catalogue import build_galaxies, dust_map
 from tests import requests
-
-from . import synthetic, test_dust_map, test_halo_catalogue, test_nearest_sed
+from tests.jobs.catalogue import synthetic, test_dust_map
+from tests.jobs.catalogue.galaxies import test_nearest_sed
+from tests.jobs.catalogue.halos import test_halo_catalogue
 
 GALAXIES = '[ingest.galaxies]\nfiles = ["theirs.parquet"]\nformat = "flagship2"\n'
 HALOS = (
@@ -66,7 +67,7 @@ def without(values, key):
 )
 def test_a_wrong_value_or_a_missing_column(tmp_path, monkeypatch, capsys, text, values, said):
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(build_galaxies.dust_map, "chosen", lambda seed, own: None)
+    monkeypatch.setattr(dust_map, "chosen", lambda seed, own: None)
     pq.write_table(pa.table(values), tmp_path / "theirs.parquet")
     found = refused(tmp_path, text, capsys)
     assert all(part in found for part in ("theirs.parquet", *said)), found
@@ -75,7 +76,7 @@ def test_a_wrong_value_or_a_missing_column(tmp_path, monkeypatch, capsys, text, 
 @pytest.mark.parametrize(("text", "values"), [(HALOS, halos()), (GALAXIES, galaxies())])
 def test_a_file_that_is_cut_short(tmp_path, monkeypatch, capsys, text, values):
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(build_galaxies.dust_map, "chosen", lambda seed, own: None)
+    monkeypatch.setattr(dust_map, "chosen", lambda seed, own: None)
     path = tmp_path / "theirs.parquet"
     pq.write_table(pa.table(values), path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])

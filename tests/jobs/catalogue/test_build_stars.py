@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from hats.io.validation import is_valid_catalog
 
-from jobs import request, shell
+from jobs import shell
 from jobs.catalogue import build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import render_exposures
-from lake_schema import ids, layout, publish, read, sky
+from jobs.render.planning import preconditions
+from jobs.request.from_toml import from_table
+from lake_schema import ids, sky
 from lake_schema.errors import BadInput
+from lake_schema.store import layout, publish, read
 from tests import requests
 
 # l = 0, b = 12
@@ -18,7 +20,7 @@ AREA = {"cone": {"ra": 255.4, "dec": -22.2, "radius": 0.5}}
 
 def wanted(**keys):
     table = {"name": "test", "seed": 1, "area": AREA, "universe": {"star_limit": 14.0}}
-    return request.from_table(table | {"fluxes": {"bands": ["euclid_vis"]}} | keys)
+    return from_table(table | {"fluxes": {"bands": ["euclid_vis"]}} | keys)
 
 
 def made(lake, **keys):
@@ -84,9 +86,9 @@ def test_fluxes_lie_beside_their_stars(versions):
     stars, beside = (one.in_cells(cells, 8, ["id"]) for one in (mixed, fluxes))
     assert stars.num_rows > 1000
     assert stars.equals(beside)
-    render_exposures._refuse_uncovered(mixed, set(cells))
+    preconditions.refuse_uncovered(mixed, set(cells))
     with pytest.raises(BadInput, match="lacks 1 order-8 cells"):
-        render_exposures._refuse_uncovered(mixed, {*cells, 0})
+        preconditions.refuse_uncovered(mixed, {*cells, 0})
 
 
 def test_what_cannot_be_drawn_is_refused_before_anything_is_made(lake, tmp_path, capsys):

@@ -1,3 +1,5 @@
+"""TODO."""
+
 import numpy as np
 import pytest
 from hats.pixel_math.partition_stats import generate_alignment
@@ -5,9 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.catalogue import cells
-from jobs.request import Area
-from lake_schema import layout, sky
+from jobs.request.area import Area
+from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
+from lake_schema.store import layout
 
 
 def held(parts):

@@ -1,3 +1,5 @@
+"""TODO."""
+
 import dataclasses
 
 import healpy as hp
@@ -8,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.catalogue import dust_map
-from jobs.own_files import DustMap
+from jobs.request.files import DustMap
 from lake_schema import sky
 from lake_schema.errors import BadInput
 

@@ -5,8 +5,11 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.table import Table
 
-from jobs.catalogue import export_galaxies, mapping
-from lake_schema import publish, read, sky
+from jobs.catalogue import export_galaxies
+from jobs.catalogue.external import mapping
+from lake_schema import sky
+from lake_schema.store import publish, read
+from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 
@@ -24,16 +27,16 @@ def lake(tmp_path):
     values |= {"ra": ra, "dec": dec, "ra_lensed": ra, "dec_lensed": dec, "_healpix_29": index}
     values |= {name: rng.uniform(-0.1, 0.1, 50) for name in ("kappa", "gamma1", "gamma2")}
     values["position_angle"] = rng.uniform(0, 180, 50)
-    part = publish.Part(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})
-    plan = publish.Plan(GALAXIES, {}, (part,))
-    publish.make(tmp_path, plan, lambda root, facts: publish.Output(GALAXIES.build(values)))
+    part = Part(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})
+    plan = Plan(GALAXIES, {}, (part,))
+    publish.make(tmp_path, plan, lambda root, facts: Output(GALAXIES.build(values)))
     table = fluxes("galaxy", ["lsst_r"])
     light = {c.name: values[c.name] for c in table.columns if c.name in values} | {
         "f_nu_lsst_r": np.full(50, 3.631),
         "integrated": np.zeros(50, bool),
     }
-    made = publish.Plan(table, {"input": plan.key}, (part,))
-    publish.make(tmp_path, made, lambda root, facts: publish.Output(table.build(light)))
+    made = Plan(table, {"input": plan.key}, (part,))
+    publish.make(tmp_path, made, lambda root, facts: Output(table.build(light)))
     return tmp_path
 
 
@@ -69,8 +72,8 @@ def test_a_skycatalogs_set_comes_back_through_its_mapping(lake, tmp_path):
 def test_fluxes_of_other_galaxies_are_refused(lake, tmp_path, capsys):
     table = fluxes("galaxy", ["lsst_r"])
     rows = read.version(lake, "galaxy_fluxes").rows()
-    part = publish.Part(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})
-    publish.make(lake, publish.Plan(table, {"input": "other"}, (part,)), lambda root, facts: publish.Output(rows))
+    part = Part(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})
+    publish.make(lake, Plan(table, {"input": "other"}, (part,)), lambda root, facts: Output(rows))
     arguments = ["--lake", str(lake), "--out", str(tmp_path / "out"), "--form", "skycatalogs"]
     assert export_galaxies.main(arguments) == 2
     assert "run compute_fluxes first" in capsys.readouterr().err

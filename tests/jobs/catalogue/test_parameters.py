@@ -1,13 +1,15 @@
+"""TODO."""
+
 import tomllib
 from pathlib import Path
 
 import pytest
 
-import jobs.catalogue
+from jobs import catalogue
 from jobs.catalogue import parameters
 from lake_schema.errors import BadInput
 
-FILES = sorted(Path(jobs.catalogue.__file__).parent.glob("*.toml"))
+FILES = sorted(Path(catalogue.__file__).parent.glob("*.toml"))
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)

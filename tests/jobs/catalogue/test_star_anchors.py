@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import stars as benchmark
-from jobs.catalogue import stars
+from jobs.catalogue.stars import stars
 from tests.benchmarks import run
 
 KEYS = ("stars_per_s_core", "cell_peak_gb")

@@ -13,13 +13,12 @@ from benchmarks import _census as census
 from benchmarks import _clustering as clustering
 from benchmarks import _shear as shear
 from benchmarks import validate_universe
-from jobs.catalogue import luminosity_function
+from jobs.catalogue.halos import luminosity_function
 from jobs.fluxes import cosmology
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from tests.benchmarks import run
-
-from .test_lensing import limber
+from tests.jobs.catalogue.galaxies.test_lensing import limber
 
 # The luminosity function, calibrated on 102 galaxies an arcmin2 with I_E < 26, makes 15 % more than observed to i = 25
 # (test_galaxies has the mean sky), and this sky 1.5 % more than that; 12 % are allowed.

@@ -3,8 +3,8 @@
 import pytest
 
 from jobs.explore.explorer import Explorer
-from lake_schema import layout, publish
-from lake_schema.publish import Output, Part, Plan
+from lake_schema.store import layout, publish
+from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 from tests.universe import plain_plan, plain_work, rows_of

@@ -12,8 +12,9 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 
 from jobs.explore.explorer import Explorer
-from lake_schema import publish, read, sky
+from lake_schema import sky
 from lake_schema.errors import BadInput, Damaged
+from lake_schema.store import publish, read
 from lake_schema.tables.galaxies import GALAXIES
 from tests.universe import plain_plan, plain_work
 

@@ -160,7 +160,7 @@ def test_enough_of_them():
 def test_the_locked_session_is_a_second_fence(explored, outside, before, text, monkeypatch):
     """Were the guard blind, DuckDB itself would still reach nothing outside."""
     from jobs.explore import worker
-    from lake_schema import read
+    from lake_schema.store import read
 
     if any(word in text for word in ("POINTER", "5000", "(" * 100, "+1+1", "x" * 100)):
         return

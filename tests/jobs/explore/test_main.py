@@ -7,8 +7,8 @@ import pytest
 
 from jobs.explore.__main__ import main
 from jobs.explore.explorer import Explorer
-from lake_schema import read
 from lake_schema.errors import Damaged
+from lake_schema.store import read
 
 
 def test_a_table_of_the_tables(explored, capsys):

@@ -7,10 +7,10 @@ import pytest
 from astropy.table import Table
 from nbclient import NotebookClient
 
-from jobs import request
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from lake_schema import layout, publish
+from jobs.request.from_toml import parse
+from lake_schema.store import layout, publish
 from tests import requests
 
 NOTEBOOK = Path(__file__).resolve().parents[3] / "notebooks" / "01_explore_catalogue.ipynb"
@@ -21,7 +21,7 @@ SMALL = requests.shallow(23.5, 20.0) + '[fluxes]\nbands = ["euclid_vis", "lsst_r
 def field(tmp_path_factory):
     """Galaxies, stars and fluxes, made without Spark."""
     folder = tmp_path_factory.mktemp("field")
-    wanted = request.parse(requests.written(folder, SMALL, requests.FIELD.format(0.02), seed=5))
+    wanted = parse(requests.written(folder, SMALL, requests.FIELD.format(0.02), seed=5))
     root = layout.lake(folder / "lake")
     root.mkdir()
     for job in (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB):

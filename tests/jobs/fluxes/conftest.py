@@ -4,7 +4,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from jobs.fluxes import lines, templates
+from jobs.fluxes.libraries import templates
+from jobs.fluxes.spectra import lines
 
 
 @pytest.fixture(scope="session")

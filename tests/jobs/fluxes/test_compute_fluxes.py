@@ -5,16 +5,19 @@ import hashlib
 import numpy as np
 import pytest
 
-from jobs import request, shell
+from jobs import shell
 from jobs.accuracy import REFERENCE
-from jobs.fluxes import compute_fluxes, inputs, lines, spectra
-from lake_schema import ids, layout, publish, read, sky
+from jobs.fluxes import band_fluxes, compute_fluxes, inputs
+from jobs.fluxes.spectra import lines
+from jobs.request.from_toml import from_table, parse
+from lake_schema import ids, sky
 from lake_schema.errors import BadInput
+from lake_schema.store import layout, plan, publish, read
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 from tests import requests
-from tests.jobs.fluxes.test_ingest import BAND, RESPONSE, WAVELENGTH, ascii_file
-from tests.jobs.fluxes.test_own_stars import black_bodies, irtf_file
+from tests.jobs.fluxes.libraries.test_from_files import BAND, RESPONSE, WAVELENGTH, ascii_file
+from tests.jobs.fluxes.libraries.test_stars_from_files import black_bodies, irtf_file
 from tests.universe import rows_of
 
 CELLS = (1607, 1608)
@@ -23,7 +26,7 @@ BANDS = ["euclid_vis", "euclid_h"]
 
 def wanted(**keys):
     area = {"cone": {"ra": 10.0, "dec": 10.0, "radius": 1.0}}
-    return request.from_table({"name": "test", "seed": 1, "area": area, "fluxes": {"bands": BANDS}} | keys)
+    return from_table({"name": "test", "seed": 1, "area": area, "fluxes": {"bands": BANDS}} | keys)
 
 
 def catalogue(lake, declared, columns):
@@ -38,10 +41,10 @@ def catalogue(lake, declared, columns):
         given = {name: np.full(n, value).astype(declared.column(name).type) for name, value in columns.items()}
         if declared is GALAXIES:
             place |= {"ra_lensed": ra, "dec_lensed": dec}
-        return publish.Output(declared.build({name: rows[name] for name in declared.names} | place | given))
+        return plan.Output(declared.build({name: rows[name] for name in declared.names} | place | given))
 
-    parts = tuple(publish.Part(layout.cell_file(5, cell), {"cell": cell}) for cell in CELLS)
-    publish.make(lake, publish.Plan(declared, {"columns": sorted(columns)}, parts), work)
+    parts = tuple(plan.Part(layout.cell_file(5, cell), {"cell": cell}) for cell in CELLS)
+    publish.make(lake, plan.Plan(declared, {"columns": sorted(columns)}, parts), work)
 
 
 @pytest.fixture
@@ -96,7 +99,7 @@ def test_the_accuracy_of_the_request_rules(filled, library):
     exact = read.version(filled, "galaxy_fluxes")
     assert draft.key != exact.key
     assert all(error["setting"] is None for error in exact.manifest["facts"]["errors"].values())
-    truth = spectra.galaxy_fluxes(read.version(filled, "galaxies").rows(), BANDS, library, REFERENCE)
+    truth = band_fluxes.galaxy_fluxes(read.version(filled, "galaxies").rows(), BANDS, library, REFERENCE)
     for band in BANDS:
         slow, fast = (version.rows()[f"f_nu_{band}"].to_numpy() for version in (exact, draft))
         np.testing.assert_array_equal(slow, truth[f"f_nu_{band}"].to_numpy())
@@ -135,7 +138,7 @@ file = "law.dat"
 format = "extinction"
 """
     path = requests.written(tmp_path, more)
-    asked = request.parse(path)
+    asked = parse(path)
     run(filled, asked, sources=True)
     made = read.version(filled, "galaxy_fluxes")
     assert [name for name in made.rows().column_names if name.startswith("f_nu")] == [
@@ -145,10 +148,10 @@ format = "extinction"
     assert facts["files"]["fluxes.passbands.mine"] == hashlib.sha256((tmp_path / "mine.dat").read_bytes()).hexdigest()
     assert all(0.0 < error["largest"] <= 1e-3 / 1.5 for error in facts["errors"].values())
     own = inputs.read(asked.curves)
-    truth = spectra.galaxy_fluxes(
+    truth = band_fluxes.galaxy_fluxes(
         read.version(filled, "galaxies").rows(), [*BANDS, own.passbands["mine"]], own.library, REFERENCE
     )
-    embedded = spectra.galaxy_fluxes(read.version(filled, "galaxies").rows(), BANDS, library, REFERENCE)
+    embedded = band_fluxes.galaxy_fluxes(read.version(filled, "galaxies").rows(), BANDS, library, REFERENCE)
     for band in (*BANDS, "mine"):
         column = f"f_nu_{band}"
         np.testing.assert_allclose(made.rows()[column], truth[column], rtol=1e-3)
@@ -158,7 +161,7 @@ format = "extinction"
     np.testing.assert_array_equal(inputs.library_of(filled, facts).flux, own.library.flux)
     # Another content of the same file is another table.
     ascii_file(tmp_path / "mine.dat", BAND, RESPONSE**2)
-    assert compute_fluxes.step_of("galaxy", filled, request.parse(path)).plan.key != made.key
+    assert compute_fluxes.step_of("galaxy", filled, parse(path)).plan.key != made.key
 
 
 def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
@@ -166,13 +169,13 @@ def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
     black_bodies(tmp_path / "synthetic.cor")
     irtf_file(tmp_path / "star.txt", -2.5, wiggle=0.3)
     own = "[fluxes.stars]\nbasel = 'synthetic.cor'\nirtf = ['star.txt']\n"
-    asked = request.parse(requests.written(tmp_path, f"fluxes.bands = {BANDS}\n{own}"))
+    asked = parse(requests.written(tmp_path, f"fluxes.bands = {BANDS}\n{own}"))
     own = inputs.read(asked.curves)
     for step in (*compute_fluxes.source_steps(own), compute_fluxes.step_of("star", filled, asked)):
         publish.make(filled, step.plan, step.work)
     made, rows = read.version(filled, "star_fluxes"), read.version(filled, "stars").rows()
-    truth = spectra.star_fluxes(rows, BANDS, own.stars, REFERENCE)
-    embedded = spectra.star_fluxes(rows, BANDS, stars_library, REFERENCE)
+    truth = band_fluxes.star_fluxes(rows, BANDS, own.stars, REFERENCE)
+    embedded = band_fluxes.star_fluxes(rows, BANDS, stars_library, REFERENCE)
     for band in BANDS:
         np.testing.assert_allclose(made.rows()[f"f_nu_{band}"], truth[f"f_nu_{band}"], rtol=1e-5)
     assert np.abs(np.log(np.asarray(truth["f_nu_euclid_vis"]) / np.asarray(embedded["f_nu_euclid_vis"]))).min() > 0.05
@@ -183,7 +186,7 @@ def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
 
 def test_what_is_there_is_not_prepared_again(filled, monkeypatch):
     run(filled, wanted())
-    monkeypatch.setattr(spectra, "prepare", None)
+    monkeypatch.setattr(band_fluxes, "prepare", None)
     run(filled, wanted())
 
 

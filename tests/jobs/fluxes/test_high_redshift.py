@@ -5,7 +5,8 @@ import pyarrow as pa
 import pytest
 
 from jobs.accuracy import SURVEY
-from jobs.fluxes import cosmology, extinction, high_redshift, passbands, spectra
+from jobs.fluxes import band_fluxes, cosmology, high_redshift, passbands
+from jobs.fluxes.spectra import extinction
 from lake_schema import units
 from lake_schema.errors import BadInput, OutOfRange
 
@@ -111,9 +112,10 @@ def test_all_kinds_in_one_table(distant, galaxies, library):
         [galaxies(5), distant(4, 2), galaxies(3, seed=9), distant(6, 3)], promote_options="permissive"
     )
     bands = ["euclid_h", "lsst_r"]
-    whole = spectra.galaxy_fluxes(table, bands, library, SURVEY)
+    whole = band_fluxes.galaxy_fluxes(table, bands, library, SURVEY)
     parts = [
-        spectra.galaxy_fluxes(table.slice(i, n), bands, library, SURVEY) for i, n in ((0, 5), (5, 4), (9, 3), (12, 6))
+        band_fluxes.galaxy_fluxes(table.slice(i, n), bands, library, SURVEY)
+        for i, n in ((0, 5), (5, 4), (9, 3), (12, 6))
     ]
     assert whole.equals(pa.concat_tables(parts))
     alone = high_redshift.fluxes(table.slice(12, 6), [H])[:, 0]

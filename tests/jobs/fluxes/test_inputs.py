@@ -5,14 +5,16 @@ import hashlib
 import numpy as np
 import pytest
 
-from jobs.fluxes import continuum, inputs, passbands, templates
-from jobs.own_files import Curves, OwnCurves
+from jobs.fluxes import inputs, passbands
+from jobs.fluxes.libraries.vega import spectrum_file
+from jobs.fluxes.spectra import continuum
+from jobs.request.files import Curves, OwnCurves
 from lake_schema.errors import BadInput
+from lake_schema.store.validate import check
 from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
 from lake_schema.tables.passbands import PASSBANDS
 from lake_schema.tables.templates import TEMPLATES
-from lake_schema.validate import check
-from tests.jobs.fluxes.test_ingest import BAND, FLUX, RESPONSE, WAVELENGTH, ascii_file, votable
+from tests.jobs.fluxes.libraries.test_from_files import BAND, FLUX, RESPONSE, WAVELENGTH, ascii_file, votable
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +42,7 @@ def test_embedded_templates_say_where_they_are_from(embedded):
     assert rows.num_rows == 31 + 9 + 15 + 444
     vega = next(row for row in rows.select(["name", "source", "sha256"]).to_pylist() if row["name"] == "Vega")
     assert vega["source"].startswith("vega.txt")
-    assert vega["sha256"] == hashlib.sha256(templates.spectrum_file("vega.txt").read_bytes()).hexdigest()
+    assert vega["sha256"] == hashlib.sha256(spectrum_file("vega.txt").read_bytes()).hexdigest()
     galaxies = rows.filter(np.array([name == "galaxy" for name in rows["library"].to_pylist()]))
     assert [galaxies["source"][k].as_py().partition(":")[0] for k in (0, 13, 30)] == [
         "CWW_E_ext.sed, CWW_Sbc_ext.sed", "CWW_Sbc_ext.sed, CWW_Scd_ext.sed", "CWW_Im_ext.sed, templates.py",

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from jobs.render.effects import bias_structure, crosstalk, illumination, nonlinearity, pixel_response, quadrants
+from jobs.render.effects.charge import pixel_response
+from jobs.render.effects.light import illumination
+from jobs.render.effects.readout import bias_structure, crosstalk, nonlinearity, quadrants
 from jobs.rng import stream
 
 

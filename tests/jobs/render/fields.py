@@ -6,8 +6,10 @@ from functools import cache
 import numpy as np
 import pyarrow as pa
 
-from jobs.render import focal_plane, profiles, psf
-from jobs.render.stamps import Sources
+from jobs.render.camera import astrometry, detectors
+from jobs.render.psf import seeing
+from jobs.render.sources import galaxy_shapes
+from jobs.render.sources.source_list import Sources
 from lake_schema.ids import source_id
 from lake_schema.mission.configuration import resolve
 
@@ -17,7 +19,7 @@ MISSION = resolve()
 @cache
 def small(camera, name, n=160):
     """A detector cut down to n x n pixels about its centre, as if they were all of one half."""
-    return replace(focal_plane.detector(camera, name, MISSION), nx=n, ny=n, middle=0)
+    return replace(detectors.detector(camera, name, MISSION), nx=n, ny=n, middle=0)
 
 
 @cache
@@ -25,8 +27,8 @@ def spread(camera, name="3-4"):
     """A narrow round PSF for VIS (the optics have their own tests), the seeing disc for LSSTCam."""
     detector = small(camera, "R22_S11" if camera == "lsstcam" else name)
     if camera == "vis":
-        return psf.ground_psf(0.16, 3.5, detector.pixel_scale)
-    return psf.ground_psf(0.73, 3.0, detector.pixel_scale)
+        return seeing.ground_psf(0.16, 3.5, detector.pixel_scale)
+    return seeing.ground_psf(0.73, 3.0, detector.pixel_scale)
 
 
 DEFAULTS = {
@@ -67,8 +69,8 @@ def one_source(detector, system, electrons=1e5, column=None, row=None, **shape):
     """A single galaxy (or, without a shape, a point) as what is drawn."""
     column = np.array([(detector.nx - 1) / 2 if column is None else column])
     row = np.array([(detector.ny - 1) / 2 if row is None else row])
-    jacobian = focal_plane.jacobian(system, column, row)
-    form = profiles.shapes(galaxies(0.0, 0.0, **shape))
+    jacobian = astrometry.jacobian(system, column, row)
+    form = galaxy_shapes.shapes(galaxies(0.0, 0.0, **shape))
     which = np.array([0 if shape else -1])
     return Sources(np.array([1]), column, row, jacobian, np.array([float(electrons)]), which, form)
 

@@ -7,7 +7,11 @@ import pytest
 
 from jobs.accuracy import SURVEY
 from jobs.fluxes import passbands
-from jobs.render import exposing, exposure, focal_plane, psf
+from jobs.render.camera import astrometry
+from jobs.render.camera.pointing import boresight_for
+from jobs.render.exposure import render
+from jobs.render.planning import planned_exposures
+from jobs.render.psf import euclid
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, stars
 
 TIME = MISSION.value("vis.exposure_time", "s")
@@ -25,13 +29,13 @@ def off(*names):
 @cache
 def spread(detector):
     """The detector's PSF, for all of its exposures."""
-    return psf.vis_psf(detector, passbands.load("euclid_vis"), MISSION)
+    return euclid.vis_psf(detector, passbands.load("euclid_vis"), MISSION)
 
 
 @cache
 def pointing(detector):
     """Where the telescope looks so that the detector sees a field at high latitude; turned a little."""
-    return focal_plane.boresight_for(detector, 53.1, -27.8, 12.0)
+    return boresight_for(detector, 53.1, -27.8, 12.0)
 
 
 def rendered(
@@ -46,18 +50,18 @@ def rendered(
     exposed = {
         "exposure_id": number, "channel": "VIS", "camera": "vis", "band": "euclid_vis", "image_type": kind,
         "ra": ra, "dec": dec, "position_angle": angle, "mjd": 60905.0 + number, "exposure_time_s": seconds,
-        "seeing": 0.0, "sky": sky, "zero_point": exposing.zero_point_of("vis", "euclid_vis", mission),
+        "seeing": 0.0, "sky": sky, "zero_point": planned_exposures.zero_point_of("vis", "euclid_vis", mission),
     }  # fmt: skip
-    system = focal_plane.wcs(detector, ra, dec, angle)
-    where = focal_plane.sky_of_pixel(system, np.atleast_1d(x).astype(float), np.atleast_1d(y).astype(float))
+    system = astrometry.wcs(detector, ra, dec, angle)
+    where = astrometry.sky_of_pixel(system, np.atleast_1d(x).astype(float), np.atleast_1d(y).astype(float))
     bodies, points = galaxies(*where, **(body or {})), stars(*where)
     bodies, points = (bodies, points.slice(0, 0)) if body else (bodies.slice(0, 0), points)
     f_nu = 10 ** (-0.4 * (np.atleast_1d(mags) - 23.9))
     with pytest.MonkeyPatch.context() as patch:
         if mission is MISSION:
             own = spread(detector)
-            patch.setattr(psf, "vis_psf", lambda *_: own)
-        return exposure.render(
+            patch.setattr(euclid, "vis_psf", lambda *_: own)
+        return render.render(
             {"detector": detector.name}, exposed,
             bodies, fluxes(bodies, "euclid_vis", f_nu if body else 0.0),
             points, fluxes(points, "euclid_vis", 0.0 if body else f_nu),

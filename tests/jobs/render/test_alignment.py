@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 
 from jobs.accuracy import SURVEY
-from jobs.catalogue import lensing
+from jobs.catalogue.galaxies import lensing
 from jobs.fluxes import passbands
-from jobs.render import exposure, stamps
-from jobs.render.focal_plane import boresight_for, pixel_of_sky, wcs
+from jobs.render.camera.astrometry import pixel_of_sky, wcs
+from jobs.render.camera.pointing import boresight_for
+from jobs.render.drawing import settings, stamps
+from jobs.render.exposure import visible_sources
 from lake_schema import sky
 from tests.jobs.render.fields import galaxies, moments, small, spread, stars
 
@@ -47,9 +49,9 @@ def test_alignment_about_a_halo_is_tangential(camera, name, angle, shears):
     band = passbands.load("euclid_vis" if camera == "vis" else "lsst_r")
     lon, lat = offset(50 * scale, BEARINGS)
     body = galaxies(lon, lat, disk_half_light_radius=3.5 * scale, gamma1=shears[0], gamma2=shears[1])
-    found, sizes = exposure.sources_of(
+    found, sizes = visible_sources.sources_of(
         (body, np.full(len(body), 1e6)), (stars([], []), np.zeros(0)), detector, system, spread(camera), NOISE,
-        stamps.settings_for(SURVEY), band,
+        settings.settings_for(SURVEY), band,
     )  # fmt: skip
     image = stamps.draw(found, sizes, spread(camera), SIDE, SIDE)
     halo = np.array([axis[0] for axis in pixel_of_sky(system, [RA], [DEC])])

@@ -12,12 +12,15 @@ from astropy.io import fits
 from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import fits_product, focal_plane, moving, plan_exposures, render_exposures
-from jobs.request import from_table
-from lake_schema import layout, publish, read
+from jobs.render import plan_exposures, render_exposures
+from jobs.render.camera import detectors
+from jobs.render.products import read_back
+from jobs.render.sources import solar_system
+from jobs.request.from_toml import from_table
 from lake_schema.ecliptic import ecliptic
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_of
+from lake_schema.store import layout, publish, read
 from tests import requests
 
 MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures)
@@ -47,14 +50,14 @@ def wanted():
 @contextmanager
 def small_detectors(side=256):
     """Detectors of VIS cut down to their middles, two halves and what is between them."""
-    mounted = focal_plane._mounted
+    mounted = detectors._mounted
 
     def smaller(*args):
         for d in mounted(*args):
             yield replace(d, nx=side, ny=side + d.middle)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(focal_plane, "_mounted", smaller)
+        patch.setattr(detectors, "_mounted", smaller)
         yield
 
 
@@ -76,7 +79,7 @@ def check(lake, rows, columns):
             assert header.get("LAMP") == exposed["lamp"]
             assert [unit.shape for unit in units[1:]] == [(rows, columns)] * 4
         least, most = KINDS[kind] if exposed["exposure_time_s"] != SHORT else (10, 40)
-        assert least < np.median(fits_product.electrons(path).data) < most
+        assert least < np.median(read_back.electrons(path).data) < most
         found.add((kind, round(exposed["exposure_time_s"])))
     assert found == {
         ("science", 561), ("science", 90), ("flat", 10), ("bias", 0), ("dark", 600), ("charge_injection", 0),
@@ -104,7 +107,7 @@ def moving_of(lake):
     """Kind of image -> how many bodies are drawn on its frames."""
     exposures, found = exposures_of(lake), defaultdict(set)
     drawn = read.version(lake, "rendered_truth").rows(["exposure_id", "id"])
-    count = Counter(drawn["exposure_id"].to_numpy()[kind_of(drawn["id"].to_numpy()) == moving.KIND].tolist())
+    count = Counter(drawn["exposure_id"].to_numpy()[kind_of(drawn["id"].to_numpy()) == solar_system.KIND].tolist())
     for number, row in exposures.items():
         found[row["image_type"]].add(count[number])
     return found

@@ -3,23 +3,32 @@
 import numpy as np
 import pytest
 
-from jobs import request as requests
-from jobs.render import coverage, exposing, focal_plane, plan_exposures, tasks
+from jobs.render import coverage, plan_exposures
+from jobs.render.camera import astrometry, detectors
 from jobs.render.plan_exposures import plan
-from lake_schema import publish, read, sky
+from jobs.render.planning import planned_exposures, source_counts, tasks
+from jobs.request import schema
+from jobs.request.from_toml import from_table
+from lake_schema import sky
 from lake_schema.mission.configuration import resolve
+from lake_schema.store import publish, read
 
 
 @pytest.mark.parametrize("distortion", [0.0, 0.01])
 def test_a_footprint_ends_where_the_detector_does(distortion):
     """To the pixel; where the optics distort, sides are bent, and a footprint's are straight: to three."""
     mission = resolve(overrides={"vis.fpa.distortion": (distortion, "")})
-    exposure = exposing.Exposure("VIS", "vis", "euclid_vis", "science", 10.0, 85.0, 33.0, 60905.0, 560.0, "x", sky=0.2)
-    rows = tasks.table(
-        exposing.table([exposure], [mission]), [("2-5",)], mission, tasks.Densities(mission, requests.Universe())
+    exposure = planned_exposures.Exposure(
+        "VIS", "vis", "euclid_vis", "science", 10.0, 85.0, 33.0, 60905.0, 560.0, "x", sky=0.2
     )
-    detector = focal_plane.detector("vis", "2-5", mission)
-    system = focal_plane.wcs(detector, 10.0, 85.0, 33.0)
+    rows = tasks.table(
+        planned_exposures.table([exposure], [mission]),
+        [("2-5",)],
+        mission,
+        source_counts.Densities(mission, schema.Universe()),
+    )
+    detector = detectors.detector("vis", "2-5", mission)
+    system = astrometry.wcs(detector, 10.0, 85.0, 33.0)
     x, y = np.random.default_rng(1).uniform(-500, 4600, (2, 3000))
     inside = (x > -0.5) & (x < detector.nx - 0.5) & (y > -0.5) & (y < detector.ny - 0.5)
     assert 0.3 < inside.mean() < 0.95
@@ -28,7 +37,7 @@ def test_a_footprint_ends_where_the_detector_does(distortion):
         edges = np.abs([x + 0.5, x - detector.nx + 0.5, y + 0.5, y - detector.ny + 0.5])
         sharp = edges.min(axis=0) > 3.0
         assert 0.98 < sharp.mean() < 1.0
-    found = coverage.counts(rows, *focal_plane.sky_of_pixel(system, x, y))
+    found = coverage.counts(rows, *astrometry.sky_of_pixel(system, x, y))
     np.testing.assert_array_equal(found[sharp], inside[sharp])
 
 
@@ -37,7 +46,7 @@ def dithers(tmp_path_factory):
     """Channel -> how often random places in the interior of a request are seen in one band."""
     area = {"cone": {"ra": 150.0, "dec": 20.0, "radius": 1.4}}
     block = {"channels": ["VIS", "NISP-P"], "short": False, "flat": False}
-    wanted = requests.from_table({"name": "x", "seed": 7, "area": area, "observation": [block]})
+    wanted = from_table({"name": "x", "seed": 7, "area": area, "observation": [block]})
     _, exposures, rows = plan(tmp_path_factory.mktemp("none"), wanted)
     seen = {row["exposure_id"] for row in exposures.to_pylist() if row["band"] in ("euclid_vis", "euclid_j")}
     assert len(seen) > 60
@@ -60,7 +69,7 @@ def test_a_plan_is_mapped_from_the_lake(lake, capsys):
     """One field of four dithers: its middle is seen four times, but for the gaps; the map shows what was measured."""
     area = {"cone": {"ra": 150.0, "dec": 20.0, "radius": 0.5}}
     block = {"channels": ["VIS"], "fields": 1}
-    wanted = requests.from_table({"name": "x", "seed": 7, "area": area, "observation": [block]})
+    wanted = from_table({"name": "x", "seed": 7, "area": area, "observation": [block]})
     for step in plan_exposures.steps(lake, wanted):
         publish.make(lake, step.plan, step.work)
     picture = lake / "coverage.png"

@@ -2,8 +2,8 @@
 
 import pytest
 
-from jobs.render import ground
-from jobs.request import Observation
+from jobs.render.planning import ground_surveys
+from jobs.request.observations import Observation
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 
@@ -16,7 +16,7 @@ ROW = "EXT,lsstcam,lsst_r,-10.0,20.5,30.0,60905.25"
 def read(tmp_path, text):
     path = tmp_path / "pointings.csv"
     path.write_text(text)
-    return ground.read(path, BLOCK, MISSION)
+    return ground_surveys.read(path, BLOCK, MISSION)
 
 
 def test_a_line_is_an_exposure(tmp_path):

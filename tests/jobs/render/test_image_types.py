@@ -6,14 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jobs import request as requests
 from jobs import rng
-from jobs.render import exposing, exposure, fits_product, focal_plane
-from jobs.render.channels import vis
-from jobs.render.effects import calibration_lamp
-from jobs.render.effects.effect import Scene, apply_all
+from jobs.render.camera import astrometry, detectors
+from jobs.render.channels import image_types, vis
+from jobs.render.effects.effect import apply_all
+from jobs.render.effects.light import calibration_lamp
+from jobs.render.effects.scene import Scene
+from jobs.render.exposure import render, rendered, scene_of
 from jobs.render.plan_exposures import plan
-from lake_schema import fits
+from jobs.render.products import fits_files, read_back
+from jobs.request.from_toml import parse
+from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render.fields import fluxes, galaxies, stars
 
@@ -25,7 +28,7 @@ SIDE = 256
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory):
     """Mission, one exposure of each kind (of a flat: each lamp), by (image type, seconds, lamp)."""
-    request = requests.parse(EXAMPLE)
+    request = parse(EXAMPLE)
     mission, exposures, tasks = plan(tmp_path_factory.mktemp("none"), request)
     assert len(tasks) == len(exposures) == 3 + 20 + 3 + 24 + 3 + 4
     rows = {}
@@ -37,23 +40,23 @@ def planned(tmp_path_factory):
 def written(planned, row, folder, forced=None, magnitude=20.0):
     """(what was rendered, what is read of its file): a galaxy and a star in the lower half of the detector."""
     request, mission, _ = planned
-    detector = replace(focal_plane.detector("vis", "3-4", mission), nx=SIDE, ny=SIDE, middle=0)
-    system = focal_plane.wcs(detector, row["ra"], row["dec"], row["position_angle"])
-    where = [focal_plane.sky_of_pixel(system, [x], [30.0]) for x in (30.0, 90.0)]
+    detector = replace(detectors.detector("vis", "3-4", mission), nx=SIDE, ny=SIDE, middle=0)
+    system = astrometry.wcs(detector, row["ra"], row["dec"], row["position_angle"])
+    where = [astrometry.sky_of_pixel(system, [x], [30.0]) for x in (30.0, 90.0)]
     flux = 10 ** (0.4 * (23.9 - magnitude))
     body, point = galaxies(*where[0]), stars(*where[1])
-    one = exposure.render(
+    one = render.render(
         {"detector": "3-4"}, row, body, fluxes(body, "euclid_vis", flux), point, fluxes(point, "euclid_vis", flux),
         mission, request.accuracy, request.seed, forced, detector, truth=request.truth,
     )  # fmt: skip
-    rows, writers = fits_product.products(one, request.truth, request.compression == "rice")
+    rows, writers = fits_files.products(one, request.truth, request.compression == "rice")
     for path, write in writers.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         write(folder / path)
-    read = fits_product.frame(folder / rows["path"][0].as_py())
+    read = read_back.frame(folder / rows["path"][0].as_py())
     np.testing.assert_array_equal(read.data, one.science)
     for content, path in zip(rows["content"].to_pylist()[1:], rows["path"].to_pylist()[1:], strict=True):
-        (image,) = fits.read_images(folder / path)
+        (image,) = images.read_images(folder / path)
         np.testing.assert_array_equal(image.data, one.maps[content])
     return one, {keyword: value for keyword, value, _ in read.cards}
 
@@ -86,7 +89,7 @@ def test_each_is_rendered_and_read(planned, tmp_path, key, least, most):
     assert header["MISSION"] == planned[1].fingerprint
     level = (np.median(one.science) - header["BIAS"]) * header["GAIN"]
     assert least < level < most
-    looks = exposing.sees_sky("VIS", key[0])
+    looks = image_types.sees_sky("VIS", key[0])
     assert len(one.sources) == 2 * looks
     names = {d.name for d in one.decisions if d.applied}
     assert ("readout_trail" in {d.name for d in one.decisions}) == (key[0] == "flat")
@@ -99,7 +102,7 @@ def test_each_is_rendered_and_read(planned, tmp_path, key, least, most):
         assert (told is not None) == (decision.applied and decision.name in effects)
         if told is not None:
             mine = np.random.Philox(key=np.array([int(told[:16], 16), int(told[16:], 16)], np.uint64))
-            identity = exposure.numbers_of(effects[decision.name], row, "3-4", planned[0].seed)
+            identity = rendered.numbers_of(effects[decision.name], row, "3-4", planned[0].seed)
             again = rng.stream(*identity)
             assert np.random.Generator(mine).random() == again.random()
 
@@ -139,7 +142,7 @@ def test_lamps_shine_from_their_own_side(planned, tmp_path):
         assert header["LAMP"] == lamp
         frame, half = one.science.astype(float), SIDE // 2
         slopes[lamp] = np.array([np.diff([f[:, :half].mean(), f[:, half:].mean()])[0] for f in (frame, frame.T)])
-    everything = focal_plane.detectors("vis", mission)
+    everything = detectors.detectors("vis", mission)
     reach = [max(abs(getattr(d, a)) for d in everything) + d_n * 0.05 for a, d_n in (("x", 4096), ("y", 4136))]
     # ADU between the halves' middles; the detector is mounted upside down.
     steepest = -mission.value("vis.flat.signal") * mission.value("vis.flat.gradient") / mission.value("vis.gain")
@@ -157,8 +160,8 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
     """
     row = next(row for (name, *_), row in planned[2].items() if name == kind)
     _, mission, _ = planned
-    detector = replace(focal_plane.detector("vis", "3-4", mission), nx=32, ny=32, middle=0)
-    scene = exposure.scene_of(row, detector, mission, planned[0].accuracy)
+    detector = replace(detectors.detector("vis", "3-4", mission), nx=32, ny=32, middle=0)
+    scene = scene_of.scene_of(row, detector, mission, planned[0].accuracy)
 
     def keys(forced):
         found = {}
@@ -172,7 +175,7 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
             return replace(effect, apply=apply)
 
         def stream(effect):
-            return rng.stream(*exposure.numbers_of(effect, row, "3-4", 1))
+            return rng.stream(*rendered.numbers_of(effect, row, "3-4", 1))
 
         apply_all(
             np.full((32, 32), 50.0), [watched(e) for e in vis.EFFECTS[kind]], replace(scene, forced=forced), stream

@@ -10,14 +10,19 @@ from hypothesis import strategies as st
 
 from jobs.accuracy import SURVEY
 from jobs.fluxes import passbands
-from jobs.render import exposure, focal_plane, outskirts, render_exposures, selection, stamps
+from jobs.render.camera import astrometry, pointing
+from jobs.render.drawing import stamp_sizes, stamps
+from jobs.render.drawing.settings import settings_for
+from jobs.render.exposure import render, visible_sources
+from jobs.render.products import keys
+from jobs.render.sources import catalogue_rows, galaxy_shapes, selection
 from lake_schema import sky
+from tests.jobs.render.exposure.test_render import field as field_of
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, spread, stars
-from tests.jobs.render.test_exposure import field as field_of
 
 BAND, DETECTOR = "lsst_r", small("lsstcam", "R22_S11")
 MARGIN = MISSION.value("survey.selection_margin", "arcsec")
-FARTHER = stamps.reach(DETECTOR.pixel_scale) - MARGIN
+FARTHER = stamp_sizes.reach(DETECTOR.pixel_scale) - MARGIN
 # A giant: in LSST 8e7 electrons, its light far above the noise a few minutes of arc away.
 GIANT = {"disk_half_light_radius": 20.0, "bulge_half_light_radius": 15.0, "bulge_fraction": 1.0,
          "bulge_sersic_index": 4.0}  # fmt: skip
@@ -57,7 +62,7 @@ def place():
 def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
     """A detector with one galaxy so many arcsec north of its centre, as a task reads it, or as it stands."""
     task = {"detector": "R22_S11", **place()}
-    ra, dec, angle = focal_plane.boresight_for(DETECTOR, task["ra"], task["dec"], 0.0)
+    ra, dec, angle = pointing.boresight_for(DETECTOR, task["ra"], task["dec"], 0.0)
     exposed = {**field_of("EXT")[1], "ra": ra, "dec": dec, "position_angle": angle}
     body = galaxies(task["ra"], task["dec"] + distance / 3600, **{**GIANT, **shape})
     nothing = stars([], [])
@@ -66,11 +71,11 @@ def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
     if found:
         cells = sky.cell_of([task["ra"]], [task["dec"] + distance / 3600], 8)
         wanted = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist()) if drawn is None else drawn(task)
-        least = exposure.least_flux(exposed, DETECTOR, MISSION, SURVEY)
-        body, light, complete = render_exposures.sources(
+        least = visible_sources.least_flux(exposed, DETECTOR, MISSION, SURVEY)
+        body, light, complete = catalogue_rows.sources(
             Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], BAND, FARTHER, least
         )
-    return exposure.render(
+    return render.render(
         task, exposed, body, light, nothing, fluxes(nothing, BAND, 1.0), MISSION, SURVEY, 1, detector=DETECTOR,
         complete=MARGIN + complete,
     )  # fmt: skip
@@ -85,12 +90,12 @@ def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
         light.append(float(one.noise_free.sum()))
     assert (np.diff(light) < 0).all()
     assert light[-1] > 0
-    assert one.complete == pytest.approx(stamps.reach(0.2), abs=0.5)
+    assert one.complete == pytest.approx(stamp_sizes.reach(0.2), abs=0.5)
 
 
 def test_what_lies_beyond_the_reach_or_is_faint_changes_no_byte():
     # Nobody shines so far.
-    far = outskirts.FARTHEST + DETECTOR.half_diagonal + 1.0
+    far = selection.FARTHEST + DETECTOR.half_diagonal + 1.0
     empty = rendered(far, found=False)
     assert len(empty.sources) == 0
     assert not empty.noise_free.any()
@@ -138,12 +143,12 @@ def test_completeness_ends_before_the_first_cell_that_is_missing(ra, dec, farthe
 
 def test_the_bound_on_what_shows_holds():
     """Whatever the profile, a source below the bound is below the edge at that distance."""
-    settings = stamps.settings_for(SURVEY)
-    least = stamps.least_electrons(MARGIN, 0.2, 40.0, settings)
+    settings = settings_for(SURVEY)
+    least = stamp_sizes.least_electrons(MARGIN, 0.2, 40.0, settings)
     for index in (0.5, 1.0, 4.0, 6.0):
         for radius in (1.0, 10.0, 60.0):
             form = galaxies(0.0, 0.0, bulge_sersic_index=index, bulge_half_light_radius=radius, bulge_fraction=1.0)
-            surface = stamps.profiles.surface(stamps.profiles.shapes(form), np.array([MARGIN]))[0, 0]
+            surface = galaxy_shapes.surface(galaxy_shapes.shapes(form), np.array([MARGIN]))[0, 0]
             assert least * surface * 0.2**2 < settings.edge * 40.0
 
 
@@ -152,12 +157,12 @@ def test_the_bound_on_what_shows_holds():
 def test_a_frame_that_no_source_shows_in_reads_none(dark):
     exposed = {**field_of("VIS")[1], **dark}
     detector, task = small("vis", "3-4"), place()
-    least = exposure.least_flux(exposed, detector, MISSION, SURVEY)
+    least = visible_sources.least_flux(exposed, detector, MISSION, SURVEY)
     assert least == np.inf
     cells = sky.cell_of([task["ra"]], [task["dec"]], 8)
-    assert np.isfinite(exposure.least_flux(field_of("VIS")[1], detector, MISSION, SURVEY))
+    assert np.isfinite(visible_sources.least_flux(field_of("VIS")[1], detector, MISSION, SURVEY))
     body = Catalogue(galaxies(task["ra"], task["dec"], **GIANT), cells, set(cells.tolist()))
-    rows, light, complete = render_exposures.sources(body, body, task, [], BAND, FARTHER, least)
+    rows, light, complete = catalogue_rows.sources(body, body, task, [], BAND, FARTHER, least)
     assert len(rows) == len(light) == 0
     assert complete == FARTHER
 
@@ -167,7 +172,7 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     detector, task = small("vis", "3-4"), place()
     exposed = {**field_of("VIS")[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
     band = passbands.load("euclid_vis")
-    spikes = exposure.spike_flux(exposed, detector, MISSION, SURVEY, band)
+    spikes = visible_sources.spike_flux(exposed, detector, MISSION, SURVEY, band)
     # A star of 11.2 mag where those of all magnitudes end (3.4 minutes of arc), in a nominal exposure.
     assert 23.9 - 2.5 * np.log10(spikes) == pytest.approx(11.2, abs=0.3)
     rows = stars([task["ra"]] * 2, [task["dec"] - 0.3] * 2)
@@ -175,15 +180,15 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     cells = sky.cell_of(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 8)
     drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
-    least = exposure.least_flux(exposed, detector, MISSION, SURVEY)
+    least = visible_sources.least_flux(exposed, detector, MISSION, SURVEY)
     for limit, wanted in ((spikes, [0]), (np.inf, [])):
-        found, shining, complete = render_exposures.sources(*catalogues, task, [], "euclid_vis", 85.0, least, limit)
+        found, shining, complete = catalogue_rows.sources(*catalogues, task, [], "euclid_vis", 85.0, least, limit)
         assert found.equals(rows.take(pa.array(wanted, pa.int64())))
         assert shining["id"].equals(found["id"])
         assert complete == 85.0
     for other in ({"image_type": "dark"}, {"exposure_time_s": 0.0}, {"psf": "own.fits"}):
-        assert exposure.spike_flux({**exposed, **other}, detector, MISSION, SURVEY, band) == np.inf
-    assert exposure.spike_flux(field_of("EXT")[1], DETECTOR, MISSION, SURVEY, band) == np.inf
+        assert visible_sources.spike_flux({**exposed, **other}, detector, MISSION, SURVEY, band) == np.inf
+    assert visible_sources.spike_flux(field_of("EXT")[1], DETECTOR, MISSION, SURVEY, band) == np.inf
 
 
 @dataclass
@@ -211,7 +216,7 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     """One of m 7 and two minutes of arc, a third of a degree away; a small one, and a faint one, are not drawn."""
     detector, task = small(camera, name), place()
     exposed = {**field_of(channel)[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
-    limit = exposure.outer_flux(exposed, detector, MISSION, SURVEY)
+    limit = visible_sources.outer_flux(exposed, detector, MISSION, SURVEY)
     form = {"bulge_sersic_index": [4.0, 1.0, 4.0], "bulge_half_light_radius": [120.0, 2.0, 120.0]}
     rows = galaxies([task["ra"]] * 3, [task["dec"] - 0.3] * 3, bulge_fraction=1.0, **form)
     mags = np.array([7.0, 7.0, 27.0])
@@ -219,20 +224,20 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     cells = sky.cell_of(np.full(3, task["ra"]), np.full(3, task["dec"] - 0.3), 8)
     drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
-    found, shining, _ = render_exposures.sources(*catalogues, task, [], "euclid_vis", 85.0, limit, limit)
+    found, shining, _ = catalogue_rows.sources(*catalogues, task, [], "euclid_vis", 85.0, limit, limit)
     assert found["id"].to_pylist() == rows["id"].to_pylist()[:2]
     assert shining["id"].equals(found["id"])
-    system = focal_plane.wcs(detector, *focal_plane.boresight_for(detector, task["ra"], task["dec"], 0.0))
+    system = astrometry.wcs(detector, *pointing.boresight_for(detector, task["ra"], task["dec"], 0.0))
     electrons = shining["f_nu_euclid_vis"].to_numpy() * 560.53 * 10 ** (0.4 * (25.93 - 23.9))
-    noise, settings = 12.0, stamps.settings_for(SURVEY)
-    seen, sizes = exposure.sources_of(
+    noise, settings = 12.0, settings_for(SURVEY)
+    seen, sizes = visible_sources.sources_of(
         (found, electrons), (stars([], []), np.zeros(0)), detector, system, spread(camera), noise, settings,
         passbands.load("euclid_vis" if channel == "VIS" else "lsst_r"),
     )  # fmt: skip
     assert seen.ids.tolist() == rows["id"].to_pylist()[:1]
     image = stamps.draw(seen, sizes, spread(camera), detector.nx, detector.ny)
     assert image.min() > 0.1 * noise
-    assert exposure.outer_flux({**exposed, "image_type": "bias"}, detector, MISSION, SURVEY) == np.inf
+    assert visible_sources.outer_flux({**exposed, "image_type": "bias"}, detector, MISSION, SURVEY) == np.inf
 
 
 def test_a_product_is_of_what_it_may_show_from_far_away():
@@ -255,7 +260,7 @@ def test_a_product_is_of_what_it_may_show_from_far_away():
         for name, columns in (("galaxies", ("ra_lensed",)), ("stars", ()), ("galaxy_fluxes", ()), ("star_fluxes", ())):
             inputs[name] = Files(columns, cells, {"near": "a", "far": "b" if name == changed else "a"})
         facts = {"request": {}, "mission": "m", "code": "c"}
-        found.append(render_exposures.product_keys(facts, pa.Table.from_pylist(some), tasks, inputs, MISSION))
+        found.append(keys.product_keys(facts, pa.Table.from_pylist(some), tasks, inputs, MISSION))
     (vis, ext), (vis_stars, ext_stars), (vis_galaxies, ext_galaxies) = found
     assert vis_stars != vis
     assert ext_stars == ext

@@ -3,15 +3,18 @@
 import numpy as np
 import pytest
 
-from jobs import request
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes, inputs, passbands
-from jobs.render import exposing, plan_exposures, render_exposures
-from lake_schema import publish, read, units
+from jobs.render import plan_exposures, render_exposures
+from jobs.render.planning import mission, planned_exposures
+from jobs.request import schema
+from jobs.request.from_toml import parse
+from lake_schema import units
 from lake_schema.errors import BadInput
+from lake_schema.store import publish, read
 from tests import requests
 
-MISSION = plan_exposures.mission_of(request.MissionChoice())
+MISSION = mission.mission_of(schema.MissionChoice())
 WAVELENGTH = np.arange(5000.0, 9501.0, 10.0)
 # A filter within VIS, synthetic.
 RESPONSE = 0.5 * np.exp(-0.5 * ((WAVELENGTH - 6500.0) / 400.0) ** 2)
@@ -39,7 +42,7 @@ SURVEY = 'channels = ["EXT"]\nsurvey = "lsst"\nbands = ["lsst_r", "mine"]'
 
 def asked(folder, keys=POINTING, block="pointing", response=RESPONSE):
     np.savetxt(folder / "mine.dat", np.stack([WAVELENGTH, response], 1))
-    return request.parse(requests.written(folder, f"{OWN}[[{block}]]\n{keys}\n", requests.FIELD.format(0.3), seed=5))
+    return parse(requests.written(folder, f"{OWN}[[{block}]]\n{keys}\n", requests.FIELD.format(0.3), seed=5))
 
 
 def test_it_is_planned_with_its_own_zero_point_and_sky(lake, tmp_path):
@@ -48,7 +51,7 @@ def test_it_is_planned_with_its_own_zero_point_and_sky(lake, tmp_path):
     assert (row["band"], rows["detector"].to_pylist()) == ("mine", ["3-4"])
     width = np.trapezoid(RESPONSE / WAVELENGTH, WAVELENGTH)
     assert row["zero_point"] == pytest.approx(units.zero_point(9926.0, width), abs=1e-3)
-    wide = exposing.zero_point_of("vis", "euclid_vis", MISSION)
+    wide = planned_exposures.zero_point_of("vis", "euclid_vis", MISSION)
     assert row["zero_point"] < wide
     # The sky is redder than the filter, fainter than in all of VIS, brighter than the band's scattered light alone.
     scattered = MISSION.value("vis.scattered_light", "electron / (s pix)") * 10 ** (0.4 * (row["zero_point"] - wide))

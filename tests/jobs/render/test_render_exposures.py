@@ -18,18 +18,26 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from jobs import shell
-from jobs.catalogue import build_galaxies, build_stars, build_strong_lenses, strong_lenses
+from jobs.catalogue import build_galaxies, build_stars, build_strong_lenses
+from jobs.catalogue.galaxies import strong_lenses
 from jobs.fluxes import compute_fluxes
-from jobs.render import archive, fits_product, focal_plane, plan_exposures, render_exposures, truth_maps
-from jobs.request import from_table
-from lake_schema import ids, layout, publish, read, sky, tables
+from jobs.render import archive, plan_exposures, render_exposures
+from jobs.render.camera import detectors
+from jobs.render.exposure import truth_maps
+from jobs.render.planning import preconditions
+from jobs.render.products import keys as products_keys
+from jobs.render.products import truth_table
+from jobs.render.sources import catalogue_rows
+from jobs.request.from_toml import from_table
+from lake_schema import ids, sky, tables
 from lake_schema.errors import BadInput, PartsFailed
-from lake_schema.plan import Part
-from lake_schema.provenance import file_sha256
+from lake_schema.store import layout, publish, read, stage
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests import requests
 from tests.faults.victims import CONTEXT
-from tests.jobs.render.test_own_psf import cube, gaussian
+from tests.jobs.render.psf.test_from_file import cube, gaussian
 
 SIDE = 300
 SMALL = f"""
@@ -55,13 +63,13 @@ REQUEST = tomllib.loads(requests.text(SMALL, requests.FIELD.format(0.03), seed=7
 @contextmanager
 def small_detectors():
     """Detectors of LSSTCam cut down to their middles, close together."""
-    listed = focal_plane._listed
+    listed = detectors._listed
 
     def smaller(section, mission):
         return tuple(replace(d, nx=SIDE, ny=SIDE, x=d.x / 20, y=d.y / 20) for d in listed(section, mission))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(focal_plane, "_listed", smaller)
+        patch.setattr(detectors, "_listed", smaller)
         yield
 
 
@@ -200,7 +208,7 @@ def test_a_bad_detector_is_a_row_and_not_the_end_of_the_run(lake, monkeypatch, t
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) == {"error": failed["error"]}
     assert failed["seconds"] >= 0
     assert 0 < failed["peak_gb"] < 100
-    assert len(publish.missing(layout.stage(lake, "products", step.plan.key), step.plan)) == 1
+    assert len(stage.missing(layout.stage(lake, "products", step.plan.key), step.plan)) == 1
     # Only what failed is made by the next run, and is then no failure any more.
     made = []
     monkeypatch.setattr(render_exposures, "work", lambda root, facts: made.append(facts) or WORK(root, facts))
@@ -245,9 +253,9 @@ def test_a_source_beyond_the_reach_of_any_stamp_changes_no_byte(lake, rendered):
         def near(root, facts, version=version):
             rows = version.rows(parts=[facts["part"]])
             distance = sky.separation(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 53.117, -27.808)
-            return publish.Output(rows.filter(distance < 8 / 60))
+            return Output(rows.filter(distance < 8 / 60))
 
-        publish.make(lake, publish.Plan(table, {**whole["facts"], "without": "the far ones"}, parts), near)
+        publish.make(lake, Plan(table, {**whole["facts"], "without": "the far ones"}, parts), near)
         assert 20 < read.version(lake, name).num_rows < 0.95 * version.num_rows
     make(lake, wanted(), compute_fluxes)
     # Their files are others, so they are rendered, to the same bytes.
@@ -356,7 +364,7 @@ def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypat
         own = cube(tmp_path / "psf.fits", gaussian(width))
         found.append(keys(rendered, wanted(psf={"lsst_r": str(own)}), plan=True))
     with monkeypatch.context() as patch:
-        patch.setattr(render_exposures, "file_sha256", lambda path: "another")
+        patch.setattr(products_keys, "file_sha256", lambda path: "another")
         step = render_exposures.steps(rendered, wanted(psf={"lsst_r": str(own)}))[0]
     with pytest.raises(BadInput, match=r"psf.fits: has changed since the rendering began"):
         render_exposures.work(rendered, {**step.plan.facts, **step.plan.parts[0].facts})
@@ -396,24 +404,24 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
     after = keys(lake, crowded)
     assert all(after[part] != key for part, key in before.items())
     assert render(lake, crowded) == BOTH
-    drawn = read.version(lake, "rendered_truth").rows(where=pc.field("method") == fits_product.PICTURE)
+    drawn = read.version(lake, "rendered_truth").rows(where=pc.field("method") == truth_table.PICTURE)
     assert len(drawn) > 0
     # In an exposure of no time nothing shows: neither galaxies are read nor what lenses make of them.
     for least, shows in ((0.0, True), (np.inf, False)):
         tasks = read.version(lake, "tasks").rows().to_pylist()
-        found = sum(render_exposures.lenses(version, task, 0.1, least).num_rows for task in tasks)
+        found = sum(catalogue_rows.lenses(version, task, 0.1, least).num_rows for task in tasks)
         assert (found > 0) == shows
     assert set(drawn["id"].to_pylist()) <= set(version.rows(["id"])["id"].to_pylist())
     changed = {path for path, data in images(lake).items() if data != plain[path]}
     for detector in set(drawn["detector"].to_pylist()):
         assert sum(f"_{detector}_" in path for path in changed) == 2
-    ahead = render_exposures._refuse_other_plan
+    ahead = preconditions.refuse_other_plan
     # Of other galaxies they are not drawn.
     facts = {**version.manifest["facts"], "galaxies": "0" * 64}
     other = replace(version, manifest={**version.manifest, "facts": facts})
     monkeypatch.setattr(
-        render_exposures,
-        "_refuse_other_plan",
+        preconditions,
+        "refuse_other_plan",
         lambda inputs, request: ahead({**inputs, "strong_lenses": other}, request),
     )
     with pytest.raises(BadInput, match="strong_lenses was drawn in another version of galaxies: run build_strong_lens"):

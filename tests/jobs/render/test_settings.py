@@ -13,8 +13,10 @@ from benchmarks import _scenes as scenes
 from benchmarks._scenes import VIS, spread
 from jobs import accuracy
 from jobs.accuracy import DRAFT, PRESETS, QUICKLOOK, REFERENCE, SURVEY
-from jobs.render import psf, stamps, transfer
-from jobs.render.stamps import Settings
+from jobs.render.drawing import stamp_sizes, stamps, transfer
+from jobs.render.drawing.settings import Settings, settings_for
+from jobs.render.psf import euclid, model, seeing
+from lake_schema.errors import BadInput
 
 # As good as it gets: nothing but the stamp is left out, and that is large.
 FULL = Settings(edge=1e-7, ghost=1e-9, floor=0.0, least=25.6, positions=9)
@@ -27,14 +29,14 @@ def rows(name):
 
 
 def test_more_is_asked_for_more_is_taken():
-    tiers = [stamps.settings_for(wanted) for wanted in (QUICKLOOK, DRAFT, SURVEY, REFERENCE)]
+    tiers = [settings_for(wanted) for wanted in (QUICKLOOK, DRAFT, SURVEY, REFERENCE)]
     for field in ("edge", "ghost", "floor"):
         of = [getattr(tier, field) for tier in tiers]
         assert of == sorted(of, reverse=True)
     for field in ("least", "positions", "colours"):
         of = [getattr(tier, field) for tier in tiers]
         assert of == sorted(of)
-    assert [tier.positions for tier in tiers][-1] == max(psf.DEGREES)
+    assert [tier.positions for tier in tiers][-1] == max(euclid.DEGREES)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,7 @@ def sample():
 @pytest.mark.parametrize("preset", PRESETS)
 def test_what_is_left_out_is_within_what_is_promised(preset, sample):
     """Of bright stars, whose spikes rise above the mean PSF at a stamp's edge, as of all others."""
-    wanted, settings = PRESETS[preset], stamps.settings_for(PRESETS[preset])
+    wanted, settings = PRESETS[preset], settings_for(PRESETS[preset])
     for one, own, image in sample:
         found = errors.errors(scenes.draw(one, own, VIS, settings, SIDE), image, VIS, one)
         magnitude, star = float(scenes.magnitudes(one, VIS)[0]), one.shape[0] < 0
@@ -66,9 +68,9 @@ def test_a_quicklook_is_half_of_the_work_of_a_draft():
     """Pixels of stamps, and samples through planes of the PSF."""
     some, found = scenes.sources(VIS, 1), []
     for wanted in (QUICKLOOK, DRAFT):
-        settings = stamps.settings_for(wanted)
+        settings = settings_for(wanted)
         through = spread(VIS, settings.positions, settings.colours)
-        sizes = stamps.stamp_sizes(some.electrons, some.shape, some.shapes, through, VIS.noise, settings)
+        sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, through, VIS.noise, settings)
         pixels = (sizes.astype(float) ** 2).sum()
         found.append((pixels, pixels * transfer.plane_count(through)))
     (quick, quick_planes), (draft, draft_planes) = found
@@ -78,8 +80,8 @@ def test_a_quicklook_is_half_of_the_work_of_a_draft():
 
 def test_planes_of_fewer_colours_are_means_of_neighbours():
     whole = spread(VIS, 9)
-    less = psf.of_colours(whole, 2)
-    assert psf.of_colours(whole, 8) is whole
+    less = model.of_colours(whole, 2)
+    assert model.of_colours(whole, 8) is whole
     np.testing.assert_allclose(less.planes.images[0], whole.planes.images[:4].mean(axis=0), rtol=1e-5, atol=1e-12)
     photons = np.array([[0.3, 0.1, 0.1, 0.1, 0.2, 0.1, 0.05, 0.05]])
     at = np.array([2000.0])
@@ -90,8 +92,8 @@ def test_planes_of_fewer_colours_are_means_of_neighbours():
     flat = np.full((1, 8), 0.125)
     both = [transfer.image_of(one.planes, transfer.basis_weights(one, flat, at, at)[0]) for one in (less, whole)]
     np.testing.assert_allclose(both[0], both[1], rtol=1e-4, atol=1e-9)
-    with pytest.raises(accuracy.BadInput, match="8 wavelengths of a PSF are not a multiple of 3"):
-        psf.of_colours(whole, 3)
+    with pytest.raises(BadInput, match="8 wavelengths of a PSF are not a multiple of 3"):
+        model.of_colours(whole, 3)
 
 
 def test_the_rim_is_the_brightest_pixel_farther_out():
@@ -106,7 +108,7 @@ def test_the_rim_is_the_brightest_pixel_farther_out():
     assert (full.rim >= full.surface - 1e-12)[20:].all()
     # Spikes: several times the mean.
     assert full.rim[48] > 4.0 * full.surface[48]
-    ground = psf.ground_psf(0.7, 3.0, 0.2)
+    ground = seeing.ground_psf(0.7, 3.0, 0.2)
     np.testing.assert_allclose(ground.rim[8:200], ground.surface[8:200], rtol=0.1)
 
 

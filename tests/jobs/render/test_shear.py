@@ -9,8 +9,10 @@ import pytest
 from benchmarks import _errors as errors
 from benchmarks._scenes import LSST, VIS, Scene
 from jobs.accuracy import DRAFT, SURVEY
-from jobs.render import profiles, stamps
-from jobs.render.stamps import Sources
+from jobs.render.drawing import reference
+from jobs.render.drawing.settings import settings_for
+from jobs.render.sources import galaxy_shapes
+from jobs.render.sources.source_list import Sources
 from tests.jobs.render.fields import galaxies, spread
 
 BOUNDS = {"survey": (SURVEY, 1e-4, 1e-5), "draft": (DRAFT, 1e-3, 1e-3)}
@@ -28,7 +30,7 @@ KINDS = {
 def galaxy(scene: Scene, kind: str, magnitude: float) -> Sources:
     electrons = scene.exposure * 10 ** (0.4 * (scene.zero_point - magnitude))
     middle = np.array([float(errors.COMPARED)])
-    form = profiles.shapes(galaxies(0.0, 0.0, position_angle=31.0, **KINDS[kind]))
+    form = galaxy_shapes.shapes(galaxies(0.0, 0.0, position_angle=31.0, **KINDS[kind]))
     jacobian = scene.scale * np.array([[[1.001, 0.002], [-0.003, 0.998]]])
     return Sources(np.array([1]), middle + 0.3, middle - 0.2, jacobian, np.array([electrons]), np.array([0]), form)
 
@@ -64,7 +66,7 @@ def some_more(*cases):
 @pytest.mark.parametrize(("kind", "magnitude"), tuple(some_more(("bulge", 20.0), ("small disc", 24.5))))
 def test_response_to_shear(tier, kind, magnitude):
     accuracy, most_m, most_c = BOUNDS[tier]
-    m, c = biases(VIS, kind, magnitude, stamps.settings_for(accuracy))
+    m, c = biases(VIS, kind, magnitude, settings_for(accuracy))
     assert abs(m) <= most_m
     assert abs(c) <= most_c
 
@@ -74,7 +76,7 @@ def test_response_to_shear(tier, kind, magnitude):
 @pytest.mark.parametrize("scene", [VIS, LSST], ids=lambda scene: scene.name)
 def test_response_of_many_galaxies_through_their_own_psf(scene, tier):
     accuracy, most_m, most_c = BOUNDS[tier]
-    found, some = errors.shear_response(scene, {tier: stamps.settings_for(accuracy)}, 92, 24)
+    found, some = errors.shear_response(scene, {tier: settings_for(accuracy)}, 92, 24)
     kinds = errors.worst_by_kind(found[tier], some, scene)
     for kind, (_, m, c) in kinds.items():
         assert (m <= most_m, c <= most_c) == (True, True), (kind, m, c)
@@ -82,7 +84,7 @@ def test_response_of_many_galaxies_through_their_own_psf(scene, tier):
 
 def test_a_drawing_that_loses_wings_is_caught():
     """The measure itself: stamps too small by half bias the response."""
-    small = replace(stamps.settings_for(DRAFT), edge=1.0, ghost=1.0, least=1.6)
+    small = replace(settings_for(DRAFT), edge=1.0, ghost=1.0, least=1.6)
     assert abs(biases(VIS, "bulge", 20.0, small)[0]) > 1e-3
 
 
@@ -92,7 +94,7 @@ def test_galsim_responds_alike(kind):
     """The truth itself, against galsim's own drawing."""
 
     def by_galsim(one):
-        return stamps.reference(one, 0, psf_of(VIS), 2 * errors.COMPARED)
+        return reference.reference(one, 0, psf_of(VIS), 2 * errors.COMPARED)
 
     found = errors.response(by_galsim, galaxy(VIS, kind, 20.0), VIS.scale)
     m, c = errors.bias(found, truth(VIS, kind, 20.0))

@@ -12,7 +12,8 @@ from benchmarks import trade
 from benchmarks._scenes import VIS
 from jobs import accuracy
 from jobs.accuracy import SURVEY
-from jobs.render import profiles, stamps
+from jobs.render.drawing.settings import settings_for
+from jobs.render.sources import galaxy_shapes
 from tests.benchmarks import run
 
 RESULTS = Path(trade.__file__).with_name("results")
@@ -68,7 +69,7 @@ def test_an_approximation_keeps_what_it_should(name):
     assert len(simple) == len(some) == 6
     np.testing.assert_array_equal(simple.electrons, some.electrons)
     np.testing.assert_array_equal(simple.column, some.column)
-    size, index = profiles.half_light(some.shapes), some.shapes.sersic_index
+    size, index = galaxy_shapes.half_light(some.shapes), some.shapes.sersic_index
     if "below" in name:
         assert size[some.shape] == pytest.approx(approximations.TINY)
     if "down and up" in name:
@@ -83,7 +84,7 @@ def test_an_approximation_keeps_what_it_should(name):
 def test_stamps_of_a_folding_threshold_hold_all_but_that():
     """Of a point, against the PSF itself: the rest lies beyond half the stamp."""
     some, spread = scenes.sample(VIS, 3, 6), scenes.spread(VIS, 1)
-    settings = stamps.settings_for(SURVEY)
+    settings = settings_for(SURVEY)
     sizes = BY_NAME["folding threshold 0.5 %"].sizes(some, spread, VIS, settings)
     outside = spread.outside[np.minimum(sizes // 2, len(spread.outside) - 1)]
     assert (outside < approximations.FOLDING).all()

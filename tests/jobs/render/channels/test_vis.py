@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from jobs.accuracy import SURVEY
-from jobs.render import exposing, exposure, focal_plane
+from jobs.render.camera import astrometry, pointing
 from jobs.render.channels import vis
-from jobs.render.effects import brighter_fatter, nonlinearity
-from jobs.render.effects.effect import Scene, apply_all
+from jobs.render.effects.charge import brighter_fatter
+from jobs.render.effects.effect import apply_all
+from jobs.render.effects.readout import nonlinearity
+from jobs.render.effects.scene import Scene
+from jobs.render.exposure import render
+from jobs.render.planning import planned_exposures
 from jobs.rng import stream
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
@@ -21,19 +25,19 @@ SIDE = 64
 def rendered(mission=MISSION, mag=20.0, body=None, x=SIDE / 2, y=SIDE / 2):
     """One source (or points) of a nominal exposure."""
     detector = small("vis", "3-4", SIDE)
-    ra, dec, angle = focal_plane.boresight_for(detector, 53.1, -27.8, 0.0)
+    ra, dec, angle = pointing.boresight_for(detector, 53.1, -27.8, 0.0)
     exposed = {
         "exposure_id": 1, "channel": "VIS", "camera": "vis", "band": "euclid_vis", "image_type": "science",
         "ra": ra, "dec": dec, "position_angle": angle, "mjd": 60905.0, "exposure_time_s": NOMINAL, "seeing": 0.0,
-        "sky": 0.25, "zero_point": exposing.zero_point_of("vis", "euclid_vis", mission),
+        "sky": 0.25, "zero_point": planned_exposures.zero_point_of("vis", "euclid_vis", mission),
     }  # fmt: skip
-    system = focal_plane.wcs(detector, ra, dec, angle)
-    where = focal_plane.sky_of_pixel(system, np.atleast_1d(x), np.atleast_1d(y))
+    system = astrometry.wcs(detector, ra, dec, angle)
+    where = astrometry.sky_of_pixel(system, np.atleast_1d(x), np.atleast_1d(y))
     bodies = galaxies(*where, **(body or {}))
     points = stars(*where)
     bodies, points = (bodies, points.slice(0, 0)) if body else (bodies.slice(0, 0), points)
     flux = 10 ** (-0.4 * (mag - 23.9))
-    return exposure.render(
+    return render.render(
         {"detector": "3-4"}, exposed, bodies, fluxes(bodies, "euclid_vis", flux), points,
         fluxes(points, "euclid_vis", flux), mission, SURVEY, 1, detector=detector,
     )  # fmt: skip

@@ -11,8 +11,12 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 
 from jobs.accuracy import SURVEY
 from jobs.fluxes import passbands
-from jobs.render import chromatic, exposure, fits_product, focal_plane, psf, stamps, transfer
-from jobs.render.stamps import Sources
+from jobs.render.camera import astrometry, detectors, pointing
+from jobs.render.drawing import settings, stamps, transfer
+from jobs.render.exposure import visible_sources
+from jobs.render.products import headers, truth_table
+from jobs.render.psf import euclid, sub_bands
+from jobs.render.sources.source_list import Sources
 from tests.jobs.render import calibrated, nominal
 from tests.jobs.render.fields import MISSION, galaxies, small, spread, stars
 
@@ -67,22 +71,22 @@ def separation(ra, dec, ra1, dec1):
 )
 def test_the_truth_table_tells_where_sources_are(name, ra, dec):
     """x, y through the header of the file are the catalogue's ra, dec, over a whole detector, to 0.01 mas."""
-    detector = focal_plane.detector("vis", name, MISSION)
-    pointed = focal_plane.boresight_for(detector, ra, dec, 33.0)
-    system = focal_plane.wcs(detector, *pointed)
+    detector = detectors.detector("vis", name, MISSION)
+    pointed = pointing.boresight_for(detector, ra, dec, 33.0)
+    system = astrometry.wcs(detector, *pointed)
     rng = np.random.default_rng(3)
-    where = focal_plane.sky_of_pixel(system, rng.uniform(-0.5, 4095.5, 300), rng.uniform(-0.5, 4131.5, 300))
+    where = astrometry.sky_of_pixel(system, rng.uniform(-0.5, 4095.5, 300), rng.uniform(-0.5, 4131.5, 300))
     points = stars(*where)
     none = galaxies(0.0, 0.0).slice(0, 0)
-    drawn, sizes = exposure.sources_of(
+    drawn, sizes = visible_sources.sources_of(
         (none, np.zeros(0)), (points, np.full(300, 1e3)), detector, system, spread("vis"), 13.0,
-        stamps.settings_for(SURVEY), BAND,
+        settings.settings_for(SURVEY), BAND,
     )  # fmt: skip
     found = replace(alone(), detector=detector, wcs=system, sources=drawn, sizes=sizes, drawn=np.zeros(len(sizes)))
-    rows = fits_product.truth(found)
+    rows = truth_table.truth(found)
     assert rows["id"].to_pylist() == sorted(points["id"].to_pylist())
     order = np.argsort(points["id"].to_numpy())
-    told = sky_of(fits_product.science_cards(found), rows["x"].to_numpy(), rows["y"].to_numpy())
+    told = sky_of(headers.science_cards(found), rows["x"].to_numpy(), rows["y"].to_numpy())
     assert separation(*told, where[0][order], where[1][order]).max() <= 0.01
 
 
@@ -106,17 +110,17 @@ def oversampled(detector, column, row, side, strength):
         (position - (n - 1) / 2) * detector.pixel_scale * (-1 if detector.upside_down else 1)
         for position, n in ((column, detector.nx), (row, detector.ny))
     ]
-    everything = focal_plane.detectors("vis", MISSION)
+    everything = detectors.detectors("vis", MISSION)
     field = [
         (centre + offset) / (max(getattr(d, axis) for d in everything) + half)
         for axis, centre, offset, half in zip("xy", (detector.x, detector.y), place, (half_x, half_y), strict=True)
     ]
-    nm, n = psf.wavefront(*field, MISSION), PUPIL
+    nm, n = euclid.wavefront(*field, MISSION), PUPIL
     axis = (np.arange(n) - n / 2 + 0.5) * 1200.0 / n
-    clear = galsim.Image(psf.pupil(*np.meshgrid(axis, axis), 1200.0 / n, MISSION).round(), scale=1.2 / n)
+    clear = galsim.Image(euclid.pupil(*np.meshgrid(axis, axis), 1200.0 / n, MISSION).round(), scale=1.2 / n)
     fine, scale = np.zeros((side * OVER, side * OVER)), detector.pixel_scale / OVER
     dx, dy = (np.rint(position) - position for position in (column, row))
-    parts = chromatic.sub_bands(BAND)
+    parts = sub_bands.sub_bands(BAND)
     for part in parts:
         wave = np.sqrt(np.average(part.wavelength**2, weights=part.response / part.wavelength)) / 10.0
         optics = galsim.OpticalPSF(
@@ -146,11 +150,11 @@ def centroid(stamp, x, y):
 def drawn_stars(detector, columns, rows):
     """Noise-free stars as an exposure would draw them."""
     columns, rows = np.asarray(columns, float), np.asarray(rows, float)
-    spread = replace(psf.vis_psf(detector, BAND, MISSION), intra_pixel=0.05)
+    spread = replace(euclid.vis_psf(detector, BAND, MISSION), intra_pixel=0.05)
     n = len(columns)
     sources = Sources(
         np.arange(n), columns, rows, np.tile(0.1 * np.eye(2), (n, 1, 1)), np.full(n, 1e6), np.full(n, -1),
-        alone().sources.shapes, np.full((n, chromatic.PARTS), 1.0 / chromatic.PARTS),
+        alone().sources.shapes, np.full((n, sub_bands.PARTS), 1.0 / sub_bands.PARTS),
     )  # fmt: skip
     return stamps.draw(sources, np.full(n, 128), spread, detector.nx, detector.ny)
 
@@ -174,7 +178,7 @@ def test_light_lies_where_galsim_s_finer_optics_put_it():
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["1-1", "3-4", "6-6"])
 def test_light_lies_where_galsim_puts_it_all_over_a_detector(name):
-    detector = focal_plane.detector("vis", name, MISSION)
+    detector = detectors.detector("vis", name, MISSION)
     found = differences(detector, [60.2, 4030.7, 2047.5, 100.9, 4000.1], [60.6, 70.1, 2066.3, 4060.5, 4071.0])
     print(name, "largest", np.abs(found).max(), "rms", np.sqrt(np.mean(found**2)), "mas")
     assert np.abs(found).max() <= 1.0
@@ -204,7 +208,7 @@ def residuals(detector, pitch, mag, number=1):
     image = calibrated.electrons(one.raw, one.scene, nominal.SEED, applied)
     bad = ~np.isfinite(image)
     image = np.ascontiguousarray(np.where(bad, 0.0, image) - one.scene.sky_electrons)
-    rows = fits_product.truth(one)
+    rows = truth_table.truth(one)
     at = np.array([rows["x"].to_numpy(), rows["y"].to_numpy()])
     flux, error, _ = sep.sum_circle(image, *at, 6.5, err=one.scene.pixel_noise, gain=1.0)
     found = np.array(sep.winpos(image, *at, WINDOW, subpix=0)[:2])
@@ -222,7 +226,7 @@ def test_sep_finds_stars_to_three_mas():
 @pytest.mark.nightly
 def test_sep_finds_stars_all_over_a_detector():
     """One offset for all of them: what the PSF's centroid does across the detector is in the residuals."""
-    found, clear = residuals(focal_plane.detector("vis", "1-1", MISSION), 128, 19.4)
+    found, clear = residuals(detectors.detector("vis", "1-1", MISSION), 128, 19.4)
     print(f"{found.shape[1]} stars: rms {np.sqrt(np.mean(found**2)):.3f} mas, S/N above {clear.min():.0f}")
     assert found.shape[1] > 800
     assert clear.min() > 300

@@ -5,8 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from jobs.render import fits_product
-from jobs.render.effects import calibration_lamp, illumination, nonlinearity, pixel_area, quadrants
+from jobs.render.effects.light import calibration_lamp, illumination, pixel_area
+from jobs.render.effects.readout import nonlinearity, quadrants
+from jobs.render.products import headers
 from tests.jobs.render import calibrated, nominal
 from tests.jobs.render.fields import small
 
@@ -62,7 +63,7 @@ def calibrated_science(detector, sky, number, rays=False):
         if part.name in applied:
             expected = part.apply(expected, *part.parameters(one.scene))
     # What the header says of the dark current: where it is not noticed there is none.
-    (dark,) = (value for keyword, value, _ in fits_product.science_cards(one) if keyword == "DARKRATE")
+    (dark,) = (value for keyword, value, _ in headers.science_cards(one) if keyword == "DARKRATE")
     expected += dark * nominal.TIME
     if rays:
         found = calibrated.without_hits(found, one.maps["cosmic_rays"])

@@ -8,7 +8,9 @@ import sep
 from scipy.ndimage import uniform_filter
 
 from benchmarks import effects
-from jobs.render import fits_product, focal_plane, transfer
+from jobs.render.camera import detectors
+from jobs.render.drawing import transfer
+from jobs.render.products import truth_table
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render import calibrated, nominal
 from tests.jobs.render.fields import MISSION, small
@@ -44,7 +46,7 @@ def photometry(one):
     applied = {decision.name for decision in one.decisions if decision.applied}
     image = calibrated.electrons(one.raw, one.scene, nominal.SEED, applied)
     bad = ~np.isfinite(image)
-    rows, scale = fits_product.truth(one), one.detector.pixel_scale
+    rows, scale = truth_table.truth(one), one.detector.pixel_scale
     x, y, true = (rows[name].to_numpy() for name in ("x", "y", "expected"))
     found, inside, around = in_aperture(np.ascontiguousarray(np.where(bad, 0.0, image)), x, y, scale)
     blind = sep.sum_circle(bad.astype(float), x, y, RING[1] / scale)[0]
@@ -81,7 +83,7 @@ def test_what_the_effects_take_is_what_the_benchmark_says():
     through = stars(detector, 64, 20.0, quiet | dict.fromkeys(nominal.CHARGE, True), old)
     (before, noise), (after, _) = photometry(without), photometry(through)
     found = np.mean(after - before)
-    rows = fits_product.truth(without)
+    rows = truth_table.truth(without)
     places = replace(
         without.sources, column=rows["x"].to_numpy(), row=rows["y"].to_numpy(), electrons=rows["expected"].to_numpy()
     )
@@ -122,7 +124,7 @@ def test_galaxies_of_the_weak_lensing_sample_are_as_clear_as_stated():
 @pytest.mark.nightly
 def test_stars_of_a_whole_detector():
     forced = nominal.off(*nominal.COSMIC_RAYS, *CTI)
-    detector = focal_plane.detector("vis", "1-1", MISSION)
+    detector = detectors.detector("vis", "1-1", MISSION)
     change, noise = photometry(stars(detector, 128, np.arange(18.2, 20.2, 0.1), forced))
     print(f"{len(change)} stars: median {np.median(change):.5f}, rms {change.std():.5f}, expected {noise.mean():.5f}")
     assert len(change) > 800

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jobs.render.channels import ext, vis
-from jobs.render.effects.effect import Lights
-from jobs.render.effects.traps import Sweeps, Traps
+from jobs.render.channels import ground, vis
+from jobs.render.effects.readout.traps import Sweeps, Traps
+from jobs.render.effects.scene import Lights
 from lake_schema.mission.configuration import resolve
 
 # Every effect of a channel, by its name.
-EFFECTS = {e.name: e for channel in (vis, ext) for effects in channel.EFFECTS.values() for e in effects}
+EFFECTS = {e.name: e for channel in (vis, ground) for effects in channel.EFFECTS.values() for e in effects}
 LIGHTS = Lights(np.array([3.2, 40.0]), np.array([2.0, -30.0]), np.array([1e8, 1e9]))
 END_OF_LIFE = Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
 EMPTY = Traps((0.0,), (1.0,), 2e5, 0.0, 0.58)

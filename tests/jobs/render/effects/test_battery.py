@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.render import effects
-from jobs.render.channels import ext, vis
+from jobs.render.channels import ground, vis
+from jobs.render.effects.light import intra_pixel
 from tests.jobs.render.effects.battery import CASES, SHAPES, call, frame_of, shapes_of
 
 MOST = 4 * max(ny * nx for ny, nx in SHAPES)
@@ -32,16 +33,16 @@ def promising(promise):
 def test_no_effect_is_forgotten():
     """Every file of the package with an `apply`, and every effect of a channel."""
     from importlib import import_module
-    from pkgutil import iter_modules
+    from pkgutil import walk_packages
 
     found = set()
-    for module in iter_modules(effects.__path__):
-        for key, value in vars(import_module(f"jobs.render.effects.{module.name}")).items():
-            if key.startswith("apply") and key != "apply_all" and value.__module__.endswith(module.name):
+    for module in walk_packages(effects.__path__, "jobs.render.effects."):
+        for key, value in vars(import_module(module.name)).items():
+            if key.startswith("apply") and key != "apply_all" and value.__module__ == module.name:
                 found.add(value)
     # Part of the pixel's transfer function: it acts before there is a frame.
-    assert found == {case.apply for case in CASES.values()} | {effects.intra_pixel.apply}
-    assert {e.apply for kind in (vis, ext) for effects in kind.EFFECTS.values() for e in effects} <= found
+    assert found == {case.apply for case in CASES.values()} | {intra_pixel.apply}
+    assert {e.apply for kind in (vis, ground) for effects in kind.EFFECTS.values() for e in effects} <= found
 
 
 @named

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jobs import request
-from jobs.render.channels import ext, vis
-from jobs.render.effects.effect import Scene, apply_all, decide
+from jobs.render.channels import ground, vis
+from jobs.render.effects.effect import apply_all, decide
+from jobs.render.effects.scene import Scene
+from jobs.request import schema
 from jobs.rng import stream
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
@@ -39,7 +40,7 @@ ORDER = (
 )
 
 
-@pytest.mark.parametrize("effects", dict.fromkeys((*vis.EFFECTS.values(), *ext.EFFECTS.values())))
+@pytest.mark.parametrize("effects", dict.fromkeys((*vis.EFFECTS.values(), *ground.EFFECTS.values())))
 def test_the_order_of_physics(effects):
     names = [effect.name for effect in effects]
     assert len(set(names)) == len(names)
@@ -50,14 +51,14 @@ def test_the_order_of_physics(effects):
 
 def test_every_effect_has_its_place():
     named = {name for chain in ORDER for name in chain} | {vis.DRAWN.name}
-    assert named == set(request.EFFECTS)
+    assert named == set(schema.EFFECTS)
     for effects in vis.EFFECTS.values():
         assert effects[-len(vis.EFFECTS["bias"]) :] == vis.EFFECTS["bias"]
 
 
 def test_a_request_may_name_every_effect():
-    tuples = (*vis.EFFECTS.values(), *ext.EFFECTS.values(), (vis.DRAWN,))
-    assert set(request.EFFECTS) == {effect.name for effects in tuples for effect in effects}
+    tuples = (*vis.EFFECTS.values(), *ground.EFFECTS.values(), (vis.DRAWN,))
+    assert set(schema.EFFECTS) == {effect.name for effects in tuples for effect in effects}
 
 
 def test_pixel_noise_is_sky_dark_and_reading():
@@ -68,7 +69,7 @@ def test_pixel_noise_is_sky_dark_and_reading():
 
 def test_a_frame_becomes_adu():
     frame = np.full((300, 300), 50.0)
-    image, decisions = run(ext.SKY, frame)
+    image, decisions = run(ground.SKY, frame)
     assert [d.name for d in decisions] == NAMES
     assert (frame == 50.0).all()
     assert (image == np.rint(image)).all()
@@ -82,19 +83,19 @@ def test_a_frame_becomes_adu():
 def test_numbers_are_the_effects_own(seed):
     """Switching the dark current on leaves the shot noise and the read noise as they were."""
     frame = np.full((50, 50), 100.0)
-    without, _ = run(ext.SKY[:5], frame, forced={"dark_current": False}, seed=seed)
-    with_dark, _ = run(ext.SKY[:5], frame, forced={"dark_current": True}, seed=seed)
+    without, _ = run(ground.SKY[:5], frame, forced={"dark_current": False}, seed=seed)
+    with_dark, _ = run(ground.SKY[:5], frame, forced={"dark_current": True}, seed=seed)
     extra = with_dark - without
     np.testing.assert_allclose(extra, np.rint(extra), atol=1e-9)
     assert 0 < extra.mean() < 1
-    again, _ = run(ext.SKY[:5], frame, forced={"dark_current": False}, seed=seed)
+    again, _ = run(ground.SKY[:5], frame, forced={"dark_current": False}, seed=seed)
     np.testing.assert_array_equal(without, again)
-    other, _ = run(ext.SKY[:5], frame, forced={"dark_current": False}, seed=seed + 10)
+    other, _ = run(ground.SKY[:5], frame, forced={"dark_current": False}, seed=seed + 10)
     assert (other != without).any()
 
 
 def test_what_a_request_forces_is_recorded():
-    decisions = {d.name: d for d in decide(ext.SKY, replace(SCENE, forced={"poisson": False, "dark_current": True}))}
+    decisions = {d.name: d for d in decide(ground.SKY, replace(SCENE, forced={"poisson": False, "dark_current": True}))}
     assert not decisions["poisson"].applied
     assert decisions["poisson"].forced
     assert decisions["dark_current"].applied
@@ -104,9 +105,9 @@ def test_what_a_request_forces_is_recorded():
 
 def test_strange_or_impossible_wishes_are_refused():
     # Of another channel.
-    assert len(decide(ext.SKY, replace(SCENE, forced={"ghosts": True}))) == len(ext.SKY)
+    assert len(decide(ground.SKY, replace(SCENE, forced={"ghosts": True}))) == len(ground.SKY)
     with pytest.raises(BadInput, match="adc"):
-        decide(ext.SKY, replace(SCENE, forced={"adc": False}))
+        decide(ground.SKY, replace(SCENE, forced={"adc": False}))
 
 
 def test_without_noise_all_is_noticed():
@@ -120,11 +121,11 @@ def test_without_noise_all_is_noticed():
 
 
 def test_margins_tell_the_ratio():
-    (dark,) = (e for e in ext.SKY if e.name == "dark_current")
+    (dark,) = (e for e in ground.SKY if e.name == "dark_current")
     d = SCENE.dark_electrons
     # Of a mean of 1024 frames, which keeps the mean and little of the noise.
     assert dark.margin(SCENE) == pytest.approx(32.0 * d / (0.1 * SCENE.pixel_noise))
-    (counted,) = (e for e in ext.SKY if e.name == "poisson")
+    (counted,) = (e for e in ground.SKY if e.name == "poisson")
     counts = np.sqrt(SCENE.peak_electrons + SCENE.sky_electrons)
     assert counted.margin(SCENE) == pytest.approx(counts / (0.1 * SCENE.pixel_noise))
     longer = replace(SCENE, exposure_time_s=1e5, sky_rate=0.0)

@@ -5,17 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs.render.effects import (
-    bias_structure,
-    charge_injection,
-    crosstalk,
-    dark_current,
-    nonlinearity,
-    poisson,
-    quadrants,
-)
-from jobs.render.effects.effect import Scene, apply_all, warmth
-from jobs.render.exposure import numbers_of
+from jobs.render.effects.charge import charge_injection, dark_current, poisson
+from jobs.render.effects.effect import apply_all
+from jobs.render.effects.readout import bias_structure, crosstalk, nonlinearity, quadrants
+from jobs.render.effects.scene import Scene, dark_current_scaling
+from jobs.render.exposure.rendered import numbers_of
 from jobs.rng import stream
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
@@ -174,16 +168,16 @@ def test_few_dark_electrons_are_counted_as_many_are(electrons):
 
 
 def test_dark_current_doubles_in_a_few_kelvin():
-    assert warmth(153.0, 153.0, 1.12) == 1.0
-    assert warmth(155.4, 153.0, 1.12) == pytest.approx(2.0, rel=0.03)
-    assert warmth(150.6, 153.0, 1.12) == pytest.approx(0.5, rel=0.05)
+    assert dark_current_scaling(153.0, 153.0, 1.12) == 1.0
+    assert dark_current_scaling(155.4, 153.0, 1.12) == pytest.approx(2.0, rel=0.03)
+    assert dark_current_scaling(150.6, 153.0, 1.12) == pytest.approx(0.5, rel=0.05)
     with pytest.raises(OutOfRange, match="temperature"):
-        warmth(0.0, 153.0, 1.12)
+        dark_current_scaling(0.0, 153.0, 1.12)
 
 
 def test_dark_current_follows_the_detector_s_temperature():
     warm = Scene(resolve(overrides={"vis.detector_temperature": (163.0, "K")}), "vis", 560.53, 0.25, 1e4)
-    assert warm.dark_electrons / SCENE.dark_electrons == pytest.approx(warmth(163.0, 153.0, 1.12))
+    assert warm.dark_electrons / SCENE.dark_electrons == pytest.approx(dark_current_scaling(163.0, 153.0, 1.12))
     assert SCENE.dark_electrons == pytest.approx(560.53 * SCENE.value("dark_current", "electron / (s pix)"))
 
 

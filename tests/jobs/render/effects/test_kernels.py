@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from jobs.render.effects import adc, background, dark_current, full_well, poisson, read_noise
+from jobs.render.effects.charge import dark_current, full_well, poisson
+from jobs.render.effects.light import background
+from jobs.render.effects.readout import adc, read_noise
 from lake_schema.errors import OutOfRange
 
 SIDE = 400

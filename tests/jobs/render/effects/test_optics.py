@@ -9,18 +9,14 @@ from scipy import stats
 
 from jobs import rng
 from jobs.fluxes import passbands
-from jobs.render import exposure, focal_plane, psf
-from jobs.render.effects import (
-    calibration_lamp,
-    ghosts,
-    illumination,
-    intra_pixel,
-    pixel_area,
-    pixel_response,
-    readout_trail,
-    straylight,
-)
-from jobs.render.effects.effect import NOTICEABLE, STACK, Lights, Scene, apply_all
+from jobs.render.camera import astrometry, detectors
+from jobs.render.effects.charge import pixel_response
+from jobs.render.effects.effect import apply_all
+from jobs.render.effects.light import calibration_lamp, ghosts, illumination, intra_pixel, pixel_area, straylight
+from jobs.render.effects.readout import readout_trail
+from jobs.render.effects.scene import NOTICEABLE, STACK, Lights, Scene
+from jobs.render.exposure import rendered
+from jobs.render.psf import euclid
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
 
@@ -31,7 +27,7 @@ CLEAN = (0.0, 3.0, 0.2)
 
 
 def scene(name="3-4", **more):
-    return Scene(MISSION, "vis", 560.53, 0.25, 1e4, focal_plane.detector("vis", name, MISSION), **more)
+    return Scene(MISSION, "vis", 560.53, 0.25, 1e4, detectors.detector("vis", name, MISSION), **more)
 
 
 def light(column, row, electrons=1e8):
@@ -77,7 +73,7 @@ def test_the_ghost_s_arms_are_the_pupil_s(name):
     y, x = np.mgrid[:400, :300] - np.array([200.0, 150.0])[:, None, None]
     turn, mm = np.radians(shown.detector.rotation), 600.0 / radius
     place = mm * (x * np.cos(turn) - y * np.sin(turn)), mm * (x * np.sin(turn) + y * np.cos(turn))
-    clear = psf.pupil(*place, mm, MISSION)
+    clear = euclid.pupil(*place, mm, MISSION)
     # Outside the central stop, which the ghost has in its own size and place, and inside the edge.
     seen = (np.hypot(*place) > 270.0) & (np.hypot(*place) < 580.0)
     np.testing.assert_allclose(image[seen] / image.max(), clear[seen], atol=0.25)
@@ -180,8 +176,8 @@ def test_a_pixel_sees_of_the_sky_what_the_jacobian_says(name):
     assert electrons == one.sky_electrons
     column, row = (np.array(at) for at in ((0, 4095, 2000, 0, 4095), (0, 0, 2000, 4131, 4131)))
     found = np.diag(pixel_area.change(u[column], v[row], stretch))
-    system = focal_plane.wcs(one.detector, 150.0, 2.0, 33.0)
-    area = np.abs(np.linalg.det(focal_plane.jacobian(system, column, row))) / 0.1**2
+    system = astrometry.wcs(one.detector, 150.0, 2.0, 33.0)
+    area = np.abs(np.linalg.det(astrometry.jacobian(system, column, row))) / 0.1**2
     # The tangent plane is 1.2e-4 larger than the sky at the corners of the field.
     np.testing.assert_allclose(found, area - 1.0, atol=2e-4)
     assert np.abs(pixel_area.change(np.zeros(1), np.zeros(1), stretch)).max() == 0
@@ -206,7 +202,7 @@ def test_illumination_is_one_map_over_the_focal_plane(name):
     turned = replace(scene(name).detector, nx=60, ny=40, pixel_scale=7.0)
     one = replace(scene(name), detector=turned)
     columns, rows = illumination.pattern(one, 60, 40, 0.02, (0.003, -0.01))
-    everything = focal_plane.detectors("vis", MISSION)
+    everything = detectors.detectors("vis", MISSION)
     half_x = max(d.x for d in everything) + 204.8
     half_y = max(d.y for d in everything) + 206.8
     for c, r in ((0, 0), (59, 39), (17, 30)):
@@ -392,13 +388,13 @@ def test_light_of_a_trail_is_seen_by_the_pixels_that_it_falls_on():
     # Old pixels, some dead.
     worn = resolve(overrides={"vis.prnu": (0.2, ""), "vis.dead_pixels": (0.05, "")})
     ny, nx = 40, 30
-    detector = replace(focal_plane.detector("vis", "3-4", worn), nx=nx, ny=ny, middle=4)
+    detector = replace(detectors.detector("vis", "3-4", worn), nx=nx, ny=ny, middle=4)
     one = Scene(worn, "vis", 10.0, 0.25, 1e5, detector)
     row = {"exposure_id": 1, "channel": "VIS", "camera": "vis", "image_type": "flat"}
     frame = np.random.default_rng(2).uniform(0.0, 1e5, (ny, nx))
 
     def stream(effect):
-        return rng.stream(*exposure.numbers_of(effect, row, "3-4", 1))
+        return rng.stream(*rendered.numbers_of(effect, row, "3-4", 1))
 
     both = (readout_trail.EFFECT, pixel_response.EFFECT)
     found, _ = apply_all(frame, both, replace(one, forced={"readout_trail": True, "pixel_response": True}), stream)

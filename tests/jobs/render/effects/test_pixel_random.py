@@ -9,7 +9,8 @@ from scipy import stats
 from jobs import rng
 from jobs.cache import sources_key
 from jobs.compiling import jit
-from jobs.render.effects import pixel_random, read_noise
+from jobs.render.effects import pixel_random
+from jobs.render.effects.readout import read_noise
 
 COUNT = 1 << 22
 KEY = pixel_random.key(np.random.default_rng(5))

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from jobs import rng
-from jobs.render import focal_plane
+from jobs.render.camera import detectors
 from jobs.render.channels import vis
-from jobs.render.effects import cosmic_rays
-from jobs.render.effects.effect import NOTICEABLE, STACK, Lights, Scene, apply_all
+from jobs.render.effects.charge import cosmic_rays
+from jobs.render.effects.effect import apply_all
+from jobs.render.effects.scene import NOTICEABLE, STACK, Lights, Scene
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render import nominal
 from tests.jobs.render.effects.battery import EFFECTS
 from tests.jobs.render.fields import small
 
 MISSION = resolve()
-DETECTOR = focal_plane.detector("vis", "1-1", MISSION)
+DETECTOR = detectors.detector("vis", "1-1", MISSION)
 NX, NY = 8, DETECTOR.ny
 
 

@@ -1,0 +1,279 @@
+"""Galaxies of one generation cell: table `galaxies`, a pure function of (seed, cell, model); and its halos.
+
+model        every table that the draws need, made once
+draw         members of halos -> colours, dust, spectra -> selection -> masses, shapes, lensing
+halo_table   table `halos` of the same cell
+
+Each step draws from a stream of its own, so that a new column leaves the others' numbers as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from jobs.catalogue import dust_map
+from jobs.catalogue.cells import in_order
+from jobs.catalogue.galaxies import (
+    band_ratios,
+    emission_lines,
+    high_redshift,
+    lensing,
+    morphology,
+    nearest_sed,
+    sed_assignment,
+    stellar_mass,
+)
+from jobs.catalogue.galaxies.band_ratios import BandRatios, Sed
+from jobs.catalogue.galaxies.emission_lines import LineModel
+from jobs.catalogue.galaxies.high_redshift import Kind
+from jobs.catalogue.galaxies.lensing import Planes
+from jobs.catalogue.galaxies.morphology import Shapes
+from jobs.catalogue.galaxies.nearest_sed import Training
+from jobs.catalogue.halos import luminosity_function, matching, population
+from jobs.catalogue.halos.halo_catalogue import LightCone
+from jobs.catalogue.halos.luminosity_function import Schechter
+from jobs.catalogue.halos.population import Cells, Members, Population
+from jobs.fluxes import cosmology
+from jobs.fluxes.libraries import templates
+from jobs.rng import stream
+from lake_schema import sky
+from lake_schema.arrays import Bool, Float, Int
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.halos import HALOS
+
+SELECTION_BAND = "euclid_vis"
+# Candidates are drawn this much deeper than the brightest SED needs, mag: more than the tables' errors.
+_MARGIN = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GalaxyModel:
+    """Everything that galaxies are drawn from; a few MB, made once by `model`.
+
+    limit     : faintest magnitude, AB, before the Milky Way's dust and intergalactic hydrogen
+    selection : the limit's band against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
+    training  : observed galaxies whose spectra ours have, None = spectra that have the colours
+    """
+
+    limit: float
+    population: Population
+    planes: Planes
+    luminosities: Schechter
+    colours: sed_assignment.Colours
+    selection: BandRatios
+    reference: BandRatios
+    colour: BandRatios
+    shapes: Shapes
+    masses: stellar_mass.MassToLight
+    light: stellar_mass.Light
+    lines: LineModel
+    distant: tuple[Kind, ...]
+    training: Training | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """Galaxies after selection: rows of the members, z, M_r, on the red sequence, realised 0.1(g - r), spectra; [n]."""
+
+    row: Int
+    z: Float
+    m_r: Float
+    red: Bool
+    colour: Float
+    sed: Sed
+
+
+def model(
+    seed: int,
+    limit: float = 26.0,
+    z_max: float = 2.3,
+    box_cells: int = 256,
+    lensing_nside: int = 512,
+    high_redshift_boost: float = 1.0,
+    quasar_boost: float = 1.0,
+    light_cone: LightCone | None = None,
+    band: str = SELECTION_BAND,
+    training: Training | None = None,
+) -> GalaxyModel:
+    """The embedded universe of a seed: its galaxies brighter than a limit in a band, and with z < z_max.
+
+    light_cone, training : halos and observed galaxies of others, in place of ours
+    The matter is the same to any limit, halos and galaxies are drawn anew for each: those that are brighter than a
+    shallow limit are as many in a deeper universe, not the same.
+    1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
+    """
+    library, colours = templates.galaxy_library(), sed_assignment.colours_model()
+    selection = _selection(band, z_max, training)
+    dustiest = float(selection.ebv[-1])
+    population_of = people(seed, limit, z_max, box_cells, light_cone, band, training)
+    distant = high_redshift.model(high_redshift_boost, quasar_boost)
+    return GalaxyModel(
+        limit=limit,
+        population=population_of,
+        planes=lensing.load(population_of.halos.box, lensing_nside, far=bool(distant)),
+        luminosities=luminosity_function.schechter(),
+        colours=colours,
+        selection=selection,
+        reference=band_ratios.load(library, band_ratios.REFERENCE_BAND, z_max, dustiest),
+        colour=band_ratios.load(library, "sdss_g01", 0.0, dustiest),
+        shapes=morphology.shapes(),
+        masses=stellar_mass.mass_to_light(),
+        light=stellar_mass.light(library, selection.ebv),
+        lines=emission_lines.model(),
+        distant=distant,
+        training=training,
+    )
+
+
+def people(
+    seed: int,
+    limit: float,
+    z_max: float,
+    box_cells: int,
+    light_cone: LightCone | None = None,
+    band: str = SELECTION_BAND,
+    training: Training | None = None,
+) -> Population:
+    """The halos and galaxies that a limit can be asked of, before they have colours."""
+    nodes, brightest = band_ratios.brightest(_selection(band, z_max, training))
+
+    def faintest(z: Float) -> Float:
+        return limit + _MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
+
+    inverse = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
+    return population.model(seed, box_cells, luminosity_function.volume(z_max), inverse, faintest, light_cone)
+
+
+def _selection(band: str, z_max: float, training: Training | None) -> BandRatios:
+    dustiest = max(sed_assignment.colours_model().dust.highest, training.dustiest if training else 0.0)
+    return band_ratios.load(templates.galaxy_library(), band, z_max, dustiest)
+
+
+def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.float32]) -> pa.Table:
+    """Table `galaxies` of one order-8 cell, sorted by _healpix_29.
+
+    cells : what has been drawn of the universe's population
+    dust  : float32[pixel] mag, map of the Milky Way's A(V) (jobs.catalogue.dust_map)
+    """
+    seed = universe.population.seed
+    people = population.members(cells, cell)
+    drawn = select(universe, *_light(cell, seed, universe, people))
+    distance_modulus = cosmology.distance_modulus(drawn.z)
+    log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, drawn.colour)
+    log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
+    rng = stream(seed, "galaxies.lines", cell)
+    columns = {
+        **_places(universe.planes, people, drawn.row, dust),
+        "abs_mag_r01": drawn.m_r,
+        "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
+        "color_gr_01": drawn.colour,
+        "log_stellar_mass": log_mass,
+        "log_sfr": log_sfr,
+        **sed_assignment.columns(drawn.sed),
+        **emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, drawn.red, drawn.sed.ebv, rng),
+        **_shape_columns(cell, seed, universe.shapes, drawn, log_mass),
+    }
+    rows = [GALAXIES.build(columns)]
+    rows += [high_redshift.draw(cell, seed, kind, universe.planes, dust) for kind in universe.distant]
+    return in_order(pa.concat_tables(rows))
+
+
+def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
+    """Table `halos` of one order-8 cell, sorted by _healpix_29."""
+    hosts, own_ids = population.halos_of(cells, cell)
+    ra, dec = sky.positions(hosts.index)
+    z = universe.halos.distances.redshift(hosts.chi)
+    return HALOS.build(
+        {
+            "id": own_ids,
+            "ra": ra,
+            "dec": dec,
+            "_healpix_29": hosts.index,
+            "z_true": z,
+            "z_obs": population.observed_redshift(z, hosts.velocity),
+            "log_mass": hosts.log_mass,
+            "concentration": universe.masses.at(universe.masses.concentration, z, hosts.log_mass),
+            "complete": hosts.log_mass >= universe.halos.mass_limit(hosts.chi),
+        }
+    )
+
+
+def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed) -> Drawn:
+    """The galaxies brighter than the limit, with their realised colours.
+
+    z, m_r : float[n] redshift, M_r mag;  red : bool[n] on the red sequence;  sed : n spectra
+    """
+    row = np.flatnonzero(apparent(universe, z, m_r, sed) < universe.limit)
+    kept = sed.part(row)
+    return Drawn(row, z[row], m_r[row], red[row], sed_assignment.colours(universe.colour, kept), kept)
+
+
+def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
+    """Magnitude[n] in the limit's band, AB, unmagnified, before intergalactic hydrogen and the Milky Way's dust.
+
+    z, m_r : float[n] redshift, M_r mag;  sed : n spectra
+    Error: < 0.001 mag (tests/jobs/catalogue/test_band_ratios)
+    """
+    return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
+
+
+def _light(cell: int, seed: int, universe: GalaxyModel, people: Members) -> tuple[Float, Float, Bool, Sed]:
+    """Candidates of a cell: z, M_r, on the red sequence, spectra."""
+    m_r = universe.population.halos.matching.magnitude(people.z, people.proxy)
+    red, colour = sed_assignment.draw_colour(
+        universe.colours, m_r, people.z, people.kind, stream(seed, "galaxies.colour", cell)
+    )
+    if universe.training is not None:
+        rng = stream(seed, "galaxies.nearest", cell)
+        return people.z, m_r, red, nearest_sed.assign(universe.training, colour, m_r, people.z, rng)
+    law, ebv = sed_assignment.draw_dust(universe.colours.dust, m_r, red, colour, stream(seed, "galaxies.dust", cell))
+    return people.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
+
+
+def _places(
+    planes: Planes, people: Members, row: Int, dust: npt.NDArray[np.float32]
+) -> dict[str, npt.NDArray[np.generic]]:
+    ra, dec = people.ra[row], people.dec[row]
+    return {
+        "id": people.id[row],
+        "halo_id": people.halo_id[row],
+        "ra": ra,
+        "dec": dec,
+        "_healpix_29": people.index[row],
+        **lensing.columns(planes, ra, dec, people.chi[row]),
+        "kind": people.kind[row],
+        "density_boost": np.ones(row.size),
+        "z_true": people.z[row],
+        "z_obs": people.z_obs[row],
+        "log_halo_mass": people.host_mass[row],
+        "a_v": dust_map.a_v(dust, ra, dec),
+    }
+
+
+def _shape_columns(
+    cell: int, seed: int, shapes: Shapes, drawn: Drawn, log_mass: Float
+) -> dict[str, npt.NDArray[np.generic]]:
+    scale = cosmology.kpc_per_arcsec(drawn.z)
+    rng = stream(seed, "galaxies.size", cell)
+    radius = morphology.half_light_radius(shapes.size, drawn.z, log_mass, drawn.red, scale, rng)
+    rng = stream(seed, "galaxies.bulge", cell)
+    fraction = morphology.bulge_fraction(shapes.bulge, log_mass, drawn.red, rng)
+    sersic = morphology.sersic_index(shapes.bulge, drawn.red, rng)
+    ratio = morphology.radius_ratio(shapes.bulge, drawn.red, rng)
+    bulge_radius, disc_radius = morphology.component_radii(shapes, radius, fraction, ratio, sersic)
+    rng = stream(seed, "galaxies.shape", cell)
+    disc_ratio = morphology.disc_axis_ratio(shapes, drawn.z.size, rng)
+    return {
+        "bulge_half_light_radius": bulge_radius,
+        "disk_half_light_radius": disc_radius,
+        "bulge_fraction": fraction,
+        "bulge_sersic_index": sersic,
+        "bulge_axis_ratio": morphology.bulge_axis_ratio(shapes.bulge, drawn.z.size, rng),
+        "disk_axis_ratio": disc_ratio,
+        "inclination": morphology.inclination(disc_ratio, shapes.scale_height),
+        "position_angle": morphology.position_angle(drawn.z.size, rng),
+    }

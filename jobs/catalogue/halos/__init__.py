@@ -1,0 +1,1 @@
+"""Haloes and the galaxies in them."""

@@ -1,0 +1,179 @@
+"""Who lives in a generation cell: the centrals of its halos, and the satellites that fall into it.
+
+model       halos, their galaxies' luminosities, and the box they come from
+Cells       what has been drawn of a universe so far: neighbours share it
+members     halos and candidate galaxies of one generation cell
+
+Galaxies belong to the cell of their own true position. Halos of the cells about it are drawn as well, and of their
+satellites those that land inside are kept: none is lost and none is there twice. What a cell holds depends on the
+seed and the cell only, never on which other cells are drawn.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs.catalogue.halos import halo_catalogue, halos, matching, satellites
+from jobs.catalogue.halos.halo_catalogue import LightCone
+from jobs.catalogue.halos.halos import LEVELS, HaloModel, Halos
+from jobs.catalogue.halos.luminosity_function import Inverse, Volume
+from jobs.catalogue.halos.matching import Masses
+from jobs.catalogue.halos.satellites import Satellites
+from jobs.catalogue.matter import density_box
+from jobs.rng import stream
+from lake_schema import ids, sky
+from lake_schema.arrays import Float, Int
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.units import LIGHT_KM_S
+
+CENTRAL, SATELLITE = 0, 1
+# Drawn cells that are kept: a block of cells and its rim are at most so many.
+_KEPT = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Population:
+    """Everything that halos and luminosities are drawn from; light_cone : halos that take the place of ours."""
+
+    seed: int
+    halos: HaloModel
+    masses: Masses
+    light_cone: LightCone | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Members:
+    """Halos of a cell, and candidate galaxies: centrals, then satellites by host, sorted by index.
+
+    halo_id, host_mass : of each galaxy's halo;  index, ra, dec : order-29 cell and position, deg
+    """
+
+    halos: Halos
+    halo_ids: Int
+    id: Int
+    halo_id: Int
+    kind: Int
+    index: Int
+    ra: Float
+    dec: Float
+    chi: Float
+    z: Float
+    z_obs: Float
+    proxy: Float
+    host_mass: Float
+
+
+@dataclass(slots=True, eq=False)
+class Cells:
+    """Cells of one population that have been drawn: (order, cell) -> halos and all their satellites."""
+
+    population: Population
+    drawn: OrderedDict[tuple[int, int], tuple[Halos, Satellites]] = field(default_factory=OrderedDict)
+
+    def at(self, order: int, cell: int) -> tuple[Halos, Satellites]:
+        """Halos drawn by a cell of a level, and their satellites, wherever these are."""
+        place = (order, cell)
+        if place not in self.drawn:
+            people = self.population
+            if people.light_cone is None:
+                hosts = halos.draw(people.halos, people.seed, order, cell)
+            else:
+                hosts = halo_catalogue.draw(people.halos, people.masses, people.light_cone, people.seed, order, cell)
+            rng = stream(people.seed, "satellites", order, cell)
+            self.drawn[place] = hosts, satellites.draw(people.halos, people.masses, hosts, rng)
+            if len(self.drawn) > _KEPT:
+                self.drawn.popitem(last=False)
+        self.drawn.move_to_end(place)
+        return self.drawn[place]
+
+
+def model(
+    seed: int,
+    box_cells: int,
+    space: Volume,
+    luminosities: Inverse,
+    faintest: Callable[[Float], Float],
+    light_cone: LightCone | None = None,
+) -> Population:
+    """The population of a seed.
+
+    faintest   : z[n] -> faintest M_r[n] that is wanted; the volume's own limit holds as well
+    light_cone : halos that take the place of ours
+    """
+    masses = matching.masses()
+    matched = matching.matching(masses, luminosities)
+
+    def wanted(z: Float) -> Float:
+        return np.minimum(faintest(z), space.m_faintest)
+
+    box = density_box.load(seed, box_cells)
+    drawn_from = halos.model(box, space.z_min, space.z_max, masses, matched, wanted)
+    return Population(seed, drawn_from, masses, light_cone)
+
+
+def halos_of(cells: Cells, cell: int) -> tuple[Halos, Int]:
+    """(halos that lie in a generation cell, their identifiers), sorted by position.
+
+    returns : n halos, int64[n]
+    """
+    own = []
+    for order in LEVELS:
+        hosts, _ = cells.at(order, cell >> 2 * (GENERATION_ORDER - order))
+        own.append(hosts.part(hosts.index >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell))
+    together = Halos(*(np.concatenate([getattr(part, name) for part in own]) for name in Halos.__slots__))
+    ordered = together.part(np.lexsort((together.number, together.index)))
+    return ordered, ids.source_id(np.zeros(ordered.number.size), cell, ordered.number)
+
+
+def members(cells: Cells, cell: int) -> Members:
+    """Halos and candidate galaxies of one generation cell."""
+    own, own_ids = halos_of(cells, cell)
+    landed = [_landed(cells, order, around, cell) for order in LEVELS for around in _around(order, cell)]
+    ra, dec = sky.positions(own.index)
+    central = (own_ids, own_ids, own.index, ra, dec, own.chi, own.velocity, own.proxy, own.log_mass)
+    columns = [np.concatenate(column) for column in zip(central, *landed, strict=True)]
+    order = np.lexsort((columns[0], columns[2]))
+    source, halo_id, index, ra, dec, chi, velocity, proxy, mass = (column[order] for column in columns)
+    z = cells.population.halos.distances.redshift(chi)
+    z_obs = observed_redshift(z, velocity)
+    return Members(own, own_ids, source, halo_id, ids.kind_of(source), index, ra, dec, chi, z, z_obs, proxy, mass)
+
+
+def observed_redshift(z: Float, velocity: Float) -> Float:
+    """[n] of sources that recede with a peculiar velocity, km/s.
+
+    z : float[n] true redshift;  velocity : float[n] km/s
+    """
+    return np.asarray((1.0 + z) * (1.0 + velocity / LIGHT_KM_S) - 1.0)
+
+
+def _around(order: int, cell: int) -> list[int]:
+    own = cell >> 2 * (GENERATION_ORDER - order)
+    return [own, *sky.margin_cells(order, own, order).tolist()]
+
+
+def _landed(cells: Cells, order: int, around: int, cell: int) -> tuple[npt.NDArray[np.generic], ...]:
+    """Satellites of one cell's halos that lie in the generation cell: the columns of `members`."""
+    hosts, found = cells.at(order, around)
+    edge = cells.population.halos.line.edge
+    found = found.part(_near(found, cell) & (found.chi > edge[0]) & (found.chi < edge[-1]))
+    index = sky.healpix_29(found.ra, found.dec)
+    inside = index >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell
+    found, index = found.part(inside), index[inside]
+    home = hosts.index[found.host] >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    number = hosts.number[found.host]
+    source = ids.source_id(np.full(home.size, SATELLITE), home, number, found.member)
+    mass = hosts.log_mass[found.host]
+    return source, ids.halo_of(source), index, found.ra, found.dec, found.chi, found.velocity, found.proxy, mass
+
+
+def _near(found: Satellites, cell: int) -> npt.NDArray[np.bool_]:
+    """Satellites that may lie in the cell: no further from its centre than its corners."""
+    ra, dec = sky.cell_centre(GENERATION_ORDER, cell)
+    radius = sky.cell_radius(GENERATION_ORDER)
+    return np.asarray(sky.separation(found.ra, found.dec, ra, dec) <= 1.001 * radius)

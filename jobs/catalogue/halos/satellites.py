@@ -1,0 +1,111 @@
+"""Satellite galaxies: how many a halo has, of which sub-mass, where, and how fast.
+
+draw    satellites of halos, a Poisson sample with an NFW profile
+
+Error: isotropic, spherical halos that are cut at R_200m
+Ref: Navarro, Frenk & White 1997, ApJ 490, 493; Evrard et al. 2008; the numbers are in halos.toml
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs.catalogue.halos.halos import HaloModel, Halos
+from jobs.catalogue.halos.matching import Masses
+from lake_schema import sky
+from lake_schema.arrays import Float, Int
+
+# Nodes of the inverse of the NFW mass profile, in concentration and in enclosed mass: 1e-3 of a radius.
+_C_NODES, _U_NODES = np.geomspace(1.0, 60.0, 40), np.linspace(0.0, 1.0, 256)
+_X_NODES = np.linspace(0.0, 1.0, 2001) ** 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Satellites:
+    """n satellites, by host.
+
+    host : int[n] row of the host;  member : int[n] from 1;  proxy : log10 of the scattered sub-mass
+    ra, dec : deg;  chi : Mpc/h;  velocity : km/s, receding, with the host's
+    """
+
+    host: Int
+    member: Int
+    proxy: Float
+    ra: Float
+    dec: Float
+    chi: Float
+    velocity: Float
+
+    def part(self, keep: npt.NDArray[np.generic]) -> Satellites:
+        """The satellites that are kept: keep : bool or int[m] rows."""
+        return Satellites(*(getattr(self, name)[keep] for name in self.__slots__))
+
+
+def draw(halos: HaloModel, masses: Masses, hosts: Halos, rng: np.random.Generator) -> Satellites:
+    """The satellites of hosts that reach the limit of their distance."""
+    occupation = halos.matching.occupation
+    limit = halos.mass_limit(hosts.chi)
+    over = 10.0 ** (hosts.log_mass - limit + occupation.depth)
+    # Below the limit, halos are only a sample that their centrals chose.
+    rich = (over > occupation.least) & (hosts.log_mass >= limit)
+    count = rng.poisson(np.where(rich, (over - occupation.least) / occupation.ratio, 0.0))
+    host = np.repeat(np.arange(count.size), count)
+    ratio = occupation.least + (over[host] - occupation.least) * rng.random(host.size)
+    proxy = hosts.log_mass[host] - np.log10(ratio) + occupation.scatter * rng.standard_normal(host.size)
+    bright = proxy >= limit[host]
+    host, proxy = host[bright], proxy[bright]
+    member = 1 + np.arange(host.size) - np.searchsorted(host, host)
+    z = halos.distances.redshift(hosts.chi)
+    offset = _offsets(masses, occupation.concentration, hosts.log_mass, z, host, rng)
+    kick = masses.dispersion(hosts.log_mass, z)[host] * rng.standard_normal(host.size)
+    ra, dec, chi = _moved(hosts, host, offset)
+    return Satellites(host, member, proxy, ra, dec, chi, hosts.velocity[host] + kick)
+
+
+def nfw_radius(concentration: Float, enclosed: Float) -> Float:
+    """Radius / R_200m[n] that holds a share of the mass inside R_200m.
+
+    concentration : float[n] c_200m;  enclosed : float[n] of the mass, 0 .. 1
+    Error: 1e-3
+    """
+    row, part = _bracket(np.log(_C_NODES), np.log(concentration))
+    step = np.asarray(enclosed) * (_U_NODES.size - 1)
+    column = np.clip(step.astype(np.int64), 0, _U_NODES.size - 2)
+    share = step - column
+    # The square of the radius is nearly linear in the enclosed mass at the centre.
+    low = _SQUARES[row, column] * (1.0 - share) + _SQUARES[row, column + 1] * share
+    high = _SQUARES[row + 1, column] * (1.0 - share) + _SQUARES[row + 1, column + 1] * share
+    return np.asarray(np.sqrt(low * (1.0 - part) + high * part))
+
+
+def _squares() -> Float:
+    x = _C_NODES[:, None] * _X_NODES
+    inside = np.log1p(x) - x / (1.0 + x)
+    return np.array([np.interp(_U_NODES, row / row[-1], _X_NODES**2) for row in inside])
+
+
+def _offsets(masses: Masses, times: float, log_mass: Float, z: Float, host: Int, rng: np.random.Generator) -> Float:
+    """Offsets from the hosts' centres, [n, 3] comoving Mpc/h."""
+    c = times * masses.at(masses.concentration, z, log_mass)
+    radius = masses.radius(log_mass)[host] * nfw_radius(np.clip(c, 1.0, 60.0)[host], rng.random(host.size))
+    direction = rng.standard_normal((host.size, 3))
+    return np.asarray(direction * (radius / np.sqrt(np.sum(direction**2, 1)))[:, None])
+
+
+def _moved(hosts: Halos, host: Int, offset: Float) -> tuple[Float, Float, Float]:
+    ra, dec = (np.radians(angle) for angle in sky.positions(hosts.index))
+    unit = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], 1)
+    x, y, z = ((unit * hosts.chi[:, None])[host] + offset).T
+    flat = np.hypot(x, y)
+    return sky.wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, flat)), np.hypot(flat, z)
+
+
+def _bracket(nodes: Float, values: Float) -> tuple[Int, Float]:
+    row = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
+    return row, (values - nodes[row]) / (nodes[row + 1] - nodes[row])
+
+
+_SQUARES = _squares()

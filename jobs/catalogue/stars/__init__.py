@@ -1,0 +1,1 @@
+"""The Milky Way's stars."""

@@ -1,0 +1,127 @@
+"""Density laws of the Milky Way's components, each relative to its own density at the Sun.
+
+Exponential, PowerLaw                     Juric et al. 2008
+Aged, Young, Parabolic, CoredPowerLaw     Robin et al. 2003, the Besancon model: bins of age of the thin disc, the
+                                          thick disc, the spheroid
+density                                   any of them
+
+Lengths are in pc; R, z are Galactocentric and cylindrical. The numbers are in milky_way.toml.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.arrays import Float
+
+
+@dataclass(frozen=True, slots=True)
+class Sun:
+    """The Sun's distance from the centre and height above the plane."""
+
+    radius: float
+    height: float
+
+
+@dataclass(frozen=True, slots=True)
+class Exponential:
+    """exp(-R / length - |z| / height)"""
+
+    length: float
+    height: float
+
+
+@dataclass(frozen=True, slots=True)
+class PowerLaw:
+    """(R^2 + (z / flattening)^2 + core^2)^(slope / 2)"""
+
+    flattening: float
+    slope: float
+    core: float
+
+
+@dataclass(frozen=True, slots=True)
+class Aged:
+    """exp(-sqrt(1/4 + a^2 / outer^2)) - exp(-sqrt(1/4 + a^2 / inner^2)), a^2 = R^2 + (z / flattening)^2"""
+
+    flattening: float
+    outer: float
+    inner: float
+
+
+@dataclass(frozen=True, slots=True)
+class Young:
+    """exp(-a^2 / outer^2) - exp(-a^2 / inner^2), a as in Aged"""
+
+    flattening: float
+    outer: float
+    inner: float
+
+
+@dataclass(frozen=True, slots=True)
+class Parabolic:
+    """exp(-R / length); in z a parabola to the height `joint`, from there an exponential, smoothly."""
+
+    length: float
+    height: float
+    joint: float
+
+
+@dataclass(frozen=True, slots=True)
+class CoredPowerLaw:
+    """max(a, core)^slope, a as in Aged"""
+
+    flattening: float
+    slope: float
+    core: float
+
+
+Law = Exponential | PowerLaw | Aged | Young | Parabolic | CoredPowerLaw
+
+
+def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike) -> Float:
+    """Density at R, z (broadcast) relative to the one at the Sun, never negative.
+
+    radius, height : float[...] pc, galactocentric
+    """
+    r, z = np.asarray(radius, float), np.asarray(height, float)
+    at_sun = _log(law, np.asarray(sun.radius), np.asarray(sun.height))
+    # A difference of logarithms: far out the densities themselves are not numbers any more.
+    return np.asarray(np.exp(_log(law, r, z) - at_sun))
+
+
+def _log(law: Law, r: Float, z: Float) -> Float:
+    match law:
+        case Exponential():
+            return np.asarray(-r / law.length - np.abs(z) / law.height)
+        case PowerLaw():
+            return np.asarray(0.5 * law.slope * np.log(_a2(law.flattening, r, z) + law.core**2))
+        case CoredPowerLaw():
+            return np.asarray(0.5 * law.slope * np.log(np.maximum(_a2(law.flattening, r, z), law.core**2)))
+        case Aged():
+            a2 = _a2(law.flattening, r, z)
+            return _log_difference(np.sqrt(0.25 + a2 / law.outer**2), np.sqrt(0.25 + a2 / law.inner**2))
+        case Young():
+            a2 = _a2(law.flattening, r, z)
+            return _log_difference(a2 / law.outer**2, a2 / law.inner**2)
+        case Parabolic():
+            return np.asarray(-r / law.length + _log_parabolic(law, np.abs(z)))
+
+
+def _a2(flattening: float, r: Float, z: Float) -> Float:
+    return np.asarray(r**2 + (z / flattening) ** 2)
+
+
+def _log_difference(near: Float, far: Float) -> Float:
+    """log(exp(-near) - exp(-far)), far >= near; -inf in the hole at the centre."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(-near + np.log(-np.expm1(near - far)))
+
+
+def _log_parabolic(law: Parabolic, z: Float) -> Float:
+    x = law.joint / law.height
+    inside = np.log1p(-(np.minimum(z, law.joint) ** 2) / (law.height * law.joint * (2.0 + x)))
+    return np.asarray(inside - np.maximum(z - law.joint, 0.0) / law.height)

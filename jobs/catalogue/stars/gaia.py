@@ -1,0 +1,120 @@
+"""The stars as Gaia's second data release would list them: table `gaia`, row by row a function of (seed, star).
+
+observe    stars and their fluxes in BANDS -> what Gaia measures
+astrometric_errors, photometric_errors, completeness   at a magnitude
+ab_minus_vega   of BANDS
+
+Random numbers are keyed by the star, so that it is measured alike in whichever file it lies.
+Ref: Gaia Collaboration, Brown et al. 2018; the numbers and their sources are in gaia.toml.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+from scipy.special import erfc, ndtri
+
+from jobs.catalogue import parameters
+from jobs.catalogue.galaxies import lensing
+from jobs.rng import uniforms
+from lake_schema import sky, units
+from lake_schema.arrays import Float
+from lake_schema.tables.gaia import GAIA
+
+BANDS = ("gaia_g", "gaia_bp", "gaia_rp")
+STAR_COLUMNS = ["id", "ra", "dec", "distance"]
+FLUX_COLUMNS = [f"f_nu_{band}" for band in BANDS]
+_FILE = "gaia.toml"
+_MAS = 1.0 / 3.6e6
+_MAG_OVER_FLUX = 2.5 / np.log(10.0)
+# Of a star's random numbers.
+_RA, _DEC, _PARALLAX, _G, _BP, _RP, _LISTED = range(7)
+
+
+def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
+    """Table `gaia` of stars, sorted by where they are measured.
+
+    stars, fluxes : columns STAR_COLUMNS, FLUX_COLUMNS, row by row
+    """
+    ids = stars["id"].to_numpy()
+    chance = uniforms(ids, _LISTED + 1, seed, "gaia")
+    true = [units.mag_of_f_nu(fluxes[name].to_numpy().astype(float)) for name in FLUX_COLUMNS]
+    vega = ab_minus_vega()
+    g = true[0] - vega[0]
+    listed = np.flatnonzero(chance[_LISTED] < completeness(g))
+    noise = ndtri(chance[:_LISTED, listed])
+    columns: dict[str, Any] = {"id": ids[listed], **_astrometry(stars.take(pa.array(listed)), g[listed], noise)}
+    for k, (short, kind) in enumerate((("g", "g"), ("bp", "xp"), ("rp", "xp"))):
+        columns |= _photometry(short, true[k][listed], vega[k], kind, noise[_G + k])
+    order = np.lexsort((columns["id"], columns["_healpix_29"]))
+    return GAIA.build({name: values[order] for name, values in columns.items()})
+
+
+def ab_minus_vega() -> tuple[float, ...]:
+    """AB - Vega magnitude in each of BANDS, as Gaia defines them; 0.04 mag from what Vega's spectrum gives."""
+    return tuple(parameters.section(_FILE, "zero_points")["ab_minus_vega"])
+
+
+def completeness(g: npt.ArrayLike) -> Float:
+    """Part of the stars[n] of a magnitude G (Vega) that is listed.
+
+    g : float[n] mag, Vega
+    """
+    law = parameters.section(_FILE, "completeness")
+    return np.asarray(0.5 * erfc((np.asarray(g, float) - law["half"]) / (np.sqrt(2.0) * law["width"])))
+
+
+def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
+    """Standard errors[n] of right ascension times cos(dec), declination and parallax, mas, at G (Vega).
+
+    g : float[n] mag, Vega
+    """
+    law = parameters.section(_FILE, "astrometry")
+    z = 10.0 ** (0.4 * (np.maximum(np.asarray(g, float), law["bright"]) - 15.0))
+    parallax = 1e-3 * law["scale"] * np.sqrt(law["c0"] + law["c1"] * z + law["c2"] * z**2)
+    ra, dec, own = (np.maximum(factor * parallax, law["floor"]) for factor in (law["ra"], law["dec"], 1.0))
+    return ra, dec, own
+
+
+def photometric_errors(mag: npt.ArrayLike, kind: str) -> Float:
+    """Standard error[n], mag, at a magnitude (Vega) in its own band; kind: "g", or "xp" for BP and RP."""
+    law = parameters.section(_FILE, "photometry")
+    at, error = np.array(law[kind]), np.log(law[f"{kind}_error"])
+    slope = np.diff(error) / np.diff(at)
+    magnitude = np.asarray(mag, float)
+    beyond = slope[-1] * np.maximum(magnitude - at[-1], 0.0) + slope[0] * np.minimum(magnitude - at[0], 0.0)
+    return np.asarray(np.exp(np.interp(magnitude, at, error) + beyond))
+
+
+def _astrometry(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
+    errors = astrometric_errors(g)
+    east, north = (_MAS * error * noise[k] for error, k in zip(errors[:2], (_RA, _DEC), strict=True))
+    ra, dec = lensing.displaced(stars["ra"].to_numpy(), stars["dec"].to_numpy(), np.radians(east), np.radians(north))
+    distance = np.asarray(pc.fill_null(stars["distance"], np.nan).to_numpy(), float)
+    parallax = 1e3 / distance + errors[2] * noise[_PARALLAX]
+    return {
+        "ra": ra,
+        "dec": dec,
+        "_healpix_29": sky.healpix_29(ra, dec),
+        "ra_error": errors[0],
+        "dec_error": errors[1],
+        "parallax": np.ma.masked_invalid(parallax),
+        "parallax_error": errors[2],
+    }
+
+
+def _photometry(short: str, true_ab: Float, vega: float, kind: str, noise: Float) -> dict[str, Any]:
+    """The flux is what has a normal error: a faint star's may come out negative, and has no magnitude then."""
+    error = photometric_errors(true_ab - vega, kind) / _MAG_OVER_FLUX
+    flux = 1.0 + error * noise
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mag = np.ma.masked_invalid(true_ab - 2.5 * np.log10(flux))
+    return {
+        f"mag_{short}_ab": mag,
+        f"phot_{short}_mean_mag": mag - vega,
+        f"phot_{short}_mean_flux_over_error": np.ma.MaskedArray(flux / error, mask=np.ma.getmaskarray(mag)),
+    }

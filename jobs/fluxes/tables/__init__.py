@@ -1,0 +1,1 @@
+"""Band fluxes from precomputed tables."""

@@ -1,0 +1,1 @@
+"""Detectors, pointing, astrometry and lamps."""

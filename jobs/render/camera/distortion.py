@@ -1,0 +1,132 @@
+"""Geometric distortion: the optics put a place of the sky a little off where a perfect camera would.
+
+A focal-plane position P (arcsec) looks where a perfect camera has P + D(P); D is a polynomial without constant and
+linear terms, so that the boresight stays, and the scale there. In pixels it is the polynomial of the SIP convention.
+
+terms      a camera's polynomial, from the mission database
+bent       P -> P + D(P)
+sip        the same in a detector's pixels: coefficients of the header's cards
+stretch    what it does to a pixel's area
+straight   what SIP makes of pixels, undone
+
+Ref : Shupe et al. 2005 (SIP)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial import polynomial
+
+from jobs import sums
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+
+# Of each term: powers of x and y; what it adds to x and to y, arcsec^(1 - powers).
+Terms = tuple[tuple[int, int, float, float], ...]
+
+_ARCSEC = 3600.0
+# The inverse: pixels that it is exact to, steps it may take (each doubles the digits), and from where on there is no
+# camera, pixels from the boresight: what lies there is left where a perfect camera has it.
+_EXACT, _MOST_STEPS, _FARTHEST = 1e-9, 30, 6e4
+
+
+def terms(section: str, mission: MissionConfiguration) -> Terms:
+    """A camera's distortion; none where the database has no polynomial, or its strength is 0."""
+    key = f"{section}.fpa.distortion_polynomial"
+    if key not in mission:
+        return ()
+    strength = mission.value(f"{section}.fpa.distortion", "")
+    # The polynomial is in degrees.
+    found = [
+        (int(i), int(j), strength * to_x * _ARCSEC ** (1 - i - j), strength * to_y * _ARCSEC ** (1 - i - j))
+        for i, j, to_x, to_y in mission.numbers(key)
+    ]
+    if any(i + j < 2 for i, j, _, _ in found):
+        raise BadInput(f"mission model {key}: a term of less than second order moves the boresight or turns the camera")
+    return tuple(term for term in found if term[2] or term[3])
+
+
+def bent(x: npt.ArrayLike, y: npt.ArrayLike, some: Terms) -> tuple[Float, Float]:
+    """Focal-plane positions [..], arcsec -> where a perfect camera has what is seen there."""
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    to_x, to_y = np.zeros_like(x), np.zeros_like(y)
+    for i, j, a, b in some:
+        power = x**i * y**j
+        to_x += a * power
+        to_y += b * power
+    return x + to_x, y + to_y
+
+
+def sip(some: Terms, matrix: Float) -> tuple[Float, Float]:
+    """Coefficients [order + 1, order + 1] of u^p v^q that SIP adds to columns and to rows.
+
+    matrix : [2, 2] focal-plane arcsec of a pixel's step along columns (u) and rows (v)
+    """
+    order = max(i + j for i, j, _, _ in some)
+    to_x, to_y = np.zeros((2, order + 1, order + 1))
+    for i, j, a, b in some:
+        power = np.zeros((order + 1, order + 1))
+        # (m00 u + m01 v)^i (m10 u + m11 v)^j, each factor a homogeneous polynomial: a row of binomials.
+        across, along = (_binomial(line, n) for line, n in ((matrix[0], i), (matrix[1], j)))
+        for p, coefficient in enumerate(across):
+            for q, another in enumerate(along):
+                power[p + q, i + j - p - q] += coefficient * another
+        to_x += a * power
+        to_y += b * power
+    inverse = sums.inverse(matrix)
+    return inverse[0, 0] * to_x + inverse[0, 1] * to_y, inverse[1, 0] * to_x + inverse[1, 1] * to_y
+
+
+def stretch(some: Terms, matrix: Float) -> Float:
+    """Coefficients [n, n] of u^p v^q: the area that a pixel sees over that at the boresight, less 1.
+
+    matrix : as of `sip`, whose derivative's determinant it is
+    """
+    a, b = sip(some, matrix)
+    (au, av), (bu, bv) = ([np.asarray(polynomial.polyder(c, axis=axis), float) for axis in (0, 1)] for c in (a, b))
+    side = 2 * len(a) - 1
+    out = np.zeros((side, side))
+    for sign, factors in ((1.0, (au, _ONE)), (1.0, (bv, _ONE)), (1.0, (au, bv)), (-1.0, (av, bu))):
+        one, other = factors
+        for p, q in np.argwhere(one).tolist():
+            out[p : p + other.shape[0], q : q + other.shape[1]] += sign * one[p, q] * other
+    return out
+
+
+_ONE = np.ones((1, 1))
+
+
+def _binomial(line: Float, n: int) -> Float:
+    """Coefficients by the power of u of (line[0] u + line[1] v)^n."""
+    return np.asarray(polynomial.polypow([line[1], line[0]], n), float) if n else np.ones(1)
+
+
+def straight(u: Float, v: Float, a: Float, b: Float) -> tuple[Float, Float]:
+    """(u, v) [n] pixels from the boresight with u + a(u, v), v + b(u, v) as given, by Newton's rule.
+
+    Error : 1e-9 pixels; beyond any camera (see above) nothing is undone
+    """
+    wanted = np.stack([np.asarray(u, float), np.asarray(v, float)])
+    found = wanted.copy()
+    with np.errstate(invalid="ignore"):
+        near = np.hypot(*wanted) < _FARTHEST
+    at, goal = found[:, near], wanted[:, near]
+    slopes = [np.asarray(polynomial.polyder(c, axis=axis), float) for c in (a, b) for axis in (0, 1)]
+    for _ in range(_MOST_STEPS):
+        wrong = at + np.stack([_at(at, c) for c in (a, b)]) - goal
+        au, av, bu, bv = (_at(at, c) for c in slopes)
+        determinant = (1.0 + au) * (1.0 + bv) - av * bu
+        step = np.stack([(1.0 + bv) * wrong[0] - av * wrong[1], (1.0 + au) * wrong[1] - bu * wrong[0]]) / determinant
+        at = np.asarray(at - step)
+        if np.abs(step).max(initial=0.0) < _EXACT:
+            break
+    else:
+        raise BadInput("the distortion is so strong that places of the sky are seen twice, or nowhere")
+    found[:, near] = at
+    return found[0], found[1]
+
+
+def _at(places: Float, coefficients: Float) -> Float:
+    return np.asarray(polynomial.polyval2d(places[0], places[1], coefficients), float)

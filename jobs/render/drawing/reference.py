@@ -1,0 +1,52 @@
+"""One source by GalSim's drawImage: what `stamps.draw` is held against.
+
+reference       one source by galsim's own drawImage: what `draw` is held against
+"""
+
+from __future__ import annotations
+
+import galsim
+import numpy as np
+
+from jobs.render.drawing import transfer
+from jobs.render.psf.model import Psf
+from jobs.render.sources import galaxy_shapes
+from jobs.render.sources.lensed_arcs import Picture
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float
+
+# What galsim takes for a point in the reference, arcsec.
+_POINT = 1e-6
+
+
+def reference(sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e-4, highest: float = 1e-4) -> Float:
+    """Source i by galsim.Convolve and drawImage, tight thresholds: slow, with none of `draw`'s transforms.
+
+    folding, highest : galsim's folding_threshold and maxk_threshold; what is cut at 1e-4 shows as 3e-3 of the noise in
+                        the middle of bright discs
+    returns : float64[size, size], lower left pixel at round(position) - size / 2
+    """
+    settings = galsim.GSParams(
+        folding_threshold=folding, maxk_threshold=highest, kvalue_accuracy=1e-7, maximum_fft_size=16384
+    )
+    weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)[i]
+    pixel = [] if psf.intra_pixel is None else [galsim.Pixel(1.0)]
+    parts = [transfer.profile_of(psf, weights).dilate(1.0 / psf.pixel_scale), *pixel]
+    picture = sources.picture_of(i)
+    if sources.shape[i] >= 0 or picture is not None:
+        profile = _of(picture) if picture else galaxy_shapes.profile(sources.shapes, int(sources.shape[i]), _POINT)
+        # World frame, arcsec -> pixels, the flux kept.
+        parts.append(galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(profile))
+    whole = galsim.Convolve(parts, gsparams=settings) * float(sources.electrons[i])
+    x0, y0 = (int(np.rint(position[i])) - size // 2 for position in (sources.column, sources.row))
+    centre = galsim.PositionD(sources.column[i] - x0, sources.row[i] - y0)
+    image = galsim.ImageD(galsim.BoundsI(0, size - 1, 0, size - 1), scale=1.0)
+    whole.drawImage(image, center=centre, method="no_pixel")
+    return np.asarray(image.array)
+
+
+def _of(picture: Picture) -> galsim.GSObject:
+    """A picture as galsim interpolates it, world frame (u to the west), flux 1."""
+    image = galsim.Image(np.ascontiguousarray(picture.image[:, ::-1], float), scale=picture.scale)
+    # Padded more than by default: the transform is as good as the reference should be.
+    return galsim.InterpolatedImage(image, x_interpolant="quintic", pad_factor=8.0)

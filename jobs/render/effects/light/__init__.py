@@ -1,0 +1,1 @@
+"""What happens to light before it is charge."""

@@ -1,0 +1,62 @@
+"""Flats: the calibration unit shines with one of its six LEDs; what it lights is far from even.
+
+Each has its own wavelengths: of as much light the band detects more or less.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jobs.fluxes import passbands
+from jobs.render.camera.lamps import LEDS
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.light import illumination
+from jobs.render.effects.scene import Frame, Scene
+from lake_schema.errors import OutOfRange
+
+_BAND = "euclid_vis"
+# Standard deviations in a full width at half maximum.
+_FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
+
+
+def apply(frame: Frame, level: float, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
+    """frame [ny, nx] expected e- -> plus level (1 + columns [nx] + rows [ny])."""
+    if not 0.0 <= level <= 1e9:
+        raise OutOfRange("lamp", level, 0.0, 1e9)
+    return np.asarray(frame + level * illumination.apply(np.ones(frame.shape), columns, rows))
+
+
+def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
+    """What an LED lights: a paraboloid, and a slope whose direction is the LED's place on the unit."""
+    if not 1 <= led <= LEDS:
+        raise OutOfRange("LED", led, 1, LEDS)
+    angle = 2.0 * np.pi * (led - 1) / LEDS
+    slope = scene.value("flat.gradient", "")
+    direction = (slope * float(np.cos(angle)), slope * float(np.sin(angle)))
+    return illumination.pattern(scene, nx, ny, scene.value("flat.illumination", ""), direction)
+
+
+def seen(scene: Scene, led: int) -> float:
+    """What the band detects of an LED's photons, over what the embedded band would where it sees best; no unit.
+
+    led    : its number, from 1
+    Error  : the LED's spectrum is taken as a Gaussian of its central wavelength and width
+    Errors : OutOfRange for a number that no LED has
+    """
+    if not 1 <= led <= LEDS:
+        raise OutOfRange("LED", led, 1, LEDS)
+    usual = passbands.load(_BAND)
+    band = scene.band or usual
+    width = 10.0 * scene.value("flat.led_width", "nm") / _FWHM
+    off = (band.wavelength - 10.0 * scene.value(f"flat.led_{led}", "nm")) / width
+    # On wavelengths 1 A apart.
+    detected = float(np.sum(band.response * np.exp(-0.5 * off**2)) / (width * np.sqrt(2.0 * np.pi)))
+    return detected / float(usual.response.max())
+
+
+def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:
+    level = scene.value("flat.signal", "electron") * seen(scene, scene.lamp)
+    return level, *pattern(scene, scene.lamp, scene.nx, scene.ny)
+
+
+EFFECT = Effect("calibration_lamp", apply, _parameters, lambda scene: _parameters(scene)[0], cost=1e-2)

@@ -1,0 +1,40 @@
+"""Analogue-to-digital conversion: gain, bias, rounding, the converter's range."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jobs.compiling import jit
+from jobs.render.effects.effect import Effect, by_pixel
+from jobs.render.effects.scene import Frame, Scene
+from lake_schema.errors import OutOfRange
+
+
+def apply(frame: Frame, gain: float, bias: float, largest: float, rng: np.random.Generator | None = None) -> Frame:
+    """Electrons [ny, nx] -> ADU, whole numbers in [0, largest].
+
+    gain : electrons per ADU;  bias : ADU
+    """
+    if not 0.0 < gain < np.inf:
+        raise OutOfRange("gain", gain, 0.0, np.inf)
+    return by_pixel(_convert, frame, gain, bias + 0.5, largest)
+
+
+@jit
+def _convert(electrons: Any, numbers: Any, gain: float, offset: float, largest: float) -> None:
+    for i in range(len(electrons)):
+        numbers[i] = min(max(np.floor(electrons[i] / gain + offset), 0.0), largest)
+
+
+def _parameters(scene: Scene) -> tuple[float, float, float]:
+    return scene.value("gain", "electron / adu"), scene.value("bias", "adu"), scene.value("adc_max", "adu")
+
+
+def _contribution(scene: Scene) -> float:
+    gain, bias, _ = _parameters(scene)
+    return gain * (bias + 0.5)
+
+
+EFFECT = Effect("adc", apply, _parameters, _contribution, optional=False, cost=3e-3)

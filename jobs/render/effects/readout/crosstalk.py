@@ -1,0 +1,64 @@
+"""Crosstalk: the four amplifiers read at the same time, and each sees a little of the others."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jobs.compiling import jit
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.scene import Frame, Scene
+from lake_schema.errors import BadInput, OutOfRange
+
+# Of the coupling between neighbours (assumed).
+_DIAGONAL = 0.5
+_RUN = 1024
+
+
+def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = None) -> Frame:
+    """quadrants [4, ny, nx] in readout order -> each plus its share of the others, all at once.
+
+    coefficients : [4, 4] of signal from the second index into the first, 0 on the diagonal
+    """
+    count = len(frame)
+    if coefficients.shape != (count, count):
+        raise BadInput(f"crosstalk of {coefficients.shape} coefficients for {count} quadrants")
+    if not np.all(np.abs(coefficients) <= 1.0):
+        raise OutOfRange("crosstalk", float(np.abs(coefficients).max()), 0.0, 1.0)
+    flat = np.ascontiguousarray(frame, dtype=float).reshape(count, -1)
+    out = np.empty_like(flat)
+    _mix(flat, np.asarray(coefficients, float), out)
+    return out.reshape(frame.shape)
+
+
+@jit
+def _mix(frame: Any, coefficients: Any, out: Any) -> None:
+    # As many pixels at a time as the processor has near at hand.
+    for start in range(0, frame.shape[1], _RUN):
+        for victim in range(len(frame)):
+            line = out[victim, start : start + _RUN]
+            line[:] = frame[victim, start : start + _RUN]
+            for source in range(len(frame)):
+                share, other = coefficients[victim, source], frame[source, start : start + _RUN]
+                if source != victim and share != 0.0:
+                    for i in range(len(line)):
+                        line[i] += share * other[i]
+
+
+def coefficients(scene: Scene) -> Frame:
+    """The mission's for neighbours along a side, half of it across the diagonal."""
+    near = far = scene.value("crosstalk", "")
+    diagonal = _DIAGONAL * near
+    # E F G H: upper left, upper right, lower right, lower left.
+    return np.array(
+        [[0, near, diagonal, far], [near, 0, far, diagonal], [diagonal, far, 0, near], [far, diagonal, near, 0]]
+    )
+
+
+def _contribution(scene: Scene) -> float:
+    full = min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)
+    return float(np.abs(coefficients(scene)).max()) * full
+
+
+EFFECT = Effect("crosstalk", apply, lambda scene: (coefficients(scene),), _contribution, cost=4e-3)

@@ -1,0 +1,107 @@
+"""Non-linearity of the output amplifier: its gain falls towards saturation, and for the first electrons.
+
+measured = s - b n0 (1 - exp(-s / n0)),  s = n / (1 + a n / saturation)
+
+apply         electrons -> what the amplifier gives, in electrons
+linearised    its inverse: what a calibration does
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jobs.compiling import jit
+from jobs.render.effects.effect import Effect, by_pixel
+from jobs.render.effects.scene import Frame, Scene
+from lake_schema.errors import OutOfRange
+
+# Newton's rule doubles the digits; the function is smooth and its slope between 1 - b and 1.
+_ITERATIONS = 6
+# Of the knee: where the series of the exponential function is exact.
+_SMALL = 0.25
+
+
+def apply(
+    frame: Frame, high: float, saturation: float, low: float, knee: float, rng: np.random.Generator | None = None
+) -> Frame:
+    """frame [..] e- >= 0 -> e-, monotonic.
+
+    high : a, what is missing at `saturation` e-;  low : b, what is missing of the first electrons;  knee : n0, e-
+    """
+    _check(high, saturation, low, knee)
+    return by_pixel(_respond, frame, high / saturation, low * knee, 1.0 / knee)
+
+
+@jit
+def _respond(light: Any, signal: Any, high: float, low: float, inverse: float) -> None:
+    """high : per electron, low : electrons, inverse : of the knee."""
+    for i in range(len(light)):
+        response = max(light[i], 0.0) / (1.0 + high * max(light[i], 0.0))
+        signal[i] = min(light[i], 0.0) + response + low * _small_expm1(-response * inverse)
+    # Most pixels are faint: a branch above would cost more than the few that are done twice.
+    for i in range(len(light)):
+        if light[i] * inverse > _SMALL:
+            response = light[i] / (1.0 + high * light[i])
+            signal[i] = response + low * np.expm1(-response * inverse)
+
+
+@jit
+def _small_expm1(x: Any) -> Any:
+    """exp(x) - 1 by its series, to 1e-14 for |x| < _SMALL."""
+    out = 1.0 + x * (1.0 / 11.0)
+    out = 1.0 + x * (1.0 / 10.0) * out
+    out = 1.0 + x * (1.0 / 9.0) * out
+    out = 1.0 + x * (1.0 / 8.0) * out
+    out = 1.0 + x * (1.0 / 7.0) * out
+    out = 1.0 + x * (1.0 / 6.0) * out
+    out = 1.0 + x * (1.0 / 5.0) * out
+    out = 1.0 + x * (1.0 / 4.0) * out
+    out = 1.0 + x * (1.0 / 3.0) * out
+    out = 1.0 + x * (1.0 / 2.0) * out
+    return x * out
+
+
+def linearised(measured: Frame, high: float, saturation: float, low: float, knee: float) -> Frame:
+    """The electrons that `apply` made into `measured`; beyond what it can give: infinite."""
+    _check(high, saturation, low, knee)
+    light = np.maximum(measured, 0.0)
+    response = light / (1.0 - low * np.exp(-light / knee))
+    for _ in range(_ITERATIONS):
+        wrong = response + low * knee * np.expm1(-response / knee) - light
+        response = np.maximum(response - wrong / (1.0 - low * np.exp(-response / knee)), 0.0)
+    left = 1.0 - high / saturation * response
+    with np.errstate(divide="ignore"):
+        out = np.where(left > 0.0, response / np.maximum(left, 0.0), np.inf)
+    return np.asarray(out + np.minimum(measured, 0.0))
+
+
+def _check(high: float, saturation: float, low: float, knee: float) -> None:
+    for name, value, least, most in (
+        ("non-linearity at saturation", high, 0.0, 10.0),
+        ("amplifier saturation", saturation, 1.0, 1e9),
+        ("non-linearity of low signals", low, 0.0, 0.99),
+        ("non-linearity knee", knee, 1e-3, 1e9),
+    ):
+        if not least <= value <= most:
+            raise OutOfRange(name, value, least, most)
+
+
+def parameters(scene: Scene) -> tuple[float, float, float, float]:
+    """high, saturation, low, knee: the converter's range is the amplifier's."""
+    saturation = scene.value("adc_max", "adu") * scene.value("gain", "electron / adu")
+    return (
+        scene.value("nonlinearity.high", ""),
+        saturation,
+        scene.value("nonlinearity.low", ""),
+        scene.value("nonlinearity.low_scale", "electron"),
+    )
+
+
+def _contribution(scene: Scene) -> float:
+    there = np.array([min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)])
+    return float((there - apply(there, *parameters(scene)))[0])
+
+
+EFFECT = Effect("nonlinearity", apply, parameters, _contribution, cost=6e-3)

@@ -1,0 +1,84 @@
+"""Quadrants: a detector is read through its four corners, each with its own pre- and overscan.
+
+Between the halves of a detector lie rows of charge injection. They are not read: what of light or cosmic rays falls
+there ends here.
+
+Readout order: [E, F, G, H][row, column], where [0, 0] is read first. E lies upper left, F upper right, G lower right,
+H lower left (Euclid Data Product Description Document, LE1 VIS). Columns: prescan, pixels, overscan; rows: pixels,
+overscan.
+
+apply, EFFECT    detector -> quadrants in readout order, no charge outside the pixels
+placed           one quadrant in readout order -> as it lies on the detector, and back
+assembled        quadrants -> detector, without pre- and overscan
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.scene import Frame, Scene
+from lake_schema.errors import BadInput, OutOfRange
+
+NAMES = "EFGH"
+# Whether a quadrant lies in the upper half, in the right half.
+_UPPER, _RIGHT = (True, True, False, False), (False, True, True, False)
+
+Number = TypeVar("Number", bound=np.generic)
+
+
+def apply(
+    frame: Frame, prescan: int, overscan: int, rows: int, middle: int = 0, rng: np.random.Generator | None = None
+) -> Frame:
+    """frame [ny, nx] e- -> quadrants [4, (ny - middle) / 2 + rows, prescan + nx / 2 + overscan] e-."""
+    for name, value in (("prescan", prescan), ("overscan", overscan), ("overscan rows", rows), ("middle rows", middle)):
+        if not 0 <= value <= 4096:
+            raise OutOfRange(name, value, 0, 4096)
+    ny, nx = frame.shape
+    if ny % 2 or nx % 2 or middle % 2 or middle > ny:
+        raise BadInput(f"a detector of {ny} x {nx} pixels has no quadrants: its sides must be even")
+    half_y, half_x = (ny - middle) // 2, nx // 2
+    out = np.zeros((4, half_y + rows, prescan + half_x + overscan), frame.dtype)
+    for number in range(4):
+        y, x = (half_y + middle) * _UPPER[number], half_x * _RIGHT[number]
+        part = frame[y : y + half_y, x : x + half_x]
+        out[number, :half_y, prescan : prescan + half_x] = placed(part, number)
+    return out
+
+
+def placed(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
+    """A quadrant [ny, nx] in readout order -> in the detector's own axes; applied twice it is itself."""
+    return quadrant[:: -1 if _UPPER[number] else 1, :: -1 if _RIGHT[number] else 1]
+
+
+def origin(
+    number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, middle: int = 0
+) -> tuple[int, int]:
+    """What is added to a detector's (column, row) to find it in a quadrant [ny, nx] as it is `placed`."""
+    ny, nx = shape
+    across = overscan - (nx - prescan - overscan) if _RIGHT[number] else prescan
+    return across, rows - (ny - rows) - middle if _UPPER[number] else 0
+
+
+def assembled(
+    quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int, middle: int = 0
+) -> npt.NDArray[Number]:
+    """Quadrants [4, ..] in readout order -> detector [ny, nx], pre- and overscan cut off, 0 in the rows between."""
+    pixels = [placed(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)]
+    e, f, g, h = pixels
+    between = np.zeros((middle, h.shape[1] + g.shape[1]), quadrants.dtype)
+    return np.concatenate([np.hstack([h, g]), between, np.hstack([e, f])])
+
+
+def sizes(scene: Scene) -> tuple[int, int, int, int]:
+    """prescan, overscan, overscan rows, rows between the halves."""
+    prescan, overscan, rows = (
+        int(scene.value(f"fpa.{key}", "pix")) for key in ("prescan", "overscan", "parallel_overscan")
+    )
+    return prescan, overscan, rows, scene.middle
+
+
+EFFECT = Effect("quadrants", apply, sizes, lambda scene: 0.0, optional=False, cost=3e-3)

@@ -1,0 +1,1 @@
+"""One detector of one exposure, from catalogue rows to raw image."""

@@ -1,0 +1,46 @@
+"""Bright sources on and around a detector, which make ghosts and scattered light; long trails as points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+from astropy.wcs import WCS
+
+from jobs.render.camera import astrometry
+from jobs.render.camera.detectors import Detector
+from jobs.render.effects.scene import Lights
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float
+
+# Electrons of a source that may shine where it is not.
+_LIGHT = 1e6
+# Pixels of a trail that shine around corners as a point.
+_PIECE = 32.0
+
+
+def bright_lights(
+    galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], detector: Detector, system: WCS
+) -> Lights:
+    """Bright sources on the detector and around it, as far as rows were given."""
+    found = []
+    for (rows, electrons), (ra, dec) in ((galaxies, ("ra_lensed", "dec_lensed")), (stars, ("ra", "dec"))):
+        bright = np.flatnonzero(electrons > _LIGHT)
+        chosen = rows.select(["id", ra, dec]).take(bright)
+        column, row = astrometry.pixel_of_sky(system, chosen[ra].to_numpy(), chosen[dec].to_numpy())
+        found.append((chosen["id"].to_numpy(), column, row, electrons[bright]))
+    ids, column, row, electrons = (np.concatenate(part) for part in zip(*found, strict=True))
+    order = np.argsort(ids)
+    return Lights(column[order], row[order], electrons[order])
+
+
+def trails(bodies: Sources) -> Lights:
+    """Bright bodies as points along their trails, near each other beside what light spreads over around corners."""
+    bright = np.flatnonzero(bodies.electrons > _LIGHT)
+    pieces = np.ceil(bodies.length[bright] / _PIECE).astype(np.int64) + 1
+    body, first = np.repeat(bright, pieces), np.repeat(np.cumsum(pieces) - pieces, pieces)
+    count = np.repeat(pieces, pieces)
+    # Of the trail, from its middle.
+    place = (np.arange(len(body)) - first + 0.5) / count - 0.5
+    trail = np.zeros((len(bodies), 2)) if bodies.trail is None else bodies.trail
+    along = place[:, None] * trail[body]
+    return Lights(bodies.column[body] + along[:, 0], bodies.row[body] + along[:, 1], bodies.electrons[body] / count)

@@ -1,0 +1,73 @@
+"""A rendered detector before it is files.
+
+numbers_of      whose random numbers an effect takes
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from astropy.wcs import WCS
+
+from jobs.accuracy import Accuracy
+from jobs.render.camera.detectors import Detector
+from jobs.render.channels import image_types
+from jobs.render.effects.effect import Decision, Effect
+from jobs.render.effects.readout import quadrants
+from jobs.render.effects.scene import Scene
+from jobs.render.psf.model import Psf
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float, Int, Row
+
+
+@dataclass(frozen=True, slots=True)
+class Rendered:
+    """One detector's products before they are files.
+
+    raw        : uint16[ny, nx] ADU, or [4, ny, nx] quadrants in readout order with pre- and overscan
+    maps       : truth [ny, nx] by its name: noise_free, and what was asked for besides
+    sources    : what was drawn, ascending id: those with light of their stamps on pixels that are read, and stars whose
+                 spikes may be noticed
+    sizes      : int[n] sides of their stamps;  drawn : float64[n] electrons of each stamp on the detector
+    zero_point : AB magnitude of one electron per second
+    complete   : how far beyond the detector every source was known that may reach it, arcsec
+    """
+
+    exposure: Row
+    detector: Detector
+    wcs: WCS
+    psf: Psf | None
+    raw: npt.NDArray[np.uint16]
+    maps: Mapping[str, npt.NDArray[Any]]
+    sources: Sources
+    sizes: Int
+    drawn: Float
+    zero_point: float
+    scene: Scene
+    decisions: tuple[Decision, ...]
+    accuracy: Accuracy
+    seed: int
+    complete: float
+
+    @property
+    def science(self) -> npt.NDArray[np.uint16]:
+        """uint16[ny, nx] ADU: the pixels alone, in the detector's own axes."""
+        return self.raw if self.raw.ndim == 2 else quadrants.assembled(self.raw, *quadrants.sizes(self.scene))
+
+    @property
+    def noise_free(self) -> npt.NDArray[np.float32]:
+        """float32[ny, nx] expected electrons of the sources alone."""
+        return self.maps["noise_free"]
+
+
+def numbers_of(effect: Effect, exposure: Row, detector: str, seed: int) -> tuple[int | str, ...]:
+    """The identity of an effect's random numbers: nobody else's, but where it follows another's pattern.
+
+    A detector's own patterns are in every exposure.
+    """
+    what = str(exposure["camera"]) if effect.fixed else image_types.identity(exposure)
+    return seed, what, detector, effect.numbers or effect.name

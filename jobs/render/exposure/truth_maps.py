@@ -1,0 +1,82 @@
+"""Truth of what is in an image besides the sources: the diffuse sky, cosmic rays, ghosts, what is full.
+
+made       which of the maps that are wanted an image has
+watch      what is called for every effect that is applied
+complete   adds the maps of effects that were not needed, and what the converter could not hold
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs.render.effects.charge import bleeding
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.readout import quadrants
+from jobs.render.effects.scene import Frame, Scene
+
+Maps = dict[str, npt.NDArray[Any]]
+
+# Bytes a pixel of each map's file.
+BYTES = {"noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "saturation": 1}
+# What adds to a map of the same name as an effect, or of another.
+_OF_EFFECT = {
+    "ghosts": "ghosts", "background": "sky", "pixel_area": "sky", "straylight": "sky", "cosmic_rays": "cosmic_rays",
+    "readout_cosmic_rays": "cosmic_rays",
+}  # fmt: skip
+
+
+def made(truth: Sequence[str], effects: Sequence[str] | None, looks: bool) -> list[str]:
+    """Those of the wanted maps that an image has.
+
+    effects : names of its channel's, None = not known: all maps;  looks : whether sources shine on it
+    """
+    found = {_OF_EFFECT[name] for name in effects or () if name in _OF_EFFECT}
+    found |= {"noise_free", "saturation"} | ({"stars"} if looks else set())
+    return [name for name in truth if effects is None or name in found]
+
+
+def watch(maps: Maps, scene: Scene, truth: Sequence[str]) -> Callable[[str, Frame, Frame], None]:
+    """Fills in the truth that effects add to the frame."""
+
+    def see(name: str, before: Frame, after: Frame) -> None:
+        if name == "ghosts" and "ghosts" in truth:
+            maps["ghosts"] = (after - before).astype(np.float32)
+        if name in ("background", "pixel_area", "straylight") and "sky" in truth:
+            maps["sky"] = (after - before).astype(np.float32) + maps.get("sky", np.float32(0.0))
+        if name in ("bleeding", "full_well") and "saturation" in truth:
+            maps["saturation"] = bleeding.saturated(after, scene.value("full_well", "electron")).astype(np.uint8)
+        if name in ("cosmic_rays", "readout_cosmic_rays") and "cosmic_rays" in truth:
+            hit = after - before
+            hit = hit if hit.ndim == 2 else quadrants.assembled(hit, *quadrants.sizes(scene))
+            # Traps may have held some of it back: to the electron.
+            maps["cosmic_rays"] = np.rint(hit).astype(np.int32) + maps.get("cosmic_rays", 0)
+
+    return see
+
+
+def complete(
+    maps: Maps, raw: npt.NDArray[np.uint16], effects: Sequence[Effect], scene: Scene, truth: Sequence[str]
+) -> None:
+    """Adds maps of effects that were not needed, and pixels that the converter could not hold.
+
+    Nothing is where no pixel is, between the halves of a detector.
+    """
+    shape = maps["noise_free"].shape
+    wanted = made(truth, [effect.name for effect in effects], False)
+    for name, dtype in (
+        ("ghosts", np.float32),
+        ("sky", np.float32),
+        ("cosmic_rays", np.int32),
+        ("saturation", np.uint8),
+    ):
+        if name in wanted and name not in maps:
+            maps[name] = np.zeros(shape, dtype)
+    if "saturation" in truth:
+        full = raw >= scene.value("adc_max", "adu")
+        maps["saturation"] |= full if full.ndim == 2 else quadrants.assembled(full, *quadrants.sizes(scene))
+    for truth_map in maps.values():
+        truth_map[slice(*scene.unread)] = 0

@@ -1,0 +1,216 @@
+"""The catalogue rows that shine onto a detector, as sources to be drawn.
+
+least_flux      what a source beyond the margin must have to be read
+spike_flux, outer_flux   and a star, a galaxy still farther out
+sources_of      the rows that shine onto the detector, as what is drawn
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from astropy.wcs import WCS
+
+from jobs.accuracy import Accuracy
+from jobs.fluxes.libraries.templates import Library
+from jobs.fluxes.passbands import Passband
+from jobs.render.camera import astrometry
+from jobs.render.camera.detectors import Detector
+from jobs.render.channels import image_types
+from jobs.render.drawing import outskirts, stamp_sizes
+from jobs.render.drawing.settings import Settings, settings_for
+from jobs.render.effects.scene import NOTICEABLE, Lights, Scene
+from jobs.render.exposure import bright_lights, scene_of
+from jobs.render.psf import euclid, spikes, sub_bands
+from jobs.render.psf.model import Psf
+from jobs.render.sources import colours, galaxy_shapes, lensed_arcs, selection, solar_system
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float, Int, Row
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.strong_lenses import STRONG_LENSES
+
+# What is read of the catalogues; fluxes are read besides.
+GALAXY_COLUMNS = tuple(
+    dict.fromkeys(("id", "kind", "ra_lensed", "dec_lensed", *galaxy_shapes.COLUMNS, *colours.GALAXY_COLUMNS))
+)
+STAR_COLUMNS = ("id", "ra", "dec", *colours.STAR_COLUMNS)
+# Of a source: more would leave the frame's integers to a tenth of an electron (kernel.units_of).
+_MOST_ELECTRONS = 1e17
+
+
+def no_sources(galaxies: pa.Table) -> Sources:
+    none, whole = np.zeros(0), np.zeros(0, np.int64)
+    return Sources(whole, none, none, np.zeros((0, 2, 2)), none, whole, galaxy_shapes.shapes(galaxies.slice(0, 0)))
+
+
+def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
+    """f_nu of the faintest source that reaches the detector from beyond its selection margin, microjansky.
+
+    Infinite where no source shows: in the dark, or in no time.
+    Error : of the fainter out there each leaves out less than the settings' `edge` of a pixel's noise
+    """
+    time = float(exposure["exposure_time_s"])
+    if time == 0.0 or not image_types.sees_sky(str(exposure["channel"]), str(exposure["image_type"])):
+        return float("inf")
+    margin = mission.value("survey.selection_margin", "arcsec")
+    noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
+    return stamp_sizes.least_electrons(margin, detector.pixel_scale, noise, settings_for(accuracy)) / (
+        scene_of.electron_rate(exposure) * time
+    )
+
+
+def spike_flux(
+    exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy, band: Passband
+) -> float:
+    """f_nu of the faintest star whose spikes are noticed from beyond what else is read, microjansky; or infinite."""
+    time = float(exposure["exposure_time_s"])
+    sees = image_types.sees_sky(str(exposure["channel"]), str(exposure["image_type"]))
+    if time == 0.0 or not sees or detector.section != "vis" or exposure.get("psf"):
+        return float("inf")
+    pupil, noise = (
+        euclid.vis_edges(detector, band, mission),
+        scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise,
+    )
+    (one,) = spikes.reach(pupil, np.ones(1), NOTICEABLE * noise)
+    return float((stamp_sizes.reach(1.0) / one) ** 2 / (scene_of.electron_rate(exposure) * time))
+
+
+def outer_flux(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
+    """f_nu of the faintest galaxy that may be noticed from beyond what else is read, microjansky; or infinite."""
+    time = float(exposure["exposure_time_s"])
+    if time == 0.0 or not image_types.sees_sky(str(exposure["channel"]), str(exposure["image_type"])):
+        return float("inf")
+    noise, scale = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise, detector.pixel_scale
+    return outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / (scene_of.electron_rate(exposure) * time)
+
+
+def sources_of(
+    galaxies: tuple[pa.Table, Float],
+    stars: tuple[pa.Table, Float],
+    detector: Detector,
+    system: WCS,
+    spread: Psf,
+    noise: float,
+    settings: Settings,
+    band: Passband,
+    library: Library | None = None,
+    stellar: Library | None = None,
+    lenses: pa.Table | None = None,
+) -> tuple[Sources, Int]:
+    """Everything that shines onto the detector, with its stamp or beyond it, ascending id, and the stamps' sides.
+
+    galaxies, stars : (rows, expected electrons [n]);  lenses : rows of `strong_lenses`, None = none
+    """
+    catalogue, points = galaxies[0], stars[0]
+    form = galaxy_shapes.shapes(catalogue)
+    arcs = _arcs(lenses, catalogue, galaxies[1], form)
+    ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy(), arcs.ids]).astype(np.int64)
+    ra = np.concatenate([catalogue["ra_lensed"].to_numpy(), points["ra"].to_numpy(), arcs.ra])
+    dec = np.concatenate([catalogue["dec_lensed"].to_numpy(), points["dec"].to_numpy(), arcs.dec])
+    electrons = np.concatenate([galaxies[1], stars[1], arcs.electrons])
+    rest = len(points) + len(arcs.ids)
+    shape = np.concatenate([np.arange(len(catalogue)), np.full(rest, -1)]).astype(np.int64)
+    picture = np.concatenate([np.full(len(catalogue) + len(points), -1), np.arange(len(arcs.ids))]).astype(np.int64)
+    _check(ids, electrons)
+    farthest = np.where((shape < 0) & (picture < 0), _spikes(electrons, detector, spread, noise), 0.0)
+    farthest[: len(catalogue)] = _outskirts(electrons[: len(catalogue)], form, detector, noise)
+    reach = detector.half_diagonal + np.maximum(farthest, stamp_sizes.reach(detector.pixel_scale))
+    seen = selection.near(ra, dec, astrometry.centre(detector, system), reach / 3600.0) & (electrons > 0)
+    kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
+    column, row = astrometry.pixel_of_sky(system, ra[kept], dec[kept])
+    wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
+    sizes = stamp_sizes.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings, wide)
+    here = stamp_sizes.shone_on(
+        column, row, electrons[kept], sizes, shape[kept], form, picture[kept], spread, noise, detector.nx, detector.ny
+    )
+    kept, column, row = kept[here], column[here], row[here]
+    jacobian = astrometry.jacobian(system, column, row)
+    # Arcs have the colour of what they are an image of.
+    coloured = np.concatenate([np.arange(len(catalogue) + len(points)), arcs.source])[kept]
+    colourful = spread.planes is not None and len(spread.planes.wavelength) > 1
+    photons = _colours(coloured, catalogue, points, band, (library, stellar)) if colourful else None
+    found = Sources(
+        ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons, picture[kept], arcs.pictures
+    )
+    return found, sizes[here]
+
+
+def _spikes(electrons: Float, detector: Detector, spread: Psf, noise: float) -> Float:
+    """[n] arcsec as far as which points' spikes are noticed."""
+    if spread.edges is None:
+        return np.zeros(len(electrons))
+    return spikes.reach(spread.edges, electrons, NOTICEABLE * noise) * detector.pixel_scale
+
+
+def _outskirts(electrons: Float, form: galaxy_shapes.Shapes, detector: Detector, noise: float) -> Float:
+    """[n] arcsec as far as which galaxies are noticed that may be from beyond what else is read, 0 of others."""
+    out, least = np.zeros(len(electrons)), stamp_sizes.reach(detector.pixel_scale)
+    some = np.flatnonzero(electrons > outskirts.least_electrons(least, detector.pixel_scale, noise))
+    out[some] = outskirts.reach(electrons[some], form.take(some), detector.pixel_scale, noise, least)
+    return out
+
+
+def _arcs(
+    lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: galaxy_shapes.Shapes
+) -> lensed_arcs.Arcs:
+    """Those of strong lenses: their pictures magnify what the galaxy shines by itself."""
+    rows = STRONG_LENSES.empty().select(lensed_arcs.ARC_COLUMNS) if lenses is None else lenses
+    return lensed_arcs.arcs(rows, galaxies["id"].to_numpy(), electrons / form.magnification)
+
+
+def with_moving(
+    sources: Sources, sizes: Int, exposure: Row, detector: Detector, system: WCS, band: Passband, scene: Scene,
+    spread: Psf, settings: Settings, seed: int, bodies: Callable[[int], solar_system.Population] | None,
+) -> tuple[Sources, Int, Lights]:  # fmt: skip
+    """The sources with those that move, whose identifiers are the largest; and bright ones around, as far as read."""
+    reach = (detector.half_diagonal + stamp_sizes.reach(detector.pixel_scale)) / 3600.0
+    found = solar_system.sources(exposure, detector, system, band, scene.mission, seed, reach, sources.shapes, bodies)
+    own = stamp_sizes.stamp_sizes(
+        found.electrons,
+        found.shape,
+        found.shapes,
+        spread,
+        scene.pixel_noise,
+        settings,
+        stamp_sizes.piece_length(found.length),
+    )
+    wide = stamp_sizes.reaches(found.electrons, own, found.shape, None, spread, scene.pixel_noise, found.length)
+    here = selection.touching(found.column, found.row, wide, detector.nx, detector.ny) & (found.electrons > 0)
+    if not here.any():
+        return sources, sizes, bright_lights.trails(found)
+    return sources.with_moving(found.take(here)), np.concatenate([sizes, own[here]]), bright_lights.trails(found)
+
+
+def _colours(
+    kept: npt.NDArray[np.int64],
+    galaxies: pa.Table,
+    stars: pa.Table,
+    band: Passband,
+    libraries: tuple[Library | None, Library | None],
+) -> Float:
+    """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
+    of_galaxy = kept < len(galaxies)
+    out = np.empty((len(kept), sub_bands.PARTS))
+    out[of_galaxy] = colours.galaxies(galaxies.take(kept[of_galaxy]), band, libraries[0])
+    out[~of_galaxy] = colours.stars(stars.take(kept[~of_galaxy] - len(galaxies)), band, libraries[1])
+    return out
+
+
+def _check(ids: npt.NDArray[np.int64], electrons: Float) -> None:
+    if len(np.unique(ids)) != len(ids):
+        raise BadInput("a source is given twice")
+    bad = ~((electrons >= 0) & (electrons <= _MOST_ELECTRONS))
+    if bad.any():
+        raise BadInput(f"source {ids[np.argmax(bad)]}: {electrons[np.argmax(bad)]} electrons, outside 0 .. 1e17")
+
+
+def fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
+    if column not in fluxes.column_names:
+        raise BadInput(f"the flux table has no column {column}")
+    if len(rows) != len(fluxes) or not np.array_equal(rows["id"].to_numpy(), fluxes["id"].to_numpy()):
+        raise BadInput("the flux table is not of the same rows as its catalogue")
+    return np.asarray(fluxes[column].to_numpy(), float)

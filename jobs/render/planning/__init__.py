@@ -1,0 +1,1 @@
+"""What is observed when, by what, and what it will cost."""

@@ -1,0 +1,125 @@
+"""Calibration exposures: bias, dark, flat, self-calibration, standard stars, planetary nebula.
+
+exposures   what an observation block of one of these types asks for
+
+Ref : Serrano et al. 2024, section 5.1 and the table of the pilot phase's products
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from jobs import rng
+from jobs.render.camera import pointing
+from jobs.render.camera.lamps import LEDS, NISP_LAMPS
+from jobs.render.planning.observing_sequence import FILTERS, RED, offsets
+from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
+from jobs.render.planning.reference_survey import position_angle
+from jobs.request.observations import Observation
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+
+_DAY_S = 86400.0
+# The two standard stars (Serrano et al. 2024).
+_STARS = ("Vega", "white dwarf DA")
+_GRISMS = ("RGS000", "RGS180", "RGS000", "RGS180")
+# From the end of a frame to the start of the next, s: the slowest of the read-outs.
+_PAUSE = 90.0
+
+
+def exposures(
+    block: Observation, camera: str, centre: tuple[float, float], mission: MissionConfiguration, seed: int, start: float
+) -> Iterator[Exposure]:
+    """Exposures of each channel of a calibration block, one after another.
+
+    camera : of the ground survey, where the channel is EXT;  centre : ra, dec deg of the request's area
+    """
+    now = start
+    for channel in block.channels:
+        own = camera if channel == "EXT" else "vis" if channel == "VIS" else "nisp"
+        angle = 0.0 if channel == "EXT" else position_angle(*centre, start)
+        first = Exposure(
+            channel, own, "", block.image_type, *centre, angle, start, 0.0, "calibration", detectors=block.detectors
+        )
+        for frame in _frames(first, block, mission, seed):
+            yield replace(frame, mjd=now)
+            now += (frame.exposure_time_s + _PAUSE) / _DAY_S
+
+
+def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, seed: int) -> Iterator[Exposure]:
+    in_bands = [
+        replace(first, band=band, exposure_time_s=_seconds(first, band, block, mission))
+        for band in block.bands or _bands(first, mission)
+    ]
+    if first.image_type == "self_calibration":
+        dithers = block.exposures or int(mission.value("survey.self_calibration.dithers"))
+        for i, (x, y) in enumerate(_scattered(first.camera, dithers, mission, seed)):
+            yield from (replace(_moved(frame, x, y), dither=i + 1) for frame in in_bands)
+    elif first.image_type in ("standard_star", "planetary_nebula"):
+        yield from _targets(in_bands, block, mission, seed)
+    elif not block.exposures:
+        raise BadInput(f"an observation of image_type {first.image_type} wants exposures = how many frames")
+    else:
+        lamps = {"nisp": NISP_LAMPS, "vis": LEDS}.get(first.camera, 1)
+        for i in range(block.exposures):
+            lamp = i % lamps + 1 if first.image_type == "flat" else None
+            yield replace(in_bands[i % len(in_bands)], lamp=lamp)
+
+
+def _seconds(first: Exposure, band: str, block: Observation, mission: MissionConfiguration) -> float:
+    if first.image_type in ("bias", "charge_injection"):
+        return 0.0
+    if block.exposure_time_s is not None:
+        return block.exposure_time_s
+    if first.camera == "vis" and first.image_type == "flat":
+        return mission.value("vis.exposure_time_flat", "s")
+    return exposure_time(first.channel, first.camera, band, mission)
+
+
+def _bands(first: Exposure, mission: MissionConfiguration) -> tuple[str, ...]:
+    if first.channel == "NISP-P":
+        # A dark needs no filter; the closing position is that of the last.
+        return FILTERS[-1:] if first.image_type == "dark" else FILTERS
+    if first.channel == "NISP-S":
+        return (RED,)
+    return bands_of(first.channel, first.camera, mission)[
+        : 1 if first.image_type in ("bias", "dark", "charge_injection") else None
+    ]
+
+
+def _targets(
+    in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
+) -> Iterator[Exposure]:
+    """Each target in each band, or in each setting of the grisms, dithered."""
+    kind, channel = in_bands[0].image_type, in_bands[0].channel
+    dithers = block.exposures or int(mission.value(f"survey.{kind}.dithers"))
+    steps = offsets("S", mission, seed, kind, channel)
+    # A nebula is seen in every setting, a star in one a dither.
+    settings = len(_GRISMS) if kind == "planetary_nebula" else 1
+    for target in _STARS if kind == "standard_star" else ("planetary nebula",):
+        for setting in range(settings):
+            for i in range(dithers):
+                for frame in in_bands:
+                    moved = replace(_moved(frame, *steps[i % len(steps)]), dither=i + 1, target=target)
+                    number = setting if settings > 1 else i % len(_GRISMS)
+                    yield _through_grism(moved, number, mission) if channel == "NISP-S" else moved
+
+
+def _through_grism(frame: Exposure, number: int, mission: MissionConfiguration) -> Exposure:
+    return replace(frame, grism=_GRISMS[number], grism_angle=mission.value(f"survey.grism_angle_{number + 1}", "deg"))
+
+
+def _scattered(camera: str, dithers: int, mission: MissionConfiguration, seed: int) -> npt.NDArray[np.float64]:
+    """[dithers, 2] arcsec: uniform within half a detector and its gap, both ways."""
+    fpa = {key: mission.value(f"{camera}.fpa.{key}") for key in ("nx", "ny", "pixel_scale", "gap_x", "gap_y")}
+    half = [0.5 * (fpa[f"n{axis}"] * fpa["pixel_scale"] + fpa[f"gap_{axis}"]) for axis in "xy"]
+    return rng.stream(seed, "self_calibration", camera).uniform(-1.0, 1.0, (dithers, 2)) * half
+
+
+def _moved(frame: Exposure, x: float, y: float) -> Exposure:
+    ra, dec = pointing.sky_of_plane([x], [y], frame.ra, frame.dec, frame.position_angle)
+    return replace(frame, ra=float(ra[0]), dec=float(dec[0]))

@@ -1,0 +1,162 @@
+"""The observing sequence of a field: dithers, and in each of them VIS with NISP-S, then the filters.
+
+offsets     where the dithers of a pattern point, with the errors of the steps
+sequence    the exposures of one visit of a field
+
+Ref : Serrano et al. 2024, section 3.2 and the figure of the observing sequence
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from jobs import rng
+from jobs.render.camera import pointing
+from jobs.render.camera.lamps import LEDS
+from jobs.render.planning.planned_exposures import Exposure, exposure_time
+from jobs.render.planning.reference_survey import Field
+from jobs.request.observations import Observation
+from lake_schema.arrays import Float
+from lake_schema.mission.configuration import MissionConfiguration
+
+_DAY_S = 86400.0
+# The filters in the order they come after the grism, and the passband of each grism.
+FILTERS = ("euclid_j", "euclid_h", "euclid_y")
+RED, BLUE = "nisp_red", "nisp_blue"
+# Grisms at 0 and -4 deg are one, at 180 and 184 deg the other.
+_GRISMS = {0.0: "RGS000", 184.0: "RGS180", -4.0: "RGS000", 180.0: "RGS180"}
+
+
+def offsets(pattern: str, mission: MissionConfiguration, seed: int, *key: int | str) -> Float:
+    """[dithers, 2] arcsec along the focal plane's x and y from the field's own pointing.
+
+    pattern : "S", "J" or "none";  key : what the errors of the steps are drawn for
+    """
+    if pattern == "none":
+        return np.zeros((1, 2))
+    names = ["dither_1", "dither_2", "dither_3", "dither_4" if pattern == "S" else "dither_j_4"]
+    planned = np.array([[mission.value(f"survey.{name}.{axis}", "arcsec") for axis in "xy"] for name in names])
+    # Three sigma of each step; the first pointing is where it was asked for.
+    sigma = mission.value("svm.aocs.pointing_error", "arcsec") / 3.0
+    errors = rng.stream(seed, "dithers", *key).normal(0.0, sigma, planned.shape)
+    errors[0] = 0.0
+    return planned + np.cumsum(errors, axis=0)
+
+
+def sequence(
+    field: Field, block: Observation, survey: str, mission: MissionConfiguration, seed: int
+) -> Iterator[Exposure]:
+    """The exposures of one visit of a field, in the order they begin."""
+    steps = offsets(block.dither, mission, seed, survey, field.number, field.visit)
+    # The pattern is laid about the field's centre.
+    x, y = (steps - steps.mean(axis=0)).T
+    ra, dec = pointing.sky_of_plane(x, y, field.ra, field.dec, field.position_angle)
+    length = _dither_time(mission)
+    for i in range(len(steps)):
+        start = field.mjd + i * (length + mission.value("svm.dither_slew_time", "s")) / _DAY_S
+        at = _At(block, field, survey, mission, float(ra[i]), float(dec[i]), start, i + 1)
+        yield from at.exposures(last=i + 1 == len(steps))
+
+
+def _dither_time(mission: MissionConfiguration) -> float:
+    """Seconds from the start of a dither to the end of its last filter."""
+    spectrum, photometry = (
+        mission.value(f"nisp.commanded_time_{kind}", "s") for kind in ("spectroscopic", "photometric")
+    )
+    settle, to_filter, wheel = _moves(mission)
+    return settle + spectrum + to_filter + len(FILTERS) * photometry + (len(FILTERS) - 1) * wheel
+
+
+def _moves(mission: MissionConfiguration) -> tuple[float, float, float]:
+    return (
+        mission.value("svm.settle_time", "s"),
+        mission.value("nisp.grism_to_filter_time", "s"),
+        mission.value("nisp.wheel_time", "s"),
+    )
+
+
+class _At:
+    """One dither: where it points, when it starts."""
+
+    def __init__(
+        self,
+        block: Observation,
+        field: Field,
+        survey: str,
+        mission: MissionConfiguration,
+        ra: float,
+        dec: float,
+        start: float,
+        dither: int,
+    ) -> None:
+        self.block, self.field, self.survey, self.mission = block, field, survey, mission
+        self.ra, self.dec, self.start, self.dither = ra, dec, start, dither
+
+    def exposures(self, last: bool) -> Iterator[Exposure]:
+        block, mission = self.block, self.mission
+        settle, to_filter, wheel = _moves(mission)
+        if "VIS" in block.channels:
+            yield self._one("VIS", "euclid_vis", settle)
+        if "NISP-S" in block.channels:
+            yield self._spectrum(settle)
+        begin = settle + mission.value("nisp.commanded_time_spectroscopic", "s") + to_filter
+        step = mission.value("nisp.commanded_time_photometric", "s") + wheel
+        for i, band in enumerate(FILTERS):
+            if "NISP-P" in block.channels and band in (block.bands or FILTERS):
+                yield self._one("NISP-P", band, begin + i * step)
+        if "VIS" in block.channels and block.short and self.dither == 1:
+            # Beside the last filter (Serrano et al. 2024: in the first dither only).
+            seconds = mission.value("vis.exposure_time_short", "s")
+            yield self._one("VIS", "euclid_vis", begin + (len(FILTERS) - 1) * step, seconds)
+        if "VIS" in block.channels and block.flat and last:
+            seconds = mission.value("vis.exposure_time_flat", "s")
+            # One LED after the other, from field to field and from visit to visit.
+            lamp = (self.field.number + self.field.visit) % LEDS + 1
+            yield self._one("VIS", "euclid_vis", _dither_time(mission), seconds, "flat", lamp=lamp)
+
+    def _spectrum(self, after: float) -> Exposure:
+        if self.block.blue and self.field.visit % 2 == 0:
+            return self._one("NISP-S", BLUE, after, grism="BGS000", grism_angle=0.0)
+        number = (self.dither - 1) % len(_GRISMS) + 1
+        angle = self.mission.value(f"survey.grism_angle_{number}", "deg")
+        grism = "RGS000" if np.cos(np.radians(angle)) > 0 else "RGS180"
+        return self._one("NISP-S", RED, after, grism=grism, grism_angle=angle)
+
+    def _one(
+        self,
+        channel: str,
+        band: str,
+        after: float,
+        seconds: float | None = None,
+        image_type: str | None = None,
+        lamp: int | None = None,
+        grism: str | None = None,
+        grism_angle: float | None = None,
+    ) -> Exposure:
+        camera = "vis" if channel == "VIS" else "nisp"
+        nominal = exposure_time(channel, camera, band, self.mission)
+        return Exposure(
+            channel=channel,
+            camera=camera,
+            band=band,
+            image_type=image_type or self.block.image_type,
+            ra=self.ra,
+            dec=self.dec,
+            position_angle=self.field.position_angle,
+            mjd=self.start + after / _DAY_S,
+            exposure_time_s=nominal if seconds is None else seconds,
+            survey=self.survey,
+            field=self.field.number,
+            visit=self.field.visit,
+            dither=self.dither,
+            grism=grism,
+            grism_angle=grism_angle,
+            lamp=lamp,
+            detectors=self.block.detectors if channel == "VIS" or not _is_vis(self.block.detectors) else (),
+        )
+
+
+def _is_vis(detectors: Sequence[str]) -> bool:
+    return any("-" in name for name in detectors)

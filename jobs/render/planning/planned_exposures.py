@@ -1,0 +1,159 @@
+"""One exposure as the planner lays it out, before it is a row of the table `exposures`.
+
+Exposure       what, where and when
+table          exposures -> rows, with the sky, zero point and seeing of each
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from jobs.fluxes import passbands
+from jobs.fluxes.passbands import Passband
+from jobs.render.camera import detectors
+from jobs.render.channels import image_types
+from jobs.render.sky.diffuse_light import SkyBand, sky_band, sky_rate
+from lake_schema import units
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.mission.parameter import CAMERAS
+from lake_schema.tables.exposures import EXPOSURES
+
+_DARK_TYPES = ("bias", "dark", "charge_injection")
+_EUCLID_BANDS = {
+    "VIS": ("euclid_vis",),
+    "NISP-P": ("euclid_y", "euclid_j", "euclid_h"),
+    "NISP-S": ("nisp_red", "nisp_blue"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """What, where and when.
+
+    ra, dec, position_angle : deg, boresight and the focal plane's y axis, north through east
+    detectors               : names, () = all of the camera
+    sky, seeing, zero_point : electrons a second and pixel, arcsec, mag; None = the mission's
+    """
+
+    channel: str
+    camera: str
+    band: str
+    image_type: str
+    ra: float
+    dec: float
+    position_angle: float
+    mjd: float
+    exposure_time_s: float
+    survey: str
+    field: int | None = None
+    visit: int | None = None
+    dither: int | None = None
+    grism: str | None = None
+    grism_angle: float | None = None
+    lamp: int | None = None
+    target: str | None = None
+    psf: str | None = None
+    detectors: tuple[str, ...] = ()
+    sky: float | None = None
+    seeing: float | None = None
+    zero_point: float | None = None
+    settings: str | None = None
+
+
+def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
+    """Passbands that a camera has; BadInput where the channel has no such camera."""
+    if channel == "EXT" and camera in CAMERAS:
+        prefix = f"ext.{camera}."
+        keys = (p.key for p in mission.parameters if p.key.startswith(prefix) and p.key.endswith(".zero_point"))
+        return tuple(key.removeprefix(prefix).partition(".")[0] for key in keys)
+    if channel in _EUCLID_BANDS and camera == channel.lower().partition("-")[0]:
+        return _EUCLID_BANDS[channel]
+    raise BadInput(f"channel {channel} has no camera {camera!r}")
+
+
+def exposure_time(channel: str, camera: str, band: str, mission: MissionConfiguration) -> float:
+    """Effective exposure time of a nominal exposure, s: of a ramp, from its first to its last group."""
+    if camera == "nisp":
+        kind = f"nisp.macc.{'spectroscopic' if channel == 'NISP-S' else 'photometric'}"
+        groups, reads, drops = (mission.value(f"{kind}.{part}") for part in ("groups", "reads", "drops"))
+        return (groups - 1) * (reads + drops) * mission.value("nisp.frame_time", "s")
+    own = f"{image_types.section(camera)}.{band}.exposure_time"
+    return mission.value(own if own in mission else f"{image_types.section(camera)}.exposure_time", "s")
+
+
+def table(
+    exposures: Sequence[Exposure],
+    missions: Sequence[MissionConfiguration],
+    own: Mapping[str, Passband] | None = None,
+) -> pa.Table:
+    """Rows of the table `exposures`, numbered from 1 in their order.
+
+    missions : the configuration of each;  own : passbands by name besides the embedded ones
+    """
+    if not exposures:
+        return EXPOSURES.empty()
+    bands: dict[tuple[int, str, str], _Band] = {}
+    rows = []
+    for number, (exposure, mission) in enumerate(zip(exposures, missions, strict=True), start=1):
+        key = (id(mission), exposure.camera, exposure.band)
+        if key not in bands:
+            bands[key] = _Band.of(exposure.camera, exposure.band, mission, (own or {}).get(exposure.band))
+        rows.append(_row(number, exposure, bands[key], mission))
+    return EXPOSURES.build({name: _column(name, [row[name] for row in rows]) for name in EXPOSURES.names})
+
+
+@dataclass(frozen=True, slots=True)
+class _Band:
+    """What all exposures of a camera in a band have in common."""
+
+    zero_point: float
+    seeing: float
+    sky: SkyBand
+
+    @classmethod
+    def of(cls, camera: str, band: str, mission: MissionConfiguration, curve: Passband | None) -> _Band:
+        prefix = image_types.section(camera)
+        seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec") if camera in CAMERAS else 0.0
+        first = detectors.detectors(camera, mission)[0]
+        return cls(zero_point_of(prefix, band, mission, curve), seeing, sky_band(first, band, mission, curve))
+
+
+def _column(name: str, values: list[Any]) -> Any:
+    if EXPOSURES.column(name).type == "string" or not EXPOSURES.column(name).nullable:
+        return values
+    return np.ma.masked_array([0 if v is None else v for v in values], [v is None for v in values])
+
+
+def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration) -> dict[str, Any]:
+    sky = e.sky
+    if e.image_type in _DARK_TYPES:
+        sky = 0.0
+    elif sky is None:
+        sky = sky_rate(band.sky, e.ra, e.dec, e.mjd, mission)
+    return {
+        **{name: getattr(e, name) for name in EXPOSURES.names if name != "exposure_id"},
+        "exposure_id": number,
+        "ra": e.ra % 360.0,
+        "position_angle": (e.position_angle + 180.0) % 360.0 - 180.0,
+        "sky": sky,
+        "seeing": band.seeing if e.seeing is None else e.seeing,
+        "zero_point": band.zero_point if e.zero_point is None else e.zero_point,
+    }
+
+
+def zero_point_of(prefix: str, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> float:
+    """AB magnitude of one electron a second: of ground cameras as published, of Euclid's from throughput and area.
+
+    curve : the passband, None = the embedded one
+    """
+    if f"{prefix}.{band}.zero_point" in mission:
+        return mission.value(f"{prefix}.{band}.zero_point", "mag")
+    return units.zero_point(
+        mission.value("plm.collecting_area", "cm2"), passbands.log_width(curve or passbands.load(band))
+    )

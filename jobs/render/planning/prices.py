@@ -1,0 +1,73 @@
+"""What a detector costs: seconds of a core, memory and bytes, from numbers that benchmarks.planner measures.
+
+price        what every detector of a kind of exposure costs
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jobs.accuracy import SURVEY, Accuracy
+from jobs.render.channels import costs
+from jobs.render.drawing import settings
+from jobs.render.effects.effect import Effect
+from jobs.render.exposure import truth_maps
+
+# A FITS header and its padding, one an image; s a byte of a truth map, to make, write and hash it.
+_HEADER_BYTES, _MAP_S = 8640, 7.5e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Price:
+    """What a detector of so many pixels and sources takes: something to start with, and something for each of them."""
+
+    start_s: float
+    pixel_s: float
+    galaxy_s: float
+    star_s: float
+    start_gb: float
+    pixel_gb: float
+    start_bytes: int
+    pixel_bytes: float
+
+    def seconds(self, pixels: int, galaxies: float, stars: float) -> float:
+        """Of one core."""
+        return self.start_s + pixels * self.pixel_s + galaxies * self.galaxy_s + stars * self.star_s
+
+    def memory(self, pixels: int) -> float:
+        """GB at the peak."""
+        return self.start_gb + pixels * self.pixel_gb
+
+    def bytes(self, pixels: int) -> int:
+        """Of the image and its truth maps."""
+        return self.start_bytes + round(pixels * self.pixel_bytes)
+
+
+def price(
+    channel: str,
+    looks: bool,
+    effects: Sequence[Effect] | None,
+    accuracy: Accuracy = SURVEY,
+    truth: Sequence[str] = (),
+) -> Price:
+    """What detectors of one kind of exposure cost.
+
+    looks   : whether the sky is drawn;  effects : that are applied; None = nothing renders the channel yet
+    truth   : maps that are wanted
+    Error   : 30 % where the sources are as those that it was measured with
+    """
+    own, applied = costs.of_channel(channel), effects or ()
+    maps = truth_maps.made(truth, None if effects is None else [e.name for e in effects], looks)
+    tier = settings.seconds_for(accuracy) / settings.seconds_for(SURVEY)
+    mapped = sum(truth_maps.BYTES[name] for name in maps)
+    return Price(
+        start_s=own.frame_s + looks * own.sky_s,
+        pixel_s=1e-6 * sum(effect.cost for effect in applied) + _MAP_S * mapped,
+        galaxy_s=looks * own.galaxy_s * tier,
+        star_s=looks * own.star_s * tier,
+        start_gb=own.base_gb,
+        pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + mapped),
+        start_bytes=_HEADER_BYTES * (1 + len(maps)),
+        pixel_bytes=own.written + mapped,
+    )

@@ -1,0 +1,94 @@
+"""How fast this machine is, of the one that jobs/render/channels/costs.csv was measured on: what a forecast's seconds
+are times.
+
+Speed        the factor, and what it was learnt from
+of_machine   from the detectors that the lake holds, else from a calibration of a second, kept in the cache
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.fft
+
+from jobs import cache
+from jobs.render.products import run_log
+from lake_schema.errors import LakeError
+from lake_schema.store import read
+from lake_schema.store.provenance import machine
+
+# CPU s of a pass of `calibration` on the machine of costs.csv: found on another (AMD EPYC, znver5), which takes 0.13 s
+# for it, and for detectors 0.4 to 0.57 of what the table says.
+REFERENCE_S = 0.28
+# Detectors that are enough to learn from: the first of each process compiles and computes what the others find.
+_ENOUGH = 3
+_REPEATS, _SIDE, _STAMPS, _NUMBERS = 5, 128, 192, 2_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """CPU s here over those of the forecast's machine; what it was learnt from, a clause."""
+
+    factor: float
+    source: str
+
+
+def of_machine(lake: Path) -> Speed:
+    """Of the machine that this process runs on.
+
+    Error : of the calibration, 30 % of a detector's seconds
+    """
+    measured = list(_measured(lake))
+    if len(measured) >= _ENOUGH:
+        return Speed(float(np.median(measured)), f"learnt from {len(measured)} detectors that this lake holds")
+    kept = cache.cached_arrays(
+        "calibration", cache.content_key(Path(__file__).read_bytes(), machine()), lambda: {"seconds": calibration()}
+    )
+    return Speed(float(kept["seconds"].min()) / REFERENCE_S, "from a calibration of a second")
+
+
+def calibration() -> np.ndarray[Any, np.dtype[np.float64]]:
+    """CPU s [repeats] of what detectors are made of: transforms of stamps, exponentials, random numbers, a sort."""
+    rng = np.random.default_rng(1)
+    waves = (rng.normal(size=(_STAMPS, _SIDE, _SIDE // 2 + 1)) + 0j).astype(np.complex64)
+    light, seconds = rng.uniform(0.0, 100.0, _NUMBERS), np.empty(_REPEATS)
+    for i in range(_REPEATS):
+        started = time.process_time()
+        for _ in range(4):
+            scipy.fft.irfft2(waves, s=(_SIDE, _SIDE))
+        np.sort(np.exp(-0.01 * light) + rng.poisson(light))
+        seconds[i] = time.process_time() - started
+    return seconds
+
+
+def _measured(lake: Path) -> Iterator[float]:
+    """CPU s over the forecast's of every detector of the current products that a machine of this kind rendered."""
+    try:
+        version = read.version(lake, "products")
+        tasks = read.version(lake, "tasks", version.manifest["facts"]["inputs"]["tasks"]).rows()
+    except (LakeError, KeyError):
+        return
+    foreseen = {(row["exposure_id"], row["detector"]): row["seconds"] for row in tasks.to_pylist()}
+    parts = {part["name"]: part["facts"] for part in version.manifest["parts"]}
+    for line in _lines(lake, version.key):
+        facts = parts.get(str(line.get("part", "")), {})
+        place = facts.get("exposure_id"), facts.get("detector")
+        took, mine = line.get("cpu_s"), line.get("machine") == machine()
+        if mine and "error" not in line and isinstance(took, float) and 0 < took < math.inf and foreseen.get(place):
+            yield took / foreseen[place]
+
+
+def _lines(lake: Path, key: str) -> Iterator[dict[str, Any]]:
+    """What was written of the parts of a version of `products`; a log that cannot be read teaches nothing."""
+    for path in run_log.of_products(lake):
+        with contextlib.suppress(LakeError, OSError):
+            first, *parts = run_log.lines(path) or [{}]
+            if first.get("key") == key:
+                yield from parts

@@ -1,0 +1,144 @@
+"""From a request to its exposures, in the order they are taken.
+
+exposures    pointings and observation blocks -> exposures, once for each variant of an exploration
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from jobs.render.camera import detectors
+from jobs.render.camera.pointing import boresight_for
+from jobs.render.channels.image_types import SKY_TYPES
+from jobs.render.planning import calibration_frames, ground_surveys, reference_survey, variants
+from jobs.render.planning.observing_sequence import sequence
+from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
+from jobs.request.area import Area
+from jobs.request.observations import Observation, Pointing
+from jobs.request.schema import Request
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+
+_DEEP = ("edf_north", "edf_south", "edf_fornax")
+_CALIBRATION = (
+    "bias", "dark", "flat", "charge_injection", "self_calibration", "standard_star", "planetary_nebula"
+)  # fmt: skip
+
+
+def exposures(request: Request, mission: MissionConfiguration) -> list[tuple[Exposure, MissionConfiguration]]:
+    """Every exposure of a request with the mission it is planned with; BadInput names the pointing or observation."""
+    found = []
+    for values in request.variants():
+        settings = json.dumps(values, sort_keys=True) if values else None
+        own = variants.variant(settings, mission, request.accuracy, {}).mission
+        for exposure in _of_mission(request, own):
+            psf = exposure.psf or dict(request.psfs).get(exposure.band)
+            found.append((replace(exposure, settings=settings, psf=psf), own))
+    for band, _ in request.psfs:
+        if band not in {exposure.band for exposure, _ in found}:
+            raise BadInput(f"psf.{band}: no exposure is taken in this band")
+    return found
+
+
+def _of_mission(request: Request, mission: MissionConfiguration) -> Iterator[Exposure]:
+    for i, pointing in enumerate(request.pointings):
+        yield _pointing(pointing, f"pointing[{i}]", request, mission)
+    for i, block in enumerate(request.observations):
+        where = f"observation[{i}]"
+        found = 0
+        for exposure in _block(block, request, mission, where):
+            found += 1
+            yield exposure
+        if not found:
+            raise BadInput(f"{where} asks for no exposure")
+
+
+def _pointing(pointing: Pointing, where: str, request: Request, mission: MissionConfiguration) -> Exposure:
+    try:
+        bands = bands_of(pointing.channel, pointing.camera, mission)
+    except BadInput as error:
+        raise BadInput(f"{where}.camera: {error}") from None
+    if pointing.band not in bands and pointing.band not in {name for name, _ in request.curves.passbands}:
+        known = ", ".join(bands)
+        raise BadInput(f"{where}.band: camera {pointing.camera} has no band {pointing.band!r} ({known})")
+    known_detectors(pointing.camera, pointing.detectors, mission, f"{where}.detectors")
+    ra, dec, angle = pointing.ra % 360.0, pointing.dec, pointing.position_angle
+    if pointing.centre_on is not None:
+        known_detectors(pointing.camera, (pointing.centre_on,), mission, f"{where}.centre_on")
+        target = detectors.detector(pointing.camera, pointing.centre_on, mission)
+        ra, dec, angle = boresight_for(target, ra, dec, angle)
+    if pointing.channel != "EXT":
+        reference_survey.check_aspect(ra, dec, pointing.mjd, mission, where)
+    seconds = pointing.exposure_time_s
+    if seconds is None:
+        seconds = exposure_time(pointing.channel, pointing.camera, pointing.band, mission)
+    return Exposure(
+        pointing.channel, pointing.camera, pointing.band, "science", ra, dec, angle, pointing.mjd, seconds,
+        request.name, detectors=pointing.detectors,
+        grism="RGS000" if pointing.band == "nisp_red" else "BGS000" if pointing.band == "nisp_blue" else None,
+        grism_angle=0.0 if pointing.channel == "NISP-S" else None,
+    )  # fmt: skip
+
+
+def known_detectors(camera: str, names: tuple[str, ...], mission: MissionConfiguration, where: str) -> None:
+    """Refuse detectors that a camera does not have."""
+    there = {detector.name for detector in detectors.detectors(camera, mission)} if names else set()
+    unknown = [name for name in names if name not in there]
+    if unknown:
+        raise BadInput(f"{where}: camera {camera} has no detector {unknown[0]!r}")
+
+
+def _block(block: Observation, request: Request, mission: MissionConfiguration, where: str) -> Iterator[Exposure]:
+    area = block.area or request.area
+    start = block.mjd if block.mjd is not None else mission.value("svm.launch", "d")
+    try:
+        found = _exposures(block, area, request.seed, start, mission)
+        for exposure in found:
+            known_detectors(exposure.camera, exposure.detectors, mission, "detectors")
+            if exposure.channel != "EXT" and block.pointings and exposure.image_type in SKY_TYPES:
+                reference_survey.check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
+            yield exposure
+    except BadInput as error:
+        raise BadInput(f"{where}: {error}") from None
+
+
+def _exposures(
+    block: Observation, area: Area, seed: int, start: float, mission: MissionConfiguration
+) -> Iterator[Exposure]:
+    if block.pointings:
+        yield from ground_surveys.read(Path(block.pointings), block, mission)
+    elif block.image_type in _CALIBRATION:
+        camera = ground_surveys.camera_of(block.survey, mission) if "EXT" in block.channels else ""
+        yield from calibration_frames.exposures(block, camera, area.bounds()[:2], mission, seed, start)
+    elif "EXT" in block.channels:
+        yield from ground_surveys.exposures(block, area, mission, seed, start)
+    else:
+        for field in _fields(block, area, start, mission):
+            yield from sequence(field, block, block.survey, mission, seed)
+
+
+def _fields(
+    block: Observation, area: Area, start: float, mission: MissionConfiguration
+) -> list[reference_survey.Field]:
+    if block.survey == "wide":
+        return reference_survey.wide(area, mission, start, block.fields, max(block.visits, 1))
+    visits = block.visits
+    if block.survey in _DEEP:
+        prefix = f"survey.{block.survey}"
+        visits = visits or int(mission.value(f"{prefix}.visits"))
+        area = block.area or deep_area(prefix, mission)
+    return reference_survey.deep(area, mission, start, max(visits, 1), block.fields)
+
+
+def deep_area(prefix: str, mission: MissionConfiguration) -> Area:
+    """A deep field: its corners where they are published, else a circle of its area."""
+    if f"{prefix}.corners" in mission:
+        return Area(vertices=tuple((float(ra), float(dec)) for ra, dec in mission.numbers(f"{prefix}.corners")))
+    cap = np.arccos(1.0 - mission.value(f"{prefix}.area", "rad2") / (2.0 * np.pi))
+    ra, dec = (mission.value(f"{prefix}.{axis}", "deg") for axis in ("ra", "dec"))
+    return Area(ra=ra, dec=dec, radius=float(np.degrees(cap)))

@@ -1,0 +1,138 @@
+"""From exposures to render tasks: one a detector, with its cells and what it will cost.
+
+table      rows of the table `tasks`, longest first
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from jobs.accuracy import SURVEY, Accuracy
+from jobs.render.camera import detectors as camera_detectors
+from jobs.render.camera import pointing
+from jobs.render.channels import registry
+from jobs.render.channels.image_types import sees_sky
+from jobs.render.exposure import scene_of
+from jobs.render.planning import variants
+from jobs.render.planning.prices import Price, price
+from jobs.render.planning.source_counts import Densities
+from lake_schema import sky
+from lake_schema.arrays import Float, Row
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.tasks import TASKS
+
+# ------------------------------------------------------------------------------------------------ tasks
+
+
+def table(
+    exposures: pa.Table,
+    detectors: Sequence[tuple[str, ...]],
+    mission: MissionConfiguration,
+    densities: Densities,
+    truth: Sequence[str] = (),
+    accuracy: Accuracy = SURVEY,
+    forced: Mapping[str, bool] | None = None,
+) -> pa.Table:
+    """Rows of the table `tasks`.
+
+    exposures  : rows of the table `exposures`;  detectors : of each exposure, () = all of its camera
+    truth      : truth maps that are wanted
+    forced     : effects that the request forces on or off
+    """
+    cameras = {camera: _Camera(camera, mission) for camera in set(exposures["camera"].to_pylist())}
+    shared: dict[tuple[Any, ...], _Places] = {}
+    prices: dict[tuple[Any, ...], Price] = {}
+    columns: dict[str, list[Any]] = {name: [] for name in TASKS.names}
+    for row, wanted in zip(exposures.to_pylist(), detectors, strict=True):
+        camera = cameras[row["camera"]]
+        where = (row["camera"], row["ra"], row["dec"], row["position_angle"])
+        if where not in shared:
+            shared[where] = camera.places(*where[1:], densities)
+        kind = tuple(row[name] for name in ("camera", "channel", "image_type", "exposure_time_s", "lamp", "settings"))
+        if kind not in prices:
+            prices[kind] = _price(row, variants.variant(row["settings"], mission, accuracy, forced or {}), truth)
+        _append(columns, row, wanted, camera, shared[where], prices[kind])
+    seconds = np.array(columns["seconds"], float)
+    numbers = np.array(columns["exposure_id"], np.int64)
+    order = np.lexsort((np.array(columns["detector"]), numbers, -seconds)) if numbers.size else np.empty(0, np.int64)
+    return TASKS.build({name: [values[i] for i in order] for name, values in columns.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class _Places:
+    ra: list[float]
+    dec: list[float]
+    cells: list[list[int]]
+    regions: list[str]
+    density: Float
+
+
+class _Camera:
+    """Detectors of a camera, and what of them does not depend on the pointing."""
+
+    def __init__(self, camera: str, mission: MissionConfiguration) -> None:
+        self.detectors = camera_detectors.detectors(camera, mission)
+        self.index = {detector.name: i for i, detector in enumerate(self.detectors)}
+        self.x, self.y = pointing.outline(self.detectors)
+        margin = mission.value("survey.selection_margin", "arcsec")
+        # On the tangent plane, where a detector that the optics distort is larger than it is.
+        corner = np.hypot(self.x[:, 1:] - self.x[:, :1], self.y[:, 1:] - self.y[:, :1]).max(axis=1)
+        reach = np.array([max(d.half_diagonal, c) for d, c in zip(self.detectors, corner, strict=True)])
+        self.radius = (reach + margin) / 3600.0
+        self.pixels = np.array([detector.nx * detector.ny for detector in self.detectors])
+        self.area = np.array([d.nx * d.ny * (d.pixel_scale / 3600.0) ** 2 for d in self.detectors])
+
+    def places(self, ra: float, dec: float, angle: float, densities: Densities) -> _Places:
+        lon, lat = pointing.sky_of_plane(self.x, self.y, ra, dec, angle)
+        cells = [
+            sky.cells_in_cone(x, y, radius, GENERATION_ORDER).tolist()
+            for x, y, radius in zip(lon[:, 0].tolist(), lat[:, 0].tolist(), self.radius.tolist(), strict=True)
+        ]
+        regions = [
+            "POLYGON ICRS " + " ".join(f"{value:.7f}" for value in corners)
+            for corners in np.stack([lon[:, 1:], lat[:, 1:]], axis=2).reshape(len(lon), -1).tolist()
+        ]
+        return _Places(lon[:, 0].tolist(), lat[:, 0].tolist(), cells, regions, densities.at(lon[:, 0], lat[:, 0]))
+
+
+def _append(
+    columns: dict[str, list[Any]], row: Row, wanted: tuple[str, ...], camera: _Camera, places: _Places, cost: Price
+) -> None:
+    looks = sees_sky(row["channel"], row["image_type"])
+    for i in [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors)):
+        galaxies, stars = (places.density[:, i] * (camera.area[i] * looks)).tolist()
+        pixels = int(camera.pixels[i])
+        columns["exposure_id"].append(row["exposure_id"])
+        columns["detector"].append(camera.detectors[i].name)
+        columns["channel"].append(row["channel"])
+        columns["ra"].append(places.ra[i])
+        columns["dec"].append(places.dec[i])
+        columns["radius"].append(float(camera.radius[i]))
+        columns["cells"].append(places.cells[i] if looks else [])
+        columns["s_region"].append(places.regions[i])
+        columns["sources"].append(math.ceil(galaxies + stars))
+        columns["seconds"].append(cost.seconds(pixels, galaxies, stars))
+        columns["memory"].append(cost.memory(pixels))
+        columns["bytes"].append(cost.bytes(pixels))
+
+
+def _price(row: Row, own: variants.Variant, truth: Sequence[str]) -> Price:
+    """Of the detectors of an exposure.
+
+    Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
+    """
+    channel, kind = str(row["channel"]), str(row["image_type"])
+    looks, effects = sees_sky(channel, kind), registry.EFFECTS.get(channel, {}).get(kind)
+    if effects is not None:
+        first = camera_detectors.detectors(str(row["camera"]), own.mission)[0]
+        scene = replace(scene_of.scene_of(row, first, own.mission, own.accuracy), forced=own.forced)
+        scene = scene_of.with_own_light(scene, effects)
+        effects = tuple(e for e in effects if own.forced.get(e.name, looks or e.needed_if(scene)))
+    return price(channel, looks, effects, own.accuracy, truth)

@@ -1,0 +1,1 @@
+"""A rendered detector as files, and back."""

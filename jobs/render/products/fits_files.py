@@ -1,0 +1,86 @@
+"""A rendered detector -> FITS files and rows of the table `products`; and back.
+
+A detector that is read in quadrants is a file of four extensions, each in the detector's own axes with its pre- and
+overscan, behind a header that holds for all of them.
+
+products   rows, and a writer for each file
+science_cards, truth_cards
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import pyarrow as pa
+
+from jobs.render.camera import astrometry
+from jobs.render.effects.readout import quadrants
+from jobs.render.exposure.rendered import Rendered
+from jobs.render.products import headers
+from lake_schema.fits.images import Image, write_images
+from lake_schema.tables.products import PRODUCTS
+
+Writer = Callable[[Path], None]
+
+
+def products(
+    rendered: Rendered, truth: Sequence[str] = ("noise_free",), rice: bool = False
+) -> tuple[pa.Table, dict[str, Writer]]:
+    """Rows of `products` and, by path, what writes each file.
+
+    truth : truth maps that are wanted beside the science image;  rice : images of whole numbers are packed
+    """
+    images = {"science": _science(rendered)}
+    for content in truth:
+        if content in rendered.maps:
+            images[content] = [Image(rendered.maps[content], headers.truth_cards(rendered, content))]
+    exposure, detector = rendered.exposure, rendered.detector
+    stem = f"images/{int(exposure['exposure_id']):06d}/{exposure['channel']}_{exposure['band']}_{detector.name}"
+    paths = {content: f"{stem}_{content}.fits" for content in images}
+    ra, dec = astrometry.centre(detector, rendered.wcs)
+    n = len(images)
+    rows = PRODUCTS.build(
+        {
+            "path": list(paths.values()),
+            "content": list(images),
+            "exposure_id": [int(exposure["exposure_id"])] * n,
+            "detector": [detector.name] * n,
+            "channel": [str(exposure["channel"])] * n,
+            "band": [str(exposure["band"])] * n,
+            "ra": [ra] * n,
+            "dec": [dec] * n,
+            "s_region": [astrometry.s_region(detector, rendered.wcs)] * n,
+            "mission": [rendered.scene.mission.fingerprint] * n,
+            "sources": [len(rendered.sources)] * n,
+        }
+    )
+    writers: dict[str, Writer] = {paths[content]: partial(_write, units, rice) for content, units in images.items()}
+    return rows, writers
+
+
+def _write(units: Sequence[Image], rice: bool, path: Path) -> None:
+    write_images(path, units, rice)
+
+
+def _science(rendered: Rendered) -> list[Image]:
+    """The image; or a header, and an extension for each quadrant, named as detector.quadrant."""
+    if rendered.raw.ndim == 2:
+        return [Image(rendered.raw, headers.science_cards(rendered))]
+    prescan, overscan, rows, middle = quadrants.sizes(rendered.scene)
+    detector, scans = rendered.detector, (
+        ("PRESCAN", prescan, "[pix] columns before the pixels"),
+        ("OVERSCAN", overscan, "[pix] columns after the pixels"),
+        ("OVERROWS", rows, "[pix] rows after the pixels"),
+        ("INJROWS", middle, "[pix] rows between the halves, without pixels"),
+    )  # fmt: skip
+    units = [Image(None, (*headers.science_cards(rendered), *scans))]
+    for number, data in enumerate(rendered.raw):
+        # Of the detector's first pixel in the extension, from 0.
+        across, up = quadrants.origin(number, data.shape, prescan, overscan, rows, middle)
+        system = astrometry.shifted(rendered.wcs, across, up)
+        cards = (("QUADRANT", quadrants.NAMES[number], "quadrant"), *scans, *astrometry.cards(system))
+        name = f"{detector.name}.{quadrants.NAMES[number]}"
+        units.append(Image(quadrants.placed(data, number), cards, name))
+    return units

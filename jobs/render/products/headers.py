@@ -1,0 +1,146 @@
+"""FITS headers of the science image and of the truth maps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+from datetime import datetime, timedelta
+
+import numpy as np
+
+from jobs import accuracy, rng
+from jobs.render.camera import astrometry
+from jobs.render.channels.registry import effects_of
+from jobs.render.effects.readout import bias_structure, charge_transfer, nonlinearity, read_noise
+from jobs.render.exposure.rendered import Rendered, numbers_of
+from lake_schema import __version__
+from lake_schema.fits.images import Card
+
+# Of an amplifier's offset, a column's stripe and a reading: what next to no pixel is below.
+_SURE = 5.0
+# Of each number of an accuracy: the end of its keywords, and what it is of.
+_ERRORS = {
+    "flux": ("FLUX", "fraction of a source's flux"),
+    "shape": ("SHAPE", "reduced-shear component"),
+    "position": ("POS", "[pix]"),
+    "background": ("BACK", "fraction of a sky pixel's noise"),
+}
+_MJD_ZERO = datetime(1858, 11, 17)
+
+
+def science_cards(rendered: Rendered) -> tuple[Card, ...]:
+    """Header of the science image: what an astronomer needs to calibrate it, and what made it."""
+    scene = rendered.scene
+    gain = scene.value("gain", "electron / adu")
+    applied = {decision.name for decision in rendered.decisions if decision.applied}
+    return (
+        *_common(rendered),
+        ("BUNIT", "adu", "unit of the pixels"),
+        ("GAIN", gain, "[electron/adu]"),
+        (
+            "RDNOISE",
+            ("read_noise" in applied) * scene.value("read_noise", "electron"),
+            "[electron] rms in the image",
+        ),
+        ("BIAS", scene.value("bias", "adu"), "[adu] added to every pixel"),
+        ("SATURATE", _saturation(rendered, gain), "[adu] a full pixel has no less"),
+        ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
+        ("DARKRATE", ("dark_current" in applied) * scene.dark_rate, "[electron/s/pix] mean dark current in the image"),
+        *_effect_cards(rendered),
+    )
+
+
+_TRUTH = {
+    "noise_free": ("electron", "unit of the pixels: expected, sources alone"),
+    "stars": ("electron", "unit of the pixels: expected, stars alone"),
+    "sky": ("electron", "unit of the pixels: expected, sky alone"),
+    "cosmic_rays": ("electron", "unit of the pixels: of cosmic rays"),
+    "ghosts": ("electron", "unit of the pixels: expected, ghosts alone"),
+    "saturation": ("", "1 where a pixel or the converter is full"),
+}
+
+
+def truth_cards(rendered: Rendered, content: str) -> tuple[Card, ...]:
+    """Header of a truth map: what one thing adds to the exposure, before the rest of the detector."""
+    return (*_common(rendered), ("BUNIT", *_TRUTH[content]))
+
+
+def _common(rendered: Rendered) -> tuple[Card, ...]:
+    exposure, scene = rendered.exposure, rendered.scene
+    return (
+        ("INSTRUME", str(exposure["camera"]), "camera"),
+        ("CHANNEL", str(exposure["channel"]), "channel"),
+        ("DETECTOR", rendered.detector.name, "detector"),
+        ("FILTER", str(exposure["band"]), "passband"),
+        ("IMAGETYP", str(exposure["image_type"]), "image type"),
+        *((("LAMP", int(exposure["lamp"]), "LED of the calibration unit"),) if exposure.get("lamp") else ()),
+        ("EXPOSURE", int(exposure["exposure_id"]), "identifier of the exposure"),
+        ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
+        ("DATE-OBS", _date(float(exposure["mjd"])), "start of the exposure"),
+        ("MJD-OBS", float(exposure["mjd"]), "[d] start of the exposure"),
+        ("TIMESYS", "UTC", "time scale of DATE-OBS and MJD-OBS"),
+        *astrometry.cards(rendered.wcs),
+        ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] at the boresight"),
+        ("ZEROPNT", rendered.zero_point, "[mag] AB of 1 electron/s"),
+        ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] of a point source, pixel included"),
+        ("SEEING", float(exposure["seeing"]), "[arcsec] FWHM of the atmosphere"),
+        ("NSOURCES", len(rendered.sources), "number of sources drawn"),
+        ("NMOVING", int((rendered.sources.length > 0).sum()), "of them moving: bodies of the Solar System"),
+        ("SRCREACH", rendered.complete, "[arcsec] beyond the detector: sources complete"),
+        ("SEED", str(rendered.seed), "of the random numbers"),
+        ("MISSION", rendered.scene.mission.fingerprint, ""),
+        ("TRUESKY", __version__, "version of the simulator"),
+        *_accuracy_cards(rendered),
+    )
+
+
+def _accuracy_cards(rendered: Rendered) -> tuple[Card, ...]:
+    """ACC*: errors that were allowed; ERR*: as measured, of drawing and of charge transfer where that is applied.
+
+    Independent causes: the root of the sum of their squares.
+    """
+    causes = [] if rendered.psf is None else [asdict(accuracy.reached(rendered.accuracy))]
+    applied = [decision.name for decision in rendered.decisions if decision.applied]
+    causes += [charge_transfer.errors(rendered.scene, name) for name in applied]
+    made = {name: math.hypot(*(cause.get(name, 0.0) for cause in causes)) for name in _ERRORS}
+    allowed = asdict(rendered.accuracy)
+    return (
+        *((f"ACC{short}", allowed[name], f"allowed error: {text}") for name, (short, text) in _ERRORS.items()),
+        *((f"ERR{short}", made[name], f"largest error: {text}") for name, (short, text) in _ERRORS.items()),
+    )
+
+
+def _date(mjd: float) -> str:
+    """ISO 8601, milliseconds."""
+    return (_MJD_ZERO + timedelta(days=mjd)).isoformat(timespec="milliseconds")
+
+
+def _saturation(rendered: Rendered, gain: float) -> float:
+    """What a full pixel reads at least: of its charge, what transfer and amplifier leave, below all noise."""
+    full = rendered.scene.value("full_well", "electron")
+    scene = replace(rendered.scene, peak_electrons=full)
+    applied = {decision.name for decision in rendered.decisions if decision.applied}
+    # The first of a column, or a row, finds all traps empty.
+    losses = (charge_transfer.PARALLEL, charge_transfer.SERIAL)
+    signal = full - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
+    if nonlinearity.EFFECT.name in applied:
+        signal = float(nonlinearity.apply(np.array([max(signal, 0.0)]), *nonlinearity.parameters(scene))[0])
+    noises = (bias_structure.EFFECT, read_noise.EFFECT)
+    signal -= _SURE * sum(effect.contribution(scene) for effect in noises if effect.name in applied)
+    level = signal / gain + scene.value("bias", "adu")
+    return float(np.floor(np.clip(level, 0.0, scene.value("adc_max", "adu"))))
+
+
+def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:
+    """EFFECTn = name, whether it was applied, and its contribution over what would be noticed (margin); EFKEYn seed."""
+    cards: list[Card] = []
+    exposed = rendered.exposure
+    where = f"exposure {exposed['exposure_id']}"
+    known = {e.name: e for e in effects_of(str(exposed["channel"]), str(exposed["image_type"]), where)}
+    for number, decision in enumerate(rendered.decisions, start=1):
+        state = ("on" if decision.applied else "off") + (" (forced)" if decision.forced else "")
+        cards.append((f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1"))
+        if decision.applied and decision.name in known:
+            numbers = numbers_of(known[decision.name], exposed, rendered.detector.name, rendered.seed)
+            cards.append((f"EFKEY{number}", rng.name_of(*numbers), "key of its numbers (Philox)"))
+    return tuple(cards)

@@ -1,0 +1,110 @@
+"""The key of each product: a digest of everything that shapes it."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pyarrow as pa
+
+from jobs.render.camera import detectors
+from jobs.render.channels.image_types import sees_bodies
+from jobs.render.drawing import stamp_sizes
+from jobs.render.psf import from_file
+from jobs.render.sources import catalogue_rows, ephemerides, selection
+from jobs.render.sources.catalogue_rows import CATALOGUES, CELLS, FARTHEST, LENSES
+from lake_schema import user_files
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.store import read
+from lake_schema.store.plan import Json
+from lake_schema.store.provenance import digest, file_sha256
+
+
+def product_keys(
+    facts: Json,
+    exposures: pa.Table,
+    tasks: Sequence[Json],
+    inputs: Mapping[str, read.Version],
+    mission: MissionConfiguration,
+) -> list[str]:
+    """Of each task, the digest of everything that shapes its products, and of nothing else.
+
+    facts : of the plan: request, mission, code
+    """
+    flux_facts = inputs["galaxy_fluxes"].manifest["facts"]
+    shared = {
+        **{key: facts[key] for key in ("request", "mission", "code")},
+        "library": [flux_facts.get("files"), flux_facts.get("sources")],
+    }
+    rows = {row["exposure_id"]: row for row in exposures.to_pylist()}
+    files = {
+        name: (catalogue_rows.deflection_of(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes]))
+        for name, fluxes in CATALOGUES
+    }
+    if LENSES in inputs:
+        files[LENSES] = catalogue_rows.deflection_of(inputs["galaxies"]), _files_of_cells(inputs[LENSES])
+
+    def catalogues(task: Json) -> list[list[tuple[str, ...]]]:
+        camera, detector = rows[task["exposure_id"]]["camera"], task["detector"]
+        reach = stamp_sizes.reach(detectors.detector(camera, detector, mission).pixel_scale)
+        # Of the cameras VIS alone has spikes, of stars.
+        reaches = {name: reach for name in files}
+        reaches["galaxies"] = max(FARTHEST, reach)
+        if rows[task["exposure_id"]]["channel"] == "VIS":
+            reaches["stars"] = max(FARTHEST, reach)
+        return [
+            sorted({sums for cell in selection.within(task, deflection, reaches[name]) for sums in found.get(cell, ())})
+            for name, (deflection, found) in files.items()
+        ]
+
+    def own(task: Json) -> Json:
+        row, files = rows[task["exposure_id"]], {}
+        if psf := row["psf"]:
+            files["psf"] = facts["psf"][str(from_file.file_of(psf, task["detector"]))]
+        if "bodies" in facts and sees_bodies(row["channel"], row["image_type"]):
+            (files["bodies"],) = facts["bodies"].values()
+        return files
+
+    return [
+        digest(
+            {
+                **shared,
+                "exposure": rows[task["exposure_id"]],
+                "task": {name: task[name] for name in ("detector", "cells", "radius")},
+                "catalogues": catalogues(task) if task["cells"] else [],
+                **own(task),
+            }
+        )
+        for task in tasks
+    ]
+
+
+def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
+    """sha256 of the PSFs that the tasks' exposures name, by file."""
+    named = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
+    pairs = {(named[task["exposure_id"]], task["detector"]) for task in tasks}
+    files = [from_file.file_of(psf, detector) for psf, detector in pairs if psf]
+    return {str(file): file_sha256(user_files.checked(file, "PSF")) for file in files}
+
+
+def ephemeris_files(file: Path, exposures: pa.Table) -> dict[str, str]:
+    """sha256 of the user's moving bodies, by file; refused before anything is rendered where they cannot be read."""
+    sha256 = file_sha256(user_files.checked(file, "table of bodies", "solar_system.bodies"))
+    kinds = exposures.select(["mjd", "channel", "image_type"]).to_pylist()
+    seen = [row["mjd"] for row in kinds if sees_bodies(row["channel"], row["image_type"])]
+    ephemerides.check(ephemerides.read(file, sha256), file, seen)
+    return {str(file): sha256}
+
+
+def _files_of_cells(*tables: read.Version) -> Mapping[int, list[tuple[str, ...]]]:
+    """Generation cell -> sha256 of the files that hold it, of each of the tables."""
+    found: dict[int, list[tuple[str, ...]]] = defaultdict(list)
+    for part in tables[0].manifest["parts"]:
+        sums = tuple(table.part_sha256(part["name"]) for table in tables)
+        for cell in part["facts"][CELLS]:
+            found[cell].append(sums)
+    return found
+
+
+def truth_file(exposure_id: int, detector: str) -> str:
+    """Where a version of `products` keeps what was drawn on a detector."""
+    return f"truth/{exposure_id:06d}/{detector}.parquet"

@@ -1,0 +1,54 @@
+"""What the logs of runs say of the detectors that they rendered.
+
+of_products     the logs of runs that made the table `products`, oldest first
+lines           one of them: an object for its start, one a part, one for its end
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from lake_schema import user_files
+from lake_schema.errors import Damaged
+from lake_schema.store import layout
+
+# What a line says of a part.
+_OF_A_PART: dict[str, tuple[type, ...]] = {
+    "part": (str,), "error": (str,), "attempt": (int,), "seconds": (float, int), "peak_gb": (float, int)
+}  # fmt: skip
+_MOST = 1e15
+
+
+def of_products(root: Path) -> list[Path]:
+    """The files, in the order of their runs."""
+    return sorted(layout.runs(root).glob("*-products-*.jsonl"))
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    """The lines of a log; the last one of a run that was killed may be anything, and is left out then.
+
+    Errors : Damaged names the line that no run writes
+    """
+    with user_files.opened(path, "run log") as stream:
+        texts = stream.read().split(b"\n")
+    found = []
+    for number, text in enumerate(texts, start=1):
+        try:
+            found.append(_checked(json.loads(text)))
+        except (ValueError, RecursionError, TypeError):
+            if any(texts[number:]):
+                raise Damaged(f"{user_files.shown(path)} line {number} is not what a run writes") from None
+    return found
+
+
+def _checked(line: Any) -> dict[str, Any]:
+    """The line; TypeError where it is not one that a run writes."""
+    if not isinstance(line, dict):
+        raise TypeError
+    for name, kinds in _OF_A_PART.items():
+        value = line.get(name, kinds[0]())
+        if type(value) not in kinds or (kinds != (str,) and not 0 <= value < _MOST):
+            raise TypeError
+    return line

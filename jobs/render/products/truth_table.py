@@ -1,0 +1,44 @@
+"""What was drawn on a detector, as rows of the table `rendered_truth`.
+
+truth      rows of the table `rendered_truth`
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from jobs.render.exposure.rendered import Rendered
+from jobs.render.sources.source_list import Sources
+from lake_schema.tables.rendered_truth import RENDERED_TRUTH
+
+# Codes of `method` in the table `rendered_truth`.
+POINT, PROFILE, PICTURE, TRAIL = 0, 1, 2, 3
+
+
+def truth(rendered: Rendered) -> pa.Table:
+    """One row a source that was drawn, ascending id."""
+    sources, n = rendered.sources, len(rendered.sources)
+    trail = np.zeros((n, 2)) if sources.trail is None else sources.trail
+    return RENDERED_TRUTH.build(
+        {
+            "exposure_id": np.full(n, int(rendered.exposure["exposure_id"]), np.int64),
+            "detector": [rendered.detector.name] * n,
+            "id": sources.ids,
+            "x": sources.column,
+            "y": sources.row,
+            "expected": sources.electrons,
+            "drawn": rendered.drawn,
+            "stamp": rendered.sizes,
+            "method": _methods(sources),
+            "trail_x": trail[:, 0],
+            "trail_y": trail[:, 1],
+        }
+    )
+
+
+def _methods(sources: Sources) -> npt.NDArray[np.int64]:
+    pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
+    method = np.where(pictured, PICTURE, np.where(sources.shape < 0, POINT, PROFILE))
+    return np.where(sources.length > 0, TRAIL, method)

@@ -1,0 +1,337 @@
+"""Point-spread functions: the Euclid optics from their pupil, and a seeing disc for ground cameras.
+
+Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), without the pixel, centred on the
+chief ray (coma moves the centroid by a few mas).
+
+vis_psf, ground_psf   -> Psf;  sampled : the same of any planes
+pupil, wavefront      the parts of the Euclid model
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import galsim
+import numpy as np
+import scipy.fft
+
+from jobs import cache, sums
+from jobs.compiling import jit
+from jobs.fluxes.passbands import Passband
+from jobs.render.camera.detectors import Detector, detectors
+from jobs.render.psf import model, spikes
+from jobs.render.psf.model import DETAIL, SAMPLES, SIDE, Planes, Psf
+from jobs.render.psf.spikes import Edges
+from jobs.render.psf.sub_bands import sub_bands
+from lake_schema.arrays import Array, Float, Float32
+from lake_schema.mission.configuration import MissionConfiguration
+
+# Side of the optical transform, samples; the 0.15 % of the light beyond its border is absent.
+_TRANSFORM = 2048
+# The same for what changes across a detector: the core alone.
+_CORE_TRANSFORM, _CORE_SIDE = 768, 160
+# Of the drift, by the number of positions: degree in place of the mean PSF, and of its slope with wavelength.
+DEGREES = {1: (0, 0), 4: (1, 0), 9: (2, 1), 25: (4, 2)}
+_ARCSEC = np.pi / 180.0 / 3600.0
+
+
+def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = 9) -> Psf:
+    """The Euclid PSF of a VIS detector: optics, pointing jitter, charge diffusion.
+
+    positions : where it is computed, one of DEGREES; polynomials lie between
+    Error     : second moments 2e-4 from the number of wavelengths; across the detector as measured (psf_positions.csv)
+    Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
+    """
+    found = model.sampled(_vis_planes(detector, band, mission, positions), detector.pixel_scale, has_pixel=False)
+    return replace(found, edges=vis_edges(detector, band, mission))
+
+
+def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
+    """What shines beyond the planes of the Euclid PSF."""
+    parts = sub_bands(band)
+    waves = np.concatenate([part.wavelength for part in parts])
+    blur = float(np.sqrt(np.mean(_blur_variances(detector, float(waves.mean()), mission))))
+    return spikes.of_pupil(parts, blur, detector.pixel_scale, _TRANSFORM / SAMPLES, mission)
+
+
+# ------------------------------------------------------------------------------------------------ the optics
+
+
+def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) -> Float:
+    """Transmission of the entrance pupil: aperture stop, decentred central stop, three spider bars.
+
+    x, y     : [...] mm;  softness : width of the edges, mm (one sample: an edge then covers its pixels by
+               area)
+    returns  : [...] 0 .. 1
+    """
+    radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
+    stop, stop_y = mission.value("plm.pupil.stop_radius", "mm"), mission.value("plm.pupil.stop_y", "mm")
+    clear = _step(radius - np.hypot(x, y), softness) * _step(np.hypot(x, y - stop_y) - stop, softness)
+    width = mission.value("plm.pupil.spider_width", "mm")
+    reach = mission.value("plm.pupil.spider_half_length", "mm")
+    for bar in ("spider1", "spider2", "spider3"):
+        bar_x, bar_y = mission.value(f"plm.pupil.{bar}.x", "mm"), mission.value(f"plm.pupil.{bar}.y", "mm")
+        angle = mission.value(f"plm.pupil.{bar}.angle", "rad")
+        # Normal form: no singular angle.
+        across = np.abs(-np.sin(angle) * (x - bar_x) + np.cos(angle) * (y - bar_y))
+        blocked = _step(width / 2 - across, softness) * _step(reach - np.hypot(x - bar_x, y - bar_y), softness)
+        clear = clear * (1.0 - blocked)
+    return np.asarray(clear)
+
+
+def _step(depth: Float, softness: float) -> Float:
+    return np.clip(0.5 + depth / softness, 0.0, 1.0)
+
+
+def wavefront(x: float, y: float, mission: MissionConfiguration) -> Float:
+    """Zernike coefficients at a field position: index = Noll number, nm rms.
+
+    x, y : -1 .. 1 across the focal plane
+    """
+    terms = mission.numbers("vis.psf.wavefront")
+    nm = np.zeros(1 + int(max(term[0] for term in terms)))
+    for noll, x_power, y_power, coefficient in terms:
+        nm[int(noll)] += coefficient * x**x_power * y**y_power
+    return nm * mission.value("vis.psf.wavefront_scale")
+
+
+def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Planes:
+    parts = sub_bands(band)
+    # Second moments of diffraction go with the square of the wavelength.
+    waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
+    nodes, powers = _nodes(positions), _powers(positions)
+    coefficients = [wavefront(*_field(detector, *place, mission), mission) for place in ((0.0, 0.0), *nodes)]
+    sampling = detector.pixel_scale / SAMPLES
+    blurs = [_blur_variances(detector, float(wavelength), mission) for wavelength in waves]
+    optics = [p for p in mission.parameters if p.key.startswith("plm.")]
+    key = cache.content_key(
+        Path(__file__).read_bytes(),
+        np.array(coefficients),
+        waves,
+        repr([(p.key, p.value, p.unit) for p in optics]),
+        repr((sampling, *blurs)),
+    )
+
+    def make() -> dict[str, Array]:
+        centre = [
+            _plane(coefficients[0], w, _TRANSFORM, SIDE, sampling, blur, mission)
+            for w, blur in zip(waves, blurs, strict=True)
+        ]
+        # Of the drift, a part in a hundred of the light, the mean's blur is blur enough.
+        blur = tuple(np.mean(blurs, axis=0).tolist())
+        return {
+            "images": np.stack(centre).astype(np.float32),
+            "drift": _drift(coefficients, positions, waves, sampling, blur, mission).astype(np.float32),
+        }
+
+    arrays = cache.cached_arrays("vis_psf", key, make)
+    turned = slice(None, None, -1 if detector.upside_down else 1)
+    # Upside down, both the planes and the places that the drift is written in are turned.
+    sign = np.array([(-1) ** (i + j) for i, j, _ in powers], np.float32)[:, None, None]
+    drift = arrays["drift"][:, turned, turned] * (sign if detector.upside_down else np.float32(1.0))
+    half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
+    return Planes(waves, arrays["images"][:, turned, turned], drift, half, powers)
+
+
+def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> tuple[float, float]:
+    """Field coordinates, -1 .. 1 over the focal plane's outer edges, of a place in half sides from the centre."""
+    everything = detectors("vis", mission)
+    half_x, half_y = (n * detector.pixel_scale / 2 for n in (detector.nx, detector.ny))
+    reach_x, reach_y = (max(abs(getattr(d, axis)) for d in everything) for axis in ("x", "y"))
+    whole = everything[0]
+    reach_x, reach_y = reach_x + whole.nx * whole.pixel_scale / 2, reach_y + whole.ny * whole.pixel_scale / 2
+    return (detector.x + x * half_x) / reach_x, (detector.y + y * half_y) / reach_y
+
+
+def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfiguration) -> tuple[float, float]:
+    """Variance along x and y, arcsec2: pointing jitter, and charge diffusion.
+
+    Charge spreads wider of blue light (A), and the wider the thicker the detector is.
+    """
+    redder = 0.1 * wavelength / mission.value("vis.diffusion_wavelength", "nm")
+    wider = redder ** mission.value("vis.diffusion_slope") * _thickness(detector, mission)
+    diffusion = wider * mission.value("vis.diffusion_sigma", "pix") * detector.pixel_scale
+    jitter_x, jitter_y = (mission.value(f"svm.aocs.jitter_{axis}", "arcsec") for axis in ("x", "y"))
+    return jitter_x**2 + diffusion**2, jitter_y**2 + diffusion**2
+
+
+def _thickness(detector: Detector, mission: MissionConfiguration) -> float:
+    """A detector's diffusion length over the mission's."""
+    if "vis.diffusion_detectors" not in mission:
+        return 1.0
+    thicker = {row["detector"]: float(row["diffusion"]) for row in mission.rows("vis.diffusion_detectors")}
+    return max(1.0 + mission.value("vis.diffusion_spread", "") * thicker.get(detector.name, 0.0), 0.0)
+
+
+def _nodes(positions: int) -> tuple[tuple[float, float], ...]:
+    """Where the PSF is computed across a detector, in half sides from its centre."""
+    axis = np.linspace(-1.0, 1.0, math.isqrt(positions)).tolist() if positions > 1 else []
+    return tuple((x, y) for y in axis for x in axis)
+
+
+def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
+    """Planes.powers of the drift: of the mean PSF, then of its slope with wavelength."""
+    return tuple(
+        (degree - j, j, colour)
+        for colour, most in enumerate(DEGREES[positions])
+        for degree in range(1, most + 1)
+        for j in range(degree + 1)
+    )
+
+
+def _drift(
+    coefficients: Sequence[Float],
+    positions: int,
+    waves: Float,
+    sampling: float,
+    blur: tuple[float, float],
+    mission: MissionConfiguration,
+) -> Float:
+    """Planes of Planes.drift in the focal plane's axes, by least squares; coefficients: of the centre and the nodes."""
+    powers, weights = _powers(positions), _weights_of(blur, sampling)
+    side = _CORE_SIDE * SAMPLES + 1
+    if not powers:
+        return np.zeros((0, side, side))
+    side += 2 * _margin(weights)
+    mean, slope = np.zeros((2, len(coefficients), side, side))
+    redder = (waves - waves.mean()) / np.sum((waves - waves.mean()) ** 2)
+    for wavelength, tilt in zip(waves, redder, strict=True):
+        optics = _optics(float(wavelength), sampling, mission, _CORE_TRANSFORM)
+        for i, nm in enumerate(coefficients):
+            image = _diffracted(nm, optics, side)
+            mean[i] += image / len(waves)
+            slope[i] += image * tilt
+    x, y = np.array(_nodes(positions)).T
+    changes = []
+    for order, images in enumerate((mean, slope)):
+        terms = [x**i * y**j for i, j, colour in powers if colour == order]
+        if terms:
+            from_nodes = sums.least_squares(np.stack(terms, axis=1), np.eye(len(x)))
+            change = sums.product(from_nodes, (images[1:] - images[0]).reshape(len(x), -1)).reshape(-1, side, side)
+            # The blur is the same for all, and linear.
+            changes += [_blurred(image, weights) for image in change]
+    return np.stack(changes)
+
+
+def _plane(
+    nm: Float, wavelength: float, transform: int, side: int, sampling: float, blur: tuple[float, float],
+    mission: MissionConfiguration,
+) -> Float32:  # fmt: skip
+    """One wavelength's PSF: [side * SAMPLES + 1] square, in the focal plane's axes."""
+    weights = _weights_of(blur, sampling)
+    optics = _optics(wavelength, sampling, mission, transform)
+    return _blurred(_diffracted(nm, optics, side * SAMPLES + 1 + 2 * _margin(weights)), weights)
+
+
+def _blurred(image: Array, weights: tuple[Float, Float]) -> Float32:
+    """Diffracted light -> blurred by weights along x and y, without a margin.
+
+    On the image: of a transform's rounding the bright core would cover the wings.
+    """
+    across, along = (w.astype(np.float32) for w in weights)
+    return _summed(image.astype(np.float32), across, along, len(image) - 2 * _margin(weights))
+
+
+@jit
+def _summed(image: Float32, across: Float32, along: Float32, side: int) -> Float32:
+    """The middle [side, side] of an image, summed with weights [odd] along columns (across) and rows (along)."""
+    margin, reach_x, reach_y = (len(image) - side) // 2, len(across) // 2, len(along) // 2
+    out = np.zeros((side, side), np.float32)
+    line = np.empty(len(image), np.float32)
+    for r in range(side):
+        line[:] = 0.0
+        for j in range(len(along)):
+            weight, row = along[j], image[r + margin + j - reach_y]
+            for c in range(len(row)):
+                line[c] += weight * row[c]
+        for j in range(len(across)):
+            weight, some = across[j], line[margin + j - reach_x : margin + j - reach_x + side]
+            for c in range(side):
+                out[r, c] += weight * some[c]
+    return out
+
+
+def _margin(weights: tuple[Float, Float]) -> int:
+    return max(len(w) // 2 for w in weights)
+
+
+def _weights_of(blur: tuple[float, float], sampling: float) -> tuple[Float, Float]:
+    across, along = (_weights(float(np.sqrt(variance)) / sampling) for variance in blur)
+    return across, along
+
+
+@lru_cache(maxsize=64)
+def _weights(sigma: float) -> Float:
+    """float64[odd]: a Gaussian of sigma samples, for images without detail finer than _DETAIL; their sum is 1.
+
+    Error : of the transfer function, 1e-7
+    """
+    k = np.linspace(0.0, 2 * np.pi * DETAIL, 400)
+    lost, half = 1.0 - np.exp(-0.5 * (sigma * k) ** 2), 0
+    while True:
+        half += 1
+        basis = 1.0 - np.cos(k[:, None] * np.arange(1, half + 1))
+        outer = sums.least_squares(basis, lost)
+        if np.abs(sums.product(basis, outer) - lost).max() < 1e-7:
+            return np.concatenate([outer[::-1] / 2, [1.0 - outer.sum()], outer / 2])
+
+
+@dataclass(frozen=True, slots=True)
+class _Optics:
+    """The pupil as light of a wavelength samples it.
+
+    transmission : [n, n];  x, y : [lit samples] of its radius;  wavelength : A
+    """
+
+    transform: int
+    transmission: Float
+    x: Float
+    y: Float
+    wavelength: float
+
+
+def _optics(wavelength: float, sampling: float, mission: MissionConfiguration, transform: int) -> _Optics:
+    """The pupil's sampling follows the wavelength, so that the image's does not; its edges are one sample wide."""
+    step = wavelength * 1e-7 / (transform * sampling * _ARCSEC)
+    radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
+    n = 2 * (int(np.ceil(radius / step)) + 1)
+    axis = (np.arange(n) - n // 2) * step
+    x, y = np.meshgrid(axis, axis)
+    transmission = pupil(x, y, step, mission)
+    lit = transmission > 0
+    return _Optics(transform, transmission, x[lit] / radius, y[lit] / radius, wavelength)
+
+
+def _diffracted(nm: Float, optics: _Optics, side: int | None = None) -> Float32:
+    """|FFT of the pupil|^2 of unit flux over the whole sky, the soft edges' loss made good: [side, side].
+
+    nm   : by Noll number;  side : samples about the middle, side // 2; None: the whole transform's
+    Error : 5e-4 of what is in a sample, 5e-6 in the core: it is in single precision
+    """
+    transmission, transform = optics.transmission, optics.transform
+    side = transform if side is None else side
+    lit = transmission > 0
+    phase = galsim.zernike.Zernike(nm * (2 * np.pi / (optics.wavelength / 10.0)))(optics.x, optics.y).astype(np.float32)
+    field = np.zeros(transmission.shape, np.complex64)
+    field.real[lit] = transmission[lit] * np.cos(phase)
+    field.imag[lit] = transmission[lit] * np.sin(phase)
+    middle = (np.arange(side) - side // 2) % transform
+    # First along the rows that have light; then the columns that are wanted.
+    lines = scipy.fft.ifft(field, transform, axis=1, overwrite_x=True)[:, middle]
+    parts = scipy.fft.ifft(lines, transform, axis=0, overwrite_x=True)[middle].view(np.float32)
+    parts *= parts
+    power = parts[:, 0::2] + parts[:, 1::2]
+    power *= _edge_gain(transform, side)
+    power *= np.float32(transform**2 / transmission.sum())
+    return np.asarray(power)
+
+
+@lru_cache(maxsize=4)
+def _edge_gain(transform: int, side: int) -> Float32:
+    """One over what the soft edges of `pupil` leave of the diffracted light, by angle: sinc^2(angle / side)."""
+    angle = (np.arange(side) - side // 2) / transform
+    return np.asarray(np.sinc(np.hypot(angle[:, None], angle)) ** -2.0, np.float32)

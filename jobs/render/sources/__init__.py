@@ -1,0 +1,1 @@
+"""Which catalogue rows shine, and how they look."""

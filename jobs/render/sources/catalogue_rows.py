@@ -1,0 +1,83 @@
+"""The catalogue rows that a task reads: in its circle, and the bright ones beyond it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from jobs.render.psf import spikes
+from jobs.render.sources import lensed_arcs, selection
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.store import read
+
+# Each with its fluxes.
+CATALOGUES = (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes"))
+# Drawn where the lake has it.
+LENSES = "strong_lenses"
+# How far beyond a detector sources are looked for that shine so far, arcsec: spikes of stars, outskirts of galaxies.
+FARTHEST = max(spikes.FARTHEST, selection.FARTHEST)
+# What the parts of catalogues say of themselves.
+CELLS = "generation_cells"
+
+
+def drawn_cells(catalogue: read.Version) -> set[int]:
+    """Order-8 cells that a catalogue was drawn in."""
+    return {cell for part in catalogue.manifest["parts"] for cell in part["facts"][CELLS]}
+
+
+def deflection_of(catalogue: read.Version) -> float:
+    """How far a source may be seen from where its cell says, deg; stars are not lensed."""
+    return catalogue.deflection() if "ra_lensed" in catalogue.schema.names else 0.0
+
+
+def sources(
+    catalogue: read.Version,
+    fluxes: read.Version,
+    task: Mapping[str, Any],
+    columns: Sequence[str],
+    band: str,
+    farther: float,
+    least: float,
+    bright: float = float("inf"),
+) -> tuple[pa.Table, pa.Table, float]:
+    """(rows of a catalogue that a task may draw, their fluxes, how far beyond the task's circle they are complete).
+
+    farther : how far beyond the circle a source may be seen and reach the detector, arcsec
+    least   : microjansky, of sources beyond the cells of the circle; infinite where no source at all shows
+    bright  : microjansky, of sources still farther out, as far as spikes and outskirts go; infinite where none do
+    """
+    deflection, flux = deflection_of(catalogue), ["id", f"f_nu_{band}"]
+    near: list[int] = []
+    far: list[int] = []
+    farthest: list[int] = []
+    complete = farther
+    if np.isfinite(least):
+        near = selection.needed(task, deflection)
+        far, complete = selection.beyond(task, deflection, farther, drawn_cells(catalogue))
+    if np.isfinite(bright):
+        around, _ = selection.beyond(task, deflection, max(FARTHEST, farther), drawn_cells(catalogue))
+        farthest = sorted(set(around) - set(far))
+    rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
+    for cells, limit in ((far, least), (farthest, bright)):
+        if not cells:
+            continue
+        more, shining = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
+        shows = pc.greater_equal(shining[flux[1]], limit)
+        rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, more), (light, shining)))
+    return rows, light, complete
+
+
+def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, least: float) -> pa.Table:
+    """Strong lenses that are seen within a task's circle.
+
+    deflection : largest of the galaxies, deg;  least : infinite where no source shows, as in `sources`
+    """
+    cells = selection.needed(task, deflection) if np.isfinite(least) else []
+    about = table.in_cells(cells, GENERATION_ORDER, ["id", "ra_lensed", "dec_lensed"])
+    ra, dec = (about[name].to_numpy() for name in ("ra_lensed", "dec_lensed"))
+    seen = about["id"].filter(pa.array(selection.near(ra, dec, (task["ra"], task["dec"]), task["radius"])))
+    # Pictures are large: only those of lenses that are seen are read.
+    parts = [part["name"] for part in table.manifest["parts"] if not set(cells).isdisjoint(part["facts"][CELLS])]
+    return table.rows(lensed_arcs.ARC_COLUMNS, parts if len(seen) else [], pc.field("id").isin(seen))

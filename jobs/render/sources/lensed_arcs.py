@@ -1,0 +1,79 @@
+"""Lensed images of a galaxy behind a strong lens, as pictures.
+
+Picture         surface brightness on a grid of its own, north up, east to the right
+arcs            rows of strong lenses -> pictures, places and electrons
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from lake_schema.arrays import Array, Float, Int
+from lake_schema.errors import BadInput
+
+# What is read of the table `strong_lenses`; arcsec of a pixel of its pictures, as the table declares.
+ARC_COLUMNS = ("id", "source_id", "ra_lensed", "dec_lensed", "stamp_side", "stamp")
+ARC_SCALE = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """image : float32[ny, nx] of sum 1, south to north and west to east, its place in the middle;  scale : arcsec"""
+
+    image: npt.NDArray[np.float32]
+    scale: float
+
+    @property
+    def diagonal(self) -> float:
+        """Corner to corner, arcsec."""
+        return float(np.hypot(*self.image.shape)) * self.scale
+
+
+@dataclass(frozen=True, slots=True)
+class Arcs:
+    """n lensed galaxies: id, ra, dec in deg, electrons, the row of the galaxy that they are an image of, pictures."""
+
+    ids: Int
+    ra: Float
+    dec: Float
+    electrons: Float
+    source: Int
+    pictures: tuple[Picture, ...]
+
+
+def arcs(rows: pa.Table, ids: Int, electrons: Float) -> Arcs:
+    """Rows of the table `strong_lenses` -> Arcs.
+
+    ids, electrons : [m] of galaxies, without the magnification of their own that fluxes hold
+    """
+    wanted, order = rows["source_id"].to_numpy(), np.argsort(ids, kind="stable")
+    at = np.searchsorted(ids, wanted, sorter=order)
+    source = order[np.minimum(at, len(ids) - 1)] if len(ids) else np.zeros(len(wanted), np.int64)
+    for lens, of, i in zip(rows["id"].to_pylist(), wanted.tolist(), source.tolist(), strict=True):
+        if not len(ids) or ids[i] != of:
+            raise BadInput(f"strong lens {lens}: its source {of} is not among the galaxies")
+    drawn = rows["stamp"].combine_chunks()
+    pixels, ends = drawn.flatten().to_numpy(zero_copy_only=False), np.cumsum(drawn.value_lengths().to_numpy())
+    lenses, sides = rows["id"].to_pylist(), rows["stamp_side"].to_pylist()
+    stamps = np.split(pixels, ends[:-1]) if len(ends) else []
+    found = [_picture(*some) for some in zip(lenses, sides, stamps, strict=True)]
+    return Arcs(
+        rows["id"].to_numpy().astype(np.int64),
+        rows["ra_lensed"].to_numpy(),
+        rows["dec_lensed"].to_numpy(),
+        electrons[source] * np.array([total for _, total in found]),
+        source,
+        tuple(picture for picture, _ in found),
+    )
+
+
+def _picture(lens: int, side: int, pixels: Array) -> tuple[Picture, float]:
+    """A strong lens' picture, and its sum."""
+    total = float(pixels.sum(dtype=float))
+    if len(pixels) != side**2 or not total > 0.0 or not np.isfinite(total):
+        raise BadInput(f"strong lens {lens}: its stamp of side {side} has {len(pixels)} pixels of sum {total:g}")
+    return Picture((pixels / total).reshape(side, side).astype(np.float32), ARC_SCALE), total

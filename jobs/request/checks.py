@@ -1,0 +1,39 @@
+"""What is checked of a whole request: its bands and the mission's parameters."""
+
+from __future__ import annotations
+
+import json
+
+from jobs.request.schema import Request
+from lake_schema.errors import BadInput
+
+
+def check_bands(request: Request) -> None:
+    """Of its own bands a request can point VIS in: of no other camera are zero point, sky and seeing known there."""
+    own = {name for name, _ in request.curves.passbands}
+    for i, pointing in enumerate(request.pointings):
+        if pointing.band in own and pointing.channel != "VIS":
+            what = f"{pointing.band} is your own passband, in which camera {pointing.camera} has no zero point and sky"
+            raise BadInput(f"pointing[{i}].band: {what}: only VIS can be pointed in it")
+    for i, block in enumerate(request.observations):
+        if found := sorted(own & set(block.bands)):
+            raise BadInput(f"observation[{i}].bands: {found[0]} is your own passband: no survey observes in it")
+
+
+def check_mission(request: Request) -> None:
+    """Overrides and explored values must be of the database's names, units and ranges."""
+    from lake_schema.mission.configuration import resolve
+
+    own = {key: (override.value, override.unit) for key, override in request.mission.overrides}
+    try:
+        mission = resolve(ladder=request.mission.ladder, overrides=own)
+    except BadInput as error:
+        raise BadInput(f"mission: {error}") from None
+    for key, values in request.explore:
+        if key == "accuracy" or key.startswith("effects."):
+            continue
+        for value in values:
+            try:
+                mission.overridden_with({key: tuple(json.loads(value))})
+            except BadInput as error:
+                raise BadInput(f"explore.{key}: {error}") from None

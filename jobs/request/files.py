@@ -1,0 +1,159 @@
+"""Files of others that a request names.
+
+OwnCurves, curves   spectra, filters and extinction laws: the section `fluxes`
+Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
+psfs                point-spread functions: the section `psf`
+file_of             a file beside the request
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from jobs.request.toml_values import Toml, boolean, shown, string, strings, table_of
+from lake_schema import user_files
+from lake_schema.errors import BadInput
+from lake_schema.store import layout
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """Files of spectra, of a filter or of an extinction law; medium : of a filter's wavelengths, "air" or "vacuum"."""
+
+    files: tuple[Path, ...]
+    format: str
+    medium: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnCurves:
+    """What stands beside the embedded passbands, and in place of the embedded galaxies, extinction laws and dwarfs.
+
+    basel : models of dwarfs;  irtf : spectra of stars whose infrared the dwarfs are given
+    intergalactic : galaxies are seen through the hydrogen between them
+    """
+
+    passbands: tuple[tuple[str, Curves], ...] = ()
+    templates: Curves | None = None
+    extinction: tuple[tuple[int, Curves], ...] = ()
+    basel: Path | None = None
+    irtf: tuple[Path, ...] = ()
+    intergalactic: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Catalogue:
+    """Files of a catalogue of others; columns : (our key, JSON of what stands for it) beside those of the format."""
+
+    files: tuple[Path, ...]
+    format: str = ""
+    columns: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class DustMap:
+    """A HEALPix map of E(B-V) or A(V); ordering, coordinates : what its header must say, or does not say."""
+
+    file: Path
+    column: str
+    quantity: str = "ebv"
+    ordering: str = ""
+    coordinates: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Ingest:
+    """What is taken from others instead of being made; training : galaxies whose spectra ours have."""
+
+    galaxies: Catalogue | None = None
+    halos: Catalogue | None = None
+    training: Catalogue | None = None
+    dust: DustMap | None = None
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """A file by its name, found from the request's folder."""
+    return user_files.expanded(name, folder)
+
+
+def curves(table: Toml, folder: Path) -> OwnCurves:
+    """The section `fluxes`; files are found from `folder`.  BadInput names the key."""
+    filters = table_of(table.get("passbands", {}), "fluxes.passbands", None)
+    laws = table_of(table.get("extinction", {}), "fluxes.extinction", set("1234"))
+    passbands = [_curves(value, f"fluxes.passbands.{layout.name(key)}", folder, True) for key, value in filters.items()]
+    extinction = [_curves(value, f"fluxes.extinction.{key}", folder) for key, value in laws.items()]
+    templates = None
+    if "templates" in table:
+        path = "fluxes.templates"
+        given = table_of(table["templates"], path, {"files", "format"})
+        files = strings(given, f"{path}.files", distinct=False)
+        if not files:
+            raise BadInput(f"{path}.files is missing")
+        templates = Curves(tuple(file_of(folder, file) for file in files), string(given, f"{path}.format"))
+    stars = table_of(table.get("stars", {}), "fluxes.stars", {"basel", "irtf"})
+    if "stars" in table and not stars:
+        raise BadInput("fluxes.stars names neither basel nor irtf")
+    return OwnCurves(
+        tuple(zip(filters, passbands, strict=True)),
+        templates,
+        tuple(zip(map(int, laws), extinction, strict=True)),
+        file_of(folder, string(stars, "fluxes.stars.basel")) if "basel" in stars else None,
+        tuple(file_of(folder, name) for name in strings(stars, "fluxes.stars.irtf")),
+        boolean(table, "fluxes.intergalactic", False),
+    )
+
+
+def _curves(value: object, path: str, folder: Path, has_medium: bool = False) -> Curves:
+    table = table_of(value, path, {"file", "format", *(["medium"] if has_medium else [])})
+    medium = string(table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
+    return Curves((file_of(folder, string(table, f"{path}.file")),), string(table, f"{path}.format"), medium)
+
+
+def ingest(table: Toml, folder: Path) -> Ingest:
+    """The section `ingest`; files are found from `folder`.  BadInput names the key."""
+    galaxies = _catalogue(table["galaxies"], "ingest.galaxies", folder) if "galaxies" in table else None
+    halos, training = (
+        _catalogue(table[name], f"ingest.{name}", folder) if name in table else None for name in ("halos", "training")
+    )
+    if galaxies and halos:
+        raise BadInput("ingest.halos: a finished catalogue of galaxies wants no halos")
+    if galaxies and training:
+        raise BadInput("ingest.training: the galaxies of a finished catalogue have their own spectra")
+    dust = None
+    if "dust" in table:
+        given = table_of(table["dust"], "ingest.dust", set(DustMap.__slots__))
+        dust = DustMap(
+            file_of(folder, string(given, "ingest.dust.file")),
+            string(given, "ingest.dust.column"),
+            string(given, "ingest.dust.quantity", ("ebv", "a_v"), "ebv"),
+            string(given, "ingest.dust.ordering", ("RING", "NESTED"), "RING") if "ordering" in given else "",
+            string(given, "ingest.dust.coordinates", ("G", "C"), "G") if "coordinates" in given else "",
+        )
+    return Ingest(galaxies, halos, training, dust)
+
+
+def psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
+    """The section `psf`: (band, file), found from `folder`.  BadInput names the key."""
+    return tuple((layout.name(band), str(file_of(folder, string(table, f"psf.{band}")))) for band in sorted(table))
+
+
+def _catalogue(value: object, path: str, folder: Path) -> Catalogue:
+    table = table_of(value, path, {"files", "columns", *(["format"] if path.endswith("galaxies") else [])})
+    files = strings(table, f"{path}.files")
+    if not files:
+        raise BadInput(f"{path}.files is missing or empty")
+    columns = table_of(table.get("columns", {}), f"{path}.columns", None)
+    return Catalogue(
+        tuple(file_of(folder, name) for name in files),
+        string(table, f"{path}.format", default=""),
+        tuple((key, _json(columns[key], f"{path}.columns.{key}")) for key in sorted(columns)),
+    )
+
+
+def _json(value: object, path: str) -> str:
+    try:
+        return json.dumps(value, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError):
+        raise BadInput(f"{path} wants texts, numbers and tables, got {shown(value)}") from None

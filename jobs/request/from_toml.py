@@ -1,0 +1,277 @@
+"""The simulation request: a TOML file of at most a screen, read into frozen records; every number has bounds.
+
+    name = "demo"      seed = 2024      accuracy = "survey" | "quicklook" | "draft" | "reference" | {flux = ..}
+    [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
+                   tile = number | patches = [[ra, dec, radius], ..] | wide = true
+    [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
+                   high_redshift_boost, quasar_boost
+    [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
+    [ingest.galaxies]  files = [..]  a finished catalogue instead of ours: Parquet, FITS, CSV, a HATS folder
+                       format = "flagship1" | "flagship2" | "euclid" | "skycatalogs"   columns = {ours = theirs, ..}
+    [ingest.halos]     files = [..]  columns = {ra, dec, z_true, log_mass, ..}   a halo light-cone instead of ours
+    [ingest.training]  files = [..]  columns = {z_true, abs_mag_r01, color_gr_01, sed, ext_law, ebv}
+                       observed galaxies: each of ours has the spectrum of one like it
+    [ingest.dust]      file, column, quantity = "ebv" | "a_v"   a HEALPix map of the Milky Way's dust instead of ours
+    [strong_lenses]  boost   how many times denser than in nature they are drawn
+    [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
+    [fluxes]       bands = [..]           default: the bands of the pointings and observations
+                   intergalactic = true   galaxies are seen through the hydrogen between them
+    [fluxes.passbands.NAME]        your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
+    [fluxes.templates]             your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
+    [fluxes.stars]                 your own dwarfs: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
+    [fluxes.extinction.CODE]       your own law in place of law 1 .. 4: file, format
+    [psf]          BAND = "file.fits"   your own PSF in a band: a cube of planes or PSFEx's
+    (jobs/render/psf/from_file.py);
+                   {detector} in the name stands for the detector's
+    [solar_system] bodies = "file"      your own moving bodies in place of ours (jobs/render/sources/ephemerides.py)
+    [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
+    [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
+    [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
+    [[observation]]
+        channels = ["VIS", "NISP-P", "NISP-S"] | ["EXT"]
+        image_type = "science" | "deep" | "bias" | "dark" | "flat" | "charge_injection" | "self_calibration"
+                     | "standard_star" | "planetary_nebula"
+        survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
+        pointings = "file.csv"     a table of pointings instead of a survey's pattern
+        dither = "S" | "J" | "none"   fields, visits, exposures, short, flat, blue, bands, detectors, mjd,
+        exposure_time_s
+    [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation"]
+                   compression = "none" | "rice"   of images of whole numbers, without loss
+
+Files are found from the folder of the request; their formats are in jobs/fluxes/libraries/spectrum_formats.toml.
+A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
+
+    python -m jobs.request check FILE
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from jobs.accuracy import SURVEY, Accuracy, preset, row_for
+from jobs.request import area as areas
+from jobs.request import checks, files, observations
+from jobs.request.area import Area
+from jobs.request.schema import (
+    BOX_CELLS,
+    COMPRESSIONS,
+    DENSITIES,
+    EFFECTS,
+    LADDER,
+    LENSING_NSIDES,
+    STATUSES,
+    TRUTH,
+    Effects,
+    MissionChoice,
+    Override,
+    Request,
+    Stars,
+    Universe,
+)
+from jobs.request.toml_values import Toml
+from jobs.request.toml_values import boolean as _boolean
+from jobs.request.toml_values import checked_number as _checked_number
+from jobs.request.toml_values import choice as _choice
+from jobs.request.toml_values import integer as _integer
+from jobs.request.toml_values import known as _known
+from jobs.request.toml_values import number as _number
+from jobs.request.toml_values import section as _section
+from jobs.request.toml_values import shown as _shown
+from jobs.request.toml_values import string as _string
+from jobs.request.toml_values import strings as _strings
+from jobs.request.toml_values import table_of as _table
+from jobs.request.toml_values import value as _value
+from lake_schema import user_files
+from lake_schema.errors import BadInput
+from lake_schema.store import layout
+
+__all__ = ["Area", "Override", "Request", "parse"]
+
+_MOST_VARIANTS = 10_000
+
+
+def parse(path: Path) -> Request:
+    """Read and check a request file.
+
+    Errors : BadInput, one line that names the file and the key
+    """
+    try:
+        table = user_files.toml(path, "request")
+    except BadInput as error:
+        raise BadInput(f"request {error}") from None
+    try:
+        return _with_files_beside(from_table(table, path.resolve().parent), path.parent)
+    except BadInput as error:
+        raise BadInput(f"request {user_files.shown(path)}: {error}") from None
+
+
+def from_table(table: Toml, folder: Path = Path()) -> Request:
+    """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
+    sections = {
+        "area",
+        "universe",
+        "stars",
+        "ingest",
+        "strong_lenses",
+        "mission",
+        "fluxes",
+        "psf",
+        "solar_system",
+        "effects",
+        "explore",
+        "products",
+    }
+    _known(table, "", {"name", "seed", "accuracy", "pointing", "observation", *sections})
+    asked, blocks = observations.pointings(table), observations.observations(table)
+    fluxes = _section(table, "fluxes", {"bands", "intergalactic", "passbands", "templates", "stars", "extinction"})
+    curves = files.curves(fluxes, folder)
+    bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in asked)
+    mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
+    products_ = _section(table, "products", {"truth", "compression"})
+    solar_system = _section(table, "solar_system", {"bodies"})
+    bodies = files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
+    request = Request(
+        name=layout.name(_string(table, "name")),
+        seed=_integer(table, "seed", 0, 2**63 - 1),
+        accuracy=_accuracy(table.get("accuracy"), "accuracy"),
+        area=areas.parse(_section(table, "area", None)),
+        universe=_universe(_section(table, "universe", set(Universe.__slots__))),
+        stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder),
+        mission=mission,
+        bands=tuple(dict.fromkeys((*bands, *(name for name, _ in curves.passbands)))),
+        pointings=asked,
+        truth=_truth(products_),
+        compression=_string(products_, "products.compression", COMPRESSIONS, "none"),
+        curves=curves,
+        observations=blocks,
+        effects=_effects(_section(table, "effects", {"on", "off"})),
+        explore=_explore(_section(table, "explore", None)),
+        ingest=files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
+        bodies=bodies,
+        psfs=files.psfs(_section(table, "psf", None), folder),
+        strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
+    )
+    checks.check_bands(request)
+    checks.check_mission(request)
+    return request
+
+
+# ------------------------------------------------------------------------------------------------ sections
+
+
+def _accuracy(value: object, path: str) -> Accuracy:
+    if value is None:
+        return SURVEY
+    if isinstance(value, str):
+        return preset(value)
+    table = _table(value, path, {"flux", "shape", "position", "background"})
+    own = Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
+    # What cannot be had is refused before anything is made.
+    row_for(own)
+    return own
+
+
+def _universe(table: Toml) -> Universe:
+    default = Universe()
+    return Universe(
+        galaxy_limit=_number(table, "universe.galaxy_limit", 10.0, 30.0, default.galaxy_limit),
+        galaxy_band=_string(table, "universe.galaxy_band", default=default.galaxy_band),
+        star_limit=_number(table, "universe.star_limit", 0.0, 30.0, default.star_limit),
+        z_max=_number(table, "universe.z_max", 0.01, 3.0, default.z_max),
+        box_cells=_choice(table, "universe.box_cells", BOX_CELLS, default.box_cells),
+        high_redshift_boost=_number(table, "universe.high_redshift_boost", 0.0, 1e5, default.high_redshift_boost),
+        quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),
+        lensing_nside=_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
+    )
+
+
+def _stars(table: Toml, folder: Path) -> Stars:
+    default = Stars()
+    rows = _integer(table, "stars.rows_a_file", 1, 3_000_000) if "rows_a_file" in table else default.rows_a_file
+    plane_limit = _number(table, "stars.plane_limit", 0.0, 30.0, math.nan)
+    given = _table(table.get("catalogue", {}), "stars.catalogue", {"file", "columns"})
+    columns = _table(given.get("columns", {}), "stars.catalogue.columns", None)
+    return Stars(
+        density=_string(table, "stars.density", DENSITIES) if "density" in table else default.density,
+        brown_dwarf_boost=_number(table, "stars.brown_dwarf_boost", 0.0, 1e4, default.brown_dwarf_boost),
+        tycho2=tuple(files.file_of(folder, name) for name in _strings(table, "stars.tycho2")),
+        catalogue=files.file_of(folder, _string(given, "stars.catalogue.file")) if given else None,
+        columns=tuple((key, _string(columns, f"stars.catalogue.columns.{key}")) for key in sorted(columns)),
+        plane_limit=None if math.isnan(plane_limit) else plane_limit,
+        rows_a_file=rows,
+    )
+
+
+def _mission(table: Toml) -> MissionChoice:
+    ladder = _strings(table, "mission.ladder", STATUSES) or LADDER
+    overrides = _table(table.get("overrides", {}), "mission.overrides", None)
+    return MissionChoice(ladder, tuple(sorted((key, _override(value, key)) for key, value in overrides.items())))
+
+
+def _override(value: object, key: str) -> Override:
+    path = f"mission.overrides.{key}"
+    table = _table(value, path, {"value", "unit"})
+    return Override(_number(table, f"{path}.value", -math.inf, math.inf), _string(table, f"{path}.unit"))
+
+
+def _with_files_beside(request: Request, folder: Path) -> Request:
+    """Tables of pointings are named relative to the request's file, and may not leave its folder."""
+    found = []
+    for i, block in enumerate(request.observations):
+        if block.pointings:
+            path = folder / block.pointings
+            try:
+                user_files.checked(layout.within(folder, path), "table of pointings")
+            except BadInput as error:
+                raise BadInput(f"observation[{i}].pointings: {error}") from None
+            block = replace(block, pointings=str(path))
+        found.append(block)
+    return replace(request, observations=tuple(found))
+
+
+def _truth(table: Toml) -> tuple[str, ...]:
+    return _strings(table, "products.truth", TRUTH)
+
+
+def _effects(table: Toml) -> Effects:
+    on, off = (_strings(table, f"effects.{key}", EFFECTS) for key in ("on", "off"))
+    if both := sorted(set(on) & set(off)):
+        raise BadInput(f"effects: {both[0]!r} is both on and off")
+    return Effects(on, off)
+
+
+def _explore(table: Toml) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    found, count = [], 1
+    for key in sorted(table):
+        values = _choices(key, table[key])
+        if not values:
+            raise BadInput(f"explore.{key} names no value")
+        if len(set(values)) != len(values):
+            raise BadInput(f"explore.{key} names a value twice")
+        count *= len(values)
+        if count > _MOST_VARIANTS:
+            raise BadInput(f"explore.{key}: the product of the values is more than {_MOST_VARIANTS} requests")
+        found.append((key, values))
+    return tuple(found)
+
+
+def _choices(key: str, value: object) -> tuple[str, ...]:
+    """The values of one explored parameter, as JSON."""
+    path = f"explore.{key}"
+    if key != "accuracy" and not key.startswith("effects."):
+        table = _table(value, path, {"values", "unit"})
+        unit, numbers = _string(table, f"{path}.unit"), _value(table, f"{path}.values")
+        if not isinstance(numbers, list):
+            raise BadInput(f"{path}.values wants a list of numbers, got {_shown(numbers)}")
+        checked = [_checked_number(n, f"{path}.values[{i}]", -math.inf, math.inf) for i, n in enumerate(numbers)]
+        return tuple(json.dumps([number, unit]) for number in checked)
+    if not isinstance(value, list):
+        raise BadInput(f"{path} wants a list, got {_shown(value)}")
+    if key == "accuracy":
+        return tuple(json.dumps(asdict(_accuracy(item, f"{path}[{i}]"))) for i, item in enumerate(value))
+    if key.removeprefix("effects.") not in EFFECTS:
+        raise BadInput(f"{path} is not one of the effects {', '.join(EFFECTS)}")
+    return tuple(json.dumps(_boolean({"x": item}, f"{path}[{i}].x", True)) for i, item in enumerate(value))

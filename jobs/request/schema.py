@@ -1,0 +1,143 @@
+"""What a request holds: frozen records."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from jobs.accuracy import Accuracy
+from jobs.request.area import Area
+from jobs.request.files import Ingest, OwnCurves
+from jobs.request.observations import Observation, Pointing
+from lake_schema.tables import mission as database
+from lake_schema.tables import products
+
+STATUSES = tuple(code for code, _ in database.STATUSES)
+LADDER = database.LADDER
+TRUTH = tuple(code for code, _ in products.CONTENTS if code != "science")
+COMPRESSIONS = ("none", "rice")
+DENSITIES = ("juric", "besancon")
+BOX_CELLS = (192, 256, 384)
+LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
+# Of the channels' tuples in jobs/render/channels (a test compares them).
+EFFECTS = (
+    "adc", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp", "charge_injection",
+    "cosmic_rays", "crosstalk", "dark_current", "full_well", "ghosts", "hot_pixels", "illumination", "injection_noise",
+    "intra_pixel", "nonlinearity", "parallel_cti", "pixel_area", "pixel_response", "poisson", "quadrants",
+    "read_noise", "readout_cosmic_rays", "readout_trail", "serial_cti", "shutter", "straylight",
+)  # fmt: skip
+_NO_FILES = OwnCurves()
+_NOTHING_TAKEN = Ingest()
+
+
+@dataclass(frozen=True, slots=True)
+class Universe:
+    """How deep and how fine.
+
+    galaxy_limit, galaxy_band : faintest magnitude (AB, before the Milky Way's dust and intergalactic hydrogen), in
+                               which of the embedded passbands; another limit draws its cells anew: a shallow request
+                               has as many bright galaxies as a deep one has, not the same
+    star_limit               : H (Vega, as observed);  z_max : highest redshift
+    box_cells                : cells of 4 Mpc/h a side of the box of matter
+    lensing_nside            : HEALPix resolution of the lensing maps
+    high_redshift_boost, quasar_boost : how many times denser than in nature these kinds are drawn, 0 = not at all
+    """
+
+    galaxy_limit: float = 26.0
+    galaxy_band: str = "euclid_vis"
+    star_limit: float = 26.0
+    z_max: float = 2.3
+    box_cells: int = 256
+    lensing_nside: int = 512
+    high_redshift_boost: float = 1.0
+    quasar_boost: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Stars:
+    """How the Milky Way's stars are drawn.
+
+    density           : whose laws of density
+    brown_dwarf_boost : how many times denser than in nature L and T dwarfs are drawn, 0 = not at all
+    tycho2            : files of Tycho-2, which replace the model brighter than V = 11
+    catalogue         : file of other stars to be taken instead of the model's; columns: (ours, theirs)
+    plane_limit       : faintest H (Vega, as observed) within 5 deg of the plane; None = an area there is refused
+    rows_a_file       : above so many expected rows a cell's file is split into those of the next HEALPix order
+    """
+
+    density: str = "juric"
+    brown_dwarf_boost: float = 1.0
+    tycho2: tuple[Path, ...] = ()
+    catalogue: Path | None = None
+    columns: tuple[tuple[str, str], ...] = ()
+    plane_limit: float | None = None
+    rows_a_file: int = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """A value that replaces what the mission's ladder would choose."""
+
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class MissionChoice:
+    """Which statuses of the mission's parameters are preferred, and what is overridden."""
+
+    ladder: tuple[str, ...] = LADDER
+    overrides: tuple[tuple[str, Override], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Effects:
+    """Effects that are forced on or off, whatever a scene needs."""
+
+    on: tuple[str, ...] = ()
+    off: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A simulation request, checked.
+
+    explore : parameter -> the values (JSON) that it takes in turn
+    psfs    : (band, file) of PSFs in place of ours
+    bodies  : file of moving bodies in place of ours
+    """
+
+    name: str
+    seed: int
+    accuracy: Accuracy
+    area: Area
+    universe: Universe
+    stars: Stars
+    mission: MissionChoice
+    bands: tuple[str, ...]
+    pointings: tuple[Pointing, ...]
+    truth: tuple[str, ...]
+    curves: OwnCurves = _NO_FILES
+    observations: tuple[Observation, ...] = ()
+    effects: Effects = Effects()
+    explore: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    ingest: Ingest = _NOTHING_TAKEN
+    strong_lens_boost: float = 1.0
+    compression: str = "none"
+    psfs: tuple[tuple[str, str], ...] = ()
+    bodies: Path | None = None
+
+    def facts(self, *parts: str) -> dict[str, Any]:
+        """The named parts of the request as JSON values, for the key of what depends on them."""
+        everything = asdict(self)
+        return {part: everything[part] for part in parts}
+
+    def variants(self) -> Iterator[dict[str, Any]]:
+        """The product of what is explored: parameter -> value; one empty variant where nothing is."""
+        names = [name for name, _ in self.explore]
+        for values in product(*(choices for _, choices in self.explore)):
+            yield {name: json.loads(value) for name, value in zip(names, values, strict=True)}

@@ -1,0 +1,1 @@
+"""How the lake keeps tables: staged, published, verified, read."""

@@ -1,0 +1,128 @@
+"""What makes a folder of cells a HATS collection: metadata, the 10 arcsec margin, the properties.
+
+<version>/collection.properties
+<version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,...}
+<version>/<table>_margin/   the same for the rows just outside each cell, so that a cross-match loses no pair at an edge
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema import sky
+from lake_schema.arrays import Int
+from lake_schema.columns import Table
+from lake_schema.store import layout, parquet
+from lake_schema.store.plan import Json
+
+MARGIN_ARCSEC = 10.0
+# Cells of order 13 are 26" wide: the rim of them about a cell holds everything within 10" of it.
+_MARGIN_ORDER = 13
+_SKYMAP_ORDER = 8
+# Above this many files the merged footers of `_metadata` outgrow their use.
+_MOST_FILES_IN_METADATA = 1000
+# The properties want a date; a clock's would make equal lakes differ.
+_DATE = "2000-01-01T00:00UTC"
+
+Cell = tuple[int, int]  # order, nested cell
+
+
+def border(rows: pa.Table, part: str) -> pa.Table:
+    """Those rows of a cell that another cell's margin may want: kept beside the receipts until the margins are made."""
+    order, cell = layout.cell_of_file(part)
+    fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, _MARGIN_ORDER)
+    return rows.filter(pa.array(np.isin(fine, sky.border_cells(order, cell, _MARGIN_ORDER))))
+
+
+def write(version: Path, table: Table, made: Sequence[Json], borders: Path) -> None:
+    """Write the metadata of a catalogue whose cells lie in `version`/<table>/dataset.
+
+    made : receipts of the cells;  borders : folder of their border rows
+    """
+    cells = [layout.cell_of_file(receipt["part"]) for receipt in made]
+    root, margin = version / table.name, version / f"{table.name}_margin"
+    along = {cell: receipt["border"] for cell, receipt in zip(cells, made, strict=True)}
+    margin_rows = _write_margin(margin, table, borders, along)
+    counts = _skymap(version, [receipt["files"][0] for receipt in made])
+    _write_catalogue(root, table, cells, sum(receipt["rows"] for receipt in made), counts)
+    _write_catalogue(margin, table, cells, margin_rows, None)
+    _write_collection(version, table)
+
+
+def _write_margin(folder: Path, table: Table, borders: Path, along: Mapping[Cell, Json]) -> int:
+    orders = sorted({order for order, _ in along})
+    total = 0
+    for order, cell in along:
+        rim = sky.margin_cells(order, cell, _MARGIN_ORDER)
+        around = [(o, int(c)) for o in orders for c in np.unique(sky.parent(rim, _MARGIN_ORDER, o))]
+        pieces = [_rows_in(borders, along[other], rim) for other in around if other in along]
+        rows = pa.concat_tables([table.empty(), *pieces]).sort_by([("_healpix_29", "ascending"), ("id", "ascending")])
+        target = folder / "dataset" / layout.cell_file(order, cell)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        parquet.write(target, rows, table)
+        total += rows.num_rows
+    return total
+
+
+def _rows_in(folder: Path, entry: Json, rim: Int) -> pa.Table:
+    rows = parquet.read(folder, entry)
+    fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, _MARGIN_ORDER)
+    return rows.filter(pa.array(np.isin(fine, rim)))
+
+
+def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, counts: Int | None) -> None:
+    from hats.catalog.dataset.table_properties import TableProperties
+    from hats.catalog.partition_info import PartitionInfo
+    from hats.io.file_io.file_io import write_fits_image
+    from hats.io.parquet_metadata import write_parquet_metadata
+    from hats.io.paths import get_skymap_file_pointer
+    from hats.pixel_math.healpix_pixel import HealpixPixel
+
+    write_parquet_metadata(root, create_metadata=len(cells) <= _MOST_FILES_IN_METADATA)
+    PartitionInfo([HealpixPixel(order, cell) for order, cell in cells]).write_to_file(catalog_path=root)
+    facts: dict[str, Any] = {
+        "total_rows": rows,
+        "ra_column": "ra",
+        "dec_column": "dec",
+        "healpix_column": "_healpix_29",
+        "healpix_order": sky.DEEPEST,
+        "npix_suffix": ".parquet",
+    }
+    if counts is None:
+        facts |= {"catalog_name": f"{table.name}_margin", "catalog_type": "margin"}
+        facts |= {"primary_catalog": f"../{table.name}", "margin_threshold": MARGIN_ARCSEC}
+    else:
+        write_fits_image(counts, get_skymap_file_pointer(root))
+        facts |= {"catalog_name": table.name, "catalog_type": "object", "skymap_order": _SKYMAP_ORDER}
+    about = TableProperties.new_provenance_dict(root, builder="truesky")
+    about["hats_creation_date"] = _DATE
+    # The size on disk would differ by a byte with the length of a path.
+    about.pop("hats_estsize", None)
+    TableProperties(**facts, **about).to_properties_file(root)
+
+
+def _skymap(folder: Path, entries: Sequence[Json]) -> Int:
+    counts = np.zeros(12 << (2 * _SKYMAP_ORDER), np.int64)
+    for entry in entries:
+        index = parquet.read(folder, entry, ["_healpix_29"])["_healpix_29"].to_numpy()
+        counts += np.bincount(sky.parent(index, sky.DEEPEST, _SKYMAP_ORDER), minlength=counts.size)
+    return counts
+
+
+def _write_collection(version: Path, table: Table) -> None:
+    from hats.catalog.dataset.collection_properties import CollectionProperties
+
+    margin = f"{table.name}_margin"
+    about: dict[str, Any] = {"hats_builder": "truesky", "hats_creation_date": _DATE}
+    CollectionProperties(
+        obs_collection=table.name,
+        hats_primary_table_url=table.name,
+        all_margins=[margin],
+        default_margin=margin,
+        **about,
+    ).to_properties_file(version)

@@ -1,0 +1,202 @@
+"""The manifest of a version: its files with bytes and sha256, what they were made from, sealed by its own digest.
+
+write     put a manifest into a version's folder
+load      read one; refused where a byte of it has changed
+faults    is a version what its manifest says?
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import pyarrow as pa
+
+from lake_schema import blocks, sky
+from lake_schema.errors import Damaged
+from lake_schema.store import layout, parquet
+from lake_schema.store.plan import Json
+from lake_schema.store.provenance import canonical, digest, file_sha256
+
+MANIFEST = "manifest.json"
+# Types of what every manifest says, and of what it says of each file.
+_FACTS = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
+_FILE = {"path": str, "bytes": int, "sha256": str}
+
+
+def write(folder: Path, facts: Json) -> None:
+    """Seal the facts of a version and put them into its folder, synced."""
+    plain = json.loads(canonical(facts))
+    write_json(folder / MANIFEST, {**plain, "digest": digest(plain)})
+
+
+def load(folder: Path, table: str) -> dict[str, Any]:
+    """The manifest of a version's folder.
+
+    Errors : Damaged where it is missing, cut short, changed, or that of another version or table
+    """
+    path = folder / MANIFEST
+    try:
+        facts = json.loads(path.read_bytes())
+        seal = facts.pop("digest")
+        sealed = digest(facts)
+    except (OSError, ValueError, KeyError, AttributeError, RecursionError) as error:
+        raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
+    if sealed != seal:
+        raise Damaged(f"{path} is not what was written: its digest differs")
+    if not _is_manifest(facts):
+        raise Damaged(f"{path} is not a manifest of this form")
+    if facts["table"] != table or folder.name != f"v-{facts['key']}":
+        raise Damaged(f"{path} is that of table {facts['table']}, version {facts['key']}")
+    return dict(facts)
+
+
+def _is_manifest(facts: Any) -> bool:
+    return (
+        _has(facts, _FACTS)
+        and type(facts.get("deflection_deg", 0.0)) is float
+        and all(_has(part, {"name": str}) for part in facts["parts"])
+        and all(_is_entry(entry) for entry in facts["files"])
+    )
+
+
+def _is_entry(entry: Any) -> bool:
+    if not _has(entry, _FILE) or type(entry.get("rows", 0)) is not int:
+        return False
+    path = PurePosixPath(entry["path"])
+    try:
+        blocks.listed(entry)
+    except (TypeError, ValueError):
+        return False
+    return not path.is_absolute() and ".." not in path.parts
+
+
+def _has(value: Any, kinds: dict[str, type]) -> bool:
+    return isinstance(value, dict) and all(type(value.get(key)) is kind for key, kind in kinds.items())
+
+
+def file_facts(path: Path, relative: str) -> dict[str, Any]:
+    """A file's entry in the manifest: path, bytes, sha256, and of a Parquet file the checksums of its blocks.
+
+    The blocks cover the file from its first byte to its last, so that whatever part of it is read can be compared.
+    """
+    if relative.endswith(".parquet"):
+        return {"path": relative, **parquet.facts(path)}
+    return {"path": relative, "bytes": path.stat().st_size, "sha256": file_sha256(path)}
+
+
+def checked(folder: Path, entry: Json) -> Path:
+    """A listed file that has the size that the manifest says; what is in it is not looked at.  Errors: Damaged"""
+    path: Path = folder / entry["path"]
+    if fault := _misfit(path, entry):
+        raise Damaged(fault)
+    return path
+
+
+def whole(folder: Path, entry: Json) -> Path:
+    """A listed file whose every byte is what was written, by its sha256.  Errors: Damaged"""
+    path = checked(folder, entry)
+    try:
+        if file_sha256(path) == entry["sha256"]:
+            return path
+    except OSError as error:
+        raise Damaged(f"{path} cannot be read: {error.strerror}") from None
+    raise Damaged(f"{path} has other contents than the manifest says")
+
+
+def _misfit(path: Path, entry: Json) -> str:
+    try:
+        return _difference(path, entry)
+    except FileNotFoundError:
+        # Removed since, with its whole version.
+        return f"{path} is missing"
+    except OSError as error:
+        return f"{path} cannot be read: {error.strerror}"
+
+
+def _difference(path: Path, entry: Json) -> str:
+    if not path.is_file() or path.is_symlink():
+        return f"{path} is missing"
+    size = path.stat().st_size
+    if size != entry["bytes"]:
+        return f"{path} has {size} bytes, the manifest says {entry['bytes']}"
+    return ""
+
+
+def faults(folder: Path, facts: Json, deep: bool = False) -> list[str]:
+    """What is wrong with a version: a list of sentences, empty where all is well.
+
+    facts : its manifest
+    deep  : also the sha256 of every file, and that each cell holds only its own rows, sorted
+    """
+    listed = facts["files"]
+    names = {entry["path"] for entry in listed}
+    here = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()}
+    found = [f"{folder / extra} is not in the manifest" for extra in sorted(here - names - {MANIFEST})]
+    # Hashing lets go of the interpreter: as many files at a time as there are cores.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for wrong in pool.map(lambda entry: _file_faults(folder, entry, deep), listed):
+            found += wrong
+    total = sum(entry.get("rows", 0) for entry in listed)
+    if total != facts["rows"]:
+        found.append(f"{folder / MANIFEST}: {facts['rows']} rows in all, {total} in the files")
+    return found
+
+
+def _file_faults(folder: Path, entry: Json, deep: bool) -> list[str]:
+    try:
+        if deep:
+            whole(folder, entry)
+            return _row_faults(folder, entry) if "rows" in entry else []
+        checked(folder, entry)
+        if "blocks" in entry:
+            # The footer; a file without blocks would be read as a whole.
+            parquet.schema(folder, entry)
+    except Damaged as error:
+        return [str(error)]
+    except (OSError, pa.ArrowInvalid) as error:
+        return [f"{folder / entry['path']}: {error}"]
+    return []
+
+
+def _row_faults(folder: Path, entry: Json) -> list[str]:
+    path, schema = folder / entry["path"], parquet.schema(folder, entry)
+    # Refuses another number of rows.
+    rows = parquet.dataset(folder, [entry], schema)
+    if "_healpix_29" not in schema.names or "Npix=" not in path.name:
+        return []
+    index = rows.to_table(columns=["_healpix_29"])["_healpix_29"].to_numpy()
+    first, last = sky.cell_range(*layout.cell_of_file("/".join(path.parts[-3:])))
+    if index.size and (index.min() < first or index.max() >= last):
+        return [f"{path} holds rows of another cell"]
+    return [f"{path} is not sorted by _healpix_29"] if (index[1:] < index[:-1]).any() else []
+
+
+# ------------------------------------------------------------------------------------------------ files that last
+
+
+def write_json(path: Path, value: Json) -> None:
+    """Replace a JSON file in one rename, synced."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("w") as stream:
+            json.dump(value, stream, indent=1, sort_keys=True, allow_nan=False)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+        sync(path.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Make a file, or the names in a folder, survive a loss of power."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

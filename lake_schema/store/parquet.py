@@ -1,0 +1,92 @@
+"""Parquet files as the lake writes and reads them: declared encodings, sorted rows, every byte compared when read.
+
+A changed byte goes through pyarrow's, Spark's, pandas', DuckDB's and lsdb's own readers as a wrong number. Here a file
+is known by its entry in a manifest or receipt, and read by nothing but `blocks.Checked`: the decoder sees no byte that
+was not compared, be it of a page, of its header, or of the footer that says where pages are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+
+from lake_schema import blocks
+from lake_schema.columns import Table
+from lake_schema.errors import Damaged
+from lake_schema.store.plan import Json
+
+# Sorted by position, 65,536 rows a group is where small cones are fast and the footer still small (tried: 4k to 262k).
+ROWS_A_GROUP = 65_536
+
+_FORMAT = ds.ParquetFileFormat()
+
+
+def write(path: Path, rows: pa.Table, table: Table) -> None:
+    """One file with the table's encodings; the same rows give the same bytes."""
+    pq.write_table(rows, path, row_group_size=ROWS_A_GROUP, **table.parquet())
+
+
+def facts(path: Path) -> dict[str, Any]:
+    """Size, sha256 and blocks of a file that was just written; a block holds the pages of one column of a row group,
+    with their headers, or of several small ones; the last one holds the page index and the footer.
+    """
+    about = pq.read_metadata(path)
+    starts, end = [], 4  # the magic number
+    for group in range(about.num_row_groups):
+        for column in range(about.num_columns):
+            chunk = about.row_group(group).column(column)
+            starts.append(chunk.dictionary_page_offset if chunk.has_dictionary_page else chunk.data_page_offset)
+            end = max(end, starts[-1] + chunk.total_compressed_size)
+    return blocks.facts(path, [*sorted(starts), end])
+
+
+class Dataset(ds.FileSystemDataset):  # type: ignore[misc]
+    """Files of a lake as an Arrow dataset.
+
+    read_from : its files, in the order of its fragments
+    """
+
+    read_from: Sequence[blocks.Checked] = ()
+
+    @property
+    def fault(self) -> str:
+        """Why one of the files was refused, "" where none was."""
+        return next((file.fault for file in self.read_from if file.fault), "")
+
+
+def dataset(folder: Path, entries: Sequence[Json], schema: pa.Schema) -> Dataset:
+    """Files below a folder as one Arrow dataset, in the order given.
+
+    entries : of the manifest
+    Errors  : Damaged names the file that has another footer, or other than the manifest's number of rows; whoever reads
+              the dataset meets it for what comes before the footer
+    """
+    files = [blocks.Checked(folder / entry["path"], entry) for entry in entries]
+    fragments = [_FORMAT.make_fragment(file) for file in files]
+    found = Dataset(fragments, schema, _FORMAT)
+    found.read_from = files
+    if len(fragments) > 1:
+        # Reads the footers, several at a time.
+        found.count_rows()
+    for file, fragment, entry in zip(files, fragments, entries, strict=True):
+        rows = fragment.metadata.num_rows
+        if rows != entry.get("rows", rows):
+            raise Damaged(f"{file.path} has {rows} rows, the manifest says {entry['rows']}")
+    return found
+
+
+def read(folder: Path, entry: Json, columns: Sequence[str] | None = None) -> pa.Table:
+    """The rows of one file, in the types that it was written with.  Errors: Damaged names the file."""
+    with blocks.Checked(folder / entry["path"], entry) as file:
+        return pq.read_table(file, columns=None if columns is None else list(columns))
+
+
+def schema(folder: Path, entry: Json) -> pa.Schema:
+    """What columns a file has.  Errors: Damaged names the file."""
+    with blocks.Checked(folder / entry["path"], entry) as file:
+        return pq.read_schema(file)

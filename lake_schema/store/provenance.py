@@ -1,0 +1,92 @@
+"""What made a product: the fingerprint of the code, and the canonical form of whatever else goes into a key."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+_ROOT = Path(__file__).resolve().parents[2]
+_PACKAGES = ("lake_schema", "jobs")
+_DATA = {".py", ".csv", ".toml"}
+# Libraries whose version can change a byte of a product.
+_LIBRARIES = (
+    "MeanStars",
+    "astropy",
+    "colossus",
+    "dust_extinction",
+    "galsim",
+    "hats",
+    "healpy",
+    "numba",
+    "numpy",
+    "pyarrow",
+    "scipy",
+    "speclite",
+)
+
+
+def canonical(value: Any) -> bytes:
+    """JSON with sorted keys and no spaces: equal values give equal bytes; NaN and infinities are refused."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode()
+
+
+def digest(value: Any) -> str:
+    """sha256 of the canonical form, hexadecimal."""
+    return hashlib.sha256(canonical(value)).hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """sha256 of a file's bytes, hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def code_version(root: Path = _ROOT) -> str:
+    """Fingerprint of the code: every source and data file of lake_schema and jobs, and the libraries' versions."""
+    files = sorted(
+        path
+        for package in _PACKAGES
+        for path in (root / package).rglob("*")
+        if path.suffix in _DATA and "__pycache__" not in path.parts
+    )
+    sums = {path.relative_to(root).as_posix(): file_sha256(path) for path in files}
+    return digest({"files": sums, "libraries": libraries()})
+
+
+def libraries() -> Mapping[str, str]:
+    """Python and the libraries that shape the bytes, with their versions."""
+    return {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}
+
+
+@cache
+def machine() -> str:
+    """What of this machine may change the last bit of a number: its kind, its processor as numba compiles for it, the
+    instruction sets that numpy chose among, the C library; recorded, never part of a version's key.
+    """
+    import llvmlite.binding
+    from numpy.lib import introspect
+
+    chosen = {kind["current"] for kinds in introspect.opt_func_info().values() for kind in kinds.values()}
+    processor = os.environ.get("NUMBA_CPU_NAME") or llvmlite.binding.get_host_cpu_name()
+    features = os.environ.get("NUMBA_CPU_FEATURES", "")
+    words = [platform.machine(), processor, features, *sorted(chosen), *platform.libc_ver()]
+    return " ".join(word for word in words if word)
+
+
+def git_commit(root: Path = _ROOT) -> str:
+    """The commit that is checked out, "unknown" outside a checkout; recorded, never part of a key."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return done.stdout.strip()

@@ -1,0 +1,322 @@
+"""How a published table is read: through its manifest, never a glob, every byte compared before it is decoded.
+
+version(root, name)     the published version (resolved once: a later publication does not mix in)
+Version.dataset         its files as an Arrow dataset
+Version.rows            rows of some columns or parts
+Version.beside          rows of a Parquet file that belongs to the version, though not to its table
+Version.file            any other file, such as an image
+Version.margin          rows just outside a part's cell
+Version.in_cells        rows inside HEALPix cells
+Version.cone            rows inside a circle, by true or lensed position
+verify                  is a version what its manifest says?
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
+
+from lake_schema import sky
+from lake_schema import tables as declarations
+from lake_schema.arrays import Int
+from lake_schema.columns import Table
+from lake_schema.errors import BadInput, Damaged, VersionMismatch
+from lake_schema.store import layout, manifest, parquet
+from lake_schema.store.provenance import digest
+
+# Cells of a cone's cover are about this part of its radius wide: finer ones skip few rows more.
+_CELLS_A_RADIUS = 4
+# So many stretches of _healpix_29 go into the filter of one file; the rest of its rows are left out after reading.
+_MOST_RANGES = 16
+# Added to a padded radius: more than the rounding of the largest deflection.
+_ROUNDING_DEG = 1e-9
+
+ON = {"true": ("ra", "dec"), "lensed": ("ra_lensed", "dec_lensed")}
+
+
+@dataclass(frozen=True, slots=True)
+class Version:
+    """One published version of a table.
+
+    schema : of its rows, with units and descriptions in the fields' metadata; a column that the files lack is null
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+    schema: pa.Schema
+
+    @property
+    def table(self) -> str:
+        return str(self.manifest["table"])
+
+    @property
+    def key(self) -> str:
+        """What stands for this version in the plan of a table made from it."""
+        return str(self.manifest["key"])
+
+    @property
+    def fingerprint(self) -> str:
+        """sha256 over the sha256 of every file, hexadecimal: what the version holds, whatever it was made from."""
+        return digest({entry["path"]: entry["sha256"] for entry in self.manifest["files"]})
+
+    @property
+    def num_rows(self) -> int:
+        return int(self.manifest["rows"])
+
+    @property
+    def parts(self) -> list[str]:
+        return [str(part["name"]) for part in self.manifest["parts"]]
+
+    def path(self, part: str) -> Path:
+        """A part's Parquet file, for a reader of somebody else's: nothing but its size is compared, see `verify`."""
+        return manifest.checked(self.folder, self._entry(part))
+
+    def part_sha256(self, part: str) -> str:
+        """sha256 of a part's Parquet file, as it was published."""
+        return str(self._entry(part)["sha256"])
+
+    def part_rows(self, part: str) -> int:
+        """Number of rows of a part."""
+        return int(self._entry(part)["rows"])
+
+    def _entry(self, part: str) -> dict[str, Any]:
+        files = self._files()
+        for prefix in (f"{self.table}/dataset/", "dataset/"):
+            if (entry := files.get(prefix + part)) is not None:
+                return entry
+        raise BadInput(f"table {self.table}: version {self.key} has no part {part}")
+
+    def file(self, relative: str) -> Path:
+        """Any other file of the version, such as an image; Damaged where its sha256 is not what the manifest says."""
+        return manifest.whole(self.folder, self._file(relative))
+
+    def sha256(self, relative: str) -> str:
+        """sha256 of such a file, as it was published."""
+        return str(self._file(relative)["sha256"])
+
+    def _file(self, relative: str) -> dict[str, Any]:
+        entry = self._files().get(relative)
+        if entry is None:
+            raise BadInput(f"table {self.table}: version {self.key} has no file {relative}")
+        return entry
+
+    def _files(self) -> dict[str, dict[str, Any]]:
+        return {entry["path"]: entry for entry in self.manifest["files"]}
+
+    def dataset(self, parts: Iterable[str] | None = None) -> parquet.Dataset:
+        """The version's files (or those parts') as an Arrow dataset that refuses what is not as it was written."""
+        entries = [self._entry(name) for name in (self.parts if parts is None else parts)]
+        return self._opened(entries, self.schema)
+
+    def _opened(self, entries: Sequence[dict[str, Any]], schema: pa.Schema) -> parquet.Dataset:
+        for entry in entries:
+            manifest.checked(self.folder, entry)
+        with self._refusing():
+            return parquet.dataset(self.folder, entries, schema)
+
+    @contextmanager
+    def _refusing(self) -> Iterator[None]:
+        """What Arrow cannot read although it is as it was written."""
+        try:
+            yield
+        except (OSError, pa.ArrowInvalid) as error:
+            raise Damaged(f"table {self.table}: version {self.key}: {error}") from None
+
+    def rows(
+        self,
+        columns: Sequence[str] | None = None,
+        parts: Iterable[str] | None = None,
+        where: ds.Expression | None = None,
+    ) -> pa.Table:
+        """Rows in file order.
+
+        columns : names, None = all;  parts : names of parts, None = all;  where : an Arrow filter
+        """
+        names = list(columns) if columns is not None else None
+        self._refuse_unknown(names or [])
+        with self._refusing():
+            return self.dataset(parts).to_table(columns=names, filter=where)
+
+    def margin(self, part: str, columns: Sequence[str] | None = None) -> pa.Table:
+        """Rows of a catalogue beside a part's cell, within 10" of it and a little farther."""
+        names = list(columns) if columns is not None else None
+        self._refuse_unknown(names or [])
+        entry = self._file(f"{self.table}_margin/dataset/{part}")
+        with self._refusing():
+            return self._opened([entry], self.schema).to_table(columns=names)
+
+    def beside(self, relative: str) -> pa.Table:
+        """Rows of a Parquet file of the version that is no part of its table."""
+        entry = self._file(relative)
+        manifest.checked(self.folder, entry)
+        with self._refusing():
+            return parquet.read(self.folder, entry)
+
+    def _refuse_unknown(self, names: Sequence[str]) -> None:
+        for name in names:
+            if name not in self.schema.names:
+                raise BadInput(f"table {self.table} has no column {name}")
+
+    def in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
+        """Rows of a catalogue inside cells of an order (nested), reading only files and row groups that can hold some.
+
+        cells : int[n]
+        """
+        wanted = np.unique(np.asarray(cells, np.int64))
+        names = None if columns is None else list(dict.fromkeys([*columns, "_healpix_29"]))
+        self._refuse_unknown(names or [])
+        empty = self.schema.empty_table()
+        pieces = [empty if names is None else empty.select(names)]
+        for part in self.parts:
+            here = _inside(part, wanted, order)
+            if here.size:
+                pieces.append(self.rows(names, [part], _in_ranges(_ranges(here, order))))
+        rows = pa.concat_tables(pieces)
+        inside = np.isin(sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, order), wanted)
+        rows = rows.filter(pa.array(inside))
+        return rows if columns is None else rows.select(list(columns))
+
+    def cone(
+        self, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None, on: str = "true"
+    ) -> pa.Table:
+        """Rows of a catalogue within `radius` of a place, its edge included.
+
+        ra, dec, radius : deg
+        on              : "true" or "lensed", which of a source's positions counts
+        """
+        if on not in ON:
+            raise BadInput(f"on = {on!r} is not one of {', '.join(ON)}")
+        self._refuse_unknown([*ON[on], "_healpix_29"])
+        padded = radius + (self.deflection() + _ROUNDING_DEG if on == "lensed" else 0.0)
+        order = cover_order(padded)
+        names = None if columns is None else list(dict.fromkeys([*columns, *ON[on]]))
+        rows = self.in_cells(sky.cells_in_cone(ra, dec, min(padded, 180.0), order).tolist(), order, names)
+        lon, lat = (rows[name].to_numpy() for name in ON[on])
+        rows = rows.filter(pa.array(sky.separation(lon, lat, ra, dec) <= radius))
+        return rows if columns is None else rows.select(list(columns))
+
+    def deflection(self) -> float:
+        """Largest distance of a lensed from its true position, deg, as it was when the version was published."""
+        if "deflection_deg" not in self.manifest:
+            raise BadInput(f"table {self.table}: version {self.key} does not say how far positions are lensed")
+        return float(self.manifest["deflection_deg"])
+
+
+def cover_order(radius: float) -> int:
+    """Order of cells that suit the cover of a circle of `radius` deg."""
+    wanted = max(radius / _CELLS_A_RADIUS, 1e-7)
+    order = int(np.ceil(np.log2(np.sqrt(sky.cell_area(0)) / wanted)))
+    return min(max(order, 0), sky.DEEPEST - 3)
+
+
+def _inside(part: str, cells: Int, order: int) -> Int:
+    """Those of the cells that a part's cell overlaps."""
+    file_order, cell = layout.cell_of_file(part)
+    if file_order <= order:
+        inside: Int = cells[sky.parent(cells, order, file_order) == cell]
+    else:
+        inside = cells[cells == cell >> (2 * (file_order - order))]
+    return inside
+
+
+def _ranges(cells: Int, order: int) -> list[tuple[int, int]]:
+    """Half-open stretches of order-29 indices that cover sorted cells: at most _MOST_RANGES, widest gaps left out."""
+    gaps = np.diff(cells)
+    cuts = np.flatnonzero(gaps > 1)
+    if cuts.size >= _MOST_RANGES:
+        cuts = np.sort(cuts[np.argsort(gaps[cuts])[-_MOST_RANGES + 1 :]])
+    firsts, lasts = cells[np.append(0, cuts + 1)], cells[np.append(cuts, -1)]
+    return [
+        (sky.cell_range(order, int(first))[0], sky.cell_range(order, int(last))[1])
+        for first, last in zip(firsts, lasts, strict=True)
+    ]
+
+
+def _in_ranges(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
+    index = pc.field("_healpix_29")
+    return reduce(lambda a, b: a | b, [(index >= first) & (index < last) for first, last in ranges])
+
+
+# ------------------------------------------------------------------------------------------------ versions
+
+
+def version(root: Path, name: str, key: str | None = None) -> Version:
+    """The published version of a table, or the one of a key.
+
+    Errors : BadInput where the lake has no such table or version; Damaged where its manifest is missing, broken or
+             another's; VersionMismatch where it was written with a declaration that this code cannot read
+    """
+    wanted = key or layout.current_key(root, name)
+    if wanted is None:
+        raise BadInput(f"lake {root} has no table {name}")
+    folder = layout.version(root, name, wanted)
+    if not folder.exists():
+        if key:
+            raise BadInput(f"lake {root} has no table {name} of version {key}")
+        raise Damaged(f"{layout.current(root, name)} leads to {folder.name}, which is missing")
+    about = manifest.load(folder, name)
+    opened = Version(folder, about, pa.schema([]))
+    if opened.parts:
+        first = opened._entry(opened.parts[0])
+        manifest.checked(folder, first)
+        with opened._refusing():
+            opened = replace(opened, schema=parquet.schema(folder, first))
+    known = declarations.find(name, opened.schema.names)
+    return opened if known is None else as_declared(opened, known)
+
+
+def as_declared(opened: Version, table: Table) -> Version:
+    """The version as `table` declares it: nullable columns that came later are filled with nulls.
+
+    Errors : VersionMismatch, naming both versions and the first column that differs
+    """
+    was, now = int(opened.manifest["version"]), table.version
+    if fault := _difference(opened.schema, table, was):
+        raise VersionMismatch(
+            f"table {table.name}: version {was} of its declaration is in the lake, this is version {now}: {fault}"
+        )
+    return replace(opened, schema=table.arrow())
+
+
+def _difference(stored: pa.Schema, table: Table, was: int) -> str:
+    if was > table.version:
+        return "it was written by a later truesky"
+    if not stored.names:
+        return ""
+    for name in stored.names:
+        if name not in table.names:
+            return f"column {name} is not declared"
+    for column in table.columns:
+        if column.name not in stored.names:
+            if column.nullable and column.since > was:
+                continue
+            return f"column {column.name} is missing"
+        have, want = stored.field(column.name), column.field()
+        if have.type != want.type or (have.nullable and not want.nullable):
+            return f"column {column.name} is {have}, wanted {want}"
+        unit = (have.metadata or {}).get(b"unit", b"").decode()
+        if unit != column.unit:
+            return f"column {column.name} has unit {unit!r}, wanted {column.unit!r}"
+    return ""
+
+
+def tables(root: Path) -> list[str]:
+    """Names of the published tables, those that are damaged among them."""
+    return layout.tables(root)
+
+
+def verify(published: Version, deep: bool = False) -> list[str]:
+    """What is wrong with a version: a list of sentences, empty where all is well.
+
+    deep : also the sha256 of every file, and that each cell holds only its own rows, sorted
+    """
+    return manifest.faults(published.folder, published.manifest, deep)

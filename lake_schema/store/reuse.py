@@ -1,0 +1,78 @@
+"""What an older version already holds is not made twice.
+
+A part whose facts have a PRODUCT, the digest of everything that shapes its bytes, is taken from the version that is
+current where that has the same part of the same product: its files are linked, after their sha256 has been compared.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from lake_schema.errors import Damaged
+from lake_schema.store import manifest
+from lake_schema.store.plan import Json, Part
+from lake_schema.store.provenance import file_sha256
+from lake_schema.store.stage import write_receipt
+
+PRODUCT = "product"
+
+
+def files_of(part: Part, receipt: Json) -> Json:
+    """What the manifest says of a part that can be used again: its rows and files."""
+    if PRODUCT not in part.facts:
+        return {}
+    return {"rows": receipt["rows"], "files": [f["path"] for f in receipt["files"]], "machine": receipt.get("machine")}
+
+
+def take(stage: Path, current: Path, table: str, parts: Sequence[Part]) -> None:
+    """Give a stage those of the parts that a version has; what is missing or damaged there is made again."""
+    if not any(PRODUCT in part.facts for part in parts) or not current.exists():
+        return
+    try:
+        facts = manifest.load(current.resolve(), table)
+    except Damaged:
+        return
+    entries = {entry["path"]: entry for entry in facts["files"]}
+    there = {entry["name"]: entry for entry in facts["parts"] if "files" in entry}
+    for part in parts:
+        found = there.get(part.name)
+        if found is None or PRODUCT not in part.facts or found["facts"] != part.facts:
+            continue
+        files = [entry for path in found["files"] if (entry := _whole(current, entries[path])) is not None]
+        if len(files) == len(found["files"]):
+            for entry in files:
+                _link(current / entry["path"], stage / entry["path"])
+            receipt = {"part": part.name, "rows": found["rows"], "files": files, "machine": found.get("machine")}
+            write_receipt(stage, receipt)
+
+
+def _whole(folder: Path, entry: Json) -> Json | None:
+    """The entry of a file that is as it was published, None of another."""
+    path = str(entry["path"])
+    try:
+        if file_sha256(folder / path) != str(entry["sha256"]):
+            return None
+        if path.endswith(".parquet") and "blocks" not in entry:
+            # An older truesky published it.
+            return manifest.file_facts(folder / path, path)
+    except OSError:
+        return None
+    return {key: value for key, value in entry.items() if key != "rows"}
+
+
+def _link(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{os.getpid()}.tmp.{target.name}")
+    temporary.unlink(missing_ok=True)
+    try:
+        os.link(source, temporary)
+    except OSError:
+        # A file system without links.
+        shutil.copyfile(source, temporary)
+    os.replace(temporary, target)
+    # Two names of one file: the replacement is then no operation, and leaves the first.
+    temporary.unlink(missing_ok=True)
+    manifest.sync(target.parent)

@@ -1,0 +1,72 @@
+"""No identifier twice in a table, whichever files its rows lie in."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from lake_schema.arrays import Int
+from lake_schema.columns import Table
+from lake_schema.errors import BadInput
+from lake_schema.ids import BLOCK_BITS
+from lake_schema.store import parquet
+from lake_schema.store.plan import Json, Plan
+from lake_schema.store.stage import is_numbered
+
+
+def refuse_duplicates(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
+    """Raise BadInput where a key stands in two parts; the rows of one part have been compared before they were written.
+
+    made : receipts.  Only parts that share a block of identifiers are read, so a catalogue costs little
+    """
+    table = plan.table
+    # A part's table is the first of its files.
+    entries = {receipt["files"][0]["path"]: receipt["files"][0] for receipt in made}
+    if not is_numbered(table):
+        return _refuse_any(stage, table, list(entries.values()))
+
+    @lru_cache(maxsize=16)
+    def ids(path: str) -> Int:
+        return np.sort(parquet.read(stage, entries[path], table.key).column(0).to_numpy())
+
+    for block, sharers in _shared_blocks(made, list(entries)).items():
+        _refuse_within(f"table {table.name}: {table.key[0]}", block, sharers, ids)
+
+
+def _shared_blocks(made: Sequence[Json], paths: Sequence[str]) -> dict[int | None, list[str]]:
+    """Block of identifiers -> the files that hold some of it, where there are two or more; None = all of them."""
+    if any(receipt["blocks"] is None for receipt in made):
+        return {None: list(paths)}
+    holders: dict[int | None, list[str]] = defaultdict(list)
+    for receipt, path in zip(made, paths, strict=True):
+        for block in receipt["blocks"]:
+            holders[block].append(path)
+    return {block: files for block, files in holders.items() if len(files) > 1}
+
+
+def _refuse_within(what: str, block: int | None, files: Sequence[str], ids: Callable[[str], Int]) -> None:
+    pieces = [ids(path) for path in files]
+    if block is not None:
+        edges = np.array([block, block + 1]) << BLOCK_BITS
+        pieces = [piece[slice(*np.searchsorted(piece, edges))] for piece in pieces]
+    together = np.concatenate(pieces)
+    order = np.argsort(together, kind="stable")
+    same = np.flatnonzero(np.diff(together[order]) == 0)
+    if same.size:
+        source = np.repeat(np.arange(len(files)), [piece.size for piece in pieces])
+        first, second = (PurePosixPath(files[source[order[same[0] + i]]]).name for i in (0, 1))
+        raise BadInput(f"{what} {together[order[same[0]]]} stands in {first} and in {second}")
+
+
+def _refuse_any(stage: Path, table: Table, entries: Sequence[Json]) -> None:
+    seen: dict[tuple[object, ...], str] = {}
+    for entry in entries:
+        columns, here = parquet.read(stage, entry, table.key), PurePosixPath(entry["path"]).name
+        for value in zip(*(columns[k].to_pylist() for k in table.key), strict=True):
+            if value in seen:
+                raise BadInput(f"table {table.name}: key {value} stands in {seen[value]} and in {here}")
+            seen[value] = here

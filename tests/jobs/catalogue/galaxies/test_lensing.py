@@ -1,0 +1,133 @@
+"""Signs and sizes against a lens of known mass; power against linear theory."""
+
+import healpy as hp
+import numpy as np
+import pytest
+
+from jobs.catalogue.galaxies import lensing
+from jobs.catalogue.matter import density_box
+from jobs.fluxes import cosmology, sources
+from lake_schema import sky
+from lake_schema.errors import BadInput
+
+BUMP_NSIDE = 128
+RA, DEC, WIDTH = 40.0, 20.0, np.radians(2.0)
+
+
+@pytest.fixture(scope="module")
+def bump():
+    """Lensing by a round lens: kappa a Gaussian of 2 deg about (40, 20)."""
+    ra, dec = hp.pix2ang(BUMP_NSIDE, np.arange(12 * BUMP_NSIDE**2), nest=True, lonlat=True)
+    angle = np.radians(sky.separation(ra, dec, RA, DEC))
+    kappa = 0.1 * np.exp(-0.5 * (angle / WIDTH) ** 2)
+    fields = lensing.transform(kappa.astype(np.float32), BUMP_NSIDE, np.ones(2 * BUMP_NSIDE + 1))
+    return lensing.Planes(BUMP_NSIDE, np.array([1000.0]), (fields,))
+
+
+def at(planes, east, north):
+    """Fields at offsets, deg, from the lens."""
+    ra = RA + east / np.cos(np.radians(DEC))
+    return lensing.at(planes, np.array([ra]), np.array([DEC + north]), np.array([1000.0]))[:, 0]
+
+
+def test_shear_is_tangential(bump):
+    """Negative gamma1 east and west of a mass, positive north and south; gamma2 negative north-east."""
+    for east, north, first, second in (
+        (3, 0, -1, 0), (-3, 0, -1, 0), (0, 3, 1, 0), (0, -3, 1, 0), (2, 2, 0, -1), (-2, -2, 0, -1), (2, -2, 0, 1),
+    ):  # fmt: skip
+        gamma1, gamma2 = at(bump, east, north)[1:3]
+        assert gamma1 == pytest.approx(0.0, abs=2e-3) if first == 0 else first * gamma1 > 0.005
+        assert gamma2 == pytest.approx(0.0, abs=2e-3) if second == 0 else second * gamma2 > 0.005
+
+
+def test_shear_and_deflection_have_the_size_of_the_lens(bump):
+    """gamma_t(r) = mean kappa inside r - kappa(r); alpha(r) = r mean kappa inside r (flat sky)."""
+    r = np.radians(3.0)
+    x = 0.5 * (r / WIDTH) ** 2
+    inside, here = 0.1 * -np.expm1(-x) / x, 0.1 * np.exp(-x)
+    kappa, gamma1, _, _, north = at(bump, 0.0, 3.0)
+    assert kappa == pytest.approx(here, rel=0.03)
+    assert gamma1 == pytest.approx(inside - here, rel=0.05)
+    assert north == pytest.approx(r * inside, rel=0.05)
+
+
+def test_sources_are_pushed_away(bump):
+    for east, north in ((3, 0), (-3, 0), (0, 3), (0, -3)):
+        fields = at(bump, east, north)
+        ra, dec = RA + east / np.cos(np.radians(DEC)), DEC + north
+        moved = lensing.displaced(np.array([ra]), np.array([dec]), fields[3:4], fields[4:5])
+        before, after = sky.separation(ra, dec, RA, DEC), sky.separation(moved[0], moved[1], RA, DEC)
+        assert 0.1 < after - before < 0.5
+
+
+@pytest.mark.parametrize("dec", [-90.0, -45.0, 0.0, 89.9])
+def test_displacements_are_great_circles(dec, rng):
+    east, north = 0.002 * rng.standard_normal((2, 50))
+    ra = 360.0 * rng.random(50)
+    lon, lat = lensing.displaced(ra, np.full(50, dec), east, north)
+    assert sky.separation(ra, np.full(50, dec), lon, lat) == pytest.approx(np.degrees(np.hypot(east, north)), rel=1e-6)
+    assert np.all((lon >= 0) & (lon <= 360))
+    if abs(dec) < 80:
+        assert (lat - dec) == pytest.approx(np.degrees(north), abs=3e-3)
+
+
+def test_interpolation_in_distance(bump):
+    half = lensing.at(bump, np.array([RA]), np.array([DEC]), np.array([500.0]))
+    whole = lensing.at(bump, np.array([RA]), np.array([DEC]), np.array([1000.0]))
+    assert half == pytest.approx(0.5 * whole, rel=1e-9, abs=0.0)
+    assert not lensing.at(bump, np.array([RA]), np.array([DEC]), np.array([0.0])).any()
+
+
+def limber(ell, chi):
+    """C_l of kappa, linear theory, one source plane."""
+    x = np.linspace(5.0, chi - 1.0, 1000)
+    z = cosmology.redshift(x)
+    weight = 1.5 * 0.319 / 2997.92458**2 * x * (chi - x) / chi * (1 + z) * density_box.growth(z)
+    k = (np.asarray(ell)[:, None] + 0.5) / x
+    power = density_box.linear_power(k.ravel()).reshape(k.shape) * (k < np.pi / 4.0 * 1.5)
+    return np.trapezoid((weight / x) ** 2 * power, x, axis=1)
+
+
+def test_power_and_modes_of_the_universe(universe):
+    """C_l of kappa within 10 % of linear theory for 30 < l < nside; no B modes; gamma = what kappa says."""
+    planes = universe.planes
+    for number in (7, 12):
+        kappa, gamma1, gamma2 = (hp.reorder(planes.maps[number][:, i].astype(float), n2r=True) for i in range(3))
+        power = hp.anafast(kappa, lmax=90, iter=2)
+        for low, high in ((30, 64),):
+            ell = np.arange(low, high)
+            ratio = power[low:high].mean() / limber(ell[::4], planes.chi[number]).mean()
+            assert ratio == pytest.approx(1.0, abs=0.10)
+        e_mode, b_mode = hp.map2alm_spin([gamma1, gamma2], 2, lmax=90)
+        assert np.sum(np.abs(b_mode) ** 2) < 0.01 * np.sum(np.abs(e_mode) ** 2)
+        assert abs(kappa.mean()) < 3 * kappa.std() / np.sqrt(500)
+
+
+def test_tangential_shear_about_massive_halos(universe, drawn):
+    """Behind halos of 10^13.3 Msun/h at 0.2 < z < 0.8 sources at z = 1.2 are sheared tangentially on average."""
+    halos = drawn.halos
+    heavy = (halos["log_mass"].to_numpy() > 13.3) & (halos["z_true"].to_numpy() > 0.2)
+    heavy &= halos["z_true"].to_numpy() < 0.8
+    ra, dec = halos["ra"].to_numpy()[heavy], halos["dec"].to_numpy()[heavy]
+    shear = []
+    for angle in np.arange(8) * np.pi / 4:
+        east, north = 1.0 * np.sin(angle), 1.0 * np.cos(angle)
+        found = lensing.at(universe.planes, ra + east / np.cos(np.radians(dec)), dec + north, np.full(ra.size, 2600.0))
+        # Position angle from north to east; gamma1 > 0 is north-south.
+        shear.append(found[1] * np.cos(2 * angle) - found[2] * np.sin(2 * angle))
+    assert ra.size > 20
+    assert np.mean(shear) > 0
+
+
+def test_determinants_and_caustics():
+    kappa, none = np.array([0.0, 0.1, 0.95, 1.2]), np.zeros(4)
+    assert sources.determinant(kappa, none, none) == pytest.approx([1.0, 0.81, 0.0025, 0.04])
+    assert sources.determinant(np.array([0.1]), np.array([0.3]), np.array([0.4])) == pytest.approx([0.81 - 0.25])
+    assert lensing.near_caustic(kappa, none, none, 0.05).tolist() == [False, False, True, True]
+    # Beyond both caustics the determinant is positive again.
+    assert lensing.near_caustic(np.array([2.5]), none[:1], none[:1], 0.05).all()
+
+
+def test_a_resolution_that_healpix_has_not_is_refused(box):
+    with pytest.raises(BadInput, match="lensing_nside = 100"):
+        lensing.load(box, 100)

@@ -1,0 +1,88 @@
+"""TODO."""
+
+import numpy as np
+import pytest
+
+from jobs.catalogue.halos import halos
+from lake_schema import sky
+from tests.jobs.catalogue.conftest import SEED
+
+
+@pytest.fixture(scope="module")
+def model(universe):
+    return universe.population.halos
+
+
+@pytest.mark.parametrize("order", halos.LEVELS)
+def test_a_reach_never_leads_beyond_the_cells_about(order, rng):
+    """Cells everywhere, positions at random inside them, steps in any direction."""
+    for cell in rng.integers(0, 12 << 2 * order, 30).tolist():
+        _, ra, dec = sky.random_in_cell(order, cell, 300, rng)
+        angle, length = 2 * np.pi * rng.random(300), np.degrees(halos.reach(order))
+        lat, lon = np.radians(dec), np.radians(ra)
+        vector = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+        east = np.stack([-np.sin(lon), np.cos(lon), np.zeros(300)])
+        north = np.cross(vector, east, axis=0)
+        moved = vector * np.cos(np.radians(length)) + np.sin(np.radians(length)) * (
+            np.cos(angle) * north + np.sin(angle) * east
+        )
+        to = sky.cell_of(np.degrees(np.arctan2(moved[1], moved[0])), np.degrees(np.arcsin(moved[2])), order)
+        assert np.isin(to, [cell, *sky.margin_cells(order, cell, order).tolist()]).all()
+
+
+def test_every_halo_has_one_level(model):
+    """Each mass bin above the limit is drawn by one order; less than one halo of the sky is too wide for all."""
+    wanted = model.log_mass[None, 1:] >= model.limit[:, None] - model.matching.occupation.depth
+    left_out = wanted & (model.level == -1)
+    expected = np.sum(np.where(left_out, model.number, 0.0) * model.line.volume[:, None]) * 4 * np.pi
+    assert expected < 1.0
+    assert set(np.unique(model.level)) == {-1, *halos.LEVELS}
+
+
+@pytest.mark.parametrize("order", halos.LEVELS)
+def test_halos_lie_in_their_cell(model, order):
+    found = halos.draw(model, SEED, order, 70)
+    assert np.all(found.index >> 2 * (29 - order) == 70)
+    assert np.all(np.diff(found.index) >= 0)
+    assert np.array_equal(found.number, halos.FIRST_NUMBER[order] + np.arange(found.number.size))
+    limit = model.mass_limit(found.chi)
+    assert np.all((found.log_mass >= limit - 1e-2) | (found.proxy >= limit - 1e-2))
+
+
+def test_mass_function_comes_out(model, drawn):
+    """Above the limit, where halos are complete; 20 cells share large structures."""
+    z, mass = (drawn.halos[name].to_numpy() for name in ("z_true", "log_mass"))
+    for low, high in ((0.5, 1.0), (1.0, 1.6), (1.6, 2.2)):
+        steps = (model.line.z > low) & (model.line.z < high)
+        for least in (11.0, 12.0, 13.0):
+            bins = np.round(model.log_mass[:-1], 3) >= least - 1e-3
+            mean = np.sum(model.number[np.ix_(steps, bins)].sum(1) * model.line.volume[steps])
+            mean *= drawn.area * np.radians(1.0) ** 2
+            found = np.sum((z > low) & (z < high) & (mass > least))
+            assert found == pytest.approx(mean, rel=0.10, abs=4 * np.sqrt(mean))
+
+
+def test_completeness_is_as_stated(drawn):
+    complete = drawn.halos["complete"].to_numpy()
+    assert 0.3 < complete.mean() < 0.9
+    assert drawn.halos["log_mass"].to_numpy()[complete].min() > 8.5
+
+
+@pytest.mark.parametrize("low_k", [0.03, 0.08])
+@pytest.mark.parametrize(("low", "high", "redshift"), [(11.5, 12.5, 0.0), (12.5, 13.5, 0.5), (12.0, 13.0, 1.5)])
+def test_bias_of_the_field_that_halos_follow(model, low, high, redshift, low_k):
+    """On large scales the power of exp(x g - ...) is x^2 / D^2 times that of the matter."""
+    from jobs.catalogue.matter import density_box
+    from tests.jobs.catalogue.matter.test_density_box import spectrum
+
+    box, step = model.box, int(np.searchsorted(model.line.z, max(redshift, 0.003)))
+    growth = float(density_box.growth(redshift))
+    for column in (np.searchsorted(model.log_mass, low), np.searchsorted(model.log_mass, high)):
+        x, field, amplitude = (float(table[step, column]) for table in (model.x, model.field, model.amplitude))
+        smooth, variance = box.smoothed[int(field)], box.variance[int(field)]
+        number = np.exp(amplitude * smooth - 0.5 * amplitude**2 * variance) - 1.0
+        k, power, weight = spectrum(number, box.model.cell)
+        inside = (k > low_k) & (k < 2.5 * low_k)
+        matter = spectrum(np.expm1(box.smoothed[0] - 0.5 * box.variance[0]), box.model.cell)[1]
+        ratio = np.sum((weight * power)[inside]) / np.sum((weight * matter)[inside])
+        assert np.sqrt(ratio) / x == pytest.approx(1.0, abs=0.07), (growth, x)

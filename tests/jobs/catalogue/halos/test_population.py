@@ -1,0 +1,105 @@
+"""Nothing is lost and nothing is there twice at any edge, and a cell does not depend on what else is drawn."""
+
+import numpy as np
+import pytest
+
+from jobs.catalogue.halos import halos, population, satellites
+from jobs.catalogue.halos.population import Cells
+from lake_schema import ids, sky
+
+# A block of four cells at an edge of an order-5 cell and of a base cell, and what lies about it.
+BLOCK = [4 * ((3 << 16) // 4 - 1) + i for i in range(4)]
+
+
+@pytest.fixture(scope="module")
+def block(universe):
+    drawn = Cells(universe.population)
+    return {cell: population.members(drawn, cell) for cell in BLOCK}
+
+
+def falling_in(universe, block):
+    """Identifiers of all satellites of all halos near, wherever they fall: of those that fall into the block."""
+    drawn = Cells(universe.population)
+    found_in = []
+    for order in halos.LEVELS:
+        own = {cell >> 2 * (8 - order) for cell in block}
+        ring = {int(c) for cell in own for c in sky.margin_cells(order, cell, order)}
+        # One ring more than is needed: nothing comes from there.
+        wide = {int(c) for cell in ring for c in sky.margin_cells(order, cell, order)} if order == 8 else set()
+        for cell in sorted(own | ring | wide):
+            hosts, found = drawn.at(order, cell)
+            home = sky.cell_of(*sky.positions(hosts.index), 8)[found.host]
+            inside = np.isin(sky.cell_of(found.ra, found.dec, 8), block)
+            edge = universe.population.halos.line.edge
+            inside &= (found.chi > edge[0]) & (found.chi < edge[-1])
+            number, member = hosts.number[found.host], found.member
+            found_in.append(ids.source_id(np.ones(home.size), home, number, member)[inside])
+    return np.sort(np.concatenate(found_in))
+
+
+def satellites_of(members):
+    return np.sort(np.concatenate([people.id[people.kind == 1] for people in members]))
+
+
+def test_satellites_are_neither_lost_nor_doubled(universe, block):
+    found = satellites_of(block.values())
+    assert found.size > 1000
+    assert np.array_equal(found, falling_in(universe, BLOCK))
+    assert np.unique(found).size == found.size
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("ra", "dec"), [((45, 135, 225, 315), 89.9), ((45, 135, 225, 315), -89.9), ((359.9, 0, 0.1), 0.1)]
+)
+def test_nor_at_a_pole_or_across_the_first_meridian(universe, ra, dec):
+    places = sorted({int(cell) for cell in sky.cell_of(np.array(ra, float), np.full(len(ra), dec), 8)})
+    drawn = Cells(universe.population)
+    found = satellites_of([population.members(drawn, cell) for cell in places])
+    assert found.size > 500
+    assert np.array_equal(found, falling_in(universe, places))
+
+
+def test_some_satellites_live_next_door(block):
+    for cell, people in block.items():
+        home = (people.id >> 40) & ((1 << 20) - 1)
+        assert np.all(home[people.kind == 0] == cell)
+        share = np.mean(home[people.kind == 1] != cell)
+        assert 0.001 < share < 0.1
+
+
+def test_members_lie_in_their_cell_sorted(block):
+    for cell, people in block.items():
+        assert np.all(people.index >> 2 * (29 - 8) == cell)
+        assert np.all(np.diff(people.index) >= 0)
+        assert np.array_equal(sky.healpix_29(people.ra, people.dec), people.index)
+        assert np.array_equal(ids.halo_of(people.id), people.halo_id)
+
+
+def test_a_cell_alone_is_the_same(universe, block):
+    alone = population.members(Cells(universe.population), BLOCK[2])
+    for name in ("id", "index", "chi", "z_obs", "proxy", "host_mass"):
+        assert getattr(alone, name).tobytes() == getattr(block[BLOCK[2]], name).tobytes()
+
+
+def test_satellites_follow_their_profile(universe, rng):
+    """NFW: enclosed mass at the radius that holds a share u of it is that share."""
+    for c in (3.0, 8.0, 20.0):
+        u = rng.random(500)
+        x = c * satellites.nfw_radius(np.full(500, c), u)
+        inside = (np.log1p(x) - x / (1 + x)) / (np.log1p(c) - c / (1 + c))
+        assert inside == pytest.approx(u, abs=2e-3)
+
+
+def test_satellites_lie_within_their_halo(universe):
+    people = universe.population
+    hosts = halos.draw(people.halos, 3, 8, 1234)
+    found = satellites.draw(people.halos, people.masses, hosts, np.random.default_rng(1))
+    ra, dec = sky.positions(hosts.index)
+    angle = np.radians(sky.separation(found.ra, found.dec, ra[found.host], dec[found.host]))
+    apart = np.hypot(hosts.chi[found.host] * angle, found.chi - hosts.chi[found.host])
+    radius = people.masses.radius(hosts.log_mass)[found.host]
+    assert np.all(apart < 1.01 * radius)
+    assert 0.3 < np.median(apart / radius) < 0.6
+    assert found.member.min() == 1
+    assert np.all(np.diff(found.host) >= 0)

@@ -1,0 +1,92 @@
+"""The forecast: what makes a detector dearer, how it adds up, and that nothing is written to give it."""
+
+from pathlib import Path
+
+import pytest
+
+from jobs import shell
+from jobs.accuracy import DRAFT, REFERENCE, SURVEY
+from jobs.render import plan_exposures
+from jobs.render.channels import registry
+from jobs.render.exposure import truth_maps
+from jobs.render.planning import forecast, prices, speed
+from tests.jobs.render.planning.test_survey import VIS, planned
+
+DEMO = Path(__file__).parents[4] / "requests" / "demo.toml"
+PIXELS = 4096 * 4132
+SKY = registry.EFFECTS["VIS"]["science"]
+
+
+def test_more_is_dearer():
+    base = prices.price("VIS", True, SKY)
+    assert base.seconds(PIXELS, 1000, 0) < base.seconds(PIXELS, 2000, 0) < base.seconds(2 * PIXELS, 2000, 100)
+    tiers = [
+        prices.price("VIS", True, SKY, accuracy).seconds(PIXELS, 5000, 0) for accuracy in (DRAFT, SURVEY, REFERENCE)
+    ]
+    assert tiers == sorted(set(tiers))
+    fewer = prices.price("VIS", True, SKY[:-5])
+    assert base.seconds(PIXELS, 0, 0) - fewer.seconds(PIXELS, 0, 0) == pytest.approx(
+        sum(effect.cost for effect in SKY[-5:]) * PIXELS / 1e6
+    )
+    # A bias frame has neither sky nor light.
+    bias = prices.price("VIS", False, registry.EFFECTS["VIS"]["bias"])
+    assert bias.seconds(PIXELS, 5000, 10) == bias.seconds(PIXELS, 0, 0) < 0.7 * base.seconds(PIXELS, 0, 0)
+
+
+def test_each_map_has_its_place_on_the_disc():
+    sizes = {}
+    for channel, kind, looks in (("VIS", "science", True), ("EXT", "science", True), ("VIS", "bias", False)):
+        effects = registry.EFFECTS[channel][kind]
+        own = [
+            prices.price(channel, looks, effects, SURVEY, maps).bytes(PIXELS) for maps in ((), tuple(truth_maps.BYTES))
+        ]
+        sizes[channel, kind] = round((own[1] - own[0]) / PIXELS, 2)
+    # All of them; no cosmic rays and ghosts; no light at all.
+    assert sizes == {("VIS", "science"): 21.0, ("EXT", "science"): 13.0, ("VIS", "bias"): 9.0}
+
+
+def test_what_a_request_asks_is_in_its_forecast(tmp_path):
+    pointing = [{**VIS, "detectors": ["3-4"]}]
+    off = {"off": ["parallel_cti", "serial_cti"]}
+    explore = {"accuracy": ["draft", "reference"], "effects.cosmic_rays": [True, False]}
+    (plain,) = planned(tmp_path, pointing=pointing)[1].to_pylist()
+    (cheap,) = planned(tmp_path, pointing=pointing, effects=off)[1].to_pylist()
+    (draft,) = planned(tmp_path, pointing=pointing, accuracy="draft")[1].to_pylist()
+    assert cheap["seconds"] < plain["seconds"] - 2.0
+    assert draft["seconds"] < plain["seconds"]
+    assert len({row["seconds"] for row in planned(tmp_path, pointing=pointing, explore=explore)[1].to_pylist()}) == 4
+
+
+def test_the_forecast_adds_up(tmp_path):
+    block = [{"channels": ["VIS", "NISP-P"], "fields": 1}, {"channels": ["VIS"], "image_type": "bias", "exposures": 3}]
+    exposures, tasks = planned(tmp_path, observation=block)
+    lines = forecast.rows(exposures, tasks)
+    assert [(line.channel, line.survey, line.image_type) for line in lines] == [
+        ("NISP-P", "wide", "science"),
+        ("VIS", "calibration", "bias"), ("VIS", "wide", "flat"), ("VIS", "wide", "science"),
+        ("NISP-P", "all", ""), ("VIS", "all", ""), ("all", "all", ""),
+    ]  # fmt: skip
+    assert [line.exposures for line in lines] == [12, 3, 1, 5, 12, 9, 21]
+    for of_channel in lines[4:6]:
+        own = [line for line in lines[:4] if line.channel == of_channel.channel]
+        assert of_channel.detectors == sum(line.detectors for line in own)
+        assert of_channel.core_hours == pytest.approx(sum(line.core_hours for line in own))
+    assert lines[-1].detectors == len(tasks)
+    assert lines[-1].core_hours * 3600 == pytest.approx(sum(tasks["seconds"].to_pylist()))
+    assert lines[-1].gigabytes * 1e9 == pytest.approx(sum(tasks["bytes"].to_pylist()))
+    *_, said = text = list(forecast.text(lines, speed.Speed(0.5, "as a test says")))
+    assert len(text) == 9
+    assert "as a test says: 0.50" in said
+    assert [line.core_hours for line in forecast.rows(exposures, tasks, 0.5)] == [
+        0.5 * line.core_hours for line in lines
+    ]
+
+
+def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
+    lake = tmp_path / "lake"
+    assert shell.main(plan_exposures.JOB, ["--lake", str(lake), "--request", str(DEMO), "--dry-run"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("channel")
+    assert lines[-2].split()[:2] == ["all", "all"]
+    assert lines[-1].startswith("core-hours are of this machine, from a calibration")
+    assert not lake.exists()

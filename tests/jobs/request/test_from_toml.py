@@ -1,0 +1,198 @@
+"""Requests: what is good is kept, what is bad is refused with its key."""
+
+import copy
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from jobs import accuracy
+from jobs.request.files import OwnCurves
+from jobs.request.from_toml import from_table, parse
+from lake_schema.errors import BadInput
+
+DEMO = Path(__file__).parents[3] / "requests" / "demo.toml"
+GOOD = tomllib.loads(DEMO.read_text())
+
+BAD = [
+    ("colour", "red", "colour"),
+    ("seed", -1, "seed"),
+    ("seed", 1.5, "seed"),
+    ("seed", True, "seed"),
+    ("seed", 2**63, "seed"),
+    ("name", "../x", "name"),
+    ("name", 5, "name"),
+    ("accuracy", "sloppy", "accuracy"),
+    ("accuracy", {"flux": 0.0, "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
+    ("accuracy", {"flux": -1.0, "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
+    ("accuracy", {"flux": float("nan"), "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
+    ("accuracy", {"flux": 1e-3}, "accuracy.shape is missing"),
+    (
+        "accuracy",
+        {"flux": 1e-3, "shape": 1e-9, "position": 1e-3, "background": 1e-3},
+        "accuracy.shape = 1e-09 is beyond reach, the best is",
+    ),
+    ("area", {}, "area wants exactly one"),
+    ("area", {"cone": {"ra": 0, "dec": 0, "radius": 1}, "box": {"ra": [0, 1], "dec": [0, 1]}}, "area wants"),
+    ("area", {"cone": {"ra": 0, "dec": 95, "radius": 1}}, "area.cone.dec"),
+    ("area", {"cone": {"ra": 0, "dec": 0, "radius": -1}}, "area.cone.radius"),
+    ("area", {"cone": {"ra": float("nan"), "dec": 0, "radius": 1}}, "area.cone.ra"),
+    ("area", {"cone": {"ra": 0, "dec": 0}}, "area.cone.radius is missing"),
+    ("area", {"cone": {"ra": 0, "dec": 0, "radius": 1, "x": 1}}, "area.cone.x"),
+    ("area", {"box": {"ra": [1, 0], "dec": [0, 1]}}, "area.box.ra"),
+    ("area", {"box": {"ra": [0, 1], "dec": [1, 0]}}, "area.box.dec"),
+    ("area", {"box": {"ra": [0, 1], "dec": [0, 1, 2]}}, "area.box.dec"),
+    ("area", {"polygon": [[0, 0], [1, 0]]}, "area.polygon"),
+    ("area", {"polygon": [[0, 0], [1, 0], [1, 95]]}, r"area.polygon\[2\].dec"),
+    ("area", {"polygon": [[0, 0], [2, 0], [1, 0.5], [2, 2]]}, "area.polygon"),
+    ("area", {"polygon": [[0, 0], 1, [1, 1]]}, r"area.polygon\[1\]"),
+    ("area", "all", "area"),
+    ("universe", {"galaxy_limit": 99}, "universe.galaxy_limit"),
+    ("universe", {"galaxy_limit": "26"}, "universe.galaxy_limit"),
+    ("universe", {"galaxy_band": 3}, "universe.galaxy_band"),
+    ("universe", {"z_max": 0}, "universe.z_max"),
+    ("universe", {"box_cells": 200}, "universe.box_cells = 200 is not one of 192, 256, 384"),
+    ("fluxes", {"intergalactic": "yes"}, "fluxes.intergalactic"),
+    ("ingest", {"training": {"files": []}}, "ingest.training.files"),
+    ("ingest", {"training": {"files": ["x"], "format": "flagship2"}}, "ingest.training.format"),
+    ("ingest", {"training": {"files": ["x"]}, "galaxies": {"files": ["y"]}}, "ingest.training: "),
+    ("universe", {"deep": True}, "universe.deep"),
+    ("stars", {"plane_limit": -1}, "stars.plane_limit"),
+    ("stars", {"plane_limit": "none"}, "stars.plane_limit"),
+    ("stars", {"density": "galaxia"}, "stars.density"),
+    ("stars", {"brown_dwarf_boost": -1}, "stars.brown_dwarf_boost"),
+    ("stars", {"tycho2": "tyc2.dat"}, "stars.tycho2"),
+    ("stars", {"catalogue": {"columns": {}}}, "stars.catalogue.file is missing"),
+    ("stars", {"catalogue": {"file": "x", "columns": {"ra": 3}}}, "stars.catalogue.columns.ra"),
+    ("stars", {"columns": []}, "stars.columns"),
+    ("stars", {"rows_a_file": 0}, "stars.rows_a_file"),
+    ("stars", {"rows_a_file": 1e6}, "stars.rows_a_file"),
+    ("mission", {"ladder": ["BEST"]}, "mission.ladder"),
+    ("mission", {"ladder": ["CBE", "CBE"]}, "mission.ladder"),
+    ("mission", {"ladder": "CBE"}, "mission.ladder"),
+    ("mission", {"overrides": {"vis.gain": 3}}, "mission.overrides.vis.gain"),
+    ("mission", {"overrides": {"vis.gain": {"value": 3.0}}}, "mission.overrides.vis.gain.unit"),
+    ("mission", {"overrides": {"vis.gain": {"value": float("inf"), "unit": ""}}}, "vis.gain.value"),
+    ("fluxes", {"bands": "r"}, "fluxes.bands"),
+    ("fluxes", {"filters": {}}, "fluxes.filters is not a key"),
+    ("fluxes", {"passbands": {"a b": {}}}, "name 'a b'"),
+    ("fluxes", {"passbands": {"mine": "file.dat"}}, "fluxes.passbands.mine wants a table"),
+    ("fluxes", {"passbands": {"mine": {"format": "passband_ascii", "medium": "air"}}}, "mine.file is missing"),
+    ("fluxes", {"passbands": {"mine": {"file": "x", "medium": "air"}}}, "mine.format is missing"),
+    ("fluxes", {"passbands": {"mine": {"file": "x", "format": "y", "medium": "sea"}}}, "mine.medium = 'sea'"),
+    ("fluxes", {"templates": {"format": "cosmos"}}, "fluxes.templates.files is missing"),
+    ("fluxes", {"templates": {"files": ["x"]}}, "fluxes.templates.format is missing"),
+    ("fluxes", {"extinction": {"5": {"file": "x", "format": "extinction"}}}, "fluxes.extinction.5 is not a key"),
+    ("fluxes", {"extinction": {"2": {"file": 3, "format": "extinction"}}}, "fluxes.extinction.2.file wants text"),
+    ("fluxes", {"stars": {}}, "fluxes.stars names neither basel nor irtf"),
+    ("fluxes", {"stars": {"basel": ["x.cor"]}}, "fluxes.stars.basel wants text"),
+    ("products", {"truth": ["everything"]}, "products.truth"),
+    ("products", {"compression": "zip"}, "products.compression"),
+    ("pointing", {}, "pointing wants a list"),
+    ("pointing", [3], r"pointing\[0\]"),
+    ("pointing.channel", "RADIO", r"pointing\[0\].channel"),
+    ("pointing.ra", "north", r"pointing\[0\].ra"),
+    ("pointing.dec", -91, r"pointing\[0\].dec"),
+    ("pointing.mjd", 0, r"pointing\[0\].mjd"),
+    ("pointing.exposure_time_s", -1, r"pointing\[0\].exposure_time_s"),
+    ("pointing.detectors", "3-4", r"pointing\[0\].detectors"),
+    ("pointing.camera", "../vis", "name"),
+    ("pointing.colour", 1, r"pointing\[0\].colour"),
+]
+
+
+def with_(key, value):
+    table = copy.deepcopy(GOOD)
+    if key.startswith("pointing."):
+        table["pointing"][0][key.partition(".")[2]] = value
+    else:
+        table[key] = value
+    return table
+
+
+@pytest.mark.parametrize(("key", "value", "words"), BAD)
+def test_bad_requests_are_refused_with_their_key(key, value, words):
+    with pytest.raises(BadInput, match=words) as caught:
+        from_table(with_(key, value))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["name", "seed"])
+def test_what_must_be_there(key):
+    table = copy.deepcopy(GOOD)
+    del table[key]
+    with pytest.raises(BadInput, match=f"{key} is missing"):
+        from_table(table)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name = ", "Invalid value"),
+        ("name = 'x'\nname = 'y'", "overwrite a value"),
+        ("\ud800", "surrogates|codec"),
+        ("x = " + "[" * 100_000, "."),
+        ("# " + "x" * 2_000_000, "larger than"),
+    ],
+)
+def test_files_that_are_no_request(tmp_path, text, words):
+    path = tmp_path / "r.toml"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(BadInput, match=words) as caught:
+        parse(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(BadInput, match="no such file"):
+        parse(tmp_path / "x.toml")
+
+
+def test_the_demo():
+    demo = parse(DEMO)
+    assert demo.bands == ("euclid_vis", "lsst_r")
+    assert demo.pointings[0].detectors == ("3-4",)
+    assert demo.accuracy == accuracy.SURVEY
+    assert set(demo.facts("seed", "universe")) == {"seed", "universe"}
+
+
+def test_areas_are_the_same_sky_in_any_form():
+    west = from_table(with_("area", {"box": {"ra": [-0.5, 0.5], "dec": [-0.5, 0.5]}}))
+    polygon = from_table(with_("area", {"polygon": [[359.5, -0.5], [0.5, -0.5], [0.5, 0.5], [359.5, 0.5]]}))
+    cone = from_table(with_("area", {"cone": {"ra": 0, "dec": 0, "radius": 0.4}}))
+    assert set(cone.area.cells()) <= set(west.area.cells()) & set(polygon.area.cells())
+    assert len(set(west.area.cells()) ^ set(polygon.area.cells())) <= 4
+
+
+def test_numbers_of_any_size_are_numbers():
+    with pytest.raises(BadInput, match=r"area\.cone\.ra"):
+        from_table(with_("area", {"cone": {"ra": 10**400, "dec": 0, "radius": 1}}))
+
+
+def test_own_curves_lie_beside_the_request_and_their_bands_are_added(tmp_path):
+    fluxes = """
+[fluxes.passbands.mine]
+file = "filters/mine.dat"
+format = "passband_ascii"
+medium = "air"
+[fluxes.templates]
+files = ["a.sed", "/b.sed"]
+format = "cosmos"
+[fluxes.extinction.3]
+file = "bump.dat"
+format = "extinction"
+[fluxes.stars]
+basel = "lcbp00.cor"
+irtf = ["G2V.txt", "M0V.txt"]
+"""
+    (tmp_path / "r.toml").write_text(DEMO.read_text() + fluxes)
+    asked = parse(tmp_path / "r.toml")
+    assert asked.bands == ("euclid_vis", "lsst_r", "mine")
+    ((name, mine),) = asked.curves.passbands
+    assert (name, mine.medium, mine.files) == ("mine", "air", (tmp_path / "filters" / "mine.dat",))
+    assert asked.curves.templates.files == (tmp_path / "a.sed", Path("/b.sed"))
+    assert [code for code, _ in asked.curves.extinction] == [3]
+    assert asked.curves.basel == tmp_path / "lcbp00.cor"
+    assert asked.curves.irtf == (tmp_path / "G2V.txt", tmp_path / "M0V.txt")
+    assert parse(DEMO).curves == OwnCurves()

@@ -1,0 +1,65 @@
+"""Names: nothing that could leave the lake gets through."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema.errors import BadInput
+from lake_schema.store import layout
+
+BAD = [
+    "", ".", "..", "../x", "/etc/x", "a/b", "a\\b", "a\0b", "a\nb", "a b", "A", "Galaxies", "-x", "_x",
+    "x" * 65, "x" * 300, "hpx=3", "%2e%2e", "a%2fb", "\u2024\u2024", "\uff0e\uff0e", "\u0430bc", "ga\u0142axy",
+    "a\u200bb", "~", "~root", "$HOME", "`ls`", "$(ls)", "a;b", "a|b", "a&b", "a>b", "a*b", "a?b", "a[b]",
+    "a{b}", "a'b", 'a"b', "a,b", "a:b", "a@b", "a#b", "a!b", "a+b", "a^b", "a=b", "a.b", "x.parquet", "con.",
+    "a\tb", "a\rb", "a\x7fb", " a", "a ", "\ufeffa", "\u202ea", "s3://x", "file:x",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", BAD)
+def test_bad_names_are_refused(text):
+    with pytest.raises(BadInput, match="name"):
+        layout.name(text)
+
+
+@given(st.text())
+def test_whatever_is_a_name_stays_in_the_lake(tmp_path_factory, text):
+    root = tmp_path_factory.getbasetemp()
+    try:
+        name = layout.name(text)
+    except BadInput:
+        return
+    for path in (layout.table(root, name), layout.stage(root, name, name), layout.version(root, name, name)):
+        assert path.resolve().is_relative_to(root.resolve())
+        assert path.resolve() != root.resolve()
+
+
+def test_a_link_out_of_the_lake_is_refused(tmp_path):
+    (tmp_path / "lake").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "lake" / "galaxies").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(BadInput, match="leaves"):
+        layout.table(tmp_path / "lake", "galaxies")
+
+
+@pytest.mark.parametrize("text", ["s3://bucket/lake", "hdfs://host/lake", "gs://x", "S3A://x"])
+def test_object_stores_are_refused(text):
+    with pytest.raises(BadInput, match="POSIX"):
+        layout.lake(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("", "empty"), ("file", "not a folder"), ("~no-such-user/lake", "lake"), ("loop", "lake"), ("a\0b", "lake")],
+)
+def test_what_cannot_be_a_lake_is_refused(tmp_path, monkeypatch, text, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(BadInput, match=words):
+        layout.lake(text)
+
+
+def test_cells_are_filed_as_hats_wants():
+    assert layout.cell_file(5, 1607) == "Norder=5/Dir=0/Npix=1607.parquet"
+    assert layout.cell_file(8, 574968) == "Norder=8/Dir=570000/Npix=574968.parquet"

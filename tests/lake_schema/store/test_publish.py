@@ -1,0 +1,279 @@
+"""Publishing: what is made is whole, repeatable and refused when it is not what it should be."""
+
+import json
+import os
+import shutil
+
+import pytest
+
+from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
+from lake_schema.store import layout, manifest, parquet, publish, read
+from lake_schema.store.plan import Output, Part, Plan, data_path
+from lake_schema.store.stage import attempt, missing
+from tests.universe import CELLS, TOY, plain_plan, plain_work, toy_plan, toy_rows, toy_work
+
+
+def sums(lake):
+    return {f["path"]: f["sha256"] for f in read.version(lake, "toy").manifest["files"]}
+
+
+def test_what_is_published_can_be_read(lake):
+    folder = publish.make(lake, toy_plan(), toy_work)
+    version = read.version(lake, "toy")
+    assert version.folder == folder
+    assert version.num_rows == sum(n for _, n in CELLS) == version.rows().num_rows
+    assert read.verify(version, deep=True) == []
+    left = {path.name for path in layout.table(lake, "toy").iterdir()} - {".lock"}
+    assert left == {"current", folder.name}
+
+
+def test_the_same_plan_gives_the_same_bytes_in_any_order(lake, tmp_path):
+    publish.make(lake, toy_plan(), toy_work)
+    other = tmp_path / "other"
+    other.mkdir()
+    publish.make(other, toy_plan(), toy_work, mapper=lambda f, parts: map(f, reversed(parts)))
+    assert sums(lake) == sums(other)
+    assert (layout.current(lake, "toy") / "manifest.json").read_bytes() == (
+        layout.current(other, "toy") / "manifest.json"
+    ).read_bytes()
+
+
+def test_a_second_run_makes_nothing(lake):
+    publish.make(lake, toy_plan(), toy_work)
+
+    def never(root, facts):
+        raise AssertionError("made again")
+
+    publish.make(lake, toy_plan(), never)
+
+
+def test_what_failed_is_listed_and_the_rest_is_kept(lake):
+    made = []
+
+    def work(root, facts):
+        made.append(facts["cell"])
+        if facts["cell"] == 1608 and len(made) <= len(CELLS):
+            raise ValueError("no luck")
+        return toy_work(root, facts)
+
+    with pytest.raises(PartsFailed, match=r"1 of 4 parts failed: .*Npix=1608.*ValueError: no luck"):
+        publish.make(lake, toy_plan(), work)
+    with pytest.raises(BadInput, match="no table toy"):
+        read.version(lake, "toy")
+    publish.make(lake, toy_plan(), work)
+    assert made == [1607, 1608, 1610, 8000, 1608]
+    assert read.verify(read.version(lake, "toy"), deep=True) == []
+
+
+def test_a_silent_worker_is_found_out(lake):
+    with pytest.raises(PartsFailed, match="ended without a receipt"):
+        publish.make(lake, toy_plan(), toy_work, mapper=lambda f, parts: [])
+
+
+@pytest.mark.parametrize("wrong", ["unsorted", "duplicate", "columns"])
+def test_wrong_rows_are_never_published(lake, wrong):
+    def work(root, facts):
+        rows = toy_rows(facts["cell"], 10)
+        if wrong == "unsorted":
+            rows = rows.take(list(reversed(range(10))))
+        if wrong == "duplicate":
+            rows = rows.take([0, 0, 1])
+        if wrong == "columns":
+            rows = rows.drop_columns(["flux"])
+        return Output(rows)
+
+    with pytest.raises(PartsFailed, match="table toy"):
+        publish.make(lake, toy_plan(), work)
+
+
+def test_whatever_goes_into_a_plan_changes_its_key():
+    plan = toy_plan()
+    others = [
+        toy_plan(seed=2),
+        toy_plan(cells=CELLS[:-1]),
+        Plan(TOY, {"seed": 1, "code": "x"}, plan.parts),
+        Plan(TOY, {"seed": 1}, (Part("x", {}),)),
+    ]
+    keys = {p.key for p in [plan, *others]}
+    assert len(keys) == len(others) + 1
+    assert toy_plan().key == plan.key
+
+
+def test_a_plan_names_a_part_once():
+    with pytest.raises(BadInput, match="twice"):
+        Plan(TOY, {}, (Part("a", {}), Part("a", {})))
+
+
+def test_a_catalogue_has_cells_though_they_may_be_empty(lake):
+    with pytest.raises(BadInput, match="no cells"):
+        Plan(TOY, {}, ())
+    publish.make(lake, toy_plan(cells=((8000, 0), (1607, 0))), toy_work)
+    version = read.version(lake, "toy")
+    assert version.rows().num_rows == version.cone(10.0, 10.0, 5.0).num_rows == 0
+    assert read.verify(version, deep=True) == []
+
+
+def test_versions_follow_each_other_and_gc_keeps_the_last(lake):
+    first = publish.make(lake, toy_plan(1), toy_work)
+    second = publish.make(lake, toy_plan(2), toy_work)
+    assert read.version(lake, "toy").folder == second
+    assert first.exists()
+    assert publish.gc(lake, "toy") == [first]
+    assert not first.exists()
+    assert read.verify(read.version(lake, "toy"), deep=True) == []
+
+
+def test_going_back_to_an_earlier_version_only_moves_the_link(lake):
+    first = publish.make(lake, toy_plan(1), toy_work)
+    publish.make(lake, toy_plan(2), toy_work)
+    publish.make(lake, toy_plan(1), None)
+    assert read.version(lake, "toy").folder == first
+
+
+def test_a_version_that_was_overtaken_is_not_published(lake):
+    publish.make(lake, toy_plan(1), toy_work)
+    base = layout.current_key(lake, "toy")
+    publish.make(lake, toy_plan(2), toy_work)
+    with pytest.raises(Superseded, match="published since"):
+        publish.make(lake, toy_plan(3), toy_work, base=base)
+    assert read.version(lake, "toy").key == toy_plan(2).key
+
+
+def test_two_runs_of_one_plan_do_not_meet(lake):
+    def work(root, facts):
+        with pytest.raises(Superseded, match="another run is making"):
+            publish.make(lake, toy_plan(), toy_work)
+        return toy_work(root, facts)
+
+    publish.make(lake, toy_plan(), work)
+
+
+def test_files_beside_the_rows_are_published_with_them(lake):
+    table = toy_plan().table
+
+    def work(root, facts):
+        return Output(toy_rows(facts["cell"], 3), {"images/a.txt": lambda path: path.write_text("pixels")})
+
+    publish.make(lake, Plan(table, {}, toy_plan().parts[:1]), work)
+    assert read.version(lake, "toy").file("images/a.txt").read_text() == "pixels"
+    with pytest.raises(BadInput, match="no file"):
+        read.version(lake, "toy").file("images/b.txt")
+
+
+def test_a_file_that_would_leave_the_stage_is_refused(lake):
+    def work(root, facts):
+        return Output(toy_rows(facts["cell"], 3), {"../../../x": lambda path: path.write_text("out")})
+
+    with pytest.raises(PartsFailed, match="leaves"):
+        publish.make(lake, toy_plan(), work)
+    assert not (lake.parent / "x").exists()
+
+
+def test_a_receipt_without_its_file_does_not_count(lake):
+    plan = toy_plan()
+    stage = layout.stage(lake, "toy", plan.key)
+    stage.mkdir(parents=True)
+    for part in plan.parts:
+        attempt(lake, plan.key, TOY, plan.facts, toy_work, part)
+    assert missing(stage, plan) == []
+    victim = stage / data_path(TOY, plan.parts[0].name)
+    os.truncate(victim, victim.stat().st_size - 1)
+    assert missing(stage, plan) == [plan.parts[0]]
+    victim.unlink()
+    assert missing(stage, plan) == [plan.parts[0]]
+
+
+def test_what_is_done_needs_no_lock(lake, monkeypatch):
+    """A lake that cannot be written is no reason to fail where nothing is left to do."""
+    folder = publish.make(lake, toy_plan(), toy_work)
+    monkeypatch.delattr(publish, "_lock")
+    assert publish.make(lake, toy_plan(), None) == folder
+
+
+def test_a_current_version_that_is_gone_can_be_made_again(lake):
+    folder = publish.make(lake, toy_plan(), toy_work)
+    shutil.rmtree(folder)
+    with pytest.raises(Damaged, match="which is missing"):
+        read.version(lake, "toy")
+    assert read.tables(lake) == ["toy"]
+    assert publish.make(lake, toy_plan(), toy_work) == folder
+    assert read.verify(read.version(lake, "toy"), deep=True) == []
+
+
+def test_two_versions_that_changed_names_are_found_out(lake):
+    first, second = (publish.make(lake, toy_plan(seed), toy_work) for seed in (1, 2))
+    other = first.with_name("other")
+    first.rename(other)
+    second.rename(first)
+    other.rename(second)
+    for key in (None, toy_plan(1).key, toy_plan(2).key):
+        with pytest.raises(Damaged, match="is that of table toy, version"):
+            read.version(lake, "toy", key)
+    for seed in (1, 2):
+        with pytest.raises(Damaged, match="is that of table toy, version"):
+            publish.make(lake, toy_plan(seed), toy_work)
+
+
+def test_a_link_to_another_table_is_found_out(lake):
+    folder = publish.make(lake, toy_plan(), toy_work)
+    publish.make(lake, plain_plan(), plain_work)
+    link = layout.current(lake, "plain")
+    link.unlink()
+    link.symlink_to(f"../toy/{folder.name}")
+    with pytest.raises(Damaged, match="does not lead to a version of table plain"):
+        read.version(lake, "plain")
+    shutil.copytree(folder, link.with_name(folder.name))
+    with pytest.raises(Damaged, match="is that of table toy"):
+        read.version(lake, "plain", toy_plan().key)
+
+
+CHANGES = {
+    "a fact is missing": lambda facts: facts.pop("parts"),
+    "a fact is another thing": lambda facts: facts.update(rows="550"),
+    "a part has no name": lambda facts: facts["parts"].append({}),
+    "a file has no sha256": lambda facts: facts["files"][0].pop("sha256"),
+    "a file is a text": lambda facts: facts["files"].append("x"),
+    "a file above the version": lambda facts: facts["files"][0].update(path="../x"),
+    "a file elsewhere": lambda facts: facts["files"][0].update(path="/etc/hosts"),
+    "blocks of another form": lambda facts: facts["files"][0].update(blocks=["x"]),
+    "blocks that are no base64": lambda facts: facts["files"][0].update(blocks="x"),
+    "blocks of a file of another size": lambda facts: facts["files"][0].update(blocks="AAAAAAAAAAA="),
+    "a deflection in words": lambda facts: facts.update(deflection_deg="far"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_a_manifest_of_another_form_is_damage(lake, change):
+    folder = publish.make(lake, toy_plan(), toy_work)
+    facts = dict(read.version(lake, "toy").manifest)
+    manifest.write(folder, facts)
+    read.version(lake, "toy")
+    change(facts)
+    manifest.write(folder, facts)
+    with pytest.raises(Damaged, match="not a manifest of this form"):
+        read.version(lake, "toy")
+
+
+def test_a_changed_page_is_not_read_while_a_version_is_made(lake):
+    version = read.version(lake, "toy", publish.make(lake, toy_plan(), toy_work).name[2:])
+    path = version.path(version.parts[0])
+    entry = manifest.file_facts(path, path.relative_to(lake).as_posix())
+    assert parquet.read(lake, entry, ["id"])["id"].equals(version.rows(["id"], [version.parts[0]])["id"])
+    data = bytearray(path.read_bytes())
+    data[100] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(Damaged, match=r"Npix=1607"):
+        parquet.read(lake, entry)
+
+
+def test_a_broken_manifest_is_named(lake):
+    publish.make(lake, toy_plan(), toy_work)
+    manifest = layout.current(lake, "toy") / "manifest.json"
+    facts = json.loads(manifest.read_text())
+    manifest.write_text(manifest.read_text()[:-20])
+    with pytest.raises(Damaged, match=r"manifest\.json"):
+        read.version(lake, "toy")
+    facts["rows"] += 1
+    manifest.write_text(json.dumps(facts))
+    with pytest.raises(Damaged, match="digest"):
+        read.version(lake, "toy")

@@ -1,0 +1,121 @@
+"""Reading: the right rows, only the files that can hold them, and no damaged byte."""
+
+import os
+
+import lsdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+from hats.io.validation import is_valid_catalog
+
+from lake_schema import sky
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.store import layout, publish, read
+from tests.universe import CELLS, toy_plan, toy_work
+
+
+@pytest.fixture
+def toy(lake):
+    publish.make(lake, toy_plan(), toy_work)
+    return read.version(lake, "toy")
+
+
+def test_rows_of_some_cells(toy):
+    everything = toy.rows()
+    fine = sky.parent(everything["_healpix_29"].to_numpy(), 29, 8)
+    for cells in ([fine[0]], np.unique(fine)[::3], [5], []):
+        wanted = everything.filter(pa.array(np.isin(fine, cells)))
+        assert toy.in_cells(cells, 8).equals(wanted)
+        assert toy.in_cells(cells, 8, ["id", "flux"]).equals(wanted.select(["id", "flux"]))
+
+
+def test_coarse_cells_are_found_too(toy):
+    assert toy.in_cells([1607 >> 4], 3).num_rows == sum(n for c, n in CELLS if c >> 4 == 1607 >> 4)
+
+
+def test_filters_and_columns(toy):
+    rows = toy.rows(["id"], where=pc.field("flux") > 0.5)
+    assert rows.column_names == ["id"]
+    assert rows.num_rows == sum(f > 0.5 for f in toy.rows()["flux"].to_pylist())
+
+
+def test_units_come_back_with_the_rows(toy):
+    assert toy.schema.field("flux").metadata[b"unit"] == b"uJy"
+
+
+def test_a_table_that_is_not_there(lake):
+    with pytest.raises(BadInput, match="no table galaxies"):
+        read.version(lake, "galaxies")
+    with pytest.raises(BadInput, match="name"):
+        read.version(lake, "../galaxies")
+
+
+@pytest.mark.parametrize("harm", ["delete", "shorten", "add", "flip"])
+def test_damage_is_named(toy, harm):
+    path = toy.path(toy.parts[0])
+    if harm == "delete":
+        path.unlink()
+    if harm == "shorten":
+        os.truncate(path, path.stat().st_size - 1)
+    if harm == "add":
+        path.with_name("Npix=9999.parquet").write_bytes(path.read_bytes())
+    if harm == "flip":
+        data = bytearray(path.read_bytes())
+        data[len(data) // 3] ^= 1
+        path.write_bytes(data)
+    found = read.verify(toy, deep=True)
+    assert len(found) == 1
+    assert ("Npix=9999" if harm == "add" else path.name) in found[0]
+    if harm == "add":
+        assert toy.rows().num_rows == toy.num_rows
+    else:
+        with pytest.raises(Damaged):
+            toy.rows()
+
+
+def test_any_hats_reader_can_open_it(toy):
+    folder = str(layout.current(toy.folder.parents[1], "toy"))
+    assert is_valid_catalog(folder, strict=True)
+    catalogue = lsdb.open_catalog(folder)
+    ra, dec = sky.cell_centre(5, 1607)
+    found = catalogue.cone_search(ra, dec, 0.8 * 3600).compute()
+    everything = toy.rows()
+    apart = sky.separation(ra, dec, everything["ra"].to_numpy(), everything["dec"].to_numpy())
+    assert sorted(found["id"]) == sorted(everything["id"].to_numpy()[apart < 0.8])
+
+
+def test_pairs_across_cell_edges_are_matched(lake):
+    """Every source has a twin 1" away in another catalogue; with the margin none is lost, edge or not."""
+    from lake_schema.store.plan import Output
+    from tests.universe import TOY
+
+    edge = sky.cell_range(5, 1608)[0]
+
+    def work(root, facts):
+        cell, shift = facts["cell"], facts["seed"] / 3600
+        rng = np.random.default_rng(7)
+        # Along the border of 1607 and its neighbours, half of the pairs straddle it.
+        rim = np.concatenate([sky.margin_cells(5, 1607, 13), [edge >> 32]])
+        index = np.repeat(rim, 4) << 32 | rng.integers(0, 1 << 32, 4 * rim.size)
+        import healpy as hp
+
+        ra, dec = hp.pix2ang(1 << 29, index, nest=True, lonlat=True)
+        dec = dec + shift
+        here = sky.cell_of(ra, dec, 5) == cell
+        order = np.argsort(sky.healpix_29(ra[here], dec[here]))
+        columns = {"id": np.flatnonzero(here)[order], "ra": ra[here][order], "dec": dec[here][order]}
+        columns["_healpix_29"] = sky.healpix_29(columns["ra"], columns["dec"])
+        return Output(TOY.build({**columns, "flux": np.ones(here.sum())}))
+
+    around = np.unique(sky.parent(sky.margin_cells(5, 1607, 13), 13, 5)).tolist()
+    cells = [(c, 0) for c in sorted({1607, *around})]
+    other = lake.parent / "other"
+    other.mkdir()
+    publish.make(lake, toy_plan(0, cells), work)
+    publish.make(other, toy_plan(1, cells), work)
+    left, right = (lsdb.open_catalog(str(layout.current(root, "toy"))) for root in (lake, other))
+    pairs = left.crossmatch(right, radius_arcsec=1.5, n_neighbors=1, suffixes=("_a", "_b")).compute()
+    same = (pairs["id_a"] == pairs["id_b"]).sum()
+    assert same > 0.97 * read.version(lake, "toy").num_rows  # the rest have another neighbour within 1"
+    assert len(pairs) == read.version(lake, "toy").num_rows
