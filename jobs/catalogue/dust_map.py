@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import healpy as hp
@@ -23,6 +22,7 @@ import numpy.typing as npt
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
+from jobs.code_keys import code_key
 from jobs.request.files import DustMap
 from jobs.rng import stream
 from lake_schema import user_files
@@ -103,7 +103,7 @@ def load(seed: int) -> npt.NDArray[np.float32]:
     returns : float32[pixel] A(V) mag, RING, Galactic
     """
     model = cosecant()
-    key = content_key(Path(__file__).read_bytes(), version("healpy"), seed, *astuple(model))
+    key = content_key(code_key(__name__), version("healpy"), seed, *astuple(model))
     return cached_arrays("dust_map", key, lambda: {"a_v": embedded(seed, model)})["a_v"]
 
 
@@ -123,7 +123,7 @@ def chosen(seed: int, own: DustMap | None) -> npt.NDArray[np.float32]:
     """
     if own is None:
         return load(seed)
-    key = content_key(Path(__file__).read_bytes(), version("healpy"), canonical(facts(own)))
+    key = content_key(code_key(__name__), version("healpy"), canonical(facts(own)))
     return cached_arrays("dust_file", key, lambda: {"a_v": read(own)})["a_v"]
 
 

@@ -23,6 +23,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs import cache
+from jobs.code_keys import code_key
 from jobs.fluxes import high_redshift, passbands
 from jobs.fluxes.libraries import brown_dwarfs, from_files, standards, stars_from_files, stellar, templates
 from jobs.fluxes.libraries.templates import Library
@@ -201,7 +202,7 @@ def published_library(lake: Path, templates_key: str, laws_key: str) -> Library:
         first, step = (float(rows[name][0].as_py()) for name in ("first_wavelength", "wavelength_step"))
         return {"wavelength": first + step * np.arange(flux.shape[1]), "flux": flux, "dust": dust}
 
-    key = cache.content_key(templates_key, laws_key, Path(__file__).read_bytes())
+    key = cache.content_key(templates_key, laws_key, code_key(__name__))
     arrays = cache.cached_arrays("published_library", key, read_rows)
     names = tuple(str(k) for k in range(len(arrays["flux"])))
     return Library(arrays["wavelength"], arrays["flux"], names, dust=arrays["dust"], own=True)
@@ -215,7 +216,7 @@ def published_stars(lake: Path, templates_key: str) -> Library:
         rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "star")
         return {"flux": np.stack(rows.sort_by("sed")["flux"].to_numpy()).astype(np.float32)}
 
-    key = cache.content_key(templates_key, Path(__file__).read_bytes())
+    key = cache.content_key(templates_key, code_key(__name__))
     return replace(
         templates.stellar_library(), flux=cache.cached_arrays("published_stars", key, read_rows)["flux"], own=True
     )

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from jobs import cache, sums
+from jobs.code_keys import code_key
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_ANGSTROM_S
@@ -69,7 +70,7 @@ def load(name: str) -> Passband:
     if name not in rows:
         raise BadInput(f"passband {name!r} is not one of {', '.join(rows)}")
     row = rows[name]
-    key = cache.content_key(Path(__file__).read_bytes(), repr(row), importlib.metadata.version("speclite"))
+    key = cache.content_key(code_key(__name__), repr(row), importlib.metadata.version("speclite"))
     arrays = cache.cached_arrays(f"passband_{name}", key, lambda: _curve(row["source"], float(row["shift"])))
     return Passband(name, arrays["wavelength"], arrays["response"], row["medium"])
 

@@ -25,6 +25,7 @@ from jobs import cache
 from jobs.cache import cache_dir, content_key
 from jobs.catalogue.external import mapping
 from jobs.catalogue.external.mapping import Columns, Rows
+from jobs.code_keys import code_key
 from lake_schema import sky
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput, Damaged
@@ -80,9 +81,8 @@ def split(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Spl
 
     Errors: BadInput or Damaged names file, column and row of what cannot be used
     """
-    code = [Path(__file__).read_bytes(), Path(mapping.__file__).read_bytes()]
     about = json.dumps([sorted((key, repr(field)) for key, field in columns.fields.items()), columns.beside])
-    folder = cache_dir() / f"ingest-{content_key(*code, about, *sha256)[:32]}"
+    folder = cache_dir() / f"ingest-{content_key(code_key(__name__), about, *sha256)[:32]}"
     sums = _usable(folder)
     if sums is None:
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -16,13 +16,13 @@ Ref: Hogg et al. 2002, arXiv:astro-ph/0210394
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from jobs import sums
 from jobs.cache import cached_arrays, content_key
+from jobs.code_keys import code_key
 from jobs.fluxes import passbands
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.spectra import extinction
@@ -116,7 +116,7 @@ def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatio
     curves = [passbands.load(name) for name in (band, REFERENCE_BAND)]
     responses = [array for curve in curves for array in (curve.wavelength, curve.response)]
     laws = extinction.laws(library.wavelength)
-    key = content_key(Path(__file__).read_bytes(), z_max, ebv_max, library.wavelength, library.flux, laws, *responses)
+    key = content_key(code_key(__name__), z_max, ebv_max, library.wavelength, library.flux, laws, *responses)
 
     def arrays() -> dict[str, npt.NDArray[np.generic]]:
         made = build(library, band, z_max, ebv_max)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
-from pathlib import Path
 
 import healpy as hp
 import numpy as np
@@ -25,6 +24,7 @@ import numpy.typing as npt
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
 from jobs.catalogue.matter.density_box import Box
+from jobs.code_keys import code_key
 from jobs.fluxes import cosmology, sources
 from lake_schema import sky
 from lake_schema.arrays import Float, Float32
@@ -72,10 +72,8 @@ def load(box: Box, nside: int, far: bool = False) -> Planes:
         raise BadInput(f"lensing_nside = {nside} is not a power of two from 16 to 2048")
     chosen = settings()
     z = np.array(chosen.planes + (chosen.far_planes if far else ()))
-    modules = ("density_box.py", "lightcone.py", "convergence.py", "lensing.py")
-    code = [(Path(__file__).parent / module).read_bytes() for module in modules]
     about = [np.atleast_1d(value).astype(float) for value in astuple(chosen)]
-    key = content_key(*code, box.seed, box.n, *map(float, np.concatenate(about)), nside, int(far))
+    key = content_key(code_key(__name__), box.seed, box.n, *map(float, np.concatenate(about)), nside, int(far))
     chi = cosmology.comoving_distance(z)
     name = f"lensing_{nside}"
     summed = cached_arrays(f"{name}_kappa", key, lambda: _summed(box, nside, chi, chosen))

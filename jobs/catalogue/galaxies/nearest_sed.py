@@ -24,6 +24,7 @@ from jobs.catalogue.external import mapping
 from jobs.catalogue.external.mapping import Columns
 from jobs.catalogue.galaxies import sed_assignment
 from jobs.catalogue.galaxies.band_ratios import Sed
+from jobs.code_keys import code_key
 from jobs.fluxes.libraries import templates
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
@@ -73,9 +74,8 @@ def load(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Trai
     Errors: BadInput or Damaged names file, column and row of what cannot be used
     """
     about = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
-    code = [Path(__file__).read_bytes(), Path(mapping.__file__).read_bytes()]
     last = templates.galaxy_library().flux.shape[0] - 1
-    key = content_key(*code, about, last, *sha256)
+    key = content_key(code_key(__name__), about, last, *sha256)
     return training(cached_arrays("training", key, lambda: _read(found, columns, last)), last)
 
 

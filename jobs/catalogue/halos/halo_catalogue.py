@@ -23,6 +23,7 @@ from jobs.catalogue.external.mapping import Columns
 from jobs.catalogue.halos import halos
 from jobs.catalogue.halos.halos import FIRST_NUMBER, HaloModel, Halos
 from jobs.catalogue.halos.matching import Masses
+from jobs.code_keys import code_key
 from jobs.fluxes import cosmology
 from jobs.rng import stream
 from lake_schema import sky
@@ -52,8 +53,9 @@ def load(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Ligh
     Errors: BadInput or Damaged names file, column and row of what cannot be used
     """
     about = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
-    code = [Path(__file__).read_bytes(), Path(mapping.__file__).read_bytes()]
-    arrays = cached_arrays("halo_light_cone", content_key(*code, about, *sha256), lambda: _read(found, columns))
+    arrays = cached_arrays(
+        "halo_light_cone", content_key(code_key(__name__), about, *sha256), lambda: _read(found, columns)
+    )
     return LightCone(**arrays)
 
 

@@ -21,7 +21,6 @@ import os
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, fields
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +30,7 @@ from scipy.special import hyp2f1
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
 from jobs.catalogue.matter import linear_theory
+from jobs.code_keys import code_key
 from jobs.fluxes import cosmology
 from jobs.rng import stream
 from lake_schema.arrays import Complex64, Float, Float32
@@ -95,9 +95,8 @@ def load(seed: int, n: int) -> Box:
     if n < 2 or n % 2:
         raise BadInput(f"a box wants an even number of cells a side, got {n}")
     model = box_model()
-    code = [(Path(__file__).parent / name).read_bytes() for name in ("density_box.py", "linear_theory.py")]
     numbers = [value for field in fields(model) for value in np.atleast_1d(getattr(model, field.name))]
-    key = content_key(*code, seed, n, *map(float, numbers))
+    key = content_key(code_key(__name__), seed, n, *map(float, numbers))
     stored = partial(_stored, key)
     with fft.set_workers(min(os.cpu_count() or 1, _MOST_WORKERS)):
         g = stored("box_g", lambda: _gaussian(seed, n, model.cell))
@@ -168,7 +167,7 @@ def biased(model: BoxModel, x: Float) -> tuple[npt.NDArray[np.int64], Float]:
     Error: bias within 10 % at 0.02 < k < 0.25 h/Mpc for 0.7 < x < 6 (tests)
     """
     names = [float(value) for name in astuple(model) for value in np.atleast_1d(name)]
-    key = content_key(Path(__file__).read_bytes(), (Path(__file__).parent / "linear_theory.py").read_bytes(), *names)
+    key = content_key(code_key(__name__), *names)
     table = cached_arrays("halo_bias", key, lambda: _bias_table(model))
     place = np.searchsorted(np.array(model.bias_edges), x)
     amplitude = np.empty(x.shape)

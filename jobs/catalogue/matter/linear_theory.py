@@ -11,12 +11,12 @@ Ref: Eisenstein & Hu 1998; Tinker et al. 2008, ApJ 688, 709; Tinker et al. 2010,
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jobs.cache import cache_dir, cached_arrays, content_key
+from jobs.code_keys import code_key
 from jobs.fluxes import cosmology
 from lake_schema.arrays import Float
 
@@ -43,7 +43,7 @@ def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
     concentration : [_Z_COARSE, m] c_200m, at redshifts uniform in ln(1 + z) over the same range
     """
     numbers = (cosmology.OMEGA_M, cosmology.OMEGA_B, cosmology.HUBBLE, cosmology.SIGMA_8)
-    key = content_key(Path(__file__).read_bytes(), *numbers, cosmology.SPECTRAL_INDEX, log_mass, z)
+    key = content_key(code_key(__name__), *numbers, cosmology.SPECTRAL_INDEX, log_mass, z)
     return cached_arrays("halo_tables", key, lambda: _halo_tables(log_mass, z))
 
 

@@ -21,6 +21,7 @@ from pyarrow import csv
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
+from jobs.code_keys import code_key
 from jobs.fluxes.libraries.stellar import StellarTypes
 from lake_schema import sky, user_files
 from lake_schema.arrays import Float, Int
@@ -72,9 +73,7 @@ def load(files: tuple[Path, ...], sums: list[str]) -> BrightStars:
     sums   : sha256 of each
     Errors : BadInput names the file and the record
     """
-    key = content_key(
-        Path(__file__).read_bytes(), Path(parameters.__file__).with_name("milky_way.toml").read_bytes(), *sums
-    )
+    key = content_key(code_key(__name__), Path(parameters.__file__).with_name("milky_way.toml").read_bytes(), *sums)
     arrays = cached_arrays("tycho2", key, lambda: _read(files))
     index, ra, dec, mag_v, color_bv = (arrays[name] for name in ("index", "ra", "dec", "mag_v", "color_bv"))
     counts = arrays["counts"].tolist()

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
+from jobs.code_keys import code_key
 from lake_schema import sky, user_files
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
@@ -81,7 +82,7 @@ def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
     columns : key -> title in the file
     Errors  : BadInput names the file, the column and the first row of what is missing or out of bounds, and how many
     """
-    key = content_key(Path(__file__).read_bytes(), sha256, canonical(dict(columns)))
+    key = content_key(code_key(__name__), sha256, canonical(dict(columns)))
     arrays = cached_arrays("star_catalogue", key, lambda: _read(file, columns))
     return StarCatalogue(arrays["index"], {name: values for name, values in arrays.items() if name != "index"})
 

@@ -14,11 +14,11 @@ import csv
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 
 from jobs import cache
+from jobs.code_keys import code_key
 from jobs.fluxes import passbands
 from jobs.fluxes.libraries import brown_dwarfs, rest_grid, standards, stellar, vega
 from jobs.fluxes.libraries.stellar import normalised, planck
@@ -75,7 +75,7 @@ class Library:
 def galaxy_library() -> Library:
     """The 31 galaxy templates, from 0, elliptical, to 30, starburst; 80 .. 24500 A, rest frame."""
     key = cache.content_key(
-        Path(__file__).read_bytes(),
+        code_key(__name__),
         emission_wavelengths(),
         *(vega.spectrum_file(f"CWW_{name}_ext.sed").read_bytes() for name in _ANCHORS),
     )
@@ -100,10 +100,8 @@ def stellar_library() -> Library:
     """
     types = stellar.types()
     names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES)
-    sources = [
-        Path(file).read_bytes() for file in (__file__, brown_dwarfs.__file__, standards.__file__, standards.NEBULA)
-    ]
-    key = cache.content_key(*sources, stellar.fingerprint(), vega.spectrum_file("vega.txt").read_bytes())
+    spectra = (standards.NEBULA.read_bytes(), vega.spectrum_file("vega.txt").read_bytes())
+    key = cache.content_key(code_key(__name__), *spectra, stellar.fingerprint())
     arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": _stars(types)})
     return Library(passbands.grid(), arrays["flux"], names, types)
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from jobs import cache, sums
+from jobs.code_keys import code_key
 from jobs.fluxes import passbands
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.passbands import Passband
@@ -62,7 +62,7 @@ class Setting:
 @lru_cache(maxsize=4)
 def library_key(library: Library) -> str:
     """Key of a library's spectra and of the dust in front of them; a tenth of a second, once a library."""
-    absorbed = [Path(intergalactic.__file__).read_bytes()] if library.intergalactic else []
+    absorbed = [code_key(intergalactic.__name__)] if library.intergalactic else []
     return cache.content_key(library.wavelength, np.asarray(library.flux), dust_of(library), *absorbed)
 
 
@@ -75,7 +75,7 @@ def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -
     """
     reference = passbands.load(REFERENCE_BAND)
     numbers = (setting.step, setting.n_ebv, setting.n_av)
-    full_key = cache.content_key(_code(), key, *numbers, *_curve(band), *_curve(reference))
+    full_key = cache.content_key(code_key(__name__), key, *numbers, *_curve(band), *_curve(reference))
     arrays = cache.cached_arrays(
         f"flux_grid_{band.name}", full_key, lambda: {"galaxies": _galaxies(library, band, reference, setting)}
     )
@@ -87,7 +87,7 @@ def star_table(band: Passband, library: Library, key: str) -> Float32:
 
     Error: 1e-6 (tests/jobs/fluxes/test_flux_grid)
     """
-    full_key = cache.content_key(_code(), key, *_curve(band))
+    full_key = cache.content_key(code_key(__name__), key, *_curve(band))
     arrays = cache.cached_arrays(f"flux_grid_stars_{band.name}", full_key, lambda: {"stars": _stars(library, band)})
     return arrays["stars"]
 
@@ -97,7 +97,7 @@ def line_table(band: Passband) -> tuple[float, Float32]:
 
     Uniform in ln(lambda) by LINE_STEP; the columns are LINE_SIGMA.
     """
-    full_key = cache.content_key(_code(), LINE_SIGMA, *_curve(band))
+    full_key = cache.content_key(code_key(__name__), LINE_SIGMA, *_curve(band))
     arrays = cache.cached_arrays(f"line_grid_{band.name}", full_key, lambda: _lines(band))
     return float(arrays["first"][0]), arrays["lines"]
 
@@ -112,10 +112,6 @@ def nodes(count: int, last: float) -> Float:
 def chebyshev(values: Float, last: float, count: int) -> Float:
     """Polynomials T_0 .. T_(count - 1) on [0, last], float64[..., count]."""
     return np.asarray(np.polynomial.chebyshev.chebvander(2.0 * values / last - 1.0, count - 1))
-
-
-def _code() -> bytes:
-    return Path(__file__).read_bytes()
 
 
 def _curve(band: Passband) -> tuple[Float, Float]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from jobs import cache
 from jobs.accuracy import Accuracy
+from jobs.code_keys import code_key
 from jobs.fluxes import integration
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.passbands import Passband
@@ -51,7 +52,8 @@ def measured(band: Passband, setting: Setting, library: Library) -> Choice:
     """Errors of a setting, rms and largest, against integration."""
     library_key = build_tables.library_key(library)
     numbers = (setting.step, setting.n_ebv, setting.n_av)
-    key = cache.content_key(library_key, *numbers, band.wavelength, band.response, band.medium, _SAMPLE, _SEED)
+    about = (*numbers, band.wavelength, band.response, band.medium, _SAMPLE, _SEED)
+    key = cache.content_key(code_key(__name__), library_key, *about)
 
     def make() -> dict[str, Array]:
         rows = drawn(_SAMPLE, len(library), np.random.default_rng(_SEED))

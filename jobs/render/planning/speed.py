@@ -1,5 +1,4 @@
-"""How fast this machine is, of the one that jobs/render/channels/costs.csv was measured on: what a forecast's seconds
-are times.
+"""How fast this machine is against the one of jobs/render/channels/costs.csv: the factor of a forecast's seconds.
 
 Speed        the factor, and what it was learnt from
 of_machine   from the detectors that the lake holds, else from a calibration of a second, kept in the cache
@@ -19,6 +18,7 @@ import numpy as np
 import scipy.fft
 
 from jobs import cache
+from jobs.code_keys import code_key
 from jobs.render.products import run_log
 from lake_schema.errors import LakeError
 from lake_schema.store import read
@@ -48,9 +48,8 @@ def of_machine(lake: Path) -> Speed:
     measured = list(_measured(lake))
     if len(measured) >= _ENOUGH:
         return Speed(float(np.median(measured)), f"learnt from {len(measured)} detectors that this lake holds")
-    kept = cache.cached_arrays(
-        "calibration", cache.content_key(Path(__file__).read_bytes(), machine()), lambda: {"seconds": calibration()}
-    )
+    key = cache.content_key(code_key(__name__), machine())
+    kept = cache.cached_arrays("calibration", key, lambda: {"seconds": calibration()})
     return Speed(float(kept["seconds"].min()) / REFERENCE_S, "from a calibration of a second")
 
 

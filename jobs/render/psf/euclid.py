@@ -13,13 +13,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 
 import galsim
 import numpy as np
 import scipy.fft
 
 from jobs import cache, sums
+from jobs.code_keys import code_key
 from jobs.compiling import jit
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector, detectors
@@ -109,7 +109,7 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
     blurs = [_blur_variances(detector, float(wavelength), mission) for wavelength in waves]
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
     key = cache.content_key(
-        Path(__file__).read_bytes(),
+        code_key(__name__),
         np.array(coefficients),
         waves,
         repr([(p.key, p.value, p.unit) for p in optics]),

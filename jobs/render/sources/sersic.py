@@ -9,8 +9,6 @@ sample's segment is read off its bits.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
@@ -18,6 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import gammainccinv, gammaln
 
 from jobs import cache
+from jobs.code_keys import code_key
 from lake_schema.arrays import Float, Float32
 
 # galsim.Sersic, the reference, accepts these.
@@ -40,7 +39,7 @@ def table() -> Float32:
     Error : 1e-7 at the nodes, 6e-6 between them (tests/jobs/render/test_sersic)
     Ref   : Hamilton 2000 (logarithmic Hankel transform)
     """
-    key = cache.content_key(Path(__file__).read_bytes())
+    key = cache.content_key(code_key(__name__))
     return cache.cached_arrays("sersic", key, lambda: {"transform": _make()})["transform"]
 
 
