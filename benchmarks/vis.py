@@ -26,9 +26,10 @@ from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.measured import forget_peak, peak_gb
 from jobs.render import plan_exposures, render_exposures
-from jobs.render.channels import registry, vis
+from jobs.render.channels import vis
 from jobs.render.drawing import stamps
-from jobs.render.exposure import render
+from jobs.render.exposure import visible_sources
+from jobs.render.sources import catalogue_rows
 from jobs.request.from_toml import parse
 from jobs.request.schema import Effects, Request
 from lake_schema.store import layout, publish
@@ -114,21 +115,21 @@ def without_planes() -> None:
 def stages(seconds: dict[str, float]) -> Iterator[None]:
     """Adds up the CPU seconds of a render's stages and effects while it is open."""
     places: tuple[tuple[Any, str, str], ...] = (
-        (render_exposures, "sources", "read"),
-        (render, "_psf", "psf"),
-        (render, "sources_of", "choose"),
+        (catalogue_rows, "sources", "read"),
+        (visible_sources, "_psf", "psf"),
+        (visible_sources, "sources_of", "choose"),
         (stamps, "draw", "draw"),
     )
     kept = [(module, name, getattr(module, name)) for module, name, _ in places]
-    effects = registry.EFFECTS["VIS"]["science"]
+    effects = vis.EFFECTS["science"]
     for module, name, stage in places:
         setattr(module, name, _timed(getattr(module, name), f"stage_{stage}_s", seconds))
     timed = tuple(replace(e, apply=_timed(e.apply, f"effect_{e.name}_s", seconds)) for e in effects)
-    registry.EFFECTS["VIS"]["science"] = timed  # type: ignore[index]
+    vis.EFFECTS["science"] = timed  # type: ignore[index]
     try:
         yield
     finally:
-        registry.EFFECTS["VIS"]["science"] = effects  # type: ignore[index]
+        vis.EFFECTS["science"] = effects  # type: ignore[index]
         for module, name, function in kept:
             setattr(module, name, function)
 

@@ -67,7 +67,7 @@ def field(spark, tmp_path_factory):
     wanted = parse(DEMO)
     # Compiled here, so that no worker's memory is the compiler's.
     for channel in ("VIS", "EXT"):
-        small(channel, forced={effect.name: True for effect in registry.EFFECTS[channel]["science"]})
+        small(channel, forced={effect.name: True for effect in registry.CHANNELS[channel].effects["science"]})
     for job in JOBS:
         shell.run(job, root, wanted)
     return root

@@ -13,9 +13,11 @@ from jobs import heap
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
 from jobs.render.camera import detectors
+from jobs.render.channels.aim import Aim
 from jobs.render.channels.image_types import sees_bodies
 from jobs.render.drawing import stamp_sizes
 from jobs.render.exposure import render, visible_sources
+from jobs.render.exposure.records import Rows
 from jobs.render.planning import preconditions, variants
 from jobs.render.planning.mission import mission_of
 from jobs.render.planning.preconditions import INPUTS
@@ -103,25 +105,18 @@ def work(lake: Path, facts: Json) -> Output:
         )
     ]
     with heap.kept():
-        rendered = render.render(
-            task,
-            exposed,
+        rows_ = Rows(
             *found[0][:2],
             *found[1][:2],
-            mission=own.mission,
-            accuracy=own.accuracy,
-            seed=request["seed"],
             library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
             stellar=stars_of(lake, inputs["star_fluxes"].manifest["facts"]),
-            passband=band,
-            forced=own.forced,
             complete=margin + min(complete for *_, complete in found),
-            truth=request["truth"],
             lenses=catalogue_rows.lenses(inputs[LENSES], task, catalogue_rows.deflection_of(inputs["galaxies"]), least)
             if LENSES in inputs
             else None,
             bodies=bodies,
         )
+        rendered = render.render(Aim.of(exposed, detector, band), rows_, own, request["seed"], request["truth"])
     rows, files = fits_files.products(rendered, request["truth"], request["compression"] == "rice")
     drawn = truth_table.truth(rendered)
     name = truth_file(facts["exposure_id"], facts["detector"])

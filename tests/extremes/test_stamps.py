@@ -23,10 +23,11 @@ from jobs.render.drawing import cost, stamp_sizes, stamps
 from jobs.render.drawing.kernels import frame
 from jobs.render.drawing.settings import settings_for
 from jobs.render.exposure import visible_sources
+from jobs.render.exposure.records import Rows
 from jobs.render.sources import galaxy_shapes, source_list
 from jobs.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
-from tests.jobs.render.fields import galaxies, moments, one_source, small, spread, stars
+from tests.jobs.render.fields import aimed, galaxies, moments, one_source, small, spread, stars
 
 NOISE = 12.0
 # Seconds of processor time: a large galaxy takes 1, what does not end takes for ever.
@@ -495,8 +496,8 @@ def test_poles_and_the_seam_are_as_good_as_any_place(camera, ra, dec):
     settings, band = settings_for(SURVEY), passbands.load("euclid_vis" if camera == "vis" else "lsst_r")
     body = galaxies(lon[:1], lat[:1], inclination=75.0, disk_half_light_radius=0.3)
     found, sizes = visible_sources.sources_of(
-        (body, np.array([1e5])), (stars(lon[1:], lat[1:]), np.array([1e5])), detector, system, spread(camera), NOISE,
-        settings, band,
+        Rows(body, None, stars(lon[1:], lat[1:]), None), (np.array([1e5]), np.array([1e5])),
+        aimed(detector, system, band), spread(camera), NOISE, settings,
     )  # fmt: skip
     np.testing.assert_allclose(np.stack([found.column, found.row], 1), places, atol=2e-6)
     # The telescope's distortion aside.

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from jobs.fluxes.passbands import Passband
+from jobs.render.camera.detectors import Detector
+from jobs.render.channels import readout
+from jobs.render.channels.channel import Channel
 from jobs.render.effects.charge import dark_current, full_well, poisson
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import background
 from jobs.render.effects.readout import adc, read_noise
+from jobs.render.psf import seeing
+from jobs.render.psf.model import Psf
+from lake_schema.arrays import Row
+from lake_schema.mission.configuration import MissionConfiguration
 
 SKY = (
     background.EFFECT,
@@ -19,3 +27,11 @@ SKY = (
 )
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {"science": SKY, "deep": SKY}
+
+
+def _psf(exposure: Row, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
+    beta = mission.value(f"{detector.section}.psf.moffat_beta")
+    return seeing.ground_psf(float(exposure["seeing"]), beta, detector.pixel_scale)
+
+
+CHANNEL = Channel(effects=EFFECTS, psf=_psf, readout=readout.frame)

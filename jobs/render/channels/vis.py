@@ -8,6 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from jobs.fluxes.passbands import Passband
+from jobs.render.camera.detectors import Detector
+from jobs.render.channels import readout
+from jobs.render.channels.channel import Channel
 from jobs.render.effects.charge import (
     bleeding,
     brighter_fatter,
@@ -38,6 +42,10 @@ from jobs.render.effects.readout import (
     readout_cosmic_rays,
     readout_trail,
 )
+from jobs.render.psf import euclid
+from jobs.render.psf.model import Psf
+from lake_schema.arrays import Row
+from lake_schema.mission.configuration import MissionConfiguration
 
 # What the pixels do to the light while sources are drawn: part of their transfer function.
 DRAWN = intra_pixel.EFFECT
@@ -95,3 +103,20 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "charge_injection": INJECTION,
     "bias": _READOUT,
 }
+
+
+def _psf(exposure: Row, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
+    return euclid.vis_psf(detector, band, mission, positions)
+
+
+CHANNEL = Channel(
+    effects=EFFECTS,
+    psf=_psf,
+    readout=readout.quadrants,
+    drawn=DRAWN,
+    pupil=euclid.vis_edges,
+    moving=True,
+    own_light=(calibration_lamp.EFFECT, charge_injection.EFFECT, charge_injection.NOISE),
+    tracks=(cosmic_rays.EFFECT, readout_cosmic_rays.READOUT),
+    scattered=True,
+)

@@ -16,19 +16,19 @@ from astropy.wcs import WCS
 from jobs.accuracy import Accuracy
 from jobs.render.camera.detectors import Detector
 from jobs.render.channels import image_types
+from jobs.render.channels.readout import Readout
 from jobs.render.effects.effect import Decision, Effect
-from jobs.render.effects.readout import quadrants
 from jobs.render.effects.scene import Scene
 from jobs.render.psf.model import Psf
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Float, Int, Row
+from lake_schema.arrays import Array, Float, Int, Row
 
 
 @dataclass(frozen=True, slots=True)
 class Rendered:
     """One detector's products before they are files.
 
-    raw        : uint16[ny, nx] ADU, or [4, ny, nx] quadrants in readout order with pre- and overscan
+    readout    : the arrays of its file
     maps       : truth [ny, nx] by its name: noise_free, and what was asked for besides
     sources    : what was drawn, ascending id: those with light of their stamps on pixels that are read, and stars whose
                  spikes may be noticed
@@ -41,7 +41,7 @@ class Rendered:
     detector: Detector
     wcs: WCS
     psf: Psf | None
-    raw: npt.NDArray[np.uint16]
+    readout: Readout
     maps: Mapping[str, npt.NDArray[Any]]
     sources: Sources
     sizes: Int
@@ -54,9 +54,14 @@ class Rendered:
     complete: float
 
     @property
-    def science(self) -> npt.NDArray[np.uint16]:
+    def raw(self) -> Array:
+        """The arrays as they are read: uint16[ny, nx] ADU, or [4, ny, nx] quadrants with pre- and overscan."""
+        return self.readout.raw
+
+    @property
+    def science(self) -> Array:
         """uint16[ny, nx] ADU: the pixels alone, in the detector's own axes."""
-        return self.raw if self.raw.ndim == 2 else quadrants.assembled(self.raw, *quadrants.sizes(self.scene))
+        return self.readout.pixels
 
     @property
     def noise_free(self) -> npt.NDArray[np.float32]:

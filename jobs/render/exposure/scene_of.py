@@ -7,25 +7,20 @@ from dataclasses import replace
 
 from jobs.accuracy import Accuracy
 from jobs.render.camera.detectors import Detector
-from jobs.render.effects.charge import charge_injection, cosmic_rays
+from jobs.render.channels.aim import Aim
+from jobs.render.channels.channel import Channel
+from jobs.render.effects.charge import cosmic_rays
 from jobs.render.effects.effect import Effect
-from jobs.render.effects.light import calibration_lamp
-from jobs.render.effects.readout import readout_cosmic_rays
-from jobs.render.effects.scene import Scene
-from lake_schema import units
+from jobs.render.effects.scene import Frame, Scene
+from jobs.render.exposure.records import Variant
 from lake_schema.arrays import Row
 from lake_schema.mission.configuration import MissionConfiguration
 
-# What fills pixels besides the sky and its sources.
-_LAMPS = (calibration_lamp.EFFECT, charge_injection.EFFECT, charge_injection.NOISE)
-# What crosses it besides light: its tracks are squeezed, and left behind, in the dark, too.
-_RAYS = (cosmic_rays.EFFECT, readout_cosmic_rays.READOUT)
 
-
-def with_own_light(scene: Scene, effects: Sequence[Effect]) -> Scene:
+def with_own_light(scene: Scene, channel: Channel, effects: Sequence[Effect]) -> Scene:
     """A lamp's light and injected charge are moved and squeezed like a star's, and so are tracks of cosmic rays."""
-    lamps = [effect for effect in effects if effect in _LAMPS and scene.forced.get(effect.name, True)]
-    rays = [effect for effect in effects if effect in _RAYS and effect.applied(scene)]
+    lamps = [effect for effect in effects if effect in channel.own_light and scene.forced.get(effect.name, True)]
+    rays = [effect for effect in effects if effect in channel.tracks and effect.applied(scene)]
     return replace(
         scene,
         peak_electrons=scene.peak_electrons + sum(lamp.contribution(scene) for lamp in lamps),
@@ -41,6 +36,13 @@ def scene_of(exposure: Row, detector: Detector, mission: MissionConfiguration, a
     )  # fmt: skip
 
 
-def electron_rate(exposure: Row) -> float:
-    """Electrons a second of a source of one microjansky."""
-    return float(10.0 ** (0.4 * (float(exposure["zero_point"]) - units.AB_UJY)))
+def of_aim(aim: Aim, variant: Variant) -> Scene:
+    """The same, with what is forced and the passband."""
+    scene = scene_of(aim.exposure, aim.detector, variant.mission, variant.accuracy)
+    return replace(scene, band=aim.band, forced=variant.forced)
+
+
+def with_peak(scene: Scene, frame: Frame) -> Scene:
+    """The scene with the brightest pixel of a frame that is read."""
+    halves = frame[: scene.unread[0]], frame[scene.unread[1] :]
+    return replace(scene, peak_electrons=max(float(half.max(initial=0.0)) for half in halves))

@@ -7,25 +7,26 @@ sources_of      the rows that shine onto the detector, as what is drawn
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from astropy.wcs import WCS
 
 from jobs.accuracy import Accuracy
-from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import astrometry
 from jobs.render.camera.detectors import Detector
-from jobs.render.channels import image_types
+from jobs.render.channels import image_types, registry
+from jobs.render.channels.aim import Aim, electron_rate
 from jobs.render.drawing import outskirts, stamp_sizes
 from jobs.render.drawing.settings import Settings, settings_for
+from jobs.render.effects.effect import Decision, decide
 from jobs.render.effects.scene import NOTICEABLE, Lights, Scene
 from jobs.render.exposure import bright_lights, scene_of
-from jobs.render.psf import euclid, spikes, sub_bands
-from jobs.render.psf.model import Psf
+from jobs.render.exposure.records import Rows
+from jobs.render.psf import from_file, spikes, sub_bands
+from jobs.render.psf.model import Psf, of_colours
 from jobs.render.sources import colours, galaxy_shapes, lensed_arcs, selection, solar_system
 from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float, Int, Row
@@ -42,7 +43,67 @@ STAR_COLUMNS = ("id", "ra", "dec", *colours.STAR_COLUMNS)
 _MOST_ELECTRONS = 1e17
 
 
-def no_sources(galaxies: pa.Table) -> Sources:
+@dataclass(frozen=True, slots=True)
+class Light:
+    """What shines onto a detector.
+
+    sources, sizes : and int[n] sides of their stamps
+    floors    : float64[n] Fourier samples that may be left out
+    psf       : None in the dark
+    scene     : with bright sources on and about the detector
+    decisions : of effects that act while sources are drawn
+    """
+
+    sources: Sources
+    sizes: Int
+    floors: Float
+    psf: Psf | None
+    scene: Scene
+    decisions: tuple[Decision, ...] = ()
+
+
+def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
+    """All that shines onto a detector, or nothing where it does not see the sky."""
+    if not aim.sees_sky:
+        return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
+    column = f"f_nu_{aim.exposure['band']}"
+    pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
+    galaxies, stars = (_fluxes(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs)
+    settings, noise = settings_for(scene.accuracy), scene.pixel_noise
+    spread = of_colours(_psf(aim, scene, settings), settings.colours)
+    sources, sizes = sources_of(rows, (galaxies, stars), aim, spread, noise, settings)
+    bright = Lights()
+    if aim.channel.moving:
+        sources, sizes, bright = _with_moving((sources, sizes), aim, rows, scene, spread, settings, seed)
+    if aim.channel.scattered:
+        around = bright_lights.bright_lights((rows.galaxies, galaxies), (rows.stars, stars), aim.detector, aim.wcs)
+        scene = replace(scene, lights=around.and_those(bright))
+    spread, decisions = _with_pixels(aim, scene, spread, sources.electrons[touching(sources, sizes, aim.detector)])
+    floors = stamp_sizes.floors(sources.electrons, noise, settings)
+    return Light(sources, sizes, floors, spread, scene, decisions)
+
+
+def _psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
+    if aim.exposure.get("psf"):
+        return from_file.read(from_file.file_of(aim.exposure["psf"], aim.detector.name), aim.detector, aim.band)
+    return aim.channel.psf(aim.exposure, aim.detector, aim.band, scene.mission, settings.positions)
+
+
+def _with_pixels(aim: Aim, scene: Scene, spread: Psf, electrons: Float) -> tuple[Psf, tuple[Decision, ...]]:
+    """(PSF with the effect that acts while sources are drawn, decision); electrons : of what is on the frame."""
+    drawn = aim.channel.drawn
+    if drawn is None:
+        return spread, ()
+    peak = float(spread.surface[0]) * float(electrons.max(initial=0.0))
+    scene = replace(scene, peak_electrons=peak)
+    decisions = decide((drawn,), scene)
+    if decisions[0].applied and spread.intra_pixel is not None:
+        (strength,) = drawn.parameters(scene)
+        spread = replace(spread, intra_pixel=strength)
+    return spread, decisions
+
+
+def _no_sources(galaxies: pa.Table) -> Sources:
     none, whole = np.zeros(0), np.zeros(0, np.int64)
     return Sources(whole, none, none, np.zeros((0, 2, 2)), none, whole, galaxy_shapes.shapes(galaxies.slice(0, 0)))
 
@@ -59,7 +120,7 @@ def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration,
     margin = mission.value("survey.selection_margin", "arcsec")
     noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
     return stamp_sizes.least_electrons(margin, detector.pixel_scale, noise, settings_for(accuracy)) / (
-        scene_of.electron_rate(exposure) * time
+        electron_rate(exposure) * time
     )
 
 
@@ -69,14 +130,13 @@ def spike_flux(
     """f_nu of the faintest star whose spikes are noticed from beyond what else is read, microjansky; or infinite."""
     time = float(exposure["exposure_time_s"])
     sees = image_types.sees_sky(str(exposure["channel"]), str(exposure["image_type"]))
-    if time == 0.0 or not sees or detector.section != "vis" or exposure.get("psf"):
+    pupil_of = registry.CHANNELS[str(exposure["channel"])].pupil
+    if time == 0.0 or not sees or pupil_of is None or exposure.get("psf"):
         return float("inf")
-    pupil, noise = (
-        euclid.vis_edges(detector, band, mission),
-        scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise,
-    )
+    noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
+    pupil = pupil_of(detector, band, mission)
     (one,) = spikes.reach(pupil, np.ones(1), NOTICEABLE * noise)
-    return float((stamp_sizes.reach(1.0) / one) ** 2 / (scene_of.electron_rate(exposure) * time))
+    return float((stamp_sizes.reach(1.0) / one) ** 2 / (electron_rate(exposure) * time))
 
 
 def outer_flux(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
@@ -85,56 +145,46 @@ def outer_flux(exposure: Row, detector: Detector, mission: MissionConfiguration,
     if time == 0.0 or not image_types.sees_sky(str(exposure["channel"]), str(exposure["image_type"])):
         return float("inf")
     noise, scale = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise, detector.pixel_scale
-    return outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / (scene_of.electron_rate(exposure) * time)
+    return outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / (electron_rate(exposure) * time)
 
 
 def sources_of(
-    galaxies: tuple[pa.Table, Float],
-    stars: tuple[pa.Table, Float],
-    detector: Detector,
-    system: WCS,
-    spread: Psf,
-    noise: float,
-    settings: Settings,
-    band: Passband,
-    library: Library | None = None,
-    stellar: Library | None = None,
-    lenses: pa.Table | None = None,
+    rows: Rows, electrons: tuple[Float, Float], aim: Aim, spread: Psf, noise: float, settings: Settings
 ) -> tuple[Sources, Int]:
     """Everything that shines onto the detector, with its stamp or beyond it, ascending id, and the stamps' sides.
 
-    galaxies, stars : (rows, expected electrons [n]);  lenses : rows of `strong_lenses`, None = none
+    electrons : expected of each of the galaxies, and of the stars;  noise : of a pixel, e-
     """
-    catalogue, points = galaxies[0], stars[0]
+    catalogue, points, detector, system = rows.galaxies, rows.stars, aim.detector, aim.wcs
     form = galaxy_shapes.shapes(catalogue)
-    arcs = _arcs(lenses, catalogue, galaxies[1], form)
+    arcs = _arcs(rows.lenses, catalogue, electrons[0], form)
     ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy(), arcs.ids]).astype(np.int64)
     ra = np.concatenate([catalogue["ra_lensed"].to_numpy(), points["ra"].to_numpy(), arcs.ra])
     dec = np.concatenate([catalogue["dec_lensed"].to_numpy(), points["dec"].to_numpy(), arcs.dec])
-    electrons = np.concatenate([galaxies[1], stars[1], arcs.electrons])
+    light = np.concatenate([*electrons, arcs.electrons])
     rest = len(points) + len(arcs.ids)
     shape = np.concatenate([np.arange(len(catalogue)), np.full(rest, -1)]).astype(np.int64)
     picture = np.concatenate([np.full(len(catalogue) + len(points), -1), np.arange(len(arcs.ids))]).astype(np.int64)
-    _check(ids, electrons)
-    farthest = np.where((shape < 0) & (picture < 0), _spikes(electrons, detector, spread, noise), 0.0)
-    farthest[: len(catalogue)] = _outskirts(electrons[: len(catalogue)], form, detector, noise)
+    _check(ids, light)
+    farthest = np.where((shape < 0) & (picture < 0), _spikes(light, detector, spread, noise), 0.0)
+    farthest[: len(catalogue)] = _outskirts(light[: len(catalogue)], form, detector, noise)
     reach = detector.half_diagonal + np.maximum(farthest, stamp_sizes.reach(detector.pixel_scale))
-    seen = selection.near(ra, dec, astrometry.centre(detector, system), reach / 3600.0) & (electrons > 0)
+    seen = selection.near(ra, dec, astrometry.centre(detector, system), reach / 3600.0) & (light > 0)
     kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
     column, row = astrometry.pixel_of_sky(system, ra[kept], dec[kept])
     wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
-    sizes = stamp_sizes.stamp_sizes(electrons[kept], shape[kept], form, spread, noise, settings, wide)
+    sizes = stamp_sizes.stamp_sizes(light[kept], shape[kept], form, spread, noise, settings, wide)
     here = stamp_sizes.shone_on(
-        column, row, electrons[kept], sizes, shape[kept], form, picture[kept], spread, noise, detector.nx, detector.ny
+        column, row, light[kept], sizes, shape[kept], form, picture[kept], spread, noise, detector.nx, detector.ny
     )
     kept, column, row = kept[here], column[here], row[here]
     jacobian = astrometry.jacobian(system, column, row)
     # Arcs have the colour of what they are an image of.
     coloured = np.concatenate([np.arange(len(catalogue) + len(points)), arcs.source])[kept]
     colourful = spread.planes is not None and len(spread.planes.wavelength) > 1
-    photons = _colours(coloured, catalogue, points, band, (library, stellar)) if colourful else None
+    photons = _colours(coloured, rows, aim.band) if colourful else None
     found = Sources(
-        ids[kept], column, row, jacobian, electrons[kept], shape[kept], form, photons, picture[kept], arcs.pictures
+        ids[kept], column, row, jacobian, light[kept], shape[kept], form, photons, picture[kept], arcs.pictures
     )
     return found, sizes[here]
 
@@ -162,21 +212,16 @@ def _arcs(
     return lensed_arcs.arcs(rows, galaxies["id"].to_numpy(), electrons / form.magnification)
 
 
-def with_moving(
-    sources: Sources, sizes: Int, exposure: Row, detector: Detector, system: WCS, band: Passband, scene: Scene,
-    spread: Psf, settings: Settings, seed: int, bodies: Callable[[int], solar_system.Population] | None,
-) -> tuple[Sources, Int, Lights]:  # fmt: skip
+def _with_moving(
+    still: tuple[Sources, Int], aim: Aim, rows: Rows, scene: Scene, spread: Psf, settings: Settings, seed: int
+) -> tuple[Sources, Int, Lights]:
     """The sources with those that move, whose identifiers are the largest; and bright ones around, as far as read."""
+    (sources, sizes), detector = still, aim.detector
     reach = (detector.half_diagonal + stamp_sizes.reach(detector.pixel_scale)) / 3600.0
-    found = solar_system.sources(exposure, detector, system, band, scene.mission, seed, reach, sources.shapes, bodies)
+    found = solar_system.sources(aim, scene.mission, seed, reach, sources.shapes, rows.bodies)
+    length = stamp_sizes.piece_length(found.length)
     own = stamp_sizes.stamp_sizes(
-        found.electrons,
-        found.shape,
-        found.shapes,
-        spread,
-        scene.pixel_noise,
-        settings,
-        stamp_sizes.piece_length(found.length),
+        found.electrons, found.shape, found.shapes, spread, scene.pixel_noise, settings, length
     )
     wide = stamp_sizes.reaches(found.electrons, own, found.shape, None, spread, scene.pixel_noise, found.length)
     here = selection.touching(found.column, found.row, wide, detector.nx, detector.ny) & (found.electrons > 0)
@@ -185,18 +230,17 @@ def with_moving(
     return sources.with_moving(found.take(here)), np.concatenate([sizes, own[here]]), bright_lights.trails(found)
 
 
-def _colours(
-    kept: npt.NDArray[np.int64],
-    galaxies: pa.Table,
-    stars: pa.Table,
-    band: Passband,
-    libraries: tuple[Library | None, Library | None],
-) -> Float:
+def touching(sources: Sources, sizes: Int, detector: Detector) -> npt.NDArray[np.bool_]:
+    """Sources with a stamp on the detector."""
+    return selection.touching(sources.column, sources.row, sizes + sources.length, detector.nx, detector.ny)
+
+
+def _colours(kept: npt.NDArray[np.int64], rows: Rows, band: Passband) -> Float:
     """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
-    of_galaxy = kept < len(galaxies)
+    of_galaxy = kept < len(rows.galaxies)
     out = np.empty((len(kept), sub_bands.PARTS))
-    out[of_galaxy] = colours.galaxies(galaxies.take(kept[of_galaxy]), band, libraries[0])
-    out[~of_galaxy] = colours.stars(stars.take(kept[~of_galaxy] - len(galaxies)), band, libraries[1])
+    out[of_galaxy] = colours.galaxies(rows.galaxies.take(kept[of_galaxy]), band, rows.library)
+    out[~of_galaxy] = colours.stars(rows.stars.take(kept[~of_galaxy] - len(rows.galaxies)), band, rows.stellar)
     return out
 
 
@@ -208,7 +252,7 @@ def _check(ids: npt.NDArray[np.int64], electrons: Float) -> None:
         raise BadInput(f"source {ids[np.argmax(bad)]}: {electrons[np.argmax(bad)]} electrons, outside 0 .. 1e17")
 
 
-def fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
+def _fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
     if column not in fluxes.column_names:
         raise BadInput(f"the flux table has no column {column}")
     if len(rows) != len(fluxes) or not np.array_equal(rows["id"].to_numpy(), fluxes["id"].to_numpy()):

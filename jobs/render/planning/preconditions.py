@@ -47,7 +47,7 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> N
 def refuse_unrendered(exposures: pa.Table) -> None:
     """Every exposure must be of a kind that has a simulator."""
     for row in exposures.group_by(["channel", "image_type"]).aggregate([([], "count_all")]).to_pylist():
-        if row["image_type"] not in registry.EFFECTS.get(row["channel"], {}):
+        if registry.effects_or_none(row["channel"], row["image_type"]) is None:
             kind = f"{row['channel']} {row['image_type']}"
             raise BadInput(
                 f"no simulator renders {kind} yet: {row['count_all']} exposures; leave them out of the request"

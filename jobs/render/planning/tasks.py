@@ -19,6 +19,7 @@ from jobs.render.camera import pointing
 from jobs.render.channels import registry
 from jobs.render.channels.image_types import sees_sky
 from jobs.render.exposure import scene_of
+from jobs.render.exposure.records import Variant
 from jobs.render.planning import variants
 from jobs.render.planning.prices import Price, price
 from jobs.render.planning.source_counts import Densities
@@ -123,16 +124,16 @@ def _append(
         columns["bytes"].append(cost.bytes(pixels))
 
 
-def _price(row: Row, own: variants.Variant, truth: Sequence[str]) -> Price:
+def _price(row: Row, own: Variant, truth: Sequence[str]) -> Price:
     """Of the detectors of an exposure.
 
     Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
     """
     channel, kind = str(row["channel"]), str(row["image_type"])
-    looks, effects = sees_sky(channel, kind), registry.EFFECTS.get(channel, {}).get(kind)
+    looks, effects = sees_sky(channel, kind), registry.effects_or_none(channel, kind)
     if effects is not None:
         first = camera_detectors.detectors(str(row["camera"]), own.mission)[0]
         scene = replace(scene_of.scene_of(row, first, own.mission, own.accuracy), forced=own.forced)
-        scene = scene_of.with_own_light(scene, effects)
+        scene = scene_of.with_own_light(scene, registry.CHANNELS[channel], effects)
         effects = tuple(e for e in effects if own.forced.get(e.name, looks or e.needed_if(scene)))
     return price(channel, looks, effects, own.accuracy, truth)

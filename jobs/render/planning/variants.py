@@ -7,21 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from jobs.accuracy import Accuracy
+from jobs.render.exposure.records import Variant
 from jobs.request.schema import Request
 from lake_schema.mission.configuration import MissionConfiguration
-
-
-@dataclass(frozen=True, slots=True)
-class Variant:
-    """What one request of an exploration is rendered with."""
-
-    mission: MissionConfiguration
-    accuracy: Accuracy
-    forced: Mapping[str, bool]
 
 
 def variant(

@@ -16,7 +16,6 @@ from pathlib import Path
 import pyarrow as pa
 
 from jobs.render.camera import astrometry
-from jobs.render.effects.readout import quadrants
 from jobs.render.exposure.rendered import Rendered
 from jobs.render.products import headers
 from lake_schema.fits.images import Image, write_images
@@ -65,22 +64,9 @@ def _write(units: Sequence[Image], rice: bool, path: Path) -> None:
 
 
 def _science(rendered: Rendered) -> list[Image]:
-    """The image; or a header, and an extension for each quadrant, named as detector.quadrant."""
-    if rendered.raw.ndim == 2:
-        return [Image(rendered.raw, headers.science_cards(rendered))]
-    prescan, overscan, rows, middle = quadrants.sizes(rendered.scene)
-    detector, scans = rendered.detector, (
-        ("PRESCAN", prescan, "[pix] columns before the pixels"),
-        ("OVERSCAN", overscan, "[pix] columns after the pixels"),
-        ("OVERROWS", rows, "[pix] rows after the pixels"),
-        ("INJROWS", middle, "[pix] rows between the halves, without pixels"),
-    )  # fmt: skip
-    units = [Image(None, (*headers.science_cards(rendered), *scans))]
-    for number, data in enumerate(rendered.raw):
-        # Of the detector's first pixel in the extension, from 0.
-        across, up = quadrants.origin(number, data.shape, prescan, overscan, rows, middle)
-        system = astrometry.shifted(rendered.wcs, across, up)
-        cards = (("QUADRANT", quadrants.NAMES[number], "quadrant"), *scans, *astrometry.cards(system))
-        name = f"{detector.name}.{quadrants.NAMES[number]}"
-        units.append(Image(quadrants.placed(data, number), cards, name))
-    return units
+    """The image; or a header that holds for all, and an extension for each array of the readout."""
+    cards, readout = headers.science_cards(rendered), rendered.readout
+    if [extension.name for extension in readout.extensions] == [""]:
+        return [Image(readout.extensions[0].data, cards)]
+    whole = Image(None, (*cards, *readout.cards))
+    return [whole, *(Image(extension.data, extension.cards, extension.name) for extension in readout.extensions)]

@@ -35,7 +35,7 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     return (
         *_common(rendered),
-        ("BUNIT", "adu", "unit of the pixels"),
+        ("BUNIT", rendered.readout.unit, "unit of the pixels"),
         ("GAIN", gain, "[electron/adu]"),
         (
             "RDNOISE",

@@ -7,6 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from jobs.render.camera import detectors
+from jobs.render.channels import registry
 from jobs.render.channels.image_types import sees_bodies
 from jobs.render.drawing import stamp_sizes
 from jobs.render.psf import from_file
@@ -46,10 +47,10 @@ def product_keys(
     def catalogues(task: Json) -> list[list[tuple[str, ...]]]:
         camera, detector = rows[task["exposure_id"]]["camera"], task["detector"]
         reach = stamp_sizes.reach(detectors.detector(camera, detector, mission).pixel_scale)
-        # Of the cameras VIS alone has spikes, of stars.
         reaches = {name: reach for name in files}
         reaches["galaxies"] = max(FARTHEST, reach)
-        if rows[task["exposure_id"]]["channel"] == "VIS":
+        # Of the sources stars alone have spikes.
+        if registry.CHANNELS[rows[task["exposure_id"]]["channel"]].pupil is not None:
             reaches["stars"] = max(FARTHEST, reach)
         return [
             sorted({sums for cell in selection.within(task, deflection, reaches[name]) for sums in found.get(cell, ())})

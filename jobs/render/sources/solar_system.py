@@ -10,19 +10,18 @@ anywhere. They shine like the Sun. At midnight UTC another population takes over
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from astropy.wcs import WCS
 
 from jobs import rng
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import astrometry, pointing
-from jobs.render.camera.detectors import Detector
+from jobs.render.channels.aim import Aim
 from jobs.render.sky.diffuse_light import solar
 from jobs.render.sources import colours
 from jobs.render.sources.galaxy_shapes import Shapes
@@ -129,10 +128,7 @@ def _of_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) -> t
 
 
 def sources(
-    exposure: Mapping[str, Any],
-    detector: Detector,
-    system: WCS,
-    band: Passband,
+    aim: Aim,
     mission: MissionConfiguration,
     seed: int,
     reach: float,
@@ -142,11 +138,12 @@ def sources(
     """Bodies whose trail comes within `reach` deg of a detector's centre, ascending id.
 
     Of a trail longer than twice `reach` it is as long a part about where it is nearest, with its share of the light.
-    exposure : a row of the table `exposures`;  shapes : of the sources that they are drawn with
+    shapes : of the sources that they are drawn with
     own      : a day's (MJD) bodies in place of the embedded population
     """
+    exposure, system, band = aim.exposure, aim.wcs, aim.band
     start, seconds = float(exposure["mjd"]), float(exposure["exposure_time_s"])
-    centre = astrometry.centre(detector, system)
+    centre = astrometry.centre(aim.detector, system)
     # An exposure belongs to the day that it begins on.
     day = int(np.floor(start))
     since = 24.0 * (start - day - 0.5)
@@ -160,13 +157,12 @@ def sources(
         astrometry.pixel_of_sky(system, *some.after(since + part * seconds / _HOUR_S))
         for part in (first, 0.5 * (first + last), last)
     )
-    rate = 10.0 ** (0.4 * (float(exposure["zero_point"]) - units.AB_UJY)) * seconds
     photons = colours.of_spectrum(band, solar(band.wavelength / 10.0, mission))
     return Sources(
         some.ids,
         *middle,
         astrometry.jacobian(system, *middle),
-        rate * flux(some.mag, band, mission) * (last - first),
+        aim.electrons * flux(some.mag, band, mission) * (last - first),
         np.full(len(near), -1),
         shapes,
         np.tile(photons, (len(near), 1)),

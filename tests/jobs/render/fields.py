@@ -2,11 +2,16 @@
 
 from dataclasses import replace
 from functools import cache
+from types import MappingProxyType
 
 import numpy as np
 import pyarrow as pa
 
 from jobs.render.camera import astrometry, detectors
+from jobs.render.channels import vis
+from jobs.render.channels.aim import Aim
+from jobs.render.exposure import render
+from jobs.render.exposure.records import Rows, Variant
 from jobs.render.psf import seeing
 from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.source_list import Sources
@@ -83,3 +88,16 @@ def moments(image):
     dx, dy = x - centre[0], y - centre[1]
     xy = (image * dx * dy).sum()
     return centre, np.array([[(image * dx * dx).sum(), xy], [xy, (image * dy * dy).sum()]]) / total
+
+
+def rendered(
+    exposed, detector, tables, mission, accuracy, seed=1, forced=None, truth=(), progress=None, passband=None, **rows
+):
+    """One detector; tables : galaxies, their fluxes, stars, theirs."""
+    variant = Variant(mission, accuracy, forced or {})
+    return render.render(Aim.of(exposed, detector, passband), Rows(*tables, **rows), variant, seed, truth, progress)
+
+
+def aimed(detector, system, band, exposed=MappingProxyType({}), channel=vis.CHANNEL):
+    """A detector that looks somewhere, in an exposure of which no more is known."""
+    return Aim(exposed, detector, system, band, channel, channel.effects["science"])

@@ -9,9 +9,9 @@ from jobs.accuracy import SURVEY
 from jobs.fluxes import passbands
 from jobs.render.camera import astrometry
 from jobs.render.camera.pointing import boresight_for
-from jobs.render.exposure import render
 from jobs.render.planning import planned_exposures
 from jobs.render.psf import euclid
+from tests.jobs.render import fields
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, stars
 
 TIME = MISSION.value("vis.exposure_time", "s")
@@ -61,12 +61,11 @@ def rendered(
         if mission is MISSION:
             own = spread(detector)
             patch.setattr(euclid, "vis_psf", lambda *_: own)
-        return render.render(
-            {"detector": detector.name}, exposed,
+        tables = (
             bodies, fluxes(bodies, "euclid_vis", f_nu if body else 0.0),
             points, fluxes(points, "euclid_vis", 0.0 if body else f_nu),
-            mission, accuracy, SEED, forced, detector, truth=truth, bodies=asteroids,
         )  # fmt: skip
+        return fields.rendered(exposed, detector, tables, mission, accuracy, SEED, forced, truth, bodies=asteroids)
 
 
 def lattice(side, pitch, seed=1):

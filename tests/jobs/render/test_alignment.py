@@ -11,8 +11,9 @@ from jobs.render.camera.astrometry import pixel_of_sky, wcs
 from jobs.render.camera.pointing import boresight_for
 from jobs.render.drawing import settings, stamps
 from jobs.render.exposure import visible_sources
+from jobs.render.exposure.records import Rows
 from lake_schema import sky
-from tests.jobs.render.fields import galaxies, moments, small, spread, stars
+from tests.jobs.render.fields import aimed, galaxies, moments, small, spread, stars
 
 NOISE, NSIDE, SIDE = 12.0, 64, 160
 RA, DEC, WIDTH = 40.0, 20.0, 4.0
@@ -50,8 +51,8 @@ def test_alignment_about_a_halo_is_tangential(camera, name, angle, shears):
     lon, lat = offset(50 * scale, BEARINGS)
     body = galaxies(lon, lat, disk_half_light_radius=3.5 * scale, gamma1=shears[0], gamma2=shears[1])
     found, sizes = visible_sources.sources_of(
-        (body, np.full(len(body), 1e6)), (stars([], []), np.zeros(0)), detector, system, spread(camera), NOISE,
-        settings.settings_for(SURVEY), band,
+        Rows(body, None, stars([], []), None), (np.full(len(body), 1e6), np.zeros(0)), aimed(detector, system, band),
+        spread(camera), NOISE, settings.settings_for(SURVEY),
     )  # fmt: skip
     image = stamps.draw(found, sizes, spread(camera), SIDE, SIDE)
     halo = np.array([axis[0] for axis in pixel_of_sky(system, [RA], [DEC])])

@@ -12,12 +12,13 @@ from jobs.render.channels import image_types, vis
 from jobs.render.effects.effect import apply_all
 from jobs.render.effects.light import calibration_lamp
 from jobs.render.effects.scene import Scene
-from jobs.render.exposure import render, rendered, scene_of
+from jobs.render.exposure import rendered, scene_of
 from jobs.render.plan_exposures import plan
 from jobs.render.products import fits_files, read_back
 from jobs.request.from_toml import parse
 from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render import fields
 from tests.jobs.render.fields import fluxes, galaxies, stars
 
 EXAMPLE = Path(__file__).parents[3] / "requests" / "vis_calibration.toml"
@@ -45,10 +46,8 @@ def written(planned, row, folder, forced=None, magnitude=20.0):
     where = [astrometry.sky_of_pixel(system, [x], [30.0]) for x in (30.0, 90.0)]
     flux = 10 ** (0.4 * (23.9 - magnitude))
     body, point = galaxies(*where[0]), stars(*where[1])
-    one = render.render(
-        {"detector": "3-4"}, row, body, fluxes(body, "euclid_vis", flux), point, fluxes(point, "euclid_vis", flux),
-        mission, request.accuracy, request.seed, forced, detector, truth=request.truth,
-    )  # fmt: skip
+    tables = body, fluxes(body, "euclid_vis", flux), point, fluxes(point, "euclid_vis", flux)
+    one = fields.rendered(row, detector, tables, mission, request.accuracy, request.seed, forced, request.truth)
     rows, writers = fits_files.products(one, request.truth, request.compression == "rice")
     for path, write in writers.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)

@@ -13,10 +13,11 @@ from jobs.fluxes import passbands
 from jobs.render.camera import astrometry, pointing
 from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.settings import settings_for
-from jobs.render.exposure import render, visible_sources
+from jobs.render.exposure import visible_sources
 from jobs.render.products import keys
 from jobs.render.sources import catalogue_rows, galaxy_shapes, selection
 from lake_schema import sky
+from tests.jobs.render import fields
 from tests.jobs.render.exposure.test_render import field as field_of
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, spread, stars
 
@@ -75,10 +76,8 @@ def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
         body, light, complete = catalogue_rows.sources(
             Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], BAND, FARTHER, least
         )
-    return render.render(
-        task, exposed, body, light, nothing, fluxes(nothing, BAND, 1.0), MISSION, SURVEY, 1, detector=DETECTOR,
-        complete=MARGIN + complete,
-    )  # fmt: skip
+    tables = body, light, nothing, fluxes(nothing, BAND, 1.0)
+    return fields.rendered(exposed, DETECTOR, tables, MISSION, SURVEY, complete=MARGIN + complete)
 
 
 def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():

@@ -12,10 +12,10 @@ from jobs.render.effects.charge import brighter_fatter
 from jobs.render.effects.effect import apply_all
 from jobs.render.effects.readout import nonlinearity
 from jobs.render.effects.scene import Scene
-from jobs.render.exposure import render
 from jobs.render.planning import planned_exposures
 from jobs.rng import stream
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render import fields
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
 
 NOMINAL = MISSION.value("vis.exposure_time", "s")
@@ -37,10 +37,8 @@ def rendered(mission=MISSION, mag=20.0, body=None, x=SIDE / 2, y=SIDE / 2):
     points = stars(*where)
     bodies, points = (bodies, points.slice(0, 0)) if body else (bodies.slice(0, 0), points)
     flux = 10 ** (-0.4 * (mag - 23.9))
-    return render.render(
-        {"detector": "3-4"}, exposed, bodies, fluxes(bodies, "euclid_vis", flux), points,
-        fluxes(points, "euclid_vis", flux), mission, SURVEY, 1, detector=detector,
-    )  # fmt: skip
+    tables = bodies, fluxes(bodies, "euclid_vis", flux), points, fluxes(points, "euclid_vis", flux)
+    return fields.rendered(exposed, detector, tables, mission, SURVEY)
 
 
 def test_stars_saturate_at_the_published_magnitude():

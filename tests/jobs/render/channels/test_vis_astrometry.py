@@ -14,11 +14,12 @@ from jobs.fluxes import passbands
 from jobs.render.camera import astrometry, detectors, pointing
 from jobs.render.drawing import settings, stamps, transfer
 from jobs.render.exposure import visible_sources
+from jobs.render.exposure.records import Rows
 from jobs.render.products import headers, truth_table
 from jobs.render.psf import euclid, sub_bands
 from jobs.render.sources.source_list import Sources
 from tests.jobs.render import calibrated, nominal
-from tests.jobs.render.fields import MISSION, galaxies, small, spread, stars
+from tests.jobs.render.fields import MISSION, aimed, galaxies, small, spread, stars
 
 BAND = passbands.load("euclid_vis")
 SMALL = small("vis", "3-4", 256)
@@ -79,8 +80,8 @@ def test_the_truth_table_tells_where_sources_are(name, ra, dec):
     points = stars(*where)
     none = galaxies(0.0, 0.0).slice(0, 0)
     drawn, sizes = visible_sources.sources_of(
-        (none, np.zeros(0)), (points, np.full(300, 1e3)), detector, system, spread("vis"), 13.0,
-        settings.settings_for(SURVEY), BAND,
+        Rows(none, None, points, None), (np.zeros(0), np.full(300, 1e3)), aimed(detector, system, BAND),
+        spread("vis"), 13.0, settings.settings_for(SURVEY),
     )  # fmt: skip
     found = replace(alone(), detector=detector, wcs=system, sources=drawn, sizes=sizes, drawn=np.zeros(len(sizes)))
     rows = truth_table.truth(found)

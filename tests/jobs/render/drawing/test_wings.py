@@ -14,9 +14,10 @@ from jobs.render.camera.astrometry import sky_of_pixel, wcs
 from jobs.render.camera.pointing import boresight_for
 from jobs.render.drawing import settings, stamp_sizes, stamps
 from jobs.render.exposure import visible_sources
+from jobs.render.exposure.records import Rows
 from jobs.render.psf import euclid
 from jobs.render.sources import galaxy_shapes, selection, source_list
-from tests.jobs.render.fields import MISSION, galaxies, small, spread, stars
+from tests.jobs.render.fields import MISSION, aimed, galaxies, small, spread, stars
 
 SIDE, NOISE = 256, 12.0
 BAND = passbands.load("euclid_vis")
@@ -39,8 +40,8 @@ def found(spread_, galaxy=None, star=None):
     )
     rows = galaxies(*body, **BULGE), stars(*points)
     some, sizes = visible_sources.sources_of(
-        (rows[0], np.full(len(rows[0]), 1e6)), (rows[1], np.full(len(rows[1]), 1e5)), detector, system, spread_, NOISE,
-        SETTINGS, BAND,
+        Rows(rows[0], None, rows[1], None), (np.full(len(rows[0]), 1e6), np.full(len(rows[1]), 1e5)),
+        aimed(detector, system, BAND), spread_, NOISE, SETTINGS,
     )  # fmt: skip
     drawn = np.zeros(len(some))
     floors = stamp_sizes.floors(some.electrons, NOISE, SETTINGS)

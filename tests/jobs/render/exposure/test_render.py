@@ -16,13 +16,12 @@ from jobs.render.camera.pointing import boresight_for
 from jobs.render.channels import costs
 from jobs.render.drawing import cost, stamps
 from jobs.render.effects.light import calibration_lamp
-from jobs.render.exposure import render as exposure_render
 from jobs.render.exposure import truth_maps
 from jobs.render.planning import planned_exposures
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_of
-from tests.jobs.render import calibrated, nominal
+from tests.jobs.render import calibrated, fields, nominal
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, stars
 
 SIDE = 256
@@ -53,15 +52,14 @@ def field(channel, n=30):
 
 
 def render(channel, body=None, points=None, flux=3.0, seed=1, accuracy=SURVEY, kind="science", **options):
-    task, exposed, all_bodies, all_points = field(channel)
+    _, exposed, all_bodies, all_points = field(channel)
     exposed = {**exposed, "image_type": kind, "sky": 0.0 if kind in ("bias", "dark") else exposed["sky"]}
     body = all_bodies if body is None else body
     points = all_points if points is None else points
     camera, name, band = CASES[channel][:3]
-    return exposure_render.render(
-        task, exposed, body, fluxes(body, band, flux), points, fluxes(points, band, flux), MISSION, accuracy,
-        seed, detector=options.pop("detector", small(camera, name, SIDE)), **options,
-    )  # fmt: skip
+    tables = body, fluxes(body, band, flux), points, fluxes(points, band, flux)
+    detector = options.pop("detector", small(camera, name, SIDE))
+    return fields.rendered(exposed, detector, tables, MISSION, accuracy, seed, **options)
 
 
 @pytest.mark.parametrize(
@@ -370,11 +368,11 @@ def test_a_scene_that_would_not_end_is_refused(monkeypatch):
 
 
 def test_bad_tables_are_refused():
-    task, exposed, body, points = field("VIS")
+    _, exposed, body, points = field("VIS")
     good = (body, fluxes(body, "euclid_vis", 1.0), points, fluxes(points, "euclid_vis", 1.0))
 
     def attempt(*tables, exposed=exposed):
-        return exposure_render.render(task, exposed, *tables, MISSION, SURVEY, 1, detector=small("vis", "3-4", 32))
+        return fields.rendered(exposed, small("vis", "3-4", 32), tables, MISSION, SURVEY)
 
     with pytest.raises(BadInput, match="not of the same rows"):
         attempt(body, good[1].slice(1), points, good[3])

@@ -14,7 +14,7 @@ from tests.jobs.render.planning.test_survey import VIS, planned
 
 DEMO = Path(__file__).parents[4] / "requests" / "demo.toml"
 PIXELS = 4096 * 4132
-SKY = registry.EFFECTS["VIS"]["science"]
+SKY = registry.CHANNELS["VIS"].effects["science"]
 
 
 def test_more_is_dearer():
@@ -29,14 +29,14 @@ def test_more_is_dearer():
         sum(effect.cost for effect in SKY[-5:]) * PIXELS / 1e6
     )
     # A bias frame has neither sky nor light.
-    bias = prices.price("VIS", False, registry.EFFECTS["VIS"]["bias"])
+    bias = prices.price("VIS", False, registry.CHANNELS["VIS"].effects["bias"])
     assert bias.seconds(PIXELS, 5000, 10) == bias.seconds(PIXELS, 0, 0) < 0.7 * base.seconds(PIXELS, 0, 0)
 
 
 def test_each_map_has_its_place_on_the_disc():
     sizes = {}
     for channel, kind, looks in (("VIS", "science", True), ("EXT", "science", True), ("VIS", "bias", False)):
-        effects = registry.EFFECTS[channel][kind]
+        effects = registry.CHANNELS[channel].effects[kind]
         own = [
             prices.price(channel, looks, effects, SURVEY, maps).bytes(PIXELS) for maps in ((), tuple(truth_maps.BYTES))
         ]

@@ -22,7 +22,7 @@ from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
 from lake_schema.ids import kind_of
 from tests.jobs.render import nominal
-from tests.jobs.render.fields import MISSION, small
+from tests.jobs.render.fields import MISSION, aimed, small
 
 DAY = 60905
 PLACE = tuple(float(x) for x in equatorial(70.0, 0.0))
@@ -52,7 +52,8 @@ def test_a_table_of_our_own_population_is_drawn_as_ours(tmp_path):
     ra, dec, angle = pointing.boresight_for(detector, *PLACE, 0.0)
     row = {"ra": ra, "dec": dec, "position_angle": angle, "mjd": DAY + 0.3, "exposure_time_s": 565.0}
     system = astrometry.wcs(detector, ra, dec, angle)
-    about = ({**row, "zero_point": 25.9}, detector, system, passbands.load("euclid_vis"), MISSION, 1, 0.1, None)
+    aim = aimed(detector, system, passbands.load("euclid_vis"), {**row, "zero_point": 25.9})
+    about = (aim, MISSION, 1, 0.1, None)
     expected = solar_system.sources(*about)
     assert len(expected) > 3
     order = np.argsort(expected.column)
@@ -378,9 +379,8 @@ def test_a_body_comes_near_on_its_way():
     row = dict(zip(("ra", "dec", "position_angle"), pointing.boresight_for(detector, *PLACE, 0.0), strict=True))
     system = astrometry.wcs(detector, *row.values())
     row |= {"mjd": DAY + 0.5, "exposure_time_s": 600.0, "zero_point": 25.9}
-    found = solar_system.sources(
-        row, detector, system, passbands.load("euclid_vis"), MISSION, 1, reach, None, lambda day: bodies
-    )
+    aim = aimed(detector, system, passbands.load("euclid_vis"), row)
+    found = solar_system.sources(aim, MISSION, 1, reach, None, lambda day: bodies)
     hours = np.linspace(0.0, 1 / 6, 501)
     away = np.min([sky.separation(*bodies.after(hour), *PLACE) for hour in hours], axis=0)
     sure = np.abs(away - reach) > 1e-3

@@ -12,7 +12,6 @@ from jobs.render.camera import astrometry, pointing
 from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.settings import settings_for
 from jobs.render.drawing.stamp_sizes import piece_length
-from jobs.render.exposure import render
 from jobs.render.planning import planned_exposures
 from jobs.render.products import truth_table
 from jobs.render.sources import solar_system
@@ -21,6 +20,7 @@ from lake_schema import sky
 from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.ids import kind_of
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render import fields
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, one_source, small, spread, stars
 
 DAY = 60905
@@ -114,7 +114,7 @@ def crowded(overrides=MappingProxyType({})):
     }  # fmt: skip
     empty = galaxies([10.0], [20.0]).slice(0, 0), stars([10.0], [20.0]).slice(0, 0)
     tables = [x for rows in empty for x in (rows, fluxes(rows, "euclid_vis", 1.0))]
-    return render.render({"detector": "3-4"}, exposed, *tables, mission, SURVEY, 1, detector=detector)
+    return fields.rendered(exposed, detector, tables, mission, SURVEY)
 
 
 def test_trails_are_in_the_image_and_in_its_truth():

@@ -1,0 +1,44 @@
+"""What an instrument's mode is to the renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from astropy.wcs import WCS
+
+from jobs.fluxes.passbands import Passband
+from jobs.render.camera.detectors import Detector
+from jobs.render.channels.readout import Readout
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.scene import Frame, Scene
+from jobs.render.psf.model import Psf
+from jobs.render.psf.spikes import Edges
+from lake_schema.arrays import Row
+from lake_schema.mission.configuration import MissionConfiguration
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """All that differs from channel to channel while a detector is rendered.
+
+    effects    : image type -> its effects, in the order of physics
+    psf        : (exposure, detector, band, mission, positions on the detector) -> PSF
+    readout    : (what the last effect leaves, scene, name of the detector, WCS) -> the arrays of its file
+    drawn      : effect that is part of the pixel's transfer function: it acts while sources are drawn
+    pupil      : (detector, band, mission) -> diffraction far from a star; None: not drawn
+    moving     : whether bodies of the Solar System are drawn
+    own_light  : effects that fill pixels besides the sky and its sources: lamps, injected charge
+    tracks     : effects that leave tracks of charge, in the dark, too
+    scattered  : whether bright sources beside a pixel shine into it: ghosts, stray light
+    """
+
+    effects: Mapping[str, tuple[Effect, ...]]
+    psf: Callable[[Row, Detector, Passband, MissionConfiguration, int], Psf]
+    readout: Callable[[Frame, Scene, str, WCS], Readout]
+    drawn: Effect | None = None
+    pupil: Callable[[Detector, Passband, MissionConfiguration], Edges] | None = None
+    moving: bool = False
+    own_light: tuple[Effect, ...] = ()
+    tracks: tuple[Effect, ...] = ()
+    scattered: bool = False

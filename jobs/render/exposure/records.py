@@ -1,0 +1,45 @@
+"""What one detector is rendered from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import pyarrow as pa
+
+from jobs.accuracy import Accuracy
+from jobs.fluxes.libraries.templates import Library
+from jobs.render.sources.solar_system import Population
+from lake_schema.mission.configuration import MissionConfiguration
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Catalogue rows that may touch the detector.
+
+    galaxies, stars : of GALAXY_COLUMNS, STAR_COLUMNS of visible_sources.py
+    galaxy_fluxes, star_fluxes : row by row their f_nu in the band, microjansky
+    lenses     : of `strong_lenses` (lensed_arcs.ARC_COLUMNS), whose sources are among the galaxies; None: there is none
+    bodies     : a day's moving bodies (ephemerides.Bodies.of_day); None = the embedded population
+    library    : what the galaxies' sed_1 and sed_2 count;  stellar : what the stars' sed does; None = the embedded ones
+    complete   : how far beyond the detector the rows have every source, arcsec
+    """
+
+    galaxies: pa.Table
+    galaxy_fluxes: pa.Table
+    stars: pa.Table
+    star_fluxes: pa.Table
+    lenses: pa.Table | None = None
+    bodies: Callable[[int], Population] | None = None
+    library: Library | None = None
+    stellar: Library | None = None
+    complete: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """What one request of an exploration is rendered with; forced : effect name -> on or off."""
+
+    mission: MissionConfiguration
+    accuracy: Accuracy
+    forced: Mapping[str, bool]
