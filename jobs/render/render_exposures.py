@@ -33,6 +33,7 @@ from lake_schema.mission.published import read_back
 from lake_schema.store import layout, parquet, read, reuse
 from lake_schema.store.plan import Json, Output, Part, Plan
 from lake_schema.store.provenance import file_sha256
+from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
@@ -77,16 +78,16 @@ def work(lake: Path, facts: Json) -> Output:
     forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
     inputs = {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
     here = pc.field("exposure_id") == facts["exposure_id"]
-    (exposed,) = inputs["exposures"].rows(where=here).to_pylist()
+    (exposed,) = map(ExposureRow.of, inputs["exposures"].rows(where=here).to_pylist())
     (task,) = inputs["tasks"].rows(where=here & (pc.field("detector") == facts["detector"])).to_pylist()
-    own = variants.variant(exposed["settings"], read_back(inputs["mission"]), Accuracy(**request["accuracy"]), forced)
-    detector = detectors.detector(exposed["camera"], task["detector"], own.mission)
-    if exposed["psf"]:
-        file = str(from_file.file_of(exposed["psf"], task["detector"]))
+    own = variants.variant(exposed.settings, read_back(inputs["mission"]), Accuracy(**request["accuracy"]), forced)
+    detector = detectors.detector(exposed.camera, task["detector"], own.mission)
+    if exposed.psf:
+        file = str(from_file.file_of(exposed.psf, task["detector"]))
         if file_sha256(Path(file)) != facts["psf"][file]:
             raise BadInput(f"{file}: has changed since the rendering began")
     bodies = None
-    if sees_bodies(exposed["channel"], exposed["image_type"]):
+    if sees_bodies(exposed.channel, exposed.image_type):
         for file, sha256 in facts.get("bodies", {}).items():
             if file_sha256(Path(file)) != sha256:
                 raise BadInput(f"{file}: has changed since the rendering began")
@@ -94,11 +95,11 @@ def work(lake: Path, facts: Json) -> Output:
     margin = own.mission.value("survey.selection_margin", "arcsec")
     farther = max(stamp_sizes.reach(detector.pixel_scale) - margin, 0.0)
     least = visible_sources.least_flux(exposed, detector, own.mission, own.accuracy)
-    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], str(exposed["band"]))
+    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
     spikes = visible_sources.spike_flux(exposed, detector, own.mission, own.accuracy, band)
     outer = visible_sources.outer_flux(exposed, detector, own.mission, own.accuracy)
     found = [
-        catalogue_rows.sources(inputs[rows], inputs[fluxes], task, columns, exposed["band"], farther, least, limit)
+        catalogue_rows.sources(inputs[rows], inputs[fluxes], task, columns, exposed.band, farther, least, limit)
         for rows, fluxes, columns, limit in (
             ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS, outer),
             ("stars", "star_fluxes", visible_sources.STAR_COLUMNS, spikes),

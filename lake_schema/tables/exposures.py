@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
 from lake_schema.columns import Column, Table
 
 CHANNELS = (
@@ -88,3 +92,37 @@ EXPOSURES = Table(
     "Exposures, in the order they are taken.",
     key=("exposure_id",),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureRow:
+    """A row of the table: one field a column, None where the column is null."""
+
+    exposure_id: int
+    channel: str
+    camera: str
+    band: str
+    image_type: str
+    ra: float
+    dec: float
+    position_angle: float
+    mjd: float
+    exposure_time_s: float
+    sky: float
+    seeing: float
+    zero_point: float
+    survey: str
+    field: int | None = None
+    visit: int | None = None
+    dither: int | None = None
+    grism: str | None = None
+    grism_angle: float | None = None
+    lamp: int | None = None
+    target: str | None = None
+    psf: str | None = None
+    settings: str | None = None
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any]) -> ExposureRow:
+        """Of a row as Arrow gives it; KeyError where a column is missing."""
+        return cls(**{name: row[name] for name in cls.__slots__})

@@ -1,7 +1,8 @@
 """The reference page, the declarations by name, and the tables of what the rest was made with."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.store.validate import check
 from lake_schema.tables import mission, passbands, templates
 from lake_schema.tables.common import Origin
+from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tables.md"
 
@@ -32,6 +34,17 @@ def test_tables_are_found_by_name():
     for table in tables.declared(["euclid_vis", "lsst_r"]):
         assert tables.find(table.name, table.names) == table
     assert tables.find("nothing") is None
+
+
+def test_a_row_of_exposures_has_a_field_a_column():
+    """In their order, of their types, None where the column may be null."""
+    types = {"int64": int, "int32": int, "float64": float, "string": str}
+    declared = {c.name: types[c.type] | None if c.nullable else types[c.type] for c in EXPOSURES.columns}
+    assert list(get_type_hints(ExposureRow).items()) == list(declared.items())
+    row = {name: number for number, name in enumerate(declared)}
+    assert asdict(ExposureRow.of({**row, "another": 0})) == row
+    with pytest.raises(KeyError, match="survey"):
+        ExposureRow.of({name: value for name, value in row.items() if name != "survey"})
 
 
 @dataclass

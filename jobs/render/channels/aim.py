@@ -14,7 +14,7 @@ from jobs.render.channels import image_types, registry
 from jobs.render.channels.channel import Channel
 from jobs.render.effects.effect import Effect
 from lake_schema import units
-from lake_schema.arrays import Row
+from lake_schema.tables.exposures import ExposureRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Aim:
     effects  : of its channel for its image type, in their order
     """
 
-    exposure: Row
+    exposure: ExposureRow
     detector: Detector
     wcs: WCS
     band: Passband
@@ -34,25 +34,25 @@ class Aim:
     effects: tuple[Effect, ...]
 
     @classmethod
-    def of(cls, exposure: Row, detector: Detector, band: Passband | None = None) -> Aim:
+    def of(cls, exposure: ExposureRow, detector: Detector, band: Passband | None = None) -> Aim:
         """Of a planned exposure; band : None = the embedded one of its name.  BadInput where nothing renders it."""
-        kind = str(exposure["image_type"])
-        channel = registry.channel_of(str(exposure["channel"]), kind, f"exposure {exposure['exposure_id']}")
-        system = astrometry.wcs(detector, exposure["ra"], exposure["dec"], exposure["position_angle"])
-        band = band or passbands.load(str(exposure["band"]))
+        kind = exposure.image_type
+        channel = registry.channel_of(exposure.channel, kind, f"exposure {exposure.exposure_id}")
+        system = astrometry.wcs(detector, exposure.ra, exposure.dec, exposure.position_angle)
+        band = band or passbands.load(exposure.band)
         return cls(exposure, detector, system, band, channel, channel.effects[kind])
 
     @property
     def sees_sky(self) -> bool:
         """Whether sources shine on the detector."""
-        return image_types.sees_sky(str(self.exposure["channel"]), str(self.exposure["image_type"]))
+        return image_types.sees_sky(self.exposure.channel, self.exposure.image_type)
 
     @property
     def electrons(self) -> float:
         """Expected of a source of one microjansky in the exposure."""
-        return electron_rate(self.exposure) * float(self.exposure["exposure_time_s"])
+        return electron_rate(self.exposure) * self.exposure.exposure_time_s
 
 
-def electron_rate(exposure: Row) -> float:
+def electron_rate(exposure: ExposureRow) -> float:
     """Electrons a second of a source of one microjansky."""
-    return float(10.0 ** (0.4 * (float(exposure["zero_point"]) - units.AB_UJY)))
+    return float(10.0 ** (0.4 * (exposure.zero_point - units.AB_UJY)))

@@ -14,8 +14,8 @@ from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
 from jobs.render.psf.model import Psf
 from jobs.render.psf.spikes import Edges
-from lake_schema.arrays import Row
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Channel:
     """
 
     effects: Mapping[str, tuple[Effect, ...]]
-    psf: Callable[[Row, Detector, Passband, MissionConfiguration, int], Psf]
+    psf: Callable[[ExposureRow, Detector, Passband, MissionConfiguration, int], Psf]
     readout: Callable[[Frame, Scene, str, WCS], Readout]
     drawn: Effect | None = None
     pupil: Callable[[Detector, Passband, MissionConfiguration], Edges] | None = None

@@ -14,8 +14,8 @@ from jobs.render.effects.light import background
 from jobs.render.effects.readout import adc, read_noise
 from jobs.render.psf import seeing
 from jobs.render.psf.model import Psf
-from lake_schema.arrays import Row
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
 
 SKY = (
     background.EFFECT,
@@ -29,9 +29,11 @@ SKY = (
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {"science": SKY, "deep": SKY}
 
 
-def _psf(exposure: Row, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
+def _psf(
+    exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
+) -> Psf:
     beta = mission.value(f"{detector.section}.psf.moffat_beta")
-    return seeing.ground_psf(float(exposure["seeing"]), beta, detector.pixel_scale)
+    return seeing.ground_psf(exposure.seeing, beta, detector.pixel_scale)
 
 
 CHANNEL = Channel(effects=EFFECTS, psf=_psf, readout=readout.frame)

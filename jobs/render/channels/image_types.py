@@ -5,10 +5,8 @@ identity       what tells an exposure's random numbers from those of all others
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from lake_schema.mission.parameter import CAMERAS
+from lake_schema.tables.exposures import ExposureRow
 
 SKY_TYPES = ("science", "deep", "self_calibration")
 
@@ -28,10 +26,7 @@ def section(camera: str) -> str:
     return f"ext.{camera}" if camera in CAMERAS else camera
 
 
-def identity(exposure: Mapping[str, Any]) -> str:
-    """What an exposure's random numbers are keyed by: what was pointed where and when, not its place in a plan.
-
-    exposure : a row of the table `exposures`
-    """
-    places = (exposure[name] for name in ("ra", "dec", "position_angle", "mjd"))
-    return ":".join((str(exposure["camera"]), str(exposure["band"]), *(float(place).hex() for place in places)))
+def identity(exposure: ExposureRow) -> str:
+    """What an exposure's random numbers are keyed by: what was pointed where and when, not its place in a plan."""
+    places = (exposure.ra, exposure.dec, exposure.position_angle, exposure.mjd)
+    return ":".join((exposure.camera, exposure.band, *(place.hex() for place in places)))

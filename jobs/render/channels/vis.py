@@ -44,8 +44,8 @@ from jobs.render.effects.readout import (
 )
 from jobs.render.psf import euclid
 from jobs.render.psf.model import Psf
-from lake_schema.arrays import Row
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
 
 # What the pixels do to the light while sources are drawn: part of their transfer function.
 DRAWN = intra_pixel.EFFECT
@@ -105,7 +105,9 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
 }
 
 
-def _psf(exposure: Row, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
+def _psf(
+    exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
+) -> Psf:
     return euclid.vis_psf(detector, band, mission, positions)
 
 

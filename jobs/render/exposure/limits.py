@@ -21,8 +21,8 @@ def refuse_too_large(aim: Aim, light: Light) -> None:
         return
     exposure, detector, sources, sizes = aim.exposure, aim.detector, light.sources, light.sizes
     here = visible_sources.touching(sources, sizes, detector)
-    where = f"exposure {exposure['exposure_id']}, detector {detector.name}: {int(here.sum())} sources"
-    base = costs.of_channel(str(exposure["channel"])).base_gb * 1e9
+    where = f"exposure {exposure.exposure_id}, detector {detector.name}: {int(here.sum())} sources"
+    base = costs.of_channel(exposure.channel).base_gb * 1e9
     picture = None if sources.picture is None else sources.picture[here]
     wanted = base + cost.memory(sources.electrons[here], sizes[here], detector.nx, detector.ny, picture)
     if wanted > _MOST_BYTES:

@@ -107,5 +107,5 @@ def _detected(
     truth_maps.complete(drawn.maps, readout.raw, aim.effects, scene, truth)
     return Rendered(
         exposure, detector, aim.wcs, light.psf, readout, drawn.maps, drawn.sources, drawn.sizes, drawn.electrons,
-        float(exposure["zero_point"]), scene, (*light.decisions, *decisions), scene.accuracy, seed, rows.complete,
+        exposure.zero_point, scene, (*light.decisions, *decisions), scene.accuracy, seed, rows.complete,
     )  # fmt: skip

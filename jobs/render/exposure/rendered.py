@@ -21,7 +21,8 @@ from jobs.render.effects.effect import Decision, Effect
 from jobs.render.effects.scene import Scene
 from jobs.render.psf.model import Psf
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Array, Float, Int, Row
+from lake_schema.arrays import Array, Float, Int
+from lake_schema.tables.exposures import ExposureRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,7 @@ class Rendered:
     complete   : how far beyond the detector every source was known that may reach it, arcsec
     """
 
-    exposure: Row
+    exposure: ExposureRow
     detector: Detector
     wcs: WCS
     psf: Psf | None
@@ -69,10 +70,10 @@ class Rendered:
         return self.maps["noise_free"]
 
 
-def numbers_of(effect: Effect, exposure: Row, detector: str, seed: int) -> tuple[int | str, ...]:
+def numbers_of(effect: Effect, exposure: ExposureRow, detector: str, seed: int) -> tuple[int | str, ...]:
     """The identity of an effect's random numbers: nobody else's, but where it follows another's pattern.
 
     A detector's own patterns are in every exposure.
     """
-    what = str(exposure["camera"]) if effect.fixed else image_types.identity(exposure)
+    what = exposure.camera if effect.fixed else image_types.identity(exposure)
     return seed, what, detector, effect.numbers or effect.name

@@ -13,8 +13,8 @@ from jobs.render.effects.charge import cosmic_rays
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
 from jobs.render.exposure.records import Variant
-from lake_schema.arrays import Row
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
 
 
 def with_own_light(scene: Scene, channel: Channel, effects: Sequence[Effect]) -> Scene:
@@ -28,11 +28,11 @@ def with_own_light(scene: Scene, channel: Channel, effects: Sequence[Effect]) ->
     )
 
 
-def scene_of(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> Scene:
+def scene_of(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> Scene:
     """Before anything is drawn."""
     return Scene(
-        mission, detector.section, float(exposure["exposure_time_s"]), float(exposure["sky"]), 0.0, detector,
-        lamp=int(exposure.get("lamp") or 1), accuracy=accuracy,
+        mission, detector.section, exposure.exposure_time_s, exposure.sky, 0.0, detector,
+        lamp=exposure.lamp or 1, accuracy=accuracy,
     )  # fmt: skip
 
 

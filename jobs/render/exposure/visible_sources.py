@@ -29,9 +29,10 @@ from jobs.render.psf import from_file, spikes, sub_bands
 from jobs.render.psf.model import Psf, of_colours
 from jobs.render.sources import colours, galaxy_shapes, lensed_arcs, selection, solar_system
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Float, Int, Row
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 
 # What is read of the catalogues; fluxes are read besides.
@@ -66,7 +67,7 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     """All that shines onto a detector, or nothing where it does not see the sky."""
     if not aim.sees_sky:
         return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
-    column = f"f_nu_{aim.exposure['band']}"
+    column = f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
     galaxies, stars = (_fluxes(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs)
     settings, noise = settings_for(scene.accuracy), scene.pixel_noise
@@ -84,8 +85,8 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
 
 
 def _psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
-    if aim.exposure.get("psf"):
-        return from_file.read(from_file.file_of(aim.exposure["psf"], aim.detector.name), aim.detector, aim.band)
+    if aim.exposure.psf:
+        return from_file.read(from_file.file_of(aim.exposure.psf, aim.detector.name), aim.detector, aim.band)
     return aim.channel.psf(aim.exposure, aim.detector, aim.band, scene.mission, settings.positions)
 
 
@@ -108,14 +109,14 @@ def _no_sources(galaxies: pa.Table) -> Sources:
     return Sources(whole, none, none, np.zeros((0, 2, 2)), none, whole, galaxy_shapes.shapes(galaxies.slice(0, 0)))
 
 
-def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
+def least_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
     """f_nu of the faintest source that reaches the detector from beyond its selection margin, microjansky.
 
     Infinite where no source shows: in the dark, or in no time.
     Error : of the fainter out there each leaves out less than the settings' `edge` of a pixel's noise
     """
-    time = float(exposure["exposure_time_s"])
-    if time == 0.0 or not image_types.sees_sky(str(exposure["channel"]), str(exposure["image_type"])):
+    time = exposure.exposure_time_s
+    if time == 0.0 or not image_types.sees_sky(exposure.channel, exposure.image_type):
         return float("inf")
     margin = mission.value("survey.selection_margin", "arcsec")
     noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
@@ -125,13 +126,13 @@ def least_flux(exposure: Row, detector: Detector, mission: MissionConfiguration,
 
 
 def spike_flux(
-    exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy, band: Passband
+    exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy, band: Passband
 ) -> float:
     """f_nu of the faintest star whose spikes are noticed from beyond what else is read, microjansky; or infinite."""
-    time = float(exposure["exposure_time_s"])
-    sees = image_types.sees_sky(str(exposure["channel"]), str(exposure["image_type"]))
-    pupil_of = registry.CHANNELS[str(exposure["channel"])].pupil
-    if time == 0.0 or not sees or pupil_of is None or exposure.get("psf"):
+    time = exposure.exposure_time_s
+    sees = image_types.sees_sky(exposure.channel, exposure.image_type)
+    pupil_of = registry.CHANNELS[exposure.channel].pupil
+    if time == 0.0 or not sees or pupil_of is None or exposure.psf:
         return float("inf")
     noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
     pupil = pupil_of(detector, band, mission)
@@ -139,10 +140,10 @@ def spike_flux(
     return float((stamp_sizes.reach(1.0) / one) ** 2 / (electron_rate(exposure) * time))
 
 
-def outer_flux(exposure: Row, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
+def outer_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
     """f_nu of the faintest galaxy that may be noticed from beyond what else is read, microjansky; or infinite."""
-    time = float(exposure["exposure_time_s"])
-    if time == 0.0 or not image_types.sees_sky(str(exposure["channel"]), str(exposure["image_type"])):
+    time = exposure.exposure_time_s
+    if time == 0.0 or not image_types.sees_sky(exposure.channel, exposure.image_type):
         return float("inf")
     noise, scale = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise, detector.pixel_scale
     return outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / (electron_rate(exposure) * time)

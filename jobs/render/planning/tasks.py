@@ -24,9 +24,10 @@ from jobs.render.planning import variants
 from jobs.render.planning.prices import Price, price
 from jobs.render.planning.source_counts import Densities
 from lake_schema import sky
-from lake_schema.arrays import Float, Row
+from lake_schema.arrays import Float
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.tasks import TASKS
 
 # ------------------------------------------------------------------------------------------------ tasks
@@ -51,14 +52,14 @@ def table(
     shared: dict[tuple[Any, ...], _Places] = {}
     prices: dict[tuple[Any, ...], Price] = {}
     columns: dict[str, list[Any]] = {name: [] for name in TASKS.names}
-    for row, wanted in zip(exposures.to_pylist(), detectors, strict=True):
-        camera = cameras[row["camera"]]
-        where = (row["camera"], row["ra"], row["dec"], row["position_angle"])
+    for row, wanted in zip(map(ExposureRow.of, exposures.to_pylist()), detectors, strict=True):
+        camera = cameras[row.camera]
+        where = (row.camera, row.ra, row.dec, row.position_angle)
         if where not in shared:
             shared[where] = camera.places(*where[1:], densities)
-        kind = tuple(row[name] for name in ("camera", "channel", "image_type", "exposure_time_s", "lamp", "settings"))
+        kind = (row.camera, row.channel, row.image_type, row.exposure_time_s, row.lamp, row.settings)
         if kind not in prices:
-            prices[kind] = _price(row, variants.variant(row["settings"], mission, accuracy, forced or {}), truth)
+            prices[kind] = _price(row, variants.variant(row.settings, mission, accuracy, forced or {}), truth)
         _append(columns, row, wanted, camera, shared[where], prices[kind])
     seconds = np.array(columns["seconds"], float)
     numbers = np.array(columns["exposure_id"], np.int64)
@@ -104,15 +105,20 @@ class _Camera:
 
 
 def _append(
-    columns: dict[str, list[Any]], row: Row, wanted: tuple[str, ...], camera: _Camera, places: _Places, cost: Price
+    columns: dict[str, list[Any]],
+    row: ExposureRow,
+    wanted: tuple[str, ...],
+    camera: _Camera,
+    places: _Places,
+    cost: Price,
 ) -> None:
-    looks = sees_sky(row["channel"], row["image_type"])
+    looks = sees_sky(row.channel, row.image_type)
     for i in [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors)):
         galaxies, stars = (places.density[:, i] * (camera.area[i] * looks)).tolist()
         pixels = int(camera.pixels[i])
-        columns["exposure_id"].append(row["exposure_id"])
+        columns["exposure_id"].append(row.exposure_id)
         columns["detector"].append(camera.detectors[i].name)
-        columns["channel"].append(row["channel"])
+        columns["channel"].append(row.channel)
         columns["ra"].append(places.ra[i])
         columns["dec"].append(places.dec[i])
         columns["radius"].append(float(camera.radius[i]))
@@ -124,15 +130,15 @@ def _append(
         columns["bytes"].append(cost.bytes(pixels))
 
 
-def _price(row: Row, own: Variant, truth: Sequence[str]) -> Price:
+def _price(row: ExposureRow, own: Variant, truth: Sequence[str]) -> Price:
     """Of the detectors of an exposure.
 
     Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
     """
-    channel, kind = str(row["channel"]), str(row["image_type"])
+    channel, kind = row.channel, row.image_type
     looks, effects = sees_sky(channel, kind), registry.effects_or_none(channel, kind)
     if effects is not None:
-        first = camera_detectors.detectors(str(row["camera"]), own.mission)[0]
+        first = camera_detectors.detectors(row.camera, own.mission)[0]
         scene = replace(scene_of.scene_of(row, first, own.mission, own.accuracy), forced=own.forced)
         scene = scene_of.with_own_light(scene, registry.CHANNELS[channel], effects)
         effects = tuple(e for e in effects if own.forced.get(e.name, looks or e.needed_if(scene)))

@@ -36,7 +36,7 @@ def products(
         if content in rendered.maps:
             images[content] = [Image(rendered.maps[content], headers.truth_cards(rendered, content))]
     exposure, detector = rendered.exposure, rendered.detector
-    stem = f"images/{int(exposure['exposure_id']):06d}/{exposure['channel']}_{exposure['band']}_{detector.name}"
+    stem = f"images/{exposure.exposure_id:06d}/{exposure.channel}_{exposure.band}_{detector.name}"
     paths = {content: f"{stem}_{content}.fits" for content in images}
     ra, dec = astrometry.centre(detector, rendered.wcs)
     n = len(images)
@@ -44,10 +44,10 @@ def products(
         {
             "path": list(paths.values()),
             "content": list(images),
-            "exposure_id": [int(exposure["exposure_id"])] * n,
+            "exposure_id": [exposure.exposure_id] * n,
             "detector": [detector.name] * n,
-            "channel": [str(exposure["channel"])] * n,
-            "band": [str(exposure["band"])] * n,
+            "channel": [exposure.channel] * n,
+            "band": [exposure.band] * n,
             "ra": [ra] * n,
             "dec": [dec] * n,
             "s_region": [astrometry.s_region(detector, rendered.wcs)] * n,

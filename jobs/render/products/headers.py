@@ -68,22 +68,22 @@ def truth_cards(rendered: Rendered, content: str) -> tuple[Card, ...]:
 def _common(rendered: Rendered) -> tuple[Card, ...]:
     exposure, scene = rendered.exposure, rendered.scene
     return (
-        ("INSTRUME", str(exposure["camera"]), "camera"),
-        ("CHANNEL", str(exposure["channel"]), "channel"),
+        ("INSTRUME", exposure.camera, "camera"),
+        ("CHANNEL", exposure.channel, "channel"),
         ("DETECTOR", rendered.detector.name, "detector"),
-        ("FILTER", str(exposure["band"]), "passband"),
-        ("IMAGETYP", str(exposure["image_type"]), "image type"),
-        *((("LAMP", int(exposure["lamp"]), "LED of the calibration unit"),) if exposure.get("lamp") else ()),
-        ("EXPOSURE", int(exposure["exposure_id"]), "identifier of the exposure"),
+        ("FILTER", exposure.band, "passband"),
+        ("IMAGETYP", exposure.image_type, "image type"),
+        *((("LAMP", exposure.lamp, "LED of the calibration unit"),) if exposure.lamp else ()),
+        ("EXPOSURE", exposure.exposure_id, "identifier of the exposure"),
         ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
-        ("DATE-OBS", _date(float(exposure["mjd"])), "start of the exposure"),
-        ("MJD-OBS", float(exposure["mjd"]), "[d] start of the exposure"),
+        ("DATE-OBS", _date(exposure.mjd), "start of the exposure"),
+        ("MJD-OBS", exposure.mjd, "[d] start of the exposure"),
         ("TIMESYS", "UTC", "time scale of DATE-OBS and MJD-OBS"),
         *astrometry.cards(rendered.wcs),
         ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] at the boresight"),
         ("ZEROPNT", rendered.zero_point, "[mag] AB of 1 electron/s"),
         ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] of a point source, pixel included"),
-        ("SEEING", float(exposure["seeing"]), "[arcsec] FWHM of the atmosphere"),
+        ("SEEING", exposure.seeing, "[arcsec] FWHM of the atmosphere"),
         ("NSOURCES", len(rendered.sources), "number of sources drawn"),
         ("NMOVING", int((rendered.sources.length > 0).sum()), "of them moving: bodies of the Solar System"),
         ("SRCREACH", rendered.complete, "[arcsec] beyond the detector: sources complete"),
@@ -135,8 +135,8 @@ def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:
     """EFFECTn = name, whether it was applied, and its contribution over what would be noticed (margin); EFKEYn seed."""
     cards: list[Card] = []
     exposed = rendered.exposure
-    where = f"exposure {exposed['exposure_id']}"
-    known = {e.name: e for e in effects_of(str(exposed["channel"]), str(exposed["image_type"]), where)}
+    where = f"exposure {exposed.exposure_id}"
+    known = {e.name: e for e in effects_of(exposed.channel, exposed.image_type, where)}
     for number, decision in enumerate(rendered.decisions, start=1):
         state = ("on" if decision.applied else "off") + (" (forced)" if decision.forced else "")
         cards.append((f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1"))

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import pyarrow as pa
@@ -18,6 +19,7 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.store import read
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import digest, file_sha256
+from lake_schema.tables.exposures import ExposureRow
 
 
 def product_keys(
@@ -36,7 +38,7 @@ def product_keys(
         **{key: facts[key] for key in ("request", "mission", "code")},
         "library": [flux_facts.get("files"), flux_facts.get("sources")],
     }
-    rows = {row["exposure_id"]: row for row in exposures.to_pylist()}
+    rows = {row.exposure_id: row for row in map(ExposureRow.of, exposures.to_pylist())}
     files = {
         name: (catalogue_rows.deflection_of(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes]))
         for name, fluxes in CATALOGUES
@@ -45,12 +47,12 @@ def product_keys(
         files[LENSES] = catalogue_rows.deflection_of(inputs["galaxies"]), _files_of_cells(inputs[LENSES])
 
     def catalogues(task: Json) -> list[list[tuple[str, ...]]]:
-        camera, detector = rows[task["exposure_id"]]["camera"], task["detector"]
-        reach = stamp_sizes.reach(detectors.detector(camera, detector, mission).pixel_scale)
+        exposure, detector = rows[task["exposure_id"]], task["detector"]
+        reach = stamp_sizes.reach(detectors.detector(exposure.camera, detector, mission).pixel_scale)
         reaches = {name: reach for name in files}
         reaches["galaxies"] = max(FARTHEST, reach)
         # Of the sources stars alone have spikes.
-        if registry.CHANNELS[rows[task["exposure_id"]]["channel"]].pupil is not None:
+        if registry.CHANNELS[exposure.channel].pupil is not None:
             reaches["stars"] = max(FARTHEST, reach)
         return [
             sorted({sums for cell in selection.within(task, deflection, reaches[name]) for sums in found.get(cell, ())})
@@ -58,10 +60,10 @@ def product_keys(
         ]
 
     def own(task: Json) -> Json:
-        row, files = rows[task["exposure_id"]], {}
-        if psf := row["psf"]:
+        exposure, files = rows[task["exposure_id"]], {}
+        if psf := exposure.psf:
             files["psf"] = facts["psf"][str(from_file.file_of(psf, task["detector"]))]
-        if "bodies" in facts and sees_bodies(row["channel"], row["image_type"]):
+        if "bodies" in facts and sees_bodies(exposure.channel, exposure.image_type):
             (files["bodies"],) = facts["bodies"].values()
         return files
 
@@ -69,7 +71,7 @@ def product_keys(
         digest(
             {
                 **shared,
-                "exposure": rows[task["exposure_id"]],
+                "exposure": asdict(rows[task["exposure_id"]]),
                 "task": {name: task[name] for name in ("detector", "cells", "radius")},
                 "catalogues": catalogues(task) if task["cells"] else [],
                 **own(task),

@@ -23,7 +23,7 @@ def truth(rendered: Rendered) -> pa.Table:
     trail = np.zeros((n, 2)) if sources.trail is None else sources.trail
     return RENDERED_TRUTH.build(
         {
-            "exposure_id": np.full(n, int(rendered.exposure["exposure_id"]), np.int64),
+            "exposure_id": np.full(n, rendered.exposure.exposure_id, np.int64),
             "detector": [rendered.detector.name] * n,
             "id": sources.ids,
             "x": sources.column,

@@ -142,7 +142,7 @@ def sources(
     own      : a day's (MJD) bodies in place of the embedded population
     """
     exposure, system, band = aim.exposure, aim.wcs, aim.band
-    start, seconds = float(exposure["mjd"]), float(exposure["exposure_time_s"])
+    start, seconds = exposure.mjd, exposure.exposure_time_s
     centre = astrometry.centre(aim.detector, system)
     # An exposure belongs to the day that it begins on.
     day = int(np.floor(start))

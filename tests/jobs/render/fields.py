@@ -17,6 +17,7 @@ from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.source_list import Sources
 from lake_schema.ids import source_id
 from lake_schema.mission.configuration import resolve
+from lake_schema.tables.exposures import ExposureRow
 
 MISSION = resolve()
 
@@ -93,11 +94,23 @@ def moments(image):
 def rendered(
     exposed, detector, tables, mission, accuracy, seed=1, forced=None, truth=(), progress=None, passband=None, **rows
 ):
-    """One detector; tables : galaxies, their fluxes, stars, theirs."""
+    """One detector; exposed : columns of its exposure;  tables : galaxies, their fluxes, stars, theirs."""
     variant = Variant(mission, accuracy, forced or {})
-    return render.render(Aim.of(exposed, detector, passband), Rows(*tables, **rows), variant, seed, truth, progress)
+    return render.render(
+        Aim.of(exposure(**exposed), detector, passband), Rows(*tables, **rows), variant, seed, truth, progress
+    )
+
+
+def exposure(**known):
+    """A row of the table `exposures`, of which some columns matter."""
+    nominal = {
+        "exposure_id": 1, "channel": "VIS", "camera": "vis", "band": "euclid_vis", "image_type": "science",
+        "ra": 0.0, "dec": 0.0, "position_angle": 0.0, "mjd": 60905.0, "exposure_time_s": 100.0,
+        "sky": 0.0, "seeing": 0.0, "zero_point": 25.93, "survey": "test",
+    }  # fmt: skip
+    return ExposureRow(**{**nominal, **known})
 
 
 def aimed(detector, system, band, exposed=MappingProxyType({}), channel=vis.CHANNEL):
     """A detector that looks somewhere, in an exposure of which no more is known."""
-    return Aim(exposed, detector, system, band, channel, channel.effects["science"])
+    return Aim(exposure(**exposed), detector, system, band, channel, channel.effects["science"])

@@ -19,7 +19,7 @@ from jobs.request.from_toml import parse
 from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render import fields
-from tests.jobs.render.fields import fluxes, galaxies, stars
+from tests.jobs.render.fields import exposure, fluxes, galaxies, stars
 
 EXAMPLE = Path(__file__).parents[3] / "requests" / "vis_calibration.toml"
 # As in other tests, so that they share the planes of the PSF.
@@ -101,7 +101,7 @@ def test_each_is_rendered_and_read(planned, tmp_path, key, least, most):
         assert (told is not None) == (decision.applied and decision.name in effects)
         if told is not None:
             mine = np.random.Philox(key=np.array([int(told[:16], 16), int(told[16:], 16)], np.uint64))
-            identity = rendered.numbers_of(effects[decision.name], row, "3-4", planned[0].seed)
+            identity = rendered.numbers_of(effects[decision.name], exposure(**row), "3-4", planned[0].seed)
             again = rng.stream(*identity)
             assert np.random.Generator(mine).random() == again.random()
 
@@ -160,7 +160,7 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
     row = next(row for (name, *_), row in planned[2].items() if name == kind)
     _, mission, _ = planned
     detector = replace(detectors.detector("vis", "3-4", mission), nx=32, ny=32, middle=0)
-    scene = scene_of.scene_of(row, detector, mission, planned[0].accuracy)
+    scene = scene_of.scene_of(exposure(**row), detector, mission, planned[0].accuracy)
 
     def keys(forced):
         found = {}
@@ -174,7 +174,7 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
             return replace(effect, apply=apply)
 
         def stream(effect):
-            return rng.stream(*rendered.numbers_of(effect, row, "3-4", 1))
+            return rng.stream(*rendered.numbers_of(effect, exposure(**row), "3-4", 1))
 
         apply_all(
             np.full((32, 32), 50.0), [watched(e) for e in vis.EFFECTS[kind]], replace(scene, forced=forced), stream

@@ -1,6 +1,6 @@
 """What a task reads: everything near, what is bright farther out, and how far that is all there is."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import pyarrow as pa
@@ -14,12 +14,13 @@ from jobs.render.camera import astrometry, pointing
 from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.settings import settings_for
 from jobs.render.exposure import visible_sources
+from jobs.render.exposure.records import Rows
 from jobs.render.products import keys
 from jobs.render.sources import catalogue_rows, galaxy_shapes, selection
 from lake_schema import sky
 from tests.jobs.render import fields
 from tests.jobs.render.exposure.test_render import field as field_of
-from tests.jobs.render.fields import MISSION, fluxes, galaxies, small, spread, stars
+from tests.jobs.render.fields import MISSION, exposure, fluxes, galaxies, small, spread, stars
 
 BAND, DETECTOR = "lsst_r", small("lsstcam", "R22_S11")
 MARGIN = MISSION.value("survey.selection_margin", "arcsec")
@@ -72,7 +73,7 @@ def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
     if found:
         cells = sky.cell_of([task["ra"]], [task["dec"] + distance / 3600], 8)
         wanted = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist()) if drawn is None else drawn(task)
-        least = visible_sources.least_flux(exposed, DETECTOR, MISSION, SURVEY)
+        least = visible_sources.least_flux(exposure(**exposed), DETECTOR, MISSION, SURVEY)
         body, light, complete = catalogue_rows.sources(
             Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], BAND, FARTHER, least
         )
@@ -156,10 +157,10 @@ def test_the_bound_on_what_shows_holds():
 def test_a_frame_that_no_source_shows_in_reads_none(dark):
     exposed = {**field_of("VIS")[1], **dark}
     detector, task = small("vis", "3-4"), place()
-    least = visible_sources.least_flux(exposed, detector, MISSION, SURVEY)
+    least = visible_sources.least_flux(exposure(**exposed), detector, MISSION, SURVEY)
     assert least == np.inf
     cells = sky.cell_of([task["ra"]], [task["dec"]], 8)
-    assert np.isfinite(visible_sources.least_flux(field_of("VIS")[1], detector, MISSION, SURVEY))
+    assert np.isfinite(visible_sources.least_flux(exposure(**field_of("VIS")[1]), detector, MISSION, SURVEY))
     body = Catalogue(galaxies(task["ra"], task["dec"], **GIANT), cells, set(cells.tolist()))
     rows, light, complete = catalogue_rows.sources(body, body, task, [], BAND, FARTHER, least)
     assert len(rows) == len(light) == 0
@@ -171,7 +172,7 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     detector, task = small("vis", "3-4"), place()
     exposed = {**field_of("VIS")[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
     band = passbands.load("euclid_vis")
-    spikes = visible_sources.spike_flux(exposed, detector, MISSION, SURVEY, band)
+    spikes = visible_sources.spike_flux(exposure(**exposed), detector, MISSION, SURVEY, band)
     # A star of 11.2 mag where those of all magnitudes end (3.4 minutes of arc), in a nominal exposure.
     assert 23.9 - 2.5 * np.log10(spikes) == pytest.approx(11.2, abs=0.3)
     rows = stars([task["ra"]] * 2, [task["dec"] - 0.3] * 2)
@@ -179,15 +180,15 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     cells = sky.cell_of(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 8)
     drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
-    least = visible_sources.least_flux(exposed, detector, MISSION, SURVEY)
+    least = visible_sources.least_flux(exposure(**exposed), detector, MISSION, SURVEY)
     for limit, wanted in ((spikes, [0]), (np.inf, [])):
         found, shining, complete = catalogue_rows.sources(*catalogues, task, [], "euclid_vis", 85.0, least, limit)
         assert found.equals(rows.take(pa.array(wanted, pa.int64())))
         assert shining["id"].equals(found["id"])
         assert complete == 85.0
     for other in ({"image_type": "dark"}, {"exposure_time_s": 0.0}, {"psf": "own.fits"}):
-        assert visible_sources.spike_flux({**exposed, **other}, detector, MISSION, SURVEY, band) == np.inf
-    assert visible_sources.spike_flux(field_of("EXT")[1], DETECTOR, MISSION, SURVEY, band) == np.inf
+        assert visible_sources.spike_flux(exposure(**{**exposed, **other}), detector, MISSION, SURVEY, band) == np.inf
+    assert visible_sources.spike_flux(exposure(**field_of("EXT")[1]), DETECTOR, MISSION, SURVEY, band) == np.inf
 
 
 @dataclass
@@ -215,7 +216,7 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     """One of m 7 and two minutes of arc, a third of a degree away; a small one, and a faint one, are not drawn."""
     detector, task = small(camera, name), place()
     exposed = {**field_of(channel)[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
-    limit = visible_sources.outer_flux(exposed, detector, MISSION, SURVEY)
+    limit = visible_sources.outer_flux(exposure(**exposed), detector, MISSION, SURVEY)
     form = {"bulge_sersic_index": [4.0, 1.0, 4.0], "bulge_half_light_radius": [120.0, 2.0, 120.0]}
     rows = galaxies([task["ra"]] * 3, [task["dec"] - 0.3] * 3, bulge_fraction=1.0, **form)
     mags = np.array([7.0, 7.0, 27.0])
@@ -229,14 +230,15 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     system = astrometry.wcs(detector, *pointing.boresight_for(detector, task["ra"], task["dec"], 0.0))
     electrons = shining["f_nu_euclid_vis"].to_numpy() * 560.53 * 10 ** (0.4 * (25.93 - 23.9))
     noise, settings = 12.0, settings_for(SURVEY)
-    seen, sizes = visible_sources.sources_of(
-        (found, electrons), (stars([], []), np.zeros(0)), detector, system, spread(camera), noise, settings,
-        passbands.load("euclid_vis" if channel == "VIS" else "lsst_r"),
-    )  # fmt: skip
+    aim = fields.aimed(detector, system, passbands.load("euclid_vis" if channel == "VIS" else "lsst_r"))
+    given = Rows(found, shining, stars([], []), shining.slice(0, 0))
+    seen, sizes = visible_sources.sources_of(given, (electrons, np.zeros(0)), aim, spread(camera), noise, settings)
     assert seen.ids.tolist() == rows["id"].to_pylist()[:1]
     image = stamps.draw(seen, sizes, spread(camera), detector.nx, detector.ny)
     assert image.min() > 0.1 * noise
-    assert visible_sources.outer_flux({**exposed, "image_type": "bias"}, detector, MISSION, SURVEY) == np.inf
+    assert (
+        visible_sources.outer_flux(exposure(**{**exposed, "image_type": "bias"}), detector, MISSION, SURVEY) == np.inf
+    )
 
 
 def test_a_product_is_of_what_it_may_show_from_far_away():
@@ -246,8 +248,8 @@ def test_a_product_is_of_what_it_may_show_from_far_away():
     cells["far"] = [int(sky.cell_of([task["ra"]], [task["dec"] - 0.3], 8)[0])]
     assert not set(cells["near"]) & set(cells["far"])
     some = [
-        {"exposure_id": 1, "camera": "vis", "channel": "VIS", "psf": ""},
-        {"exposure_id": 2, "camera": "lsstcam", "channel": "EXT", "psf": ""},
+        asdict(exposure(exposure_id=1, camera="vis", channel="VIS", psf="")),
+        asdict(exposure(exposure_id=2, camera="lsstcam", channel="EXT", psf="")),
     ]
     tasks = [
         {**task, "exposure_id": 1, "detector": "3-4", "cells": 1},

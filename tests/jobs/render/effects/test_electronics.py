@@ -13,6 +13,7 @@ from jobs.render.exposure.rendered import numbers_of
 from jobs.rng import stream
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render.fields import exposure
 
 SCENE = Scene(resolve(), "vis", 560.53, 0.25, 1e4)
 CURVE = (0.05, 2.28e5, 0.01, 2e3)
@@ -149,7 +150,7 @@ def test_columns_take_the_same_charge_in_every_exposure():
         for mjd in (60905.0, 60906.0):
 
             def own(effect, when=mjd, name=detector):
-                return stream(*numbers_of(effect, {**row, "mjd": when}, name, 1))
+                return stream(*numbers_of(effect, exposure(**row, mjd=when), name, 1))
 
             both = (charge_injection.EFFECT, charge_injection.NOISE)
             found[detector, mjd] = apply_all(np.zeros((900, 200)), both, SCENE, own)[0]

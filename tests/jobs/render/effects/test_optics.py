@@ -19,6 +19,7 @@ from jobs.render.exposure import rendered
 from jobs.render.psf import euclid
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render.fields import exposure
 
 MISSION = resolve()
 PLACES = ("1-1", "3-4", "6-2")
@@ -394,7 +395,7 @@ def test_light_of_a_trail_is_seen_by_the_pixels_that_it_falls_on():
     frame = np.random.default_rng(2).uniform(0.0, 1e5, (ny, nx))
 
     def stream(effect):
-        return rng.stream(*rendered.numbers_of(effect, row, "3-4", 1))
+        return rng.stream(*rendered.numbers_of(effect, exposure(**row), "3-4", 1))
 
     both = (readout_trail.EFFECT, pixel_response.EFFECT)
     found, _ = apply_all(frame, both, replace(one, forced={"readout_trail": True, "pixel_response": True}), stream)

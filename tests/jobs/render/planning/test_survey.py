@@ -27,7 +27,7 @@ from lake_schema import sky
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import validate
-from lake_schema.tables.exposures import EXPOSURES
+from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 from lake_schema.tables.tasks import TASKS
 
 MISSION = resolve()
@@ -234,7 +234,7 @@ def test_an_exploration_is_the_product_of_requests(tmp_path):
     assert sorted({v.mission.value("vis.read_noise") for v in own}) == [4.0, 5.0, 6.0]
     assert {v.accuracy.flux for v in own} == {5e-3, 1e-3}
     # Each variant has the same noise but for what it changes.
-    assert len({image_types.identity(row) for row in exposures.to_pylist()}) == 1
+    assert len({image_types.identity(ExposureRow.of(row)) for row in exposures.to_pylist()}) == 1
     forced = variants.variant('{"effects.full_well": false}', MISSION, accuracy.SURVEY, {"full_well": True}).forced
     assert forced == {"full_well": False}
 
@@ -245,7 +245,7 @@ def test_a_pointing_in_front_changes_nobody_else_s_noise(tmp_path):
     both, _ = planned(tmp_path, pointing=[first, second])
     (a,), (_, b) = alone.to_pylist(), both.to_pylist()
     assert a["exposure_id"] != b["exposure_id"]
-    assert image_types.identity(a) == image_types.identity(b)
+    assert image_types.identity(ExposureRow.of(a)) == image_types.identity(ExposureRow.of(b))
 
 
 # ------------------------------------------------------------------------------------------------ ground surveys
