@@ -33,7 +33,7 @@ def drawn(camera, electrons, seeing=None, side=256, accuracy=SURVEY, most=1024, 
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, beam, noise, settings)
     light = np.zeros(1)
     sizes, floors = np.minimum(sizes, most), stamp_sizes.floors(source.electrons, noise, settings)
-    return stamps.draw(source, sizes, beam, side, side, floors=floors, drawn=light), sizes[0], light[0]
+    return stamps.draw(source, sizes, beam, side, side, floors=floors, tally=stamps.Tally(light)), sizes[0], light[0]
 
 
 @given(

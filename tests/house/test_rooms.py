@@ -20,13 +20,6 @@ MODULES, LINES, FUNCTION, PARAMETERS = 16, 400, 60, 8
 LARGER = {
     "jobs/catalogue/galaxies/galaxies.py:model": (10, 60),
     "jobs/fluxes/libraries/stellar.py:matching": (9, 60),
-    "jobs/render/drawing/far_light.py:add": (10, 61),
-    "jobs/render/drawing/far_light.py:unfold": (13, 60),
-    "jobs/render/drawing/stamp_sizes.py:shone_on": (11, 60),
-    "jobs/render/drawing/stamps.py:_draw": (11, 81),
-    "jobs/render/drawing/stamps.py:_draw_some": (13, 60),
-    "jobs/render/drawing/stamps.py:draw": (9, 60),
-    "jobs/render/drawing/wings.py:galaxies": (9, 60),
     "jobs/render/effects/light/ghosts.py:apply": (9, 60),
 }
 

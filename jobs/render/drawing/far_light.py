@@ -3,6 +3,7 @@
 So far out the rings of a band's wavelengths overlap: what is left of them falls as r^-3. Each straight bar draws two
 spikes across itself, as wide as it is long, with the fringes of its width along them.
 
+Star      one of them
 add       what a star shines outside the plane, onto a frame
 unfold    what of it the plane has inside, taken off
 left      how the plane fades there
@@ -14,6 +15,7 @@ Ref : Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,39 +37,42 @@ _PART = 16.0
 _STAR_S, _TRAIL_S, _LONGER_S, _UNFOLD_S = 7e-9, 8e-8, 4e-10, 1.2e-7
 
 
-def add(
-    frame: Int,
-    column: float,
-    row: float,
-    electrons: float,
-    photons: Float | None,
-    size: int,
-    least: float,
-    edges: Edges | None,
-    trail: Float | None = None,
-    unit: float = FIXED_POINT,
-) -> None:
-    """Adds what a star shines outside its plane, which fades by `left`, to a frame that has `unit` of an electron.
+@dataclass(frozen=True, slots=True)
+class Star:
+    """A point that shines beyond its PSF's plane.
 
-    photons : [w] share of each sub-band, None = equal;  size : of the plane, pixels
+    column, row : pixels, of its middle where it moves;  electrons : expected
+    photons : [w] share of each sub-band, None = equal
+    size    : of the plane, pixels
     least   : electrons in a pixel that may be left out
-    trail   : [2] pixels that it moves by, with its plane, (column, row) in its middle; None: it is at rest
+    edges   : what diffracts; None: nothing does
+    trail   : [2] pixels that it moves by, with its plane; None: it is at rest
     """
-    if edges is None:
+
+    column: float
+    row: float
+    electrons: float
+    photons: Float | None
+    size: int
+    least: float
+    edges: Edges | None
+    trail: Float | None = None
+
+
+def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
+    """Adds what a star shines outside its plane, which fades by `left`, to a frame that has `unit` of an electron."""
+    if star.edges is None:
         return
-    photons, turned, length, along = _seen(photons, edges, trail)
-    ny, nx = frame.shape
-    ends = np.array([-0.5, 0.5]) * length
-    columns, rows = column + ends * along[0], row + ends * along[1]
-    # Beyond the farthest corner's pixel.
-    farthest = float(np.hypot(max(columns.max() + 1.0, nx - columns.min()), max(rows.max() + 1.0, ny - rows.min())))
+    column, row, edges = star.column, star.row, star.edges
+    photons, turned, length, along = _seen(star.photons, edges, star.trail)
+    farthest = _farthest_corner(frame, column, row, length, along)
     if length > 0.0:
         farthest = min(farthest, FARTHEST / edges.pixel_scale)
-    level = electrons * spikes.ring(edges, photons)
-    lines = electrons * spikes.spikes(edges, photons, max(farthest, edges.period))
-    faintest = _FAINTEST * least
+    level = star.electrons * spikes.ring(edges, photons)
+    lines = star.electrons * spikes.spikes(edges, photons, max(farthest, edges.period))
+    faintest = _FAINTEST * star.least
     radius = min((level / faintest) ** (1.0 / 3.0), farthest) if faintest > 0.0 else farthest
-    inner = size / 2 - SPARED
+    inner = star.size / 2 - SPARED
     # What a spike shows outside the plane: so far out, so wide.
     shown = lines[:, int(inner / LONG) :] > faintest
     out, across = (np.flatnonzero(shown.any(axis=axes)) for axes in ((0, 2), (0, 1)))
@@ -78,53 +83,36 @@ def add(
         lines /= length
         fine = length / math.ceil(length / _finest(edges))
         far_light.streak(
-            frame,
-            column,
-            row,
-            *along,
-            length,
-            inner,
-            level / length,
-            radius,
-            turned,
-            lines,
-            _sums(lines),
-            far,
-            wide,
+            frame, column, row, *along, length, inner, level / length, radius, turned, lines, _sums(lines), far, wide,
             fine,
-        )
+        )  # fmt: skip
         return
     far_light.outside(frame, column, row, inner, level, radius, turned, lines, far, wide)
     far_light.inside(frame, column, row, inner, level, turned, lines)
 
 
-def unfold(
-    stamp: npt.NDArray[Any],
-    left: int,
-    low: int,
-    nx: int,
-    ny: int,
-    column: float,
-    row: float,
-    electrons: float,
-    photons: Float | None,
-    size: int,
-    least: float,
-    edges: Edges | None,
-    trail: Float | None = None,
-) -> None:
+def _farthest_corner(frame: Int, column: float, row: float, length: float, along: tuple[float, float]) -> float:
+    """Pixels from a trail to beyond the farthest corner's pixel."""
+    ny, nx = frame.shape
+    ends = np.array([-0.5, 0.5]) * length
+    columns, rows = column + ends * along[0], row + ends * along[1]
+    return float(np.hypot(max(columns.max() + 1.0, nx - columns.min()), max(rows.max() + 1.0, ny - rows.min())))
+
+
+def unfold(star: Star, stamp: npt.NDArray[Any], left: int, low: int, nx: int, ny: int) -> None:
     """Takes off a star's stamp, in place, what its plane's transform had folded into it: a fifth of its corners.
 
-    left, low : the stamp's first pixel on a frame of nx, ny, outside which nothing is done;  others : as of `add`
+    left, low : the stamp's first pixel on a frame of nx, ny, outside which nothing is done
     Of each pixel it is the share that folded light has in all that should be there: the two run through each other, and
     where they cancel there is less than of either.
     """
-    if edges is None:
+    if star.edges is None:
         return
-    photons, turned, length, along = _seen(photons, edges, trail)
-    level, inner = electrons * spikes.ring(edges, photons), size / 2 - SPARED
-    if FOLDED * level / inner**3 > _FAINTEST * least:
-        lines = electrons * spikes.spikes(edges, photons, edges.period) / (length or 1.0)
+    column, row, edges = star.column, star.row, star.edges
+    photons, turned, length, along = _seen(star.photons, edges, star.trail)
+    level, inner = star.electrons * spikes.ring(edges, photons), star.size / 2 - SPARED
+    if FOLDED * level / inner**3 > _FAINTEST * star.least:
+        lines = star.electrons * spikes.spikes(edges, photons, edges.period) / (length or 1.0)
         seen = stamp[max(-low, 0) : max(ny - low, 0), max(-left, 0) : max(nx - left, 0)]
         parts = max(math.ceil(length / _PART), 1)
         places = length * ((np.arange(parts) + 0.5) / parts - 0.5)

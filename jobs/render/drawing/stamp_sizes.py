@@ -20,6 +20,7 @@ from jobs.render.psf import spikes as psf_spikes
 from jobs.render.psf.model import SIDE, Psf
 from jobs.render.sources import galaxy_shapes, selection
 from jobs.render.sources.galaxy_shapes import Shapes
+from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float, Int
 
 # Sides whose transforms are fast; the last bounds memory (its planes have 134 MB).
@@ -139,15 +140,15 @@ def piece_count(length: Float) -> Int:
     return np.maximum(np.ceil(length / _PIECE), 1.0).astype(np.int64)
 
 
-def shone_on(
-    column: Float, row: Float, electrons: Float, sizes: Int, shape: Int, shapes: Shapes, picture: Int | None, psf: Psf,
-    noise: float, nx: int, ny: int,
-) -> npt.NDArray[np.bool_]:  # fmt: skip
+def shone_on(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int, ny: int) -> npt.NDArray[np.bool_]:
     """[n] True of sources at rest of which light may be noticed on the frame: their stamps', or what is drawn beyond.
 
-    column .. picture : as of Sources;  noise : of a pixel, electrons
+    noise : of a pixel, electrons
     """
-    wide = reaches(electrons, sizes, shape, picture, psf, noise)
+    column, row, electrons, shape, shapes = (
+        sources.column, sources.row, sources.electrons, sources.shape, sources.shapes,
+    )  # fmt: skip
+    wide = reaches(electrons, sizes, shape, sources.picture, psf, noise)
     largest = on_largest(shape, sizes)
     farthest = outskirts.reach(
         electrons[largest], shapes.take(shape[largest]), psf.pixel_scale, noise, 0.5 * SIZES[-1] * psf.pixel_scale

@@ -8,18 +8,15 @@ A stamp is large enough that all that comes in is below a part of the flux in th
 largest does not hold has its outer light from real space (outskirts.py). Nothing is lost, nothing is rescaled. A source
 whose stamp lies beside the frame sends in what is drawn beyond its stamp.
 
-draw            sources -> frame
+draw            sources -> frame;  Tally : with what each brought
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import fields, replace
-from functools import partial
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import numpy.typing as npt
 import scipy.fft
 
 from jobs.render.drawing import arcs, far_light, outskirts, stamp_sizes, transfer, wings
@@ -31,7 +28,7 @@ from jobs.render.psf.model import SIDE, Psf
 from jobs.render.sources import galaxy_shapes, selection, sersic
 from jobs.render.sources.galaxy_shapes import Forms, Shapes
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Array, Float, Int
+from lake_schema.arrays import Array, Bool, Float, Int
 
 # In Fourier space such sources are followed to so many times what may be left out of them: at the most three
 # thousandths of what is cut off ring (seeing of two pixels).
@@ -54,25 +51,46 @@ def draw(
     ny: int,
     progress: Callable[[int], None] | None = None,
     floors: Float | None = None,
-    drawn: Float | None = None,
-    unread: tuple[int, int] = (0, 0),
+    tally: Tally | None = None,
 ) -> Float:
     """Expected electrons of the sources alone.
 
     sizes    : int[n] from stamp_sizes;  floors : float[n] from `floors`, None: nothing is left out
     progress : called now and then with the number of sources drawn
-    drawn    : float64[n] to be filled with what of each source's stamp fell onto the frame, electrons
-    unread   : of the frame, the first row that counts for nothing in `drawn`, and the first behind that counts again
+    tally    : to be filled with what of each source's stamp fell onto the frame
     returns  : float64[ny, nx], to half a unit of `kernel.units_of` a source (5e-7 electrons for all but the brightest);
                the same, bit by bit, in any order of the sources
     """
     pieces, trail, whole = in_pieces(sources)
-    of_piece = np.zeros(len(pieces))
     some_floors = None if floors is None else floors[whole]
-    frame = _draw(pieces, trail, whole, sizes[whole], psf, nx, ny, progress, some_floors, of_piece, unread)
-    if drawn is not None:
-        drawn[:] = np.bincount(whole, of_piece, len(sources))
-    return frame
+    one = _prepared(pieces, trail, whole, sizes[whole], psf, some_floors)
+    frame, fallen = np.zeros((ny, nx), np.int64), np.zeros(len(pieces))
+    unread = (0, 0) if tally is None else tally.unread
+    here = selection.touching(pieces.column, pieces.row, one.sizes, nx, ny)
+    done = int(np.sum(~here))
+    for chosen, passed, share in _batches(one, here, in_double_precision(pieces, some_floors)):
+        fallen[chosen] = _draw_some(one, chosen, passed, share, frame, unread)
+        done += len(chosen)
+        if progress is not None:
+            progress(done)
+    _draw_beyond(one, here, frame, fallen, unread)
+    if tally is not None:
+        tally.electrons[:] = np.bincount(whole, fallen, len(sources))
+    layer = wings.wings(pieces.column, pieces.row, pieces.electrons, one.sizes, psf, nx, ny, one.unit)
+    layer += wings.galaxies(pieces.column, pieces.row, one.outside, one.sizes, nx, ny, one.unit)
+    return np.asarray(electrons_of(frame, one.unit, layer, wings.BLOCK, wings.MARGIN))
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What of each source's stamp fell onto the frame.
+
+    electrons : float64[n], filled by `draw`
+    unread    : of the frame, the first row that does not count, and the first behind that counts again
+    """
+
+    electrons: Float
+    unread: tuple[int, int] = (0, 0)
 
 
 def in_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
@@ -95,98 +113,130 @@ def in_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
     return pieces, trail / count[whole, None], whole
 
 
-def _draw(
-    sources: Sources,
-    trail: Float,
-    whole: Int,
-    sizes: Int,
-    psf: Psf,
-    nx: int,
-    ny: int,
-    progress: Callable[[int], None] | None,
-    floors: Float | None,
-    drawn: Float,
-    unread: tuple[int, int],
-) -> Float:
-    frame, unit = np.zeros((ny, nx), np.int64), fourier.units_of(sources.electrons)
-    weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)
-    some, form = _forms(sources)
-    bodies, table = (*_bodies(sources, some, form), trail), sersic.table()
-    stray, farthest, most = _strays(sources, some, form, sizes, psf.pixel_scale)
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """What is known of the pieces [p] before any is drawn.
+
+    trail, whole   : [p, 2] pixels that each moves by, whose piece it is;  sizes : of their stamps
+    weights        : [p, planes] of transfer.basis_weights
+    shapes, form   : of those that have a shape;  bodies, table : the kernel's arguments for each profile
+    cut, deep, reach : how far each is followed in Fourier space, whether farther than others, how far others are
+    left_out       : Fourier samples that may be left out of each
+    outside        : light of galaxies that is drawn beyond their stamps, of which `_draw_some` tells what was taken off
+    curve          : of kernels.frame.returning
+    far, largest   : points that shine beyond the PSF's planes, galaxies that no stamp holds
+    unit           : of the frame's integers to an electron
+    """
+
+    sources: Sources
+    trail: Float
+    whole: Int
+    sizes: Int
+    psf: Psf
+    weights: Float
+    shapes: Shapes
+    form: Forms
+    bodies: tuple[Array, ...]
+    table: Array
+    cut: Float
+    deep: Bool
+    reach: float
+    left_out: Float
+    outside: wings.Outside
+    curve: Float
+    far: Bool
+    largest: Bool
+    unit: float
+
+    def star(self, parts: Int) -> far_light.Star:
+        """A point at rest, or pieces of one trail."""
+        sources, first = self.sources, parts[0]
+        electrons = float(sources.electrons[parts].sum())
+        return far_light.Star(
+            float(sources.column[parts].mean()), float(sources.row[parts].mean()), electrons,
+            None if sources.photons is None else sources.photons[first], SIDE, self.left_out[first] * electrons,
+            self.psf.edges, self.trail[parts].sum(axis=0),
+        )  # fmt: skip
+
+    def outskirts(self, i: int, nx: int, ny: int) -> outskirts.Outskirts:
+        """Of galaxy i."""
+        sources = self.sources
+        own = np.array([np.count_nonzero(sources.shape[:i] >= 0)])
+        x, y = sources.column[i], sources.row[i]
+        # The corners of the stamps about its own, and of the frame.
+        farthest = max(1.5 * SIZES[-1] + 1.0, x, nx - x, y, ny - y)
+        one = Forms(*(getattr(self.form, part.name)[own] for part in fields(Forms)))
+        light = float(sources.electrons[i])
+        return outskirts.of_galaxy(self.shapes.take(own), one, light, self.psf, self.weights[i], farthest)
+
+
+def _prepared(sources: Sources, trail: Float, whole: Int, sizes: Int, psf: Psf, floors: Float | None) -> _Prepared:
+    shapes, form = _forms(sources)
+    bodies, table = (*_bodies(sources, shapes, form), trail), sersic.table()
+    profile, farthest, most = _strays(sources, shapes, form, sizes, psf.pixel_scale)
     x0, y0 = (np.rint(position).astype(np.int64) - sizes // 2 for position in (sources.column, sources.row))
-    curve = returning(sizes, sources.column - x0, sources.row - y0, stray, most)
-    # Of stamps that are not drawn, what would come in: 5 % from what would be taken off, 0.1 % of many together.
-    taken = curve[:, -1].copy()
+    curve = returning(sizes, sources.column - x0, sources.row - y0, profile, most)
     passing = transfer.passing(psf)
     left_out = np.zeros(len(sources)) if floors is None else floors
     body, fraction, bulge, disk, _, row, *_ = bodies
     bodied = body, fraction, bulge, disk, table, row
     cut = fourier.reaches(passing, transfer.STEP, *bodied, left_out)
-    reach = transfer.STEP * len(passing)
-    deep = _ringing(cut, sources.electrons, sizes, left_out, psf, bodied)
-    far = stamp_sizes.shining(sources.electrons, sizes, sources.shape, sources.picture, psf)
-    largest = stamp_sizes.on_largest(sources.shape, sizes)
-
-    def star(parts: Int) -> dict[str, Any]:
-        # A point at rest, or pieces of one trail.
-        electrons, first = float(sources.electrons[parts].sum()), parts[0]
-        return {
-            "column": float(sources.column[parts].mean()), "row": float(sources.row[parts].mean()),
-            "electrons": electrons, "photons": None if sources.photons is None else sources.photons[first],
-            "size": SIDE, "least": left_out[first] * electrons, "edges": psf.edges, "trail": trail[parts].sum(axis=0),
-        }  # fmt: skip
-
-    def of_largest(i: int) -> outskirts.Outskirts:
-        return _outskirts(sources, i, some, form, psf, weights, nx, ny)
-
-    def add_outskirts(i: int, of: outskirts.Outskirts) -> None:
-        hole, place = (int(x0[i]), int(y0[i]), int(sizes[i])), (float(sources.column[i]), float(sources.row[i]))
-        drawn[i] += outskirts.add(of, frame, *place, hole, unread, unit) / unit
-
-    here, precise = selection.touching(sources.column, sources.row, sizes, nx, ny), in_double_precision(sources, floors)
-    done = int(np.sum(~here))
-    for size in np.unique(sizes):
-        alone, together = (found[here[found]] for found in split_by_size(sources, sizes, psf, int(size), precise))
-        shared = transfer.transfer(psf, int(size), reach) if len(together) else None
-        own = transfer.grid(int(size), float(cut[alone].max()) if size > SIDE else reach) if len(alone) else None
-        batch = max(_BATCH // int(size) ** 2, 2)
-        groups = [together[i : i + batch] for i in range(0, len(together), batch)]
-        for number, chosen in enumerate([*groups, *alone[:, None]]):
-            if own is not None and number >= len(groups):
-                dtype = np.float64 if precise[chosen[0]] else np.float32
-                seen = transfer.grid(int(size), float(cut[chosen[0]])) if deep[chosen[0]] else own
-                passed = transfer.collapsed(psf, weights[chosen[0]], seen, dtype, bool(far[chosen[0]]))
-                if (picture := sources.picture_of(int(chosen[0]))) is not None:
-                    passed = arcs.through(passed, picture, sources.jacobian[chosen[0]])
-                share = np.ones((1, 1), dtype)
-            elif shared is not None:
-                passed, share = shared, weights[chosen].astype(np.float32)
-            finish = partial(far_light.unfold, **star(chosen)) if far[chosen[0]] else None
-            outer = of_largest(int(chosen[0])) if largest[chosen[0]] else None
-            if outer is not None:
-                finish = partial(_finish_largest, sources, int(chosen[0]), outer)
-            added = _draw_some(
-                frame, sources, chosen, passed, share, bodies, table, cut, curve, taken, finish, unread, unit
-            )
-            drawn[chosen] = added / unit
-            if outer is not None:
-                add_outskirts(int(chosen[0]), outer)
-            done += len(chosen)
-            if progress is not None:
-                progress(done)
-    for i in np.flatnonzero(largest & ~here).tolist():
-        add_outskirts(i, of_largest(i))
-    bright = np.flatnonzero(far)
-    for trailing in np.split(bright, np.flatnonzero(np.diff(whole[bright])) + 1) if len(bright) else []:
-        far_light.add(frame, **star(trailing), unit=unit)
-    layer = wings.wings(sources.column, sources.row, sources.electrons, sizes, psf, nx, ny, unit)
-    layer += wings.galaxies(sources.column, sources.row, stray, taken, farthest, sizes, nx, ny, unit)
-    return np.asarray(electrons_of(frame, unit, layer, wings.BLOCK, wings.MARGIN))
+    return _Prepared(
+        sources, trail, whole, sizes, psf, transfer.basis_weights(psf, sources.photons, sources.column, sources.row),
+        shapes, form, bodies, table, cut, deep=_ringing(cut, sources.electrons, sizes, left_out, psf, bodied),
+        reach=transfer.STEP * len(passing), left_out=left_out,
+        # Of stamps that are not drawn, what would come in: 5 % from what would be taken off, 0.1 % of many together.
+        outside=wings.Outside(profile, curve[:, -1].copy(), farthest), curve=curve,
+        far=stamp_sizes.shining(sources.electrons, sizes, sources.shape, sources.picture, psf),
+        largest=stamp_sizes.on_largest(sources.shape, sizes), unit=fourier.units_of(sources.electrons),
+    )  # fmt: skip
 
 
-def _ringing(
-    cut: Float, electrons: Float, sizes: Int, left_out: Float, psf: Psf, bodied: tuple[Array, ...]
-) -> npt.NDArray[np.bool_]:
+def _batches(one: _Prepared, here: Bool, precise: Bool) -> Iterator[tuple[Int, Transfer, Array]]:
+    """(sources of one size, the PSF's planes that they go through, their shares [n, planes]) of those on the frame.
+
+    precise : those that are drawn in double precision
+    """
+    sources, psf = one.sources, one.psf
+    for size in np.unique(one.sizes).tolist():
+        alone, together = (found[here[found]] for found in split_by_size(sources, one.sizes, psf, size, precise))
+        if len(together):
+            shared, batch = transfer.transfer(psf, size, one.reach), max(_BATCH // size**2, 2)
+            for i in range(0, len(together), batch):
+                chosen = together[i : i + batch]
+                yield chosen, shared, one.weights[chosen].astype(np.float32)
+        if len(alone):
+            own = transfer.grid(size, float(one.cut[alone].max()) if size > SIDE else one.reach)
+        for i in alone.tolist():
+            dtype = np.float64 if precise[i] else np.float32
+            seen = transfer.grid(size, float(one.cut[i])) if one.deep[i] else own
+            passed = transfer.collapsed(psf, one.weights[i], seen, dtype, bool(one.far[i]))
+            if (picture := sources.picture_of(i)) is not None:
+                passed = arcs.through(passed, picture, sources.jacobian[i])
+            yield np.array([i]), passed, np.ones((1, 1), dtype)
+
+
+def _add_outskirts(one: _Prepared, i: int, light: outskirts.Outskirts, frame: Int, unread: tuple[int, int]) -> float:
+    """What galaxy i has outside its stamp, onto the frame; returns the electrons that fell there."""
+    place, size = (float(one.sources.column[i]), float(one.sources.row[i])), int(one.sizes[i])
+    left, low = (int(np.rint(at)) - size // 2 for at in place)
+    return float(outskirts.add(light, frame, *place, (left, low, size), unread, one.unit) / one.unit)
+
+
+def _draw_beyond(one: _Prepared, here: Bool, frame: Int, fallen: Float, unread: tuple[int, int]) -> None:
+    """What galaxies have outside stamps that are not `here`, and points beyond the PSF's planes.
+
+    fallen : float64[p] electrons on the frame, to which the galaxies' are added
+    """
+    ny, nx = frame.shape
+    for i in np.flatnonzero(one.largest & ~here).tolist():
+        fallen[i] += _add_outskirts(one, i, one.outskirts(i, nx, ny), frame, unread)
+    bright = np.flatnonzero(one.far)
+    for trailing in np.split(bright, np.flatnonzero(np.diff(one.whole[bright])) + 1) if len(bright) else []:
+        far_light.add(frame, one.star(trailing), one.unit)
+
+
+def _ringing(cut: Float, electrons: Float, sizes: Int, left_out: Float, psf: Psf, bodied: tuple[Array, ...]) -> Bool:
     """[n] True of sources that are followed so far, in `cut`, that what is cut off behind is not seen to ring.
 
     A hard edge in Fourier space rings by up to three thousandths of what it cuts off. Planes end by themselves.
@@ -206,32 +256,13 @@ def _ringing(
     return deep
 
 
-def _outskirts(
-    sources: Sources, i: int, shapes: Shapes, form: Forms, psf: Psf, weights: Float, nx: int, ny: int
-) -> outskirts.Outskirts:
-    """Of galaxy i; shapes, form : of the sources that have one;  weights : of `transfer.basis_weights`."""
-    own = np.array([np.count_nonzero(sources.shape[:i] >= 0)])
-    x, y = sources.column[i], sources.row[i]
-    # The corners of the stamps about its own, and of the frame.
-    farthest = max(1.5 * SIZES[-1] + 1.0, x, nx - x, y, ny - y)
-    one = Forms(*(getattr(form, part.name)[own] for part in fields(Forms)))
-    return outskirts.of_galaxy(shapes.take(own), one, float(sources.electrons[i]), psf, weights[i], farthest)
-
-
-def _finish_largest(
-    sources: Sources, i: int, outer: outskirts.Outskirts, stamp: Array, left: int, low: int, *_: int
-) -> None:
-    """Takes off galaxy i's stamp, whose first pixel is (left, low) of the frame, what came in at its edges."""
-    outskirts.take_in(outer, stamp, float(sources.column[i]) - left, float(sources.row[i]) - low)
-
-
-def in_double_precision(sources: Sources, floors: Float | None) -> npt.NDArray[np.bool_]:
+def in_double_precision(sources: Sources, floors: Float | None) -> Bool:
     """[n] True of those that are drawn in double precision; floors : of `draw`."""
     wanted = np.zeros(len(sources), bool) if floors is None else floors < ROUNDING
     return np.asarray(wanted | (sources.electrons > BRIGHT))
 
 
-def split_by_size(sources: Sources, sizes: Int, psf: Psf, size: int, precise: npt.NDArray[np.bool_]) -> tuple[Int, Int]:
+def split_by_size(sources: Sources, sizes: Int, psf: Psf, size: int, precise: Bool) -> tuple[Int, Int]:
     """Sources of a size that are drawn each through a PSF of its own, and those that share planes."""
     of_size = sizes == size
     few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW * transfer.plane_count(psf))
@@ -241,42 +272,34 @@ def split_by_size(sources: Sources, sizes: Int, psf: Psf, size: int, precise: np
 
 
 def _draw_some(
-    frame: Int,
-    sources: Sources,
-    chosen: Int,
-    passed: Transfer,
-    weights: Array,
-    bodies: tuple[Array, ...],
-    table: Array,
-    cut: Float,
-    curve: Float,
-    taken: Float,
-    finish: Callable[..., None] | None,
-    unread: tuple[int, int],
-    unit: float,
-) -> Int:
-    """Stamps of one size through one set of planes, onto the frame; returns what `accumulate` does.
-
-    bodies, cut, curve : arrays by source: of `_bodies` and trails; of kernel.reaches; of kernel.returning
-    taken : filled at the chosen with what kernel.take_off took;  finish : what is still done to a stamp of one source
-    """
-    size = passed.grid.size
+    one: _Prepared, chosen: Int, passed: Transfer, share: Array, frame: Int, unread: tuple[int, int]
+) -> Float:
+    """Stamps of one size through one set of planes, onto the frame; returns each source's electrons there."""
+    sources, size = one.sources, passed.grid.size
     column, row = sources.column[chosen], sources.row[chosen]
     x0, y0 = (np.rint(position).astype(np.int64) - size // 2 for position in (column, row))
     kind = np.complex128 if passed.planes.dtype == np.float64 else np.complex64
     zones = np.empty((len(chosen), size, size // 2 + 1), kind)
     some = passed.grid
     fourier.nyquist_zones(
-        zones, passed.planes, some.kx, some.ky, some.runs, some.pieces, some.inner, weights, column - x0, row - y0,
-        sources.electrons[chosen], cut[chosen], table, *(part[chosen] for part in bodies),
+        zones, passed.planes, some.kx, some.ky, some.runs, some.pieces, some.inner, share, column - x0, row - y0,
+        sources.electrons[chosen], one.cut[chosen], one.table, *(part[chosen] for part in one.bodies),
     )  # fmt: skip
     stamps = scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True)
     off = np.zeros(len(chosen))
-    take_off(stamps, column - x0, row - y0, curve[chosen], off)
-    taken[chosen] = off
-    if finish is not None:
-        finish(stamps[0], int(x0[0]), int(y0[0]), frame.shape[1], frame.shape[0])
-    return accumulate(frame, stamps, x0, y0, unread, unit)
+    take_off(stamps, column - x0, row - y0, one.curve[chosen], off)
+    one.outside.electrons[chosen] = off
+    first, left, low, (ny, nx) = int(chosen[0]), int(x0[0]), int(y0[0]), frame.shape
+    # Of these, which are alone, what comes in at the stamp's edges is taken off.
+    outer = one.outskirts(first, nx, ny) if one.largest[first] else None
+    if outer is not None:
+        outskirts.take_in(outer, stamps[0], float(column[0]) - left, float(row[0]) - low)
+    elif one.far[first]:
+        far_light.unfold(one.star(chosen), stamps[0], left, low, nx, ny)
+    fallen = accumulate(frame, stamps, x0, y0, unread, one.unit) / one.unit
+    if outer is not None:
+        fallen[0] += _add_outskirts(one, first, outer, frame, unread)
+    return np.asarray(fallen)
 
 
 def _forms(sources: Sources) -> tuple[Shapes, Forms]:

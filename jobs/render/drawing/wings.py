@@ -7,6 +7,8 @@ drawn here on blocks of pixels, through the mean PSF. So is what the stamps of g
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from jobs.render.drawing.kernels import frame
@@ -47,21 +49,28 @@ def _layer(nx: int, ny: int) -> Int:
     return np.zeros((-(-ny // BLOCK) + 2 * MARGIN, -(-nx // BLOCK) + 2 * MARGIN), np.int64)
 
 
-def galaxies(
-    column: Float, row: Float, stray: Float, light: Float, reach: Float, sizes: Int, nx: int, ny: int, unit: float
-) -> Float:
+class Outside(NamedTuple):
+    """Light of galaxies [n] outside their stamps.
+
+    profile : float64[n, 11] galaxy_shapes.on_the_sky;  electrons : [n] that leave the stamp;  reach : [n] pixels
+    """
+
+    profile: Float
+    electrons: Float
+    reach: Float
+
+
+def galaxies(column: Float, row: Float, outside: Outside, sizes: Int, nx: int, ny: int, unit: float) -> Float:
     """Electrons a pixel of galaxies [n] outside stamps of `sizes`, on the blocks of `wings`.
 
-    stray   : float64[n, 11] profiles.on_the_sky;  light : [n] electrons that leave the stamp;  reach : [n] pixels
     returns : float64[blocks, blocks], the same in any order of the galaxies
     Error   : a galaxy's own light, as if the PSF did nothing to it so far out; what is left on the stamp stays there;
               a block has whole units a pixel: of the faintest little is seen
     """
     out = _layer(nx, ny)
-    some = (light > 0) & selection.touching(column, row, around(2.0 * reach), nx, ny)
-    frame.leaving(
-        out, BLOCK, MARGIN, sizes[some], reach[some], column[some], row[some], stray[some], light[some], unit
-    )  # fmt: skip
+    some = (outside.electrons > 0) & selection.touching(column, row, around(2.0 * outside.reach), nx, ny)
+    profile, electrons, reach = (part[some] for part in outside)
+    frame.leaving(out, BLOCK, MARGIN, sizes[some], reach, column[some], row[some], profile, electrons, unit)
     return out / unit
 
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from jobs import rng
 from jobs.render.channels.aim import Aim
 from jobs.render.drawing import stamp_sizes, stamps
+from jobs.render.drawing.stamps import Tally
 from jobs.render.effects.effect import Effect, apply_all
 from jobs.render.effects.scene import Frame, Scene
 from jobs.render.exposure import limits, rendered, scene_of, truth_maps
@@ -76,7 +77,7 @@ def _drawn(
         return _Drawn(sources, sizes, np.zeros(0), maps, scene), [empty]
     drawn, maps = np.zeros(len(sources)), {}
     frame = stamps.draw(
-        sources, sizes, light.psf, detector.nx, detector.ny, progress, light.floors, drawn, scene.unread
+        sources, sizes, light.psf, detector.nx, detector.ny, progress, light.floors, Tally(drawn, scene.unread)
     )
     scene = scene_of.with_peak(scene, frame)
     if "stars" in truth:

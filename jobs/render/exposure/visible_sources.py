@@ -175,19 +175,18 @@ def sources_of(
     column, row = astrometry.pixel_of_sky(system, ra[kept], dec[kept])
     wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
     sizes = stamp_sizes.stamp_sizes(light[kept], shape[kept], form, spread, noise, settings, wide)
-    here = stamp_sizes.shone_on(
-        column, row, light[kept], sizes, shape[kept], form, picture[kept], spread, noise, detector.nx, detector.ny
-    )
-    kept, column, row = kept[here], column[here], row[here]
-    jacobian = astrometry.jacobian(system, column, row)
+    found = Sources(
+        ids[kept], column, row, np.zeros((len(kept), 2, 2)), light[kept], shape[kept], form, None, picture[kept],
+        arcs.pictures,
+    )  # fmt: skip
+    here = stamp_sizes.shone_on(found, sizes, spread, noise, detector.nx, detector.ny)
+    kept, found = kept[here], found.take(here)
     # Arcs have the colour of what they are an image of.
     coloured = np.concatenate([np.arange(len(catalogue) + len(points)), arcs.source])[kept]
     colourful = spread.planes is not None and len(spread.planes.wavelength) > 1
     photons = _colours(coloured, rows, aim.band) if colourful else None
-    found = Sources(
-        ids[kept], column, row, jacobian, light[kept], shape[kept], form, photons, picture[kept], arcs.pictures
-    )
-    return found, sizes[here]
+    jacobian = astrometry.jacobian(system, found.column, found.row)
+    return replace(found, jacobian=jacobian, photons=photons), sizes[here]
 
 
 def _spikes(electrons: Float, detector: Detector, spread: Psf, noise: float) -> Float:

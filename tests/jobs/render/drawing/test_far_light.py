@@ -42,7 +42,7 @@ def vis():
 def shone(spread, side, column, row, electrons=BRIGHT, least=0.0):
     """What `add` adds to an empty frame, electrons."""
     frame = np.zeros((side, side), np.int64)
-    far_light.add(frame, column, row, electrons, None, SIDE, least, spread.edges)
+    far_light.add(frame, far_light.Star(column, row, electrons, None, SIDE, least, spread.edges))
     return frame / FIXED_POINT
 
 
@@ -176,9 +176,11 @@ def test_a_trail_s_spikes_are_no_comb(vis):
     """A spike smeared along a trail is even: four times as many points draw the same."""
     side, x, y, trail, points = 300, 150.3, -290.2, np.array([60.0, 10.0]), 100
     even, many = np.zeros((side, side), np.int64), np.zeros((side, side), np.int64)
-    far_light.add(even, x, y, BRIGHT, None, SIDE, 0.0, vis.edges, trail)
+    far_light.add(even, far_light.Star(x, y, BRIGHT, None, SIDE, 0.0, vis.edges, trail))
     for a in (np.arange(points) + 0.5) / points - 0.5:
-        far_light.add(many, x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
+        far_light.add(
+            many, far_light.Star(x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
+        )
     # A spike's table ends 40 pixels from its middle: there a point more or less is a step.
     wrong = np.abs(even / many - 1.0)
     assert np.quantile(wrong, 0.99) < 0.03
@@ -198,9 +200,11 @@ def test_a_line_of_light_is_many_points(vis, x, y, trail):
     """In the squares' borders, outside them and on the trail's own line: as points closer than any fringe draw it."""
     side, points = 200, int(np.hypot(*trail))
     line, many = np.zeros((side, side), np.int64), np.zeros((side, side), np.int64)
-    far_light.add(line, x, y, BRIGHT, None, SIDE, 0.0, vis.edges, np.array(trail))
+    far_light.add(line, far_light.Star(x, y, BRIGHT, None, SIDE, 0.0, vis.edges, np.array(trail)))
     for a in (np.arange(points) + 0.5) / points - 0.5:
-        far_light.add(many, x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
+        far_light.add(
+            many, far_light.Star(x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
+        )
     level = BRIGHT * spikes.ring(vis.edges, EQUAL) / 400.0**3 * FIXED_POINT
     wrong = np.abs(line - many) / np.maximum(many, level)
     assert np.quantile(wrong, 0.99) < 0.02
@@ -237,7 +241,8 @@ def test_a_trail_is_unfolded_as_its_points_are(vis):
         light += np.outer(faded[1], faded[0]) * level / np.hypot(pixels - px, pixels[:, None] - py) ** 3
     fast, slow = np.ones((size, size)), light.copy()
     fast[60 : 60 + corner, 60 : 60 + corner] = light
-    far_light.unfold(fast, 0, 0, size, size, 320.2, 319.7, BRIGHT, None, SIDE, 0.0, vis.edges, trail)
+    star = far_light.Star(320.2, 319.7, BRIGHT, None, SIDE, 0.0, vis.edges, trail)
+    far_light.unfold(star, fast, 0, 0, size, size)
     turned = np.stack([np.cos(vis.edges.bars[:, 0]), np.sin(vis.edges.bars[:, 0])], axis=1)
     lines = BRIGHT / points * spikes.spikes(vis.edges, EQUAL, vis.edges.period)
     unfold_compiled(slow, x, y, 0.0, 0.0, 0.0, inner, level, turned, lines, lines, vis.edges.period)
@@ -316,7 +321,7 @@ def test_the_farthest_pixel_of_a_frame_is_lit(vis):
     """To its corner, however the distance is rounded."""
     for x, y in ((132.7667590299948, 168.83949347535636), (-40.3, -70.2), (108.82925776227592, 122.95520170604388)):
         frame = np.zeros((100, 100), np.int64)
-        far_light.add(frame, x, y, 1e13, None, 32, 0.0, vis.edges)
+        far_light.add(frame, far_light.Star(x, y, 1e13, None, 32, 0.0, vis.edges))
         assert frame.min() > 0
 
 

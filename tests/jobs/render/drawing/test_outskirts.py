@@ -22,6 +22,7 @@ from jobs.render.drawing.settings import settings_for
 from jobs.render.psf.model import SAMPLES
 from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS
+from jobs.render.sources.source_list import Sources
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 from tests.jobs.render import nominal
 from tests.jobs.render.fields import galaxies, one_source, small, spread
@@ -226,7 +227,7 @@ def test_all_light_is_somewhere():
     system, drawn = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0)), np.zeros(1)
     source = one_source(detector, system, 1e9, **shape)
     with mock.patch.object(outskirts, "of_galaxy", wraps=outskirts.of_galaxy) as made:
-        image = stamps.draw(source, stamp_sizes.SIZES[-1:], spread("lsstcam"), 3000, 3000, drawn=drawn)
+        image = stamps.draw(source, stamp_sizes.SIZES[-1:], spread("lsstcam"), 3000, 3000, tally=stamps.Tally(drawn))
     made.assert_called_once()
     y, x = np.mgrid[-4499:4500:3, -4499:4500:3]
     light = profile(shape, source.jacobian[0], x, y) * 9.0
@@ -242,8 +243,14 @@ def test_what_shows_is_looked_for_as_far_as_it_does():
     shapes = galaxy_shapes.shapes(galaxies(0.0, 0.0, **EDGE_ON))
     for mag, seen in ((10.0, True), (22.0, False)):
         electrons = np.array([BRIGHT["vis"] * 10 ** (-0.4 * mag)])
-        here = stamp_sizes.shone_on(
-            np.array([-1800.0]), np.array([32.0]), electrons, stamp_sizes.SIZES[-1:], np.array([0]), shapes, None,
-            spread("vis"), NOISE["vis"], SIDE, SIDE,
-        )  # fmt: skip
+        one = Sources(
+            np.array([1]),
+            np.array([-1800.0]),
+            np.array([32.0]),
+            0.1 * np.eye(2)[None],
+            electrons,
+            np.array([0]),
+            shapes,
+        )
+        here = stamp_sizes.shone_on(one, stamp_sizes.SIZES[-1:], spread("vis"), NOISE["vis"], SIDE, SIDE)
         assert here[0] == seen

@@ -312,7 +312,7 @@ def test_what_is_drawn_through_was_counted_before(monkeypatch):
 
     add = stamps._draw_some
     monkeypatch.setattr(
-        stamps, "_draw_some", watched(add, "stamps", lambda _, f, s, chosen, p, *a: chosen.size * p.grid.size**2)
+        stamps, "_draw_some", watched(add, "stamps", lambda _, one, chosen, p, *a: chosen.size * p.grid.size**2)
     )
     for name in ("transfer", "collapsed"):
         made = watched(getattr(transfer, name), "planes", lambda t, *a: len(t.planes) * t.grid.size**2)

@@ -45,7 +45,7 @@ def found(spread_, galaxy=None, star=None):
     )  # fmt: skip
     drawn = np.zeros(len(some))
     floors = stamp_sizes.floors(some.electrons, NOISE, SETTINGS)
-    image = stamps.draw(some, sizes, spread_, SIDE, SIDE, None, floors, drawn)
+    image = stamps.draw(some, sizes, spread_, SIDE, SIDE, None, floors, stamps.Tally(drawn))
     return some, sizes, image, drawn
 
 
@@ -92,9 +92,7 @@ def crowd(n, seed, margin):
 
 
 def shone_on(some, sizes, spread_):
-    return stamp_sizes.shone_on(
-        some.column, some.row, some.electrons, sizes, some.shape, some.shapes, some.picture, spread_, NOISE, SIDE, SIDE
-    )
+    return stamp_sizes.shone_on(some, sizes, spread_, NOISE, SIDE, SIDE)
 
 
 @given(st.integers(0, 1000), st.sampled_from(["vis", "seeing"]))

@@ -88,7 +88,7 @@ def test_a_trail_is_a_row_of_points(line):
         body.electrons, body.shape, body.shapes, psf, 12.0, settings, piece_length(body.length)
     )
     drawn = np.zeros(1)
-    image = stamps.draw(body, sizes, psf, SIDE, SIDE, drawn=drawn)
+    image = stamps.draw(body, sizes, psf, SIDE, SIDE, tally=stamps.Tally(drawn))
     count = max(int(12 * np.hypot(*line)), 1)
     part = (np.arange(count) + 0.5) / count - 0.5
     row = Sources(
