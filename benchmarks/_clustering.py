@@ -107,7 +107,7 @@ def velocities(box: Box, x: float) -> float:
 # ------------------------------------------------------------------------------------------------ on the sky
 
 
-def people(seed: int, box_cells: int, near: float, far: float, log_mass: float) -> Population:
+def population_above(seed: int, box_cells: int, near: float, far: float, log_mass: float) -> Population:
     """Halos, and galaxies of a proxy mass, above log_mass."""
     table, inverse = matching.masses(), luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
     matched = matching.matching(table, inverse)

@@ -20,6 +20,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from jobs.request.schema import Universe
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
@@ -30,7 +32,6 @@ from jobs.catalogue.galaxies import galaxies
 from jobs.catalogue.halos import luminosity_function, population
 from jobs.fluxes import cosmology
 from jobs.measured import forget_peak, peak_gb
-from jobs.request.schema import Universe
 from lake_schema import sky
 from lake_schema.store import layout, parquet
 from lake_schema.tables.galaxies import GALAXIES
@@ -160,13 +161,13 @@ def schechter(area: float) -> float:
 
 def luminosities(count: int, about: dict[str, object]) -> float:
     """Ours, the same sub-task: candidates a second with halo, position, velocity, redshift and luminosity."""
-    given = (about[name] for name in ("seed", "galaxy_limit", "z_max", "box_cells"))
-    people = galaxies.people(*given)  # type: ignore[arg-type]
-    drawn = population.Cells(people)
+    wanted = Universe(**{name: about[name] for name in ("galaxy_limit", "z_max", "box_cells")})  # type: ignore[arg-type]
+    universe = galaxies.halos_and_galaxies(about["seed"], wanted)  # type: ignore[arg-type]
+    drawn = population.Cells(universe)
     started = time.process_time()
     found = [population.members(drawn, cell) for cell in range(CELL << 6, (CELL << 6) + count)]
     for one in found:
-        people.halos.matching.magnitude(one.z, one.proxy)
+        universe.halos.matching.magnitude(one.z, one.proxy)
     return float(sum(one.id.size for one in found) / (time.process_time() - started))
 
 

@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -182,14 +182,14 @@ def published_halos() -> Callable[[float, float], float]:
 
 def counted(size: Size) -> tuple[dict[str, float], census.Census]:
     """Everything that the galaxies of small blocks tell."""
-    universe = galaxies.model(SEED, box_cells=size.settings.box_cells, lensing_nside=size.settings.lensing_nside)
+    universe = galaxies.model(SEED, size.settings)
     dust, law = dust_map.load(SEED), luminosity_function.schechter()
     seen = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
     figures = {"galaxies": float(seen.block.size), "galaxies_deg2": seen.area}
     figures |= census.counts(seen) | census.colours(seen) | census.sizes(seen) | census.halpha(seen)
     figures |= census.halos(seen, published_halos()) | census.luminosities(seen, law, 0.0, 1.5)
     if size.deep:
-        deep = galaxies.model(SEED, 28.0, box_cells=size.settings.box_cells, lensing_nside=size.settings.lensing_nside)
+        deep = galaxies.model(SEED, replace(size.settings, galaxy_limit=28.0))
         far = census.draw(deep, dust, census.blocks(size.deep, 0))
         figures |= census.luminosities(far, law, 1.5, 2.3)
     return figures, seen
@@ -220,7 +220,7 @@ def clustered(size: Size) -> tuple[dict[str, float], dict[str, Any], clustering.
     whole, pieces, figures, curves = [], [], {}, {}
     for seed in seeds:
         with own_cache(seed):
-            universe = clustering.people(seed, size.settings.box_cells, NEAR, FAR, LOG_MASS)
+            universe = clustering.population_above(seed, size.settings.box_cells, NEAR, FAR, LOG_MASS)
             for cell in cells:
                 found = clustering.tracers(universe, clustering.BLOCK_ORDER, cell)
                 kinds = (found.part(~found.satellite & (found.log_mass > LOG_MASS)), found.part(found.proxy > LOG_MASS))
@@ -255,7 +255,9 @@ def abundances(size: Size) -> dict[str, float]:
     number, cells = published_halos(), ((np.arange(size.pixels) + 0.43) * (12 << 10) / size.pixels).astype(int).tolist()
     figures, area = {}, sky.cell_area(5) * np.radians(1.0) ** 2
     for at, half in census.HALO_SHELLS:
-        universe = clustering.people(SEED, size.settings.box_cells, at - half, at + half, census.HALO_MASSES[0])
+        universe = clustering.population_above(
+            SEED, size.settings.box_cells, at - half, at + half, census.HALO_MASSES[0]
+        )
         found = [clustering.tracers(universe, 5, cell) for cell in cells]
         volume = float(cosmology.comoving_volume(at - half, at + half)) * area
         for least in census.HALO_MASSES:
@@ -270,7 +272,7 @@ def abundances(size: Size) -> dict[str, float]:
 
 def nearby(size: Size) -> dict[str, float]:
     """Satellites of M_r < -20 at z = 0.1, SDSS's limit of volume."""
-    universe = clustering.people(SEED, size.settings.box_cells, 0.05, 0.15, 11.8)
+    universe = clustering.population_above(SEED, size.settings.box_cells, 0.05, 0.15, 11.8)
     cells = ((np.arange(size.near) + 0.4) * 192 / size.near).astype(int).tolist()
     found = clustering.joined([clustering.tracers(universe, 2, cell) for cell in cells])
     z = universe.halos.distances.redshift(found.chi)

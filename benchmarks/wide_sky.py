@@ -18,6 +18,7 @@ from jobs.catalogue.halos import halos, luminosity_function, population
 from jobs.catalogue.halos.population import Population
 from jobs.catalogue.matter import density_box
 from jobs.fluxes import cosmology
+from jobs.request.schema import Universe
 from lake_schema import sky
 from lake_schema.arrays import Float
 
@@ -45,19 +46,19 @@ class Sky:
         return len(self.blocks) * sky.cell_area(BLOCK_ORDER)
 
 
-def draw(people: Population, count: int) -> Sky:
+def draw(universe: Population, count: int) -> Sky:
     """`count` blocks spread over the sky."""
     many = 12 << 2 * BLOCK_ORDER
     blocks = np.linspace(0.04 * many, 0.97 * many, count).astype(int).tolist()
     found: list[list[npt.NDArray[np.generic]]] = [[] for _ in range(7)]
     shift = 2 * (8 - BLOCK_ORDER)
     for block in blocks:
-        drawn = population.Cells(people)
+        drawn = population.Cells(universe)
         for cell in range(block << shift, (block + 1) << shift):
             one = population.members(drawn, cell)
-            bright = people.halos.matching.magnitude(one.z, one.proxy)
+            bright = universe.halos.matching.magnitude(one.z, one.proxy)
             kept = (one.z > NEAR) & (one.z < FAR) | (bright < -20.0) | (one.z < 0.2)
-            hosts = people.halos.distances.redshift(one.halos.chi), one.halos.log_mass, one.halos.index
+            hosts = universe.halos.distances.redshift(one.halos.chi), one.halos.log_mass, one.halos.index
             members = one.z[kept], bright[kept], one.host_mass[kept], one.index[kept]
             for column, values in zip(found, (*hosts, *members), strict=True):
                 column.append(values)
@@ -65,9 +66,9 @@ def draw(people: Population, count: int) -> Sky:
     return Sky(blocks, tuple(together[:3]), tuple(together[3:]))  # type: ignore[arg-type]
 
 
-def mass_function(people: Population, seen: Sky) -> dict[str, float]:
+def mass_function(universe: Population, seen: Sky) -> dict[str, float]:
     """Found / expected halos above a mass that is complete."""
-    model, figures = people.halos, {}
+    model, figures = universe.halos, {}
     z, mass, _ = seen.halos
     for near, far, least in ((0.2, 0.5, 12.0), (0.5, 0.8, 12.0), (0.5, 0.8, 13.0), (0.8, 1.2, 13.0), (0.8, 1.2, 13.5)):
         steps, bins = _cut(model, near, far, least)
@@ -77,12 +78,12 @@ def mass_function(people: Population, seen: Sky) -> dict[str, float]:
     return figures
 
 
-def luminosities(people: Population, seen: Sky) -> dict[str, float]:
+def luminosities(universe: Population, seen: Sky) -> dict[str, float]:
     """Found / expected galaxies brighter than what the limit reaches in any colour."""
     law, figures = luminosity_function.schechter(), {}
     z, m, _, _ = seen.galaxies
     for at, half in ((0.1, 0.07), (0.5, 0.1), (0.8, 0.15), (1.0, 0.2)):
-        faintest = _faintest(people, at - half, at + half)
+        faintest = _faintest(universe, at - half, at + half)
         grid = np.linspace(at - half, at + half, 81)
         density = luminosity_function.number_density(law, faintest, grid)
         shells = cosmology.comoving_volume(grid[:-1], grid[1:]) * np.radians(1.0) ** 2 * seen.area
@@ -92,12 +93,12 @@ def luminosities(people: Population, seen: Sky) -> dict[str, float]:
     return figures
 
 
-def correlation(people: Population, seen: Sky) -> dict[str, float]:
+def correlation(universe: Population, seen: Sky) -> dict[str, float]:
     """w(theta) of halos and of galaxies at 0.4 < z < 0.8 / Limber's, with the halos' linear bias.
 
     Densities are measured against the mean of the model, not of the blocks: there is no integral constraint.
     """
-    model, figures = people.halos, {}
+    model, figures = universe.halos, {}
     z, mass, index = seen.halos
     kept = (z > NEAR) & (z < FAR) & (mass > LEAST_MASS)
     steps, bins = _cut(model, NEAR, FAR, LEAST_MASS)
@@ -106,7 +107,7 @@ def correlation(people: Population, seen: Sky) -> dict[str, float]:
     mean = float(np.sum(number.sum(1) * model.line.volume[steps])) * np.radians(1.0) ** 2 * seen.area
     figures |= _compared("halos", seen, index[kept], mean, model.line.middle[steps], number.sum(1), growing)
 
-    faintest = _faintest(people, NEAR, FAR)
+    faintest = _faintest(universe, NEAR, FAR)
     z, m, host, index = seen.galaxies
     kept = (z > NEAR) & (z < FAR) & (m < faintest)
     law = luminosity_function.schechter()
@@ -176,14 +177,14 @@ def _cut(
     return steps, np.round(model.log_mass[:-1], 3) >= least - 1e-3
 
 
-def _faintest(people: Population, near: float, far: float) -> float:
+def _faintest(universe: Population, near: float, far: float) -> float:
     """M_r to which galaxies between two redshifts are complete: above the mass limit's magnitude, all are drawn."""
-    model = people.halos
+    model = universe.halos
     steps = (model.line.z > near) & (model.line.z < far)
     limits = model.matching.magnitude(model.line.z[steps], model.limit[steps])
     return float(np.floor(10.0 * (limits.min() - 0.02)) / 10.0)
 
 
-def people(seed: int, box_cells: int) -> Population:
+def drawn_from(seed: int, box_cells: int) -> Population:
     """The population that is drawn."""
-    return galaxies.people(seed, LIMIT, 2.3, box_cells)
+    return galaxies.halos_and_galaxies(seed, Universe(galaxy_limit=LIMIT, box_cells=box_cells))

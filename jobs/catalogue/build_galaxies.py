@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
@@ -24,7 +23,7 @@ from jobs.catalogue.halos import halo_catalogue, population
 from jobs.catalogue.halos.halo_catalogue import LightCone
 from jobs.fluxes import passbands, sources
 from jobs.request.files import Catalogue, DustMap, Ingest
-from jobs.request.schema import Request
+from jobs.request.schema import Request, Universe
 from jobs.shell import Job, Step, main
 from lake_schema.errors import BadInput
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
@@ -79,10 +78,10 @@ def _drawn(lake: Path, request: Request) -> list[Step]:
 
 def halo_work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
     """The halos of one order-5 cell."""
-    given: list[Any] = [facts["seed"], *(facts[name] for name in _HALO_FACTS), *_chosen(facts, own)]
-    people = galaxies.people(*given)
-    drawn = population.Cells(people)
-    return Output(cells.rows(facts, HALOS, lambda cell: galaxies.halo_table(cell, people, drawn)))
+    light_cone, training = _external(facts, own)
+    found = galaxies.halos_and_galaxies(facts["seed"], _wanted(facts, _HALO_FACTS), light_cone, training)
+    drawn = population.Cells(found)
+    return Output(cells.rows(facts, HALOS, lambda cell: galaxies.halo_table(cell, found, drawn)))
 
 
 def work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
@@ -119,12 +118,16 @@ def _parted(facts: Json, rows: pa.Table) -> Output:
 
 
 def _universe(facts: Json, own: Ingest | None = None) -> GalaxyModel:
-    given: list[Any] = [facts["seed"], *(facts[name] for name in _GALAXY_FACTS), *_chosen(facts, own)]
-    return galaxies.model(*given)
+    light_cone, training = _external(facts, own)
+    return galaxies.model(facts["seed"], _wanted(facts, _GALAXY_FACTS), light_cone, training)
 
 
-def _chosen(facts: Json, own: Ingest | None) -> tuple[LightCone | None, str, Training | None]:
-    """Halos of others, the limit's band, spectra of others."""
+def _wanted(facts: Json, names: Sequence[str]) -> Universe:
+    return Universe(**{name: facts[name] for name in ("galaxy_band", *names)})
+
+
+def _external(facts: Json, own: Ingest | None) -> tuple[LightCone | None, Training | None]:
+    """The user's halos and observed galaxies, where the request names some."""
     light_cone = training = None
     if own is not None and own.halos is not None:
         columns = mapping.halos(dict(own.halos.columns))
@@ -134,7 +137,7 @@ def _chosen(facts: Json, own: Ingest | None) -> tuple[LightCone | None, str, Tra
         columns = mapping.training(dict(own.training.columns))
         found, _ = ingest.listed(own.training.files, columns)
         training = nearest_sed.load(found, facts["training"]["sha256"], columns)
-    return light_cone, facts["galaxy_band"], training
+    return light_cone, training
 
 
 def _about(given: Catalogue, columns: mapping.Columns) -> Json:

@@ -39,6 +39,7 @@ from jobs.catalogue.halos.luminosity_function import Schechter
 from jobs.catalogue.halos.population import Cells, Members, Population
 from jobs.fluxes import cosmology
 from jobs.fluxes.libraries import templates
+from jobs.request.schema import Universe
 from jobs.rng import stream
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Int
@@ -88,33 +89,24 @@ class Drawn:
 
 
 def model(
-    seed: int,
-    limit: float = 26.0,
-    z_max: float = 2.3,
-    box_cells: int = 256,
-    lensing_nside: int = 512,
-    high_redshift_boost: float = 1.0,
-    quasar_boost: float = 1.0,
-    light_cone: LightCone | None = None,
-    band: str = SELECTION_BAND,
-    training: Training | None = None,
+    seed: int, wanted: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> GalaxyModel:
     """The embedded universe of a seed: its galaxies brighter than a limit in a band, and with z < z_max.
 
-    light_cone, training : halos and observed galaxies of others, in place of ours
+    light_cone, training : external tables of halos and of observed galaxies, in place of ours
     The matter is the same to any limit, halos and galaxies are drawn anew for each: those that are brighter than a
     shallow limit are as many in a deeper universe, not the same.
     1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
     """
     library, colours = templates.galaxy_library(), sed_assignment.colours_model()
-    selection = _selection(band, z_max, training)
+    selection, z_max = _selection(wanted, training), wanted.z_max
     dustiest = float(selection.ebv[-1])
-    population_of = people(seed, limit, z_max, box_cells, light_cone, band, training)
-    distant = high_redshift.model(high_redshift_boost, quasar_boost)
+    found = halos_and_galaxies(seed, wanted, light_cone, training)
+    distant = high_redshift.model(wanted.high_redshift_boost, wanted.quasar_boost)
     return GalaxyModel(
-        limit=limit,
-        population=population_of,
-        planes=lensing.load(population_of.halos.box, lensing_nside, far=bool(distant)),
+        limit=wanted.galaxy_limit,
+        population=found,
+        planes=lensing.load(found.halos.box, wanted.lensing_nside, far=bool(distant)),
         luminosities=luminosity_function.schechter(),
         colours=colours,
         selection=selection,
@@ -129,28 +121,23 @@ def model(
     )
 
 
-def people(
-    seed: int,
-    limit: float,
-    z_max: float,
-    box_cells: int,
-    light_cone: LightCone | None = None,
-    band: str = SELECTION_BAND,
-    training: Training | None = None,
+def halos_and_galaxies(
+    seed: int, wanted: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> Population:
-    """The halos and galaxies that a limit can be asked of, before they have colours."""
-    nodes, brightest = band_ratios.brightest(_selection(band, z_max, training))
+    """The population that a limit can be asked of: halos with their galaxies, before these have colours."""
+    nodes, brightest = band_ratios.brightest(_selection(wanted, training))
 
     def faintest(z: Float) -> Float:
-        return limit + _MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
+        return wanted.galaxy_limit + _MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
 
     inverse = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
-    return population.model(seed, box_cells, luminosity_function.volume(z_max), inverse, faintest, light_cone)
+    volume = luminosity_function.volume(wanted.z_max)
+    return population.model(seed, wanted.box_cells, volume, inverse, faintest, light_cone)
 
 
-def _selection(band: str, z_max: float, training: Training | None) -> BandRatios:
+def _selection(wanted: Universe, training: Training | None) -> BandRatios:
     dustiest = max(sed_assignment.colours_model().dust.highest, training.dustiest if training else 0.0)
-    return band_ratios.load(templates.galaxy_library(), band, z_max, dustiest)
+    return band_ratios.load(templates.galaxy_library(), wanted.galaxy_band, wanted.z_max, dustiest)
 
 
 def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.float32]) -> pa.Table:
@@ -160,14 +147,14 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.fl
     dust  : float32[pixel] mag, map of the Milky Way's A(V) (jobs.catalogue.dust_map)
     """
     seed = universe.population.seed
-    people = population.members(cells, cell)
-    drawn = select(universe, *_light(cell, seed, universe, people))
+    members = population.members(cells, cell)
+    drawn = select(universe, *_light(cell, seed, universe, members))
     distance_modulus = cosmology.distance_modulus(drawn.z)
     log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, drawn.colour)
     log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
     rng = stream(seed, "galaxies.lines", cell)
     columns = {
-        **_places(universe.planes, people, drawn.row, dust),
+        **_places(universe.planes, members, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
         "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
         "color_gr_01": drawn.colour,
@@ -221,35 +208,35 @@ def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
     return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
 
 
-def _light(cell: int, seed: int, universe: GalaxyModel, people: Members) -> tuple[Float, Float, Bool, Sed]:
+def _light(cell: int, seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Bool, Sed]:
     """Candidates of a cell: z, M_r, on the red sequence, spectra."""
-    m_r = universe.population.halos.matching.magnitude(people.z, people.proxy)
+    m_r = universe.population.halos.matching.magnitude(members.z, members.proxy)
     red, colour = sed_assignment.draw_colour(
-        universe.colours, m_r, people.z, people.kind, stream(seed, "galaxies.colour", cell)
+        universe.colours, m_r, members.z, members.kind, stream(seed, "galaxies.colour", cell)
     )
     if universe.training is not None:
         rng = stream(seed, "galaxies.nearest", cell)
-        return people.z, m_r, red, nearest_sed.assign(universe.training, colour, m_r, people.z, rng)
+        return members.z, m_r, red, nearest_sed.assign(universe.training, colour, m_r, members.z, rng)
     law, ebv = sed_assignment.draw_dust(universe.colours.dust, m_r, red, colour, stream(seed, "galaxies.dust", cell))
-    return people.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
+    return members.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
 
 
 def _places(
-    planes: Planes, people: Members, row: Int, dust: npt.NDArray[np.float32]
+    planes: Planes, members: Members, row: Int, dust: npt.NDArray[np.float32]
 ) -> dict[str, npt.NDArray[np.generic]]:
-    ra, dec = people.ra[row], people.dec[row]
+    ra, dec = members.ra[row], members.dec[row]
     return {
-        "id": people.id[row],
-        "halo_id": people.halo_id[row],
+        "id": members.id[row],
+        "halo_id": members.halo_id[row],
         "ra": ra,
         "dec": dec,
-        "_healpix_29": people.index[row],
-        **lensing.columns(planes, ra, dec, people.chi[row]),
-        "kind": people.kind[row],
+        "_healpix_29": members.index[row],
+        **lensing.columns(planes, ra, dec, members.chi[row]),
+        "kind": members.kind[row],
         "density_boost": np.ones(row.size),
-        "z_true": people.z[row],
-        "z_obs": people.z_obs[row],
-        "log_halo_mass": people.host_mass[row],
+        "z_true": members.z[row],
+        "z_obs": members.z_obs[row],
+        "log_halo_mass": members.host_mass[row],
         "a_v": dust_map.a_v(dust, ra, dec),
     }
 

@@ -79,13 +79,13 @@ class Cells:
         """Halos drawn by a cell of a level, and their satellites, wherever these are."""
         place = (order, cell)
         if place not in self.drawn:
-            people = self.population
-            if people.light_cone is None:
-                hosts = halos.draw(people.halos, people.seed, order, cell)
+            own = self.population
+            if own.light_cone is None:
+                hosts = halos.draw(own.halos, own.seed, order, cell)
             else:
-                hosts = halo_catalogue.draw(people.halos, people.masses, people.light_cone, people.seed, order, cell)
-            rng = stream(people.seed, "satellites", order, cell)
-            self.drawn[place] = hosts, satellites.draw(people.halos, people.masses, hosts, rng)
+                hosts = halo_catalogue.draw(own.halos, own.masses, own.light_cone, own.seed, order, cell)
+            rng = stream(own.seed, "satellites", order, cell)
+            self.drawn[place] = hosts, satellites.draw(own.halos, own.masses, hosts, rng)
             if len(self.drawn) > _KEPT:
                 self.drawn.popitem(last=False)
         self.drawn.move_to_end(place)

@@ -29,7 +29,7 @@ _J = _BANDS.index("twomass_j")
 _COLOR_YJ = 0.8
 # Scatter of J - H and H - Ks within a subtype, mag (adopted).
 _SCATTER = 0.07
-_COLOR_ERROR, _PASSES = 1e-4, 200
+_UNTIL = 1e-4, 200
 # Bands of methane and water: centre, width, A, and depth (adopted: texture, the colours come after).
 _METHANE = ((11_500.0, 700.0, 0.6), (16_700.0, 900.0, 0.8), (22_500.0, 1200.0, 0.8))
 _WATER = ((9_300.0, 300.0, 0.4), (14_000.0, 700.0, 0.7), (18_700.0, 900.0, 0.8))
@@ -104,7 +104,7 @@ def spectra() -> Float:
         k = types.names.index(subtype)
         start = stellar.planck(grid, types.teff[k]) * _absorbed(grid, k / (len(types.names) - 1.0))
         colors = types.colors[k] + _scatter(subtype, int(number))
-        found = stellar.matching(np.log(grid), start, seen, pivots, colors, _J, _COLOR_ERROR, _PASSES, mean)
+        found = stellar.matching(np.log(grid), start, seen, pivots, colors, _J, _UNTIL, mean)
         if number == "00":
             mean = found
         out.append(stellar.corrected(np.log(grid), start, pivots, found))

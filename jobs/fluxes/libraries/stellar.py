@@ -42,7 +42,7 @@ _BANDS = (
 )
 _V = _BANDS.index("bessell_v")
 # Colours are matched to this, mag; the late M dwarfs take the most passes (about 100).
-_COLOR_ERROR, _PASSES = 2e-7, 400
+_UNTIL = 2e-7, 400
 # log10 of the Sun's surface gravity, cm s-2 (IAU 2015 nominal values).
 _LOG_G_SUN = 4.438
 # Hydrogen: Rydberg's wavelength in vacuum, A; lines of a series that are drawn.
@@ -170,7 +170,7 @@ def _matched(log_wavelength: Float, start: Float, response: Float, pivots: Float
     """`start` times 10^(-0.4 c) with the wanted colours; c is cubic between the pivots, constant outside."""
     known = np.isfinite(colors)
     at, v = pivots[known], int(np.sum(known[:_V]))
-    found = matching(log_wavelength, start, response[:, known], at, colors[known], v, _COLOR_ERROR, _PASSES)
+    found = matching(log_wavelength, start, response[:, known], at, colors[known], v, _UNTIL)
     return corrected(log_wavelength, start, at, found)
 
 
@@ -181,20 +181,20 @@ def matching(
     pivots: Float,
     colors: Float,
     tied: int,
-    error: float,
-    passes: int,
+    until: tuple[float, int],
     first: Float | None = None,
 ) -> Float:
     """The correction at the pivots, mag, that brings the colours m_band - m_(band `tied`); see `corrected`.
 
     response : float64[n_lambda, n_band] f_nu = f_lambda @ response;  first : where to begin
+    until    : (largest error of a colour, mag; steps), whichever is reached first
     """
     correction = np.zeros(len(pivots)) if first is None else first
-    for _ in range(passes):
+    for _ in range(until[1]):
         seen = sums.product(corrected(log_wavelength, start, pivots, correction), response)
         mags = -2.5 * np.log10(seen)
         missing = colors - (mags - mags[tied])
-        if np.abs(missing).max() < error:
+        if np.abs(missing).max() < until[0]:
             break
         correction = correction + missing
     return correction

@@ -12,6 +12,7 @@ from jobs.catalogue.halos import population
 from jobs.catalogue.matter import density_box
 from jobs.fluxes import cosmology
 from jobs.fluxes.libraries import templates
+from jobs.request.schema import Universe
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 
@@ -30,9 +31,12 @@ def dust():
     return dust_map.load(SEED)
 
 
+SMALL = {"box_cells": BOX_CELLS, "lensing_nside": NSIDE}
+
+
 @pytest.fixture(scope="session")
 def universe():
-    return galaxies.model(SEED, box_cells=BOX_CELLS, lensing_nside=NSIDE)
+    return galaxies.model(SEED, Universe(**SMALL))
 
 
 @pytest.fixture(scope="session")

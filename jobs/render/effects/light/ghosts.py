@@ -5,7 +5,7 @@ An annulus with the gaps of the three arms that hold the secondary mirror; of ev
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,17 +18,29 @@ from lake_schema.errors import OutOfRange
 _FINE = 4
 
 
+class Pupil(NamedTuple):
+    """The image of the pupil, pixels.
+
+    radius : of the outer edge;  hole : the inner radius over the outer
+    arms   : of each its middle's column and row from the centre, its angle from x to y (degrees), half its length
+    width  : of all arms
+    """
+
+    radius: float
+    hole: float
+    arms: tuple[tuple[float, float, float, float], ...]
+    width: float
+
+
 def apply(
-    frame: Frame, lights: Lights, ratio: float, offset: tuple[float, float], radius: float, hole: float,
-    arms: tuple[tuple[float, float, float, float], ...], width: float, rng: np.random.Generator | None = None,
+    frame: Frame, lights: Lights, ratio: float, offset: tuple[float, float], pupil: Pupil,
+    rng: np.random.Generator | None = None,
 ) -> Frame:  # fmt: skip
     """frame [ny, nx] e- -> plus the ghost of every light, also of those outside the frame.
 
-    ratio  : light of a ghost over its star's;  offset : (columns, rows) from star to ghost
-    radius : pixels;  hole : its inner radius over the outer
-    arms   : of each its middle's column and row from the ghost's centre, its angle from x to y (degrees), half its
-             length;  width : of all.  Pixels
+    ratio : light of a ghost over its star's;  offset : (columns, rows) from star to ghost
     """
+    radius, hole, arms, width = pupil
     for name, value, least, most in (
         ("ghost ratio", ratio, 0.0, 1.0), ("ghost radius", radius, 0.5, 1e4), ("ghost hole", hole, 0.0, 0.99),
         ("ghost arms", width, 0.0, radius),
@@ -108,7 +120,7 @@ def parameters(scene: Scene) -> tuple[Any, ...]:
     )
     width = scale * of("spider_width", "mm")
     ratio, hole = scene.value("ghost.flux_ratio", ""), scene.value("ghost.radius_in_ratio", "")
-    return noticeable(scene, ratio), ratio, (length * sine, length * cosine), radius, hole, arms, width
+    return noticeable(scene, ratio), ratio, (length * sine, length * cosine), Pupil(radius, hole, arms, width)
 
 
 def noticeable(scene: Scene, ratio: float) -> Lights:

@@ -13,12 +13,15 @@ from jobs.catalogue.galaxies import band_ratios, galaxies, sed_assignment
 from jobs.catalogue.halos import luminosity_function, population
 from jobs.catalogue.matter import lightcone
 from jobs.fluxes import cosmology
+from jobs.request.schema import Universe
 from lake_schema import ids, sky
 from lake_schema.store import validate
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
 from lake_schema.units import LIGHT_KM_S
-from tests.jobs.catalogue.conftest import BOX_CELLS, NSIDE, SEED
+from tests.jobs.catalogue.conftest import SEED, SMALL
+
+NEARBY = {"high_redshift_boost": 0.0, "quasar_boost": 0.0}
 
 ARCMIN2_PER_DEG2 = 3600.0
 CELL = 303_117
@@ -150,7 +153,7 @@ def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, 
 
 @pytest.mark.nightly
 def test_the_luminosity_function_comes_out_of_a_deep_catalogue_at_z_2(dust):
-    deep = galaxies.model(SEED, 28.0, 2.3, BOX_CELLS, NSIDE)
+    deep = galaxies.model(SEED, Universe(galaxy_limit=28.0, **SMALL))
     drawn, cells = population.Cells(deep.population), (4000, 4001, 4002, 4003, 40_000, 40_001)
     rows = pa.concat_tables([galaxies.draw(cell, deep, drawn, dust) for cell in cells])
     z, m_r = rows["z_true"].to_numpy(), rows["abs_mag_r01"].to_numpy()
@@ -261,7 +264,7 @@ def test_the_apparent_reference_magnitude_is_near_the_seen_ones(drawn):
 
 
 def test_an_empty_cell_is_an_empty_table(dust):
-    shallow = galaxies.model(SEED, 10.0, 2.3, BOX_CELLS, NSIDE, 0.0, 0.0)
+    shallow = galaxies.model(SEED, Universe(galaxy_limit=10.0, **SMALL, **NEARBY))
     rows = galaxies.draw(0, shallow, population.Cells(shallow.population), dust)
     # High-redshift galaxies and quasars have limits of their own.
     assert (rows["z_true"].to_numpy() < 6).sum() < 5
@@ -272,7 +275,7 @@ def test_an_empty_cell_is_an_empty_table(dust):
 @pytest.mark.parametrize(("band", "limit"), [("euclid_h", 21.5), ("lsst_g", 23.0)])
 def test_a_limit_in_another_band(drawn, dust, band, limit):
     """As many as a deeper catalogue has there, none fainter, and of fewer halos."""
-    there = galaxies.model(SEED, limit, 2.3, BOX_CELLS, NSIDE, 0.0, 0.0, band=band)
+    there = galaxies.model(SEED, Universe(galaxy_limit=limit, galaxy_band=band, **SMALL, **NEARBY))
     cells = population.Cells(there.population)
     places = drawn.places[:2]
     rows = pa.concat_tables([galaxies.draw(cell, there, cells, dust) for cell in places])
@@ -291,7 +294,8 @@ def test_a_limit_in_another_band(drawn, dust, band, limit):
 
 def test_a_shallow_limit_needs_little_of_the_volume():
     """Halos a steradian that are drawn, by distance."""
-    near, deep = (galaxies.people(SEED, limit, 2.3, BOX_CELLS).halos for limit in (18.0, 26.0))
+    wanted = (Universe(galaxy_limit=limit, **SMALL) for limit in (18.0, 26.0))
+    near, deep = (galaxies.halos_and_galaxies(SEED, one).halos for one in wanted)
     number = [np.sum((m.level >= 0) * m.number, 1) * m.line.volume for m in (near, deep)]
     assert number[0].sum() < 0.01 * number[1].sum()
     assert np.sum(number[0][near.line.z > 1.2]) < 1e-3 * number[0].sum()
@@ -310,7 +314,7 @@ def test_poles_and_the_first_meridian(universe, dust, place):
 
 
 def test_the_deepest_and_widest_request(dust):
-    deep = galaxies.model(SEED, 28.0, 3.0, BOX_CELLS, NSIDE)
+    deep = galaxies.model(SEED, Universe(galaxy_limit=28.0, z_max=3.0, **SMALL))
     rows = galaxies.draw((12 << 16) - 1, deep, population.Cells(deep.population), dust)
     assert validate.violations(rows, GALAXIES) == []
     assert rows["z_true"].to_numpy().max() > 2.9

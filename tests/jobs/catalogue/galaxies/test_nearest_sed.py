@@ -12,6 +12,7 @@ from jobs.catalogue.external import mapping
 from jobs.catalogue.galaxies import galaxies, nearest_sed
 from jobs.catalogue.halos import population
 from jobs.request.from_toml import parse
+from jobs.request.schema import Universe
 from lake_schema.errors import BadInput
 from lake_schema.store import publish, read, validate
 from lake_schema.tables.galaxies import GALAXIES
@@ -109,8 +110,9 @@ def test_a_request_with_a_training_table(tmp_path):
 
 def test_dustier_galaxies_are_searched_for_as_deep_as_they_can_be_seen(given):
     """E(B-V) beyond the embedded universe's: the tables reach as far, and so do the halos."""
-    deep = galaxies.people(7, 22.0, 2.3, 192, None, "euclid_h", given)
-    usual = galaxies.people(7, 22.0, 2.3, 192, None, "euclid_h")
+    wanted = Universe(galaxy_limit=22.0, galaxy_band="euclid_h", box_cells=192)
+    deep = galaxies.halos_and_galaxies(7, wanted, training=given)
+    usual = galaxies.halos_and_galaxies(7, wanted)
     assert given.dustiest > 0.6
     assert np.all(deep.halos.limit <= usual.halos.limit + 1e-9)
     assert np.any(deep.halos.limit < usual.halos.limit - 0.01)

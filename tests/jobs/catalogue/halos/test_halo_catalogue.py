@@ -10,6 +10,7 @@ from jobs.catalogue.external import mapping
 from jobs.catalogue.galaxies import galaxies
 from jobs.catalogue.halos import halo_catalogue, population
 from jobs.fluxes import cosmology
+from jobs.request.schema import Universe
 from lake_schema import ids, sky
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.store.provenance import file_sha256
@@ -64,10 +65,10 @@ def loaded(path, columns=COLUMNS):
 def test_the_halos_of_a_cell_are_those_of_the_file(tmp_path, ending):
     values = synthetic()
     cone = loaded(write(tmp_path / f"synthetic.{ending}", values))
-    people = galaxies.people(SEED, 24.5, 2.3, BOX_CELLS, cone)
-    rows = galaxies.halo_table(CELL, people, population.Cells(people))
+    universe = galaxies.halos_and_galaxies(SEED, Universe(galaxy_limit=24.5, box_cells=BOX_CELLS), cone)
+    rows = galaxies.halo_table(CELL, universe, population.Cells(universe))
     inside = sky.cell_of(values["ra"], values["dec"], ids.GENERATION_ORDER) == CELL
-    bright = inside & (np.log10(values["mass"]) > people.halos.mass_limit(cosmology.comoving_distance(values["z"])))
+    bright = inside & (np.log10(values["mass"]) > universe.halos.mass_limit(cosmology.comoving_distance(values["z"])))
     found = rows.filter(pa.array(rows["complete"].to_numpy(zero_copy_only=False)))
     assert found.num_rows == bright.sum() > 50
     assert np.sort(found["log_mass"].to_numpy()) == pytest.approx(np.sort(np.log10(values["mass"][bright])), abs=1e-5)
@@ -76,8 +77,8 @@ def test_the_halos_of_a_cell_are_those_of_the_file(tmp_path, ending):
 
 def test_galaxies_live_in_them_and_none_is_lost_between_cells(tmp_path):
     cone = loaded(write(tmp_path / "synthetic.parquet", synthetic()))
-    people = galaxies.people(SEED, 24.5, 2.3, BOX_CELLS, cone)
-    cells = population.Cells(people)
+    universe = galaxies.halos_and_galaxies(SEED, Universe(galaxy_limit=24.5, box_cells=BOX_CELLS), cone)
+    cells = population.Cells(universe)
     parts = [population.members(cells, cell) for cell in range(CELL >> 4 << 4, (CELL >> 4 << 4) + 16)]
     own, host = (np.concatenate([getattr(part, name) for part in parts]) for name in ("id", "halo_id"))
     known = np.concatenate([part.halo_ids for part in parts])

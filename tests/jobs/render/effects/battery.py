@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jobs.render.channels import ground, vis
+from jobs.render.effects.light.ghosts import Pupil
 from jobs.render.effects.readout.traps import Sweeps, Traps
 from jobs.render.effects.scene import Lights
 from lake_schema.mission.configuration import resolve
@@ -65,8 +66,8 @@ _CASES = (
     Case("background", (120.0,), (0.0,), zero=False, whole=True),
     Case(
         "ghosts",
-        (LIGHTS, 1e-4, (0.0, 5.0), 6.0, 0.33, ((2.6, 2.4, 16.8, 3.5), (-3.3, 1.3, -39.9, 3.5)), 0.2),
-        (LIGHTS, 0.0, (0.0, 5.0), 6.0, 0.33, (), 0.0),
+        (LIGHTS, 1e-4, (0.0, 5.0), Pupil(6.0, 0.33, ((2.6, 2.4, 16.8, 3.5), (-3.3, 1.3, -39.9, 3.5)), 0.2)),
+        (LIGHTS, 0.0, (0.0, 5.0), Pupil(6.0, 0.33, (), 0.0)),
         zero=False,
     ),
     Case("pixel_area", stretched(1e-2), stretched(0.0), zero=False),

@@ -39,7 +39,7 @@ def light(column, row, electrons=1e8):
 
 
 def test_a_ghost_is_an_annulus_of_the_right_light():
-    image = ghosts.apply(EMPTY, light(150.3, 100.6), 1e-4, (0.0, 100.0), 56.0, 0.33, (), 0.0)
+    image = ghosts.apply(EMPTY, light(150.3, 100.6), 1e-4, (0.0, 100.0), ghosts.Pupil(56.0, 0.33, (), 0.0))
     assert image.sum() == pytest.approx(1e4, rel=1e-6)
     y, x = np.mgrid[:400, :300]
     radius = np.hypot(x - 150.3, y - 200.6)
@@ -56,7 +56,7 @@ def test_arms_of_the_ghost():
     arms = tuple(
         (40 * np.cos(np.radians(angle)), 40 * np.sin(np.radians(angle)), angle, 20.0) for angle in (0.0, 90.0, 225.0)
     )
-    image = ghosts.apply(EMPTY, light(150.0, 100.0), 1e-4, (0.0, 100.0), 56.0, 0.33, arms, 4.0)
+    image = ghosts.apply(EMPTY, light(150.0, 100.0), 1e-4, (0.0, 100.0), ghosts.Pupil(56.0, 0.33, arms, 4.0))
     along = {
         angle: (150 + 40 * np.cos(np.radians(angle)), 200 + 40 * np.sin(np.radians(angle)))
         for angle in range(0, 360, 15)
@@ -69,10 +69,10 @@ def test_arms_of_the_ghost():
 def test_the_ghost_s_arms_are_the_pupil_s(name):
     """Pixel by pixel what the pupil of the PSF lets through, in whatever way the detector is mounted."""
     shown = scene(name, lights=light(150, 100, 1e12))
-    _, _, _, radius, _, arms, width = ghosts.parameters(shown)
-    image = ghosts.apply(EMPTY, light(150, 200), 1.0, (0.0, 0.0), radius, 0.0, arms, width)
+    *_, pupil = ghosts.parameters(shown)
+    image = ghosts.apply(EMPTY, light(150, 200), 1.0, (0.0, 0.0), pupil._replace(hole=0.0))
     y, x = np.mgrid[:400, :300] - np.array([200.0, 150.0])[:, None, None]
-    turn, mm = np.radians(shown.detector.rotation), 600.0 / radius
+    turn, mm = np.radians(shown.detector.rotation), 600.0 / pupil.radius
     place = mm * (x * np.cos(turn) - y * np.sin(turn)), mm * (x * np.sin(turn) + y * np.cos(turn))
     clear = euclid.pupil(*place, mm, MISSION)
     # Outside the central stop, which the ghost has in its own size and place, and inside the edge.
@@ -83,24 +83,19 @@ def test_the_ghost_s_arms_are_the_pupil_s(name):
 
 def test_stars_outside_send_their_ghosts_in():
     """A star below the frame; the ghost is the one of a larger frame."""
-    large = ghosts.apply(
-        np.zeros((1000, 300)), light(100, 200), 1e-4, (0.0, 700.0), 56.0, 0.33, ((20.0, 6.0, 16.8, 30.0),), 1.0
-    )
-    inside = ghosts.apply(
-        np.zeros((400, 300)), light(100, -400), 1e-4, (0.0, 700.0), 56.0, 0.33, ((20.0, 6.0, 16.8, 30.0),), 1.0
-    )
+    pupil = ghosts.Pupil(56.0, 0.33, ((20.0, 6.0, 16.8, 30.0),), 1.0)
+    large = ghosts.apply(np.zeros((1000, 300)), light(100, 200), 1e-4, (0.0, 700.0), pupil)
+    inside = ghosts.apply(np.zeros((400, 300)), light(100, -400), 1e-4, (0.0, 700.0), pupil)
     np.testing.assert_array_equal(large[600:], inside)
     assert inside.sum() == pytest.approx(1e4, rel=1e-6)
-    far = ghosts.apply(
-        np.zeros((400, 300)), light(100, 250), 1e-4, (0.0, 700.0), 56.0, 0.33, ((20.0, 6.0, 16.8, 30.0),), 1.0
-    )
+    far = ghosts.apply(np.zeros((400, 300)), light(100, 250), 1e-4, (0.0, 700.0), pupil)
     assert (far == 0).all()
 
 
 def test_ghosts_add_up():
     one, two = light(100, 50), light(150, 180, 3e7)
     both = Lights(*(np.concatenate([getattr(one, k), getattr(two, k)]) for k in ("column", "row", "electrons")))
-    args = (1e-4, (0.0, 60.0), 20.0, 0.33, (), 0.0)
+    args = (1e-4, (0.0, 60.0), ghosts.Pupil(20.0, 0.33, (), 0.0))
     together = ghosts.apply(EMPTY, both, *args)
     np.testing.assert_allclose(together, ghosts.apply(EMPTY, one, *args) + ghosts.apply(EMPTY, two, *args), atol=1e-9)
 
@@ -109,7 +104,7 @@ def test_ghosts_add_up():
 def test_the_offset_is_the_focal_plane_s(name):
     """Detectors that are mounted upside down see it the other way."""
     shown = scene(name, lights=light(100, 100, 1e12))
-    chosen, ratio, offset, radius, hole, arms, width = ghosts.parameters(shown)
+    chosen, ratio, offset, (radius, hole, arms, width) = ghosts.parameters(shown)
     assert len(chosen.electrons) == 1
     assert ratio == 1e-6
     assert (radius, hole) == (56.0, 0.33)
@@ -129,7 +124,7 @@ def test_what_no_ghost_shows_is_left_out():
         one = scene(lights=light(100, 100, factor * edge))
         assert ghosts.EFFECT.needed_if(one) == shown
         assert len(ghosts.parameters(one)[0].electrons) == shown
-        image = ghosts.apply(EMPTY, one.lights, 1e-6, (0.0, 100.0), 56.0, 0.33, (), 0.0)
+        image = ghosts.apply(EMPTY, one.lights, 1e-6, (0.0, 100.0), ghosts.Pupil(56.0, 0.33, (), 0.0))
         if not shown:
             assert image.max() < NOTICEABLE * noise
             assert image.sum() < NOTICEABLE * noise * np.sqrt((image > 0).sum()) * 1.1
@@ -138,7 +133,7 @@ def test_what_no_ghost_shows_is_left_out():
 @pytest.mark.parametrize("wrong", [(-1.0, 56.0, 0.3), (1e-4, 0.0, 0.3), (1e-4, 56.0, 1.0), (np.nan, 56.0, 0.3)])
 def test_impossible_ghosts_are_refused(wrong):
     with pytest.raises(OutOfRange, match="ghost"):
-        ghosts.apply(EMPTY, light(1, 1), wrong[0], (0.0, 0.0), *wrong[1:], (), 0.0)
+        ghosts.apply(EMPTY, light(1, 1), wrong[0], (0.0, 0.0), ghosts.Pupil(*wrong[1:], (), 0.0))
 
 
 # ------------------------------------------------------------------------------------------------ straylight
