@@ -22,6 +22,7 @@ from jobs.catalogue.galaxies.nearest_sed import Training
 from jobs.catalogue.halos import halo_catalogue, population
 from jobs.catalogue.halos.halo_catalogue import LightCone
 from jobs.fluxes import passbands, sources
+from jobs.request.checks import check_rendered
 from jobs.request.files import Catalogue, DustMap, Ingest
 from jobs.request.schema import Request, Universe
 from jobs.shell import Job, Step, main
@@ -44,6 +45,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     Galaxies of a finished catalogue have no table of halos: these are not known. Galaxies that weak lensing cannot
     describe lie in files beside the others, and are a table of their own.
     """
+    check_rendered(request)
     # Whatever is wrong with a file is said before anything is published.
     dust_map.chosen(request.seed, request.ingest.dust)
     if request.ingest.galaxies is not None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from jobs.catalogue import cells, dust_map
 from jobs.catalogue.stars import bright_stars, from_catalogue, stars
+from jobs.request.checks import check_rendered
 from jobs.request.files import DustMap
 from jobs.request.schema import Request, Stars
 from jobs.shell import Job, Step, main
@@ -26,6 +27,7 @@ _LARGEST = 3
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """Files of about as many rows, made of the generation cells that the request's area touches."""
+    check_rendered(request)
     choice = request.stars
     facts = {
         "seed": request.seed,

@@ -1,4 +1,4 @@
-"""What is checked of a whole request: its bands and the mission's parameters."""
+"""What is checked of a whole request: its bands, the mission's parameters, and whether all of it can be rendered."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 
 from jobs.request.schema import Request
 from lake_schema.errors import BadInput
+from lake_schema.tables.exposures import RENDERED
 
 
 def check_bands(request: Request) -> None:
@@ -37,3 +38,13 @@ def check_mission(request: Request) -> None:
                 mission.overridden_with({key: tuple(json.loads(value))})
             except BadInput as error:
                 raise BadInput(f"explore.{key}: {error}") from None
+
+
+def check_rendered(request: Request) -> None:
+    """There must be a simulator for every channel and image type: what can only be planned is refused by its key."""
+    wanted = [(f"pointing[{i}].channel", (p.channel,), "science") for i, p in enumerate(request.pointings)]
+    wanted += [(f"observation[{i}].channels", o.channels, o.image_type) for i, o in enumerate(request.observations)]
+    for key, channels, image_type in wanted:
+        for channel in channels:
+            if image_type not in RENDERED.get(channel, ()):
+                raise BadInput(f"{key}: no simulator renders {channel} {image_type} yet: it can be planned alone")

@@ -25,6 +25,11 @@ IMAGE_TYPES = (
     ("standard_star", "standard star"),
     ("planetary_nebula", "emission lines for the wavelength scale"),
 )
+# What there is a simulator for: channel -> image types. All others can be planned and forecast.
+RENDERED: Mapping[str, tuple[str, ...]] = {
+    "VIS": ("science", "deep", "self_calibration", "flat", "dark", "charge_injection", "bias"),
+    "EXT": ("science", "deep"),
+}
 
 EXPOSURES = Table(
     "exposures",
