@@ -33,7 +33,7 @@ SHEAR = 0.02
 COMPARED = 256
 NAMES = ("aperture_mag", "centroid_mas", "r2", "ellipticity", "pixel_sigma")
 # No approximation but the stamp, and that the largest.
-FULL = Settings(edge=1e-7, ghost=1e-9, floor=0.0, least=51.2, positions=9)
+FULL = Settings(edge=1e-7, aliased=1e-9, floor=0.0, least=51.2, positions=9)
 
 
 def capped(work: Callable[..., Found], *args: Any) -> Found:

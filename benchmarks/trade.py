@@ -47,7 +47,7 @@ _CHAIN = (
     Settings(0.005, 5e-5, 1e-4, 8.0, 25),
 )
 _SURVEY = 4
-_CHANGED = (("edge", 0.1), ("ghost", 1e-2), ("floor", 1e-2), ("least", 5.6), ("least", 3.2), ("colours", 4))
+_CHANGED = (("edge", 0.1), ("aliased", 1e-2), ("floor", 1e-2), ("least", 5.6), ("least", 3.2), ("colours", 4))
 # Of each layer of magnitude as many galaxies and stars: that the settings are chosen on, that the errors are quoted of;
 # of each, galaxies that are sheared in pairs. Galaxies that approximations are measured on, and their pairs.
 _EACH, _HELD, _SHEARED, _QUOTED, _PAIRS = 3, 4, 12, 24, 18
@@ -61,7 +61,7 @@ _SMALL = 20.0
 # galsim at its tightest but for one parameter each.
 _LOOSER = (("folding 1e-3", 1e-3, _HIGHEST), ("largest frequency 1e-4", references.ACCURACY, 1e-4))
 # No approximation but the stamp, and that large; in double precision, as nothing may be left out.
-_TRUTH = Settings(edge=1e-6, ghost=1e-8, floor=0.0, least=25.6, positions=9)
+_TRUTH = Settings(edge=1e-6, aliased=1e-8, floor=0.0, least=25.6, positions=9)
 # Magnitudes of a relative error.
 _MAG = 1.0857362
 _NUMBERS = ("flux", "shape", "position", "background")
@@ -76,7 +76,7 @@ _SETTINGS = f"""\
 # of their PSF, pairs against the largest stamps. To each, as the root of the sum of squares, the PSF's own error of
 # {positions.STARS} and of {positions.HELD} stars of other places, their colours of eight sub-bands. CPU seconds of a
 # VIS detector's sources, on {{machine}}.
-edge,ghost,floor,least,positions,colours,{",".join(_NUMBERS)},{",".join(f"{name}_held" for name in _NUMBERS)},seconds
+edge,aliased,floor,least,positions,colours,{",".join(_NUMBERS)},{",".join(f"{name}_held" for name in _NUMBERS)},seconds
 """
 
 

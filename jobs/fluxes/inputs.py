@@ -31,7 +31,7 @@ from jobs.fluxes.libraries.vega import spectrum_file
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.spectra import extinction
 from jobs.fluxes.spectra.continuum import dust_of
-from jobs.request.files import Curves, OwnCurves
+from jobs.request.files import Curves, UserCurves
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
 from lake_schema.store import read as lake_read
@@ -63,7 +63,7 @@ class Own:
         return {key: origin.sha256 for key, origin in self.origins.items()}
 
 
-def read(given: OwnCurves) -> Own:
+def read(given: UserCurves) -> Own:
     """The embedded library with whatever the request puts in its place, and its passbands.
 
     Errors: BadInput names the key of the request, the file, and the row where there is one
@@ -89,7 +89,7 @@ def read(given: OwnCurves) -> Own:
     return Own(found, library, stars, origins | of_stars, dwarfs)
 
 
-def filters(given: OwnCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
+def filters(given: UserCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
     """The request's own passbands by name, and their origins by key; errors as of `read`."""
     found, origins = {}, {}
     for name, curves in given.passbands:
@@ -102,7 +102,7 @@ def filters(given: OwnCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
     return found, origins
 
 
-def _stars(given: OwnCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
+def _stars(given: UserCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
     """Stars, the request's files by key, and what each of its own dwarfs was made of."""
     if given.basel is None and not given.irtf:
         return templates.stellar_library(), {}, []

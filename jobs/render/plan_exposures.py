@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import pyarrow as pa
 
 from jobs.render.planning import forecast, planned_exposures, psf_files, source_counts, speed, survey, tasks, variants
-from jobs.render.planning.mission import PARTS, mission_of, own_filters
+from jobs.render.planning.mission import PARTS, mission_of, user_filters
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema.columns import Table
@@ -36,7 +36,7 @@ def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, 
     mission = mission_of(request.mission)
     checks.check(mission)
     found = survey.exposures(request, mission)
-    filters, _ = own_filters(request)
+    filters, _ = user_filters(request)
     exposures = planned_exposures.table([exposure for exposure, _ in found], [own for _, own in found], filters)
     psf_files.check([(exposure, own) for exposure, own in found], filters)
     densities = source_counts.Densities(mission, request.universe, _catalogues(lake))
@@ -55,7 +55,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """The mission configuration, the exposures, and a task for each of their detectors; prints the forecast."""
     mission, exposures, rows = plan(lake, request)
     _print_forecast(lake, exposures, rows)
-    facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **own_filters(request)[1]}
+    facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **user_filters(request)[1]}
     # What they cost depends on more than which they are.
     counts = {v.table: v.key for v in _catalogues(lake)}
     costs = {**facts, "counts": counts, "rendered": request.facts("accuracy", "effects")}

@@ -42,6 +42,7 @@ def check_mission(request: Request) -> None:
 
 def check_rendered(request: Request) -> None:
     """There must be a simulator for every channel and image type: what can only be planned is refused by its key."""
+    wanted: list[tuple[str, tuple[str, ...], str]]
     wanted = [(f"pointing[{i}].channel", (p.channel,), "science") for i, p in enumerate(request.pointings)]
     wanted += [(f"observation[{i}].channels", o.channels, o.image_type) for i, o in enumerate(request.observations)]
     for key, channels, image_type in wanted:

@@ -1,6 +1,6 @@
 """Files of others that a request names.
 
-OwnCurves, curves   spectra, filters and extinction laws: the section `fluxes`
+UserCurves, curves   spectra, filters and extinction laws: the section `fluxes`
 Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
 psfs                point-spread functions: the section `psf`
 file_of             a file beside the request
@@ -28,7 +28,7 @@ class Curves:
 
 
 @dataclass(frozen=True, slots=True)
-class OwnCurves:
+class UserCurves:
     """What stands beside the embedded passbands, and in place of the embedded galaxies, extinction laws and dwarfs.
 
     basel : models of dwarfs;  irtf : spectra of stars whose infrared the dwarfs are given
@@ -78,7 +78,7 @@ def file_of(folder: Path, name: str) -> Path:
     return user_files.expanded(name, folder)
 
 
-def curves(table: Toml, folder: Path) -> OwnCurves:
+def curves(table: Toml, folder: Path) -> UserCurves:
     """The section `fluxes`; files are found from `folder`.  BadInput names the key."""
     filters = table_of(table.get("passbands", {}), "fluxes.passbands", None)
     laws = table_of(table.get("extinction", {}), "fluxes.extinction", set("1234"))
@@ -95,7 +95,7 @@ def curves(table: Toml, folder: Path) -> OwnCurves:
     stars = table_of(table.get("stars", {}), "fluxes.stars", {"basel", "irtf"})
     if "stars" in table and not stars:
         raise BadInput("fluxes.stars names neither basel nor irtf")
-    return OwnCurves(
+    return UserCurves(
         tuple(zip(filters, passbands, strict=True)),
         templates,
         tuple(zip(map(int, laws), extinction, strict=True)),

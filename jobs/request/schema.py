@@ -11,7 +11,7 @@ from typing import Any
 
 from jobs.accuracy import Accuracy
 from jobs.request.area import Area
-from jobs.request.files import Ingest, OwnCurves
+from jobs.request.files import Ingest, UserCurves
 from jobs.request.observations import Observation, Pointing
 from lake_schema.tables import mission as database
 from lake_schema.tables import products
@@ -30,7 +30,7 @@ EFFECTS = (
     "intra_pixel", "nonlinearity", "parallel_cti", "pixel_area", "pixel_response", "poisson", "quadrants",
     "read_noise", "readout_cosmic_rays", "readout_trail", "serial_cti", "shutter", "straylight",
 )  # fmt: skip
-_NO_FILES = OwnCurves()
+_NO_FILES = UserCurves()
 _NOTHING_TAKEN = Ingest()
 
 
@@ -121,7 +121,7 @@ class Request:
     bands: tuple[str, ...]
     pointings: tuple[Pointing, ...]
     truth: tuple[str, ...]
-    curves: OwnCurves = _NO_FILES
+    curves: UserCurves = _NO_FILES
     observations: tuple[Observation, ...] = ()
     effects: Effects = Effects()
     explore: tuple[tuple[str, tuple[str, ...]], ...] = ()

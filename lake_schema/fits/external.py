@@ -45,7 +45,7 @@ def read_numbers(path: Path, kind: str) -> dict[str, npt.NDArray[np.float64]]:
     kind   : of file, as user_files has it
     Errors : BadInput for a file that is cut short or is none, and where there is no table
     """
-    with _foreign(path, kind) as units:
+    with _opened(path, kind) as units:
         return _numbers_of(_first_table(path, units))
 
 
@@ -57,7 +57,7 @@ def number_batches(
     texts  : more columns, of texts or whole numbers; left out where there are none
     Errors : BadInput for a file that is cut short or is none, and names a column that is missing or no number
     """
-    with _foreign(path, kind) as units:
+    with _opened(path, kind) as units:
         unit = _first_table(path, units)
         known = {column.name: column for column in unit.columns}
         for name in columns:
@@ -75,7 +75,7 @@ def read_table(path: Path, kind: str) -> Any:
     # Slow to import, and seldom needed.
     from astropy.table import QTable
 
-    with _foreign(path, kind) as units:
+    with _opened(path, kind) as units:
         unit = _first_table(path, units)
         for column in unit.columns:
             _refuse_lists(path, column)
@@ -125,7 +125,7 @@ def read_map(path: Path, column: str) -> tuple[npt.NDArray[np.float64], dict[str
 
     Errors : BadInput for a file that is cut short or is none, and where there is no table or column
     """
-    with _foreign(path, "map of dust") as units:
+    with _opened(path, "map of dust") as units:
         unit = _first_table(path, units)
         known = {found.name: found for found in unit.columns}
         if column not in known:
@@ -144,7 +144,7 @@ def read_planes(path: Path, column: str, kind: str = "PSF") -> tuple[npt.NDArray
 
     Errors : BadInput for a file that is cut short or is none, and where it holds neither, or packed images
     """
-    with _foreign(path, kind) as units:
+    with _opened(path, kind) as units:
         for unit in units:
             found = None
             if isinstance(unit, fits.BinTableHDU):
@@ -176,7 +176,7 @@ def _numbers_of(unit: Any) -> dict[str, npt.NDArray[np.float64]]:
 
 
 @contextmanager
-def _foreign(path: Path, kind: str) -> Iterator[fits.HDUList]:
+def _opened(path: Path, kind: str) -> Iterator[fits.HDUList]:
     """Somebody's file, plain or packed by gzip, its headers looked through before astropy is given it.
 
     Errors : BadInput, whatever it is that astropy trips over: what its readers raise has no end

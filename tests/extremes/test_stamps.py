@@ -233,7 +233,7 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     assert least * electrons - rounding <= image.sum() <= electrons + rounding
     assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
     # Where nothing is taken off the stamp all of its light is on it.
-    with mock.patch.object(stamp_sizes, "_STRAY", 2.0):
+    with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
         image = stamps.draw(source, sizes, psf, side, side, floors=floors)
     assert image.sum() == pytest.approx(electrons, rel=2e-6, abs=image.size * 2.0**-21)
     assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
@@ -266,7 +266,7 @@ def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
     # Of a stamp that nothing is taken off, half as large, too.
     source.column[:] -= 32.0
     source.row[:] -= 32.0
-    with mock.patch.object(stamp_sizes, "_STRAY", 2.0):
+    with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
         moved = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
         source.column[:] -= dx
         source.row[:] -= dy
@@ -284,7 +284,7 @@ def test_a_galaxy_turned_by_half_a_turn_is_itself(kind, angle):
     inside = image[17:80, 17:80]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
     # A stamp that nothing is taken off is so to its edges.
-    with mock.patch.object(stamp_sizes, "_STRAY", 2.0):
+    with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
         image = stamps.draw(centred(source), np.array([64]), spread("vis"), 65, 65)
     inside = image[1:64, 1:64]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
@@ -397,7 +397,7 @@ def response(size, q):
 def test_of_steep_light_nothing_is_taken_off(q):
     """Too slim for a quadratic: it is no worse than a stamp that keeps all of its light."""
     wrong = abs(response(64, q) - response(512, q))
-    with mock.patch.object(stamp_sizes, "_STRAY", 2.0):
+    with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
         kept = abs(response.__wrapped__(64, q) - response(512, q))
     assert wrong < 1.05 * kept + 1e-3
 
@@ -414,8 +414,8 @@ def test_what_is_taken_off_ends_by_and_by_where_it_cancels():
     for q in np.arange(0.2, 0.3, 0.002):
         one = source_of("vis", 1e5, bulge_fraction=1.0, bulge_axis_ratio=q, bulge_half_light_radius=1.0)
         one = replace(centred(one, 64.0), jacobian=0.1 * np.eye(2)[None])
-        stray = stamps._strays(one, *stamps._forms(one), np.array([64]), 0.1)
-        taken.append(frame.returning(np.array([64]), *np.full((2, 1), 32.0), stray[0], stray[2])[0])
+        outside = stamps._outside(one, *stamps._forms(one), np.array([64]), 0.1)
+        taken.append(frame.returning(np.array([64]), *np.full((2, 1), 32.0), outside[0], outside[2])[0])
     level, light = np.array(taken)[:, 0], np.array(taken)[:, -1]
     assert light[0] < 1.0 < 500.0 < light[-1]
     assert np.abs(np.diff(level)).max() < 0.15 * level.max()

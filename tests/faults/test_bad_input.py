@@ -27,7 +27,7 @@ from jobs.render import archive, coverage, plan_exposures, render_exposures
 from jobs.render.products import keys
 from jobs.render.psf import from_file
 from jobs.request import __main__
-from jobs.request.files import OwnCurves
+from jobs.request.files import UserCurves
 from jobs.request.from_toml import parse
 from lake_schema import __main__ as lake_schema
 from lake_schema import user_files
@@ -254,7 +254,7 @@ def quoted(text):
 @pytest.fixture(scope="module")
 def warm():
     """What is made once a machine, and costs more than a refusal may."""
-    inputs.read(OwnCurves())
+    inputs.read(UserCurves())
 
 
 @pytest.mark.usefixtures("warm")

@@ -17,7 +17,7 @@ class Settings:
     """What decides how much of a source is drawn.
 
     edge  : largest light at a stamp's edge, of a pixel's noise: the source's own, and of the PSF's spikes there
-    ghost : largest part of a source's flux that wraps into its own aperture
+    aliased : largest fraction of a source's flux that is aliased into its own aperture: a stamp is periodic
     floor : Fourier samples of less than this are left out, 1 at k = 0
     least : smallest side of a stamp, arcsec: what of the PSF a source keeps
     positions : of the PSF on a detector, one of psf.DEGREES
@@ -25,7 +25,7 @@ class Settings:
     """
 
     edge: float
-    ghost: float
+    aliased: float
     floor: float
     least: float
     positions: int
@@ -40,7 +40,7 @@ def settings_for(wanted: Accuracy) -> Settings:
 def of_row(row: Mapping[str, float]) -> Settings:
     """Settings of a row of the measured table."""
     whole = {name: int(row[name]) for name in ("positions", "colours")}
-    return Settings(row["edge"], row["ghost"], row["floor"], row["least"], **whole)
+    return Settings(row["edge"], row["aliased"], row["floor"], row["least"], **whole)
 
 
 def seconds_for(wanted: Accuracy) -> float:

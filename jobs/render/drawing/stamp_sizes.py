@@ -45,7 +45,7 @@ BRIGHT, ROUNDING = 1e7, 2.5e-8
 # A trail is drawn in pieces no longer than this, pixels, each on a stamp of its own.
 _PIECE = 64.0
 # Of a galaxy's light, what may stay where it comes in at the stamp's edges: about what single precision sums to.
-_STRAY = 2e-6
+_OUTSIDE = 2e-6
 # Of a galaxy's light, what may lie nearer than it should, beyond the stamp: a tenth of the 3e-3 that circles about it
 # are known to.
 _LOST = 3e-4
@@ -92,7 +92,7 @@ def stamp_sizes(
         # A PSF in planes is cut to the stamp and does not wrap.
         wings = _LATTICE_PSF * psf_light[1] * (psf.planes is None)
         wrapped = (wings + _LATTICE_GALAXY * steeper * near) * aperture
-        enough = (electrons[left] * (psf_edge + edge) < settings.edge * noise) & (wrapped < settings.ghost)
+        enough = (electrons[left] * (psf_edge + edge) < settings.edge * noise) & (wrapped < settings.aliased)
         enough &= size * psf.pixel_scale >= least[left]
         # A point has no light beyond the PSF's planes.
         enough |= ~body & (psf.planes is not None) & (size >= SIDE)
@@ -213,4 +213,4 @@ def beyond_stamps(shapes: Shapes, sizes: Int, pixel_scale: float) -> tuple[Float
         left = left[galaxy_shapes.outside(shapes.take(left), half[left] * step * pixel_scale) > _LOST]
         far[left] = next_one
     far = np.maximum(np.minimum(half * far, _FARTHEST), _STEPS[0] * half)
-    return np.where(leaves > _STRAY, far, 0.0), leaves
+    return np.where(leaves > _OUTSIDE, far, 0.0), leaves

@@ -173,7 +173,7 @@ class _Prepared:
 def _prepared(sources: Sources, trail: Float, whole: Int, sizes: Int, psf: Psf, floors: Float | None) -> _Prepared:
     shapes, form = _forms(sources)
     bodies, table = (*_bodies(sources, shapes, form), trail), sersic.table()
-    profile, farthest, most = _strays(sources, shapes, form, sizes, psf.pixel_scale)
+    profile, farthest, most = _outside(sources, shapes, form, sizes, psf.pixel_scale)
     x0, y0 = (np.rint(position).astype(np.int64) - sizes // 2 for position in (sources.column, sources.row))
     curve = returning(sizes, sources.column - x0, sources.row - y0, profile, most)
     passing = transfer.passing(psf)
@@ -320,21 +320,21 @@ def _bodies(sources: Sources, shapes: Shapes, form: Forms) -> tuple[Array, ...]:
     return body, fraction, bulge, disk, thick, row, row_weights
 
 
-def _strays(
+def _outside(
     sources: Sources, shapes: Shapes, form: Forms, sizes: Int, pixel_scale: float
 ) -> tuple[Float, Float, Float]:
     """Of sources [n], what leaves their stamps.
 
-    returns : ([n, 11] profiles.on_the_sky of a source's electrons, 0 where nothing leaves its stamp; [n] how far,
+    returns : ([n, 11] galaxy_shapes.on_the_sky of a source's electrons, 0 where nothing leaves its stamp; [n] how far,
               pixels: until no more than _LOST of the light lies farther out; [n] electrons at most)
     """
     body = sources.shape >= 0
-    stray, far, most = np.zeros((len(sources), 11)), np.zeros(len(sources)), np.zeros(len(sources))
+    profile, far, most = np.zeros((len(sources), 11)), np.zeros(len(sources)), np.zeros(len(sources))
     far[body], leaves = stamp_sizes.beyond_stamps(shapes, sizes[body], pixel_scale)
     # The largest have outskirts.
     far[stamp_sizes.on_largest(sources.shape, sizes)] = 0.0
     sky = galaxy_shapes.on_the_sky(shapes, form)
     sky[:, [BULGE, DISK]] *= np.where(far[body] > 0, sources.electrons[body], 0.0)[:, None]
-    stray[body] = sky
+    profile[body] = sky
     most[body] = leaves * sources.electrons[body]
-    return stray, far, most
+    return profile, far, most

@@ -41,7 +41,7 @@ def wings(
     x, y = ((at - (BLOCK - 1) / 2) / BLOCK + MARGIN for at in (column, row))
     for size in np.unique(sizes[sizes < SIDE]):
         some = sizes == size
-        frame.spread(out, _beyond(cells, int(size)) / BLOCK**2, x[some], y[some], electrons[some], unit)
+        frame.smooth(out, _beyond(cells, int(size)) / BLOCK**2, x[some], y[some], electrons[some], unit)
     return out / unit
 
 

@@ -126,7 +126,7 @@ class Scene:
         return max(self.peak_electrons, self.track_electrons) + self.sky_electrons
 
     @property
-    def warmth(self) -> float:
+    def dark_current_scaling(self) -> float:
         """Thermal electrons over those at the temperature that they are given at."""
         # Ground cameras are given at the temperature they are run at.
         if f"{self.section}.detector_temperature" not in self.mission:
@@ -137,7 +137,7 @@ class Scene:
     @property
     def dark_rate(self) -> float:
         """Dark current at the detector's temperature, e-/s in a pixel."""
-        return self.value("dark_current", "electron / (s pix)") * self.warmth
+        return self.value("dark_current", "electron / (s pix)") * self.dark_current_scaling
 
     @property
     def dark_electrons(self) -> float:

@@ -71,17 +71,17 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
     galaxies, stars = (_fluxes(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs)
     settings, noise = settings_for(scene.accuracy), scene.pixel_noise
-    spread = of_colours(_psf(aim, scene, settings), settings.colours)
-    sources, sizes = sources_of(rows, (galaxies, stars), aim, spread, noise, settings)
+    psf = of_colours(_psf(aim, scene, settings), settings.colours)
+    sources, sizes = sources_of(rows, (galaxies, stars), aim, psf, noise, settings)
     bright = Lights()
     if aim.channel.moving:
-        sources, sizes, bright = _with_moving((sources, sizes), aim, rows, scene, spread, settings, seed)
+        sources, sizes, bright = _with_moving((sources, sizes), aim, rows, scene, psf, settings, seed)
     if aim.channel.scattered:
         around = bright_lights.bright_lights((rows.galaxies, galaxies), (rows.stars, stars), aim.detector, aim.wcs)
         scene = replace(scene, lights=around.and_those(bright))
-    spread, decisions = _with_pixels(aim, scene, spread, sources.electrons[touching(sources, sizes, aim.detector)])
+    psf, decisions = _with_pixels(aim, scene, psf, sources.electrons[touching(sources, sizes, aim.detector)])
     floors = stamp_sizes.floors(sources.electrons, noise, settings)
-    return Light(sources, sizes, floors, spread, scene, decisions)
+    return Light(sources, sizes, floors, psf, scene, decisions)
 
 
 def _psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
@@ -90,18 +90,18 @@ def _psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
     return aim.channel.psf(aim.exposure, aim.detector, aim.band, scene.mission, settings.positions)
 
 
-def _with_pixels(aim: Aim, scene: Scene, spread: Psf, electrons: Float) -> tuple[Psf, tuple[Decision, ...]]:
+def _with_pixels(aim: Aim, scene: Scene, psf: Psf, electrons: Float) -> tuple[Psf, tuple[Decision, ...]]:
     """(PSF with the effect that acts while sources are drawn, decision); electrons : of what is on the frame."""
     drawn = aim.channel.drawn
     if drawn is None:
-        return spread, ()
-    peak = float(spread.surface[0]) * float(electrons.max(initial=0.0))
+        return psf, ()
+    peak = float(psf.surface[0]) * float(electrons.max(initial=0.0))
     scene = replace(scene, peak_electrons=peak)
     decisions = decide((drawn,), scene)
-    if decisions[0].applied and spread.intra_pixel is not None:
+    if decisions[0].applied and psf.intra_pixel is not None:
         (strength,) = drawn.parameters(scene)
-        spread = replace(spread, intra_pixel=strength)
-    return spread, decisions
+        psf = replace(psf, intra_pixel=strength)
+    return psf, decisions
 
 
 def _no_sources(galaxies: pa.Table) -> Sources:
@@ -150,7 +150,7 @@ def outer_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfig
 
 
 def sources_of(
-    rows: Rows, electrons: tuple[Float, Float], aim: Aim, spread: Psf, noise: float, settings: Settings
+    rows: Rows, electrons: tuple[Float, Float], aim: Aim, psf: Psf, noise: float, settings: Settings
 ) -> tuple[Sources, Int]:
     """Everything that shines onto the detector, with its stamp or beyond it, ascending id, and the stamps' sides.
 
@@ -167,33 +167,33 @@ def sources_of(
     shape = np.concatenate([np.arange(len(catalogue)), np.full(rest, -1)]).astype(np.int64)
     picture = np.concatenate([np.full(len(catalogue) + len(points), -1), np.arange(len(arcs.ids))]).astype(np.int64)
     _check(ids, light)
-    farthest = np.where((shape < 0) & (picture < 0), _spikes(light, detector, spread, noise), 0.0)
+    farthest = np.where((shape < 0) & (picture < 0), _spikes(light, detector, psf, noise), 0.0)
     farthest[: len(catalogue)] = _outskirts(light[: len(catalogue)], form, detector, noise)
     reach = detector.half_diagonal + np.maximum(farthest, stamp_sizes.reach(detector.pixel_scale))
     seen = selection.near(ra, dec, astrometry.centre(detector, system), reach / 3600.0) & (light > 0)
     kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
     column, row = astrometry.pixel_of_sky(system, ra[kept], dec[kept])
     wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
-    sizes = stamp_sizes.stamp_sizes(light[kept], shape[kept], form, spread, noise, settings, wide)
+    sizes = stamp_sizes.stamp_sizes(light[kept], shape[kept], form, psf, noise, settings, wide)
     found = Sources(
         ids[kept], column, row, np.zeros((len(kept), 2, 2)), light[kept], shape[kept], form, None, picture[kept],
         arcs.pictures,
     )  # fmt: skip
-    here = stamp_sizes.shone_on(found, sizes, spread, noise, detector.nx, detector.ny)
+    here = stamp_sizes.shone_on(found, sizes, psf, noise, detector.nx, detector.ny)
     kept, found = kept[here], found.take(here)
     # Arcs have the colour of what they are an image of.
     coloured = np.concatenate([np.arange(len(catalogue) + len(points)), arcs.source])[kept]
-    colourful = spread.planes is not None and len(spread.planes.wavelength) > 1
+    colourful = psf.planes is not None and len(psf.planes.wavelength) > 1
     photons = _colours(coloured, rows, aim.band) if colourful else None
     jacobian = astrometry.jacobian(system, found.column, found.row)
     return replace(found, jacobian=jacobian, photons=photons), sizes[here]
 
 
-def _spikes(electrons: Float, detector: Detector, spread: Psf, noise: float) -> Float:
+def _spikes(electrons: Float, detector: Detector, psf: Psf, noise: float) -> Float:
     """[n] arcsec as far as which points' spikes are noticed."""
-    if spread.edges is None:
+    if psf.edges is None:
         return np.zeros(len(electrons))
-    return spikes.reach(spread.edges, electrons, NOTICEABLE * noise) * detector.pixel_scale
+    return spikes.reach(psf.edges, electrons, NOTICEABLE * noise) * detector.pixel_scale
 
 
 def _outskirts(electrons: Float, form: galaxy_shapes.Shapes, detector: Detector, noise: float) -> Float:
@@ -213,17 +213,15 @@ def _arcs(
 
 
 def _with_moving(
-    still: tuple[Sources, Int], aim: Aim, rows: Rows, scene: Scene, spread: Psf, settings: Settings, seed: int
+    still: tuple[Sources, Int], aim: Aim, rows: Rows, scene: Scene, psf: Psf, settings: Settings, seed: int
 ) -> tuple[Sources, Int, Lights]:
     """The sources with those that move, whose identifiers are the largest; and bright ones around, as far as read."""
     (sources, sizes), detector = still, aim.detector
     reach = (detector.half_diagonal + stamp_sizes.reach(detector.pixel_scale)) / 3600.0
     found = solar_system.sources(aim, scene.mission, seed, reach, sources.shapes, rows.bodies)
     length = stamp_sizes.piece_length(found.length)
-    own = stamp_sizes.stamp_sizes(
-        found.electrons, found.shape, found.shapes, spread, scene.pixel_noise, settings, length
-    )
-    wide = stamp_sizes.reaches(found.electrons, own, found.shape, None, spread, scene.pixel_noise, found.length)
+    own = stamp_sizes.stamp_sizes(found.electrons, found.shape, found.shapes, psf, scene.pixel_noise, settings, length)
+    wide = stamp_sizes.reaches(found.electrons, own, found.shape, None, psf, scene.pixel_noise, found.length)
     here = selection.touching(found.column, found.row, wide, detector.nx, detector.ny) & (found.electrons > 0)
     if not here.any():
         return sources, sizes, bright_lights.trails(found)

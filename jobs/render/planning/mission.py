@@ -2,7 +2,7 @@
 
 from jobs.fluxes import inputs
 from jobs.fluxes.passbands import Passband
-from jobs.request.files import OwnCurves
+from jobs.request.files import UserCurves
 from jobs.request.schema import MissionChoice, Request
 from lake_schema.errors import BadInput
 from lake_schema.mission import configuration
@@ -19,10 +19,10 @@ def mission_of(choice: MissionChoice) -> MissionConfiguration:
     return configuration.resolve(ladder=choice.ladder, overrides=overrides)
 
 
-def own_filters(request: Request) -> tuple[dict[str, Passband], Json]:
+def user_filters(request: Request) -> tuple[dict[str, Passband], Json]:
     """The request's own passbands that it points in, by name, and their sha256 as facts of a plan."""
     wanted = {pointing.band for pointing in request.pointings}
-    given = OwnCurves(tuple(own for own in request.curves.passbands if own[0] in wanted))
+    given = UserCurves(tuple(own for own in request.curves.passbands if own[0] in wanted))
     found, origins = inputs.filters(given)
     for name, band in found.items():
         if band.response.max() > 1.0:

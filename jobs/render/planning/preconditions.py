@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import pyarrow as pa
 
 from jobs.render.channels import registry
-from jobs.render.planning.mission import PARTS, mission_of, own_filters
+from jobs.render.planning.mission import PARTS, mission_of, user_filters
 from jobs.render.sources import catalogue_rows
 from jobs.render.sources.catalogue_rows import CATALOGUES, LENSES
 from jobs.request.schema import Request
@@ -20,7 +20,7 @@ INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars",
 def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> None:
     """What lies in the lake must have been made for this request, and the tables from one another."""
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
-    filters = own_filters(request)[1]
+    filters = user_filters(request)[1]
     wanted = {"request": request.facts(*PARTS), "mission": mission_of(request.mission).fingerprint, **filters}
     for name in ("exposures", "tasks"):
         if canonical({key: facts[name].get(key) for key in wanted}) != canonical(wanted):

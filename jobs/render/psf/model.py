@@ -73,16 +73,16 @@ class Psf:
     edges: Edges | None = None
 
 
-def of_colours(spread: Psf, colours: int) -> Psf:
+def of_colours(psf: Psf, colours: int) -> Psf:
     """The same PSF of so many wavelengths at most: each the mean of neighbours, which are of as many photons."""
-    planes = spread.planes
+    planes = psf.planes
     if planes is None or len(planes.wavelength) <= colours:
-        return spread
+        return psf
     if len(planes.wavelength) % colours:
         raise BadInput(f"{len(planes.wavelength)} wavelengths of a PSF are not a multiple of {colours}")
     wavelength = planes.wavelength.reshape(colours, -1).mean(axis=1)
     images = planes.images.reshape(colours, -1, *planes.images.shape[1:]).mean(axis=1)
-    return replace(spread, planes=replace(planes, wavelength=wavelength, images=images))
+    return replace(psf, planes=replace(planes, wavelength=wavelength, images=images))
 
 
 def galsim_profile(image: Array, pixel_scale: float, exact: bool = False) -> galsim.GSObject:

@@ -116,10 +116,10 @@ def _of_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) -> t
     slow, usual, fastest = (
         mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_min", "rate_max", "fast_rate_max")
     )
-    stray = fast < mission.value(f"{_KEY}.fast_fraction", "")
+    is_fast = fast < mission.value(f"{_KEY}.fast_fraction", "")
     # Fast ones: as many in every octave.
-    rate = np.where(stray, usual * (fastest / usual) ** pace, slow + (usual - slow) * pace)
-    turn = np.where(stray, 2.0 * np.pi * angle, 0.0)
+    rate = np.where(is_fast, usual * (fastest / usual) ** pace, slow + (usual - slow) * pace)
+    turn = np.where(is_fast, 2.0 * np.pi * angle, 0.0)
     # 1 - u lies in (0, 1].
     mag = mission.value(f"{_KEY}.faintest", "mag") + np.log10(1.0 - brightness) / _slope(mission)
     sub_cells = 4 ** (GENERATION_ORDER - FILE_ORDER)

@@ -8,7 +8,7 @@ import pytest
 from jobs.fluxes import inputs, passbands
 from jobs.fluxes.libraries.vega import spectrum_file
 from jobs.fluxes.spectra import continuum
-from jobs.request.files import Curves, OwnCurves
+from jobs.request.files import Curves, UserCurves
 from lake_schema.errors import BadInput
 from lake_schema.store.validate import check
 from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
@@ -19,7 +19,7 @@ from tests.jobs.fluxes.libraries.test_from_files import BAND, FLUX, RESPONSE, WA
 
 @pytest.fixture(scope="module")
 def embedded():
-    return inputs.read(OwnCurves())
+    return inputs.read(UserCurves())
 
 
 def own(tmp_path, **changes):
@@ -33,7 +33,7 @@ def own(tmp_path, **changes):
         "templates": Curves(files, "cosmos"),
         "extinction": ((3, Curves((law,), "extinction")),),
     }
-    return OwnCurves(**(wanted | changes))
+    return UserCurves(**(wanted | changes))
 
 
 def test_embedded_templates_say_where_they_are_from(embedded):
@@ -112,10 +112,10 @@ def test_what_is_wrong_is_refused_with_its_key(tmp_path, changes, message):
         for name, value in changes.items()
     }
     with pytest.raises(BadInput, match=message):
-        inputs.read(OwnCurves(**given))
+        inputs.read(UserCurves(**given))
 
 
 def test_a_votable_without_its_own_unit_is_in_angstrom(tmp_path):
     path = votable(tmp_path / "filter.xml")
-    mine = inputs.read(OwnCurves(passbands=(("svo", Curves((path,), "passband_svo", "vacuum")),)))
+    mine = inputs.read(UserCurves(passbands=(("svo", Curves((path,), "passband_svo", "vacuum")),)))
     assert passbands.pivot_wavelength(mine.passbands["svo"]) == pytest.approx(5985.0, abs=20.0)

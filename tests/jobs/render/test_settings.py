@@ -19,7 +19,7 @@ from jobs.render.psf import euclid, model, seeing
 from lake_schema.errors import BadInput
 
 # As good as it gets: nothing but the stamp is left out, and that is large.
-FULL = Settings(edge=1e-7, ghost=1e-9, floor=0.0, least=25.6, positions=9)
+FULL = Settings(edge=1e-7, aliased=1e-9, floor=0.0, least=25.6, positions=9)
 SIDE = 256
 
 
@@ -30,7 +30,7 @@ def rows(name):
 
 def test_more_is_asked_for_more_is_taken():
     tiers = [settings_for(wanted) for wanted in (QUICKLOOK, DRAFT, SURVEY, REFERENCE)]
-    for field in ("edge", "ghost", "floor"):
+    for field in ("edge", "aliased", "floor"):
         of = [getattr(tier, field) for tier in tiers]
         assert of == sorted(of, reverse=True)
     for field in ("least", "positions", "colours"):

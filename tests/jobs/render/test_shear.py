@@ -84,7 +84,7 @@ def test_response_of_many_galaxies_through_their_own_psf(scene, tier):
 
 def test_a_drawing_that_loses_wings_is_caught():
     """The measure itself: stamps too small by half bias the response."""
-    small = replace(settings_for(DRAFT), edge=1.0, ghost=1.0, least=1.6)
+    small = replace(settings_for(DRAFT), edge=1.0, aliased=1.0, least=1.6)
     assert abs(biases(VIS, "bulge", 20.0, small)[0]) > 1e-3
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from jobs import accuracy
-from jobs.request.files import OwnCurves
+from jobs.request.files import UserCurves
 from jobs.request.from_toml import from_table, parse
 from lake_schema.errors import BadInput
 
@@ -195,4 +195,4 @@ irtf = ["G2V.txt", "M0V.txt"]
     assert [code for code, _ in asked.curves.extinction] == [3]
     assert asked.curves.basel == tmp_path / "lcbp00.cor"
     assert asked.curves.irtf == (tmp_path / "G2V.txt", tmp_path / "M0V.txt")
-    assert parse(DEMO).curves == OwnCurves()
+    assert parse(DEMO).curves == UserCurves()

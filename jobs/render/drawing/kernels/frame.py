@@ -2,7 +2,7 @@
 
 accumulate    stamps onto the frame, in fixed point
 returning     the light that comes in at the opposite edges of stamps;  take_off : it;  leaving : it where it belongs
-spread        an image about points
+smooth        an image about points
 electrons_of  the frame with a smooth layer on top
 """
 
@@ -20,8 +20,8 @@ from lake_schema.arrays import Float, Int
 FIXED_POINT, FULL = float(1 << 20), 61
 # Of a float's bits, those within a sixteenth of an octave; square of the scale lengths at which a disc ends.
 _COARSE, _DARK = 19, 900.0
-# Columns of profiles.on_the_sky: light in the middle of a bulge and of a disc, the first of the four of their matrices,
-# and the bulge's exponent.
+# Columns of galaxy_shapes.on_the_sky: light in the middle of a bulge and of a disc, the first of the four of their
+# matrices, and the bulge's exponent.
 BULGE, DISK, BULGE_FORM, POWER, DISK_FORM = 0, 1, 2, 6, 7
 # Light that enters a stamp is taken off where it varies by less than the first about the middle, of itself; from the
 # second on nothing is. Measured on stamps too small by far (64 pixels, n = 3, half-light radius 10): without an end the
@@ -92,23 +92,23 @@ def take_off(stamps: npt.NDArray[Any], x: Float, y: Float, curve: Float, taken: 
 
 
 @jit
-def returning(size: Int, x: Float, y: Float, stray: Float, most: Float) -> Float:
+def returning(size: Int, x: Float, y: Float, profile: Float, most: Float) -> Float:
     """[m, 5] light that enters stamps at their edges: its level in the middle, terms of x^2, x y and y^2; all of it.
 
-    size, x, y : [m] side of the stamp, position in it, pixels;  stray : [m, 11] profiles.on_the_sky, electrons
+    size, x, y : [m] side of the stamp, position in it, pixels;  profile : [m, 11] galaxy_shapes.on_the_sky, electrons
     most  : [m] electrons that may enter
     Error : of a round galaxy 2 % within an eighth of the stamp of the middle, of axis ratio 0.3 a third; too little
             farther out. All 0 where the light varies too much for such terms: of steep, slim galaxies
     """
-    out = np.zeros((len(stray), 5))
-    for i in range(len(stray)):
+    out = np.zeros((len(profile), 5))
+    for i in range(len(profile)):
         n, h = size[i], size[i] / 8.0
-        if stray[i, BULGE] == 0.0 and stray[i, DISK] == 0.0:
+        if profile[i, BULGE] == 0.0 and profile[i, DISK] == 0.0:
             continue
         # The lattice of the stamp's images has no odd terms.
-        middle, rising = _images(stray[i], n, 0.0, 0.0), _images(stray[i], n, h, h)
-        right, up = _images(stray[i], n, h, 0.0), _images(stray[i], n, 0.0, h)
-        falling = _images(stray[i], n, h, -h)
+        middle, rising = _images(profile[i], n, 0.0, 0.0), _images(profile[i], n, h, h)
+        right, up = _images(profile[i], n, h, 0.0), _images(profile[i], n, 0.0, h)
+        falling = _images(profile[i], n, h, -h)
         highest, lowest = max(max(right, up), max(rising, falling)), min(min(right, up), min(rising, falling))
         uneven = max(highest - middle, middle - lowest) / middle if middle > 0.0 else _STEEP
         across2, up2 = (right - middle) / h**2, (up - middle) / h**2
@@ -128,40 +128,40 @@ def returning(size: Int, x: Float, y: Float, stray: Float, most: Float) -> Float
 
 
 @jit
-def _images(stray: Float, size: int, x: float, y: float) -> Any:
+def _images(profile: Float, size: int, x: float, y: float) -> Any:
     """Light of a source's images in the stamps about its own, three deep."""
     total = 0.0
     for r in range(-3, 4):
         for c in range(-3, 4):
             if r != 0 or c != 0:
-                total += _light(stray, x - c * size, y - r * size)
+                total += _light(profile, x - c * size, y - r * size)
     return total
 
 
 @jit
-def _light(stray: Float, x: float, y: float) -> Any:
+def _light(profile: Float, x: float, y: float) -> Any:
     """Of a galaxy, electrons a pixel at (x, y) pixels from its middle."""
     out = 0.0
-    if stray[BULGE] > 0.0:
-        out += stray[BULGE] * np.exp(-np.exp(stray[POWER] * np.log(_square(stray, BULGE_FORM, x, y) + 1e-300)))
-    return out + _disk_light(stray, x, y)
+    if profile[BULGE] > 0.0:
+        out += profile[BULGE] * np.exp(-np.exp(profile[POWER] * np.log(_square(profile, BULGE_FORM, x, y) + 1e-300)))
+    return out + _disk_light(profile, x, y)
 
 
 @jit
-def _disk_light(stray: Float, x: float, y: float) -> Any:
-    lengths = _square(stray, DISK_FORM, x, y)
-    return stray[DISK] * np.exp(-np.sqrt(lengths)) if lengths < _DARK else 0.0
+def _disk_light(profile: Float, x: float, y: float) -> Any:
+    lengths = _square(profile, DISK_FORM, x, y)
+    return profile[DISK] * np.exp(-np.sqrt(lengths)) if lengths < _DARK else 0.0
 
 
 @jit
-def _square(stray: Float, form: int, x: float, y: float) -> Any:
+def _square(profile: Float, form: int, x: float, y: float) -> Any:
     """u^2 + v^2 of the matrix that begins at a column."""
-    u, v = stray[form] * x + stray[form + 1] * y, stray[form + 2] * x + stray[form + 3] * y
+    u, v = profile[form] * x + profile[form + 1] * y, profile[form + 2] * x + profile[form + 3] * y
     return u * u + v * v
 
 
 @jit
-def spread(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit: float) -> None:
+def smooth(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit: float) -> None:
     """Adds an image about points (x, y) [m], blocks, each shared among the four nearest, `unit` to an electron.
 
     image : electrons a pixel of one electron, on blocks, its middle one the point's, with a border of nothing
@@ -188,22 +188,23 @@ def spread(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit
 
 @jit
 def leaving(
-    blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, stray: Float, light: Float,
-    unit: float,
+    blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, profile: Float,
+    light: Float, unit: float,
 ) -> None:  # fmt: skip
     """Adds what is taken off galaxies' stamps to blocks of `side` pixels outside, `unit` to an electron.
 
     margin : blocks before the frame's first;  size, reach : [m] side of the stamp, and as far as it goes, pixels
-    column, row : [m] pixels;  stray : [m, 11] profiles.on_the_sky;  light : [m] electrons to be shared among the blocks
+    column, row : [m] pixels;  profile : [m, 11] galaxy_shapes.on_the_sky
+    light  : [m] electrons to be shared among the blocks
     """
     middle = 0.5 * (side - 1)
     square = np.empty(1, np.float32)
     bits = square.view(np.int32)
     for i in range(len(size)):
         half = size[i] // 2
-        form = stray[i, BULGE_FORM : BULGE_FORM + 4].copy()
+        form = profile[i, BULGE_FORM : BULGE_FORM + 4].copy()
         least = max(half - 0.5 * side - 1.0, 1.0) ** 2 * smaller(form.reshape(2, 2))
-        bulge, first = _by_square(stray[i], least, 3.0 * (reach[i] + side) ** 2 * np.sum(form**2))
+        bulge, first = _by_square(profile[i], least, 3.0 * (reach[i] + side) ** 2 * np.sum(form**2))
         x0, y0 = np.rint(column[i]) - half - 0.5, np.rint(row[i]) - half - 0.5
         left, low = int(np.floor((column[i] - reach[i]) / side)), int(np.floor((row[i] - reach[i]) / side))
         right, high = int(np.ceil((column[i] + reach[i]) / side)), int(np.ceil((row[i] + reach[i]) / side))
@@ -217,10 +218,10 @@ def leaving(
                 outside = 1.0 - covered_x * covered_y
                 if outside > 0.0:
                     x, y = edge + 0.5 + middle - column[i], bottom + 0.5 + middle - row[i]
-                    square[0] = _square(stray[i], BULGE_FORM, x, y)
+                    square[0] = _square(profile[i], BULGE_FORM, x, y)
                     place = min(max((bits[0] >> _COARSE) - first, 0), len(bulge) - 2)
                     part = (bits[0] & ((1 << _COARSE) - 1)) / (1 << _COARSE)
-                    some = bulge[place] + part * (bulge[place + 1] - bulge[place]) + _disk_light(stray[i], x, y)
+                    some = bulge[place] + part * (bulge[place + 1] - bulge[place]) + _disk_light(profile[i], x, y)
                     image[r, c] = outside * some
         whole = np.sum(image) * side**2
         if whole > 0.0:
@@ -238,16 +239,16 @@ def _add(blocks: Int, image: Float, left: int, low: int, scale: float) -> None:
 
 
 @jit
-def _by_square(stray: Float, least: float, most: float) -> tuple[Float, int]:
+def _by_square(profile: Float, least: float, most: float) -> tuple[Float, int]:
     """(light of the bulge by u^2 + v^2, 16 places an octave, linear between; the top bits of the first)."""
     ends = np.array([max(least, 1e-30), min(max(most, 1e-30), 1e30)], np.float32)
     bits = ends.view(np.int32)
     first, last = bits[0] >> _COARSE, (bits[1] >> _COARSE) + 2
     nodes = ((np.arange(last - first) + first) << _COARSE).astype(np.int32).view(np.float32)
     out = np.zeros(len(nodes))
-    if stray[BULGE] > 0.0:
+    if profile[BULGE] > 0.0:
         for j in range(len(nodes)):
-            out[j] = stray[BULGE] * np.exp(-np.exp(stray[POWER] * np.log(nodes[j])))
+            out[j] = profile[BULGE] * np.exp(-np.exp(profile[POWER] * np.log(nodes[j])))
     return out, first
 
 

@@ -67,7 +67,7 @@ def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Ge
 
 
 def _hot(scene: Scene) -> tuple[float, float]:
-    rate = scene.value("hot_current", "electron / (s pix)") * scene.warmth
+    rate = scene.value("hot_current", "electron / (s pix)") * scene.dark_current_scaling
     return scene.value("hot_pixels", ""), min(rate * scene.exposure_time_s, _OVERFLOWING)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from jobs.fluxes import inputs, passbands
 from jobs.fluxes.libraries import from_files, stars_from_files, stellar, templates
-from jobs.request.files import OwnCurves
+from jobs.request.files import UserCurves
 from lake_schema.errors import BadInput
 from lake_schema.store.validate import check
 from lake_schema.tables.templates import TEMPLATES
@@ -110,7 +110,7 @@ def test_infrared_alone_goes_onto_the_embedded_dwarfs(tmp_path):
 def test_each_star_says_which_files_it_is_of(tmp_path):
     models = black_bodies(tmp_path / "synthetic.cor")
     irtf = tuple(irtf_file(tmp_path / f"{name}.txt", slope) for name, slope in (("hot", -3.5), ("cool", -1.0)))
-    own = inputs.read(OwnCurves(basel=models, irtf=irtf))
+    own = inputs.read(UserCurves(basel=models, irtf=irtf))
     assert set(own.sha256()) == {"fluxes.stars.basel", "fluxes.stars.irtf.0", "fluxes.stars.irtf.1"}
     rows = inputs.template_rows(own)
     check(rows, TEMPLATES)
@@ -130,7 +130,7 @@ def test_each_star_says_which_files_it_is_of(tmp_path):
 def test_what_is_wrong_is_refused_with_its_key(tmp_path, given, words):
     paths = {key: tmp_path / name if key == "basel" else (tmp_path / name[0],) for key, name in given.items()}
     with pytest.raises(BadInput, match=words):
-        inputs.read(OwnCurves(**paths))
+        inputs.read(UserCurves(**paths))
 
 
 def test_infrared_stars_are_spliced_by_colour():

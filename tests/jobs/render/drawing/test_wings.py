@@ -22,7 +22,7 @@ from tests.jobs.render.fields import MISSION, aimed, galaxies, small, spread, st
 SIDE, NOISE = 256, 12.0
 BAND = passbands.load("euclid_vis")
 BULGE = {"bulge_fraction": 1.0, "bulge_sersic_index": 4.0, "bulge_half_light_radius": 4.0}
-SETTINGS = settings.Settings(edge=0.01, ghost=1e-4, floor=3e-4, least=6.4, positions=9)
+SETTINGS = settings.Settings(edge=0.01, aliased=1e-4, floor=3e-4, least=6.4, positions=9)
 
 
 @pytest.fixture(scope="module")
