@@ -20,40 +20,22 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 
 from benchmarks import report
 from jobs.catalogue import build_stars, dust_map
-from jobs.catalogue.stars import brown_dwarfs, gaia, milky_way, stars
+from jobs.catalogue.stars import gaia, milky_way, stars
 from jobs.fluxes import band_fluxes, compute_fluxes, passbands
-from jobs.fluxes.libraries import brown_dwarfs as spectra_of_dwarfs
 from jobs.fluxes.libraries import templates
 from jobs.fluxes.libraries.vega import vega_magnitude
 from jobs.request.from_toml import from_table
-from jobs.rng import stream
+from jobs.validation import star_counts
 from lake_schema import sky, units
-from lake_schema.arrays import Float
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, publish, read
 
-SEED = 7
-AREA = sky.cell_area(GENERATION_ORDER)
 BANDS = [f"euclid_{b}" for b in ("vis", "y", "j", "h")] + [f"lsst_{b}" for b in "ugrizy"]
-# Northern latitude -> stars deg-2 to I = 18, 20, 22, 24.5 and H = 18, 22, 26 (Vega), mean over longitude, without dust.
-COUNTS = {
-    90: (898, 2248, 5119, 12869, 2149, 10947, 36451),
-    60: (1174, 2984, 6864, 17121, 2833, 14687, 47254),
-    45: (1708, 4439, 10413, 25723, 4154, 22374, 67569),
-    30: (3250, 8707, 21375, 52519, 7870, 46724, 124538),
-    20: (6699, 18113, 46740, 116048, 15669, 104824, 249659),
-}
-LIMITS = {"I": (18.0, 20.0, 22.0, 24.5), "H": (18.0, 22.0, 26.0)}
-# L, then T dwarfs deg-2 to J = 22, 24, 26 (Vega).
-DWARFS = {30: (62, 267, 458, 6, 60, 330), 60: (32, 81, 105, 5, 35, 116), 90: (25, 57, 69, 5, 29, 83)}
 # Stars to H < 26 at |b| > 20 deg by the same laws.
 SKY_20 = 2.65e9
-# mas at G = 15, 17, 20: the law of PyGaia scaled to DR2, which publishes 0.04, 0.1, 0.7.
-PARALLAX = {15.0: 0.037, 17.0: 0.098, 20.0: 0.765}
 
 
 def pole_counts(v: float) -> float:
@@ -64,40 +46,6 @@ def pole_counts(v: float) -> float:
     disc = 925.0 * 10.0 ** (0.035 * (v - 15.75)) / (1.0 + 10.0 ** (-0.132 * (v - 15.75))) ** 3
     spheroid = 1050.0 * 10.0 ** (0.087 * (v - 17.5)) / (1.0 + 10.0 ** (-0.18 * (v - 17.5))) ** 2.5
     return float(disc + spheroid)
-
-
-def around(b: float, cells: int, south: bool = False) -> list[int]:
-    """Generation cells at Galactic latitude b, evenly in longitude; with `south`, every other one at -b.
-
-    The Sun stands north of the plane, so that there are more stars in the south.
-    """
-    lon = np.arange(cells) * 360.0 / cells
-    # At a pole the parallel is too short for them.
-    lat = np.minimum(b, 89.9 - 0.1 * np.arange(cells)) * np.where(south & (np.arange(cells) % 2 == 1), -1.0, 1.0)
-    return sorted({int(cell) for cell in sky.cell_of(*sky.equatorial(lon, lat), GENERATION_ORDER)})
-
-
-def counts(b: float, cells: int, universe: stars.StarModel, dust: npt.NDArray[np.float32]) -> Float:
-    """Stars drawn deg-2 at a latitude, as in COUNTS."""
-    types, drawn = universe.types, around(b, cells)
-    total = np.zeros(sum(map(len, LIMITS.values())))
-    for cell in drawn:
-        rows = stars.draw(cell, SEED, universe, dust)
-        rows = rows.filter(pa.array(rows["component"].to_numpy() != stars.BROWN))
-        h = rows["mag_h"].to_numpy().astype(float)
-        mags = {"H": h, "I": h + (types.v_minus_h - types.color_vi)[rows["sed"].to_numpy()]}
-        total += [np.sum(mags[band] < limit) for band, limits in LIMITS.items() for limit in limits]
-    return np.asarray(total / (len(drawn) * AREA))
-
-
-def dwarf_counts(b: float, area: float) -> Float:
-    """L and T dwarfs drawn deg-2 at a latitude, as in DWARFS: one draw over so many deg2, without dust."""
-    galaxy, dwarfs, types = milky_way.milky_way(), brown_dwarfs.brown_dwarfs(1.0), spectra_of_dwarfs.templates()
-    found = brown_dwarfs.draw(dwarfs, galaxy, 90.0, b, area, 28.0, stream(SEED, "benchmark", int(b)))
-    j = types.abs_mag_j[found.template] + 5.0 * np.log10(found.distance) - 5.0
-    is_t = types.subtype[found.template] >= 10
-    total = [np.sum(~is_t & (j < m)) for m in (22, 24, 26)] + [np.sum(is_t & (j < m)) for m in (22, 24, 26)]
-    return np.array(total) / area
 
 
 def far_from_the_plane(step: int) -> float:
@@ -136,15 +84,15 @@ def pole(cells: int, dust: npt.NDArray[np.float32]) -> dict[str, float]:
     """Stars deg-2 at both poles to V = 20 and G = 20 from the flux table, against published counts in the same band."""
     universe, library = stars.model(24.0), templates.stellar_library()
     zero = {"bessell_v": vega_magnitude(passbands.load("bessell_v")), "gaia_g": gaia.ab_minus_vega()[0]}
-    drawn = around(90.0, cells, south=True)
+    drawn = star_counts.around(90.0, cells, south=True)
     found = {band: [] for band in zero}
     for cell in drawn:
-        rows = stars.draw(cell, SEED, universe, dust)
+        rows = stars.draw(cell, star_counts.SEED, universe, dust)
         fluxes = band_fluxes.star_fluxes(rows, list(zero), library)
         for band, offset in zero.items():
             found[band].append(units.mag_of_f_nu(fluxes[f"f_nu_{band}"].to_numpy().astype(float)) - offset)
     v, g = (np.concatenate(found[band]) for band in zero)
-    area = len(drawn) * AREA
+    area = len(drawn) * star_counts.AREA
     # The published counts in G: in bins of V, the part of our stars that is brighter than G = 20.
     edges = np.arange(8.0, 24.1, 0.5)
     inside, _ = np.histogram(v[g < 20.0], edges)
@@ -161,13 +109,13 @@ def pole(cells: int, dust: npt.NDArray[np.float32]) -> dict[str, float]:
 def speed(radius: float) -> dict[str, float]:
     """CPU seconds of the two jobs at b = 30 deg, without Spark."""
     ra, dec = (float(x) for x in sky.equatorial(90.0, 30.0))
-    table = {"name": "benchmark", "seed": SEED, "area": {"cone": {"ra": ra, "dec": dec, "radius": radius}}}
+    table = {"name": "benchmark", "seed": star_counts.SEED, "area": {"cone": {"ra": ra, "dec": dec, "radius": radius}}}
     wanted = from_table({**table, "fluxes": {"bands": BANDS}})
     # Libraries and machine code are made once, whatever is asked for.
     curves = [passbands.load(band) for band in BANDS]
     libraries = templates.galaxy_library(), templates.stellar_library()
     band_fluxes.prepare(curves, [None] * len(curves), *libraries, wanted.accuracy)
-    dust_map.load(SEED)
+    dust_map.load(star_counts.SEED)
     with tempfile.TemporaryDirectory() as folder:
         lake = layout.lake(folder)
         started = time.process_time()
@@ -204,7 +152,7 @@ def crowded(limit: float) -> int:
     near = cells[(np.abs(lat) >= stars.PLANE) & (np.abs(lat) < stars.PLANE + 0.3)]
     (ra,), (dec,) = sky.cell_centres(GENERATION_ORDER, near[[stars.numbers(near, stars.model()).argmax()]])
     area = {"cone": {"ra": float(ra), "dec": float(dec), "radius": 0.0}}
-    wanted = from_table({"name": "x", "seed": SEED, "area": area, "universe": {"star_limit": limit}})
+    wanted = from_table({"name": "x", "seed": star_counts.SEED, "area": area, "universe": {"star_limit": limit}})
     with tempfile.TemporaryDirectory() as folder:
         lake = layout.lake(folder)
         (step,) = build_stars.steps(lake, wanted)
@@ -224,21 +172,21 @@ def peak(limit: float) -> tuple[float, float]:
 
 def run(quick: bool) -> dict[str, float]:
     """All figures."""
-    dust = dust_map.load(SEED)
+    dust = dust_map.load(star_counts.SEED)
     figures = speed(0.1 if quick else 1.0)
     figures["cell_rows"], figures["cell_peak_gb"] = peak(16.0 if quick else 26.0)
     cells, universe = (4, stars.model(22.0)) if quick else (24, stars.model())
-    for b in (60,) if quick else COUNTS:
-        found = counts(b, cells, universe, dust) / np.array(COUNTS[b])
+    for b in (60,) if quick else star_counts.COUNTS:
+        found = star_counts.counts(b, cells, universe, dust) / np.array(star_counts.COUNTS[b])
         kept = found[:-1] if quick else found
         figures[f"counts_b{b}_off"] = float(kept[np.abs(kept - 1.0).argmax()] - 1.0)
-    for b in (60,) if quick else DWARFS:
-        found = dwarf_counts(b, 100.0 if quick else 1000.0) / np.array(DWARFS[b])
+    for b in (60,) if quick else star_counts.DWARFS:
+        found = star_counts.dwarf_counts(b, 100.0 if quick else 1000.0) / np.array(star_counts.DWARFS[b])
         figures[f"lt_b{b}_off"] = float(found[np.abs(found - 1.0).argmax()] - 1.0)
     figures["sky_b20_off"] = far_from_the_plane(4096 if quick else 64) / SKY_20 - 1.0
     figures["sky_v11"] = brighter_than_11(64 if quick else 4, dust)
     figures |= pole(4 if quick else 24, dust)
-    for g, published in PARALLAX.items():
+    for g, published in star_counts.PARALLAX.items():
         figures[f"gaia_parallax_g{g:g}_off"] = float(gaia.astrometric_errors(g)[2] / published - 1.0)
     return figures
 

@@ -28,7 +28,7 @@ _SPARK = (
     "tests/faults/test_spark.py", "tests/jobs/test_session.py", "tests/jobs/render/test_calibration_job.py",
     "tests/test_field.py",
 )  # fmt: skip
-_SKY = "tests/jobs/catalogue/"
+_SKY = ("tests/jobs/catalogue/", "tests/jobs/validation/")
 
 
 def _scope(file):

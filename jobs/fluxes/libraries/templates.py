@@ -80,7 +80,7 @@ def galaxy_library() -> Library:
         *(vega.spectrum_file(f"CWW_{name}_ext.sed").read_bytes() for name in _ANCHORS),
     )
     wavelength = rest_grid.rest_grid()
-    arrays = cache.cached_arrays("galaxy_library", key, lambda: {"flux": _galaxies(wavelength).astype(np.float32)})
+    arrays = cache.cached_arrays("galaxy_library", key, lambda: {"flux": galaxies(wavelength).astype(np.float32)})
     names = tuple(
         name for first, last, early, late, *_ in _SEQUENCE for name in [f"{early}-{late}"] * (last - first + 1)
     )
@@ -117,8 +117,12 @@ def emission_wavelengths() -> Float:
         return np.array([float(row["vacuum"]) for row in csv.DictReader(file)])
 
 
-def _galaxies(wavelength: Float) -> Float:
-    anchors = {name: _anchor(name, wavelength) for name in _ANCHORS}
+def galaxies(wavelength: Float, bridged: float = _LINE_MASK) -> Float:
+    """f_lambda of the sequence, float64[31, n_lambda].
+
+    bridged : a straight line stands in place of the spectrum so far about each emission line, A; < 0 = nowhere
+    """
+    anchors = {name: _anchor(name, wavelength, bridged) for name in _ANCHORS}
     anchors[YOUNG] = _young(wavelength)
     spectra = []
     for first, last, early, late, offset, denominator, factor in _SEQUENCE:
@@ -128,13 +132,13 @@ def _galaxies(wavelength: Float) -> Float:
     return normalised(wavelength, np.stack(spectra))
 
 
-def _anchor(name: str, wavelength: Float) -> Float:
+def _anchor(name: str, wavelength: Float, bridged: float) -> Float:
     table = np.loadtxt(vega.spectrum_file(f"CWW_{name}_ext.sed").read_text().splitlines())
     at, flux = table[:, 0], table[:, 1]
     # In the logarithm: the ultraviolet is sampled every 100 A, over which an elliptical fades by half.
     sampled = np.exp(np.interp(wavelength, at, np.log(flux), left=-np.inf))
     sampled = np.where(wavelength > at[-1], flux[-1] * (wavelength / at[-1]) ** _INFRARED_SLOPE, sampled)
-    away = (np.abs(wavelength[:, None] - emission_wavelengths()) > _LINE_MASK).all(1)
+    away = (np.abs(wavelength[:, None] - emission_wavelengths()) > bridged).all(1)
     return normalised(wavelength, np.interp(wavelength, wavelength[away], sampled[away]))
 
 

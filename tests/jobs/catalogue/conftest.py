@@ -1,5 +1,6 @@
 """One galaxy model, one dust map and one drawn sky for all tests of the folder."""
 
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -36,6 +37,11 @@ SMALL = {"box_cells": BOX_CELLS, "lensing_nside": NSIDE}
 
 @pytest.fixture(scope="session")
 def universe():
+    return made()
+
+
+@cache
+def made():
     return galaxies.model(SEED, Universe(**SMALL))
 
 
@@ -51,8 +57,15 @@ def cells(universe):
 
 
 @pytest.fixture(scope="session")
-def drawn(universe, cells, dust, library):
+def drawn():
+    return sky_drawn()
+
+
+@cache
+def sky_drawn():
     """Five blocks of four cells spread over the sky (1.05 deg2): rows, columns by name, and magnitudes by band."""
+    universe, library = made(), templates.galaxy_library()
+    cells, dust = population.Cells(universe.population), dust_map.load(SEED)
     places = [4 * block + i for block in range(25, 3 << 16, (3 << 16) // 5) for i in range(4)]
     rows = pa.concat_tables([galaxies.draw(cell, universe, cells, dust) for cell in places])
     halos = pa.concat_tables([galaxies.halo_table(cell, universe.population, cells) for cell in places])

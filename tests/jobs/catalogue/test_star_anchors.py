@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import stars as benchmark
 from jobs.catalogue.stars import stars
+from jobs.validation import star_counts
 from tests.benchmarks import run
 
 KEYS = ("stars_per_s_core", "cell_peak_gb")
@@ -15,9 +16,9 @@ KEYS = ("stars_per_s_core", "cell_peak_gb")
 @pytest.mark.parametrize("b", [60, 20])
 def test_counts_of_drawn_stars(b, dust):
     """Mean over 12 cells to I = 18 .. 24.5 and H = 18 .. 26, each within 15 % and its Poisson error."""
-    found = benchmark.counts(b, 12, stars.model(), dust)
-    published = np.array(benchmark.COUNTS[b], float)
-    error = 3 * np.sqrt(published / (12 * benchmark.AREA))
+    found = star_counts.counts(b, 12, stars.model(), dust)
+    published = np.array(star_counts.COUNTS[b], float)
+    error = 3 * np.sqrt(published / (12 * star_counts.AREA))
     assert np.all(np.abs(found - published) < 0.15 * published + error)
 
 

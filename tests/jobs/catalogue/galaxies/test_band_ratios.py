@@ -39,10 +39,8 @@ K_CORRECTIONS = {
 @pytest.fixture(scope="module")
 def with_lines():
     """The library whose observed spectra keep their weak lines."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(templates, "_LINE_MASK", -1.0)
-        wavelength = rest_grid.rest_grid()
-        flux = templates._galaxies(wavelength)[[0, 13, 25]].astype(np.float32)
+    wavelength = rest_grid.rest_grid()
+    flux = templates.galaxies(wavelength, bridged=-1.0)[[0, 13, 25]].astype(np.float32)
     return templates.Library(wavelength, flux, ("0", "13", "25"))
 
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from benchmarks.stars import DWARFS as DWARF_COUNTS
 from jobs.catalogue.stars import brown_dwarfs, milky_way, stars
 from jobs.fluxes import passbands
 from jobs.fluxes.libraries import brown_dwarfs as spectra
 from jobs.fluxes.libraries import templates
 from jobs.fluxes.libraries.vega import vega_magnitude
+from jobs.validation.star_counts import DWARFS as DWARF_COUNTS
 from lake_schema import sky
 from tests.jobs.catalogue.conftest import SEED
 

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.stars import COUNTS
 from jobs.catalogue.stars import milky_way as mw
 from jobs.fluxes.libraries import stellar
 from jobs.request import schema
+from jobs.validation.star_counts import COUNTS
 
 GALAXY = mw.milky_way()
 BESANCON = mw.milky_way("besancon")

@@ -79,7 +79,7 @@ def test_red_tail_and_lyman_edge(library):
 def test_made_once(library, monkeypatch):
     """By all processes; within one it is not even read again."""
     assert templates.galaxy_library() is library
-    monkeypatch.setattr(templates, "_galaxies", lambda wavelength: pytest.fail("made again"))
+    monkeypatch.setattr(templates, "galaxies", lambda *_: pytest.fail("made again"))
     again = templates.galaxy_library.__wrapped__()
     np.testing.assert_array_equal(again.flux, library.flux)
     assert not again.flux.flags.writeable

@@ -13,12 +13,12 @@ import healpy as hp
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks._clustering import Tracers
 from jobs.catalogue.galaxies import lensing
 from jobs.catalogue.galaxies.lensing import Planes
 from jobs.catalogue.matter import convergence, density_box, lightcone
 from jobs.catalogue.matter.density_box import Box
 from jobs.fluxes import cosmology
+from jobs.validation.clustering import Tracers
 from lake_schema.arrays import Float
 
 # Patches of the sky whose scatter gives the error of a mean: cells of this nside.

@@ -6,7 +6,7 @@ figures   what is counted, by name; a count's own error, from the scatter of the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from jobs.catalogue.halos import luminosity_function, population
 from jobs.fluxes import cosmology
 from jobs.fluxes.libraries import templates
 from lake_schema import sky
-from lake_schema.arrays import Float, Float32
+from lake_schema.arrays import Array, Bool, Float, Int
 from lake_schema.ids import GENERATION_ORDER
 
 ARCMIN2 = 3600.0
@@ -51,15 +51,15 @@ class Census:
     blocks: int
     area: float
     limit: float
-    rows: dict[str, npt.NDArray[np.generic]]
-    block: npt.NDArray[np.int64]
-    mags: dict[str, Float32]
-    halos: dict[str, npt.NDArray[np.generic]]
-    halo_block: npt.NDArray[np.int64]
+    rows: Mapping[str, Array]
+    block: Int
+    mags: Mapping[str, Array]
+    halos: Mapping[str, Array]
+    halo_block: Int
 
-    def per_deg2(self, kept: npt.NDArray[np.bool_]) -> Float:
+    def per_deg2(self, kept: Bool) -> Float:
         """Galaxies[block] deg-2."""
-        return np.bincount(self.block[kept], minlength=self.blocks) * (self.blocks / self.area)
+        return np.asarray(np.bincount(self.block[kept], minlength=self.blocks) * (self.blocks / self.area))
 
 
 def blocks(count: int, side_order: int) -> list[list[int]]:
@@ -81,10 +81,10 @@ def draw(universe: GalaxyModel, dust: npt.NDArray[np.float32], places: Sequence[
         table = pa.concat_tables([galaxies.halo_table(cell, universe.population, drawn) for cell in place])
         hosts.append({name: table[name].to_numpy() for name in HALO_COLUMNS})
 
-    def together(parts: Sequence[dict[str, npt.NDArray[np.generic]]]) -> dict[str, npt.NDArray[np.generic]]:
+    def together(parts: Sequence[Mapping[str, Array]]) -> Mapping[str, Array]:
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def which(parts: Sequence[dict[str, npt.NDArray[np.generic]]]) -> npt.NDArray[np.int64]:
+    def which(parts: Sequence[Mapping[str, Array]]) -> npt.NDArray[np.int64]:
         return np.repeat(np.arange(len(parts)), [part["z_true"].size for part in parts])
 
     area = sum(len(place) for place in places) * AREA
@@ -93,12 +93,10 @@ def draw(universe: GalaxyModel, dust: npt.NDArray[np.float32], places: Sequence[
     )
 
 
-def magnitudes(
-    rows: dict[str, npt.NDArray[np.generic]], library: templates.Library, z_max: float
-) -> dict[str, npt.NDArray[np.generic]]:
+def magnitudes(rows: Mapping[str, Array], library: templates.Library, z_max: float) -> Mapping[str, Array]:
     """Magnitudes by band, AB, unlensed and before the Milky Way's dust."""
     names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
-    sed = band_ratios.Sed(*(rows[name] for name in names))  # type: ignore[arg-type]
+    sed = band_ratios.Sed(*(rows[name] for name in names))
     z = rows["z_true"].astype(float)
     plain = rows["abs_mag_r01"] + cosmology.distance_modulus(z)
     return {
@@ -153,7 +151,7 @@ def colours(census: Census) -> dict[str, float]:
     return figures
 
 
-def half_light(rows: dict[str, npt.NDArray[np.generic]], part: npt.NDArray[np.int64]) -> Float:
+def half_light(rows: Mapping[str, Array], part: npt.NDArray[np.int64]) -> Float:
     """Half-light radius[n] of both components together, arcsec, by bisection."""
     names = ("bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index")
     bulge, disc, fraction, sersic = (rows[name][part].astype(float) for name in names)

@@ -1,4 +1,4 @@
-"""The universe against its list of expectations, benchmarks/validate_universe.csv: at a few cells, and whole at night.
+"""The universe against its list of expectations, jobs/validation/expectations.csv: at a few cells, and whole at night.
 
 A few cells hold a few structures: here every tolerance is as wide as the list says and two errors of the blocks more.
 """
@@ -9,15 +9,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from benchmarks import _census as census
-from benchmarks import _clustering as clustering
-from benchmarks import _shear as shear
-from benchmarks import validate_universe
 from jobs.catalogue.halos import luminosity_function
 from jobs.fluxes import cosmology
+from jobs.validation import __main__, census, checks, clustering, shear
+from jobs.validation import universe as measured
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
-from tests.benchmarks import run
 from tests.jobs.catalogue.galaxies.test_lensing import limber
 
 # The luminosity function, calibrated on 102 galaxies an arcmin2 with I_E < 26, makes 15 % more than observed to i = 25
@@ -27,7 +24,7 @@ KNOWN = {"i_25"}
 
 @pytest.fixture(scope="module")
 def seen(drawn):
-    """The drawn sky, as the benchmark counts it."""
+    """The drawn sky, as the validation counts it."""
     first = np.array(drawn.places[::4]) // 4
     deepest = 2 * (sky.DEEPEST - GENERATION_ORDER) + 2
 
@@ -48,7 +45,7 @@ def seen(drawn):
 
 
 def failed(figures):
-    return [(check.name, check.found) for check in validate_universe.checks(figures, 2.0) if not check.passed]
+    return [(check.name, check.found) for check in checks.checks(figures, 2.0) if not check.passed]
 
 
 def test_colours(seen):
@@ -64,7 +61,7 @@ def test_halpha(seen):
 
 
 def test_halos(seen):
-    assert failed(census.halos(seen, validate_universe.published_halos())) == []
+    assert failed(census.halos(seen, measured.published_halos())) == []
 
 
 def test_luminosities(seen):
@@ -79,7 +76,7 @@ def test_a_figure_that_is_off_fails():
     assert [name for name, _ in failed({**bad, "vis_24.5_error": 0.1})] == ["sigma_8", "vis_24.5"]
     # The share of emitters is given the error of their number.
     counted = {"halpha_2e-16_0.9_1.8": 1.07, "halpha_2e-16_0.9_1.8_error": 0.03}
-    (check,) = validate_universe.checks(counted)
+    (check,) = checks.checks(counted)
     assert check.passed
     assert check.most == pytest.approx(1.08)
 
@@ -151,21 +148,7 @@ def test_theories_agree():
 def test_the_fuller_report(tmp_path):
     """Every expectation, at the settings that a request has by default: a quarter of an hour of one core."""
     file = tmp_path / "universe.json"
-    validate_universe.main(["--json", str(file), "--figures", str(tmp_path)])
+    __main__.main(["--json", str(file), "--figures", str(tmp_path)])
     figures = json.loads(file.read_text())
     assert (tmp_path / "universe.png").stat().st_size > 10_000
     assert set(filter(None, figures["failed"].split(", "))) <= KNOWN
-
-
-@pytest.mark.spark
-@pytest.mark.nightly
-def test_the_benchmark(tmp_path):
-    file = tmp_path / "catalogue.json"
-    run("catalogue", "--quick", "--json", file)
-    figures = json.loads(file.read_text())
-    keys = (
-        "cell_rows", "cell_s", "cell_peak_gb", "speedup_2_cores", "galaxies_per_s_core", "schechter_per_s_core",
-        "projected_core_hours_922m",
-    )  # fmt: skip
-    assert {"name", "commit", "machine", "repeats", *keys} <= set(figures)
-    assert figures["cell_peak_gb"] < 1.5

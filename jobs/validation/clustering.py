@@ -20,6 +20,7 @@ import numpy.typing as npt
 from scipy import fft
 from scipy.special import j0
 
+from jobs import sums
 from jobs.catalogue.halos import halos, luminosity_function, matching, population, satellites
 from jobs.catalogue.halos.luminosity_function import Volume
 from jobs.catalogue.halos.population import Population
@@ -93,7 +94,7 @@ def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
     for i, times in zip(field.tolist(), amplitude.tolist(), strict=True):
         number = np.exp(np.float32(times) * box.smoothed[i] - np.float32(0.5 * times**2 * box.variance[i]))
         rows.append(np.sqrt(_binned(number, box.model.cell, edges) / matter))
-    return np.array(rows) / np.array(x)[:, None]
+    return np.asarray(np.array(rows) / np.array(x)[:, None])
 
 
 def velocities(box: Box, x: float) -> float:
@@ -168,8 +169,8 @@ class Pairs:
 
     def left(self, w: Float) -> tuple[Float, Float]:
         """w[m] at the nodes -> (w[bin], what is left of it[bin] where each pixel is held against the block's mean)."""
-        mean = self.of_bin @ w
-        return mean, mean - 2.0 * (self.of_pixel @ w) + self.of_all @ w
+        mean, pixel, every = (sums.product(pairs, w) for pairs in (self.of_bin, self.of_pixel, self.of_all))
+        return mean, mean - 2.0 * pixel + every
 
 
 def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: int, edges: Float) -> list[Correlation]:
@@ -198,7 +199,7 @@ def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: 
 
 def _separations(some: Float, every: Float, edges: Float) -> tuple[Int, Float]:
     """Bin of the separation of each pair, -1 or the number of bins outside; and the separation, deg."""
-    theta = np.degrees(np.arccos(np.clip(some @ every.T, -1.0, 1.0))).ravel()
+    theta = np.degrees(np.arccos(np.clip(sums.product(some, every.T), -1.0, 1.0))).ravel()
     return np.searchsorted(edges, theta) - 1, theta
 
 
@@ -250,8 +251,8 @@ class Shells:
 
 def shells(everything: Tracers, near: float, far: float) -> Shells:
     """The tracers' own redshifts and biases."""
-    ends = [float(cosmology.comoving_distance(z)) for z in (near, far)]
-    edges = np.linspace(*ends, int(np.ceil((ends[1] - ends[0]) / _SHELL)) + 1)
+    first, last = (float(cosmology.comoving_distance(z)) for z in (near, far))
+    edges = np.linspace(first, last, int(np.ceil((last - first) / _SHELL)) + 1)
     number = np.histogram(everything.chi, edges)[0]
     x = np.histogram(everything.chi, edges, weights=everything.x)[0] / number
     wide = np.diff(edges)

@@ -1,4 +1,4 @@
-"""The figures of benchmarks.validate_universe."""
+"""The figures of the universe."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import _census as census
 from jobs.catalogue.halos import luminosity_function
 from jobs.fluxes import cosmology
+from jobs.validation import census
 from lake_schema.arrays import Float
 
 # Galaxies an arcmin2 brighter than i: GAMA and zCOSMOS (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST Science
