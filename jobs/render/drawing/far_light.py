@@ -1,13 +1,27 @@
 """Light that the pupil's edges diffract far from a bright star, where its PSF's plane has ended.
 
-So far out the rings of a band's wavelengths overlap: what is left of them falls as r^-3. Each straight bar draws two
-spikes across itself, as wide as it is long, with the fringes of its width along them.
-
 Star      one of them
 add       what a star shines outside the plane, onto a frame
 unfold    what of it the plane has inside, taken off
 left      how the plane fades there
 seconds, unfold_seconds   what `add` and `unfold` take
+
+Rings fall as r^-3, spikes are tabulated (psf/spikes.py).  The plane of side N fades over 24 pixels by the smooth step
+s(z) = z^2 (3 - 2 z) in columns and in rows; `add` draws 1 - s s of the light there and all of it farther out, so that
+the sum has no seam.
+
+A star that moves by L pixels shines 1 / L of its light from each pixel of its trail.  With d the distance of a pixel
+from the trail's line and a .. b the stretch of the trail, measured from the pixel's foot on that line,
+
+    integral of ds / (s^2 + d^2)^(3/2) = [s / (d^2 h)],  h = sqrt(s^2 + d^2),
+
+of which s / (d^2 h) = 1 / d^2 - 1 / (h (h + s)) for s > 0: the second form has no difference of large numbers on the
+line itself.  A spike is a product of a slow function along and a table across it: each part of the trail that moves
+8 pixels along the spike brings the table's integral over what it moves across.
+
+The plane itself is a discrete transform of the pupil and repeats itself after a period Q: a pixel at r of the middle
+holds what belongs at r + Q m, too (m whole numbers), weakened by the softened edges of the sampled pupil to
+sinc^2(|r + Q m| / Q) against sinc^2(|r| / Q) of its own.  `unfold` keeps of each pixel own / (own + folded).
 
 Ref : Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a circle, far out)
 """

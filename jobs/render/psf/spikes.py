@@ -1,7 +1,30 @@
 """Diffraction spikes and rings of a pupil, far from a star.
 
 Edges     of a pupil;  of_pupil : the Euclid one's
-reach     how far out a star's spikes are noticed
+ring, spikes   light in a pixel;  reach : how far out a star's spikes are noticed
+
+A point's light is spread over angles theta as |A(theta)|^2 / (lambda^2 S), where A is the integral of
+exp(-2 pi i x theta / lambda) over the clear pupil and S the pupil's area.  Far out only edges count, and those of
+different parts of the pupil beat so fast that their light adds up.
+
+Circles. Of an aperture of radius R, A = 2 pi R^2 J1(z) / z with z = 2 pi R theta / lambda.  Far out
+J1(z)^2 = 2 / (pi z) cos^2(z - 3 pi / 4), whose mean over rings is 1 / (pi z), so that
+
+    |A|^2 / (lambda^2 S) = R lambda / (2 pi^2 S theta^3) = P lambda / (4 pi^3 S theta^3)
+
+with the perimeter P = 2 pi R: perimeters of all circles add up.  A pixel of side p at r pixels has p^2 of that, with
+theta = p r: P lambda / (4 pi^3 S p r^3), which is `ring` at r = 1.
+
+Bars. A straight bar of width w and length l takes A = w l sinc(w u / lambda) sinc(l v / lambda) away, where u runs
+across the bar and v along it, sinc(x) = sin(pi x) / (pi x).  Its light in a pixel,
+
+    (w l p / lambda)^2 / S  sinc^2(w p r / lambda)  sinc^2(l p t / lambda),
+
+is a pair of spikes across the bar (r pixels out) as narrow as l is long (t pixels beside their middle), with fringes
+along them.  The mean of the fringes is l^2 / (2 pi^2 S r^2), whatever the width: far out spikes outshine rings.
+Each sub-band is the sum of its wavelengths, smoothed across by jitter, diffusion and the pixel.
+
+Ref : Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a circle)
 """
 
 from __future__ import annotations

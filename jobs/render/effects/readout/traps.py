@@ -5,10 +5,23 @@ gives its electron back with its species' time scale, into whichever packet lies
 
 A line is n packets; packet i is shifted over the pixels i, i - 1 .. 0. Taken one pixel at a time this is exact and
 slow. Here many pixels are taken together: all see the same packets, so one stack of watermarks (the heights up to which
-clouds have filled traps, and when) serves them all, and every species: a trap filled at row t is full with
-exp(-(row - t) / tau). Pixel i joins empty when packet i arrives. What is left out is that packets change on their way:
-the second order in the losses, which a second sweep over the changed packets brings in (Heun's rule), and further
-steps along the line make as small as wanted. Each electron is counted once, captured or not: charge is conserved.
+clouds have filled traps, and when) serves them all, and every species.
+
+Let m pixels see packet i, of n electrons, and let species s have rho_s traps in a pixel, of time scale tau_s in
+transfers. At height z of the volume the m pixels were last filled by packet j(z), when there were m(z) of them: pixel i
+joins empty when packet i arrives. Of the traps in dz, rho_s m(z) exp(-(i - j(z)) / tau_s) are full, H_s in all.
+One transfer on,
+
+    released   G = sum_s rho_s H_s (1 - exp(-1 / tau_s)), each pixel its share of it;
+    reached    V(n + G / m);
+    captured   C = integral from 0 to V of sum_s rho_s (m - m(z) exp(-(i - j(z)) / tau_s)) dz, at most n + G;
+    left over  n + G - C, and m(z) = m, j(z) = i below V.
+
+Both m(z) and j(z) are steps, the lower the newer, so that a packet looks at those below V alone and replaces them by
+one: the cost of a line is that of its packets, not of packets times pixels. What is left out is that packets change
+on their way: the second order in the losses. Heun's rule brings it in, with the change c of a sweep,
+n' = n + (c(n) + c(n + c(n))) / 2, and further steps along the line make it as small as wanted. Each electron is counted
+once, captured or not: charge is conserved.
 
 Ref : Massey et al. 2014 (volume and watermarks), Massey et al. 2010
 """
