@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from jobs import demo, shell
-from jobs.catalogue import build_gaia, build_galaxies, build_stars
+from jobs.catalogue import build_gaia, build_galaxies, build_stars, build_strong_lenses
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
 from jobs.request.from_toml import from_table
@@ -18,7 +18,7 @@ from tests import requests
 
 ROOT = Path(__file__).parents[1]
 FIRST = (build_galaxies.JOB, build_stars.JOB)
-LATER = (compute_fluxes.JOB, build_gaia.JOB, plan_exposures.JOB, render_exposures.JOB)
+LATER = (compute_fluxes.JOB, build_strong_lenses.JOB, build_gaia.JOB, plan_exposures.JOB, render_exposures.JOB)
 JOBS = FIRST + LATER
 # Four order-5 cells meet here, so that there is something to share out.
 SMALL = requests.text(
@@ -57,6 +57,14 @@ def submit(*arguments):
     return subprocess.run([command, *map(str, arguments)], capture_output=True, text=True, cwd="/", timeout=300)
 
 
+def test_no_job_is_forgotten():
+    """Here, and in the README's table."""
+    found = {path for path in (ROOT / "jobs").rglob("*.py") if "\nJOB = Job(" in path.read_text()}
+    assert {path.stem for path in found} == {job.name for job in JOBS}
+    table = (ROOT / "README.md").read_text()
+    assert [path for path in found if f"| `{path.relative_to(ROOT).as_posix()}` |" not in table] == []
+
+
 @pytest.mark.parametrize(("text", "key"), BAD)
 @pytest.mark.parametrize("job", JOBS, ids=lambda job: job.name)
 def test_a_bad_request_ends_with_one_line_and_nothing_written(job, text, key, tmp_path, capsys):
@@ -90,6 +98,7 @@ def test_what_must_be_built_first_is_named(job, tmp_path, capsys):
     assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 2
     missing = {
         "compute_fluxes": "no table galaxies",
+        "build_strong_lenses": "no table galaxies",
         "build_gaia": "no table stars",
         "plan_exposures": "pointing and observation are missing",
         "render_exposures": "no table mission",

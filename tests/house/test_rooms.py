@@ -11,6 +11,7 @@ import pytest
 from jobs.accuracy import SURVEY
 from jobs.render.channels import costs, ground, registry
 from jobs.render.effects.effect import Effect
+from lake_schema.errors import BadInput
 from lake_schema.tables.exposures import CHANNELS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -75,7 +76,7 @@ def test_a_channel_is_added_in_one_place(monkeypatch):
     from tests.jobs.render import fields
     from tests.jobs.render.exposure.test_render import field
 
-    effect = Effect("brighter", brighter, lambda scene: (3.0,), lambda scene: 1.0, optional=False)
+    effect = Effect("brighter", brighter, lambda scene: (3.0,), lambda scene: 1.0, optional=False, cost=1e-3)
     made = replace(ground.CHANNEL, effects={"science": (effect,)})
     monkeypatch.setattr(registry, "CHANNELS", {**registry.CHANNELS, "DUMMY": made})
     measured = costs.of_channel("EXT")
@@ -93,3 +94,9 @@ def test_a_channel_is_added_in_one_place(monkeypatch):
 @pytest.mark.parametrize("name", [name for name in dict(CHANNELS) if name not in registry.CHANNELS])
 def test_a_channel_that_nothing_renders_has_no_effects(name):
     assert registry.effects_or_none(name, "science") is None
+
+
+def test_an_effect_without_a_cost_is_refused():
+    effect = Effect("brighter", brighter, lambda scene: (3.0,), lambda scene: 1.0)
+    with pytest.raises(BadInput, match="effect brighter has the cost 0: a forecast would take it as free"):
+        replace(ground.CHANNEL, effects={"science": (effect,)})

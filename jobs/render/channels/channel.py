@@ -14,6 +14,7 @@ from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
 from jobs.render.psf.model import Psf
 from jobs.render.psf.spikes import Edges
+from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 
@@ -42,3 +43,10 @@ class Channel:
     own_light: tuple[Effect, ...] = ()
     tracks: tuple[Effect, ...] = ()
     scattered: bool = False
+
+    def __post_init__(self) -> None:
+        for effects in self.effects.values():
+            for effect in effects:
+                if not effect.cost > 0.0:
+                    what = f"effect {effect.name} has the cost {effect.cost:g}: a forecast would take it as free"
+                    raise BadInput(f"{what}; python -m benchmarks.effects measures it")

@@ -7,7 +7,7 @@ import pytest
 from jobs import shell
 from jobs.accuracy import DRAFT, REFERENCE, SURVEY
 from jobs.render import plan_exposures
-from jobs.render.channels import registry
+from jobs.render.channels import costs, registry
 from jobs.render.exposure import truth_maps
 from jobs.render.planning import forecast, prices, speed
 from tests.jobs.render.planning.test_survey import VIS, planned
@@ -90,3 +90,9 @@ def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
     assert lines[-2].split()[:2] == ["all", "all"]
     assert lines[-1].startswith("core-hours are of this machine, from a calibration")
     assert not lake.exists()
+
+
+@pytest.mark.parametrize("channel", registry.CHANNELS)
+def test_every_channel_has_measured_costs(channel):
+    cost = costs.of_channel(channel)
+    assert min(getattr(cost, name) for name in cost.__slots__) > 0.0
