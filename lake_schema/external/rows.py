@@ -29,8 +29,8 @@ from lake_schema.external import files as external_files
 from lake_schema.fits import external
 
 _BLOCK_BYTES, _FIRST_LOOK = 8 << 20, 1 << 16
-# Of a name, characters.
-_LONGEST_TEXT = 64
+# Of a name, characters; of a CSV file.
+_LONGEST_TEXT, _MOST_COLUMNS = 64, 4096
 _CSV, _FITS, _PARQUET = (".csv",), (".fits", ".fit"), (".parquet", ".parq")
 _ENDINGS = (*_PARQUET, *_FITS, *_CSV)
 
@@ -80,9 +80,17 @@ def looked_at(file: Path, kind: str = "catalogue") -> Path:
     good = start.startswith(b"PAR1") if form == _PARQUET else start.startswith((b"SIMPLE", b"\x1f\x8b"))
     if form == _CSV:
         good = b"\0" not in start
+        _refuse_wide(file, start)
     if not good:
         raise BadInput(f"{user_files.shown(file)}: is not a {form[0].removeprefix('.')} file")
     return file
+
+
+def _refuse_wide(file: Path, start: bytes) -> None:
+    """Arrow makes room for every column that a file has, 4 kB each and more, whichever are asked for."""
+    titles = (start.splitlines() or [b""])[0]
+    if len(titles) == _FIRST_LOOK or titles.count(b",") >= _MOST_COLUMNS:
+        raise BadInput(f"{user_files.shown(file)}: has more than {_MOST_COLUMNS} columns, or titles of any length")
 
 
 def pieces(

@@ -40,7 +40,7 @@ _TITLES = (
     ("VTmag", "VT"),
 )
 _NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
-_KIND = "catalogue of stars"
+_KIND, _LONGEST_LINE = "catalogue of stars", 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +147,11 @@ def _records(file: Path) -> tuple[Float, Float, Float]:
 
 def _text(file: Path) -> list[Float]:
     with user_files.opened(file, _KIND) as stream:
-        count = stream.readline(1000).count(b"|") + 1
+        line = stream.readline(_LONGEST_LINE)
+    if len(line) == _LONGEST_LINE:
+        # Room would be made for every field that it has.
+        raise BadInput(f"{file}: the first record has {_LONGEST_LINE} characters or more")
+    count = line.count(b"|") + 1
     found = [about for about in _FIELDS.values() if about[0] == count]
     if not found:
         raise BadInput(f"{file}: records of {count} fields, wanted 32 (tyc2.dat) or 18 (suppl_1.dat) between bars")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from lake_schema.mission.configuration import MissionConfiguration
 
 _DAY_S, _OVERHEAD_S = 86400.0, 30.0
 _MOST_ROWS, _LONGEST = 1_000_000, 1000
+_MOST_LINES, _LONGEST_LINE = 2 * _MOST_ROWS, 20 * _LONGEST
 # Mean midnight of the sites is not modelled: ground exposures follow one another from the earliest date on.
 _COLUMNS = ("channel", "camera", "band", "ra", "dec", "position_angle", "mjd")
 _OPTIONAL = ("exposure_time_s", "sky", "seeing", "zero_point", "psf", "detectors", "image_type")
@@ -172,8 +173,15 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
     Errors : BadInput names the file, the line and the column
     """
     stream = io.StringIO(user_files.text(path, "table of pointings"), newline="")
-    numbered = [(n, line) for n, line in enumerate(stream, start=1) if not line.startswith("#")]
-    lines = csv.DictReader(line for _, line in numbered)
+    numbered, at = _plain_lines(path, stream), 0
+
+    def texts() -> Iterator[str]:
+        nonlocal at
+        for number, line in numbered:
+            at = number
+            yield line
+
+    lines = csv.DictReader(texts())
     found: list[Exposure] = []
     try:
         names = lines.fieldnames or []
@@ -187,13 +195,22 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
         for row in lines:
             if len(found) >= _MOST_ROWS:
                 raise BadInput(f"{path}: more than {_MOST_ROWS} pointings")
-            where = f"{path} line {numbered[lines.line_num - 1][0]}"
+            where = f"{path} line {at}"
             if not all(isinstance(text, str) and len(text) <= _LONGEST for text in row.values() if text is not None):
                 raise BadInput(f"{where}: a text is too long, or there are more than columns")
             found.append(_of_row(row, where, len(found) + 1, block, mission, path.parent))
     except csv.Error as error:
         raise BadInput(f"{path}: {' '.join(str(error).split())}") from None
     return found
+
+
+def _plain_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """Number and text of each line that is no comment, as many and as long as pointings need."""
+    for number, line in enumerate(stream, start=1):
+        if number > _MOST_LINES or len(line) > _LONGEST_LINE:
+            raise BadInput(f"{path}: more than {_MOST_LINES} lines, or one of more than {_LONGEST_LINE} characters")
+        if not line.startswith("#"):
+            yield number, line
 
 
 def _of_row(

@@ -49,6 +49,8 @@ def test_a_line_is_an_exposure(tmp_path):
         (f"{HEAD},image_type\n{ROW},art\n", "line 2: image_type = 'art'"),
         (f"{HEAD},seeing\n{ROW},0\n", "line 2: seeing = 0.0 is outside"),
         (f"{HEAD}\nEXT,lsstcam,lsst_r\n", "line 2: ra = None is not a number"),
+        (f"{HEAD}\n{ROW}\n" + "\n" * 2_000_000, "more than 2000000 lines"),
+        (f"{HEAD}{',ra' * 7000}\n{ROW}\n", "one of more than 20000 characters"),
     ],
 )
 def test_what_is_wrong_is_refused_by_its_line(tmp_path, text, words):

@@ -105,6 +105,7 @@ def test_the_fits_form_says_the_same(tmp_path):
         ([record(vt="   nan")], "record 1: 'nan' is no number"),
         ([MEAN, MEAN[:100]], "Expected 32 columns"),
         (["a,b,c"], "records of 1 fields, wanted 32"),
+        ([MEAN + " " * 1000 + "|" * 5000], "the first record has 1000 characters or more"),
     ],
 )
 def test_bad_records_are_named(tmp_path, records, words):

@@ -1,0 +1,31 @@
+"""Rows of other programs' tables: what is refused before there is room made for it."""
+
+import numpy as np
+import pytest
+
+from lake_schema import foreign_rows
+from lake_schema.errors import BadInput
+
+
+def rows(path):
+    return [piece.columns["ra"] for piece in foreign_rows.pieces(path, ["ra"])]
+
+
+@pytest.mark.parametrize("title", ["c{}", ""])
+def test_a_csv_of_any_number_of_columns_is_refused(tmp_path, title):
+    """Room is made for each, whichever are asked for: some gigabytes for a header of some megabytes."""
+    path = tmp_path / "x.csv"
+    for count in (4000, 5000):
+        titles = ",".join(title.format(i) for i in range(count - 1))
+        path.write_text(f"ra,{titles}\n" + "1.5" + "," * (count - 1) + "\n")
+        if count == 4000:
+            np.testing.assert_array_equal(rows(path), [[1.5]])
+    with pytest.raises(BadInput, match=r"x\.csv: has more than 4096 columns"):
+        rows(path)
+
+
+def test_titles_of_any_length_are_refused(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("ra," + "x" * 70_000 + "\n1,2\n")
+    with pytest.raises(BadInput, match="titles of any length"):
+        rows(path)
