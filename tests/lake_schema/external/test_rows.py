@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from lake_schema import foreign_rows
 from lake_schema.errors import BadInput
+from lake_schema.external import rows as external_rows
 
 
 def rows(path):
-    return [piece.columns["ra"] for piece in foreign_rows.pieces(path, ["ra"])]
+    return [piece.columns["ra"] for piece in external_rows.pieces(path, ["ra"])]
 
 
 @pytest.mark.parametrize("title", ["c{}", ""])
