@@ -11,7 +11,6 @@ from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks import _references as references
 from benchmarks import _scenes as scenes
@@ -20,7 +19,7 @@ from jobs.render.drawing.settings import Settings
 from jobs.render.psf import model
 from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 
 Found = TypeVar("Found")
 # galsim asks for more than any machine has where a bulge is steep: bytes of address space.
@@ -88,9 +87,7 @@ def errors(image: Float, truth: Float, scene: Scene, one: Sources) -> Float:
     )
 
 
-def against_galsim(
-    scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int
-) -> tuple[dict[str, Float], npt.NDArray[np.int64], int]:
+def against_galsim(scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int) -> tuple[dict[str, Float], Int, int]:
     """(errors [m, 5] of each of the settings, magnitude bins [m], galaxies that galsim refused)."""
     some, full = scenes.sample(scene, seed, n), scenes.spread(scene)
     out: dict[str, list[Float]] = {name: [] for name in tiers}
@@ -181,12 +178,12 @@ def figures(found: Float) -> dict[str, float]:
     return {key: float(value) for name, a, b in named for key, value in ((f"{name}_rms", a), (f"{name}_worst", b))}
 
 
-def by_bin(found: Float, bins: npt.NDArray[np.int64]) -> dict[str, float]:
+def by_bin(found: Float, bins: Int) -> dict[str, float]:
     """`figures` of each magnitude bin: their keys end in the bin's bright edge."""
     return {f"{key}_m{BINS[b]:.0f}": value for b in np.unique(bins) for key, value in figures(found[bins == b]).items()}
 
 
-def table(title: str, found: Float, bins: npt.NDArray[np.int64]) -> None:
+def table(title: str, found: Float, bins: Int) -> None:
     """Prints rms / worst of errors by magnitude bin."""
     print(f"{title:24}" + "".join(f"{name:>20}" for name in NAMES))
     rows = [(f"m {BINS[b]:.0f}-{BINS[b + 1]:.0f}", found[bins == b]) for b in range(len(BINS) - 1)]

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.fluxes import passbands
 from jobs.render.camera import detectors
@@ -22,7 +21,7 @@ from jobs.render.drawing.settings import Settings
 from jobs.render.psf import euclid, model, seeing, sub_bands
 from jobs.render.sources.galaxy_shapes import Shapes
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 from lake_schema.mission.configuration import resolve
 
 # Edges of the magnitude bins that errors are told by.
@@ -126,7 +125,7 @@ def magnitudes(some: Sources, scene: Scene) -> Float:
     return np.asarray(scene.zero_point - 2.5 * np.log10(some.electrons / scene.exposure))
 
 
-def bins_of(some: Sources, scene: Scene) -> npt.NDArray[np.int64]:
+def bins_of(some: Sources, scene: Scene) -> Int:
     """Magnitude bin of each source."""
     return np.clip(np.searchsorted(BINS, magnitudes(some, scene)) - 1, 0, len(BINS) - 2)
 

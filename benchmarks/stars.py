@@ -16,10 +16,11 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from lake_schema.arrays import Float32
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks import report
 from jobs.catalogue import build_stars, dust_map
@@ -55,7 +56,7 @@ def far_from_the_plane(step: int) -> float:
     return float(stars.numbers(cells[np.abs(b) > 20.0], stars.model()).sum() * step)
 
 
-def brighter_than_11(step: int, dust: npt.NDArray[np.float32]) -> float:
+def brighter_than_11(step: int, dust: Float32) -> float:
     """Stars of the whole sky to expect with V < 11, behind the dust, from every step-th cell of order 4."""
     universe, order = stars.model(), 4
     galaxy, types = universe.galaxy, universe.types
@@ -80,7 +81,7 @@ def brighter_than_11(step: int, dust: npt.NDArray[np.float32]) -> float:
     return total * (12 << 2 * order) / cells.size
 
 
-def pole(cells: int, dust: npt.NDArray[np.float32]) -> dict[str, float]:
+def pole(cells: int, dust: Float32) -> dict[str, float]:
     """Stars deg-2 at both poles to V = 20 and G = 20 from the flux table, against published counts in the same band."""
     universe, library = stars.model(24.0), templates.stellar_library()
     zero = {"bessell_v": vega_magnitude(passbands.load("bessell_v")), "gaia_g": gaia.ab_minus_vega()[0]}

@@ -20,7 +20,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks import _approximations as approximations
 from benchmarks import _errors as errors
@@ -34,7 +33,7 @@ from benchmarks._scenes import VIS
 from jobs.render.drawing.settings import Settings
 from jobs.render.psf import model
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Float
+from lake_schema.arrays import Bool, Float
 
 Row = dict[str, str | float]
 # From quicklook to reference; then the survey's with one setting changed at a time.
@@ -166,7 +165,7 @@ def point(settings: Settings, chosen: list[Known], held: list[Known], spread: Ma
     return {**row, **_summary(found[galaxy], bias)}
 
 
-def _largest(found: Float, bias: Float, star: npt.NDArray[np.bool_]) -> dict[str, float]:
+def _largest(found: Float, bias: Float, star: Bool) -> dict[str, float]:
     """Errors in the terms of an accuracy; found [n, 5] and bias [pairs, 2] of `compared`."""
     worst = found.max(axis=0)
     return {

@@ -20,7 +20,7 @@ from jobs.catalogue.matter import density_box
 from jobs.fluxes import cosmology
 from jobs.request.schema import Universe
 from lake_schema import sky
-from lake_schema.arrays import Float
+from lake_schema.arrays import Bool, Float, Int
 
 BLOCK_ORDER, PIXEL_ORDER = 4, 9
 LIMIT = 22.0
@@ -38,8 +38,8 @@ class Sky:
     """
 
     blocks: list[int]
-    halos: tuple[Float, Float, npt.NDArray[np.int64]]
-    galaxies: tuple[Float, Float, Float, npt.NDArray[np.int64]]
+    halos: tuple[Float, Float, Int]
+    galaxies: tuple[Float, Float, Float, Int]
 
     @property
     def area(self) -> float:
@@ -122,7 +122,7 @@ def correlation(universe: Population, seen: Sky) -> dict[str, float]:
 
 
 def _compared(
-    name: str, seen: Sky, index: npt.NDArray[np.int64], mean: float, chi: Float, density: Float, growing: Float
+    name: str, seen: Sky, index: Int, mean: float, chi: Float, density: Float, growing: Float
 ) -> dict[str, float]:
     found, error = _angular(seen.blocks, index, mean)
     expected = _limber(chi, density, growing)
@@ -134,7 +134,7 @@ def _compared(
     return figures
 
 
-def _angular(blocks: Sequence[int], index: npt.NDArray[np.int64], mean: float) -> tuple[Float, Float]:
+def _angular(blocks: Sequence[int], index: Int, mean: float) -> tuple[Float, Float]:
     """w in bins of EDGES from pairs of pixels, and its error from the scatter of the blocks."""
     pixels = 4 ** (PIXEL_ORDER - BLOCK_ORDER)
     pixel = index >> 2 * (sky.DEEPEST - PIXEL_ORDER)
@@ -170,9 +170,7 @@ def _limber(chi: Float, density: Float, growing: Float) -> Float:
     return np.array(means)
 
 
-def _cut(
-    model: halos.HaloModel, near: float, far: float, least: float
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+def _cut(model: halos.HaloModel, near: float, far: float, least: float) -> tuple[Int, Bool]:
     steps = np.flatnonzero((model.line.z > near) & (model.line.z < far))
     return steps, np.round(model.log_mass[:-1], 3) >= least - 1e-3
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 
 # SplitMix64's step.
@@ -40,7 +41,7 @@ def stream(*identity: int | str) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=_key(identity)))
 
 
-def uniforms(ids: npt.NDArray[np.int64], count: int, *identity: int | str) -> npt.NDArray[np.float64]:
+def uniforms(ids: Int, count: int, *identity: int | str) -> Float:
     """Random numbers in (0, 1), [count, n], each a function of the identity, the source and its place alone.
 
     ids : int64[n]

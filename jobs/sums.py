@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema.arrays import Float
+from lake_schema.arrays import Array, Float
 
 # Up to so many terms a sum is made of whole arrays, without compiled code.
 _FEW = 8
@@ -46,7 +46,7 @@ def product(one: npt.ArrayLike, other: npt.ArrayLike) -> Any:
     return float(out) if np.ndim(out) == 0 else out
 
 
-def _of_few(left: npt.NDArray[Any], right: npt.NDArray[Any]) -> Float:
+def _of_few(left: Array, right: Array) -> Float:
     shape = np.broadcast_shapes(left.shape[:-2], right.shape[:-2])
     out = np.zeros((*shape, left.shape[-2], right.shape[-1]))
     for k in range(left.shape[-1]):
@@ -54,7 +54,7 @@ def _of_few(left: npt.NDArray[Any], right: npt.NDArray[Any]) -> Float:
     return out
 
 
-def _of_many(left: npt.NDArray[Any], right: npt.NDArray[Any]) -> Float:
+def _of_many(left: Array, right: Array) -> Float:
     # Compiled code is imported where it is wanted.
     from jobs import compiled_sums
 

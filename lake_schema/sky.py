@@ -253,7 +253,7 @@ def margin_cells(order: int, cell: int, fine: int) -> Int:
     return outside
 
 
-def _interleave(values: npt.NDArray[np.int64]) -> Int:
+def _interleave(values: Int) -> Int:
     spread = np.zeros_like(values, np.int64)
     for bit in range(DEEPEST):
         spread |= ((values >> bit) & 1) << (2 * bit)

@@ -26,7 +26,7 @@ from jobs.code_keys import code_key
 from jobs.request.files import DustMap
 from jobs.rng import stream
 from lake_schema import user_files
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Float32
 from lake_schema.errors import BadInput
 from lake_schema.fits.external import read_map
 from lake_schema.sky import equatorial, galactic
@@ -70,7 +70,7 @@ def layer() -> Layer:
     return Layer(**parameters.section("dust_map.toml", "layer"))
 
 
-def embedded(seed: int, model: Cosecant) -> npt.NDArray[np.float32]:
+def embedded(seed: int, model: Cosecant) -> Float32:
     """Map of A(V), float32[12 nside^2] mag."""
     _, b = hp.pix2ang(model.nside, np.arange(hp.nside2npix(model.nside)), lonlat=True)
     field = _gaussian_field(seed, model)
@@ -79,7 +79,7 @@ def embedded(seed: int, model: Cosecant) -> npt.NDArray[np.float32]:
     return np.asarray((model.r_v * np.minimum(ebv, model.ebv_max)).astype(np.float32))
 
 
-def a_v(sky_map: npt.NDArray[np.float32], ra: Float, dec: Float) -> Float:
+def a_v(sky_map: Float32, ra: Float, dec: Float) -> Float:
     """A(V)[n] mag at ICRS positions, deg, bilinear between the map's pixels.
 
     sky_map : float32[pixel] mag, RING, Galactic;  ra, dec : float[n] deg
@@ -97,7 +97,7 @@ def a_v_at(to_infinity: Float, distance: Float, b: npt.ArrayLike, dust: Layer, s
     return np.asarray(-to_infinity * np.expm1(-distance * sin_b / dust.height))
 
 
-def load(seed: int) -> npt.NDArray[np.float32]:
+def load(seed: int) -> Float32:
     """The embedded map of a seed, from the cache or made now (1 s).
 
     returns : float32[pixel] A(V) mag, RING, Galactic
@@ -116,7 +116,7 @@ def facts(own: DustMap | None) -> dict[str, Any]:
     return {"dust": {"sha256": file_sha256(own.file), **about}}
 
 
-def chosen(seed: int, own: DustMap | None) -> npt.NDArray[np.float32]:
+def chosen(seed: int, own: DustMap | None) -> Float32:
     """Map of A(V), RING and Galactic, of a request's file (from the cache or read now), or the embedded one.
 
     returns : float32[pixel] mag
@@ -127,7 +127,7 @@ def chosen(seed: int, own: DustMap | None) -> npt.NDArray[np.float32]:
     return cached_arrays("dust_file", key, lambda: {"a_v": read(own)})["a_v"]
 
 
-def read(own: DustMap) -> npt.NDArray[np.float32]:
+def read(own: DustMap) -> Float32:
     """A map of others as ours are: A(V), RING, Galactic, not finer than the embedded one.
 
     returns : float32[pixel] mag

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lake_schema import sky
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 
 
 def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
@@ -36,7 +35,7 @@ def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **sty
     return axes
 
 
-def skymap(cells: npt.NDArray[np.int64], counts: Float, order: int, ax: Any = None, **style: Any) -> Any:
+def skymap(cells: Int, counts: Float, order: int, ax: Any = None, **style: Any) -> Any:
     """Number a square degree in HEALPix cells, east to the left; returns the axes.
 
     cells : int64[n] nested cells of the order;  counts : [n], as `Explorer.skymap` gives them

@@ -34,7 +34,7 @@ from jobs.fluxes.tables import errors_measured, flux_tables
 from jobs.fluxes.tables.build_tables import Setting
 from jobs.fluxes.tables.settings import stars_tabulated
 from lake_schema import units
-from lake_schema.arrays import Bool, Float
+from lake_schema.arrays import Bool, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.tables.fluxes import fluxes
 
@@ -200,7 +200,7 @@ def _curves(bands: Sequence[str | Passband]) -> list[Passband]:
     return [band if isinstance(band, Passband) else passbands.load(band) for band in bands]
 
 
-def _kinds(table: pa.Table) -> npt.NDArray[np.int64]:
+def _kinds(table: pa.Table) -> Int:
     if "kind" not in table.column_names:
         return np.zeros(table.num_rows, np.int64)
     return np.asarray(table["kind"].to_numpy(), np.int64)

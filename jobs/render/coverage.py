@@ -25,7 +25,7 @@ from jobs.render.camera import pointing
 from jobs.render.channels.image_types import SKY_TYPES
 from jobs.request.area import Area
 from lake_schema import command, sky, user_files
-from lake_schema.arrays import Int
+from lake_schema.arrays import Bool, Int
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
 
@@ -48,7 +48,7 @@ class Depth:
     band: str
     exposures: int
     seen: Int
-    interior: npt.NDArray[np.bool_]
+    interior: Bool
     extent: float
 
     def share(self, least: int) -> float:

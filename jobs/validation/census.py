@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.catalogue.galaxies import band_ratios, emission_lines, galaxies, morphology
@@ -19,7 +18,7 @@ from jobs.catalogue.halos import luminosity_function, population
 from jobs.fluxes import cosmology
 from jobs.fluxes.libraries import templates
 from lake_schema import sky
-from lake_schema.arrays import Array, Bool, Float, Int
+from lake_schema.arrays import Array, Bool, Float, Float32, Int
 from lake_schema.ids import GENERATION_ORDER
 
 ARCMIN2 = 3600.0
@@ -69,7 +68,7 @@ def blocks(count: int, side_order: int) -> list[list[int]]:
     return [[int(block) * inside + i for i in range(inside)] for block in first]
 
 
-def draw(universe: GalaxyModel, dust: npt.NDArray[np.float32], places: Sequence[Sequence[int]]) -> Census:
+def draw(universe: GalaxyModel, dust: Float32, places: Sequence[Sequence[int]]) -> Census:
     """What the catalogue holds in the blocks."""
     drawn, library = population.Cells(universe.population), templates.galaxy_library()
     rows, hosts, mags = [], [], []
@@ -84,7 +83,7 @@ def draw(universe: GalaxyModel, dust: npt.NDArray[np.float32], places: Sequence[
     def together(parts: Sequence[Mapping[str, Array]]) -> Mapping[str, Array]:
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def which(parts: Sequence[Mapping[str, Array]]) -> npt.NDArray[np.int64]:
+    def which(parts: Sequence[Mapping[str, Array]]) -> Int:
         return np.repeat(np.arange(len(parts)), [part["z_true"].size for part in parts])
 
     area = sum(len(place) for place in places) * AREA
@@ -151,7 +150,7 @@ def colours(census: Census) -> dict[str, float]:
     return figures
 
 
-def half_light(rows: Mapping[str, Array], part: npt.NDArray[np.int64]) -> Float:
+def half_light(rows: Mapping[str, Array], part: Int) -> Float:
     """Half-light radius[n] of both components together, arcsec, by bisection."""
     names = ("bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index")
     bulge, disc, fraction, sersic = (rows[name][part].astype(float) for name in names)

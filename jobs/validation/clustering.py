@@ -29,7 +29,7 @@ from jobs.catalogue.matter.density_box import Box
 from jobs.fluxes import cosmology
 from jobs.rng import stream
 from lake_schema import sky
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 
 # Blocks are cells of this order (53.7 deg2), in pixels of 6.9 arcmin; small separations are counted in one piece of
 # each, in pixels of 0.9 arcmin: DEPTH orders finer.
@@ -51,7 +51,7 @@ class Tracers:
     dec: Float
     chi: Float
     x: Float
-    satellite: npt.NDArray[np.bool_]
+    satellite: Bool
     log_mass: Float
     proxy: Float
     velocity: Float

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import healpy as hp
 import numpy as np
-import numpy.typing as npt
 
 from jobs.catalogue.galaxies import lensing
 from jobs.catalogue.galaxies.lensing import Planes
@@ -19,7 +18,7 @@ from jobs.catalogue.matter import convergence, density_box, lightcone
 from jobs.catalogue.matter.density_box import Box
 from jobs.fluxes import cosmology
 from jobs.validation.clustering import Tracers
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Float32
 
 # Patches of the sky whose scatter gives the error of a mean: cells of this nside.
 _PATCHES = 2
@@ -57,7 +56,7 @@ def bands(power: Float, chi: float, edges: Sequence[int]) -> Float:
     return np.bincount(place, ratio) / np.bincount(place, modes)
 
 
-def sums(box: Box, nside: int, redshifts: Sequence[float], l_max: int) -> tuple[npt.NDArray[np.float32], Float]:
+def sums(box: Box, nside: int, redshifts: Sequence[float], l_max: int) -> tuple[Float32, Float]:
     """Convergence [plane, pixel] (nested) along lines of sight, and what its multipoles are multiplied by for maps."""
     chosen = lensing.settings()
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)

@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import numpy.typing as npt
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
 
 from lake_schema import user_files
+from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput, LakeError
 
 _ROWS_A_BATCH = 65_536
@@ -39,7 +39,7 @@ _SIZES = re.compile(rb"(?:HIERARCH +)?(BITPIX|NAXIS\d{0,3}|PCOUNT|GCOUNT|TFIELDS
 _LONGEST_TEXT = 256
 
 
-def read_numbers(path: Path, kind: str) -> dict[str, npt.NDArray[np.float64]]:
+def read_numbers(path: Path, kind: str) -> dict[str, Float]:
     """Columns of numbers of a file's first table, title -> float64[n]; NaN where TNULL says that there is none.
 
     kind   : of file, as user_files has it
@@ -51,7 +51,7 @@ def read_numbers(path: Path, kind: str) -> dict[str, npt.NDArray[np.float64]]:
 
 def number_batches(
     path: Path, columns: Sequence[str], texts: Sequence[str] = (), rows: int = _ROWS_A_BATCH, kind: str = "catalogue"
-) -> Iterator[tuple[dict[str, npt.NDArray[Any]], dict[str, str]]]:
+) -> Iterator[tuple[dict[str, Array], dict[str, str]]]:
     """Columns of numbers of a file's first table: (title -> numbers[n], whole numbers as they are; title -> TUNIT).
 
     texts  : more columns, of texts or whole numbers; left out where there are none
@@ -96,7 +96,7 @@ def _refuse_lists(path: Path, column: Any) -> None:
         raise BadInput(f"{path}: column {column.name} holds lists")
 
 
-def _texts_of(path: Path, unit: Any, name: str) -> npt.NDArray[Any]:
+def _texts_of(path: Path, unit: Any, name: str) -> Array:
     """A column of texts as it is stored, bytes, or of whole numbers; astropy would decode all rows at once."""
     stored = unit.data.view(np.ndarray)[name]
     if stored.dtype.kind in "iu":
@@ -106,13 +106,13 @@ def _texts_of(path: Path, unit: Any, name: str) -> npt.NDArray[Any]:
     return np.asarray(stored)
 
 
-def _decoded(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _decoded(values: Array) -> Array:
     if values.dtype.kind == "S":
         return np.asarray(np.char.decode(values, "ascii"))
     return values.astype(values.dtype.newbyteorder("="))
 
 
-def _native(values: Any, null: int | None) -> npt.NDArray[Any]:
+def _native(values: Any, null: int | None) -> Array:
     numbers = np.array(values)
     numbers = numbers.astype(np.int8 if numbers.dtype.kind == "b" else numbers.dtype.newbyteorder("="))
     if numbers.dtype.kind in "iu" and null is not None and (numbers == null).any():
@@ -120,7 +120,7 @@ def _native(values: Any, null: int | None) -> npt.NDArray[Any]:
     return numbers
 
 
-def read_map(path: Path, column: str) -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
+def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
     """A column of a HEALPix map, float64[pixels] in its file's order, and the cards of its header.
 
     Errors : BadInput for a file that is cut short or is none, and where there is no table or column
@@ -137,7 +137,7 @@ def read_map(path: Path, column: str) -> tuple[npt.NDArray[np.float64], dict[str
         return np.asarray(values, np.float64).ravel(), dict(unit.header.items())
 
 
-def read_planes(path: Path, column: str, kind: str = "PSF") -> tuple[npt.NDArray[np.float64], dict[str, Any]]:
+def read_planes(path: Path, column: str, kind: str = "PSF") -> tuple[Float, dict[str, Any]]:
     """Somebody's planes, float64[ny, nx] or [n, ny, nx], with the cards of their header.
 
     The first image of two or three axes, or the array that the first row of a table has in `column`.
@@ -160,7 +160,7 @@ def read_planes(path: Path, column: str, kind: str = "PSF") -> tuple[npt.NDArray
     raise BadInput(f"{path}: holds no image of two or three axes and no table with a column {column}")
 
 
-def _numbers_of(unit: Any) -> dict[str, npt.NDArray[np.float64]]:
+def _numbers_of(unit: Any) -> dict[str, Float]:
     found = {}
     for column in unit.columns:
         if any(letter in str(column.format) for letter in "PQA"):

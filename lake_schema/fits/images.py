@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
 
+from lake_schema.arrays import Array
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.fits import write
 from lake_schema.fits.write import MOST_BYTES
@@ -47,7 +47,7 @@ class Image:
     cards : (keyword, value, comment), in order, structural keywords left out
     """
 
-    data: npt.NDArray[Any] | None
+    data: Array | None
     cards: tuple[Card, ...] = ()
     name: str = ""
 
@@ -142,7 +142,7 @@ def _dressed(unit: Any, image: Image) -> Any:
     return unit
 
 
-def _big_enough(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _big_enough(data: Array) -> Array:
     if data.ndim != 2 or data.dtype.kind not in "fiu" or data.dtype.itemsize > 8:
         raise BadInput(f"a FITS image wants numbers in two dimensions, got {data.dtype}{list(data.shape)}")
     return np.ascontiguousarray(data)

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from astropy import units
 from astropy.io import fits
 
+from lake_schema.arrays import Array
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
 from lake_schema.fits import write
@@ -76,7 +75,7 @@ def _fits_column(column: Column, values: pa.ChunkedArray) -> fits.Column:
     return fits.Column(column.name, code, array=wide.fill_null(missing).to_numpy(), null=missing, **unit)
 
 
-def _unused(values: npt.NDArray[Any]) -> int:
+def _unused(values: Array) -> int:
     """The lowest number of an integer type that does not occur."""
     limits, seen = np.iinfo(values.dtype), np.unique(values)
     taken = np.flatnonzero(seen != limits.min + np.arange(seen.size))

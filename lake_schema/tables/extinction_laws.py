@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from lake_schema.arrays import Float, Float32
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import Origin
 
@@ -27,7 +27,7 @@ EXTINCTION_LAWS = Table(
 )
 
 
-def rows(wavelength: npt.NDArray[np.float64], k: npt.NDArray[np.float32], origins: Sequence[Origin]) -> pa.Table:
+def rows(wavelength: Float, k: Float32, origins: Sequence[Origin]) -> pa.Table:
     """Table `extinction_laws`.
 
     wavelength : [m] A, in equal steps;  k : [5, m];  origins : where each is from

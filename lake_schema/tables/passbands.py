@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from lake_schema.arrays import Float
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import Origin
 
@@ -41,9 +42,9 @@ class Passband(Protocol):
     @property
     def medium(self) -> str: ...
     @property
-    def wavelength(self) -> npt.NDArray[np.float64]: ...
+    def wavelength(self) -> Float: ...
     @property
-    def response(self) -> npt.NDArray[np.float64]: ...
+    def response(self) -> Float: ...
 
 
 def rows(

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from lake_schema.arrays import Float, Float32
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import Origin
 
@@ -51,18 +51,18 @@ class Types(Protocol):
     """What is known of the first stars of a library: float64[n] each."""
 
     @property
-    def teff(self) -> npt.NDArray[np.float64]: ...
+    def teff(self) -> Float: ...
     @property
-    def log_g(self) -> npt.NDArray[np.float64]: ...
+    def log_g(self) -> Float: ...
 
 
 class Library(Protocol):
     """Spectra on one grid of equal steps: wavelength[m] A, flux[n, m], n names."""
 
     @property
-    def wavelength(self) -> npt.NDArray[np.float64]: ...
+    def wavelength(self) -> Float: ...
     @property
-    def flux(self) -> npt.NDArray[np.float32]: ...
+    def flux(self) -> Float32: ...
     @property
     def names(self) -> Sequence[str]: ...
     @property
@@ -95,7 +95,7 @@ def _rows(name: str, library: Library, origins: Sequence[Origin]) -> pa.Table:
     )
 
 
-def _first(values: npt.NDArray[np.float64], n: int) -> Any:
+def _first(values: Float, n: int) -> Any:
     """Values of the first rows of n, the others missing."""
     missing = np.arange(n) >= len(values)
     return np.ma.masked_array(np.concatenate([values[:n], np.zeros(max(n - len(values), 0))]), missing)

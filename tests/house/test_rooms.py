@@ -1,6 +1,7 @@
 """How large a room, a file and a function may be, and where a channel may be named."""
 
 import ast
+import graphlib
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -100,3 +101,27 @@ def test_an_effect_without_a_cost_is_refused():
     effect = Effect("brighter", brighter, lambda scene: (3.0,), lambda scene: 1.0)
     with pytest.raises(BadInput, match="effect brighter has the cost 0: a forecast would take it as free"):
         replace(ground.CHANNEL, effects={"science": (effect,)})
+
+
+def test_array_types_are_named_once():
+    """All modules take their names from lake_schema/arrays.py."""
+    named = re.findall(r"^(\w+) = (npt\.NDArray\[.+\])$", (ROOT / "lake_schema" / "arrays.py").read_text(), re.M)
+    assert ("Float", "npt.NDArray[np.float64]") in named
+    spelt = {path.as_posix() for path in SOURCES for _, form in named if form in path.read_text()}
+    assert spelt == {(ROOT / "lake_schema" / "arrays.py").as_posix()}
+
+
+def imported(path):
+    """Modules of the project that a file imports, at its top or within functions."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("jobs", "lake_schema"):
+            for name in node.names:
+                inner = ROOT / (f"{node.module}.{name.name}".replace(".", "/") + ".py")
+                outer = ROOT / (node.module.replace(".", "/") + ".py")
+                yield from (file for file in (inner, outer) if file.exists())
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Not even within functions: what is imported late to avoid a circle is one."""
+    graph = graphlib.TopologicalSorter({path: set(imported(path)) for path in SOURCES if path.name != "__init__.py"})
+    graph.prepare()

@@ -26,7 +26,7 @@ from jobs.code_keys import code_key
 from jobs.fluxes import passbands
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.spectra import extinction
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Float, Float32, Int
 
 REFERENCE_BAND = "sdss_r01"
 # Uniform steps of ln(1 + z), and numbers of Chebyshev-Lobatto nodes of E(B-V): the fewest whose error is below that,
@@ -70,7 +70,7 @@ class BandRatios:
 
     band: str
     ebv: Float
-    values: npt.NDArray[np.float32]
+    values: Float32
 
 
 def build(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatios:

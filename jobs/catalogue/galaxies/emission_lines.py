@@ -16,12 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs import sums
 from jobs.catalogue import parameters
 from jobs.fluxes import cosmology
-from lake_schema.arrays import Bool, Float
+from lake_schema.arrays import Bool, Float, Int
 from lake_schema.units import LIGHT_KM_S
 
 _FILE = "emission_lines.toml"
@@ -222,7 +221,7 @@ def _sulphur(ratios: Ratios, n2: Float, rng: np.random.Generator) -> Float:
     return np.asarray(mean + ratios.sii_scatter * rng.standard_normal(n2.size))
 
 
-def _bracket(nodes: Float, values: Float) -> tuple[npt.NDArray[np.int64], Float]:
+def _bracket(nodes: Float, values: Float) -> tuple[Int, Float]:
     index = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
     weight = (values - nodes[index]) / (nodes[index + 1] - nodes[index])
     return index, np.clip(weight, 0.0, 1.0)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.catalogue import cells, dust_map
@@ -30,7 +29,7 @@ from jobs.fluxes import cosmology, sources
 from jobs.fluxes.libraries import templates
 from jobs.rng import stream
 from lake_schema import ids
-from lake_schema.arrays import Array, Float, Int
+from lake_schema.arrays import Array, Bool, Float, Float32, Int
 from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import GALAXIES
 
@@ -78,7 +77,7 @@ def model(seed: int, columns: Columns, given: Split) -> IngestModel:
     )
 
 
-def draw(cell: int, given: Given, universe: IngestModel, dust: npt.NDArray[np.float32]) -> pa.Table:
+def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Table:
     """Table `galaxies` of one order-8 cell; given : jobs.catalogue.external.ingest.rows.
 
     dust : float32[pixel] map of A(V), mag (jobs.catalogue.dust_map)
@@ -196,7 +195,7 @@ def _shrinking(lens: Mapping[str, Array]) -> Float:
 
 def _light(
     given: Given, universe: IngestModel, z: Float, kind: Int, seen: Float | None, rng: Any
-) -> tuple[Float, npt.NDArray[np.bool_], Sed, Int, Float]:
+) -> tuple[Float, Bool, Sed, Int, Float]:
     """M_r, on the red sequence, spectra, and law and E(B-V) of the second component."""
     m_r = given.get("abs_mag_r01")
     # Without an absolute magnitude, colours are drawn for that of a flat spectrum.
@@ -232,7 +231,7 @@ def _spectra(given: Given, count: int) -> Sed:
 
 
 def _shapes(
-    given: Given, shapes: Shapes, z: Float, log_mass: Float, red: npt.NDArray[np.bool_], rng: np.random.Generator
+    given: Given, shapes: Shapes, z: Float, log_mass: Float, red: Bool, rng: np.random.Generator
 ) -> dict[str, Float]:
     n = z.size
     radius = morphology.half_light_radius(shapes.size, z, log_mass, red, cosmology.kpc_per_arcsec(z), rng)

@@ -42,7 +42,7 @@ from jobs.fluxes.libraries import templates
 from jobs.request.schema import Universe
 from jobs.rng import stream
 from lake_schema import sky
-from lake_schema.arrays import Bool, Float, Int
+from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
 
@@ -140,7 +140,7 @@ def _selection(wanted: Universe, training: Training | None) -> BandRatios:
     return band_ratios.load(templates.galaxy_library(), wanted.galaxy_band, wanted.z_max, dustiest)
 
 
-def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: npt.NDArray[np.float32]) -> pa.Table:
+def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Table:
     """Table `galaxies` of one order-8 cell, sorted by _healpix_29.
 
     cells : what has been drawn of the universe's population
@@ -221,9 +221,7 @@ def _light(cell: int, seed: int, universe: GalaxyModel, members: Members) -> tup
     return members.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
 
 
-def _places(
-    planes: Planes, members: Members, row: Int, dust: npt.NDArray[np.float32]
-) -> dict[str, npt.NDArray[np.generic]]:
+def _places(planes: Planes, members: Members, row: Int, dust: Float32) -> dict[str, npt.NDArray[np.generic]]:
     ra, dec = members.ra[row], members.dec[row]
     return {
         "id": members.id[row],

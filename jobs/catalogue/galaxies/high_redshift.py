@@ -33,7 +33,7 @@ from jobs.fluxes.high_redshift import (
 )
 from jobs.rng import stream
 from lake_schema import ids, sky
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Float32, Int
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.tables.galaxies import GALAXIES
 
@@ -70,7 +70,7 @@ def model(galaxy_boost: float = 1.0, quasar_boost: float = 1.0) -> tuple[Kind, .
     return tuple(_kind(code, parameters.section(_FILE, name), boost) for code, name, boost in wanted if boost > 0.0)
 
 
-def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: npt.NDArray[np.float32]) -> pa.Table:
+def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: Float32) -> pa.Table:
     """Rows of one kind in a generation cell, sorted by _healpix_29.
 
     dust : float32[pixel] map of A(V), mag (jobs.catalogue.dust_map)
@@ -138,7 +138,7 @@ def _kind(code: int, numbers: dict[str, Any], boost: float) -> Kind:
     return Kind(code, numbers, boost, z, m, np.where(bright, counts, 0.0))
 
 
-def _templates(kind: Kind, m: Float, rng: np.random.Generator) -> npt.NDArray[np.int64]:
+def _templates(kind: Kind, m: Float, rng: np.random.Generator) -> Int:
     """Index of the template: slope, then strength of the lines."""
     if kind.code == QUASAR:
         slope = rng.integers(0, len(QUASAR_OFFSETS), m.size)

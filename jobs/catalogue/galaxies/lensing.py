@@ -27,7 +27,7 @@ from jobs.catalogue.matter.density_box import Box
 from jobs.code_keys import code_key
 from jobs.fluxes import cosmology, sources
 from lake_schema import sky
-from lake_schema.arrays import Float, Float32
+from lake_schema.arrays import Bool, Float, Float32
 from lake_schema.errors import BadInput
 
 KAPPA, GAMMA_1, GAMMA_2, EAST, NORTH = range(5)
@@ -131,7 +131,7 @@ def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, 
     return sky.wrapped(np.degrees(moved)), np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
 
 
-def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> npt.NDArray[np.bool_]:
+def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> Bool:
     """Sources[n] that weak lensing cannot describe: at a caustic, or beyond it.
 
     kappa, gamma1, gamma2 : float[n];  caustic : least determinant that is described

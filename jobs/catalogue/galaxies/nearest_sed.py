@@ -13,10 +13,9 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
@@ -26,7 +25,7 @@ from jobs.catalogue.galaxies import sed_assignment
 from jobs.catalogue.galaxies.band_ratios import Sed
 from jobs.code_keys import code_key
 from jobs.fluxes.libraries import templates
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ def load(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Trai
     return training(cached_arrays("training", key, lambda: _read(found, columns, last)), last)
 
 
-def training(values: dict[str, npt.NDArray[Any]], last: int) -> Training:
+def training(values: dict[str, Array], last: int) -> Training:
     """Of columns by our key.
 
     values : float[t] each: colour 0.1(g - r) mag, m_r mag, z, sed, ext_law, ebv mag;  last : template of the library
@@ -110,7 +109,7 @@ def _scaled(law: Nearness, colour: Float, m_r: Float, z: Float) -> Float:
     return np.asarray(np.stack([colour, m_r, z], 1) / np.array(law.units))
 
 
-def _read(found: Sequence[Path], columns: Columns, last: int) -> dict[str, npt.NDArray[Any]]:
+def _read(found: Sequence[Path], columns: Columns, last: int) -> dict[str, Array]:
     pieces = list(mapping.read(found, columns))
     for piece in pieces:
         beyond = piece.values["sed"] > last

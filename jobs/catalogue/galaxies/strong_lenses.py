@@ -30,7 +30,7 @@ from jobs.catalogue.halos import luminosity_function
 from jobs.fluxes import cosmology
 from jobs.rng import stream
 from lake_schema import ids, sky
-from lake_schema.arrays import Array, Float
+from lake_schema.arrays import Array, Float, Float32
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from lake_schema.units import LIGHT_KM_S
@@ -197,7 +197,7 @@ def image_positions(lens: Lens, east: float, north: float) -> Float:
     return np.array(found).reshape(-1, 2)
 
 
-def shoot(lens: Lens, source: Disc, shape: Stamps, side: int) -> npt.NDArray[np.float32]:
+def shoot(lens: Lens, source: Disc, shape: Stamps, side: int) -> Float32:
     """Picture [side, side] of a source of flux 1, south to north and west to east; its sum is the magnification.
 
     Error: 1 % of the magnification (tests), for sources larger than a quarter of a pixel

@@ -27,7 +27,7 @@ from jobs.code_keys import code_key
 from jobs.fluxes import cosmology
 from jobs.rng import stream
 from lake_schema import sky
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_KM_S
 
@@ -41,7 +41,7 @@ class LightCone:
     index : order-29 cell;  chi : Mpc/h;  log_mass : log10 M_200m / (Msun/h);  velocity : km/s, receding
     """
 
-    index: npt.NDArray[np.int64]
+    index: Int
     chi: Float
     log_mass: Float
     velocity: Float

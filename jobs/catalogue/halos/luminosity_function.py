@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.special import gamma, gammaincc
 
 from jobs.catalogue import parameters
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import OutOfRange
 
 _LN10_04 = 0.4 * np.log(10.0)
@@ -157,7 +157,7 @@ def magnitude(table: Inverse, number: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     return np.asarray(m_star - (low * (1.0 - above_row) + high * above_row) / _LN10_04)
 
 
-def _bracket(nodes: Float, values: Float) -> tuple[npt.NDArray[np.int64], Float]:
+def _bracket(nodes: Float, values: Float) -> tuple[Int, Float]:
     index = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
     weight = (values - nodes[index]) / (nodes[index + 1] - nodes[index])
     return index, np.clip(weight, 0.0, 1.0)

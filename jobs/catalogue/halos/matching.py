@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
 from jobs import sums
@@ -22,7 +21,7 @@ from jobs.catalogue.halos import luminosity_function
 from jobs.catalogue.halos.luminosity_function import Inverse
 from jobs.catalogue.matter import linear_theory
 from jobs.fluxes import cosmology
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 
 # Tables reach redshift 3, uniform in ln(1 + z), and 0.02 dex.
 Z_LAST, _Z_NODES = 3.0, 49
@@ -172,13 +171,13 @@ def satellites_above(log_mass: Float, occupation: Occupation) -> Float:
     return np.asarray(np.maximum(over - occupation.least, 0.0) / occupation.ratio)
 
 
-def _place(z: Float, nodes: int) -> tuple[npt.NDArray[np.int64], Float]:
+def _place(z: Float, nodes: int) -> tuple[Int, Float]:
     step = np.log1p(np.asarray(z, float)) * ((nodes - 1) / np.log1p(Z_LAST))
     row = np.clip(step.astype(np.int64), 0, nodes - 2)
     return row, step - row
 
 
-def _column(log_mass: Float, nodes: Float) -> tuple[npt.NDArray[np.int64], Float]:
+def _column(log_mass: Float, nodes: Float) -> tuple[Int, Float]:
     step = (np.asarray(log_mass, float) - nodes[0]) / (nodes[1] - nodes[0])
     column = np.clip(step.astype(np.int64), 0, nodes.size - 2)
     return column, step - column

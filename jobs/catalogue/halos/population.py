@@ -27,7 +27,7 @@ from jobs.catalogue.halos.satellites import Satellites
 from jobs.catalogue.matter import density_box
 from jobs.rng import stream
 from lake_schema import ids, sky
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.units import LIGHT_KM_S
 
@@ -172,7 +172,7 @@ def _landed(cells: Cells, order: int, around: int, cell: int) -> tuple[npt.NDArr
     return source, ids.halo_of(source), index, found.ra, found.dec, found.chi, found.velocity, found.proxy, mass
 
 
-def _near(found: Satellites, cell: int) -> npt.NDArray[np.bool_]:
+def _near(found: Satellites, cell: int) -> Bool:
     """Satellites that may lie in the cell: no further from its centre than its corners."""
     ra, dec = sky.cell_centre(GENERATION_ORDER, cell)
     radius = sky.cell_radius(GENERATION_ORDER)

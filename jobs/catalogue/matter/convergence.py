@@ -17,14 +17,13 @@ from dataclasses import dataclass, fields
 from itertools import groupby
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs import sums
 from jobs.catalogue.matter import density_box, lightcone
 from jobs.catalogue.matter.density_box import Box, BoxModel
 from jobs.compiling import exact_jit
 from jobs.fluxes import cosmology
-from lake_schema.arrays import Float, Float32
+from lake_schema.arrays import Float, Float32, Int
 
 # Tables reach this redshift, however near the last plane is: it leaves the nearer ones as they are.
 _Z_LAST = 12.0
@@ -50,8 +49,8 @@ class Layers:
     """
 
     middle: Float
-    factor: npt.NDArray[np.int64]
-    stretch: npt.NDArray[np.int64]
+    factor: Int
+    stretch: Int
     growth: Float
     now: Float
     gain: Float
@@ -191,7 +190,7 @@ def averaged(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> 
     return mean
 
 
-def _together(slabs: Layers, plane: npt.NDArray[np.int64]) -> Iterator[slice]:
+def _together(slabs: Layers, plane: Int) -> Iterator[slice]:
     """Stretches of layers that share their matter and the planes behind them."""
     same = zip(slabs.stretch.tolist(), slabs.factor.tolist(), plane.tolist(), strict=True)
     at = 0
@@ -226,7 +225,7 @@ def add_layers(
     direction: Float32,
     delta: Float32,
     n: int,
-    axes: npt.NDArray[np.int64],
+    axes: Int,
     scale: Float32,
     shift: Float32,
     weights: Float32,

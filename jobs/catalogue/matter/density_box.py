@@ -33,7 +33,7 @@ from jobs.catalogue.matter import linear_theory
 from jobs.code_keys import code_key
 from jobs.fluxes import cosmology
 from jobs.rng import stream
-from lake_schema.arrays import Complex64, Float, Float32
+from lake_schema.arrays import Complex64, Float, Float32, Int
 from lake_schema.errors import BadInput
 
 _FILE = "density_box.toml"
@@ -138,7 +138,7 @@ def velocity_factor(model: BoxModel, z: npt.ArrayLike) -> Float:
     return np.asarray(rate * growth_rate(z, model.growth_index) * growth(z))
 
 
-def overdensity(box: Box, index: npt.NDArray[np.int64], growths: npt.ArrayLike) -> Float:
+def overdensity(box: Box, index: Int, growths: npt.ArrayLike) -> Float:
     """Matter overdensity delta[n] in cells of the box, at growth D[n].
 
     index : int[n] flat cell;  growths : float[n]
@@ -158,7 +158,7 @@ def matter_gain(model: BoxModel, growths: Float) -> Float:
     return np.asarray(1.0 / np.sqrt(share[:, 0]))
 
 
-def biased(model: BoxModel, x: Float) -> tuple[npt.NDArray[np.int64], Float]:
+def biased(model: BoxModel, x: Float) -> tuple[Int, Float]:
     """The field that halos of x = b D follow, and its amplitude A, each of x's shape.
 
     Halos drawn in voxels from exp(A g_R) have the power x^2 P_linear(z = 0) in the band of the model; A = x would be
@@ -232,7 +232,7 @@ def _growing(a: Float) -> Float:
     return np.asarray(hyp2f1(1.0 / 3.0, 1.0, 11.0 / 6.0, -(a**3) * cosmology.OMEGA_LAMBDA / cosmology.OMEGA_M))
 
 
-def _stored(key: str, name: str, make: Callable[[], npt.NDArray[np.generic]]) -> npt.NDArray[np.float32]:
+def _stored(key: str, name: str, make: Callable[[], npt.NDArray[np.generic]]) -> Float32:
     return np.asarray(cached_arrays(name, key, lambda: {"field": make()})["field"])
 
 

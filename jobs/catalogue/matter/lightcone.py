@@ -20,7 +20,7 @@ import numpy.typing as npt
 from jobs.catalogue.matter.density_box import Box
 from jobs.fluxes import cosmology
 from jobs.rng import stream
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 
 # Side of a HEALPix cell in units of 1 / nside, rad, and how much wider than a cell of the box a voxel may be.
 _SIDE, _WIDEST = 1.023, 1.2
@@ -126,7 +126,7 @@ def steps(cell: float, near: float, far: float, table: Distances) -> Steps:
     return Steps(edge, table.redshift(0.5 * (edge[1:] + edge[:-1])))
 
 
-def voxels(box: Box, turned: Replicas, line: Steps, order: int, cell: int, used: npt.NDArray[np.bool_]) -> Voxels:
+def voxels(box: Box, turned: Replicas, line: Steps, order: int, cell: int, used: Bool) -> Voxels:
     """Voxels of a nested cell, in the steps that are used (bool[s]).
 
     order, cell : of the nested cell;  used : bool[s]

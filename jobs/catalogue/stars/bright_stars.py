@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import csv
@@ -24,7 +23,7 @@ from jobs.catalogue import parameters
 from jobs.code_keys import code_key
 from jobs.fluxes.libraries.stellar import StellarTypes
 from lake_schema import sky, user_files
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.fits import external
 from lake_schema.ids import GENERATION_ORDER
@@ -110,7 +109,7 @@ def _numbers() -> dict[str, Any]:
     return parameters.section("milky_way.toml", "bright_stars")
 
 
-def _read(files: tuple[Path, ...]) -> dict[str, npt.NDArray[Any]]:
+def _read(files: tuple[Path, ...]) -> dict[str, Array]:
     numbers = _numbers()
     place, bt, vt = (np.concatenate(values, -1) for values in zip(*map(_records, files), strict=True))
     known = np.isfinite(bt) | np.isfinite(vt)

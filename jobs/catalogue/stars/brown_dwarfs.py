@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs import sums
 from jobs.catalogue import parameters
@@ -22,7 +21,7 @@ from jobs.catalogue.stars.density_laws import Exponential, density
 from jobs.catalogue.stars.milky_way import MilkyWay
 from jobs.fluxes.libraries import brown_dwarfs as spectra
 from jobs.fluxes.libraries import stellar
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 
 _FILE = "milky_way.toml"
 
@@ -92,6 +91,6 @@ def draw(
     return Sample(template, distance)
 
 
-def _seen(dwarfs: BrownDwarfs, galaxy: MilkyWay, h_limit: float) -> npt.NDArray[np.bool_]:
+def _seen(dwarfs: BrownDwarfs, galaxy: MilkyWay, h_limit: float) -> Bool:
     """[365, s] whether a template is brighter than the limit at the near edge of a shell."""
     return np.asarray(dwarfs.m_h[:, None] + 5.0 * np.log10(galaxy.distance[:-1]) - 5.0 < h_limit)

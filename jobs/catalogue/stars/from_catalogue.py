@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +23,7 @@ from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
 from jobs.code_keys import code_key
 from lake_schema import sky, user_files
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
 from lake_schema.fits import external
@@ -59,7 +58,7 @@ class StarCatalogue:
     """n stars by cell and position: index (order-29), and the values by key (deg, mag, K, pc) that the file has."""
 
     index: Int
-    values: Mapping[str, npt.NDArray[Any]]
+    values: Mapping[str, Array]
 
 
 def checked_columns(columns: Mapping[str, str]) -> None:
@@ -97,7 +96,7 @@ def numbers(stars: StarCatalogue, cells: npt.ArrayLike) -> Float:
     return np.asarray(last - first, float)
 
 
-def of_cell(stars: StarCatalogue, cell: int) -> dict[str, npt.NDArray[Any]]:
+def of_cell(stars: StarCatalogue, cell: int) -> dict[str, Array]:
     """The values of an order-8 cell's stars, with `index`.
 
     returns : [n] each, in the units of `load`
@@ -106,9 +105,9 @@ def of_cell(stars: StarCatalogue, cell: int) -> dict[str, npt.NDArray[Any]]:
     return {"index": stars.index[rows], **{name: values[rows] for name, values in stars.values.items()}}
 
 
-def _read(file: Path, columns: Mapping[str, str]) -> dict[str, npt.NDArray[Any]]:
+def _read(file: Path, columns: Mapping[str, str]) -> dict[str, Array]:
     table = _table(file, list(columns.values()))
-    values: dict[str, npt.NDArray[Any]] = {
+    values: dict[str, Array] = {
         key: external_rows.within(file, f"{title} ({key})", table[title], KEYS[key]) for key, title in columns.items()
     }
     if "l" in values:

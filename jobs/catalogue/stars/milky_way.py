@@ -37,7 +37,7 @@ from jobs.catalogue.stars.stellar_populations import (
     luminosity,
     white_dwarf_sequence,
 )
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 
 MODELS = ("juric", "besancon")
 THIN, THICK, HALO = 0, 1, 2
@@ -188,7 +188,7 @@ def volumes(galaxy: MilkyWay, area: float) -> Float:
     return np.asarray(area * _SR_PER_DEG2 * (far - near) * (far**2 + far * near + near**2) / 3.0)
 
 
-def _seen(galaxy: MilkyWay, h_limit: float) -> npt.NDArray[np.bool_]:
+def _seen(galaxy: MilkyWay, h_limit: float) -> Bool:
     """[s, b] whether a star of the bin may be brighter than the limit in the shell."""
     return np.asarray(galaxy.m_h[None, :-1] + 5.0 * np.log10(galaxy.distance[:-1, None]) - 5.0 < h_limit)
 

@@ -28,7 +28,7 @@ from jobs.fluxes.libraries import stellar
 from jobs.fluxes.libraries.stellar import StellarTypes
 from jobs.rng import stream
 from lake_schema import ids, sky
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.tables.stars import STARS
@@ -142,7 +142,7 @@ def _limits(lat: Float, universe: StarModel) -> Float:
     return np.where(in_plane, universe.plane_limit, universe.limit)
 
 
-def draw(cell: int, seed: int, universe: StarModel, dust: npt.NDArray[np.float32]) -> pa.Table:
+def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
     """Table `stars` of one order-8 cell, sorted by _healpix_29.
 
     dust : float32[pixel] mag, map of the Milky Way's A(V) to infinity (jobs.catalogue.dust_map)
@@ -173,7 +173,7 @@ def draw(cell: int, seed: int, universe: StarModel, dust: npt.NDArray[np.float32
     return rows if len(lots) == 1 else rows.sort_by([("_healpix_29", "ascending"), ("id", "ascending")])
 
 
-def _drawn(cell: int, seed: int, universe: StarModel, dust: npt.NDArray[np.float32], where: Where) -> Lot:
+def _drawn(cell: int, seed: int, universe: StarModel, dust: Float32, where: Where) -> Lot:
     """Stars of the Milky Way's model."""
     galaxy = universe.galaxy
     stars = milky_way.draw(galaxy, milky_way.expected(galaxy, *where), stream(seed, "stars.luminosity", cell))
@@ -193,9 +193,7 @@ def _drawn(cell: int, seed: int, universe: StarModel, dust: npt.NDArray[np.float
     }
 
 
-def _brown(
-    cell: int, seed: int, universe: StarModel, dwarfs: BrownDwarfs, dust: npt.NDArray[np.float32], where: Where
-) -> Lot:
+def _brown(cell: int, seed: int, universe: StarModel, dwarfs: BrownDwarfs, dust: Float32, where: Where) -> Lot:
     """L and T dwarfs."""
     found = brown_dwarfs.draw(dwarfs, universe.galaxy, *where, stream(seed, "brown_dwarfs.number", cell))
     n = found.template.size
@@ -215,16 +213,14 @@ def _brown(
     }
 
 
-def _placed(
-    cell: int, universe: StarModel, dust: npt.NDArray[np.float32], distance: Float, rng: np.random.Generator
-) -> Lot:
+def _placed(cell: int, universe: StarModel, dust: Float32, distance: Float, rng: np.random.Generator) -> Lot:
     """Places uniform in a cell, ascending, and the dust on the way."""
     index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, distance.size, rng)
     a_v = _extinction(universe, distance, dust, ra, dec)
     return {"_healpix_29": index, "ra": ra, "dec": dec, "distance": distance, "a_v": a_v}
 
 
-def _given(cell: int, catalogue: StarCatalogue, universe: StarModel, dust: npt.NDArray[np.float32]) -> Lot:
+def _given(cell: int, catalogue: StarCatalogue, universe: StarModel, dust: Float32) -> Lot:
     """Stars of somebody's catalogue; what it does not say is null, dust is ours."""
     values = from_catalogue.of_cell(catalogue, cell)
     n = len(values["ra"])
@@ -265,7 +261,7 @@ def _catalogued(cell: int, bright: BrightStars, types: StellarTypes) -> Lot:
     }
 
 
-def _selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> npt.NDArray[np.bool_]:
+def _selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> Bool:
     """[n] brighter than the limit, and not where Tycho-2 has the stars."""
     seen = lot["mag_h"] + universe.h_over_v * lot["a_v"] < limit
     if universe.bright is None:
@@ -293,6 +289,6 @@ def nearest_template(library: Float, teff: Float) -> Int:
     return np.asarray(order[np.searchsorted(between, np.log(teff))], np.int64)
 
 
-def _extinction(universe: StarModel, distance: Float, dust: npt.NDArray[np.float32], ra: Float, dec: Float) -> Float:
+def _extinction(universe: StarModel, distance: Float, dust: Float32, ra: Float, dec: Float) -> Float:
     _, lat = sky.galactic(ra, dec)
     return dust_map.a_v_at(dust_map.a_v(dust, ra, dec), distance, lat, universe.layer, universe.sin_b_min)

@@ -14,12 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.fluxes import passbands
 from jobs.fluxes.libraries import stellar
 from jobs.rng import stream
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 
 COUNT = 365
 _FIRST, _LAST = "L0V", "T8V"
@@ -69,7 +68,7 @@ def template_names() -> tuple[str, ...]:
 class Templates:
     """The 365 templates: number[365] of the subtype, teff K, abs_mag_j, abs_mag_h (Vega)."""
 
-    subtype: npt.NDArray[np.int64]
+    subtype: Int
     teff: Float
     abs_mag_j: Float
     abs_mag_h: Float

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.fluxes import passbands
 from jobs.fluxes.libraries import text_tables, votable
@@ -28,7 +27,7 @@ from jobs.fluxes.libraries.stellar import normalised
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.passbands import Passband
 from lake_schema import user_files
-from lake_schema.arrays import Float
+from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.fits.external import read_table
 
@@ -172,7 +171,7 @@ def check(path: Path, wavelength: Float, value: Float, form: Mapping[str, Any]) 
     _refuse(path, np.append(False, wide), "follows a gap")
 
 
-def _refuse(path: Path, bad: npt.NDArray[np.bool_], what: str) -> None:
+def _refuse(path: Path, bad: Bool, what: str) -> None:
     if bad.any():
         raise BadInput(f"{path}: row {int(np.flatnonzero(bad)[0]) + 1} {what}")
 

@@ -49,7 +49,7 @@ class Mix:
     def __len__(self) -> int:
         return len(self.z_obs)
 
-    def rows(self, chosen: npt.NDArray[np.int64] | slice) -> Mix:
+    def rows(self, chosen: Int | slice) -> Mix:
         return Mix(
             picked(self.z_obs, chosen),
             picked(self.sed, chosen),

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.fluxes import passbands
 from jobs.fluxes.calibration import continuum_scale, star_scale
@@ -39,7 +38,7 @@ from jobs.fluxes.tables.build_tables import (
     Setting,
 )
 from lake_schema import units
-from lake_schema.arrays import Bool, Float, Float32, Int
+from lake_schema.arrays import Bool, Float, Float32, Int, Int32, UInt32
 
 # Of the reference band: its error is everybody's.
 REFERENCE_SETTING = Setting(0.005, 6, 1)
@@ -55,12 +54,12 @@ class LineGrid:
     """The line tables of all bands in one, see compiled.add_up; wavelengths of the lines."""
 
     tables: Float32
-    start: npt.NDArray[np.uint32]
-    last: npt.NDArray[np.int32]
-    medium: npt.NDArray[np.uint32]
+    start: UInt32
+    last: Int32
+    medium: UInt32
     first: Float
     cells: Int
-    members: npt.NDArray[np.uint32]
+    members: UInt32
     cell_first: float
     vacuum: Float
 

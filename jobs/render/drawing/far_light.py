@@ -30,17 +30,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.render.drawing.kernels import far_light
 from jobs.render.drawing.kernels.far_light import FOLDED, SPARED
 from jobs.render.drawing.kernels.frame import FIXED_POINT
 from jobs.render.psf import spikes
 from jobs.render.psf.spikes import ARCSEC, FARTHEST, LONG, STEP, Edges
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Array, Float, Int
 
 # Light is drawn to where it is this part of what may be left out: its border is not to be seen.
 _FAINTEST = 0.5
@@ -113,7 +111,7 @@ def _farthest_corner(frame: Int, column: float, row: float, length: float, along
     return float(np.hypot(max(columns.max() + 1.0, nx - columns.min()), max(rows.max() + 1.0, ny - rows.min())))
 
 
-def unfold(star: Star, stamp: npt.NDArray[Any], left: int, low: int, nx: int, ny: int) -> None:
+def unfold(star: Star, stamp: Array, left: int, low: int, nx: int, ny: int) -> None:
     """Takes off a star's stamp, in place, what its plane's transform had folded into it: a fifth of its corners.
 
     left, low : the stamp's first pixel on a frame of nx, ny, outside which nothing is done

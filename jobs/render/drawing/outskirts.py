@@ -20,7 +20,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import RectBivariateSpline
 from scipy.signal import fftconvolve
 from scipy.special import gammaincc, gammaln
@@ -33,7 +32,7 @@ from jobs.render.psf.model import SAMPLES, Psf
 from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.galaxy_shapes import Forms, Shapes
 from jobs.render.sources.selection import FARTHEST
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 
 # CPU s, measured (2.5 GHz, one core), of a frame's pixel and of one of the stamp.
@@ -156,7 +155,7 @@ def _shares(length: int) -> Float:
     return out
 
 
-def take_in(some: Outskirts, stamp: npt.NDArray[Any], x: float, y: float) -> None:
+def take_in(some: Outskirts, stamp: Array, x: float, y: float) -> None:
     """Takes off a stamp [N, N], in place, what has come in at its edges of the galaxy at (x, y) of it, pixels."""
     _take_in(some.light, some.disk, some.across, some.blurred, from_afar(some, len(stamp), x, y), x, y, stamp)
 

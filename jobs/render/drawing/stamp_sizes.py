@@ -27,7 +27,6 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.render.drawing import outskirts, wings
 from jobs.render.drawing.settings import Settings
@@ -37,7 +36,7 @@ from jobs.render.psf.model import SIDE, Psf
 from jobs.render.sources import galaxy_shapes, selection
 from jobs.render.sources.galaxy_shapes import Shapes
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 
 # Sides whose transforms are fast; the last bounds memory (its planes have 134 MB).
 SIZES = np.array(
@@ -156,7 +155,7 @@ def piece_count(length: Float) -> Int:
     return np.maximum(np.ceil(length / _PIECE), 1.0).astype(np.int64)
 
 
-def shone_on(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int, ny: int) -> npt.NDArray[np.bool_]:
+def shone_on(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int, ny: int) -> Bool:
     """[n] True of sources at rest of which light may be noticed on the frame: their stamps', or what is drawn beyond.
 
     noise : of a pixel, electrons
@@ -180,7 +179,7 @@ def shone_on(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int, ny: 
     return here
 
 
-def shining(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: Psf) -> npt.NDArray[np.bool_]:
+def shining(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: Psf) -> Bool:
     """[n] True of points so bright that their light does not end where the PSF's plane does: `draw` takes it on."""
     point = shape < 0 if picture is None else (shape < 0) & (picture < 0)
     return np.asarray(point & (sizes >= SIDE) & (electrons > BRIGHT) & (psf.edges is not None))
@@ -212,7 +211,7 @@ def reaches(
     return np.ceil(sides + length).astype(np.int64)
 
 
-def on_largest(shape: Int, sizes: Int) -> npt.NDArray[np.bool_]:
+def on_largest(shape: Int, sizes: Int) -> Bool:
     """[n] True of galaxies that no stamp holds."""
     return np.asarray((shape >= 0) & (sizes >= SIZES[-1]))
 

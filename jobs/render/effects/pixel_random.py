@@ -20,6 +20,7 @@ import numpy as np
 
 from jobs.compiling import jit
 from jobs.rng import GOLDEN, mixed
+from lake_schema.arrays import Float
 
 _S11, _LAYER, _SIGN = np.uint64(11), np.uint64(255), np.uint64(256)
 # Of 256 layers of equal area under exp(-x^2 / 2): where the tail begins, and the area (Doornik 2005).
@@ -31,7 +32,7 @@ def key(rng: np.random.Generator) -> np.uint64:
     return rng.integers(0, 2**64, dtype=np.uint64)
 
 
-def _layers() -> np.ndarray[Any, np.dtype[np.float64]]:
+def _layers() -> Float:
     """Right ends of the layers, from the lowest, whose end stands for its tail, to 0."""
     ends = [_AREA * math.exp(0.5 * _TAIL**2), _TAIL]
     while len(ends) < 256:

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.accuracy import SURVEY, Accuracy
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
+from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 
-Frame = npt.NDArray[np.float64]
+Frame = Float
 
 # An effect is needed where its largest contribution exceeds this part of a pixel's noise; and what comes back in every
 # frame, or in every pixel, where it exceeds this part of the noise that is left in the mean of so many: 32 x 32 pixels

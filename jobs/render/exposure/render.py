@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs import rng
 from jobs.render.channels.aim import Aim
@@ -23,7 +21,7 @@ from jobs.render.exposure.records import Rows, Variant
 from jobs.render.exposure.rendered import Rendered
 from jobs.render.exposure.visible_sources import Light, visible_light
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.ids import kind_of
 
 # Code of a star in an identifier.
@@ -62,7 +60,7 @@ class _Drawn:
     sources: Sources
     sizes: Int
     electrons: Float
-    maps: dict[str, npt.NDArray[Any]]
+    maps: dict[str, Array]
     scene: Scene
 
 
@@ -73,7 +71,7 @@ def _drawn(
     sources, sizes, scene, detector = light.sources, light.sizes, light.scene, aim.detector
     if light.psf is None:
         empty = np.zeros((detector.ny, detector.nx))
-        maps: dict[str, npt.NDArray[Any]] = {"noise_free": empty.astype(np.float32)}
+        maps: dict[str, Array] = {"noise_free": empty.astype(np.float32)}
         return _Drawn(sources, sizes, np.zeros(0), maps, scene), [empty]
     drawn, maps = np.zeros(len(sources)), {}
     frame = stamps.draw(

@@ -7,10 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 from astropy.wcs import WCS
 
 from jobs.accuracy import Accuracy
@@ -21,7 +18,7 @@ from jobs.render.effects.effect import Decision, Effect
 from jobs.render.effects.scene import Scene
 from jobs.render.psf.model import Psf
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Array, Float, Int
+from lake_schema.arrays import Array, Float, Float32, Int
 from lake_schema.tables.exposures import ExposureRow
 
 
@@ -43,7 +40,7 @@ class Rendered:
     wcs: WCS
     psf: Psf | None
     readout: Readout
-    maps: Mapping[str, npt.NDArray[Any]]
+    maps: Mapping[str, Array]
     sources: Sources
     sizes: Int
     drawn: Float
@@ -65,7 +62,7 @@ class Rendered:
         return self.readout.pixels
 
     @property
-    def noise_free(self) -> npt.NDArray[np.float32]:
+    def noise_free(self) -> Float32:
         """float32[ny, nx] expected electrons of the sources alone."""
         return self.maps["noise_free"]
 

@@ -8,7 +8,6 @@ complete   adds the maps of effects that were not needed, and what the converter
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +16,9 @@ from jobs.render.effects.charge import bleeding
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.readout import quadrants
 from jobs.render.effects.scene import Frame, Scene
+from lake_schema.arrays import Array
 
-Maps = dict[str, npt.NDArray[Any]]
+Maps = dict[str, Array]
 
 # Bytes a pixel of each map's file.
 BYTES = {"noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "saturation": 1}

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.accuracy import Accuracy
@@ -29,7 +28,7 @@ from jobs.render.psf import from_file, spikes, sub_bands
 from jobs.render.psf.model import Psf, of_colours
 from jobs.render.sources import colours, galaxy_shapes, lensed_arcs, selection, solar_system
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
@@ -228,12 +227,12 @@ def _with_moving(
     return sources.with_moving(found.take(here)), np.concatenate([sizes, own[here]]), bright_lights.trails(found)
 
 
-def touching(sources: Sources, sizes: Int, detector: Detector) -> npt.NDArray[np.bool_]:
+def touching(sources: Sources, sizes: Int, detector: Detector) -> Bool:
     """Sources with a stamp on the detector."""
     return selection.touching(sources.column, sources.row, sizes + sources.length, detector.nx, detector.ny)
 
 
-def _colours(kept: npt.NDArray[np.int64], rows: Rows, band: Passband) -> Float:
+def _colours(kept: Int, rows: Rows, band: Passband) -> Float:
     """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
     of_galaxy = kept < len(rows.galaxies)
     out = np.empty((len(kept), sub_bands.PARTS))
@@ -242,7 +241,7 @@ def _colours(kept: npt.NDArray[np.int64], rows: Rows, band: Passband) -> Float:
     return out
 
 
-def _check(ids: npt.NDArray[np.int64], electrons: Float) -> None:
+def _check(ids: Int, electrons: Float) -> None:
     if len(np.unique(ids)) != len(ids):
         raise BadInput("a source is given twice")
     bad = ~((electrons >= 0) & (electrons <= _MOST_ELECTRONS))

@@ -10,9 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import numpy as np
-import numpy.typing as npt
-
 from jobs import rng
 from jobs.render.camera import pointing
 from jobs.render.camera.lamps import LEDS, NISP_LAMPS
@@ -20,6 +17,7 @@ from jobs.render.planning.observing_sequence import FILTERS, RED, offsets
 from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
 from jobs.render.planning.reference_survey import position_angle
 from jobs.request.observations import Observation
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
@@ -113,7 +111,7 @@ def _through_grism(frame: Exposure, number: int, mission: MissionConfiguration) 
     return replace(frame, grism=_GRISMS[number], grism_angle=mission.value(f"survey.grism_angle_{number + 1}", "deg"))
 
 
-def _scattered(camera: str, dithers: int, mission: MissionConfiguration, seed: int) -> npt.NDArray[np.float64]:
+def _scattered(camera: str, dithers: int, mission: MissionConfiguration, seed: int) -> Float:
     """[dithers, 2] arcsec: uniform within half a detector and its gap, both ways."""
     fpa = {key: mission.value(f"{camera}.fpa.{key}") for key in ("nx", "ny", "pixel_scale", "gap_x", "gap_y")}
     half = [0.5 * (fpa[f"n{axis}"] * fpa["pixel_scale"] + fpa[f"gap_{axis}"]) for axis in "xy"]

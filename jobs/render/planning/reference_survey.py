@@ -21,7 +21,7 @@ from jobs.render.camera import pointing
 from jobs.render.sky.diffuse_light import sun_longitude
 from jobs.request.area import Area
 from lake_schema import sky
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -87,7 +87,7 @@ def _vector(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Float:
 # ------------------------------------------------------------------------------------------------ wide survey
 
 
-def lattice(area: Area, mission: MissionConfiguration, count: int = 0) -> tuple[npt.NDArray[np.int64], Float, Float]:
+def lattice(area: Area, mission: MissionConfiguration, count: int = 0) -> tuple[Int, Float, Float]:
     """Numbers, ra, dec of the wide survey's fields that may see an area; of `count` > 0, those deepest inside.
 
     The lattice does not depend on the area: rows of ecliptic latitude, equally spaced in longitude.

@@ -20,6 +20,7 @@ import scipy.fft
 from jobs import cache
 from jobs.code_keys import code_key
 from jobs.render.products import run_log
+from lake_schema.arrays import Float
 from lake_schema.errors import LakeError
 from lake_schema.store import read
 from lake_schema.store.provenance import machine
@@ -53,7 +54,7 @@ def of_machine(lake: Path) -> Speed:
     return Speed(float(kept["seconds"].min()) / REFERENCE_S, "from a calibration of a second")
 
 
-def calibration() -> np.ndarray[Any, np.dtype[np.float64]]:
+def calibration() -> Float:
     """CPU s [repeats] of what detectors are made of: transforms of stamps, exponentials, random numbers, a sort."""
     rng = np.random.default_rng(1)
     waves = (rng.normal(size=(_STAMPS, _SIDE, _SIDE // 2 + 1)) + 0j).astype(np.complex64)

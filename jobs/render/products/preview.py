@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from astropy.wcs import WCS
 
 from jobs import sums
 from jobs.render.camera import astrometry
 from jobs.render.products import preview_labels, read_back
 from jobs.render.products.preview_labels import CLOSE_UP_ARCSEC, CLOSE_UP_SHAPE, CLOSE_UPS, LABELS, Label
-from lake_schema.arrays import Float
+from lake_schema.arrays import Array, Bool, Float
 from lake_schema.fits import images
 from lake_schema.fits.images import Card
 from lake_schema.store import read
@@ -60,7 +59,7 @@ def _frame_of(row: dict[str, Any]) -> tuple[Any, ...]:
     return row["exposure_id"], row["detector"]
 
 
-def _mended(image: Float, hit: npt.NDArray[np.bool_]) -> Float:
+def _mended(image: Float, hit: Bool) -> Float:
     """Pixels that cosmic rays hit take the median of those around them that none did."""
     rows, columns = np.nonzero(hit)
     whole = np.where(hit, np.nan, image)
@@ -79,7 +78,7 @@ def _mended(image: Float, hit: npt.NDArray[np.bool_]) -> Float:
 # ------------------------------------------------------------------------------------------------ drawing
 
 
-def picture(path: Path, image: npt.NDArray[Any], cards: Sequence[Card], names: Sequence[Label]) -> None:
+def picture(path: Path, image: Array, cards: Sequence[Card], names: Sequence[Label]) -> None:
     """Draw one image.
 
     image : [ny, nx] electrons or ADU;  cards : its header;  names : sources, brightest first
@@ -119,7 +118,7 @@ def _caption(header: dict[str, Any], system: WCS, shape: tuple[int, ...]) -> str
     )
 
 
-def _shrunk(image: npt.NDArray[Any], block: int) -> Float:
+def _shrunk(image: Array, block: int) -> Float:
     ny, nx = (n // block for n in image.shape)
     return np.asarray(image[: ny * block, : nx * block].reshape(ny, block, nx, block).mean((1, 3), dtype=float))
 
@@ -144,14 +143,14 @@ def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], upside_dow
         side.set_edgecolor("#3a4150")
 
 
-def _levels(image: npt.NDArray[Any]) -> tuple[float, float]:
+def _levels(image: Array) -> tuple[float, float]:
     """Sky and noise, from the median and the pixels below it."""
     level = float(np.median(image))
     below = image[image < level] - level
     return level, float(np.sqrt(np.mean(below**2))) if below.size else 1.0
 
 
-def _stretched(image: npt.NDArray[Any], level: float, noise: float) -> Float:
+def _stretched(image: Array, level: float, noise: float) -> Float:
     """Electrons or ADU -> 0 .. 1 by asinh."""
     signal = np.clip((image - level) / noise, _BLACK, _WHITE)
     lo, hi = np.arcsinh(_BLACK / _KNEE), np.arcsinh(_WHITE / _KNEE)
@@ -233,7 +232,7 @@ def _compass(axes: Any, system: WCS, shape: tuple[int, ...]) -> None:
 def _close_up(
     axes: Any,
     main: Any,
-    image: npt.NDArray[Any],
+    image: Array,
     label: Label,
     pixel_scale: float,
     upside_down: bool,

@@ -6,11 +6,11 @@ truth      rows of the table `rendered_truth`
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.render.exposure.rendered import Rendered
 from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Int
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 # Codes of `method` in the table `rendered_truth`.
@@ -38,7 +38,7 @@ def truth(rendered: Rendered) -> pa.Table:
     )
 
 
-def _methods(sources: Sources) -> npt.NDArray[np.int64]:
+def _methods(sources: Sources) -> Int:
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
     method = np.where(pictured, PICTURE, np.where(sources.shape < 0, POINT, PROFILE))
     return np.where(sources.length > 0, TRAIL, method)

@@ -18,13 +18,12 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs.render.sources.solar_system import KIND, Population
 from lake_schema import sky
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 from lake_schema.ecliptic import equatorial
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
@@ -48,7 +47,7 @@ _MOST_ROWS = 1 << 21
 class Bodies:
     """Rows of a table by the day, int64[n], MJD, that they are of."""
 
-    day: npt.NDArray[np.int64]
+    day: Int
     rows: Population
 
     def of_day(self, day: int) -> Population:
@@ -95,7 +94,7 @@ def _table(file: Path) -> tuple[dict[str, Float], pa.ChunkedArray | None]:
     return {key: np.concatenate(column) for key, column in parts.items()}, pa.chunked_array(names) if names else None
 
 
-def _refuse_twice(file: Path, names: pa.ChunkedArray, day: npt.NDArray[np.int64]) -> None:
+def _refuse_twice(file: Path, names: pa.ChunkedArray, day: Int) -> None:
     """One row a name and day."""
     if (absent := pc.index(names, "").as_py()) >= 0:
         raise BadInput(f"{file}: {_NAME} of row {absent + 1} is missing")

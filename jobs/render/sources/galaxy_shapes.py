@@ -17,13 +17,12 @@ from functools import lru_cache
 
 import galsim
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from scipy.special import gammaincc, gammaincinv, gammaln
 
 from jobs import sums
 from jobs.render.sources import sersic
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 
 # Half-light radius of a face-on exponential disc in scale lengths: (1 + x) exp(-x) = 1/2.
@@ -79,7 +78,7 @@ class Shapes:
     def __len__(self) -> int:
         return len(self.beta)
 
-    def take(self, chosen: npt.NDArray[np.int64]) -> Shapes:
+    def take(self, chosen: Int) -> Shapes:
         """Some of the galaxies."""
         return Shapes(*(getattr(self, field.name)[chosen] for field in fields(self)))
 

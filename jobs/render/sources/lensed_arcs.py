@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
-from lake_schema.arrays import Array, Float, Int
+from lake_schema.arrays import Array, Float, Float32, Int
 from lake_schema.errors import BadInput
 
 # What is read of the table `strong_lenses`; arcsec of a pixel of its pictures, as the table declares.
@@ -24,7 +23,7 @@ ARC_SCALE = 0.05
 class Picture:
     """image : float32[ny, nx] of sum 1, south to north and west to east, its place in the middle;  scale : arcsec"""
 
-    image: npt.NDArray[np.float32]
+    image: Float32
     scale: float
 
     @property

@@ -10,14 +10,13 @@ sample's segment is read off its bits.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import scipy.fft
 from scipy.interpolate import CubicSpline
 from scipy.special import gammainccinv, gammaln
 
 from jobs import cache
 from jobs.code_keys import code_key
-from lake_schema.arrays import Float, Float32
+from lake_schema.arrays import Float, Float32, Int
 
 # galsim.Sersic, the reference, accepts these.
 INDEX_LO, INDEX_HI = 0.3, 6.2
@@ -43,7 +42,7 @@ def table() -> Float32:
     return cache.cached_arrays("sersic", key, lambda: {"transform": _make()})["transform"]
 
 
-def row_of(index: Float) -> tuple[npt.NDArray[np.int64], Float]:
+def row_of(index: Float) -> tuple[Int, Float]:
     """Where indices lie: the first of four rows [n], and the four weights [n, 4] of cubic interpolation in ln n."""
     position = (np.log(np.clip(index, INDEX_LO, INDEX_HI)) - _LOG_LO) / _LOG_STEP
     first = np.clip(np.floor(position).astype(np.int64) - 1, 0, ROWS - 4)

@@ -27,7 +27,7 @@ from jobs.render.sources import colours
 from jobs.render.sources.galaxy_shapes import Shapes
 from jobs.render.sources.source_list import Sources
 from lake_schema import sky, units
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER, source_id
 from lake_schema.mission.configuration import MissionConfiguration
@@ -65,7 +65,7 @@ class Population:
         since = (hours - self.hour) / 3600.0
         return equatorial(self.lon + self.east * since / across, np.clip(self.lat + self.north * since, -90.0, 90.0))
 
-    def take(self, some: npt.NDArray[np.bool_] | Int) -> Population:
+    def take(self, some: Bool | Int) -> Population:
         """Some of the bodies."""
         return Population(
             *(np.broadcast_to(getattr(self, field.name), self.ids.shape)[some] for field in fields(Population))

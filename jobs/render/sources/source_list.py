@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.render.sources.galaxy_shapes import Shapes
 from jobs.render.sources.lensed_arcs import Picture
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Bool, Float, Int
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +44,7 @@ class Sources:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def take(self, chosen: npt.NDArray[np.bool_] | Int) -> Sources:
+    def take(self, chosen: Bool | Int) -> Sources:
         """Some of the sources."""
         return Sources(
             self.ids[chosen],

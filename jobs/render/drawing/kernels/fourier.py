@@ -17,12 +17,11 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.compiling import jit
 from jobs.render.drawing.kernels.frame import FIXED_POINT, FULL, smaller
 from jobs.render.sources.sersic import FIRST_BITS
-from lake_schema.arrays import Bool, Float, Float32, Int
+from lake_schema.arrays import Array, Bool, Float, Float32, Int
 
 _TWO_PI = 2.0 * np.pi
 _FIRST = int(FIRST_BITS)
@@ -39,8 +38,8 @@ def units_of(electrons: Float) -> float:
 
 @jit
 def nyquist_zones(
-    zones: npt.NDArray[Any], planes: npt.NDArray[Any], kx: Float32, ky: Float32, runs: Int, pieces: Int, inner: Float,
-    weights: npt.NDArray[Any], x: Float, y: Float, electrons: Float, cut: Float, sersic: Float32, body: Bool,
+    zones: Array, planes: Array, kx: Float32, ky: Float32, runs: Int, pieces: Int, inner: Float,
+    weights: Array, x: Float, y: Float, electrons: Float, cut: Float, sersic: Float32, body: Bool,
     fraction: Float, bulge: Float, disk: Float, thick: Float, row: Int, row_weights: Float, trail: Float,
 ) -> None:  # fmt: skip
     """Fills zones, complex[m, N, N / 2 + 1]: what irfft2 turns into the stamps of m sources.
@@ -248,7 +247,7 @@ def _interpolate(sersic: Float32, row: int, row_weights: Float, least: float, mo
 
 
 @jit
-def take(spectrum: npt.NDArray[Any], runs: Int, pixel: Float, out: npt.NDArray[Any]) -> None:
+def take(spectrum: Array, runs: Int, pixel: Float, out: Array) -> None:
     """Fills out [2, s] with the samples of transfer.Grid.runs: real and imaginary part of spectrum times pixel.
 
     spectrum : complex[iy, ix], ix >= 0 of a real image;  pixel : [|iy|, |ix|] the pixel's own transform
@@ -312,9 +311,7 @@ def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> 
 
 
 @jit
-def between(
-    spectrum: npt.NDArray[Any], across: Float, up: Float, width: int, slope: float, out: npt.NDArray[Any]
-) -> None:
+def between(spectrum: Array, across: Float, up: Float, width: int, slope: float, out: Array) -> None:
     """Fills out [s] with the sums of a periodic spectrum [ny, nx] under a window about frequencies, radian / pixel.
 
     window : exp(slope (sqrt(1 - z^2) - 1)), z = -1 .. 1 over `width` samples a direction

@@ -11,10 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.compiling import jit
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Array, Float, Int
 
 # What an electron is in the frame's integers, to 1e-6; and their largest sum, which leaves room for what rings.
 FIXED_POINT, FULL = float(1 << 20), 61
@@ -42,7 +41,7 @@ def smaller(form: Float) -> Any:
 
 @jit
 def accumulate(
-    frame: Int, stamps: npt.NDArray[Any], x0: Int, y0: Int, unread: tuple[int, int], unit: float
+    frame: Int, stamps: Array, x0: Int, y0: Int, unread: tuple[int, int], unit: float
 ) -> Int:  # fmt: skip
     """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, `unit` to an electron.
 
@@ -68,7 +67,7 @@ def accumulate(
 
 
 @jit
-def take_off(stamps: npt.NDArray[Any], x: Float, y: Float, curve: Float, taken: Float) -> None:
+def take_off(stamps: Array, x: Float, y: Float, curve: Float, taken: Float) -> None:
     """Takes curve [m, 5] of `returning`, about (x, y) [m], off stamps [m, N, N], but leaves no pixel darker than none.
 
     taken : [m] filled with the electrons

@@ -13,12 +13,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.compiling import jit
 from jobs.render.effects.charge import full_well
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame
+from lake_schema.arrays import Bool
 from lake_schema.errors import OutOfRange
 
 
@@ -80,7 +80,7 @@ def _bleed(half: Any, columns: Any, full: float) -> float:
     return lost
 
 
-def saturated(frame: Frame, capacity: float) -> npt.NDArray[np.bool_]:
+def saturated(frame: Frame, capacity: float) -> Bool:
     """Pixels [ny, nx] that hold all they can."""
     return np.asarray(frame >= np.floor(capacity))
 
