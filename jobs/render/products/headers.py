@@ -36,14 +36,14 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
     return (
         *_common(rendered),
         ("BUNIT", rendered.readout.unit, "unit of the pixels"),
-        ("GAIN", gain, "[electron/adu]"),
+        ("GAIN", gain, "[electron/adu] conversion gain"),
         (
             "RDNOISE",
             ("read_noise" in applied) * scene.value("read_noise", "electron"),
-            "[electron] rms in the image",
+            "[electron] rms read noise in the image",
         ),
-        ("BIAS", scene.value("bias", "adu"), "[adu] added to every pixel"),
-        ("SATURATE", _saturation(rendered, gain), "[adu] a full pixel has no less"),
+        ("BIAS", scene.value("bias", "adu"), "[adu] bias level, added to every pixel"),
+        ("SATURATE", _saturation(rendered, gain), "[adu] lowest level of a saturated pixel"),
         ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
         ("DARKRATE", ("dark_current" in applied) * scene.dark_rate, "[electron/s/pix] mean dark current in the image"),
         *_effect_cards(rendered),
@@ -54,9 +54,9 @@ _TRUTH = {
     "noise_free": ("electron", "unit of the pixels: expected, sources alone"),
     "stars": ("electron", "unit of the pixels: expected, stars alone"),
     "sky": ("electron", "unit of the pixels: expected, sky alone"),
-    "cosmic_rays": ("electron", "unit of the pixels: of cosmic rays"),
+    "cosmic_rays": ("electron", "unit of the pixels: cosmic rays alone"),
     "ghosts": ("electron", "unit of the pixels: expected, ghosts alone"),
-    "saturation": ("", "1 where a pixel or the converter is full"),
+    "saturation": ("", "1 where a pixel or the converter is saturated"),
 }
 
 
@@ -80,14 +80,14 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("MJD-OBS", exposure.mjd, "[d] start of the exposure"),
         ("TIMESYS", "UTC", "time scale of DATE-OBS and MJD-OBS"),
         *astrometry.cards(rendered.wcs),
-        ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] at the boresight"),
-        ("ZEROPNT", rendered.zero_point, "[mag] AB of 1 electron/s"),
-        ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] of a point source, pixel included"),
+        ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] pixel scale at the boresight"),
+        ("ZEROPNT", rendered.zero_point, "[mag] AB magnitude of 1 electron/s"),
+        ("PSFFWHM", rendered.psf.fwhm if rendered.psf else 0.0, "[arcsec] FWHM of a point source, with the pixel"),
         ("SEEING", exposure.seeing, "[arcsec] FWHM of the atmosphere"),
         ("NSOURCES", len(rendered.sources), "number of sources drawn"),
-        ("NMOVING", int((rendered.sources.length > 0).sum()), "of them moving: bodies of the Solar System"),
-        ("SRCREACH", rendered.complete, "[arcsec] beyond the detector: sources complete"),
-        ("SEED", str(rendered.seed), "of the random numbers"),
+        ("NMOVING", int((rendered.sources.length > 0).sum()), "number of moving Solar System objects drawn"),
+        ("SRCREACH", rendered.complete, "[arcsec] sources complete beyond the detector"),
+        ("SEED", str(rendered.seed), "seed of the random numbers"),
         ("MISSION", rendered.scene.mission.fingerprint, ""),
         ("TRUESKY", __version__, "version of the simulator"),
         *_accuracy_cards(rendered),
@@ -142,5 +142,5 @@ def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:
         cards.append((f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1"))
         if decision.applied and decision.name in known:
             numbers = numbers_of(known[decision.name], exposed, rendered.detector.name, rendered.seed)
-            cards.append((f"EFKEY{number}", rng.name_of(*numbers), "key of its numbers (Philox)"))
+            cards.append((f"EFKEY{number}", rng.name_of(*numbers), "key of its random numbers"))
     return tuple(cards)
