@@ -14,6 +14,7 @@ from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import TextIOWrapper
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,8 @@ _NEEDED = (("ra", "l"), ("dec", "b"), ("mag_h", "mag_h_seen"), ("teff", "log_tef
 _COMPONENT = np.array([0] * 8 + [1, 2, 5])
 _STAGE = np.array([0, 1, 1, 1, 0, 0, 2, 0])
 _LONGEST_LINE = 100_000
+# Lines before that of the titles: what a model of the Galaxy was run with.
+_MOST_BEFORE = 10_000
 KIND = "catalogue of stars"
 
 
@@ -144,9 +147,11 @@ def _table(file: Path, titles: list[str]) -> Mapping[str, Float]:
 def _text(file: Path, titles: list[str]) -> Mapping[str, Float]:
     with user_files.opened(file, KIND) as opened, TextIOWrapper(opened, "utf-8", "replace") as stream:
         lines = iter(lambda: stream.readline(_LONGEST_LINE), "")
-        head: list[str] = next((found for line in lines if set(titles) <= set(found := _fields(line))), [])
+        head: list[str] = next(
+            (found for line in islice(lines, _MOST_BEFORE) if set(titles) <= set(found := _fields(line))), []
+        )
         if not head:
-            raise BadInput(f"{file}: no line holds the titles {', '.join(titles)}")
+            raise BadInput(f"{file}: none of the first {_MOST_BEFORE} lines holds the titles {', '.join(titles)}")
         if twice := [title for title in titles if head.count(title) > 1]:
             raise BadInput(f"{file}: the title {twice[0]} stands twice in its line")
         values = {title: array("d") for title in titles}

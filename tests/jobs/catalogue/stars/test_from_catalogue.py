@@ -84,7 +84,8 @@ def test_commas_and_fits_say_the_same(tmp_path):
         (("3.763", "9.999"), r"LTef \(log_teff\) of row 1 is 9.999, not in \[2.4, 5\] \(1 of 4 rows like it\)"),
         (("12.005", "nan   "), r"H \(mag_h_seen\) of row 1 is nan"),
         (("18.020", "18.x20"), r"H of row 2 is '18.x20', no number"),
-        (("  Dist ", "  Far  "), "no line holds the titles"),
+        (("  Dist ", "  Far  "), "lines holds the titles"),
+        (("  Dist ", "\n" * 10_000 + "  Dist "), "none of the first 10000 lines holds the titles"),
         (("  Mv ", " Av "), "the title Av stands twice"),
     ],
 )
