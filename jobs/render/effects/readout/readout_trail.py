@@ -1,4 +1,4 @@
-"""Readout trail: with the shutter open, a row collects light at every place that it is shifted over.
+"""Readout trail, or frame-transfer smear: the shutter is open, and a row collects light wherever it is shifted over.
 
 Runs on expected electrons: what falls in there is counted like all light, and seen by the pixel that it falls on. The
 lamp is out while rows move. As the response of the pixel where a row began comes once, after all light has, it is
