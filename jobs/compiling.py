@@ -6,12 +6,12 @@ import os
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import numba
-
 from jobs import cache
 
 # numba reads this when it is imported, and processes begun from here have it.
 os.environ["NUMBA_CACHE_DIR"] = str(cache.machine_code_dir())
+
+import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +20,17 @@ print(hashlib.sha256(moved.tobytes()).hexdigest(), held.hex())
 """
 
 
+def test_machine_code_is_kept_in_the_cache(tmp_path):
+    """Beside the sources it would be looked up by its own file alone, whatever is compiled into it."""
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    code = "from jobs import cache, compiling; import numba; print(cache.machine_code_dir(), numba.config.CACHE_DIR)"
+    command = [sys.executable, "-c", code]
+    environment["TRUESKY_CACHE"] = str(tmp_path)
+    wanted, used = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+    assert used == wanted
+    assert Path(used).is_relative_to(tmp_path)
+
+
 @pytest.mark.nightly
 def test_compiled_here_or_found_in_the_cache(tmp_path):
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
@@ -27,7 +39,7 @@ def test_compiled_here_or_found_in_the_cache(tmp_path):
     first, second = (
         subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2)
     )
-    assert list(tmp_path.glob("numba/*/*/*.nbc"))
+    assert list(tmp_path.glob("numba/**/*.nbc"))
     assert first == second
     assert len(first.split()) == 2
 
