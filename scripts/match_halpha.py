@@ -22,11 +22,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from jobs.catalogue.galaxies import emission_lines, galaxies, sed_assignment, stellar_mass
 from jobs.catalogue.halos import halos, population, satellites
 from jobs.fluxes import cosmology
+from jobs.request.schema import Universe
 from jobs.rng import stream
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 
-SEED, LIMIT, Z_MAX, BOX_CELLS = 2016, 26.0, 3.0, 192
+SEED, WANTED = 2016, Universe(galaxy_limit=26.0, z_max=3.0, box_cells=192, lensing_nside=64)
 EDGES = np.concatenate([[0.03, 0.2], np.arange(0.3, 3.01, 0.1)])
 LOG_L = np.linspace(39.0, 43.6, 47)
 # A luminosity that fewer have takes the shift of the last that enough have.
@@ -35,8 +36,8 @@ CM_PER_MPC = 3.0856775814913673e24
 
 
 def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """(z, raw log L) of galaxies with I_E < LIMIT in so many cells' area."""
-    universe = galaxies.model(SEED, LIMIT, Z_MAX, BOX_CELLS, 64)
+    """(z, raw log L) of galaxies with I_E < WANTED.galaxy_limit in so many cells' area."""
+    universe = galaxies.model(SEED, WANTED)
     flat = replace(universe.population.halos, amplitude=np.zeros_like(universe.population.halos.amplitude))
     lines = emission_lines.unmatched(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
     found = []
