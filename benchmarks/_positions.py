@@ -36,7 +36,7 @@ _ABOUT = f"""\
 # Error of the VIS PSF by the number of its positions on a detector: of {STARS} stars of other places and colours the
 # flux in 1" (relative), the position (pixels), R2 (relative) and the ellipticity under a Gaussian weight of 0.75" (rms
 # and largest); CPU seconds to compute its planes, and what they hold. nearest: 0 = polynomials through the positions
-# (psf.DEGREES), 1 = the nearest of a grid, as in Serrano et al. 2024. Written by python -m benchmarks.trade
+# (euclid.DEGREES), 1 = the nearest of a grid, as in Serrano et al. 2024. Written by python -m benchmarks.trade
 # --positions.
 """
 

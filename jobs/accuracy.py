@@ -14,7 +14,7 @@ from pathlib import Path
 
 from lake_schema.errors import BadInput, OutOfRange
 
-# What benchmarks/trade writes.
+# Written by benchmarks/trade.py.
 _TABLE = Path(__file__).with_name("accuracy.csv")
 
 

@@ -9,7 +9,8 @@ galaxy_fluxes_by the same with chosen settings of the tables
 prepare          make the tables that the two need, and compile
 
 Spectra are on the grid of passbands.grid(), 600 .. 24000 A by 1 A. The flux tables are the same sums, interpolated in
-tables (flux_grid.py) where the accuracy allows it, else over the wavelengths of the wanted bands (integration.py).
+tables (tables/flux_tables.py) where the accuracy allows it, else over the wavelengths of the wanted bands
+(integration.py).
 Ref: Serrano et al. 2024, appendix B, in its order
 """
 
@@ -92,7 +93,7 @@ def galaxy_fluxes(
     galaxies : rows of the table `galaxies`, of any kind;  bands : names of passbands, or a user's own
     library  : of the kinds central, satellite and strong lens
     returns  : rows of the table `galaxy_fluxes` in the same order, microjansky
-    Error    : |df/f| <= accuracy.flux against band_fluxes of galaxy_spectra (benchmarks/fluxes); 1e-6 at best
+    Error    : |df/f| <= accuracy.flux against band_fluxes of galaxy_spectra (benchmarks/fluxes.py); 1e-6 at best
     Errors   : BadInput names the column and source of a missing value, OutOfRange what is out of bounds
     """
     curves = _curves(bands)

@@ -55,7 +55,7 @@ class Stretch:
 def galaxies(rows: Galaxies, bands: Sequence[Passband], library: Library) -> Float:
     """f_nu, float64[n, n_band] microjansky: internal dust, lines, magnification and the Milky Way included.
 
-    Error: 1e-7 relative to the whole spectra's (tests/jobs/fluxes/test_integration)
+    Error: 1e-7 relative to the whole spectra's (tests/jobs/fluxes/test_integration.py)
     """
     reference, dust = passbands.load(REFERENCE_BAND), dust_of(library)
     stretches, reference_weights = _stretches(bands, reference), passbands.weights(reference)

@@ -14,6 +14,9 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("lake_schema", "jobs", "benchmarks", "scripts")
 MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path.stem[:2] != "__")
 ELSEWHERE = re.compile(r"(?<![\w.~])/(?:home|root|Users|work)/\w|\.\./shared|\bissues? #?\d", re.IGNORECASE)
+# A file or folder of the tree, and a module by its file's name alone.
+NAMED = re.compile(r"(?<![\w./])(?:benchmarks|docs|jobs|lake_schema|notebooks|requests|scripts|tests)/[\w/.-]*\w")
+MODULE = re.compile(r"(?<![\w/.-])[a-z_0-9]+\.py\b")
 MAX_BYTES = 1_000_000
 
 
@@ -50,6 +53,19 @@ def test_elsewhere_is_recognised(text):
 @pytest.mark.parametrize("text", ["the home/work balance", "/path/to/python", "issue of 2024", "framework/work"])
 def test_here_is_let_through(text):
     assert not ELSEWHERE.search(text)
+
+
+def test_files_that_are_named_are_there():
+    """In comments, docstrings and pages, too, which nothing else would compare with the tree."""
+    there = {path.relative_to(ROOT) for path in files()}
+    there |= {folder for path in there for folder in path.parents}
+    modules, found = {path.name for path in there}, []
+    for path in files():
+        text = path.read_bytes().decode("utf-8", errors="replace")
+        found += [f"{path.relative_to(ROOT)}: {name}" for name in NAMED.findall(text) if Path(name) not in there]
+        if path in MODULES:
+            found += [f"{path.relative_to(ROOT)}: {name}" for name in MODULE.findall(text) if name not in modules]
+    assert found == []
 
 
 def test_no_large_file():

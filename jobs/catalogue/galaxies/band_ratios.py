@@ -76,7 +76,7 @@ class BandRatios:
 def build(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatios:
     """The table of one passband, 0 <= z <= z_max, 0 <= E(B-V) <= ebv_max (0.5 s for z_max = 2.3).
 
-    Error: `ln_ratio` within 0.0005 mag where the template has light (tests/jobs/catalogue/test_band_ratios)
+    Error: `ln_ratio` within 0.0005 mag where the template has light (tests/jobs/catalogue/galaxies/test_band_ratios.py)
     """
     ebv = _nodes(library, band, z_max, ebv_max)
     steps = int(np.ceil(np.log1p(z_max) / _STEP)) + 1

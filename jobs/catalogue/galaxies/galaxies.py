@@ -46,7 +46,6 @@ from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
 
-SELECTION_BAND = "euclid_vis"
 # Candidates are drawn this much deeper than the brightest SED needs, mag: more than the tables' errors.
 _MARGIN = 0.02
 
@@ -203,7 +202,7 @@ def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
     """Magnitude[n] in the limit's band, AB, unmagnified, before intergalactic hydrogen and the Milky Way's dust.
 
     z, m_r : float[n] redshift, M_r mag;  sed : n spectra
-    Error: < 0.001 mag (tests/jobs/catalogue/test_band_ratios)
+    Error: < 0.001 mag (tests/jobs/catalogue/galaxies/test_band_ratios.py)
     """
     return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
 

@@ -170,7 +170,7 @@ def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float,
 
     radius : float[n] arcsec, or any length, as what is returned
     fraction : bulge / total; ratio : bulge radius / disc radius; sersic : index of the bulge
-    Error: the light within `radius` is 0.5 to 0.005 (tests/jobs/catalogue/test_morphology)
+    Error: the light within `radius` is 0.5 to 0.005 (tests/jobs/catalogue/galaxies/test_morphology.py)
     """
     # Slow to import, and not needed where a job is only submitted.
     from scipy.interpolate import RegularGridInterpolator

@@ -118,7 +118,7 @@ def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
 
     a, x : float[...]
     Error: relative 1e-9 where |a| > 1e-2 and x < 300, 1e-4 where |a| < 1e-5
-           (tests/jobs/catalogue/test_luminosity_function)
+           (tests/jobs/catalogue/halos/test_luminosity_function.py)
     Ref: Abramowitz & Stegun 1972, 6.5.22: Gamma(a, x) = [Gamma(a + 1, x) - x^a e^-x] / a
     """
     order, at = np.asarray(a, float), np.asarray(x, float)
@@ -147,7 +147,7 @@ def magnitude(table: Inverse, number: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     """M[n] such that n(< M, z) = number[n] (Mpc/h)^-3.
 
     number : float[n] comoving (Mpc/h)^-3;  z : float[n]
-    Error: < 0.003 mag over 1e-12 .. 1 (Mpc/h)^-3 (tests/jobs/catalogue/test_luminosity_function)
+    Error: < 0.003 mag over 1e-12 .. 1 (Mpc/h)^-3 (tests/jobs/catalogue/halos/test_luminosity_function.py)
     """
     m_star, phi_star, alpha = table.schechter.at(z)
     row, above_row = _bracket(table.a, alpha + 1.0)

@@ -1,4 +1,4 @@
-"""The tables of the flux grid: made in seconds, kept in the cache, mapped from disc.
+"""The tables of fluxes: made in seconds, kept in the cache, mapped from disc.
 
 Setting        how fine a table of galaxies is: three numbers
 galaxy_table   continuum of every template behind every law: redshift x E(B-V) x A_V
@@ -85,7 +85,7 @@ def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -
 def star_table(band: Passband, library: Library, key: str) -> Float32:
     """ln(f_nu) of each star of a library in units of its spectrum: float32[n_template, 12] coefficients in A_V.
 
-    Error: 1e-6 (tests/jobs/fluxes/test_flux_grid)
+    Error: 1e-6 (tests/jobs/fluxes/tables/test_flux_tables.py)
     """
     full_key = cache.content_key(code_key(__name__), key, *_curve(band))
     arrays = cache.cached_arrays(f"flux_grid_stars_{band.name}", full_key, lambda: {"stars": _stars(library, band)})

@@ -30,7 +30,7 @@ _SAMPLE, _SEED = 4000, 5
 
 
 def choose(bands: Sequence[Passband], accuracy: Accuracy, library: Library) -> tuple[Choice, ...]:
-    """For each band the smallest setting that is fine enough, see grid_settings.choose.
+    """For each band the smallest setting that is fine enough, see settings.choose.
 
     For a passband or a library of others, or one behind absorbing gas, the errors of 4000 random galaxies decide, from
     the setting upwards that is fine enough for all bands with the embedded library.

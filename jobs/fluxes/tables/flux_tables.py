@@ -51,7 +51,7 @@ _CELL, _AIR = 0.01, 1e-3
 
 @dataclass(frozen=True, slots=True)
 class LineGrid:
-    """The line tables of all bands in one, see compiled.add_up; wavelengths of the lines."""
+    """The line tables of all bands in one, see kernels.add_up; wavelengths of the lines."""
 
     tables: Float32
     start: UInt32

@@ -1,4 +1,4 @@
-"""The inner loops of the flux grid.
+"""The compiled loops of the flux tables.
 
 place         where galaxies lie in the tables of a step in redshift
 products      their polynomials in E(B-V) and A_V

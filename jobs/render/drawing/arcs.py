@@ -39,7 +39,7 @@ def transform(picture: Picture, jacobian: Float, kx: Array, ky: Array) -> Array:
     """complex128[s]: the picture's transform, about its middle, at (kx, ky) radian / pixel of the detector.
 
     jacobian : [2, 2] d(u, v) / d(column, row), arcsec, u to the west
-    Error    : 1e-6 of the flux (tests/jobs/render/test_pictures)
+    Error    : 1e-6 of the flux (tests/jobs/render/drawing/test_arcs.py)
     """
     west, north = sums.product(sums.inverse(jacobian).T, np.stack([kx, ky]).astype(float)) * picture.scale
     across, up = -west, north

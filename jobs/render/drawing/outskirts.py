@@ -63,7 +63,7 @@ _DIRECTIONS = 1440
 class Outskirts:
     """Of one galaxy, by pixels (x, y) from its middle.
 
-    light  : float64[11] of profiles.on_the_sky, electrons; of the disc, matrix and light of the disc face-on
+    light  : float64[11] of galaxy_shapes.on_the_sky, electrons; of the disc, matrix and light of the disc face-on
     disk   : float64[n, n] log of the disc's light by u, v = sinh of the nodes;  across : v over the table's
     blurred : float64[m, m] what the PSF adds to each pixel, on nodes _BLOCK pixels apart, the galaxy in the middle
     """

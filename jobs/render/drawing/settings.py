@@ -20,8 +20,8 @@ class Settings:
     aliased : largest fraction of a source's flux that is aliased into its own aperture: a stamp is periodic
     floor : Fourier samples of less than this are left out, 1 at k = 0
     least : smallest side of a stamp, arcsec: what of the PSF a source keeps
-    positions : of the PSF on a detector, one of psf.DEGREES
-    colours : that the PSF is made of, a divisor of chromatic.PARTS
+    positions : of the PSF on a detector, one of euclid.DEGREES
+    colours : that the PSF is made of, a divisor of sub_bands.PARTS
     """
 
     edge: float

@@ -52,7 +52,7 @@ _LATTICE_PSF, _LATTICE_GALAXY = 9.03, 6.0
 _RESPONSE, _SLOPE_RATIO = 3.0, 1.05
 # Of a galaxy's half-light radius, that its stamp is wider than a point's.
 _EXTENT = 4.0
-# Axis ratio of the thinnest sources: discs of the scale height profiles.py draws, seen edge-on.
+# Axis ratio of the thinnest sources: discs of the scale height galaxy_shapes.py draws, seen edge-on.
 _THINNEST = 0.1
 # Above this many electrons the rounding of single precision would show; and where no pixel may miss more than this of a
 # source's flux.

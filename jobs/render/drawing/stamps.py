@@ -58,7 +58,7 @@ def draw(
     sizes    : int[n] from stamp_sizes;  floors : float[n] from `floors`, None: nothing is left out
     progress : called now and then with the number of sources drawn
     tally    : to be filled with what of each source's stamp fell onto the frame
-    returns  : float64[ny, nx], to half a unit of `kernel.units_of` a source (5e-7 electrons for all but the brightest);
+    returns  : float64[ny, nx], to half a unit of fourier.units_of a source (5e-7 electrons for all but the brightest);
                the same, bit by bit, in any order of the sources
     """
     pieces, trail, whole = in_pieces(sources)
@@ -240,7 +240,7 @@ def _ringing(cut: Float, electrons: Float, sizes: Int, left_out: Float, psf: Psf
     """[n] True of sources that are followed so far, in `cut`, that what is cut off behind is not seen to ring.
 
     A hard edge in Fourier space rings by up to three thousandths of what it cuts off. Planes end by themselves.
-    left_out : of `floors`, what may be left out of a source, 0 = as of others;  bodied : arguments of kernel.reaches
+    left_out : of `floors`, what may be left out of a source, 0 = as of others;  bodied : arguments of fourier.reaches
     """
     floor = np.where(left_out > 0.0, np.clip(_RINGS * left_out, transfer.LEAST, transfer.NOTHING), transfer.NOTHING)
     deep = (electrons > BRIGHT) & (floor < transfer.NOTHING) & (psf.planes is None)

@@ -156,7 +156,7 @@ def transfer(psf: Psf, size: int, reach: float) -> Transfer:
 def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any], fading: bool = False) -> Transfer:
     """One plane: a source's own PSF, for large stamps or in double precision (float64).
 
-    weights : [planes] from basis_weights;  fading : towards its border, into what edges.py draws
+    weights : [planes] from basis_weights;  fading : towards its border, into what far_light.py draws
     """
     if psf.planes is None:
         return Transfer(some, _planes(psf, some, dtype))

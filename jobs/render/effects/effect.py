@@ -24,7 +24,7 @@ class Effect:
     optional     : False where the frame is no product without it
     fixed        : a pattern of the detector itself: its random numbers are the same in every exposure
     numbers      : the effect whose random numbers it takes, "" = its own
-    cost         : seconds a million pixels take on one core (measured by benchmarks/effects); a channel has none of 0
+    cost         : seconds a million pixels take on one core (benchmarks/effects.py); a channel has none of 0
     """
 
     name: str

@@ -39,7 +39,7 @@ GALAXY_COLUMNS = tuple(
     dict.fromkeys(("id", "kind", "ra_lensed", "dec_lensed", *galaxy_shapes.COLUMNS, *colours.GALAXY_COLUMNS))
 )
 STAR_COLUMNS = ("id", "ra", "dec", *colours.STAR_COLUMNS)
-# Of a source: more would leave the frame's integers to a tenth of an electron (kernel.units_of).
+# Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
 _MOST_ELECTRONS = 1e17
 
 

@@ -18,7 +18,7 @@ from lake_schema.errors import BadInput
 # Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide; cycles a sample that are more.
 SAMPLES, DETAIL = 3, 0.4
 # Side of the plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is drawn for bright
-# stars alone (edges.py).
+# stars alone (drawing/far_light.py).
 SIDE = 512
 # Side and samples a pixel of the drawing that tells the width.
 _CORE, _FINE = 243, 9

@@ -9,7 +9,7 @@ import numpy as np
 
 from jobs.fluxes.passbands import Passband
 
-# Eight reproduce the second moments of a PSF of continuous colour to 2e-4 (benchmarks/render).
+# Eight reproduce the second moments of a PSF of continuous colour to 2e-4 (benchmarks/render.py).
 PARTS = 8
 
 

@@ -222,7 +222,7 @@ def outside(shape: Shapes, radius: Float) -> Float:
 
 
 def on_the_sky(shape: Shapes, form: Forms) -> Float:
-    """float64[n, 11]: what kernel.py takes the light at a place from, of unit flux.
+    """float64[n, 11]: what drawing/kernels/frame.py takes the light at a place from, of unit flux.
 
     Of the bulge and of the disc the light in the middle, by square pixel; of the bulge, of pixels (x, y) from the
     middle, the rows of a matrix and an exponent p: light exp(-(u^2 + v^2)^p); of the disc a matrix:

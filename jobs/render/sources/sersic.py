@@ -20,7 +20,7 @@ from lake_schema.arrays import Float, Float32, Int
 
 # galsim.Sersic, the reference, accepts these.
 INDEX_LO, INDEX_HI = 0.3, 6.2
-# Rows, uniform in ln n: 4-point interpolation is then good to 1e-7 (tests/jobs/render/test_sersic).
+# Rows, uniform in ln n: 4-point interpolation is then good to 1e-7 (tests/jobs/render/sources/test_sersic.py).
 ROWS = 96
 # k^2 from 2^-30, where 1 - S is below 1e-7 for every n, to 2^26.
 OCTAVE_LO, OCTAVE_HI = -30, 26
@@ -35,7 +35,7 @@ _LOG_LO, _LOG_STEP = float(np.log(INDEX_LO)), float(np.log(INDEX_HI / INDEX_LO) 
 def table() -> Float32:
     """float32[ROWS, segments + 1]: S(k) at the nodes; the first is set to 1, the flux.
 
-    Error : 1e-7 at the nodes, 6e-6 between them (tests/jobs/render/test_sersic)
+    Error : 1e-7 at the nodes, 6e-6 between them (tests/jobs/render/sources/test_sersic.py)
     Ref   : Hamilton 2000 (logarithmic Hankel transform)
     """
     key = cache.content_key(code_key(__name__))

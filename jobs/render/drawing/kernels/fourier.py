@@ -47,7 +47,7 @@ def nyquist_zones(
     planes, kx .. inner : of transfer.Transfer and transfer.Grid; weights [m, b] sum the planes
     body        : [m] False for a point
     fraction    : [m] of the light in the bulge
-    bulge, disk, thick : [m, 2, 2], [m, 2, 2], [m, 2] of profiles.Forms
+    bulge, disk, thick : [m, 2, 2], [m, 2, 2], [m, 2] of galaxy_shapes.Forms
     sersic      : table of sersic.py; row, row_weights : [m], [m, 4] from sersic.row_of
     cut         : [m] pieces from this |k| on, radian / pixel, are left out
     x, y        : [m] position in the stamp, pixels, 0 = centre of the first;  electrons : [m]

@@ -74,7 +74,7 @@ def test_isolated_stars_are_as_bright_as_the_catalogue_says():
 
 
 def test_what_the_effects_take_is_what_the_benchmark_says():
-    """Through old traps and brighter-fatter a star is dimmer by what benchmarks/effects finds of each, added up."""
+    """Through old traps and brighter-fatter a star is dimmer by what benchmarks/effects.py finds of each, added up."""
     old = resolve(overrides={"vis.cti.age": (10.0, "")})
     detector = small("vis", "3-4", 256)
     quiet = nominal.off(*nominal.COSMIC_RAYS)

@@ -24,7 +24,7 @@ EXACT, LEVELS, MANY = Sweeps(64, 2), Sweeps(1, 1, 9), Sweeps(1, 1, 900)
 
 @cache
 def reference(name):
-    """(input, arCTIc's output, galaxies) of benchmarks/cti_reference."""
+    """(input, arCTIc's output, galaxies) of benchmarks/cti_reference.py."""
     with np.load(Path(__file__).with_name("cti_reference.npz")) as file:
         image = file["galaxies"].astype(float) + (file["cosmic_rays"] if name == "hit" else 0)
         return image, image + UNIT * file[name], file["table"]
