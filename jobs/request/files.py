@@ -1,6 +1,6 @@
 """Files of others that a request names.
 
-UserCurves, curves   spectra, filters and extinction laws: the section `fluxes`
+UserCurves, curves  spectra, filters and extinction laws: the section `fluxes`
 Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
 psfs                point-spread functions: the section `psf`
 file_of             a file beside the request

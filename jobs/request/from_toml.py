@@ -21,8 +21,7 @@
     [fluxes.stars]                 your own dwarfs: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
     [fluxes.extinction.CODE]       your own law in place of law 1 .. 4: file, format
     [psf]          BAND = "file.fits"   your own PSF in a band: a cube of planes or PSFEx's
-    (jobs/render/psf/from_file.py);
-                   {detector} in the name stands for the detector's
+                   (jobs/render/psf/from_file.py); {detector} in the name stands for the detector's
     [solar_system] bodies = "file"      your own moving bodies in place of ours (jobs/render/sources/ephemerides.py)
     [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
@@ -41,7 +40,7 @@
 Files are found from the folder of the request; their formats are in jobs/fluxes/libraries/spectrum_formats.toml.
 A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
 
-    python -m jobs.request check FILE
+    python -m jobs.request check FILE [--plan]
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """How the embedded universe clusters: power of the box, bias of its halos, and w(theta) beside Limber's approximation.
 
-box_power       P(k) of the box over that of linear theory;  halo_bias : bias of the fields that halos are drawn from
-velocities      of centrals at z = 0
-people          halos and galaxies of a mass or more between two redshifts, to be drawn over hundreds of deg2
-tracers         them, in one block of the sky
-correlation     w(theta) of counts in pixels;  limber : what linear bias makes of linear power
-structure       the Gaussian field along the same lines of sight, whose w(theta) says what the blocks happen to hold
+box_power         P(k) of the box over that of linear theory;  halo_bias : bias of the fields that halos are drawn from
+velocities        of centrals at z = 0
+population_above  halos and galaxies of a mass or more between two redshifts, to be drawn over hundreds of deg2
+tracers           them, in one block of the sky
+correlation       w(theta) of counts in pixels;  limber : what linear bias makes of linear power
+structure         the Gaussian field along the same lines of sight, whose w(theta) says what the blocks happen to hold
 
 Ref: Limber 1953, ApJ 117, 134; Landy & Szalay 1993, ApJ 412, 64 (in pixels their estimator is <delta delta'>)
 """

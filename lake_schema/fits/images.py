@@ -1,4 +1,4 @@
-"""FITS files: the one module that touches astropy.io.fits.
+"""FITS images: written and read with their checksums.
 
 Image           an image with its header cards
 write_images    images -> one file: checksums, the same bytes for the same input; whole numbers packed where wanted

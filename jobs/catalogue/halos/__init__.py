@@ -1,1 +1,1 @@
-"""Haloes and the galaxies in them."""
+"""Halos and the galaxies in them."""

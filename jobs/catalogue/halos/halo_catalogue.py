@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue.external import mapping
@@ -27,11 +26,9 @@ from jobs.code_keys import code_key
 from jobs.fluxes import cosmology
 from jobs.rng import stream
 from lake_schema import sky
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_KM_S
-
-Array = npt.NDArray[np.generic]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

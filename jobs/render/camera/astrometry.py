@@ -1,4 +1,4 @@
-"""Cameras: where detectors lie in the focal plane, and where their pixels look.
+"""Astrometry: the world coordinate system of a detector, from pixels to the sky and back.
 
 Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, as the sky is seen from
 inside: with y to the north, x points west (east is left).  Where the optics distort, they are those of the
@@ -6,8 +6,9 @@ detectors' own places, and `distortion` tells what is seen there.  Pixel coordin
 and whole at a pixel's centre.
 
 wcs             the world coordinate system of a detector (astropy): TAN, with SIP where the optics distort
-sky_of_pixel, pixel_of_sky, jacobian
-corners, s_region, radius
+sky_of_pixel, pixel_of_sky, jacobian   by a system
+corners, centre, s_region      of a detector on the sky
+cards, shifted, from_cards     a system as FITS cards, and back
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The order of effects in each channel."""
+"""What differs from channel to channel: effects and their order, PSF, readout, measured costs."""

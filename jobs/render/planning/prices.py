@@ -1,4 +1,4 @@
-"""What a detector costs: seconds of a core, memory and bytes, from numbers that benchmarks.planner measures.
+"""What a detector costs: seconds of a core, memory and bytes, from numbers that benchmarks/planner.py measures.
 
 price        what every detector of a kind of exposure costs
 """

@@ -1,10 +1,9 @@
-"""A rendered detector -> FITS files and rows of the table `products`; and back.
+"""A rendered detector -> FITS files and rows of the table `products`.
 
 A detector that is read in quadrants is a file of four extensions, each in the detector's own axes with its pre- and
 overscan, behind a header that holds for all of them.
 
 products   rows, and a writer for each file
-science_cards, truth_cards
 """
 
 from __future__ import annotations

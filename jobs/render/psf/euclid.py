@@ -1,10 +1,10 @@
-"""Point-spread functions: the Euclid optics from their pupil, and a seeing disc for ground cameras.
+"""The point-spread function of Euclid VIS: the optics from their pupil, jitter and charge diffusion.
 
 Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), without the pixel, centred on the
 chief ray (coma moves the centroid by a few mas).
 
-vis_psf, ground_psf   -> Psf;  sampled : the same of any planes
-pupil, wavefront      the parts of the Euclid model
+vis_psf            -> Psf;  vis_edges : its diffraction far from a star
+pupil, wavefront   the parts of the model
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Light of the sky that no source gives."""
+"""Diffuse light of the sky."""
