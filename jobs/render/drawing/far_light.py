@@ -10,14 +10,7 @@ Rings fall as r^-3, spikes are tabulated (psf/spikes.py).  The plane of side N f
 s(z) = z^2 (3 - 2 z) in columns and in rows; `add` draws 1 - s s of the light there and all of it farther out, so that
 the sum has no seam.
 
-A star that moves by L pixels shines 1 / L of its light from each pixel of its trail.  With d the distance of a pixel
-from the trail's line and a .. b the stretch of the trail, measured from the pixel's foot on that line,
-
-    integral of ds / (s^2 + d^2)^(3/2) = [s / (d^2 h)],  h = sqrt(s^2 + d^2),
-
-of which s / (d^2 h) = 1 / d^2 - 1 / (h (h + s)) for s > 0: the second form has no difference of large numbers on the
-line itself.  A spike is a product of a slow function along and a table across it: each part of the trail that moves
-8 pixels along the spike brings the table's integral over what it moves across.
+A star that moves is drawn as points along its trail, closer than the finest fringe lambda / l of a bar.
 
 The plane itself is a discrete transform of the pupil and repeats itself after a period Q: a pixel at r of the middle
 holds what belongs at r + Q m, too (m whole numbers), weakened by the softened edges of the sampled pupil to
@@ -42,11 +35,13 @@ from lake_schema.arrays import Array, Float, Int
 
 # Light is drawn to where it is this part of what may be left out: its border is not to be seen.
 _FAINTEST = 0.5
-# Of a trail's piece, the pixels that count as a point where a plane is unfolded; its spikes as a line.
-_PART = 16.0
-# CPU s, measured (2.5 GHz, one core), of a frame's pixel: about a star, a trail, and for each pixel of its length; and
-# of a stamp's pixel and part of a piece.
-_STAR_S, _TRAIL_S, _LONGER_S, _UNFOLD_S = 7e-9, 8e-8, 4e-10, 1.2e-7
+# Of the finest fringe, between points along a trail: where a spike's table ends, a point more or less is a step.
+_ALONG = 0.6
+# Pixels between points along a piece of a trail where a plane is unfolded, of which a share is asked for.
+_PART = 4.0
+# CPU s, measured (2.5 GHz, one core), of a frame's pixel: about a star, and for each pixel of a trail's length; and of
+# a stamp's pixel and part of a piece.
+_STAR_S, _LONGER_S, _UNFOLD_S = 7e-9, 1.6e-9, 5e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +70,11 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
     """Adds what a star shines outside its plane, which fades by `left`, to a frame that has `unit` of an electron."""
     if star.edges is None:
         return
-    column, row, edges = star.column, star.row, star.edges
-    photons, turned, length, along = _seen(star.photons, edges, star.trail)
-    farthest = _farthest_corner(frame, column, row, length, along)
-    if length > 0.0:
+    edges = star.edges
+    photons, turned = _seen(star.photons, edges)
+    x, y = _points(star, _ALONG * _finest(edges))
+    farthest = _farthest_corner(frame, x, y)
+    if len(x) > 1:
         farthest = min(farthest, FARTHEST / edges.pixel_scale)
     level = star.electrons * spikes.ring(edges, photons)
     lines = star.electrons * spikes.spikes(edges, photons, max(farthest, edges.period))
@@ -90,25 +86,16 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
     out, across = (np.flatnonzero(shown.any(axis=axes)) for axes in ((0, 2), (0, 1)))
     far = min(inner + LONG * float(out[-1] + 1) if len(out) else 0.0, farthest)
     wide = STEP * float(across[-1] + 1) if len(across) else 0.0
-    level, lines = level * unit, lines * unit
-    if length > 0.0:
-        lines /= length
-        fine = length / math.ceil(length / _finest(edges))
-        far_light.streak(
-            frame, column, row, *along, length, inner, level / length, radius, turned, lines, _sums(lines), far, wide,
-            fine,
-        )  # fmt: skip
-        return
-    far_light.outside(frame, column, row, inner, level, radius, turned, lines, far, wide)
-    far_light.inside(frame, column, row, inner, level, turned, lines)
+    level, lines = level * unit / len(x), lines * unit / len(x)
+    for column, row in zip(x.tolist(), y.tolist(), strict=True):
+        far_light.outside(frame, column, row, inner, level, radius, turned, lines, far, wide)
+        far_light.inside(frame, column, row, inner, level, turned, lines)
 
 
-def _farthest_corner(frame: Int, column: float, row: float, length: float, along: tuple[float, float]) -> float:
-    """Pixels from a trail to beyond the farthest corner's pixel."""
+def _farthest_corner(frame: Int, x: Float, y: Float) -> float:
+    """Pixels from points to beyond the farthest corner's pixel."""
     ny, nx = frame.shape
-    ends = np.array([-0.5, 0.5]) * length
-    columns, rows = column + ends * along[0], row + ends * along[1]
-    return float(np.hypot(max(columns.max() + 1.0, nx - columns.min()), max(rows.max() + 1.0, ny - rows.min())))
+    return float(np.hypot(max(x.max() + 1.0, nx - x.min()), max(y.max() + 1.0, ny - y.min())))
 
 
 def unfold(star: Star, stamp: Array, left: int, low: int, nx: int, ny: int) -> None:
@@ -120,18 +107,15 @@ def unfold(star: Star, stamp: Array, left: int, low: int, nx: int, ny: int) -> N
     """
     if star.edges is None:
         return
-    column, row, edges = star.column, star.row, star.edges
-    photons, turned, length, along = _seen(star.photons, edges, star.trail)
+    edges = star.edges
+    photons, turned = _seen(star.photons, edges)
     level, inner = star.electrons * spikes.ring(edges, photons), star.size / 2 - SPARED
     if FOLDED * level / inner**3 > _FAINTEST * star.least:
-        lines = star.electrons * spikes.spikes(edges, photons, edges.period) / (length or 1.0)
         seen = stamp[max(-low, 0) : max(ny - low, 0), max(-left, 0) : max(nx - left, 0)]
-        parts = max(math.ceil(length / _PART), 1)
-        places = length * ((np.arange(parts) + 0.5) / parts - 0.5)
-        x, y = column - max(left, 0) + places * along[0], row - max(low, 0) + places * along[1]
-        far_light.unfold_compiled(
-            seen, x, y, *along, length / parts, inner, level / parts, turned, lines, _sums(lines), edges.period
-        )
+        x, y = _points(star, _PART)
+        x, y = x - max(left, 0), y - max(low, 0)
+        lines = star.electrons * spikes.spikes(edges, photons, edges.period) / len(x)
+        far_light.unfold_compiled(seen, x, y, inner, level / len(x), turned, lines, edges.period)
 
 
 def seconds(length: Float, nx: int, ny: int) -> float:
@@ -139,8 +123,7 @@ def seconds(length: Float, nx: int, ny: int) -> float:
 
     Error : half and twice; less where little of them is noticed
     """
-    longer = np.minimum(length, nx + ny)
-    return float(np.where(length > 0.0, _TRAIL_S + _LONGER_S * longer, _STAR_S).sum()) * nx * ny
+    return float((_STAR_S + _LONGER_S * length).sum()) * nx * ny
 
 
 def unfold_seconds(length: Float, sizes: Int) -> float:
@@ -148,21 +131,20 @@ def unfold_seconds(length: Float, sizes: Int) -> float:
     return float((_UNFOLD_S * sizes.astype(float) ** 2 * np.maximum(np.ceil(length / _PART), 1.0)).sum())
 
 
-def _seen(photons: Float | None, edges: Edges, trail: Float | None) -> tuple[Float, Float, float, tuple[float, float]]:
-    """(photons [w], bars' directions [b, 2], a trail's length, pixels, 0 if it is as good as a point; direction)."""
+def _seen(photons: Float | None, edges: Edges) -> tuple[Float, Float]:
+    """(photons [w], bars' directions [b, 2])."""
     photons = np.full(len(edges.wavelength), 1.0 / len(edges.wavelength)) if photons is None else photons
-    turned = np.stack([np.cos(edges.bars[:, 0]), np.sin(edges.bars[:, 0])], axis=1)
-    length = 0.0 if trail is None else float(np.hypot(*trail))
-    if trail is None or length <= _finest(edges):
-        return photons, turned, 0.0, (0.0, 0.0)
-    return photons, turned, length, (float(trail[0]) / length, float(trail[1]) / length)
+    return photons, np.stack([np.cos(edges.bars[:, 0]), np.sin(edges.bars[:, 0])], axis=1)
 
 
-def _sums(lines: Float) -> Float:
-    """Of a spike's table from its middle outward, pixels times its unit."""
-    whole = np.zeros(lines.shape)
-    np.cumsum(0.5 * STEP * (lines[:, :, 1:] + lines[:, :, :-1]), axis=2, out=whole[:, :, 1:])
-    return whole
+def _points(star: Star, apart: float) -> tuple[Float, Float]:
+    """Columns and rows [p] of points along a trail, at most so many pixels apart; one, if it is no longer than that."""
+    length = 0.0 if star.trail is None else float(np.hypot(*star.trail))
+    if star.trail is None or length <= apart:
+        return np.array([star.column]), np.array([star.row])
+    count = math.ceil(length / apart)
+    along = (np.arange(count) + 0.5) / count - 0.5
+    return star.column + along * star.trail[0], star.row + along * star.trail[1]
 
 
 def _finest(edges: Edges) -> float:

@@ -11,7 +11,7 @@ from jobs.fluxes import passbands
 from jobs.render.camera.astrometry import wcs
 from jobs.render.camera.pointing import boresight_for
 from jobs.render.drawing import cost, far_light, stamp_sizes, stamps
-from jobs.render.drawing.kernels.far_light import _ring_of, left_compiled, unfold_compiled
+from jobs.render.drawing.kernels.far_light import left_compiled, unfold_compiled
 from jobs.render.drawing.kernels.frame import FIXED_POINT
 from jobs.render.drawing.settings import settings_for
 from jobs.render.psf import euclid, spikes, sub_bands
@@ -212,21 +212,6 @@ def test_a_line_of_light_is_many_points(vis, x, y, trail):
     assert line.sum() == pytest.approx(many.sum(), rel=2e-3)
 
 
-def test_the_ring_of_a_line_is_the_integral_of_its_law():
-    """Beside it, near it, on its own line on either side, and of next to no length."""
-    for dx, dy, low, high in (
-        (300.0, 40.0, -50.0, 700.0), (900.0, 0.0, -300.0, 300.0), (-900.0, 1e-9, -300.0, 300.0),
-        (20.0, 500.0, -3000.0, 1e5), (5000.0, 5000.0, 0.0, 1e-3), (900.0, 1e-3, -1e5, 500.0),
-    ):  # fmt: skip
-        turn = 0.7
-        ux, uy = np.cos(turn), np.sin(turn)
-        s = np.unique(np.concatenate([np.linspace(low, high, 200001), dx + 1e3 * np.linspace(-1, 1, 200001)]))
-        s = s[(s >= low) & (s <= high)]
-        law = ((s - dx) ** 2 + dy**2) ** -1.5
-        found = _ring_of(dx * ux - dy * uy, dx * uy + dy * ux, ux, uy, low, high)
-        assert found == pytest.approx(np.trapezoid(law, s), rel=1e-5, abs=0.0)
-
-
 def test_a_trail_is_unfolded_as_its_points_are(vis):
     """A piece's share of light that belongs elsewhere, from its lines and from points closer than any fringe."""
     size, corner, trail, points = 640, 160, np.array([50.0, 30.0]), 60
@@ -245,7 +230,7 @@ def test_a_trail_is_unfolded_as_its_points_are(vis):
     far_light.unfold(star, fast, 0, 0, size, size)
     turned = np.stack([np.cos(vis.edges.bars[:, 0]), np.sin(vis.edges.bars[:, 0])], axis=1)
     lines = BRIGHT / points * spikes.spikes(vis.edges, EQUAL, vis.edges.period)
-    unfold_compiled(slow, x, y, 0.0, 0.0, 0.0, inner, level, turned, lines, lines, vis.edges.period)
+    unfold_compiled(slow, x, y, inner, level, turned, lines, vis.edges.period)
     whole = points * level / np.hypot(pixels - 260.2, pixels[:, None] - 259.7) ** 3
     assert ((light - slow) / whole).max() > 0.05
     wrong = np.abs(fast[60 : 60 + corner, 60 : 60 + corner] - slow) / whole
@@ -259,7 +244,7 @@ def test_the_time_a_bright_trail_takes_is_foreseen(vis):
     source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), 1e10, 2048.0, 2048.0)
     sizes = np.array([640])
     # CPU s that were measured on a full detector.
-    for length, took in ((94.0, 2.5), (470.0, 5.8), (1880.0, 18.0)):
+    for length, took in ((94.0, 3.3), (470.0, 16.3), (1880.0, 63.6)):
         moving = replace(source, trail=length * np.array([[1.0, 0.3]]))
         assert took / 2 < cost.seconds(moving, sizes, vis, 4096, 4096) < 2 * took
     faint = replace(moving, electrons=np.array([1e6]))
