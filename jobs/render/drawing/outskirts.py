@@ -39,8 +39,8 @@ from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 FRAME_S, STAMP_S = 6e-8, 4e-7
 # Part of a pixel's noise that is noticed of a galaxy: less than of an effect, for it is the same in many pixels.
 _NOTICED = 1e-2
-# Pixels between the nodes of what the PSF does.
-_BLOCK = 8
+# Pixels between the nodes of what the PSF does; half of that about galaxies slimmer than this, no farther than this.
+_BLOCK, _SLIM, _NEAR = 8, 0.025, 6144.0
 # Images of a galaxy are summed ring by ring about its stamp, to the last at most, until so many rings like one would
 # differ from even light by less than this, electrons a pixel.
 _RINGS, _UNEVEN = 64, 0.05
@@ -65,13 +65,14 @@ class Outskirts:
 
     light  : float64[11] of galaxy_shapes.on_the_sky, electrons; of the disc, matrix and light of the disc face-on
     disk   : float64[n, n] log of the disc's light by u, v = sinh of the nodes;  across : v over the table's
-    blurred : float64[m, m] what the PSF adds to each pixel, on nodes _BLOCK pixels apart, the galaxy in the middle
+    blurred : float64[m, m] what the PSF adds to each pixel, on nodes `block` pixels apart, the galaxy in the middle
     """
 
     light: Float
     disk: Float
     across: float
     blurred: Float
+    block: int
 
 
 def of_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: Float, farthest: float) -> Outskirts:
@@ -91,11 +92,12 @@ def of_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: F
         light[DISK_FORM : DISK_FORM + 4] = sums.inverse(matrix).ravel()
     light[[BULGE, DISK]] *= electrons
     disk, wide = surface_disk(inclination)
-    cells = _cells(psf, weights)
-    half = int(np.ceil(farthest / _BLOCK)) + 1 + len(cells) // 2
+    block = _BLOCK // 2 if slimness(light, wide) < _SLIM and farthest <= _NEAR else _BLOCK
+    cells = _cells(psf, weights, block)
+    half = int(np.ceil(farthest / block)) + 1 + len(cells) // 2
     alone = np.zeros((2 * half + 1, 2 * half + 1))
-    _sample(light, disk, wide, float(half * _BLOCK), float(half * _BLOCK), float(_BLOCK), alone)
-    return Outskirts(light, disk, wide, fftconvolve(alone, cells, mode="valid"))
+    _sample(light, disk, wide, float(half * block), float(half * block), float(block), alone)
+    return Outskirts(light, disk, wide, fftconvolve(alone, cells, mode="valid"), block)
 
 
 @lru_cache(maxsize=16)
@@ -125,10 +127,10 @@ def surface_disk(inclination: float) -> tuple[Float, float]:
     return np.log(np.maximum(total, _DARK)), wide
 
 
-def _cells(psf: Psf, weights: Float) -> Float:
-    """What a PSF does to light on nodes _BLOCK apart: itself, without what stays where it is.
+def _cells(psf: Psf, weights: Float, block: int) -> Float:
+    """What a PSF does to light on nodes `block` apart: itself, without what stays where it is.
 
-    Each of its samples is shared among three nodes a direction, its moments up to the second kept, the pixel's added.
+    Each of its samples is shared among five nodes a direction, its moments up to the fourth kept, the pixel's added.
     """
     if psf.planes is None:
         side = 2 * _MOFFAT * SAMPLES + 1
@@ -136,28 +138,42 @@ def _cells(psf: Psf, weights: Float) -> Float:
         image = drawn.array / drawn.array.sum(dtype=float)
     else:
         image = np.asarray(transfer.image_of(psf.planes, weights), float)
-    sides = [_shares(length) for length in image.shape]
+    sides = [_shares(length, block) for length in image.shape]
     out: Float = sums.product(sides[0].T, sums.product(image, sides[1]))
     out[len(out) // 2, len(out) // 2] -= 1.0
     return np.asarray(out)
 
 
-def _shares(length: int) -> Float:
+def _shares(length: int, block: int) -> Float:
     """[samples, nodes] of a line of samples about its middle one."""
-    place = (np.arange(length) - length // 2) / (SAMPLES * _BLOCK)
+    place = (np.arange(length) - length // 2) / (SAMPLES * block)
     node = np.rint(place).astype(int)
-    off, pixel = place - node, 1.0 / (12.0 * _BLOCK**2)
-    half = int(np.abs(node).max()) + 1
+    off, pixel = place - node, 1.0 / (12.0 * block**2)
+    half = int(np.abs(node).max()) + 2
     out = np.zeros((length, 2 * half + 1))
-    second = off**2 + pixel
-    for step, share in ((-1, 0.5 * (second - off)), (0, 1.0 - second), (1, 0.5 * (second + off))):
+    # The moments of a pixel about the sample.
+    first, second, third = off, off**2 + pixel, off**3 + 3.0 * off * pixel
+    fourth = off**4 + 6.0 * off**2 * pixel + 1.8 * pixel**2
+    for step, share in (
+        (-2, (2.0 * first - second - 2.0 * third + fourth) / 24.0),
+        (-1, (-4.0 * first + 4.0 * second + third - fourth) / 6.0),
+        (0, 1.0 - (5.0 * second - fourth) / 4.0),
+        (1, (4.0 * first + 4.0 * second - third - fourth) / 6.0),
+        (2, (-2.0 * first - second + 2.0 * third + fourth) / 24.0),
+    ):
         out[np.arange(length), node + half + step] = share
     return out
 
 
 def take_in(some: Outskirts, stamp: Array, x: float, y: float) -> None:
     """Takes off a stamp [N, N], in place, what has come in at its edges of the galaxy at (x, y) of it, pixels."""
-    _take_in(some.light, some.disk, some.across, some.blurred, from_afar(some, len(stamp), x, y), x, y, stamp)
+    size, middle = len(stamp), some.block * (len(some.blurred) // 2)
+    more, blurred, pixels = from_afar(some, size, x, y), _spline(some.blurred, some.block), np.arange(size)
+    for up in (-size, 0, size):
+        for right in (-size, 0, size):
+            if up or right:
+                more += blurred(pixels - y - up + middle, pixels - x - right + middle)
+    _take_in(some.light, some.disk, some.across, more, x, y, stamp)
 
 
 def from_afar(some: Outskirts, size: int, x: float, y: float) -> Float:
@@ -167,11 +183,11 @@ def from_afar(some: Outskirts, size: int, x: float, y: float) -> Float:
     size    : a power of two;  returns : float64[size, size] electrons
     Error   : 0.05 electrons; of axis ratio 0.02 1e-3 of the light
     """
-    slimness, pixels = _slimness(some.light, some.across), np.arange(size)
+    slim, pixels = slimness(some.light, some.across), np.arange(size)
     out, onto, step = np.zeros((size, size)), np.zeros((1, 1)), 0
     left = _beyond(some.light, some.across, 1.5 * size) / size**2
     for ring in range(2, _RINGS + 1):
-        wanted = 2 ** int(np.log2(np.clip(_PART * slimness * ring * size, _FINEST, _COARSEST * size)))
+        wanted = 2 ** int(np.log2(np.clip(_PART * slim * ring * size, _FINEST, _COARSEST * size)))
         if wanted != step:
             if step:
                 out += _spline(onto, step)(pixels, pixels)
@@ -194,7 +210,7 @@ def _spline(values: Float, step: int) -> RectBivariateSpline:
     return RectBivariateSpline(nodes, nodes, values)
 
 
-def _slimness(light: Float, across: float) -> float:
+def slimness(light: Float, across: float) -> float:
     """Axis ratio on the pixels of the slimmer component;  light, across : of Outskirts."""
     out = 1.0
     for middle, first, width in ((BULGE, BULGE_FORM, 1.0), (DISK, DISK_FORM, across)):
@@ -214,7 +230,7 @@ def add(
     hole : the stamp's first column and row, its side;  unread : rows of the frame that do not count, as of stamps.draw
     """
     return int(
-        _add(some.light, some.disk, some.across, some.blurred, frame, column, row, hole, unread, unit)
+        _add(some.light, some.disk, some.across, some.blurred, some.block, frame, column, row, hole, unread, unit)
     )  # fmt: skip
 
 
@@ -317,10 +333,10 @@ def _between(nodes: Float, x: float, y: float) -> Any:
 
 
 @jit
-def _seen(light: Float, disk: Float, across: float, blurred: Float, x: float, y: float) -> Any:
+def _seen(light: Float, disk: Float, across: float, blurred: Float, block: int, x: float, y: float) -> Any:
     """Electrons in a pixel at (x, y) from a galaxy's middle."""
     middle = blurred.shape[0] // 2
-    more = _between(blurred, x / _BLOCK + middle, y / _BLOCK + middle)
+    more = _between(blurred, x / block + middle, y / block + middle)
     return max(_light(light, disk, across, x, y) + more, 0.0)
 
 
@@ -333,23 +349,21 @@ def _sample(light: Float, disk: Float, across: float, x: float, y: float, step: 
 
 
 @jit
-def _take_in(
-    light: Float, disk: Float, across: float, blurred: Float, distant: Float, x: float, y: float, stamp: Any
-) -> None:
+def _take_in(light: Float, disk: Float, across: float, more: Float, x: float, y: float, stamp: Any) -> None:
     size = stamp.shape[0]
     for r in range(size):
         for c in range(size):
-            some = distant[r, c]
+            some = more[r, c]
             for up in (-size, 0, size):
                 for right in (-size, 0, size):
                     if up != 0 or right != 0:
-                        some += _seen(light, disk, across, blurred, c - x - right, r - y - up)
+                        some += _light(light, disk, across, c - x - right, r - y - up)
             stamp[r, c] -= some
 
 
 @jit
 def _add(
-    light: Float, disk: Float, across: float, blurred: Float, frame: Int, x: float, y: float,
+    light: Float, disk: Float, across: float, blurred: Float, block: int, frame: Int, x: float, y: float,
     hole: tuple[int, int, int], unread: tuple[int, int], unit: float,
 ) -> Any:  # fmt: skip
     ny, nx = frame.shape
@@ -361,7 +375,7 @@ def _add(
         for c in range(nx):
             if inside and left <= c < left + size:
                 continue
-            some = np.int64(np.rint(_seen(light, disk, across, blurred, c - x, r - y) * unit))
+            some = np.int64(np.rint(_seen(light, disk, across, blurred, block, c - x, r - y) * unit))
             frame[r, c] += some
             if read:
                 total += some

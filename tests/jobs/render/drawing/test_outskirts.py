@@ -133,6 +133,7 @@ PLACES = st.sampled_from([(500.0, 300.0), (HALF, 0.0), (-HALF, 200.0), (HALF, -H
 EDGE_ON = shape_of(0.0, 60.0, 1.0, 1.0, 90.0, 57.0)
 SLIM = shape_of(1.0, 30.0, 1.0, 0.15, 0.0, 57.0)
 HUGE = shape_of(1.0, 120.0, 4.0, 0.02, 0.0, 10.0)
+SHARP = shape_of(1.0, 120.0, 0.3, 0.02, 0.0, 3.0)
 
 
 def check(found, expected, noise, size):
@@ -146,6 +147,7 @@ def check(found, expected, noise, size):
         (EDGE_ON, 10.0, (HALF, 400.0)),
         (SLIM, 12.0, (0.0, -HALF + 40.0)),
         pytest.param(HUGE, 10.0, (300.0, 900.0), marks=pytest.mark.nightly),
+        pytest.param(SHARP, 6.0, (-HALF, 280.0), marks=pytest.mark.nightly),
     ],
 )
 def test_light_far_from_the_centre_is_where_it_belongs(shape, mag, place):
@@ -189,7 +191,7 @@ def test_what_comes_into_a_stamp_is_the_light_of_all_images(index, ratio, angle,
     form = galaxy_shapes.forms(source.shapes, source.jacobian)
     weights = transfer.basis_weights(psf, None, source.column, source.row)[0]
     some = replace(
-        outskirts.of_galaxy(source.shapes, form, electrons, psf, weights, 1.0), blurred=np.zeros((1, 1))
+        outskirts.of_galaxy(source.shapes, form, electrons, psf, weights, 1.0), blurred=np.zeros((9, 9))
     )  # fmt: skip
     stamp = np.zeros((side, side))
     outskirts.take_in(some, stamp, side / 2 + 0.3, side / 2 - 0.2)
@@ -202,6 +204,21 @@ def test_what_comes_into_a_stamp_is_the_light_of_all_images(index, ratio, angle,
         for a, b in zip(x, y, strict=True)
     ]
     np.testing.assert_allclose(-stamp[y, x], electrons * np.array(expected), rtol=2e-3, atol=0.1)
+
+
+@given(st.integers(1, 60), st.sampled_from([4, 8]), st.floats(-4.0, 4.0), st.floats(-40.0, 40.0))
+def test_samples_on_nodes_keep_what_any_quartic_sees(half, block, curve, slope):
+    """Of a sample spread over a pixel: its mean on the nodes is its mean on the sky."""
+    shares = outskirts._shares(2 * half + 1, block)
+    nodes = block * (np.arange(shares.shape[1]) - shares.shape[1] // 2)
+    seen = np.linspace(-0.5, 0.5, 2001)
+    at = (np.arange(-half, half + 1) / SAMPLES)[:, None] + 0.5 * (seen[1:] + seen[:-1])
+
+    def quartic(x):
+        x = x / block
+        return x**4 + curve * x**3 + x**2 + slope * x + 1.0
+
+    np.testing.assert_allclose(shares @ quartic(nodes), quartic(at).mean(axis=1), rtol=1e-6, atol=1e-5)
 
 
 @given(st.floats(0.0, 90.0), st.floats(0.0, 8.0), st.floats(0.0, 4.0))
