@@ -21,6 +21,8 @@ def test_distances_are_astropys():
     np.testing.assert_allclose(cosmology.expansion_rate(Z), ORACLE.efunc(Z), rtol=1e-13)
     volume = ORACLE.comoving_volume(Z).value / (4.0 * np.pi)
     np.testing.assert_allclose(cosmology.comoving_volume(0.0, Z), volume, rtol=1e-9)
+    nearer = ORACLE.comoving_volume(0.7 * Z).value / (4.0 * np.pi)
+    np.testing.assert_allclose(cosmology.comoving_volume(0.7 * Z, Z), volume - nearer, rtol=1e-9)
 
 
 def test_physical_scale_has_h():
