@@ -1,5 +1,7 @@
 """What passes PSF and pixels: every frequency that counts once, in the right place; far ones left out harmlessly."""
 
+from dataclasses import replace
+
 import galsim
 import numpy as np
 import pytest
@@ -22,6 +24,15 @@ def planes_psf(widths=(0.09, 0.13), place=0.0):
     drift = (place * (images[1] - images[0]))[None]
     planes = Planes(np.array([6000.0, 8000.0])[: len(widths)], images, drift, (79.5, 79.5), ((1, 0, 0),))
     return model.tabulated(model.galsim_profile(images.mean(axis=0), 0.1), 0.1, planes)
+
+
+def test_places_on_a_detector_are_in_units_of_its_own_sides():
+    """One of 200 columns and 100 rows: -1 and 1 at its borders, 0 in its middle; beyond the border that is held."""
+    psf = replace(planes_psf().planes, half=(99.5, 49.5), powers=((1, 0, 0), (0, 1, 0)))
+    column, row = np.array([-0.5, 99.5, 199.5, 149.5, 300.0]), np.array([99.5, 49.5, -0.5, 74.5, -40.0])
+    found = transfer.basis_weights(replace(planes_psf(), planes=psf), None, column, row)
+    np.testing.assert_allclose(found[:, 2:], [[-1, 1], [0, 0], [1, -1], [0.5, 0.5], [1, -1]], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(found[:, :2], 0.5, rtol=1e-12)
 
 
 @pytest.mark.parametrize("size", [32, 56, 64])
