@@ -239,7 +239,7 @@ for n in range(50):
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="stderr stays joined to stdout")
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the system does not say which files a process has open")
 def test_a_log_that_both_streams_go_to_loses_no_line(prepare, environment, tmp_path):
     """Under nohup, or > log 2>&1, a file has one position for all who write to it."""
     (talking := tmp_path / "talking.py").write_text(TALKING)

@@ -9,6 +9,7 @@ Ref : Serrano et al. 2024, section 3.2 and the figure of the observing sequence
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,22 +78,18 @@ def _moves(mission: MissionConfiguration) -> tuple[float, float, float]:
     )
 
 
+@dataclass(frozen=True, slots=True)
 class _At:
-    """One dither: where it points, when it starts."""
+    """One dither: where it points (deg), when it starts (MJD), its number from 1."""
 
-    def __init__(
-        self,
-        block: Observation,
-        field: Field,
-        survey: str,
-        mission: MissionConfiguration,
-        ra: float,
-        dec: float,
-        start: float,
-        dither: int,
-    ) -> None:
-        self.block, self.field, self.survey, self.mission = block, field, survey, mission
-        self.ra, self.dec, self.start, self.dither = ra, dec, start, dither
+    block: Observation
+    field: Field
+    survey: str
+    mission: MissionConfiguration
+    ra: float
+    dec: float
+    start: float
+    dither: int
 
     def exposures(self, last: bool) -> Iterator[Exposure]:
         block, mission = self.block, self.mission
@@ -114,34 +111,26 @@ class _At:
             seconds = mission.value("vis.exposure_time_flat", "s")
             # One LED after the other, from field to field and from visit to visit.
             lamp = (self.field.number + self.field.visit) % LEDS + 1
-            yield self._one("VIS", "euclid_vis", _dither_time(mission), seconds, "flat", lamp=lamp)
+            flat = self._one("VIS", "euclid_vis", _dither_time(mission), seconds)
+            yield replace(flat, image_type="flat", lamp=lamp)
 
     def _spectrum(self, after: float) -> Exposure:
         if self.block.blue and self.field.visit % 2 == 0:
-            return self._one("NISP-S", BLUE, after, grism="BGS000", grism_angle=0.0)
+            return replace(self._one("NISP-S", BLUE, after), grism="BGS000", grism_angle=0.0)
         number = (self.dither - 1) % len(_GRISMS) + 1
         angle = self.mission.value(f"survey.grism_angle_{number}", "deg")
         grism = "RGS000" if np.cos(np.radians(angle)) > 0 else "RGS180"
-        return self._one("NISP-S", RED, after, grism=grism, grism_angle=angle)
+        return replace(self._one("NISP-S", RED, after), grism=grism, grism_angle=angle)
 
-    def _one(
-        self,
-        channel: str,
-        band: str,
-        after: float,
-        seconds: float | None = None,
-        image_type: str | None = None,
-        lamp: int | None = None,
-        grism: str | None = None,
-        grism_angle: float | None = None,
-    ) -> Exposure:
+    def _one(self, channel: str, band: str, after: float, seconds: float | None = None) -> Exposure:
+        """One that begins `after` seconds of the dither's start;  seconds : it takes, None = the mission's."""
         camera = "vis" if channel == "VIS" else "nisp"
         nominal = exposure_time(channel, camera, band, self.mission)
         return Exposure(
             channel=channel,
             camera=camera,
             band=band,
-            image_type=image_type or self.block.image_type,
+            image_type=self.block.image_type,
             ra=self.ra,
             dec=self.dec,
             position_angle=self.field.position_angle,
@@ -151,9 +140,6 @@ class _At:
             field=self.field.number,
             visit=self.field.visit,
             dither=self.dither,
-            grism=grism,
-            grism_angle=grism_angle,
-            lamp=lamp,
             detectors=self.block.detectors if channel == "VIS" or not _is_vis(self.block.detectors) else (),
         )
 
