@@ -5,6 +5,7 @@ opened      the same, as a stream of bytes
 text        its text
 toml        its tables
 target      where a result may be written;  folder : where several may
+staged      a file that takes its place in one rename
 expanded    a path as it was typed
 shown       a path as messages name it
 
@@ -166,6 +167,7 @@ def target(path: Path, endings: Sequence[str] = ()) -> Path:
             raise BadInput(f"{shown(path)}: its folder is not there")
         if os.path.lexists(path) and not path.is_file():
             raise BadInput(f"{shown(path)}: is there, and is no file")
+        _refuse_unwritable(path, path.parent)
     return path
 
 
@@ -174,7 +176,27 @@ def folder(path: Path) -> Path:
     with _reachable(path):
         if os.path.lexists(path) and not path.is_dir():
             raise BadInput(f"{shown(path)}: is there, and is no folder")
+        there = next(one for one in (path, *path.absolute().parents) if os.path.lexists(one))
+        if not there.is_dir():
+            raise BadInput(f"{shown(path)}: {shown(there)} is no folder")
+        _refuse_unwritable(path, there)
     return path
+
+
+def _refuse_unwritable(path: Path, folder: Path) -> None:
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise BadInput(f"{shown(path)}: its folder cannot be written to")
+
+
+@contextmanager
+def staged(path: Path) -> Iterator[Path]:
+    """A temporary name beside a file: what is written to it replaces the file in one rename, or is removed."""
+    temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 # ------------------------------------------------------------------------------------------------ TOML

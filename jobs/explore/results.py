@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -68,14 +67,10 @@ def write(rows: pa.Table, path: Path) -> None:
     """
     writer = _WRITERS[user_files.target(path, ENDINGS).suffix.lower()]
     _refuse_same_names(rows)
-    temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
-    try:
+    with user_files.staged(path) as temporary:
         if error := _refusal(writer, rows, temporary):
             column = next((name for name in rows.column_names if _refusal(writer, rows.select([name]), temporary)), "")
             raise BadInput(f"{path}: column {column}: {' '.join(str(error).split())[:300]}") from None
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _refusal(writer: Callable[[pa.Table, Path], None], rows: pa.Table, path: Path) -> Exception | None:

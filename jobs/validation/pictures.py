@@ -11,6 +11,7 @@ import numpy as np
 from jobs.catalogue.halos import luminosity_function
 from jobs.fluxes import cosmology
 from jobs.validation import census
+from lake_schema import user_files
 from lake_schema.arrays import Float
 
 # Galaxies an arcmin2 brighter than i: GAMA and zCOSMOS (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST Science
@@ -38,7 +39,8 @@ def draw(
         plot(ax, seen, figures)
     _clustering(axes[1, 1], curves)
     _convergence(axes[1, 2], power, bands)
-    figure.savefig(folder / "universe.png", dpi=110)
+    with user_files.staged(folder / "universe.png") as temporary:
+        figure.savefig(temporary, dpi=110, format="png")
     pyplot.close(figure)
 
 

@@ -17,10 +17,6 @@ from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from tests.jobs.catalogue.galaxies.test_lensing import limber
 
-# The luminosity function, calibrated on 102 galaxies an arcmin2 with I_E < 26, makes 15 % more than observed to i = 25
-# (test_galaxies has the mean sky), and this sky 1.5 % more than that; 12 % are allowed.
-KNOWN = {"i_25"}
-
 
 @pytest.fixture(scope="module")
 def seen(drawn):
@@ -148,7 +144,6 @@ def test_theories_agree():
 def test_the_fuller_report(tmp_path):
     """Every expectation, at the settings that a request has by default: a quarter of an hour of one core."""
     file = tmp_path / "universe.json"
-    __main__.main(["--json", str(file), "--figures", str(tmp_path)])
-    figures = json.loads(file.read_text())
+    assert __main__.main(["--json", str(file), "--figures", str(tmp_path)]) == 0
+    assert json.loads(file.read_text())["checks"] > 130
     assert (tmp_path / "universe.png").stat().st_size > 10_000
-    assert set(filter(None, figures["failed"].split(", "))) <= KNOWN
