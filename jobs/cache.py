@@ -25,10 +25,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lake_schema import blocks, user_files
+from lake_schema import user_files
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
-from lake_schema.store import layout, manifest
+from lake_schema.store import blocks, layout, manifest
 from lake_schema.store.provenance import digest, machine
 
 _SEAL, _ARRAY = "sums.json", ".npy"

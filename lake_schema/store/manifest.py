@@ -15,9 +15,9 @@ from typing import Any
 
 import pyarrow as pa
 
-from lake_schema import blocks, sky
+from lake_schema import sky
 from lake_schema.errors import Damaged
-from lake_schema.store import layout, parquet
+from lake_schema.store import blocks, layout, parquet
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical, digest, file_sha256
 

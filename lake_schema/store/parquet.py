@@ -15,9 +15,9 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
-from lake_schema import blocks
 from lake_schema.columns import Table
 from lake_schema.errors import Damaged
+from lake_schema.store import blocks
 from lake_schema.store.plan import Json
 
 # Sorted by position, 65,536 rows a group is where small cones are fast and the footer still small (tried: 4k to 262k).

@@ -19,10 +19,9 @@ from jobs.explore import worker
 from jobs.explore.guard import checked
 from jobs.render.products.keys import truth_file
 from jobs.render.render_exposures import truth_work
-from lake_schema import blocks
 from lake_schema.errors import Damaged
 from lake_schema.fits import images
-from lake_schema.store import layout, manifest, parquet, publish, read
+from lake_schema.store import blocks, layout, manifest, parquet, publish, read
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables import declared
 from tests.make_old_lake import OLD_LAKE

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,10 +90,19 @@ def parquet_readings(tree: ast.AST) -> list[str]:
 
 
 def test_contracts():
-    """The floors as pyproject.toml states them."""
+    """The layers as pyproject.toml states them."""
     command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_module_has_its_layer():
+    """A module that is new is refused until pyproject.toml says what it may import; each package of jobs has layers."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    within = {one["containers"][0]: one for one in contracts if "containers" in one}
+    packages = {f"jobs.{path.parent.name}" for path in (ROOT / "jobs").glob("*/__init__.py")}
+    assert within.keys() >= packages | {"jobs", "lake_schema"}
+    assert [name for name, one in within.items() if not one.get("exhaustive") or "exhaustive_ignores" in one] == []
 
 
 def test_one_room_knows_fits():

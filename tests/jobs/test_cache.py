@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jobs import cache
-from lake_schema import blocks
 from lake_schema.errors import BadInput
+from lake_schema.store import blocks
 
 
 @pytest.fixture(autouse=True)

@@ -10,10 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lake_schema import blocks
 from lake_schema.errors import BadInput
 from lake_schema.external import files as external_files
-from lake_schema.store import parquet
+from lake_schema.store import blocks, parquet
 
 GOOD = pa.table({"ra": np.linspace(0, 359, 1000), "name": ["a", "b"] * 500, "flag": [True, False] * 500})
 # The reading process has a limit of its own, in processor time; the machine may be doing other things.
