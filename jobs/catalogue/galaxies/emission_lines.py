@@ -19,8 +19,9 @@ import numpy as np
 
 from jobs import sums
 from jobs.catalogue import parameters
+from jobs.catalogue.interpolation import bracket
 from jobs.fluxes import cosmology
-from lake_schema.arrays import Bool, Float, Int
+from lake_schema.arrays import Bool, Float
 from lake_schema.units import LIGHT_KM_S
 
 _FILE = "emission_lines.toml"
@@ -131,8 +132,8 @@ def matched(lines: LineModel, z: Float, log_l: Float) -> Float:
 
     z : float[n];  log_l : float[n] log10 erg/s
     """
-    row, part = _bracket(lines.z, z)
-    column, share = _bracket(lines.log_l, log_l)
+    row, part = bracket(lines.z, z)
+    column, share = bracket(lines.log_l, log_l)
     low = lines.shift[row, column] * (1.0 - share) + lines.shift[row, column + 1] * share
     high = lines.shift[row + 1, column] * (1.0 - share) + lines.shift[row + 1, column + 1] * share
     return np.asarray(log_l + low * (1.0 - part) + high * part)
@@ -219,9 +220,3 @@ def _oxygen(ratios: Ratios, n2: Float, z: Float, rng: np.random.Generator) -> Fl
 def _sulphur(ratios: Ratios, n2: Float, rng: np.random.Generator) -> Float:
     mean = ratios.sii_zero + ratios.sii_rate * (n2 + ratios.sii_pivot)
     return np.asarray(mean + ratios.sii_scatter * rng.standard_normal(n2.size))
-
-
-def _bracket(nodes: Float, values: Float) -> tuple[Int, Float]:
-    index = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
-    weight = (values - nodes[index]) / (nodes[index + 1] - nodes[index])
-    return index, np.clip(weight, 0.0, 1.0)

@@ -16,7 +16,8 @@ import numpy.typing as npt
 from scipy.special import gamma, gammaincc
 
 from jobs.catalogue import parameters
-from lake_schema.arrays import Float, Int
+from jobs.catalogue.interpolation import bracket
+from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 
 _LN10_04 = 0.4 * np.log(10.0)
@@ -150,14 +151,8 @@ def magnitude(table: Inverse, number: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     Error: < 0.003 mag over 1e-12 .. 1 (Mpc/h)^-3 (tests/jobs/catalogue/halos/test_luminosity_function.py)
     """
     m_star, phi_star, alpha = table.schechter.at(z)
-    row, above_row = _bracket(table.a, alpha + 1.0)
-    col, above_col = _bracket(table.ln_g, np.log(np.asarray(number, float) / phi_star))
+    row, above_row = bracket(table.a, alpha + 1.0)
+    col, above_col = bracket(table.ln_g, np.log(np.asarray(number, float) / phi_star))
     low = table.ln_x[row, col] * (1.0 - above_col) + table.ln_x[row, col + 1] * above_col
     high = table.ln_x[row + 1, col] * (1.0 - above_col) + table.ln_x[row + 1, col + 1] * above_col
     return np.asarray(m_star - (low * (1.0 - above_row) + high * above_row) / _LN10_04)
-
-
-def _bracket(nodes: Float, values: Float) -> tuple[Int, Float]:
-    index = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
-    weight = (values - nodes[index]) / (nodes[index + 1] - nodes[index])
-    return index, np.clip(weight, 0.0, 1.0)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from jobs.catalogue.halos.halos import HaloModel, Halos
 from jobs.catalogue.halos.matching import Masses
+from jobs.catalogue.interpolation import bracket
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
 
@@ -71,7 +72,7 @@ def nfw_radius(concentration: Float, enclosed: Float) -> Float:
     concentration : float[n] c_200m;  enclosed : float[n] of the mass, 0 .. 1
     Error: 1e-3
     """
-    row, part = _bracket(np.log(_C_NODES), np.log(concentration))
+    row, part = bracket(np.log(_C_NODES), np.log(concentration), extrapolated=True)
     step = np.asarray(enclosed) * (_U_NODES.size - 1)
     column = np.clip(step.astype(np.int64), 0, _U_NODES.size - 2)
     share = step - column
@@ -101,11 +102,6 @@ def _moved(hosts: Halos, host: Int, offset: Float) -> tuple[Float, Float, Float]
     x, y, z = ((unit * hosts.chi[:, None])[host] + offset).T
     flat = np.hypot(x, y)
     return sky.wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, flat)), np.hypot(flat, z)
-
-
-def _bracket(nodes: Float, values: Float) -> tuple[Int, Float]:
-    row = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
-    return row, (values - nodes[row]) / (nodes[row + 1] - nodes[row])
 
 
 _SQUARES = _squares()
