@@ -14,15 +14,9 @@ import threading
 import warnings
 from pathlib import Path
 
-import pyarrow as pa
 from py4j.protocol import Py4JError
 from pyspark import SparkConf, SparkContext, accumulators
 from pyspark.sql import SparkSession
-from pyspark.sql.pandas.types import from_arrow_type
-from pyspark.sql.types import StructField, StructType
-
-from lake_schema.errors import Damaged
-from lake_schema.store import read
 
 # What nobody from outside may reach, wherever the configuration says nothing else.
 _CLOSED = {"spark.ui.enabled": "false"}
@@ -71,35 +65,3 @@ def is_alive(spark: SparkSession) -> bool:
         return not spark.sparkContext._jsc.sc().isStopped()
     except (Py4JError, OSError, LookupError):
         return False
-
-
-def views(spark: SparkSession, root: Path) -> list[str]:
-    """Make every table of a lake a view of its name, for SQL in a job; returns the names.
-
-    Spark verifies nothing while it reads, so each byte is compared with the manifest first (a second a gigabyte).
-    Errors : Damaged names the file
-    """
-    names = read.tables(root)
-    for name in names:
-        version = read.version(root, name)
-        if faults := read.verify(version, deep=True):
-            raise Damaged(faults[0])
-        files = [_literal(version.path(part)) for part in version.parts]
-        spark.read.schema(struct(version.schema)).parquet(*files).createOrReplaceTempView(name)
-    return names
-
-
-def _literal(path: Path) -> str:
-    """A path in which Spark finds no pattern."""
-    return re.sub(r"[\[\]{}*?\\]", r"\\\g<0>", str(path))
-
-
-def struct(schema: pa.Schema) -> StructType:
-    """A declared Arrow schema as Spark's, with unit, UCD and description in the fields' metadata."""
-    return StructType([_field(field) for field in schema])
-
-
-def _field(field: pa.Field) -> StructField:
-    about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
-    about["comment"] = about.get("description", "")
-    return StructField(field.name, from_arrow_type(field.type), field.nullable, about)

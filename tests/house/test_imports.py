@@ -62,8 +62,6 @@ PARQUET = ("pyarrow.parquet", "pyarrow.dataset", "pyarrow.orc")
 NO_READING = {"write_table", "ParquetWriter", "Expression", "field", "scalar"}
 # The one door; Parquet of other programs, in a process of its own.
 PARQUET_READERS = {"lake_schema/store/parquet.py", "lake_schema/external/files.py"}
-# Spark's own reader, after every byte was compared.
-SPARK_READERS = {"jobs/session.py"}
 
 
 def parquet_readings(tree: ast.AST) -> list[str]:
@@ -117,7 +115,7 @@ def test_parquet_is_read_through_one_door():
     # Rows that a process was handed in a file of Arrow's own, which is removed with it.
     handed = found.pop("jobs/explore/worker.py")
     assert handed == {"pyarrow.dataset.dataset", "pyarrow.dataset.Dataset"}
-    assert found.keys() == PARQUET_READERS | SPARK_READERS
+    assert found.keys() == PARQUET_READERS
 
 
 @pytest.mark.parametrize(
