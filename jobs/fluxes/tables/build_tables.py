@@ -77,7 +77,7 @@ def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -
     numbers = (setting.step, setting.n_ebv, setting.n_av)
     full_key = cache.content_key(code_key(__name__), key, *numbers, *_curve(band), *_curve(reference))
     arrays = cache.cached_arrays(
-        f"flux_grid_{band.name}", full_key, lambda: {"galaxies": _galaxies(library, band, reference, setting)}
+        f"galaxy_table_{band.name}", full_key, lambda: {"galaxies": _galaxies(library, band, reference, setting)}
     )
     return arrays["galaxies"]
 
@@ -88,7 +88,7 @@ def star_table(band: Passband, library: Library, key: str) -> Float32:
     Error: 1e-6 (tests/jobs/fluxes/tables/test_flux_tables.py)
     """
     full_key = cache.content_key(code_key(__name__), key, *_curve(band))
-    arrays = cache.cached_arrays(f"flux_grid_stars_{band.name}", full_key, lambda: {"stars": _stars(library, band)})
+    arrays = cache.cached_arrays(f"star_table_{band.name}", full_key, lambda: {"stars": _stars(library, band)})
     return arrays["stars"]
 
 
@@ -98,7 +98,7 @@ def line_table(band: Passband) -> tuple[float, Float32]:
     Uniform in ln(lambda) by LINE_STEP; the columns are LINE_SIGMA.
     """
     full_key = cache.content_key(code_key(__name__), LINE_SIGMA, *_curve(band))
-    arrays = cache.cached_arrays(f"line_grid_{band.name}", full_key, lambda: _lines(band))
+    arrays = cache.cached_arrays(f"line_table_{band.name}", full_key, lambda: _lines(band))
     return float(arrays["first"][0]), arrays["lines"]
 
 
