@@ -35,8 +35,8 @@ def _as_it_is(what: Anything) -> Anything:
     return what
 
 
-def _sizes(some: Sources, spread: model.Psf, scene: Scene, settings: Settings) -> Int:
-    return stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, spread, scene.noise, settings)
+def _sizes(some: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
+    return stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, psf, scene.noise, settings)
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,21 @@ class Approximation:
     name: str
     concerned: Callable[[Scene, int, int], Sources] = scenes.sample
     simplified: Callable[[Sources], Sources] = _as_it_is
-    spread: Callable[[model.Psf], model.Psf] = _as_it_is
+    psf: Callable[[model.Psf], model.Psf] = _as_it_is
     sizes: Callable[[Sources, model.Psf, Scene, Settings], Int] = _sizes
     after: Callable[[Float], Float] = _as_it_is
     numbers: tuple[int, int, int] = (24, 6, 0)
     timed: Approximation | None = None
 
-    def draw(
-        self, some: Sources, spread: model.Psf, scene: Scene, settings: Settings, side: int | None = None
-    ) -> Float:
+    def draw(self, some: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
         """Sources that are simplified, through a PSF that is."""
-        floors = stamp_sizes.floors(some.electrons, scene.noise, settings)
+        neglected = stamp_sizes.neglected_flux(some.electrons, scene.noise, settings)
         nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
-        sizes = self.sizes(some, spread, scene, settings)
-        return self.after(stamps.draw(some, sizes, spread, nx, ny, None, floors))
+        sizes = self.sizes(some, psf, scene, settings)
+        return self.after(stamps.draw(some, sizes, psf, nx, ny, None, neglected))
 
 
-def _folded(some: Sources, spread: model.Psf, scene: Scene, settings: Settings) -> Int:
+def _folded(some: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
     """Stamps as wide as galsim's folding_threshold asks for: all but that of the light."""
     shapes = some.shapes.take(some.shape)
     stretch = np.sqrt(shapes.magnification)
@@ -78,9 +76,9 @@ def _folded(some: Sources, spread: model.Psf, scene: Scene, settings: Settings) 
     ):
         whole = (gammaincinv(2 * index, 1 - FOLDING) / gammaincinv(2 * index, 0.5)) ** index
         radius = np.maximum(radius, np.where(share > 0, half_light * stretch * whole, 0.0))
-    light = spread.outside / (spread.outside[0] + spread.surface[0])
+    light = psf.outside / (psf.outside[0] + psf.surface[0])
     of_psf = np.argmax(light < FOLDING) if (light < FOLDING).any() else len(light)
-    wanted = 2 * np.hypot(radius / spread.pixel_scale, of_psf)
+    wanted = 2 * np.hypot(radius / psf.pixel_scale, of_psf)
     return np.asarray(
         stamp_sizes.SIZES[np.minimum(np.searchsorted(stamp_sizes.SIZES, wanted), len(stamp_sizes.SIZES) - 1)]
     )
@@ -139,8 +137,8 @@ def _down_and_up(image: Float) -> Float:
     return np.asarray(zoom(coarse, 2, order=2, mode="nearest", grid_mode=True)) / 4
 
 
-def _half(some: Sources, spread: model.Psf, scene: Scene, settings: Settings) -> Int:
-    sizes = _sizes(some, spread, scene, settings)
+def _half(some: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
+    sizes = _sizes(some, psf, scene, settings)
     return np.asarray(stamp_sizes.SIZES[np.searchsorted(stamp_sizes.SIZES, sizes // 2)])
 
 
@@ -154,22 +152,22 @@ def _grey(some: Sources) -> Sources:
     return replace(some, photons=None)
 
 
-def _grey_planes(spread: model.Psf) -> model.Psf:
+def _grey_planes(psf: model.Psf) -> model.Psf:
     """One plane for all colours; its drift across the detector stays."""
-    planes = spread.planes
+    planes = psf.planes
     assert planes is not None
     kept = [i for i, power in enumerate(planes.powers) if power[2] == 0]
     mean = planes.images.mean(axis=0, keepdims=True)
     powers = tuple(planes.powers[i] for i in kept)
     waves = planes.wavelength.mean(keepdims=True)
-    return replace(spread, planes=model.Planes(waves, mean, planes.drift[kept], planes.half, powers))
+    return replace(psf, planes=model.Planes(waves, mean, planes.drift[kept], planes.half, powers))
 
 
-def _still(spread: model.Psf) -> model.Psf:
+def _still(psf: model.Psf) -> model.Psf:
     """The detector's centre everywhere."""
-    planes = spread.planes
+    planes = psf.planes
     assert planes is not None
-    return replace(spread, planes=replace(planes, drift=planes.drift[:0], powers=()))
+    return replace(psf, planes=replace(planes, drift=planes.drift[:0], powers=()))
 
 
 NONE = Approximation("none")
@@ -185,6 +183,6 @@ ALL = (
         numbers=(4, 2, 4),
         timed=Approximation("half the side", sizes=_half, after=_up),
     ),
-    Approximation("one PSF for all colours", simplified=_grey, spread=_grey_planes),
-    Approximation("one PSF for all places", spread=_still),
+    Approximation("one PSF for all colours", simplified=_grey, psf=_grey_planes),
+    Approximation("one PSF for all places", psf=_still),
 )

@@ -89,7 +89,7 @@ def errors(image: Float, truth: Float, scene: Scene, one: Sources) -> Float:
 
 def against_galsim(scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int) -> tuple[dict[str, Float], Int, int]:
     """(errors [m, 5] of each of the settings, magnitude bins [m], galaxies that galsim refused)."""
-    some, full = scenes.sample(scene, seed, n), scenes.spread(scene)
+    some, full = scenes.sample(scene, seed, n), scenes.psf_of(scene)
     out: dict[str, list[Float]] = {name: [] for name in tiers}
     bins, refused = [], 0
     for i, b in enumerate(scenes.bins_of(some, scene)):
@@ -111,7 +111,7 @@ def shear_response(
 
     The truth is the same galaxy through the same PSF on the largest stamp (FULL); |m| <= 1e-5 of galsim's.
     """
-    some, full = scenes.sample(scene, seed, n), scenes.spread(scene)
+    some, full = scenes.sample(scene, seed, n), scenes.psf_of(scene)
     out: dict[str, list[tuple[float, float]]] = {name: [] for name in tiers}
     for i in range(len(some)):
         mine, one = scenes.own(full, some, i), scenes.moved(some, i, 2 * COMPARED)
@@ -121,9 +121,9 @@ def shear_response(
     return {name: np.array(rows) for name, rows in out.items()}, some
 
 
-def drawing(spread: model.Psf, scene: Scene, settings: Settings) -> Callable[[Sources], Float]:
+def drawing(psf: model.Psf, scene: Scene, settings: Settings) -> Callable[[Sources], Float]:
     """A way to draw a galaxy: ours, on a frame of twice COMPARED."""
-    return lambda one: scenes.draw(one, spread, scene, settings, 2 * COMPARED)
+    return lambda one: scenes.draw(one, psf, scene, settings, 2 * COMPARED)
 
 
 def response(draw: Callable[[Sources], Float], one: Sources, scale: float, g: float = SHEAR) -> Float:

@@ -25,7 +25,7 @@ def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float
     returns : with a PSF of its own for each galaxy (its image summed to its colour and place); with one PSF for all,
               the index rounded to 0.1, and every index drawn once before
     """
-    some, full = scenes.sample(scene, seed, each * (len(BINS) - 1)), scenes.spread(scene)
+    some, full = scenes.sample(scene, seed, each * (len(BINS) - 1)), scenes.psf_of(scene)
     bins = scenes.bins_of(some, scene)
     everything = scenes.sources(scene, 1, stars=0)
     counts = np.bincount(scenes.bins_of(everything, scene), minlength=len(BINS) - 1)
@@ -57,11 +57,11 @@ def _image(full: model.Psf, weights: Float) -> galsim.GSObject:
     return galsim.InterpolatedImage(galsim.Image(whole[middle, middle], scale=1.0 / model.SAMPLES))
 
 
-def _draw(some: Sources, i: int, spread: galsim.GSObject, index: float) -> None:
+def _draw(some: Sources, i: int, psf: galsim.GSObject, index: float) -> None:
     shape = some.shapes.take(some.shape[i : i + 1])
     shape.sersic_index[0] = index
     body = galsim.JacobianWCS(*some.jacobian[i].ravel()).toImage(galaxy_shapes.profile(shape, 0, 1e-6))
-    whole = galsim.Convolve([body.withFlux(some.electrons[i]), spread])
+    whole = galsim.Convolve([body.withFlux(some.electrons[i]), psf])
     whole.drawImage(scale=1.0, offset=(some.column[i] % 1, some.row[i] % 1))
 
 

@@ -54,7 +54,7 @@ def optics() -> Callable[[tuple[float, float]], Float]:
     """The PSF at a place, computed: (x, y) in half sides -> [wavelengths, t, t], in the detector's axes."""
     mission = resolve()
     detector = detectors.detector("vis", "3-4", mission)
-    waves = scenes.spread(VIS, 1).planes.wavelength  # type: ignore[union-attr]
+    waves = scenes.psf_of(VIS, 1).planes.wavelength  # type: ignore[union-attr]
     blurs = [euclid._blur_variances(detector, float(waves[w]), mission) for w in range(len(waves))]
     sign = -1 if detector.upside_down else 1
 
@@ -80,15 +80,15 @@ def rows(stars: int, nearest: tuple[int, ...] = _NEAREST) -> list[dict[str, floa
     some = [star(at, rng) for _ in range(stars)]
     out = []
     for positions in euclid.DEGREES:
-        cold, spread = _cold(positions)
-        found = np.array([errors_of(centre + drift(spread, one), one) for one in some])
-        out.append(_row(positions, False, found, cold, (spread.images.nbytes + spread.drift.nbytes) / 1e6))
+        cold, psf = _cold(positions)
+        found = np.array([errors_of(centre + drift(psf, one), one) for one in some])
+        out.append(_row(positions, False, found, cold, (psf.images.nbytes + psf.drift.nbytes) / 1e6))
     for side in nearest:
         middles = (2 * np.arange(side) + 1) / side - 1
         found = np.array([errors_of(at(_nearest(middles, one.place)), one) for one in some])
         # The wings are the centre's everywhere: a position has the core alone.
-        planes = side**2 * len(spread.wavelength)
-        megabytes = (planes * centre[0].size * spread.images.itemsize + spread.images.nbytes) / 1e6
+        planes = side**2 * len(psf.wavelength)
+        megabytes = (planes * centre[0].size * psf.images.itemsize + psf.images.nbytes) / 1e6
         out.append(_row(side**2, True, found, out[0]["seconds"] + planes * plane_s, megabytes))
     return out
 
@@ -125,10 +125,10 @@ def largest(seed: int, n: int, kinds: Sequence[tuple[int, int]]) -> dict[tuple[i
     centre, some = at((0.0, 0.0)), [star(at, rng) for _ in range(n)]
     out = {}
     for positions, colours in kinds:
-        spread = scenes.spread(VIS, positions, colours).planes
-        assert spread is not None
+        psf = scenes.psf_of(VIS, positions, colours).planes
+        assert psf is not None
         middle = centre.reshape(colours, -1, *centre.shape[1:]).mean(axis=1)
-        flux, moved, r2, e = np.array([errors_of(middle + drift(spread, one), one) for one in some]).max(axis=0)
+        flux, moved, r2, e = np.array([errors_of(middle + drift(psf, one), one) for one in some]).max(axis=0)
         out[positions, colours] = {"flux": flux, "shape": max(LENSED * r2, e / 2), "position": moved}
     return out
 
@@ -138,13 +138,13 @@ def _moments(image: Float) -> Float:
     return errors.measured(image, VIS.scale / model.SAMPLES, middle, middle)
 
 
-def drift(spread: model.Planes, star: Star) -> Float:
+def drift(psf: model.Planes, star: Star) -> Float:
     """What the polynomials add to the centre's planes: [wavelengths, t, t]."""
     out = []
-    for wavelength in spread.wavelength:
-        redder = wavelength - spread.wavelength.mean()
-        terms = [star.place[0] ** i * star.place[1] ** j * redder**colour for i, j, colour in spread.powers]
-        out.append(np.tensordot(terms, spread.drift, 1) if terms else 0.0)
+    for wavelength in psf.wavelength:
+        redder = wavelength - psf.wavelength.mean()
+        terms = [star.place[0] ** i * star.place[1] ** j * redder**colour for i, j, colour in psf.powers]
+        out.append(np.tensordot(terms, psf.drift, 1) if terms else 0.0)
     return np.stack([np.broadcast_to(each, star.truth.shape[1:]) for each in out])
 
 
@@ -157,7 +157,7 @@ def _cold(positions: int) -> tuple[float, model.Planes]:
     """CPU s to compute the planes, and they."""
     with scenes.empty_cache():
         start = time.process_time()
-        planes = scenes.spread(VIS, positions).planes
+        planes = scenes.psf_of(VIS, positions).planes
         seconds = time.process_time() - start
     assert planes is not None
     return seconds, planes

@@ -19,7 +19,7 @@ ACCURACY = 1e-4
 
 
 def image(
-    one: Sources, spread: model.Psf, side: int, highest: float = ACCURACY, folding: float = ACCURACY
+    one: Sources, psf: model.Psf, side: int, highest: float = ACCURACY, folding: float = ACCURACY
 ) -> Float | None:
     """The only source, through a PSF that is its own, on a frame [side, side]; None where memory does not suffice.
 
@@ -34,14 +34,14 @@ def image(
         one.electrons,
         *(getattr(shapes, field.name) for field in fields(shapes)),
     ]
-    through = [repr(spread.profile)] if spread.planes is None else ["Lanczos 31", spread.planes.images]
+    through = [repr(psf.profile)] if psf.planes is None else ["Lanczos 31", psf.planes.images]
     key = cache.content_key(
-        galsim.__version__, highest, folding, side, spread.pixel_scale, spread.intra_pixel, *seen, *through
+        galsim.__version__, highest, folding, side, psf.pixel_scale, psf.intra_pixel, *seen, *through
     )  # fmt: skip
 
     def make() -> dict[str, Float]:
         try:
-            return {"image": reference.reference(one, 0, spread, side, folding, highest)}
+            return {"image": reference.reference(one, 0, psf, side, folding, highest)}
         except (MemoryError, RuntimeError):
             return {"image": np.zeros((0, 0))}
 
@@ -49,15 +49,15 @@ def image(
     return found if found.size else None
 
 
-def by_series(one: Sources, spread: model.Psf, side: int) -> Float:
+def by_series(one: Sources, psf: model.Psf, side: int) -> Float:
     """The same through planes, all but their Fourier series between samples: moved, averaged over pixels, sampled.
 
     A galaxy's own transform is galsim's, at its tightest. galsim knows a PSF between its samples by Lanczos' kernel of
     31 of these, ten pixels away from which it is wrong by 6e-7 of the flux: a sigma of a star of 15 mag, and 4e-5 of
     its R2. A galaxy that is not small beside the frame folds: for those `image` is the better one.
     """
-    assert spread.planes is not None
-    plane = spread.planes.images[0].astype(float)
+    assert psf.planes is not None
+    plane = psf.planes.images[0].astype(float)
     wide = model.SAMPLES * 2 * -(-(len(plane) + model.SAMPLES * side) // (2 * model.SAMPLES))
     padded = np.zeros((wide, wide))
     padded[: len(plane), : len(plane)] = plane

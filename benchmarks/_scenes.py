@@ -51,7 +51,7 @@ VIS = Scene("vis", 4096, 4132, 0.1, 565.0, 25.7, 12.45, 4701, 300)
 LSST = Scene("lsst", 4096, 4004, 0.2, 30.0, 28.17, 38.3, 18223, 1160)
 
 
-def spread(scene: Scene, positions: int = 9, colours: int = sub_bands.PARTS) -> model.Psf:
+def psf_of(scene: Scene, positions: int = 9, colours: int = sub_bands.PARTS) -> model.Psf:
     """The scene's PSF."""
     if scene.name == "lsst":
         return seeing.ground_psf(SEEING, BETA, scene.scale)
@@ -153,23 +153,23 @@ def stratified(scene: Scene, seed: int, each: int) -> Sources:
     return replace(some, shapes=shapes, electrons=scene.exposure * 10 ** (0.4 * (scene.zero_point - mag)))
 
 
-def draw(some: Sources, spread_: model.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
+def draw(some: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
     """The whole of drawing, as for an exposure; `side`: on a small frame instead of the scene's."""
-    sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, spread_, scene.noise, settings)
-    floors = stamp_sizes.floors(some.electrons, scene.noise, settings)
+    sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, psf, scene.noise, settings)
+    neglected = stamp_sizes.neglected_flux(some.electrons, scene.noise, settings)
     nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
-    return stamps.draw(some, sizes, spread_, nx, ny, None, floors)
+    return stamps.draw(some, sizes, psf, nx, ny, None, neglected)
 
 
-def own(spread_: model.Psf, some: Sources, i: int) -> model.Psf:
+def own(psf: model.Psf, some: Sources, i: int) -> model.Psf:
     """The PSF of source i everywhere on a frame, and nothing beyond its planes."""
-    planes = spread_.planes
+    planes = psf.planes
     if planes is None:
-        return spread_
-    weights = transfer.basis_weights(spread_, some.photons, some.column, some.row)[i]
+        return psf
+    weights = transfer.basis_weights(psf, some.photons, some.column, some.row)[i]
     image = transfer.image_of(planes, weights)
     alone = model.Planes(planes.wavelength[:1], image[None], planes.drift[:0], planes.half)
-    return replace(spread_, planes=alone, edges=None)
+    return replace(psf, planes=alone, edges=None)
 
 
 def moved(some: Sources, i: int, side: int) -> Sources:

@@ -162,12 +162,12 @@ def sources_changed(side: int | None, repeats: int) -> dict[str, float]:
     detector = detectors.detector("vis", "3-4", mission)
     detector = detector if side is None else replace(detector, nx=side, ny=side)
     some = standard(detector, _PITCH)
-    spread = euclid.vis_psf(detector, passbands.load("euclid_vis"), mission)
-    light = stamps.draw(some, np.full(len(some), _STAMP), spread, detector.nx, detector.ny)
+    psf = euclid.vis_psf(detector, passbands.load("euclid_vis"), mission)
+    light = stamps.draw(some, np.full(len(some), _STAMP), psf, detector.nx, detector.ny)
     lights = Lights(np.array([100.0]), np.array([100.0]), np.array([_LIGHT]))
     scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(light.max()), detector, lights)
     out: dict[str, float] = {}
-    own = _drawn(some, spread, light, scene, repeats, out)
+    own = _drawn(some, psf, light, scene, repeats, out)
     for name, change in {vis.DRAWN.name: own, **changes(scene, some, light)}.items():
         for kind, chosen in (("star", some.shape < 0), ("galaxy", some.shape >= 0)):
             mag, size, e1, e2 = np.nanmedian(change[chosen], axis=0)
@@ -177,13 +177,13 @@ def sources_changed(side: int | None, repeats: int) -> dict[str, float]:
 
 
 def _drawn(
-    some: Sources, spread: model.Psf, light: Frame, scene: Scene, repeats: int, out: dict[str, float]
+    some: Sources, psf: model.Psf, light: Frame, scene: Scene, repeats: int, out: dict[str, float]
 ) -> Frame:  # fmt: skip
     """Adds the figures of what is part of drawing: what that takes more with it; what it does to sources, [n, 4]."""
     (strength,) = vis.DRAWN.parameters(scene)
     sizes, (ny, nx) = np.full(len(some), _STAMP), light.shape
     with_it, without = (
-        partial(stamps.draw, some, sizes, one, nx, ny) for one in (replace(spread, intra_pixel=strength), spread)
+        partial(stamps.draw, some, sizes, one, nx, ny) for one in (replace(psf, intra_pixel=strength), psf)
     )
     more = report.best(with_it, repeats, time.process_time) - report.best(without, repeats, time.process_time)
     # Less than two drawings differ by chance.

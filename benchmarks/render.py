@@ -53,18 +53,18 @@ _NOTES = {
 
 def seconds(scene: Scene, settings: Settings, repeats: int, stars: bool = True, shared: bool = False) -> float:
     """CPU s of all sources, or of the galaxies alone; `shared`: one PSF for all."""
-    some, spread = scenes.sources(scene, 1, stars=None if stars else 0), _spread(scene, settings)
-    if shared and spread.planes is not None:
-        spread = scenes.own(spread, some, 0)
+    some, psf = scenes.sources(scene, 1, stars=None if stars else 0), _psf(scene, settings)
+    if shared and psf.planes is not None:
+        psf = scenes.own(psf, some, 0)
         some = replace(some, photons=None)
     # The brightest are drawn in double precision, which is compiled on its own.
     bright = some.electrons >= np.sort(some.electrons)[-3]
-    scenes.draw(some.take(bright | (np.arange(len(some)) % 500 == 0)), spread, scene, settings)
-    return report.best(lambda: scenes.draw(some, spread, scene, settings), repeats, time.process_time)
+    scenes.draw(some.take(bright | (np.arange(len(some)) % 500 == 0)), psf, scene, settings)
+    return report.best(lambda: scenes.draw(some, psf, scene, settings), repeats, time.process_time)
 
 
-def _spread(scene: Scene, settings: Settings) -> model.Psf:
-    return scenes.spread(scene, settings.positions, settings.colours)
+def _psf(scene: Scene, settings: Settings) -> model.Psf:
+    return scenes.psf_of(scene, settings.positions, settings.colours)
 
 
 def planes_seconds() -> tuple[float, float]:
@@ -73,7 +73,7 @@ def planes_seconds() -> tuple[float, float]:
     with scenes.empty_cache():
         for _ in range(2):
             start = time.process_time()
-            scenes.spread(VIS)
+            scenes.psf_of(VIS)
             out.append(time.process_time() - start)
     return out[0], out[1]
 

@@ -84,7 +84,7 @@ class Known:
     """One of a sample: itself, on frames that it is in the middle of, and its PSF; its image and response to shear."""
 
     sources: Sources
-    spread: model.Psf
+    psf: model.Psf
     image: Float
     response: Float | None
 
@@ -95,7 +95,7 @@ class Known:
 
 def sample(some: Sources, pairs: int, highest: float = 0.0) -> list[Known]:
     """Sources with the truth about them, the first galaxies' response too; highest : galsim's, if that is the truth."""
-    full, out = scenes.spread(VIS), []
+    full, out = scenes.psf_of(VIS), []
     order = np.random.default_rng(_CHOSEN_SEED).permutation(len(some))
     for i in order:
         own, one = scenes.own(full, some, i), scenes.moved(some, i, errors.COMPARED)
@@ -122,10 +122,8 @@ def _truth(one: Sources, own: model.Psf, highest: float) -> Float | None:
     return references.image(one, own, errors.COMPARED, highest)
 
 
-def _response(one: Sources, spread: model.Psf, approximation: Approximation, settings: Settings) -> Float:
-    return errors.response(
-        lambda each: approximation.draw(each, spread, VIS, settings, errors.COMPARED), one, VIS.scale
-    )
+def _response(one: Sources, psf: model.Psf, approximation: Approximation, settings: Settings) -> Float:
+    return errors.response(lambda each: approximation.draw(each, psf, VIS, settings, errors.COMPARED), one, VIS.scale)
 
 
 def compared(
@@ -134,10 +132,10 @@ def compared(
     """(errors [n, 5], m and c [pairs, 2]) of galaxies; others : the same as they are approximated, or themselves."""
     found, bias = [], []
     for galaxy, other in zip(galaxies, others, strict=True):
-        image = approximation.draw(other.sources, other.spread, VIS, settings, errors.COMPARED)
+        image = approximation.draw(other.sources, other.psf, VIS, settings, errors.COMPARED)
         found.append(errors.errors(image, galaxy.image, VIS, galaxy.sources))
         if galaxy.response is not None:
-            response = _response(other.sources, other.spread, approximation, settings)
+            response = _response(other.sources, other.psf, approximation, settings)
             bias.append(errors.bias(response, galaxy.response))
     return np.array(found), np.array(bias)
 
@@ -147,16 +145,18 @@ def _summary(found: Float, bias: Float) -> Row:
     return {**errors.figures(found), "shear_m_worst": float(m), "shear_c_worst": float(c), "galaxies": len(found)}
 
 
-def point(settings: Settings, chosen: list[Known], held: list[Known], spread: Mapping[str, dict[str, float]]) -> Row:
+def point(
+    settings: Settings, chosen: list[Known], held: list[Known], psf_errors: Mapping[str, dict[str, float]]
+) -> Row:
     """Errors of settings: of the sources that they are chosen on, and of others.
 
-    spread : "" and "_held": the largest errors of the PSF's own positions and colours
+    psf_errors : "" and "_held": the largest errors of the PSF's own positions and colours
     """
     row: Row = {}
     for kind, some in (("", chosen), ("_held", held)):
         found, bias = compared(settings, some, some)
         drawn = _largest(found, bias, np.array([each.star for each in some]))
-        row |= {f"{name}{kind}": math.hypot(drawn[name], spread[kind].get(name, 0.0)) for name in _NUMBERS}
+        row |= {f"{name}{kind}": math.hypot(drawn[name], psf_errors[kind].get(name, 0.0)) for name in _NUMBERS}
         row |= {f"{name}{kind}_drawn": value for name, value in drawn.items()}
     mag = np.array([float(scenes.magnitudes(each.sources, VIS)[0]) for each in held])
     for low, high in pairwise(scenes.LAYERS):
@@ -179,11 +179,11 @@ def _largest(found: Float, bias: Float, star: Bool) -> dict[str, float]:
 def approximated(approximation: Approximation, settings: Settings, repeats: int, quoted: list[Known]) -> Row:
     """What an approximation buys and costs: seconds of its galaxies with and without, and errors."""
     n, pairs, timed = approximation.numbers
-    some, full = scenes.sources(VIS, _SCENE_SEED, stars=0), scenes.spread(VIS)
+    some, full = scenes.sources(VIS, _SCENE_SEED, stars=0), scenes.psf_of(VIS)
     if timed:
         some = approximation.concerned(VIS, _SCENE_SEED, timed)
     row: Row = {"galaxies_timed": len(some), "seconds_before": _seconds(some, full, settings, repeats)}
-    simple, less = approximation.simplified(some), approximation.spread(full)
+    simple, less = approximation.simplified(some), approximation.psf(full)
     row["seconds"] = _seconds(simple, less, settings, repeats, approximation.timed or approximation)
     some = approximation.concerned(VIS, _QUOTED_SEED, n)
     galaxies = quoted if approximation.concerned is NONE.concerned else sample(some, pairs)
@@ -196,20 +196,20 @@ def approximated(approximation: Approximation, settings: Settings, repeats: int,
 def _changed(galaxy: Known, some: Sources, less: model.Psf, approximation: Approximation) -> Known:
     """A galaxy of `some` as it is approximated; `less`: the detector's PSF as it is."""
     one = replace(approximation.simplified(galaxy.sources), photons=None)
-    if approximation.spread is NONE.spread:
+    if approximation.psf is NONE.psf:
         return replace(galaxy, sources=one)
     place = np.flatnonzero(some.ids == galaxy.sources.ids[0])
-    return replace(galaxy, sources=one, spread=scenes.own(less, approximation.simplified(some), int(place[0])))
+    return replace(galaxy, sources=one, psf=scenes.own(less, approximation.simplified(some), int(place[0])))
 
 
 def _seconds(
-    some: Sources, spread: model.Psf, settings: Settings, repeats: int, approximation: Approximation = NONE
+    some: Sources, psf: model.Psf, settings: Settings, repeats: int, approximation: Approximation = NONE
 ) -> float:
     """CPU s of sources on the scene's frame."""
     # The brightest are drawn in double precision, which is compiled on its own.
     bright = some.electrons >= np.sort(some.electrons)[-3:].min()
-    approximation.draw(some.take(bright | (np.arange(len(some)) % 500 == 0)), spread, VIS, settings)
-    return report.best(lambda: approximation.draw(some, spread, VIS, settings), repeats, time.process_time)
+    approximation.draw(some.take(bright | (np.arange(len(some)) % 500 == 0)), psf, VIS, settings)
+    return report.best(lambda: approximation.draw(some, psf, VIS, settings), repeats, time.process_time)
 
 
 def together(some: Sequence[Settings], repeats: int) -> dict[Settings, float]:
@@ -217,8 +217,8 @@ def together(some: Sequence[Settings], repeats: int) -> dict[Settings, float]:
     scene, out = scenes.sources(VIS, _SCENE_SEED), dict.fromkeys(some, np.inf)
     for _ in range(repeats):
         for each in some:
-            spread = scenes.spread(VIS, each.positions, each.colours)
-            out[each] = min(out[each], _seconds(scene, spread, each, 1))
+            psf = scenes.psf_of(VIS, each.positions, each.colours)
+            out[each] = min(out[each], _seconds(scene, psf, each, 1))
     return out
 
 
@@ -227,7 +227,7 @@ def by_galsim(held: list[Known], each: int) -> Row:
     default, _ = peers.galsim_seconds(VIS, each)
     some = [known for known in held if not known.star]
     found = [
-        errors.errors(peers.galsim_image(g.sources, g.spread, errors.COMPARED), g.image, VIS, g.sources) for g in some
+        errors.errors(peers.galsim_image(g.sources, g.psf, errors.COMPARED), g.image, VIS, g.sources) for g in some
     ]
     return {"seconds": default, **errors.figures(np.array(found)), "galaxies": len(found)}
 
@@ -236,7 +236,7 @@ def oracles(held: list[Known]) -> Iterator[Row]:
     """How far galsim's tightest is to be trusted: others that should be as good, against it, of the same galaxies."""
     some = [known for known in held if not known.star]
     ways: dict[str, Callable[[Known], Float | None]] = {
-        "ours, the largest stamps": lambda g: scenes.draw(g.sources, g.spread, VIS, _TRUTH, errors.COMPARED)
+        "ours, the largest stamps": lambda g: scenes.draw(g.sources, g.psf, VIS, _TRUTH, errors.COMPARED)
     }
     for name, folding, highest in _LOOSER:
         ways[name] = partial(_looser, folding=folding, highest=highest)
@@ -252,11 +252,11 @@ def oracles(held: list[Known]) -> Iterator[Row]:
 
 
 def _by_series(known: Known) -> Float:
-    return references.by_series(known.sources, known.spread, errors.COMPARED)
+    return references.by_series(known.sources, known.psf, errors.COMPARED)
 
 
 def _looser(known: Known, folding: float, highest: float) -> Float | None:
-    return references.image(known.sources, known.spread, errors.COMPARED, highest, folding)
+    return references.image(known.sources, known.psf, errors.COMPARED, highest, folding)
 
 
 def walk(quick: bool, repeats: int) -> Iterator[Row]:
@@ -268,12 +268,14 @@ def walk(quick: bool, repeats: int) -> Iterator[Row]:
     held = errors.capped(sample, scenes.stratified(VIS, _HELD_SEED, others), pairs, 0.0 if quick else _HIGHEST)
     kinds = list(dict.fromkeys((some.positions, some.colours) for some in (*chain, *changed)))
     stars = (positions.STARS, positions.HELD)
-    spread = [positions.largest(seed, 4 if quick else n, kinds) for seed, n in zip(_PSF_SEEDS, stars, strict=True)]
+    psf_errors = [positions.largest(seed, 4 if quick else n, kinds) for seed, n in zip(_PSF_SEEDS, stars, strict=True)]
     seconds = errors.capped(together, [*chain, *changed], repeats)
     for kind, some in (("settings", chain), ("changed", changed)):
         for i, settings in enumerate(some):
             name = f"{i + 1}" if kind == "settings" else "{} {:g}".format(*_CHANGED[i])
-            own = {end: of[settings.positions, settings.colours] for end, of in zip(("", "_held"), spread, strict=True)}
+            own = {
+                end: of[settings.positions, settings.colours] for end, of in zip(("", "_held"), psf_errors, strict=True)
+            }
             found = errors.capped(point, settings, chosen, held, own)
             about = {"kind": kind, "name": name, **asdict(settings), "seconds": seconds[settings]}
             yield {**about, **found, "machine": report.machine()}

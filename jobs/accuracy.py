@@ -1,4 +1,4 @@
-"""The one knob: how wrong a user allows a product to be.  What it buys in speed is looked up, never chosen by name.
+"""Accuracy: how wrong a user allows a product to be.  What it buys in speed is looked up, never chosen by name.
 
 Accuracy     what is asked for: the presets, or numbers of one's own
 row_for      the cheapest measured settings of drawing (accuracy.csv) that are within it

@@ -1,4 +1,4 @@
-"""Arrays that are costly to make and the same for everybody: kept on disc, keyed by what they were made from.
+"""Arrays that are costly to make and the same for every run: kept on disc, keyed by what they were made from.
 
 A process compares a file with its checksum before it first maps it; what differs is made again, and said so.
 

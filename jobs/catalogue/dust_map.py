@@ -128,7 +128,7 @@ def chosen(seed: int, own: DustMap | None) -> Float32:
 
 
 def read(own: DustMap) -> Float32:
-    """A map of others as ours are: A(V), RING, Galactic, not finer than the embedded one.
+    """An external map in the form of the embedded one: A(V), RING, Galactic, not finer than the embedded one.
 
     returns : float32[pixel] mag
     Errors: BadInput names the file, and what is missing or wrong: ordering, coordinates, or the row of a pixel

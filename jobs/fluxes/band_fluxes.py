@@ -149,7 +149,7 @@ def prepare(
     chosen = [(curve, setting) for curve, setting in zip(curves, settings, strict=True) if setting is not None]
     if chosen:
         grid = flux_tables.open_grid([curve for curve, _ in chosen], [setting for _, setting in chosen], library)
-        flux_tables.warm(grid)
+        flux_tables.compile_kernels(grid)
     if stars_tabulated(accuracy):
         flux_tables.stars(Stars(np.zeros(1, np.int64), np.zeros(1), np.zeros(1)), curves, stars)
 

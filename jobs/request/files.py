@@ -1,4 +1,4 @@
-"""Files of others that a request names.
+"""External files that a request names.
 
 UserCurves, curves  spectra, filters and extinction laws: the section `fluxes`
 Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
@@ -45,7 +45,7 @@ class UserCurves:
 
 @dataclass(frozen=True, slots=True)
 class Catalogue:
-    """Files of a catalogue of others; columns : (our key, JSON of what stands for it) beside those of the format."""
+    """Files of an external catalogue; columns : (our key, JSON of what stands for it) beside those of the format."""
 
     files: tuple[Path, ...]
     format: str = ""

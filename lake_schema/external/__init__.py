@@ -1,1 +1,1 @@
-"""Files and tables of others."""
+"""External files and tables."""

@@ -1,10 +1,10 @@
-"""FITS files of others, read with bounds: columns of numbers, HEALPix maps, cubes of planes.
+"""External FITS files, read with bounds: columns of numbers, HEALPix maps, cubes of planes.
 
-read_numbers    somebody's binary table -> its columns of numbers
+read_numbers    an external binary table -> its columns of numbers
 number_batches  the same, some columns and a bounded piece at a time
 read_table      the same as an astropy table
-read_map        somebody's HEALPix map -> its pixels and header
-read_planes     somebody's image of two or three axes -> its samples and header
+read_map        an external HEALPix map -> its pixels and header
+read_planes     an external image of two or three axes -> its samples and header
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def number_batches(
 
 
 def read_table(path: Path, kind: str) -> Any:
-    """Somebody's first table as an astropy QTable, units and all; errors as of read_numbers."""
+    """An external file's first table as an astropy QTable, units and all; errors as of read_numbers."""
     # Slow to import, and seldom needed.
     from astropy.table import QTable
 
@@ -138,7 +138,7 @@ def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
 
 
 def read_planes(path: Path, column: str, kind: str = "PSF") -> tuple[Float, dict[str, Any]]:
-    """Somebody's planes, float64[ny, nx] or [n, ny, nx], with the cards of their header.
+    """An external file's planes, float64[ny, nx] or [n, ny, nx], with the cards of their header.
 
     The first image of two or three axes, or the array that the first row of a table has in `column`.
 
@@ -177,7 +177,7 @@ def _numbers_of(unit: Any) -> dict[str, Float]:
 
 @contextmanager
 def _opened(path: Path, kind: str) -> Iterator[fits.HDUList]:
-    """Somebody's file, plain or packed by gzip, its headers looked through before astropy is given it.
+    """An external file, plain or packed by gzip, its headers looked through before astropy is given it.
 
     Errors : BadInput, whatever it is that astropy trips over: what its readers raise has no end
     """

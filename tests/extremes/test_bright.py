@@ -18,7 +18,7 @@ from lake_schema.store import validate
 from lake_schema.tables.galaxies import GALAXIES
 from tests.extremes.test_stamps import source_of
 from tests.jobs.render import nominal
-from tests.jobs.render.fields import small, spread
+from tests.jobs.render.fields import psf_of, small
 
 NOISE = {"vis": 12.0, "lsstcam": 38.0}
 # Magnitudes from the Moon's to faint stars', in no time and in eleven days: electrons.
@@ -28,12 +28,16 @@ LIGHT = st.floats(0.0, 16.9).map(lambda x: 10.0**x)
 def drawn(camera, electrons, seeing=None, side=256, accuracy=SURVEY, most=1024, **shape):
     """(frame, size, light of the stamp on it): of one source whose stamp is at most so large."""
     source = source_of(camera, electrons, column=side / 2 + 0.3, row=side / 2 - 0.4, **shape)
-    beam = spread(camera) if seeing is None else ground_psf(seeing, 3.0, 0.2)
+    beam = psf_of(camera) if seeing is None else ground_psf(seeing, 3.0, 0.2)
     settings, noise = settings_for(accuracy), NOISE[camera]
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, beam, noise, settings)
     light = np.zeros(1)
-    sizes, floors = np.minimum(sizes, most), stamp_sizes.floors(source.electrons, noise, settings)
-    return stamps.draw(source, sizes, beam, side, side, floors=floors, tally=stamps.Tally(light)), sizes[0], light[0]
+    sizes, neglected = np.minimum(sizes, most), stamp_sizes.neglected_flux(source.electrons, noise, settings)
+    return (
+        stamps.draw(source, sizes, beam, side, side, neglected=neglected, tally=stamps.Tally(light)),
+        sizes[0],
+        light[0],
+    )
 
 
 @given(
@@ -102,8 +106,8 @@ def test_an_axis_ratio_is_drawn_as_it_is_given(ratio):
         "vis", 1e6, column=64.0, row=64.0, bulge_fraction=1.0, bulge_sersic_index=1.0, bulge_axis_ratio=ratio
     )
     asked = replace(source, shapes=replace(source.shapes, bulge_axis_ratio=np.array([ratio])))
-    image = stamps.draw(source, np.array([128]), spread("vis"), 128, 128)
-    expected = reference.reference(asked, 0, spread("vis"), 128)
+    image = stamps.draw(source, np.array([128]), psf_of("vis"), 128, 128)
+    expected = reference.reference(asked, 0, psf_of("vis"), 128)
     np.testing.assert_allclose(image[34:94, 34:94], expected[34:94, 34:94], atol=1e-3 * expected.max())
 
 

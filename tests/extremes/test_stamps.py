@@ -27,7 +27,7 @@ from jobs.render.exposure.records import Rows
 from jobs.render.sources import galaxy_shapes, source_list
 from jobs.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
-from tests.jobs.render.fields import aimed, galaxies, moments, one_source, small, spread, stars
+from tests.jobs.render.fields import aimed, galaxies, moments, one_source, psf_of, small, stars
 
 NOISE = 12.0
 # Seconds of processor time: a large galaxy takes 1, what does not end takes for ever.
@@ -59,15 +59,15 @@ HUGE = {
 def drawn(source, psf, side=SIDE, accuracy=SURVEY):
     settings = settings_for(accuracy)
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
-    floors = stamp_sizes.floors(source.electrons, NOISE, settings)
-    return stamps.draw(source, sizes, psf, side, side, floors=floors), int(sizes[0])
+    neglected = stamp_sizes.neglected_flux(source.electrons, NOISE, settings)
+    return stamps.draw(source, sizes, psf, side, side, neglected=neglected), int(sizes[0])
 
 
 @cache
 def compiled():
     """Both precisions once, or the clock counts the compiler."""
     for electrons in (1e4, 1e8):
-        drawn(source_of("vis", electrons, bulge_fraction=0.5), spread("vis"))
+        drawn(source_of("vis", electrons, bulge_fraction=0.5), psf_of("vis"))
 
 
 def source_of(camera, electrons, **where_and_shape):
@@ -81,7 +81,7 @@ def test_flux_is_right_and_nothing_rings(camera, kind):
     # A frame that holds the largest stamp of these, and what is drawn beyond it.
     side = 4 * SIDE
     source = source_of(camera, 1e4, column=side / 2 + 0.3, row=side / 2 - 0.4, **SHAPES[kind])
-    image, size = drawn(source, spread(camera), side)
+    image, size = drawn(source, psf_of(camera), side)
     assert size < side
     assert np.isfinite(image).all()
     assert image.sum() == pytest.approx(1e4, rel=2e-6 if kind != "n 6.2" else 2e-4)
@@ -92,7 +92,7 @@ def test_flux_is_right_and_nothing_rings(camera, kind):
 def test_the_largest_are_bounded_in_time(kind):
     compiled()
     start = time.process_time()
-    image, size = drawn(source_of("vis", 1e6, **HUGE[kind]), spread("vis"))
+    image, size = drawn(source_of("vis", 1e6, **HUGE[kind]), psf_of("vis"))
     assert size <= stamp_sizes.SIZES[-1]
     assert time.process_time() - start < HANGS
     assert np.isfinite(image).all()
@@ -102,20 +102,20 @@ def test_the_largest_are_bounded_in_time(kind):
 @pytest.mark.parametrize("electrons", [1e-6, 1.0, 1e7 - 1, 1e7 + 1, 1e11])
 def test_linear_in_flux(electrons):
     """Single and double precision alike."""
-    whole, _ = drawn(source_of("lsstcam", electrons), spread("lsstcam"))
+    whole, _ = drawn(source_of("lsstcam", electrons), psf_of("lsstcam"))
     settings = settings_for(SURVEY)
     one = source_of("lsstcam", 1e5)
-    sizes = stamp_sizes.stamp_sizes(np.array([electrons]), one.shape, one.shapes, spread("lsstcam"), NOISE, settings)
-    unit = stamps.draw(one, sizes, spread("lsstcam"), SIDE, SIDE) / 1e5
+    sizes = stamp_sizes.stamp_sizes(np.array([electrons]), one.shape, one.shapes, psf_of("lsstcam"), NOISE, settings)
+    unit = stamps.draw(one, sizes, psf_of("lsstcam"), SIDE, SIDE) / 1e5
     np.testing.assert_allclose(whole, electrons * unit, atol=3e-6 * electrons * unit.max() + 1e-6)
 
 
 @pytest.mark.parametrize("electrons", [1e8, 1e10])
 def test_a_bright_star_shines_as_far_as_it_shows(electrons):
     """Behind an atmosphere: a Moffat's light at any distance, sampled on pixels."""
-    image, size = drawn(source_of("lsstcam", electrons, column=500.0, row=500.0), spread("lsstcam"), 1000)
+    image, size = drawn(source_of("lsstcam", electrons, column=500.0, row=500.0), psf_of("lsstcam"), 1000)
     assert size >= (128 if electrons == 1e8 else 256)
-    profile = spread("lsstcam").profile
+    profile = psf_of("lsstcam").profile
     for radius in (30, 60, 100, 140, 300):
         expected = electrons * profile.xValue(0.2 * radius, 0.0) * 0.2**2
         assert image[500, 500 + radius] == pytest.approx(expected, rel=0.02, abs=1.5 * SURVEY.background * NOISE)
@@ -134,9 +134,9 @@ def test_a_bright_star_shines_as_far_as_it_shows(electrons):
 def test_edges_and_corners(x, y, least, most):
     """A detector sees what a larger one sees there; of a source on its edge, half."""
     source = source_of("vis", 1e4, inclination=40.0)
-    image, _ = drawn(replace(source, column=np.array([x]), row=np.array([y])), spread("vis"))
+    image, _ = drawn(replace(source, column=np.array([x]), row=np.array([y])), psf_of("vis"))
     moved = replace(source, column=np.array([x + SIDE]), row=np.array([y + SIDE]))
-    larger, _ = drawn(moved, spread("vis"), 3 * SIDE)
+    larger, _ = drawn(moved, psf_of("vis"), 3 * SIDE)
     np.testing.assert_allclose(image, larger[SIDE : 2 * SIDE, SIDE : 2 * SIDE], atol=2e-6 * 1e4)
     assert least * 1e4 <= image.sum() <= most * 1e4
     assert larger.sum() == pytest.approx(1e4 * (x > -SIDE), rel=2e-4, abs=1e-3)
@@ -145,16 +145,16 @@ def test_edges_and_corners(x, y, least, most):
 @pytest.mark.parametrize(("dx", "dy"), [(3, 0), (-7, 20)])
 def test_whole_pixels_move_the_image(dx, dy):
     args = {"inclination": 50.0, "bulge_fraction": 0.3}
-    base, _ = drawn(source_of("vis", 1e4, column=120.3, row=125.8, **args), spread("vis"))
+    base, _ = drawn(source_of("vis", 1e4, column=120.3, row=125.8, **args), psf_of("vis"))
     source = source_of("vis", 1e4, column=120.3, row=125.8, **args)
     other = source_list.Sources(
         source.ids, source.column + dx, source.row + dy, source.jacobian, source.electrons, source.shape, source.shapes
     )
-    np.testing.assert_allclose(drawn(other, spread("vis"))[0], np.roll(base, (dy, dx), (0, 1)), atol=1e-5 * base.max())
+    np.testing.assert_allclose(drawn(other, psf_of("vis"))[0], np.roll(base, (dy, dx), (0, 1)), atol=1e-5 * base.max())
 
 
 def test_a_face_on_disc_is_symmetric():
-    image, _ = drawn(source_of("vis", 1e4, column=128.0, row=128.0, inclination=0.0), spread("vis"))
+    image, _ = drawn(source_of("vis", 1e4, column=128.0, row=128.0, inclination=0.0), psf_of("vis"))
     core = image[98:159, 98:159]
     np.testing.assert_allclose(core, core[::-1, ::-1], atol=1e-5 * core.max())
 
@@ -172,11 +172,11 @@ def test_any_order_gives_the_same_bits(seed):
     )  # fmt: skip
     sizes = np.full(n, 64)
     sizes[::7] = 96
-    base = stamps.draw(source, sizes, spread("vis"), SIDE, SIDE)
+    base = stamps.draw(source, sizes, psf_of("vis"), SIDE, SIDE)
     order = rng.permutation(n)
-    np.testing.assert_array_equal(base, stamps.draw(source.take(order), sizes[order], spread("vis"), SIDE, SIDE))
+    np.testing.assert_array_equal(base, stamps.draw(source.take(order), sizes[order], psf_of("vis"), SIDE, SIDE))
     halves = [
-        stamps.draw(source.take(part), sizes[part], spread("vis"), SIDE, SIDE) for part in np.array_split(order, 2)
+        stamps.draw(source.take(part), sizes[part], psf_of("vis"), SIDE, SIDE) for part in np.array_split(order, 2)
     ]
     np.testing.assert_array_equal(base, sum(halves))
 
@@ -211,7 +211,7 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     """On a frame as large as the stamp nothing is lost but what the profile has outside; memory and seconds are bounded
     before anything is drawn."""
     shape, electrons = what
-    source, psf = source_of(camera, electrons, **shape), spread(camera)
+    source, psf = source_of(camera, electrons, **shape), psf_of(camera)
     settings = settings_for(accuracy)
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
     assert cost.memory(source.electrons, sizes, 4096, 4132) < 1.4e9
@@ -221,9 +221,9 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     side = int(sizes[0])
     source.column[:], source.row[:] = side // 2, side // 2
     compiled()
-    floors = stamp_sizes.floors(source.electrons, NOISE, settings)
+    neglected = stamp_sizes.neglected_flux(source.electrons, NOISE, settings)
     start = time.process_time()
-    image = stamps.draw(source, sizes, psf, side, side, floors=floors)
+    image = stamps.draw(source, sizes, psf, side, side, neglected=neglected)
     assert time.process_time() - start < HANGS
     assert np.isfinite(image).all()
     # A pixel is rounded to 2^-20 electrons; single precision sums to 1e-6.
@@ -234,14 +234,14 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
     # Where nothing is taken off the stamp all of its light is on it.
     with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
-        image = stamps.draw(source, sizes, psf, side, side, floors=floors)
+        image = stamps.draw(source, sizes, psf, side, side, neglected=neglected)
     assert image.sum() == pytest.approx(electrons, rel=2e-6, abs=image.size * 2.0**-21)
     assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
 
 
 @given(st.floats(1e-3, 1e10), st.sampled_from(sorted(SHAPES)))
 def test_half_the_flux_is_half_the_image(electrons, kind):
-    source, psf, sizes = source_of("lsstcam", electrons, **SHAPES[kind]), spread("lsstcam"), np.array([64])
+    source, psf, sizes = source_of("lsstcam", electrons, **SHAPES[kind]), psf_of("lsstcam"), np.array([64])
     half = source_of("lsstcam", 0.5 * electrons, **SHAPES[kind])
     whole, less = (stamps.draw(one, sizes, psf, 64, 64) for one in (centred(source), centred(half)))
     np.testing.assert_allclose(less, 0.5 * whole, atol=3e-6 * whole.max() + 2.0**-20)
@@ -255,10 +255,10 @@ def centred(source, at=32.0):
 @given(st.sampled_from(sorted(SHAPES)), st.integers(-9, 9), st.integers(-9, 9), st.floats(92, 100), st.floats(92, 100))
 def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
     source = source_of("vis", 1e4, column=x, row=y, **SHAPES[kind])
-    base = stamps.draw(source, np.array([128]), spread("vis"), 192, 192)
+    base = stamps.draw(source, np.array([128]), psf_of("vis"), 192, 192)
     source.column[:] += dx
     source.row[:] += dy
-    moved = stamps.draw(source, np.array([128]), spread("vis"), 192, 192)
+    moved = stamps.draw(source, np.array([128]), psf_of("vis"), 192, 192)
     # Beside a half pixel the stamp itself may lie one farther; what lies beyond it is on blocks of the frame.
     middle = slice(76, 116)
     expected = np.roll(base, (dy, dx), (0, 1))[middle, middle]
@@ -267,10 +267,10 @@ def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
     source.column[:] -= 32.0
     source.row[:] -= 32.0
     with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
-        moved = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
+        moved = stamps.draw(source, np.array([64]), psf_of("vis"), 128, 128)
         source.column[:] -= dx
         source.row[:] -= dy
-        base = stamps.draw(source, np.array([64]), spread("vis"), 128, 128)
+        base = stamps.draw(source, np.array([64]), psf_of("vis"), 128, 128)
     middle = slice(44, 84)
     expected = np.roll(base, (dy, dx), (0, 1))[middle, middle]
     np.testing.assert_allclose(moved[middle, middle], expected, atol=2e-4 * base.max() + 2.0**-20)
@@ -279,13 +279,13 @@ def test_any_whole_step_moves_the_image(kind, dx, dy, x, y):
 @given(st.sampled_from([kind for kind in SHAPES if "gamma1" not in SHAPES[kind]]), st.floats(0, 180))
 def test_a_galaxy_turned_by_half_a_turn_is_itself(kind, angle):
     source = centred(source_of("vis", 1e4, position_angle=angle, **SHAPES[kind]), 48.0)
-    image = stamps.draw(source, np.array([96]), spread("vis"), 97, 97)
+    image = stamps.draw(source, np.array([96]), psf_of("vis"), 97, 97)
     # What lies beyond the stamp is on blocks, which have another middle.
     inside = image[17:80, 17:80]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
     # A stamp that nothing is taken off is so to its edges.
     with mock.patch.object(stamp_sizes, "_OUTSIDE", 2.0):
-        image = stamps.draw(centred(source), np.array([64]), spread("vis"), 65, 65)
+        image = stamps.draw(centred(source), np.array([64]), psf_of("vis"), 65, 65)
     inside = image[1:64, 1:64]
     np.testing.assert_allclose(inside, inside[::-1, ::-1], atol=2e-6 * image.max() + 2.0**-20)
 
@@ -305,9 +305,9 @@ def test_any_sources_in_any_order_give_the_same_bits(several, shuffled):
     order = np.arange(len(some))
     shuffled.shuffle(order)
     sizes = np.array([56, 64])[np.arange(len(some)) % 2]
-    base, other = (stamps.draw(together.take(o), sizes[o], spread("vis"), 64, 64) for o in (slice(None), order))
+    base, other = (stamps.draw(together.take(o), sizes[o], psf_of("vis"), 64, 64) for o in (slice(None), order))
     np.testing.assert_array_equal(base, other)
-    alone = [stamps.draw(one, sizes[i : i + 1], spread("vis"), 64, 64) for i, one in enumerate(some)]
+    alone = [stamps.draw(one, sizes[i : i + 1], psf_of("vis"), 64, 64) for i, one in enumerate(some)]
     np.testing.assert_allclose(sum(alone), base, atol=1e-5 + 1e-6 * base.max())
 
 
@@ -347,10 +347,10 @@ SLIM = {
 def test_what_is_taken_off_slim_galaxies_is_theirs(kind, accuracy):
     """A frame of twice the stamp: nothing is doubled, and no pixel is darker than the noise allows."""
     shape = {"bulge_fraction": 1.0} | SLIM[kind]
-    size = drawn(source_of("vis", 1e5, **shape), spread("vis"), accuracy=accuracy)[1]
+    size = drawn(source_of("vis", 1e5, **shape), psf_of("vis"), accuracy=accuracy)[1]
     side = 2 * size
     source = source_of("vis", 1e5, column=side / 2 + 0.3, row=side / 2 - 0.4, **shape)
-    image, _ = drawn(source, spread("vis"), side, accuracy)
+    image, _ = drawn(source, psf_of("vis"), side, accuracy)
     least = 1.0 - galaxy_shapes.outside(source.shapes, np.array([0.5 * side * 0.1]))[0]
     assert 1e5 * (least - 1e-3) < image.sum() < 1e5 * (1 + 2e-6)
     assert image.min() > -accuracy.background * NOISE
@@ -360,7 +360,7 @@ def test_light_of_a_disc_on_edge_leaves_its_stamp():
     """It is as thick as it is high: as much leaves a small stamp as a large one has there."""
     source = source_of("vis", 1e6, inclination=90.0, disk_half_light_radius=0.8, position_angle=33.0)
     centred(source, 128.0)
-    small, large = (stamps.draw(source, np.array([size]), spread("vis"), SIDE, SIDE) for size in (48, 512))
+    small, large = (stamps.draw(source, np.array([size]), psf_of("vis"), SIDE, SIDE) for size in (48, 512))
     y, x = np.abs(np.mgrid[:SIDE, :SIDE] - 128)
     outside = np.maximum(x, y) > 24
     assert large[outside].sum() > 1e4
@@ -375,7 +375,7 @@ def test_a_stamp_gives_no_more_than_what_is_outside(index):
     # Its stamp lies beside the frame, left and right, alike on the blocks: there is no more than what leaves it.
     for column in (-26.0, 2078.0):
         source = source_of("vis", 1e6, column=column, row=1023.5, bulge_axis_ratio=0.02, position_angle=80.0, **shape)
-        light += stamps.draw(source, np.array([48]), spread("vis"), 2048, 2048).sum()
+        light += stamps.draw(source, np.array([48]), psf_of("vis"), 2048, 2048).sum()
     outside = 1e6 * galaxy_shapes.outside(source.shapes, np.array([2.4]))[0]
     assert 0.1 * outside < light < outside
 
@@ -388,7 +388,7 @@ def response(size, q):
     found = []
     for g in (-0.01, 0.01):
         source = centred(source_of("vis", 1e5, position_angle=45.0, gamma1=g, **shape), 64.0)
-        light = np.exp(-0.5 * (x**2 + y**2) / 8.0**2) * stamps.draw(source, np.array([size]), spread("vis"), 128, 128)
+        light = np.exp(-0.5 * (x**2 + y**2) / 8.0**2) * stamps.draw(source, np.array([size]), psf_of("vis"), 128, 128)
         found.append((light * (x**2 - y**2)).sum() / (light * (x**2 + y**2)).sum())
     return (found[1] - found[0]) / 0.02
 
@@ -415,7 +415,7 @@ def test_what_is_taken_off_ends_by_and_by_where_it_cancels():
         one = source_of("vis", 1e5, bulge_fraction=1.0, bulge_axis_ratio=q, bulge_half_light_radius=1.0)
         one = replace(centred(one, 64.0), jacobian=0.1 * np.eye(2)[None])
         outside = stamps._outside(one, *stamps._forms(one), np.array([64]), 0.1)
-        taken.append(frame.returning(np.array([64]), *np.full((2, 1), 32.0), outside[0], outside[2])[0])
+        taken.append(frame.aliased_light(np.array([64]), *np.full((2, 1), 32.0), outside[0], outside[2])[0])
     level, light = np.array(taken)[:, 0], np.array(taken)[:, -1]
     assert light[0] < 1.0 < 500.0 < light[-1]
     assert np.abs(np.diff(level)).max() < 0.15 * level.max()
@@ -425,9 +425,9 @@ def test_what_is_taken_off_ends_by_and_by_where_it_cancels():
 @pytest.mark.parametrize("kind", SHAPES)
 def test_single_precision_is_as_good_as_double(camera, kind, monkeypatch):
     source, sizes = source_of(camera, 9e6, **SHAPES[kind]), np.array([96])
-    single = stamps.draw(source, sizes, spread(camera), SIDE, SIDE)
+    single = stamps.draw(source, sizes, psf_of(camera), SIDE, SIDE)
     monkeypatch.setattr(stamp_sizes, "BRIGHT", 0.0)
-    double = stamps.draw(source, sizes, spread(camera), SIDE, SIDE)
+    double = stamps.draw(source, sizes, psf_of(camera), SIDE, SIDE)
     assert np.abs(single - double).max() < 5e-7 * double.max()
 
 
@@ -469,7 +469,7 @@ def test_photons_fall_where_the_image_is_bright(camera, kind):
     x, y = photons(source, {"position_angle": 40.0, **SHAPES[kind]}, n, np.random.default_rng(8), seeing / scale, beta)
     inside = (x >= 0) & (x < SIDE) & (y >= 0) & (y < SIDE)
     counted = np.bincount(y[inside] * SIDE + x[inside], minlength=SIDE**2).reshape(SIDE, SIDE)
-    image, _ = drawn(source, spread(camera))
+    image, _ = drawn(source, psf_of(camera))
     bright = image > 20
     pull = (counted - image)[bright] / np.sqrt(image[bright])
     assert bright.sum() > 20
@@ -497,13 +497,13 @@ def test_poles_and_the_seam_are_as_good_as_any_place(camera, ra, dec):
     body = galaxies(lon[:1], lat[:1], inclination=75.0, disk_half_light_radius=0.3)
     found, sizes = visible_sources.sources_of(
         Rows(body, None, stars(lon[1:], lat[1:]), None), (np.array([1e5]), np.array([1e5])),
-        aimed(detector, system, band), spread(camera), NOISE, settings,
+        aimed(detector, system, band), psf_of(camera), NOISE, settings,
     )  # fmt: skip
     np.testing.assert_allclose(np.stack([found.column, found.row], 1), places, atol=2e-6)
     # The telescope's distortion aside.
     np.testing.assert_allclose(np.linalg.det(found.jacobian), detector.pixel_scale**2, rtol=0.02)
     image = stamps.draw(
-        found, sizes, spread(camera), 128, 128, floors=stamp_sizes.floors(found.electrons, NOISE, settings)
+        found, sizes, psf_of(camera), 128, 128, neglected=stamp_sizes.neglected_flux(found.electrons, NOISE, settings)
     )
     assert np.isfinite(image).all()
     assert image.sum() == pytest.approx(2e5, rel=1e-3)
@@ -513,5 +513,5 @@ def test_poles_and_the_seam_are_as_good_as_any_place(camera, ra, dec):
 
 
 def test_nothing_is_drawn_of_no_flux():
-    image, _ = drawn(source_of("vis", 0.0, **SHAPES["slim"]), spread("vis"))
+    image, _ = drawn(source_of("vis", 0.0, **SHAPES["slim"]), psf_of("vis"))
     assert not image.any()

@@ -1,1 +1,1 @@
-"""Catalogues of others."""
+"""External catalogues."""

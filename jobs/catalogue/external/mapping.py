@@ -218,7 +218,7 @@ def _need(fields: Mapping[str, Field], path: str, *groups: tuple[str, ...]) -> N
 
 
 def _unit(text: str, where: str) -> Any:
-    # Slow to import, and needed for catalogues of others only.
+    # Slow to import, and needed for external catalogues only.
     from astropy import units
     from astropy.cosmology.units import littleh
 

@@ -1,4 +1,4 @@
-"""Spectra by the nearest of many observed galaxies, in colour, luminosity and redshift: a training table of others.
+"""Spectra by the nearest of many observed galaxies, in colour, luminosity and redshift: an external training table.
 
 load     the galaxies of a request's files, checked, from the cache or read now
 assign   the spectrum of the nearest one, scattered

@@ -1,4 +1,4 @@
-"""Stars of somebody else's model, such as an output of the Besancon model, instead of ours.
+"""Stars of an external model, such as an output of the Besancon model, instead of ours.
 
 load       a text or FITS table whose columns the request names -> stars by generation cell
 numbers, of_cell    of cells

@@ -221,7 +221,7 @@ def _placed(cell: int, universe: StarModel, dust: Float32, distance: Float, rng:
 
 
 def _given(cell: int, catalogue: StarCatalogue, universe: StarModel, dust: Float32) -> Lot:
-    """Stars of somebody's catalogue; what it does not say is null, dust is ours."""
+    """Stars of an external catalogue; what it does not say is null, dust is ours."""
     values = from_catalogue.of_cell(catalogue, cell)
     n = len(values["ra"])
     unknown = bright_stars.unknown(n)

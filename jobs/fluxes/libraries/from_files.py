@@ -1,4 +1,4 @@
-"""Spectra, extinction curves and passbands from files of others: checked, named, never guessed.
+"""Spectra, extinction curves and passbands from external files: checked, named, never guessed.
 
 formats         what can be read (spectrum_formats.toml)
 read            wavelengths and values of one file

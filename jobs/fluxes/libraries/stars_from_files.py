@@ -1,4 +1,4 @@
-"""Stars from files of others, in place of the embedded dwarfs.
+"""Stars from external files, in place of the embedded dwarfs.
 
 library    the stellar library with its dwarfs from models, with infrared spectra spliced on, or both
 basel      model spectra of Lejeune, Cuisinier & Buser 1997 (.cor)

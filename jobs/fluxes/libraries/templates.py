@@ -55,7 +55,7 @@ class Library:
     names      : n labels
     types      : what is known of the first stars, the dwarf sequence; None for galaxies
     dust       : float32[5, n_lambda] k(lambda) of the laws in front of galaxies, None = those of extinction.laws
-    own        : read from files of others: what was measured of the embedded one says nothing about it
+    own        : read from external files: what was measured of the embedded one says nothing about it
     intergalactic : what is between the galaxies absorbs (jobs.fluxes.spectra.intergalactic)
     """
 

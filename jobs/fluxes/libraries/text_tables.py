@@ -1,4 +1,4 @@
-"""What a table in text of another program may have, counted before astropy makes room for any of it.
+"""What an external table in text may have, counted before astropy makes room for any of it.
 
 Words of a column get as much room each as the longest of them, a header is read as YAML, which is slow and can name
 types of any size, and words in quotes may go over lines.

@@ -1,4 +1,4 @@
-"""What a VOTable of others may have, counted before astropy makes room for any of it.
+"""What an external VOTable may have, counted before astropy makes room for any of it.
 
 An XML parser that keeps nothing goes over the text first. Refused is what takes astropy a square of the time (tables,
 columns of one name), what it makes room for at once (arrays of a fixed size in every row), and what it would unpack or

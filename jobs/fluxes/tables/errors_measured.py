@@ -1,4 +1,4 @@
-"""How wrong the tables are for spectra and passbands of others, for which nothing was measured in advance.
+"""How wrong the tables are for external spectra and passbands, for which nothing was measured in advance.
 
 choose     setting and error of each band: looked up (flux_errors.csv), or measured here
 measured   the error of one setting, kept in the cache
@@ -32,7 +32,7 @@ _SAMPLE, _SEED = 4000, 5
 def choose(bands: Sequence[Passband], accuracy: Accuracy, library: Library) -> tuple[Choice, ...]:
     """For each band the smallest setting that is fine enough, see settings.choose.
 
-    For a passband or a library of others, or one behind absorbing gas, the errors of 4000 random galaxies decide, from
+    For an external passband or library, or one behind absorbing gas, the errors of 4000 random galaxies decide, from
     the setting upwards that is fine enough for all bands with the embedded library.
     """
     known = settings.choose([band.name for band in bands], accuracy)

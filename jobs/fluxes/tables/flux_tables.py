@@ -129,7 +129,7 @@ def _chunk(rows: Galaxies, grid: Grid, part: Int, out: Float) -> None:
     )  # fmt: skip
 
 
-def warm(grid: Grid) -> None:
+def compile_kernels(grid: Grid) -> None:
     """Compile, by computing one galaxy."""
     one, two = np.ones(1), np.zeros((2, 1))
     mix = Mix(one, two.astype(np.int64), two.astype(np.int64), two + 0.5, two)

@@ -47,13 +47,13 @@ def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
     pixels, transformed = work(pieces.take(here), sizes[here], psf)
     reach, _ = stamp_sizes.beyond_stamps(pieces.shapes.take(pieces.shape[body]), sizes[body], psf.pixel_scale)
     blocks = float(((2 * reach / wings.BLOCK) ** 2).sum())
-    far = stamp_sizes.shining(pieces.electrons, sizes, pieces.shape, pieces.picture, psf)
-    shone = far_light.seconds(sources.length[np.unique(whole[far])], nx, ny)
-    shone += far_light.unfold_seconds(np.hypot(*trail[here & far].T), sizes[here & far])
+    far = stamp_sizes.has_far_light(pieces.electrons, sizes, pieces.shape, pieces.picture, psf)
+    far_s = far_light.seconds(sources.length[np.unique(whole[far])], nx, ny)
+    far_s += far_light.remove_aliased_seconds(np.hypot(*trail[here & far].T), sizes[here & far])
     largest = stamp_sizes.on_largest(pieces.shape, sizes)
-    shone += outskirts.FRAME_S * nx * ny * float(largest.sum())
-    shone += outskirts.STAMP_S * float(SIZES[-1]) ** 2 * float((largest & here).sum())
-    return _STAMP_S * pixels + _PLANE_S * transformed + _BLOCK_S * blocks + shone + _FRAME_S * nx * ny + _START_S
+    far_s += outskirts.FRAME_S * nx * ny * float(largest.sum())
+    far_s += outskirts.STAMP_S * float(SIZES[-1]) ** 2 * float((largest & here).sum())
+    return _STAMP_S * pixels + _PLANE_S * transformed + _BLOCK_S * blocks + far_s + _FRAME_S * nx * ny + _START_S
 
 
 def memory(electrons: Float, sizes: Int, nx: int, ny: int, picture: Int | None = None) -> float:

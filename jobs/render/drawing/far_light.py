@@ -1,10 +1,10 @@
 """Light that the pupil's edges diffract far from a bright star, where its PSF's plane has ended.
 
-Star      one of them
-add       what a star shines outside the plane, onto a frame
-unfold    what of it the plane has inside, taken off
-left      how the plane fades there
-seconds, unfold_seconds   what `add` and `unfold` take
+Star             one of them
+add              what a star shines outside the plane, onto a frame
+remove_aliased   what of it the plane has inside, taken off
+left             how the plane fades there
+seconds, remove_aliased_seconds   what `add` and `remove_aliased` take
 
 Rings fall as r^-3, spikes are tabulated (psf/spikes.py).  The plane of side N fades over 24 pixels by the smooth step
 s(z) = z^2 (3 - 2 z) in columns and in rows; `add` draws 1 - s s of the light there and all of it farther out, so that
@@ -14,7 +14,7 @@ A star that moves is drawn as points along its trail, closer than the finest fri
 
 The plane itself is a discrete transform of the pupil and repeats itself after a period Q: a pixel at r of the middle
 holds what belongs at r + Q m, too (m whole numbers), weakened by the softened edges of the sampled pupil to
-sinc^2(|r + Q m| / Q) against sinc^2(|r| / Q) of its own.  `unfold` keeps of each pixel own / (own + folded).
+sinc^2(|r + Q m| / Q) against sinc^2(|r| / Q) of its own.  `remove_aliased` keeps of each pixel own / (own + folded).
 
 Ref : Born & Wolf, Principles of Optics, sections 8.5.1 (a straight bar) and 8.5.2 (a circle, far out)
 """
@@ -98,7 +98,7 @@ def _farthest_corner(frame: Int, x: Float, y: Float) -> float:
     return float(np.hypot(max(x.max() + 1.0, nx - x.min()), max(y.max() + 1.0, ny - y.min())))
 
 
-def unfold(star: Star, stamp: Array, left: int, low: int, nx: int, ny: int) -> None:
+def remove_aliased(star: Star, stamp: Array, left: int, low: int, nx: int, ny: int) -> None:
     """Takes off a star's stamp, in place, what its plane's transform had folded into it: a fifth of its corners.
 
     left, low : the stamp's first pixel on a frame of nx, ny, outside which nothing is done
@@ -115,7 +115,7 @@ def unfold(star: Star, stamp: Array, left: int, low: int, nx: int, ny: int) -> N
         x, y = _points(star, _PART)
         x, y = x - max(left, 0), y - max(low, 0)
         lines = star.electrons * spikes.spikes(edges, photons, edges.period) / len(x)
-        far_light.unfold_compiled(seen, x, y, inner, level / len(x), turned, lines, edges.period)
+        far_light.remove_aliased_compiled(seen, x, y, inner, level / len(x), turned, lines, edges.period)
 
 
 def seconds(length: Float, nx: int, ny: int) -> float:
@@ -126,8 +126,8 @@ def seconds(length: Float, nx: int, ny: int) -> float:
     return float((_STAR_S + _LONGER_S * length).sum()) * nx * ny
 
 
-def unfold_seconds(length: Float, sizes: Int) -> float:
-    """CPU s that `unfold` takes for pieces of trails on stamps of sides, pixels."""
+def remove_aliased_seconds(length: Float, sizes: Int) -> float:
+    """CPU s that `remove_aliased` takes for pieces of trails on stamps of sides, pixels."""
     return float((_UNFOLD_S * sizes.astype(float) ** 2 * np.maximum(np.ceil(length / _PART), 1.0)).sum())
 
 

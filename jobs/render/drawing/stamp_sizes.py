@@ -2,8 +2,8 @@
 
 stamp_sizes     pixels, from flux, shape, PSF, noise and settings
 reach, least_electrons   how far a source may show, and what it takes to show there
-shone_on        sources that `draw` puts light of onto a frame
-shining         points that do so beyond their stamps;  reaches : and how far
+touching_frame  sources that `draw` puts light of onto a frame
+has_far_light   points that do so beyond their stamps;  reaches : and how far
 
 A stamp of side N is periodic: a pixel at x from the source's middle has F sum_m f(x + N m) electrons, where F is the
 flux, f(r) its fraction in a pixel at r, and m runs over pairs of whole numbers. A side is large enough if
@@ -140,7 +140,7 @@ def _beyond_the_table(psf: Psf, light: Float, radius: Int) -> Float:
     return np.where((radius < SIDE) | (psf.planes is None), wing, 0.0)
 
 
-def floors(electrons: Float, noise: float, settings: Settings) -> Float:
+def neglected_flux(electrons: Float, noise: float, settings: Settings) -> Float:
     """Per source, the Fourier samples that `draw` may leave out: of its flux, and in the noise."""
     return np.minimum(settings.floor, settings.edge * noise / np.maximum(electrons, 1e-30))
 
@@ -155,7 +155,7 @@ def piece_count(length: Float) -> Int:
     return np.maximum(np.ceil(length / _PIECE), 1.0).astype(np.int64)
 
 
-def shone_on(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int, ny: int) -> Bool:
+def touching_frame(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int, ny: int) -> Bool:
     """[n] True of sources at rest of which light may be noticed on the frame: their stamps', or what is drawn beyond.
 
     noise : of a pixel, electrons
@@ -179,7 +179,7 @@ def shone_on(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int, ny: 
     return here
 
 
-def shining(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: Psf) -> Bool:
+def has_far_light(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: Psf) -> Bool:
     """[n] True of points so bright that their light does not end where the PSF's plane does: `draw` takes it on."""
     point = shape < 0 if picture is None else (shape < 0) & (picture < 0)
     return np.asarray(point & (sizes >= SIDE) & (electrons > BRIGHT) & (psf.edges is not None))
@@ -198,13 +198,13 @@ def reaches(
 
     Of stamps, and of the PSF's wings beyond them; about points that shine beyond these all that is read of the sky
     around (`reach`), and for their spikes more: to where no pixel has a tenth of its noise. Of a galaxy's own light
-    beyond its stamp `shone_on` knows.
+    beyond its stamp `touching_frame` knows.
     length : float64[n] of trails, pixels;  noise : of a pixel, electrons
     """
     length = np.zeros(len(sizes)) if length is None else length
     pieces = piece_count(length)
     sides = np.maximum(sizes, 0.0 if psf.planes is None else 2.0 * wings.MARGIN * wings.BLOCK)
-    far = shining(electrons / pieces, sizes, shape, picture, psf)
+    far = has_far_light(electrons / pieces, sizes, shape, picture, psf)
     if psf.edges is not None and far.any():
         spikes = psf_spikes.reach(psf.edges, electrons[far], NOTICEABLE * noise)
         sides[far] = 2.0 * np.maximum(spikes, reach(1.0))

@@ -21,7 +21,7 @@ import scipy.fft
 
 from jobs.render.drawing import arcs, far_light, outskirts, stamp_sizes, transfer, wings
 from jobs.render.drawing.kernels import fourier
-from jobs.render.drawing.kernels.frame import BULGE, DISK, accumulate, electrons_of, returning, take_off
+from jobs.render.drawing.kernels.frame import BULGE, DISK, accumulate, aliased_light, electrons_of, subtract_aliased
 from jobs.render.drawing.stamp_sizes import BRIGHT, ROUNDING, SIZES
 from jobs.render.drawing.transfer import Transfer
 from jobs.render.psf.model import SIDE, Psf
@@ -50,25 +50,25 @@ def draw(
     nx: int,
     ny: int,
     progress: Callable[[int], None] | None = None,
-    floors: Float | None = None,
+    neglected: Float | None = None,
     tally: Tally | None = None,
 ) -> Float:
     """Expected electrons of the sources alone.
 
-    sizes    : int[n] from stamp_sizes;  floors : float[n] from `floors`, None: nothing is left out
+    sizes    : int[n] from stamp_sizes;  neglected : float[n] from `neglected_flux`, None: nothing is left out
     progress : called now and then with the number of sources drawn
     tally    : to be filled with what of each source's stamp fell onto the frame
     returns  : float64[ny, nx], to half a unit of fourier.units_of a source (5e-7 electrons for all but the brightest);
                the same, bit by bit, in any order of the sources
     """
     pieces, trail, whole = in_pieces(sources)
-    some_floors = None if floors is None else floors[whole]
-    one = _prepared(pieces, trail, whole, sizes[whole], psf, some_floors)
+    of_whole = None if neglected is None else neglected[whole]
+    one = _prepared(pieces, trail, whole, sizes[whole], psf, of_whole)
     frame, fallen = np.zeros((ny, nx), np.int64), np.zeros(len(pieces))
     unread = (0, 0) if tally is None else tally.unread
     here = selection.touching(pieces.column, pieces.row, one.sizes, nx, ny)
     done = int(np.sum(~here))
-    for chosen, passed, share in _batches(one, here, in_double_precision(pieces, some_floors)):
+    for chosen, passed, share in _batches(one, here, in_double_precision(pieces, of_whole)):
         fallen[chosen] = _draw_some(one, chosen, passed, share, frame, unread)
         done += len(chosen)
         if progress is not None:
@@ -123,7 +123,7 @@ class _Prepared:
     cut, deep, reach : how far each is followed in Fourier space, whether farther than others, how far others are
     left_out       : Fourier samples that may be left out of each
     outside        : light of galaxies that is drawn beyond their stamps, of which `_draw_some` tells what was taken off
-    curve          : of kernels.frame.returning
+    curve          : of kernels.frame.aliased_light
     far, largest   : points that shine beyond the PSF's planes, galaxies that no stamp holds
     unit           : of the frame's integers to an electron
     """
@@ -170,14 +170,14 @@ class _Prepared:
         return outskirts.of_galaxy(self.shapes.take(own), one, light, self.psf, self.weights[i], farthest)
 
 
-def _prepared(sources: Sources, trail: Float, whole: Int, sizes: Int, psf: Psf, floors: Float | None) -> _Prepared:
+def _prepared(sources: Sources, trail: Float, whole: Int, sizes: Int, psf: Psf, neglected: Float | None) -> _Prepared:
     shapes, form = _forms(sources)
     bodies, table = (*_bodies(sources, shapes, form), trail), sersic.table()
     profile, farthest, most = _outside(sources, shapes, form, sizes, psf.pixel_scale)
     x0, y0 = (np.rint(position).astype(np.int64) - sizes // 2 for position in (sources.column, sources.row))
-    curve = returning(sizes, sources.column - x0, sources.row - y0, profile, most)
+    curve = aliased_light(sizes, sources.column - x0, sources.row - y0, profile, most)
     passing = transfer.passing(psf)
-    left_out = np.zeros(len(sources)) if floors is None else floors
+    left_out = np.zeros(len(sources)) if neglected is None else neglected
     body, fraction, bulge, disk, _, row, *_ = bodies
     bodied = body, fraction, bulge, disk, table, row
     cut = fourier.reaches(passing, transfer.STEP, *bodied, left_out)
@@ -187,7 +187,7 @@ def _prepared(sources: Sources, trail: Float, whole: Int, sizes: Int, psf: Psf, 
         reach=transfer.STEP * len(passing), left_out=left_out,
         # Of stamps that are not drawn, what would come in: 5 % from what would be taken off, 0.1 % of many together.
         outside=wings.Outside(profile, curve[:, -1].copy(), farthest), curve=curve,
-        far=stamp_sizes.shining(sources.electrons, sizes, sources.shape, sources.picture, psf),
+        far=stamp_sizes.has_far_light(sources.electrons, sizes, sources.shape, sources.picture, psf),
         largest=stamp_sizes.on_largest(sources.shape, sizes), unit=fourier.units_of(sources.electrons),
     )  # fmt: skip
 
@@ -240,7 +240,8 @@ def _ringing(cut: Float, electrons: Float, sizes: Int, left_out: Float, psf: Psf
     """[n] True of sources that are followed so far, in `cut`, that what is cut off behind is not seen to ring.
 
     A hard edge in Fourier space rings by up to three thousandths of what it cuts off. Planes end by themselves.
-    left_out : of `floors`, what may be left out of a source, 0 = as of others;  bodied : arguments of fourier.reaches
+    left_out : of `neglected_flux`, what may be left out of a source, 0 = as of others
+    bodied   : arguments of fourier.reaches
     """
     floor = np.where(left_out > 0.0, np.clip(_RINGS * left_out, transfer.LEAST, transfer.NOTHING), transfer.NOTHING)
     deep = (electrons > BRIGHT) & (floor < transfer.NOTHING) & (psf.planes is None)
@@ -256,9 +257,9 @@ def _ringing(cut: Float, electrons: Float, sizes: Int, left_out: Float, psf: Psf
     return deep
 
 
-def in_double_precision(sources: Sources, floors: Float | None) -> Bool:
-    """[n] True of those that are drawn in double precision; floors : of `draw`."""
-    wanted = np.zeros(len(sources), bool) if floors is None else floors < ROUNDING
+def in_double_precision(sources: Sources, neglected: Float | None) -> Bool:
+    """[n] True of those that are drawn in double precision; neglected : of `draw`."""
+    wanted = np.zeros(len(sources), bool) if neglected is None else neglected < ROUNDING
     return np.asarray(wanted | (sources.electrons > BRIGHT))
 
 
@@ -287,7 +288,7 @@ def _draw_some(
     )  # fmt: skip
     stamps = scipy.fft.irfft2(zones, s=(size, size), overwrite_x=True)
     off = np.zeros(len(chosen))
-    take_off(stamps, column - x0, row - y0, one.curve[chosen], off)
+    subtract_aliased(stamps, column - x0, row - y0, one.curve[chosen], off)
     one.outside.electrons[chosen] = off
     first, left, low, (ny, nx) = int(chosen[0]), int(x0[0]), int(y0[0]), frame.shape
     # Of these, which are alone, what comes in at the stamp's edges is taken off.
@@ -295,7 +296,7 @@ def _draw_some(
     if outer is not None:
         outskirts.take_in(outer, stamps[0], float(column[0]) - left, float(row[0]) - low)
     elif one.far[first]:
-        far_light.unfold(one.star(chosen), stamps[0], left, low, nx, ny)
+        far_light.remove_aliased(one.star(chosen), stamps[0], left, low, nx, ny)
     fallen = accumulate(frame, stamps, x0, y0, unread, one.unit) / one.unit
     if outer is not None:
         fallen[0] += _add_outskirts(one, first, outer, frame, unread)

@@ -70,7 +70,7 @@ def galaxies(column: Float, row: Float, outside: Outside, sizes: Int, nx: int, n
     out = _layer(nx, ny)
     some = (outside.electrons > 0) & selection.touching(column, row, around(2.0 * outside.reach), nx, ny)
     profile, electrons, reach = (part[some] for part in outside)
-    frame.leaving(out, BLOCK, MARGIN, sizes[some], reach, column[some], row[some], profile, electrons, unit)
+    frame.spill(out, BLOCK, MARGIN, sizes[some], reach, column[some], row[some], profile, electrons, unit)
     return out / unit
 
 

@@ -50,7 +50,7 @@ class Lights:
     row: Frame = field(default_factory=lambda: np.zeros(0))
     electrons: Frame = field(default_factory=lambda: np.zeros(0))
 
-    def and_those(self, more: Lights) -> Lights:
+    def joined(self, more: Lights) -> Lights:
         """These, then those."""
         return Lights(
             np.append(self.column, more.column),
@@ -68,7 +68,7 @@ class Scene:
     peak_electrons : brightest pixel of the expected image: of the sources, with a lamp's light or injected charge
     track_electrons : brightest likely pixel of cosmic rays' tracks, where there are some
     detector       : where it lies in the focal plane; None: at its centre
-    lights         : what shines around corners: ghosts, straylight
+    lights         : sources of scattered light: ghosts, straylight
     lamp           : the LED of a flat, from 1
     forced         : effect name -> on or off, instead of what the scene needs
     band           : the exposure's passband, None = the embedded one

@@ -14,7 +14,7 @@ from lake_schema.arrays import Float
 
 # Electrons of a source that may shine where it is not.
 _LIGHT = 1e6
-# Pixels of a trail that shine around corners as a point.
+# Pixels of a trail whose scattered light is that of a point.
 _PIECE = 32.0
 
 
@@ -34,7 +34,7 @@ def bright_lights(
 
 
 def trails(bodies: Sources) -> Lights:
-    """Bright bodies as points along their trails, near each other beside what light spreads over around corners."""
+    """Bright bodies as points along their trails, close to each other beside the extent of scattered light."""
     bright = np.flatnonzero(bodies.electrons > _LIGHT)
     pieces = np.ceil(bodies.length[bright] / _PIECE).astype(np.int64) + 1
     body, first = np.repeat(bright, pieces), np.repeat(np.cumsum(pieces) - pieces, pieces)

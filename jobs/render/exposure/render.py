@@ -75,17 +75,17 @@ def _drawn(
         return _Drawn(sources, sizes, np.zeros(0), maps, scene), [empty]
     drawn, maps = np.zeros(len(sources)), {}
     frame = stamps.draw(
-        sources, sizes, light.psf, detector.nx, detector.ny, progress, light.floors, Tally(drawn, scene.unread)
+        sources, sizes, light.psf, detector.nx, detector.ny, progress, light.neglected, Tally(drawn, scene.unread)
     )
     scene = scene_of.with_peak(scene, frame)
     if "stars" in truth:
         of_stars = kind_of(sources.ids) == _STAR
-        maps["stars"] = stamps.draw(
-            sources.take(of_stars), sizes[of_stars], light.psf, detector.nx, detector.ny, None, light.floors[of_stars]
-        ).astype(np.float32)
+        some, neglected = sources.take(of_stars), light.neglected[of_stars]
+        light_of = stamps.draw(some, sizes[of_stars], light.psf, detector.nx, detector.ny, None, neglected)
+        maps["stars"] = light_of.astype(np.float32)
     # What sends in no more than faint wings is drawn, not listed.
     a_piece = sources.electrons / stamp_sizes.piece_count(sources.length)
-    listed = (drawn > 0.0) | stamp_sizes.shining(a_piece, sizes, sources.shape, sources.picture, light.psf)
+    listed = (drawn > 0.0) | stamp_sizes.has_far_light(a_piece, sizes, sources.shape, sources.picture, light.psf)
     maps["noise_free"] = frame.astype(np.float32)
     return _Drawn(sources.take(listed), sizes[listed], drawn[listed], maps, scene), [frame]
 

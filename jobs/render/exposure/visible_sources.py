@@ -48,7 +48,7 @@ class Light:
     """What shines onto a detector.
 
     sources, sizes : and int[n] sides of their stamps
-    floors    : float64[n] Fourier samples that may be left out
+    neglected : float64[n] Fourier samples that may be left out
     psf       : None in the dark
     scene     : with bright sources on and about the detector
     decisions : of effects that act while sources are drawn
@@ -56,7 +56,7 @@ class Light:
 
     sources: Sources
     sizes: Int
-    floors: Float
+    neglected: Float
     psf: Psf | None
     scene: Scene
     decisions: tuple[Decision, ...] = ()
@@ -77,10 +77,10 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
         sources, sizes, bright = _with_moving((sources, sizes), aim, rows, scene, psf, settings, seed)
     if aim.channel.scattered:
         around = bright_lights.bright_lights((rows.galaxies, galaxies), (rows.stars, stars), aim.detector, aim.wcs)
-        scene = replace(scene, lights=around.and_those(bright))
+        scene = replace(scene, lights=around.joined(bright))
     psf, decisions = _with_pixels(aim, scene, psf, sources.electrons[touching(sources, sizes, aim.detector)])
-    floors = stamp_sizes.floors(sources.electrons, noise, settings)
-    return Light(sources, sizes, floors, psf, scene, decisions)
+    neglected = stamp_sizes.neglected_flux(sources.electrons, noise, settings)
+    return Light(sources, sizes, neglected, psf, scene, decisions)
 
 
 def _psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
@@ -178,7 +178,7 @@ def sources_of(
         ids[kept], column, row, np.zeros((len(kept), 2, 2)), light[kept], shape[kept], form, None, picture[kept],
         arcs.pictures,
     )  # fmt: skip
-    here = stamp_sizes.shone_on(found, sizes, psf, noise, detector.nx, detector.ny)
+    here = stamp_sizes.touching_frame(found, sizes, psf, noise, detector.nx, detector.ny)
     kept, found = kept[here], found.take(here)
     # Arcs have the colour of what they are an image of.
     coloured = np.concatenate([np.arange(len(catalogue) + len(points)), arcs.source])[kept]

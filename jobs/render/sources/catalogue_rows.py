@@ -63,9 +63,9 @@ def sources(
     for cells, limit in ((far, least), (farthest, bright)):
         if not cells:
             continue
-        more, shining = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
-        shows = pc.greater_equal(shining[flux[1]], limit)
-        rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, more), (light, shining)))
+        more, fluxes_there = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
+        shows = pc.greater_equal(fluxes_there[flux[1]], limit)
+        rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, more), (light, fluxes_there)))
     return rows, light, complete
 
 

@@ -1,4 +1,4 @@
-"""Synthetic catalogues in the forms of others: made up here, a few hundred galaxies each, no real data in them."""
+"""Synthetic catalogues in the forms of external ones: a few hundred galaxies each, no real data in them."""
 
 import numpy as np
 import pyarrow as pa

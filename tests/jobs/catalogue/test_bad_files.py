@@ -1,4 +1,4 @@
-"""Requests with a file of others that is wrong: one line that names it, with its column and row; nothing published."""
+"""Requests with an external file that is wrong: one line that names it, with its column and row; nothing published."""
 
 import numpy as np
 import pyarrow as pa

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Generation cells and the files that they lie in."""
 
 import numpy as np
 import pytest

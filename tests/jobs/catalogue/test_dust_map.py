@@ -1,4 +1,4 @@
-"""TODO."""
+"""The dust map: reddening by latitude and distance, its structure, and external maps."""
 
 import dataclasses
 
@@ -79,7 +79,7 @@ def test_extinction_grows_with_distance(total, distance, times, b):
     assert far <= total
 
 
-# ------------------------------------------------------------------------------------------------ maps of others
+# ------------------------------------------------------------------------------------------------ external maps
 
 
 def synthetic_map(nside=64, frame="G"):

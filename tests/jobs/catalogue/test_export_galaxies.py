@@ -1,4 +1,4 @@
-"""Galaxies leave in the forms of others, and what leaves as skyCatalogs comes back through the ingest."""
+"""Galaxies leave in the forms of other programs, and what leaves as skyCatalogs comes back through the ingest."""
 
 import numpy as np
 import pyarrow.parquet as pq

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Tables of numbers: read by name, refused without their source."""
 
 import tomllib
 from pathlib import Path

@@ -231,6 +231,6 @@ GOOD = [
 
 
 @pytest.mark.parametrize("text", GOOD)
-def test_what_people_ask_is_possible(explorer, text):
+def test_usual_queries_are_possible(explorer, text):
     assert len(explorer.sql(text)) >= 0
     assert guard.checked(text, explorer.versions).text == text

@@ -42,7 +42,7 @@ def test_the_accuracy_holds_on_galaxies_that_were_not_used_to_choose(figures):
 
 
 def test_speclite_agrees(figures):
-    # Synthetic photometry by other people's code, of the same spectra.
+    # Synthetic photometry by independent code, of the same spectra.
     assert 0.0 < figures["oracle_mag_max"] <= 1e-4
 
 

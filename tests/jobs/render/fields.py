@@ -29,7 +29,7 @@ def small(camera, name, n=160):
 
 
 @cache
-def spread(camera, name="3-4"):
+def psf_of(camera, name="3-4"):
     """A narrow round PSF for VIS (the optics have their own tests), the seeing disc for LSSTCam."""
     detector = small(camera, "R22_S11" if camera == "lsstcam" else name)
     if camera == "vis":

@@ -27,7 +27,7 @@ def off(*names):
 
 
 @cache
-def spread(detector):
+def psf_of(detector):
     """The detector's PSF, for all of its exposures."""
     return euclid.vis_psf(detector, passbands.load("euclid_vis"), MISSION)
 
@@ -59,7 +59,7 @@ def rendered(
     f_nu = 10 ** (-0.4 * (np.atleast_1d(mags) - 23.9))
     with pytest.MonkeyPatch.context() as patch:
         if mission is MISSION:
-            own = spread(detector)
+            own = psf_of(detector)
             patch.setattr(euclid, "vis_psf", lambda *_: own)
         tables = (
             bodies, fluxes(bodies, "euclid_vis", f_nu if body else 0.0),

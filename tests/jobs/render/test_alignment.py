@@ -13,7 +13,7 @@ from jobs.render.drawing import settings, stamps
 from jobs.render.exposure import visible_sources
 from jobs.render.exposure.records import Rows
 from lake_schema import sky
-from tests.jobs.render.fields import aimed, galaxies, moments, small, spread, stars
+from tests.jobs.render.fields import aimed, galaxies, moments, psf_of, small, stars
 
 NOISE, NSIDE, SIDE = 12.0, 64, 160
 RA, DEC, WIDTH = 40.0, 20.0, 4.0
@@ -52,9 +52,9 @@ def test_alignment_about_a_halo_is_tangential(camera, name, angle, shears):
     body = galaxies(lon, lat, disk_half_light_radius=3.5 * scale, gamma1=shears[0], gamma2=shears[1])
     found, sizes = visible_sources.sources_of(
         Rows(body, None, stars([], []), None), (np.full(len(body), 1e6), np.zeros(0)), aimed(detector, system, band),
-        spread(camera), NOISE, settings.settings_for(SURVEY),
+        psf_of(camera), NOISE, settings.settings_for(SURVEY),
     )  # fmt: skip
-    image = stamps.draw(found, sizes, spread(camera), SIDE, SIDE)
+    image = stamps.draw(found, sizes, psf_of(camera), SIDE, SIDE)
     halo = np.array([axis[0] for axis in pixel_of_sky(system, [RA], [DEC])])
     tangential, cross = [], []
     for x, y in zip(found.column, found.row, strict=True):

@@ -20,7 +20,7 @@ from jobs.render.sources import catalogue_rows, galaxy_shapes, selection
 from lake_schema import sky
 from tests.jobs.render import fields
 from tests.jobs.render.exposure.test_render import field as field_of
-from tests.jobs.render.fields import MISSION, exposure, fluxes, galaxies, small, spread, stars
+from tests.jobs.render.fields import MISSION, exposure, fluxes, galaxies, psf_of, small, stars
 
 BAND, DETECTOR = "lsst_r", small("lsstcam", "R22_S11")
 MARGIN = MISSION.value("survey.selection_margin", "arcsec")
@@ -182,9 +182,9 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
     least = visible_sources.least_flux(exposure(**exposed), detector, MISSION, SURVEY)
     for limit, wanted in ((spikes, [0]), (np.inf, [])):
-        found, shining, complete = catalogue_rows.sources(*catalogues, task, [], "euclid_vis", 85.0, least, limit)
+        found, light, complete = catalogue_rows.sources(*catalogues, task, [], "euclid_vis", 85.0, least, limit)
         assert found.equals(rows.take(pa.array(wanted, pa.int64())))
-        assert shining["id"].equals(found["id"])
+        assert light["id"].equals(found["id"])
         assert complete == 85.0
     for other in ({"image_type": "dark"}, {"exposure_time_s": 0.0}, {"psf": "own.fits"}):
         assert visible_sources.spike_flux(exposure(**{**exposed, **other}), detector, MISSION, SURVEY, band) == np.inf
@@ -224,17 +224,17 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     cells = sky.cell_of(np.full(3, task["ra"]), np.full(3, task["dec"] - 0.3), 8)
     drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
-    found, shining, _ = catalogue_rows.sources(*catalogues, task, [], "euclid_vis", 85.0, limit, limit)
+    found, light, _ = catalogue_rows.sources(*catalogues, task, [], "euclid_vis", 85.0, limit, limit)
     assert found["id"].to_pylist() == rows["id"].to_pylist()[:2]
-    assert shining["id"].equals(found["id"])
+    assert light["id"].equals(found["id"])
     system = astrometry.wcs(detector, *pointing.boresight_for(detector, task["ra"], task["dec"], 0.0))
-    electrons = shining["f_nu_euclid_vis"].to_numpy() * 560.53 * 10 ** (0.4 * (25.93 - 23.9))
+    electrons = light["f_nu_euclid_vis"].to_numpy() * 560.53 * 10 ** (0.4 * (25.93 - 23.9))
     noise, settings = 12.0, settings_for(SURVEY)
     aim = fields.aimed(detector, system, passbands.load("euclid_vis" if channel == "VIS" else "lsst_r"))
-    given = Rows(found, shining, stars([], []), shining.slice(0, 0))
-    seen, sizes = visible_sources.sources_of(given, (electrons, np.zeros(0)), aim, spread(camera), noise, settings)
+    given = Rows(found, light, stars([], []), light.slice(0, 0))
+    seen, sizes = visible_sources.sources_of(given, (electrons, np.zeros(0)), aim, psf_of(camera), noise, settings)
     assert seen.ids.tolist() == rows["id"].to_pylist()[:1]
-    image = stamps.draw(seen, sizes, spread(camera), detector.nx, detector.ny)
+    image = stamps.draw(seen, sizes, psf_of(camera), detector.nx, detector.ny)
     assert image.min() > 0.1 * noise
     assert (
         visible_sources.outer_flux(exposure(**{**exposed, "image_type": "bias"}), detector, MISSION, SURVEY) == np.inf

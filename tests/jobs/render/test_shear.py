@@ -13,7 +13,7 @@ from jobs.render.drawing import reference
 from jobs.render.drawing.settings import settings_for
 from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.source_list import Sources
-from tests.jobs.render.fields import galaxies, spread
+from tests.jobs.render.fields import galaxies, psf_of
 
 BOUNDS = {"survey": (SURVEY, 1e-4, 1e-5), "draft": (DRAFT, 1e-3, 1e-3)}
 # Half-light radius, arcsec, and index: a disc, a bulge in a disc, a steep bulge.
@@ -35,21 +35,21 @@ def galaxy(scene: Scene, kind: str, magnitude: float) -> Sources:
     return Sources(np.array([1]), middle + 0.3, middle - 0.2, jacobian, np.array([electrons]), np.array([0]), form)
 
 
-def psf_of(scene):
-    return spread("vis" if scene is VIS else "lsstcam")
+def psf_in(scene):
+    return psf_of("vis" if scene is VIS else "lsstcam")
 
 
 @cache
 def truth(scene, kind, magnitude):
     one = galaxy(scene, kind, magnitude)
-    found = errors.response(errors.drawing(psf_of(scene), scene, errors.FULL), one, scene.scale)
+    found = errors.response(errors.drawing(psf_in(scene), scene, errors.FULL), one, scene.scale)
     # The weight of the moments halves what shear does; nothing more is wrong with it.
     assert 0.2 < found[:2].min() <= found[:2].max() < 2.0
     return found
 
 
 def biases(scene, kind, magnitude, settings) -> tuple[float, float]:
-    draw = errors.drawing(psf_of(scene), scene, settings)
+    draw = errors.drawing(psf_in(scene), scene, settings)
     return errors.bias(
         errors.response(draw, galaxy(scene, kind, magnitude), scene.scale), truth(scene, kind, magnitude)
     )
@@ -94,7 +94,7 @@ def test_galsim_responds_alike(kind):
     """The truth itself, against galsim's own drawing."""
 
     def by_galsim(one):
-        return reference.reference(one, 0, psf_of(VIS), 2 * errors.COMPARED)
+        return reference.reference(one, 0, psf_in(VIS), 2 * errors.COMPARED)
 
     found = errors.response(by_galsim, galaxy(VIS, kind, 20.0), VIS.scale)
     m, c = errors.bias(found, truth(VIS, kind, 20.0))

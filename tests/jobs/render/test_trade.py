@@ -83,10 +83,10 @@ def test_an_approximation_keeps_what_it_should(name):
 
 def test_stamps_of_a_folding_threshold_hold_all_but_that():
     """Of a point, against the PSF itself: the rest lies beyond half the stamp."""
-    some, spread = scenes.sample(VIS, 3, 6), scenes.spread(VIS, 1)
+    some, psf = scenes.sample(VIS, 3, 6), scenes.psf_of(VIS, 1)
     settings = settings_for(SURVEY)
-    sizes = BY_NAME["folding threshold 0.5 %"].sizes(some, spread, VIS, settings)
-    outside = spread.outside[np.minimum(sizes // 2, len(spread.outside) - 1)]
+    sizes = BY_NAME["folding threshold 0.5 %"].sizes(some, psf, VIS, settings)
+    outside = psf.outside[np.minimum(sizes // 2, len(psf.outside) - 1)]
     assert (outside < approximations.FOLDING).all()
 
 

@@ -1,4 +1,4 @@
-"""FITS files of others: whatever is wrong in one is a sentence, soon, and in little memory."""
+"""External FITS files: whatever is wrong in one is a sentence, soon, and in little memory."""
 
 import gzip
 import resource

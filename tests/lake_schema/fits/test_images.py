@@ -269,7 +269,7 @@ def test_units_are_spelled_as_fits_wants():
 
 
 def somebodys(path):
-    """A table of others: whole numbers, one of them none, numbers, a flag, texts, and lists of two lengths."""
+    """An external table: whole numbers, one of them none, numbers, a flag, texts, and lists of two lengths."""
     columns = [
         astropy_fits.Column("number", "J", null=-9, array=np.array([3, -9, 5])),
         astropy_fits.Column("id", "K", array=np.array([2**60, 2, 3])),

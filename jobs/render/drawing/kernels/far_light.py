@@ -72,7 +72,7 @@ def inside(frame: Any, x: float, y: float, inner: float, level: float, turned: A
 
 
 @jit
-def unfold_compiled(
+def remove_aliased_compiled(
     stamp: Any, x: Float, y: Float, inner: float, level: float, turned: Any, lines: Any, period: float,
 ) -> None:  # fmt: skip
     """Multiplies a stamp by what is not folded of the light that points at x, y send to each pixel."""

@@ -1,9 +1,10 @@
 """Compiled: stamps onto the frame, in fixed point; light that wraps around a stamp goes where it belongs.
 
-accumulate    stamps onto the frame, in fixed point
-returning     the light that comes in at the opposite edges of stamps;  take_off : it;  leaving : it where it belongs
-smooth        an image about points
-electrons_of  the frame with a smooth layer on top
+accumulate        stamps onto the frame, in fixed point
+aliased_light     the light that comes in at the opposite edges of stamps
+subtract_aliased  takes it off them;  spill : and adds it where it belongs
+smooth            an image about points
+electrons_of      the frame with a smooth layer on top
 """
 
 from __future__ import annotations
@@ -67,8 +68,8 @@ def accumulate(
 
 
 @jit
-def take_off(stamps: Array, x: Float, y: Float, curve: Float, taken: Float) -> None:
-    """Takes curve [m, 5] of `returning`, about (x, y) [m], off stamps [m, N, N], but leaves no pixel darker than none.
+def subtract_aliased(stamps: Array, x: Float, y: Float, curve: Float, taken: Float) -> None:
+    """Takes curve [m, 5] of `aliased_light` about (x, y) [m] off stamps [m, N, N]; no pixel becomes negative.
 
     taken : [m] filled with the electrons
     """
@@ -91,7 +92,7 @@ def take_off(stamps: Array, x: Float, y: Float, curve: Float, taken: Float) -> N
 
 
 @jit
-def returning(size: Int, x: Float, y: Float, profile: Float, most: Float) -> Float:
+def aliased_light(size: Int, x: Float, y: Float, profile: Float, most: Float) -> Float:
     """[m, 5] light that enters stamps at their edges: its level in the middle, terms of x^2, x y and y^2; all of it.
 
     size, x, y : [m] side of the stamp, position in it, pixels;  profile : [m, 11] galaxy_shapes.on_the_sky, electrons
@@ -186,7 +187,7 @@ def smooth(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit
 
 
 @jit
-def leaving(
+def spill(
     blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, profile: Float,
     light: Float, unit: float,
 ) -> None:  # fmt: skip

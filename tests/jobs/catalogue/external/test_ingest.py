@@ -1,4 +1,4 @@
-"""Catalogues of others become table `galaxies`; what is wrong in them is named by file, column and row."""
+"""External catalogues become table `galaxies`; what is wrong in them is named by file, column and row."""
 
 import numpy as np
 import pyarrow as pa

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Ratios of fluxes in other bands to the reference band: published K-corrections, and integration."""
 
 import numpy as np
 import pytest

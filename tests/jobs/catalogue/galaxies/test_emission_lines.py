@@ -1,4 +1,4 @@
-"""TODO."""
+"""Emission lines: published counts of emitters, line ratios, and the matching of luminosities."""
 
 import numpy as np
 import pytest

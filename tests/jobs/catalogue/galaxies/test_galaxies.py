@@ -1,4 +1,4 @@
-"""TODO."""
+"""Galaxies of cells: counts, luminosities and star formation as published; rows as declared."""
 
 import dataclasses
 import pickle

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Galaxies and quasars beyond redshift 6, and the boost of their numbers."""
 
 import numpy as np
 import pytest

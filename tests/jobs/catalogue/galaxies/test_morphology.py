@@ -1,4 +1,4 @@
-"""TODO."""
+"""Sizes, Sersic indices and axis ratios of bulges and discs, against published relations and GalSim."""
 
 import galsim
 import numpy as np

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Red and blue galaxies, their colours, dust and spectra."""
 
 import dataclasses
 

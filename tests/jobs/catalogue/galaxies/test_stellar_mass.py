@@ -1,4 +1,4 @@
-"""TODO."""
+"""Stellar masses and star-formation rates from light and colour."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A halo light-cone of others in place of ours: a synthetic one, and what is refused."""
+"""An external halo light-cone in place of ours: a synthetic one, and what is refused."""
 
 import numpy as np
 import pyarrow as pa

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Halos: mass function, completeness and bias, and the cells that they lie in."""
 
 import numpy as np
 import pytest

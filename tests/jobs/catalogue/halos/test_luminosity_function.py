@@ -1,4 +1,4 @@
-"""TODO."""
+"""The luminosity function: published densities, its integrals and its inverse."""
 
 import numpy as np
 import pytest

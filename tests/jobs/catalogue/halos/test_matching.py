@@ -1,4 +1,4 @@
-"""TODO."""
+"""Luminosities matched to halo masses: abundances, concentrations, satellites."""
 
 import numpy as np
 import pytest

@@ -38,7 +38,7 @@ def falling_in(universe, block):
 
 
 def satellites_of(members):
-    return np.sort(np.concatenate([people.id[people.kind == 1] for people in members]))
+    return np.sort(np.concatenate([one.id[one.kind == 1] for one in members]))
 
 
 def test_satellites_are_neither_lost_nor_doubled(universe, block):
@@ -61,19 +61,19 @@ def test_nor_at_a_pole_or_across_the_first_meridian(universe, ra, dec):
 
 
 def test_some_satellites_live_next_door(block):
-    for cell, people in block.items():
-        home = (people.id >> 40) & ((1 << 20) - 1)
-        assert np.all(home[people.kind == 0] == cell)
-        share = np.mean(home[people.kind == 1] != cell)
+    for cell, members in block.items():
+        home = (members.id >> 40) & ((1 << 20) - 1)
+        assert np.all(home[members.kind == 0] == cell)
+        share = np.mean(home[members.kind == 1] != cell)
         assert 0.001 < share < 0.1
 
 
 def test_members_lie_in_their_cell_sorted(block):
-    for cell, people in block.items():
-        assert np.all(people.index >> 2 * (29 - 8) == cell)
-        assert np.all(np.diff(people.index) >= 0)
-        assert np.array_equal(sky.healpix_29(people.ra, people.dec), people.index)
-        assert np.array_equal(ids.halo_of(people.id), people.halo_id)
+    for cell, members in block.items():
+        assert np.all(members.index >> 2 * (29 - 8) == cell)
+        assert np.all(np.diff(members.index) >= 0)
+        assert np.array_equal(sky.healpix_29(members.ra, members.dec), members.index)
+        assert np.array_equal(ids.halo_of(members.id), members.halo_id)
 
 
 def test_a_cell_alone_is_the_same(universe, block):
@@ -92,13 +92,13 @@ def test_satellites_follow_their_profile(universe, rng):
 
 
 def test_satellites_lie_within_their_halo(universe):
-    people = universe.population
-    hosts = halos.draw(people.halos, 3, 8, 1234)
-    found = satellites.draw(people.halos, people.masses, hosts, np.random.default_rng(1))
+    model = universe.population
+    hosts = halos.draw(model.halos, 3, 8, 1234)
+    found = satellites.draw(model.halos, model.masses, hosts, np.random.default_rng(1))
     ra, dec = sky.positions(hosts.index)
     angle = np.radians(sky.separation(found.ra, found.dec, ra[found.host], dec[found.host]))
     apart = np.hypot(hosts.chi[found.host] * angle, found.chi - hosts.chi[found.host])
-    radius = people.masses.radius(hosts.log_mass)[found.host]
+    radius = model.masses.radius(hosts.log_mass)[found.host]
     assert np.all(apart < 1.01 * radius)
     assert 0.3 < np.median(apart / radius) < 0.6
     assert found.member.min() == 1

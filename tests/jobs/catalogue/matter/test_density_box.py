@@ -1,4 +1,4 @@
-"""TODO."""
+"""The box of density: its linear power, growth and velocities."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""TODO."""
+"""The light-cone through replicas of the box: distances, voxels and orientations."""
 
 import healpy as hp
 import numpy as np

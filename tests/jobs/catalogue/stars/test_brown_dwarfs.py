@@ -1,4 +1,4 @@
-"""TODO."""
+"""Brown dwarfs: counts, colours of their templates, and the boost of their numbers."""
 
 import numpy as np
 import pytest

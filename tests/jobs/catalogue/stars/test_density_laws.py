@@ -1,4 +1,4 @@
-"""TODO."""
+"""Densities of the components of the Milky Way, as published."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Star counts of the Milky Way against independent sums, and the labels of what is drawn."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Stars of cells: counts behind dust, rows as declared, the same stars in any order of cells."""
 
 import dataclasses
 import pickle

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Initial masses, evolution and local densities of stellar populations."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Files of others, all synthetic: made here in the published forms, with numbers that nobody measured."""
+"""External files, all synthetic: made here in the published forms, with numbers that nobody measured."""
 
 import numpy as np
 import pytest

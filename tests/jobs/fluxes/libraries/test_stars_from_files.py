@@ -1,4 +1,4 @@
-"""Stars from files of others, all synthetic: made here in the published forms, with numbers that nobody measured."""
+"""Stars from external files, all synthetic: made here in the published forms, with numbers that nobody measured."""
 
 import hashlib
 

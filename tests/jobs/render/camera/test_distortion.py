@@ -1,4 +1,4 @@
-"""Where the optics distort, and detectors are mounted askew: as large as the mission says, undone, or absent."""
+"""Distortion of the optics, and mounting rotation of detectors: as large as the mission says, undone, or absent."""
 
 import numpy as np
 import pytest

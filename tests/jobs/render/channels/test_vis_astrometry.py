@@ -19,7 +19,7 @@ from jobs.render.products import headers, truth_table
 from jobs.render.psf import euclid, sub_bands
 from jobs.render.sources.source_list import Sources
 from tests.jobs.render import calibrated, nominal
-from tests.jobs.render.fields import MISSION, aimed, galaxies, small, spread, stars
+from tests.jobs.render.fields import MISSION, aimed, galaxies, psf_of, small, stars
 
 BAND = passbands.load("euclid_vis")
 SMALL = small("vis", "3-4", 256)
@@ -81,7 +81,7 @@ def test_the_truth_table_tells_where_sources_are(name, ra, dec):
     none = galaxies(0.0, 0.0).slice(0, 0)
     drawn, sizes = visible_sources.sources_of(
         Rows(none, None, points, None), (np.zeros(0), np.full(300, 1e3)), aimed(detector, system, BAND),
-        spread("vis"), 13.0, settings.settings_for(SURVEY),
+        psf_of("vis"), 13.0, settings.settings_for(SURVEY),
     )  # fmt: skip
     found = replace(alone(), detector=detector, wcs=system, sources=drawn, sizes=sizes, drawn=np.zeros(len(sizes)))
     rows = truth_table.truth(found)
@@ -151,13 +151,13 @@ def centroid(stamp, x, y):
 def drawn_stars(detector, columns, rows):
     """Noise-free stars as an exposure would draw them."""
     columns, rows = np.asarray(columns, float), np.asarray(rows, float)
-    spread = replace(euclid.vis_psf(detector, BAND, MISSION), intra_pixel=0.05)
+    psf = replace(euclid.vis_psf(detector, BAND, MISSION), intra_pixel=0.05)
     n = len(columns)
     sources = Sources(
         np.arange(n), columns, rows, np.tile(0.1 * np.eye(2), (n, 1, 1)), np.full(n, 1e6), np.full(n, -1),
         alone().sources.shapes, np.full((n, sub_bands.PARTS), 1.0 / sub_bands.PARTS),
     )  # fmt: skip
-    return stamps.draw(sources, np.full(n, 128), spread, detector.nx, detector.ny)
+    return stamps.draw(sources, np.full(n, 128), psf, detector.nx, detector.ny)
 
 
 def differences(detector, columns, rows, side=41):

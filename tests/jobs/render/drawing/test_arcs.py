@@ -20,7 +20,7 @@ from jobs.render.sources.lensed_arcs import Picture
 from lake_schema.errors import BadInput
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests.jobs.render.exposure.test_render import SIDE, field, render
-from tests.jobs.render.fields import galaxies, moments, one_source, small, spread
+from tests.jobs.render.fields import galaxies, moments, one_source, psf_of, small
 
 NOISE = 12.0
 
@@ -43,8 +43,8 @@ def pictured(camera, name, picture, electrons, column=80.3, row=77.6):
 def drawn(source, psf, accuracy=SURVEY):
     settings, wide = settings_for(accuracy), np.array([source.pictures[0].diagonal / psf.pixel_scale])
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings, wide)
-    floors = stamp_sizes.floors(source.electrons, NOISE, settings)
-    return stamps.draw(source, sizes, psf, 160, 160, floors=floors), int(sizes[0])
+    neglected = stamp_sizes.neglected_flux(source.electrons, NOISE, settings)
+    return stamps.draw(source, sizes, psf, 160, 160, neglected=neglected), int(sizes[0])
 
 
 @given(st.integers(8, 33), st.integers(8, 33), st.integers(0, 99))
@@ -66,7 +66,7 @@ def test_the_transform_is_that_of_the_pixels_under_the_interpolant(rows, columns
 @pytest.mark.parametrize(("side", "electrons"), [(40, 2e4), (61, 2e4), (40, 3e7)])
 def test_a_picture_is_what_galsim_draws(camera, name, side, electrons):
     """Also in double precision; to what galsim's own interpolation in Fourier space is good for."""
-    source, psf = pictured(camera, name, ring(side), electrons), spread(camera)
+    source, psf = pictured(camera, name, ring(side), electrons), psf_of(camera)
     ours, _ = drawn(source, psf, REFERENCE)
     theirs = np.roll(reference.reference(source, 0, psf, 160), (78 - 80, 80 - 80), (0, 1))
     assert np.abs(ours - theirs)[8:-8, 8:-8].max() < 2e-4 * theirs.max()
@@ -76,10 +76,10 @@ def test_a_picture_is_what_galsim_draws(camera, name, side, electrons):
 @pytest.mark.parametrize(("size", "electrons"), [(320, 1e5), (512, 1e9)])
 def test_memory_is_what_was_predicted(size, electrons):
     source = pictured("vis", "2-3", ring(200), electrons)
-    stamps.draw(source, np.array([96]), spread("vis"), 64, 64)
+    stamps.draw(source, np.array([96]), psf_of("vis"), 64, 64)
     tracemalloc.start()
     try:
-        stamps.draw(source, np.array([size]), spread("vis"), 256, 256)
+        stamps.draw(source, np.array([size]), psf_of("vis"), 256, 256)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -11,14 +11,14 @@ from jobs.fluxes import passbands
 from jobs.render.camera.astrometry import wcs
 from jobs.render.camera.pointing import boresight_for
 from jobs.render.drawing import cost, far_light, stamp_sizes, stamps
-from jobs.render.drawing.kernels.far_light import left_compiled, unfold_compiled
+from jobs.render.drawing.kernels.far_light import left_compiled, remove_aliased_compiled
 from jobs.render.drawing.kernels.frame import FIXED_POINT
 from jobs.render.drawing.settings import settings_for
 from jobs.render.psf import euclid, spikes, sub_bands
 from jobs.render.psf.model import SIDE
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render.fields import one_source, small
-from tests.jobs.render.nominal import COSMIC_RAYS, TIME, off, rendered, spread
+from tests.jobs.render.nominal import COSMIC_RAYS, TIME, off, psf_of, rendered
 
 MISSION = resolve()
 PARTS = sub_bands.sub_bands(passbands.load("euclid_vis"))
@@ -36,19 +36,19 @@ def of_pupil(blur=0.034, pixel_scale=0.1, parts=PARTS):
 @pytest.fixture(scope="module")
 def vis():
     # As in other tests, so that they share the planes.
-    return spread(small("vis", "3-4", 256))
+    return psf_of(small("vis", "3-4", 256))
 
 
-def shone(spread, side, column, row, electrons=BRIGHT, least=0.0):
+def shone(psf, side, column, row, electrons=BRIGHT, least=0.0):
     """What `add` adds to an empty frame, electrons."""
     frame = np.zeros((side, side), np.int64)
-    far_light.add(frame, far_light.Star(column, row, electrons, None, SIDE, least, spread.edges))
+    far_light.add(frame, far_light.Star(column, row, electrons, None, SIDE, least, psf.edges))
     return frame / FIXED_POINT
 
 
-def off_spikes(spread, dx, dy, clear):
+def off_spikes(psf, dx, dy, clear):
     """Pixels more than `clear` from the middle of every spike."""
-    along = [np.abs(dx * np.cos(a) + dy * np.sin(a)) for a in spread.edges.bars[:, 0]]
+    along = [np.abs(dx * np.cos(a) + dy * np.sin(a)) for a in psf.edges.bars[:, 0]]
     return np.min(along, axis=0) > clear
 
 
@@ -227,10 +227,10 @@ def test_a_trail_is_unfolded_as_its_points_are(vis):
     fast, slow = np.ones((size, size)), light.copy()
     fast[60 : 60 + corner, 60 : 60 + corner] = light
     star = far_light.Star(320.2, 319.7, BRIGHT, None, SIDE, 0.0, vis.edges, trail)
-    far_light.unfold(star, fast, 0, 0, size, size)
+    far_light.remove_aliased(star, fast, 0, 0, size, size)
     turned = np.stack([np.cos(vis.edges.bars[:, 0]), np.sin(vis.edges.bars[:, 0])], axis=1)
     lines = BRIGHT / points * spikes.spikes(vis.edges, EQUAL, vis.edges.period)
-    unfold_compiled(slow, x, y, inner, level, turned, lines, vis.edges.period)
+    remove_aliased_compiled(slow, x, y, inner, level, turned, lines, vis.edges.period)
     whole = points * level / np.hypot(pixels - 260.2, pixels[:, None] - 259.7) ** 3
     assert ((light - slow) / whole).max() > 0.05
     wrong = np.abs(fast[60 : 60 + corner, 60 : 60 + corner] - slow) / whole
@@ -267,11 +267,11 @@ def stars(column, row, electrons, side):
     return replace(some[0], **together, ids=np.arange(len(some)), shape=np.full(len(some), -1))
 
 
-def drawn(sources, spread, side):
+def drawn(sources, psf, side):
     settings = settings_for(SURVEY)
-    sizes = stamp_sizes.stamp_sizes(sources.electrons, sources.shape, sources.shapes, spread, NOISE, settings)
-    floors = stamp_sizes.floors(sources.electrons, NOISE, settings)
-    return stamps.draw(sources, sizes, spread, side, side, None, floors)
+    sizes = stamp_sizes.stamp_sizes(sources.electrons, sources.shape, sources.shapes, psf, NOISE, settings)
+    neglected = stamp_sizes.neglected_flux(sources.electrons, NOISE, settings)
+    return stamps.draw(sources, sizes, psf, side, side, None, neglected)
 
 
 def test_only_bright_points_shine_so_far(vis):
@@ -279,7 +279,7 @@ def test_only_bright_points_shine_so_far(vis):
     faint = stars([200.0, 90.0, 310.5], [200.0, 400.0, 11.0], [1e3, 1e5, 5e6], 512)
     np.testing.assert_array_equal(drawn(faint, vis, 512), drawn(faint, replace(vis, edges=None), 512))
     sizes, shape = np.array([SIDE, SIDE, 384, SIDE]), np.array([-1, 0, -1, -1])
-    found = stamp_sizes.shining(np.array([1e9, 1e9, 1e9, 1e6]), sizes, shape, None, vis)
+    found = stamp_sizes.has_far_light(np.array([1e9, 1e9, 1e9, 1e6]), sizes, shape, None, vis)
     np.testing.assert_array_equal(found, [True, False, False, False])
 
 

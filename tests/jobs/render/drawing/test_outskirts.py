@@ -25,7 +25,7 @@ from jobs.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS
 from jobs.render.sources.source_list import Sources
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 from tests.jobs.render import nominal
-from tests.jobs.render.fields import galaxies, one_source, small, spread
+from tests.jobs.render.fields import galaxies, one_source, psf_of, small
 
 NOISE = {"vis": 12.0, "lsstcam": 38.0}
 # Electrons of magnitude 0 in a nominal exposure.
@@ -99,8 +99,8 @@ def drawn_and_expected(camera, psf, shape, mag, place, step, points=6):
     )
     how = settings_for(SURVEY)
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE[camera], how)
-    floors = stamp_sizes.floors(source.electrons, NOISE[camera], how)
-    image = stamps.draw(source, sizes, psf, SIDE, SIDE, floors=floors)
+    neglected = stamp_sizes.neglected_flux(source.electrons, NOISE[camera], how)
+    image = stamps.draw(source, sizes, psf, SIDE, SIDE, neglected=neglected)
     x, y = np.random.default_rng(3).integers(0, SIDE, (2, points))
     # And the brightest: a ridge.
     x[0], y[0] = np.unravel_index(image.argmax(), image.shape)[::-1]
@@ -152,7 +152,7 @@ def check(found, expected, noise, size):
 )
 def test_light_far_from_the_centre_is_where_it_belongs(shape, mag, place):
     """Through the optics' own PSF; where streaks of 100 and of 1.3 sigma were that came in at the opposite edge."""
-    psf = nominal.spread(small("vis", "3-4", SIDE))
+    psf = nominal.psf_of(small("vis", "3-4", SIDE))
     found, expected, size = drawn_and_expected("vis", psf, shape, mag, place, 3)
     check(found, expected, NOISE["vis"], size)
 
@@ -161,7 +161,7 @@ def test_light_far_from_the_centre_is_where_it_belongs(shape, mag, place):
 @given(LARGE, st.sampled_from([8.0, 10.0, 12.0]), PLACES, st.sampled_from(["vis", "lsstcam"]))
 @example(EDGE_ON, 10.0, (HALF, 400.0), "lsstcam")
 def test_any_large_galaxy_is_drawn_to_its_outskirts(shape, mag, place, camera):
-    found, expected, size = drawn_and_expected(camera, spread(camera), shape, mag, place, 1)
+    found, expected, size = drawn_and_expected(camera, psf_of(camera), shape, mag, place, 1)
     if size == stamp_sizes.SIZES[-1]:
         check(found, expected, NOISE[camera], size)
     else:
@@ -189,7 +189,7 @@ def test_what_comes_into_a_stamp_is_the_light_of_all_images(index, ratio, angle,
     shape = shape_of(0.0 if disc else 1.0, 12.0 if disc else 24.0, index, ratio, inclination or 0.0, angle)
     detector = small("vis", "3-4", side)
     source = one_source(detector, wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0)), electrons, **shape)
-    psf = spread("vis")
+    psf = psf_of("vis")
     form = galaxy_shapes.forms(source.shapes, source.jacobian)
     weights = transfer.basis_weights(psf, None, source.column, source.row)[0]
     some = replace(
@@ -250,7 +250,7 @@ def test_all_light_is_somewhere():
     system, drawn = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0)), np.zeros(1)
     source = one_source(detector, system, 1e9, **shape)
     with mock.patch.object(outskirts, "of_galaxy", wraps=outskirts.of_galaxy) as made:
-        image = stamps.draw(source, stamp_sizes.SIZES[-1:], spread("lsstcam"), 3000, 3000, tally=stamps.Tally(drawn))
+        image = stamps.draw(source, stamp_sizes.SIZES[-1:], psf_of("lsstcam"), 3000, 3000, tally=stamps.Tally(drawn))
     made.assert_called_once()
     y, x = np.mgrid[-4499:4500:3, -4499:4500:3]
     light = profile(shape, source.jacobian[0], x, y) * 9.0
@@ -275,5 +275,5 @@ def test_what_shows_is_looked_for_as_far_as_it_does():
             np.array([0]),
             shapes,
         )
-        here = stamp_sizes.shone_on(one, stamp_sizes.SIZES[-1:], spread("vis"), NOISE["vis"], SIDE, SIDE)
+        here = stamp_sizes.touching_frame(one, stamp_sizes.SIZES[-1:], psf_of("vis"), NOISE["vis"], SIDE, SIDE)
         assert here[0] == seen

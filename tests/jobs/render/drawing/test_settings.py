@@ -10,7 +10,7 @@ import pytest
 from benchmarks import _errors as errors
 from benchmarks import _positions as positions
 from benchmarks import _scenes as scenes
-from benchmarks._scenes import VIS, spread
+from benchmarks._scenes import VIS, psf_of
 from jobs import accuracy
 from jobs.accuracy import DRAFT, PRESETS, QUICKLOOK, REFERENCE, SURVEY
 from jobs.render.drawing import stamp_sizes, stamps, transfer
@@ -42,7 +42,7 @@ def test_more_is_asked_for_more_is_taken():
 @pytest.fixture(scope="module")
 def sample():
     """Galaxies and stars of 14.5 to 26 mag, of a seed of its own, each with its image at its best."""
-    some, full = scenes.stratified(VIS, 58, 1), spread(VIS)
+    some, full = scenes.stratified(VIS, 58, 1), psf_of(VIS)
     out = []
     for i in range(len(some)):
         one, own = scenes.moved(some, i, SIDE), scenes.own(full, some, i)
@@ -69,7 +69,7 @@ def test_a_quicklook_is_half_of_the_work_of_a_draft():
     some, found = scenes.sources(VIS, 1), []
     for wanted in (QUICKLOOK, DRAFT):
         settings = settings_for(wanted)
-        through = spread(VIS, settings.positions, settings.colours)
+        through = psf_of(VIS, settings.positions, settings.colours)
         sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, through, VIS.noise, settings)
         pixels = (sizes.astype(float) ** 2).sum()
         found.append((pixels, pixels * transfer.plane_count(through)))
@@ -79,7 +79,7 @@ def test_a_quicklook_is_half_of_the_work_of_a_draft():
 
 
 def test_planes_of_fewer_colours_are_means_of_neighbours():
-    whole = spread(VIS, 9)
+    whole = psf_of(VIS, 9)
     less = model.of_colours(whole, 2)
     assert model.of_colours(whole, 8) is whole
     np.testing.assert_allclose(less.planes.images[0], whole.planes.images[:4].mean(axis=0), rtol=1e-5, atol=1e-12)
@@ -98,7 +98,7 @@ def test_planes_of_fewer_colours_are_means_of_neighbours():
 
 def test_the_rim_is_the_brightest_pixel_farther_out():
     """Of a star on its largest stamp, too, but for its colour."""
-    full = replace(spread(VIS), edges=None)
+    full = replace(psf_of(VIS), edges=None)
     one = scenes.moved(scenes.stratified(VIS, 3, 1), 8, SIDE)
     star = scenes.draw(one, full, VIS, FULL, SIDE) / one.electrons[0]
     away = np.maximum(*np.abs(np.indices(star.shape) - SIDE // 2))
@@ -116,7 +116,7 @@ def test_between_its_positions_the_psf_is_as_wrong_as_the_table_says():
     """Against the optics computed at the place of a star."""
     table = {row["positions"]: row for row in rows("psf_positions.csv") if row["nearest"] == 0}
     at = positions.optics()
-    star, planes = positions.star(at, np.random.default_rng(8)), spread(VIS, 9).planes
+    star, planes = positions.star(at, np.random.default_rng(8)), psf_of(VIS, 9).planes
     flux, moved, r2, ellipticity = positions.errors_of(at((0.0, 0.0)) + positions.drift(planes, star), star)
     assert flux <= table[9]["flux_error"]
     assert moved <= table[9]["position_error"]

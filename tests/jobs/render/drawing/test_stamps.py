@@ -20,7 +20,7 @@ from jobs.render.drawing.settings import settings_for
 from jobs.render.psf import model
 from jobs.render.psf.model import Planes
 from jobs.render.sources import galaxy_shapes, source_list
-from tests.jobs.render.fields import galaxies, moments, one_source, small, spread
+from tests.jobs.render.fields import galaxies, moments, one_source, psf_of, small
 
 NOISE = 12.0
 KINDS = {
@@ -35,13 +35,15 @@ KINDS = {
 
 def scene(camera, name, angle=20.0, n=160):
     detector = small(camera, name, n)
-    return detector, wcs(detector, *boresight_for(detector, 10.0, 20.0, angle)), spread(camera, name)
+    return detector, wcs(detector, *boresight_for(detector, 10.0, 20.0, angle)), psf_of(camera, name)
 
 
 def drawn(sources, psf, n=160, accuracy=SURVEY):
     settings = settings_for(accuracy)
     sizes = stamp_sizes.stamp_sizes(sources.electrons, sources.shape, sources.shapes, psf, NOISE, settings)
-    return stamps.draw(sources, sizes, psf, n, n, floors=stamp_sizes.floors(sources.electrons, NOISE, settings))
+    return stamps.draw(
+        sources, sizes, psf, n, n, neglected=stamp_sizes.neglected_flux(sources.electrons, NOISE, settings)
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -92,7 +94,7 @@ def test_neighbouring_orientations_show_the_same_sky():
     for name in ("2-3", "2-4"):
         detector = small("vis", name)
         system = wcs(detector, *boresight_for(detector, 10.0, 0.0, 0.0))
-        images.append(drawn(one_source(detector, system, 1e5, **KINDS["both"]), spread("vis"), accuracy=REFERENCE))
+        images.append(drawn(one_source(detector, system, 1e5, **KINDS["both"]), psf_of("vis"), accuracy=REFERENCE))
     np.testing.assert_allclose(images[0], images[1][::-1, ::-1], atol=2e-3 * images[0].max())
 
 
@@ -185,7 +187,7 @@ def many(n, seed=5):
 
 
 def test_a_frame_is_the_sum_of_its_sources_and_the_same_every_time():
-    sources, psf = many(40), spread("lsstcam")
+    sources, psf = many(40), psf_of("lsstcam")
     whole = drawn(sources, psf)
     np.testing.assert_array_equal(whole, drawn(sources, psf))
     parts = sum(drawn(sources.take(np.arange(40) % 2 == i), psf) for i in (0, 1))
@@ -195,12 +197,12 @@ def test_a_frame_is_the_sum_of_its_sources_and_the_same_every_time():
 def test_progress_is_told():
     told = []
     sources = many(3)
-    stamps.draw(sources, np.full(3, 32), spread("lsstcam"), 160, 160, told.append)
+    stamps.draw(sources, np.full(3, 32), psf_of("lsstcam"), 160, 160, told.append)
     assert told[-1] == 3
 
 
 def test_sizes_follow_flux_noise_and_accuracy():
-    sources, psf = many(200), spread("lsstcam")
+    sources, psf = many(200), psf_of("lsstcam")
 
     def sizes(factor=1.0, noise=NOISE, accuracy=SURVEY):
         settings = settings_for(accuracy)
@@ -254,8 +256,8 @@ def test_the_jacobian_of_the_place_is_used():
     )
     point = one_source(detector, system, 1e6)
     _, second = moments(drawn(source, psf, accuracy=REFERENCE))
-    _, spread_out = moments(drawn(point, psf, accuracy=REFERENCE))
-    body = second - spread_out
+    _, psf = moments(drawn(point, psf, accuracy=REFERENCE))
+    body = second - psf
     assert np.sqrt(body[1, 1] / body[0, 0]) == pytest.approx(2.0, rel=0.05)
 
 
@@ -273,11 +275,11 @@ def test_memory_is_what_was_predicted(size, electrons, side):
     detector = small("vis", "3-4")
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 0.0))
     source = one_source(detector, system, electrons, disk_half_light_radius=1.0)
-    spread_out, sizes = spread("vis"), np.array([size])
-    stamps.draw(source, np.array([32]), spread_out, 64, 64)
+    psf, sizes = psf_of("vis"), np.array([size])
+    stamps.draw(source, np.array([32]), psf, 64, 64)
     tracemalloc.start()
     try:
-        stamps.draw(source, sizes, spread_out, side, side)
+        stamps.draw(source, sizes, psf, side, side)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -297,7 +299,7 @@ def test_every_scene_that_a_task_takes_has_room():
 
 def test_what_is_drawn_through_was_counted_before(monkeypatch):
     """Pixels of stamps, and of the PSF's planes on their grids: of many, of few, of bright ones."""
-    sources, psf = many(60), spread("lsstcam")
+    sources, psf = many(60), psf_of("lsstcam")
     sources.electrons[:3] = 1e9
     sizes = np.where(np.arange(60) % 7 == 0, 96, 48)
     counted = {"stamps": 0, "planes": 0}
@@ -323,7 +325,7 @@ def test_what_is_drawn_through_was_counted_before(monkeypatch):
 
 def test_seconds_follow_the_stamps():
     """Nine times the pixels: in proportion, whatever the machine; the planes, of one size each, are the rest."""
-    sources, psf = many(400), spread("lsstcam")
+    sources, psf = many(400), psf_of("lsstcam")
     spent, predicted = [], []
     for size in (64, 192):
         sizes = np.full(400, size)

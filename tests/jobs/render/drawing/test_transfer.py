@@ -12,7 +12,7 @@ from jobs.render.psf import model
 from jobs.render.psf.model import SAMPLES, Planes
 from jobs.render.psf.seeing import ground_psf
 from jobs.render.sources import galaxy_shapes, source_list
-from tests.jobs.render.fields import galaxies, one_source, small, spread
+from tests.jobs.render.fields import galaxies, one_source, psf_of, small
 
 
 def planes_psf(widths=(0.09, 0.13), place=0.0):
@@ -58,8 +58,8 @@ def test_a_grid_holds_each_frequency_once(size, reach):
 
 
 def test_planes_are_the_transform_of_the_psf_s_image():
-    spread_ = planes_psf()
-    some = transfer.transfer(spread_, 64, 6.0)
+    psf = planes_psf()
+    some = transfer.transfer(psf, 64, 6.0)
     k2 = some.grid.kx.astype(float) ** 2 + some.grid.ky.astype(float) ** 2
     pixel = np.sinc(some.grid.kx / (2 * np.pi)) * np.sinc(some.grid.ky / (2 * np.pi))
     for plane, width in zip(some.planes, (0.9, 1.3), strict=False):
@@ -69,7 +69,7 @@ def test_planes_are_the_transform_of_the_psf_s_image():
 
 def test_a_psf_in_planes_and_the_same_as_a_profile_draw_alike():
     """Colour and place by weights against one image made of them, many together against each alone."""
-    spread_, n = planes_psf(place=0.5), 20
+    psf, n = planes_psf(place=0.5), 20
     rng = np.random.default_rng(3)
     form = galaxy_shapes.shapes(galaxies(rng.random(n), rng.random(n), inclination=50.0, disk_half_light_radius=0.3))
     red = rng.random(n)
@@ -77,12 +77,12 @@ def test_a_psf_in_planes_and_the_same_as_a_profile_draw_alike():
         np.arange(n), 30 + 100 * rng.random(n), 30 + 100 * rng.random(n), np.tile(0.1 * np.eye(2), (n, 1, 1)),
         np.full(n, 1e5), np.where(np.arange(n) % 3 == 0, -1, np.arange(n)), form, np.column_stack([1 - red, red]),
     )  # fmt: skip
-    whole = stamps.draw(some, np.full(n, 64), spread_, 160, 160)
-    alone = sum(stamps.draw(some.take(np.array([i])), np.array([64]), spread_, 160, 160) for i in range(n))
+    whole = stamps.draw(some, np.full(n, 64), psf, 160, 160)
+    alone = sum(stamps.draw(some.take(np.array([i])), np.array([64]), psf, 160, 160) for i in range(n))
     np.testing.assert_allclose(whole, alone, atol=2e-6 * whole.max())
     width = (1 - red) * 0.09**2 + red * 0.13**2 + 0.5 * (some.column - 79.5) / 80 * (0.13**2 - 0.09**2)
     for i in (0, 3, 6):
-        image = stamps.draw(some.take(np.array([i])), np.array([64]), spread_, 160, 160)
+        image = stamps.draw(some.take(np.array([i])), np.array([64]), psf, 160, 160)
         y, x = np.mgrid[:160, :160]
         second = (image * ((x - some.column[i]) ** 2 + (y - some.row[i]) ** 2)).sum() / image.sum()
         assert second * 0.01 == pytest.approx(2 * (width[i] + 0.01 / 12), rel=1e-3)
@@ -96,18 +96,18 @@ def test_what_is_left_out_is_below_its_floor(index):
     source = one_source(
         detector, system, 1e4, bulge_fraction=0.7, bulge_sersic_index=index, bulge_half_light_radius=1.0
     )
-    whole = stamps.draw(source, np.array([128]), spread("vis"), 160, 160)
+    whole = stamps.draw(source, np.array([128]), psf_of("vis"), 160, 160)
     for floor in (1e-5, 1e-4, 1e-3, 1e-2):
-        less = stamps.draw(source, np.array([128]), spread("vis"), 160, 160, floors=np.array([floor]))
+        less = stamps.draw(source, np.array([128]), psf_of("vis"), 160, 160, neglected=np.array([floor]))
         assert np.isfinite(less).all()
         assert np.abs(less - whole).max() < 0.5 * floor * 1e4
 
 
 def test_passing_is_an_upper_bound_of_the_seeing_disc_s_transform():
-    spread_ = spread("lsstcam")
-    passing = transfer.passing(spread_)
+    psf = psf_of("lsstcam")
+    passing = transfer.passing(psf)
     k = (np.arange(len(passing)) + 0.5) * transfer.STEP
-    profile = galsim.Convolve(spread_.profile.dilate(5.0), galsim.Pixel(1.0))
+    profile = galsim.Convolve(psf.profile.dilate(5.0), galsim.Pixel(1.0))
     for at, most in zip(k, passing, strict=True):
         assert abs(profile.kValue(at, 0.0)) <= most * 1.1
 

@@ -17,7 +17,7 @@ from jobs.render.exposure import visible_sources
 from jobs.render.exposure.records import Rows
 from jobs.render.psf import euclid
 from jobs.render.sources import galaxy_shapes, selection, source_list
-from tests.jobs.render.fields import MISSION, aimed, galaxies, small, spread, stars
+from tests.jobs.render.fields import MISSION, aimed, galaxies, psf_of, small, stars
 
 SIDE, NOISE = 256, 12.0
 BAND = passbands.load("euclid_vis")
@@ -31,7 +31,7 @@ def vis():
     return euclid.vis_psf(detectors.detector("vis", "3-4", MISSION), BAND, MISSION, 1)
 
 
-def found(spread_, galaxy=None, star=None):
+def found(psf, galaxy=None, star=None):
     """(sources, sizes, image, drawn) of a small detector with a galaxy of 1e6 and a star of 1e5 electrons on pixels."""
     detector = small("vis", "3-4", SIDE)
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
@@ -41,11 +41,11 @@ def found(spread_, galaxy=None, star=None):
     rows = galaxies(*body, **BULGE), stars(*points)
     some, sizes = visible_sources.sources_of(
         Rows(rows[0], None, rows[1], None), (np.full(len(rows[0]), 1e6), np.full(len(rows[1]), 1e5)),
-        aimed(detector, system, BAND), spread_, NOISE, SETTINGS,
+        aimed(detector, system, BAND), psf, NOISE, SETTINGS,
     )  # fmt: skip
     drawn = np.zeros(len(some))
-    floors = stamp_sizes.floors(some.electrons, NOISE, SETTINGS)
-    image = stamps.draw(some, sizes, spread_, SIDE, SIDE, None, floors, stamps.Tally(drawn))
+    neglected = stamp_sizes.neglected_flux(some.electrons, NOISE, SETTINGS)
+    image = stamps.draw(some, sizes, psf, SIDE, SIDE, None, neglected, stamps.Tally(drawn))
     return some, sizes, image, drawn
 
 
@@ -53,14 +53,14 @@ def test_a_galaxy_s_light_comes_from_beside_the_frame_as_far_as_it_goes():
     """Where its stamp leaves the frame there is no step, and no end."""
     light, on_stamp = [], []
     for column in (-382.0, -383.0, -384.0, -385.0, -386.0, -387.0, -388.0):
-        _, sizes, image, drawn = found(spread("vis"), (column, 100.0))
+        _, sizes, image, drawn = found(psf_of("vis"), (column, 100.0))
         assert sizes.tolist() == [768]
         light.append(image.sum())
         on_stamp.append(drawn[0])
     assert on_stamp[0] > 0
     assert on_stamp[-1] == 0
     np.testing.assert_allclose(np.array(light[1:]) / light[:-1], 1.0, atol=0.03)
-    far = [found(spread("vis"), (column, 100.0))[2].sum() for column in (-500.0, -900.0, -1300.0)]
+    far = [found(psf_of("vis"), (column, 100.0))[2].sum() for column in (-500.0, -900.0, -1300.0)]
     assert light[-1] > far[0] > far[1] > far[2] > 1.0
 
 
@@ -71,7 +71,7 @@ def test_a_star_s_wings_come_from_beside_the_frame(vis):
         assert (drawn > 0) == (column > -0.5 * sizes)
     assert len(found(vis, star=(-300.0, 100.0))[0]) == 0
     # Behind an atmosphere all of them are on the stamp.
-    assert len(found(spread("vis"), star=(-60.0, 100.0))[0]) == 0
+    assert len(found(psf_of("vis"), star=(-60.0, 100.0))[0]) == 0
 
 
 def crowd(n, seed, margin):
@@ -91,17 +91,17 @@ def crowd(n, seed, margin):
     return source_list.Sources(np.arange(n), column, row, jacobian, 10 ** rng.uniform(2, 5, n), shape, shapes)
 
 
-def shone_on(some, sizes, spread_):
-    return stamp_sizes.shone_on(some, sizes, spread_, NOISE, SIDE, SIDE)
+def touching_frame(some, sizes, psf):
+    return stamp_sizes.touching_frame(some, sizes, psf, NOISE, SIDE, SIDE)
 
 
 @given(st.integers(0, 1000), st.sampled_from(["vis", "seeing"]))
 def test_whom_nobody_names_brings_no_light(vis, seed, kind):
     """As far as a galaxy's light is drawn, and a point's wings: the others may be left out, bit by bit."""
-    some, spread_ = crowd(40, seed, 1200.0), vis if kind == "vis" else spread("vis")
-    sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, spread_, NOISE, SETTINGS)
-    here = shone_on(some, sizes, spread_)
-    assert not stamps.draw(some.take(~here), sizes[~here], spread_, SIDE, SIDE).any()
+    some, psf = crowd(40, seed, 1200.0), vis if kind == "vis" else psf_of("vis")
+    sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, psf, NOISE, SETTINGS)
+    here = touching_frame(some, sizes, psf)
+    assert not stamps.draw(some.take(~here), sizes[~here], psf, SIDE, SIDE).any()
 
 
 def test_the_border_of_a_crowded_field_is_as_bright_as_its_middle(vis):
@@ -110,7 +110,7 @@ def test_the_border_of_a_crowded_field_is_as_bright_as_its_middle(vis):
     some = crowd(500, 3, 300.0)
     some.electrons[some.shape < 0] = 2e5
     sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, vis, NOISE, SETTINGS)
-    here = shone_on(some, sizes, vis)
+    here = touching_frame(some, sizes, vis)
     ours = stamps.draw(some.take(here), sizes[here], vis, SIDE, SIDE)
     wide = replace(some, column=some.column + margin, row=some.row + margin)
     whole = stamps.draw(wide, sizes, vis, SIDE + 2 * margin, SIDE + 2 * margin)

@@ -21,7 +21,7 @@ from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.ids import kind_of
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render import fields
-from tests.jobs.render.fields import MISSION, fluxes, galaxies, one_source, small, spread, stars
+from tests.jobs.render.fields import MISSION, fluxes, galaxies, one_source, psf_of, small, stars
 
 DAY = 60905
 ECLIPTIC = tuple(float(x) for x in equatorial(70.0, 0.0))
@@ -82,7 +82,7 @@ def test_a_trail_is_a_row_of_points(line):
     trail = np.array([line])
     body = Sources(*(getattr(point, n) for n in ("ids", "column", "row", "jacobian", "electrons", "shape", "shapes")),
                    trail=trail)  # fmt: skip
-    psf = spread("vis")
+    psf = psf_of("vis")
     settings = settings_for(SURVEY)
     sizes = stamp_sizes.stamp_sizes(
         body.electrons, body.shape, body.shapes, psf, 12.0, settings, piece_length(body.length)
