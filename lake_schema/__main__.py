@@ -1,5 +1,5 @@
 """Look after a lake: python -m lake_schema verify|gc|describe LAKE [TABLE]; `tables` prints the reference page;
-`mission diff A B` compares two mission configurations, each a ladder (CBE,DES,SIM), a request or a LAKE[@KEY].
+`mission list [PATTERN]` prints the mission database, `mission diff A [B]` compares two configurations of it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: 0 all well, 1 something is wrong with the lake, 2 the call is wrong."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["mission"]:
-        return _mission(arguments[1:])
+        from lake_schema.mission import commands as mission
+
+        return mission.main(arguments[1:])
     parser = argparse.ArgumentParser(prog="python -m lake_schema", description=__doc__, epilog=f"truesky {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="verify|gc|describe|tables")
     for name in ("verify", "gc", "describe"):
@@ -44,26 +46,6 @@ def _looked_after(options: argparse.Namespace) -> int:
     actions = {"verify": _verify, "gc": _gc, "describe": _describe}
     # What is wrong with one table is said, and the others are looked at all the same.
     return max(_status(actions[options.command], root, name, options.deep) for name in names)
-
-
-def _mission(argv: Sequence[str]) -> int:
-    """Exit status as of diff: 0 the same, 1 different, 2 the call is wrong."""
-    from lake_schema.mission.compare import compare
-
-    parser = argparse.ArgumentParser(prog="python -m lake_schema mission", description="Compare mission configurations")
-    parser.add_argument("command", choices=("diff",))
-    about = "a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of its table mission"
-    parser.add_argument("first", help=about)
-    parser.add_argument("second", help="the same")
-    options = parser.parse_args(argv)
-
-    def compared() -> int:
-        lines = compare(options.first, options.second)
-        for line in lines:
-            print(line)
-        return int(bool(lines))
-
-    return command.status("lake_schema", compared)
 
 
 def _names(root: Path, command: str) -> list[str]:

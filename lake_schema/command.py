@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import sys
 from collections.abc import Callable
 
@@ -23,7 +24,13 @@ def status(name: str, body: Callable[[], int]) -> int:
         # Not every terminal has the letters of every name.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        return body()
+        code = body()
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        # Who reads has seen enough, and Python would complain again at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except BadInput as error:
         return say(name, error, 2)
     except (LakeError, OSError, MemoryError) as error:

@@ -14,6 +14,7 @@
     [ingest.dust]      file, column, quantity = "ebv" | "a_v"   a HEALPix map of the Milky Way's dust instead of ours
     [strong_lenses]  boost   how many times denser than in nature they are drawn
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
+                   of one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
     [fluxes]       bands = [..]           default: the bands of the pointings and observations
                    intergalactic = true   galaxies are seen through the hydrogen between them
     [fluxes.passbands.NAME]        your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format

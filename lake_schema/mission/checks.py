@@ -14,6 +14,7 @@ import numpy as np
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import CAMERAS, convert, read_all
+from lake_schema.mission.places import split
 
 # Quantities of which no chosen value may be worse than what is required, and which way worse is.
 _LOWER = ("*.read_noise", "*.dark_current", "*.prnu", "*.crosstalk", "*.jitter_?", "*.psf.fwhm", "*.ellipticity",
@@ -47,7 +48,7 @@ def faults(configuration: MissionConfiguration) -> Iterator[str]:
 def _worse_than_required(configuration: MissionConfiguration) -> Iterator[str]:
     required = {record.key: record for record in read_all() if record.status == "REQ"}
     for chosen in configuration.parameters:
-        limit = required.get(chosen.key)
+        limit = required.get(split(chosen.key, configuration)[0])
         if limit is None or chosen.status in ("REQ", "SIM"):
             continue
         bound = convert(limit.value, limit.unit, chosen.unit, chosen.key)

@@ -1,7 +1,8 @@
 """A mission configuration: exactly one value and one model for every name, chosen by a ladder of statuses.
 
 resolve                 records + ladder + overrides -> MissionConfiguration
-MissionConfiguration    .value(key, unit), .numbers(key), .rows(key), .fingerprint
+MissionConfiguration    .value(key, unit, place), .of_amplifiers(key, unit, detector), .numbers(key), .rows(key),
+                        .fingerprint
 difference              what two configurations do not have in common
 """
 
@@ -20,9 +21,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from lake_schema.errors import BadInput, OutOfRange
-from lake_schema.mission import model
+from lake_schema.mission import model, places
 from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import STATUSES, Parameter, convert, read_all
+from lake_schema.mission.places import Place
 from lake_schema.tables.mission import LADDER
 
 __all__ = ["LADDER", "MissionConfiguration", "difference", "resolve"]
@@ -32,7 +34,7 @@ Chosen = TypeVar("Chosen", Parameter, Model)
 
 @dataclass(frozen=True, slots=True)
 class MissionConfiguration:
-    """One record a name, sorted by name.
+    """One record a name, sorted by name; a value of a detector or an amplifier is under a name of its own (places).
 
     overridden : names whose value a request replaced
     folder     : where the files of its models lie, if they are not the package's
@@ -45,10 +47,17 @@ class MissionConfiguration:
     folder: Path | None = None
     _index: dict[str, Parameter] = field(init=False, repr=False, compare=False)
     _files: dict[str, Model] = field(init=False, repr=False, compare=False)
+    _placed: dict[str, tuple[Place, ...]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_index", {p.key: p for p in self.parameters})
         object.__setattr__(self, "_files", {m.key: m for m in self.models})
+        placed: dict[str, tuple[Place, ...]] = {}
+        for name in self.overridden:
+            key, place = places.split(name, self._index)
+            if key != name:
+                placed[key] = (*placed.get(key, ()), place)
+        object.__setattr__(self, "_placed", placed)
 
     def parameter(self, key: str) -> Parameter:
         """The record chosen for a name; BadInput for an unknown one."""
@@ -65,12 +74,22 @@ class MissionConfiguration:
     def __contains__(self, key: str) -> bool:
         return key in self._index or key in self._files
 
-    def value(self, key: str, unit: str | None = None) -> float:
-        """The value of a name, in `unit` where one is given, else in its record's own."""
+    def value(self, key: str, unit: str | None = None, place: Place | None = None) -> float:
+        """The value of a name, in `unit` where one is given, else in its record's own; place : that it is wanted for."""
         record = self.parameter(key)
+        if place and key in self._placed:
+            record = next(self._index[name] for name in places.names(key, place) if name in self._index)
         if unit is None or unit == record.unit:
             return record.value
         return convert(record.value, record.unit, unit, f"mission parameter {key}")
+
+    def of_amplifiers(self, key: str, unit: str, detector: str) -> tuple[float, ...]:
+        """The value for each amplifier of a detector, in the order in which they are read; one where all have it."""
+        if not any(place.amplifier and place.detector in ("", detector) for place in self._placed.get(key, ())):
+            return (self.value(key, unit, Place(detector)),)
+        names = places.amplifiers(places.section_of(key), self)
+        values = tuple(self.value(key, unit, Place(detector, name)) for name in names)
+        return values if len(set(values)) > 1 else values[:1]
 
     def numbers(self, key: str) -> tuple[tuple[float, ...], ...]:
         """A model that is a table of numbers: its rows."""
@@ -83,11 +102,15 @@ class MissionConfiguration:
     def overridden_with(self, overrides: Mapping[str, tuple[float, str]]) -> MissionConfiguration:
         """The same with other values of some names; BadInput / OutOfRange name the parameter."""
         chosen = dict(self._index)
-        for key, (value, unit) in overrides.items():
-            chosen[key] = _overridden(chosen, key, value, unit)
-            _check_bounds(chosen[key])
+        for name, (value, unit) in overrides.items():
+            chosen[name] = _overridden(self._index, name, value, unit)
+            _check_bounds(chosen[name], places.split(name, self._index)[0])
         names = tuple(sorted({*self.overridden, *overrides}))
-        return replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
+        found = replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
+        for name in names:
+            if places.split(name, chosen)[0] != name:
+                places.check(name, found)
+        return found
 
     @property
     def fingerprint(self) -> str:
@@ -128,7 +151,7 @@ def resolve(
     if twice := sorted(set(chosen) & set(files_)):
         raise BadInput(f"mission parameter {twice[0]} is a value and a model")
     for parameter in chosen.values():
-        _check_bounds(parameter)
+        _check_bounds(parameter, parameter.key)
     found = MissionConfiguration(
         tuple(chosen[key] for key in sorted(chosen)),
         tuple(ladder),
@@ -158,15 +181,17 @@ def _choose(key: str, group: Sequence[Chosen], ladder: Sequence[str], mjd: float
     raise BadInput(f"mission parameter {key} has no record of status {', '.join(ladder)} at this date")
 
 
-def _overridden(chosen: Mapping[str, Parameter], key: str, value: float, unit: str) -> Parameter:
-    if key not in chosen:
-        raise BadInput(f"mission override {key}: the mission database has no such parameter")
-    where = f"mission override {key}"
+def _overridden(known: Mapping[str, Parameter], name: str, value: float, unit: str) -> Parameter:
+    where = f"mission override {name}"
+    key, _ = places.split(name, known)
+    if key not in known:
+        raise BadInput(f"{where}: the mission database has no such parameter")
     if not math.isfinite(value):
         raise BadInput(f"{where} = {value} is not finite")
-    own = chosen[key].unit
+    own = known[key].unit
     return replace(
-        chosen[key],
+        known[key],
+        key=name,
         status="SIM",
         value=convert(value, unit, own, where),
         confidence="assumed",
@@ -189,8 +214,9 @@ def bounds_of(key: str) -> tuple[tuple[float, float, str], ...]:
     return tuple((lo, hi, unit) for pattern, lo, hi, unit in _bounds() if pattern.fullmatch(key))
 
 
-def _check_bounds(parameter: Parameter) -> None:
-    for lo, hi, unit in bounds_of(parameter.key):
+def _check_bounds(parameter: Parameter, key: str) -> None:
+    """key : the parameter's name, without a place."""
+    for lo, hi, unit in bounds_of(key):
         value = convert(parameter.value, parameter.unit, unit, f"mission parameter {parameter.key}")
         if not lo <= value <= hi:
             raise OutOfRange(f"mission parameter {parameter.key} [{unit}]", value, lo, hi)

@@ -12,6 +12,7 @@ import numpy as np
 
 from jobs.render.camera import distortion
 from lake_schema.errors import BadInput
+from lake_schema.mission import places
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import CAMERAS
 
@@ -64,11 +65,11 @@ def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...
     """
     if camera == "vis":
         _refuse_odd("vis", mission)
-        planned = _grid(mission, "vis", lambda row, column: (f"{row}-{column}", column >= _VIS_FIRST_ROTATED_COLUMN))
+        planned = _grid(mission, "vis", lambda row, column: column >= _VIS_FIRST_ROTATED_COLUMN)
         bending = distortion.terms("vis", mission)
         return tuple(replace(d, bending=bending) for d in _mounted(planned, "vis", mission))
     if camera == "nisp":
-        return tuple(_grid(mission, "nisp", lambda row, column: (f"DET{row}{column}", row >= _NISP_FIRST_ROTATED_ROW)))
+        return tuple(_grid(mission, "nisp", lambda row, column: row >= _NISP_FIRST_ROTATED_ROW))
     if camera in CAMERAS:
         return _listed(f"ext.{camera}", mission)
     raise BadInput(f"camera {camera!r} is not one of vis, nisp, {', '.join(CAMERAS)}")
@@ -91,9 +92,9 @@ def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
 
 
 def _grid(
-    mission: MissionConfiguration, section: str, label: Callable[[int, int], tuple[str, bool]]
+    mission: MissionConfiguration, section: str, upside_down: Callable[[int, int], bool]
 ) -> Iterator[Detector]:
-    """Rows from the top, columns from the left; `label` gives the name, and whether it is mounted upside down.
+    """Rows from the top, columns from the left; upside_down : row, column -> whether one is mounted so.
 
     The pitch is of the published rows, without those of charge injection, and gaps: VIS fills 0.7781 deg.
     Error : VIS, 0.4": so much less than the published gap is left between the images of neighbours in a column
@@ -106,15 +107,14 @@ def _grid(
     pitch_y = ny * scale + mission.value(f"{section}.fpa.gap_y", "arcsec")
     for row in range(1, rows + 1):
         for column in range(1, columns + 1):
-            name, turned = label(row, column)
             yield Detector(
-                name=name,
+                name=places.GRID_NAMES[section].format(row=row, column=column),
                 section=section,
                 nx=nx,
                 ny=ny + middle,
                 x=(column - (columns + 1) / 2) * pitch_x,
                 y=((rows + 1) / 2 - row) * pitch_y,
-                rotation=180.0 if turned else 0.0,
+                rotation=180.0 if upside_down(row, column) else 0.0,
                 pixel_scale=scale,
                 middle=middle,
             )

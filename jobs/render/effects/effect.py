@@ -60,9 +60,20 @@ def nothing(scene: Scene) -> float:
 
 
 def by_pixel(kernel: Callable[..., None], frame: Frame, *numbers: Any) -> Frame:
-    """A new frame of the same shape, in which a compiled kernel(before [n], after [n], *numbers) has set each pixel."""
+    """A new frame of the same shape, in which a compiled kernel(before [n], after [n], *numbers) has set each pixel.
+
+    numbers : each for the frame, or [q] for its q amplifiers, which are then set one by one: frame [q, ..]
+    """
     out = np.empty(frame.shape)
-    kernel(np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1), *numbers)
+    before, after = np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1)
+    parts = max(np.size(number) for number in numbers)
+    if parts == 1:
+        kernel(before, after, *numbers)
+        return out
+    if frame.shape[0] != parts:
+        raise BadInput(f"numbers of {parts} amplifiers for a frame of {frame.shape[0]}")
+    for number, (one, other) in enumerate(zip(np.split(before, parts), np.split(after, parts), strict=True)):
+        kernel(one, other, *(n[number] if np.ndim(n) else n for n in numbers))
     return out
 
 

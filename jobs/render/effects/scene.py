@@ -13,6 +13,7 @@ from jobs.render.camera.detectors import Detector
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.mission.places import Place
 
 Frame = Float
 
@@ -89,7 +90,16 @@ class Scene:
 
     def value(self, key: str, unit: str) -> float:
         """A parameter of the detector."""
-        return self.mission.value(f"{self.section}.{key}", unit)
+        return self.mission.value(f"{self.section}.{key}", unit, Place(self._name))
+
+    def of_amplifiers(self, key: str, unit: str) -> float | Float:
+        """A parameter of its amplifiers: float64[q] in the order in which they are read; one number where all agree."""
+        values = self.mission.of_amplifiers(f"{self.section}.{key}", unit, self._name)
+        return np.array(values) if len(values) > 1 else values[0]
+
+    @property
+    def _name(self) -> str:
+        return self.detector.name if self.detector is not None else ""
 
     @property
     def nx(self) -> int:
@@ -146,5 +156,6 @@ class Scene:
     @property
     def pixel_noise(self) -> float:
         """Electrons rms of a pixel without a source: sky, dark current, reading."""
-        read_noise = self.value("read_noise", "electron")
+        # Of the quietest amplifier: what is noticed there matters.
+        read_noise = np.min(self.of_amplifiers("read_noise", "electron"))
         return float(np.sqrt(self.sky_electrons + self.dark_electrons + read_noise**2))

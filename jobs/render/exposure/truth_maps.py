@@ -76,7 +76,8 @@ def complete(
         if name in wanted and name not in maps:
             maps[name] = np.zeros(shape, dtype)
     if "saturation" in truth:
-        full = raw >= scene.value("adc_max", "adu")
+        largest = scene.of_amplifiers("adc_max", "adu")
+        full = raw >= (np.reshape(largest, (-1, 1, 1)) if np.ndim(largest) else largest)
         maps["saturation"] |= full if full.ndim == 2 else quadrants.assembled(full, *quadrants.sizes(scene))
     for truth_map in maps.values():
         truth_map[slice(*scene.unread)] = 0

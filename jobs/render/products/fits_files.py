@@ -68,4 +68,8 @@ def _science(rendered: Rendered) -> list[Image]:
     if [extension.name for extension in readout.extensions] == [""]:
         return [Image(readout.extensions[0].data, cards)]
     whole = Image(None, (*cards, *readout.cards))
-    return [whole, *(Image(extension.data, extension.cards, extension.name) for extension in readout.extensions)]
+    arrays = [
+        Image(extension.data, (*extension.cards, *headers.amplifier_cards(rendered, number)), extension.name)
+        for number, extension in enumerate(readout.extensions)
+    ]
+    return [whole, *arrays]

@@ -14,6 +14,7 @@ from jobs.render.channels.registry import effects_of
 from jobs.render.effects.readout import bias_structure, charge_transfer, nonlinearity, read_noise
 from jobs.render.exposure.rendered import Rendered, numbers_of
 from lake_schema import __version__
+from lake_schema.arrays import Float
 from lake_schema.fits.images import Card
 
 # Of an amplifier's offset, a column's stripe and a reading: what next to no pixel is below.
@@ -31,22 +32,32 @@ _MJD_ZERO = datetime(1858, 11, 17)
 def science_cards(rendered: Rendered) -> tuple[Card, ...]:
     """Header of the science image: what an astronomer needs to calibrate it, and what made it."""
     scene = rendered.scene
-    gain = scene.value("gain", "electron / adu")
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     return (
         *_common(rendered),
         ("BUNIT", rendered.readout.unit, "unit of the pixels"),
-        ("GAIN", gain, "[electron/adu] conversion gain"),
-        (
-            "RDNOISE",
-            ("read_noise" in applied) * scene.value("read_noise", "electron"),
-            "[electron] rms read noise in the image",
-        ),
-        ("BIAS", scene.value("bias", "adu"), "[adu] bias level, added to every pixel"),
-        ("SATURATE", _saturation(rendered, gain), "[adu] lowest level of a saturated pixel"),
+        *((key, value, comment) for key, value, comment in _of_amplifiers(rendered) if np.ndim(value) == 0),
         ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
         ("DARKRATE", ("dark_current" in applied) * scene.dark_rate, "[electron/s/pix] mean dark current in the image"),
         *_effect_cards(rendered),
+    )
+
+
+def amplifier_cards(rendered: Rendered, number: int) -> tuple[Card, ...]:
+    """Header of an amplifier's array: what differs from one amplifier to the other, and is not in the common header."""
+    found = ((key, np.atleast_1d(value), comment) for key, value, comment in _of_amplifiers(rendered))
+    return tuple((key, float(values[number]), comment) for key, values, comment in found if len(values) > 1)
+
+
+def _of_amplifiers(rendered: Rendered) -> tuple[tuple[str, float | Float, str], ...]:
+    """Keyword, value or values [q], comment."""
+    scene = rendered.scene
+    noisy = any(decision.name == "read_noise" and decision.applied for decision in rendered.decisions)
+    return (
+        ("GAIN", scene.of_amplifiers("gain", "electron / adu"), "[electron/adu] conversion gain"),
+        ("RDNOISE", noisy * scene.of_amplifiers("read_noise", "electron"), "[electron] rms read noise in the image"),
+        ("BIAS", scene.of_amplifiers("bias", "adu"), "[adu] bias level, added to every pixel"),
+        ("SATURATE", _saturation(rendered), "[adu] lowest level of a saturated pixel"),
     )
 
 
@@ -115,20 +126,25 @@ def _date(mjd: float) -> str:
     return (_MJD_ZERO + timedelta(days=mjd)).isoformat(timespec="milliseconds")
 
 
-def _saturation(rendered: Rendered, gain: float) -> float:
-    """What a full pixel reads at least: of its charge, what transfer and amplifier leave, below all noise."""
+def _saturation(rendered: Rendered) -> float | Float:
+    """What a full pixel reads at least: of its charge, what transfer and amplifier leave, below all noise; or [q]."""
     full = rendered.scene.value("full_well", "electron")
     scene = replace(rendered.scene, peak_electrons=full)
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     # The first of a column, or a row, finds all traps empty.
     losses = (charge_transfer.PARALLEL, charge_transfer.SERIAL)
-    signal = full - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
+    left = full - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
+    signal: float | Float = left
     if nonlinearity.EFFECT.name in applied:
-        signal = float(nonlinearity.apply(np.array([max(signal, 0.0)]), *nonlinearity.parameters(scene))[0])
+        curve = nonlinearity.parameters(scene)
+        parts = max(np.size(number) for number in curve)
+        signal = nonlinearity.apply(np.full(parts, max(left, 0.0)), *curve)
+        signal = signal if parts > 1 else float(signal[0])
     noises = (bias_structure.EFFECT, read_noise.EFFECT)
-    signal -= _SURE * sum(effect.contribution(scene) for effect in noises if effect.name in applied)
-    level = signal / gain + scene.value("bias", "adu")
-    return float(np.floor(np.clip(level, 0.0, scene.value("adc_max", "adu"))))
+    signal = signal - _SURE * sum(effect.contribution(scene) for effect in noises if effect.name in applied)
+    level = signal / scene.of_amplifiers("gain", "electron / adu") + scene.of_amplifiers("bias", "adu")
+    found = np.floor(np.clip(level, 0.0, scene.of_amplifiers("adc_max", "adu")))
+    return np.asarray(found) if np.ndim(found) else float(found)
 
 
 def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:

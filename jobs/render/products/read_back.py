@@ -29,10 +29,12 @@ def electrons(path: Path) -> images.Image:
     """A science file's pixels [ny, nx], float64 e- above the level of each amplifier."""
     read = images.read_images(path)
     header = {keyword: value for keyword, value, _ in read[0].cards}
-    gain, bias = float(header["GAIN"]), float(header["BIAS"])
     if read[0].data is not None:
-        return images.Image((read[0].data - bias) * gain, read[0].cards)
+        return images.Image((read[0].data - float(header["BIAS"])) * float(header["GAIN"]), read[0].cards)
     raw, sizes = _raw(read)
+    # In the extension's header where the amplifiers have different gains.
+    own = [{**header, **{keyword: value for keyword, value, _ in unit.cards}} for unit in read[1:]]
+    gain = np.array([float(cards["GAIN"]) for cards in own]).reshape(-1, 1, 1)
     _, overscan, rows, _ = sizes
     # The last half of the columns after the pixels: charge that traps gave back is in the first.
     level = raw[:, : raw.shape[1] - rows, raw.shape[2] - max(overscan // 2, 1) :].mean(axis=(1, 2), keepdims=True)

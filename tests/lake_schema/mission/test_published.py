@@ -25,7 +25,10 @@ def put(lake, configuration, **facts):
     return read.version(lake, "mission")
 
 
-@pytest.mark.parametrize("configuration", [resolve(), CHANGED])
+PLACED = resolve(overrides={"vis.gain.E": (3.3, "electron / adu"), "vis.gain@3-4": (3.2, "electron / adu")})
+
+
+@pytest.mark.parametrize("configuration", [resolve(), CHANGED, PLACED])
 def test_it_comes_back_as_it_went(tmp_path, configuration):
     version = put(tmp_path, configuration)
     back = published.read_back(version)

@@ -9,15 +9,22 @@ import numpy as np
 from jobs.compiling import jit
 from jobs.render.effects.effect import Effect, by_pixel
 from jobs.render.effects.scene import Frame, Scene
+from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 
 
-def apply(frame: Frame, gain: float, bias: float, largest: float, rng: np.random.Generator | None = None) -> Frame:
+def apply(
+    frame: Frame,
+    gain: float | Float,
+    bias: float | Float,
+    largest: float | Float,
+    rng: np.random.Generator | None = None,
+) -> Frame:
     """Electrons [ny, nx] -> ADU, whole numbers in [0, largest].
 
-    gain : electrons per ADU;  bias : ADU
+    gain : electrons per ADU;  bias : ADU;  each may be [q] of the amplifiers of a frame [q, ny, nx]
     """
-    if not 0.0 < gain < np.inf:
+    if not (np.min(gain) > 0.0 and np.max(gain) < np.inf):
         raise OutOfRange("gain", gain, 0.0, np.inf)
     return by_pixel(_convert, frame, gain, bias + 0.5, largest)
 
@@ -28,13 +35,14 @@ def _convert(electrons: Any, numbers: Any, gain: float, offset: float, largest: 
         numbers[i] = min(max(np.floor(electrons[i] / gain + offset), 0.0), largest)
 
 
-def _parameters(scene: Scene) -> tuple[float, float, float]:
-    return scene.value("gain", "electron / adu"), scene.value("bias", "adu"), scene.value("adc_max", "adu")
+def _parameters(scene: Scene) -> tuple[float | Float, float | Float, float | Float]:
+    gain, bias = scene.of_amplifiers("gain", "electron / adu"), scene.of_amplifiers("bias", "adu")
+    return gain, bias, scene.of_amplifiers("adc_max", "adu")
 
 
 def _contribution(scene: Scene) -> float:
     gain, bias, _ = _parameters(scene)
-    return gain * (bias + 0.5)
+    return float(np.max(gain * (bias + 0.5)))
 
 
 EFFECT = Effect("adc", apply, _parameters, _contribution, optional=False, cost=3e-3)

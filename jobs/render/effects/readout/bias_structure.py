@@ -6,11 +6,15 @@ import numpy as np
 
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
+from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 
 
+Number = float | Float
+
+
 def apply(
-    frame: Frame, offset: float, settling: float, length: float, stripes: float, rng: np.random.Generator
+    frame: Frame, offset: Number, settling: Number, length: Number, stripes: Number, rng: np.random.Generator
 ) -> Frame:
     """quadrants [q, ny, nx] e- in readout order -> plus `structure`, the same in every row."""
     shape = frame.reshape(-1, *frame.shape[-2:]).shape
@@ -19,9 +23,9 @@ def apply(
 
 
 def structure(
-    quadrants: int, nx: int, offset: float, settling: float, length: float, stripes: float, rng: np.random.Generator
+    quadrants: int, nx: int, offset: Number, settling: Number, length: Number, stripes: Number, rng: np.random.Generator
 ) -> Frame:
-    """The pattern [quadrants, nx], e-.
+    """The pattern [quadrants, nx], e-; each number may be [quadrants].
 
     offset : rms between amplifiers, e-;  settling : of the first column, e-, falling off over `length` columns
     stripes : rms between columns, e-
@@ -29,22 +33,25 @@ def structure(
     for name, value, least in (
         ("bias offset", offset, 0.0), ("bias stripes", stripes, 0.0), ("bias settling length", length, 1e-3)
     ):  # fmt: skip
-        if not least <= value < np.inf:
+        if not (np.min(value) >= least and np.max(value) < np.inf):
             raise OutOfRange(name, value, least, np.inf)
+    offset, settling, length, stripes = (np.reshape(number, (-1, 1)) for number in (offset, settling, length, stripes))
     own = offset * rng.standard_normal((quadrants, 1))
     settled = settling * np.exp(-np.arange(nx) / length)
     return np.asarray(own + settled + stripes * rng.standard_normal((quadrants, nx)))
 
 
-def _parameters(scene: Scene) -> tuple[float, float, float, float]:
-    gain = scene.value("gain", "electron / adu")
-    offset, settling, stripes = (gain * scene.value(f"bias_{key}", "adu") for key in ("offset", "settling", "stripes"))
-    return offset, settling, scene.value("bias_settling_length", "pix"), stripes
+def _parameters(scene: Scene) -> tuple[Number, Number, Number, Number]:
+    gain = scene.of_amplifiers("gain", "electron / adu")
+    offset, settling, stripes = (
+        gain * scene.of_amplifiers(f"bias_{key}", "adu") for key in ("offset", "settling", "stripes")
+    )
+    return offset, settling, scene.of_amplifiers("bias_settling_length", "pix"), stripes
 
 
 def _contribution(scene: Scene) -> float:
     offset, settling, _, stripes = _parameters(scene)
-    return offset + abs(settling) + stripes
+    return float(np.max(offset + np.abs(settling) + stripes))
 
 
 EFFECT = Effect("bias_structure", apply, _parameters, _contribution, fixed=True, cost=4e-3)

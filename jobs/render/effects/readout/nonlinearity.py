@@ -15,6 +15,7 @@ import numpy as np
 from jobs.compiling import jit
 from jobs.render.effects.effect import Effect, by_pixel
 from jobs.render.effects.scene import Frame, Scene
+from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 
 # Newton's rule doubles the digits; the function is smooth and its slope between 1 - b and 1.
@@ -23,10 +24,13 @@ _ITERATIONS = 6
 _SMALL = 0.25
 
 
+Number = float | Float
+
+
 def apply(
-    frame: Frame, high: float, saturation: float, low: float, knee: float, rng: np.random.Generator | None = None
+    frame: Frame, high: Number, saturation: Number, low: Number, knee: Number, rng: np.random.Generator | None = None
 ) -> Frame:
-    """frame [..] e- >= 0 -> e-, monotonic.
+    """frame [..] e- >= 0 -> e-, monotonic; each number may be [q] of the amplifiers of a frame [q, ..].
 
     high : a, what is missing at `saturation` e-;  low : b, what is missing of the first electrons;  knee : n0, e-
     """
@@ -63,9 +67,12 @@ def _small_expm1(x: Any) -> Any:
     return x * out
 
 
-def linearised(measured: Frame, high: float, saturation: float, low: float, knee: float) -> Frame:
+def linearised(measured: Frame, high: Number, saturation: Number, low: Number, knee: Number) -> Frame:
     """The electrons that `apply` made into `measured`; beyond what it can give: infinite."""
     _check(high, saturation, low, knee)
+    high, saturation, low, knee = (
+        np.reshape(n, (-1, *[1] * (measured.ndim - 1))) if np.ndim(n) else n for n in (high, saturation, low, knee)
+    )
     light = np.maximum(measured, 0.0)
     response = light / (1.0 - low * np.exp(-light / knee))
     for _ in range(_ITERATIONS):
@@ -77,31 +84,33 @@ def linearised(measured: Frame, high: float, saturation: float, low: float, knee
     return np.asarray(out + np.minimum(measured, 0.0))
 
 
-def _check(high: float, saturation: float, low: float, knee: float) -> None:
+def _check(high: Number, saturation: Number, low: Number, knee: Number) -> None:
     for name, value, least, most in (
         ("non-linearity at saturation", high, 0.0, 10.0),
         ("amplifier saturation", saturation, 1.0, 1e9),
         ("non-linearity of low signals", low, 0.0, 0.99),
         ("non-linearity knee", knee, 1e-3, 1e9),
     ):
-        if not least <= value <= most:
+        if not (np.min(value) >= least and np.max(value) <= most):
             raise OutOfRange(name, value, least, most)
 
 
-def parameters(scene: Scene) -> tuple[float, float, float, float]:
+def parameters(scene: Scene) -> tuple[Number, Number, Number, Number]:
     """high, saturation, low, knee: the converter's range is the amplifier's."""
-    saturation = scene.value("adc_max", "adu") * scene.value("gain", "electron / adu")
+    saturation = scene.of_amplifiers("adc_max", "adu") * scene.of_amplifiers("gain", "electron / adu")
     return (
-        scene.value("nonlinearity.high", ""),
+        scene.of_amplifiers("nonlinearity.high", ""),
         saturation,
-        scene.value("nonlinearity.low", ""),
-        scene.value("nonlinearity.low_scale", "electron"),
+        scene.of_amplifiers("nonlinearity.low", ""),
+        scene.of_amplifiers("nonlinearity.low_scale", "electron"),
     )
 
 
 def _contribution(scene: Scene) -> float:
-    there = np.array([min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)])
-    return float((there - apply(there, *parameters(scene)))[0])
+    there = min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)
+    curve = parameters(scene)
+    light = np.full(max(np.size(number) for number in curve), there)
+    return float(np.max(light - apply(light, *curve)))
 
 
 EFFECT = Effect("nonlinearity", apply, parameters, _contribution, cost=6e-3)

@@ -1,0 +1,51 @@
+"""Look into the mission database: python -m lake_schema mission list [PATTERN] | diff A [B].
+
+A configuration is named by a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of its table mission.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+
+from lake_schema import command
+from lake_schema.mission import compare, listing
+from lake_schema.tables.mission import LADDER
+
+_DEFAULT = ",".join(LADDER)
+_WHAT = "a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of its table mission"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Exit status: 2 the call is wrong; of diff as of diff: 0 the same, 1 different."""
+    parser = argparse.ArgumentParser(prog="python -m lake_schema mission", description="Look into the mission database")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="list|diff")
+    one = commands.add_parser("list", help="names, values, units, bounds, status and source")
+    one.add_argument("pattern", nargs="?", default="*", help="of names, as vis.* or *gain*; without * a part of them")
+    one.add_argument("--of", default=_DEFAULT, metavar="WHAT", help=f"{_WHAT} (default: {_DEFAULT})")
+    one.add_argument("--json", action="store_true", help="a list of objects")
+    two = commands.add_parser("diff", help="what differs between two configurations")
+    two.add_argument("first", help=_WHAT)
+    two.add_argument("second", nargs="?", default=_DEFAULT, help=f"the same (default: {_DEFAULT})")
+    options = parser.parse_args(argv)
+    body = _listed if options.command == "list" else _compared
+    return command.status("lake_schema", lambda: body(options))
+
+
+def _listed(options: argparse.Namespace) -> int:
+    entries = listing.listed(compare.configuration(options.of), options.pattern)
+    if options.json:
+        print(json.dumps([asdict(entry) for entry in entries], indent=1))
+        return 0
+    for line in listing.aligned(entries):
+        print(line)
+    return 0
+
+
+def _compared(options: argparse.Namespace) -> int:
+    lines = compare.compare(options.first, options.second)
+    for line in lines:
+        print(line)
+    return int(bool(lines))

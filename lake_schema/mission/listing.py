@@ -1,0 +1,77 @@
+"""The parameters of the mission database as a list: python -m lake_schema mission list [PATTERN].
+
+listed    a configuration -> entries, one a parameter or model
+aligned   entries -> lines of text, columns below each other
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass
+from fnmatch import fnmatchcase
+
+from lake_schema.errors import BadInput
+from lake_schema.mission import places
+from lake_schema.mission.configuration import MissionConfiguration, bounds_of
+from lake_schema.mission.model import Model
+from lake_schema.mission.parameter import Parameter, convert
+
+_HEAD = ("name", "value", "unit", "bounds", "may differ by", "status", "source")
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A parameter: its value, or of a model its file.
+
+    bounds : (lowest, highest) in its unit, None = none are declared;  by : "detector" or "amplifier" where a
+             request may give each a value of its own, else ""
+    """
+
+    name: str
+    value: float | str
+    unit: str
+    bounds: tuple[float, float] | None
+    by: str
+    status: str
+    confidence: str
+    source: str
+
+
+def listed(configuration: MissionConfiguration, pattern: str = "*") -> list[Entry]:
+    """By name; pattern : with *, ? and [..] for the whole name, without them a part of it.  BadInput if none matches."""
+    whole = pattern if any(c in pattern for c in "*?[") else f"*{pattern}*"
+    records: list[Parameter | Model] = [*configuration.parameters, *configuration.models]
+    found = [record for record in records if fnmatchcase(record.key.lower(), whole.lower())]
+    if not found:
+        raise BadInput(f"no name of the mission database matches {pattern!r}")
+    return [_entry(record, configuration) for record in sorted(found, key=lambda record: record.key)]
+
+
+def _entry(record: Parameter | Model, configuration: MissionConfiguration) -> Entry:
+    about = (record.status, record.confidence, record.source)
+    if isinstance(record, Model):
+        return Entry(record.key, record.file, "", None, places.CAMERA, *about)
+    key, _ = places.split(record.key, configuration)
+    return Entry(record.key, record.value, record.unit, _bounds(key, record.unit), places.scope(key), *about)
+
+
+def _bounds(key: str, unit: str) -> tuple[float, float] | None:
+    """What all bounds of a parameter allow, in its unit."""
+    where = f"mission parameter {key}"
+    ends = [(convert(lo, of, unit, where), convert(hi, of, unit, where)) for lo, hi, of in bounds_of(key)]
+    return (max(lo for lo, _ in ends), min(hi for _, hi in ends)) if ends else None
+
+
+def aligned(entries: Sequence[Entry]) -> Iterator[str]:
+    """A line a parameter below a line of headings; the source comes last, at its length."""
+    table = [_HEAD, *map(_texts, entries)]
+    widths = [max(len(row[i]) for row in table) for i in range(len(_HEAD))]
+    for row in table:
+        yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+
+
+def _texts(entry: Entry) -> tuple[str, ...]:
+    name, value, unit, bounds, by, status, confidence, source = astuple(entry)
+    said = source if confidence in source else f"{source} ({confidence})"
+    between = f"{bounds[0]:g} .. {bounds[1]:g}" if bounds else ""
+    return name, value if isinstance(value, str) else f"{value:.10g}", unit, between, by, status, said

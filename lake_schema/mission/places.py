@@ -1,0 +1,128 @@
+"""Values of one detector or one amplifier: vis.gain@3-4 (a detector), vis.gain.E (an amplifier of every detector),
+vis.gain@3-4.E (an amplifier of one detector).
+
+Of several that hold for a place the narrowest is taken: an amplifier's of one detector, then the detector's, then the
+amplifier's of every detector, then the camera's.
+
+Place        a detector, an amplifier, or both
+split        a name -> the parameter's, and the place
+names        the names under which a place's value may stand, the narrowest first
+scope        whether a parameter may differ from amplifier to amplifier, from detector to detector, or not at all
+check        refuse a place that its camera does not have, or at which a parameter has no value of its own
+detectors    names of a camera's detectors
+amplifiers   names of the amplifiers that are read apart
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Container
+from dataclasses import dataclass
+from fnmatch import translate
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING
+
+from lake_schema.errors import BadInput
+
+if TYPE_CHECKING:
+    from lake_schema.mission.configuration import MissionConfiguration
+
+# Cameras whose detectors stand in a grid: their names by row and column, from 1 (Euclid Data Product Description
+# Document, LE1 VIS and NISP).
+GRID_NAMES = {"vis": "{row}-{column}", "nisp": "DET{row}{column}"}
+CAMERA, DETECTOR, AMPLIFIER = "", "detector", "amplifier"
+# Cameras whose amplifiers are simulated one by one; of the others a detector is read as one frame.
+_READ_APART = ("vis",)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A detector, an amplifier, or both; "" = every one."""
+
+    detector: str = ""
+    amplifier: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.detector or self.amplifier)
+
+
+def split(name: str, known: Container[str]) -> tuple[str, Place]:
+    """The parameter and the place of a name; known : names of the parameters."""
+    key, at, place = name.partition("@")
+    if at:
+        detector, _, amplifier = place.partition(".")
+        return key, Place(detector, amplifier)
+    # No parameter's name goes on where another's ends.
+    parent, _, last = name.rpartition(".")
+    if parent in known:
+        return parent, Place(amplifier=last)
+    return name, Place()
+
+
+def names(key: str, place: Place) -> tuple[str, str, str, str]:
+    """Names of a parameter's values at a place, the narrowest first."""
+    detector, amplifier = f"@{place.detector}", f".{place.amplifier}"
+    return f"{key}{detector}{amplifier}", f"{key}{detector}", f"{key}{amplifier}", key
+
+
+@cache
+def _scopes() -> tuple[tuple[re.Pattern[str], str], ...]:
+    with (files("lake_schema.mission") / "places.csv").open(encoding="utf-8") as stream:
+        return tuple((re.compile(translate(row["pattern"])), row["by"]) for row in csv.DictReader(stream))
+
+
+@cache
+def scope(key: str) -> str:
+    """CAMERA, DETECTOR or AMPLIFIER: how far a parameter's values may differ."""
+    return next((by for pattern, by in _scopes() if pattern.fullmatch(key)), CAMERA)
+
+
+def check(name: str, configuration: MissionConfiguration) -> None:
+    """BadInput names what is wrong with a name at a place."""
+    key, place = split(name, configuration)
+    where, by = f"mission override {name}", scope(key)
+    if ("@" in name and not place.detector) or name.endswith("."):
+        raise BadInput(f"{where}: names no {AMPLIFIER if name.endswith('.') else DETECTOR}")
+    if by == CAMERA:
+        raise BadInput(f"{where}: {key} is one value for the whole camera")
+    if place.amplifier and by == DETECTOR:
+        raise BadInput(f"{where}: {key} may differ between detectors ({key}@NAME), not between their amplifiers")
+    section = section_of(key)
+    for kind, wanted, there in (
+        ("detector", place.detector, detectors(section, configuration)),
+        ("amplifier", place.amplifier, amplifiers(section, configuration)),
+    ):
+        if wanted and wanted not in there:
+            raise BadInput(f"{where}: {section} has no {kind} {wanted!r}, only {_listed(there)}")
+
+
+def _listed(there: tuple[str, ...]) -> str:
+    return ", ".join(there) if len(there) <= 16 else f"{len(there)} from {there[0]} to {there[-1]}"
+
+
+def section_of(key: str) -> str:
+    """The camera's prefix of a parameter's name: vis, nisp, ext.lsstcam."""
+    parts = key.split(".")
+    return ".".join(parts[:2] if parts[0] == "ext" else parts[:1])
+
+
+def detectors(section: str, configuration: MissionConfiguration) -> tuple[str, ...]:
+    """Names of a camera's detectors, in their order; none of a section that is no camera."""
+    if section in GRID_NAMES:
+        rows, columns = (int(configuration.value(f"{section}.fpa.{key}")) for key in ("rows", "columns"))
+        name = GRID_NAMES[section]
+        return tuple(
+            name.format(row=row, column=column) for row in range(1, rows + 1) for column in range(1, columns + 1)
+        )
+    key = f"{section}.layout"
+    return tuple(row["detector"] for row in configuration.rows(key)) if key in configuration else ()
+
+
+def amplifiers(section: str, configuration: MissionConfiguration) -> tuple[str, ...]:
+    """Names of the amplifiers of a detector, in the order in which they are read; none where it is read as one frame."""
+    key = f"{section}.amplifiers"
+    if section not in _READ_APART or key not in configuration:
+        return ()
+    return tuple(row["amplifier"] for row in configuration.rows(key))

@@ -1,0 +1,152 @@
+"""Values of a detector or an amplifier: the narrowest holds, and what has no such place is refused by name."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema import __main__
+from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.mission import listing, places
+from lake_schema.mission.checks import faults
+from lake_schema.mission.configuration import resolve
+from lake_schema.mission.model import read_models
+from lake_schema.mission.parameter import CAMERAS, read_all
+from lake_schema.mission.places import Place
+
+GAIN = "electron / adu"
+MISSION = resolve()
+CAMERA_SECTIONS = ("vis", "nisp", *(f"ext.{camera}" for camera in CAMERAS))
+
+
+def test_names_of_places_are_no_names_of_parameters():
+    keys = {record.key for record in (*read_all(), *read_models())}
+    assert not {key for key in keys if "@" in key or key.rpartition(".")[0] in keys}
+    for section in CAMERA_SECTIONS:
+        found = places.detectors(section, MISSION)
+        assert len(set(found)) == len(found) > 10
+        assert not [name for name in found if "." in name or "@" in name]
+    for section, count in (("vis", 4), ("nisp", 0), ("ext.decam", 0)):
+        assert len(places.amplifiers(section, MISSION)) == count
+
+
+@pytest.mark.parametrize("pattern", [pattern for pattern, _ in places._scopes()])
+def test_each_pattern_is_of_some_parameter(pattern):
+    assert [record.key for record in read_all() if pattern.fullmatch(record.key)]
+
+
+@given(
+    given=st.dictionaries(st.sampled_from(["", "@3-4", ".E", ".G", "@3-4.E", "@1-1.F"]), st.floats(1.0, 9.0)),
+    detector=st.sampled_from(["", "3-4", "1-1", "6-6"]),
+)
+def test_the_narrowest_holds(given, detector):
+    mission = resolve(overrides={f"vis.gain{where}": (value, GAIN) for where, value in given.items()})
+    wanted = tuple(
+        next(
+            (given[where] for where in (f"@{detector}.{name}", f"@{detector}", f".{name}", "") if where in given),
+            3.48,
+        )
+        for name in "EFGH"
+    )
+    found = mission.of_amplifiers("vis.gain", GAIN, detector)
+    assert (found * 4 if len(found) == 1 else found) == wanted
+    # A detector's own, whatever one of its amplifiers has.
+    assert mission.value("vis.gain", place=Place(detector)) == given.get(f"@{detector}", given.get("", 3.48))
+    assert mission.value("vis.gain", "electron / adu") == given.get("", 3.48)
+    assert (mission.fingerprint == MISSION.fingerprint) == ({**given, "": 3.48} == {"": given.get("", 3.48)})
+    assert list(faults(mission)) == []
+
+
+def test_each_camera_has_its_detectors():
+    mission = resolve(
+        overrides={
+            "nisp.dark_current@DET23": (0.05, "electron / (s pix)"),
+            "ext.decam.gain@N1": (4.0, GAIN),
+            "vis.dark_current@3-4": (7.2, "electron / (h pix)"),
+        }
+    )
+    assert mission.value("nisp.dark_current", place=Place("DET23")) == 0.05
+    assert mission.value("nisp.dark_current", place=Place("DET22")) == 0.02
+    assert mission.value("ext.decam.gain", place=Place("N1")) == 4.0
+    assert mission.value("vis.dark_current", "electron / (s pix)", Place("3-4", "E")) == pytest.approx(0.002, abs=0)
+    later = mission.overridden_with({"nisp.dark_current@DET22": (0.03, "electron / (s pix)")})
+    assert later.value("nisp.dark_current", place=Place("DET22")) == 0.03
+    assert later.value("nisp.dark_current", place=Place("DET23")) == 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("vis.gain.X", "vis has no amplifier 'X', only E, F, G, H"),
+        ("vis.gain@3-4.Q", "vis has no amplifier 'Q', only E, F, G, H"),
+        ("vis.gain@7-1", "vis has no detector '7-1', only 36 from 1-1 to 6-6"),
+        ("vis.gain@", "names no detector"),
+        ("vis.gain@.E", "names no detector"),
+        ("vis.gain.", "names no amplifier"),
+        ("vis.gain@3-4.", "names no amplifier"),
+        ("vis.gains.E", "no such parameter"),
+        ("vis.amplifiers.E", "no such parameter"),
+        ("vis.cti.age.E", r"may differ between detectors \(vis.cti.age@NAME\), not between their amplifiers"),
+        ("vis.exposure_time@3-4", "vis.exposure_time is one value for the whole camera"),
+        ("nisp.gain@DET55", "nisp has no detector 'DET55', only DET11, .*, DET44"),
+        ("nisp.gain.E", "not between their amplifiers"),
+        ("ext.decam.gain@3-4", "ext.decam has no detector '3-4', only 62"),
+    ],
+)
+def test_a_place_that_is_not_there_is_refused_by_name(name, words):
+    key = places.split(name, MISSION)[0]
+    unit = MISSION.parameter(key).unit if key in [record.key for record in read_all()] else ""
+    with pytest.raises(BadInput, match=words) as error:
+        resolve(overrides={name: (3.0, unit)})
+    assert str(error.value).startswith(f"mission override {name}: ")
+    assert len(str(error.value)) < 300
+
+
+def test_units_and_bounds_are_the_parameters():
+    with pytest.raises(BadInput, match=r"vis\.gain\.E: .*does not convert"):
+        resolve(overrides={"vis.gain.E": (3.0, "s")})
+    with pytest.raises(OutOfRange, match=r"vis\.gain@3-4\.E"):
+        resolve(overrides={"vis.gain@3-4.E": (-3.0, GAIN)})
+
+
+# ------------------------------------------------------------------------------------------------ list
+
+
+def test_the_list_has_every_name_with_its_bounds():
+    mission = resolve(overrides={"vis.gain@3-4.E": (3.3, GAIN)})
+    entries = {entry.name: entry for entry in listing.listed(mission)}
+    assert set(entries) == {p.key for p in mission.parameters} | {m.key for m in mission.models}
+    for name in ("vis.gain", "vis.gain@3-4.E"):
+        assert entries[name].bounds == (1e-3, 1e3)
+        assert entries[name].by == "amplifier"
+    assert entries["vis.gain@3-4.E"].status == "SIM"
+    assert (entries["vis.dark_current"].by, entries["vis.exposure_time"].by) == ("detector", "")
+    # In the parameter's own unit, whatever the bound's.
+    lo, hi = entries["svm.launch"].bounds or (0.0, 1e9)
+    assert lo <= mission.value("svm.launch") <= hi
+    for entry in entries.values():
+        assert entry.bounds is None or entry.bounds[0] <= entry.value <= entry.bounds[1]
+
+
+def test_the_list_is_aligned_and_filtered(capsys, tmp_path):
+    assert __main__.main(["mission", "list", "VIS.gain"]) == 0
+    head, line = capsys.readouterr().out.splitlines()
+    assert line.startswith("vis.gain  3.48   electron / adu  0.001 .. 1000  amplifier      CBE     GalSim-Euclid-Like")
+    assert head.index("status") == line.index("CBE")
+    request = tmp_path / "r.toml"
+    request.write_text('[mission]\noverrides = {"vis.gain.E" = {value = 3.3, unit = "electron / adu"}}\n')
+    assert __main__.main(["mission", "list", "*.gain*", "--of", str(request), "--json"]) == 0
+    found = {entry["name"]: entry for entry in json.loads(capsys.readouterr().out)}
+    assert found["vis.gain.E"]["value"] == 3.3
+    assert "nisp.gain_spread" in found
+    assert __main__.main(["mission", "list", "nothing"]) == 2
+    assert capsys.readouterr().err == "lake_schema: no name of the mission database matches 'nothing'\n"
+
+
+def test_one_configuration_is_compared_with_the_default(capsys, tmp_path):
+    request = tmp_path / "r.toml"
+    request.write_text('[mission]\noverrides = {"vis.gain.E" = {value = 3.3, unit = "electron / adu"}}\n')
+    assert __main__.main(["mission", "diff", str(request)]) == 1
+    assert capsys.readouterr().out == "vis.gain.E: 3.3 electron / adu (SIM) -> absent\n"
+    assert __main__.main(["mission", "diff", "CBE,BLT,DES,REQ,SIM"]) == 0
