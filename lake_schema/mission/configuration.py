@@ -71,11 +71,11 @@ class MissionConfiguration:
             raise BadInput(f"the mission database has no model {key}")
         return self._files[key]
 
-    def __contains__(self, key: str) -> bool:
+    def __contains__(self, key: object) -> bool:
         return key in self._index or key in self._files
 
     def value(self, key: str, unit: str | None = None, place: Place | None = None) -> float:
-        """The value of a name, in `unit` where one is given, else in its record's own; place : that it is wanted for."""
+        """The value of a name, in `unit` where one is given, else in its record's own; place : where."""
         record = self.parameter(key)
         if place and key in self._placed:
             record = next(self._index[name] for name in places.names(key, place) if name in self._index)

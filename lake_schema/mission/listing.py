@@ -38,7 +38,7 @@ class Entry:
 
 
 def listed(configuration: MissionConfiguration, pattern: str = "*") -> list[Entry]:
-    """By name; pattern : with *, ? and [..] for the whole name, without them a part of it.  BadInput if none matches."""
+    """By name; pattern : with *, ? and [..] for the whole name, without them a part of it.  BadInput: none matches."""
     whole = pattern if any(c in pattern for c in "*?[") else f"*{pattern}*"
     records: list[Parameter | Model] = [*configuration.parameters, *configuration.models]
     found = [record for record in records if fnmatchcase(record.key.lower(), whole.lower())]

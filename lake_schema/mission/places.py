@@ -22,12 +22,9 @@ from dataclasses import dataclass
 from fnmatch import translate
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from lake_schema.errors import BadInput
-
-if TYPE_CHECKING:
-    from lake_schema.mission.configuration import MissionConfiguration
 
 # Cameras whose detectors stand in a grid: their names by row and column, from 1 (Euclid Data Product Description
 # Document, LE1 VIS and NISP).
@@ -35,6 +32,14 @@ GRID_NAMES = {"vis": "{row}-{column}", "nisp": "DET{row}{column}"}
 CAMERA, DETECTOR, AMPLIFIER = "", "detector", "amplifier"
 # Cameras whose amplifiers are simulated one by one; of the others a detector is read as one frame.
 _READ_APART = ("vis",)
+
+
+class Known(Protocol):
+    """What is asked of a mission configuration."""
+
+    def value(self, key: str) -> float: ...
+    def rows(self, key: str) -> tuple[dict[str, str], ...]: ...
+    def __contains__(self, key: object) -> bool: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +84,7 @@ def scope(key: str) -> str:
     return next((by for pattern, by in _scopes() if pattern.fullmatch(key)), CAMERA)
 
 
-def check(name: str, configuration: MissionConfiguration) -> None:
+def check(name: str, configuration: Known) -> None:
     """BadInput names what is wrong with a name at a place."""
     key, place = split(name, configuration)
     where, by = f"mission override {name}", scope(key)
@@ -108,7 +113,7 @@ def section_of(key: str) -> str:
     return ".".join(parts[:2] if parts[0] == "ext" else parts[:1])
 
 
-def detectors(section: str, configuration: MissionConfiguration) -> tuple[str, ...]:
+def detectors(section: str, configuration: Known) -> tuple[str, ...]:
     """Names of a camera's detectors, in their order; none of a section that is no camera."""
     if section in GRID_NAMES:
         rows, columns = (int(configuration.value(f"{section}.fpa.{key}")) for key in ("rows", "columns"))
@@ -120,8 +125,8 @@ def detectors(section: str, configuration: MissionConfiguration) -> tuple[str, .
     return tuple(row["detector"] for row in configuration.rows(key)) if key in configuration else ()
 
 
-def amplifiers(section: str, configuration: MissionConfiguration) -> tuple[str, ...]:
-    """Names of the amplifiers of a detector, in the order in which they are read; none where it is read as one frame."""
+def amplifiers(section: str, configuration: Known) -> tuple[str, ...]:
+    """Names of a detector's amplifiers, in the order in which they are read; none where it is read as one frame."""
     key = f"{section}.amplifiers"
     if section not in _READ_APART or key not in configuration:
         return ()

@@ -91,9 +91,7 @@ def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
             raise BadInput(f"mission parameter {section}.fpa.{name} = {count:g}: must be an even number")
 
 
-def _grid(
-    mission: MissionConfiguration, section: str, upside_down: Callable[[int, int], bool]
-) -> Iterator[Detector]:
+def _grid(mission: MissionConfiguration, section: str, upside_down: Callable[[int, int], bool]) -> Iterator[Detector]:
     """Rows from the top, columns from the left; upside_down : row, column -> whether one is mounted so.
 
     The pitch is of the published rows, without those of charge injection, and gaps: VIS fills 0.7781 deg.

@@ -36,7 +36,7 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
     return (
         *_common(rendered),
         ("BUNIT", rendered.readout.unit, "unit of the pixels"),
-        *((key, value, comment) for key, value, comment in _of_amplifiers(rendered) if np.ndim(value) == 0),
+        *((key, float(value), comment) for key, value, comment in _of_amplifiers(rendered) if np.ndim(value) == 0),
         ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
         ("DARKRATE", ("dark_current" in applied) * scene.dark_rate, "[electron/s/pix] mean dark current in the image"),
         *_effect_cards(rendered),

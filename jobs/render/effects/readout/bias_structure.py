@@ -9,7 +9,6 @@ from jobs.render.effects.scene import Frame, Scene
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 
-
 Number = float | Float
 
 
