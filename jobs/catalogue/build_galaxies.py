@@ -18,6 +18,7 @@ from jobs.catalogue import cells, dust_map
 from jobs.catalogue.external import ingest, mapping
 from jobs.catalogue.galaxies import from_catalogue, galaxies, lensing, nearest_sed
 from jobs.catalogue.galaxies.galaxies import GalaxyModel
+from jobs.catalogue.galaxies.lensing import Shear
 from jobs.catalogue.galaxies.nearest_sed import Training
 from jobs.catalogue.halos import halo_catalogue, population
 from jobs.catalogue.halos.halo_catalogue import LightCone
@@ -36,7 +37,8 @@ from lake_schema.tables.halos import HALOS
 from lake_schema.tables.quarantine import QUARANTINE
 
 _HALO_FACTS = ("galaxy_limit", "z_max", "box_cells")
-_GALAXY_FACTS = (*_HALO_FACTS, "lensing_nside", "high_redshift_boost", "quasar_boost")
+_LENS_FACTS = ("lensing", "rotation")
+_GALAXY_FACTS = (*_HALO_FACTS, "lensing_nside", *_LENS_FACTS, "high_redshift_boost", "quasar_boost")
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
@@ -71,7 +73,8 @@ def _drawn(lake: Path, request: Request) -> list[Step]:
     parts = cells.parts(request.area)
     halos = Plan(HALOS, {key: facts[key] for key in ("seed", *_HALO_FACTS, "galaxy_band", *theirs, "code")}, parts)
     # Up to this multipole the lensing has the power of linear theory within 10 %.
-    plan = Plan(GALAXIES, {**facts, "lensing_l_max": facts["lensing_nside"]}, parts)
+    reach = {"lensing_l_max": facts["lensing_nside"]} if request.universe.lensing is None else {}
+    plan = Plan(GALAXIES, {**facts, **reach}, parts)
     if not layout.version(lake, GALAXIES.name, plan.key).exists():
         # The box and its lensing are made here, once, and only mapped by the workers.
         _universe(facts, own)
@@ -151,7 +154,9 @@ def _ingested(lake: Path, request: Request, given: Catalogue) -> Step:
     found, sha256 = ingest.files(given.files, columns)
     about = {"sha256": sha256, "format": given.format, "columns": dict(given.columns)}
     dust = request.ingest.dust
-    facts = {"seed": request.seed, "ingest": about, **dust_map.facts(dust), "code": code_version()}
+    universe = request.facts("universe")["universe"]
+    controlled = {name: universe[name] for name in _LENS_FACTS}
+    facts = {"seed": request.seed, "ingest": about, **controlled, **dust_map.facts(dust), "code": code_version()}
     plan = Plan(GALAXIES, facts, cells.parts(request.area))
     if not layout.version(lake, GALAXIES.name, plan.key).exists():
         ingest.split(found, sha256, columns)
@@ -163,7 +168,8 @@ def ingested_work(lake: Path, facts: Json, given: Catalogue, dust: DustMap | Non
     columns = mapping.galaxies(given.format, dict(given.columns))
     found, _ = ingest.listed(given.files, columns)
     laid_out = ingest.split(found, facts["ingest"]["sha256"], columns)
-    model = from_catalogue.model(facts["seed"], columns, laid_out)
+    lens = None if facts["lensing"] is None else Shear(*facts["lensing"])
+    model = from_catalogue.model(facts["seed"], columns, laid_out, lens, facts["rotation"])
     sky_map = dust_map.chosen(facts["seed"], dust)
 
     def draw(cell: int) -> pa.Table:

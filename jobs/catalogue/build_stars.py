@@ -7,6 +7,7 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
+import math
 from functools import partial
 from typing import Any
 
@@ -33,6 +34,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
         "seed": request.seed,
         "star_limit": request.universe.star_limit,
         "plane_limit": choice.plane_limit,
+        "bright_limit": choice.bright_limit,
         "density": choice.density,
         "brown_dwarf_boost": choice.brown_dwarf_boost,
         **_files(choice),
@@ -76,7 +78,8 @@ def _model(facts: Json, choice: Stars) -> stars.StarModel:
     if choice.tycho2:
         bright = bright_stars.load(choice.tycho2, facts["tycho2"]["sha256"])
     limits = facts["star_limit"], facts["plane_limit"]
-    return stars.model(*limits, facts["density"], facts["brown_dwarf_boost"], catalogue, bright)
+    brightest = -math.inf if facts["bright_limit"] is None else facts["bright_limit"]
+    return stars.model(*limits, facts["density"], facts["brown_dwarf_boost"], catalogue, bright, brightest)
 
 
 JOB = Job("build_stars", "Draw the Milky Way's stars of a sky area.", steps)

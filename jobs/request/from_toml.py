@@ -5,7 +5,10 @@
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
     [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
                    high_redshift_boost, quasar_boost
+                   lensing = "box" | "none" | {g1, g2}   a constant reduced shear of all galaxies, frame (east, north)
+                   rotation       deg, added to the position angle of every galaxy, before lensing
     [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
+                   bright_limit   H (Vega, as observed), brighter stars are left out
     [ingest.galaxies]  files = [..]  a finished catalogue instead of ours: Parquet, FITS, CSV, a HATS folder
                        format = "flagship1" | "flagship2" | "euclid" | "skycatalogs"   columns = {ours = theirs, ..}
     [ingest.halos]     files = [..]  columns = {ra, dec, z_true, log_mass, ..}   a halo light-cone instead of ours
@@ -62,6 +65,7 @@ from jobs.request.schema import (
     EFFECTS,
     LADDER,
     LENSING_NSIDES,
+    MOST_SHEAR,
     STATUSES,
     TRUTH,
     Effects,
@@ -78,6 +82,7 @@ from jobs.request.toml_values import choice as _choice
 from jobs.request.toml_values import integer as _integer
 from jobs.request.toml_values import known as _known
 from jobs.request.toml_values import number as _number
+from jobs.request.toml_values import optional as _optional
 from jobs.request.toml_values import section as _section
 from jobs.request.toml_values import shown as _shown
 from jobs.request.toml_values import string as _string
@@ -133,13 +138,14 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     products_ = _section(table, "products", {"truth", "compression"})
     solar_system = _section(table, "solar_system", {"bodies"})
     bodies = files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
+    universe = _universe(_section(table, "universe", set(Universe.__slots__)))
     request = Request(
         name=layout.name(_string(table, "name")),
         seed=_integer(table, "seed", 0, 2**63 - 1),
         accuracy=_accuracy(table.get("accuracy"), "accuracy"),
         area=areas.parse(_section(table, "area", None)),
-        universe=_universe(_section(table, "universe", set(Universe.__slots__))),
-        stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder),
+        universe=universe,
+        stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder, universe.star_limit),
         mission=mission,
         bands=tuple(dict.fromkeys((*bands, *(name for name, _ in curves.passbands)))),
         pointings=asked,
@@ -185,11 +191,28 @@ def _universe(table: Toml) -> Universe:
         high_redshift_boost=_number(table, "universe.high_redshift_boost", 0.0, 1e5, default.high_redshift_boost),
         quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),
         lensing_nside=_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
+        lensing=_lensing(table.get("lensing", "box")),
+        rotation=_number(table, "universe.rotation", -360.0, 360.0, default.rotation),
     )
 
 
-def _stars(table: Toml, folder: Path) -> Stars:
+def _lensing(value: object) -> tuple[float, float] | None:
+    """None of the box's lensing; else a constant shear, 0 for "none"."""
+    path = "universe.lensing"
+    if isinstance(value, str):
+        return None if _string({"lensing": value}, path, ("box", "none")) == "box" else (0.0, 0.0)
+    table = _table(value, path, {"g1", "g2"})
+    g1, g2 = (_number(table, f"{path}.{key}", -1.0, 1.0) for key in ("g1", "g2"))
+    if (size := math.hypot(g1, g2)) > MOST_SHEAR:
+        raise BadInput(f"{path} = {_shown(value)}: |g| = {size:.4g}, images are ellipses up to {MOST_SHEAR}")
+    return g1, g2
+
+
+def _stars(table: Toml, folder: Path, star_limit: float) -> Stars:
     default = Stars()
+    bright_limit = _optional(table, "stars.bright_limit", -10.0, 30.0)
+    if bright_limit is not None and bright_limit >= star_limit:
+        raise BadInput(f"stars.bright_limit = {bright_limit:g} leaves no star up to star_limit = {star_limit:g}")
     rows = _integer(table, "stars.rows_a_file", 1, 3_000_000) if "rows_a_file" in table else default.rows_a_file
     plane_limit = _number(table, "stars.plane_limit", 0.0, 30.0, math.nan)
     given = _table(table.get("catalogue", {}), "stars.catalogue", {"file", "columns"})
@@ -201,6 +224,7 @@ def _stars(table: Toml, folder: Path) -> Stars:
         catalogue=files.file_of(folder, _string(given, "stars.catalogue.file")) if given else None,
         columns=tuple((key, _string(columns, f"stars.catalogue.columns.{key}")) for key in sorted(columns)),
         plane_limit=None if math.isnan(plane_limit) else plane_limit,
+        bright_limit=bright_limit,
         rows_a_file=rows,
     )
 

@@ -23,6 +23,8 @@ COMPRESSIONS = ("none", "rice")
 DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
+# As far as jobs/render/sources/galaxy_shapes.py draws a lensed ellipse (a test compares them).
+MOST_SHEAR = 0.9
 # Of the channels' tuples in jobs/render/channels (a test compares them).
 EFFECTS = (
     "adc", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp", "charge_injection",
@@ -44,6 +46,10 @@ class Universe:
     star_limit               : H (Vega, as observed);  z_max : highest redshift
     box_cells                : cells of 4 Mpc/h a side of the box of matter
     lensing_nside            : HEALPix resolution of the lensing maps
+    lensing                  : (g1, g2), a constant reduced shear of all galaxies in place of the box's lensing, in the
+                               frame (east, north): g1 > 0 stretches east-west, g2 > 0 from the south-west to the
+                               north-east; None = the box's
+    rotation                 : deg, added to the position angle of every galaxy, before lensing
     high_redshift_boost, quasar_boost : how many times denser than in nature these kinds are drawn, 0 = not at all
     """
 
@@ -53,6 +59,8 @@ class Universe:
     z_max: float = 2.3
     box_cells: int = 256
     lensing_nside: int = 512
+    lensing: tuple[float, float] | None = None
+    rotation: float = 0.0
     high_redshift_boost: float = 1.0
     quasar_boost: float = 1.0
 
@@ -65,6 +73,7 @@ class Stars:
     brown_dwarf_boost : how many times denser than in nature L and T dwarfs are drawn, 0 = not at all
     tycho2            : files of Tycho-2, which replace the model brighter than V = 11
     catalogue         : file of other stars to be taken instead of the model's; columns: (ours, theirs)
+    bright_limit      : brightest H (Vega, as observed) that is drawn; None = all
     plane_limit       : faintest H (Vega, as observed) within 5 deg of the plane; None = an area there is refused
     rows_a_file       : above so many expected rows a cell's file is split into those of the next HEALPix order
     """
@@ -75,6 +84,7 @@ class Stars:
     catalogue: Path | None = None
     columns: tuple[tuple[str, str], ...] = ()
     plane_limit: float | None = None
+    bright_limit: float | None = None
     rows_a_file: int = 1_000_000
 
 

@@ -3,7 +3,8 @@
 model    the tables that this takes
 draw     rows of one generation cell
 
-What the catalogue holds stays as it is. Without magnification a galaxy is seen where it is, and its shear is nothing.
+What the catalogue holds stays as it is, but for the lensing and the position angles where a request changes them.
+Without magnification a galaxy is seen where it is, and its shear is nothing.
 A galaxy's id counts the catalogue's halos of its generation cell (without any, its galaxies), in the order of
 position: a halo whose galaxies lie in two cells has two numbers. origin_id is the catalogue's own.
 """
@@ -23,6 +24,7 @@ from jobs.catalogue.external.mapping import Columns
 from jobs.catalogue.galaxies import band_ratios, emission_lines, lensing, morphology, sed_assignment, stellar_mass
 from jobs.catalogue.galaxies.band_ratios import BandRatios, Sed
 from jobs.catalogue.galaxies.emission_lines import LineModel
+from jobs.catalogue.galaxies.lensing import Shear
 from jobs.catalogue.galaxies.morphology import Shapes
 from jobs.catalogue.halos.population import SATELLITE
 from jobs.fluxes import cosmology, sources
@@ -41,10 +43,15 @@ _LEAST_EBV = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IngestModel:
-    """What missing columns are drawn from; `seen` : the band of the mapping's `mag`, None where it has none."""
+    """What missing columns are drawn from; `seen` : the band of the mapping's `mag`, None where it has none.
+
+    lens : in place of the catalogue's lensing, None = the catalogue's;  rotation : as of GalaxyModel
+    """
 
     seed: int
     columns: Columns
+    lens: Shear | None
+    rotation: float
     templates: int
     colours: sed_assignment.Colours
     reference: BandRatios
@@ -56,8 +63,8 @@ class IngestModel:
     lines: LineModel
 
 
-def model(seed: int, columns: Columns, given: Split) -> IngestModel:
-    """Tables as far as the catalogue reaches in redshift and E(B-V)."""
+def model(seed: int, columns: Columns, given: Split, lens: Shear | None = None, rotation: float = 0.0) -> IngestModel:
+    """Tables as far as the catalogue reaches in redshift and E(B-V); lens, rotation : as of IngestModel."""
     # In steps, so that similar catalogues share their tables.
     dustiest, z_max = (float(np.ceil(10.0 * x) / 10.0) for x in (max(_LEAST_EBV, given.ebv_max), given.z_max + 0.1))
     library = templates.galaxy_library()
@@ -65,6 +72,8 @@ def model(seed: int, columns: Columns, given: Split) -> IngestModel:
     return IngestModel(
         seed,
         columns,
+        lens,
+        rotation,
         library.flux.shape[0],
         sed_assignment.colours_model(),
         reference,
@@ -91,6 +100,7 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Ta
     lens = _lensing(given, n)
     if universe.columns.lines_magnified:
         given = {**given, **{name: given[name] * _shrinking(lens) for name in given if name.startswith("flux_")}}
+    lens_seen = lens if universe.lens is None else lensing.columns(universe.lens, given["ra"] % 360.0, given["dec"], z)
     a_v = given["a_v"] if "a_v" in given else dust_map.a_v(dust, given["ra"], given["dec"])
     m_r, red, sed, law_2, ebv_2 = _light(given, universe, z, kind, _seen(given, universe, lens, a_v), rng)
     colour = given["color_gr_01"] if "color_gr_01" in given else sed_assignment.colours(universe.colour, sed)
@@ -102,7 +112,7 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Ta
         **_identity(given, cell, kind),
         **{name: given[name] for name in ("ra", "dec")},
         "_healpix_29": given["index"],
-        **lens,
+        **lens_seen,
         "kind": kind,
         "density_boost": np.ones(n),
         "z_true": _first(given, "z_true", "z_obs"),
@@ -122,7 +132,8 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Ta
     }
     if "origin_id" in given:
         columns["origin_id"] = given["origin_id"]
-    return cells.in_order(GALAXIES.build({name: _masked(name, values) for name, values in columns.items()}))
+    rows = GALAXIES.build({name: _masked(name, values) for name, values in columns.items()})
+    return cells.in_order(lensing.turned(rows, universe.rotation))
 
 
 def _streams(seed: int, cell: int) -> Any:

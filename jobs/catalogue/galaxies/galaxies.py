@@ -30,7 +30,7 @@ from jobs.catalogue.galaxies import (
 from jobs.catalogue.galaxies.band_ratios import BandRatios, Sed
 from jobs.catalogue.galaxies.emission_lines import LineModel
 from jobs.catalogue.galaxies.high_redshift import Kind
-from jobs.catalogue.galaxies.lensing import Planes
+from jobs.catalogue.galaxies.lensing import Lens, Shear
 from jobs.catalogue.galaxies.morphology import Shapes
 from jobs.catalogue.galaxies.nearest_sed import Training
 from jobs.catalogue.halos import luminosity_function, matching, population
@@ -55,13 +55,15 @@ class GalaxyModel:
     """Everything that galaxies are drawn from; a few MB, made once by `model`.
 
     limit     : faintest magnitude, AB, before the Milky Way's dust and intergalactic hydrogen
+    rotation  : deg, added to every position angle, before lensing
     selection : the limit's band against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
     training  : observed galaxies whose spectra ours have, None = spectra that have the colours
     """
 
     limit: float
     population: Population
-    planes: Planes
+    lens: Lens
+    rotation: float
     luminosities: Schechter
     colours: sed_assignment.Colours
     selection: BandRatios
@@ -105,7 +107,8 @@ def model(
     return GalaxyModel(
         limit=wanted.galaxy_limit,
         population=found,
-        planes=lensing.load(found.halos.box, wanted.lensing_nside, far=bool(distant)),
+        lens=_lens(found, wanted, far=bool(distant)),
+        rotation=wanted.rotation,
         luminosities=luminosity_function.schechter(),
         colours=colours,
         selection=selection,
@@ -134,6 +137,12 @@ def halos_and_galaxies(
     return population.model(seed, wanted.box_cells, volume, inverse, faintest, light_cone)
 
 
+def _lens(found: Population, wanted: Universe, far: bool) -> Lens:
+    if wanted.lensing is not None:
+        return Shear(*wanted.lensing)
+    return lensing.load(found.halos.box, wanted.lensing_nside, far)
+
+
 def _selection(wanted: Universe, training: Training | None) -> BandRatios:
     dustiest = max(sed_assignment.colours_model().dust.highest, training.dustiest if training else 0.0)
     return band_ratios.load(templates.galaxy_library(), wanted.galaxy_band, wanted.z_max, dustiest)
@@ -153,7 +162,7 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
     log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
     rng = stream(seed, "galaxies.lines", cell)
     columns = {
-        **_places(universe.planes, members, drawn.row, dust),
+        **_places(universe.lens, members, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
         "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
         "color_gr_01": drawn.colour,
@@ -164,8 +173,8 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
         **_shape_columns(cell, seed, universe.shapes, drawn, log_mass),
     }
     rows = [GALAXIES.build(columns)]
-    rows += [high_redshift.draw(cell, seed, kind, universe.planes, dust) for kind in universe.distant]
-    return in_order(pa.concat_tables(rows))
+    rows += [high_redshift.draw(cell, seed, kind, universe.lens, dust) for kind in universe.distant]
+    return in_order(lensing.turned(pa.concat_tables(rows), universe.rotation))
 
 
 def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
@@ -220,7 +229,7 @@ def _light(cell: int, seed: int, universe: GalaxyModel, members: Members) -> tup
     return members.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
 
 
-def _places(planes: Planes, members: Members, row: Int, dust: Float32) -> dict[str, npt.NDArray[np.generic]]:
+def _places(lens: Lens, members: Members, row: Int, dust: Float32) -> dict[str, npt.NDArray[np.generic]]:
     ra, dec = members.ra[row], members.dec[row]
     return {
         "id": members.id[row],
@@ -228,7 +237,7 @@ def _places(planes: Planes, members: Members, row: Int, dust: Float32) -> dict[s
         "ra": ra,
         "dec": dec,
         "_healpix_29": members.index[row],
-        **lensing.columns(planes, ra, dec, members.chi[row]),
+        **lensing.columns(lens, ra, dec, members.chi[row]),
         "kind": members.kind[row],
         "density_boost": np.ones(row.size),
         "z_true": members.z[row],

@@ -20,7 +20,7 @@ import pyarrow as pa
 
 from jobs.catalogue import dust_map, parameters
 from jobs.catalogue.galaxies import lensing, morphology
-from jobs.catalogue.galaxies.lensing import Planes
+from jobs.catalogue.galaxies.lensing import Lens
 from jobs.fluxes import cosmology
 from jobs.fluxes.high_redshift import (
     HIGH_REDSHIFT,
@@ -70,7 +70,7 @@ def model(galaxy_boost: float = 1.0, quasar_boost: float = 1.0) -> tuple[Kind, .
     return tuple(_kind(code, parameters.section(_FILE, name), boost) for code, name, boost in wanted if boost > 0.0)
 
 
-def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: Float32) -> pa.Table:
+def draw(cell: int, seed: int, kind: Kind, lens: Lens, dust: Float32) -> pa.Table:
     """Rows of one kind in a generation cell, sorted by _healpix_29.
 
     dust : float32[pixel] map of A(V), mag (jobs.catalogue.dust_map)
@@ -83,7 +83,6 @@ def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: Float32) -> pa.
     m = kind.m[column] + _M_STEP * rng.random(n)
     index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, n, rng)
     source = ids.source_id(np.full(n, kind.code), cell, _FIRST_NUMBER + np.arange(n))
-    chi = np.minimum(cosmology.comoving_distance(z), planes.chi[-1])
     zeros = np.zeros(n)
     columns = {
         "id": source,
@@ -91,7 +90,7 @@ def draw(cell: int, seed: int, kind: Kind, planes: Planes, dust: Float32) -> pa.
         "ra": ra,
         "dec": dec,
         "_healpix_29": index,
-        **lensing.columns(planes, ra, dec, chi),
+        **lensing.columns(lens, ra, dec, cosmology.comoving_distance(z)),
         "kind": np.full(n, kind.code),
         "density_boost": np.full(n, kind.boost),
         "z_true": z,

@@ -1,9 +1,11 @@
 """Weak lensing by the box itself: convergence, shear and deflection maps on source planes, and lensed positions.
 
 load        the planes of a box, from the cache or made now
+Shear       in their place one and the same shear of all sources, or none
 at          kappa, gamma1, gamma2, deflection of sources: bilinear on the sky, linear in distance between planes
 displaced   true positions -> observed ones
 columns     both, as table `galaxies` has them
+turned      galaxies with other position angles, before lensing
 
 gamma1, gamma2 are in the frame (x, y) = (east, north): east or west of a mass gamma1 < 0, north-east of it
 gamma2 < 0.  Deflections point away from a mass.
@@ -20,6 +22,7 @@ from dataclasses import astuple, dataclass
 import healpy as hp
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
 from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
@@ -57,6 +60,20 @@ class Planes:
     maps: tuple[Float32, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Shear:
+    """A constant shear without convergence, in place of the box's; kappa = 0, so that gamma is the reduced shear.
+
+    A constant shear has no origin on the sphere: sources are seen where they are.
+    """
+
+    g1: float = 0.0
+    g2: float = 0.0
+
+
+Lens = Planes | Shear
+
+
 def settings() -> Settings:
     """The lensing of the embedded universe."""
     return Settings(**parameters.section("lensing.toml", "lensing"))
@@ -87,10 +104,10 @@ def load(box: Box, nside: int, far: bool = False) -> Planes:
 def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     """[5, n] kappa, gamma1, gamma2, deflection east, north (rad) of sources at chi[n] Mpc/h.
 
-    ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
+    ra, dec : float[n] deg, true;  chi : float[n] Mpc/h; beyond the last plane the lensing is that plane's
     """
     pixel, weight = hp.get_interp_weights(planes.nside, ra, dec, nest=True, lonlat=True)
-    node = np.concatenate([[0.0], planes.chi])
+    node, chi = np.concatenate([[0.0], planes.chi]), np.minimum(chi, planes.chi[-1])
     upper = np.clip(np.searchsorted(node, chi, side="right"), 1, planes.chi.size)
     part = (chi - node[upper - 1]) / (node[upper] - node[upper - 1])
     found = np.zeros((5, chi.size))
@@ -104,12 +121,15 @@ def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     return found
 
 
-def columns(planes: Planes, ra: Float, dec: Float, chi: Float) -> dict[str, Float]:
+def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Float]:
     """Observed positions and lensing of sources as columns of table `galaxies`.
 
     ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
     """
-    kappa, gamma1, gamma2, east, north = at(planes, ra, dec, chi)
+    if isinstance(lens, Shear):
+        gamma = {"gamma1": np.full(ra.size, lens.g1), "gamma2": np.full(ra.size, lens.g2)}
+        return {"ra_lensed": ra, "dec_lensed": dec, "kappa": np.zeros(ra.size), **gamma}
+    kappa, gamma1, gamma2, east, north = at(lens, ra, dec, chi)
     ra_lensed, dec_lensed = displaced(ra, dec, east, north)
     shear = {"kappa": kappa, "gamma1": gamma1, "gamma2": gamma2}
     return {"ra_lensed": ra_lensed, "dec_lensed": dec_lensed, **shear}
@@ -129,6 +149,16 @@ def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, 
     sideways = ratio * east
     moved = lon + np.arctan2(sideways, forward)
     return sky.wrapped(np.degrees(moved)), np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
+
+
+def turned(rows: pa.Table, angle: float) -> pa.Table:
+    """Rows of table `galaxies` with every position angle increased by `angle` deg: what is lensed, not the lensing."""
+    if angle % 180.0 == 0.0:
+        return rows
+    number = rows.schema.get_field_index("position_angle")
+    angles = np.mod(rows["position_angle"].to_numpy() + angle, 180.0)
+    field = rows.schema.field(number)
+    return rows.set_column(number, field, pa.array(angles, field.type))
 
 
 def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> Bool:

@@ -10,6 +10,7 @@ stars.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -53,6 +54,7 @@ class StarModel:
 
     limit, plane_limit : faintest H, Vega, with the Milky Way's extinction; of cells with their centre nearer to the
                          plane than PLANE; None = not to be drawn
+    brightest  : brighter H are left out
     galaxy     : whose stars are drawn, unless there is a
     catalogue  : of other stars
     brown      : L and T dwarfs, None = none; bright : Tycho-2, None = the model's own bright stars
@@ -61,6 +63,7 @@ class StarModel:
 
     limit: float
     plane_limit: float | None
+    brightest: float
     galaxy: MilkyWay
     catalogue: StarCatalogue | None
     brown: BrownDwarfs | None
@@ -78,8 +81,9 @@ def model(
     brown_dwarf_boost: float = 1.0,
     catalogue: StarCatalogue | None = None,
     bright: BrightStars | None = None,
+    brightest: float = -math.inf,
 ) -> StarModel:
-    """The embedded universe's stars with H < limit (70 ms).
+    """The embedded universe's stars with brightest <= H < limit (70 ms).
 
     density           : one of milky_way.MODELS
     brown_dwarf_boost : how many times denser than in nature L and T dwarfs are, 0 = not at all
@@ -87,6 +91,7 @@ def model(
     return StarModel(
         limit=limit,
         plane_limit=plane_limit,
+        brightest=brightest,
         galaxy=milky_way.milky_way(density),
         catalogue=catalogue,
         brown=brown_dwarfs.brown_dwarfs(brown_dwarf_boost) if brown_dwarf_boost else None,
@@ -161,7 +166,7 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
     kept = [_selected(universe, lot, limit) for lot in lots]
     if universe.bright is not None:
         lots.append(_catalogued(cell, universe.bright, universe.types))
-        kept.append(lots[-1]["mag_h"] < limit)
+        kept.append((lots[-1]["mag_h"] < limit) & (lots[-1]["mag_h"] >= universe.brightest))
     first = np.cumsum([0, *(len(lot["ra"]) for lot in lots)])
     tables = [
         STARS.build(
@@ -262,8 +267,9 @@ def _catalogued(cell: int, bright: BrightStars, types: StellarTypes) -> Lot:
 
 
 def _selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> Bool:
-    """[n] brighter than the limit, and not where Tycho-2 has the stars."""
-    seen = lot["mag_h"] + universe.h_over_v * lot["a_v"] < limit
+    """[n] brighter than the limit, not too bright, and not where Tycho-2 has the stars."""
+    mag = lot["mag_h"] + universe.h_over_v * lot["a_v"]
+    seen = (mag < limit) & (mag >= universe.brightest)
     if universe.bright is None:
         return np.asarray(seen)
     return np.asarray(seen & (mag_v(universe.types, lot) >= universe.bright.hand_over))

@@ -16,6 +16,9 @@ from lake_schema.store.provenance import canonical
 
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 
+# What a request says of stars by values alone.
+_STAR_KEYS = ("plane_limit", "bright_limit", "density", "brown_dwarf_boost")
+
 
 def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> None:
     """What lies in the lake must have been made for this request, and the tables from one another."""
@@ -28,10 +31,11 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> N
     if facts["mission"].get("mission") != wanted["mission"]:
         raise BadInput("table mission was planned for another request: run plan_exposures first")
     drawn = {"seed": request.seed, **request.facts("universe")["universe"]}
+    drawn |= {key: request.facts("stars")["stars"][key] for key in _STAR_KEYS}
     for name in ("galaxies", "stars"):
         # A catalogue that was not drawn by us has a seed alone.
         for key in ("seed", *(key for key in drawn if key in facts[name])):
-            if facts[name].get(key) != drawn[key]:
+            if canonical(facts[name].get(key)) != canonical(drawn[key]):
                 values = f"{key} {facts[name].get(key)}, the request {drawn[key]}"
                 raise BadInput(f"table {name} has {values}: run build_{name} first, then compute_fluxes")
     if LENSES in inputs and facts[LENSES].get("galaxies") != inputs["galaxies"].key:

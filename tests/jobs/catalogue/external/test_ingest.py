@@ -102,6 +102,21 @@ def test_seen_magnitudes_are_taken_back_to_before_dust_and_lens(tmp_path):
     assert found == pytest.approx(values["mag"][order], abs=2e-3)
 
 
+def test_a_request_replaces_the_lensing_and_turns_the_galaxies(tmp_path):
+    """Of magnitudes as observed the catalogue's own magnification is taken off."""
+    file = synthetic.write(tmp_path, "skycatalogs", synthetic.columns())
+    own = build(tmp_path, file, 'format = "skycatalogs"')
+    more = 'format = "skycatalogs"\n[universe]\nlensing = { g1 = 0.02, g2 = -0.01 }\nrotation = 90'
+    sheared = build(tmp_path, file, more)
+    changed = {name for name in own.column_names if not own[name].equals(sheared[name])}
+    assert changed == {"kappa", "gamma1", "gamma2", "position_angle"}
+    assert np.unique(sheared["gamma1"]) == np.float32(0.02)
+    assert np.unique(sheared["gamma2"]) == np.float32(-0.01)
+    assert np.all(sheared["kappa"].to_numpy() == 0)
+    away = (sheared["position_angle"].to_numpy() - own["position_angle"].to_numpy()) % 180.0
+    assert away == pytest.approx(90.0, abs=1e-4)
+
+
 def test_galaxies_at_a_caustic_are_kept_apart_and_counted(tmp_path):
     """The table `galaxies` is whole without them; what they are is in the table `quarantine`."""
     values = synthetic.columns()

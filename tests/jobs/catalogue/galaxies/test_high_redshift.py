@@ -33,14 +33,14 @@ def test_a_boost_is_written_beside_its_rows(universe, dust):
         (HIGH_REDSHIFT, high_redshift.model(8.0, 0.0)[0]),
         (QUASAR, high_redshift.model(0.0, 4500.0)[0]),
     ):
-        rows = high_redshift.draw(1234, 5, kind, universe.planes, dust)
+        rows = high_redshift.draw(1234, 5, kind, universe.lens, dust)
         assert validate.violations(rows, GALAXIES) == []
         assert len(rows) == pytest.approx(kind.boost * kind.per_deg2 * 0.05245, abs=5 * np.sqrt(len(rows)))
         assert np.all(rows["density_boost"].to_numpy() == kind.boost)
         assert np.all(ids.kind_of(rows["id"].to_numpy()) == code)
         assert rows["mag_r01"].to_numpy().max() < kind.numbers["limit"] + 0.05
         assert rows["z_true"].to_numpy().min() >= 6.0
-        again = high_redshift.draw(1234, 5, kind, universe.planes, dust)
+        again = high_redshift.draw(1234, 5, kind, universe.lens, dust)
         assert again.equals(rows)
 
 
@@ -52,7 +52,7 @@ def test_fluxes_can_be_computed(universe, dust):
     from jobs.fluxes import high_redshift as spectra
     from jobs.fluxes import passbands
 
-    rows = high_redshift.draw(77, 5, GALAXIES_BEYOND, universe.planes, dust)
+    rows = high_redshift.draw(77, 5, GALAXIES_BEYOND, universe.lens, dust)
     flux = spectra.fluxes(rows, [passbands.load("lsst_g"), passbands.load("euclid_h")])
     assert np.all(flux[:, 1] > 0)
     # Nothing below Lyman alpha, but for what the filter leaks.

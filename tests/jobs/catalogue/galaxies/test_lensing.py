@@ -1,12 +1,18 @@
 """Signs and sizes against a lens of known mass; power against linear theory."""
 
+from dataclasses import replace
+
 import healpy as hp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from jobs.catalogue.galaxies import lensing
+from jobs.catalogue.galaxies import galaxies, lensing
 from jobs.catalogue.matter import density_box
 from jobs.fluxes import cosmology, sources
+from jobs.render.sources import galaxy_shapes
+from jobs.request.schema import MOST_SHEAR
 from lake_schema import sky
 from lake_schema.errors import BadInput
 
@@ -90,7 +96,7 @@ def limber(ell, chi):
 
 def test_power_and_modes_of_the_universe(universe):
     """C_l of kappa within 10 % of linear theory for 30 < l < nside; no B modes; gamma = what kappa says."""
-    planes = universe.planes
+    planes = universe.lens
     for number in (7, 12):
         kappa, gamma1, gamma2 = (hp.reorder(planes.maps[number][:, i].astype(float), n2r=True) for i in range(3))
         power = hp.anafast(kappa, lmax=90, iter=2)
@@ -112,7 +118,7 @@ def test_tangential_shear_about_massive_halos(universe, drawn):
     shear = []
     for angle in np.arange(8) * np.pi / 4:
         east, north = 1.0 * np.sin(angle), 1.0 * np.cos(angle)
-        found = lensing.at(universe.planes, ra + east / np.cos(np.radians(dec)), dec + north, np.full(ra.size, 2600.0))
+        found = lensing.at(universe.lens, ra + east / np.cos(np.radians(dec)), dec + north, np.full(ra.size, 2600.0))
         # Position angle from north to east; gamma1 > 0 is north-south.
         shear.append(found[1] * np.cos(2 * angle) - found[2] * np.sin(2 * angle))
     assert ra.size > 20
@@ -131,3 +137,72 @@ def test_determinants_and_caustics():
 def test_a_resolution_that_healpix_has_not_is_refused(box):
     with pytest.raises(BadInput, match="lensing_nside = 100"):
         lensing.load(box, 100)
+
+
+CELL = 303_117
+LENSED = ("ra_lensed", "dec_lensed", "kappa", "gamma1", "gamma2")
+
+
+@pytest.fixture(scope="module")
+def drawn_with(universe, cells, dust):
+    """Galaxies of one cell, with another lensing or rotation of the same universe."""
+    return lambda **changed: galaxies.draw(CELL, replace(universe, **changed), cells, dust)
+
+
+@pytest.fixture(scope="module")
+def unlensed(drawn_with):
+    return drawn_with(lens=lensing.Shear())
+
+
+def ellipticities(rows):
+    """Complex ellipticities (a - b) / (a + b) of bulges, of discs as they are drawn, from west to north."""
+    forms = galaxy_shapes.forms(galaxy_shapes.shapes(rows), np.broadcast_to(np.eye(2), (len(rows), 2, 2)))
+    for axes in (forms.bulge, forms.disk):
+        second = axes @ axes.swapaxes(1, 2)
+        xx, xy, yy = second[:, 0, 0], second[:, 0, 1], second[:, 1, 1]
+        yield (xx - yy + 2j * xy) / (xx + yy + 2 * np.abs(np.linalg.det(axes)))
+
+
+def test_without_lensing_everything_else_is_the_same(drawn_with, unlensed):
+    lensed = drawn_with()
+    assert len(lensed) > 1000
+    for name in lensed.column_names:
+        assert lensed[name].equals(unlensed[name]) == (name not in LENSED), name
+    assert unlensed["ra_lensed"].equals(unlensed["ra"])
+    assert unlensed["dec_lensed"].equals(unlensed["dec"])
+    assert all(np.all(unlensed[name].to_numpy() == 0) for name in LENSED[2:])
+
+
+@given(size=st.floats(0.0, MOST_SHEAR - 1e-6), angle=st.floats(0.0, 6.3))
+def test_a_constant_shear_acts_on_every_ellipticity(drawn_with, unlensed, size, angle):
+    """e -> (e + g) / (1 + g* e), at the same places; g2 is of (east, north), shapes are drawn in (west, north)."""
+    g1, g2 = size * np.cos(angle), size * np.sin(angle)
+    rows = drawn_with(lens=lensing.Shear(g1, g2))
+    assert [n for n in rows.column_names if not rows[n].equals(unlensed[n])] in ([], ["gamma1"], ["gamma1", "gamma2"])
+    g = np.complex128(np.float32(g1) - 1j * np.float32(g2))
+    for before, after in zip(ellipticities(unlensed), ellipticities(rows), strict=True):
+        np.testing.assert_allclose(after, (before + g) / (1 + np.conj(g) * before), rtol=0, atol=1e-6)
+    mu = sources.magnification_of(rows)
+    np.testing.assert_allclose(mu, 1 / (1 - abs(g) ** 2), rtol=1e-5)
+
+
+def test_positive_shears_stretch_east_west_and_to_the_north_east(drawn_with):
+    for shear, direction in (((0.3, 0.0), 1.0), ((0.0, 0.3), -1j)):
+        rows = drawn_with(lens=lensing.Shear(*shear))
+        (stretched, _) = ellipticities(rows)
+        assert np.mean((stretched / direction).real) == pytest.approx(0.3, abs=0.03)
+
+
+def test_a_rotation_by_90_degrees_turns_the_intrinsic_ellipticity_alone(drawn_with, unlensed):
+    turned = drawn_with(lens=lensing.Shear(), rotation=90.0)
+    assert [name for name in turned.column_names if not turned[name].equals(unlensed[name])] == ["position_angle"]
+    for before, after in zip(ellipticities(unlensed), ellipticities(turned), strict=True):
+        np.testing.assert_allclose(after, -before, atol=1e-6)
+    lensed, both = drawn_with(), drawn_with(rotation=90.0)
+    assert all(lensed[name].equals(both[name]) for name in LENSED)
+    assert not lensed["position_angle"].equals(both["position_angle"])
+
+
+def test_requests_are_refused_where_ellipses_are_not_drawn():
+    assert MOST_SHEAR == galaxy_shapes._MOST_SHEAR
+    assert lensing.settings().caustic < 1.0 - MOST_SHEAR**2

@@ -85,6 +85,13 @@ def test_a_brighter_limit_has_fewer_stars(dust, cell):
     assert empty.schema.equals(STARS.arrow())
 
 
+def test_bright_stars_are_left_out_and_the_others_are_the_same(dust, cell):
+    faint = stars.draw(CELL, SEED, stars.model(brightest=20.0), dust)
+    seen = cell["mag_h"].to_numpy() + UNIVERSE.h_over_v * cell["a_v"].to_numpy()
+    assert 0 < np.sum(seen < 20.0) < len(cell)
+    assert faint.equals(cell.filter(pa.array(seen >= 20.0)))
+
+
 def test_templates_are_the_nearest_in_temperature(rng):
     library = stellar.types().teff
     teff = np.exp(rng.uniform(np.log(2000.0), np.log(50_000.0), 500))
