@@ -51,7 +51,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
         of_task = [selection.needed(task, catalogue_rows.deflection_of(inputs[name])) for task in places.values()]
         preconditions.refuse_uncovered(inputs[name], {cell for cells in of_task for cell in cells})
     facts = {
-        **common_facts(request, "seed", "accuracy", "mission", "effects", "truth", "compression"),
+        **common_facts(request, "seed", "noise_seed", "accuracy", "mission", "effects", "truth", "compression"),
         "mission": mission_of(request.mission).fingerprint,
         "inputs": {name: version.key for name, version in inputs.items()},
     }
@@ -117,7 +117,8 @@ def work(lake: Path, facts: Json) -> Output:
             else None,
             bodies=bodies,
         )
-        rendered = render.render(Aim.of(exposed, detector, band), rows_, own, request["seed"], request["truth"])
+        aim, noise = Aim.of(exposed, detector, band), request.get("noise_seed")
+        rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
     rows, files = fits_files.products(rendered, request["truth"], request["compression"] == "rice")
     drawn = truth_table.truth(rendered)
     name = truth_file(facts["exposure_id"], facts["detector"])

@@ -1,6 +1,7 @@
 """The simulation request: a TOML file of at most a screen, read into frozen records; every number has bounds.
 
-    name = "demo"      seed = 2024      accuracy = "survey" | "quicklook" | "draft" | "reference" | {flux = ..}
+    name = "demo"      seed = 2024      noise_seed = 1 (default: seed)
+    accuracy = "survey" | "quicklook" | "draft" | "reference" | {flux = ..}
     [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
     [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
@@ -28,8 +29,10 @@
                    (jobs/render/psf/from_file.py); {detector} in the name stands for the detector's
     [solar_system] bodies = "file"      your own moving bodies in place of ours (jobs/render/sources/ephemerides.py)
     [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
+                   off = ["all"]          all that are not in `on`, but for the conversion to whole numbers
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
-    [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s
+    [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s,
+                   realisations   how many exposures, which differ in their noise alone
     [[observation]]
         channels = ["VIS", "NISP-P", "NISP-S"] | ["EXT"]
         image_type = "science" | "deep" | "bias" | "dark" | "flat" | "charge_injection" | "self_calibration"
@@ -37,7 +40,7 @@
         survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
         pointings = "file.csv"     a table of pointings instead of a survey's pattern
         dither = "S" | "J" | "none"   fields, visits, exposures, short, flat, blue, bands, detectors, mjd,
-        exposure_time_s
+        exposure_time_s, realisations
     [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation"]
                    compression = "none" | "rice"   of images of whole numbers, without loss
 
@@ -59,6 +62,7 @@ from jobs.request import area as areas
 from jobs.request import checks, files, observations
 from jobs.request.area import Area
 from jobs.request.schema import (
+    ALWAYS,
     BOX_CELLS,
     COMPRESSIONS,
     DENSITIES,
@@ -96,6 +100,8 @@ from lake_schema.store import layout
 __all__ = ["Area", "Override", "Request", "parse"]
 
 _MOST_VARIANTS = 10_000
+_LARGEST_SEED = 2**63 - 1
+_ALL = "all"
 
 
 def parse(path: Path) -> Request:
@@ -129,7 +135,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         "explore",
         "products",
     }
-    _known(table, "", {"name", "seed", "accuracy", "pointing", "observation", *sections})
+    _known(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *sections})
     asked, blocks = observations.pointings(table), observations.observations(table)
     fluxes = _section(table, "fluxes", {"bands", "intergalactic", "passbands", "templates", "stars", "extinction"})
     curves = files.curves(fluxes, folder)
@@ -141,7 +147,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     universe = _universe(_section(table, "universe", set(Universe.__slots__)))
     request = Request(
         name=layout.name(_string(table, "name")),
-        seed=_integer(table, "seed", 0, 2**63 - 1),
+        seed=_integer(table, "seed", 0, _LARGEST_SEED),
         accuracy=_accuracy(table.get("accuracy"), "accuracy"),
         area=areas.parse(_section(table, "area", None)),
         universe=universe,
@@ -157,6 +163,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         explore=_explore(_section(table, "explore", None)),
         ingest=files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
         bodies=bodies,
+        noise_seed=_integer(table, "noise_seed", 0, _LARGEST_SEED) if "noise_seed" in table else None,
         psfs=files.psfs(_section(table, "psf", None), folder),
         strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
     )
@@ -261,7 +268,11 @@ def _truth(table: Toml) -> tuple[str, ...]:
 
 
 def _effects(table: Toml) -> Effects:
-    on, off = (_strings(table, f"effects.{key}", EFFECTS) for key in ("on", "off"))
+    on, off = _strings(table, "effects.on", EFFECTS), _strings(table, "effects.off", (_ALL, *EFFECTS))
+    if off == (_ALL,):
+        return Effects(on, tuple(name for name in EFFECTS if name not in (*ALWAYS, *on)))
+    if _ALL in off:
+        raise BadInput("effects.off: 'all' stands alone")
     if both := sorted(set(on) & set(off)):
         raise BadInput(f"effects: {both[0]!r} is both on and off")
     return Effects(on, off)

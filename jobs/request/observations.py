@@ -27,7 +27,7 @@ from lake_schema.errors import BadInput
 from lake_schema.store import layout
 from lake_schema.tables import exposures as declared
 
-_MOST_POINTINGS, _MOST_OBSERVATIONS = 100_000, 1000
+_MOST_POINTINGS, _MOST_OBSERVATIONS, _MOST_REALISATIONS = 100_000, 1000, 10_000
 CHANNELS = tuple(code for code, _ in declared.CHANNELS)
 IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
 DITHERS = ("S", "J", "none")
@@ -51,6 +51,7 @@ class Pointing:
     position_angle  : deg, of the focal plane's y axis, north through east
     detectors       : names, () = all of the camera
     exposure_time_s : None = the mission's
+    realisations    : how many exposures, which differ in their noise alone
     """
 
     channel: str
@@ -63,6 +64,7 @@ class Pointing:
     detectors: tuple[str, ...] = ()
     centre_on: str | None = None
     exposure_time_s: float | None = None
+    realisations: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,7 @@ class Observation:
     dither    : pattern within a field;  short, flat : with the short VIS exposure, the closing flat
     blue      : with the blue grism besides the red ones
     mjd       : the earliest date, None = the mission's launch
+    realisations : how many of each exposure, which differ in their noise alone
     """
 
     channels: tuple[str, ...]
@@ -95,6 +98,7 @@ class Observation:
     detectors: tuple[str, ...] = ()
     mjd: float | None = None
     exposure_time_s: float | None = None
+    realisations: int = 1
 
 
 def pointings(table: Toml) -> tuple[Pointing, ...]:
@@ -117,6 +121,7 @@ def _pointing(value: object, path: str) -> Pointing:
         detectors=strings(table, f"{path}.detectors"),
         centre_on=string(table, f"{path}.centre_on") if "centre_on" in table else None,
         exposure_time_s=optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
+        realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
     )
 
 
@@ -159,4 +164,5 @@ def _observation(value: object, path: str) -> Observation:
         detectors=strings(table, f"{path}.detectors"),
         mjd=optional(table, f"{path}.mjd", 40_000.0, 100_000.0),
         exposure_time_s=optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
+        realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
     )

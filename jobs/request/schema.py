@@ -32,6 +32,8 @@ EFFECTS = (
     "intra_pixel", "nonlinearity", "parallel_cti", "pixel_area", "pixel_response", "poisson", "quadrants",
     "read_noise", "readout_cosmic_rays", "readout_trail", "serial_cti", "shutter", "straylight",
 )  # fmt: skip
+# What no image is a product without.
+ALWAYS = ("adc", "quadrants")
 _NO_FILES = UserCurves()
 _NOTHING_TAKEN = Ingest()
 
@@ -119,6 +121,7 @@ class Request:
     explore : parameter -> the values (JSON) that it takes in turn
     psfs    : (band, file) of PSFs in place of ours
     bodies  : file of moving bodies in place of ours
+    noise_seed : of all that differs between exposures of the same sky with the same detectors; None = the seed
     """
 
     name: str
@@ -140,6 +143,7 @@ class Request:
     compression: str = "none"
     psfs: tuple[tuple[str, str], ...] = ()
     bodies: Path | None = None
+    noise_seed: int | None = None
 
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""

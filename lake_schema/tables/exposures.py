@@ -33,7 +33,7 @@ RENDERED: Mapping[str, tuple[str, ...]] = {
 
 EXPOSURES = Table(
     "exposures",
-    2,
+    3,
     (
         Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="identifier of the exposure", lo=0),
         Column("channel", "string", ucd="instr", doc="channel", codes=CHANNELS),
@@ -93,6 +93,16 @@ EXPOSURES = Table(
             nullable=True,
             since=2,
         ),
+        Column(
+            "realisation",
+            "int32",
+            "",
+            "meta.number",
+            "of the noise, from 1: counts exposures of the same camera, band, place, position angle and start",
+            1,
+            nullable=True,
+            since=3,
+        ),
     ),
     "Exposures, in the order they are taken.",
     key=("exposure_id",),
@@ -126,6 +136,7 @@ class ExposureRow:
     target: str | None = None
     psf: str | None = None
     settings: str | None = None
+    realisation: int | None = None
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> ExposureRow:

@@ -27,6 +27,11 @@ def section(camera: str) -> str:
 
 
 def identity(exposure: ExposureRow) -> str:
-    """What an exposure's random numbers are keyed by: what was pointed where and when, not its place in a plan."""
+    """What an exposure's random numbers are keyed by: what was pointed where and when, not its place in a plan.
+
+    Of several alike the first has the numbers that it has alone.
+    """
     places = (exposure.ra, exposure.dec, exposure.position_angle, exposure.mjd)
-    return ":".join((exposure.camera, exposure.band, *(place.hex() for place in places)))
+    number = exposure.realisation or 1
+    again = (str(number),) if number > 1 else ()
+    return ":".join((exposure.camera, exposure.band, *(place.hex() for place in places), *again))

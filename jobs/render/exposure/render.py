@@ -35,17 +35,19 @@ def render(
     seed: int,
     truth: Sequence[str] = (),
     progress: Callable[[int], None] | None = None,
+    noise_seed: int | None = None,
 ) -> Rendered:
     """Render one detector.
 
     truth    : maps that are wanted besides the noise-free one, of lake_schema.tables.products.CONTENTS
     progress : called now and then with the number of sources drawn
+    noise_seed : of what differs between exposures, None = the seed
     """
     scene = scene_of.of_aim(aim, variant)
     light = visible_light(aim, rows, scene, seed)
     limits.refuse_too_large(aim, light)
     drawn, frame = _drawn(aim, light, truth, progress)
-    return _detected(aim, rows, light, drawn, frame, (seed, truth))
+    return _detected(aim, rows, light, drawn, frame, (seed, noise_seed, truth))
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,14 +93,14 @@ def _drawn(
 
 
 def _detected(
-    aim: Aim, rows: Rows, light: Light, drawn: _Drawn, frame: list[Frame], asked: tuple[int, Sequence[str]]
+    aim: Aim, rows: Rows, light: Light, drawn: _Drawn, frame: list[Frame], asked: tuple[int, int | None, Sequence[str]]
 ) -> Rendered:
-    """The frame, taken from its list, after all effects of the channel; asked : seed and truth maps."""
-    exposure, detector, (seed, truth) = aim.exposure, aim.detector, asked
+    """The frame, taken from its list, after all effects of the channel; asked : seeds and truth maps."""
+    exposure, detector, (seed, noise_seed, truth) = aim.exposure, aim.detector, asked
     scene = scene_of.with_own_light(drawn.scene, aim.channel, aim.effects)
 
     def stream(effect: Effect) -> np.random.Generator:
-        return rng.stream(*rendered.numbers_of(effect, exposure, detector.name, seed))
+        return rng.stream(*rendered.numbers_of(effect, exposure, detector.name, seed, noise_seed))
 
     watch = truth_maps.watch(drawn.maps, scene, truth)
     found, decisions = apply_all(frame.pop(), aim.effects, scene, stream, watch)
@@ -107,4 +109,5 @@ def _detected(
     return Rendered(
         exposure, detector, aim.wcs, light.psf, readout, drawn.maps, drawn.sources, drawn.sizes, drawn.electrons,
         exposure.zero_point, scene, (*light.decisions, *decisions), scene.accuracy, seed, rows.complete,
+        noise_seed,
     )  # fmt: skip

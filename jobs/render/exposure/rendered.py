@@ -33,6 +33,7 @@ class Rendered:
     sizes      : int[n] sides of their stamps;  drawn : float64[n] electrons of each stamp on the detector
     zero_point : AB magnitude of one electron per second
     complete   : how far beyond the detector every source was known that may reach it, arcsec
+    noise_seed : of the noise, None = the seed
     """
 
     exposure: ExposureRow
@@ -50,6 +51,7 @@ class Rendered:
     accuracy: Accuracy
     seed: int
     complete: float
+    noise_seed: int | None = None
 
     @property
     def raw(self) -> Array:
@@ -67,10 +69,13 @@ class Rendered:
         return self.maps["noise_free"]
 
 
-def numbers_of(effect: Effect, exposure: ExposureRow, detector: str, seed: int) -> tuple[int | str, ...]:
+def numbers_of(
+    effect: Effect, exposure: ExposureRow, detector: str, seed: int, noise_seed: int | None = None
+) -> tuple[int | str, ...]:
     """The identity of an effect's random numbers: nobody else's, but where it follows another's pattern.
 
-    A detector's own patterns are in every exposure.
+    A detector's own patterns are in every exposure, and of the seed whatever the noise is of (None = the same).
     """
     what = exposure.camera if effect.fixed else image_types.identity(exposure)
-    return seed, what, detector, effect.numbers or effect.name
+    own = seed if effect.fixed or noise_seed is None else noise_seed
+    return own, what, detector, effect.numbers or effect.name

@@ -6,6 +6,7 @@ table          exposures -> rows, with the sky, zero point and seeing of each
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +25,11 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.exposures import EXPOSURES
 
+# What two exposures have in common whose random numbers would be the same, of one request of an exploration.
+_ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd")
 _DARK_TYPES = ("bias", "dark", "charge_injection")
+# Columns that are counted here.
+_NUMBERS = ("exposure_id", "realisation")
 _EUCLID_BANDS = {
     "VIS": ("euclid_vis",),
     "NISP-P": ("euclid_y", "euclid_j", "euclid_h"),
@@ -99,12 +104,15 @@ def table(
     if not exposures:
         return EXPOSURES.empty()
     bands: dict[tuple[int, str, str], _Band] = {}
-    rows = []
+    rows, taken = [], Counter[tuple[Any, ...]]()
     for number, (exposure, mission) in enumerate(zip(exposures, missions, strict=True), start=1):
         key = (id(mission), exposure.camera, exposure.band)
         if key not in bands:
             bands[key] = _Band.of(exposure.camera, exposure.band, mission, (own or {}).get(exposure.band))
-        rows.append(_row(number, exposure, bands[key], mission))
+        row = _row(number, exposure, bands[key], mission)
+        alike = tuple(row[name] for name in _ALIKE)
+        taken[alike] += 1
+        rows.append({**row, "realisation": taken[alike]})
     return EXPOSURES.build({name: _column(name, [row[name] for row in rows]) for name in EXPOSURES.names})
 
 
@@ -137,7 +145,7 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration) -
     elif sky is None:
         sky = sky_rate(band.sky, e.ra, e.dec, e.mjd, mission)
     return {
-        **{name: getattr(e, name) for name in EXPOSURES.names if name != "exposure_id"},
+        **{name: getattr(e, name) for name in EXPOSURES.names if name not in _NUMBERS},
         "exposure_id": number,
         "ra": e.ra % 360.0,
         "position_angle": (e.position_angle + 180.0) % 360.0 - 180.0,

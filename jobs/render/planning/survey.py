@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -47,13 +48,13 @@ def exposures(request: Request, mission: MissionConfiguration) -> list[tuple[Exp
 
 def _of_mission(request: Request, mission: MissionConfiguration) -> Iterator[Exposure]:
     for i, pointing in enumerate(request.pointings):
-        yield _pointing(pointing, f"pointing[{i}]", request, mission)
+        yield from repeat(_pointing(pointing, f"pointing[{i}]", request, mission), pointing.realisations)
     for i, block in enumerate(request.observations):
         where = f"observation[{i}]"
         found = 0
         for exposure in _block(block, request, mission, where):
             found += 1
-            yield exposure
+            yield from repeat(exposure, block.realisations)
         if not found:
             raise BadInput(f"{where} asks for no exposure")
 

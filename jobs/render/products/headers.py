@@ -99,6 +99,8 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("NMOVING", int((rendered.sources.length > 0).sum()), "number of moving Solar System objects drawn"),
         ("SRCREACH", rendered.complete, "[arcsec] sources complete beyond the detector"),
         ("SEED", str(rendered.seed), "seed of the random numbers"),
+        *((("NOISSEED", str(rendered.noise_seed), "seed of the noise"),) if rendered.noise_seed is not None else ()),
+        *((("REALIS", exposure.realisation, "realisation of the noise"),) if (exposure.realisation or 1) > 1 else ()),
         ("MISSION", rendered.scene.mission.fingerprint, ""),
         ("TRUESKY", __version__, "version of the simulator"),
         *_accuracy_cards(rendered),
@@ -157,6 +159,8 @@ def _effect_cards(rendered: Rendered) -> tuple[Card, ...]:
         state = ("on" if decision.applied else "off") + (" (forced)" if decision.forced else "")
         cards.append((f"EFFECT{number}", f"{decision.name}: {state}, margin {decision.margin:.3g}", "needed above 1"))
         if decision.applied and decision.name in known:
-            numbers = numbers_of(known[decision.name], exposed, rendered.detector.name, rendered.seed)
+            numbers = numbers_of(
+                known[decision.name], exposed, rendered.detector.name, rendered.seed, rendered.noise_seed
+            )
             cards.append((f"EFKEY{number}", rng.name_of(*numbers), "key of its random numbers"))
     return tuple(cards)

@@ -92,12 +92,29 @@ def moments(image):
 
 
 def rendered(
-    exposed, detector, tables, mission, accuracy, seed=1, forced=None, truth=(), progress=None, passband=None, **rows
+    exposed,
+    detector,
+    tables,
+    mission,
+    accuracy,
+    seed=1,
+    forced=None,
+    truth=(),
+    progress=None,
+    passband=None,
+    noise_seed=None,
+    **rows,
 ):
     """One detector; exposed : columns of its exposure;  tables : galaxies, their fluxes, stars, theirs."""
     variant = Variant(mission, accuracy, forced or {})
     return render.render(
-        Aim.of(exposure(**exposed), detector, passband), Rows(*tables, **rows), variant, seed, truth, progress
+        Aim.of(exposure(**exposed), detector, passband),
+        Rows(*tables, **rows),
+        variant,
+        seed,
+        truth,
+        progress,
+        noise_seed,
     )
 
 

@@ -511,6 +511,7 @@ def test_what_the_catalogue_does_not_hold_is_refused_before_anything_is_rendered
     [
         ({"seed": 8}, "table galaxies has seed 7, the request 8: run build_galaxies first"),
         ({"galaxy_limit": 24.0}, "table galaxies has galaxy_limit 23.5, the request 24.0: run build_galaxies first"),
+        ({"lensing": "none"}, r"table galaxies has lensing None, the request \(0.0, 0.0\): run build_galaxies first"),
         ({"star_limit": 21.0}, "table stars has star_limit 20.0, the request 21.0: run build_stars first"),
     ],
 )

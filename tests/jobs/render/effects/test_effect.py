@@ -59,6 +59,7 @@ def test_every_effect_has_its_place():
 def test_a_request_may_name_every_effect():
     tuples = (*vis.EFFECTS.values(), *ground.EFFECTS.values(), (vis.DRAWN,))
     assert set(schema.EFFECTS) == {effect.name for effects in tuples for effect in effects}
+    assert set(schema.ALWAYS) == {effect.name for effects in tuples for effect in effects if not effect.optional}
 
 
 def test_pixel_noise_is_sky_dark_and_reading():

@@ -17,7 +17,9 @@ from jobs.render.channels import costs
 from jobs.render.drawing import cost, stamps
 from jobs.render.effects.light import calibration_lamp
 from jobs.render.exposure import truth_maps
-from jobs.render.planning import planned_exposures
+from jobs.render.planning import planned_exposures, variants
+from jobs.request import schema
+from jobs.request.from_toml import from_table
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_of
@@ -54,6 +56,7 @@ def field(channel, n=30):
 def render(channel, body=None, points=None, flux=3.0, seed=1, accuracy=SURVEY, kind="science", **options):
     _, exposed, all_bodies, all_points = field(channel)
     exposed = {**exposed, "image_type": kind, "sky": 0.0 if kind in ("bias", "dark") else exposed["sky"]}
+    exposed |= options.pop("exposed", {})
     body = all_bodies if body is None else body
     points = all_points if points is None else points
     camera, name, band = CASES[channel][:3]
@@ -297,6 +300,35 @@ def test_the_seed_changes_the_noise_alone():
     base, other = render("VIS"), render("VIS", seed=2)
     np.testing.assert_array_equal(base.noise_free, other.noise_free)
     assert (base.science != other.science).mean() > 0.5
+
+
+@pytest.mark.parametrize("changed", [{"noise_seed": 5}, {"exposed": {"realisation": 2}}], ids=["seed", "realisation"])
+def test_the_same_sky_with_other_noise(changed):
+    """Sources and what is the detector's own stay; every pixel's noise is another, and independent."""
+    base, other = render("VIS"), render("VIS", **changed)
+    np.testing.assert_array_equal(base.noise_free, other.noise_free)
+    assert (base.science != other.science).mean() > 0.5
+    off = dict.fromkeys(schema.EFFECTS, False) | dict.fromkeys(schema.ALWAYS, True)
+    noisy = off | dict.fromkeys(("background", "poisson", "read_noise"), True)
+    shots = [render("VIS", forced=noisy, **more).science.astype(float) for more in ({}, changed)]
+    dark = base.noise_free < 5.0
+    assert abs(np.corrcoef(*(shot[dark] for shot in shots))[0, 1]) < 4.0 / np.sqrt(dark.sum())
+    own = off | dict.fromkeys(("background", "pixel_response", "hot_pixels"), True)
+    np.testing.assert_array_equal(*(render("VIS", forced=own, **more).science for more in ({}, changed)))
+    same = {"noise_seed": 1, "exposed": {"realisation": 1}}
+    np.testing.assert_array_equal(base.science, render("VIS", **same).science)
+
+
+def test_without_any_effect_the_image_is_the_truth_in_whole_numbers():
+    for channel, keep in (("VIS", ()), ("EXT", ()), ("VIS", ("background",))):
+        asked = {"effects": {"on": list(keep), "off": ["all"]}}
+        request = from_table({"name": "x", "seed": 1, "area": {"cone": {"ra": 0, "dec": 0, "radius": 1}}, **asked})
+        one = render(channel, forced=variants.forced(request))
+        needed = {"adc", "quadrants"} & {decision.name for decision in one.decisions}
+        assert {decision.name for decision in one.decisions if decision.applied} == needed | set(keep)
+        light = one.noise_free.astype(float) + bool(keep) * one.scene.sky_electrons
+        gain, bias = one.scene.value("gain", "electron / adu"), one.scene.value("bias", "adu")
+        assert np.abs(one.science - bias - light / gain).max() == pytest.approx(0.5, abs=1e-2)
 
 
 def test_a_source_just_outside_still_shines_in():

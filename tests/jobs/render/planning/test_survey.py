@@ -239,6 +239,30 @@ def test_an_exploration_is_the_product_of_requests(tmp_path):
     assert forced == {"full_well": False}
 
 
+def test_exposures_alike_are_numbered(tmp_path):
+    """Of the same camera, band, place, angle and time; each request of an exploration begins anew."""
+    twice, other = {**VIS, "realisations": 2}, {**VIS, "mjd": 60906.0}
+    explored = {"effects.poisson": [True, False]}
+    exposures, rows = planned(tmp_path, pointing=[twice, other, {**VIS, "detectors": ["3-4"]}], explore=explored)
+    assert exposures["realisation"].to_pylist() == [1, 2, 1, 3] * 2
+    identities = [image_types.identity(ExposureRow.of(row)) for row in exposures.to_pylist()]
+    assert len(set(identities)) == 4
+    assert identities[:4] == identities[4:]
+    # The first is what it is alone, also in lakes that have not numbered it.
+    (alone,) = planned(tmp_path, pointing=[VIS])[0].to_pylist()
+    row = ExposureRow.of({**alone, "realisation": None})
+    assert (
+        image_types.identity(row)
+        == identities[0]
+        == ":".join(("vis", "euclid_vis", *(value.hex() for value in (row.ra, row.dec, row.position_angle, row.mjd))))
+    )
+    assert len(rows) == 2 * (36 * 3 + 1)
+    block = {"channels": ["VIS"], "image_type": "bias", "exposures": 2, "realisations": 3}
+    found, _ = planned(tmp_path, observation=[block, {**block, "image_type": "dark", "realisations": 1}])
+    # The first bias and the first dark would have the same read noise.
+    assert found["realisation"].to_pylist() == [1, 2, 3, 1, 2, 3, 4, 1]
+
+
 def test_a_pointing_in_front_changes_nobody_else_s_noise(tmp_path):
     first, second = {**VIS, "detectors": ["1-1"]}, {**VIS, "mjd": 60906.0, "detectors": ["1-1"]}
     alone, _ = planned(tmp_path, pointing=[second])
