@@ -1,11 +1,11 @@
-# make demo | test | check | bench | clean -- each installs what it is missing into .venv, and nothing a second time.
+# make demo | test | check | bench | docs | clean -- each installs what it is missing into .venv, and nothing a second time.
 
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help demo test check bench clean spark FORCE
+.PHONY: help demo test check bench docs clean spark FORCE
 
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -26,6 +26,7 @@ help:
 	@echo 'make test    all tests'
 	@echo 'make check   style, types, who may import whom'
 	@echo 'make bench   all benchmarks'
+	@echo 'make docs    the documentation as a site in out/site, its notebooks run on the lake of make demo'
 	@echo 'make clean   remove what was computed (.venv and the cache stay)'
 
 demo: spark
@@ -39,6 +40,9 @@ check: .venv/installed-test
 
 bench: .venv/installed-bench spark
 	@$(RUN) for file in benchmarks/[a-z]*.py; do name=$${file##*/}; python -m "benchmarks.$${name%.py}"; done
+
+docs: .venv/installed-test demo
+	@$(RUN) python -m scripts.make_docs --notebooks
 
 clean:
 	rm -rf out build dist *.egg-info spark-warehouse

@@ -79,7 +79,8 @@ def main() -> None:
         made = {"run": compiled([project], known), "build": compiled([builders], known)}
         for extra in ("test", "bench"):
             wanted = compiled([project], known, "--extra", extra)
-            made[extra] = {name: lines for name, lines in wanted.items() if name not in made["run"]}
+            # What run.txt has for some machines alone may here be wanted on all.
+            made[extra] = {name: lines for name, lines in wanted.items() if lines != made["run"].get(name)}
         made["java"] = {JAVA: made["test"].pop(JAVA)}
     for name, some in made.items():
         head = [f"# {ABOUT[name]}", "# Made by scripts/pin_packages.py.", ""]

@@ -1,0 +1,287 @@
+"""Write the documentation site: the pages of docs/, the notebooks with their figures, references made from the code.
+
+    python -m scripts.make_docs [--out out/site] [--notebooks]
+
+--notebooks runs them (on the lake that `make demo` leaves in out/demo); without it they are shown as they are kept,
+without figures. Nothing is downloaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import matplotlib
+import matplotlib.pyplot as plt
+import nbformat
+import numpy as np
+from nbclient import NotebookClient
+from nbconvert import MarkdownExporter
+from sphinx.application import Sphinx
+
+from benchmarks import effects as scene_of_effects
+from jobs.render.camera import detectors
+from jobs.render.channels import ground, vis
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.readout import quadrants
+from jobs.render.effects.scene import Frame, Lights, Scene
+from jobs.request import from_toml
+from jobs.rng import stream
+from lake_schema.mission.configuration import MissionConfiguration, resolve
+
+ROOT = Path(__file__).resolve().parents[1]
+# Chapters of the site: title, pages.  Those of docs/ that none names tell how to do something.
+CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("Tutorials", ("notebooks",)),
+    ("How to", ("others",)),
+    ("Reference", ("request.md", "tables.md", "mission.md", "effects.md", "modelled.md", "corrections.md", "api.md")),
+    ("Contributing", ("contributing.md",)),
+)
+# What readers of a lake import.
+API = ("lake_schema.store.read", "lake_schema.store.layout", "jobs.explore.explorer", "jobs.render.products.read_back")
+# Side of the frame that effects are shown on, pixels.
+_SIDE = 320
+_FILE = re.compile(r"\[([^\]]*)\]\((?:\.\./)*(?:(?:jobs|lake_schema|requests|benchmarks|tests|scripts)/|README)[^)]*\)")
+_NOTEBOOK = re.compile(r"\]\((?:\.\./)*notebooks/([^)]*)\.ipynb\)")
+
+
+def notebooks(into: Path, run: bool) -> list[str]:
+    """Pages made of the notebooks; their names."""
+    pages = []
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        notebook = nbformat.read(path, as_version=4)
+        if run:
+            NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}}).execute()
+        text, resources = MarkdownExporter().from_notebook_node(notebook)
+        folder = into / "tutorials"
+        folder.mkdir(exist_ok=True)
+        for name, data in resources["outputs"].items():
+            (folder / f"{path.stem}_{name}").write_bytes(data)
+            text = text.replace(f"]({name})", f"]({path.stem}_{name})")
+        (folder / f"{path.stem}.md").write_text(text, encoding="utf-8")
+        pages.append(f"tutorials/{path.stem}.md")
+    return pages
+
+
+# ------------------------------------------------------------------------------------------------ references
+
+
+def request_page() -> str:
+    """The head of the parser: every key with what it takes."""
+    text = inspect.cleandoc(from_toml.__doc__ or "")
+    return f"# Keys of a request\n\n```text\n{text}\n```\n"
+
+
+def mission_page(mission: MissionConfiguration) -> str:
+    """Every parameter that the default ladder chooses."""
+    lines = [
+        "# The mission database",
+        "",
+        "What the default ladder of statuses chooses; a request replaces values under `[mission.overrides]`.",
+    ]
+    section = ""
+    for record in mission.parameters:
+        head = record.key.split(".")[0]
+        if head != section:
+            section = head
+            lines += ["", f"## {head}", "", "| parameter | value | unit | status | source |", "|---|---|---|---|---|"]
+        source = record.source.replace("|", "/")
+        lines.append(f"| `{record.key}` | {record.value:g} | {record.unit} | {record.status} | {source} |")
+    return "\n".join(lines) + "\n"
+
+
+def effects_page(into: Path, mission: MissionConfiguration) -> str:
+    """Every effect of every channel: what its module says, the parameters that it asks for, what it does to a frame."""
+    names = {"VIS": "science", "EXT": "science"}
+    channels = {"VIS": vis.CHANNEL.effects, "EXT": ground.CHANNEL.effects}
+    order: dict[str, Effect] = {}
+    users: dict[str, list[str]] = {}
+    for channel, types in channels.items():
+        for kind, effects in types.items():
+            for effect in effects:
+                order.setdefault(effect.name, effect)
+                users.setdefault(effect.name, []).append(f"{channel} {kind}")
+    lines = [
+        "# Effects",
+        "",
+        "In the order of physics. An image has what its scene needs: an effect whose largest change",
+    ]
+    lines += ["of a pixel is less than a tenth of its noise is left out, unless a request forces it.", ""]
+    for channel, kind in names.items():
+        listed = ", ".join(f"[{e.name}](#{e.name})" for e in channels[channel][kind])
+        lines += [f"**{channel}, {kind}:** {listed}", ""]
+    asked = _asked(list(order.values()), mission)
+    shown = _figures(into, mission)
+    for name, effect in order.items():
+        module = inspect.getmodule(effect.apply)
+        text = inspect.cleandoc((module.__doc__ if module else "") or "")
+        lines += [f"## {name}", "", "```text", text, "```", ""]
+        if asked[name]:
+            lines += ["| parameter | value | unit |", "|---|---|---|"]
+            lines += [f"| `{k}` | {mission.value(k):g} | {mission.parameter(k).unit} |" for k in asked[name]]
+            lines.append("")
+        if name in shown:
+            lines += [f"![What {name} does to a frame](effects/{name}.png)", ""]
+        lines += ["In: " + ", ".join(users[name]) + ".", ""]
+    return "\n".join(lines)
+
+
+def _scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
+    """A small VIS detector with points, squares of light and a bright star whose ghost falls onto it."""
+    detector = detectors.detector("vis", "3-4", mission)
+    small = type(detector)("3-4", "vis", _SIDE, _SIDE, detector.x, detector.y, 0.0, detector.pixel_scale)
+    frame = scene_of_effects.light(_SIDE, _SIDE)
+    frame[200, 100] += 3e6
+    lights = Lights(np.array([150.0]), np.array([150.0 - mission.value("vis.ghost.offset_y", "pix")]), np.array([1e9]))
+    return frame, Scene(mission, "vis", 560.53, 0.25, float(frame.max()), small, lights)
+
+
+def _asked(effects: list[Effect], mission: MissionConfiguration) -> dict[str, list[str]]:
+    """The scalar parameters that each effect asks the mission for."""
+    _, scene = _scene(mission)
+    ground_scene = Scene(mission, "ext.lsstcam", 30.0, 50.0, 1e5)
+    found, value = {}, MissionConfiguration.value
+    for effect in effects:
+        keys: dict[str, None] = {}
+
+        def noted(*arguments: str, keys: dict[str, None] = keys) -> float:
+            keys[arguments[1]] = None
+            return value(*arguments)
+
+        with patch.object(MissionConfiguration, "value", noted):
+            effect.parameters(scene if effect in vis.SKY + vis.FLAT + vis.INJECTION else ground_scene)
+        found[effect.name] = list(keys)
+    return found
+
+
+def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
+    """A figure an effect of a VIS image: the frame before it, after it, and the difference."""
+    frame, scene = _scene(mission)
+    folder = into / "effects"
+    folder.mkdir()
+    drawn = set()
+    light = frame
+    for effect in dict.fromkeys((*vis.SKY, *vis.FLAT, *vis.INJECTION)):
+        before = frame if effect in vis.SKY else light
+        after = effect.apply(before, *effect.parameters(scene), rng=stream(1, effect.name))
+        # Some need more than a small frame to show.
+        if before.shape != after.shape or np.ptp(after - before) > 0.0:
+            _figure(folder / f"{effect.name}.png", _flat(before), _flat(after), effect.name)
+            drawn.add(effect.name)
+        frame = after if effect in vis.SKY else frame
+    return drawn
+
+
+def _flat(frame: Frame) -> Frame:
+    """As one image, the quadrants where they lie, with their pre- and overscan."""
+    if frame.ndim == 2:
+        return frame
+    placed = [quadrants.placed(frame[i], i) for i in range(4)]
+    return np.block([[placed[3], placed[2]], [placed[0], placed[1]]])
+
+
+def _figure(path: Path, before: Frame, after: Frame, name: str) -> None:
+    same = before.shape == after.shape and name != "adc"
+    figure, axes = plt.subplots(1, 3 if same else 2, figsize=(9 if same else 6, 3.2), layout="constrained")
+    middle = float(np.median(after))
+    for axis, image, title in zip(axes, (before, after), ("before", "after"), strict=False):
+        level = float(np.median(image)) if not same else middle
+        width = max(float(np.percentile(np.abs(image - level), 99.0)), 1.0)
+        axis.imshow(np.arcsinh((image - level) / (0.2 * width)), origin="lower", cmap="gray")
+        unit = "adu" if name == "adc" and title == "after" else "e⁻"
+        axis.set_title(f"{title}, median {np.median(image):.4g} {unit}", fontsize=9)
+    if same:
+        change = after - before
+        width = max(float(np.percentile(np.abs(change), 99.7)), 0.1 * float(np.abs(change).max()))
+        shown = axes[2].imshow(change, origin="lower", cmap="RdBu_r", vmin=-width, vmax=width)
+        axes[2].set_title("change, e⁻", fontsize=9)
+        figure.colorbar(shown, ax=axes[2], shrink=0.8)
+    for axis in axes:
+        axis.set(xticks=[], yticks=[])
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+def api_page() -> str:
+    lines = ["# Reading a lake from Python", ""]
+    for module in API:
+        lines += [f"## {module}", "", "```{eval-rst}", f".. automodule:: {module}", "```", ""]
+    return "\n".join(lines)
+
+
+# ------------------------------------------------------------------------------------------------ the site
+
+
+def pages(into: Path, run: bool) -> None:
+    """Write all pages."""
+    shutil.copytree(ROOT / "docs", into, dirs_exist_ok=True)
+    mission = resolve()
+    made = {
+        "request.md": request_page(),
+        "mission.md": mission_page(mission),
+        "effects.md": effects_page(into, mission),
+        "api.md": api_page(),
+        "contributing.md": (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"),
+    }
+    for name, text in made.items():
+        (into / name).write_text(text, encoding="utf-8")
+    tutorials = notebooks(into, run)
+    named = {page for _, names in CHAPTERS for page in names} | {"index.md"}
+    listed = {"notebooks": tutorials, "others": sorted({path.name for path in into.glob("*.md")} - named)}
+    for path in into.glob("*.md"):
+        text = _NOTEBOOK.sub(r"](tutorials/\1.md)", path.read_text(encoding="utf-8"))
+        # A file of the clone is named; the site does not hold it.
+        path.write_text(_FILE.sub(r"`\1`", text).replace("](docs/", "]("), encoding="utf-8")
+    with (into / "index.md").open("a", encoding="utf-8") as home:
+        for title, names in CHAPTERS:
+            entries = [page for name in names for page in listed.get(name, [name]) if (into / page).exists()]
+            home.write("\n".join(["", "```{toctree}", f":caption: {title}", ":hidden:", "", *entries, "```", ""]))
+
+
+def build(source: Path, out: Path) -> int:
+    """The site of a folder of pages; 0 without errors and warnings."""
+    configuration = {
+        "project": "truesky",
+        "extensions": ["myst_parser", "sphinx.ext.autodoc"],
+        "html_theme": "pydata_sphinx_theme",
+        "html_theme_options": {"show_prev_next": False, "secondary_sidebar_items": ["page-toc"]},
+        "html_copy_source": False,
+        "myst_heading_anchors": 3,
+        "autodoc_default_options": {"members": True, "member-order": "bysource"},
+        "autodoc_typehints": "none",
+    }
+    site = Sphinx(source, None, out, source / "_built", "html", configuration, status=None, warningiserror=True)
+    site.connect("autodoc-process-docstring", _as_written)
+    site.build()
+    return site.statuscode
+
+
+def _as_written(*event: Any) -> None:
+    """A docstring is shown as it is written."""
+    lines = event[-1]
+    lines[1:] = ["", "::", "", *("    " + line for line in lines[1:]), ""] if any(lines[1:]) else []
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "site")
+    parser.add_argument("--notebooks", action="store_true", help="run the notebooks, for their figures")
+    options = parser.parse_args()
+    matplotlib.use("Agg")
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "docs"
+        source.mkdir()
+        pages(source, options.notebooks)
+        if build(source, options.out):
+            raise SystemExit("truesky: the site has errors, above")
+    print(options.out / "index.html")
+
+
+if __name__ == "__main__":
+    main()
