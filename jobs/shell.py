@@ -109,7 +109,10 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
 
 
 def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
-    """Make and publish every table of a job that is not there yet; raises what `publish.make` raises."""
+    """Make and publish every table of a job that is not there yet; raises what `publish.make` raises.
+
+    job     : its steps;  root : folder of the lake;  request : checked;  verbose : whether progress is shown
+    """
     for step in job.steps(root, request):
         _run(job, step, root, request, verbose)
 

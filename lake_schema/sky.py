@@ -179,7 +179,10 @@ def cells_in_box(west: float, east: float, south: float, north: float, order: in
 
 
 def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2: npt.ArrayLike) -> Float:
-    """Great-circle distance, deg, by the haversine (accurate from 0 to 180 deg); all angles deg, broadcast."""
+    """Great-circle distance, deg, by the haversine (accurate from 0 to 180 deg); all angles deg, broadcast.
+
+    ra1, dec1 : of one place;  ra2, dec2 : of the other
+    """
     lon1, lat1, lon2, lat2 = (np.radians(np.asarray(x, float)) for x in (ra1, dec1, ra2, dec2))
     dlon, dlat = np.sin((lon2 - lon1) / 2), np.sin((lat2 - lat1) / 2)
     near = dlat**2 + np.cos(lat1) * np.cos(lat2) * dlon**2
@@ -189,7 +192,10 @@ def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2
 
 
 def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> tuple[Int, Float, Float]:
-    """n positions uniform in a cell: (int64[n] order-29 index, ascending; ra[n], dec[n] deg)."""
+    """n positions uniform in a cell: (int64[n] order-29 index, ascending; ra[n], dec[n] deg).
+
+    order, cell : of the nested cell;  n : positions;  rng : random numbers
+    """
     first, _ = cell_range(order, cell)
     index = np.sort(rng.integers(0, 1 << (2 * (DEEPEST - order)), n, dtype=np.int64)) | np.int64(first)
     ra, dec = _hp().pix2ang(1 << DEEPEST, index, nest=True, lonlat=True)

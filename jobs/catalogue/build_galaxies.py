@@ -164,7 +164,11 @@ def _ingested(lake: Path, request: Request, given: Catalogue) -> Step:
 
 
 def ingested_work(lake: Path, facts: Json, given: Catalogue, dust: DustMap | None) -> Output:
-    """A catalogue's galaxies of one order-5 cell."""
+    """A catalogue's galaxies of one order-5 cell.
+
+    lake  : folder of the lake;  facts : of the plan and of the part, which has its cell
+    given : the catalogue's files and columns;  dust : an external map of dust, None = the embedded one
+    """
     columns = mapping.galaxies(given.format, dict(given.columns))
     found, _ = ingest.listed(given.files, columns)
     laid_out = ingest.split(found, facts["ingest"]["sha256"], columns)

@@ -64,7 +64,11 @@ def _files(choice: Stars) -> dict[str, Any]:
 
 
 def work(lake: Path, facts: Json, choice: Stars, own: DustMap | None = None) -> Output:
-    """The stars of one file's cell."""
+    """The stars of one file's cell.
+
+    lake   : folder of the lake;  facts : of the plan and of the part, which has its cell
+    choice : section `stars` of the request;  own : an external map of dust, None = the embedded one
+    """
     model = _model(facts, choice)
     dust = dust_map.chosen(facts["seed"], own)
     return Output(cells.rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))

@@ -92,6 +92,7 @@ def a_v_at(to_infinity: Float, distance: Float, b: npt.ArrayLike, dust: Layer, s
     """A(V)[n] mag on the way to a star.
 
     to_infinity : [n] mag; distance : [n] pc; b : Galactic latitude, deg; sin_b_min : as in the map
+    dust        : the layer that the dust lies in
     """
     sin_b = np.maximum(np.abs(np.sin(np.radians(np.asarray(b, float)))), sin_b_min)
     return np.asarray(-to_infinity * np.expm1(-distance * sin_b / dust.height))

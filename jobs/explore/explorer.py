@@ -115,6 +115,7 @@ class Explorer:
         """Rows of a catalogue within a circle.
 
         ra, dec, radius : deg;  on : "true" or "lensed" positions
+        table, columns  : names; columns None: all of them;  into : kind of the result, as of `sql`
         """
         return results.converted(self._version(table).cone(ra, dec, radius, columns, on), into)
 
@@ -156,6 +157,8 @@ class Explorer:
     ) -> tuple[Float, Float, Float]:  # fmt: skip
         """Counts of two expressions in a grid of equal bins.
 
+        table   : as of `hist`;  where : SQL condition of the rows that count;  weight : SQL that is summed, None = 1
+        x, y    : SQL expressions;  bins, span : of each of the two; span None: from least to largest
         returns : counts[y bins, x bins], edges of x, edges of y
         """
         for axis in bins:
@@ -173,7 +176,11 @@ class Explorer:
         return counts, np.linspace(x_lo, x_hi, bins[0] + 1), np.linspace(y_lo, y_hi, bins[1] + 1)
 
     def skymap(self, table: str, order: int = 8, where: str = "true", weight: str | None = None) -> tuple[Int, Float]:
-        """Counts in nested HEALPix cells of an order: int64[n] cells that hold any, ascending, and their counts [n]."""
+        """Counts in nested HEALPix cells of an order: int64[n] cells that hold any, ascending, and their counts [n].
+
+        table  : as of `hist`;  order : of the cells
+        where  : SQL condition of the rows that count;  weight : SQL that is summed, None = 1
+        """
         if not 0 <= order <= sky.DEEPEST:
             raise BadInput(f"order = {order} is outside [0, {sky.DEEPEST}]")
         text = f"""

@@ -24,6 +24,7 @@ def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **sty
     """Colours, logarithmic, blank where there is nothing; returns the axes.
 
     counts : [y bins, x bins];  x_edges, y_edges : one more than bins, as `Explorer.heatmap` gives them
+    ax     : of matplotlib; None: a new one
     """
     from matplotlib.colors import LogNorm
 
@@ -39,6 +40,7 @@ def skymap(cells: Int, counts: Float, order: int, ax: Any = None, **style: Any) 
     """Number a square degree in HEALPix cells, east to the left; returns the axes.
 
     cells : int64[n] nested cells of the order;  counts : [n], as `Explorer.skymap` gives them
+    ax    : of matplotlib; None: a new one
     """
     from matplotlib.collections import PolyCollection
 

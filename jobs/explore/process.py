@@ -87,7 +87,10 @@ class Process:
 
 
 def check(name: str, value: float, lo: float, hi: float) -> None:
-    """Refuse a number outside its bounds."""
+    """Refuse a number outside its bounds.
+
+    name : in the refusal;  value : what was given;  lo, hi : both still allowed
+    """
     if not lo <= value <= hi:
         raise OutOfRange(name, value, lo, hi)
 

@@ -104,7 +104,11 @@ def galaxy_fluxes(
 def galaxy_fluxes_by(
     galaxies: pa.Table, curves: Sequence[Passband], settings: Sequence[Setting | None], library: Library
 ) -> pa.Table:
-    """`galaxy_fluxes` from the tables of these settings; bands without one are integrated."""
+    """`galaxy_fluxes` from the tables of these settings; bands without one are integrated.
+
+    galaxies : rows of table `galaxies`;  curves, settings : passbands, and how fine the table of each is
+    library  : templates of galaxies
+    """
     tabulated = [k for k, setting in enumerate(settings) if setting is not None]
     grid = None
     f_nu, integrated = np.zeros((galaxies.num_rows, len(curves))), np.ones(galaxies.num_rows, bool)
@@ -125,7 +129,11 @@ def galaxy_fluxes_by(
 def star_fluxes(
     stars: pa.Table, bands: Sequence[str | Passband], library: Library, accuracy: Accuracy = REFERENCE
 ) -> pa.Table:
-    """f_nu of stars through bands, with the dust on the way to each; as `galaxy_fluxes`."""
+    """f_nu of stars through bands, with the dust on the way to each; as `galaxy_fluxes`.
+
+    stars   : rows of table `stars`;  bands : embedded ones by name
+    library : spectra of stars;  accuracy : largest errors that are allowed
+    """
     curves = _curves(bands)
     tabulated = stars_tabulated(accuracy)
     f_nu, integrated = np.zeros((stars.num_rows, len(curves))), np.ones(stars.num_rows, bool)
@@ -145,6 +153,8 @@ def prepare(
     """Make what the cache lacks for these bands, tables and machine code, so that workers find it there.
 
     library, stars : of galaxies, of stars
+    curves, settings : passbands, and how fine the table of each is; None: it is integrated
+    accuracy         : largest errors that are allowed
     """
     chosen = [(curve, setting) for curve, setting in zip(curves, settings, strict=True) if setting is not None]
     if chosen:

@@ -109,6 +109,7 @@ def magnification(
 ) -> Float:
     """mu = 1 / ((1 - kappa)^2 - gamma^2), float64[n].
 
+    kappa, gamma1, gamma2 : float64[n] convergence and shear;  ids : of the sources, named in the refusal
     Errors: OutOfRange names the source where mu is not in (0, 100], at and inside the critical curve
     Ref: Serrano et al. 2024, eq. magnification_factor
     """

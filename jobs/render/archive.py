@@ -94,6 +94,7 @@ def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _
     """The answer to a query of the rows, which it calls `products`; it reaches no file.
 
     memory : bytes that the query may take;  timeout : s
+    rows   : of table `products`;  sql : one SELECT
     """
     with tempfile.TemporaryDirectory(prefix="truesky-") as folder:
         file = Path(folder) / "products.arrow"
@@ -121,6 +122,7 @@ def again(root: Path, product: str, out: Path, key: str | None = None) -> str:
     """Render a product into a file of its own; returns what is to be said of it, empty where its bytes are the same.
 
     product : its path in the table;  key : of the version of `products` that has it, None = the current one
+    root    : folder of the lake;  out : the file
     Errors  : BadInput where there is no such product, or where a table that it was made from has been removed
     """
     from jobs.render import render_exposures

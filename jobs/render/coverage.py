@@ -78,6 +78,7 @@ def depths(exposures: pa.Table, tasks: pa.Table, area: Area, side: int = _SIDE) 
     """Of every channel and band that looks at the sky, long exposures alone.
 
     area : of the request, where its interior lies
+    exposures, tasks : rows of the tables;  side : pixels of the map
     """
     looks = exposures.filter(pc.is_in(exposures["image_type"], pa.array(SKY_TYPES)))
     if not looks.num_rows:

@@ -55,7 +55,11 @@ def value(table: Toml, path: str) -> object:
 
 
 def string(table: Toml, path: str, legal: Sequence[str] = (), default: str | None = None) -> str:
-    """A text, one of `legal` where some are named."""
+    """A text, one of `legal` where some are named.
+
+    table, path : a section, and the key's name with its sections' names
+    legal       : texts that are allowed, none = all;  default : where the key is not there, None = it has to be
+    """
     if default is not None and not has(table, path):
         return default
     found = value(table, path)
@@ -67,7 +71,11 @@ def string(table: Toml, path: str, legal: Sequence[str] = (), default: str | Non
 
 
 def strings(table: Toml, path: str, legal: Sequence[str] = (), distinct: bool = True) -> tuple[str, ...]:
-    """A list of texts, empty where it is not there."""
+    """A list of texts, empty where it is not there.
+
+    table, path : as of `string`;  legal : texts that are allowed, none = all
+    distinct    : whether a text that stands twice is refused
+    """
     found = table.get(path.rpartition(".")[2], [])
     if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
         raise BadInput(f"{path} wants a list of texts, got {shown(found)}")
@@ -80,19 +88,29 @@ def strings(table: Toml, path: str, legal: Sequence[str] = (), distinct: bool = 
 
 
 def number(table: Toml, path: str, lo: float, hi: float, default: float | None = None) -> float:
-    """A finite number from lo to hi."""
+    """A finite number from lo to hi.
+
+    table, path : as of `string`;  lo, hi : both still allowed
+    default     : where the key is not there, None = it has to be
+    """
     if default is not None and not has(table, path):
         return default
     return checked_number(value(table, path), path, lo, hi)
 
 
 def optional(table: Toml, path: str, lo: float, hi: float) -> float | None:
-    """The same, None where the key is not there."""
+    """The same, None where the key is not there.
+
+    table, path, lo, hi : as of `number`
+    """
     return number(table, path, lo, hi) if has(table, path) else None
 
 
 def checked_number(found: object, path: str, lo: float, hi: float) -> float:
-    """A value that must be a finite number from lo to hi."""
+    """A value that must be a finite number from lo to hi.
+
+    found : what stands in the request;  path : the key's name;  lo, hi : both still allowed
+    """
     if isinstance(found, bool) or not isinstance(found, (int, float)):
         raise BadInput(f"{path} wants a number, got {shown(found)}")
     # Whole numbers are compared before they become floats: TOML's have no largest one.
@@ -102,7 +120,10 @@ def checked_number(found: object, path: str, lo: float, hi: float) -> float:
 
 
 def integer(table: Toml, path: str, lo: int, hi: int, default: int | None = None) -> int:
-    """A whole number from lo to hi."""
+    """A whole number from lo to hi.
+
+    table, path, lo, hi, default : as of `number`
+    """
     if default is not None and not has(table, path):
         return default
     found = value(table, path)
@@ -122,7 +143,10 @@ def boolean(table: Toml, path: str, default: bool) -> bool:
 
 
 def choice(table: Toml, path: str, legal: Sequence[int], default: int) -> int:
-    """One of a few whole numbers."""
+    """One of a few whole numbers.
+
+    table, path : as of `string`;  legal : numbers that are allowed;  default : where the key is not there
+    """
     found = integer(table, path, min(legal), max(legal), default)
     if found not in legal:
         raise BadInput(f"{path} = {found} is not one of {', '.join(map(str, legal))}")
@@ -130,7 +154,10 @@ def choice(table: Toml, path: str, legal: Sequence[int], default: int) -> int:
 
 
 def pair(table: Toml, path: str, lo: float, hi: float) -> tuple[float, float]:
-    """Two numbers."""
+    """Two numbers.
+
+    table, path, lo, hi : as of `number`, lo and hi of each of the two
+    """
     found = value(table, path)
     if not isinstance(found, list) or len(found) != 2:
         raise BadInput(f"{path} wants [from, to], got {shown(found)}")

@@ -158,6 +158,11 @@ def half_light(rows: Mapping[str, Array], part: Int) -> Float:
 
 
 def bisected(bulge: Float, disc: Float, fraction: Float, sersic: Float) -> Float:
+    """Half-light radius[n] of a bulge and an exponential disc together, arcsec, by bisection.
+
+    bulge, disc : float[n] half-light radii of the components, arcsec
+    fraction    : float[n] bulge / total;  sersic : float[n] index of the bulge
+    """
     low, high = np.minimum(bulge, disc), np.maximum(bulge, disc)
     for _ in range(30):
         middle = np.sqrt(low * high)
@@ -204,7 +209,10 @@ def halpha(census: Census) -> dict[str, float]:
 
 
 def luminosities(census: Census, law: luminosity_function.Schechter, near: float, far: float) -> dict[str, float]:
-    """Galaxies / those of the luminosity function, where all spectra beat the limit; shells between near and far."""
+    """Galaxies / those of the luminosity function, where all spectra beat the limit; shells between near and far.
+
+    census : what was drawn;  law : the luminosity function;  near, far : redshifts
+    """
     z, m = census.rows["z_true"], census.rows["abs_mag_r01"]
     found = {}
     for at, half, reddest in SHELLS:

@@ -109,7 +109,11 @@ def velocities(box: Box, x: float) -> float:
 
 
 def population_above(seed: int, box_cells: int, near: float, far: float, log_mass: float) -> Population:
-    """Halos, and galaxies of a proxy mass, above log_mass."""
+    """Halos, and galaxies of a proxy mass, above log_mass.
+
+    seed, box_cells : of the box of matter, and its cells a side
+    near, far       : redshifts;  log_mass : log10 of the least mass, as of table `halos`
+    """
     table, inverse = matching.masses(), luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
     matched = matching.matching(table, inverse)
     volume = Volume(near, far, 0.0)
@@ -275,7 +279,11 @@ def limber(seen: Shells, found: Correlation, power: Callable[[Float], Float]) ->
 
 
 def structure(box: Box, order: int, cell: int, seen: Shells) -> Float:
-    """The Gaussian field of the box along the lines of sight of a block's pixels, weighted as the tracers are."""
+    """The Gaussian field of the box along the lines of sight of a block's pixels, weighted as the tracers are.
+
+    box         : of matter;  order, cell : of the nested block
+    seen        : the tracers' numbers by distance
+    """
     turned, direction = lightcone.replicas(box, float(seen.chi[-1] + seen.wide[-1])), _vectors(order, cell)
     step, g, total = box.model.cell, box.smoothed[0].ravel(), np.zeros(len(direction))
     ends = seen.chi[0] - 0.5 * seen.wide[0], seen.chi[-1] + 0.5 * seen.wide[-1]

@@ -27,7 +27,12 @@ def draw(
     bands: Sequence[int],
     figures: Mapping[str, float],
 ) -> None:
-    """universe.png: counts, redshifts, luminosities, halos, w(theta), C_l of the convergence."""
+    """universe.png: counts, redshifts, luminosities, halos, w(theta), C_l of the convergence.
+
+    folder  : where it is written;  seen : galaxies that were counted;  figures : what was measured, by name
+    curves  : by tracer and scale, (theta, w, its error, linear theory)
+    power   : [plane, band] C_l over theory;  bands : edges of the bands in l
+    """
     import matplotlib
 
     matplotlib.use("Agg")

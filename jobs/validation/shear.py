@@ -57,7 +57,10 @@ def bands(power: Float, chi: float, edges: Sequence[int]) -> Float:
 
 
 def sums(box: Box, nside: int, redshifts: Sequence[float], l_max: int) -> tuple[Float32, Float]:
-    """Convergence [plane, pixel] (nested) along lines of sight, and what its multipoles are multiplied by for maps."""
+    """Convergence [plane, pixel] (nested) along lines of sight, and what its multipoles are multiplied by for maps.
+
+    box       : of matter;  nside : of the maps;  redshifts : of the sources, a plane each;  l_max : highest multipole
+    """
     chosen = lensing.settings()
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)
     chi = np.asarray(cosmology.comoving_distance(np.array(redshifts)))
@@ -76,7 +79,11 @@ def gaussian_box(seed: int, n: int) -> Box:
 
 
 def power_of_box(seed: int, n: int, nside: int, redshifts: Sequence[float], edges: Sequence[int]) -> Float:
-    """C_l / theory [plane, band] of the maps that the catalogue would have of another seed."""
+    """C_l / theory [plane, band] of the maps that the catalogue would have of another seed.
+
+    seed, n   : of the box of matter, and its cells a side;  nside : of the maps
+    redshifts : of the sources, a plane each;  edges : of the bands in l
+    """
     kappa, gain = sums(gaussian_box(seed, n), nside, redshifts, edges[-1])
     rows = []
     for plane, z in enumerate(redshifts):

@@ -44,7 +44,11 @@ def around(b: float, cells: int, south: bool = False) -> list[int]:
 
 
 def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Float:
-    """Stars drawn deg-2 at a latitude, as in COUNTS."""
+    """Stars drawn deg-2 at a latitude, as in COUNTS.
+
+    b        : Galactic latitude, deg;  cells : that are drawn there
+    universe : the model of stars;  dust : float32[pixel] map of A(V), mag
+    """
     types, drawn = universe.types, around(b, cells)
     total = np.zeros(sum(map(len, LIMITS.values())))
     for cell in drawn:

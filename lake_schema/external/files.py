@@ -107,7 +107,12 @@ def main(argv: Sequence[str]) -> int:
 
 
 def send(path: Path, needed: Sequence[str], texts: Sequence[str], out: IO[bytes]) -> None:
-    """Write the batches of a file as an Arrow stream; BadInput, whatever Arrow's reader trips over."""
+    """Write the batches of a file as an Arrow stream; BadInput, whatever Arrow's reader trips over.
+
+    path   : a Parquet file of another program
+    needed : columns that have to be there;  texts : columns that are left out where they are not
+    out    : where the stream goes
+    """
     try:
         with _opened(path, needed, texts) as (file, found):
             _send(path, file, found, out)

@@ -55,6 +55,7 @@ def number_batches(
     """Columns of numbers of a file's first table: (title -> numbers[n], whole numbers as they are; title -> TUNIT).
 
     texts  : more columns, of texts or whole numbers; left out where there are none
+    path   : the file;  rows : of a batch;  kind : of user_files, whose largest size holds
     Errors : BadInput for a file that is cut short or is none, and names a column that is missing or no number
     """
     with _opened(path, kind) as units:

@@ -122,7 +122,10 @@ def _factor(unit: str, to: str) -> float | None:
 
 
 def convert(value: float, unit: str, to: str, where: str) -> float:
-    """A value in one unit -> in another; BadInput names where they do not fit."""
+    """A value in one unit -> in another; BadInput names where they do not fit.
+
+    value, unit : what is given, and in what;  to : the unit that is wanted;  where : named in the refusal
+    """
     parse_unit(unit, where)
     parse_unit(to, where)
     factor = _factor(unit, to)

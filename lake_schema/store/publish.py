@@ -54,6 +54,7 @@ def make(root: Path, plan: Plan, work: Work, mapper: Mapper = map, base: str | N
     work   : (lake, facts of the plan and the part) -> its Output; runs wherever `mapper` runs it
     mapper : like map: (function, parts) -> results in any order.  Results are only reported on; the receipts decide
     base   : key of the version that this one replaces, "" = whatever is current when the call begins
+    root   : folder of the lake;  plan : table, facts and parts
     Errors : PartsFailed lists the parts that could not be made (the others are kept); Superseded where another run
              holds the same plan, or has published another version since; Damaged where it is there and not whole
     """

@@ -192,6 +192,7 @@ class Version:
 
         ra, dec, radius : deg
         on              : "true" or "lensed", which of a source's positions counts
+        columns         : that are wanted; None: all of them
         """
         if on not in ON:
             raise BadInput(f"on = {on!r} is not one of {', '.join(ON)}")

@@ -28,7 +28,11 @@ def files_of(part: Part, receipt: Json) -> Json:
 
 
 def take(stage: Path, current: Path, table: str, parts: Sequence[Part]) -> None:
-    """Give a stage those of the parts that a version has; what is missing or damaged there is made again."""
+    """Give a stage those of the parts that a version has; what is missing or damaged there is made again.
+
+    stage   : folder of the version that is being made;  current : folder of the version that may have parts of it
+    table   : its name;  parts : of the plan that is being made
+    """
     if not any(PRODUCT in part.facts for part in parts) or not current.exists():
         return
     try:

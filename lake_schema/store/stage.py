@@ -33,6 +33,8 @@ def attempt(root: Path, key: str, table: Table, facts: Json, work: Work, part: P
     """Make and write one part, if it is not done yet; a failure comes back as {"part", "error", "traceback", "final"}.
 
     final : the same input will fail again
+    root, key   : folder of the lake, key of the version;  table : its declaration;  part : of the plan
+    facts, work : of the plan, and what makes a part's Output of them and the part's own
     """
     stage = layout.stage(root, table.name, key)
     if is_done(stage, part):
@@ -48,6 +50,8 @@ def attempt(root: Path, key: str, table: Table, facts: Json, work: Work, part: P
 def write_part(stage: Path, table: Table, part: Part, output: Output) -> Json:
     """Write one part into the stage, its receipt last; returns the receipt.
 
+    stage  : folder of the version that is being made;  table : its declaration
+    part   : of the plan;  output : its rows and further files
     Errors: BadInput where the rows are not what the table declares or the plan wants; OSError where the disc refuses
     """
     if not isinstance(output, Output):

@@ -53,6 +53,7 @@ def rows(
     """Table `passbands`.
 
     pivot_wavelengths : [n] A;  log_widths : [n];  origins : where each is from
+    bands             : n passbands, a row each
     """
     return PASSBANDS.build(
         {

@@ -76,6 +76,7 @@ class BandRatios:
 def build(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatios:
     """The table of one passband, 0 <= z <= z_max, 0 <= E(B-V) <= ebv_max (0.5 s for z_max = 2.3).
 
+    library : templates;  band : name of the passband;  z_max, ebv_max : where the table ends
     Error: `ln_ratio` within 0.0005 mag where the template has light (tests/jobs/catalogue/galaxies/test_band_ratios.py)
     """
     ebv = _nodes(library, band, z_max, ebv_max)
@@ -112,7 +113,10 @@ def _ln_ratios(library: Library, band: str, redshifts: Float, ebv: Float) -> Flo
 
 
 def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatios:
-    """`build`, kept in the cache under everything that it depends on."""
+    """`build`, kept in the cache under everything that it depends on.
+
+    library, band, z_max, ebv_max : as of `build`
+    """
     curves = [passbands.load(name) for name in (band, REFERENCE_BAND)]
     responses = [array for curve in curves for array in (curve.wavelength, curve.response)]
     laws = extinction.laws(library.wavelength)
@@ -162,6 +166,7 @@ def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -
     """ln(ratio)[n], linear in ln(1 + z), polynomial in E(B-V); law 0 has no dust.
 
     z, ebv : float[n] redshift, E(B-V) mag;  template, law : int[n]
+    table  : of `build`
     """
     step = np.log1p(z) / _STEP
     row = np.clip(step.astype(np.int64), 0, table.values.shape[0] - 2)

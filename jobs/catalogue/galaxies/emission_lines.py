@@ -121,6 +121,7 @@ def raw_halpha(law: Halpha, dust: float, log_sfr: Float, ebv: Float, rng: np.ran
     """log10 of the observed H alpha luminosity[n], erg/s.
 
     log_sfr : float[n] log10 Msun/yr, Salpeter;  ebv : float[n] mag, internal;  dust : k(H alpha)
+    law     : constants of the calibration;  rng : of the scatter
     Ref: Kennicutt 1998
     """
     intrinsic = log_sfr - np.log10(law.sfr_per_luminosity) + law.scatter * rng.standard_normal(log_sfr.size)
@@ -146,6 +147,7 @@ def fluxes(
 
     z : float[n] true redshift;  log_mass, log_sfr : float[n] log10 Msun, log10 Msun/yr (Salpeter)
     red : bool[n] on the red sequence;  ebv : float[n] mag, internal
+    lines : constants and matching;  rng : of the scatter of luminosities and ratios
     """
     law, ratios, n = lines.halpha, lines.ratios, z.size
     observed = matched(lines, z, raw_halpha(law, lines.dust["halpha"], log_sfr, ebv, rng))

@@ -64,7 +64,10 @@ class IngestModel:
 
 
 def model(seed: int, columns: Columns, given: Split, lens: Shear | None = None, rotation: float = 0.0) -> IngestModel:
-    """Tables as far as the catalogue reaches in redshift and E(B-V); lens, rotation : as of IngestModel."""
+    """Tables as far as the catalogue reaches in redshift and E(B-V); lens, rotation : as of IngestModel.
+
+    seed : of the request;  columns : of the mapping;  given : the catalogue, laid out by cell
+    """
     # In steps, so that similar catalogues share their tables.
     dustiest, z_max = (float(np.ceil(10.0 * x) / 10.0) for x in (max(_LEAST_EBV, given.ebv_max), given.z_max + 0.1))
     library = templates.galaxy_library()
@@ -90,6 +93,8 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Ta
     """Table `galaxies` of one order-8 cell; given : jobs.catalogue.external.ingest.rows.
 
     dust : float32[pixel] map of A(V), mag (jobs.catalogue.dust_map)
+    cell     : nested index at order 8
+    universe : what completes the catalogue's columns
     """
     if not given or not given["index"].size:
         return GALAXIES.empty()

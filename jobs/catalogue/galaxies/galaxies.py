@@ -98,6 +98,7 @@ def model(
     The matter is the same to any limit, halos and galaxies are drawn anew for each: those that are brighter than a
     shallow limit are as many in a deeper universe, not the same.
     1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
+    seed                   : of the request;  wanted : section `universe` of the request
     """
     library, colours = templates.galaxy_library(), sed_assignment.colours_model()
     selection, z_max = _selection(wanted, training), wanted.z_max
@@ -126,7 +127,10 @@ def model(
 def halos_and_galaxies(
     seed: int, wanted: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> Population:
-    """The population that a limit can be asked of: halos with their galaxies, before these have colours."""
+    """The population that a limit can be asked of: halos with their galaxies, before these have colours.
+
+    seed, wanted, light_cone, training : as of `model`
+    """
     nodes, brightest = band_ratios.brightest(_selection(wanted, training))
 
     def faintest(z: Float) -> Float:
@@ -201,6 +205,7 @@ def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed) -> 
     """The galaxies brighter than the limit, with their realised colours.
 
     z, m_r : float[n] redshift, M_r mag;  red : bool[n] on the red sequence;  sed : n spectra
+    universe : whose limit and passband hold
     """
     row = np.flatnonzero(apparent(universe, z, m_r, sed) < universe.limit)
     kept = sed.part(row)
@@ -211,6 +216,7 @@ def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
     """Magnitude[n] in the limit's band, AB, unmagnified, before intergalactic hydrogen and the Milky Way's dust.
 
     z, m_r : float[n] redshift, M_r mag;  sed : n spectra
+    universe : whose passband holds
     Error: < 0.001 mag (tests/jobs/catalogue/galaxies/test_band_ratios.py)
     """
     return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)

@@ -74,6 +74,8 @@ def draw(cell: int, seed: int, kind: Kind, lens: Lens, dust: Float32) -> pa.Tabl
     """Rows of one kind in a generation cell, sorted by _healpix_29.
 
     dust : float32[pixel] map of A(V), mag (jobs.catalogue.dust_map)
+    cell   : nested index at order 8;  seed : of the request;  kind : the objects' luminosity function and boost
+    lens   : maps, or one shear for all
     """
     rng = stream(seed, _STREAM[kind.code], cell)
     n = int(rng.poisson(kind.boost * kind.per_deg2 * sky.cell_area(GENERATION_ORDER)))
@@ -114,6 +116,7 @@ def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:
     """dn/dM, Mpc^-3 mag^-1.
 
     m : float[...] absolute ultraviolet AB mag;  z : float[...]
+    code    : kind of object;  numbers : constants of its luminosity function
     """
     since = z - 6.0
     if code == QUASAR:

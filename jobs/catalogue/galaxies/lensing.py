@@ -105,6 +105,7 @@ def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     """[5, n] kappa, gamma1, gamma2, deflection east, north (rad) of sources at chi[n] Mpc/h.
 
     ra, dec : float[n] deg, true;  chi : float[n] Mpc/h; beyond the last plane the lensing is that plane's
+    planes  : maps of convergence, shear and deflection, by distance of the sources
     """
     pixel, weight = hp.get_interp_weights(planes.nside, ra, dec, nest=True, lonlat=True)
     node, chi = np.concatenate([[0.0], planes.chi]), np.minimum(chi, planes.chi[-1])
@@ -125,6 +126,7 @@ def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Float]:
     """Observed positions and lensing of sources as columns of table `galaxies`.
 
     ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
+    lens    : maps, or one shear for all
     """
     if isinstance(lens, Shear):
         gamma = {"gamma1": np.full(ra.size, lens.g1), "gamma2": np.full(ra.size, lens.g2)}

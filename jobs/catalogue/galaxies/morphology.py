@@ -120,6 +120,7 @@ def half_light_radius(
 
     z : float[n];  red : bool[n] on the red sequence
     log_stellar_mass : [n] log10 Msun (h = 0.67); kpc_per_arcsec : [n] proper
+    size : constants of the relation;  rng : of the scatter about it
     Ref: van der Wel et al. 2014
     """
     log_mass = log_stellar_mass - np.log10(size.pivot)
@@ -140,6 +141,7 @@ def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: np.ran
     """Flux of the bulge / total, [n] in [0, 1].
 
     log_stellar_mass : float[n] log10 Msun;  red : bool[n]
+    bulge            : constants of the relation;  rng : of the scatter about it
     """
     mean = np.clip(bulge.late_mean + bulge.late_rate * (log_stellar_mass - bulge.late_pivot), *bulge.late_limits)
     a = np.where(red, bulge.early_a, bulge.late_concentration * mean)
@@ -170,6 +172,7 @@ def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float,
 
     radius : float[n] arcsec, or any length, as what is returned
     fraction : bulge / total; ratio : bulge radius / disc radius; sersic : index of the bulge
+    model    : light of profiles within radii, tabulated
     Error: the light within `radius` is 0.5 to 0.005 (tests/jobs/catalogue/galaxies/test_morphology.py)
     """
     # Slow to import, and not needed where a job is only submitted.

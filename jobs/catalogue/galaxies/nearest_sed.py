@@ -95,6 +95,7 @@ def assign(given: Training, colour: Float, m_r: Float, z: Float, rng: np.random.
     """Spectra[n] of galaxies of 0.1(g - r), M_r and z.
 
     colour, m_r, z : float[n] 0.1(g - r) mag, M_r mag, redshift
+    given          : observed galaxies with their spectra;  rng : of the scatter
     """
     law, n = given.law, colour.size
     _, nearest = given.tree.query(_scaled(law, colour, m_r, z), p=1)

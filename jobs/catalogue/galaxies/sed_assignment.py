@@ -102,6 +102,7 @@ def red_fraction(law: RedFraction, m_r: Float, z: Float, kind: Int) -> Float:
 
     m_r, z : float[n] M_r mag, redshift
     kind : [n] 0 central, 1 satellite
+    law   : constants of the relation
     Ref: Skibba & Sheth 2009
     """
     bright = np.clip(1.0 - (law.blue + law.blue_rate * (m_r - _PIVOT)), *law.limits)
@@ -113,6 +114,7 @@ def draw_colour(model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.
     """(on the red sequence[n], 0.1(g - r)[n]).
 
     m_r, z : float[n] M_r mag, redshift;  kind : int[n] 0 central, 1 satellite
+    model   : the two sequences;  rng : of sequence and scatter
     """
     law, x = model.sequence, m_r - _PIVOT
     red = rng.random(m_r.size) < red_fraction(model.fraction, m_r, z, kind)
@@ -129,6 +131,7 @@ def draw_dust(dust: Dust, m_r: Float, red: Bool, colour: Float, rng: np.random.G
     """(extinction law[n], E(B-V)[n] mag); red galaxies have no dust.
 
     m_r : float[n] mag;  red : bool[n] on the red sequence;  colour : float[n] 0.1(g - r) mag
+    dust  : laws and the distribution of E(B-V);  rng : of law and E(B-V)
     Ref: Ilbert et al. 2009
     """
     mean = np.clip(dust.mean + dust.mean_rate * (m_r - dust.pivot), *dust.mean_limits)

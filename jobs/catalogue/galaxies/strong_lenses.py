@@ -112,6 +112,7 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
     galaxies : the cell's rows of table `galaxies`, COLUMNS
     boost    : how many times denser than in nature; a source lies as probably within an Einstein radius of a lens as
                anywhere else on as much sky
+    cell     : nested index at order 8;  seed : of the request
     """
     law, shape, rng = laws(), stamps(), stream(seed, "strong_lenses", cell)
     columns = {name: galaxies[name].to_numpy() for name in COLUMNS}
@@ -200,6 +201,8 @@ def image_positions(lens: Lens, east: float, north: float) -> Float:
 def shoot(lens: Lens, source: Disc, shape: Stamps, side: int) -> Float32:
     """Picture [side, side] of a source of flux 1, south to north and west to east; its sum is the magnification.
 
+    lens  : what deflects;  source : an exponential disc behind it
+    shape : samples and pixel scale of pictures;  side : of this one, pixels
     Error: 1 % of the magnification (tests), for sources larger than a quarter of a pixel
     """
     wanted = np.ceil(shape.samples_a_radius * shape.pixel_scale / (source.radius * source.axis_ratio))

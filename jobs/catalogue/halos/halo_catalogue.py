@@ -57,7 +57,11 @@ def load(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Ligh
 
 
 def draw(model: HaloModel, masses: Masses, cone: LightCone, seed: int, order: int, cell: int) -> Halos:
-    """The halos of one level in a nested cell of its order; kept are those that halos.draw would keep."""
+    """The halos of one level in a nested cell of its order; kept are those that halos.draw would keep.
+
+    model, masses : of our own halos: levels and limits, and tables of masses
+    cone          : the external halos;  seed : of the request;  order, cell : of the nested cell
+    """
     rows = slice(*np.searchsorted(cone.index, sky.cell_range(order, cell)))
     index, velocity = cone.index[rows], cone.velocity[rows]
     chi, log_mass = cone.chi[rows], cone.log_mass[rows]

@@ -97,6 +97,8 @@ def model(
     """Tables of halos between two redshifts.
 
     faintest : z[n] -> the faintest M_r[n] that is wanted there
+    box              : of matter;  near, far : redshifts
+    masses, matching : tables of halos by mass, and of luminosities by mass
     """
     table = lightcone.distances(far)
     line = lightcone.steps(box.model.cell, float(cosmology.comoving_distance(near)), float(table.chi[-1]), table)
@@ -140,6 +142,7 @@ def draw(halos: HaloModel, seed: int, order: int, cell: int) -> Halos:
     """Halos of one level in a nested cell of its order, a Poisson sample of the biased field.
 
     Kept are those above the mass limit, and those below it whose central is scattered above it.
+    halos : tables of `model`;  seed : of the request;  order, cell : of the nested cell
     """
     used = halos.level == order
     space = lightcone.voxels(halos.box, halos.turned, halos.line, order, cell, used.any(1))

@@ -104,6 +104,8 @@ def model(
 
     faintest   : z[n] -> faintest M_r[n] that is wanted; the volume's own limit holds as well
     light_cone : halos that take the place of ours
+    seed, box_cells : of the box of matter, and its cells a side;  space : redshifts, and the faintest M_r
+    luminosities    : inverse of the luminosity function
     """
     masses = matching.masses()
     matched = matching.matching(masses, luminosities)

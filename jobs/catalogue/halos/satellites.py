@@ -46,7 +46,10 @@ class Satellites:
 
 
 def draw(halos: HaloModel, masses: Masses, hosts: Halos, rng: np.random.Generator) -> Satellites:
-    """The satellites of hosts that reach the limit of their distance."""
+    """The satellites of hosts that reach the limit of their distance.
+
+    halos, masses : tables of halos, and by mass;  hosts : n halos;  rng : of numbers, masses and places
+    """
     occupation = halos.matching.occupation
     limit = halos.mass_limit(hosts.chi)
     over = 10.0 ** (hosts.log_mass - limit + occupation.depth)

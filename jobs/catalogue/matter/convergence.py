@@ -68,6 +68,7 @@ def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest
     direction : float32[3, n] unit vectors, neighbours close to each other, n a multiple of 1024
     width     : of a pixel, rad
     coarsest  : most cells a side that matter is averaged over;  stretch : Mpc/h in which its growth is linear
+    box       : of matter
     """
     direction = np.ascontiguousarray(direction.reshape(3, -1, _PATCH).swapaxes(0, 1))
     turned = lightcone.replicas(box, float(chi[-1]))
@@ -87,7 +88,10 @@ def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest
 
 
 def layers(box: Box, width: float, far: float, coarsest: int, stretch: float) -> Layers:
-    """Layers out to `far` Mpc/h, as thick as the cells that a pixel of `width` rad is averaged over."""
+    """Layers out to `far` Mpc/h, as thick as the cells that a pixel of `width` rad is averaged over.
+
+    box : of matter;  coarsest, stretch : as of `convergence`
+    """
     middle, factor, at = [], [], 0.0
     while at < far:
         cells = min(1 << max(int(np.log2(max(width * at / box.model.cell, 1.0))), 0), coarsest)
@@ -111,6 +115,7 @@ def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stre
 
     Both by Limber's approximation, which holds for the ratio where it matters: it is 1 for small l.
     chi : float[p] Mpc/h, ascending
+    box, width, coarsest, stretch : as of `convergence`;  l_max : highest multipole
     Error: 5 % in power for l < nside and z > 0.4 (tests)
     """
     slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
@@ -174,7 +179,11 @@ def window(cell: float, factor: int, k: Float) -> Float:
 
 
 def averaged(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> Float32:
-    """Matter overdensity at a growth, in cubes of factor^3 cells: float32[(n / factor)^3]."""
+    """Matter overdensity at a growth, in cubes of factor^3 cells: float32[(n / factor)^3].
+
+    box  : of n^3 cells;  growth : of linear density, 1 today;  factor : cells a side that are averaged
+    pool : threads that share the slabs
+    """
     n = box.n // factor
     mean = np.empty((n, n, n), np.float32)
     offset = np.float32(0.5 * growth**2 * box.variance[0])

@@ -111,6 +111,7 @@ def box_cells(box: Box, turned: Replicas, direction: Float, chi: Float) -> tuple
     """(flat cell of the box[n], direction in the box's frame [n, 3]).
 
     direction : [n, 3] unit vectors;  chi : [n] Mpc/h
+    box       : of matter;  turned : how each replica of it is turned
     """
     shell = np.broadcast_to(np.asarray(chi // box.length, np.int64), direction.shape[:1])
     seen = turned.sign[shell] * np.take_along_axis(direction, turned.axes[shell], 1)
@@ -120,7 +121,10 @@ def box_cells(box: Box, turned: Replicas, direction: Float, chi: Float) -> tuple
 
 
 def steps(cell: float, near: float, far: float, table: Distances) -> Steps:
-    """Steps of `cell` Mpc/h from near to far."""
+    """Steps of `cell` Mpc/h from near to far.
+
+    cell : side of the box's cells;  near, far : Mpc/h;  table : of distances
+    """
     inner = np.arange(np.floor(near / cell) + 1, np.ceil(far / cell)) * cell
     edge = np.concatenate([[near], inner, [far]])
     return Steps(edge, table.redshift(0.5 * (edge[1:] + edge[:-1])))
@@ -130,6 +134,7 @@ def voxels(box: Box, turned: Replicas, line: Steps, order: int, cell: int, used:
     """Voxels of a nested cell, in the steps that are used (bool[s]).
 
     order, cell : of the nested cell;  used : bool[s]
+    box, turned : of matter, and how each replica of it is turned;  line : steps along the line of sight
     """
     wanted = np.ceil(np.log2(np.maximum(_SIDE * line.middle / (_WIDEST * box.model.cell), 1.0)))
     orders = np.maximum(wanted.astype(np.int64), order)

@@ -67,6 +67,7 @@ def numbers(dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area:
     """Dwarfs[n] of cells before their dust; arguments as milky_way.numbers.
 
     lon, lat : float[n] deg, Galactic;  area : deg2;  h_limit : float[n] mag, Vega
+    dwarfs, galaxy : densities and magnitudes by type, and the components of the Milky Way
     """
     total = np.zeros(lon.size)
     for limit in np.unique(h_limit):
@@ -83,6 +84,7 @@ def draw(
     """Poisson sample of the dwarfs of a cell that are brighter than the limit but for their dust.
 
     lon, lat : Galactic, of the cell's centre, deg; area : deg2
+    dwarfs, galaxy : as of `numbers`;  h_limit : mag, Vega;  rng : random numbers
     """
     r, z = milky_way.cylindrical(galaxy, lon, lat, milky_way.middles(galaxy))
     per_shell = dwarfs.boost * density(dwarfs.law, galaxy.sun, r, z) * milky_way.volumes(galaxy, area)

@@ -86,6 +86,7 @@ def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike) ->
     """Density at R, z (broadcast) relative to the one at the Sun, never negative.
 
     radius, height : float[...] pc, galactocentric
+    law : of the component;  sun : where the Sun is
     """
     r, z = np.asarray(radius, float), np.asarray(height, float)
     at_sun = _log(law, np.asarray(sun.radius), np.asarray(sun.height))

@@ -142,6 +142,7 @@ def cylindrical(galaxy: MilkyWay, lon: npt.ArrayLike, lat: npt.ArrayLike, distan
     """Galactocentric R, z pc at heliocentric distances along Galactic (l, b) deg, all of them broadcast.
 
     lon, lat : float[...] deg;  distance : float[...] pc
+    galaxy   : where the Sun is in it
     """
     l_rad, b_rad = np.radians(lon), np.radians(lat)
     across = distance * np.cos(b_rad)
@@ -153,6 +154,7 @@ def numbers(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Floa
     """Stars[n] of cells before their dust: the sum of `expected` of each.
 
     lon, lat : [n] Galactic, of the cells' centres, deg; area : of one of them, deg2; h_limit : [n]
+    galaxy   : components, their populations and laws
     """
     total = np.zeros(lon.size)
     for limit in np.unique(h_limit):
@@ -170,6 +172,7 @@ def expected(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: flo
     """Stars of a cell in every (population, shell, bin), [p, s, b]; 0 where all are fainter than h_limit.
 
     lon, lat : Galactic, of the cell's centre, deg; area : deg2
+    galaxy   : components, their populations and laws;  h_limit : mag, Vega
     """
     r, z = cylindrical(galaxy, lon, lat, middles(galaxy))
     relative = np.stack([density(component.law, galaxy.sun, r, z) for component in galaxy.components])

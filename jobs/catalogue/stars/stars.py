@@ -87,6 +87,8 @@ def model(
 
     density           : one of milky_way.MODELS
     brown_dwarf_boost : how many times denser than in nature L and T dwarfs are, 0 = not at all
+    limit, plane_limit : faintest H, mag, Vega, plane_limit in the Galactic plane; None: cells there are refused
+    catalogue, bright  : external stars in place of the drawn ones, and of those that are bright
     """
     return StarModel(
         limit=limit,
@@ -151,6 +153,7 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
     """Table `stars` of one order-8 cell, sorted by _healpix_29.
 
     dust : float32[pixel] mag, map of the Milky Way's A(V) to infinity (jobs.catalogue.dust_map)
+    cell : nested index at order 8;  seed : of the request;  universe : of `model`
     Errors: BadInput as `numbers`
     Error: the density is that of the cell's centre: 2 % at its edges at |b| = 20 deg
     """

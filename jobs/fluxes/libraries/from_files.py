@@ -98,7 +98,10 @@ def law(path: Path, name: str, wavelength: Float) -> Float:
 
 
 def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -> Passband:
-    """A user's filter, to be given in place of a passband's name; medium is "air" or "vacuum"."""
+    """A user's filter, to be given in place of a passband's name; medium is "air" or "vacuum".
+
+    path : of the file;  name : that it is to have;  form : one of spectrum_formats.toml
+    """
     if medium not in ("air", "vacuum"):
         raise BadInput(f"{path}: medium {medium!r} is not air or vacuum")
     curve = read(path, form)
@@ -147,7 +150,10 @@ def _plain(column: Any) -> Float:
 
 
 def check(path: Path, wavelength: Float, value: Float, form: Mapping[str, Any]) -> None:
-    """Refuse what is no curve, naming the row; form : bounds, largest_gap and covers as in the formats."""
+    """Refuse what is no curve, naming the row; form : bounds, largest_gap and covers as in the formats.
+
+    path : named in the refusal;  wavelength, value : float[n] of the curve
+    """
     lo, hi = form["bounds"]
     if wavelength.ndim != 1 or wavelength.shape != value.shape:
         raise BadInput(f"{path}: {list(wavelength.shape)} wavelengths and {list(value.shape)} values are no curve")

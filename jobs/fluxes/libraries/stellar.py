@@ -188,6 +188,8 @@ def matching(
 
     response : float64[n_lambda, n_band] f_nu = f_lambda @ response;  first : where to begin
     until    : (largest error of a colour, mag; steps), whichever is reached first
+    log_wavelength : float64[n_lambda];  start : f_lambda there, before the correction
+    pivots, colors : float64[n_band] log wavelengths of the correction, and the colours that are wanted, mag
     """
     correction = np.zeros(len(pivots)) if first is None else first
     for _ in range(until[1]):
@@ -201,7 +203,10 @@ def matching(
 
 
 def corrected(log_wavelength: Float, start: Float, pivots: Float, correction: Float) -> Float:
-    """`start` times 10^(-0.4 c): c is the correction, cubic between the pivots, constant outside."""
+    """`start` times 10^(-0.4 c): c is the correction, cubic between the pivots, constant outside.
+
+    log_wavelength, start : float64[n_lambda];  pivots, correction : float64[n_band] log wavelengths and mag there
+    """
     from scipy.interpolate import PchipInterpolator
 
     inside = np.clip(log_wavelength, pivots[0], pivots[-1])
@@ -225,7 +230,11 @@ def _absorbed(wavelength: Float, teff: float) -> Float:
 
 
 def shape(kind: str, wavelength: Float, centre: float, width: float) -> Float:
-    """Shape with peak 1: line, band shaded to the red, edge, or hydrogen series (centre = lower level)."""
+    """Shape with peak 1: line, band shaded to the red, edge, or hydrogen series (centre = lower level).
+
+    kind       : line, band, edge or series
+    wavelength : float64[n_lambda] A;  centre, width : A
+    """
     if kind == "line":
         return np.asarray(np.exp(-0.5 * ((wavelength - centre) / width) ** 2))
     if kind == "band":

@@ -100,14 +100,21 @@ def mix_of(columns: Mapping[str, npt.ArrayLike], library: Library) -> Mix:
 
 
 def within(name: str, values: Float, lo: float, hi: float) -> None:
-    """OutOfRange for the first value outside [lo, hi]; NaN is outside."""
+    """OutOfRange for the first value outside [lo, hi]; NaN is outside.
+
+    name : in the refusal;  values : float64[...]
+    """
     bad = ~((values >= lo) & (values <= hi))
     if bad.any():
         raise OutOfRange(name, float(values[bad].ravel()[0]), lo, hi)
 
 
 def rest_flux(sed: Int, law: Int, ebv: Float, band: Passband, library: Library, dust: Float32) -> Float:
-    """Band-averaged f_nu of templates behind dust, at z = 0: float64[n], in units of the library."""
+    """Band-averaged f_nu of templates behind dust, at z = 0: float64[n], in units of the library.
+
+    sed, law : int64[n] template and extinction law;  ebv : float64[n] E(B-V), mag
+    band     : passband;  library : templates;  dust : float32[law, n_lambda] curve of each law
+    """
     first = int(band.wavelength[0] - library.wavelength[0])
     stretch = slice(first, first + len(band.wavelength))
     ebv32 = ebv.astype(np.float32)[:, None]
@@ -117,7 +124,11 @@ def rest_flux(sed: Int, law: Int, ebv: Float, band: Passband, library: Library, 
 
 
 def amplitudes(mix: Mix, band: Passband, library: Library, dust: Float32) -> Float:
-    """float64[2, n]: frac / rest-frame f_nu of each component in the reference band."""
+    """float64[2, n]: frac / rest-frame f_nu of each component in the reference band.
+
+    mix  : components of n galaxies;  band : passband
+    library, dust : as of `rest_flux`
+    """
     return np.stack(
         [
             mix.frac[k] / rest_flux(mix.sed[k], mix.law[k], mix.ebv[k], band, library, dust)
@@ -132,6 +143,7 @@ def observed_shape(mix: Mix, amplitude: Float, library: Library, dust: Float32, 
     amplitude : float64[2, n] factor of each component
     Combined and extinguished on the library's grid; then wavelengths times (1 + z), flux divided by (1 + z),
     and linear interpolation onto the observed grid, behind what is between the galaxies where the library says so.
+    mix       : components of n galaxies;  library, dust : as of `rest_flux`
     """
     shrink = 1.0 / (1.0 + mix.z_obs)
     start = first * shrink - library.wavelength[0]

@@ -119,6 +119,7 @@ def profiles(
     In the observed frame a line is a Gaussian of centre lambda_i = mu_i (1 + z) and width sigma / c lambda_i,
     whose integral is the flux. Serrano et al. 2024 (appendix B, eq. f_el) print the un-redshifted centre and
     a stray 1 / (1 + z) in the exponent.
+    z_obs  : float64[n];  medium : "air" or "vacuum", that the wavelengths are in
     Error: 2e-8 of the flux in the shape; the bins sum to the flux to 1e-14
     """
     from scipy.special import erf

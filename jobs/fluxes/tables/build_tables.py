@@ -70,6 +70,7 @@ def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -
     """ln(f_nu in the band at z / f_nu in the reference band at rest), both behind dust, of each template.
 
     key     : library_key(library)
+    band    : passband;  library : templates;  setting : how fine the table is
     returns : float32[n_template, 4, n_z, n_ebv * n_av] Chebyshev coefficients; laws 1 .. 4, of which any is none at
               E(B-V) = 0
     """

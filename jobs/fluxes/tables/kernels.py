@@ -25,6 +25,7 @@ def place(
     """Fills first, int64[2, n], the first of four nodes of each component, and z_weights, float32[n, 4]: Lagrange's.
 
     sed, law : int64[2, n];  log_z = ln(1 + z)
+    n_law     : laws of the table;  log_first, step, z_count : its first node in ln(1 + z), their distance and number
     """
     for i in range(len(log_z)):
         position = (log_z[i] - log_first) / step
@@ -43,7 +44,11 @@ def place(
 def products(
     law: Int, ebv: Float, a_v: Float, ebv_last: float, a_v_last: float, n_ebv: int, n_av: int, basis: Float32
 ) -> None:
-    """Fills basis, float32[2, n, n_ebv * n_av]: products of Chebyshev polynomials in E(B-V), [2, n], and A_V, [n]."""
+    """Fills basis, float32[2, n, n_ebv * n_av]: products of Chebyshev polynomials in E(B-V), [2, n], and A_V, [n].
+
+    law, ebv, a_v         : int64[2, n], float64[2, n], float64[n]; without a law E(B-V) is 0
+    ebv_last, a_v_last    : where the tables end;  n_ebv, n_av : polynomials in each
+    """
     # Flat arrays and unsigned positions, here and below: nothing is looked up from the end.
     in_av, flat, n, width = np.empty(n_av, np.float32), basis.ravel(), len(a_v), np.uint64(n_av)
     for i in range(n):
@@ -70,6 +75,7 @@ def log_ratios(table: Float32, first: Int, z_weights: Float32, basis: Float32, o
     """Fills out, float32[2, n]: ln(f_nu in the band / f_nu in the reference band at rest) of each component.
 
     table : float32[n_template, 4, n_z, n_coefficient], laws 1 .. 4; without a law E(B-V) is 0 in any of them
+    first, z_weights, basis : of `place` and `products`
     """
     flat, polynomials, count, n = table.ravel(), basis.ravel(), np.uint64(table.shape[3]), len(z_weights)
     for k in range(2):
@@ -95,6 +101,8 @@ def line_centres(
     ciddor : float64[2, 2] (strength, resonance) of the refractivity of air
     curve  : A(lambda) / A(V) in steps of 1 A from `first`; lines beyond it are in no band
     centre, flux : float64[n, n_line, 2]
+    fluxes, vacuum : float64[n, n_line] before dust, and float64[n_line] wavelengths at rest, A
+    log_z, a_v     : float64[n] ln(1 + z), and A(V) of the Milky Way, mag
     """
     log_vacuum = np.log(vacuum)
     for i in range(len(log_z)):
@@ -133,6 +141,8 @@ def add_up(
     start, last  : [n_band] first row of a band in `tables`, and its last counted from there
     medium       : [n_band] 1 for air;  first : [n_band] ln(lambda) of a band's first row
     cells        : int64[n_cell + 1]: members[cells[c] : cells[c + 1]] are the bands that see wavelength cell c
+    centre, flux : of `line_centres`
+    cell_first, cell_step : ln(lambda) where the first wavelength cell begins, and the width of a cell
     """
     per_row, per_cell, n_band = 1.0 / step, 1.0 / cell_step, len(first)
     flat, widths, one = tables.ravel(), np.uint32(tables.shape[1]), np.uint32(1)

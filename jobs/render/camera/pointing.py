@@ -51,6 +51,7 @@ def sky_of_plane(
     """Focal-plane coordinates [n] arcsec on the tangent plane -> ra [n] in [0, 360), dec [n], deg.
 
     ra, dec, position_angle : deg, of the boresight and of the y axis there
+    x, y                    : arcsec, x to the west where the position angle is 0
     """
     angle = np.radians(position_angle)
     u, v = np.asarray(x, float) * ARCSEC, np.asarray(y, float) * ARCSEC

@@ -50,13 +50,21 @@ class Readout:
 
 
 def frame(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """A detector that is read as one frame: uint16[ny, nx] ADU."""
+    """A detector that is read as one frame: uint16[ny, nx] ADU.
+
+    found    : ADU of the detector;  scene : what it was rendered with
+    detector : its name;  system : its world coordinates
+    """
     raw = found.astype(np.uint16)
     return Readout((Extension("", raw),), raw, raw, "adu")
 
 
 def quadrants(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """A detector that is read in quadrants [4, rows, columns]: uint16 ADU, extensions named detector.quadrant."""
+    """A detector that is read in quadrants [4, rows, columns]: uint16 ADU, extensions named detector.quadrant.
+
+    found    : ADU of the quadrants;  scene : what they were rendered with
+    detector : its name;  system : its world coordinates
+    """
     raw = found.astype(np.uint16)
     prescan, overscan, rows, middle = sizes = layout.sizes(scene)
     scans = (

@@ -39,6 +39,7 @@ def work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
 def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
     """CPU s that `draw` takes, predicted from the sources and their stamps.
 
+    sources, sizes : as of `draw`;  psf : of the detector;  nx, ny : its pixels
     Error : between half and twice of what the machine takes that it was measured on
     """
     pieces, trail, whole = stamps.in_pieces(sources)
@@ -60,6 +61,7 @@ def memory(electrons: Float, sizes: Int, nx: int, ny: int, picture: Int | None =
     """Bytes that `draw` takes at its peak on top of its arguments, predicted from the stamps alone.
 
     picture : of Sources
+    electrons, sizes : float64[n], int64[n] stamps' sides;  nx, ny : pixels of the detector
     Error : the peak is between a third of it and all of it: what is faint is not followed to the last frequency
     """
     bright = electrons > BRIGHT

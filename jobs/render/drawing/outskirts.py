@@ -79,8 +79,9 @@ class Outskirts:
 def of_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: Float, farthest: float) -> Outskirts:
     """Of a galaxy, the only one of `shape` and `form`.
 
-    weights : [planes] of transfer.basis_weights;  farthest : pixels, along columns or rows, that it is asked for
-    Error   : next to the stamp 1e-3 of the light there; of bulges slimmer than 1 : 50 along the axis a few per cent
+    electrons : expected;  psf : of the detector;  weights : [planes] of transfer.basis_weights
+    farthest  : pixels, along columns or rows, that it is asked for
+    Error     : next to the stamp 1e-3 of the light there; of bulges slimmer than 1 : 50 along the axis a few per cent
     """
     light = galaxy_shapes.on_the_sky(shape, form)[0].copy()
     inclination = float(shape.inclination[0])
@@ -176,7 +177,7 @@ def _shares(length: int, block: int) -> Float:
 
 
 def take_in(some: Outskirts, stamp: Array, x: float, y: float) -> None:
-    """Takes off a stamp [N, N], in place, what has come in at its edges of the galaxy at (x, y) of it, pixels."""
+    """Takes off a stamp [N, N], in place, what has come in at its edges of `some` galaxy at (x, y) of it, pixels."""
     size, middle = len(stamp), some.block * (len(some.blurred) // 2)
     more, blurred, pixels = from_afar(some, size, x, y), _spline(some.blurred, some.block), np.arange(size)
     for up in (-size, 0, size):
@@ -191,6 +192,7 @@ def from_afar(some: Outskirts, size: int, x: float, y: float) -> Float:
 
     An ellipse's images are even light only where they are as wide as a stamp: the slimmer it is, the farther out.
     size    : a power of two;  returns : float64[size, size] electrons
+    some    : the galaxy's outskirts
     Error   : 0.05 electrons; of axis ratio 0.02 1e-3 of the light
     """
     slim, pixels = slimness(some.light, some.across), np.arange(size)
@@ -238,6 +240,7 @@ def add(
     """Adds a galaxy at (column, row) to a frame of `unit` an electron, but for a stamp; returns how many units.
 
     hole : the stamp's first column and row, its side;  unread : rows of the frame that do not count, as of stamps.draw
+    some : the galaxy's outskirts;  frame : integers
     """
     return int(
         _add(some.light, some.disk, some.across, some.blurred, some.block, frame, column, row, hole, unread, unit)
@@ -245,7 +248,11 @@ def add(
 
 
 def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, least: float) -> Float:
-    """float64[n] arcsec as far as which galaxies are noticed, from `least` in steps of a tenth, at most FARTHEST."""
+    """float64[n] arcsec as far as which galaxies are noticed, from `least` in steps of a tenth, at most FARTHEST.
+
+    electrons   : float64[n] expected;  shapes : of the n galaxies
+    pixel_scale : arcsec;  noise : of a pixel, electrons;  least : arcsec
+    """
     out, left = np.full(len(electrons), min(least, FARTHEST)), np.arange(len(electrons))
     while len(left):
         found = galaxy_shapes.surface(shapes.take(left), out[left[:1]])[:, 0] * pixel_scale**2 * electrons[left]

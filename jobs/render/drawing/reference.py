@@ -24,6 +24,7 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e
 
     folding, highest : galsim's folding_threshold and maxk_threshold; what is cut at 1e-4 shows as 3e-3 of the noise in
                         the middle of bright discs
+    sources, i : the list, and which of it;  psf : of the detector;  size : side of the image, pixels
     returns : float64[size, size], lower left pixel at round(position) - size / 2
     """
     settings = galsim.GSParams(

@@ -82,6 +82,8 @@ def stamp_sizes(
     wider : float64[n] pixels that a stamp is wider than a point's: the length of a piece of a trail, a picture's side
     noise : of a pixel, electrons. A cut by noise alone biases faint sources, for what wraps is coherent: the second
             condition holds it to a part of the flux, from the wings of the PSF and of high-n bulges alike
+    electrons : float64[n] expected;  shape : int64[n] number in `shapes` of galaxies, -1 of points
+    psf       : of the detector;  settings : of the accuracy
     """
     # The PSF's wings beyond a stamp are those of a point: the larger a galaxy, the farther out that may begin.
     least = np.full(len(shape), float(settings.least))
@@ -127,6 +129,7 @@ def least_electrons(distance: float, pixel_scale: float, noise: float, settings:
     """Electrons of which a source must have more to show at a distance, arcsec, from its middle.
 
     No profile rises outward: at its edge an ellipse is no brighter than all of the light spread over it.
+    pixel_scale : arcsec;  noise : of a pixel, electrons;  settings : of the accuracy
     Error : of a source thinner than 1 : 10, the edge-on disc, what shows may be left out
     """
     pixels = np.pi * _THINNEST * (distance / pixel_scale) ** 2
@@ -159,6 +162,7 @@ def touching_frame(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int
     """[n] True of sources at rest of which light may be noticed on the frame: their stamps', or what is drawn beyond.
 
     noise : of a pixel, electrons
+    sources, sizes : n sources and their stamps' sides;  psf : of the detector;  nx, ny : its pixels
     """
     column, row, electrons, shape, shapes = (
         sources.column, sources.row, sources.electrons, sources.shape, sources.shapes,
@@ -180,7 +184,11 @@ def touching_frame(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int
 
 
 def has_far_light(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: Psf) -> Bool:
-    """[n] True of points so bright that their light does not end where the PSF's plane does: `draw` takes it on."""
+    """[n] True of points so bright that their light does not end where the PSF's plane does: `draw` takes it on.
+
+    electrons, sizes : float64[n] expected, int64[n] stamps' sides;  psf : of the detector
+    shape, picture   : int64[n] as of Sources, -1 of points; picture None: there are none
+    """
     point = shape < 0 if picture is None else (shape < 0) & (picture < 0)
     return np.asarray(point & (sizes >= SIDE) & (electrons > BRIGHT) & (psf.edges is not None))
 
@@ -200,6 +208,7 @@ def reaches(
     around (`reach`), and for their spikes more: to where no pixel has a tenth of its noise. Of a galaxy's own light
     beyond its stamp `touching_frame` knows.
     length : float64[n] of trails, pixels;  noise : of a pixel, electrons
+    electrons, sizes, shape, picture, psf : as of `has_far_light`
     """
     length = np.zeros(len(sizes)) if length is None else length
     pieces = piece_count(length)

@@ -58,6 +58,7 @@ def draw(
     sizes    : int[n] from stamp_sizes;  neglected : float[n] from `neglected_flux`, None: nothing is left out
     progress : called now and then with the number of sources drawn
     tally    : to be filled with what of each source's stamp fell onto the frame
+    sources  : to be drawn;  psf : of the detector;  nx, ny : its pixels
     returns  : float64[ny, nx], to half a unit of fourier.units_of a source (5e-7 electrons for all but the brightest);
                the same, bit by bit, in any order of the sources
     """
@@ -264,7 +265,11 @@ def in_double_precision(sources: Sources, neglected: Float | None) -> Bool:
 
 
 def split_by_size(sources: Sources, sizes: Int, psf: Psf, size: int, precise: Bool) -> tuple[Int, Int]:
-    """Sources of a size that are drawn each through a PSF of its own, and those that share planes."""
+    """Sources of a size that are drawn each through a PSF of its own, and those that share planes.
+
+    sources, sizes : n sources and their stamps' sides;  size : of the stamps that are wanted
+    psf            : of the detector;  precise : bool[n] drawn in double precision
+    """
     of_size = sizes == size
     few = psf.planes is not None and (size > _SHARED or of_size.sum() < _FEW * transfer.plane_count(psf))
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0

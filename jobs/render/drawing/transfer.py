@@ -45,6 +45,7 @@ def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) ->
 
     photons     : [n, w] fraction of its photons in each sub-band; None: flat f_nu
     column, row : [n] pixels
+    psf         : of the detector
     """
     planes, n = psf.planes, len(column)
     if planes is None:
@@ -157,6 +158,7 @@ def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any], fading: bo
     """One plane: a source's own PSF, for large stamps or in double precision (float64).
 
     weights : [planes] from basis_weights;  fading : towards its border, into what far_light.py draws
+    psf     : of the detector;  some : the stamp's Fourier grid;  dtype : of the plane
     """
     if psf.planes is None:
         return Transfer(some, _planes(psf, some, dtype))

@@ -31,6 +31,7 @@ def wings(
     """Electrons a pixel of sources [n] beyond stamps of `sizes`, on blocks, MARGIN of them before the frame's first.
 
     unit    : of the blocks' integers to an electron
+    column, row, electrons : float64[n] pixels, and expected;  psf : of the detector;  nx, ny : its pixels
     returns : float64[blocks, blocks], the same in any order of the sources
     Error   : the PSF of mean colour at the detector's centre, on blocks: a few per cent of what is beyond the stamp
     """
@@ -63,6 +64,8 @@ class Outside(NamedTuple):
 def galaxies(column: Float, row: Float, outside: Outside, sizes: Int, nx: int, ny: int, unit: float) -> Float:
     """Electrons a pixel of galaxies [n] outside stamps of `sizes`, on the blocks of `wings`.
 
+    column, row : float64[n] pixels;  outside : what is taken off their stamps
+    nx, ny      : pixels of the detector;  unit : of the blocks' integers to an electron
     returns : float64[blocks, blocks], the same in any order of the galaxies
     Error   : a galaxy's own light, as if the PSF did nothing to it so far out; what is left on the stamp stays there;
               a block has whole units a pixel: of the faintest little is seen

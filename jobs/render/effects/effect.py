@@ -109,6 +109,7 @@ def apply_all(
 
     stream : effect -> its own generator, so that switching one effect off leaves the draws of the others as they were
     watch  : sees the name of an effect that is applied, and the frame before and after it
+    frame  : [ny, nx];  effects : in the order of the channel;  scene : what their parameters are taken from
     """
     decisions = decide(effects, scene)
     for effect, decision in zip(effects, decisions, strict=True):

@@ -21,7 +21,11 @@ _PIECE = 32.0
 def bright_lights(
     galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], detector: Detector, system: WCS
 ) -> Lights:
-    """Bright sources on the detector and around it, as far as rows were given."""
+    """Bright sources on the detector and around it, as far as rows were given.
+
+    galaxies, stars : rows, and expected electrons of each
+    detector        : that they are seen from;  system : its world coordinates
+    """
     found = []
     for (rows, electrons), (ra, dec) in ((galaxies, ("ra_lensed", "dec_lensed")), (stars, ("ra", "dec"))):
         bright = np.flatnonzero(electrons > _LIGHT)

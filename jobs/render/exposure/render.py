@@ -42,6 +42,8 @@ def render(
     truth    : maps that are wanted besides the noise-free one, of lake_schema.tables.products.CONTENTS
     progress : called now and then with the number of sources drawn
     noise_seed : of what differs between exposures, None = the seed
+    aim      : the exposure and detector;  rows : catalogue rows that it may see
+    variant  : mission, accuracy, and the effects that are forced on or off;  seed : of the request
     """
     scene = scene_of.of_aim(aim, variant)
     light = visible_light(aim, rows, scene, seed)

@@ -29,7 +29,11 @@ def with_own_light(scene: Scene, channel: Channel, effects: Sequence[Effect]) ->
 
 
 def scene_of(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> Scene:
-    """Before anything is drawn."""
+    """Before anything is drawn.
+
+    exposure : its row;  detector : of its camera
+    mission  : the mission database;  accuracy : of the request
+    """
     return Scene(
         mission, detector.section, exposure.exposure_time_s, exposure.sky, 0.0, detector,
         lamp=exposure.lamp or 1, accuracy=accuracy,

@@ -64,6 +64,8 @@ def complete(
     """Adds maps of effects that were not needed, and pixels that the converter could not hold.
 
     Nothing is where no pixel is, between the halves of a detector.
+    maps  : what there is so far;  raw : ADU;  effects : of the channel
+    scene : what was rendered;  truth : maps that are wanted
     """
     shape = maps["noise_free"].shape
     wanted = made(truth, [effect.name for effect in effects], False)

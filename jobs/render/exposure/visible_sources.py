@@ -63,7 +63,11 @@ class Light:
 
 
 def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
-    """All that shines onto a detector, or nothing where it does not see the sky."""
+    """All that shines onto a detector, or nothing where it does not see the sky.
+
+    aim   : the exposure and detector;  rows : catalogue rows that it may see
+    scene : before anything is drawn;  seed : of the request
+    """
     if not aim.sees_sky:
         return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
     column = f"f_nu_{aim.exposure.band}"
@@ -112,6 +116,8 @@ def least_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfig
     """f_nu of the faintest source that reaches the detector from beyond its selection margin, microjansky.
 
     Infinite where no source shows: in the dark, or in no time.
+    exposure : its row;  detector : of its camera
+    mission  : the mission database;  accuracy : of the request
     Error : of the fainter out there each leaves out less than the settings' `edge` of a pixel's noise
     """
     time = exposure.exposure_time_s
@@ -127,7 +133,10 @@ def least_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfig
 def spike_flux(
     exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy, band: Passband
 ) -> float:
-    """f_nu of the faintest star whose spikes are noticed from beyond what else is read, microjansky; or infinite."""
+    """f_nu of the faintest star whose spikes are noticed from beyond what else is read, microjansky; or infinite.
+
+    exposure, detector, mission, accuracy : as of `least_flux`;  band : passband
+    """
     time = exposure.exposure_time_s
     sees = image_types.sees_sky(exposure.channel, exposure.image_type)
     pupil_of = registry.CHANNELS[exposure.channel].pupil
@@ -140,7 +149,10 @@ def spike_flux(
 
 
 def outer_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
-    """f_nu of the faintest galaxy that may be noticed from beyond what else is read, microjansky; or infinite."""
+    """f_nu of the faintest galaxy that may be noticed from beyond what else is read, microjansky; or infinite.
+
+    exposure, detector, mission, accuracy : as of `least_flux`
+    """
     time = exposure.exposure_time_s
     if time == 0.0 or not image_types.sees_sky(exposure.channel, exposure.image_type):
         return float("inf")
@@ -154,6 +166,8 @@ def sources_of(
     """Everything that shines onto the detector, with its stamp or beyond it, ascending id, and the stamps' sides.
 
     electrons : expected of each of the galaxies, and of the stars;  noise : of a pixel, e-
+    rows : catalogue rows that the detector may see;  aim : the exposure and detector
+    psf  : of the detector;  settings : of the accuracy
     """
     catalogue, points, detector, system = rows.galaxies, rows.stars, aim.detector, aim.wcs
     form = galaxy_shapes.shapes(catalogue)

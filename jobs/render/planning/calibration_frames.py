@@ -35,6 +35,7 @@ def exposures(
     """Exposures of each channel of a calibration block, one after another.
 
     camera : of the ground survey, where the channel is EXT;  centre : ra, dec deg of the request's area
+    block   : of the request;  mission : the mission database;  seed : of the request;  start : MJD
     """
     now = start
     for channel in block.channels:

@@ -45,6 +45,8 @@ def exposures(
     """The exposures of a survey over an area: as many as are asked for, else one layer.
 
     Bands that the survey takes together are taken at the same places.
+    block   : of the request, with its survey and bands;  area : of the request
+    mission : the mission database;  seed : of the request;  start : MJD
     """
     now = start
     rules = _rules(block.survey, mission)

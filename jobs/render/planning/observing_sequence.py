@@ -49,7 +49,11 @@ def offsets(pattern: str, mission: MissionConfiguration, seed: int, *key: int | 
 def sequence(
     field: Field, block: Observation, survey: str, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
-    """The exposures of one visit of a field, in the order they begin."""
+    """The exposures of one visit of a field, in the order they begin.
+
+    field   : where, and when it is visited;  block : of the request;  survey : name that exposures have
+    mission : the mission database;  seed : of the request
+    """
     steps = offsets(block.dither, mission, seed, survey, field.number, field.visit)
     # The pattern is laid about the field's centre.
     x, y = (steps - steps.mean(axis=0)).T

@@ -83,7 +83,10 @@ def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[
 
 
 def exposure_time(channel: str, camera: str, band: str, mission: MissionConfiguration) -> float:
-    """Effective exposure time of a nominal exposure, s: of a ramp, from its first to its last group."""
+    """Effective exposure time of a nominal exposure, s: of a ramp, from its first to its last group.
+
+    channel, camera, band : names;  mission : the mission database
+    """
     if camera == "nisp":
         kind = f"nisp.macc.{'spectroscopic' if channel == 'NISP-S' else 'photometric'}"
         groups, reads, drops = (mission.value(f"{kind}.{part}") for part in ("groups", "reads", "drops"))
@@ -159,6 +162,7 @@ def zero_point_of(prefix: str, band: str, mission: MissionConfiguration, curve: 
     """AB magnitude of one electron a second: of ground cameras as published, of Euclid's from throughput and area.
 
     curve : the passband, None = the embedded one
+    prefix : of the camera's keys in the mission database;  band : name;  mission : the mission database
     """
     if f"{prefix}.{band}.zero_point" in mission:
         return mission.value(f"{prefix}.{band}.zero_point", "mag")

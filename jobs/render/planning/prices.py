@@ -55,6 +55,7 @@ def price(
 
     looks   : whether the sky is drawn;  effects : that are applied; None = nothing renders the channel yet
     truth   : maps that are wanted
+    channel : its name;  accuracy : of the request
     Error   : 30 % where the sources are as those that it was measured with
     """
     own, applied = costs.of_channel(channel), effects or ()

@@ -70,7 +70,10 @@ def position_angle(ra: float, dec: float, mjd: float) -> float:
 
 
 def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguration, where: str) -> None:
-    """Refuse a pointing of the telescope that its sunshield forbids."""
+    """Refuse a pointing of the telescope that its sunshield forbids.
+
+    ra, dec, mjd : deg, and date;  mission : the mission database;  where : named in the refusal
+    """
     lowest, highest = (mission.value(f"svm.solar_aspect_{end}", "deg") for end in ("min", "max"))
     angle = solar_aspect(ra, dec, mjd)
     # The low-precision Sun is good to 0.02 deg.
@@ -116,6 +119,8 @@ def wide(area: Area, mission: MissionConfiguration, start: float, count: int = 0
     """Fields of the wide survey over an area, in the order they are observed.
 
     start : MJD before which nothing is observed
+    area  : of the request;  mission : the mission database
+    count : fields, those deepest in the area, 0 = all that see it;  visits : of each field
     """
     number, ra, dec = lattice(area, mission, count)
     lon, lat = ecliptic(ra, dec)
@@ -196,6 +201,8 @@ def deep(area: Area, mission: MissionConfiguration, start: float, visits: int, c
     """Visits of a deep field, in the order they are observed: a raster about the area's centre, turned at each visit.
 
     count : fields of the raster, those deepest in the area, 0 = all that may see it
+    area  : of the request;  mission : the mission database
+    start : MJD before which nothing is observed;  visits : of the field
     """
     ra0, dec0, _ = area.bounds()
     lon, lat = (float(x) for x in ecliptic(ra0, dec0))

@@ -87,7 +87,11 @@ def _pointing(pointing: Pointing, where: str, request: Request, mission: Mission
 
 
 def known_detectors(camera: str, names: tuple[str, ...], mission: MissionConfiguration, where: str) -> None:
-    """Refuse detectors that a camera does not have."""
+    """Refuse detectors that a camera does not have.
+
+    camera, names : of the camera, and of the detectors
+    mission       : the mission database;  where : named in the refusal
+    """
     there = {detector.name for detector in detectors.detectors(camera, mission)} if names else set()
     unknown = [name for name in names if name not in there]
     if unknown:

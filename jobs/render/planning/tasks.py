@@ -47,6 +47,7 @@ def table(
     exposures  : rows of the table `exposures`;  detectors : of each exposure, () = all of its camera
     truth      : truth maps that are wanted
     forced     : effects that the request forces on or off
+    mission    : the mission database;  densities : of galaxies and stars;  accuracy : of the request
     """
     cameras = {camera: _Camera(camera, mission) for camera in set(exposures["camera"].to_pylist())}
     shared: dict[tuple[Any, ...], _Places] = {}

@@ -32,6 +32,8 @@ def product_keys(
     """Of each task, the digest of everything that shapes its products, and of nothing else.
 
     facts : of the plan: request, mission, code
+    exposures : rows of the table;  tasks : rows of the table, to be rendered
+    inputs    : versions of the tables that are read, by name;  mission : the mission database
     """
     flux_facts = inputs["galaxy_fluxes"].manifest["facts"]
     shared = {

@@ -82,6 +82,7 @@ def picture(path: Path, image: Array, cards: Sequence[Card], names: Sequence[Lab
     """Draw one image.
 
     image : [ny, nx] electrons or ADU;  cards : its header;  names : sources, brightest first
+    path  : of the PNG
     """
     # A canvas of its own: no window system, and no state shared with a caller's figures.
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -74,7 +74,10 @@ def _labels_of(
 
 
 def moved_apart(names: Sequence[Label], wide: float, high: float, most: int) -> list[Label]:
-    """Labels that do not cover each other, brightest first, at most so many of a kind; wide and high in pixels."""
+    """Labels that do not cover each other, brightest first, at most so many of a kind; wide and high in pixels.
+
+    names : where they are to point, brightest first;  most : of a kind
+    """
     kept: list[Label] = []
     for label in names:
         free = all(abs(label.column - x.column) > wide or abs(label.row - x.row) > high for x in kept)

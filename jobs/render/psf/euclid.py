@@ -43,6 +43,7 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
     """The Euclid PSF of a VIS detector: optics, pointing jitter, charge diffusion.
 
     positions : where it is computed, one of DEGREES; polynomials lie between
+    detector  : of VIS;  band : passband;  mission : the mission database
     Error     : second moments 2e-4 from the number of wavelengths; across the detector as measured (psf_positions.csv)
     Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
     """
@@ -66,6 +67,7 @@ def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) ->
 
     x, y     : [...] mm;  softness : width of the edges, mm (one sample: an edge then covers its pixels by
                area)
+    mission  : the mission database
     returns  : [...] 0 .. 1
     """
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")

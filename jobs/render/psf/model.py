@@ -112,7 +112,11 @@ def sampled(planes: Planes, pixel_scale: float, has_pixel: bool) -> Psf:
 def tabulated(
     profile: galsim.GSObject, pixel_scale: float, planes: Planes | None = None, has_pixel: bool = False
 ) -> Psf:
-    """With azimuthal means, and the largest values, of the profile sampled on pixels."""
+    """With azimuthal means, and the largest values, of the profile sampled on pixels.
+
+    profile     : of the PSF;  pixel_scale : arcsec;  planes : to draw through, None: the profile
+    has_pixel   : whether the profile is averaged over a pixel already
+    """
     image = profile.drawImage(nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
     grid = np.arange(SIDE + 1) - SIDE // 2
     ring = np.rint(np.hypot(*np.meshgrid(grid, grid))).astype(int)

@@ -76,6 +76,7 @@ def of_pupil(
     """Of the Euclid pupil: the aperture stop, the central stop and three bars, as far as the stops let them be seen.
 
     parts : sub-bands of the PSF;  blur, pixel_scale, period : of Edges
+    mission : the mission database
     """
     # The middles of parts of as many photons.
     places = (np.arange(_WAVES) + 0.5) / _WAVES

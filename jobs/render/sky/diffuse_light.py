@@ -63,6 +63,7 @@ def sky_band(detector: Detector, band: str, mission: MissionConfiguration, curve
 
     Euclid : zodiacal light and scattered starlight;  ground : the band's dark-sky rate of the mission
              database, or what follows from its surface brightness and zero point
+    detector, band : of the camera, and the band's name;  mission : the mission database
     """
     section = detector.section
     if section in ("vis", "nisp"):
@@ -82,7 +83,11 @@ def sky_band(detector: Detector, band: str, mission: MissionConfiguration, curve
 
 
 def sky_rate(own: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
-    """Electrons per second in a pixel of a band, at a place and date."""
+    """Electrons per second in a pixel of a band, at a place and date.
+
+    own          : of `sky_band`;  mission : the mission database
+    ra, dec, mjd : deg, and date
+    """
     scattered = own.stars * starlight(ra, dec, mission) if own.stars else 0.0
     return own.constant + scattered + (_zodiacal(own, ra, dec, mjd, mission) if own.zodi else 0.0)
 
@@ -165,6 +170,7 @@ def zodiacal_rate(
     """Electrons per second in a pixel from the zodiacal light.
 
     area : m2, collecting;  pixel_scale : arcsec
+    ra, dec, mjd : deg, and date;  band : passband;  mission : the mission database
     Spectrum : the Sun's, reddened with the wavelength and the elongation
     Ref      : Leinert et al. 1998, section 8
     """

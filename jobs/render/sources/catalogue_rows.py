@@ -47,6 +47,8 @@ def sources(
     farther : how far beyond the circle a source may be seen and reach the detector, arcsec
     least   : microjansky, of sources beyond the cells of the circle; infinite where no source at all shows
     bright  : microjansky, of sources still farther out, as far as spikes and outskirts go; infinite where none do
+    catalogue, fluxes : versions of the two tables;  task : its row
+    columns : that are wanted;  band : whose fluxes are
     """
     deflection, flux = deflection_of(catalogue), ["id", f"f_nu_{band}"]
     near: list[int] = []
@@ -73,6 +75,7 @@ def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, leas
     """Strong lenses that are seen within a task's circle.
 
     deflection : largest of the galaxies, deg;  least : infinite where no source shows, as in `sources`
+    table      : version of `strong_lenses`;  task : its row
     """
     cells = selection.needed(task, deflection) if np.isfinite(least) else []
     about = table.in_cells(cells, GENERATION_ORDER, ["id", "ra_lensed", "dec_lensed"])

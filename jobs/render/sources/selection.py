@@ -47,6 +47,7 @@ def beyond(task: Mapping[str, Any], deflection: float, farther: float, drawn: Se
 
     farther : how far beyond the task's circle a source may be seen and reach the detector, arcsec
     drawn   : order-8 cells that the catalogue has
+    task    : its row;  deflection : largest of the galaxies, deg
     returns : the second in arcsec beyond the task's circle, at most `farther`, rounded down to 1"
     """
     inner = set(_cells(task, deflection))
@@ -69,7 +70,10 @@ def _cells(task: Mapping[str, Any], wider: float) -> list[int]:
 
 
 def near(ra: Float, dec: Float, centre: tuple[float, float], radius: float | Float) -> Bool:
-    """[n] True within `radius` deg of a centre; a gnomonic projection is then safe."""
+    """[n] True within `radius` deg of a centre; a gnomonic projection is then safe.
+
+    ra, dec : float64[n] deg;  centre : ra, dec deg
+    """
     return np.asarray(sky.separation(ra, dec, centre[0], centre[1]) <= radius)
 
 

@@ -75,7 +75,10 @@ class Population:
 def population(
     ra: float, dec: float, radius: float, day: int, mission: MissionConfiguration, seed: int, hours: float = 12.0
 ) -> Population:
-    """Everything that is within `radius` deg of a place at some time of a day (MJD), so many hours around its noon."""
+    """Everything that is within `radius` deg of a place at some time of a day (MJD), so many hours around its noon.
+
+    ra, dec : of the place, deg;  mission : the mission database;  seed : of the request
+    """
     fastest = max(mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_max", "fast_rate_max"))
     # Away from where it is at noon.
     reach = min(radius + hours * fastest / 3600.0, 180.0)
@@ -140,6 +143,7 @@ def sources(
     Of a trail longer than twice `reach` it is as long a part about where it is nearest, with its share of the light.
     shapes : of the sources that they are drawn with
     own      : a day's (MJD) bodies in place of the embedded population
+    aim      : the exposure and detector;  mission : the mission database;  seed : of the request
     """
     exposure, system, band = aim.exposure, aim.wcs, aim.band
     start, seconds = exposure.mjd, exposure.exposure_time_s

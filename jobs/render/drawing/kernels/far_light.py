@@ -38,6 +38,8 @@ def outside(
     """Adds what lies outside a square of half side `inner`: the ring up to `radius`, spikes up to `far`.
 
     level, lines : in the frame's units, as below
+    frame : integers;  x, y : of the star, pixels
+    turned : [b, 2] directions of the bars;  wide : half width of a spike's table, pixels, 0 = no spikes
     """
     ny, nx = frame.shape
     for r in range(ny):
@@ -60,7 +62,10 @@ def outside(
 
 @jit
 def inside(frame: Any, x: float, y: float, inner: float, level: float, turned: Any, lines: Any) -> None:
-    """Adds what has faded of the plane, inside the square."""
+    """Adds what has faded of the plane, inside the square.
+
+    frame, x, y, inner, level, turned, lines : as of `outside`
+    """
     ny, nx = frame.shape
     for r in range(max(int(np.ceil(y - inner)), 0), min(int(np.ceil(y + inner)), ny)):
         for c in range(max(int(np.ceil(x - inner)), 0), min(int(np.ceil(x + inner)), nx)):
@@ -75,7 +80,12 @@ def inside(frame: Any, x: float, y: float, inner: float, level: float, turned: A
 def remove_aliased_compiled(
     stamp: Any, x: Float, y: Float, inner: float, level: float, turned: Any, lines: Any, period: float,
 ) -> None:  # fmt: skip
-    """Multiplies a stamp by what is not folded of the light that points at x, y send to each pixel."""
+    """Multiplies a stamp by what is not folded of the light that points at x, y send to each pixel.
+
+    inner        : half side of the square outside which the plane has faded, pixels
+    level, lines : ring and spikes of each point, electrons;  turned : [b, 2] directions of the bars
+    period       : of the plane's transform, pixels
+    """
     for r in range(stamp.shape[0]):
         for c in range(stamp.shape[1]):
             folded = 0.0

@@ -52,6 +52,7 @@ def nyquist_zones(
     cut         : [m] pieces from this |k| on, radian / pixel, are left out
     x, y        : [m] position in the stamp, pixels, 0 = centre of the first;  electrons : [m]
     trail       : [m, 2] pixels that it moves by, along columns and rows, about this position
+    ky, runs    : of transfer.Grid
     """
     m, n, columns = zones.shape
     most, low, high, far = 0, 0, 0, 0
@@ -208,6 +209,8 @@ def reaches(
     """[m] the |k|, radian / pixel, beyond which profile times PSF is below `floor` [m] in every direction.
 
     passing : [i] the most that the PSF passes at |k| = i step
+    step    : radian / pixel;  floor : [m] part of the flux
+    body, fraction, bulge, disk, sersic, row : as of `nyquist_zones`
     """
     out = np.full(len(body), step * len(passing))
     square = np.empty(1, np.float32)
@@ -269,6 +272,7 @@ def runs(size: int, reach: float, shells: int, out: Int) -> tuple[int, int]:
 
     reach   : largest |(ix, iy)|;  shells : rings of equal width that the runs are sorted by, then by iy
     out     : filled with first sample, ix, iy, shell, as far as it has rows
+    size    : side of the stamp, pixels
     returns : number of runs, number of samples
     """
     count, samples = 0, 0
@@ -301,7 +305,10 @@ def _half_chord(radius: float, y: int) -> int:
 
 @jit
 def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> None:
-    """Adds the weighted sum of planes [b, s, s] to the image inside a margin."""
+    """Adds the weighted sum of planes [b, s, s] to the image inside a margin.
+
+    weights : [b] of the planes;  margin : pixels of the image before the first of the planes
+    """
     for r in range(planes.shape[1]):
         out = image[margin + r, margin : margin + planes.shape[2]]
         for b in range(len(planes)):
@@ -315,6 +322,7 @@ def between(spectrum: Array, across: Float, up: Float, width: int, slope: float,
     """Fills out [s] with the sums of a periodic spectrum [ny, nx] under a window about frequencies, radian / pixel.
 
     window : exp(slope (sqrt(1 - z^2) - 1)), z = -1 .. 1 over `width` samples a direction
+    across, up : [s] frequencies along columns and rows, radian / pixel
     """
     ny, nx = spectrum.shape
     x_weights, y_weights = np.empty(width), np.empty(width)

@@ -25,7 +25,11 @@ from lake_schema.errors import OutOfRange
 def apply(
     frame: Frame, capacity: float, halves: int, between: int = 0, rng: np.random.Generator | None = None
 ) -> Frame:
-    """frame [ny, nx] whole e- -> no pixel above `capacity`."""
+    """frame [ny, nx] whole e- -> no pixel above `capacity`.
+
+    capacity        : of a pixel, e-;  rng : not used
+    halves, between : as of `bleed`
+    """
     return bleed(frame, capacity, halves, between)[0]
 
 
@@ -34,6 +38,7 @@ def bleed(frame: Frame, capacity: float, halves: int, between: int = 0) -> tuple
 
     frame    : float64[ny, nx] e- >= 0;  halves : 2 = registers at both ends of the columns, 1 = at row 0 alone
     between  : rows between the halves, which stay as they are
+    capacity : of a pixel, e-
     Error    : 0: what was in is in the frame or lost; whole electrons stay whole
     """
     if not 1.0 <= capacity < np.inf:

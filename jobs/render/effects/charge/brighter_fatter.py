@@ -43,6 +43,7 @@ def apply(
     capacity  : e-; what a pixel cannot hold does not repel either
     dim       : e-; borders about which no pixel holds as much are left as they are
     between   : rows between the halves, whose charge is drained
+    rng       : random numbers of the whole electrons that cross a border
     """
     for name, value, low, high in (
         ("brighter-fatter shift", shift, 0.0, 1e-4), ("full well", capacity, 1.0, 1e9),

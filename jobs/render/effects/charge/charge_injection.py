@@ -18,6 +18,7 @@ def apply(frame: Frame, level: float, on: int, off: int, spread: float, rng: np.
     """frame [ny, nx] e- -> plus whole electrons in every block of `on` rows after `off` rows, from both registers.
 
     level : e-;  spread : rms between columns, of the level
+    rng   : random numbers of the columns
     """
     for name, value in (("charge injection", level), ("injection spread", spread)):
         if not 0.0 <= value <= 1e9:
@@ -32,6 +33,7 @@ def apply_noise(frame: Frame, on: int, off: int, noise: float, rng: np.random.Ge
     """frame [ny, nx] e- >= 0 -> less or more by whole electrons in those rows, never below 0.
 
     noise : rms of a pixel, e-
+    on, off : rows of a block, and before it;  rng : random numbers of the pixels
     """
     if not 0.0 <= noise <= 1e9:
         raise OutOfRange("injection noise", noise, 0.0, 1e9)

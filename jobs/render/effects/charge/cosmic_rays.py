@@ -29,7 +29,10 @@ _FEW = 1e-3
 
 
 def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
-    """frame [ny, nx] e- -> plus the charge of Poisson(expected) tracks."""
+    """frame [ny, nx] e- -> plus the charge of Poisson(expected) tracks.
+
+    quantiles : as of `tracks`;  rng : random numbers of the tracks
+    """
     out = np.array(frame, dtype=float, order="C")
     _add_tracks(out, expected, quantiles, rng)
     return out
@@ -41,6 +44,7 @@ def tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: np.ra
     quantiles : [q, 3] probability, length (pixels) and charge (e-) that so many are below; their logarithms are linear
 
     A track that leaves at one edge enters at the other, as its neighbours' tracks do: the density is even.
+    shape     : ny, nx;  rng : random numbers of the tracks
     """
     out = np.zeros(shape)
     _add_tracks(out, expected, quantiles, rng)
@@ -57,7 +61,11 @@ def _add_tracks(out: Frame, expected: float, quantiles: Frame, rng: np.random.Ge
 
 @jit
 def add_track(frame: Any, row: Any, column: Any, charge: Any) -> None:
-    """What leaves at one edge enters at the other."""
+    """What leaves at one edge enters at the other.
+
+    frame       : [ny, nx] e-, to which it is added
+    row, column : int[n] pixels, which may lie outside;  charge : [n] e- in each of them
+    """
     ny, nx = frame.shape
     for i in range(len(charge)):
         frame[row[i] % ny, column[i] % nx] += charge[i]
@@ -73,6 +81,8 @@ def events(count: int, ny: int, nx: int, quantiles: Frame, rng: np.random.Genera
     """Start (x, y), direction, length in pixels, whole electrons.
 
     Length and charge have the same rank, as in Niemi 2015: who crosses more silicon leaves more.
+    count : tracks;  nx, ny : pixels that they start in
+    quantiles, rng : as of `tracks`
     """
     chance, length, charge = quantiles.T
     angle = 2.0 * np.pi * rng.random(count)

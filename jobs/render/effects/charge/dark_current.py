@@ -53,6 +53,7 @@ def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Ge
     """frame [ny, nx] e- -> plus whole electrons in hot pixels.
 
     fraction  : of the pixels;  electrons : mean of a hot pixel, exponentially distributed
+    rng       : random numbers of the detector's pixels
     Error     : the count of a hot pixel has no noise of its own from exposure to exposure
     """
     if not 0.0 <= fraction <= 1.0:

@@ -26,7 +26,10 @@ def apply(
     dust: tuple[float, float, float],
     rng: np.random.Generator,
 ) -> Frame:
-    """frame [ny, nx] e- -> times `response`."""
+    """frame [ny, nx] e- -> times `response`.
+
+    rms, dead, dark_columns, dust, rng : as of `response`
+    """
     out = response(frame.shape, rms, dead, dark_columns, dust, rng)
     out *= frame
     return out
@@ -45,6 +48,7 @@ def response(
     rms : between pixels;  dead : fraction of pixels that see little
     dark_columns : mean number of columns that see nothing from some row on, away from their register, to the middle
     dust : grains a pixel; mean rms of their shadows, pixels, exponentially distributed; what a shadow's middle lacks
+    shape : ny, nx;  rng : random numbers of the detector's pixels
     """
     grains, radius, depth = dust
     for name, value, most in (

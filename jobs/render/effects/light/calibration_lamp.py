@@ -20,14 +20,20 @@ _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
 def apply(frame: Frame, level: float, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] expected e- -> plus level (1 + columns [nx] + rows [ny])."""
+    """frame [ny, nx] expected e- -> plus level (1 + columns [nx] + rows [ny]).
+
+    level : expected e-;  rng : not used
+    """
     if not 0.0 <= level <= 1e9:
         raise OutOfRange("lamp", level, 0.0, 1e9)
     return np.asarray(frame + level * illumination.apply(np.ones(frame.shape), columns, rows))
 
 
 def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
-    """What an LED lights: a paraboloid, and a slope whose direction is the LED's place on the unit."""
+    """What an LED lights: a paraboloid, and a slope whose direction is the LED's place on the unit.
+
+    scene : with the parameters of the unit;  led : its number;  nx, ny : pixels of the detector
+    """
     if not 1 <= led <= LEDS:
         raise OutOfRange("LED", led, 1, LEDS)
     angle = 2.0 * np.pi * (led - 1) / LEDS

@@ -39,6 +39,7 @@ def apply(
     """frame [ny, nx] e- -> plus the ghost of every light, also of those outside the frame.
 
     ratio : light of a ghost over its star's;  offset : (columns, rows) from star to ghost
+    lights : positions and electrons of stars;  pupil : shape of a ghost;  rng : not used
     """
     radius, hole, arms, width = pupil
     for name, value, least, most in (

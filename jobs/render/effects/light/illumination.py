@@ -18,7 +18,10 @@ from lake_schema.errors import BadInput, OutOfRange
 
 
 def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] e- -> times 1 + columns [nx] + rows [ny]."""
+    """frame [ny, nx] e- -> times 1 + columns [nx] + rows [ny].
+
+    rng : not used
+    """
     if frame.shape[-2:] != (len(rows), len(columns)):
         raise BadInput(f"an illumination of {len(rows)} x {len(columns)} pixels for a frame of {frame.shape[-2:]}")
     if frame.size and not (1.0 + columns.min() + rows.min() >= 0.0 and columns.max() + rows.max() < np.inf):
@@ -29,7 +32,11 @@ def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | 
 
 
 def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, float]) -> tuple[Frame, Frame]:
-    """(columns [nx], rows [ny]) of 1 - bowl r^2 + slope . (x, y); x, y, r = 1 at the edges and corners of the field."""
+    """(columns [nx], rows [ny]) of 1 - bowl r^2 + slope . (x, y); x, y, r = 1 at the edges and corners of the field.
+
+    scene       : with the detector's place in the field;  nx, ny : its pixels
+    bowl, slope : fractions at the corners and edges of the field
+    """
     half_x, half_y = _half_sides(scene)
     corner = float(np.hypot(half_x, half_y))
     detector = scene.detector

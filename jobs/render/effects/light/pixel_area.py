@@ -21,7 +21,11 @@ _EVERY = 64
 def apply(
     frame: Frame, electrons: float, u: Frame, v: Frame, stretch: Frame, rng: np.random.Generator | None = None
 ) -> Frame:
-    """frame [ny, nx] e- -> plus electrons times `change`: what a pixel of the boresight's area has of the sky."""
+    """frame [ny, nx] e- -> plus electrons times `change`: what a pixel of the boresight's area has of the sky.
+
+    electrons     : of the sky in a pixel at the boresight;  rng : not used
+    u, v, stretch : as of `change`
+    """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("sky electrons", electrons, 0.0, np.inf)
     out = change(u, v, electrons * stretch)

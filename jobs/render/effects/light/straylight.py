@@ -23,6 +23,7 @@ def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.r
     """frame [ny, nx] e- -> plus the halos of all lights, also of those outside.
 
     fraction : of a light in its halo;  scale : pixels
+    lights   : positions and electrons of stars;  rng : not used
     """
     if not 0.0 <= fraction <= 1.0:
         raise OutOfRange("straylight fraction", fraction, 0.0, 1.0)

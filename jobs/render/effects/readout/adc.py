@@ -23,6 +23,7 @@ def apply(
     """Electrons [ny, nx] -> ADU, whole numbers in [0, largest].
 
     gain : electrons per ADU;  bias : ADU;  each may be [q] of the amplifiers of a frame [q, ny, nx]
+    frame : e-;  largest : ADU that the converter can give;  rng : not used
     """
     if not (np.min(gain) > 0.0 and np.max(gain) < np.inf):
         raise OutOfRange("gain", gain, 0.0, np.inf)

@@ -15,7 +15,11 @@ Number = float | Float
 def apply(
     frame: Frame, offset: Number, settling: Number, length: Number, stripes: Number, rng: np.random.Generator
 ) -> Frame:
-    """quadrants [q, ny, nx] e- in readout order -> plus `structure`, the same in every row."""
+    """quadrants [q, ny, nx] e- in readout order -> plus `structure`, the same in every row.
+
+    frame, rng                        : e-, and random numbers of the detector
+    offset, settling, length, stripes : as of `structure`
+    """
     shape = frame.reshape(-1, *frame.shape[-2:]).shape
     pattern = structure(shape[0], shape[2], offset, settling, length, stripes, rng)
     return np.asarray(frame + pattern.reshape(*frame.shape[:-2], 1, shape[2]))
@@ -28,6 +32,7 @@ def structure(
 
     offset : rms between amplifiers, e-;  settling : of the first column, e-, falling off over `length` columns
     stripes : rms between columns, e-
+    quadrants, nx : amplifiers, and columns of each;  rng : random numbers of the detector
     """
     for name, value, least in (
         ("bias offset", offset, 0.0), ("bias stripes", stripes, 0.0), ("bias settling length", length, 1e-3)

@@ -35,14 +35,22 @@ _SWEEPS = (
 def apply_parallel(
     frame: Frame, lattice: Traps, sweeps: Sweeps, rows: int, rng: np.random.Generator | None = None
 ) -> Frame:
-    """quadrants [.., ny, nx] e- in readout order, `rows` of them pixels, the rest overscan."""
+    """quadrants [.., ny, nx] e- in readout order, `rows` of them pixels, the rest overscan.
+
+    frame  : the quadrants;  lattice : traps along the columns
+    sweeps : how closely charge is followed;  rng : not used
+    """
     return traps.shifted(frame, lattice, sweeps, -2, min(rows, frame.shape[-2]))[0]
 
 
 def apply_serial(
     frame: Frame, lattice: Traps, sweeps: Sweeps, columns: int, rng: np.random.Generator | None = None
 ) -> Frame:
-    """quadrants [.., ny, nx] e- in readout order, `columns` of them register pixels, the rest overscan."""
+    """quadrants [.., ny, nx] e- in readout order, `columns` of them register pixels, the rest overscan.
+
+    frame  : the quadrants;  lattice : traps of the serial register
+    sweeps : how closely charge is followed;  rng : not used
+    """
     return traps.shifted(frame, lattice, sweeps, -1, min(columns, frame.shape[-1]))[0]
 
 

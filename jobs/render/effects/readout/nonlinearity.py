@@ -33,6 +33,7 @@ def apply(
     """frame [..] e- >= 0 -> e-, monotonic; each number may be [q] of the amplifiers of a frame [q, ..].
 
     high : a, what is missing at `saturation` e-;  low : b, what is missing of the first electrons;  knee : n0, e-
+    rng  : not used
     """
     _check(high, saturation, low, knee)
     return by_pixel(_respond, frame, high / saturation, low * knee, 1.0 / knee)
@@ -68,7 +69,10 @@ def _small_expm1(x: Any) -> Any:
 
 
 def linearised(measured: Frame, high: Number, saturation: Number, low: Number, knee: Number) -> Frame:
-    """The electrons that `apply` made into `measured`; beyond what it can give: infinite."""
+    """The electrons that `apply` made into `measured`; beyond what it can give: infinite.
+
+    measured : e-;  high, saturation, low, knee : as of `apply`
+    """
     _check(high, saturation, low, knee)
     high, saturation, low, knee = (
         np.reshape(n, (-1, *[1] * (measured.ndim - 1))) if np.ndim(n) else n for n in (high, saturation, low, knee)

@@ -33,7 +33,11 @@ Number = TypeVar("Number", bound=np.generic)
 def apply(
     frame: Frame, prescan: int, overscan: int, rows: int, middle: int = 0, rng: np.random.Generator | None = None
 ) -> Frame:
-    """frame [ny, nx] e- -> quadrants [4, (ny - middle) / 2 + rows, prescan + nx / 2 + overscan] e-."""
+    """frame [ny, nx] e- -> quadrants [4, (ny - middle) / 2 + rows, prescan + nx / 2 + overscan] e-.
+
+    prescan, overscan, rows : columns before and after the pixels, and rows after them;  rng : not used
+    middle                  : rows between the halves, which have no pixels
+    """
     for name, value in (("prescan", prescan), ("overscan", overscan), ("overscan rows", rows), ("middle rows", middle)):
         if not 0 <= value <= 4096:
             raise OutOfRange(name, value, 0, 4096)
@@ -57,7 +61,11 @@ def placed(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
 def origin(
     number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, middle: int = 0
 ) -> tuple[int, int]:
-    """What is added to a detector's (column, row) to find it in a quadrant [ny, nx] as it is `placed`."""
+    """What is added to a detector's (column, row) to find it in a quadrant [ny, nx] as it is `placed`.
+
+    number : of the quadrant;  shape : ny, nx of it
+    prescan, overscan, rows, middle : as of `apply`
+    """
     ny, nx = shape
     across = overscan - (nx - prescan - overscan) if _RIGHT[number] else prescan
     return across, rows - (ny - rows) - middle if _UPPER[number] else 0
@@ -66,7 +74,11 @@ def origin(
 def assembled(
     quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int, middle: int = 0
 ) -> npt.NDArray[Number]:
-    """Quadrants [4, ..] in readout order -> detector [ny, nx], pre- and overscan cut off, 0 in the rows between."""
+    """Quadrants [4, ..] in readout order -> detector [ny, nx], pre- and overscan cut off, 0 in the rows between.
+
+    quadrants                       : of `apply`
+    prescan, overscan, rows, middle : as of `apply`
+    """
     pixels = [placed(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)]
     e, f, g, h = pixels
     between = np.zeros((middle, h.shape[1] + g.shape[1]), quadrants.dtype)

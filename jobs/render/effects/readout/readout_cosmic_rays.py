@@ -29,6 +29,8 @@ def apply_readout(
 
     expected : tracks on one quadrant's rows x columns pixels;  prescan : first column that is a pixel
     silicon  : what is on the way down the columns, None: nothing
+    frame     : the quadrants;  rows, columns : of a quadrant's pixels
+    quantiles : as of cosmic_rays.tracks;  rng : random numbers of the tracks
     """
     out = np.array(frame, dtype=float)
     for quadrant in out.reshape(-1, *frame.shape[-2:]):

@@ -31,6 +31,7 @@ def apply(
     halves   : 2 = the upper half is read at its last row, 1 = all through row 0
     response : of pixel_response.response, which comes later and with whose random numbers this one comes; None: all
                pixels are alike
+    rng      : random numbers of that response; None: all pixels are alike
     """
     if not 0.0 <= share <= 1e6:
         raise OutOfRange("readout trail", share, 0.0, 1e6)

@@ -55,6 +55,8 @@ def shift(
     """Lines plane[:, k] (axis -2) or plane[k, :] (axis -1), in place, over the traps of `pixels` pixels.
 
     ends, volume : electrons and parts of a pixel's volume at the levels' ends
+    plane             : [n, m] e-
+    density, released : [species] traps a pixel, and the part of the full ones that is released in a step
     returns      : what is still trapped
     """
     some = density > 0.0

@@ -113,6 +113,7 @@ def shifted(frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int |
 
     frame  : float64[.., ny, nx] electrons >= 0; the output lies at index 0 of `axis` (-2: rows, -1: columns)
     pixels : how many packets of a line start in a pixel; those after (overscan) follow through all of them
+    traps  : their density and release times;  sweeps : how closely charge is followed
     returns: frame, and the electrons still trapped when the last packet has passed
     """
     if axis not in (-1, -2):
