@@ -3,7 +3,7 @@
 quasar_library       3 slopes x 3 strengths of the lines: template 3 i + j
 high_redshift_library  5 slopes of the ultraviolet x 3 strengths of Lyman alpha: template 3 i + j
 fluxes               f_nu of rows of `galaxies` of these two kinds
-spectra              their f_lambda
+spectra              their f_lambda;  scale : of a template to a magnitude
 ultraviolet_magnitude  M_UV -> apparent magnitude, the column mag_r01 of these kinds
 
 A row of these kinds has one template, sed_1, without internal dust; its lines are in the template. Its mag_r01 is
@@ -28,7 +28,7 @@ from jobs.fluxes.sources import column, ids_of, magnification_of
 from jobs.fluxes.spectra import extinction
 from jobs.fluxes.spectra.continuum import within
 from lake_schema import units
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_ANGSTROM_S
 
@@ -111,16 +111,24 @@ def spectra(galaxies: pa.Table) -> Float:
             continue
         templates = library()
         within("sed_1", sed[chosen].astype(float), 0, len(templates) - 1)
-        at = MAGNITUDE_AT[code]
-        for i in chosen:
+        factors = scale(code, templates, sed[chosen], mag[chosen], z[chosen])
+        for i, factor in zip(chosen, factors, strict=True):
             spectrum = templates.flux[sed[i]].astype(float)
-            observed = at * (1.0 + z[i])
-            f_nu = units.cgs_of_ujy(units.f_nu_of_mag(mag[i]))
-            scale = f_nu * LIGHT_ANGSTROM_S / observed**2 / np.interp(at, templates.wavelength, spectrum)
-            out[i] = scale * np.interp(grid / (1.0 + z[i]), templates.wavelength, spectrum)
+            out[i] = factor * np.interp(grid / (1.0 + z[i]), templates.wavelength, spectrum)
     out *= magnification_of(galaxies)[:, None]
     out *= extinction.transmitted(extinction.milky_way(grid), a_v[:, None])
     return out
+
+
+def scale(code: int, templates: Library, sed: Int, mag: Float, z: Float) -> Float:
+    """What a template's f_lambda at lambda / (1 + z) is multiplied by to be seen at lambda: float64[n].
+
+    code : of the kind;  templates : its library;  sed : int64[n];  mag : float64[n] mag_r01;  z : float64[n]
+    """
+    at = MAGNITUDE_AT[code]
+    level = np.array([np.interp(at, templates.wavelength, spectrum.astype(float)) for spectrum in templates.flux])
+    f_nu = units.cgs_of_ujy(units.f_nu_of_mag(mag))
+    return np.asarray(f_nu * LIGHT_ANGSTROM_S / (at * (1.0 + z)) ** 2 / level[sed])
 
 
 def _refuse_mixtures(galaxies: pa.Table) -> None:

@@ -1,0 +1,1 @@
+"""Catalogues in the forms of others."""
