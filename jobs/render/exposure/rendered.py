@@ -74,7 +74,8 @@ def numbers_of(
 ) -> tuple[int | str, ...]:
     """The identity of an effect's random numbers: nobody else's, but where it follows another's pattern.
 
-    A detector's own patterns are in every exposure, and of the seed whatever the noise is of (noise_seed; None = the same).
+    A detector's own patterns are in every exposure, and of the seed whatever the noise is of.
+    noise_seed : of the noise, None = the seed
     effect, exposure, detector, seed : what is applied, in which exposure, to which detector, of which request
     """
     what = exposure.camera if effect.fixed else image_types.identity(exposure)
