@@ -53,7 +53,7 @@ clean:
 
 # Java is looked at every time (0.1 s): it may have come, gone or changed since.
 spark: .venv/installed
-	@.venv/bin/python scripts/prepare_spark.py
+	@.venv/bin/python jobs/commands/prepare_spark.py
 
 .venv/installed: .venv/bin/python pyproject.toml requirements/build.txt requirements/run.txt
 	$(KNOWN) requirements/build.txt

@@ -1,4 +1,4 @@
-"""What a part took, beside its receipt: seconds, those of the processor, the largest memory of its own time."""
+"""What a part took, beside its receipt: seconds, those of the processor, its largest memory; bytes of its files."""
 
 from __future__ import annotations
 
@@ -24,8 +24,14 @@ class Measured:
         forget_peak()
         started, cpu = time.perf_counter(), time.process_time()
         result = self.function(part)
-        took = {"seconds": time.perf_counter() - started, "cpu_s": time.process_time() - cpu}
-        return {**result, **took, "peak_gb": peak_gb()}
+        took: dict[str, Any] = {
+            "seconds": time.perf_counter() - started,
+            "cpu_s": time.process_time() - cpu,
+            "peak_gb": peak_gb(),
+        }
+        if "files" in result:
+            took["bytes"] = sum(file["bytes"] for file in result["files"])
+        return {**result, **took}
 
 
 def forget_peak() -> None:

@@ -41,10 +41,13 @@ def session(name: str) -> SparkSession:
     conf = SparkConf()
     builder = SparkSession.builder.appName(name)
     wanted = dict(_CLOSED)
-    if _LOCAL.fullmatch(conf.get("spark.master", "local")):
+    local = _LOCAL.fullmatch(conf.get("spark.master", "local")) is not None
+    if local:
         wanted |= {**_CLOSED_LOCAL, "spark.executorEnv.PYTHONPATH": str(Path(__file__).resolve().parents[1])}
-        # PySpark looks for its workers' Python in this variable alone, and would take any `python3` that is on PATH.
-        os.environ.setdefault("PYSPARK_PYTHON", conf.get("spark.pyspark.python") or sys.executable)
+    # PySpark looks for its workers' Python in this variable alone, and would take any `python3` that is on PATH. On
+    # this machine it is our own, whatever the variable says; on others the one that was named, else of the same path.
+    named = conf.get("spark.pyspark.python") or (None if local else os.environ.get("PYSPARK_PYTHON"))
+    os.environ["PYSPARK_PYTHON"] = named or sys.executable
     for key, value in wanted.items():
         builder = builder if conf.contains(key) else builder.config(key, value)
     before = signal.getsignal(signal.SIGINT)

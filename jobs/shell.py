@@ -62,6 +62,7 @@ class Job:
     """A job: its name, what it does (the text of --help), and its steps for a lake and a request.
 
     options : lists of the request, such as bands, that its command line may give instead, each with its text of help
+    numbers : the same of whole numbers
     dry_run : what is done in place of the steps where only a forecast is asked for; None = there is none
     """
 
@@ -69,6 +70,7 @@ class Job:
     doc: str
     steps: Callable[[Path, Request], Sequence[Step]]
     options: tuple[tuple[str, str], ...] = ()
+    numbers: tuple[tuple[str, str], ...] = ()
     dry_run: Callable[[Path, Request], Sequence[Step]] | None = None
 
 
@@ -76,6 +78,7 @@ _RESULT = pa.schema(
     [
         pa.field("part", pa.string()),
         pa.field("rows", pa.int64()),
+        pa.field("bytes", pa.int64()),
         pa.field("seconds", pa.float64()),
         pa.field("cpu_s", pa.float64()),
         pa.field("peak_gb", pa.float64()),
@@ -113,8 +116,13 @@ def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
 
     job     : its steps;  root : folder of the lake;  request : checked;  verbose : whether progress is shown
     """
-    for step in job.steps(root, request):
-        _run(job, step, root, request, verbose)
+    started, cpu = time.time(), time.process_time()
+    steps = job.steps(root, request)
+    took = {"prepare_s": time.time() - started, "prepare_cpu_s": time.process_time() - cpu}
+    for step in steps:
+        _run(job, step, root, request, verbose, took)
+        # Once a job.
+        took = {}
 
 
 def common_facts(request: Request, *parts: str) -> dict[str, Any]:
@@ -133,6 +141,8 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--request", required=True, type=Path, help="simulation request, a TOML file")
     for name, text in job.options:
         parser.add_argument(f"--{name}", nargs="+", help=text)
+    for name, text in job.numbers:
+        parser.add_argument(f"--{name}", type=int, metavar="N", help=text)
     if job.dry_run is not None:
         parser.add_argument("--dry-run", action="store_true", help="print the forecast, write nothing")
     parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and Spark's own messages")
@@ -155,8 +165,10 @@ def _refuse_mangled(*paths: str) -> None:
 
 def _request(job: Job, options: argparse.Namespace) -> Request:
     given = {name: getattr(options, name) for name, _ in job.options}
-    lists: dict[str, Any] = {name: tuple(dict.fromkeys(value)) for name, value in given.items() if value is not None}
-    return replace(parse(options.request), **lists)
+    wanted: dict[str, Any] = {name: tuple(dict.fromkeys(value)) for name, value in given.items() if value is not None}
+    numbers = {name: getattr(options, name) for name, _ in job.numbers}
+    wanted |= {name: value for name, value in numbers.items() if value is not None}
+    return replace(parse(options.request), **wanted)
 
 
 @contextmanager
@@ -177,9 +189,10 @@ def _stoppable(job: Job) -> Iterator[None]:
 # ------------------------------------------------------------------------------------------------ one step
 
 
-def _run(job: Job, step: Step, root: Path, request: Request, verbose: bool) -> None:
+def _run(job: Job, step: Step, root: Path, request: Request, verbose: bool, took: Json) -> None:
+    """took : what else the first line of the run's log says"""
     plan, started = step.plan, time.time()
-    log = _RunLog(root, job, step, request)
+    log = _RunLog(root, job, step, request, took)
     results: list[Json] = []
     before = layout.version(root, plan.table.name, plan.key).exists()
 
@@ -223,7 +236,7 @@ class _RunLog:
     A run goes on where it cannot be written.
     """
 
-    def __init__(self, root: Path, job: Job, step: Step, request: Request) -> None:
+    def __init__(self, root: Path, job: Job, step: Step, request: Request, more: Json) -> None:
         folder = layout.runs(root)
         now = datetime.now(UTC)
         self.common = {"job": job.name, "table": step.plan.table.name}
@@ -234,7 +247,7 @@ class _RunLog:
         except OSError as error:
             command.say(job.name, f"no log of this run: {error}", 0)
             self.stream = io.StringIO()
-        about = {"started": now.isoformat(), "request": request.name, "key": step.plan.key}
+        about = {"started": now.isoformat(), "request": request.name, "key": step.plan.key, **more}
         self.write({**about, "truesky": __version__, "commit": git_commit(), "parts": len(step.plan.parts)})
 
     def write(self, line: Json) -> None:

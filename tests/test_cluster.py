@@ -19,13 +19,13 @@ from pathlib import Path
 
 import pytest
 
-from jobs import demo
+from jobs.commands import run
 from lake_schema.store import layout, read
 
 pytestmark = [pytest.mark.spark, pytest.mark.nightly]
 
 ROOT = Path(__file__).parents[1]
-JOBS = [script for script, _ in demo.JOBS]
+JOBS = [stage.file for stage in (*run.CATALOGUES, *run.IMAGES)]
 # Which of them have something for workers to do.
 SHARED = [script for script in JOBS if "plan" not in script]
 

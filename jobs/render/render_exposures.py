@@ -19,6 +19,7 @@ from jobs.render.drawing import stamp_sizes
 from jobs.render.exposure import render, visible_sources
 from jobs.render.exposure.records import Rows
 from jobs.render.planning import preconditions, variants
+from jobs.render.planning import tasks as planned
 from jobs.render.planning.mission import mission_of
 from jobs.render.planning.preconditions import INPUTS
 from jobs.render.products import fits_files, truth_table
@@ -43,7 +44,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     names = (*INPUTS, LENSES) if layout.current_key(lake, LENSES) else INPUTS
     inputs = {name: read.version(lake, name) for name in names}
     preconditions.refuse_other_plan(inputs, request)
-    tasks = inputs["tasks"].rows().to_pylist()
+    tasks = planned.part(inputs["tasks"].rows(), request)
     exposures = inputs["exposures"].rows()
     preconditions.refuse_unrendered(exposures)
     places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in tasks if task["cells"]}
@@ -132,7 +133,13 @@ def truth_work(lake: Path, facts: Json) -> Output:
     return Output(products.beside(truth_file(row["exposure_id"], row["detector"])))
 
 
-JOB = Job("render_exposures", "Render every planned detector to FITS.", steps)
+JOB = Job(
+    "render_exposures",
+    "Render every planned detector to FITS.",
+    steps,
+    options=(("detectors", "only these of every exposure"),),
+    numbers=(("limit", "only the first so many of them, by exposure and detector"),),
+)
 
 if __name__ == "__main__":
     sys.exit(main(JOB))

@@ -122,6 +122,8 @@ class Request:
     psfs    : (band, file) of PSFs in place of ours
     bodies  : file of moving bodies in place of ours
     noise_seed : of all that differs between exposures of the same sky with the same detectors; None = the seed
+    detectors, limit : of a plan, the detectors that are to be rendered now, () = all; and how many at most.  A
+              command line gives them, and the plan is the same without
     """
 
     name: str
@@ -144,6 +146,8 @@ class Request:
     psfs: tuple[tuple[str, str], ...] = ()
     bodies: Path | None = None
     noise_seed: int | None = None
+    detectors: tuple[str, ...] = ()
+    limit: int | None = None
 
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from urllib.parse import unquote
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput, Damaged
@@ -25,6 +26,7 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
 _CELL = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet", re.ASCII)
 _VERSION = re.compile(r"v-([0-9a-f]{16})", re.ASCII)
 _REMOTE = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+:/")
+_LOCAL = re.compile(r"file:(?://(?:localhost)?)?(/(?!/).*)", re.IGNORECASE | re.DOTALL)
 
 
 def name(text: str) -> str:
@@ -37,8 +39,10 @@ def name(text: str) -> str:
 def lake(text: str | Path) -> Path:
     """The root of a lake: a folder of a POSIX file system, absolute; object stores are refused (they cannot rename).
 
-    It need not be there yet.
+    It need not be there yet.  file:///a/b is /a/b, as Spark's users write it.
     """
+    if local := _LOCAL.fullmatch(str(text)):
+        text = unquote(local[1])
     if not str(text):
         raise BadInput("lake: its path is empty")
     if _REMOTE.match(str(text)):

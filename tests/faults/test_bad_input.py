@@ -11,7 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from jobs import demo, shell
+from jobs import demo, report, shell
 from jobs.catalogue import (
     build_gaia,
     build_galaxies,
@@ -21,6 +21,8 @@ from jobs.catalogue import (
     export_gaia,
     export_galaxies,
 )
+from jobs.commands import run as whole
+from jobs.commands import submit
 from jobs.explore import __main__ as explore
 from jobs.fluxes import compute_fluxes, inputs
 from jobs.render import archive, coverage, plan_exposures, render_exposures
@@ -64,11 +66,14 @@ OF_LAKE = {
     **{name: (lambda lake, good, name=name: lake_schema.main([name, lake])) for name in ("verify", "gc", "describe")},
     "mission diff": lambda lake, good: lake_schema.main(["mission", "diff", ",".join(LADDER), f"{lake}@{0:016}"]),
     "demo": lambda lake, good: demo.main(["--out", lake, "--request", good]),
+    "run": lambda lake, good: whole.main([good, "--lake", lake], pytest.fail),
+    "report": lambda lake, good: report.main([lake]),
 }
 OF_REQUEST = {
     **{name: (lambda path, new, name=name: run(name, new, path)) for name in JOBS},
     "request check": lambda path, new: __main__.main(["check", path]),
     "demo": lambda path, new: demo.main(["--request", path, "--out", new]),
+    "run": lambda path, new: whole.main([path, "--lake", new], pytest.fail),
     "mission diff": lambda path, new: lake_schema.main(["mission", "diff", path, ",".join(LADDER)]),
 }
 OF_TARGET = {
@@ -137,7 +142,7 @@ def _soon(monkeypatch):
         raise AssertionError("a session was asked for")
 
     monkeypatch.setattr(shell, "_spark_map", fail)
-    monkeypatch.setattr(demo, "_run_all", fail)
+    monkeypatch.setattr(submit, "submit", fail)
     before = signal.signal(signal.SIGALRM, fail)
     signal.alarm(300)
     yield

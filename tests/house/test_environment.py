@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from jobs import demo
+from jobs.commands import run
 
 ROOT = Path(__file__).resolve().parents[2]
-SCRIPT = ROOT / "scripts" / "prepare_spark.py"
+SCRIPT = ROOT / "jobs" / "commands" / "prepare_spark.py"
 SUBMITTED = sorted(path for path in (ROOT / "jobs").rglob("*.py") if "\nJOB = Job(" in path.read_text())
 # Draws on a worker, complains once and ends like a job that was given a bad request.
 TINY = """
@@ -136,7 +136,8 @@ def wrapped(prepare, tmp_path, major):
     """The wrapper around a fake Java, in a folder with a blank and a quote in its name."""
     environment, home = tmp_path / "an environment", fake_java(tmp_path / "a java's home", str(major))
     return environment, program(
-        environment / "java" / "bin" / "java", prepare.wrapper(prepare.Java(home, major, "PATH"), environment)
+        environment / "java" / "bin" / "java",
+        prepare.wrapper(prepare.Java(home, major, "PATH"), environment / "bin" / "python"),
     )
 
 
@@ -213,14 +214,26 @@ def test_spark_submit_is_this_environments(prepare, environment, tmp_path):
     """Whether or not it is activated, whatever Spark is named elsewhere, and without a Python on PATH that knows it."""
     program(tmp_path / "path" / "python3", "exit 1")
     spark_home = environment / "lib" / "its spark"
-    program(spark_home / "bin" / "spark-submit", 'echo "$SPARK_HOME" "$SPARK_CONF_DIR" "$@"')
+    program(spark_home / "bin" / "spark-submit", 'echo "$SPARK_HOME" "$SPARK_CONF_DIR" $SPARK_ENV_LOADED "$@"')
     prepare.prepare(environment, prepare.Java(fake_java(tmp_path / "home", "21"), 21, "PATH"), spark_home)
     assert (spark_home / "conf" / "spark-env.sh").is_file()
     variables = {"PATH": f"{tmp_path / 'path'}:/usr/bin:/bin"}
-    for other in ({}, {"SPARK_HOME": str(tmp_path / "other"), "SPARK_CONF_DIR": str(tmp_path / "other" / "conf")}):
+    for other in (
+        {},
+        {"SPARK_ENV_LOADED": "1"},
+        {"SPARK_HOME": str(tmp_path / "other"), "SPARK_CONF_DIR": str(tmp_path / "other" / "conf")},
+    ):
         for submit in (f'"{environment}/bin/spark-submit"', f'. "{environment}/bin/activate" && spark-submit'):
             done = shell(f'{submit} "a b" c', **variables, **other)
             assert (done.stdout, done.stderr) == (f"{spark_home} {environment}/spark-conf a b c\n", "")
+
+
+@pytest.mark.parametrize(("exported", "found"), [({}, "127.0.0.1"), ({"SPARK_LOCAL_IP": "10.1.2.3"}, "10.1.2.3")])
+def test_the_address_of_a_driver_is_what_its_user_exports(prepare, environment, tmp_path, exported, found):
+    """Every start script of Spark reads the file in this way."""
+    prepare.prepare(environment, prepare.Java(fake_java(tmp_path / "home", "21"), 21, "PATH"), tmp_path / "spark")
+    done = shell(f'set -a; . "{environment}/spark-conf/spark-env.sh"; set +a; printenv SPARK_LOCAL_IP', **exported)
+    assert done.stdout == f"{found}\n"
 
 
 # As Spark runs a job: its stderr is joined to its stdout, and passed on in pieces.
@@ -291,6 +304,7 @@ def test_a_session_is_closed_to_others_and_finds_its_python_without_any_configur
         f'"{spark_home}/bin/spark-submit" --conf spark.pyspark.driver.python={sys.executable} "{script}" "{ROOT}"',
         PATH=f"{tmp_path / 'path'}:{os.environ['PATH']}",
         SPARK_CONF_DIR=str(tmp_path / "conf"),
+        PYSPARK_PYTHON="/bin/false",
     )
     assert done.returncode == 0, done.stderr[-2000:]
     own, addresses, closed = done.stdout.splitlines()
@@ -306,7 +320,7 @@ def test_submitted_files_answer_from_anywhere(environment):
         environment = Path(sys.prefix)
     else:
         prepared(environment)
-    assert {ROOT / script for script, _ in demo.JOBS} < set(SUBMITTED)
+    assert {ROOT / stage.file for stage in (*run.CATALOGUES, *run.IMAGES)} < set(SUBMITTED)
     # What spark-submit runs is this Python; a Java for each file would say nothing more.
     starters = ["spark-submit", *["python"] * (len(SUBMITTED) - 1)]
     with ThreadPoolExecutor(2) as two_at_a_time:
@@ -344,6 +358,6 @@ def test_make_refuses_a_folder_that_spark_cannot_read(tmp_path):
 @pytest.mark.parametrize(("given", "taken"), [("C", "C.UTF-8"), ("POSIX", "C.UTF-8"), ("C.UTF-8", "C.UTF-8")])
 def test_names_of_files_keep_their_letters(prepare, environment, given, taken):
     """Java would hand on a question mark for each that is not ASCII."""
-    command = f"set -a; {prepare.spark_env(environment)}\necho $LC_ALL"
+    command = f"set -a; {prepare.spark_env(environment, environment / 'bin' / 'python')}\necho $LC_ALL"
     told = subprocess.run(["bash", "-c", command], env={**os.environ, "LC_ALL": given}, capture_output=True, text=True)
     assert told.stdout.split() == [taken]

@@ -5,11 +5,14 @@ from __future__ import annotations
 import email
 import importlib
 import importlib.metadata
+import json
+import os
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
+import venv
 import zipfile
 from pathlib import Path
 
@@ -18,30 +21,43 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import lake_schema
+from lake_schema.store import provenance
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-SHIPPED = {".py", ".csv", ".toml", ".typed"}
+PACKAGES = ("lake_schema", "jobs", "truesky")
+# Whatever else lies in the packages is no part of them.
+NOT_SHIPPED = {".pyc"}
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    """A wheel, built from a copy so that nothing is left in the tree."""
+def built(tmp_path_factory):
+    """The file of a wheel, built without a network from a copy, so that nothing is left in the tree."""
     copy = tmp_path_factory.mktemp("wheel")
-    for name in ("lake_schema", "jobs"):
-        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in (*PACKAGES, "requests", "notebooks"):
+        shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "LICENSE"):
         shutil.copy(ROOT / name, copy)
-    code = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=copy, capture_output=True, text=True)
+    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--no-index", "--quiet", "."]
+    done = subprocess.run(command, cwd=copy, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    with zipfile.ZipFile(copy / done.stdout.split()[-1]) as archive:
+    (file,) = copy.glob("*.whl")
+    return file
+
+
+@pytest.fixture(scope="module")
+def wheel(built):
+    with zipfile.ZipFile(built) as archive:
         yield archive
 
 
 def test_everything_of_the_packages_ships(wheel):
-    there = {path for name in ("lake_schema", "jobs") for path in (ROOT / name).rglob("*") if path.suffix in SHIPPED}
-    expected = {path.relative_to(ROOT).as_posix() for path in there}
+    of_packages = {path for name in ("lake_schema", "jobs") for path in (ROOT / name).rglob("*") if path.is_file()}
+    there = {path.relative_to(ROOT) for path in of_packages if path.suffix not in NOT_SHIPPED}
+    examples = {path.relative_to(ROOT) for folder in ("requests", "notebooks") for path in (ROOT / folder).iterdir()}
+    expected = {path.as_posix() for path in there} | {f"truesky/{path.as_posix()}" for path in examples}
+    # It wants a clone.
+    expected = expected - {"truesky/notebooks/02_speed_for_accuracy.ipynb"} | {"truesky/__init__.py"}
     shipped = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert shipped == expected
     assert {"lake_schema/py.typed", "jobs/py.typed", "lake_schema/mission/vis.csv"} <= shipped
@@ -54,6 +70,48 @@ def test_metadata(wheel):
     assert metadata["License-Expression"] == "BSD-3-Clause"
     # An application: package indexes refuse this classifier.
     assert "Private :: Do Not Upload" in metadata.get_all("Classifier")
+
+
+# What a user's machine may have set for a Spark of another kind.
+FOREIGN = {
+    "SPARK_HOME": "/nowhere", "SPARK_CONF_DIR": "/nowhere", "SPARK_ENV_LOADED": "1", "PYSPARK_PYTHON": "/bin/false",
+    "PYSPARK_DRIVER_PYTHON": "/bin/false", "PYSPARK_DRIVER_PYTHON_OPTS": "notebook",
+}  # fmt: skip
+
+
+@pytest.mark.spark
+@pytest.mark.nightly
+def test_an_installed_wheel_runs_a_request_from_an_empty_folder(built, tmp_path):
+    """The commands of docs/command.md, in a fresh environment that sees the packages truesky wants, and no clone."""
+    environment, folder = tmp_path / "venv", tmp_path / "empty"
+    venv.EnvBuilder(with_pip=False, symlinks=True).create(environment)
+    folder.mkdir()
+    (packages,) = environment.glob("lib/python*/site-packages")
+    (packages / "ready.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")))
+    install = [sys.executable, "-m", "pip", "--python", str(environment / "bin" / "python"), "install", "--no-deps"]
+    subprocess.run([*install, "--no-index", "--force-reinstall", str(built)], check=True, capture_output=True)
+    kept = {name: os.environ[name] for name in ("JAVA_HOME", "PATH", "LANG") if name in os.environ}
+    variables = {**kept, **FOREIGN, "HOME": str(tmp_path), "OMP_NUM_THREADS": "1"}
+
+    def truesky(*words):
+        command = [str(environment / "bin" / "truesky"), *words]
+        done = subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, timeout=3000)
+        # Neither Spark's messages nor Python's.
+        assert (done.returncode, done.stderr) == (0, ""), done.stdout
+        return done.stdout
+
+    assert "requests/demo.toml" in truesky("examples", ".")
+    truesky("check", "requests/demo.toml")
+    said = truesky("run", "requests/demo.toml", "--lake", "lake", "--detectors", "R22_S11")
+    (picture,) = (folder / "lake" / "pictures").glob("*.png")
+    assert said.splitlines()[-1] == str(picture)
+    assert "render_exposures" in said
+    assert truesky("sql", "SELECT count(*) FROM products", "--lake", "lake").split()[-3] == "1"
+    truesky("verify", "lake")
+    # A wheel's products have the keys of a clone's.
+    manifest = json.loads((folder / "lake" / "galaxies" / "current" / "manifest.json").read_text())
+    assert manifest["facts"]["code"] == provenance.code_version()
+    assert {path.name for path in folder.iterdir()} == {"requests", "notebooks", "lake"}
 
 
 def test_changes_name_the_version():

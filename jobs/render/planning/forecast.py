@@ -2,17 +2,21 @@
 
 rows     a line a channel, survey and image type, one a channel, one in all: exposures, detectors, core-hours, storage
 text     the table that a person reads
+of_lake  CPU seconds and GB of what a lake holds, by job
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
 from jobs.render.planning.speed import Speed
+from lake_schema.errors import LakeError
+from lake_schema.store import read
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,3 +98,27 @@ def text(lines: list[Line], speed: Speed) -> Iterator[str]:
             f"{line.sources:14,} {line.core_hours:11,.2f} {line.gigabytes:10,.2f} {line.memory_gb:8.2f}"
         )
     yield f"core-hours are of this machine, {speed.source}: {speed.factor:.2f} of those in costs.csv"
+
+
+@dataclass(frozen=True, slots=True)
+class JobCost:
+    """CPU seconds and GB of one job."""
+
+    seconds: float
+    gb: float
+
+
+def of_lake(lake: Path, factor: float = 1.0) -> dict[str, JobCost]:
+    """What was forecast of the tables that a lake holds, by the job that makes them.
+
+    factor : as of `rows`
+    """
+    try:
+        products = read.version(lake, "products")
+        tasks = read.version(lake, "tasks", products.manifest["facts"]["inputs"]["tasks"]).rows().to_pylist()
+    except (LakeError, KeyError):
+        return {}
+    made = {(part["facts"]["exposure_id"], part["facts"]["detector"]) for part in products.manifest["parts"]}
+    own = [task for task in tasks if (task["exposure_id"], task["detector"]) in made]
+    cost = JobCost(factor * sum(task["seconds"] for task in own), sum(task["bytes"] for task in own) / 1e9)
+    return {"render_exposures": cost}

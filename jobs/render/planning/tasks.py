@@ -1,6 +1,7 @@
 """From exposures to render tasks: one a detector, with its cells and what it will cost.
 
 table      rows of the table `tasks`, longest first
+part       those of them that are to be rendered now
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ from jobs.render.exposure.records import Variant
 from jobs.render.planning import variants
 from jobs.render.planning.prices import Price, price
 from jobs.render.planning.source_counts import Densities
+from jobs.request.schema import Request
 from lake_schema import sky
 from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
@@ -66,6 +69,24 @@ def table(
     numbers = np.array(columns["exposure_id"], np.int64)
     order = np.lexsort((np.array(columns["detector"]), numbers, -seconds)) if numbers.size else np.empty(0, np.int64)
     return TASKS.build({name: [values[i] for i in order] for name, values in columns.items()})
+
+
+def part(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:
+    """Rows of the request's detectors, the first so many of them by exposure and name where it has a limit.
+
+    Errors : BadInput where no exposure has a detector of that name, or the limit leaves none
+    """
+    rows: list[dict[str, Any]] = tasks.to_pylist()
+    if unknown := sorted({*request.detectors} - {row["detector"] for row in rows}):
+        some = ", ".join(sorted({row["detector"] for row in rows})[:4])
+        raise BadInput(f"detectors: {unknown[0]} is not in the plan of request {request.name}, which has {some}, ...")
+    if request.limit is not None and request.limit < 1:
+        raise BadInput(f"limit = {request.limit} leaves no detector")
+    if request.detectors:
+        rows = [row for row in rows if row["detector"] in request.detectors]
+    first = sorted((row["exposure_id"], row["detector"]) for row in rows)[: request.limit]
+    chosen = {*first}
+    return [row for row in rows if (row["exposure_id"], row["detector"]) in chosen]
 
 
 @dataclass(frozen=True, slots=True)

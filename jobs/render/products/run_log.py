@@ -1,6 +1,7 @@
-"""What the logs of runs say of the detectors that they rendered.
+"""What the logs of runs say of the parts that they made.
 
-of_products     the logs of runs that made the table `products`, oldest first
+of_lake         the logs of all runs, oldest first
+of_products     those of runs that made the table `products`
 lines           one of them: an object for its start, one a part, one for its end
 """
 
@@ -14,11 +15,19 @@ from lake_schema import user_files
 from lake_schema.errors import Damaged
 from lake_schema.store import layout
 
-# What a line says of a part.
-_OF_A_PART: dict[str, tuple[type, ...]] = {
-    "part": (str,), "error": (str,), "attempt": (int,), "seconds": (float, int), "peak_gb": (float, int)
+Json = dict[str, Any]
+# What a line says: of a run, of a part.
+_SAID: dict[str, tuple[type, ...]] = {
+    "job": (str,), "status": (str,), "prepare_s": (float, int), "prepare_cpu_s": (float, int),
+    "part": (str,), "error": (str,), "attempt": (int,), "seconds": (float, int), "cpu_s": (float, int),
+    "peak_gb": (float, int), "rows": (int,), "bytes": (int,),
 }  # fmt: skip
 _MOST = 1e15
+
+
+def of_lake(root: Path) -> list[Path]:
+    """The files, in the order of their runs."""
+    return sorted(layout.runs(root).glob("*.jsonl"))
 
 
 def of_products(root: Path) -> list[Path]:
@@ -47,7 +56,7 @@ def _checked(line: Any) -> dict[str, Any]:
     """The line; TypeError where it is not one that a run writes."""
     if not isinstance(line, dict):
         raise TypeError
-    for name, kinds in _OF_A_PART.items():
+    for name, kinds in _SAID.items():
         value = line.get(name, kinds[0]())
         if type(value) not in kinds or (kinds != (str,) and not 0 <= value < _MOST):
             raise TypeError

@@ -42,7 +42,12 @@ def test_a_link_out_of_the_lake_is_refused(tmp_path):
         layout.table(tmp_path / "lake", "galaxies")
 
 
-@pytest.mark.parametrize("text", ["s3://bucket/lake", "hdfs://host/lake", "gs://x", "S3A://x"])
+@pytest.mark.parametrize("text", ["file://{}/a b", "file:{}/a%20b", "FILE://localhost{}/a b", "{}/a b"])
+def test_a_folder_may_be_given_as_spark_names_files(tmp_path, text):
+    assert layout.lake(text.format(tmp_path)) == tmp_path / "a b"
+
+
+@pytest.mark.parametrize("text", ["s3://bucket/lake", "hdfs://host/lake", "gs://x", "S3A://x", "file://host/x"])
 def test_object_stores_are_refused(text):
     with pytest.raises(BadInput, match="POSIX"):
         layout.lake(text)

