@@ -25,8 +25,8 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.ge
 # Where tests run in several processes (pytest-xdist, --dist loadfile), a file stays in one, and so do these together:
 # what shares the Spark session, and what shares the drawn sky. They begin first, for they take longest.
 _SPARK = (
-    "tests/faults/test_spark.py", "tests/jobs/test_session.py", "tests/jobs/render/test_calibration_job.py",
-    "tests/test_field.py",
+    "tests/faults/test_spark.py", "tests/jobs/test_session.py", "tests/test_field.py",
+    "tests/jobs/render/test_render_exposures_calibration.py",
 )  # fmt: skip
 _SKY = ("tests/jobs/catalogue/", "tests/jobs/validation/")
 

@@ -11,7 +11,7 @@ from nbclient import NotebookClient
 from benchmarks import fluxes as benchmark
 from jobs.accuracy import SURVEY
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOK = ROOT / "notebooks" / "02_speed_for_accuracy.ipynb"
 INLINE = "module://matplotlib_inline.backend_inline"
 KEYS = (

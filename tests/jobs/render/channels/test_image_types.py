@@ -21,7 +21,7 @@ from lake_schema.mission.configuration import resolve
 from tests.jobs.render import fields
 from tests.jobs.render.fields import exposure, fluxes, galaxies, stars
 
-EXAMPLE = Path(__file__).parents[3] / "requests" / "vis_calibration.toml"
+EXAMPLE = Path(__file__).parents[4] / "requests" / "vis_calibration.toml"
 # As in other tests, so that they share the planes of the PSF.
 SIDE = 256
 
