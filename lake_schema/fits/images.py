@@ -43,7 +43,7 @@ _STRUCTURE |= {"BZERO", "BSCALE", "EXTNAME", "CHECKSUM", "DATASUM"}
 class Image:
     """One header-data unit.
 
-    data  : [ny, nx] uint8, int16, uint16, int32, float32 or float64; None = a header alone
+    data  : [ny, nx] or [n, ny, nx] uint8, int16, uint16, int32, float32 or float64; None = a header alone
     cards : (keyword, value, comment), in order, structural keywords left out
     """
 
@@ -143,8 +143,8 @@ def _dressed(unit: Any, image: Image) -> Any:
 
 
 def _big_enough(data: Array) -> Array:
-    if data.ndim != 2 or data.dtype.kind not in "fiu" or data.dtype.itemsize > 8:
-        raise BadInput(f"a FITS image wants numbers in two dimensions, got {data.dtype}{list(data.shape)}")
+    if data.ndim not in (2, 3) or data.dtype.kind not in "fiu" or data.dtype.itemsize > 8:
+        raise BadInput(f"a FITS image wants numbers in two or three dimensions, got {data.dtype}{list(data.shape)}")
     return np.ascontiguousarray(data)
 
 

@@ -68,6 +68,14 @@ def test_channels_are_named_where_they_are_made():
     assert found == []
 
 
+def test_quadrants_are_known_where_they_are_read():
+    """What is assembled from a readout is asked of the channel's readout mode."""
+    render = ROOT / "jobs" / "render"
+    quadrants = render / "effects" / "readout" / "quadrants.py"
+    knowing = {path.relative_to(render).parts[0] for path in render.rglob("*.py") if quadrants in imported(path)}
+    assert knowing == {"channels"}
+
+
 def brighter(frame, factor, rng=None):
     return frame * factor
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from astropy.wcs import WCS
-
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
-from jobs.render.channels.readout import Readout
+from jobs.render.channels.readout import ReadoutMode
 from jobs.render.effects.effect import Effect
-from jobs.render.effects.scene import Frame, Scene
 from jobs.render.psf.model import Psf
 from jobs.render.psf.spikes import Edges
 from lake_schema.errors import BadInput
@@ -25,7 +22,7 @@ class Channel:
 
     effects    : image type -> its effects, in the order of physics
     psf        : (exposure, detector, band, mission, positions on the detector) -> PSF
-    readout    : (what the last effect leaves, scene, name of the detector, WCS) -> the arrays of its file
+    readout    : how its detectors are read, and which arrays their files have
     drawn      : effect that is part of the pixel's transfer function: it acts while sources are drawn
     pupil      : (detector, band, mission) -> diffraction far from a star; None: not drawn
     moving     : whether bodies of the Solar System are drawn
@@ -36,7 +33,7 @@ class Channel:
 
     effects: Mapping[str, tuple[Effect, ...]]
     psf: Callable[[ExposureRow, Detector, Passband, MissionConfiguration, int], Psf]
-    readout: Callable[[Frame, Scene, str, WCS], Readout]
+    readout: ReadoutMode
     drawn: Effect | None = None
     pupil: Callable[[Detector, Passband, MissionConfiguration], Edges] | None = None
     moving: bool = False

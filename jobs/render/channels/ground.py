@@ -36,4 +36,4 @@ def _psf(
     return seeing.ground_psf(exposure.seeing, beta, detector.pixel_scale)
 
 
-CHANNEL = Channel(effects=EFFECTS, psf=_psf, readout=readout.frame)
+CHANNEL = Channel(effects=EFFECTS, psf=_psf, readout=readout.FRAME)

@@ -1,12 +1,14 @@
-"""What a detector is read out as: arrays, each with its unit and cards, whatever the camera.
+"""How a detector is read: the arrays that it gives, each with its unit and cards, and back from its files.
 
-frame       one array of pixels
-quadrants   four of them, each in the detector's own axes with its pre- and overscan
+FRAME       one array of pixels
+QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,21 +17,26 @@ from astropy.wcs import WCS
 from jobs.render.camera import astrometry
 from jobs.render.effects.readout import quadrants as layout
 from jobs.render.effects.scene import Frame, Scene
-from lake_schema.arrays import Array
-from lake_schema.fits.images import Card
+from lake_schema.arrays import Array, Float
+from lake_schema.fits.images import Card, Image
 
 
 @dataclass(frozen=True, slots=True)
 class Extension:
-    """An array of a readout: its dtype is the file's.
+    """An array of a readout; its dtype is the file's: a slope may have 16 bits, the quality of its fit 8.
 
-    name  : of its extension; "" = the only array of its file
-    cards : of it alone
+    name      : of its extension; "" = the only array of its file
+    data      : [ny, nx], or [n, ny, nx], such as the groups of a ramp
+    unit      : as FITS writes it; "" = none, of a flag
+    cards     : of it alone
+    amplifier : the number of the one that it is read through; None = of several
     """
 
     name: str
     data: Array
+    unit: str
     cards: tuple[Card, ...] = ()
+    amplifier: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,33 +45,65 @@ class Readout:
 
     raw     : as the last effect leaves them, in readout order
     pixels  : [ny, nx] those of the detector alone, in its own axes
-    unit    : of all arrays, as FITS writes it
     cards   : for all arrays
     """
 
     extensions: tuple[Extension, ...]
     raw: Array
     pixels: Array
-    unit: str
     cards: tuple[Card, ...] = ()
 
+    @property
+    def unit(self) -> str | None:
+        """Of all arrays; None where they differ."""
+        units = {extension.unit for extension in self.extensions}
+        return units.pop() if len(units) == 1 else None
 
-def frame(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """A detector that is read as one frame: uint16[ny, nx] ADU.
 
-    found    : ADU of the detector;  scene : what it was rendered with
-    detector : its name;  system : its world coordinates
+@dataclass(frozen=True, slots=True)
+class ReadoutMode:
+    """How a detector is read, and how what was written of it is read back.
+
+    arrays    : (what the last effect leaves, scene, name of the detector, WCS) -> the arrays of its file
+    assembled : (array with the axes of what any effect leaves, scene) -> [ny, nx] the detector's pixels, in its own
+                axes; the array itself where it is that already
+    pixels    : images of a file -> [ny, nx] its pixels as stored
+    electrons : images of a file -> float64[ny, nx] its pixels in e-, the bias subtracted
     """
+
+    arrays: Callable[[Frame, Scene, str, WCS], Readout]
+    assembled: Callable[[Array, Scene], Array]
+    pixels: Callable[[Sequence[Image]], Array]
+    electrons: Callable[[Sequence[Image]], Float]
+
+
+# ---------------------------------------------------------------------------------------------- one frame
+
+
+def _frame(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
+    """uint16[ny, nx] ADU."""
     raw = found.astype(np.uint16)
-    return Readout((Extension("", raw),), raw, raw, "adu")
+    return Readout((Extension("", raw, "adu"),), raw, raw)
 
 
-def quadrants(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """A detector that is read in quadrants [4, rows, columns]: uint16 ADU, extensions named detector.quadrant.
+def _frame_electrons(read: Sequence[Image]) -> Float:
+    header = _header(read[0])
+    return np.asarray((np.asarray(read[0].data) - float(header["BIAS"])) * float(header["GAIN"]))
 
-    found    : ADU of the quadrants;  scene : what they were rendered with
-    detector : its name;  system : its world coordinates
-    """
+
+FRAME = ReadoutMode(
+    arrays=_frame,
+    assembled=lambda array, scene: array,
+    pixels=lambda read: np.asarray(read[0].data),
+    electrons=_frame_electrons,
+)
+
+
+# ---------------------------------------------------------------------------------------------- quadrants
+
+
+def _quadrants(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
+    """uint16[4, rows, columns] ADU, extensions named detector.quadrant."""
     raw = found.astype(np.uint16)
     prescan, overscan, rows, middle = sizes = layout.sizes(scene)
     scans = (
@@ -79,6 +118,42 @@ def quadrants(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout
         across, up = layout.origin(number, raw[number].shape, *sizes)
         place = astrometry.cards(astrometry.shifted(system, across, up))
         cards: tuple[Card, ...] = (("QUADRANT", name, "quadrant"), *scans, *place)
-        extensions.append(Extension(f"{detector}.{name}", layout.placed(raw[number], number), cards))
-    pixels: npt.NDArray[np.uint16] = layout.assembled(raw, *sizes)
-    return Readout(tuple(extensions), raw, pixels, "adu", scans)
+        extensions.append(Extension(f"{detector}.{name}", layout.placed(raw[number], number), "adu", cards, number))
+    return Readout(tuple(extensions), raw, layout.assembled(raw, *sizes), scans)
+
+
+def _assembled(array: Array, scene: Scene) -> Array:
+    return array if array.ndim == 2 else layout.assembled(array, *layout.sizes(scene))
+
+
+def _quadrant_pixels(read: Sequence[Image]) -> Array:
+    raw, sizes = _raw(read)
+    return layout.assembled(raw, *sizes)
+
+
+def _quadrant_electrons(read: Sequence[Image]) -> Float:
+    """Above the level of each amplifier."""
+    raw, sizes = _raw(read)
+    # In the extension's header where the amplifiers have different gains.
+    own = [{**_header(read[0]), **_header(unit)} for unit in read[1:]]
+    gain = np.array([float(cards["GAIN"]) for cards in own]).reshape(-1, 1, 1)
+    _, overscan, rows, _ = sizes
+    # The last half of the columns after the pixels: charge that traps gave back is in the first.
+    level = raw[:, : raw.shape[1] - rows, raw.shape[2] - max(overscan // 2, 1) :].mean(axis=(1, 2), keepdims=True)
+    return layout.assembled((raw - level) * gain, *sizes)
+
+
+def _raw(read: Sequence[Image]) -> tuple[npt.NDArray[np.uint16], tuple[int, int, int, int]]:
+    """Quadrants in readout order; prescan, overscan, overscan rows, rows between the halves."""
+    header = _header(read[0])
+    raw = np.stack([layout.placed(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
+    prescan, overscan, rows = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS"))
+    # Files of older versions know nothing of rows between the halves.
+    return raw, (prescan, overscan, rows, int(header.get("INJROWS", 0)))
+
+
+def _header(image: Image) -> dict[str, Any]:
+    return {keyword: value for keyword, value, _ in image.cards}
+
+
+QUADRANTS = ReadoutMode(arrays=_quadrants, assembled=_assembled, pixels=_quadrant_pixels, electrons=_quadrant_electrons)

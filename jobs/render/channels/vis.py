@@ -114,7 +114,7 @@ def _psf(
 CHANNEL = Channel(
     effects=EFFECTS,
     psf=_psf,
-    readout=readout.quadrants,
+    readout=readout.QUADRANTS,
     drawn=DRAWN,
     pupil=euclid.vis_edges,
     moving=True,

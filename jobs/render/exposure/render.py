@@ -104,10 +104,11 @@ def _detected(
     def stream(effect: Effect) -> np.random.Generator:
         return rng.stream(*rendered.numbers_of(effect, exposure, detector.name, seed, noise_seed))
 
-    watch = truth_maps.watch(drawn.maps, scene, truth)
+    mode = aim.channel.readout
+    watch = truth_maps.watch(drawn.maps, scene, truth, mode)
     found, decisions = apply_all(frame.pop(), aim.effects, scene, stream, watch)
-    readout = aim.channel.readout(found, scene, detector.name, aim.wcs)
-    truth_maps.complete(drawn.maps, readout.raw, aim.effects, scene, truth)
+    readout = mode.arrays(found, scene, detector.name, aim.wcs)
+    truth_maps.complete(drawn.maps, readout.raw, aim.effects, scene, truth, mode)
     return Rendered(
         exposure, detector, aim.wcs, light.psf, readout, drawn.maps, drawn.sources, drawn.sizes, drawn.electrons,
         exposure.zero_point, scene, (*light.decisions, *decisions), scene.accuracy, seed, rows.complete,

@@ -55,12 +55,12 @@ class Rendered:
 
     @property
     def raw(self) -> Array:
-        """The arrays as they are read: uint16[ny, nx] ADU, or [4, ny, nx] quadrants with pre- and overscan."""
+        """The arrays as they are read, with pre- and overscan, in readout order."""
         return self.readout.raw
 
     @property
     def science(self) -> Array:
-        """uint16[ny, nx] ADU: the pixels alone, in the detector's own axes."""
+        """[ny, nx] the pixels alone, in the detector's own axes, as they are read."""
         return self.readout.pixels
 
     @property

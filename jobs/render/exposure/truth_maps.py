@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from jobs.render.channels.readout import ReadoutMode
 from jobs.render.effects.charge import bleeding
 from jobs.render.effects.effect import Effect
-from jobs.render.effects.readout import quadrants
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.arrays import Array
 
@@ -39,7 +38,7 @@ def made(truth: Sequence[str], effects: Sequence[str] | None, looks: bool) -> li
     return [name for name in truth if effects is None or name in found]
 
 
-def watch(maps: Maps, scene: Scene, truth: Sequence[str]) -> Callable[[str, Frame, Frame], None]:
+def watch(maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode) -> Callable[[str, Frame, Frame], None]:
     """Fills in the truth that effects add to the frame."""
 
     def see(name: str, before: Frame, after: Frame) -> None:
@@ -50,16 +49,16 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str]) -> Callable[[str, Fram
         if name in ("bleeding", "full_well") and "saturation" in truth:
             maps["saturation"] = bleeding.saturated(after, scene.value("full_well", "electron")).astype(np.uint8)
         if name in ("cosmic_rays", "readout_cosmic_rays") and "cosmic_rays" in truth:
-            hit = after - before
-            hit = hit if hit.ndim == 2 else quadrants.assembled(hit, *quadrants.sizes(scene))
             # Traps may have held some of it back: to the electron.
-            maps["cosmic_rays"] = np.rint(hit).astype(np.int32) + maps.get("cosmic_rays", 0)
+            maps["cosmic_rays"] = np.rint(mode.assembled(after - before, scene)).astype(np.int32) + maps.get(
+                "cosmic_rays", 0
+            )
 
     return see
 
 
 def complete(
-    maps: Maps, raw: npt.NDArray[np.uint16], effects: Sequence[Effect], scene: Scene, truth: Sequence[str]
+    maps: Maps, raw: Array, effects: Sequence[Effect], scene: Scene, truth: Sequence[str], mode: ReadoutMode
 ) -> None:
     """Adds maps of effects that were not needed, and pixels that the converter could not hold.
 
@@ -80,6 +79,6 @@ def complete(
     if "saturation" in truth:
         largest = scene.of_amplifiers("adc_max", "adu")
         full = raw >= (np.reshape(largest, (-1, 1, 1)) if np.ndim(largest) else largest)
-        maps["saturation"] |= full if full.ndim == 2 else quadrants.assembled(full, *quadrants.sizes(scene))
+        maps["saturation"] |= mode.assembled(full, scene)
     for truth_map in maps.values():
         truth_map[slice(*scene.unread)] = 0

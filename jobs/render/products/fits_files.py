@@ -1,7 +1,7 @@
 """A rendered detector -> FITS files and rows of the table `products`.
 
-A detector that is read in quadrants is a file of four extensions, each in the detector's own axes with its pre- and
-overscan, behind a header that holds for all of them.
+A detector whose readout is one array is a file of one image; of several, each is an extension, behind a header that
+holds for all of them.
 
 products   rows, and a writer for each file
 """
@@ -63,13 +63,26 @@ def _write(units: Sequence[Image], rice: bool, path: Path) -> None:
 
 
 def _science(rendered: Rendered) -> list[Image]:
-    """The image; or a header that holds for all, and an extension for each array of the readout."""
-    cards, readout = headers.science_cards(rendered), rendered.readout
+    """The image; or a header that holds for all, and an extension for each array of the readout.
+
+    The unit of the pixels stands in the header of all where they share it, else in each array's own.
+    """
+    readout = rendered.readout
+    cards = (*headers.science_cards(rendered), *readout.cards)
     if [extension.name for extension in readout.extensions] == [""]:
-        return [Image(readout.extensions[0].data, cards)]
-    whole = Image(None, (*cards, *readout.cards))
+        (only,) = readout.extensions
+        return [Image(only.data, (*cards, *only.cards))]
+    shared = readout.unit is not None
     arrays = [
-        Image(extension.data, (*extension.cards, *headers.amplifier_cards(rendered, number)), extension.name)
-        for number, extension in enumerate(readout.extensions)
+        Image(
+            extension.data,
+            (
+                *headers.unit_cards(None if shared else extension.unit),
+                *extension.cards,
+                *headers.amplifier_cards(rendered, extension.amplifier),
+            ),
+            extension.name,
+        )
+        for extension in readout.extensions
     ]
-    return [whole, *arrays]
+    return [Image(None, cards), *arrays]

@@ -35,7 +35,7 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     return (
         *_common(rendered),
-        ("BUNIT", rendered.readout.unit, "unit of the pixels"),
+        *unit_cards(rendered.readout.unit),
         *((key, float(value), comment) for key, value, comment in _of_amplifiers(rendered) if np.ndim(value) == 0),
         ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
         ("DARKRATE", ("dark_current" in applied) * scene.dark_rate, "[electron/s/pix] mean dark current in the image"),
@@ -43,8 +43,18 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
     )
 
 
-def amplifier_cards(rendered: Rendered, number: int) -> tuple[Card, ...]:
-    """Header of an amplifier's array: what differs from one amplifier to the other, and is not in the common header."""
+def unit_cards(unit: str | None) -> tuple[Card, ...]:
+    """Of arrays of one unit; none where they have none, or each its own."""
+    return (("BUNIT", unit, "unit of the pixels"),) if unit else ()
+
+
+def amplifier_cards(rendered: Rendered, number: int | None) -> tuple[Card, ...]:
+    """Header of an amplifier's array: what differs from one amplifier to the other, and is not in the common header.
+
+    number : of the amplifier; None = the array is of several
+    """
+    if number is None:
+        return ()
     found = ((key, np.atleast_1d(value), comment) for key, value, comment in _of_amplifiers(rendered))
     return tuple((key, float(values[number]), comment) for key, values, comment in found if len(values) > 1)
 

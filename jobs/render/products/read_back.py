@@ -1,51 +1,51 @@
-"""A science file -> pixels.
+"""A file of a detector -> pixels.
 
-frame      a science file -> the detector's pixels in one piece, ADU
-electrons  the same less the level of each amplifier's overscan
+frame      a science file or a truth map -> the detector's pixels in one piece, as stored
+electrons  the same in electrons, the bias of a science file subtracted
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from jobs.render.effects.readout import quadrants
+from jobs.render.channels import registry
+from jobs.render.channels.readout import ReadoutMode
+from lake_schema.errors import BadInput
 from lake_schema.fits import images
 
 
 def frame(path: Path) -> images.Image:
-    """A science file's pixels [ny, nx], uint16 ADU, without pre- and overscan, with the header of the whole."""
+    """A file's pixels [ny, nx], of a science file without pre- and overscan, with the header of the whole."""
     read = images.read_images(path)
     if read[0].data is not None:
         return read[0]
-    raw, sizes = _raw(read)
-    return images.Image(quadrants.assembled(raw, *sizes), read[0].cards)
+    return images.Image(_mode(path, read).pixels(read), read[0].cards)
 
 
 def electrons(path: Path) -> images.Image:
-    """A science file's pixels [ny, nx], float64 e- above the level of each amplifier."""
+    """A file's pixels [ny, nx], float64 e-: of a science file above the level of each amplifier.
+
+    Errors : BadInput for a map of what has no electrons, such as of saturated pixels
+    """
     read = images.read_images(path)
-    header = {keyword: value for keyword, value, _ in read[0].cards}
-    if read[0].data is not None:
-        return images.Image((read[0].data - float(header["BIAS"])) * float(header["GAIN"]), read[0].cards)
-    raw, sizes = _raw(read)
-    # In the extension's header where the amplifiers have different gains.
-    own = [{**header, **{keyword: value for keyword, value, _ in unit.cards}} for unit in read[1:]]
-    gain = np.array([float(cards["GAIN"]) for cards in own]).reshape(-1, 1, 1)
-    _, overscan, rows, _ = sizes
-    # The last half of the columns after the pixels: charge that traps gave back is in the first.
-    level = raw[:, : raw.shape[1] - rows, raw.shape[2] - max(overscan // 2, 1) :].mean(axis=(1, 2), keepdims=True)
-    above = quadrants.assembled((raw - level) * gain, *sizes)
-    return images.Image(above, read[0].cards)
+    unit = _header(read).get("BUNIT")
+    if unit == "electron":
+        return images.Image(np.asarray(read[0].data, float), read[0].cards)
+    if unit == "":
+        raise BadInput(f"{path}: its pixels have no unit: they are not electrons")
+    return images.Image(_mode(path, read).electrons(read), read[0].cards)
 
 
-def _raw(read: Sequence[images.Image]) -> tuple[npt.NDArray[np.uint16], tuple[int, int, int, int]]:
-    """Quadrants in readout order; prescan, overscan, overscan rows, rows between the halves."""
-    header = {keyword: value for keyword, value, _ in read[0].cards}
-    raw = np.stack([quadrants.placed(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
-    prescan, overscan, rows = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS"))
-    # Files of older versions know nothing of rows between the halves.
-    return raw, (prescan, overscan, rows, int(header.get("INJROWS", 0)))
+def _mode(path: Path, read: Sequence[images.Image]) -> ReadoutMode:
+    name = str(_header(read).get("CHANNEL"))
+    if name not in registry.CHANNELS:
+        raise BadInput(f"{path}: CHANNEL {name!r} is not one of {', '.join(registry.CHANNELS)}")
+    return registry.CHANNELS[name].readout
+
+
+def _header(read: Sequence[images.Image]) -> dict[str, Any]:
+    return {keyword: value for keyword, value, _ in read[0].cards}

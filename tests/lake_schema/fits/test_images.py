@@ -164,7 +164,7 @@ def test_a_card_that_fits_cannot_hold_is_refused(tmp_path, card):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("data", [np.zeros(3), np.zeros((2, 2), complex), np.zeros((2, 2, 2)), np.array([["a"]])])
+@pytest.mark.parametrize("data", [np.zeros(3), np.zeros((2, 2), complex), np.zeros((1, 2, 2, 2)), np.array([["a"]])])
 def test_what_is_no_image_is_refused(tmp_path, data):
     with pytest.raises(BadInput, match="image"):
         write_images(tmp_path / "a.fits", [Image(data)])
