@@ -1,7 +1,8 @@
-"""Keys of code: what is cached is made anew when any code that may have shaped it changes.
+"""Keys of code: what is cached is made anew when any code that may have shaped it changes, or any table of numbers.
 
-code_key   of a module and of all that it imports, for jobs.cache.content_key
-modules    which these are
+code_key     of a module and of all that it imports, for jobs.cache.content_key
+modules      which these are
+data_files   the tables of numbers that they read
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 from jobs.cache import content_key
 
 _ROOT = Path(__file__).resolve().parents[1]
+_ENDINGS = (".csv", ".toml")
 # What checks, stores, transports or names arrays and shapes none: its changes leave them as they are.
 _SHAPES_NONE = (
     "jobs.cache", "jobs.code_keys", "jobs.request", "lake_schema.arrays", "lake_schema.columns", "lake_schema.errors",
@@ -26,9 +28,20 @@ def code_key(module: str) -> str:
     """sha256 (hex) of the code of a module, `__name__`, and of every module of ours that it imports, however far.
 
     A function that moves from one of them to another changes the key, and so does one that comes from a new module.
-    Numbers that the code reads from tables are not in it: they go into the key of what is made of them.
+    The tables of numbers (.csv, .toml) that they read are in it; what they are given, such as the mission's parameters
+    and the user's files, goes into the key of what is made of it.
     """
-    return content_key(*(part for name in modules(module) for part in (name, _source(name))))
+    code = (part for name in modules(module) for part in (name, _source(name)))
+    data = (part for file in data_files(module) for part in (file.name, _content(file)))
+    return content_key(*code, *data)
+
+
+def data_files(module: str) -> tuple[Path, ...]:
+    """Tables of numbers that the code of a module and of what it imports names, wherever in `jobs` they lie; sorted.
+
+    A file is named by its whole name as a constant, or by the ending alone where it has the module's own name.
+    """
+    return tuple(sorted({file for name in modules(module) for file in _named(name)}))
 
 
 def modules(module: str) -> tuple[str, ...]:
@@ -52,6 +65,23 @@ def _source(module: str) -> bytes:
     if file is None:
         raise ImportError(f"no module {module} in {_ROOT}")
     return file.read_bytes()
+
+
+def _content(file: Path) -> bytes:
+    return file.read_bytes()
+
+
+@lru_cache
+def _data() -> dict[str, Path]:
+    """Every table of `jobs` by its name."""
+    return {file.name: file for file in (_ROOT / "jobs").rglob("*") if file.suffix in _ENDINGS}
+
+
+@lru_cache
+def _named(module: str) -> tuple[Path, ...]:
+    texts = {node.value for node in ast.walk(ast.parse(_source(module))) if isinstance(node, ast.Constant)}
+    names = {module.rpartition(".")[2] + text if text in _ENDINGS else text for text in texts}
+    return tuple(_data()[name] for name in names if isinstance(name, str) and name in _data())
 
 
 @lru_cache

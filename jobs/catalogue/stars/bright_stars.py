@@ -72,7 +72,7 @@ def load(files: tuple[Path, ...], sums: list[str]) -> BrightStars:
     sums   : sha256 of each
     Errors : BadInput names the file and the record
     """
-    key = content_key(code_key(__name__), Path(parameters.__file__).with_name("milky_way.toml").read_bytes(), *sums)
+    key = content_key(code_key(__name__), *sums)
     arrays = cached_arrays("tycho2", key, lambda: _read(files))
     index, ra, dec, mag_v, color_bv = (arrays[name] for name in ("index", "ra", "dec", "mag_v", "color_bv"))
     counts = arrays["counts"].tolist()

@@ -129,7 +129,7 @@ def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
 def fingerprint() -> str:
     """Key of everything the spectra depend on."""
     responses = [array for name in _BANDS for array in (passbands.load(name).wavelength, passbands.load(name).response)]
-    return cache.content_key(code_key(__name__), _FEATURES.read_bytes(), table_file().read_bytes(), *responses)
+    return cache.content_key(code_key(__name__), table_file().read_bytes(), *responses)
 
 
 def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Float:

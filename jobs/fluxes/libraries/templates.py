@@ -100,8 +100,7 @@ def stellar_library() -> Library:
     """
     types = stellar.types()
     names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES)
-    spectra = (standards.NEBULA.read_bytes(), vega.spectrum_file("vega.txt").read_bytes())
-    key = cache.content_key(code_key(__name__), *spectra, stellar.fingerprint())
+    key = cache.content_key(code_key(__name__), vega.spectrum_file("vega.txt").read_bytes(), stellar.fingerprint())
     arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": _stars(types)})
     return Library(passbands.grid(), arrays["flux"], names, types)
 

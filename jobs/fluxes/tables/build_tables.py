@@ -62,7 +62,7 @@ class Setting:
 @lru_cache(maxsize=4)
 def library_key(library: Library) -> str:
     """Key of a library's spectra and of the dust in front of them; a tenth of a second, once a library."""
-    absorbed = [code_key(intergalactic.__name__), repr(intergalactic.series())] if library.intergalactic else []
+    absorbed = [code_key(intergalactic.__name__)] if library.intergalactic else []
     return cache.content_key(library.wavelength, np.asarray(library.flux), dust_of(library), *absorbed)
 
 

@@ -53,7 +53,7 @@ def measured(band: Passband, setting: Setting, library: Library) -> Choice:
     library_key = build_tables.library_key(library)
     numbers = (setting.step, setting.n_ebv, setting.n_av)
     about = (*numbers, band.wavelength, band.response, band.medium, _SAMPLE, _SEED)
-    key = cache.content_key(code_key(__name__), library_key, repr(lines.line_list()), *about)
+    key = cache.content_key(code_key(__name__), library_key, *about)
 
     def make() -> dict[str, Array]:
         rows = drawn(_SAMPLE, len(library), np.random.default_rng(_SEED))
