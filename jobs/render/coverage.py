@@ -28,6 +28,7 @@ from lake_schema import command, sky, user_files
 from lake_schema.arrays import Bool, Int
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
+from lake_schema.tables.exposures import ExposureRow
 
 # Places along a side of a map; the widest map, and how far inside an area its edge is no longer felt, deg.
 _SIDE, _WIDEST, _INSIDE = 500, 60.0, 0.5
@@ -95,7 +96,7 @@ def depths(exposures: pa.Table, tasks: pa.Table, area: Area, side: int = _SIDE) 
     inside = area.depth(ra, dec)
     interior = (inside > min(_INSIDE, 0.5 * float(inside.max()))).reshape(side, side)
     found = []
-    for channel, band in sorted({(row["channel"], row["band"]) for row in looks.to_pylist()}):
+    for channel, band in sorted({(row.channel, row.band) for row in map(ExposureRow.of, looks.to_pylist())}):
         own = looks.filter(pc.and_(pc.equal(looks["channel"], channel), pc.equal(looks["band"], band)))
         long = own.filter(pc.greater(own["exposure_time_s"], 0.5 * pc.max(own["exposure_time_s"]).as_py()))
         seen = counts(tasks.filter(pc.is_in(tasks["exposure_id"], long["exposure_id"])), ra, dec)
@@ -110,7 +111,7 @@ def _centre(exposures: pa.Table) -> tuple[float, float]:
 
 def _reach(tasks: pa.Table, exposures: pa.Table) -> pa.Array:
     """How far from its boresight each task of some exposures looks, deg."""
-    at = {row["exposure_id"]: (row["ra"], row["dec"]) for row in exposures.to_pylist()}
+    at = {row.exposure_id: (row.ra, row.dec) for row in map(ExposureRow.of, exposures.to_pylist())}
     own = tasks.filter(pc.is_in(tasks["exposure_id"], exposures["exposure_id"]))
     ra, dec = np.array([at[i] for i in own["exposure_id"].to_pylist()]).T
     return pa.array(sky.separation(own["ra"].to_numpy(), own["dec"].to_numpy(), ra, dec) + own["radius"].to_numpy())
