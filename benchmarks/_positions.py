@@ -59,7 +59,9 @@ def optics() -> Callable[[tuple[float, float]], Float]:
     sign = -1 if detector.upside_down else 1
 
     def at(place: tuple[float, float]) -> Float:
-        nm = euclid.wavefront(*euclid._field(detector, sign * place[0], sign * place[1], mission), mission)
+        nm = euclid.wavefront(
+            *euclid._field(detector, sign * place[0], sign * place[1], mission), detector.section, mission
+        )
         scale = detector.pixel_scale / model.SAMPLES
         size = euclid._CORE_TRANSFORM, euclid._CORE_SIDE
         planes = [

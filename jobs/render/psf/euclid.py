@@ -89,16 +89,16 @@ def _step(depth: Float, softness: float) -> Float:
     return np.clip(0.5 + depth / softness, 0.0, 1.0)
 
 
-def wavefront(x: float, y: float, mission: MissionConfiguration) -> Float:
+def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -> Float:
     """Zernike coefficients at a field position: index = Noll number, nm rms.
 
-    x, y : -1 .. 1 across the focal plane
+    x, y : -1 .. 1 across the focal plane;  section : of the mission database, of the camera
     """
-    terms = mission.numbers("vis.psf.wavefront")
+    terms = mission.numbers(f"{section}.psf.wavefront")
     nm = np.zeros(1 + int(max(term[0] for term in terms)))
     for noll, x_power, y_power, coefficient in terms:
         nm[int(noll)] += coefficient * x**x_power * y**y_power
-    return nm * mission.value("vis.psf.wavefront_scale")
+    return nm * mission.value(f"{section}.psf.wavefront_scale")
 
 
 def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Planes:
@@ -106,7 +106,8 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
     # Second moments of diffraction go with the square of the wavelength.
     waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
     nodes, powers = _nodes(positions), _powers(positions)
-    coefficients = [wavefront(*_field(detector, *place, mission), mission) for place in ((0.0, 0.0), *nodes)]
+    places = ((0.0, 0.0), *nodes)
+    coefficients = [wavefront(*_field(detector, *place, mission), detector.section, mission) for place in places]
     sampling = detector.pixel_scale / SAMPLES
     blurs = [_blur_variances(detector, float(wavelength), mission) for wavelength in waves]
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
@@ -141,7 +142,7 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
 
 def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> tuple[float, float]:
     """Field coordinates, -1 .. 1 over the focal plane's outer edges, of a place in half sides from the centre."""
-    everything = detectors("vis", mission)
+    everything = detectors(detector.section, mission)
     half_x, half_y = (n * detector.pixel_scale / 2 for n in (detector.nx, detector.ny))
     reach_x, reach_y = (max(abs(getattr(d, axis)) for d in everything) for axis in ("x", "y"))
     whole = everything[0]
@@ -154,19 +155,21 @@ def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfi
 
     Charge spreads wider of blue light (A), and the wider the thicker the detector is.
     """
-    redder = 0.1 * wavelength / mission.value("vis.diffusion_wavelength", "nm")
-    wider = redder ** mission.value("vis.diffusion_slope") * _thickness(detector, mission)
-    diffusion = wider * mission.value("vis.diffusion_sigma", "pix") * detector.pixel_scale
+    section = detector.section
+    redder = 0.1 * wavelength / mission.value(f"{section}.diffusion_wavelength", "nm")
+    wider = redder ** mission.value(f"{section}.diffusion_slope") * _thickness(detector, mission)
+    diffusion = wider * mission.value(f"{section}.diffusion_sigma", "pix") * detector.pixel_scale
     jitter_x, jitter_y = (mission.value(f"svm.aocs.jitter_{axis}", "arcsec") for axis in ("x", "y"))
     return jitter_x**2 + diffusion**2, jitter_y**2 + diffusion**2
 
 
 def _thickness(detector: Detector, mission: MissionConfiguration) -> float:
     """A detector's diffusion length over the mission's."""
-    if "vis.diffusion_detectors" not in mission:
+    key = f"{detector.section}.diffusion_detectors"
+    if key not in mission:
         return 1.0
-    thicker = {row["detector"]: float(row["diffusion"]) for row in mission.rows("vis.diffusion_detectors")}
-    return max(1.0 + mission.value("vis.diffusion_spread", "") * thicker.get(detector.name, 0.0), 0.0)
+    thicker = {row["detector"]: float(row["diffusion"]) for row in mission.rows(key)}
+    return max(1.0 + mission.value(f"{detector.section}.diffusion_spread", "") * thicker.get(detector.name, 0.0), 0.0)
 
 
 def _nodes(positions: int) -> tuple[tuple[float, float], ...]:

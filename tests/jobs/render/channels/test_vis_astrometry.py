@@ -116,7 +116,7 @@ def oversampled(detector, column, row, side, strength):
         (centre + offset) / (max(getattr(d, axis) for d in everything) + half)
         for axis, centre, offset, half in zip("xy", (detector.x, detector.y), place, (half_x, half_y), strict=True)
     ]
-    nm, n = euclid.wavefront(*field, MISSION), PUPIL
+    nm, n = euclid.wavefront(*field, "vis", MISSION), PUPIL
     axis = (np.arange(n) - n / 2 + 0.5) * 1200.0 / n
     clear = galsim.Image(euclid.pupil(*np.meshgrid(axis, axis), 1200.0 / n, MISSION).round(), scale=1.2 / n)
     fine, scale = np.zeros((side * OVER, side * OVER)), detector.pixel_scale / OVER

@@ -47,7 +47,7 @@ def test_the_pupil_is_decentred():
 
 @given(st.floats(-1, 1), st.floats(-1, 1))
 def test_the_wavefront_is_small_and_low(x, y):
-    nm = euclid.wavefront(x, y, MISSION)
+    nm = euclid.wavefront(x, y, "vis", MISSION)
     assert len(nm) == 12
     # No piston, tip or tilt: the plane is centred on the chief ray.
     assert (nm[:4] == 0).all()
@@ -56,7 +56,7 @@ def test_the_wavefront_is_small_and_low(x, y):
 
 def test_wavefront_error_over_the_field():
     """34-51 nm rms on a 3 x 3 grid."""
-    grid = [np.linalg.norm(euclid.wavefront(x, y, MISSION)) for x in (-0.7, 0, 0.7) for y in (-0.7, 0, 0.7)]
+    grid = [np.linalg.norm(euclid.wavefront(x, y, "vis", MISSION)) for x in (-0.7, 0, 0.7) for y in (-0.7, 0, 0.7)]
     assert 25 < min(grid) < max(grid) < 65
 
 
@@ -66,7 +66,7 @@ def plane(nm, wavelength):
 
 def test_diffraction_is_galsims():
     """galsim.OpticalPSF of the same pupil and aberrations: an independent transform."""
-    n, nm, wavelength = 1024, euclid.wavefront(0.5, -0.3, MISSION), 700.0
+    n, nm, wavelength = 1024, euclid.wavefront(0.5, -0.3, "vis", MISSION), 700.0
     step = 1200.0 / n
     axis = (np.arange(n) - n / 2 + 0.5) * step
     clear = euclid.pupil(*np.meshgrid(axis, axis), step, MISSION) > 0.5
@@ -105,7 +105,7 @@ def test_wings_hold_what_edges_diffract(wavelength):
 
 
 def test_a_part_of_the_light_is_a_part_of_the_whole():
-    nm, optics = euclid.wavefront(-0.4, 0.8, MISSION), euclid._optics(6000.0, SAMPLING, MISSION, 768)
+    nm, optics = euclid.wavefront(-0.4, 0.8, "vis", MISSION), euclid._optics(6000.0, SAMPLING, MISSION, 768)
     whole, part = euclid._diffracted(nm, optics), euclid._diffracted(nm, optics, 201)
     np.testing.assert_allclose(part, whole[284:485, 284:485], rtol=1e-5, atol=1e-12)
 
@@ -113,7 +113,7 @@ def test_a_part_of_the_light_is_a_part_of_the_whole():
 @pytest.mark.parametrize("blur", [(0.0, 0.0), (0.01**2, 0.02**2), (0.04**2, 0.045**2), (0.2**2, 0.1**2)])
 def test_blur_is_a_gaussian_in_fourier_space(blur):
     """arcsec2 along x and y; against the product of transforms, of the light as diffracted."""
-    nm, n = euclid.wavefront(0.6, 0.3, MISSION), 768
+    nm, n = euclid.wavefront(0.6, 0.3, "vis", MISSION), 768
     optics, weights = euclid._optics(5500.0, SAMPLING, MISSION, n), euclid._weights_of(blur, SAMPLING)
     found = euclid._blurred(euclid._diffracted(nm, optics, 301 + 2 * euclid._margin(weights)), weights)
     k = 2 * np.pi * np.fft.fftfreq(n, SAMPLING)
