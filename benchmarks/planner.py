@@ -1,7 +1,7 @@
 """Planning and what surrounds a render: seconds of a plan, overhead of a task, errors of the forecast, two cores.
 
 Detectors of VIS and LSST are rendered as a job renders them, of three skies: the demo's, one of few sources and one of
-many stars. What they take is what jobs/render/channels/costs.csv says.
+many stars. What they take are the costs in jobs/render/channels.
 """
 
 from __future__ import annotations

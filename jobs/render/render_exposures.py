@@ -13,8 +13,8 @@ from jobs import heap
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
 from jobs.render.camera import detectors
+from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim
-from jobs.render.channels.image_types import sees_bodies
 from jobs.render.drawing import stamp_sizes
 from jobs.render.exposure import render, visible_sources
 from jobs.render.exposure.records import Rows
@@ -88,7 +88,7 @@ def work(lake: Path, facts: Json) -> Output:
         if file_sha256(Path(file)) != facts["psf"][file]:
             raise BadInput(f"{file}: has changed since the rendering began")
     bodies = None
-    if sees_bodies(exposed.channel, exposed.image_type):
+    if registry.CHANNELS[exposed.channel].sees_bodies(exposed.image_type):
         for file, sha256 in facts.get("bodies", {}).items():
             if file_sha256(Path(file)) != sha256:
                 raise BadInput(f"{file}: has changed since the rendering began")

@@ -3,6 +3,8 @@
 import ast
 import graphlib
 import re
+import sys
+import types
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +12,16 @@ import numpy as np
 import pytest
 
 from jobs.accuracy import SURVEY
-from jobs.render.channels import costs, ground, registry
+from jobs.render.camera import detectors
+from jobs.render.channels import ground, registry
 from jobs.render.effects.effect import Effect
+from jobs.render.planning import planned_exposures, tasks
+from jobs.render.planning.source_counts import Densities
+from jobs.render.products import fits_files, read_back
+from jobs.request.schema import Universe
 from lake_schema.errors import BadInput
+from lake_schema.mission import model, parameter
+from lake_schema.mission.configuration import resolve
 from lake_schema.tables.exposures import CHANNELS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,6 +77,41 @@ def test_channels_are_named_where_they_are_made():
     assert found == []
 
 
+def texts(tree):
+    """Strings of a file that are no docstrings, the constant parts of f-strings among them."""
+    docs = {
+        id(first.value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        for first in node.body[:1]
+        if isinstance(first, ast.Expr)
+    }
+    constants = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in docs)
+    return [node.value for node in constants if isinstance(node.value, str)]
+
+
+CAMERA = re.compile(r"(vis|nisp|ext)(\.|$)")
+
+
+def test_cameras_are_named_where_they_are_made():
+    """A parameter of a camera is asked for by the detector's own section of the mission database."""
+    own = [ROOT / "jobs" / "render" / room for room in ("channels", "planning", "camera")]
+    named = {
+        path.relative_to(ROOT).as_posix(): found
+        for path in (ROOT / "jobs" / "render").rglob("*.py")
+        if not any(path.is_relative_to(room) for room in own)
+        and (found := [text for text in texts(ast.parse(path.read_text())) if CAMERA.match(text)])
+    }
+    assert named == {}
+
+
+def test_what_names_a_camera_is_found():
+    tree = ast.parse(
+        '"""vis"""\ndef f(a):\n    """nisp"""\n    return a in ("vis", "nisp", "ext_law"), f"ext.{a}", "vis.x"'
+    )
+    assert sorted(text for text in texts(tree) if CAMERA.match(text)) == ["ext.", "nisp", "vis", "vis.x"]
+
+
 def test_quadrants_are_known_where_they_are_read():
     """What is assembled from a readout is asked of the channel's readout mode."""
     render = ROOT / "jobs" / "render"
@@ -76,28 +120,99 @@ def test_quadrants_are_known_where_they_are_read():
     assert knowing == {"channels"}
 
 
-def brighter(frame, factor, rng=None):
+# A channel with one effect; and the camera that it is of, which is declared in lake_schema: LSSTCam under another name.
+DUMMY = '''"""A channel that makes everything three times as bright."""
+
+from jobs.render.channels import readout
+from jobs.render.channels.channel import Channel
+from jobs.render.channels.cost import Cost
+from jobs.render.effects.effect import Effect
+from jobs.render.psf import seeing
+from jobs.render.sky import diffuse_light
+
+def apply(frame, factor, rng):
     return frame * factor
 
 
-def test_a_channel_is_added_in_one_place(monkeypatch):
-    """One of one effect and one camera: an entry in the registry and a row of costs; all else asks the channel."""
+EFFECT = Effect("brighter", apply, lambda scene: (3.0,), lambda scene: 1.0, optional=False, cost=1.0)
+CHANNEL = Channel(
+    effects={"science": (EFFECT,)},
+    psf=lambda exposure, detector, band, mission, positions: seeing.ground_psf(0.7, 3.0, detector.pixel_scale),
+    readout=readout.FRAME,
+    sky=diffuse_light.ground_sky,
+    cost=Cost(1.0, 0.5, 1e-3, 1e-3, 0.5, 33.0, 34.0, 2.0),
+)
+'''
+TOUCHED = {"channels/dummy.py": DUMMY, "channels/registry.py": None}
+
+
+def with_the_dummy(monkeypatch):
+    """The renderer with the files of TOUCHED, and nothing else, added or changed; the dummy's module."""
+    text = (ROOT / "jobs" / "render" / "channels" / "registry.py").read_text()
+    for old, new in (("import ground", "import dummy, ground"), ('= {"VIS"', '= {"DUMMY": dummy.CHANNEL, "VIS"')):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    made = {name: types.ModuleType(f"jobs.render.channels.{name}") for name in ("dummy", "registry")}
+    for path, source in {**TOUCHED, "channels/registry.py": text}.items():
+        module = made[Path(path).stem]
+        exec(compile(source, path, "exec"), module.__dict__)
+        if module.__name__ not in sys.modules:
+            monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(registry, "CHANNELS", made["registry"].CHANNELS)
+    return made["dummy"]
+
+
+def with_its_camera(monkeypatch):
+    """The mission database with the records of a camera more."""
+
+    def copied(records):
+        own = [r for r in records if r.key.startswith("ext.lsstcam.")]
+        return [*records, *(replace(r, key=r.key.replace("ext.lsstcam.", "ext.dummycam.")) for r in own)]
+
+    for module in [m for name, m in sys.modules.items() if name.startswith(("jobs.", "lake_schema."))]:
+        if hasattr(module, "CAMERAS"):
+            monkeypatch.setattr(module, "CAMERAS", (*parameter.CAMERAS, "dummycam"))
+    return resolve(copied(parameter.read_all()), models=copied(model.read_models()))
+
+
+def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
+    """One of one effect and one camera is planned, forecast, rendered, written and read with no more than these."""
     from tests.jobs.render import fields
     from tests.jobs.render.exposure.test_render import field
 
-    effect = Effect("brighter", brighter, lambda scene: (3.0,), lambda scene: 1.0, optional=False, cost=1e-3)
-    made = replace(ground.CHANNEL, effects={"science": (effect,)})
-    monkeypatch.setattr(registry, "CHANNELS", {**registry.CHANNELS, "DUMMY": made})
-    measured = costs.of_channel("EXT")
-    monkeypatch.setattr(costs, "of_channel", lambda name: measured)
-    _, exposed, body, points = field("EXT")
-    exposed = {**exposed, "channel": "DUMMY"}
+    assert len(TOUCHED) == 2
+    mission = with_its_camera(monkeypatch)
+    dummy = with_the_dummy(monkeypatch)
+    _, old, body, points = field("EXT")
+    wanted = planned_exposures.Exposure(
+        "DUMMY",
+        "dummycam",
+        "lsst_r",
+        "science",
+        *(old[name] for name in ("ra", "dec", "position_angle", "mjd")),
+        100.0,
+        "x",
+    )
+    (row,) = planned_exposures.table([wanted], [mission]).to_pylist()
+    assert row["sky"] == mission.value("ext.dummycam.lsst_r.sky")
+    table = tasks.table(
+        planned_exposures.table([wanted], [mission]), [("R22_S11",)], mission, Densities(mission, Universe())
+    )
+    (task,) = table.to_pylist()
+    # 4072 x 4000 pixels of an effect that takes a second a million, besides what the channel costs.
+    assert task["seconds"] > 16.0 + dummy.CHANNEL.cost.frame_s
+    assert task["sources"] > 0
     tables = body, fields.fluxes(body, "lsst_r", 3.0), points, fields.fluxes(points, "lsst_r", 3.0)
-    one = fields.rendered(exposed, fields.small("lsstcam", "R22_S11", 256), tables, fields.MISSION, SURVEY)
+    detector = replace(detectors.detector("dummycam", "R22_S11", mission), nx=256, ny=256, middle=0)
+    one = fields.rendered(row, detector, tables, mission, SURVEY)
     assert one.noise_free.max() > 100.0
     assert [decision.name for decision in one.decisions] == ["brighter"]
     np.testing.assert_allclose(one.science, 3.0 * one.noise_free, rtol=1e-5, atol=1.0)
-    assert [extension.name for extension in one.readout.extensions] == [""]
+    _, writers = fits_files.products(one, ())
+    path = tmp_path / "science.fits"
+    (write,) = writers.values()
+    write(path)
+    np.testing.assert_array_equal(read_back.frame(path).data, one.science)
 
 
 @pytest.mark.parametrize("name", [name for name in dict(CHANNELS) if name not in registry.CHANNELS])
@@ -106,7 +221,7 @@ def test_a_channel_that_nothing_renders_has_no_effects(name):
 
 
 def test_an_effect_without_a_cost_is_refused():
-    effect = Effect("brighter", brighter, lambda scene: (3.0,), lambda scene: 1.0)
+    effect = Effect("brighter", lambda frame, rng: frame, lambda scene: (), lambda scene: 1.0)
     with pytest.raises(BadInput, match="effect brighter has the cost 0: a forecast would take it as free"):
         replace(ground.CHANNEL, effects={"science": (effect,)})
 

@@ -1,1 +1,1 @@
-"""What differs from channel to channel: effects and their order, PSF, readout, measured costs."""
+"""What differs from channel to channel: effects and their order, PSF, readout, sky, measured costs."""

@@ -10,7 +10,7 @@ from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import astrometry
 from jobs.render.camera.detectors import Detector
-from jobs.render.channels import image_types, registry
+from jobs.render.channels import registry
 from jobs.render.channels.channel import Channel
 from jobs.render.effects.effect import Effect
 from lake_schema import units
@@ -45,7 +45,7 @@ class Aim:
     @property
     def sees_sky(self) -> bool:
         """Whether sources shine on the detector."""
-        return image_types.sees_sky(self.exposure.channel, self.exposure.image_type)
+        return self.channel.sees_sky(self.exposure.image_type)
 
     @property
     def electrons(self) -> float:

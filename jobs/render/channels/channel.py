@@ -7,10 +7,13 @@ from dataclasses import dataclass
 
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
+from jobs.render.channels.cost import Cost
+from jobs.render.channels.image_types import SKY_TYPES
 from jobs.render.channels.readout import ReadoutMode
 from jobs.render.effects.effect import Effect
 from jobs.render.psf.model import Psf
 from jobs.render.psf.spikes import Edges
+from jobs.render.sky.diffuse_light import SkyBand
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
@@ -18,11 +21,14 @@ from lake_schema.tables.exposures import ExposureRow
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """All that differs from channel to channel while a detector is rendered.
+    """All that differs from channel to channel while a detector is planned and rendered.
 
     effects    : image type -> its effects, in the order of physics
     psf        : (exposure, detector, band, mission, positions on the detector) -> PSF
     readout    : how its detectors are read, and which arrays their files have
+    sky        : (detector, name of a band, mission, its passband, None = the embedded one) -> the diffuse sky of a band
+    cost       : of a detector, measured
+    sky_types  : image types in which sources shine on the detectors
     drawn      : effect that is part of the pixel's transfer function: it acts while sources are drawn
     pupil      : (detector, band, mission) -> diffraction far from a star; None: not drawn
     moving     : whether bodies of the Solar System are drawn
@@ -34,6 +40,9 @@ class Channel:
     effects: Mapping[str, tuple[Effect, ...]]
     psf: Callable[[ExposureRow, Detector, Passband, MissionConfiguration, int], Psf]
     readout: ReadoutMode
+    sky: Callable[[Detector, str, MissionConfiguration, Passband | None], SkyBand]
+    cost: Cost
+    sky_types: tuple[str, ...] = SKY_TYPES
     drawn: Effect | None = None
     pupil: Callable[[Detector, Passband, MissionConfiguration], Edges] | None = None
     moving: bool = False
@@ -47,3 +56,11 @@ class Channel:
                 if not effect.cost > 0.0:
                     what = f"effect {effect.name} has the cost {effect.cost:g}: a forecast would take it as free"
                     raise BadInput(f"{what}; python -m benchmarks.effects measures it")
+
+    def sees_sky(self, image_type: str) -> bool:
+        """Whether sources shine on the detectors."""
+        return image_type in self.sky_types
+
+    def sees_bodies(self, image_type: str) -> bool:
+        """Whether moving bodies are drawn."""
+        return self.moving and self.sees_sky(image_type)

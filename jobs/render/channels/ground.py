@@ -8,12 +8,14 @@ from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
 from jobs.render.channels import readout
 from jobs.render.channels.channel import Channel
+from jobs.render.channels.cost import Cost
 from jobs.render.effects.charge import dark_current, full_well, poisson
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import background
 from jobs.render.effects.readout import adc, read_noise
 from jobs.render.psf import seeing
 from jobs.render.psf.model import Psf
+from jobs.render.sky import diffuse_light
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 
@@ -36,4 +38,7 @@ def _psf(
     return seeing.ground_psf(exposure.seeing, beta, detector.pixel_scale)
 
 
-CHANNEL = Channel(effects=EFFECTS, psf=_psf, readout=readout.FRAME)
+# As VIS, of LSSTCam's R22_S11 (2.1e4 predicted sources; others with 1e3 and 1e5).
+COST = Cost(frame_s=0.1, sky_s=0.1, galaxy_s=1.0e-4, star_s=4.5e-5, base_gb=0.5, held=33.0, held_sky=34.0, written=2.0)
+
+CHANNEL = Channel(effects=EFFECTS, psf=_psf, readout=readout.FRAME, sky=diffuse_light.ground_sky, cost=COST)

@@ -1,4 +1,4 @@
-"""Image types: which see the sky, which see moving bodies; whose random numbers an exposure has.
+"""Image types of the sky; whose random numbers an exposure has.
 
 identity       what tells an exposure's random numbers from those of all others
 """
@@ -9,16 +9,6 @@ from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.exposures import ExposureRow
 
 SKY_TYPES = ("science", "deep", "self_calibration")
-
-
-def sees_sky(channel: str, image_type: str) -> bool:
-    """Whether sources shine on the detectors; a flat of VIS is taken with its shutter open."""
-    return image_type in SKY_TYPES or (channel, image_type) == ("VIS", "flat")
-
-
-def sees_bodies(channel: str, image_type: str) -> bool:
-    """Whether moving bodies are drawn: of the channels by VIS alone."""
-    return channel == "VIS" and sees_sky(channel, image_type)
 
 
 def section(camera: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from jobs.render.channels import costs
 from jobs.render.channels.aim import Aim
 from jobs.render.drawing import cost
 from jobs.render.exposure import visible_sources
@@ -22,7 +21,7 @@ def refuse_too_large(aim: Aim, light: Light) -> None:
     exposure, detector, sources, sizes = aim.exposure, aim.detector, light.sources, light.sizes
     here = visible_sources.touching(sources, sizes, detector)
     where = f"exposure {exposure.exposure_id}, detector {detector.name}: {int(here.sum())} sources"
-    base = costs.of_channel(exposure.channel).base_gb * 1e9
+    base = aim.channel.cost.base_gb * 1e9
     picture = None if sources.picture is None else sources.picture[here]
     wanted = base + cost.memory(sources.electrons[here], sizes[here], detector.nx, detector.ny, picture)
     if wanted > _MOST_BYTES:

@@ -16,7 +16,7 @@ from jobs.accuracy import Accuracy
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import astrometry
 from jobs.render.camera.detectors import Detector
-from jobs.render.channels import image_types, registry
+from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim, electron_rate
 from jobs.render.drawing import outskirts, stamp_sizes
 from jobs.render.drawing.settings import Settings, settings_for
@@ -121,7 +121,7 @@ def least_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfig
     Error : of the fainter out there each leaves out less than the settings' `edge` of a pixel's noise
     """
     time = exposure.exposure_time_s
-    if time == 0.0 or not image_types.sees_sky(exposure.channel, exposure.image_type):
+    if time == 0.0 or not registry.CHANNELS[exposure.channel].sees_sky(exposure.image_type):
         return float("inf")
     margin = mission.value("survey.selection_margin", "arcsec")
     noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
@@ -138,9 +138,9 @@ def spike_flux(
     exposure, detector, mission, accuracy : as of `least_flux`;  band : passband
     """
     time = exposure.exposure_time_s
-    sees = image_types.sees_sky(exposure.channel, exposure.image_type)
-    pupil_of = registry.CHANNELS[exposure.channel].pupil
-    if time == 0.0 or not sees or pupil_of is None or exposure.psf:
+    channel = registry.CHANNELS[exposure.channel]
+    pupil_of = channel.pupil
+    if time == 0.0 or not channel.sees_sky(exposure.image_type) or pupil_of is None or exposure.psf:
         return float("inf")
     noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
     pupil = pupil_of(detector, band, mission)
@@ -154,7 +154,7 @@ def outer_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfig
     exposure, detector, mission, accuracy : as of `least_flux`
     """
     time = exposure.exposure_time_s
-    if time == 0.0 or not image_types.sees_sky(exposure.channel, exposure.image_type):
+    if time == 0.0 or not registry.CHANNELS[exposure.channel].sees_sky(exposure.image_type):
         return float("inf")
     noise, scale = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise, detector.pixel_scale
     return outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / (electron_rate(exposure) * time)

@@ -97,7 +97,7 @@ def text(lines: list[Line], speed: Speed) -> Iterator[str]:
             f"{line.channel:8} {line.survey:12} {line.image_type:17} {line.exposures:10,} {line.detectors:10,} "
             f"{line.sources:14,} {line.core_hours:11,.2f} {line.gigabytes:10,.2f} {line.memory_gb:8.2f}"
         )
-    yield f"core-hours are of this machine, {speed.source}: {speed.factor:.2f} of those in costs.csv"
+    yield f"core-hours are of this machine, {speed.source}: {speed.factor:.2f} of those of the channels' costs"
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,8 @@ from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import detectors
 from jobs.render.channels import image_types
-from jobs.render.sky.diffuse_light import SkyBand, sky_band, sky_rate
+from jobs.render.planning import unrendered
+from jobs.render.sky.diffuse_light import SkyBand, sky_rate
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -106,12 +107,12 @@ def table(
     """
     if not exposures:
         return EXPOSURES.empty()
-    bands: dict[tuple[int, str, str], _Band] = {}
+    bands: dict[tuple[int, str, str, str], _Band] = {}
     rows, taken = [], Counter[tuple[Any, ...]]()
     for number, (exposure, mission) in enumerate(zip(exposures, missions, strict=True), start=1):
-        key = (id(mission), exposure.camera, exposure.band)
+        key = (id(mission), exposure.channel, exposure.camera, exposure.band)
         if key not in bands:
-            bands[key] = _Band.of(exposure.camera, exposure.band, mission, (own or {}).get(exposure.band))
+            bands[key] = _Band.of(exposure, mission, (own or {}).get(exposure.band))
         row = _row(number, exposure, bands[key], mission)
         alike = tuple(row[name] for name in _ALIKE)
         taken[alike] += 1
@@ -121,18 +122,20 @@ def table(
 
 @dataclass(frozen=True, slots=True)
 class _Band:
-    """What all exposures of a camera in a band have in common."""
+    """What all exposures of a channel and camera in a band have in common."""
 
     zero_point: float
     seeing: float
     sky: SkyBand
 
     @classmethod
-    def of(cls, camera: str, band: str, mission: MissionConfiguration, curve: Passband | None) -> _Band:
+    def of(cls, exposure: Exposure, mission: MissionConfiguration, curve: Passband | None) -> _Band:
+        camera, band = exposure.camera, exposure.band
         prefix = image_types.section(camera)
         seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec") if camera in CAMERAS else 0.0
         first = detectors.detectors(camera, mission)[0]
-        return cls(zero_point_of(prefix, band, mission, curve), seeing, sky_band(first, band, mission, curve))
+        sky = unrendered.of_channel(exposure.channel).sky(first, band, mission, curve)
+        return cls(zero_point_of(prefix, band, mission, curve), seeing, sky)
 
 
 def _column(name: str, values: list[Any]) -> Any:

@@ -1,4 +1,4 @@
-"""How fast this machine is against the one of jobs/render/channels/costs.csv: the factor of a forecast's seconds.
+"""How fast this machine is against that of the channels' costs: the factor of a forecast's seconds.
 
 Speed        the factor, and what it was learnt from
 of_machine   from the detectors that the lake holds, else from a calibration of a second, kept in the cache
@@ -25,8 +25,8 @@ from lake_schema.errors import LakeError
 from lake_schema.store import read
 from lake_schema.store.provenance import machine
 
-# CPU s of a pass of `calibration` on the machine of costs.csv: found on another (AMD EPYC, znver5), which takes 0.13 s
-# for it, and for detectors 0.4 to 0.57 of what the table says.
+# CPU s of a pass of `calibration` on the machine of the channels' costs: found on another (AMD EPYC, znver5), which
+# takes 0.13 s for it, and for detectors 0.4 to 0.57 of what they say.
 REFERENCE_S = 0.28
 # Detectors that are enough to learn from: the first of each process compiles and computes what the others find.
 _ENOUGH = 3

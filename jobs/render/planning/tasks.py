@@ -18,10 +18,9 @@ from jobs.accuracy import SURVEY, Accuracy
 from jobs.render.camera import detectors as camera_detectors
 from jobs.render.camera import pointing
 from jobs.render.channels import registry
-from jobs.render.channels.image_types import sees_sky
 from jobs.render.exposure import scene_of
 from jobs.render.exposure.records import Variant
-from jobs.render.planning import variants
+from jobs.render.planning import unrendered, variants
 from jobs.render.planning.prices import Price, price
 from jobs.render.planning.source_counts import Densities
 from jobs.request.schema import Request
@@ -134,7 +133,7 @@ def _append(
     places: _Places,
     cost: Price,
 ) -> None:
-    looks = sees_sky(row.channel, row.image_type)
+    looks = row.image_type in unrendered.of_channel(row.channel).sky_types
     for i in [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors)):
         galaxies, stars = (places.density[:, i] * (camera.area[i] * looks)).tolist()
         pixels = int(camera.pixels[i])
@@ -158,7 +157,7 @@ def _price(row: ExposureRow, own: Variant, truth: Sequence[str]) -> Price:
     Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
     """
     channel, kind = row.channel, row.image_type
-    looks, effects = sees_sky(channel, kind), registry.effects_or_none(channel, kind)
+    looks, effects = kind in unrendered.of_channel(channel).sky_types, registry.effects_or_none(channel, kind)
     if effects is not None:
         first = camera_detectors.detectors(row.camera, own.mission)[0]
         scene = replace(scene_of.scene_of(row, first, own.mission, own.accuracy), forced=own.forced)

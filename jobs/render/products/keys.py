@@ -9,7 +9,6 @@ import pyarrow as pa
 
 from jobs.render.camera import detectors
 from jobs.render.channels import registry
-from jobs.render.channels.image_types import sees_bodies
 from jobs.render.drawing import stamp_sizes
 from jobs.render.psf import from_file
 from jobs.render.sources import catalogue_rows, ephemerides, selection
@@ -65,7 +64,7 @@ def product_keys(
         exposure, files = rows[task["exposure_id"]], {}
         if psf := exposure.psf:
             files["psf"] = facts["psf"][str(from_file.file_of(psf, task["detector"]))]
-        if "bodies" in facts and sees_bodies(exposure.channel, exposure.image_type):
+        if "bodies" in facts and registry.CHANNELS[exposure.channel].sees_bodies(exposure.image_type):
             (files["bodies"],) = facts["bodies"].values()
         return files
 
@@ -94,8 +93,8 @@ def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
 def ephemeris_files(file: Path, exposures: pa.Table) -> dict[str, str]:
     """sha256 of the user's moving bodies, by file; refused before anything is rendered where they cannot be read."""
     sha256 = file_sha256(user_files.checked(file, "table of bodies", "solar_system.bodies"))
-    kinds = exposures.select(["mjd", "channel", "image_type"]).to_pylist()
-    seen = [row["mjd"] for row in kinds if sees_bodies(row["channel"], row["image_type"])]
+    rows = map(ExposureRow.of, exposures.to_pylist())
+    seen = [row.mjd for row in rows if registry.CHANNELS[row.channel].sees_bodies(row.image_type)]
     ephemerides.check(ephemerides.read(file, sha256), file, seen)
     return {str(file): sha256}
 

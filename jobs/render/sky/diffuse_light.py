@@ -1,6 +1,7 @@
 """The diffuse sky: electrons per second in a pixel.
 
-sky_band, sky_rate    of a camera and band, at a position and date
+starlit_sky, thermal_sky, ground_sky   of a band, as different cameras see it
+sky_rate              of a band, at a position and date
 zodiacal_intensity    W m-2 sr-1 um-1 at 500 nm
 zodiacal_rate         through a passband
 starlight             of a field's stars, of which the telescope scatters some
@@ -58,23 +59,23 @@ class SkyBand:
     stars: float = 0.0
 
 
-def sky_band(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """The sky of a camera's band; curve : the passband, None = the embedded one.
+def starlit_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
+    """Zodiacal light, and starlight that the telescope scatters; curve : the passband, None = the embedded one."""
+    rate = mission.value(f"{detector.section}.scattered_light", "electron / (s pix)")
+    # Of the light that a telescope scatters a band has its part, which for flat f_nu goes with its width.
+    part = passbands.log_width(curve) / passbands.log_width(passbands.load(_VIS)) if curve else 1.0
+    return SkyBand(0.0, *_zodiacal_of(detector, band, mission, curve), rate * part)
 
-    Euclid : zodiacal light and scattered starlight;  ground : the band's dark-sky rate of the mission
-             database, or what follows from its surface brightness and zero point
-    detector, band : of the camera, and the band's name;  mission : the mission database
-    """
+
+def thermal_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
+    """Zodiacal light, and thermal light of the instrument; curve : the passband, None = the embedded one."""
+    thermal = mission.value(f"{detector.section}.{band}.thermal", "electron / (s pix)")
+    return SkyBand(thermal, *_zodiacal_of(detector, band, mission, curve))
+
+
+def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
+    """The band's dark-sky rate of the mission database, or what follows from its surface brightness and zero point."""
     section = detector.section
-    if section in ("vis", "nisp"):
-        extra = f"{section}.scattered_light" if section == "vis" else f"{section}.{band}.thermal"
-        rate = mission.value(extra, "electron / (s pix)")
-        # Of the light that a telescope scatters a band has its part, which for flat f_nu goes with its width.
-        part = passbands.log_width(curve) / passbands.log_width(passbands.load(_VIS)) if curve else 1.0
-        constant, stars = (0.0, rate * part) if section == "vis" else (rate, 0.0)
-        area = mission.value("plm.collecting_area", "m2")
-        zodi = _zodiacal_integrals(curve or passbands.load(band), area, detector.pixel_scale, mission)
-        return SkyBand(constant, *zodi, stars)
     if f"{section}.{band}.sky" in mission:
         return SkyBand(mission.value(f"{section}.{band}.sky", "electron / (s pix)"))
     zero_point = mission.value(f"{section}.{band}.zero_point", "mag")
@@ -185,6 +186,13 @@ def _zodiacal(own: SkyBand, ra: float, dec: float, mjd: float, mission: MissionC
     elongation = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     red, blue = _reddening(elongation, mission)
     return zodiacal_intensity(from_sun, latitude, mission) * (own.zodi + red * own.red + blue * own.blue)
+
+
+def _zodiacal_of(
+    detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None
+) -> tuple[float, float, float]:
+    area = mission.value("plm.collecting_area", "m2")
+    return _zodiacal_integrals(curve or passbands.load(band), area, detector.pixel_scale, mission)
 
 
 def _zodiacal_integrals(

@@ -8,7 +8,7 @@ import pytest
 
 from jobs import rng
 from jobs.render.camera import astrometry, detectors
-from jobs.render.channels import image_types, vis
+from jobs.render.channels import vis
 from jobs.render.effects.effect import apply_all
 from jobs.render.effects.light import calibration_lamp
 from jobs.render.effects.scene import Scene
@@ -88,7 +88,7 @@ def test_each_is_rendered_and_read(planned, tmp_path, key, least, most):
     assert header["MISSION"] == planned[1].fingerprint
     level = (np.median(one.science) - header["BIAS"]) * header["GAIN"]
     assert least < level < most
-    looks = image_types.sees_sky("VIS", key[0])
+    looks = vis.CHANNEL.sees_sky(key[0])
     assert len(one.sources) == 2 * looks
     names = {d.name for d in one.decisions if d.applied}
     assert ("readout_trail" in {d.name for d in one.decisions}) == (key[0] == "flat")

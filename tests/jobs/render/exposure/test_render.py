@@ -13,7 +13,7 @@ from jobs.accuracy import DRAFT, SURVEY
 from jobs.fluxes import passbands
 from jobs.render.camera import astrometry, detectors
 from jobs.render.camera.pointing import boresight_for
-from jobs.render.channels import costs
+from jobs.render.channels import vis
 from jobs.render.drawing import cost, stamps
 from jobs.render.effects.light import calibration_lamp
 from jobs.render.exposure import truth_maps
@@ -385,7 +385,7 @@ def test_draft_is_close_to_survey():
 def test_a_scene_that_a_task_has_no_memory_for_is_refused(monkeypatch):
     """Before anything is drawn; in one line."""
     monkeypatch.setattr(stamps, "draw", None)
-    monkeypatch.setattr(cost, "memory", lambda *scene: (2.2 - costs.of_channel("VIS").base_gb) * 1e9)
+    monkeypatch.setattr(cost, "memory", lambda *scene: (2.2 - vis.CHANNEL.cost.base_gb) * 1e9)
     with pytest.raises(BadInput, match=r"exposure 3, detector 3-4: \d+ sources take 2\.2 GB, a task has 2"):
         render("VIS")
 

@@ -111,11 +111,11 @@ def test_what_a_camera_sees():
     place = at(90, 30)
     zodi = diffuse_light.zodiacal_rate(*place, passbands.load("euclid_vis"), 0.9926, 0.1, MISSION)
     scattered = 0.0296 * diffuse_light.starlight(*place[:2], MISSION)
-    assert diffuse_light.sky_rate(diffuse_light.sky_band(vis, "euclid_vis", MISSION), *place, MISSION) == pytest.approx(
-        zodi + scattered
-    )
+    assert diffuse_light.sky_rate(
+        diffuse_light.starlit_sky(vis, "euclid_vis", MISSION), *place, MISSION
+    ) == pytest.approx(zodi + scattered)
     lsst = detectors.detector("lsstcam", "R22_S11", MISSION)
-    assert diffuse_light.sky_rate(diffuse_light.sky_band(lsst, "lsst_r", MISSION), *place, MISSION) == 32.95
+    assert diffuse_light.sky_rate(diffuse_light.ground_sky(lsst, "lsst_r", MISSION), *place, MISSION) == 32.95
 
 
 @pytest.mark.parametrize(
@@ -148,11 +148,13 @@ def test_bands_share_the_sky_of_the_one_that_they_make_up():
     detector = detectors.detector("vis", "3-4", mission)
     whole = passbands.load("euclid_vis")
     rates = [
-        diffuse_light.sky_rate(diffuse_light.sky_band(detector, "own", mission, curve), 53.1, -27.8, 60905.0, mission)
+        diffuse_light.sky_rate(
+            diffuse_light.starlit_sky(detector, "own", mission, curve), 53.1, -27.8, 60905.0, mission
+        )
         for curve in (*sub_bands.sub_bands(whole, 3), whole)
     ]
     # The trapezoids between the pieces are lost.
     assert sum(rates[:3]) == pytest.approx(rates[3], rel=2e-3)
     assert rates[3] == diffuse_light.sky_rate(
-        diffuse_light.sky_band(detector, "euclid_vis", mission), 53.1, -27.8, 60905.0, mission
+        diffuse_light.starlit_sky(detector, "euclid_vis", mission), 53.1, -27.8, 60905.0, mission
     )
