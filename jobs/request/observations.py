@@ -33,7 +33,8 @@ IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
 DITHERS = ("S", "J", "none")
 EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
 GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes")
-# What each channel can be asked for.
+# What each channel can be asked for besides the sky. Not derived from what is rendered: more than that can be planned
+# (test_checks.py: all that is rendered is in it).
 _CALIBRATIONS = {
     "VIS": ("bias", "dark", "flat", "charge_injection", "self_calibration"),
     "NISP-P": ("dark", "flat", "self_calibration", "standard_star"),

@@ -25,7 +25,8 @@ BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
 # As far as jobs/render/sources/galaxy_shapes.py draws a lensed ellipse (a test compares them).
 MOST_SHEAR = 0.9
-# Of the channels' tuples in jobs/render/channels (a test compares them).
+# Of all channels that are rendered. A copy, since requests are read below the renderer (test_effect.py holds it to the
+# registry of channels).
 EFFECTS = (
     "adc", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp", "charge_injection",
     "cosmic_rays", "crosstalk", "dark_current", "full_well", "ghosts", "hot_pixels", "illumination", "injection_noise",

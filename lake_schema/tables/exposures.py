@@ -25,7 +25,8 @@ IMAGE_TYPES = (
     ("standard_star", "standard star"),
     ("planetary_nebula", "emission lines for the wavelength scale"),
 )
-# What there is a simulator for: channel -> image types. All others can be planned and forecast.
+# What there is a simulator for: channel -> image types. All others can be planned and forecast. A copy, since
+# requests are refused below the renderer (test_checks.py holds it to the registry of channels).
 RENDERED: Mapping[str, tuple[str, ...]] = {
     "VIS": ("science", "deep", "self_calibration", "flat", "dark", "charge_injection", "bias"),
     "EXT": ("science", "deep"),

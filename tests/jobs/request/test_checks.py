@@ -8,7 +8,7 @@ import pytest
 
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.render.channels import registry
-from jobs.request import __main__, checks
+from jobs.request import __main__, checks, observations
 from jobs.request.from_toml import parse
 from lake_schema.errors import BadInput
 from lake_schema.tables.exposures import RENDERED
@@ -22,6 +22,12 @@ def test_what_is_said_to_be_rendered_has_effects():
     assert {name: set(kinds) for name, kinds in RENDERED.items()} == {
         name: set(channel.effects) for name, channel in registry.CHANNELS.items()
     }
+
+
+@pytest.mark.parametrize("channel", observations.CHANNELS)
+def test_what_is_rendered_can_be_asked_for(channel):
+    asked = {*observations._SKY_TYPES, *observations._CALIBRATIONS[channel]}
+    assert set(RENDERED.get(channel, ())) <= asked <= set(observations.IMAGE_TYPES)
 
 
 @pytest.mark.parametrize("path", sorted(REQUESTS.glob("*.toml")), ids=lambda path: path.stem)

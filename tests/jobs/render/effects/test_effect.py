@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jobs.render.channels import ground, vis
+from jobs.render.channels import ground, registry, vis
 from jobs.render.effects.effect import apply_all, decide
 from jobs.render.effects.scene import Scene
 from jobs.request import schema
@@ -57,9 +57,12 @@ def test_every_effect_has_its_place():
 
 
 def test_a_request_may_name_every_effect():
-    tuples = (*vis.EFFECTS.values(), *ground.EFFECTS.values(), (vis.DRAWN,))
-    assert set(schema.EFFECTS) == {effect.name for effects in tuples for effect in effects}
-    assert set(schema.ALWAYS) == {effect.name for effects in tuples for effect in effects if not effect.optional}
+    """Of every channel, those that act while sources are drawn among them; and no other."""
+    channels = registry.CHANNELS.values()
+    found = [effect for channel in channels for effects in channel.effects.values() for effect in effects]
+    found += [channel.drawn for channel in channels if channel.drawn is not None]
+    assert sorted(schema.EFFECTS) == sorted({effect.name for effect in found})
+    assert set(schema.ALWAYS) == {effect.name for effect in found if not effect.optional}
 
 
 def test_pixel_noise_is_sky_dark_and_reading():
