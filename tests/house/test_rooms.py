@@ -15,9 +15,10 @@ from jobs.accuracy import SURVEY
 from jobs.render.camera import detectors
 from jobs.render.channels import ground, registry
 from jobs.render.effects.effect import Effect
-from jobs.render.planning import planned_exposures, tasks
+from jobs.render.planning import planned_exposures, survey, tasks
 from jobs.render.planning.source_counts import Densities
 from jobs.render.products import fits_files, read_back
+from jobs.request.from_toml import from_table
 from jobs.request.schema import Universe
 from lake_schema.errors import BadInput
 from lake_schema.mission import model, parameter
@@ -123,6 +124,7 @@ def test_quadrants_are_known_where_they_are_read():
 # A channel with one effect; and the camera that it is of, which is declared in lake_schema: LSSTCam under another name.
 DUMMY = '''"""A channel that makes everything three times as bright."""
 
+from jobs.render.camera import bands
 from jobs.render.channels import readout
 from jobs.render.channels.channel import Channel
 from jobs.render.channels.cost import Cost
@@ -139,8 +141,10 @@ CHANNEL = Channel(
     effects={"science": (EFFECT,)},
     psf=lambda exposure, detector, band, mission, positions: seeing.ground_psf(0.7, 3.0, detector.pixel_scale),
     readout=readout.FRAME,
+    bands=bands.of_ground,
     sky=diffuse_light.ground_sky,
     cost=Cost(1.0, 0.5, 1e-3, 1e-3, 0.5, 33.0, 34.0, 2.0),
+    on_ground=True,
 )
 '''
 TOUCHED = {"channels/dummy.py": DUMMY, "channels/registry.py": None}
@@ -184,20 +188,17 @@ def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
     mission = with_its_camera(monkeypatch)
     dummy = with_the_dummy(monkeypatch)
     _, old, body, points = field("EXT")
-    wanted = planned_exposures.Exposure(
-        "DUMMY",
-        "dummycam",
-        "lsst_r",
-        "science",
-        *(old[name] for name in ("ra", "dec", "position_angle", "mjd")),
-        100.0,
-        "x",
-    )
-    (row,) = planned_exposures.table([wanted], [mission]).to_pylist()
+    asked = {name: old[name] for name in ("camera", "band", "ra", "dec", "position_angle", "mjd", "exposure_time_s")}
+    area = {"cone": {"ra": 53.1, "dec": -27.8, "radius": 1.0}}
+    pointing = {"channel": "EXT", **asked, "detectors": ["R22_S11"]}
+    request = from_table({"name": "x", "seed": 1, "area": area, "pointing": [pointing]})
+    (pointing,) = request.pointings
+    request = replace(request, pointings=(replace(pointing, channel="DUMMY", camera="dummycam"),))
+    ((wanted, _),) = survey.exposures(request, mission)
+    exposures = planned_exposures.table([wanted], [mission])
+    (row,) = exposures.to_pylist()
     assert row["sky"] == mission.value("ext.dummycam.lsst_r.sky")
-    table = tasks.table(
-        planned_exposures.table([wanted], [mission]), [("R22_S11",)], mission, Densities(mission, Universe())
-    )
+    table = tasks.table(exposures, [wanted.detectors], mission, Densities(mission, Universe()))
     (task,) = table.to_pylist()
     # 4072 x 4000 pixels of an effect that takes a second a million, besides what the channel costs.
     assert task["seconds"] > 16.0 + dummy.CHANNEL.cost.frame_s

@@ -26,8 +26,10 @@ class Channel:
     effects    : image type -> its effects, in the order of physics
     psf        : (exposure, detector, band, mission, positions on the detector) -> PSF
     readout    : how its detectors are read, and which arrays their files have
+    bands      : (camera, mission) -> names of the camera's passbands; () where the channel has no such camera
     sky        : (detector, name of a band, mission, its passband, None = the embedded one) -> the diffuse sky of a band
     cost       : of a detector, measured
+    on_ground  : whether it looks where it wants: a spacecraft keeps its side to the Sun
     sky_types  : image types in which sources shine on the detectors
     drawn      : effect that is part of the pixel's transfer function: it acts while sources are drawn
     pupil      : (detector, band, mission) -> diffraction far from a star; None: not drawn
@@ -40,8 +42,10 @@ class Channel:
     effects: Mapping[str, tuple[Effect, ...]]
     psf: Callable[[ExposureRow, Detector, Passband, MissionConfiguration, int], Psf]
     readout: ReadoutMode
+    bands: Callable[[str, MissionConfiguration], tuple[str, ...]]
     sky: Callable[[Detector, str, MissionConfiguration, Passband | None], SkyBand]
     cost: Cost
+    on_ground: bool = False
     sky_types: tuple[str, ...] = SKY_TYPES
     drawn: Effect | None = None
     pupil: Callable[[Detector, Passband, MissionConfiguration], Edges] | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from jobs.fluxes.passbands import Passband
+from jobs.render.camera import bands
 from jobs.render.camera.detectors import Detector
 from jobs.render.channels import readout
 from jobs.render.channels.channel import Channel
@@ -41,4 +42,12 @@ def _psf(
 # As VIS, of LSSTCam's R22_S11 (2.1e4 predicted sources; others with 1e3 and 1e5).
 COST = Cost(frame_s=0.1, sky_s=0.1, galaxy_s=1.0e-4, star_s=4.5e-5, base_gb=0.5, held=33.0, held_sky=34.0, written=2.0)
 
-CHANNEL = Channel(effects=EFFECTS, psf=_psf, readout=readout.FRAME, sky=diffuse_light.ground_sky, cost=COST)
+CHANNEL = Channel(
+    effects=EFFECTS,
+    psf=_psf,
+    readout=readout.FRAME,
+    bands=bands.of_ground,
+    sky=diffuse_light.ground_sky,
+    cost=COST,
+    on_ground=True,
+)

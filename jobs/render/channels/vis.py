@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from jobs.fluxes.passbands import Passband
+from jobs.render.camera import bands
 from jobs.render.camera.detectors import Detector
 from jobs.render.channels import readout
 from jobs.render.channels.channel import Channel
@@ -122,6 +123,7 @@ CHANNEL = Channel(
     effects=EFFECTS,
     psf=_psf,
     readout=readout.QUADRANTS,
+    bands=bands.of_one("vis", "euclid_vis"),
     sky=diffuse_light.starlit_sky,
     cost=COST,
     # A flat is taken with the shutter open.

@@ -31,11 +31,6 @@ _ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd")
 _DARK_TYPES = ("bias", "dark", "charge_injection")
 # Columns that are counted here.
 _NUMBERS = ("exposure_id", "realisation")
-_EUCLID_BANDS = {
-    "VIS": ("euclid_vis",),
-    "NISP-P": ("euclid_y", "euclid_j", "euclid_h"),
-    "NISP-S": ("nisp_red", "nisp_blue"),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +69,10 @@ class Exposure:
 
 def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
     """Passbands that a camera has; BadInput where the channel has no such camera."""
-    if channel == "EXT" and camera in CAMERAS:
-        prefix = f"ext.{camera}."
-        keys = (p.key for p in mission.parameters if p.key.startswith(prefix) and p.key.endswith(".zero_point"))
-        return tuple(key.removeprefix(prefix).partition(".")[0] for key in keys)
-    if channel in _EUCLID_BANDS and camera == channel.lower().partition("-")[0]:
-        return _EUCLID_BANDS[channel]
-    raise BadInput(f"channel {channel} has no camera {camera!r}")
+    found = unrendered.of_channel(channel).bands(camera, mission)
+    if not found:
+        raise BadInput(f"channel {channel} has no camera {camera!r}")
+    return found
 
 
 def exposure_time(channel: str, camera: str, band: str, mission: MissionConfiguration) -> float:

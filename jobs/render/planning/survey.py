@@ -16,7 +16,7 @@ import numpy as np
 from jobs.render.camera import detectors
 from jobs.render.camera.pointing import boresight_for
 from jobs.render.channels.image_types import SKY_TYPES
-from jobs.render.planning import calibration_frames, ground_surveys, reference_survey, variants
+from jobs.render.planning import calibration_frames, ground_surveys, reference_survey, unrendered, variants
 from jobs.render.planning.observing_sequence import sequence
 from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
 from jobs.request.area import Area
@@ -73,7 +73,7 @@ def _pointing(pointing: Pointing, where: str, request: Request, mission: Mission
         known_detectors(pointing.camera, (pointing.centre_on,), mission, f"{where}.centre_on")
         target = detectors.detector(pointing.camera, pointing.centre_on, mission)
         ra, dec, angle = boresight_for(target, ra, dec, angle)
-    if pointing.channel != "EXT":
+    if not unrendered.of_channel(pointing.channel).on_ground:
         reference_survey.check_aspect(ra, dec, pointing.mjd, mission, where)
     seconds = pointing.exposure_time_s
     if seconds is None:
@@ -105,7 +105,8 @@ def _block(block: Observation, request: Request, mission: MissionConfiguration, 
         found = _exposures(block, area, request.seed, start, mission)
         for exposure in found:
             known_detectors(exposure.camera, exposure.detectors, mission, "detectors")
-            if exposure.channel != "EXT" and block.pointings and exposure.image_type in SKY_TYPES:
+            own = unrendered.of_channel(exposure.channel)
+            if not own.on_ground and block.pointings and exposure.image_type in SKY_TYPES:
                 reference_survey.check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
             yield exposure
     except BadInput as error:

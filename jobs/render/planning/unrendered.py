@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from jobs.fluxes.passbands import Passband
+from jobs.render.camera import bands
 from jobs.render.camera.detectors import Detector
 from jobs.render.channels import registry
 from jobs.render.channels.channel import Channel
@@ -24,7 +25,9 @@ class Unrendered:
     """What of jobs.render.channels.channel.Channel planning needs."""
 
     cost: Cost
+    bands: Callable[[str, MissionConfiguration], tuple[str, ...]]
     sky: Callable[[Detector, str, MissionConfiguration, Passband | None], SkyBand]
+    on_ground: bool = False
     sky_types: tuple[str, ...] = SKY_TYPES
 
 
@@ -41,6 +44,7 @@ UNRENDERED: Mapping[str, Unrendered] = {
             held_sky=80.0,
             written=3.0,
         ),
+        bands.of_one("nisp", "euclid_y", "euclid_j", "euclid_h"),
         diffuse_light.thermal_sky,
     ),
     # Assumed: a spectrum is 512 pixels long.
@@ -55,6 +59,7 @@ UNRENDERED: Mapping[str, Unrendered] = {
             held_sky=80.0,
             written=3.0,
         ),
+        bands.of_one("nisp", "nisp_red", "nisp_blue"),
         diffuse_light.thermal_sky,
     ),
 }
