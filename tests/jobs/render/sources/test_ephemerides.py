@@ -2,6 +2,7 @@
 
 import gzip
 import os
+from dataclasses import asdict, replace
 
 import numpy as np
 import pyarrow as pa
@@ -21,7 +22,7 @@ from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
 from lake_schema.ids import kind_of
-from tests.jobs.render import nominal
+from tests.jobs.render import fields, nominal
 from tests.jobs.render.fields import MISSION, aimed, small
 
 DAY = 60905
@@ -318,8 +319,9 @@ def test_a_request_names_it(tmp_path, monkeypatch):
     request = parse(path)
     assert request.bodies == tmp_path / "bodies.csv"
     # A dark one of another day sees none.
-    kinds = {"channel": ["VIS", "EXT", "VIS"], "image_type": ["science", "science", "dark"]}
-    exposed = pa.table({**kinds, "mjd": [DAY + 0.3, DAY + 90.0, DAY + 90.0]})
+    kinds = (("VIS", "science", DAY + 0.3), ("EXT", "science", DAY + 90.0), ("VIS", "dark", DAY + 90.0))
+    rows = [fields.exposure(channel=channel, image_type=kind, mjd=mjd) for channel, kind, mjd in kinds]
+    exposed = pa.Table.from_pylist([asdict(row) for row in rows])
     with pytest.raises(BadInput, match=r"solar_system.bodies: .*bodies.csv: no such file"):
         keys.ephemeris_files(request.bodies, exposed)
     request.bodies.write_bytes(b"")
@@ -331,8 +333,9 @@ def test_a_request_names_it(tmp_path, monkeypatch):
     written(request.bodies, columns(solar_system.population(*PLACE, 0.1, DAY, MISSION, 1)))
     assert list(keys.ephemeris_files(request.bodies, exposed)) == [str(request.bodies)]
     assert list(keys.ephemeris_files(request.bodies, exposed.slice(1))) == [str(request.bodies)]
+    later = pa.Table.from_pylist([asdict(replace(row, channel="VIS")) for row in rows[1:]])
     with pytest.raises(BadInput, match=r"has bodies of MJD"):
-        keys.ephemeris_files(request.bodies, exposed.slice(1).set_column(0, "channel", pa.array(["VIS"] * 2)))
+        keys.ephemeris_files(request.bodies, later)
     path.write_text(demo + '\n[solar_system]\nbody = "bodies.csv"\n', encoding="utf-8")
     with pytest.raises(BadInput, match=r"solar_system.body"):
         parse(path)
