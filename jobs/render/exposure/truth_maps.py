@@ -39,7 +39,11 @@ def made(truth: Sequence[str], effects: Sequence[str] | None, looks: bool) -> li
 
 
 def watch(maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode) -> Callable[[str, Frame, Frame], None]:
-    """Fills in the truth that effects add to the frame."""
+    """Fills in the truth that effects add to the frame.
+
+    maps  : by name, filled in;  scene : what is rendered;  truth : the maps that are wanted
+    mode  : how the detector is read
+    """
 
     def see(name: str, before: Frame, after: Frame) -> None:
         if name == "ghosts" and "ghosts" in truth:
@@ -65,6 +69,7 @@ def complete(
     Nothing is where no pixel is, between the halves of a detector.
     maps  : what there is so far;  raw : ADU;  effects : of the channel
     scene : what was rendered;  truth : maps that are wanted
+    mode  : how the detector is read
     """
     shape = maps["noise_free"].shape
     wanted = made(truth, [effect.name for effect in effects], False)

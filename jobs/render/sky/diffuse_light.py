@@ -60,7 +60,11 @@ class SkyBand:
 
 
 def starlit_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """Zodiacal light, and starlight that the telescope scatters; curve : the passband, None = the embedded one."""
+    """Zodiacal light, and starlight that the telescope scatters.
+
+    detector, band : of the camera, and the band's name;  mission : the mission database
+    curve          : the passband, None = the embedded one
+    """
     rate = mission.value(f"{detector.section}.scattered_light", "electron / (s pix)")
     # Of the light that a telescope scatters a band has its part, which for flat f_nu goes with its width.
     part = passbands.log_width(curve) / passbands.log_width(passbands.load(_VIS)) if curve else 1.0
@@ -68,13 +72,21 @@ def starlit_sky(detector: Detector, band: str, mission: MissionConfiguration, cu
 
 
 def thermal_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """Zodiacal light, and thermal light of the instrument; curve : the passband, None = the embedded one."""
+    """Zodiacal light, and thermal light of the instrument.
+
+    detector, band : of the camera, and the band's name;  mission : the mission database
+    curve          : the passband, None = the embedded one
+    """
     thermal = mission.value(f"{detector.section}.{band}.thermal", "electron / (s pix)")
     return SkyBand(thermal, *_zodiacal_of(detector, band, mission, curve))
 
 
 def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """The band's dark-sky rate of the mission database, or what follows from its surface brightness and zero point."""
+    """The band's dark-sky rate of the mission database, or what follows from its surface brightness and zero point.
+
+    detector, band : of the camera, and the band's name;  mission : the mission database
+    curve          : is not asked for: the sky of a band is as published
+    """
     section = detector.section
     if f"{section}.{band}.sky" in mission:
         return SkyBand(mission.value(f"{section}.{band}.sky", "electron / (s pix)"))
