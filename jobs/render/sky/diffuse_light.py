@@ -98,7 +98,7 @@ def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, cur
 def sky_rate(own: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
     """Electrons per second in a pixel of a band, at a place and date.
 
-    own          : of `sky_band`;  mission : the mission database
+    own          : of a band;  mission : the mission database
     ra, dec, mjd : deg, and date
     """
     scattered = own.stars * starlight(ra, dec, mission) if own.stars else 0.0
