@@ -38,6 +38,7 @@ LARGEST = {
     "map of dust": 8 * _GB,
     "catalogue of stars": 2 * _GB,
     "table of bodies": 4 * _GB,
+    "table of sources": 64 * _MB,
     "catalogue": 1 << 42,
     "run log": _GB,
     "manifest": 4 * _GB,

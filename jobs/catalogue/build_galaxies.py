@@ -14,7 +14,7 @@ if __name__ == "__main__":
 
 import pyarrow as pa
 
-from jobs.catalogue import cells, dust_map
+from jobs.catalogue import cells, dust_map, given_sources
 from jobs.catalogue.external import ingest, mapping
 from jobs.catalogue.galaxies import from_catalogue, galaxies, lensing, nearest_sed
 from jobs.catalogue.galaxies.galaxies import GalaxyModel
@@ -23,8 +23,9 @@ from jobs.catalogue.galaxies.nearest_sed import Training
 from jobs.catalogue.halos import halo_catalogue, population
 from jobs.catalogue.halos.halo_catalogue import LightCone
 from jobs.fluxes import passbands, sources
+from jobs.request.area import Area
 from jobs.request.checks import check_rendered
-from jobs.request.files import Catalogue, DustMap, Ingest
+from jobs.request.files import Catalogue, DustMap, GivenSources, Ingest
 from jobs.request.schema import Request, Universe
 from jobs.shell import Job, Step, main
 from lake_schema.errors import BadInput
@@ -50,7 +51,9 @@ def steps(lake: Path, request: Request) -> list[Step]:
     check_rendered(request)
     # Whatever is wrong with a file is said before anything is published.
     dust_map.chosen(request.seed, request.ingest.dust)
-    if request.ingest.galaxies is not None:
+    if request.sources is not None:
+        made = [_given(request, request.sources)]
+    elif request.ingest.galaxies is not None:
         made = [_ingested(lake, request, request.ingest.galaxies)]
     else:
         made = _drawn(lake, request)
@@ -163,6 +166,34 @@ def _ingested(lake: Path, request: Request, given: Catalogue) -> Step:
     return Step(plan, partial(ingested_work, given=given, dust=dust))
 
 
+def _given(request: Request, own: GivenSources) -> Step:
+    universe = request.facts("universe")["universe"]
+    controlled = {name: universe[name] for name in _LENS_FACTS}
+    about = own.facts(request.area.bounds())
+    given_sources.load(own, request.area)
+    plan = Plan(
+        GALAXIES,
+        {"seed": request.seed, "sources": about, **controlled, "code": code_version()},
+        cells.parts(request.area),
+    )
+    return Step(plan, partial(given_work, own=own, area=request.area))
+
+
+def given_work(lake: Path, facts: Json, own: GivenSources, area: Area) -> Output:
+    """The galaxies of a request that names them all, of one order-5 cell.
+
+    lake  : not used;  facts : of the part
+    own   : the tables;  area : of the request
+    """
+    given = given_sources.load(own, area, facts["sources"])
+    model = given_sources.model(facts["seed"], own, given, _shear(facts), facts["rotation"])
+    return _parted(facts, cells.rows(facts, GALAXIES, lambda cell: given_sources.galaxies(cell, given, model)))
+
+
+def _shear(facts: Json) -> Shear | None:
+    return None if facts["lensing"] is None else Shear(*facts["lensing"])
+
+
 def ingested_work(lake: Path, facts: Json, given: Catalogue, dust: DustMap | None) -> Output:
     """A catalogue's galaxies of one order-5 cell.
 
@@ -172,8 +203,7 @@ def ingested_work(lake: Path, facts: Json, given: Catalogue, dust: DustMap | Non
     columns = mapping.galaxies(given.format, dict(given.columns))
     found, _ = ingest.listed(given.files, columns)
     laid_out = ingest.split(found, facts["ingest"]["sha256"], columns)
-    lens = None if facts["lensing"] is None else Shear(*facts["lensing"])
-    model = from_catalogue.model(facts["seed"], columns, laid_out, lens, facts["rotation"])
+    model = from_catalogue.model(facts["seed"], columns, laid_out, _shear(facts), facts["rotation"])
     sky_map = dust_map.chosen(facts["seed"], dust)
 
     def draw(cell: int) -> pa.Table:

@@ -11,10 +11,13 @@ import math
 from functools import partial
 from typing import Any
 
-from jobs.catalogue import cells, dust_map
+import numpy as np
+
+from jobs.catalogue import cells, dust_map, given_sources
 from jobs.catalogue.stars import bright_stars, from_catalogue, stars
+from jobs.request.area import Area
 from jobs.request.checks import check_rendered
-from jobs.request.files import DustMap
+from jobs.request.files import DustMap, GivenSources
 from jobs.request.schema import Request, Stars
 from jobs.shell import Job, Step, main
 from lake_schema import user_files
@@ -30,6 +33,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """Files of about as many rows, made of the generation cells that the request's area touches."""
     check_rendered(request)
     choice = request.stars
+    if request.sources is not None:
+        return [_given(request, request.sources)]
     facts = {
         "seed": request.seed,
         "star_limit": request.universe.star_limit,
@@ -45,6 +50,30 @@ def steps(lake: Path, request: Request) -> list[Step]:
     numbers = stars.numbers(drawn, _model(facts, choice))
     parts = cells.by_number(drawn, numbers, choice.rows_a_file, _LARGEST)
     return [Step(Plan(STARS, facts, parts), partial(work, choice=choice, own=request.ingest.dust))]
+
+
+def _given(request: Request, own: GivenSources) -> Step:
+    facts = {"seed": request.seed, "sources": own.facts(request.area.bounds()), "code": code_version()}
+    model = _given_model(own, request.area)
+    drawn = request.area.cells()
+    parts = cells.by_number(drawn, stars.numbers(drawn, model), request.stars.rows_a_file, _LARGEST)
+    return Step(Plan(STARS, facts, parts), partial(given_work, own=own, area=request.area))
+
+
+def given_work(lake: Path, facts: Json, own: GivenSources, area: Area) -> Output:
+    """The stars of a request that names them all, of one file's cell.
+
+    lake  : not used;  facts : of the part
+    own   : the tables;  area : of the request
+    """
+    model, dust = _given_model(own, area, facts["sources"]), np.zeros(12, np.float32)
+    return Output(cells.rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
+
+
+def _given_model(own: GivenSources, area: Area, planned: Json | None = None) -> stars.StarModel:
+    """Each star, however faint and wherever it is."""
+    catalogue = given_sources.stars(given_sources.load(own, area, planned), own.band)
+    return stars.model(math.inf, math.inf, brown_dwarf_boost=0.0, catalogue=catalogue)
 
 
 def _files(choice: Stars) -> dict[str, Any]:

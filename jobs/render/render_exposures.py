@@ -25,7 +25,7 @@ from jobs.render.planning.preconditions import INPUTS
 from jobs.render.products import fits_files, truth_table
 from jobs.render.products.keys import ephemeris_files, product_keys, psf_files, truth_file
 from jobs.render.psf import from_file
-from jobs.render.sources import catalogue_rows, ephemerides, selection
+from jobs.render.sources import catalogue_rows, ephemerides, selection, solar_system
 from jobs.render.sources.catalogue_rows import LENSES
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
@@ -58,6 +58,9 @@ def steps(lake: Path, request: Request) -> list[Step]:
     }
     if psfs := psf_files(exposures, tasks):
         facts["psf"] = psfs
+    if request.sources is not None:
+        # Those of the tables are the only ones: no bodies move.
+        facts["request"]["bodies"] = "none"
     if request.bodies is not None:
         facts["bodies"] = ephemeris_files(request.bodies, exposures)
     keys = product_keys(facts, exposures, tasks, inputs, mission_of(request.mission))
@@ -87,7 +90,7 @@ def work(lake: Path, facts: Json) -> Output:
         file = str(from_file.file_of(exposed.psf, task["detector"]))
         if file_sha256(Path(file)) != facts["psf"][file]:
             raise BadInput(f"{file}: has changed since the rendering began")
-    bodies = None
+    bodies = solar_system.nobody if request.get("bodies") == "none" else None
     if registry.CHANNELS[exposed.channel].sees_bodies(exposed.image_type):
         for file, sha256 in facts.get("bodies", {}).items():
             if file_sha256(Path(file)) != sha256:

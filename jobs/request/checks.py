@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import json
 
-from jobs.request.schema import Request
+from jobs.request.files import Ingest
+from jobs.request.schema import Request, Stars
 from lake_schema.errors import BadInput
 from lake_schema.tables.exposures import RENDERED
+
+
+def check_sources(request: Request) -> None:
+    """Where a request names its sources, nothing else makes some."""
+    others = {"ingest": request.ingest != Ingest(), "stars": request.stars != Stars(), "solar_system": request.bodies}
+    if request.sources is not None:
+        for key, there in others.items():
+            if there:
+                raise BadInput(f"sources: those of the tables are the only ones, but there is a section {key}")
 
 
 def check_bands(request: Request) -> None:

@@ -3,6 +3,7 @@
 UserCurves, curves  spectra, filters and extinction laws: the section `fluxes`
 Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
 psfs                point-spread functions: the section `psf`
+GivenSources, sources   tables of all sources that there are: the section `sources`
 file_of             a file beside the request
 """
 
@@ -11,11 +12,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from jobs.request.toml_values import Toml, boolean, shown, string, strings, table_of
+from jobs.request.toml_values import Toml, boolean, number, shown, string, strings, table_of
 from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
+from lake_schema.store.provenance import file_sha256
+
+# A kind of lake_schema.user_files.
+SOURCES = "table of sources"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +77,33 @@ class Ingest:
     halos: Catalogue | None = None
     training: Catalogue | None = None
     dust: DustMap | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GivenSources:
+    """Tables of the only sources that there are (jobs/catalogue/given_sources.py).
+
+    band    : of their magnitudes
+    spacing : arcsec, of the grid on which their rows stand in turn; 0 = at places of their own
+    """
+
+    galaxies: Path | None
+    stars: Path | None
+    band: str
+    spacing: float
+
+    def facts(self, bounds: tuple[float, float, float]) -> dict[str, Any]:
+        """What tells these sources from others in the key of a plan; bounds : of the request's area."""
+        files = {"galaxies": self.galaxies, "stars": self.stars}
+        sums = {name: file_sha256(_csv(file, f"sources.{name}")) for name, file in files.items() if file is not None}
+        grid = {"spacing": self.spacing, "bounds": list(bounds)} if self.spacing else {}
+        return {"sha256": sums, "band": self.band, **grid}
+
+
+def _csv(file: Path, key: str) -> Path:
+    if file.suffix.lower() != ".csv":
+        raise BadInput(f"{key}: {user_files.shown(file)}: the ending is not .csv")
+    return user_files.checked(file, SOURCES, key)
 
 
 def file_of(folder: Path, name: str) -> Path:
@@ -137,6 +170,21 @@ def ingest(table: Toml, folder: Path) -> Ingest:
 def psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
     """The section `psf`: (band, file), found from `folder`.  BadInput names the key."""
     return tuple((layout.name(band), str(file_of(folder, string(table, f"psf.{band}")))) for band in sorted(table))
+
+
+def sources(table: Toml, folder: Path) -> GivenSources | None:
+    """The section `sources`; files are found from `folder`.  BadInput names the key."""
+    if not table:
+        return None
+    grid = string(table, "sources.only", ("table", "grid")) == "grid"
+    if "spacing" in table and not grid:
+        raise BadInput('sources.spacing wants only = "grid": the sources of a table have places of their own')
+    spacing = number(table, "sources.spacing", 0.01, 3600.0) if grid else 0.0
+    files = {name: file_of(folder, string(table, f"sources.{name}")) for name in ("galaxies", "stars") if name in table}
+    if not files:
+        raise BadInput("sources names neither galaxies nor stars")
+    band = string(table, "sources.band", default="euclid_vis")
+    return GivenSources(files.get("galaxies"), files.get("stars"), band, spacing)
 
 
 def _catalogue(value: object, path: str, folder: Path) -> Catalogue:

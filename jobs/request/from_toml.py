@@ -16,6 +16,8 @@
     [ingest.training]  files = [..]  columns = {z_true, abs_mag_r01, color_gr_01, sed, ext_law, ebv}
                        observed galaxies: each of ours has the spectrum of one like it
     [ingest.dust]      file, column, quantity = "ebv" | "a_v"   a HEALPix map of the Milky Way's dust instead of ours
+    [sources]      only = "table" | "grid"   galaxies = "file.csv"  stars = "file.csv"   these and no others
+                   band   of their magnitudes (AB), default: "euclid_vis"   spacing   arcsec, of a grid
     [strong_lenses]  boost   how many times denser than in nature they are drawn
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
                    of one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
@@ -61,6 +63,7 @@ from jobs.accuracy import SURVEY, Accuracy, preset, row_for
 from jobs.request import area as areas
 from jobs.request import checks, files, observations
 from jobs.request.area import Area
+from jobs.request.files import GivenSources
 from jobs.request.schema import (
     ALWAYS,
     BOX_CELLS,
@@ -126,6 +129,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         "universe",
         "stars",
         "ingest",
+        "sources",
         "strong_lenses",
         "mission",
         "fluxes",
@@ -163,10 +167,12 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         explore=_explore(_section(table, "explore", None)),
         ingest=files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
         bodies=bodies,
+        sources=files.sources(_section(table, "sources", {"only", *GivenSources.__slots__}), folder),
         noise_seed=_integer(table, "noise_seed", 0, _LARGEST_SEED) if "noise_seed" in table else None,
         psfs=files.psfs(_section(table, "psf", None), folder),
         strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
     )
+    checks.check_sources(request)
     checks.check_bands(request)
     checks.check_mission(request)
     return request

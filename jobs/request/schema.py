@@ -11,7 +11,7 @@ from typing import Any
 
 from jobs.accuracy import Accuracy
 from jobs.request.area import Area
-from jobs.request.files import Ingest, UserCurves
+from jobs.request.files import GivenSources, Ingest, UserCurves
 from jobs.request.observations import Observation, Pointing
 from lake_schema.tables import mission as database
 from lake_schema.tables import products
@@ -122,6 +122,7 @@ class Request:
     explore : parameter -> the values (JSON) that it takes in turn
     psfs    : (band, file) of PSFs in place of ours
     bodies  : file of moving bodies in place of ours
+    sources : the only sources that there are, in place of the universe
     noise_seed : of all that differs between exposures of the same sky with the same detectors; None = the seed
     detectors, limit : of a plan, the detectors that are to be rendered now, () = all; and how many at most.  A
               command line gives them, and the plan is the same without
@@ -147,6 +148,7 @@ class Request:
     psfs: tuple[tuple[str, str], ...] = ()
     bodies: Path | None = None
     noise_seed: int | None = None
+    sources: GivenSources | None = None
     detectors: tuple[str, ...] = ()
     limit: int | None = None
 

@@ -1,6 +1,7 @@
 """Tables of numbers from other programs, whatever their form: a bounded piece at a time, in the order of the files.
 
 files    a path -> the files that it stands for: itself, or the Parquet files of a folder such as a HATS catalogue
+titles   of a CSV file
 pieces   the rows of some columns of a Parquet, FITS or CSV file
 within   a column whose values have to lie between bounds
 
@@ -120,6 +121,19 @@ def pieces(
         units = {field.name: unit for field in batch.schema if (unit := _unit(field))}
         yield Piece(file, first, {**arrays, **named}, units)
         first += batch.num_rows
+
+
+def titles(file: Path, kind: str = "catalogue") -> list[str]:
+    """The titles of a CSV file's columns; BadInput where one stands twice."""
+    try:
+        with user_files.opened(looked_at(file, kind), kind) as stream, csv.open_csv(stream) as table:
+            found = list(table.schema.names)
+    except UnicodeDecodeError:
+        raise BadInput(f"{file}: is no CSV in UTF-8") from None
+    except (pa.ArrowException, OSError) as error:
+        raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
+    external_files.check_titles(file, found, found)
+    return found
 
 
 def within(file: Path, column: str, values: Array, bounds: tuple[float, float]) -> Array:

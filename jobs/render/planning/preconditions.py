@@ -30,6 +30,10 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> N
             raise BadInput(f"table {name} was planned for another request: run plan_exposures first")
     if facts["mission"].get("mission") != wanted["mission"]:
         raise BadInput("table mission was planned for another request: run plan_exposures first")
+    theirs = None if request.sources is None else request.sources.facts(request.area.bounds())
+    for name in ("galaxies", "stars"):
+        if canonical(facts[name].get("sources")) != canonical(theirs):
+            raise BadInput(f"table {name} has other sources than the request: run build_{name} first")
     drawn = {"seed": request.seed, **request.facts("universe")["universe"]}
     drawn |= {key: request.facts("stars")["stars"][key] for key in _STAR_KEYS}
     for name in ("galaxies", "stars"):

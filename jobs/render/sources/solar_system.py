@@ -72,6 +72,12 @@ class Population:
         )
 
 
+def nobody(day: int) -> Population:
+    """The bodies of a day on which there are none."""
+    none = np.zeros(0)
+    return Population(np.zeros(0, np.int64), none, none, none, none, none)
+
+
 def population(
     ra: float, dec: float, radius: float, day: int, mission: MissionConfiguration, seed: int, hours: float = 12.0
 ) -> Population:
