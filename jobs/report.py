@@ -13,11 +13,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from jobs.render.planning import forecast, speed
+from jobs.render import catalogue_forecast
+from jobs.render.planning import speed
 from jobs.render.products import run_log
 from lake_schema import __version__, command
-from lake_schema.errors import BadInput
-from lake_schema.store import layout
+from lake_schema.errors import BadInput, LakeError
+from lake_schema.store import layout, read
 
 _ABOUT = (
     "seconds are of the clock, CPU s of all cores; failed are parts that could not be made and runs that ended badly, "
@@ -64,12 +65,26 @@ def rows(root: Path) -> list[Line]:
             _add(found.setdefault(job, Line(job)), lines)
     if not found:
         raise BadInput(f"lake {root}: no run has left a log there")
-    foreseen = forecast.of_lake(root, speed.of_machine(root).factor)
+    foreseen = _forecast(root, speed.of_machine(root).factor)
     made = [
-        replace(line, forecast_s=foreseen[job].seconds, forecast_gb=foreseen[job].gb) if job in foreseen else line
+        replace(line, forecast_s=foreseen[job][0], forecast_gb=foreseen[job][1]) if job in foreseen else line
         for job, line in found.items()
     ]
     return [*made, _all(made)]
+
+
+def _forecast(root: Path, factor: float) -> dict[str, tuple[float, float]]:
+    """CPU seconds and GB of what the lake holds, made once, by the job that makes it."""
+    jobs = {line.job: (line.seconds, line.gb) for line in catalogue_forecast.of_lake(root, factor)}
+    try:
+        products = read.version(root, "products")
+        tasks = read.version(root, "tasks", products.manifest["facts"]["inputs"]["tasks"]).rows().to_pylist()
+    except (LakeError, KeyError):
+        return jobs
+    made = {(part["facts"]["exposure_id"], part["facts"]["detector"]) for part in products.manifest["parts"]}
+    own = [task for task in tasks if (task["exposure_id"], task["detector"]) in made]
+    seconds, size = (sum(task[name] for task in own) for name in ("seconds", "bytes"))
+    return {**jobs, "render_exposures": (factor * seconds, size / 1e9)}
 
 
 def _add(line: Line, lines: Sequence[run_log.Json]) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import pyarrow as pa
 
+from jobs.render import catalogue_forecast
 from jobs.render.planning import forecast, planned_exposures, psf_files, source_counts, speed, survey, tasks, variants
 from jobs.render.planning.mission import PARTS, mission_of, user_filters
 from jobs.request.schema import Request
@@ -76,9 +77,12 @@ def _step(table: Table, output: Output, facts: Json) -> Step:
 
 
 def dry_run(lake: Path, request: Request) -> Sequence[Step]:
-    """The forecast alone."""
+    """The forecast alone, of the catalogues, too."""
     _, exposures, rows = plan(lake, request)
     _print_forecast(lake, exposures, rows)
+    print()
+    for line in catalogue_forecast.text(catalogue_forecast.of_request(request, speed.of_machine(lake).factor)):
+        print(line)
     return ()
 
 

@@ -2,26 +2,23 @@
 
 rows     a line a channel, survey and image type, one a channel, one in all: exposures, detectors, core-hours, storage
 text     the table that a person reads
-of_lake  CPU seconds and GB of what a lake holds, by job
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
+from jobs.render.planning import unrendered
 from jobs.render.planning.speed import Speed
-from lake_schema.errors import LakeError
-from lake_schema.store import read
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One kind of exposure."""
+    """One kind of exposure; assumed : some of its costs were not measured."""
 
     channel: str
     survey: str
@@ -32,6 +29,7 @@ class Line:
     core_hours: float
     gigabytes: float
     memory_gb: float
+    assumed: bool = False
 
 
 def rows(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line]:
@@ -69,6 +67,7 @@ def _sum(name: str, lines: list[Line]) -> Line:
         sum(line.core_hours for line in lines),
         sum(line.gigabytes for line in lines),
         max((line.memory_gb for line in lines), default=0.0),
+        any(line.assumed for line in lines),
     )
 
 
@@ -83,6 +82,7 @@ def _line(row: dict[str, Any], factor: float) -> Line:
         row["seconds_sum"] * factor / 3600.0,
         row["bytes_sum"] / 1e9,
         row["memory_max"],
+        unrendered.of_channel(row["channel"]).cost.assumed,
     )
 
 
@@ -96,29 +96,6 @@ def text(lines: list[Line], speed: Speed) -> Iterator[str]:
         yield (
             f"{line.channel:8} {line.survey:12} {line.image_type:17} {line.exposures:10,} {line.detectors:10,} "
             f"{line.sources:14,} {line.core_hours:11,.2f} {line.gigabytes:10,.2f} {line.memory_gb:8.2f}"
+            f"{' assumed' * line.assumed}"
         )
     yield f"core-hours are of this machine, {speed.source}: {speed.factor:.2f} of those of the channels' costs"
-
-
-@dataclass(frozen=True, slots=True)
-class JobCost:
-    """CPU seconds and GB of one job."""
-
-    seconds: float
-    gb: float
-
-
-def of_lake(lake: Path, factor: float = 1.0) -> dict[str, JobCost]:
-    """What was forecast of the tables that a lake holds, by the job that makes them.
-
-    factor : as of `rows`
-    """
-    try:
-        products = read.version(lake, "products")
-        tasks = read.version(lake, "tasks", products.manifest["facts"]["inputs"]["tasks"]).rows().to_pylist()
-    except (LakeError, KeyError):
-        return {}
-    made = {(part["facts"]["exposure_id"], part["facts"]["detector"]) for part in products.manifest["parts"]}
-    own = [task for task in tasks if (task["exposure_id"], task["detector"]) in made]
-    cost = JobCost(factor * sum(task["seconds"] for task in own), sum(task["bytes"] for task in own) / 1e9)
-    return {"render_exposures": cost}

@@ -78,6 +78,8 @@ def test_the_forecast_adds_up(tmp_path):
     *_, said = text = list(forecast.text(lines, speed.Speed(0.5, "as a test says")))
     assert len(text) == 9
     assert "as a test says: 0.50" in said
+    # Nothing renders NISP: what it costs is no measurement, and so is the sum.
+    assert [line.split()[0] for line in text if line.endswith(" assumed")] == ["NISP-P", "NISP-P", "all"]
     assert [line.core_hours for line in forecast.rows(exposures, tasks, 0.5)] == [
         0.5 * line.core_hours for line in lines
     ]
@@ -86,7 +88,8 @@ def test_the_forecast_adds_up(tmp_path):
 def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
     lake = tmp_path / "lake"
     assert shell.main(plan_exposures.JOB, ["--lake", str(lake), "--request", str(DEMO), "--dry-run"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines, catalogues = (table.splitlines() for table in capsys.readouterr().out.split("\n\n"))
+    assert [line.split()[0] for line in catalogues] == ["job", "build_galaxies", "build_stars", "compute_fluxes"]
     assert lines[0].startswith("channel")
     assert lines[-2].split()[:2] == ["all", "all"]
     assert lines[-1].startswith("core-hours are of this machine, from a calibration")
@@ -96,7 +99,8 @@ def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
 @pytest.mark.parametrize("channel", registry.CHANNELS)
 def test_every_channel_has_measured_costs(channel):
     cost = unrendered.of_channel(channel).cost
-    assert min(getattr(cost, name) for name in cost.__slots__) > 0.0
+    assert not cost.assumed
+    assert min(getattr(cost, name) for name in cost.__slots__ if name != "assumed") > 0.0
 
 
 def test_every_channel_can_be_planned():

@@ -1,0 +1,119 @@
+"""The forecast of catalogues and fluxes: against what was measured, on the areas of its numbers and on another."""
+
+import json
+import tomllib
+from dataclasses import replace
+
+import pytest
+
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+from jobs.render import catalogue_forecast
+from jobs.request.files import Catalogue, Ingest
+from jobs.request.from_toml import from_table
+from lake_schema.store import publish
+from tests import requests
+
+# Cone, limits and bands of three areas, and what their jobs made and took on an AMD EPYC whose calibration gave
+# FACTOR: rows, CPU seconds (None = arrays of the machine's own were computed, too), GB. The costs are of the first two.
+AREAS = {
+    "one": ((53.117, -27.808, 0.3), 26.0, 26.0, ["euclid_vis", "lsst_r"]),
+    "two": ((270.0, 0.0, 0.25), 24.0, 24.0, ["euclid_vis"]),
+    "three": ((150.1, 2.2, 0.6), 25.0, 22.0, ["euclid_vis", "lsst_r", "lsst_i"]),
+}
+MEASURED = {
+    "one": {
+        "build_galaxies": (462_604, None, 0.03357), "build_stars": (21_462, None, 0.00093),
+        "compute_fluxes": (220_843, None, 0.03829),
+    },
+    "two": {
+        "build_galaxies": (154_034, 5.98, 0.00956), "build_stars": (794_695, 2.58, 0.03212),
+        "compute_fluxes": (839_978, 5.43, 0.04766),
+    },
+    "three": {
+        "build_galaxies": (935_904, 9.01, 0.06027), "build_stars": (31_383, 1.27, 0.00133),
+        "compute_fluxes": (370_491, 6.30, 0.04317),
+    },
+}  # fmt: skip
+FACTOR, ROWS_ERROR, SECONDS_ERROR, BYTES_ERROR = 0.45, 0.05, 0.3, 0.1
+
+
+def request(cone, galaxies, stars, bands, **more):
+    ra, dec, radius = cone
+    return from_table(
+        {
+            "name": "x", "seed": 5, "area": {"cone": {"ra": ra, "dec": dec, "radius": radius}}, **more,
+            "universe": {"galaxy_limit": galaxies, "star_limit": stars, "box_cells": 192, "lensing_nside": 256},
+            "fluxes": {"bands": bands},
+        }
+    )  # fmt: skip
+
+
+def forecast(wanted, factor=1.0):
+    return {line.job: line for line in catalogue_forecast.of_request(wanted, factor)}
+
+
+def test_more_is_dearer():
+    one = forecast(request((53.0, -28.0, 0.3), 24.0, 22.0, ["euclid_vis"]))
+    for change in (
+        {"cone": (53.0, -28.0, 1.0)}, {"galaxies": 25.0, "stars": 24.0}, {"bands": ["euclid_vis", "lsst_r"]},
+    ):  # fmt: skip
+        given = {"cone": (53.0, -28.0, 0.3), "galaxies": 24.0, "stars": 22.0, "bands": ["euclid_vis"]}
+        more = forecast(request(**{**given, **change}))
+        assert all(more[job].seconds >= one[job].seconds and more[job].gb >= one[job].gb for job in one)
+        assert more["compute_fluxes"].seconds > one["compute_fluxes"].seconds
+    assert forecast(request((53.0, -28.0, 0.3), 24.0, 22.0, ["euclid_vis"]), 0.5)["build_stars"].seconds == (
+        0.5 * one["build_stars"].seconds
+    )
+
+
+def test_stars_are_where_the_milky_way_is():
+    high, low = (forecast(request(cone, 24.0, 24.0, ["euclid_vis"])) for cone in ((190, 27, 0.5), (270, 0, 0.5)))
+    assert low["build_stars"].rows > 10 * high["build_stars"].rows
+
+
+def test_the_numbers_are_a_forecast_of_another_area():
+    """Measured on areas `one` and `two`, whose limits lie on both sides of the third's."""
+    for area, found in MEASURED.items():
+        lines = forecast(request(*AREAS[area]), FACTOR)
+        for job, (rows, seconds, size) in found.items():
+            assert lines[job].rows == pytest.approx(rows, rel=ROWS_ERROR), (area, job)
+            if seconds is not None:
+                assert lines[job].seconds == pytest.approx(seconds, rel=SECONDS_ERROR), (area, job)
+            assert lines[job].gb == pytest.approx(size, rel=BYTES_ERROR), (area, job)
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """A lake of few sources."""
+    lake = tmp_path_factory.mktemp("lake")
+    wanted = from_table(tomllib.loads(requests.text(
+        f'fluxes.bands = ["euclid_vis"]\n{requests.shallow(22.0, 22.0)}', requests.FIELD.format(0.4)
+    )))  # fmt: skip
+    for job in (build_galaxies, build_stars, compute_fluxes):
+        for step in job.steps(lake, wanted):
+            publish.make(lake, step.plan, step.work)
+    return lake, wanted
+
+
+@pytest.mark.nightly
+def test_what_is_drawn_is_what_was_forecast(drawn):
+    lake, wanted = drawn
+    held = {line.job: line for line in catalogue_forecast.of_lake(lake)}
+    for job, line in forecast(wanted).items():
+        assert (held[job].rows, held[job].gb) == pytest.approx((line.rows, line.gb), rel=1e-6)
+        tables = {"build_galaxies": ["halos", "galaxies"], "build_stars": ["stars"]}.get(
+            job, ["galaxy_fluxes", "star_fluxes"]
+        )
+        manifests = [json.loads((lake / name / "current" / "manifest.json").read_text()) for name in tables]
+        assert sum(one["rows"] for one in manifests) == pytest.approx(line.rows, rel=0.25)
+
+
+def test_an_external_catalogue_is_not_forecast(tmp_path):
+    (tmp_path / "g.csv").write_text("ra,dec\n0,0\n")
+    wanted = request((53.0, -28.0, 0.3), 24.0, 22.0, ["euclid_vis"])
+    given = Catalogue(files=(tmp_path / "g.csv",), format="csv", columns=())
+    lines = forecast(replace(wanted, ingest=Ingest(galaxies=given)))
+    assert list(lines) == ["build_stars", "compute_fluxes"]
+    assert lines["compute_fluxes"].rows == lines["build_stars"].rows
+    assert "\n".join(catalogue_forecast.text(list(lines.values()))).count("\n") == 2
