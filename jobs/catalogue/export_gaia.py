@@ -1,4 +1,8 @@
-"""Write the table `gaia` under Gaia's own names: python -m jobs.catalogue.export_gaia --lake LAKE --out FILE"""
+"""Write the table `gaia` for others: python -m jobs.catalogue.export_gaia --lake LAKE --out FILE
+
+table  CSV or FITS under the names of Gaia's archive, --release dr3 with DR3's columns in its order
+ldac   FITS_LDAC as SCAMP reads it (ASTREF_CATALOG FILE), with its own names of columns
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,58 +19,121 @@ import pyarrow.compute as pc
 from pyarrow import csv
 
 from jobs.catalogue import parameters
+from jobs.catalogue.exports import ldac
+from jobs.catalogue.galaxies import lensing
+from jobs.catalogue.stars import gaia
 from lake_schema import __version__, command, user_files
+from lake_schema.columns import Table
+from lake_schema.errors import BadInput
 from lake_schema.fits.tables import table_to_fits
 from lake_schema.store import layout, read
-from lake_schema.tables.gaia import EXPORT
+from lake_schema.tables.gaia import EXPORT, EXPORT_DR3, PARAMETERS
+
+RELEASES = {"dr2": EXPORT, "dr3": EXPORT_DR3}
+FORMS = {"table": (".csv", ".fits"), "ldac": (".fits", ".cat", ".ldac")}
+_MAS = np.pi / 180.0 / 3.6e6
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: 0 done, 1 something is wrong with the lake, 2 the call is wrong."""
-    parser = argparse.ArgumentParser(prog="export_gaia", description=__doc__, epilog=f"truesky {__version__}")
+    parser = argparse.ArgumentParser(
+        prog="export_gaia",
+        description=__doc__,
+        epilog=f"truesky {__version__}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--lake", required=True, help="folder of the lake")
-    parser.add_argument("--out", required=True, type=Path, help="file to write, .csv or .fits")
+    parser.add_argument("--out", required=True, type=Path, help="file to write: .csv or .fits; ldac .fits, .cat, .ldac")
+    parser.add_argument("--form", default="table", choices=FORMS)
+    parser.add_argument("--release", default="dr2", choices=RELEASES, help="whose columns; the values are those of DR2")
+    parser.add_argument("--epoch", type=float, help="year at which the images are taken: stars carried there by their "
+                        "proper motions come to lie where images show them")  # fmt: skip
     options = parser.parse_args(argv)
-    return command.status("export_gaia", lambda: _exported(layout.lake(options.lake), options.out))
+
+    def exported() -> int:
+        lake, declared = layout.lake(options.lake), RELEASES[options.release]
+        rows = export(lake, options.out, declared, options.form, options.epoch)
+        print(f"{options.out}: {rows:,} stars")
+        return 0
+
+    return command.status("export_gaia", exported)
 
 
-def _exported(lake: Path, out: Path) -> int:
-    rows = export(lake, out)
-    print(f"{out}: {rows:,} stars")
-    return 0
-
-
-def export(lake: Path, path: Path) -> int:
+def export(lake: Path, path: Path, declared: Table = EXPORT, form: str = "table", epoch: float | None = None) -> int:
     """Write the published table `gaia` to a file, replaced in one rename; returns its rows.
 
-    Errors : BadInput for another ending than .csv and .fits
+    lake     : root of the lake
+    path     : of the file, with an ending of its form
+    declared : the columns of form "table"
+    form     : "table" or "ldac"
+    epoch    : year at which stars lie where images show them, None = that of the catalogue
+    Errors   : BadInput for another ending than those of FORMS, an epoch that no proper motion reaches, and where the
+               table is one without proper motions
     """
-    user_files.target(path, (".csv", ".fits"))
+    user_files.target(path, FORMS[form])
+    if epoch is not None and not 1900.0 <= epoch <= 2100.0:
+        raise BadInput(f"epoch {epoch:g} is not in [1900, 2100]")
     version = read.version(lake, "gaia")
-    if path.suffix.lower() == ".fits":
-        table_to_fits(path, pa.concat_tables([_named(version, part) for part in version.parts]), EXPORT)
+    parts = (_named(version, part, epoch) for part in version.parts)
+    if form == "ldac":
+        ldac.write(path, pa.concat_tables(list(parts)))
+    elif path.suffix.lower() == ".fits":
+        table_to_fits(path, pa.concat_tables([part.select(declared.names) for part in parts]), declared)
     else:
-        _csv(version, path)
+        temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
+        try:
+            with csv.CSVWriter(temporary, declared.arrow()) as writer:
+                for part in parts:
+                    writer.write_table(_as(part, declared))
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
     return version.num_rows
 
 
-def _csv(version: read.Version, path: Path) -> None:
-    temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
-    try:
-        with csv.CSVWriter(temporary, EXPORT.arrow()) as writer:
-            for part in version.parts:
-                writer.write_table(_named(version, part))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+def _as(rows: pa.Table, declared: Table) -> pa.Table:
+    return declared.build({name: rows[name] for name in declared.names})
 
 
-def _named(version: read.Version, part: str) -> pa.Table:
+def _named(version: read.Version, part: str, epoch: float | None) -> pa.Table:
+    """Rows of a part with every column that any release has."""
     rows = version.rows(parts=[part])
-    known = {"source_id": rows["id"], "bp_rp": pc.subtract(rows["phot_bp_mean_mag"], rows["phot_rp_mean_mag"])}
-    epoch = np.full(rows.num_rows, parameters.section("gaia.toml", "astrometry")["epoch"])
-    columns = {name: rows[name] for name in EXPORT.names if name in rows.column_names}
-    return EXPORT.build({**columns, **known, "ref_epoch": epoch})
+    if rows.num_rows and rows["ruwe"].null_count:
+        raise BadInput("table gaia has no proper motions: it was built before it had them; run build_gaia again")
+    columns: dict[str, Any] = {name: rows[name] for name in rows.column_names}
+    columns |= {"source_id": rows["id"], "bp_rp": pc.subtract(rows["phot_bp_mean_mag"], rows["phot_rp_mean_mag"])}
+    own_epoch = parameters.section("gaia.toml", "astrometry")["epoch"]
+    columns["ref_epoch"] = pa.array(np.full(rows.num_rows, own_epoch))
+    if epoch is not None:
+        columns["ra"], columns["dec"] = map(pa.array, _before(rows, epoch - own_epoch))
+    known = pc.is_valid(rows["pmra"])
+    columns |= _correlations(known)
+    for band, short in enumerate(("g", "bp", "rp")):
+        name = f"phot_{short}_mean"
+        flux = gaia.mean_flux(pc.fill_null(rows[f"{name}_mag"], np.nan).to_numpy(), band)
+        error = flux / pc.fill_null(rows[f"{name}_flux_over_error"], np.nan).to_numpy()
+        columns |= {
+            f"{name}_flux": pa.array(flux, mask=np.isnan(flux)),
+            f"{name}_flux_error": pa.array(error, mask=np.isnan(flux)),
+        }
+    columns["parallax_over_error"] = pc.divide(rows["parallax"], rows["parallax_error"]).cast(pa.float32())
+    columns["pm"] = pc.sqrt(pc.add(pc.power(rows["pmra"], 2), pc.power(rows["pmdec"], 2))).cast(pa.float32())
+    columns["astrometric_params_solved"] = pc.if_else(known, 31, 3).cast(pa.int16())
+    return pa.table(columns)
+
+
+def _correlations(known: pa.ChunkedArray) -> dict[str, Any]:
+    """Errors are drawn one by one: where all five parameters are known their correlations are 0."""
+    zero = pc.if_else(known, pa.scalar(0.0, pa.float32()), pa.scalar(None, pa.float32()))
+    pairs = [(one, other) for i, one in enumerate(PARAMETERS) for other in PARAMETERS[i + 1 :]]
+    position = pa.array(np.zeros(len(known), np.float32))
+    return {f"{one}_{other}_corr": position if (one, other) == ("ra", "dec") else zero for one, other in pairs}
+
+
+def _before(rows: pa.Table, years: float) -> tuple[Any, Any]:
+    """Positions from which the proper motions lead to the rows' own in so many years."""
+    east, north = (-_MAS * years * pc.fill_null(rows[name], 0.0).to_numpy() for name in ("pmra", "pmdec"))
+    return lensing.displaced(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
 
 
 if __name__ == "__main__":

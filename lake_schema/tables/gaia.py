@@ -1,6 +1,6 @@
 """Table `gaia`: the stars as Gaia's second data release would list them, a reference to calibrate by.
 
-EXPORT   the same under Gaia's own names, for a file of its own
+EXPORT, EXPORT_DR3   the same under Gaia's own names, for a file of its own, in the order of ours and of DR3
 """
 
 from __future__ import annotations
@@ -40,8 +40,24 @@ def _photometry(short: str, name: str) -> tuple[Column, ...]:
     )
 
 
-def _error(of: str, unit: str, ucd: str, doc: str) -> Column:
-    return Column(f"{of}_error", "float32", unit, f"stat.error;{ucd}", f"standard error of {doc}", 0.0, 1e3)
+def _error(of: str, unit: str, ucd: str, doc: str, since: int = 1) -> Column:
+    return Column(
+        f"{of}_error",
+        "float32",
+        unit,
+        f"stat.error;{ucd}",
+        f"standard error of {doc}",
+        0.0,
+        1e3,
+        since > 1,
+        since=since,
+    )
+
+
+def _motion(short: str, axis: str, doc: str) -> tuple[Column, ...]:
+    ucd = f"pos.pm;pos.eq.{axis}"
+    value = Column(short, "float64", "mas yr-1", ucd, f"proper motion in {doc}, as measured", -1e5, 1e5, True, since=2)
+    return value, _error(short, "mas yr-1", ucd, f"the proper motion in {doc}", since=2)
 
 
 _ID = id_of_kinds(5, 5)
@@ -55,9 +71,18 @@ _MEASURED = (
     *(column for short, name in _BANDS for column in _photometry(short, name)),
 )
 
+_RUWE = Column(
+    "ruwe", "float32", "", "stat.error", "renormalised unit weight error of the astrometry", 0.0, 100.0, True, since=2
+)
+_MOTIONS = (
+    *_motion("pmra", "ra", "right ascension times cos(dec)"),
+    *_motion("pmdec", "dec", "declination"),
+    _RUWE,
+)
+
 GAIA = Table(
     "gaia",
-    1,
+    2,
     (
         _ID,
         _RA,
@@ -77,15 +102,45 @@ GAIA = Table(
             )
             for short, name in _BANDS
         ),
+        *_MOTIONS,
     ),
     "The stars as Gaia DR2 would list them: brighter than G = 21, with its errors; the truth is in `stars`, by id.",
     order=3,
     finest=8,
 )
 
+PARAMETERS = ("ra", "dec", "parallax", "pmra", "pmdec")
+
+
+def _flux(short: str, name: str) -> tuple[Column, ...]:
+    ucd = f"phot.flux;{ {'g': 'em.opt', 'bp': 'em.opt.B', 'rp': 'em.opt.R'}[short] }"
+    return (
+        Column(f"phot_{short}_mean_flux", "float64", "electron s-1", ucd, f"mean flux in {name}", 0.0, 1e15, True),
+        Column(
+            f"phot_{short}_mean_flux_error",
+            "float64",
+            "electron s-1",
+            f"stat.error;{ucd}",
+            f"standard error of the mean flux in {name}",
+            0.0,
+            1e15,
+            True,
+        ),
+    )
+
+
+_CORRELATIONS = tuple(
+    Column(
+        f"{one}_{other}_corr", "float32", "", "stat.correlation", f"correlation of {one} and {other}", -1.0, 1.0, True
+    )
+    for i, one in enumerate(PARAMETERS)
+    for other in PARAMETERS[i + 1 :]
+)
+_FLUXES = tuple(column for short, name in _BANDS for column in _flux(short, name))
+
 EXPORT = Table(
     "gaia_source",
-    1,
+    2,
     (
         replace(_ID, name="source_id"),
         Column("ref_epoch", "float64", "yr", "meta.ref;time.epoch", "epoch of the position", 2000.0, 2100.0),
@@ -93,7 +148,47 @@ EXPORT = Table(
         _DEC,
         *_MEASURED,
         Column("bp_rp", "float32", "mag", "phot.color", "BP - RP", -20.0, 20.0, True),
+        *_MOTIONS,
+        *_CORRELATIONS,
+        *_FLUXES,
     ),
     "Rows of the table `gaia` under the names of Gaia's archive.",
     key=("source_id",),
 )
+
+
+def _dr3() -> Table:
+    """The columns of DR3's gaia_source that we have, in its order."""
+    known = {column.name: column for column in EXPORT.columns}
+    of_one = [name for parameter in PARAMETERS for name in (parameter, f"{parameter}_error")]
+    # parallax_over_error and pm stand behind the parallax.
+    order: list[str | Column] = ["source_id", "ref_epoch", *of_one[:6]]
+    order += [
+        Column(
+            "parallax_over_error", "float32", "", "stat.snr;pos.parallax", "parallax over its error", None, None, True
+        ),
+        Column("pm", "float32", "mas yr-1", "pos.pm", "total proper motion", 0.0, 2e5, True),
+        *of_one[6:],
+        *(column.name for column in _CORRELATIONS),
+        Column(
+            "astrometric_params_solved",
+            "int16",
+            "",
+            "meta.number",
+            "which parameters are known: 31 all five, 3 the position alone",
+            3,
+            31,
+        ),
+        "ruwe",
+    ]
+    for short, _ in _BANDS:
+        of_band = f"phot_{short}_mean"
+        order += [f"{of_band}_flux", f"{of_band}_flux_error", f"{of_band}_flux_over_error", f"{of_band}_mag"]
+    columns = tuple(known[one] if isinstance(one, str) else one for one in [*order, "bp_rp"])
+    doc = (
+        "Rows of the table `gaia` under the names, and in the order, of DR3's gaia_source; the values are those of DR2."
+    )
+    return Table("gaia_source", 3, columns, doc, key=("source_id",))
+
+
+EXPORT_DR3 = _dr3()

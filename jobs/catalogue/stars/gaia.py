@@ -1,10 +1,12 @@
 """The stars as Gaia's second data release would list them: table `gaia`, row by row a function of (seed, star).
 
 observe    stars and their fluxes in BANDS -> what Gaia measures
-astrometric_errors, photometric_errors, completeness   at a magnitude
+astrometric_errors, proper_motion_errors, photometric_errors, completeness   at a magnitude
+mean_flux  of a magnitude as measured
 ab_minus_vega   of BANDS
 
-Random numbers are keyed by the star, so that it is measured alike in whichever file it lies.
+Random numbers are keyed by the star, so that it is measured alike in whichever file it lies; errors are not correlated.
+Velocities are drawn here (jobs.catalogue.stars.kinematics): table `stars` has none, and images show no star move.
 Ref: Gaia Collaboration, Brown et al. 2018; the numbers and their sources are in gaia.toml.
 """
 
@@ -16,23 +18,25 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
-from scipy.special import erfc, ndtri
+from scipy.special import chdtri, erfc, ndtri
 
 from jobs.catalogue import parameters
 from jobs.catalogue.galaxies import lensing
+from jobs.catalogue.stars import kinematics
 from jobs.rng import uniforms
 from lake_schema import sky, units
 from lake_schema.arrays import Float
 from lake_schema.tables.gaia import GAIA
 
 BANDS = ("gaia_g", "gaia_bp", "gaia_rp")
-STAR_COLUMNS = ["id", "ra", "dec", "distance"]
+STAR_COLUMNS = ["id", "ra", "dec", "distance", "component"]
 FLUX_COLUMNS = [f"f_nu_{band}" for band in BANDS]
 _FILE = "gaia.toml"
 _MAS = 1.0 / 3.6e6
 _MAG_OVER_FLUX = 2.5 / np.log(10.0)
 # Of a star's random numbers.
-_RA, _DEC, _PARALLAX, _G, _BP, _RP, _LISTED = range(7)
+_RA, _DEC, _PARALLAX, _G, _BP, _RP, _LISTED, _PMRA, _PMDEC, _RUWE, _VELOCITY = range(11)
+_COUNT = _VELOCITY + 3
 
 
 def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
@@ -41,13 +45,15 @@ def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
     stars, fluxes : columns STAR_COLUMNS, FLUX_COLUMNS, row by row
     """
     ids = stars["id"].to_numpy()
-    chance = uniforms(ids, _LISTED + 1, seed, "gaia")
+    chance = uniforms(ids, _COUNT, seed, "gaia")
     true = [units.mag_of_f_nu(fluxes[name].to_numpy().astype(float)) for name in FLUX_COLUMNS]
     vega = ab_minus_vega()
     g = true[0] - vega[0]
     listed = np.flatnonzero(chance[_LISTED] < completeness(g))
-    noise = ndtri(chance[:_LISTED, listed])
-    columns: dict[str, Any] = {"id": ids[listed], **_astrometry(stars.take(pa.array(listed)), g[listed], noise)}
+    noise, seen = ndtri(chance[:, listed]), stars.take(pa.array(listed))
+    columns: dict[str, Any] = {"id": ids[listed], **_astrometry(seen, g[listed], noise)}
+    columns |= _motion(seen, g[listed], noise)
+    columns["ruwe"] = _ruwe(chance[_RUWE, listed])
     for k, (short, kind) in enumerate((("g", "g"), ("bp", "xp"), ("rp", "xp"))):
         columns |= _photometry(short, true[k][listed], vega[k], kind, noise[_G + k])
     order = np.lexsort((columns["id"], columns["_healpix_29"]))
@@ -80,6 +86,21 @@ def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
     return ra, dec, own
 
 
+def proper_motion_errors(g: npt.ArrayLike) -> tuple[Float, Float]:
+    """Standard errors[n] of the proper motions in right ascension times cos(dec) and declination, mas/yr, at G (Vega).
+
+    g : float[n] mag, Vega
+    """
+    law, (_, _, parallax) = parameters.section(_FILE, "proper_motion"), astrometric_errors(g)
+    return law["ra"] * parallax, law["dec"] * parallax
+
+
+def mean_flux(mag: npt.ArrayLike, band: int) -> Float:
+    """Electrons per second of magnitudes[n] (Vega) in G, BP or RP, by number in BANDS."""
+    zero = parameters.section(_FILE, "flux_zero_points")["vega"][band]
+    return np.asarray(10.0 ** (0.4 * (zero - np.asarray(mag, float))))
+
+
 def photometric_errors(mag: npt.ArrayLike, kind: str) -> Float:
     """Standard error[n], mag, at a magnitude (Vega) in its own band; kind: "g", or "xp" for BP and RP."""
     law = parameters.section(_FILE, "photometry")
@@ -105,6 +126,24 @@ def _astrometry(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
         "parallax": np.ma.masked_invalid(parallax),
         "parallax_error": errors[2],
     }
+
+
+def _motion(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
+    """Of stars without a distance nothing is known."""
+    distance = np.asarray(pc.fill_null(stars["distance"], np.nan).to_numpy(), float)
+    ra, dec = (stars[name].to_numpy() for name in ("ra", "dec"))
+    component = stars["component"].to_numpy().astype(np.int64)
+    true = kinematics.proper_motions(ra, dec, distance, component, noise[_VELOCITY:])
+    errors, found = proper_motion_errors(g), {}
+    for name, value, error, own in zip(("pmra", "pmdec"), true, errors, noise[_PMRA : _PMDEC + 1], strict=True):
+        found[name] = np.ma.masked_invalid(value + error * own)
+        found[f"{name}_error"] = np.ma.MaskedArray(error, mask=np.isnan(value))
+    return found
+
+
+def _ruwe(chance: Float) -> Float:
+    degrees = parameters.section(_FILE, "goodness")["degrees"]
+    return np.asarray(np.sqrt(chdtri(degrees, chance) / degrees))
 
 
 def _photometry(short: str, true_ab: Float, vega: float, kind: str, noise: Float) -> dict[str, Any]:

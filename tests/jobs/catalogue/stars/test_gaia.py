@@ -1,15 +1,20 @@
 """What Gaia lists of the stars: the published errors, the same star alike wherever it lies, no star lost at an edge."""
 
+import hashlib
+
 import numpy as np
 import pyarrow as pa
 import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
+from astropy.time import Time
 from hats.io.validation import is_valid_catalog
 from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.catalogue import build_gaia, export_gaia
-from jobs.catalogue.stars import gaia
+from jobs.catalogue.stars import gaia, kinematics
 from jobs.fluxes import passbands
 from jobs.fluxes.libraries.vega import vega_magnitude
 from jobs.request.from_toml import from_table
@@ -32,6 +37,7 @@ def stars_of(g, bp_rp=1.0, distance=500.0, place=(40.0, 30.0), seed=1):
     rng = np.random.default_rng(seed)
     ra, dec = place[0] + 0.2 * rng.uniform(-1, 1, n), place[1] + 0.2 * rng.uniform(-1, 1, n)
     columns = {"id": (5 << 60) + np.arange(n), "ra": ra, "dec": dec, "distance": np.full(n, distance)}
+    columns["component"] = np.zeros(n, np.int8)
     mags = np.stack([g, g + 0.5 * bp_rp, g - 0.5 * bp_rp])
     flux = {f"f_nu_{b}": units.f_nu_of_mag(m + v) for b, m, v in zip(gaia.BANDS, mags, VEGA, strict=True)}
     return pa.table(columns), pa.table(flux)
@@ -243,3 +249,107 @@ def test_what_it_must_have_is_named(lake):
     publish.make(lake, Plan(flux, {}, part), lambda root, facts: Output(flux.build(rows)))
     with pytest.raises(BadInput, match=r"no column f_nu_gaia_g, .* into fluxes\.bands and run compute_fluxes"):
         build_gaia.steps(lake, asked())
+
+
+# ------------------------------------------------------------------------------------------------ proper motions
+
+# Of what was listed before there were proper motions, at 200 stars.
+OLD = (
+    "id", "ra", "dec", "_healpix_29", "ra_error", "dec_error", "parallax", "parallax_error", "phot_g_mean_mag",
+    "phot_bp_mean_mag", "phot_rp_mean_mag", "phot_g_mean_flux_over_error",
+)  # fmt: skip
+
+
+def test_what_was_listed_before_is_listed_alike():
+    stars, flux = stars_of(np.linspace(10.0, 21.5, 200))
+    found = gaia.observe(stars, flux, 7)
+    values = [np.ascontiguousarray(found[name].fill_null(0).to_numpy()).tobytes() for name in OLD]
+    assert (
+        hashlib.sha256(b"".join(values)).hexdigest()
+        == "9bbe69319d92d1e1d80a2998922d183e1dab87465680cf47d0f1c31901f08549"
+    )
+
+
+@pytest.mark.parametrize(("g", "published"), [(15.0, 0.06), (17.0, 0.2), (20.0, 1.2)])
+def test_errors_of_proper_motions(g, published):
+    """mas/yr, Lindegren et al. 2018, and errors that are those said and correlated with nothing."""
+    n = 20_000
+    east, north = gaia.proper_motion_errors(np.array([g]))
+    assert (east + north) / 2 == pytest.approx(published, rel=0.3)
+    stars, flux = stars_of(np.full(n, g))
+    found = gaia.observe(stars, flux, 7)
+    chance = gaia.ndtri(gaia.uniforms(found["id"].to_numpy(), gaia._COUNT, 7, "gaia"))
+    place = [stars[name].to_numpy()[found["id"].to_numpy() - (5 << 60)] for name in ("ra", "dec")]
+    component = np.zeros(len(found), int)
+    true = kinematics.proper_motions(*place, np.full(len(found), 500.0), component, chance[gaia._VELOCITY :])
+    off = [found[name].to_numpy() - own for name, own in zip(("pmra", "pmdec"), true, strict=True)]
+    assert off[0].std() == pytest.approx(east[0], rel=0.05)
+    assert off[1].std() == pytest.approx(north[0], rel=0.05)
+    noise = [*off, found["parallax"].to_numpy() - 2.0]
+    apart = [(found["ra"].to_numpy() - place[0]) * np.cos(np.radians(place[1])), found["dec"].to_numpy() - place[1]]
+    correlation = np.corrcoef([*noise, *apart])
+    assert np.abs(correlation - np.eye(5)).max() < 5 / n**0.5
+    ruwe = found["ruwe"].to_numpy()
+    assert ruwe.mean() == pytest.approx(1.0, abs=0.01)
+    assert ruwe.std() == pytest.approx(0.05, rel=0.05)
+
+
+def test_names_of_dr3_in_its_order_and_fluxes_that_are_the_magnitudes(lake, tmp_path):
+    filled(lake)
+    rows = built(lake).rows()
+    path = tmp_path / "dr3.fits"
+    assert export_gaia.main(["--lake", str(lake), "--out", str(path), "--release", "dr3"]) == 0
+    table = fits.getdata(path, 1)
+    of_five = ["ra", "ra_error", "dec", "dec_error", "parallax", "parallax_error", "parallax_over_error", "pm", "pmra"]
+    assert table.names[:13] == ["source_id", "ref_epoch", *of_five, "pmra_error", "pmdec"]
+    assert sum(name.endswith("_corr") for name in table.names) == 10
+    assert table.names[-1] == "bp_rp"
+    assert np.array_equal(table["pmra"], rows["pmra"].to_numpy())
+    assert table["pm"] == pytest.approx(np.hypot(table["pmra"], table["pmdec"]), rel=1e-6)
+    assert set(table["astrometric_params_solved"]) == {31}
+    assert not table["pmra_pmdec_corr"].any()
+    for band, zero in (("g", 25.6884), ("bp", 25.3514), ("rp", 24.7619)):
+        mag, flux = table[f"phot_{band}_mean_mag"], table[f"phot_{band}_mean_flux"]
+        known = np.isfinite(mag)
+        assert flux[known] == pytest.approx(10 ** (0.4 * (zero - mag[known].astype(float))), rel=1e-6)
+        over = table[f"phot_{band}_mean_flux_over_error"][known]
+        assert flux[known] / table[f"phot_{band}_mean_flux_error"][known] == pytest.approx(over, rel=1e-5)
+
+
+def test_carried_to_the_epoch_of_the_images_stars_are_where_images_show_them(lake, tmp_path):
+    filled(lake)
+    rows = built(lake).rows()
+    export_gaia.export(lake, tmp_path / "moved.fits", epoch=2027.5)
+    moved = fits.getdata(tmp_path / "moved.fits", 1)
+    apart = sky.separation(moved["ra"], moved["dec"], rows["ra"].to_numpy(), rows["dec"].to_numpy()) / MAS
+    assert apart == pytest.approx(12.0 * np.hypot(moved["pmra"], moved["pmdec"]), rel=1e-3, abs=1e-3)
+    there = SkyCoord(
+        moved["ra"] * u.deg,
+        moved["dec"] * u.deg,
+        pm_ra_cosdec=moved["pmra"] * u.mas / u.yr,
+        pm_dec=moved["pmdec"] * u.mas / u.yr,
+        obstime=Time(moved["ref_epoch"], format="jyear"),
+    ).apply_space_motion(Time(2027.5, format="jyear"))
+    again = sky.separation(there.ra.deg, there.dec.deg, rows["ra"].to_numpy(), rows["dec"].to_numpy()) / MAS
+    assert again.max() < 1e-2
+    with pytest.raises(BadInput, match=r"epoch 20275 is not in \[1900, 2100\]"):
+        export_gaia.export(lake, tmp_path / "never.fits", epoch=20275.0)
+
+
+def test_ldac_as_scamp_names_it(lake, tmp_path):
+    filled(lake)
+    rows = built(lake).rows()
+    assert export_gaia.main(["--lake", str(lake), "--out", str(tmp_path / "gaia.cat"), "--form", "ldac"]) == 0
+    with fits.open(tmp_path / "gaia.cat") as units:
+        assert [unit.name for unit in units] == ["PRIMARY", "LDAC_IMHEAD", "LDAC_OBJECTS"]
+        found = units["LDAC_OBJECTS"].data
+        cards = units["LDAC_IMHEAD"].data["Field Header Card"].ravel()
+        assert "".join(cards).rstrip().endswith("END")
+    assert np.array_equal(found["X_WORLD"], rows["ra"].to_numpy())
+    assert np.array_equal(found["Y_WORLD"], rows["dec"].to_numpy())
+    assert found["ERRA_WORLD"] == pytest.approx(rows["ra_error"].to_numpy() / 3.6e6, rel=1e-6, abs=0)
+    assert found["ERRB_WORLD"] == pytest.approx(rows["dec_error"].to_numpy() / 3.6e6, rel=1e-6, abs=0)
+    assert found["PMALPHA_J2000"] == pytest.approx(rows["pmra"].to_numpy(), rel=1e-6)
+    assert found["MAGERR"] == pytest.approx(1.0857 / rows["phot_g_mean_flux_over_error"].to_numpy(), rel=1e-4)
+    assert set(found["OBSDATE"]) == {2015.5}
+    assert export_gaia.main(["--lake", str(lake), "--out", str(tmp_path / "gaia.csv"), "--form", "ldac"]) == 2

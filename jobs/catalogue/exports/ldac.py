@@ -1,0 +1,75 @@
+"""A reference catalogue as SCAMP reads it: FITS_LDAC, columns under the names that its ASTREF*_KEYS have by default.
+
+write   rows under the names of Gaia's archive -> a file
+
+A star without a proper motion has the motion 0.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from astropy.io import fits
+
+from lake_schema.arrays import Array, Float
+from lake_schema.fits import write as fits_write
+
+_MAG_OVER_FLUX = 2.5 / np.log(10.0)
+_DEG = 1.0 / 3.6e6
+_CARD = 80
+
+
+def write(path: Path, rows: pa.Table) -> None:
+    """Replaced in one rename.
+
+    rows : columns source_id, ref_epoch, ra, dec (deg) and their errors (mas), pmra, pmdec and theirs (mas/yr),
+           phot_g_mean_mag (Vega), phot_g_mean_flux_over_error
+    """
+    objects = fits.BinTableHDU.from_columns(_columns(rows), name="LDAC_OBJECTS")
+    fits_write.write_staged(path, fits.HDUList([fits.PrimaryHDU(), _header(), objects]))
+
+
+def _columns(rows: pa.Table) -> list[fits.Column]:
+    def values(name: str) -> Float:
+        return np.asarray(pc.fill_null(rows[name], 0.0).to_numpy(), float)
+
+    east, north = values("ra_error") * _DEG, values("dec_error") * _DEG
+    columns: list[tuple[str, str, str, Array]] = [
+        ("SOURCE_ID", "K", "", rows["source_id"].to_numpy()),
+        ("X_WORLD", "D", "deg", values("ra")),
+        ("Y_WORLD", "D", "deg", values("dec")),
+        ("ERRA_WORLD", "E", "deg", np.maximum(east, north)),
+        ("ERRB_WORLD", "E", "deg", np.minimum(east, north)),
+        # From the axis of right ascension.
+        ("ERRTHETA_WORLD", "E", "deg", np.where(east >= north, 0.0, 90.0)),
+        ("PMALPHA_J2000", "E", "mas/yr", values("pmra")),
+        ("PMDELTA_J2000", "E", "mas/yr", values("pmdec")),
+        ("PMALPHAERR_J2000", "E", "mas/yr", values("pmra_error")),
+        ("PMDELTAERR_J2000", "E", "mas/yr", values("pmdec_error")),
+        ("MAG", "E", "mag", values("phot_g_mean_mag")),
+        ("MAGERR", "E", "mag", _MAG_OVER_FLUX / values("phot_g_mean_flux_over_error")),
+        ("OBSDATE", "D", "yr", values("ref_epoch")),
+    ]
+    return [
+        fits.Column(name, code, array=array, **({"unit": unit} if unit else {})) for name, code, unit, array in columns
+    ]
+
+
+def _header() -> fits.BinTableHDU:
+    """The cards of a field's header as one text, as the form wants them: here none but the end."""
+    cards = b"".join(
+        text.ljust(_CARD)
+        for text in (
+            b"SIMPLE  =                    T",
+            b"BITPIX  =                    8",
+            b"NAXIS   =                    0",
+            b"END",
+        )
+    )
+    column = fits.Column("Field Header Card", f"{len(cards)}A", array=np.array([cards]))
+    unit = fits.BinTableHDU.from_columns([column], name="LDAC_IMHEAD")
+    unit.header["TDIM1"] = f"({_CARD}, {len(cards) // _CARD})"
+    return unit
