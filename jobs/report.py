@@ -59,10 +59,17 @@ def rows(root: Path) -> list[Line]:
     Errors : BadInput where nothing has run;  Damaged names a log's line that no run writes
     """
     found: dict[str, Line] = {}
+    # Of each process the tables that it has made so far: a job writes a log a table.
+    tables: dict[tuple[str, str], set[str]] = {}
     for path in run_log.of_lake(root):
         if lines := run_log.lines(path):
-            job = str(lines[0].get("job", path.stem))
-            _add(found.setdefault(job, Line(job)), lines)
+            job, table = (str(lines[0].get(name, path.stem)) for name in ("job", "table"))
+            line, before = found.setdefault(job, Line(job)), tables.setdefault((job, path.stem.split("-")[-1]), set())
+            if not before or table in before:
+                line.runs += 1
+                before.clear()
+            before.add(table)
+            _add(line, lines)
     if not found:
         raise BadInput(f"lake {root}: no run has left a log there")
     foreseen = _forecast(root, speed.of_machine(root).factor)
@@ -91,7 +98,6 @@ def _add(line: Line, lines: Sequence[run_log.Json]) -> None:
     first, last = lines[0], lines[-1]
     parts = [one for one in lines if "part" in one]
     made = [one for one in parts if "error" not in one]
-    line.runs += 1
     line.stopped += "status" not in last
     line.failed_runs += last.get("status") == "failed"
     line.parts += len(made)

@@ -23,6 +23,8 @@ from jobs.request.schema import Request
 from lake_schema import __version__, command, user_files
 from lake_schema.store import layout, read
 
+# A picture takes some 3 s to draw.
+_PICTURES = 12
 # Status of a job: its file, its arguments.
 Start = Callable[[str, Sequence[str]], int]
 
@@ -135,5 +137,5 @@ def _show(root: Path, out: Path) -> None:
     # All that renders: seconds that the first job need not wait for.
     from jobs.render.products import preview
 
-    for picture in preview.previews(root, out):
+    for picture in preview.previews(root, out, _PICTURES):
         print(picture)

@@ -24,7 +24,7 @@ def part(name, **about):
 
 
 def test_runs_add_up(lake):
-    first = {"job": "draw", "prepare_s": 3.0, "prepare_cpu_s": 2.0}
+    first = {"job": "draw", "table": "x", "prepare_s": 3.0, "prepare_cpu_s": 2.0}
     log(
         lake,
         "1-x-1",
@@ -40,6 +40,13 @@ def test_runs_add_up(lake):
     assert (one.rows, one.seconds, one.cpu_s, one.gb, one.peak_gb) == (15, 15.0, 8.5, 3.0, 0.75)
     assert (other.job, other.stopped, other.parts, other.seconds) == ("other", 1, 1, 0.0)
     assert (total.job, total.runs, total.parts, total.rows, total.peak_gb) == ("all", 3, 3, 16, 0.75)
+
+
+def test_a_run_makes_several_tables(lake):
+    """A log each; the number of its process ends their names, and may come again."""
+    for name in ("1-x-7", "2-y-7", "3-x-8", "4-x-7"):
+        log(lake, name, {"job": "draw", "table": name[2]}, part("a", rows=1), {"seconds": 1.0, "status": "done"})
+    assert (report.rows(lake)[0].runs, report.rows(lake)[0].parts) == (3, 4)
 
 
 def test_what_is_not_known_is_said(lake, capsys):

@@ -1,11 +1,13 @@
 """Pictures of rendered images: asinh stretch, the brightest sources labelled, scale bar, compass, close-ups.
 
 picture     one image -> a PNG
-previews    every science image of a lake -> PNGs, without the cosmic rays whose truth the lake has
+previews    science images of a lake -> PNGs, without the cosmic rays whose truth the lake has
+shown       which of them, where they are many
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -38,21 +40,34 @@ _INK, _PAPER, _GALAXY, _STAR = "#e8e6df", "#0b0d12", "#ffd27d", "#9fd3ff"
 _SCALE_BARS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
 
-def previews(root: Path, out: Path) -> list[Path]:
-    """A PNG beside each other in `out` for every science image of the lake; returns their paths."""
+def previews(root: Path, out: Path, most: int | None = None) -> list[Path]:
+    """A PNG beside each other in `out` for the science images of the lake; returns their paths.
+
+    most : so many of them, as `shown` chooses, None = all
+    """
     version = read.version(root, "products")
     made, rows = [], version.rows().to_pylist()
-    hits = {_frame_of(row): version.file(row["path"]) for row in rows if row["content"] == "cosmic_rays"}
-    for row in rows:
-        if row["content"] == "science":
-            image = read_back.electrons(version.file(row["path"]))
-            if _frame_of(row) in hits:
-                (truth,) = images.read_images(hits[_frame_of(row)])
-                image = images.Image(_mended(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
-            path = out / f"{row['channel']}_{row['band']}_{row['detector']}_{row['exposure_id']}.png".lower()
-            picture(path, np.asarray(image.data), image.cards, preview_labels.labels(root, row, image))
-            made.append(path)
+    hits = {_frame_of(row): row["path"] for row in rows if row["content"] == "cosmic_rays"}
+    for row in shown([row for row in rows if row["content"] == "science"], most):
+        image = read_back.electrons(version.file(row["path"]))
+        if _frame_of(row) in hits:
+            (truth,) = images.read_images(version.file(hits[_frame_of(row)]))
+            image = images.Image(_mended(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
+        path = out / f"{row['channel']}_{row['band']}_{row['detector']}_{row['exposure_id']}.png".lower()
+        picture(path, np.asarray(image.data), image.cards, preview_labels.labels(root, row, image))
+        made.append(path)
     return made
+
+
+def shown(rows: Sequence[dict[str, Any]], most: int | None) -> list[dict[str, Any]]:
+    """So many rows of `products`, in their order: one of every channel and band before a second one of any."""
+    seen: Counter[tuple[str, str]] = Counter()
+    turn = []
+    for i, row in enumerate(rows):
+        kind = row["channel"], row["band"]
+        turn.append((seen[kind], i))
+        seen[kind] += 1
+    return [rows[i] for i in sorted(i for _, i in sorted(turn)[:most])]
 
 
 def _frame_of(row: dict[str, Any]) -> tuple[Any, ...]:

@@ -73,3 +73,15 @@ def test_cosmic_rays_are_mended_from_around_them():
     assert np.abs(mended - image).max() <= 1.0
     everything = preview._mended(spoiled, np.ones(image.shape, bool))
     np.testing.assert_array_equal(everything, spoiled)
+
+
+def test_of_many_images_each_kind_is_shown_first():
+    kinds = [("VIS", "v")] * 4 + [("EXT", "r"), ("EXT", "g"), ("EXT", "r")]
+    rows = [{"channel": channel, "band": band, "number": i} for i, (channel, band) in enumerate(kinds)]
+
+    def numbers(most):
+        return [row["number"] for row in preview.shown(rows, most)]
+
+    assert numbers(3) == [0, 4, 5]
+    assert numbers(5) == [0, 1, 4, 5, 6]
+    assert numbers(None) == numbers(99) == list(range(7))
