@@ -31,6 +31,7 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from jobs.measured import Measured
+from jobs.request import checks
 from jobs.request.from_toml import parse
 from jobs.request.schema import Request
 from lake_schema import __version__, command, user_files
@@ -105,7 +106,10 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
         with _stoppable(job):
             _refuse_mangled(options.lake, str(options.request))
             chosen = replace(job, steps=job.dry_run) if job.dry_run is not None and options.dry_run else job
-            run(chosen, layout.lake(options.lake), _request(job, options), options.verbose)
+            request = _request(job, options)
+            if skipped := checks.skipped(request):
+                command.say(job.name, skipped, 0)
+            run(chosen, layout.lake(options.lake), request, options.verbose)
         return 0
 
     return command.status(job.name, made)

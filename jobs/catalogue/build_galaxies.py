@@ -22,13 +22,13 @@ from jobs.catalogue.galaxies.lensing import Shear
 from jobs.catalogue.galaxies.nearest_sed import Training
 from jobs.catalogue.halos import halo_catalogue, population
 from jobs.catalogue.halos.halo_catalogue import LightCone
-from jobs.fluxes import passbands, sources
+from jobs.catalogue.request_checks import check_band
+from jobs.fluxes import sources
 from jobs.request.area import Area
 from jobs.request.checks import check_rendered
 from jobs.request.files import Catalogue, DustMap, GivenSources, Ingest
 from jobs.request.schema import Request, Universe
 from jobs.shell import Job, Step, main
-from lake_schema.errors import BadInput
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.store import layout, parquet, read
 from lake_schema.store.plan import Json, Output, Part, Plan
@@ -66,9 +66,7 @@ def _drawn(lake: Path, request: Request) -> list[Step]:
     universe = request.facts("universe")["universe"]
     del universe["star_limit"]
     own = request.ingest
-    if universe["galaxy_band"] not in passbands.names():
-        band, known = universe["galaxy_band"], ", ".join(passbands.names())
-        raise BadInput(f"universe.galaxy_band = {band!r} is not one of {known}")
+    check_band(request)
     # The spectra of a training table say how faint a halo's galaxy may be.
     theirs = {"halos": _about(own.halos, mapping.halos(dict(own.halos.columns)))} if own.halos else {}
     theirs |= {"training": _about(own.training, mapping.training(dict(own.training.columns)))} if own.training else {}

@@ -9,20 +9,18 @@ if __name__ == "__main__":
 
 import math
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from jobs.catalogue import cells, dust_map, given_sources
-from jobs.catalogue.stars import bright_stars, from_catalogue, stars
+from jobs.catalogue import cells, dust_map, given_sources, request_checks
+from jobs.catalogue.stars import stars
 from jobs.request.area import Area
 from jobs.request.checks import check_rendered
 from jobs.request.files import DustMap, GivenSources
 from jobs.request.schema import Request, Stars
 from jobs.shell import Job, Step, main
-from lake_schema import user_files
 from lake_schema.store.plan import Json, Output, Plan
-from lake_schema.store.provenance import code_version, file_sha256
+from lake_schema.store.provenance import code_version
 from lake_schema.tables.stars import STARS
 
 # Lowest order of a file: 54 deg2, what a bright limit leaves in them is soon drawn.
@@ -42,12 +40,12 @@ def steps(lake: Path, request: Request) -> list[Step]:
         "bright_limit": choice.bright_limit,
         "density": choice.density,
         "brown_dwarf_boost": choice.brown_dwarf_boost,
-        **_files(choice),
+        **request_checks.star_files(choice),
         **dust_map.facts(request.ingest.dust),
         "code": code_version(),
     }
     drawn = request.area.cells()
-    numbers = stars.numbers(drawn, _model(facts, choice))
+    numbers = stars.numbers(drawn, request_checks.star_model(facts["star_limit"], choice, facts))
     parts = cells.by_number(drawn, numbers, choice.rows_a_file, _LARGEST)
     return [Step(Plan(STARS, facts, parts), partial(work, choice=choice, own=request.ingest.dust))]
 
@@ -76,43 +74,15 @@ def _given_model(own: GivenSources, area: Area, planned: Json | None = None) -> 
     return stars.model(math.inf, math.inf, brown_dwarf_boost=0.0, catalogue=catalogue)
 
 
-def _files(choice: Stars) -> dict[str, Any]:
-    """What the user's files hold, wherever they lie."""
-    facts: dict[str, Any] = {}
-    if choice.tycho2:
-        sums = bright_stars.sha256(choice.tycho2)
-        read = bright_stars.load(choice.tycho2, sums)
-        counts = {"records": read.read, "without_color": read.without_color, "left_out": read.without_magnitude}
-        facts["tycho2"] = {"sha256": sums, "brighter": read.ra.size, **counts}
-    if choice.catalogue:
-        columns = dict(choice.columns)
-        from_catalogue.checked_columns(columns)
-        file = user_files.checked(choice.catalogue, from_catalogue.KIND, "stars.catalogue.file")
-        facts["catalogue"] = {"sha256": file_sha256(file), "columns": columns}
-    return facts
-
-
 def work(lake: Path, facts: Json, choice: Stars, own: DustMap | None = None) -> Output:
     """The stars of one file's cell.
 
     lake   : folder of the lake;  facts : of the plan and of the part, which has its cell
     choice : section `stars` of the request;  own : an external map of dust, None = the embedded one
     """
-    model = _model(facts, choice)
+    model = request_checks.star_model(facts["star_limit"], choice, facts)
     dust = dust_map.chosen(facts["seed"], own)
     return Output(cells.rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
-
-
-def _model(facts: Json, choice: Stars) -> stars.StarModel:
-    catalogue = bright = None
-    if choice.catalogue:
-        given = facts["catalogue"]
-        catalogue = from_catalogue.load(choice.catalogue, given["sha256"], given["columns"])
-    if choice.tycho2:
-        bright = bright_stars.load(choice.tycho2, facts["tycho2"]["sha256"])
-    limits = facts["star_limit"], facts["plane_limit"]
-    brightest = -math.inf if facts["bright_limit"] is None else facts["bright_limit"]
-    return stars.model(*limits, facts["density"], facts["brown_dwarf_boost"], catalogue, bright, brightest)
 
 
 JOB = Job("build_stars", "Draw the Milky Way's stars of a sky area.", steps)

@@ -17,7 +17,6 @@ from pathlib import Path
 from jobs.catalogue.stars import gaia
 from jobs.commands import space
 from jobs.render import plan_exposures
-from jobs.request.checks import check_rendered
 from jobs.request.from_toml import parse
 from jobs.request.schema import Request
 from lake_schema import __version__, command, user_files
@@ -104,9 +103,12 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
     that is to be rendered;  start : starts a job;  out : folder of the pictures
     """
     # Whatever is wrong with the request, or with the room on the disc, is said before the first job runs.
-    check_rendered(request)
     rendered = wanted[-1].name == IMAGES[-1].name
-    tasks = plan_exposures.plan(root, request)[2] if rendered else None
+    tasks = None
+    if rendered:
+        _, tasks = plan_exposures.check(request, root)
+    else:
+        plan_exposures.check_catalogues(request)
     space.check(root, request, tasks)
     rows, began = [], time.perf_counter()
     for stage in wanted:

@@ -11,9 +11,23 @@ from collections.abc import Sequence
 
 import pyarrow as pa
 
+from jobs.catalogue import request_checks
+from jobs.fluxes import inputs
 from jobs.render import catalogue_forecast
-from jobs.render.planning import forecast, planned_exposures, psf_files, source_counts, speed, survey, tasks, variants
+from jobs.render.planning import (
+    forecast,
+    planned_exposures,
+    preconditions,
+    psf_files,
+    source_counts,
+    speed,
+    survey,
+    tasks,
+    variants,
+)
 from jobs.render.planning.mission import PARTS, mission_of, user_filters
+from jobs.render.products.keys import ephemeris_files
+from jobs.request.checks import check_rendered
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema.columns import Table
@@ -30,8 +44,8 @@ from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
 
 
-def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
-    """The mission configuration, and rows of the tables `exposures` and `tasks`."""
+def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
+    """The mission configuration, and rows of the tables `exposures` and `tasks`; lake : with catalogues, if any."""
     if not request.pointings and not request.observations:
         raise BadInput(f"request {request.name}: pointing and observation are missing: there is nothing to plan")
     mission = mission_of(request.mission)
@@ -40,7 +54,7 @@ def plan(lake: Path, request: Request) -> tuple[MissionConfiguration, pa.Table, 
     filters, _ = user_filters(request)
     exposures = planned_exposures.table([exposure for exposure, _ in found], [own for _, own in found], filters)
     psf_files.check([(exposure, own) for exposure, own in found], filters)
-    densities = source_counts.Densities(mission, request.universe, _catalogues(lake))
+    densities = source_counts.Densities(mission, request.universe, [] if lake is None else _catalogues(lake))
     wanted = [exposure.detectors for exposure, _ in found]
     rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, variants.forced(request))
     return mission, exposures, rows
@@ -77,13 +91,36 @@ def _step(table: Table, output: Output, facts: Json) -> Step:
 
 
 def dry_run(lake: Path, request: Request) -> Sequence[Step]:
-    """The forecast alone, of the catalogues, too."""
-    _, exposures, rows = plan(lake, request)
+    """The forecast alone, of the catalogues, too, of a request that no later job would refuse."""
+    exposures, rows = check(request, lake)
     _print_forecast(lake, exposures, rows)
     print()
     for line in catalogue_forecast.text(catalogue_forecast.of_request(request, speed.of_machine(lake).factor)):
         print(line)
     return ()
+
+
+def check(request: Request, lake: Path | None = None) -> tuple[pa.Table, pa.Table]:
+    """Refuse whatever the jobs of this request would refuse, the catalogues' as well, before any of them runs.
+
+    returns : rows of the tables `exposures` and `tasks`, as planned;  lake : whose catalogues say how dense the sky is
+    """
+    check_rendered(request)
+    check_catalogues(request)
+    _, exposures, rows = plan(lake, request)
+    if request.bodies is not None:
+        ephemeris_files(request.bodies, exposures)
+    seen = preconditions.rendered(exposures, rows)
+    if request.detectors or request.limit is not None:
+        seen = pa.Table.from_pylist(tasks.part(seen, request), seen.schema)
+    preconditions.refuse_small_area(request.area, seen)
+    return exposures, rows
+
+
+def check_catalogues(request: Request) -> None:
+    """Refuse whatever the jobs of catalogues and fluxes would refuse."""
+    inputs.curves(request.bands, inputs.read(request.curves).passbands)
+    request_checks.refuse(request)
 
 
 def _print_forecast(lake: Path, exposures: pa.Table, rows: pa.Table) -> None:

@@ -44,9 +44,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
     names = (*INPUTS, LENSES) if layout.current_key(lake, LENSES) else INPUTS
     inputs = {name: read.version(lake, name) for name in names}
     preconditions.refuse_other_plan(inputs, request)
-    tasks = planned.part(inputs["tasks"].rows(), request)
     exposures = inputs["exposures"].rows()
-    preconditions.refuse_unrendered(exposures)
+    tasks = planned.part(preconditions.rendered(exposures, inputs["tasks"].rows()), request)
     places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in tasks if task["cells"]}
     for name in ("galaxies", "stars"):
         of_task = [selection.needed(task, catalogue_rows.deflection_of(inputs[name])) for task in places.values()]

@@ -1,4 +1,4 @@
-"""python -m jobs.request check FILE [--plan]: whether a request is valid, and all of it can be rendered."""
+"""python -m jobs.request check FILE [--plan]: whether any job would refuse a request, or --plan, planning alone."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jobs.request.checks import check_rendered
+from jobs.request import checks
 from jobs.request.from_toml import parse
-from lake_schema import command
+from jobs.request.schema import Request
+from lake_schema import command, user_files
+from lake_schema.errors import BadInput
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -23,12 +25,28 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _check(path: Path, alone: bool) -> int:
     request = parse(path)
-    if not alone:
-        check_rendered(request)
+    try:
+        _refuse(request, alone)
+    except BadInput as error:
+        raise BadInput(f"request {user_files.shown(path)}: {error}") from None
     variants = sum(1 for _ in request.variants())
     counts = f"{len(request.pointings)} pointings, {len(request.observations)} observations, {variants} variants"
     print(f"{request.name}: good: {counts}")
+    if skipped := checks.skipped(request):
+        print(f"{request.name}: {skipped}")
     return 0
+
+
+def _refuse(request: Request, alone: bool) -> None:
+    # What reads files and plans takes seconds to import: only a request whose keys are good is worth them.
+    from jobs.render import plan_exposures
+
+    if not request.pointings and not request.observations:
+        plan_exposures.check_catalogues(request)
+    elif alone:
+        plan_exposures.plan(None, request)
+    else:
+        plan_exposures.check(request)
 
 
 if __name__ == "__main__":

@@ -146,10 +146,12 @@ def _cone(found: object, path: str) -> Area:
 
 def _box(found: object, path: str) -> Area:
     box = table_of(found, path, {"ra", "dec"})
-    west, east = pair(box, f"{path}.ra", -360.0, 360.0)
+    west, east = pair(box, f"{path}.ra", -360.0, 720.0)
     south, north = pair(box, f"{path}.dec", -90.0, 90.0)
-    if not 0.0 < east - west < 180.0:
-        raise BadInput(f"{path}.ra = [{west}, {east}]: the second must be larger, by less than 180")
+    # [350, 10] crosses 0.
+    width = east - west + (360.0 if east < west else 0.0)
+    if not 0.0 < width < 180.0:
+        raise BadInput(f"{path}.ra = [{west}, {east}]: the second must lie to the east of the first, by less than 180")
     if not north > south:
         raise BadInput(f"{path}.dec = [{south}, {north}]: the second must be larger")
     return Area(box=(west % 360.0, east % 360.0, south, north))

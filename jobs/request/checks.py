@@ -1,13 +1,23 @@
-"""What is checked of a whole request: its bands, the mission's parameters, and whether all of it can be rendered."""
+"""What is checked of a whole request: its bands, the mission's parameters, and whether any of it can be rendered.
+
+check_bands, check_mission   of names and values
+check_rendered               something of it can be rendered
+skipped                      what of it cannot, as one line
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from jobs.request.files import Ingest
 from jobs.request.schema import Request, Stars
 from lake_schema.errors import BadInput
 from lake_schema.tables.exposures import RENDERED
+
+if TYPE_CHECKING:
+    from lake_schema.mission.configuration import MissionConfiguration
 
 
 def check_sources(request: Request) -> None:
@@ -31,8 +41,8 @@ def check_bands(request: Request) -> None:
             raise BadInput(f"observation[{i}].bands: {found[0]} is your own passband: no survey observes in it")
 
 
-def check_mission(request: Request) -> None:
-    """Overrides and explored values must be of the database's names, units and ranges."""
+def check_mission(request: Request) -> MissionConfiguration:
+    """The mission that a request chooses: overrides and explored values must be of its names, units and ranges."""
     from lake_schema.mission.configuration import resolve
 
     own = {key: (override.value, override.unit) for key, override in request.mission.overrides}
@@ -48,14 +58,37 @@ def check_mission(request: Request) -> None:
                 mission.overridden_with({key: tuple(json.loads(value))})
             except BadInput as error:
                 raise BadInput(f"explore.{key}: {error}") from None
+    return mission
 
 
 def check_rendered(request: Request) -> None:
-    """There must be a simulator for every channel and image type: what can only be planned is refused by its key."""
-    wanted: list[tuple[str, tuple[str, ...], str]]
-    wanted = [(f"pointing[{i}].channel", (p.channel,), "science") for i, p in enumerate(request.pointings)]
-    wanted += [(f"observation[{i}].channels", o.channels, o.image_type) for i, o in enumerate(request.observations)]
-    for key, channels, image_type in wanted:
-        for channel in channels:
-            if image_type not in RENDERED.get(channel, ()):
-                raise BadInput(f"{key}: no simulator renders {channel} {image_type} yet: it can be planned alone")
+    """There must be a simulator for some channel and image type of it, if it wants anything observed."""
+    kinds = [kind for _, kind in _kinds(request)]
+    if kinds and not any(map(_is_rendered, kinds)):
+        key, (channel, image_type) = next(_kinds(request))
+        raise BadInput(f"{key}: no simulator renders {channel} {image_type} yet: it can be planned alone")
+
+
+def skipped(request: Request) -> str:
+    """A line about what of a request is planned and forecast and not rendered, empty where all of it is rendered."""
+    names = dict.fromkeys(
+        f"{channel} {image_type}" if channel in RENDERED else channel
+        for _, (channel, image_type) in _kinds(request)
+        if not _is_rendered((channel, image_type))
+    )
+    *most, last = names or ("",)
+    what = f"{', '.join(most)} and {last}" if most else last
+    return f"{what}: planned and forecast, skipped by rendering (no simulator yet)" if what else ""
+
+
+def _kinds(request: Request) -> Iterator[tuple[str, tuple[str, str]]]:
+    """The key, channel and image type of all that a request wants observed."""
+    for i, pointing in enumerate(request.pointings):
+        yield f"pointing[{i}].channel", (pointing.channel, "science")
+    for i, block in enumerate(request.observations):
+        kinds = block.table.kinds if block.table else [(channel, block.image_type) for channel in block.channels]
+        yield from ((f"observation[{i}].{'pointings' if block.table else 'channels'}", kind) for kind in kinds)
+
+
+def _is_rendered(kind: tuple[str, str]) -> bool:
+    return kind[1] in RENDERED.get(kind[0], ())

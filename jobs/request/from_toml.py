@@ -40,9 +40,10 @@
         image_type = "science" | "deep" | "bias" | "dark" | "flat" | "charge_injection" | "self_calibration"
                      | "standard_star" | "planetary_nebula"
         survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
-        pointings = "file.csv"     a table of pointings instead of a survey's pattern
-        dither = "S" | "J" | "none"   fields, visits, exposures, short, flat, blue, bands, detectors, mjd,
-        exposure_time_s, realisations
+        ra, dec, position_angle    a field of your own instead of the survey's (docs/own_field.md)
+        pointings = "file.csv"     a table of pointings instead of either (jobs/request/pointing_tables.py)
+        dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
+        detectors, mjd, exposure_time_s, realisations
     [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation"]
                    compression = "none" | "rice"   of images of whole numbers, without loss
 
@@ -61,6 +62,7 @@ from pathlib import Path
 
 from jobs.accuracy import SURVEY, Accuracy, preset, row_for
 from jobs.request import area as areas
+from jobs.request import bands as passbands
 from jobs.request import checks, files, observations
 from jobs.request.area import Area
 from jobs.request.files import GivenSources
@@ -117,7 +119,7 @@ def parse(path: Path) -> Request:
     except BadInput as error:
         raise BadInput(f"request {error}") from None
     try:
-        return _with_files_beside(from_table(table, path.resolve().parent), path.parent)
+        return from_table(table, path.resolve().parent)
     except BadInput as error:
         raise BadInput(f"request {user_files.shown(path)}: {error}") from None
 
@@ -140,10 +142,10 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         "products",
     }
     _known(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *sections})
-    asked, blocks = observations.pointings(table), observations.observations(table)
+    asked, blocks = observations.pointings(table), observations.observations(table, folder)
     fluxes = _section(table, "fluxes", {"bands", "intergalactic", "passbands", "templates", "stars", "extinction"})
     curves = files.curves(fluxes, folder)
-    bands = _strings(fluxes, "fluxes.bands") or tuple(p.band for p in asked)
+    bands = _strings(fluxes, "fluxes.bands")
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
     products_ = _section(table, "products", {"truth", "compression"})
     solar_system = _section(table, "solar_system", {"bodies"})
@@ -157,7 +159,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         universe=universe,
         stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder, universe.star_limit),
         mission=mission,
-        bands=tuple(dict.fromkeys((*bands, *(name for name, _ in curves.passbands)))),
+        bands=bands,
         pointings=asked,
         truth=_truth(products_),
         compression=_string(products_, "products.compression", COMPRESSIONS, "none"),
@@ -174,8 +176,9 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     )
     checks.check_sources(request)
     checks.check_bands(request)
-    checks.check_mission(request)
-    return request
+    found = passbands.of_request(request, checks.check_mission(request))
+    own = (name for name, _ in curves.passbands)
+    return replace(request, bands=tuple(dict.fromkeys((*(bands or found), *own))))
 
 
 # ------------------------------------------------------------------------------------------------ sections
@@ -252,21 +255,6 @@ def _override(value: object, key: str) -> Override:
     path = f"mission.overrides.{key}"
     table = _table(value, path, {"value", "unit"})
     return Override(_number(table, f"{path}.value", -math.inf, math.inf), _string(table, f"{path}.unit"))
-
-
-def _with_files_beside(request: Request, folder: Path) -> Request:
-    """Tables of pointings are named relative to the request's file, and may not leave its folder."""
-    found = []
-    for i, block in enumerate(request.observations):
-        if block.pointings:
-            path = folder / block.pointings
-            try:
-                user_files.checked(layout.within(folder, path), "table of pointings")
-            except BadInput as error:
-                raise BadInput(f"observation[{i}].pointings: {error}") from None
-            block = replace(block, pointings=str(path))
-        found.append(block)
-    return replace(request, observations=tuple(found))
 
 
 def _truth(table: Toml) -> tuple[str, ...]:

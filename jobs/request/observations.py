@@ -7,29 +7,34 @@ Observation, observations      the list `observation`
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from jobs.request import area as areas
+from jobs.request import pointing_tables
 from jobs.request.area import Area
+from jobs.request.pointing_tables import CHANNELS, IMAGE_TYPES, Contents
 from jobs.request.toml_values import (
     Toml,
     boolean,
+    checked_number,
     has,
     integer,
     number,
     optional,
     section,
+    shown,
     string,
     strings,
     table_of,
     tables,
 )
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
-from lake_schema.tables import exposures as declared
 
 _MOST_POINTINGS, _MOST_OBSERVATIONS, _MOST_REALISATIONS = 100_000, 1000, 10_000
-CHANNELS = tuple(code for code, _ in declared.CHANNELS)
-IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
+# Dithers of an observation's own: how many, and how far from its place, arcsec.
+_MOST_DITHERS, _FARTHEST = 1000, 36_000.0
 DITHERS = ("S", "J", "none")
 EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
 GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes")
@@ -72,12 +77,16 @@ class Pointing:
 class Observation:
     """A block of exposures that the planner lays out.
 
-    survey    : whose pattern;  pointings : a table of pointings (path) instead
+    survey    : whose pattern
+    pointings : a table of pointings (path) instead;  table : what it holds
+    ra, dec   : deg, the centre of a field of its own instead of the survey's; None = the survey's
+    position_angle : deg, of the focal plane's y axis there, None = Euclid's as the Sun asks, 0 of a ground camera
     area      : where, None = the request's
     fields    : how many fields at most, those deepest in the area, 0 = all
     visits    : how often each field is observed, 0 = the survey's
     exposures : of a ground survey, in all bands together of which the positions are its own; of calibrations, frames
-    dither    : pattern within a field;  short, flat : with the short VIS exposure, the closing flat
+    dither    : pattern within a field, or its own offsets (x, y) arcsec along the focal plane's axes
+    short, flat : with the short VIS exposure, the closing flat
     blue      : with the blue grism besides the red ones
     mjd       : the earliest date, None = the mission's launch
     realisations : how many of each exposure, which differ in their noise alone
@@ -87,11 +96,15 @@ class Observation:
     image_type: str = "science"
     survey: str = "wide"
     pointings: str = ""
+    table: Contents | None = None
+    ra: float | None = None
+    dec: float | None = None
+    position_angle: float | None = None
     area: Area | None = None
     fields: int = 0
     visits: int = 0
     exposures: int = 0
-    dither: str = "S"
+    dither: str | tuple[tuple[float, float], ...] = "S"
     short: bool = True
     flat: bool = True
     blue: bool = False
@@ -100,6 +113,11 @@ class Observation:
     mjd: float | None = None
     exposure_time_s: float | None = None
     realisations: int = 1
+
+    @property
+    def place(self) -> tuple[float, float] | None:
+        """ra, dec deg of the observation's own field, None where it has none."""
+        return None if self.ra is None or self.dec is None else (self.ra, self.dec)
 
 
 def pointings(table: Toml) -> tuple[Pointing, ...]:
@@ -126,14 +144,14 @@ def _pointing(value: object, path: str) -> Pointing:
     )
 
 
-def observations(table: Toml) -> tuple[Observation, ...]:
-    """Of a request's table.  BadInput names the key."""
+def observations(table: Toml, folder: Path = Path()) -> tuple[Observation, ...]:
+    """Of a request's table; tables of pointings lie in `folder` or below.  BadInput names the key."""
     found = tables(table, "observation", _MOST_OBSERVATIONS)
-    return tuple(_observation(value, f"observation[{i}]") for i, value in enumerate(found))
+    return tuple(_observation(value, f"observation[{i}]", folder) for i, value in enumerate(found))
 
 
-def _observation(value: object, path: str) -> Observation:
-    table = table_of(value, path, set(Observation.__slots__))
+def _observation(value: object, path: str, folder: Path) -> Observation:
+    table = table_of(value, path, set(Observation.__slots__) - {"table"})
     channels = strings(table, f"{path}.channels", CHANNELS)
     if not channels:
         raise BadInput(f"{path}.channels is missing or empty")
@@ -147,17 +165,22 @@ def _observation(value: object, path: str) -> Observation:
                 legal = ", ".join((*_SKY_TYPES, *_CALIBRATIONS[channel]))
                 raise BadInput(f"{path}.image_type = {image_type!r} is none of {channel}'s: {legal}")
     surveys = GROUND_SURVEYS if ground else EUCLID_SURVEYS
-    own = has(table, f"{path}.area")
+    _refuse_two_places(table, path)
+    file = _file(table, path, folder)
     return Observation(
         channels=channels,
         image_type=image_type,
         survey=string(table, f"{path}.survey", surveys, None if ground else "wide"),
-        pointings=string(table, f"{path}.pointings", default=""),
-        area=areas.parse(section(table, "area", None), f"{path}.area") if own else None,
+        pointings="" if file is None else str(file),
+        table=None if file is None else _contents(file, channels, image_type, path),
+        ra=_turn(optional(table, f"{path}.ra", -360.0, 360.0)),
+        dec=optional(table, f"{path}.dec", -90.0, 90.0),
+        position_angle=optional(table, f"{path}.position_angle", -360.0, 360.0),
+        area=areas.parse(section(table, "area", None), f"{path}.area") if has(table, f"{path}.area") else None,
         fields=integer(table, f"{path}.fields", 1, 1_000_000, 0),
         visits=integer(table, f"{path}.visits", 1, 1000, 0),
         exposures=integer(table, f"{path}.exposures", 1, 1_000_000, 0),
-        dither=string(table, f"{path}.dither", DITHERS, "S"),
+        dither=_dither(table, f"{path}.dither", ground),
         short=boolean(table, f"{path}.short", True),
         flat=boolean(table, f"{path}.flat", True),
         blue=boolean(table, f"{path}.blue", False),
@@ -167,3 +190,51 @@ def _observation(value: object, path: str) -> Observation:
         exposure_time_s=optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
         realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
     )
+
+
+def _turn(ra: float | None) -> float | None:
+    return None if ra is None else ra % 360.0
+
+
+def _refuse_two_places(table: Toml, path: str) -> None:
+    """A place of the observation's own, a table of pointings and an area with a survey's fields exclude one another."""
+    if ("ra" in table) != ("dec" in table):
+        raise BadInput(f"{path}.{'dec' if 'ra' in table else 'ra'} is missing: a field has both")
+    if "position_angle" in table and "ra" not in table:
+        raise BadInput(f"{path}.position_angle wants ra and dec: a survey's fields have their own")
+    for key in ("ra", "pointings"):
+        for other in ("pointings", "area", "fields"):
+            if key != other and key in table and other in table:
+                raise BadInput(f"{path}: {key} and {other} exclude each other")
+
+
+def _file(table: Toml, path: str, folder: Path) -> Path | None:
+    """The table of pointings, which may not lie outside the request's folder."""
+    if not string(table, f"{path}.pointings", default=""):
+        return None
+    file = folder / string(table, f"{path}.pointings")
+    try:
+        return user_files.checked(layout.within(folder, file), "table of pointings")
+    except BadInput as error:
+        raise BadInput(f"{path}.pointings: {error}") from None
+
+
+def _contents(file: Path, channels: tuple[str, ...], image_type: str, path: str) -> Contents:
+    try:
+        return pointing_tables.contents(file, channels, image_type)
+    except BadInput as error:
+        raise BadInput(f"{path}.pointings: {error}") from None
+
+
+def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, float], ...]:
+    """A pattern's name, or offsets."""
+    found = table.get("dither", "none" if ground else "S")
+    if not isinstance(found, list):
+        pattern = string({"dither": found}, path, DITHERS)
+        if ground and pattern != "none":
+            raise BadInput(f"{path} = {shown(found)} is a pattern of Euclid's: name offsets in arcsec, [[x, y], ..]")
+        return pattern
+    if not 1 <= len(found) <= _MOST_DITHERS or not all(isinstance(step, list) and len(step) == 2 for step in found):
+        raise BadInput(f"{path} wants one of {', '.join(DITHERS)}, or 1 to {_MOST_DITHERS} offsets [x, y] in arcsec")
+    steps = [[checked_number(n, f"{path}[{i}]", -_FARTHEST, _FARTHEST) for n in step] for i, step in enumerate(found)]
+    return tuple((x, y) for x, y in steps)

@@ -25,6 +25,12 @@ IMAGE_TYPES = (
     ("standard_star", "standard star"),
     ("planetary_nebula", "emission lines for the wavelength scale"),
 )
+# Passbands of Euclid's channels, which requests know by themselves (a test holds them to the planner's).
+EUCLID_BANDS: Mapping[str, tuple[str, ...]] = {
+    "VIS": ("euclid_vis",),
+    "NISP-P": ("euclid_y", "euclid_j", "euclid_h"),
+    "NISP-S": ("nisp_red", "nisp_blue"),
+}
 # What there is a simulator for: channel -> image types. All others can be planned and forecast. A copy, since
 # requests are refused below the renderer (test_checks.py holds it to the registry of channels).
 RENDERED: Mapping[str, tuple[str, ...]] = {

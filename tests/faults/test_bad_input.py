@@ -20,6 +20,7 @@ from jobs.catalogue import (
     dust_map,
     export_gaia,
     export_galaxies,
+    request_checks,
 )
 from jobs.commands import run as whole
 from jobs.commands import submit
@@ -238,10 +239,10 @@ OWN = {
     "ingest.galaxies": ("[ingest.galaxies]\n" + CATALOGUE + "files = [{}]\n", lambda r: build_galaxies.steps(None, r)),
     "ingest.halos": ("[ingest.halos]\n" + HALOS + "files = [{}]\n", lambda r: build_galaxies.steps(None, r)),
     "ingest.dust": ('[ingest.dust]\ncolumn = "EBV"\nfile = {}\n', lambda r: dust_map.chosen(1, r.ingest.dust)),
-    "stars.tycho2": ("[stars]\ntycho2 = [{}]\n", lambda r: build_stars._files(r.stars)),
+    "stars.tycho2": ("[stars]\ntycho2 = [{}]\n", lambda r: request_checks.star_files(r.stars)),
     "stars.catalogue": (
         '[stars.catalogue]\ncolumns = {{ ra = "ra", dec = "dec", mag_h = "h", teff = "t" }}\nfile = {}\n',
-        lambda r: build_stars._files(r.stars),
+        lambda r: request_checks.star_files(r.stars),
     ),
     "psf": (POINT + "[psf]\neuclid_vis = {}\n", lambda r: from_file.read(Path(dict(r.psfs)["euclid_vis"]), None, None)),
     "solar_system.bodies": (

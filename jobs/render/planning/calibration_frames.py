@@ -13,9 +13,10 @@ from dataclasses import replace
 from jobs import rng
 from jobs.render.camera import pointing
 from jobs.render.camera.lamps import LEDS, NISP_LAMPS
+from jobs.render.planning import unrendered
 from jobs.render.planning.observing_sequence import FILTERS, RED, offsets
 from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
-from jobs.render.planning.reference_survey import position_angle
+from jobs.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
 from jobs.request.observations import Observation
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
@@ -34,15 +35,23 @@ def exposures(
 ) -> Iterator[Exposure]:
     """Exposures of each channel of a calibration block, one after another.
 
-    camera : of the ground survey, where the channel is EXT;  centre : ra, dec deg of the request's area
-    block   : of the request;  mission : the mission database;  seed : of the request;  start : MJD
+    camera : of the ground survey, where the channel is EXT
+    centre : ra, dec deg of the block's own field or of the request's area
+    block  : of the request;  mission : the mission database;  seed : of the request;  start : MJD
     """
+    own = [unrendered.of_channel(channel) for channel in block.channels]
+    if any(not channel.on_ground and block.image_type in channel.sky_types for channel in own):
+        if block.mjd is None:
+            start = next_allowed(*centre, start, mission)
+        check_aspect(*centre, start, mission, "mjd")
     now = start
     for channel in block.channels:
-        own = camera if channel == "EXT" else "vis" if channel == "VIS" else "nisp"
-        angle = 0.0 if channel == "EXT" else position_angle(*centre, start)
+        name = camera if channel == "EXT" else "vis" if channel == "VIS" else "nisp"
+        angle = block.position_angle
+        if angle is None:
+            angle = 0.0 if channel == "EXT" else position_angle(*centre, start)
         first = Exposure(
-            channel, own, "", block.image_type, *centre, angle, start, 0.0, "calibration", detectors=block.detectors
+            channel, name, "", block.image_type, *centre, angle, start, 0.0, "calibration", detectors=block.detectors
         )
         for frame in _frames(first, block, mission, seed):
             yield replace(frame, mjd=now)
@@ -52,7 +61,7 @@ def exposures(
 def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, seed: int) -> Iterator[Exposure]:
     in_bands = [
         replace(first, band=band, exposure_time_s=_seconds(first, band, block, mission))
-        for band in block.bands or _bands(first, mission)
+        for band in _chosen(block.bands, _bands(first, mission))
     ]
     if first.image_type == "self_calibration":
         dithers = block.exposures or int(mission.value("survey.self_calibration.dithers"))
@@ -67,6 +76,11 @@ def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, 
         for i in range(block.exposures):
             lamp = i % lamps + 1 if first.image_type == "flat" else None
             yield replace(in_bands[i % len(in_bands)], lamp=lamp)
+
+
+def _chosen(wanted: Sequence[str], own: Sequence[str]) -> Sequence[str]:
+    """Those of a channel's bands that a block names, all where it names none of them."""
+    return [band for band in own if band in wanted] or own
 
 
 def _seconds(first: Exposure, band: str, block: Observation, mission: MissionConfiguration) -> float:

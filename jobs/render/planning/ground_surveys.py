@@ -8,9 +8,7 @@ Ref : Serrano et al. 2024, appendix on the survey files of the eighth science ch
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +18,16 @@ from jobs.render.camera import detectors as camera_detectors
 from jobs.render.camera import pointing
 from jobs.render.camera.detectors import Detector
 from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
+from jobs.render.sky.solar_aspect import next_allowed, position_angle
+from jobs.request import pointing_tables
 from jobs.request.area import Area
-from jobs.request.observations import CHANNELS, IMAGE_TYPES, Observation
-from lake_schema import user_files
+from jobs.request.observations import Observation
+from jobs.request.pointing_tables import Row
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
 _DAY_S, _OVERHEAD_S = 86400.0, 30.0
-_MOST_ROWS, _LONGEST = 1_000_000, 1000
-_MOST_LINES, _LONGEST_LINE = 2 * _MOST_ROWS, 20 * _LONGEST
 # Mean midnight of the sites is not modelled: ground exposures follow one another from the earliest date on.
-_COLUMNS = ("channel", "camera", "band", "ra", "dec", "position_angle", "mjd")
-_OPTIONAL = ("exposure_time_s", "sky", "seeing", "zero_point", "psf", "detectors", "image_type")
 
 
 def camera_of(survey: str, mission: MissionConfiguration) -> str:
@@ -42,7 +38,7 @@ def camera_of(survey: str, mission: MissionConfiguration) -> str:
 def exposures(
     block: Observation, area: Area, mission: MissionConfiguration, seed: int, start: float
 ) -> Iterator[Exposure]:
-    """The exposures of a survey over an area: as many as are asked for, else one layer.
+    """The exposures of a survey over an area: as many as are asked for, else one layer; or of a field of its own.
 
     Bands that the survey takes together are taken at the same places.
     block   : of the request, with its survey and bands;  area : of the request
@@ -52,17 +48,15 @@ def exposures(
     rules = _rules(block.survey, mission)
     groups = [tuple(rule["bands"].split()) for rule in rules]
     if block.bands:
-        known = [band for group in groups for band in group]
-        for band in block.bands:
-            if band not in known:
-                raise BadInput(f"survey {block.survey} has no band {band!r} ({', '.join(known)})")
         groups = [tuple(band for band in group if band in block.bands) for group in groups]
     for rule, bands in zip(rules, groups, strict=True):
         if not bands:
             continue
-        for i, (ra, dec) in enumerate(_places(rule, bands, block, area, mission, seed)):
+        places = _places(rule, block, area, mission, seed) if block.place is None else _own(block)
+        for i, (ra, dec) in enumerate(places):
             # Where the survey shares its exposures among bands, they take turns.
-            turn = bands if rule["shared"] == "0" else (bands[i % len(bands)],)
+            whole = rule["shared"] == "0" or (block.place is not None and not block.exposures)
+            turn = bands if whole else (bands[i % len(bands)],)
             for band in turn:
                 own = float(rule["exposure_time_s"])
                 seconds = own if block.exposure_time_s is None else block.exposure_time_s
@@ -73,7 +67,7 @@ def exposures(
                     image_type=block.image_type,
                     ra=ra,
                     dec=dec,
-                    position_angle=0.0,
+                    position_angle=block.position_angle or 0.0,
                     mjd=now,
                     exposure_time_s=seconds,
                     survey=block.survey,
@@ -88,12 +82,7 @@ def _rules(survey: str, mission: MissionConfiguration) -> list[dict[str, str]]:
 
 
 def _places(
-    rule: Mapping[str, str],
-    bands: tuple[str, ...],
-    block: Observation,
-    area: Area,
-    mission: MissionConfiguration,
-    seed: int,
+    rule: Mapping[str, str], block: Observation, area: Area, mission: MissionConfiguration, seed: int
 ) -> list[tuple[float, float]]:
     """Pointings of a pattern, in passes over the area, those nearest to it kept."""
     detectors = camera_detectors.detectors(rule["camera"], mission)
@@ -117,6 +106,15 @@ def _places(
     depth = area.depth(*np.array(places).T)
     kept = np.sort(np.argsort(-depth, kind="stable")[:count])
     return [places[i] for i in kept]
+
+
+def _own(block: Observation) -> list[tuple[float, float]]:
+    """The place of an observation's own with its dithers, as often as exposures are asked for, else once each."""
+    assert block.place is not None
+    steps = np.zeros((1, 2)) if isinstance(block.dither, str) else np.array(block.dither)
+    ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], *block.place, block.position_angle or 0.0)
+    count = block.exposures or len(steps)
+    return [(float(ra[i % len(steps)]), float(dec[i % len(steps)])) for i in range(count)]
 
 
 def _pass(
@@ -168,99 +166,45 @@ def _by_chips(
 
 
 def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[Exposure]:
-    """Pointings of a CSV file: columns channel, camera, band, ra, dec, position_angle, mjd, and any of exposure_time_s,
-    sky (electron / (s pix)), seeing (arcsec), zero_point (mag), psf (a file beside it), detectors
-    (by blanks), image_type.
+    """Exposures of a table of pointings (jobs.request.pointing_tables), with what its rows leave to the mission.
 
     Errors : BadInput names the file, the line and the column
     """
-    stream = io.StringIO(user_files.text(path, "table of pointings"), newline="")
-    numbered, at = _plain_lines(path, stream), 0
+    rows = pointing_tables.read(path, block.channels, block.image_type)
+    return [_of_row(row, number, block, mission) for number, row in enumerate(rows, start=1)]
 
-    def texts() -> Iterator[str]:
-        nonlocal at
-        for number, line in numbered:
-            at = number
-            yield line
 
-    lines = csv.DictReader(texts())
-    found: list[Exposure] = []
+def _of_row(row: Row, number: int, block: Observation, mission: MissionConfiguration) -> Exposure:
+    camera = row.camera or camera_of(block.survey, mission)
     try:
-        names = lines.fieldnames or []
-        for name in _COLUMNS:
-            if name not in names:
-                raise BadInput(f"{path}: column {name} is missing")
-        for name in names:
-            if name not in (*_COLUMNS, *_OPTIONAL):
-                known = ", ".join((*_COLUMNS, *_OPTIONAL))
-                raise BadInput(f"{path}: column {user_files.shown(name)} is not known; known: {known}")
-        for row in lines:
-            if len(found) >= _MOST_ROWS:
-                raise BadInput(f"{path}: more than {_MOST_ROWS} pointings")
-            where = f"{path} line {at}"
-            if not all(isinstance(text, str) and len(text) <= _LONGEST for text in row.values() if text is not None):
-                raise BadInput(f"{where}: a text is too long, or there are more than columns")
-            found.append(_of_row(row, where, len(found) + 1, block, mission, path.parent))
-    except csv.Error as error:
-        raise BadInput(f"{path}: {' '.join(str(error).split())}") from None
-    return found
-
-
-def _plain_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:
-    """Number and text of each line that is no comment, as many and as long as pointings need."""
-    for number, line in enumerate(stream, start=1):
-        if number > _MOST_LINES or len(line) > _LONGEST_LINE:
-            raise BadInput(f"{path}: more than {_MOST_LINES} lines, or one of more than {_LONGEST_LINE} characters")
-        if not line.startswith("#"):
-            yield number, line
-
-
-def _of_row(
-    row: Mapping[str, str], where: str, number: int, block: Observation, mission: MissionConfiguration, folder: Path
-) -> Exposure:
-    channel, camera, band = (str(row[name]) for name in ("channel", "camera", "band"))
-    if channel not in CHANNELS:
-        raise BadInput(f"{where}: channel = {channel!r} is not one of {', '.join(CHANNELS)}")
-    try:
-        bands = bands_of(channel, camera, mission)
+        bands = bands_of(row.channel, camera, mission)
     except BadInput as error:
-        raise BadInput(f"{where}: {error}") from None
-    if band not in bands:
-        raise BadInput(f"{where}: camera {camera} has no band {band!r}")
-    image_type = row.get("image_type") or block.image_type
-    if image_type not in IMAGE_TYPES:
-        raise BadInput(f"{where}: image_type = {image_type!r} is not one of {', '.join(IMAGE_TYPES)}")
-
-    def number_of(name: str, lo: float, hi: float) -> float:
-        try:
-            value = float(row[name])
-        except (ValueError, TypeError):
-            raise BadInput(f"{where}: {name} = {row[name]!r} is not a number") from None
-        if not lo <= value <= hi:
-            raise BadInput(f"{where}: {name} = {value} is outside {lo:g} to {hi:g}")
-        return value
-
-    def optional(name: str, lo: float, hi: float) -> float | None:
-        return number_of(name, lo, hi) if row.get(name) else None
-
-    seconds = optional("exposure_time_s", 0.0, 1e6)
-    if seconds is None:
-        seconds = block.exposure_time_s
+        raise BadInput(f"{row.where}: {error}") from None
+    if row.band not in bands:
+        raise BadInput(f"{row.where}: camera {camera} has no band {row.band!r} ({', '.join(bands)})")
+    mjd, angle = row.mjd if row.mjd is not None else block.mjd, row.position_angle
+    euclid = row.channel != "EXT"
+    if mjd is None:
+        mjd = mission.value("svm.launch", "d")
+        mjd = next_allowed(row.ra, row.dec, mjd, mission) if euclid else mjd
+    if angle is None:
+        angle = position_angle(row.ra, row.dec, mjd) if euclid else 0.0
+    seconds = block.exposure_time_s if row.exposure_time_s is None else row.exposure_time_s
     return Exposure(
-        channel=channel,
+        channel=row.channel,
         camera=camera,
-        band=band,
-        image_type=image_type,
-        ra=number_of("ra", -360.0, 360.0) % 360.0,
-        dec=number_of("dec", -90.0, 90.0),
-        position_angle=number_of("position_angle", -360.0, 360.0),
-        mjd=number_of("mjd", 40_000.0, 100_000.0),
-        exposure_time_s=exposure_time(channel, camera, band, mission) if seconds is None else seconds,
+        band=row.band,
+        image_type=row.image_type,
+        ra=row.ra,
+        dec=row.dec,
+        position_angle=angle,
+        mjd=mjd,
+        exposure_time_s=exposure_time(row.channel, camera, row.band, mission) if seconds is None else seconds,
         survey=block.survey,
         field=number,
-        sky=optional("sky", 0.0, 1e6),
-        seeing=optional("seeing", 0.01, 10.0) if channel == "EXT" else None,
-        zero_point=optional("zero_point", 0.0, 50.0),
-        psf=str(user_files.expanded(row["psf"], folder)) if row.get("psf") else None,
-        detectors=tuple((row.get("detectors") or "").split()) or block.detectors,
+        sky=row.sky,
+        seeing=row.seeing,
+        zero_point=row.zero_point,
+        psf=row.psf,
+        detectors=row.detectors or block.detectors,
     )

@@ -54,10 +54,16 @@ def sequence(
     field   : where, and when it is visited;  block : of the request;  survey : name that exposures have
     mission : the mission database;  seed : of the request
     """
-    steps = offsets(block.dither, mission, seed, survey, field.number, field.visit)
-    # The pattern is laid about the field's centre.
-    x, y = (steps - steps.mean(axis=0)).T
-    ra, dec = pointing.sky_of_plane(x, y, field.ra, field.dec, field.position_angle)
+    if isinstance(block.dither, str):
+        # Fields of the user's own have no number: their places tell them apart.
+        place = () if block.place is None else tuple(angle.hex() for angle in block.place)
+        steps = offsets(block.dither, mission, seed, survey, field.number, field.visit, *place)
+        # The pattern is laid about the field's centre.
+        steps = steps - steps.mean(axis=0)
+    else:
+        # Of the user's own: taken as they are.
+        steps = np.array(block.dither)
+    ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], field.ra, field.dec, field.position_angle)
     length = _dither_time(mission)
     for i in range(len(steps)):
         start = field.mjd + i * (length + mission.value("svm.dither_slew_time", "s")) / _DAY_S
@@ -97,6 +103,8 @@ class _At:
 
     def exposures(self, last: bool) -> Iterator[Exposure]:
         block, mission = self.block, self.mission
+        # A block may name some of the filters; VIS has but one.
+        bands = set(block.bands) & set(FILTERS) or set(FILTERS)
         settle, to_filter, wheel = _moves(mission)
         if "VIS" in block.channels:
             yield self._one("VIS", "euclid_vis", settle)
@@ -105,7 +113,7 @@ class _At:
         begin = settle + mission.value("nisp.commanded_time_spectroscopic", "s") + to_filter
         step = mission.value("nisp.commanded_time_photometric", "s") + wheel
         for i, band in enumerate(FILTERS):
-            if "NISP-P" in block.channels and band in (block.bands or FILTERS):
+            if "NISP-P" in block.channels and band in bands:
                 yield self._one("NISP-P", band, begin + i * step)
         if "VIS" in block.channels and block.short and self.dither == 1:
             # Beside the last filter (Serrano et al. 2024: in the first dither only).

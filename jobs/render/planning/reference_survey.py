@@ -2,7 +2,7 @@
 
 wide      fields of the wide survey over an area, each with its date and position angle
 deep      fields of a deep survey: a raster in the tangent plane, turned with the Sun from visit to visit
-position_angle, solar_aspect
+own       visits of a field of the user's
 
 Ref : Scaramella et al. 2022; Serrano et al. 2024, section 3.2
 """
@@ -14,11 +14,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from jobs import sums
 from jobs.render.camera import pointing
 from jobs.render.sky.diffuse_light import sun_longitude
+from jobs.render.sky.solar_aspect import next_allowed, position_angle
 from jobs.request.area import Area
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
@@ -28,7 +27,6 @@ from lake_schema.mission.configuration import MissionConfiguration
 
 # Half the diagonal of the field of view, deg: fields whose centre is nearer to an area than this may see it.
 _REACH = 0.52
-_DAY_S = 86400.0
 # The Sun's largest daily motion, deg; how many half-years are looked through for a free date.
 _SUN_RATE, _MOST_SEASONS = 1.02, 40
 
@@ -43,48 +41,6 @@ class Field:
     dec: float
     position_angle: float
     mjd: float
-
-
-# ------------------------------------------------------------------------------------------------ the Sun
-
-
-def sun_vector(mjd: float) -> Float:
-    """Unit vector [3], ICRS, from the Earth to the Sun.  Error: 0.02 deg"""
-    return _vector(*equatorial(sun_longitude(mjd), 0.0))
-
-
-def solar_aspect(ra: float, dec: float, mjd: float) -> float:
-    """Angle between a pointing and the Sun, deg."""
-    return float(np.degrees(np.arccos(np.clip(sums.product(_vector(ra, dec), sun_vector(mjd)), -1.0, 1.0))))
-
-
-def position_angle(ra: float, dec: float, mjd: float) -> float:
-    """Of the focal plane's y axis, deg, north through east: across the direction of the Sun, z x p."""
-    p, s = _vector(ra, dec), sun_vector(mjd)
-    towards = s - sums.product(s, p) * p
-    if sums.product(towards, towards) < 1e-12:
-        raise BadInput(f"a pointing at ra {ra:g}, dec {dec:g} on MJD {mjd:g} looks along the Sun's direction")
-    y = np.cross(towards, p)
-    east, north, _ = pointing.basis(ra, dec)
-    return float(np.degrees(np.arctan2(sums.product(y, east), sums.product(y, north))))
-
-
-def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguration, where: str) -> None:
-    """Refuse a pointing of the telescope that its sunshield forbids.
-
-    ra, dec, mjd : deg, and date;  mission : the mission database;  where : named in the refusal
-    """
-    lowest, highest = (mission.value(f"svm.solar_aspect_{end}", "deg") for end in ("min", "max"))
-    angle = solar_aspect(ra, dec, mjd)
-    # The low-precision Sun is good to 0.02 deg.
-    if not lowest - 0.05 <= angle <= highest + 0.05:
-        limits = f"the telescope looks {lowest:g} to {highest:g} deg from it"
-        raise BadInput(f"{where}: {angle:.1f} deg from the Sun on MJD {mjd:g}, {limits}")
-
-
-def _vector(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Float:
-    lon, lat = np.radians(ra), np.radians(dec)
-    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
 
 
 # ------------------------------------------------------------------------------------------------ wide survey
@@ -244,3 +200,24 @@ def _raster(
     depth = area.depth(ra, dec)
     kept = np.flatnonzero(depth >= -_REACH) if not count else np.sort(np.argsort(-depth, kind="stable")[:count])
     return [(float(ra[i]), float(dec[i])) for i in kept]
+
+
+# ------------------------------------------------------------------------------------------------ a field of one's own
+
+
+def own(
+    place: tuple[float, float], mission: MissionConfiguration, start: float, visits: int, angle: float | None = None
+) -> list[Field]:
+    """Visits of a field, one after another, each at the first date that the Sun allows.
+
+    place   : ra, dec deg;  mission : the mission database;  start : MJD, the earliest
+    visits  : how many;  angle : position angle, deg, None = as the Sun asks at each visit
+    """
+    fields: list[Field] = []
+    now = start
+    for visit in range(visits):
+        now = next_allowed(*place, now, mission)
+        turned = position_angle(*place, now) if angle is None else angle
+        fields.append(Field(1, visit + 1, *place, turned, now))
+        now += mission.value("svm.field_time", "d")
+    return fields

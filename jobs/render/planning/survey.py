@@ -19,6 +19,7 @@ from jobs.render.channels.image_types import SKY_TYPES
 from jobs.render.planning import calibration_frames, ground_surveys, reference_survey, unrendered, variants
 from jobs.render.planning.observing_sequence import sequence
 from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
+from jobs.render.sky.solar_aspect import check_aspect
 from jobs.request.area import Area
 from jobs.request.observations import Observation, Pointing
 from jobs.request.schema import Request
@@ -74,7 +75,7 @@ def _pointing(pointing: Pointing, where: str, request: Request, mission: Mission
         target = detectors.detector(pointing.camera, pointing.centre_on, mission)
         ra, dec, angle = boresight_for(target, ra, dec, angle)
     if not unrendered.of_channel(pointing.channel).on_ground:
-        reference_survey.check_aspect(ra, dec, pointing.mjd, mission, where)
+        check_aspect(ra, dec, pointing.mjd, mission, where)
     seconds = pointing.exposure_time_s
     if seconds is None:
         seconds = exposure_time(pointing.channel, pointing.camera, pointing.band, mission)
@@ -107,7 +108,7 @@ def _block(block: Observation, request: Request, mission: MissionConfiguration, 
             known_detectors(exposure.camera, exposure.detectors, mission, "detectors")
             own = unrendered.of_channel(exposure.channel)
             if not own.on_ground and block.pointings and exposure.image_type in SKY_TYPES:
-                reference_survey.check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
+                check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
             yield exposure
     except BadInput as error:
         raise BadInput(f"{where}: {error}") from None
@@ -120,17 +121,21 @@ def _exposures(
         yield from ground_surveys.read(Path(block.pointings), block, mission)
     elif block.image_type in _CALIBRATION:
         camera = ground_surveys.camera_of(block.survey, mission) if "EXT" in block.channels else ""
-        yield from calibration_frames.exposures(block, camera, area.bounds()[:2], mission, seed, start)
+        yield from calibration_frames.exposures(block, camera, block.place or area.bounds()[:2], mission, seed, start)
     elif "EXT" in block.channels:
         yield from ground_surveys.exposures(block, area, mission, seed, start)
     else:
         for field in _fields(block, area, start, mission):
-            yield from sequence(field, block, block.survey, mission, seed)
+            yield from sequence(field, block, "own" if block.place else block.survey, mission, seed)
 
 
 def _fields(
     block: Observation, area: Area, start: float, mission: MissionConfiguration
 ) -> list[reference_survey.Field]:
+    if block.place is not None:
+        if block.mjd is not None:
+            check_aspect(*block.place, block.mjd, mission, "mjd")
+        return reference_survey.own(block.place, mission, start, max(block.visits, 1), block.position_angle)
     if block.survey == "wide":
         return reference_survey.wide(area, mission, start, block.fields, max(block.visits, 1))
     visits = block.visits

@@ -1,4 +1,4 @@
-"""What nothing renders is refused by the check and by the first job; it may be planned."""
+"""What nothing renders is planned and named, and skipped; a request of nothing else is refused."""
 
 import re
 from dataclasses import replace
@@ -6,12 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars
+from jobs.render import plan_exposures
 from jobs.render.channels import registry
+from jobs.render.planning.planned_exposures import bands_of
 from jobs.request import __main__, checks, observations
 from jobs.request.from_toml import parse
 from lake_schema.errors import BadInput
-from lake_schema.tables.exposures import RENDERED
+from lake_schema.mission.configuration import resolve
+from lake_schema.tables.exposures import EUCLID_BANDS, RENDERED
+from tests import requests
 
 REQUESTS = Path(__file__).resolve().parents[3] / "requests"
 # Euclid's three channels, and calibrations of NISP.
@@ -24,38 +29,89 @@ def test_what_is_said_to_be_rendered_has_effects():
     }
 
 
+# The main run's half a million detectors take a minute.
+SHIPPED = [
+    pytest.param(path, marks=[pytest.mark.nightly] if path.stem == "sc8_main" else [], id=path.stem)
+    for path in sorted(REQUESTS.glob("*.toml"))
+]
+
+
 @pytest.mark.parametrize("channel", observations.CHANNELS)
 def test_what_is_rendered_can_be_asked_for(channel):
     asked = {*observations._SKY_TYPES, *observations._CALIBRATIONS[channel]}
     assert set(RENDERED.get(channel, ())) <= asked <= set(observations.IMAGE_TYPES)
 
 
-@pytest.mark.parametrize("path", sorted(REQUESTS.glob("*.toml")), ids=lambda path: path.stem)
-def test_the_check_refuses_what_can_only_be_planned(path, capsys):
-    only_planned = path.stem.startswith("sc8")
-    assert __main__.main(["check", str(path)]) == (2 if only_planned else 0)
+def test_requests_know_the_bands_that_the_planner_knows():
+    cameras = {"VIS": "vis", "NISP-P": "nisp", "NISP-S": "nisp"}
+    assert {name: bands_of(name, camera, resolve()) for name, camera in cameras.items()} == EUCLID_BANDS
+
+
+@pytest.mark.parametrize("path", SHIPPED)
+def test_the_check_takes_every_request_and_names_what_is_only_planned(path, capsys):
+    assert __main__.main(["check", str(path)]) == 0
     said = capsys.readouterr()
-    if only_planned:
-        wanted = r"request: observation\[\d\].channels: no simulator renders NISP-P \w+ yet: it can be planned alone\n"
-        assert re.fullmatch(wanted, said.err)
-    assert __main__.main(["check", str(path), "--plan"]) == 0
-    assert capsys.readouterr().out.startswith(f"{path.stem}: good: ")
+    assert said.err == ""
+    good, *more = said.out.splitlines()
+    assert good.startswith(f"{path.stem}: good: ")
+    assert [line.partition(": planned and forecast, skipped by rendering")[0] for line in more] == {
+        "sc8_deep": ["sc8_deep: NISP-P and NISP-S"],
+        "sc8_main": ["sc8_main: NISP-P and NISP-S"],
+        "sc8_pilot": ["sc8_pilot: NISP-P, NISP-S, EXT flat and EXT bias"],
+    }.get(path.stem, [])
 
 
-@pytest.mark.parametrize("job", [build_galaxies, build_stars])
-def test_the_first_job_refuses_it_too(job, tmp_path):
-    with pytest.raises(BadInput, match=r"^observation\[\d\]\.channels: no simulator renders NISP-P science yet"):
-        job.steps(tmp_path, parse(SURVEY))
+def only(channels, kind):
+    """A request for one block."""
+    request = parse(SURVEY)
+    return replace(request, observations=(replace(request.observations[0], channels=channels, image_type=kind),))
+
+
+@pytest.mark.parametrize(
+    ("channels", "kind", "first"),
+    [(("EXT",), "dark", "EXT"), (("NISP-P", "NISP-S"), "science", "NISP-P"), (("NISP-S", "NISP-P"), "dark", "NISP-S")],
+)
+def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_first_job(
+    channels, kind, first, tmp_path
+):
+    wanted = f"^observation\\[0\\].channels: no simulator renders {first} {kind} yet: it can be planned alone$"
+    for refuse in (
+        checks.check_rendered,
+        plan_exposures.check,
+        lambda request: plan_exposures.dry_run(tmp_path, request),
+        lambda request: build_galaxies.JOB.steps(tmp_path, request),
+        lambda request: build_stars.JOB.steps(tmp_path, request),
+    ):
+        with pytest.raises(BadInput, match=wanted):
+            refuse(only(channels, kind))
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("channels", "kind"), [(("EXT",), "dark"), (("VIS", "NISP-S"), "flat")])
-def test_an_image_type_that_nothing_renders_is_refused(channels, kind):
-    request = parse(SURVEY)
-    block = replace(request.observations[0], channels=channels, image_type=kind)
-    wanted = f"^observation\\[0\\].channels: no simulator renders {channels[-1]} {kind} yet: it can be planned alone$"
-    with pytest.raises(BadInput, match=wanted):
-        checks.check_rendered(replace(request, observations=(block,)))
+@pytest.mark.parametrize(
+    ("channels", "kind", "said"),
+    [(("EXT",), "science", ""), (("VIS", "NISP-S"), "flat", "NISP-S: "), (("VIS",), "bias", ""), ((), "", "")],
+)
+def test_what_is_rendered_in_part_is_taken_and_the_rest_named(channels, kind, said):
+    request = only(channels, kind)
+    checks.check_rendered(request)
+    assert checks.skipped(request).startswith(said)
+    assert bool(checks.skipped(request)) == bool(said)
+
+
+def test_the_command_refuses_in_one_line_and_plans_on_demand(tmp_path, capsys):
+    path = requests.written(tmp_path, '[[observation]]\nchannels = ["NISP-P"]\n')
+    assert __main__.main(["check", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert re.fullmatch(r"request: .*observation\[0\]\.channels: no simulator renders NISP-P science yet: .*\n", said)
+    assert __main__.main(["check", str(path), "--plan"]) == 0
+    assert "NISP-P: planned and forecast, skipped by rendering" in capsys.readouterr().out
+
+
+def test_every_job_says_what_is_only_planned(tmp_path, capsys):
+    path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS", "NISP-P"]\n')
+    job = shell.Job("sleep", "", lambda lake, request: [])
+    assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 0
+    assert capsys.readouterr().err == ("sleep: NISP-P: planned and forecast, skipped by rendering (no simulator yet)\n")
 
 
 @pytest.mark.parametrize("words", [[], ["check"], ["check", "a", "--plans"], ["check", "a", "b"], ["a", "b", "--plan"]])

@@ -1,0 +1,182 @@
+"""A table of pointings, a CSV file of the user's: one exposure a line, what is left out has a default.
+
+COLUMNS     the columns: name, unit, what they are, what stands in place of an empty field
+Row, read   the lines of a file, checked
+Contents    what a plan must know of the file before it is read again
+
+Lines that begin with # are comments.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lake_schema import user_files
+from lake_schema.errors import BadInput
+from lake_schema.store.provenance import file_sha256
+from lake_schema.tables import exposures as declared
+from lake_schema.tables.exposures import EUCLID_BANDS
+
+CHANNELS = tuple(code for code, _ in declared.CHANNELS)
+IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
+
+# Name, unit, meaning, default; "" = there is none.
+COLUMNS = (
+    ("ra", "deg", "right ascension of the boresight, ICRS, -360 to 360", ""),
+    ("dec", "deg", "declination of the boresight, ICRS", ""),
+    ("position_angle", "deg", "of the focal plane's y axis, north through east", "Euclid: as the Sun asks; ground: 0"),
+    ("mjd", "d", "start of the exposure, MJD (UTC)", "the observation's `mjd`; Euclid: the first date the Sun allows"),
+    ("channel", "", "VIS, NISP-P, NISP-S or EXT", "the observation's, where it has one"),
+    ("camera", "", "of the mission database", "vis, nisp; EXT: the camera of the observation's `survey`"),
+    ("band", "", "passband", "VIS: euclid_vis"),
+    ("exposure_time_s", "s", "effective exposure time", "the observation's, else the mission's"),
+    ("image_type", "", "as in a request", "the observation's"),
+    ("detectors", "", "names of detectors, separated by blanks", "the observation's, else all of the camera"),
+    ("sky", "electron pix-1 s-1", "diffuse sky", "the mission's"),
+    ("seeing", "arcsec", "FWHM of the atmosphere, of ground cameras", "the mission's"),
+    ("zero_point", "mag", "AB magnitude of 1 electron/s", "the mission's"),
+    ("psf", "", "file of a PSF, found from the table's folder", "the request's `[psf]`, else the model's"),
+)
+_REQUIRED = tuple(name for name, _, _, default in COLUMNS if not default)
+_NAMES = tuple(name for name, *_ in COLUMNS)
+_MOST_ROWS, _LONGEST = 1_000_000, 1000
+_MOST_LINES, _LONGEST_LINE = 2 * _MOST_ROWS, 20 * _LONGEST
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A line: the columns of the table, None or "" where the field is empty and the mission knows the default.
+
+    where : file and line, for messages;  psf : path
+    """
+
+    where: str
+    channel: str
+    camera: str
+    band: str
+    image_type: str
+    ra: float
+    dec: float
+    position_angle: float | None
+    mjd: float | None
+    exposure_time_s: float | None
+    sky: float | None
+    seeing: float | None
+    zero_point: float | None
+    psf: str | None
+    detectors: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """sha256 of the file;  bands : of its rows;  kinds : channels and image types of its rows, each pair once."""
+
+    sha256: str
+    bands: tuple[str, ...]
+    kinds: tuple[tuple[str, str], ...]
+
+
+def contents(path: Path, channels: Sequence[str], image_type: str) -> Contents:
+    """Of a file, whose rows are checked; arguments and errors as of `read`."""
+    rows = read(path, channels, image_type)
+    bands = tuple(dict.fromkeys(row.band for row in rows))
+    return Contents(file_sha256(path), bands, tuple(dict.fromkeys((row.channel, row.image_type) for row in rows)))
+
+
+def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
+    """The rows of a file, in its order.
+
+    channels, image_type : of the observation that the table belongs to
+    Errors : BadInput names the file, the line and the column
+    """
+    stream = io.StringIO(user_files.text(path, "table of pointings"), newline="")
+    numbered, at = _plain_lines(path, stream), 0
+
+    def texts() -> Iterator[str]:
+        nonlocal at
+        for number, line in numbered:
+            at = number
+            yield line
+
+    lines = csv.DictReader(texts())
+    found: list[Row] = []
+    try:
+        _refuse_columns(path, lines.fieldnames or [], channels)
+        for row in lines:
+            if len(found) >= _MOST_ROWS:
+                raise BadInput(f"{path}: more than {_MOST_ROWS} pointings")
+            if not all(isinstance(text, str) and len(text) <= _LONGEST for text in row.values() if text is not None):
+                raise BadInput(f"{path} line {at}: a text is too long, or there are more than columns")
+            found.append(_of_line({k: (v or "").strip() for k, v in row.items()}, path, at, channels, image_type))
+    except csv.Error as error:
+        raise BadInput(f"{path}: {' '.join(str(error).split())}") from None
+    return found
+
+
+def _refuse_columns(path: Path, names: Sequence[str], channels: Sequence[str]) -> None:
+    needed = (*_REQUIRED, *(("channel",) if len(channels) > 1 else ()))
+    if missing := [name for name in needed if name not in names]:
+        raise BadInput(f"{path}: column {missing[0]} is missing")
+    if unknown := [name for name in names if name not in _NAMES]:
+        raise BadInput(f"{path}: column {user_files.shown(unknown[0])} is not known; known: {', '.join(_NAMES)}")
+    if twice := [name for name in names if list(names).count(name) > 1]:
+        raise BadInput(f"{path}: column {twice[0]} stands there twice")
+
+
+def _plain_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """Number and text of each line that is no comment, as many and as long as pointings need."""
+    for number, line in enumerate(stream, start=1):
+        if number > _MOST_LINES or len(line) > _LONGEST_LINE:
+            raise BadInput(f"{path}: more than {_MOST_LINES} lines, or one of more than {_LONGEST_LINE} characters")
+        if not line.startswith("#"):
+            yield number, line
+
+
+def _of_line(row: Mapping[str, str], path: Path, line: int, channels: Sequence[str], image_type: str) -> Row:
+    where = f"{path} line {line}"
+    channel = row.get("channel") or (channels[0] if len(channels) == 1 else "")
+    if channel not in channels:
+        raise BadInput(f"{where}: channel = {channel!r} is none of the observation's: {', '.join(channels)}")
+    only = EUCLID_BANDS.get(channel, ())
+    band = row.get("band") or (only[0] if len(only) == 1 else "")
+    if not band:
+        raise BadInput(f"{where}: band is missing")
+    kind = row.get("image_type") or image_type
+    if kind not in IMAGE_TYPES:
+        raise BadInput(f"{where}: image_type = {kind!r} is not one of {', '.join(IMAGE_TYPES)}")
+
+    def number_of(name: str, lo: float, hi: float) -> float:
+        if not row[name]:
+            raise BadInput(f"{where}: {name} is missing")
+        try:
+            value = float(row[name])
+        except ValueError:
+            raise BadInput(f"{where}: {name} = {row[name]!r} is not a number") from None
+        if not lo <= value <= hi:
+            raise BadInput(f"{where}: {name} = {value} is outside {lo:g} to {hi:g}")
+        return value
+
+    def optional(name: str, lo: float, hi: float) -> float | None:
+        return number_of(name, lo, hi) if row.get(name) else None
+
+    return Row(
+        where=where,
+        channel=channel,
+        camera=row.get("camera") or ("" if channel == "EXT" else channel.lower().partition("-")[0]),
+        band=band,
+        image_type=kind,
+        ra=number_of("ra", -360.0, 360.0) % 360.0,
+        dec=number_of("dec", -90.0, 90.0),
+        position_angle=optional("position_angle", -360.0, 360.0),
+        mjd=optional("mjd", 40_000.0, 100_000.0),
+        exposure_time_s=optional("exposure_time_s", 0.0, 1e6),
+        sky=optional("sky", 0.0, 1e6),
+        seeing=optional("seeing", 0.01, 10.0) if channel == "EXT" else None,
+        zero_point=optional("zero_point", 0.0, 50.0),
+        psf=str(user_files.expanded(row["psf"], path.parent)) if row.get("psf") else None,
+        detectors=tuple(row.get("detectors", "").split()),
+    )
