@@ -1,13 +1,16 @@
-"""The notebook renders a field of small detectors from a request, and shows what it says."""
+"""Notebooks that render: a field of small detectors, and the shear of known galaxies; they show what they say."""
 
 from pathlib import Path
 
 import nbformat
+import numpy as np
 import pytest
 from nbclient import NotebookClient
 
+from jobs.accuracy import PRESETS
+
 ROOT = Path(__file__).resolve().parents[3]
-NOTEBOOK = ROOT / "notebooks" / "03_render_one_field.ipynb"
+NOTEBOOKS = ROOT / "notebooks"
 # The detectors of the focal plane cut to a tenth of their area, two of them.
 SMALL = """
 name = "small"
@@ -38,21 +41,44 @@ truth = []
 """
 
 
+def run(monkeypatch, name, **environment):
+    """The outputs of a notebook's cells."""
+    environment |= {"MPLBACKEND": "module://matplotlib_inline.backend_inline", "PYTHONPATH": ROOT}
+    for key, value in environment.items():
+        monkeypatch.setenv(key, str(value))
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(NOTEBOOKS)}}).execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert [output for output in outputs if output.output_type == "error"] == []
+    return outputs
+
+
+@pytest.mark.nightly
+def test_the_shear_of_known_galaxies_is_measured_as_in_galsim_s_images(tmp_path, monkeypatch):
+    """The renderer's own m and c, less GalSim's, are within what each accuracy allows."""
+    outputs = run(monkeypatch, "04_measure_shear", TRUESKY_LAKE=tmp_path / "shear")
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 1
+    text = "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
+    rows = [line.split() for line in text.partition("less GalSim, without noise")[2].splitlines() if line]
+    found = {name: [float(value) for value in values[::3]] for name, *values in rows}
+    assert list(found) == ["quicklook", "survey"]
+    for name, biases in found.items():
+        assert np.abs(biases).max() < PRESETS[name].shape
+    (m,) = (float(line.split()[3]) for line in text.splitlines() if line.startswith("GalSim "))
+    # Re-Gaussianisation is no better than some per cent; without the pairs it would be far off.
+    assert -0.05 < m < 0.01
+
+
 @pytest.mark.nightly
 def test_every_cell_runs(tmp_path, monkeypatch):
     (tmp_path / "small.toml").write_text(SMALL)
-    for name, value in {
-        "TRUESKY_REQUEST": tmp_path / "small.toml",
-        "TRUESKY_LAKE": tmp_path / "lake",
-        "TRUESKY_PICTURE": tmp_path / "field.jpg",
-        "MPLBACKEND": "module://matplotlib_inline.backend_inline",
-        "PYTHONPATH": ROOT,
-    }.items():
-        monkeypatch.setenv(name, str(value))
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(NOTEBOOK.parent)}}).execute()
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    assert [output for output in outputs if output.output_type == "error"] == []
+    outputs = run(
+        monkeypatch,
+        "03_render_one_field",
+        TRUESKY_REQUEST=tmp_path / "small.toml",
+        TRUESKY_LAKE=tmp_path / "lake",
+        TRUESKY_PICTURE=tmp_path / "field.jpg",
+    )
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
     texts = [
         " ".join(output.data["text/plain"].split()) for output in outputs if "text/plain" in output.get("data", {})
