@@ -10,8 +10,9 @@
                    rotation       deg, added to the position angle of every galaxy, before lensing
     [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
                    bright_limit   H (Vega, as observed), brighter stars are left out
-    [ingest.galaxies]  files = [..]  a finished catalogue instead of ours: Parquet, FITS, CSV, a HATS folder
-                       format = "flagship1" | "flagship2" | "euclid" | "skycatalogs"   columns = {ours = theirs, ..}
+    [ingest.galaxies]  files = [..]  a finished catalogue instead of ours: Parquet, FITS, CSV, HDF5, a HATS folder
+                       format = "flagship1" | "flagship2" | "euclid" | "skycatalogs" | "opencosmo"
+                       columns = {ours = theirs, ..}
     [ingest.halos]     files = [..]  columns = {ra, dec, z_true, log_mass, ..}   a halo light-cone instead of ours
     [ingest.training]  files = [..]  columns = {z_true, abs_mag_r01, color_gr_01, sed, ext_law, ebv}
                        observed galaxies: each of ours has the spectrum of one like it

@@ -14,7 +14,7 @@ import resource
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -50,7 +50,17 @@ def batches(path: Path, columns: Sequence[str], texts: Sequence[str] = ()) -> It
     Errors  : BadInput, one line, where the file is not Parquet, is damaged, or asks for more than is reasonable
     """
     _refuse_large_footer(path)
-    command = [sys.executable, "-m", __name__, str(path.resolve()), str(len(columns)), *columns, *texts]
+    yield from read_apart(__name__, path, columns, texts)
+
+
+def read_apart(module: str, path: Path, columns: Sequence[str], texts: Sequence[str] = ()) -> Iterator[pa.RecordBatch]:
+    """The batches that a module sends, run by a process of its own.
+
+    module  : name of one that calls `main` with its reader
+    path    : of the file
+    columns : names of those that are needed;  texts : of those that are sent where they are there
+    """
+    command = [sys.executable, "-m", module, str(path.resolve()), str(len(columns)), *columns, *texts]
     environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, cwd=_ROOT, env=environment, **pipes) as reader:
@@ -89,8 +99,11 @@ def _refuse_large_footer(path: Path) -> None:
 # ----------------------------------------------------------------------------------------- in a process of its own
 
 
-def main(argv: Sequence[str]) -> int:
-    """Write the batches of a file to stdout as an Arrow stream; a refusal goes to stderr."""
+def main(argv: Sequence[str], sender: Callable[[Path, Sequence[str], Sequence[str], IO[bytes]], None]) -> int:
+    """Write the batches of a file to stdout as an Arrow stream; a refusal goes to stderr.
+
+    argv : FILE NEEDED COLUMN ...;  sender : what writes them
+    """
     path, needed, columns = Path(argv[0]), int(argv[1]), list(argv[2:])
     seconds = _LEAST_SECONDS + path.stat().st_size // _BYTES_A_SECOND
     resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
@@ -99,7 +112,7 @@ def main(argv: Sequence[str]) -> int:
     pa.set_cpu_count(1)
     try:
         with os.fdopen(1, "wb", closefd=False) as out:
-            send(path, columns[:needed], columns[needed:], out)
+            sender(path, columns[:needed], columns[needed:], out)
     except BadInput as error:
         print(error, file=sys.stderr)
         return _REFUSED
@@ -152,11 +165,12 @@ def _opened(path: Path, needed: Sequence[str], texts: Sequence[str]) -> Iterator
 
 
 def check_titles(path: Path, titles: Sequence[str], columns: Sequence[str]) -> None:
-    """Refuse a file in which a column is not there, or there twice; BadInput names the first."""
+    """Refuse a file in which columns are not there, or one twice; BadInput names all that are missing."""
     count = Counter(titles)
+    if missing := [name for name in dict.fromkeys(columns) if not count[name]]:
+        has = " ".join(", ".join(titles).split())[:300]
+        raise BadInput(f"{path}: has no column {', '.join(missing)}; it has {has}")
     for name in columns:
-        if not count[name]:
-            raise BadInput(f"{path}: has no column {name}; it has {' '.join(', '.join(titles).split())}"[:500])
         if count[name] > 1:
             raise BadInput(f"{path}: has column {name} more than once")
 
@@ -195,4 +209,4 @@ def _bounded(path: Path, batch: pa.RecordBatch) -> pa.RecordBatch:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(sys.argv[1:], send))

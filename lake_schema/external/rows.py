@@ -1,8 +1,8 @@
 """Tables of numbers from other programs, whatever their form: a bounded piece at a time, in the order of the files.
 
-files    a path -> the files that it stands for: itself, or the Parquet files of a folder such as a HATS catalogue
+files    a path -> the files that it stands for: itself, or the Parquet or else HDF5 files of a folder
 titles   of a CSV file
-pieces   the rows of some columns of a Parquet, FITS or CSV file
+pieces   the rows of some columns of a Parquet, FITS, CSV or HDF5 file
 within   a column whose values have to lie between bounds
 
 Parquet is read by a process of its own (lake_schema.external.files), FITS and CSV in pieces. What a file is, its
@@ -27,13 +27,14 @@ from lake_schema import user_files
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
 from lake_schema.external import files as external_files
+from lake_schema.external import hdf5
 from lake_schema.fits import external
 
 _BLOCK_BYTES, _FIRST_LOOK = 8 << 20, 1 << 16
 # Of a name, characters; of a CSV file.
 _LONGEST_TEXT, _MOST_COLUMNS = 64, 4096
-_CSV, _FITS, _PARQUET = (".csv",), (".fits", ".fit"), (".parquet", ".parq")
-_ENDINGS = (*_PARQUET, *_FITS, *_CSV)
+_CSV, _FITS, _PARQUET, _HDF5 = (".csv",), (".fits", ".fit"), (".parquet", ".parq"), (".hdf5", ".h5")
+_ENDINGS = (*_PARQUET, *_FITS, *_CSV, *_HDF5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,7 @@ def files(path: Path) -> list[Path]:
     if _is_folder(path):
         found = _of_folder(path)
         if not found:
-            raise BadInput(f"{path}: no Parquet file in this folder")
+            raise BadInput(f"{path}: no Parquet or HDF5 file in this folder")
         return found
     if path.suffix.lower() not in _ENDINGS:
         raise BadInput(f"{user_files.shown(path)}: the ending is none of {', '.join(_ENDINGS)}")
@@ -79,6 +80,8 @@ def looked_at(file: Path, kind: str = "catalogue") -> Path:
     with user_files.opened(file, kind) as stream:
         start = stream.read(_FIRST_LOOK)
     good = start.startswith(b"PAR1") if form == _PARQUET else start.startswith((b"SIMPLE", b"\x1f\x8b"))
+    if form == _HDF5:
+        good = start.startswith(hdf5.MAGIC)
     if form == _CSV:
         good = b"\0" not in start
         _refuse_wide(file, start)
@@ -112,9 +115,12 @@ def pieces(
             yield Piece(file, first, {**arrays, **named}, units)
             first += len(arrays[columns[0]])
         return
-    batches = (
-        external_files.batches(file, columns, texts) if form == _PARQUET else _csv_batches(file, columns, whole, texts)
-    )
+    if form == _HDF5:
+        batches = hdf5.batches(file, columns)
+    elif form == _PARQUET:
+        batches = external_files.batches(file, columns, texts)
+    else:
+        batches = _csv_batches(file, columns, whole, texts)
     for batch in batches:
         arrays = {name: _numbers(file, first, name, batch.column(name), whole) for name in columns}
         named = {name: _texts(file, first, name, batch.column(name)) for name in texts if name in batch.schema.names}
@@ -155,7 +161,9 @@ def _of_folder(folder: Path) -> list[Path]:
         primary = {key.strip(): value.strip() for key, _, value in lines}.get("hats_primary_table_url", "")
         folder = folder / primary
     inside = folder / "dataset" if (folder / "dataset").is_dir() else folder
-    found = sorted(path for path in inside.rglob("*") if path.suffix.lower() in _PARQUET and path.is_file())
+    every = sorted(path for path in inside.rglob("*") if path.is_file())
+    found = [path for path in every if path.suffix.lower() in _PARQUET]
+    found = found or [path for path in every if path.suffix.lower() in _HDF5]
     return [path for path in found if not path.name.startswith(("_", ".")) and path.stem != "data_thumbnail"]
 
 
@@ -165,7 +173,7 @@ def _unit(field: pa.Field) -> str:
 
 def _format(file: Path, kind: str) -> tuple[str, ...]:
     """Its endings."""
-    for endings in (_PARQUET, _FITS, _CSV):
+    for endings in (_PARQUET, _FITS, _CSV, _HDF5):
         if file.suffix.lower() in endings:
             return endings
     try:

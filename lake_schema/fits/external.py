@@ -61,6 +61,9 @@ def number_batches(
     with _opened(path, kind) as units:
         unit = _first_table(path, units)
         known = {column.name: column for column in unit.columns}
+        if missing := [name for name in dict.fromkeys(columns) if name not in known]:
+            has = ", ".join(map(str, known))[:300]
+            raise BadInput(f"{path}: has no column {', '.join(missing)}; it has {has}")
         for name in columns:
             _refuse_no_numbers(path, unit, known, name)
         said = {name: str(known[name].unit) for name in columns if known[name].unit}
@@ -84,8 +87,6 @@ def read_table(path: Path, kind: str) -> Any:
 
 
 def _refuse_no_numbers(path: Path, unit: Any, known: Mapping[str, Any], name: str) -> None:
-    if name not in known:
-        raise BadInput(f"{path}: has no column {name}; it has {', '.join(map(str, known))}"[:500])
     _refuse_lists(path, known[name])
     if unit.data[name].dtype.kind not in "fiub" or unit.data[name].ndim != 1:
         raise BadInput(f"{path}: column {name} is {unit.data[name].dtype}, wanted a number a row")

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from jobs.fluxes import cosmology
 from lake_schema import user_files
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
@@ -27,7 +28,9 @@ Bounds = Mapping[str, tuple[float, float]]
 
 _FILE = Path(__file__).with_name("ingest_formats.toml")
 WHOLE = ("origin_id", "halo")
-_FIELD_KEYS = ("column", "minus", "over", "power10", "log10", "scale", "offset", "unit", "value", "beside")
+_FIELD_KEYS = (
+    "column", "plus", "minus", "over", "kpc_at", "power10", "log10", "scale", "offset", "unit", "value", "beside",
+)  # fmt: skip
 _FORMAT_KEYS = ("source", "columns", "band", "beside", "seen_over_v", "lines_magnified")
 _SED = ("sed_1", "frac_1", "ext_law_1", "ebv_1", "sed_2", "frac_2", "ext_law_2", "ebv_2")
 # Computed by us, or another key's affair.
@@ -73,8 +76,10 @@ class Field:
     """One entry of a mapping (ingest_formats.toml says what it means)."""
 
     column: str = ""
+    plus: str = ""
     minus: str = ""
     over: str = ""
+    kpc_at: str = ""
     power10: bool = False
     log10: bool = False
     scale: float = 1.0
@@ -85,7 +90,7 @@ class Field:
 
     def titles(self) -> list[str]:
         """Columns of the file that the field is made of."""
-        return [title for title in (self.column, self.minus, self.over) if title]
+        return [title for title in (self.column, self.plus, self.minus, self.over, self.kpc_at) if title]
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,15 +270,25 @@ def _value(key: str, field: Field, columns: Mapping[str, Array], rows: int) -> A
         return values.astype(np.int64) if values.dtype.kind in "iu" else values
     values = values.astype(np.float64)
     with np.errstate(all="ignore"):
+        if field.plus:
+            values = values + columns[field.plus]
         if field.minus:
             values = values - columns[field.minus]
         if field.over:
             values = values / columns[field.over]
+        if field.kpc_at:
+            values = values / _kpc_per_arcsec(columns[field.kpc_at])
         if field.power10:
             values = 10.0**values
         if field.log10:
             values = np.log10(values)
         return np.asarray(field.scale * values + field.offset)
+
+
+def _kpc_per_arcsec(z: Array) -> Array:
+    """NaN, which is refused, where a length has no angle."""
+    known = (z > 0.0) & (z <= cosmology.Z_MAX)
+    return np.where(known, cosmology.kpc_per_arcsec(np.where(known, z, 1.0)), np.nan)
 
 
 def _check(piece: Piece, key: str, columns: Columns, values: Array) -> None:

@@ -9,7 +9,8 @@ from astropy.table import Table
 from jobs import shell
 from jobs.catalogue import build_galaxies
 from jobs.catalogue.external import mapping
-from jobs.fluxes import cosmology, sources
+from jobs.fluxes import band_fluxes, cosmology, sources
+from jobs.fluxes.libraries import templates
 from jobs.request.from_toml import parse
 from lake_schema import ids, sky
 from lake_schema.errors import BadInput
@@ -18,6 +19,7 @@ from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.quarantine import QUARANTINE
 from tests import requests
 from tests.jobs.catalogue import synthetic
+from tests.lake_schema.external import opencosmo
 
 FORMATS = ("flagship1", "flagship2", "euclid", "skycatalogs")
 
@@ -245,3 +247,74 @@ def test_a_unit_that_the_file_itself_denies(tmp_path):
 def test_a_mapping_that_does_not_fit(tmp_path, more, said):
     with pytest.raises(BadInput, match=said):
         build(tmp_path, synthetic.write(tmp_path, "flagship2"), more)
+
+
+# ------------------------------------------------------------------------------------------------ OpenCosmo
+
+
+def test_a_diffsky_mock_comes_through(tmp_path):
+    slices = [opencosmo.columns(seed=seed) for seed in (1, 2)]
+    rows = build(tmp_path, opencosmo.write(tmp_path / "mock.hdf5", *slices), 'format = "opencosmo"')
+    assert validate.violations(rows, GALAXIES) == []
+    given = {name: np.concatenate([one[name] for one in slices]) for name in slices[0]}
+    order = np.argsort(given["gal_id"])
+    found = rows.sort_by("origin_id")
+    assert found["origin_id"].to_pylist() == given["gal_id"][order].tolist()
+    z = given["redshift_true"][order]
+    arcsec = given["r50_disk_2d"][order] / cosmology.kpc_per_arcsec(z)
+    for name, wanted in {
+        "ra": given["ra"][order],
+        "z_obs": given["redshift_obs"][order],
+        "kind": 1 - given["central"][order],
+        "log_sfr": (given["logssfr_obs"] + given["logsm_obs"])[order],
+        "log_halo_mass": given["logmp_obs_host"][order] + np.log10(0.6766),
+        "disk_half_light_radius": arcsec,
+        "disk_axis_ratio": (given["beta_disk"] / given["alpha_disk"])[order],
+    }.items():
+        assert found[name].to_numpy() == pytest.approx(wanted, rel=1e-4, abs=1e-4), name
+    # Magnitudes are of the continuum: lines are drawn.
+    bare = found.drop_columns([name for name in found.column_names if name.startswith("flux_")])
+    light = band_fluxes.galaxy_fluxes(bare, ["lsst_r"], templates.galaxy_library())["f_nu_lsst_r"].to_numpy()
+    unseen = light / sources.magnification_of(found)
+    dust = 0.87 * found["a_v"].to_numpy()
+    mag = 23.9 - 2.5 * np.log10(unseen) - dust
+    assert mag == pytest.approx(given["lsst_r"][order], abs=0.1)
+    assert np.median(np.abs(mag - given["lsst_r"][order])) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("lsst_r", np.nan, r"column lsst_r \(mag\) of row 8 is nan"),
+        ("redshift_true", -0.3, r"column redshift_true \(z_true\) of row 8 is -0.3"),
+        ("beta_disk", 0.0, r"column beta_disk and alpha_disk \(disk_axis_ratio\) of row 8 is 0"),
+    ],
+)
+def test_a_wrong_value_of_a_mock_is_named(tmp_path, name, value, said):
+    values = opencosmo.columns()
+    values[name][7] = value
+    with pytest.raises(BadInput, match=rf"mock\.hdf5: {said}"):
+        build(tmp_path, opencosmo.write(tmp_path / "mock.hdf5", values), 'format = "opencosmo"')
+
+
+def test_another_unit_of_a_mock_is_named(tmp_path):
+    path = opencosmo.write(tmp_path / "mock.hdf5", opencosmo.columns(), units={**opencosmo.UNITS, "r50_disk_2d": "Mpc"})
+    with pytest.raises(BadInput, match=r"r50_disk_2d \(disk_half_light_radius\) is in 'Mpc', the mapping says 'kpc'"):
+        build(tmp_path, path, 'format = "opencosmo"')
+
+
+@pytest.mark.parametrize("form", ["flagship2", "euclid"])
+def test_all_missing_columns_are_named_at_once(tmp_path, form):
+    path = synthetic.write(tmp_path, form)
+    fields = mapping.formats()[form]["columns"]
+    gone = [fields["kappa"], fields["position_angle"], fields["z_obs"]]
+    if form == "euclid":
+        table = Table.read(path)
+        table.remove_columns(gone)
+        table.write(path, overwrite=True)
+    else:
+        pq.write_table(pq.read_table(path).drop_columns(gone), path)
+    with pytest.raises(BadInput) as caught:
+        build(tmp_path, path, f'format = "{form}"')
+    said = str(caught.value).partition("; it has")[0].partition("has no column ")[2].split(", ")
+    assert set(said) == set(gone)
