@@ -117,7 +117,7 @@ def _psf(
 
 # CPU of the demo's detector 3-4 (5.5e3 predicted sources), of others with 3e2 and 2.7e4, of bias, dark and flat frames:
 # Intel Xeon 2.5 GHz, 2 shared cores.
-COST = Cost(frame_s=0.05, sky_s=0.5, galaxy_s=5.0e-4, star_s=8.5e-4, base_gb=0.5, held=48.0, held_sky=57.0, written=2.1)
+COST = Cost(frame_s=0.05, sky_s=1.5, galaxy_s=5.0e-4, star_s=8.5e-4, base_gb=0.5, held=48.0, held_sky=57.0, written=2.1)
 
 CHANNEL = Channel(
     effects=EFFECTS,

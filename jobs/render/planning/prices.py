@@ -14,8 +14,16 @@ from jobs.render.effects.effect import Effect
 from jobs.render.exposure import truth_maps
 from jobs.render.planning import unrendered
 
-# A FITS header and its padding, one an image; s a byte of a truth map, to make, write and hash it.
-_HEADER_BYTES, _MAP_S = 8640, 7.5e-9
+# A FITS header and its padding, one an image; s a byte of a truth map, to write and hash it.
+_HEADER_BYTES, _MAP_S = 8640, 2.5e-9
+# s a pixel of a map, for each effect that fills it in; and of the stars' own frame, on which they are drawn again.
+_FILLED_S = {
+    "sky": {"background": 1e-8, "pixel_area": 4e-8, "straylight": 4e-8},
+    "cosmic_rays": {"cosmic_rays": 4.5e-8, "readout_cosmic_rays": 3e-8},
+    "ghosts": {"ghosts": 5e-8},
+    "saturation": {"full_well": 1e-8, "bleeding": 2e-8},
+}
+_STARS_S = 2e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +70,14 @@ def price(
     maps = truth_maps.made(truth, None if effects is None else [e.name for e in effects], looks)
     tier = settings.seconds_for(accuracy) / settings.seconds_for(SURVEY)
     mapped = sum(truth_maps.BYTES[name] for name in maps)
+    names = [effect.name for effect in applied]
+    filled = sum(cost for name in maps for by, cost in _FILLED_S.get(name, {}).items() if by in names)
+    filled += _STARS_S * ("stars" in maps)
     return Price(
         start_s=own.frame_s + looks * own.sky_s,
-        pixel_s=1e-6 * sum(effect.cost for effect in applied) + _MAP_S * mapped,
+        pixel_s=1e-6 * sum(effect.cost for effect in applied) + _MAP_S * mapped + filled,
         galaxy_s=looks * own.galaxy_s * tier,
-        star_s=looks * own.star_s * tier,
+        star_s=looks * own.star_s * tier * (1 + ("stars" in maps)),
         start_gb=own.base_gb,
         pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + mapped),
         start_bytes=_HEADER_BYTES * (1 + len(maps)),

@@ -46,6 +46,25 @@ def test_each_map_has_its_place_on_the_disc():
     assert sizes == {("VIS", "science"): 21.0, ("EXT", "science"): 13.0, ("VIS", "bias"): 9.0}
 
 
+def test_each_map_costs_what_fills_it_in():
+    """CPU s of all maps of a detector of few sources, seen on a machine whose calibration gives 0.45."""
+    seen = {"VIS": 2.4, "EXT": 0.42}
+    for channel, seconds in seen.items():
+        effects = registry.CHANNELS[channel].effects["science"]
+        none, every = (
+            prices.price(channel, True, effects, SURVEY, maps).seconds(PIXELS, 300, 30)
+            for maps in ((), tuple(truth_maps.BYTES))
+        )
+        assert 0.45 * (every - none) == pytest.approx(seconds, abs=0.2)
+    light, hits = (
+        prices.price("VIS", True, SKY, SURVEY, (name,)).seconds(PIXELS, 0, 0) for name in ("noise_free", "cosmic_rays")
+    )
+    assert hits > light
+    # The stars are drawn again.
+    again = [prices.price("VIS", True, SKY, SURVEY, maps).star_s for maps in ((), ("stars",))]
+    assert again[1] == 2 * again[0]
+
+
 def test_what_a_request_asks_is_in_its_forecast(tmp_path):
     pointing = [{**VIS, "detectors": ["3-4"]}]
     off = {"off": ["parallel_cti", "serial_cti"]}
