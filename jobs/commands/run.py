@@ -17,6 +17,7 @@ from pathlib import Path
 from jobs.catalogue.stars import gaia
 from jobs.commands import space
 from jobs.render import plan_exposures
+from jobs.render.planning import preconditions
 from jobs.request.from_toml import parse
 from jobs.request.schema import Request
 from lake_schema import __version__, command, user_files
@@ -106,7 +107,7 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
     rendered = wanted[-1].name == IMAGES[-1].name
     tasks = None
     if rendered:
-        _, tasks = plan_exposures.check(request, root)
+        tasks = preconditions.rendered(*plan_exposures.check(request, root))
     else:
         plan_exposures.check_catalogues(request)
     space.check(root, request, tasks)

@@ -24,7 +24,7 @@ _GB = 1e9
 def check(root: Path, request: Request, tasks: pa.Table | None) -> None:
     """Refuses a run whose forecast is larger than what is free; what an earlier run left of it is taken off.
 
-    tasks : rows of the table `tasks`, None = nothing is rendered
+    tasks : rows of the table `tasks` that have a simulator, None = nothing is rendered
     """
     foreseen = {line.job: line.gb * _GB for line in catalogue_forecast.of_request(request)}
     if tasks is not None:

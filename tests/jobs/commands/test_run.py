@@ -97,3 +97,12 @@ def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys):
     told = ("--lake", str(root), "--request", str(DEMO))
     assert started == [("build_galaxies", *told), ("build_stars", *told)]
     assert capsys.readouterr().out == "build_galaxies ...\nbuild_stars ...\n"
+
+
+def test_what_a_later_job_would_refuse_is_refused_first(tmp_path, capsys):
+    """An area without the detectors' sky, which the last job would find out."""
+    path = tmp_path / "small.toml"
+    path.write_text(DEMO.read_text().replace("radius = 0.2", "radius = 0.001"))
+    assert run.main([str(path), "--lake", str(tmp_path / "lake")], pytest.fail) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "area" in line
