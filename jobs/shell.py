@@ -106,10 +106,7 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
         with _stoppable(job):
             _refuse_mangled(options.lake, str(options.request))
             chosen = replace(job, steps=job.dry_run) if job.dry_run is not None and options.dry_run else job
-            request = _request(job, options)
-            if skipped := checks.skipped(request):
-                command.say(job.name, skipped, 0)
-            run(chosen, layout.lake(options.lake), request, options.verbose)
+            run(chosen, layout.lake(options.lake), _request(job, options), options.verbose)
         return 0
 
     return command.status(job.name, made)
@@ -122,6 +119,8 @@ def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
     """
     started, cpu = time.time(), time.process_time()
     steps = job.steps(root, request)
+    if skipped := checks.skipped(request):
+        command.say(job.name, skipped, 0)
     took = {"prepare_s": time.time() - started, "prepare_cpu_s": time.process_time() - cpu}
     for step in steps:
         _run(job, step, root, request, verbose, took)

@@ -106,8 +106,9 @@ def check(request: Request, lake: Path | None = None) -> tuple[pa.Table, pa.Tabl
     returns : rows of the tables `exposures` and `tasks`, as planned;  lake : whose catalogues say how dense the sky is
     """
     check_rendered(request)
-    check_catalogues(request)
+    # First what names the pointing or the observation that is wrong.
     _, exposures, rows = plan(lake, request)
+    check_catalogues(request)
     if request.bodies is not None:
         ephemeris_files(request.bodies, exposures)
     seen = preconditions.rendered(exposures, rows)
