@@ -31,7 +31,7 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from jobs.measured import Measured
-from jobs.request import checks
+from jobs.request import checks, universe
 from jobs.request.from_toml import parse
 from jobs.request.schema import Request
 from lake_schema import __version__, command, user_files
@@ -117,6 +117,7 @@ def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
 
     job     : its steps;  root : folder of the lake;  request : checked;  verbose : whether progress is shown
     """
+    universe.refuse_others(root, request)
     started, cpu = time.time(), time.process_time()
     steps = job.steps(root, request)
     if skipped := checks.skipped(request):
@@ -210,7 +211,7 @@ def _run(job: Job, step: Step, root: Path, request: Request, verbose: bool, took
 
     root.mkdir(parents=True, exist_ok=True)
     try:
-        publish.make(root, plan, step.work, mapper)
+        publish.make(root, plan, step.work, mapper, name=request.name)
     except BaseException as error:
         log.close(time.time() - started, error)
         if verbose:

@@ -1,17 +1,18 @@
-"""Look after a lake: python -m lake_schema verify|gc|describe LAKE [TABLE]; `tables` prints the reference page;
+"""Look after a lake: python -m lake_schema list|verify|gc|describe LAKE [TABLE]; `tables` prints the reference page;
 `mission list [PATTERN]` prints the mission database, `mission diff A [B]` compares two configurations of it.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from lake_schema import __version__, command, tables
+from lake_schema import __version__, command, listing, tables
 from lake_schema.errors import BadInput
-from lake_schema.store import layout, publish, read
+from lake_schema.store import garbage, layout, names, read
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -22,14 +23,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         return mission.main(arguments[1:])
     parser = argparse.ArgumentParser(prog="python -m lake_schema", description=__doc__, epilog=f"truesky {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="verify|gc|describe|tables")
-    for name in ("verify", "gc", "describe"):
-        one = commands.add_parser(name)
-        one.add_argument("lake", help="folder of the lake")
-        one.add_argument("table", nargs="?", help="one table (default: all of them)")
-        one.set_defaults(deep=False)
-        if name == "verify":
-            one.add_argument("--deep", action="store_true", help="read every byte and compare its sha256")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="list|verify|gc|describe|tables")
+    one = {name: commands.add_parser(name) for name in ("list", "verify", "gc", "describe")}
+    for name, its in one.items():
+        its.add_argument("lake", help="folder of the lake")
+        its.add_argument("table", nargs="?", help="one table (default: all of them)")
+        if name in ("verify", "describe"):
+            its.add_argument("--name", help="only what belongs to this request (default: all of them)")
+    one["list"].add_argument("--json", action="store_true", help="one JSON list instead of columns")
+    one["verify"].add_argument("--deep", action="store_true", help="read every byte and compare its sha256")
+    one["gc"].add_argument("--delete", action="store_true", help="remove what is said; without it nothing is")
     commands.add_parser("tables")
     options = parser.parse_args(arguments)
     if options.command == "tables":
@@ -40,46 +43,68 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _looked_after(options: argparse.Namespace) -> int:
     root = layout.lake(options.lake)
-    names = [options.table] if options.table else _names(root, options.command)
-    if not names:
+    if options.command == "list":
+        return _list(root, options.table, options.json)
+    if options.command == "gc":
+        return _gc(root, options.table, options.delete)
+    own = names.checked(root, options.name) if options.name else None
+    there = names.tables(root, own) if own else read.tables(root)
+    if not (chosen := [options.table] if options.table else there):
         raise BadInput(f"lake {root} holds no table")
-    actions = {"verify": _verify, "gc": _gc, "describe": _describe}
+
+    def looked_at(name: str) -> int:
+        versions = _versions(root, name, own)
+        return max(int(_verify(v, options.deep) if options.command == "verify" else _describe(v)) for v in versions)
+
     # What is wrong with one table is said, and the others are looked at all the same.
-    return max(_status(actions[options.command], root, name, options.deep) for name in names)
+    return max(command.status("lake_schema", lambda name=name: looked_at(name)) for name in chosen)  # type: ignore[misc]
 
 
-def _names(root: Path, command: str) -> list[str]:
-    """The published tables; gc also looks where nothing has been published yet."""
-    if command != "gc":
-        return read.tables(root)
-    return sorted({path.parent.name for path in root.glob("*/.lock*")})
+def _versions(root: Path, name: str, own: str | None) -> list[read.Version]:
+    """The current version of a table and those of its requests, or the one of a request."""
+    if own:
+        return [read.version(root, name, request=own)]
+    current, held = layout.current_key(root, name), names.holders(root, name)
+    if current is None and not held:
+        raise BadInput(f"lake {root} has no table {name}")
+    found = {held[request]: read.version(root, name, request=request) for request in held}
+    if current is not None and current not in found:
+        found[current] = read.published_last(root, name)
+    return list(found.values())
 
 
-def _status(action: Callable[[Path, str, bool], bool], root: Path, name: str, deep: bool) -> int:
-    return command.status("lake_schema", lambda: int(action(root, name, deep)))
+def _list(root: Path, name: str | None, as_json: bool) -> int:
+    found = [row for row in listing.rows(root) if name in (None, row["table"])]
+    if not found:
+        raise BadInput(f"lake {root} has no table {name}")
+    print(json.dumps(found, indent=1) if as_json else listing.text(found))
+    return int(any("error" in row for row in found))
 
 
-def _verify(root: Path, name: str, deep: bool) -> bool:
-    version = read.version(root, name)
+def _gc(root: Path, name: str | None, delete: bool) -> int:
+    if not garbage.tables(root):
+        raise BadInput(f"lake {root} holds no table")
+    found = garbage.collect(root, name, delete)
+    for path in found:
+        print(f"{'removed' if delete else 'would remove'} {path}")
+    if found and not delete:
+        print("nothing was removed: gc --delete removes these")
+    return 0
+
+
+def _verify(version: read.Version, deep: bool) -> bool:
     found = read.verify(version, deep)
     for line in found:
         print(line)
     size = sum(entry["bytes"] for entry in version.manifest["files"])
     verdict = f"{len(found)} faults" if found else "sound"
-    print(f"{name:16} v-{version.key} {version.num_rows:12,} rows {size / 1e6:10.1f} MB   {verdict}")
+    print(f"{version.table:16} v-{version.key} {version.num_rows:12,} rows {size / 1e6:10.1f} MB   {verdict}")
     return bool(found)
 
 
-def _gc(root: Path, name: str, deep: bool) -> bool:
-    for path in publish.gc(root, name):
-        print(f"removed {path}")
-    return False
-
-
-def _describe(root: Path, name: str, deep: bool) -> bool:
-    version = read.version(root, name)
+def _describe(version: read.Version) -> bool:
     schema = version.schema
-    print(f"{name}: {(schema.metadata or {}).get(b'description', b'').decode()}")
+    print(f"{version.table}: {(schema.metadata or {}).get(b'description', b'').decode()}")
     print(f"  version {version.key}, {version.num_rows:,} rows in {len(version.parts)} files")
     width = max(len(field.name) for field in schema)
     for field in schema:

@@ -277,7 +277,8 @@ def test_a_picture_names_the_brightest_of_the_frame(field, image):
     channel = image.header["CHANNEL"]
     products = read.version(field, "products").rows().to_pylist()
     (row,) = (row for row in products if (row["channel"], row["content"]) == (channel, "science"))
-    names = preview_labels.labels(field, row, read_back.electrons(product(field, channel, "science")))
+    made_of = read.version(field, "products").manifest["facts"]["inputs"]
+    names = preview_labels.labels(field, row, read_back.electrons(product(field, channel, "science")), made_of)
     for kind in ("galaxy", "star"):
         flux = np.sort(image.expected[image.is_star == (kind == "star")])[-16:] / image.header["EXPTIME"]
         brightest = image.header["ZEROPNT"] - 2.5 * np.log10(flux[::-1])

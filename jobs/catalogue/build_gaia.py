@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs.catalogue.stars import gaia
+from jobs.request import universe
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
 from lake_schema import sky
@@ -26,7 +27,8 @@ from lake_schema.tables.gaia import GAIA
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """One part a file of the stars."""
-    stars, fluxes = (read.version(lake, name) for name in ("stars", "star_fluxes"))
+    stars, fluxes = (read.for_request(lake, name, request.name) for name in ("stars", "star_fluxes"))
+    universe.refuse_other([stars], request)
     if missing := [name for name in gaia.FLUX_COLUMNS if name not in fluxes.schema.names]:
         raise BadInput(
             f"table star_fluxes has no column {', '.join(missing)}: put {', '.join(gaia.BANDS)} into fluxes.bands and "

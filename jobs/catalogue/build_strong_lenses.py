@@ -15,6 +15,7 @@ import pyarrow as pa
 
 from jobs.catalogue import cells
 from jobs.catalogue.galaxies import strong_lenses
+from jobs.request import universe
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
 from lake_schema import sky
@@ -27,7 +28,8 @@ from lake_schema.tables.strong_lenses import STRONG_LENSES
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """One part a file of the galaxies."""
-    galaxies = read.version(lake, "galaxies")
+    galaxies = read.for_request(lake, "galaxies", request.name)
+    universe.refuse_other([galaxies], request)
     facts = {"seed": request.seed, "galaxies": galaxies.key, "boost": request.strong_lens_boost, "code": code_version()}
     named = {part["name"]: part["facts"].get("generation_cells") for part in galaxies.manifest["parts"]}
     parts = tuple(Part(name, {"part": name, "generation_cells": own or _all(name)}) for name, own in named.items())

@@ -18,6 +18,7 @@ from jobs.catalogue.stars import gaia
 from jobs.commands import space
 from jobs.render import plan_exposures
 from jobs.render.planning import preconditions
+from jobs.request import universe
 from jobs.request.from_toml import parse
 from jobs.request.schema import Request
 from lake_schema import __version__, command, user_files
@@ -104,6 +105,7 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
     that is to be rendered;  start : starts a job;  out : folder of the pictures
     """
     # Whatever is wrong with the request, or with the room on the disc, is said before the first job runs.
+    universe.refuse_others(root, request)
     rendered = wanted[-1].name == IMAGES[-1].name
     tasks = None
     if rendered:
@@ -118,16 +120,16 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
         if status := start(stage.file, ["--lake", str(root), "--request", str(file), *stage.options]):
             return status
         rows.append((stage, time.perf_counter() - started))
-    _table(root, rows, time.perf_counter() - began)
+    _table(root, request.name, rows, time.perf_counter() - began)
     if rendered:
-        _show(root, out)
+        _show(root, out, request.name)
     return 0
 
 
-def _table(root: Path, stages: Sequence[tuple[Stage, float]], total: float) -> None:
+def _table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], total: float) -> None:
     print(f"\n{'stage':20} {'table':14} {'rows':>10} {'rows/s':>10} {'MB':>8} {'seconds':>8}")
     for stage, seconds in stages:
-        versions = [read.version(root, name) for name in stage.tables]
+        versions = [read.version(root, name, request=request) for name in stage.tables]
         rows = sum(version.num_rows for version in versions)
         for i, version in enumerate(versions):
             size = sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6
@@ -136,9 +138,9 @@ def _table(root: Path, stages: Sequence[tuple[Stage, float]], total: float) -> N
     print(f"{'all':20} {'':14} {'':10} {'':10} {'':8} {total:8.1f}\n")
 
 
-def _show(root: Path, out: Path) -> None:
+def _show(root: Path, out: Path, request: str) -> None:
     # All that renders: seconds that the first job need not wait for.
     from jobs.render.products import preview
 
-    for picture in preview.previews(root, out, _PICTURES):
+    for picture in preview.previews(root, out, _PICTURES, request):
         print(picture)

@@ -1,4 +1,7 @@
-"""Ask a lake: python -m jobs.explore "SELECT ..." --lake LAKE [--out FILE.csv|FILE.parquet|FILE.fits]."""
+"""Ask a lake: python -m jobs.explore "SELECT ..." --lake LAKE [--name REQUEST] [--out FILE].
+
+FILE is .csv, .parquet or .fits.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _answer(options: argparse.Namespace) -> int:
     if options.out is not None:
         user_files.target(options.out, results.ENDINGS)
-    with Explorer(options.lake, options.memory * _GIGABYTE, options.timeout) as lake:
+    with Explorer(options.lake, options.memory * _GIGABYTE, options.timeout, options.name) as lake:
         if options.sql is None:
             print(lake.tables().to_string())
             return int(bool(lake.damaged))
@@ -47,6 +50,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("sql", nargs="?", help="a SELECT, in DuckDB's SQL")
     parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser.add_argument("--name", help="of the request whose tables are meant, where the lake has several")
     parser.add_argument("--out", type=Path, help="write to this .csv, .parquet or .fits file")
     limit = MEMORY / _GIGABYTE
     parser.add_argument("--memory", type=float, default=limit, help=f"GB that it may take (default {limit:g})")

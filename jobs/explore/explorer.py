@@ -14,7 +14,7 @@ from jobs.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process, check
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, LakeError
-from lake_schema.store import layout, read
+from lake_schema.store import layout, names, read
 
 Range = tuple[float, float]
 
@@ -26,26 +26,39 @@ class Explorer:
 
     memory  : bytes that a query and its result may take together
     timeout : s after which a query is stopped
+    request : whose tables; without it every table that all requests share goes by its name, and any table of a
+              request by both: "demo.products", in SQL too
     damaged : tables that cannot be opened, and why; the others can be looked at
     """
 
-    def __init__(self, lake: str | Path, memory: float = MEMORY, timeout: float = TIMEOUT) -> None:
+    def __init__(
+        self, lake: str | Path, memory: float = MEMORY, timeout: float = TIMEOUT, request: str | None = None
+    ) -> None:
         self.root = layout.lake(lake)
         self.versions: dict[str, read.Version] = {}
         self.damaged: dict[str, LakeError] = {}
-        for name in read.tables(self.root):
-            try:
-                self.versions[name] = read.version(self.root, name)
-            except LakeError as error:
-                self.damaged[name] = error
+        self._unclear: dict[str, LakeError] = {}
+        for table in read.tables(self.root) if request is None else names.tables(self.root, request):
+            self._open(table, request, table)
+        for own in names.names(self.root) if request is None else [names.checked(self.root, request)]:
+            for table in names.tables(self.root, own):
+                self._open(f"{own}.{table}", own, table)
         if not self.versions and not self.damaged:
             raise BadInput(f"lake {self.root} holds no table")
         versions = [f"{name}={version.key}" for name, version in self.versions.items()]
         # Whoever asks for one of these is told what is wrong with it.
-        versions += [f"{name}=" for name in self.damaged]
+        versions += [f"{name}=?{request or name.rpartition('.')[0]}" for name in (*self.damaged, *self._unclear)]
         self._process = Process(self.root, versions, memory)
         check("timeout", timeout, 0.0, TIMEOUT_HI)
         self.timeout = timeout
+
+    def _open(self, name: str, request: str | None, table: str) -> None:
+        try:
+            self.versions[name] = read.version(self.root, table, request=request)
+        except BadInput as error:
+            self._unclear[name] = error
+        except LakeError as error:
+            self.damaged[name] = error
 
     def __enter__(self) -> Explorer:
         return self
@@ -71,11 +84,21 @@ class Explorer:
                 "meaning": (version.schema.metadata or {}).get(b"description", b"").decode(),
             }
             for name, version in self.versions.items()
+            if self._is_listed(name)
         ]
-        rows += [{"table": name, "version": "damaged", "meaning": str(error)} for name, error in self.damaged.items()]
+        rows += [
+            {"table": name, "version": "damaged", "meaning": str(error)}
+            for name, error in self.damaged.items()
+            if self._is_listed(name)
+        ]
         columns = ["table", "rows", "MB", "files", "version", "meaning"]
         frame = pd.DataFrame(rows, columns=columns).astype({"rows": "Int64", "files": "Int64"})
         return frame.set_index("table").sort_index()
+
+    def _is_listed(self, name: str) -> bool:
+        """Tables go by their own names; where requests have versions of their own, by both."""
+        table = name.rpartition(".")[2]
+        return name == table or table in self._unclear
 
     def describe(self, table: str) -> pd.DataFrame:
         """The columns of a table: type, unit, range, UCD, meaning."""
@@ -89,8 +112,8 @@ class Explorer:
         return pd.DataFrame(rows).set_index("column")
 
     def _version(self, table: str) -> read.Version:
-        if table in self.damaged:
-            raise self.damaged[table]
+        if error := self.damaged.get(table) or self._unclear.get(table):
+            raise error
         if table not in self.versions:
             raise BadInput(f"lake {self.root} has no table {table}; it has {', '.join(self.versions)}")
         return self.versions[table]

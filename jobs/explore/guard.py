@@ -6,7 +6,7 @@ The text is parsed by DuckDB itself, into the tree that it would run; nothing is
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,17 +29,33 @@ Tree = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
+class Origins:
+    """Which names of a result, in lower case, are columns of the lake's tables, as they are.
+
+    names : these, None = every name of a table's column;  other : names that something else has as well
+    """
+
+    names: frozenset[str] | None
+    other: frozenset[str] = frozenset()
+
+    def __contains__(self, name: str) -> bool:
+        return name not in self.other and (self.names is None or name in self.names)
+
+
+_NOTHING = Origins(frozenset())
+
+
+@dataclass(frozen=True, slots=True)
 class Query:
     """A query that may run.
 
     tables  : those of the lake that it names
-    columns : names of the result, in lower case, that are columns of these tables, as they are; None = every name of
-              a table's column
+    columns : of the result, that are columns of these tables
     """
 
     text: str
     tables: tuple[str, ...]
-    columns: frozenset[str] | None
+    columns: Origins
 
 
 def checked(text: str, known: Collection[str]) -> Query:
@@ -55,16 +71,14 @@ def checked(text: str, known: Collection[str]) -> Query:
         raise BadInput(f"SQL: {one_line(error)}") from None
     tree = _parsed(text)
     used: set[str] = set()
-    named: set[str] = set()
     for node, visible in _nodes(tree):
-        named |= visible
         if "cte_map" in node and node.get("type") not in _QUERIES:
             raise BadInput(f"SQL: only SELECT is possible, not {_words(node)}")
         if {"type", "alias", "sample"} <= node.keys():
             used |= _source(node, known, visible)
         if node.get("class") == "FUNCTION":
             _refuse_function(str(node["function_name"]).lower())
-    return Query(text, tuple(sorted(used)), _plain_columns(tree, used - named))
+    return Query(text, tuple(sorted(used)), _origins(tree, used, {}))
 
 
 def _parsed(text: str) -> Tree:
@@ -124,12 +138,12 @@ def _source(node: Tree, known: Collection[str], named: Collection[str]) -> set[s
         raise BadInput(f"SQL: {one_line(name)}() is not a table of the lake ({', '.join(sorted(known))})")
     if kind != "BASE_TABLE":
         return set()
-    name, qualified = str(node["table_name"]).lower(), node.get("schema_name") or node.get("catalog_name")
-    if not qualified and name in known:
+    name = _table_name(node)
+    if not node.get("catalog_name") and name in known:
         return {name}
-    if not qualified and name in named:
+    if not node.get("catalog_name") and name in named:
         return set()
-    raise BadInput(f"SQL: {one_line(repr(node['table_name']))} is not a table of the lake ({', '.join(sorted(known))})")
+    raise BadInput(f"SQL: {one_line(repr(name))} is not a table of the lake ({', '.join(sorted(known))})")
 
 
 def _refuse_function(name: str) -> None:
@@ -137,30 +151,52 @@ def _refuse_function(name: str) -> None:
         raise BadInput(f"SQL: the function {one_line(name)} is not possible here")
 
 
-def _plain_columns(tree: Tree, tables: Collection[str]) -> frozenset[str] | None:
-    """Names of result columns that are columns of the tables, so that their units still hold."""
-    if tree.get("type") != "SELECT_NODE" or not _only_tables(tree["from_table"], tables):
-        return frozenset()
-    plain, renamed, everything = set(), set(), False
-    for entry in tree["select_list"]:
+def _origins(node: Tree, tables: Collection[str], before: Mapping[str, Origins]) -> Origins:
+    """Which columns of a query's result are columns of the lake's tables, however deep in it they are chosen.
+
+    before : of the WITH clauses that the query sees
+    """
+    seen = dict(before)
+    for entry in node.get("cte_map", {}).get("map", ()):
+        own = entry["value"]
+        query = {} if own.get("aliases") else own.get("query_node", {})
+        seen[str(entry["key"]).lower()] = _origins(query, tables, seen)
+    if node.get("type") != "SELECT_NODE":
+        return _NOTHING
+    given = _given(node["from_table"], tables, seen)
+    names, other, everything = set[str](), set(given.other), False
+    for entry in node["select_list"]:
         if entry["class"] == "STAR" and not (
             entry.get("replace_list") or entry.get("rename_list") or entry.get("columns")
         ):
             everything = True
         elif entry["class"] == "COLUMN_REF" and not entry["alias"]:
-            plain.add(str(entry["column_names"][-1]).lower())
+            *within, name = (str(part).lower() for part in entry["column_names"])
+            # A field of a structure that the query made.
+            (other if given.other & set(within) else names).add(name)
         else:
-            renamed.add(str(entry["alias"]).lower())
-    if everything and not renamed:
-        return None
-    return frozenset(plain - renamed)
+            other.add(str(entry["alias"]).lower())
+    if everything:
+        return Origins(given.names, frozenset(other))
+    return Origins(frozenset(names if given.names is None else names & given.names), frozenset(other))
 
 
-def _only_tables(source: Tree, tables: Collection[str]) -> bool:
+def _given(source: Tree, tables: Collection[str], seen: Mapping[str, Origins]) -> Origins:
+    """The same of what follows FROM."""
+    if source.get("column_name_alias"):
+        return _NOTHING
     if source["type"] == "JOIN":
-        return _only_tables(source["left"], tables) and _only_tables(source["right"], tables)
-    return (
-        source["type"] == "BASE_TABLE"
-        and str(source["table_name"]).lower() in tables
-        and not source["column_name_alias"]
-    )
+        left, right = (_given(source[side], tables, seen) for side in ("left", "right"))
+        names = None if left.names is None or right.names is None else left.names | right.names
+        return Origins(names, left.other | right.other) if _NOTHING not in (left, right) else _NOTHING
+    if source["type"] == "SUBQUERY":
+        return _origins(source["subquery"]["node"], tables, seen)
+    if source["type"] == "BASE_TABLE":
+        name = _table_name(source)
+        return seen.get(name, Origins(None) if name in tables else _NOTHING)
+    return _NOTHING
+
+
+def _table_name(source: Tree) -> str:
+    """A table as it is called in FROM, with the name of its request where one is given."""
+    return ".".join(str(source[key]).lower() for key in ("schema_name", "table_name") if source.get(key))

@@ -27,7 +27,7 @@ _ERRORS = {"BadInput": BadInput, "Damaged": Damaged}
 class Process:
     """Answers queries of some tables; starts with the first, ends with `close`, and then starts again.
 
-    tables  : NAME=KEY of tables of the lake `root`, NAME=@FILE of an Arrow file
+    tables  : NAME=KEY or REQUEST.NAME=KEY of tables of the lake `root`, NAME=@FILE of an Arrow file
     memory  : bytes that a query and its result may take together
     """
 

@@ -46,7 +46,9 @@ def _astropy(rows: pa.Table) -> Any:
     table = AstropyTable()
     for field, values in zip(rows.schema, rows.columns, strict=True):
         facts = _facts(field)
-        about = {"unit": facts.get("unit") or None, "description": facts.get("description")}
+        about: dict[str, Any] = {"unit": facts.get("unit") or None, "description": facts.get("description")}
+        # As astropy does with those of a VOTable.
+        about |= {"meta": {"ucd": facts["ucd"]}} if facts.get("ucd") else {}
         if values.null_count:
             filled = values.fill_null(pa.scalar(0).cast(field.type)) if field.type in _NULLABLE else values
             table[field.name] = MaskedColumn(filled.to_numpy(), mask=values.is_null().to_numpy(), **about)

@@ -49,8 +49,8 @@ _BASE_BYTES, _SHARE = 1 << 30, 0.5
 def main(argv: Sequence[str]) -> int:
     """Answer queries until stdin ends.
 
-    argv : lake, most bytes of memory, TABLE=KEY of each table, without a key where it could not be opened, or
-           TABLE=@FILE of rows in an Arrow file
+    argv : lake, most bytes of memory, TABLE=KEY or REQUEST.TABLE=KEY of each table, =?REQUEST of one that could not be
+           opened, TABLE=@FILE of rows in an Arrow file
     """
     root, memory = layout.lake(argv[0]), int(argv[1])
     resource.setrlimit(resource.RLIMIT_DATA, (memory + _BASE_BYTES, memory + _BASE_BYTES))
@@ -84,7 +84,20 @@ def _answer(out: IO[bytes], root: Path, versions: dict[str, str], memory: int, q
 def _table(root: Path, name: str, what: str) -> Opened:
     if what.startswith("@"):
         return ds.dataset(what[1:], format="ipc")
-    return read.version(root, name, what or None)
+    table = name.rpartition(".")[2]
+    if what.startswith("?"):
+        # Whatever was wrong with it is said again.
+        return read.version(root, table, request=what[1:] or None)
+    return read.version(root, table, what)
+
+
+def _registered(session: duckdb.DuckDBPyConnection, name: str, rows: ds.Dataset) -> None:
+    """A table by its name, one of a request in a schema of the request's name."""
+    session.register(name, rows)
+    if "." in name:
+        request, _, table = name.partition(".")
+        session.execute(f'CREATE SCHEMA IF NOT EXISTS "{request}"')
+        session.execute(f'CREATE VIEW "{request}"."{table}" AS SELECT * FROM "{name}"')
 
 
 _TOO_LARGE = "SQL: the query or its result needs more memory than it may have: ask for less"
@@ -100,7 +113,7 @@ def _run(query: Query, opened: Mapping[str, Opened], memory: int, parameters: di
     datasets = {n: rows.dataset() if isinstance(rows, read.Version) else rows for n, rows in opened.items()}
     with duckdb.connect(":memory:", config=config) as session:
         for name, rows in datasets.items():
-            session.register(name, rows)
+            _registered(session, name, rows)
         for command in (*_MACROS, *_LOCKS):
             session.execute(command)
         try:
@@ -144,10 +157,17 @@ def _with_units(found: pa.Table, query: Query, opened: Mapping[str, Opened]) -> 
     fields = []
     for field in found.schema:
         name = field.name.lower()
-        sources = [source for version in opened.values() for source in version.schema if source.name.lower() == name]
-        same = [s for s in sources if s.type == field.type and (query.columns is None or name in query.columns)]
-        fields.append(field.with_metadata(same[0].metadata) if same else field)
+        columns = [column for version in opened.values() for column in version.schema if column.name.lower() == name]
+        own = [dict(c.metadata or {}).items() for c in columns if _kind(c.type) == _kind(field.type)]
+        # Which of several tables it is from is not known: what they all say holds.
+        facts = dict(set.intersection(*map(set, own))) if own and name in query.columns else None
+        fields.append(field.with_metadata(facts) if facts else field)
     return pa.Table.from_arrays(found.columns, schema=pa.schema(fields))
+
+
+def _kind(kind: pa.DataType) -> pa.DataType:
+    """A type without the name that the elements of a list have: DuckDB has one of its own."""
+    return pa.list_(_kind(kind.value_type)) if pa.types.is_list(kind) else kind
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from jobs.fluxes.inputs import Own
 from jobs.fluxes.tables import errors_measured
 from jobs.fluxes.tables.build_tables import Setting
 from jobs.fluxes.tables.settings import COVERED, Choice, of_stars
+from jobs.request import universe
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
 from lake_schema.columns import Table
@@ -42,9 +43,10 @@ CATALOGUES = (("galaxy", "galaxies"), ("star", "stars"))
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """What fluxes are made with; then one part a cell of each catalogue, row by row beside it."""
+    catalogues = [(kind, read.for_request(lake, name, request.name)) for kind, name in CATALOGUES]
+    universe.refuse_other([version for _, version in catalogues], request)
     own = inputs.read(request.curves)
     curves = inputs.curves(request.bands, own.passbands)
-    catalogues = [(kind, read.version(lake, name)) for kind, name in CATALOGUES]
     sources = source_steps(own)
     chosen = errors_measured.choose(curves, request.accuracy, own.library)
     made = [_step(catalogue, kind, request, own, chosen, sources) for kind, catalogue in catalogues]
@@ -58,7 +60,9 @@ def step_of(kind: str, lake: Path, request: Request) -> Step:
     """The step of the galaxies or of the stars alone."""
     own = inputs.read(request.curves)
     chosen = errors_measured.choose(inputs.curves(request.bands, own.passbands), request.accuracy, own.library)
-    return _step(read.version(lake, dict(CATALOGUES)[kind]), kind, request, own, chosen, source_steps(own))
+    return _step(
+        read.for_request(lake, dict(CATALOGUES)[kind], request.name), kind, request, own, chosen, source_steps(own)
+    )
 
 
 def source_steps(own: Own) -> list[Step]:

@@ -1,6 +1,7 @@
 """The archive of a lake's images: what there is, of what, made when, with what, and what could not be made.
 
-    python -m jobs.render.archive --lake LAKE [--at RA DEC] [--sql "select .. from products"] [--failures]
+    python -m jobs.render.archive --lake LAKE [--name REQUEST] [--at RA DEC] [--sql "select .. from products"]
+                                  [--failures]
     python -m jobs.render.archive --lake LAKE --again PATH --out FILE.fits [--version KEY]
 
 products    the published products, each with its sha256, seconds and peak memory
@@ -31,7 +32,7 @@ from jobs.render.camera import pointing
 from jobs.render.products import run_log
 from lake_schema import command, sky, user_files
 from lake_schema.errors import BadInput
-from lake_schema.store import layout, read
+from lake_schema.store import layout, names, read
 from lake_schema.store.provenance import code_version, file_sha256
 
 # Bytes and s that a query of the archive may take.
@@ -48,11 +49,14 @@ _FAILURES = pa.schema(
 )
 
 
-def products(root: Path) -> pa.Table:
-    """Rows of the table `products` with sha256, bytes, seconds (s) and peak_gb (GB), null where no log says so."""
-    version = read.version(root, "products")
+def products(root: Path, request: str | None = None) -> pa.Table:
+    """Rows of the table `products` with sha256, bytes, seconds (s) and peak_gb (GB), null where no log says so.
+
+    request : whose products, where a lake has those of several
+    """
+    version = read.version(root, "products", request=request)
     files = {entry["path"]: entry for entry in version.manifest["files"]}
-    made = {line["part"]: line for line in _parts(root) if "error" not in line}
+    made = {line["part"]: line for line in _parts(root, request) if "error" not in line}
     rows = []
     for part in version.manifest["parts"]:
         about = made.get(part["name"], {})
@@ -63,10 +67,13 @@ def products(root: Path) -> pa.Table:
     return pa.Table.from_pylist(rows, pa.schema([*version.schema, *(pa.field(*column) for column in own)]))
 
 
-def failures(root: Path) -> pa.Table:
-    """Detectors whose last attempt failed: error, attempt, seconds, peak_gb (GB), and the run."""
-    last = {line["part"]: line for line in _parts(root)}
-    failed = [line for _, line in sorted(last.items()) if "error" in line]
+def failures(root: Path, request: str | None = None) -> pa.Table:
+    """Detectors whose last attempt failed: error, attempt, seconds, peak_gb (GB), and the run.
+
+    request : whose detectors, None = of all requests
+    """
+    last = {(line["request"], line["part"]): line for line in _parts(root, request)}
+    failed = [last[key] for key in sorted(last) if "error" in last[key]]
     return pa.Table.from_pylist([{k: line.get(k) for k in _FAILURES.names} for line in failed], _FAILURES)
 
 
@@ -84,10 +91,13 @@ def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
     return rows.filter(pa.array(inside & (sums.product(edges.sum(axis=1), place) > 0)))
 
 
-def _parts(root: Path) -> Iterator[dict[str, Any]]:
-    """What the runs' logs say of parts of `products`, oldest first, each with its run."""
+def _parts(root: Path, request: str | None = None) -> Iterator[dict[str, Any]]:
+    """What the runs' logs say of parts of `products`, oldest first, each with its run; of a request, or of all."""
     for path in run_log.of_products(root):
-        yield from ({**line, "run": path.stem} for line in run_log.lines(path) if "part" in line)
+        lines = run_log.lines(path)
+        own = next((str(line["request"]) for line in lines if "request" in line), "")
+        if request in (None, own):
+            yield from ({**line, "run": path.stem, "request": own} for line in lines if "part" in line)
 
 
 def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _TIMEOUT) -> pa.Table:
@@ -118,16 +128,16 @@ def _objects(rows: pa.Table) -> list[str]:
         raise BadInput(f"--sql: the result has no form in JSON: {' '.join(str(error).split())[:300]}") from None
 
 
-def again(root: Path, product: str, out: Path, key: str | None = None) -> str:
+def again(root: Path, product: str, out: Path, key: str | None = None, request: str | None = None) -> str:
     """Render a product into a file of its own; returns what is to be said of it, empty where its bytes are the same.
 
-    product : its path in the table;  key : of the version of `products` that has it, None = the current one
-    root    : folder of the lake;  out : the file
+    product : its path in the table;  key : of the version of `products` that has it, None = that of the request
+    root    : folder of the lake;  out : the file;  request : whose products, where a lake has those of several
     Errors  : BadInput where there is no such product, or where a table that it was made from has been removed
     """
     from jobs.render import render_exposures
 
-    version = read.version(root, "products", key)
+    version = read.version(root, "products", key, request)
     rows = [row for row in version.rows().to_pylist() if row["path"] == product]
     if not rows:
         raise BadInput(f"table products: version {version.key} has no product {product}")
@@ -151,6 +161,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m jobs.render.archive", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser.add_argument("--name", help="of the request whose products are meant, where the lake has several")
     parser.add_argument("--at", nargs=2, type=float, metavar=("RA", "DEC"), help="only what holds this place, deg")
     parser.add_argument("--sql", help="a query of the table products")
     parser.add_argument("--failures", action="store_true", help="what could not be made, in place of the products")
@@ -168,12 +179,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _answered(options: argparse.Namespace) -> int:
     root = layout.lake(options.lake)
     if options.again is not None:
-        said = again(root, options.again, user_files.target(options.out), options.version)
+        said = again(root, options.again, user_files.target(options.out), options.version, options.name)
         print(said or f"{options.out} equals {options.again}")
         return int(bool(said))
     if options.at is not None:
         sky.checked(*([value] for value in options.at))
-    rows = (failures if options.failures else products)(root)
+    own = None if options.name is None else names.checked(root, options.name)
+    rows = (failures if options.failures else products)(root, own)
     rows = rows if options.at is None else covering(rows, *options.at)
     rows = rows if options.sql is None else search(rows, options.sql)
     for line in _objects(rows):

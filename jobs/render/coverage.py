@@ -1,6 +1,6 @@
 """How often each place of the sky is looked at: measured, and as a map.
 
-    python -m jobs.render.coverage --lake LAKE --out coverage.png
+    python -m jobs.render.coverage --lake LAKE [--name REQUEST] --out coverage.png
 
 counts     of places: how many of the planned detectors see each
 depths     of the lake's plan, each band over its area
@@ -181,16 +181,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Prints a line a band and draws the maps."""
     parser = argparse.ArgumentParser(prog="python -m jobs.render.coverage", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lake", required=True, help="folder of the lake, with a plan")
+    parser.add_argument("--name", help="of the request whose plan is meant, where the lake has several")
     parser.add_argument("--out", type=Path, help="PNG of the maps")
     options = parser.parse_args(argv)
-    return command.status("coverage", lambda: _drawn(options.lake, options.out))
+    return command.status("coverage", lambda: _drawn(options.lake, options.name, options.out))
 
 
-def _drawn(lake: str, out: Path | None) -> int:
+def _drawn(lake: str, name: str | None, out: Path | None) -> int:
     if out is not None:
         user_files.target(out, (".png",))
     root = layout.lake(lake)
-    exposures, tasks = read.version(root, "exposures"), read.version(root, "tasks")
+    exposures, tasks = (read.version(root, table, request=name) for table in ("exposures", "tasks"))
     found = depths(exposures.rows(), tasks.rows(), area_of(exposures))
     for depth in found:
         print(line(depth))

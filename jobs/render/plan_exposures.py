@@ -27,6 +27,7 @@ from jobs.render.planning import (
 )
 from jobs.render.planning.mission import PARTS, mission_of, user_filters
 from jobs.render.products.keys import ephemeris_files
+from jobs.request import universe
 from jobs.request.checks import check_rendered
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
@@ -54,25 +55,27 @@ def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.
     filters, _ = user_filters(request)
     exposures = planned_exposures.table([exposure for exposure, _ in found], [own for _, own in found], filters)
     psf_files.check([(exposure, own) for exposure, own in found], filters)
-    densities = source_counts.Densities(mission, request.universe, [] if lake is None else _catalogues(lake))
+    catalogues = [] if lake is None else _catalogues(lake, request)
+    densities = source_counts.Densities(mission, request.universe, catalogues)
     wanted = [exposure.detectors for exposure, _ in found]
     rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, variants.forced(request))
     return mission, exposures, rows
 
 
-def _catalogues(lake: Path) -> list[read.Version]:
-    """The lake's catalogues, if it has them all."""
-    names = ("galaxies", "stars")
-    return [read.version(lake, name) for name in names] if all(layout.current(lake, n).exists() for n in names) else []
+def _catalogues(lake: Path, request: Request) -> list[read.Version]:
+    """The catalogues of the request, if it has them all."""
+    there = all(layout.current(lake, name).exists() for name in universe.CATALOGUES)
+    return [read.for_request(lake, name, request.name) for name in universe.CATALOGUES] if there else []
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """The mission configuration, the exposures, and a task for each of their detectors; prints the forecast."""
+    universe.refuse_other(_catalogues(lake, request), request)
     mission, exposures, rows = plan(lake, request)
     _print_forecast(lake, exposures, rows)
     facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **user_filters(request)[1]}
     # What they cost depends on more than which they are.
-    counts = {v.table: v.key for v in _catalogues(lake)}
+    counts = {v.table: v.key for v in _catalogues(lake, request)}
     costs = {**facts, "counts": counts, "rendered": request.facts("accuracy", "effects")}
     about = {
         "mission": mission.fingerprint,
@@ -92,6 +95,7 @@ def _step(table: Table, output: Output, facts: Json) -> Step:
 
 def dry_run(lake: Path, request: Request) -> Sequence[Step]:
     """The forecast alone, of the catalogues, too, of a request that no later job would refuse."""
+    universe.refuse_other(_catalogues(lake, request), request)
     exposures, rows = check(request, lake)
     _print_forecast(lake, exposures, rows)
     print()

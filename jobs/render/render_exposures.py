@@ -31,7 +31,7 @@ from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema.errors import BadInput
 from lake_schema.mission.published import read_back
-from lake_schema.store import layout, parquet, read, reuse
+from lake_schema.store import layout, names, parquet, read, reuse
 from lake_schema.store.plan import Json, Output, Part, Plan
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.exposures import ExposureRow
@@ -41,8 +41,9 @@ from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """One part a detector of an exposure, the longest first; then what was drawn on each."""
-    names = (*INPUTS, LENSES) if layout.current_key(lake, LENSES) else INPUTS
-    inputs = {name: read.version(lake, name) for name in names}
+    inputs = {name: read.for_request(lake, name, request.name) for name in INPUTS}
+    if (lenses := _lenses(lake, request, inputs["galaxies"])) is not None:
+        inputs[LENSES] = lenses
     preconditions.refuse_other_plan(inputs, request)
     exposures = inputs["exposures"].rows()
     tasks = planned.part(preconditions.rendered(exposures, inputs["tasks"].rows()), request)
@@ -73,6 +74,15 @@ def steps(lake: Path, request: Request) -> list[Step]:
     plan = Plan(PRODUCTS, facts, parts)
     drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in parts)
     return [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
+
+
+def _lenses(lake: Path, request: Request, galaxies: read.Version) -> read.Version | None:
+    """The strong lenses, if there are some; those of another request only where they lie in the same galaxies."""
+    if layout.current_key(lake, LENSES) is None:
+        return None
+    found, own = read.for_request(lake, LENSES, request.name), names.key_of(lake, request.name, LENSES)
+    shared = own is None and found.key in names.holders(lake, LENSES).values()
+    return None if shared and found.manifest["facts"].get("galaxies") != galaxies.key else found
 
 
 def work(lake: Path, facts: Json) -> Output:

@@ -1,6 +1,7 @@
 """The one grammar of paths in a lake; a name that could leave the lake is refused here.
 
-LAKE/<table>/current -> v-<key>               the published version
+LAKE/<table>/current -> v-<key>               the version that was published last, whichever request it belongs to
+LAKE/names/<name>/<table> -> ../../<table>/v-<key>    the version that belongs to a request
 LAKE/<table>/v-<key>/manifest.json            every file of the version with rows, bytes and sha256
 LAKE/<table>/v-<key>/<table>/dataset/...      a catalogue: HATS, beside <table>_margin/ and collection.properties
 LAKE/<table>/v-<key>/dataset/<part>.parquet   any other table
@@ -24,16 +25,22 @@ from lake_schema.errors import BadInput, Damaged
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
 _CELL = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet", re.ASCII)
-_VERSION = re.compile(r"v-([0-9a-f]{16})", re.ASCII)
+_VERSION = re.compile(r"(?:\.\./\.\./(?P<table>[a-z0-9_-]+)/)?v-(?P<key>[0-9a-f]{16})", re.ASCII)
+_NAMES, _RUNS = "names", "runs"
 _REMOTE = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+:/")
 _LOCAL = re.compile(r"file:(?://(?:localhost)?)?(/(?!/).*)", re.IGNORECASE | re.DOTALL)
 
 
 def name(text: str) -> str:
     """`text` where it is a legal name of a table, request or file stem; else BadInput."""
-    if not isinstance(text, str) or _NAME.fullmatch(text) is None:
+    if not is_name(text):
         raise BadInput(f"name {str(text)[:100]!r} is not of the form [a-z0-9][a-z0-9_-]* with at most 64 characters")
     return text
+
+
+def is_name(text: object) -> bool:
+    """Is it a legal name?"""
+    return isinstance(text, str) and _NAME.fullmatch(text) is not None
 
 
 def lake(text: str | Path) -> Path:
@@ -83,32 +90,50 @@ def current(root: Path, table_name: str) -> Path:
     return table(root, table_name) / "current"
 
 
+def named(root: Path) -> Path:
+    """Folder of the requests, in each of which are links to its tables."""
+    return within(root, root / _NAMES)
+
+
+def pin(root: Path, request: str, table_name: str) -> Path:
+    """The link of a request to its version of a table."""
+    return named(root) / name(request) / name(table_name)
+
+
 def tables(root: Path) -> list[str]:
     """Names of the tables that have been published, sorted; also of one whose version has gone since."""
-    folders = [path for path in root.iterdir() if _NAME.fullmatch(path.name)] if root.is_dir() else []
+    others = {_NAMES, _RUNS}
+    folders = [p for p in root.iterdir() if is_name(p.name) and p.name not in others] if root.is_dir() else []
     return sorted(path.name for path in folders if path.is_dir() and "current" in os.listdir(path))
 
 
 def current_key(root: Path, table_name: str) -> str | None:
-    """Key of the published version, which may be missing; None where nothing has been published.
+    """Key of the version that was published last, which may be missing; None where nothing has been published.
 
     Errors : Damaged where `current` is not a link to a version beside it
     """
-    link = current(root, table_name)
+    return linked_key(current(root, table_name), "")
+
+
+def linked_key(link: Path, table_name: str) -> str | None:
+    """Key of the version that a link leads to, None where there is no link; Damaged where it leads elsewhere.
+
+    table_name : where the version stands, as seen from the link; "" = beside it
+    """
     try:
         found = _VERSION.fullmatch(os.readlink(link))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
         raise Damaged(f"{link} is no link ({error.strerror}): a copy of a lake must keep its links") from None
-    if found is None:
-        raise Damaged(f"{link} does not lead to a version of table {table_name}")
-    return found[1]
+    if found is None or (found["table"] or "") != table_name:
+        raise Damaged(f"{link} does not lead to a version of table {table_name or link.parent.name}")
+    return found["key"]
 
 
 def runs(root: Path) -> Path:
     """Folder of the run logs."""
-    return within(root, root / "runs")
+    return within(root, root / _RUNS)
 
 
 def cell_file(order: int, cell: int) -> str:

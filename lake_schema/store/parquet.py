@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
+from lake_schema import votable
 from lake_schema.columns import Table
 from lake_schema.errors import Damaged
 from lake_schema.store import blocks
@@ -27,8 +28,10 @@ _FORMAT = ds.ParquetFileFormat()
 
 
 def write(path: Path, rows: pa.Table, table: Table) -> None:
-    """One file with the table's encodings; the same rows give the same bytes."""
-    pq.write_table(rows, path, row_group_size=ROWS_A_GROUP, **table.parquet())
+    """One file with the table's encodings, and its columns as a VOTable too; the same rows give the same bytes."""
+    with pq.ParquetWriter(path, rows.schema, **table.parquet()) as file:
+        file.write_table(rows, row_group_size=ROWS_A_GROUP)
+        file.add_key_value_metadata(votable.footer(rows, table))
 
 
 def facts(path: Path) -> dict[str, Any]:

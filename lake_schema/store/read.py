@@ -1,6 +1,7 @@
 """How a published table is read: through its manifest, never a glob, every byte compared before it is decoded.
 
-version(root, name)     the published version (resolved once: a later publication does not mix in)
+version(root, name)     a published version (resolved once: a later publication does not mix in)
+for_request             the one that a request's next table is made of
 Version.dataset         its files as an Arrow dataset
 Version.rows            rows of some columns or parts
 Version.beside          rows of a Parquet file that belongs to the version, though not to its table
@@ -30,7 +31,7 @@ from lake_schema import tables as declarations
 from lake_schema.arrays import Int
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput, Damaged, VersionMismatch
-from lake_schema.store import layout, manifest, parquet
+from lake_schema.store import layout, manifest, names, parquet
 from lake_schema.store.provenance import digest
 
 # Cells of a cone's cover are about this part of its radius wide: finer ones skip few rows more.
@@ -250,20 +251,55 @@ def _in_ranges(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
 # ------------------------------------------------------------------------------------------------ versions
 
 
-def version(root: Path, name: str, key: str | None = None) -> Version:
-    """The published version of a table, or the one of a key.
+def version(root: Path, name: str, key: str | None = None, request: str | None = None) -> Version:
+    """A published version of a table: the one of a key, or of a request; without these, the one published last.
 
-    Errors : BadInput where the lake has no such table or version; Damaged where its manifest is missing, broken or
-             another's; VersionMismatch where it was written with a declaration that this code cannot read
+    Errors : BadInput where the lake has no such table, version or request, or where several requests have versions of
+             their own and none is named; Damaged where its manifest is missing, broken or another's; VersionMismatch
+             where it was written with a declaration that this code cannot read
     """
-    wanted = key or layout.current_key(root, name)
+    wanted = key or _chosen(root, name, request)
+    if wanted is None:
+        raise BadInput(f"lake {root} has no table {name}" + (f" of request {request}" if request else ""))
+    return _open(root, name, wanted, asked=key is not None, link=_link(root, name, request))
+
+
+def for_request(root: Path, name: str, request: str) -> Version:
+    """What the next table of a request is made of: its own version of a table, else the one that was published last.
+
+    The second is for lakes that an older truesky wrote, and for requests that share a catalogue.  Errors: as `version`
+    """
+    own = names.key_of(root, request, name)
+    return published_last(root, name) if own is None else version(root, name, request=request)
+
+
+def published_last(root: Path, name: str) -> Version:
+    """The version that `current` leads to, whichever request it belongs to.  Errors: as `version`"""
+    wanted = layout.current_key(root, name)
     if wanted is None:
         raise BadInput(f"lake {root} has no table {name}")
+    return _open(root, name, wanted, asked=False, link=layout.current(root, name))
+
+
+def _chosen(root: Path, name: str, request: str | None) -> str | None:
+    if request is not None:
+        return names.key_of(root, names.checked(root, request), name)
+    if len(set((held := names.holders(root, name)).values())) > 1:
+        which = f"requests {', '.join(held)} have versions of their own of table {name}"
+        raise BadInput(f"lake {root}: {which}: name one of them")
+    return layout.current_key(root, name)
+
+
+def _link(root: Path, name: str, request: str | None) -> Path:
+    return layout.current(root, name) if request is None else layout.pin(root, request, name)
+
+
+def _open(root: Path, name: str, wanted: str, asked: bool, link: Path) -> Version:
     folder = layout.version(root, name, wanted)
     if not folder.exists():
-        if key:
-            raise BadInput(f"lake {root} has no table {name} of version {key}")
-        raise Damaged(f"{layout.current(root, name)} leads to {folder.name}, which is missing")
+        if asked:
+            raise BadInput(f"lake {root} has no table {name} of version {wanted}")
+        raise Damaged(f"{link} leads to {folder.name}, which is missing")
     about = manifest.load(folder, name)
     opened = Version(folder, about, pa.schema([]))
     if opened.parts:

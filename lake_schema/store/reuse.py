@@ -1,7 +1,7 @@
 """What an older version already holds is not made twice.
 
-A part whose facts have a PRODUCT, the digest of everything that shapes its bytes, is taken from the version that is
-current where that has the same part of the same product: its files are linked, after their sha256 has been compared.
+A part whose facts have a PRODUCT, the digest of everything that shapes its bytes, is taken from a version that has the
+same part of the same product: its files are linked, after their sha256 has been compared.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ def files_of(part: Part, receipt: Json) -> Json:
     return {"rows": receipt["rows"], "files": [f["path"] for f in receipt["files"]], "machine": receipt.get("machine")}
 
 
-def take(stage: Path, current: Path, table: str, parts: Sequence[Part]) -> None:
+def take(stage: Path, version: Path, table: str, parts: Sequence[Part]) -> None:
     """Give a stage those of the parts that a version has; what is missing or damaged there is made again.
 
-    stage   : folder of the version that is being made;  current : folder of the version that may have parts of it
+    stage   : folder of the version that is being made;  version : folder of the version that may have parts of it
     table   : its name;  parts : of the plan that is being made
     """
-    if not any(PRODUCT in part.facts for part in parts) or not current.exists():
+    if not any(PRODUCT in part.facts for part in parts):
         return
     try:
-        facts = manifest.load(current.resolve(), table)
+        facts = manifest.load(version, table)
     except Damaged:
         return
     entries = {entry["path"]: entry for entry in facts["files"]}
@@ -45,10 +45,10 @@ def take(stage: Path, current: Path, table: str, parts: Sequence[Part]) -> None:
         found = there.get(part.name)
         if found is None or PRODUCT not in part.facts or found["facts"] != part.facts:
             continue
-        files = [entry for path in found["files"] if (entry := _whole(current, entries[path])) is not None]
+        files = [entry for path in found["files"] if (entry := _whole(version, entries[path])) is not None]
         if len(files) == len(found["files"]):
             for entry in files:
-                _link(current / entry["path"], stage / entry["path"])
+                _link(version / entry["path"], stage / entry["path"])
             receipt = {"part": part.name, "rows": found["rows"], "files": files, "machine": found.get("machine")}
             write_receipt(stage, receipt)
 

@@ -12,7 +12,7 @@ import io
 import os
 from pathlib import Path
 
-import pyarrow.parquet as pq
+from lake_schema.store import parquet
 
 
 class Killed(BaseException):
@@ -60,7 +60,7 @@ class Disc:
         yield os, "fsync", self._fsync(os.fsync)
         yield io, "open", self._open(io.open)
         yield builtins, "open", self._open(builtins.open)
-        yield pq, "write_table", self._write_table(pq.write_table)
+        yield parquet, "write", self._write_table(parquet.write)
 
     def _on_first(self, name, real):
         def call(path, *args, **kwargs):
@@ -94,13 +94,13 @@ class Disc:
         return call
 
     def _write_table(self, real):
-        def call(table, path, *args, **kwargs):
+        def call(path, *args):
             try:
                 self.before("write", path)
             except OSError:
                 Path(path).write_bytes(b"PAR1 half a file")
                 raise
-            return real(table, path, *args, **kwargs)
+            return real(path, *args)
 
         return call
 

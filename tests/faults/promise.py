@@ -19,10 +19,10 @@ def key(kind, seed):
     return KINDS[kind][0](seed).key
 
 
-def current(root, kind):
+def current(root, kind, request=None):
     """Key of the version that a reader sees, None where there is none; fails where it is not whole."""
     try:
-        version = read.version(root, kind)
+        version = read.version(root, kind, request=request)
     except BadInput:
         return None
     assert read.verify(version, deep=True) == []

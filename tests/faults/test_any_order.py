@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule, run_state_machine_as_test
 
 from lake_schema.errors import BadInput, LakeError
-from lake_schema.store import publish, read
+from lake_schema.store import garbage, read
 from tests.faults import promise
 from tests.faults.disc import Disc, Killed
 
@@ -57,18 +57,18 @@ class Lake(RuleBasedStateMachine):
     @rule()
     def clean(self):
         if any((self.root / "plain").glob("*")):
-            publish.gc(self.root, "plain")
+            garbage.collect(self.root, "plain", delete=True)
         else:
             # Not begun, or killed before it had more than the folder: there is no table yet, and gc says so.
             with pytest.raises(BadInput, match="no table plain"):
-                publish.gc(self.root, "plain")
+                garbage.collect(self.root, "plain", delete=True)
 
     @rule(n=st.integers(1, 25))
     def die_cleaning(self, n):
         if any((self.root / "plain").glob("*")):
             try:
                 with Disc(self.root, die_at=n):
-                    publish.gc(self.root, "plain")
+                    garbage.collect(self.root, "plain", delete=True)
             except Killed:
                 pass
 

@@ -3,7 +3,7 @@
 import pytest
 
 from lake_schema.errors import LakeError, PartsFailed
-from lake_schema.store import layout, publish, read
+from lake_schema.store import garbage, layout, publish, read
 from lake_schema.store.plan import Plan
 from tests.faults import promise, victims
 from tests.faults.disc import Disc, Killed
@@ -80,18 +80,65 @@ def test_death_in_gc_leaves_no_half_version(tmp_path_factory):
     for seed in (1, 2):
         promise.make(root, "plain", seed)
     with Disc(root) as disc:
-        publish.gc(root, "plain")
+        garbage.collect(root, "plain", delete=True)
     for n in range(1, len(disc.calls) + 1):
         root = tmp_path_factory.mktemp("lake")
         for seed in (1, 2):
             promise.make(root, "plain", seed)
         with Disc(root, die_at=n), pytest.raises(Killed):
-            publish.gc(root, "plain")
+            garbage.collect(root, "plain", delete=True)
         assert promise.current(root, "plain") == promise.key("plain", 2)
         promise.make(root, "plain", 1)
         assert promise.current(root, "plain") == promise.key("plain", 1)
-        publish.gc(root, "plain")
+        garbage.collect(root, "plain", delete=True)
         assert [path.name for path in layout.table(root, "plain").glob("*v-*")] == [f"v-{promise.key('plain', 1)}"]
+
+
+def two_requests(tmp_path_factory):
+    """A lake in which a and b have a version each, and an older one is nobody's."""
+    root = tmp_path_factory.mktemp("lake")
+    for name, seed in (("a", 4), ("a", 1), ("b", 3)):
+        promise.make(root, "plain", seed, name=name)
+    return root
+
+
+def versions(root):
+    return [promise.current(root, "plain", name) for name in "ab"]
+
+
+def test_death_between_any_two_steps_leaves_every_request_its_version(tmp_path_factory):
+    """The one that publishes has its old or its new version, whole, the other its own; then gc takes from neither."""
+    first, other, new = (promise.key("plain", seed) for seed in (1, 3, 2))
+    root = two_requests(tmp_path_factory)
+    with Disc(root) as disc:
+        promise.make(root, "plain", 2, name="a")
+    found = set()
+    for n in range(len(disc.calls), 0, -2):
+        root = two_requests(tmp_path_factory)
+        with Disc(root, die_at=n), pytest.raises(Killed):
+            promise.make(root, "plain", 2, name="a")
+        now = versions(root)
+        assert now in ([first, other], [new, other]), disc.calls[n - 1]
+        found.add(now[0])
+        garbage.collect(root, delete=True)
+        assert versions(root) == now
+        promise.make(root, "plain", 2, name="a")
+        assert versions(root) == [new, other]
+    assert found == {first, new}
+
+
+def test_death_in_gc_leaves_what_names_link_to(tmp_path_factory):
+    root = two_requests(tmp_path_factory)
+    with Disc(root) as disc:
+        assert garbage.collect(root, delete=True) == [layout.version(root, "plain", promise.key("plain", 4))]
+    for n in range(1, len(disc.calls) + 1):
+        root = two_requests(tmp_path_factory)
+        with Disc(root, die_at=n), pytest.raises(Killed):
+            garbage.collect(root, delete=True)
+        assert versions(root) == [promise.key("plain", seed) for seed in (1, 3)]
+        garbage.collect(root, delete=True)
+        assert garbage.collect(root) == []
+        assert versions(root) == [promise.key("plain", seed) for seed in (1, 3)]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lake_schema.errors import BadInput, Damaged, Superseded
-from lake_schema.store import layout, parquet, publish, read
+from lake_schema.store import garbage, layout, locks, parquet, read
 from tests.faults import promise, victims
 from tests.faults.disc import Disc
 
@@ -123,7 +123,7 @@ def test_a_reader_never_sees_two_versions(kind, versions, reads, lake):
 
 
 def test_gc_leaves_a_running_publisher_alone(lake, plain_phases, monkeypatch):
-    monkeypatch.setattr(publish, "_PATIENCE", victims.PATIENCE)
+    monkeypatch.setattr(locks, "PATIENCE", victims.PATIENCE)
     promise.make(lake, "plain", 1)
     answers = victims.CONTEXT.SimpleQueue()
     for name, n in plain_phases.items():
@@ -134,7 +134,7 @@ def test_gc_leaves_a_running_publisher_alone(lake, plain_phases, monkeypatch):
         )
         assert reached.wait(60)
         try:
-            publish.gc(lake, "plain")
+            garbage.collect(lake, "plain", delete=True)
         except Superseded:
             assert name in ("the stage is renamed", "the link is swapped")  # it holds the table's lock here
         finally:

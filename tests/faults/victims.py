@@ -9,7 +9,7 @@ import numpy as np
 
 from lake_schema.errors import LakeError
 from lake_schema.fits import images
-from lake_schema.store import publish
+from lake_schema.store import garbage, locks, publish
 from lake_schema.store.plan import Output
 from tests.faults import promise
 from tests.faults.disc import Disc
@@ -53,7 +53,7 @@ def kill_at(root, kind, seed, n):
 
 def stop_at(root, kind, seed, n, base, reached, go, answers):
     """Publish, and wait at the n-th call to the disc until told to go on."""
-    os.fsync, publish._PATIENCE = _no_fsync, PATIENCE
+    os.fsync, locks.PATIENCE = _no_fsync, PATIENCE
 
     def wait(call, what, path):
         if call == n:
@@ -78,7 +78,7 @@ def publish_many(root, kind, versions, stop):
         n += 1
         promise.make(root, kind, n)
         if n % 7 == 0:
-            publish.gc(root, kind)
+            garbage.collect(root, kind, delete=True)
 
 
 def with_image(root, facts):

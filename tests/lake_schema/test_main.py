@@ -11,7 +11,7 @@ import pytest
 from lake_schema import __version__
 from lake_schema.__main__ import main
 from lake_schema.errors import Damaged, PartsFailed
-from lake_schema.store import layout, manifest, provenance, publish, read
+from lake_schema.store import garbage, layout, manifest, provenance, publish, read
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
 
 
@@ -94,10 +94,10 @@ def test_a_copy_that_followed_links_is_damaged_for_everyone(filled, tmp_path, ca
 
 
 def test_a_disc_that_refuses_is_one_line(filled, capsys, monkeypatch):
-    def refuse(root, name):
+    def refuse(root, name, delete):
         raise OSError(errno.EROFS, "Read-only file system", str(root))
 
-    monkeypatch.setattr(publish, "gc", refuse)
+    monkeypatch.setattr(garbage, "collect", refuse)
     assert main(["gc", str(filled), "toy"]) == 1
     assert capsys.readouterr().err == f"lake_schema: [Errno 30] Read-only file system: '{filled}'\n"
 
@@ -106,9 +106,9 @@ def test_gc_leaves_what_is_not_its_own(filled, capsys):
     (filled / "plain" / "my-Notes.txt").touch()
     (filled / "plain" / "v-2").mkdir()
     (filled / "runs").mkdir()
-    assert main(["gc", str(filled)]) == 0
+    assert main(["gc", str(filled), "--delete"]) == 0
     assert capsys.readouterr().out == f"removed {layout.version(filled, 'plain', plain_plan(1).key)}\n"
-    assert main(["gc", str(filled), "runs"]) == 2
+    assert main(["gc", str(filled), "runs", "--delete"]) == 2
     assert list((filled / "runs").iterdir()) == []
     assert {"my-Notes.txt", "v-2"} < {path.name for path in (filled / "plain").iterdir()}
 
@@ -121,7 +121,7 @@ def test_gc_keeps_everything_while_it_does_not_know_what_is_current(filled, caps
     else:
         (filled / "plain" / "current").unlink()
         (filled / "plain" / "current").symlink_to(versions[0])
-    assert main(["gc", str(filled), "plain"]) == 1
+    assert main(["gc", str(filled), "plain", "--delete"]) == 1
     assert sorted((filled / "plain").glob("v-*")) == versions
     assert str(filled / "plain" / "current") in capsys.readouterr().err
 
@@ -135,19 +135,19 @@ def test_an_argument_that_means_nothing_is_refused(arguments, capsys):
 
 def test_gc_removes_what_is_old_and_says_so(filled, capsys):
     old = layout.version(filled, "plain", plain_plan(1).key)
-    assert main(["gc", str(filled)]) == 0
+    assert main(["gc", str(filled), "--delete"]) == 0
     assert capsys.readouterr().out == f"removed {old}\n"
     assert not old.exists()
     assert main(["verify", str(filled), "--deep"]) == 0
     capsys.readouterr()
-    assert main(["gc", str(filled)]) == 0
+    assert main(["gc", str(filled), "--delete"]) == 0
     assert capsys.readouterr().out == ""
 
 
 def test_gc_removes_the_stage_of_a_run_that_was_given_up(lake, capsys):
     with pytest.raises(PartsFailed):
         publish.make(lake, plain_plan(1), lambda root, facts: None)
-    assert main(["gc", str(lake)]) == 0
+    assert main(["gc", str(lake), "--delete"]) == 0
     assert "removed" in capsys.readouterr().out
     assert [path.name for path in (lake / "plain").iterdir()] == [".lock"]
 

@@ -11,6 +11,7 @@ from jobs.render.channels import registry
 from jobs.render.planning.mission import PARTS, mission_of, user_filters
 from jobs.render.sources import catalogue_rows, selection
 from jobs.render.sources.catalogue_rows import CATALOGUES, LENSES
+from jobs.request import universe
 from jobs.request.area import Area
 from jobs.request.schema import Request
 from lake_schema import sky
@@ -27,12 +28,10 @@ _LINK, _MOST_PATCHES = 5.0, 12
 
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 
-# What a request says of stars by values alone.
-_STAR_KEYS = ("plane_limit", "bright_limit", "density", "brown_dwarf_boost")
-
 
 def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> None:
     """What lies in the lake must have been made for this request, and the tables from one another."""
+    universe.refuse_other([inputs[name] for name in universe.CATALOGUES], request)
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
     filters = user_filters(request)[1]
     wanted = {"request": request.facts(*PARTS), "mission": mission_of(request.mission).fingerprint, **filters}
@@ -41,18 +40,6 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> N
             raise BadInput(f"table {name} was planned for another request: run plan_exposures first")
     if facts["mission"].get("mission") != wanted["mission"]:
         raise BadInput("table mission was planned for another request: run plan_exposures first")
-    theirs = None if request.sources is None else request.sources.facts(request.area.bounds())
-    for name in ("galaxies", "stars"):
-        if canonical(facts[name].get("sources")) != canonical(theirs):
-            raise BadInput(f"table {name} has other sources than the request: run build_{name} first")
-    drawn = {"seed": request.seed, **request.facts("universe")["universe"]}
-    drawn |= {key: request.facts("stars")["stars"][key] for key in _STAR_KEYS}
-    for name in ("galaxies", "stars"):
-        # A catalogue that was not drawn by us has a seed alone.
-        for key in ("seed", *(key for key in drawn if key in facts[name])):
-            if canonical(facts[name].get(key)) != canonical(drawn[key]):
-                values = f"{key} {facts[name].get(key)}, the request {drawn[key]}"
-                raise BadInput(f"table {name} has {values}: run build_{name} first, then compute_fluxes")
     if LENSES in inputs and facts[LENSES].get("galaxies") != inputs["galaxies"].key:
         raise BadInput(f"table {LENSES} was drawn in another version of galaxies: run build_strong_lenses first")
     for catalogue, fluxes in CATALOGUES:

@@ -71,7 +71,7 @@ def calibration() -> Float:
 def _measured(lake: Path) -> Iterator[float]:
     """CPU s over the forecast's of every detector of the current products that a machine of this kind rendered."""
     try:
-        version = read.version(lake, "products")
+        version = read.published_last(lake, "products")
         tasks = read.version(lake, "tasks", version.manifest["facts"]["inputs"]["tasks"]).rows()
     except (LakeError, KeyError):
         return

@@ -40,12 +40,13 @@ _INK, _PAPER, _GALAXY, _STAR = "#e8e6df", "#0b0d12", "#ffd27d", "#9fd3ff"
 _SCALE_BARS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
 
-def previews(root: Path, out: Path, most: int | None = None) -> list[Path]:
-    """A PNG beside each other in `out` for the science images of the lake; returns their paths.
+def previews(root: Path, out: Path, most: int | None = None, request: str | None = None) -> list[Path]:
+    """A PNG beside each other in `out` for the science images of a request, or of the lake; returns their paths.
 
-    most : so many of them, as `shown` chooses, None = all
+    most : so many of them, as `shown` chooses, None = all;  request : its name, where the lake has several
     """
-    version = read.version(root, "products")
+    version = read.version(root, "products", request=request)
+    made_of = version.manifest["facts"]["inputs"]
     made, rows = [], version.rows().to_pylist()
     hits = {_frame_of(row): row["path"] for row in rows if row["content"] == "cosmic_rays"}
     for row in shown([row for row in rows if row["content"] == "science"], most):
@@ -54,7 +55,7 @@ def previews(root: Path, out: Path, most: int | None = None) -> list[Path]:
             (truth,) = images.read_images(version.file(hits[_frame_of(row)]))
             image = images.Image(_mended(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
         path = out / f"{row['channel']}_{row['band']}_{row['detector']}_{row['exposure_id']}.png".lower()
-        picture(path, np.asarray(image.data), image.cards, preview_labels.labels(root, row, image))
+        picture(path, np.asarray(image.data), image.cards, preview_labels.labels(root, row, image, made_of))
         made.append(path)
     return made
 

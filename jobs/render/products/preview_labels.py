@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,11 @@ class Label:
     text: str
 
 
-def labels(root: Path, product: dict[str, Any], image: images.Image) -> list[Label]:
-    """The brightest sources of the lake's catalogues inside a product's frame, brightest first."""
+def labels(root: Path, product: dict[str, Any], image: images.Image, made_of: Mapping[str, str]) -> list[Label]:
+    """The brightest sources inside a product's frame, brightest first.
+
+    made_of : table -> key of the versions that the product was made of
+    """
     system = astrometry.from_cards(image.cards)
     ny, nx = np.asarray(image.data).shape
     column = f"f_nu_{product['band']}"
@@ -51,8 +54,9 @@ def labels(root: Path, product: dict[str, Any], image: images.Image) -> list[Lab
     for kind, position in (("galaxy", ("ra_lensed", "dec_lensed")), ("star", ("ra", "dec"))):
         table = "galaxies" if kind == "galaxy" else "stars"
         columns = ["id", *position] + (["z_obs"] if kind == "galaxy" else [])
-        rows = read.version(root, table).in_cells(cells, GENERATION_ORDER, columns)
-        flux = read.version(root, f"{kind}_fluxes").in_cells(cells, GENERATION_ORDER, ["id", column])
+        rows = read.version(root, table, made_of[table]).in_cells(cells, GENERATION_ORDER, columns)
+        fluxes = read.version(root, f"{kind}_fluxes", made_of[f"{kind}_fluxes"])
+        flux = fluxes.in_cells(cells, GENERATION_ORDER, ["id", column])
         near = sky.separation(*centre, *(rows[name].to_numpy() for name in position)) < radius
         near &= flux[column].to_numpy() > 0
         if near.any():

@@ -3,13 +3,17 @@
 import pytest
 
 from jobs.explore.explorer import Explorer
+from lake_schema.columns import Column, Table
 from lake_schema.store import layout, publish
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
-from tests.universe import plain_plan, plain_work, rows_of
+from tests.universe import PLAIN, plain_plan, plain_work, rows_of
 
 ROWS = 500
+LISTS = Table(
+    "lists", 1, (PLAIN.columns[0], Column("stars", "list<float32>", "uJy", "phot.flux.density", "fluxes")), "Lists."
+)
 FLUXES = fluxes("galaxy", ["euclid_vis"])
 
 
@@ -25,6 +29,8 @@ def explored(tmp_path_factory):
     for table, rows in ((GALAXIES, galaxies), (FLUXES, flux)):
         publish.make(root, Plan(table, {}, (part,)), lambda lake, facts, rows=rows: Output(rows))
     publish.make(root, plain_plan(), plain_work)
+    lists = LISTS.build({"id": [1, 2], "stars": [[1.0, 2.0], [3.0]]})
+    publish.make(root, Plan(LISTS, {}, (Part("0.parquet", {}),)), lambda lake, facts: Output(lists))
     return root
 
 

@@ -21,7 +21,7 @@ from tests.universe import plain_plan, plain_work
 
 def test_tables_and_their_columns(explorer):
     tables = explorer.tables()
-    assert tables["rows"].to_dict() == {"galaxies": 500, "galaxy_fluxes": 500, "plain": 60}
+    assert tables["rows"].to_dict() == {"galaxies": 500, "galaxy_fluxes": 500, "lists": 2, "plain": 60}
     assert (tables["MB"] > 0).all()
     columns = explorer.describe("galaxies")
     assert list(columns.index) == GALAXIES.names
@@ -118,6 +118,20 @@ UNITS = [
     ("WITH galaxies AS (SELECT value AS ra FROM plain) SELECT ra FROM galaxies", {"ra": ""}),
     ("SELECT ra FROM galaxies AS g(dec, ra)", {"ra": ""}),
     ("SELECT ra FROM galaxies UNION SELECT dec FROM galaxies", {"ra": ""}),
+    ("SELECT * FROM (SELECT ra, a_v, 2 AS dec FROM galaxies) LIMIT 3", {"ra": "deg", "a_v": "mag", "dec": ""}),
+    ("SELECT * FROM (SELECT * FROM (FROM galaxies) WHERE z_obs > 0.1) AS q ORDER BY ra LIMIT 3", {"ra": "deg"}),
+    ("SELECT q.ra FROM (SELECT * FROM galaxies) AS q JOIN galaxy_fluxes USING (id)", {"ra": "deg"}),
+    ("WITH q AS (SELECT ra, z_obs AS dec FROM galaxies) SELECT * FROM q LIMIT 3", {"ra": "deg", "dec": ""}),
+    ("WITH q AS (SELECT ra FROM galaxies), r AS (SELECT * FROM q) SELECT * FROM r", {"ra": "deg"}),
+    ("WITH q(ra) AS (SELECT dec FROM galaxies) SELECT * FROM q", {"ra": ""}),
+    ("SELECT *, 1 AS one FROM galaxies", {"ra": "deg", "one": ""}),
+    ("SELECT * FROM (SELECT ra, dec FROM galaxies) AS q(dec, ra)", {"ra": "", "dec": ""}),
+    ("SELECT * FROM (SELECT dec AS ra FROM (SELECT dec FROM galaxies))", {"ra": ""}),
+    ("SELECT s.ra FROM galaxies JOIN (SELECT {'ra': 1.0::DOUBLE} AS s) ON true", {"ra": ""}),
+    ("SELECT * FROM (SELECT ra FROM galaxies UNION SELECT z_obs FROM galaxies)", {"ra": ""}),
+    ("SELECT ra FROM (SELECT 1.0::DOUBLE AS ra), plain", {"ra": ""}),
+    ("SELECT stars, list_transform(stars, lambda x: 2 * x) AS twice FROM lists", {"stars": "uJy", "twice": ""}),
+    ("SELECT * FROM (FROM lists) LIMIT 1", {"stars": "uJy"}),
 ]
 
 
@@ -125,6 +139,11 @@ UNITS = [
 def test_a_unit_is_never_given_to_another_quantity(explorer, text, units):
     schema = explorer.sql(text, into="arrow").schema
     assert {name: (schema.field(name).metadata or {}).get(b"unit", b"").decode() for name in units} == units
+
+
+def test_lists_keep_unit_and_ucd_in_astropy(explorer):
+    column = explorer.sql("SELECT * FROM (SELECT stars FROM lists) LIMIT 2", into="astropy")["stars"]
+    assert (str(column.unit), column.meta["ucd"], len(column)) == ("uJy", "phot.flux.density", 2)
 
 
 def test_sums_of_integers_are_numbers(explorer):

@@ -31,7 +31,7 @@ from jobs.render.sources import catalogue_rows
 from jobs.request.from_toml import from_table
 from lake_schema import ids, sky, tables
 from lake_schema.errors import BadInput, PartsFailed
-from lake_schema.store import layout, publish, read, stage
+from lake_schema.store import garbage, layout, publish, read, stage
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.strong_lenses import STRONG_LENSES
@@ -326,7 +326,7 @@ def test_what_an_older_version_holds_is_not_rendered_again(rendered):
         row["sources"] for row in read.version(lake, "products").rows().to_pylist() if row["content"] == "science"
     )
     # The older version may go: what was taken from it stays.
-    publish.gc(lake, "products")
+    garbage.collect(lake, "products", delete=True)
     assert images(lake) == both
 
 
@@ -455,7 +455,7 @@ def test_an_old_product_is_rendered_again_with_the_mission_that_it_had(rendered,
     assert archive.main([*command[:3], "images/no.fits", *command[4:]]) == 2
     assert "has no product images/no.fits" in capsys.readouterr().err
     # The tables that it was made from have gone.
-    publish.gc(rendered, "mission")
+    garbage.collect(rendered, "mission", delete=True)
     assert archive.main([*command, "--version", old.key]) == 2
     assert "no table mission of version" in capsys.readouterr().err
 

@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
-from lake_schema.store import layout, manifest, parquet, publish, read
+from lake_schema.store import garbage, layout, locks, manifest, parquet, publish, read
 from lake_schema.store.plan import Output, Part, Plan, data_path
 from lake_schema.store.stage import attempt, missing
 from tests.universe import CELLS, TOY, plain_plan, plain_work, toy_plan, toy_rows, toy_work
@@ -118,7 +118,7 @@ def test_versions_follow_each_other_and_gc_keeps_the_last(lake):
     second = publish.make(lake, toy_plan(2), toy_work)
     assert read.version(lake, "toy").folder == second
     assert first.exists()
-    assert publish.gc(lake, "toy") == [first]
+    assert garbage.collect(lake, "toy", delete=True) == [first]
     assert not first.exists()
     assert read.verify(read.version(lake, "toy"), deep=True) == []
 
@@ -186,7 +186,7 @@ def test_a_receipt_without_its_file_does_not_count(lake):
 def test_what_is_done_needs_no_lock(lake, monkeypatch):
     """A lake that cannot be written is no reason to fail where nothing is left to do."""
     folder = publish.make(lake, toy_plan(), toy_work)
-    monkeypatch.delattr(publish, "_lock")
+    monkeypatch.delattr(locks, "held")
     assert publish.make(lake, toy_plan(), None) == folder
 
 

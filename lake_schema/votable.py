@@ -1,0 +1,57 @@
+"""Units and UCDs for clients that do not know Arrow's metadata: a VOTable header in a Parquet file's footer.
+
+The convention is VOParquet's, as the archives of Rubin and of IRSA write it and astropy (`Table.read(file,
+format="parquet.votable")`), TOPCAT and hats read it: a VOTable without data, its fields those of the file.
+
+Ref: IVOA Note "VOParquet", 1.0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from xml.etree import ElementTree
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from lake_schema.columns import Column, Table
+
+VERSION, CONTENT = "IVOA.VOTable-Parquet.version", "IVOA.VOTable-Parquet.content"
+_NAMESPACE = "http://www.ivoa.net/xml/VOTable/v1.3"
+_TYPES = {
+    "int64": "long", "int32": "int", "int16": "short", "int8": "short", "float64": "double", "float32": "float",
+    "bool": "boolean", "string": "char",
+}  # fmt: skip
+
+
+def footer(rows: pa.Table, table: Table) -> dict[str, str]:
+    """What is added to the footer of a file that holds these rows of a table."""
+    texts = [column.name for column in table.columns if column.type == "string"]
+    # A text of unknown length is an object to astropy's VOTables, and none to its Parquet files.
+    longest = tuple((name, pc.max(pc.utf8_length(rows[name])).as_py() or 1) for name in texts)
+    return {VERSION: "1.0", CONTENT: header(table, longest)}
+
+
+@lru_cache(maxsize=64)
+def header(table: Table, longest: tuple[tuple[str, int], ...] = ()) -> str:
+    """The table's columns as a VOTable without data, XML.
+
+    longest : (column, most characters) of the texts
+    """
+    root = ElementTree.Element("VOTABLE", {"version": "1.4", "xmlns": _NAMESPACE})
+    about = ElementTree.SubElement(ElementTree.SubElement(root, "RESOURCE"), "TABLE", {"name": table.name})
+    ElementTree.SubElement(about, "DESCRIPTION").text = table.doc
+    lengths = dict(longest)
+    for column in table.columns:
+        field = ElementTree.SubElement(about, "FIELD", _field(column, lengths))
+        ElementTree.SubElement(field, "DESCRIPTION").text = column.doc
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _field(column: Column, lengths: Mapping[str, int]) -> dict[str, str]:
+    kind = _TYPES[column.type.removeprefix("list<").removesuffix(">")]
+    facts = {"name": column.name, "datatype": kind}
+    if column.type.startswith("list<") or kind == "char":
+        facts["arraysize"] = f"{lengths.get(column.name, '')}*"
+    return facts | {key: text for key, text in (("unit", column.unit), ("ucd", column.ucd)) if text}

@@ -1,0 +1,65 @@
+"""Several requests in one lake: one is named, or its tables are called by its name, and no query mixes them unseen."""
+
+import pytest
+
+from jobs.explore.__main__ import main
+from jobs.explore.explorer import Explorer
+from lake_schema.errors import BadInput
+from lake_schema.store import publish
+from tests.universe import plain_plan, plain_work, toy_plan, toy_work
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    root = tmp_path_factory.mktemp("two") / "lake"
+    root.mkdir()
+    for name, seed in (("a", 1), ("my-b", 2)):
+        publish.make(root, toy_plan(), toy_work, name=name)
+        publish.make(root, plain_plan(seed), plain_work, name=name)
+    return root
+
+
+@pytest.fixture(scope="module")
+def opened(two):
+    with Explorer(two, timeout=30.0) as explorer:
+        yield explorer
+
+
+def test_tables_of_both(opened):
+    assert sorted(opened.tables().index) == ["a.plain", "my-b.plain", "toy"]
+    assert opened.describe("a.plain").index.tolist() == ["id", "value"]
+
+
+def test_a_query_of_both(opened):
+    text = """SELECT a.plain.value AS x, b.value AS y FROM a.plain JOIN "my-b".plain AS b USING (id) JOIN toy ON true
+              LIMIT 1"""
+    assert opened.sql(text).to_dict("list") == {"x": [1.0], "y": [2.0]}
+    assert opened.sql("SELECT flux FROM A.toy", into="astropy")["flux"].unit == "uJy"
+
+
+@pytest.mark.parametrize("call", [lambda e: e.sql("FROM plain"), lambda e: e.describe("plain")])
+def test_a_table_that_two_have_is_not_guessed(opened, call):
+    with pytest.raises(BadInput, match=r"requests a, my-b have versions of their own of table plain: name one"):
+        call(opened)
+
+
+@pytest.mark.parametrize(
+    "text", ["FROM c.plain", "FROM a.galaxies", "FROM x.a.plain", "FROM temp.plain", "FROM main.toy"]
+)
+def test_no_other_schema_is_reached(opened, text):
+    with pytest.raises(BadInput, match="is not a table of the lake"):
+        opened.sql(text)
+
+
+def test_one_is_named(two, capsys):
+    with Explorer(two, timeout=30.0, request="a") as explorer:
+        assert sorted(explorer.tables().index) == ["plain", "toy"]
+        assert explorer.sql("SELECT DISTINCT value FROM plain")["value"].tolist() == [1.0]
+        with pytest.raises(BadInput, match="is not a table of the lake"):
+            explorer.sql('FROM "my-b".plain')
+    with pytest.raises(BadInput, match="has no request c; it has a, my-b"):
+        Explorer(two, request="c")
+    assert main(["SELECT max(value) FROM plain", "--lake", str(two), "--name", "my-b"]) == 0
+    assert "2.0" in capsys.readouterr().out
+    assert main(["FROM plain", "--lake", str(two)]) == 2
+    assert main(["--lake", str(two)]) == 0

@@ -1,0 +1,118 @@
+"""Catalogues of one universe are used together, those of two are not."""
+
+from dataclasses import replace
+
+import pytest
+
+from jobs.request import universe
+from jobs.request.files import Catalogue, DustMap, Ingest
+from jobs.request.from_toml import from_table
+from lake_schema.errors import BadInput
+from lake_schema.store import layout, publish, read
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.provenance import file_sha256
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.stars import STARS
+from tests.universe import rows_of
+
+TABLES = {"galaxies": GALAXIES, "stars": STARS}
+
+
+def wanted(name="a", seed=11, **depth):
+    area = {"cone": {"ra": 53.0, "dec": -27.0, "radius": 0.1}}
+    return from_table({"name": name, "seed": seed, "area": area, "universe": depth})
+
+
+def catalogue(lake, table, request, name=None, **facts):
+    """A catalogue as a build job would publish it for a request."""
+    own = {key: value for key, value in universe.wanted(request).items() if key in KEYS[table]}
+    plan = Plan(TABLES[table], {**own, **facts}, (Part(layout.cell_file(5, 1607), {}),))
+    publish.make(lake, plan, lambda root, facts: Output(rows_of(TABLES[table], 3)), name=name)
+    return read.version(lake, table, plan.key)
+
+
+KEYS = {
+    "galaxies": {"seed", "galaxy_limit", "galaxy_band", "z_max", "box_cells", "lensing_nside"},
+    "stars": {"seed", "star_limit", "density", "brown_dwarf_boost", "plane_limit"},
+}
+
+
+def test_what_shapes_a_catalogue_is_in_the_universe():
+    """A key that a build job writes down and this does not know would never be compared."""
+    known = universe.wanted(wanted())
+    assert set().union(*KEYS.values()) <= known.keys()
+    assert not known.keys() & {"rows_a_file", "tycho2", "catalogue", "columns"}
+
+
+@pytest.mark.parametrize(
+    ("table", "other", "words"),
+    [
+        ("galaxies", wanted(seed=12), "table galaxies has seed 11, the request 12: run build_galaxies first"),
+        ("galaxies", wanted(galaxy_limit=24.0), "table galaxies has galaxy_limit 26.0, the request 24.0"),
+        ("stars", wanted(seed=12), "table stars has seed 11, the request 12: run build_stars first, then compute_fl"),
+        ("stars", wanted(star_limit=20.0), "table stars has star_limit 26.0, the request 20.0"),
+        (
+            "stars",
+            replace(wanted(), stars=replace(wanted().stars, density="besancon")),
+            "table stars has density juric, the request besancon",
+        ),
+    ],
+)
+def test_another_universe_is_refused_by_what_differs(lake, table, other, words):
+    version = catalogue(lake, table, wanted())
+    universe.refuse_other([version], wanted())
+    with pytest.raises(BadInput, match=words):
+        universe.refuse_other([version], other)
+
+
+@pytest.mark.parametrize("depth", [{"lensing": "none"}, {"rotation": 90.0}])
+def test_a_catalogue_of_before_there_was_the_key(lake, depth):
+    version = catalogue(lake, "galaxies", wanted())
+    assert not depth.keys() & version.manifest["facts"].keys()
+    with pytest.raises(BadInput, match=f"table galaxies has {next(iter(depth))} (None|0.0), the request"):
+        universe.refuse_other([version], wanted(**depth))
+
+
+def test_what_shapes_only_the_other_catalogue_is_no_difference(lake):
+    universe.refuse_other([catalogue(lake, "galaxies", wanted())], wanted(star_limit=20.0))
+
+
+def test_files_are_compared_by_what_they_hold(lake, tmp_path):
+    file, same, other = (tmp_path / f"{name}.csv" for name in ("file", "same", "other"))
+    for path, text in ((file, "1"), (same, "1"), (other, "2")):
+        path.write_text(text)
+
+    def request(path):
+        return replace(wanted(), ingest=Ingest(galaxies=Catalogue((path,), "euclid")))
+
+    version = catalogue(lake, "galaxies", wanted(), ingest={"sha256": [file_sha256(file)], "format": "euclid"})
+    for path in (file, same):
+        universe.refuse_other([version], request(path))
+    with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
+        universe.refuse_other([version], request(other))
+    with pytest.raises(BadInput, match="table galaxies has files of ingest, the request none"):
+        universe.refuse_other([version], wanted())
+    file.unlink()
+    universe.refuse_other([version], request(file))
+
+
+def test_dust_is_of_both_catalogues(lake, tmp_path):
+    (tmp_path / "dust.fits").write_text("x")
+    dust = Ingest(dust=DustMap(tmp_path / "dust.fits", "EBV", "ebv", "", ""))
+    for table in TABLES:
+        with pytest.raises(BadInput, match=f"table {table} has no files of dust, the request some"):
+            universe.refuse_other([catalogue(lake, table, wanted())], replace(wanted(), ingest=dust))
+
+
+def test_a_lake_holds_one_universe(lake):
+    for table in TABLES:
+        catalogue(lake, table, wanted("a"), name="a")
+    universe.refuse_others(lake, wanted("b"))
+    with pytest.raises(
+        BadInput, match=r"holds the universe of request a: its galaxies have seed 11, the request 12: use"
+    ):
+        universe.refuse_others(lake, wanted("b", seed=12))
+    with pytest.raises(BadInput, match=r"its stars have star_limit 26.0, .*: use another folder for request b"):
+        universe.refuse_others(lake, wanted("b", star_limit=20.0))
+    # Alone in its lake, a request may change its own.
+    universe.refuse_others(lake, wanted("a", seed=12))

@@ -1,0 +1,117 @@
+"""What gc may remove: nothing that a name links to, nor what that was made of, however far back."""
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lake_schema.errors import Damaged
+from lake_schema.store import garbage, layout, locks, names, publish, read
+from lake_schema.store.plan import Part, Plan
+from tests.universe import PLAIN, plain_plan, plain_work, toy_plan, toy_work
+
+TABLES = ("first", "second", "third")
+
+
+def plan_of(table, number, inputs=()):
+    facts = {"seed": number, "made of": {f"x{i}": key for i, key in enumerate(inputs)}}
+    return Plan(replace(PLAIN, name=table), facts, (Part("0.parquet", {"part": 0}),))
+
+
+# (table, request or none, which of the versions before it it was made of)
+PUBLISHED = st.tuples(
+    st.sampled_from(TABLES), st.sampled_from(["a", "b", None]), st.lists(st.integers(0, 9), max_size=2)
+)
+
+
+@settings(max_examples=25)
+@given(st.lists(PUBLISHED, min_size=1, max_size=8), st.sampled_from([None, *TABLES]))
+def test_nothing_that_is_reached_from_a_name_is_removed(published, chosen):
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fsync", lambda descriptor: None)
+        root, every, pinned, made_of = Path(folder), [], {}, {}
+        for number, (table, request, before) in enumerate(published):
+            inputs = [every[i % len(every)] for i in before if every]
+            plan = plan_of(table, number, [key for _, key in inputs])
+            publish.make(root, plan, plain_work, name=request)
+            this = (table, plan.key)
+            every.append(this)
+            made_of[this] = inputs
+            pinned[table, None] = this
+            if request:
+                pinned[table, request] = this
+                for one in (one for one in inputs if one[0] != table):
+                    pinned.setdefault((one[0], request), one)
+        reached, waiting = set(), list(pinned.values())
+        while waiting:
+            one = waiting.pop()
+            reached.add(one)
+            waiting += made_of[one]
+        there = set(every)
+        rest = {one for one in there - reached if chosen in (None, one[0])}
+        if chosen in (None, *(table for table, _ in there)):
+            said = garbage.collect(root, chosen)
+            assert {(path.parent.name, path.name[2:]) for path in said} == rest
+            assert all(path.exists() for path in said)
+            assert garbage.collect(root, chosen, delete=True) == said
+            assert garbage.collect(root, chosen) == []
+        for table, key in there - rest:
+            assert read.verify(read.version(root, table, key), deep=True) == []
+        assert not any(layout.version(root, *one).exists() for one in rest)
+
+
+def test_gc_says_and_does_not(lake):
+    for seed in (1, 2):
+        publish.make(lake, plain_plan(seed), plain_work, name="a")
+    before = sorted(lake.rglob("*"))
+    assert garbage.collect(lake) == [layout.version(lake, "plain", plain_plan(1).key)]
+    assert sorted(lake.rglob("*")) == before
+
+
+def test_the_images_of_another_request_stay(lake):
+    publish.make(lake, plain_plan(1), plain_work, name="a")
+    publish.make(lake, plain_plan(2), plain_work, name="b")
+    assert garbage.collect(lake, delete=True) == []
+    assert [read.version(lake, "plain", request=name).num_rows for name in "ab"] == [60, 60]
+
+
+@pytest.mark.parametrize("what", ["manifest", "version", "link"])
+def test_nothing_is_removed_while_it_is_not_known_what_a_name_needs(lake, what):
+    publish.make(lake, plain_plan(1), plain_work)
+    first = publish.make(lake, toy_plan(1), toy_work, name="a")
+    publish.make(lake, toy_plan(2), toy_work, name="b")
+    publish.make(lake, plain_plan(2), plain_work)
+    if what == "manifest":
+        (first / "manifest.json").write_text("{}")
+    elif what == "version":
+        first.rename(lake / "elsewhere")
+    else:
+        link = layout.pin(lake, "a", "toy")
+        link.unlink()
+        link.symlink_to("/etc")
+    for delete in (False, True):
+        with pytest.raises(Damaged):
+            garbage.collect(lake, "plain", delete)
+    assert layout.version(lake, "plain", plain_plan(1).key).exists()
+
+
+def test_a_stage_in_use_is_neither_said_nor_removed(lake):
+    plan = plain_plan(1)
+    stage = layout.stage(lake, "plain", plan.key)
+    stage.mkdir(parents=True)
+    with locks.held(stage.parent / f".lock-{plan.key}", "in use"):
+        assert garbage.collect(lake) == garbage.collect(lake, delete=True) == []
+    assert garbage.collect(lake) == garbage.collect(lake, delete=True) == [stage]
+    assert not stage.exists()
+
+
+def test_a_name_that_is_removed_by_hand_keeps_nothing(lake):
+    first = publish.make(lake, plain_plan(1), plain_work, name="a")
+    publish.make(lake, plain_plan(2), plain_work, name="b")
+    layout.pin(lake, "a", "plain").unlink()
+    layout.pin(lake, "a", "plain").parent.rmdir()
+    assert names.names(lake) == ["b"]
+    assert garbage.collect(lake, delete=True) == [first]
