@@ -43,6 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser.add_argument("--name", help="of the request whose stars are meant, where the lake has several")
     parser.add_argument("--out", required=True, type=Path, help="file to write: .csv or .fits; ldac .fits, .cat, .ldac")
     parser.add_argument("--form", default="table", choices=FORMS)
     parser.add_argument("--release", default="dr2", choices=RELEASES, help="whose columns; the values are those of DR2")
@@ -52,14 +53,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     def exported() -> int:
         lake, declared = layout.lake(options.lake), RELEASES[options.release]
-        rows = export(lake, options.out, declared, options.form, options.epoch)
+        rows = export(lake, options.out, declared, options.form, options.epoch, options.name)
         print(f"{options.out}: {rows:,} stars")
         return 0
 
     return command.status("export_gaia", exported)
 
 
-def export(lake: Path, path: Path, declared: Table = EXPORT, form: str = "table", epoch: float | None = None) -> int:
+def export(
+    lake: Path, path: Path, declared: Table = EXPORT, form: str = "table", epoch: float | None = None,
+    request: str | None = None,
+) -> int:  # fmt: skip
     """Write the published table `gaia` to a file, replaced in one rename; returns its rows.
 
     lake     : root of the lake
@@ -67,13 +71,14 @@ def export(lake: Path, path: Path, declared: Table = EXPORT, form: str = "table"
     declared : the columns of form "table"
     form     : "table" or "ldac"
     epoch    : year at which stars lie where images show them, None = that of the catalogue
+    request  : whose stars, where a lake has those of several
     Errors   : BadInput for another ending than those of FORMS, an epoch that no proper motion reaches, and where the
                table is one without proper motions
     """
     user_files.target(path, FORMS[form])
     if epoch is not None and not 1900.0 <= epoch <= 2100.0:
         raise BadInput(f"epoch {epoch:g} is not in [1900, 2100]")
-    version = read.version(lake, "gaia")
+    version = read.version(lake, "gaia", request=request)
     parts = (_named(version, part, epoch) for part in version.parts)
     if form == "ldac":
         ldac.write(path, pa.concat_tables(list(parts)))

@@ -32,21 +32,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--lake", required=True, help="folder of the lake")
     parser.add_argument("--out", required=True, type=Path, help="folder to write to (made where it is not there)")
     parser.add_argument("--form", required=True, choices=FORMS)
+    parser.add_argument("--name", help="of the request whose tables are meant, where the lake has several")
     options = parser.parse_args(argv)
-    return command.status("export_galaxies", lambda: _exported(layout.lake(options.lake), options.out, options.form))
+    return command.status("export_galaxies", lambda: _exported(options))
 
 
-def _exported(lake: Path, out: Path, form: str) -> int:
-    written = export(lake, user_files.folder(out), form)
+def _exported(options: argparse.Namespace) -> int:
+    out = options.out
+    written = export(layout.lake(options.lake), user_files.folder(out), options.form, options.name)
     print(f"{out}: {len(written)} files")
     return 0
 
 
-def export(lake: Path, folder: Path, form: str) -> list[Path]:
-    """Write the published galaxies, a file a cell, each replaced in one rename; returns the files."""
+def export(lake: Path, folder: Path, form: str, request: str | None = None) -> list[Path]:
+    """Write the published galaxies, a file a cell, each replaced in one rename; returns the files.
+
+    lake : folder of the lake;  folder : to write to;  form : one of FORMS
+    request : whose galaxies, where a lake has those of several
+    """
     if form == "skycatalogs":
-        return skycatalogs.write(lake, folder)
-    version = read.version(lake, GALAXIES.name)
+        return skycatalogs.write(lake, folder, request)
+    version = read.version(lake, GALAXIES.name, request=request)
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for part in version.parts:

@@ -26,7 +26,7 @@ from jobs.fluxes.spectra.extinction import MILKY_WAY_R_V
 from lake_schema import __version__, sky
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
-from lake_schema.store import layout, read
+from lake_schema.store import layout, names, read
 from lake_schema.units import LIGHT_KM_S, electron_rate
 
 # Of the pixels: Nside 32.
@@ -63,12 +63,12 @@ class _Catalogue:
         return sky.cell_of(ra, dec, ORDER)
 
 
-def write(lake: Path, folder: Path) -> list[Path]:
+def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
     """Write the set, each file replaced in one rename, the document last; returns the files.
 
     Errors: BadInput where fluxes are missing, or those of other rows
     """
-    found = {kind: _catalogue(lake, kind) for kind in ("galaxy", "star") if _has(lake, kind)}
+    found = {kind: _catalogue(lake, kind, request) for kind in ("galaxy", "star") if _has(lake, kind, request)}
     if "galaxy" not in found:
         raise BadInput(f"lake {lake} has no table galaxies")
     folder.mkdir(parents=True, exist_ok=True)
@@ -95,13 +95,17 @@ def write(lake: Path, folder: Path) -> list[Path]:
 # ------------------------------------------------------------------------------------------------ rows by pixel
 
 
-def _has(lake: Path, kind: str) -> bool:
-    return layout.current_key(lake, {"galaxy": "galaxies", "star": "stars"}[kind]) is not None
+def _has(lake: Path, kind: str, request: str | None) -> bool:
+    table = {"galaxy": "galaxies", "star": "stars"}[kind]
+    own = (
+        layout.current_key(lake, table) if request is None else names.key_of(lake, names.checked(lake, request), table)
+    )
+    return own is not None
 
 
-def _catalogue(lake: Path, kind: str) -> _Catalogue:
-    rows = read.version(lake, {"galaxy": "galaxies", "star": "stars"}[kind])
-    fluxes = read.version(lake, f"{kind}_fluxes")
+def _catalogue(lake: Path, kind: str, request: str | None) -> _Catalogue:
+    rows = read.version(lake, {"galaxy": "galaxies", "star": "stars"}[kind], request=request)
+    fluxes = read.version(lake, f"{kind}_fluxes", request=request)
     if fluxes.manifest["facts"].get("input") != rows.key:
         raise BadInput(
             f"table {fluxes.table} was computed from another version of {rows.table}: run compute_fluxes first"
