@@ -44,7 +44,7 @@ def catalogue(lake, declared, columns):
         return plan.Output(declared.build({name: rows[name] for name in declared.names} | place | given))
 
     parts = tuple(plan.Part(layout.cell_file(5, cell), {"cell": cell}) for cell in CELLS)
-    publish.make(lake, plan.Plan(declared, {"columns": sorted(columns)}, parts), work)
+    publish.make(lake, plan.Plan(declared, {"seed": wanted().seed, "columns": sorted(columns)}, parts), work)
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ from jobs.render.sources import catalogue_rows
 from jobs.request.from_toml import from_table
 from lake_schema import ids, sky, tables
 from lake_schema.errors import BadInput, PartsFailed
-from lake_schema.store import garbage, layout, publish, read, stage
+from lake_schema.store import garbage, layout, names, publish, read, stage
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.strong_lenses import STRONG_LENSES
@@ -518,7 +518,40 @@ def test_what_the_catalogue_does_not_hold_is_refused_before_anything_is_rendered
 def test_a_catalogue_of_another_universe_is_refused(lake, other, words):
     universe = {**REQUEST["universe"], **{key: value for key, value in other.items() if key != "seed"}}
     request = wanted(universe=universe, seed=other.get("seed", REQUEST["seed"]))
-    make(lake, request, plan_exposures)
-    with pytest.raises(BadInput, match=words):
-        render_exposures.steps(lake, request)
+    make(lake, wanted(), plan_exposures)
+    for module in (compute_fluxes, plan_exposures, render_exposures):
+        with pytest.raises(BadInput, match=words):
+            module.steps(lake, request)
     assert not (lake / "products").exists()
+
+
+def images_of(lake, name):
+    folder = lake / "names" / name / "products"
+    return {path.relative_to(folder).as_posix() for path in folder.glob("images/*/*.fits")}
+
+
+def test_requests_lie_side_by_side(lake, tmp_path, capsys):
+    """Two plans of one universe: neither's images are taken for the other's, and gc takes from neither."""
+    found = {}
+    for name, mjd in (("a", 60905.25), ("b", 60906.25)):
+        request = replace(wanted(), name=name)
+        request = replace(request, pointings=tuple(replace(p, mjd=mjd) for p in request.pointings))
+        for module in (plan_exposures, render_exposures):
+            for step in module.steps(lake, request):
+                publish.make(lake, step.plan, step.work, name=name)
+        found[name] = archive.products(lake, name).to_pylist()
+        assert {row["path"] for row in found[name]} == images_of(lake, name)
+    assert names.tables(lake, "b") == sorted((*preconditions.INPUTS, "products", "rendered_truth"))
+    assert read.version(lake, "galaxies", request="a").key == read.version(lake, "galaxies", request="b").key
+    assert not {row["sha256"] for row in found["a"]} & {row["sha256"] for row in found["b"]}
+    assert garbage.collect(lake, delete=True) == []
+    assert [archive.products(lake, name).to_pylist() for name in "ab"] == [found["a"], found["b"]]
+    assert archive.main(["--lake", str(lake)]) == 2
+    assert "requests a, b have versions of their own of table products" in capsys.readouterr().err
+    path = found["a"][0]["path"]
+    assert archive.main(["--lake", str(lake), "--name", "a", "--again", path, "--out", str(tmp_path / "x.fits")]) == 0
+    assert f"equals {path}" in capsys.readouterr().out
+    # A plan anew of the same name frees what that name had before, and nothing else.
+    for step in plan_exposures.steps(lake, replace(wanted(), name="b")):
+        publish.make(lake, step.plan, step.work, name="b")
+    assert {path.parent.name for path in garbage.collect(lake)} <= {"exposures", "tasks"}

@@ -176,7 +176,7 @@ def filled(lake):
         return Output(flux_table.build({name: rows[name] for name in ("id", "ra", "dec", "_healpix_29")} | flux))
 
     parts = tuple(Part(layout.cell_file(5, cell), {"cell": cell}) for cell in files)
-    publish.make(lake, Plan(STARS, {}, parts), stars)
+    publish.make(lake, Plan(STARS, {"seed": asked().seed}, parts), stars)
     publish.make(lake, Plan(flux_table, {"input": read.version(lake, "stars").key}, parts), beside)
     return index
 
