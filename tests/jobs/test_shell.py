@@ -15,7 +15,7 @@ from py4j.protocol import Py4JNetworkError
 from jobs import shell
 from jobs.shell import Job, Step
 from lake_schema import __version__
-from lake_schema.store import layout, publish, read, stage
+from lake_schema.store import layout, names, publish, read, stage
 from lake_schema.store.plan import Part, Plan
 from tests import requests
 from tests.universe import PLAIN, plain_plan, plain_work
@@ -234,3 +234,12 @@ def test_a_stopped_run_says_so_and_the_next_continues(run, lake, request_file, n
         assert driver.stderr.read() == "slow: stopped; a second run continues where this one ended\n"
     assert run(plain_work) == 0
     assert [line["part"] for line in logs(lake)[-1] if "part" in line] == ["1.parquet", "2.parquet"]
+
+
+def test_what_a_job_makes_belongs_to_its_request(run, lake, tmp_path):
+    assert run(plain_work) == 0
+    other = tmp_path / "other"
+    other.mkdir()
+    file = requests.written(other, name="other", seed=3)
+    assert shell.main(job_of(plain_work), ["--lake", str(lake), "--request", str(file)]) == 0
+    assert names.holders(lake, "plain") == {"other": plain_plan(3).key, "small": plain_plan(2).key}

@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import pytest
 
+from jobs import shell
 from jobs.request import universe
 from jobs.request.files import Catalogue, DustMap, Ingest
-from jobs.request.from_toml import from_table
+from jobs.request.from_toml import from_table, parse
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, publish, read
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
+from tests import requests
 from tests.universe import rows_of
 
 TABLES = {"galaxies": GALAXIES, "stars": STARS}
@@ -116,3 +118,16 @@ def test_a_lake_holds_one_universe(lake):
         universe.refuse_others(lake, wanted("b", star_limit=20.0))
     # Alone in its lake, a request may change its own.
     universe.refuse_others(lake, wanted("a", seed=12))
+
+
+def test_every_job_looks_before_it_computes(lake, tmp_path, capsys):
+    catalogue(lake, "stars", wanted("a"), name="a")
+    before = sorted(lake.rglob("*"))
+    job = shell.Job("toy", "", lambda root, request: pytest.fail("it began"))
+    file = requests.written(tmp_path, seed=12)
+    assert shell.main(job, ["--lake", str(lake), "--request", str(file)]) == 2
+    assert capsys.readouterr().err.endswith(
+        f"lake {lake} holds the universe of request a: its stars have seed 11, the request 12: use another folder for "
+        f"request {parse(file).name}\n"
+    )
+    assert sorted(lake.rglob("*")) == before

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from lake_schema import listing
 from lake_schema.columns import Column
 from lake_schema.errors import VersionMismatch
-from lake_schema.store import publish, read
+from lake_schema.store import garbage, publish, read
 from lake_schema.tables.galaxies import GALAXIES
 from tests.make_old_lake import OLD_LAKE
 from tests.universe import PLAIN, plain_plan, plain_work, rows_of
@@ -29,6 +30,14 @@ def test_the_old_lake_is_whole():
     assert sorted(read.tables(OLD_LAKE)) == ["galaxies", "plain"]
     for name in read.tables(OLD_LAKE):
         assert read.verify(read.version(OLD_LAKE, name), deep=True) == []
+
+
+def test_an_old_lake_belongs_to_nobody_and_serves_everybody():
+    version = read.version(OLD_LAKE, "plain")
+    assert read.for_request(OLD_LAKE, "plain", "anybody").key == version.key
+    assert garbage.collect(OLD_LAKE) == []
+    (row,) = (row for row in listing.rows(OLD_LAKE) if row["table"] == "plain")
+    assert (row["version"], row["names"], row["current"], row["rows"]) == (version.key, [], True, 60)
 
 
 def test_galaxies_of_an_old_lake():
