@@ -144,7 +144,7 @@ def test_another_run_of_the_same_plan_is_refused(run, lake, request_file, capsys
 
 
 def test_a_run_that_breaks_off_says_so_in_its_log(run, lake, capsys, monkeypatch):
-    def full(root, plan, base):
+    def full(root, plan, base, name):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(publish, "_publish", full)
