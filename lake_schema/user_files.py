@@ -41,6 +41,8 @@ LARGEST = {
     "table of sources": 64 * _MB,
     "catalogue": 1 << 42,
     "run log": _GB,
+    "master frame": _GB,
+    "calibrated image": 16 * _GB,
     "manifest": 4 * _GB,
 }
 _LONGEST_SHOWN, _LONGEST_PATH = 200, 4096

@@ -1,7 +1,7 @@
 """How a detector is read: the arrays that it gives, each with its unit and cards, and back from its files.
 
 FRAME       one array of pixels
-QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan
+QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan; quadrant_map: where each lies
 """
 
 from __future__ import annotations
@@ -124,6 +124,12 @@ def _quadrants(found: Frame, scene: Scene, detector: str, system: WCS) -> Readou
 
 def _assembled(array: Array, scene: Scene) -> Array:
     return array if array.ndim == 2 else layout.assembled(array, *layout.sizes(scene))
+
+
+def quadrant_map(numbers: Float, shape: tuple[int, ...], middle: int) -> Float:
+    """Numbers [4] of the quadrants, in the order in which they are read -> [ny, nx] of their pixels, 0 between them."""
+    parts = np.broadcast_to(np.reshape(numbers, (4, 1, 1)), (4, (shape[0] - middle) // 2, shape[1] // 2))
+    return layout.assembled(np.array(parts, float), 0, 0, 0, middle)
 
 
 def _quadrant_pixels(read: Sequence[Image]) -> Array:

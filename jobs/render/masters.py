@@ -1,0 +1,113 @@
+"""Master bias, dark and flat of each detector, from the calibration frames of a lake.
+
+    python -m jobs.render.masters --lake LAKE --out FOLDER [--detectors 3-4 ..]
+
+FOLDER/VIS_3-4_bias.fits (e-), .._dark.fits (e-/s) and .._flat.fits (response; 1 = all light is counted), each with its
+uncertainty and the number of frames that a pixel is of. A flat is over its lamp's light as the mission declares it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jobs.render.effects.light import calibration_lamp, illumination
+from jobs.render.reduction import calibration, files
+from jobs.render.reduction import frames as frames_of
+from jobs.render.reduction.combining import Combined, clipped_mean
+from jobs.render.reduction.frames import Frame
+from lake_schema import command, user_files
+from lake_schema.arrays import Array, Float
+from lake_schema.errors import BadInput
+from lake_schema.store import layout
+
+
+def made(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, Combined, list[Frame]]]:
+    """(kind, master, its frames) of what a detector's calibration frames allow: a bias, then a dark, then a flat.
+
+    scratch : folder for the frames while they are combined: 4 bytes a pixel and frame
+    """
+    shape = frames[0].scene.ny, frames[0].scene.nx
+    masters = {kind: calibration.nothing(shape, 0.0) for kind in ("bias", "dark")}
+    for kind in files.KINDS:
+        own = frames_of.of_types(frames, (kind,))
+        if not own and kind == "bias":
+            raise BadInput(f"detector {frames[0].detector}: the lake has no frame of it of the image type bias")
+        if own:
+            frames_of.common(own, (*files.SAME, "MISSION"))
+            stack = np.memmap(scratch / kind, np.float32, "w+", shape=(len(own), *shape))
+            masters[kind] = _combined(kind, own, masters, stack)
+            del stack
+            (scratch / kind).unlink()
+            yield kind, masters[kind], own
+
+
+def _combined(kind: str, frames: Sequence[Frame], masters: Mapping[str, Combined], stack: Array) -> Combined:
+    """Frames of a kind -> their master; stack : float32[n, ny, nx] that it fills."""
+    unit = np.zeros(stack.shape[1:])
+    for number, frame in enumerate(frames):
+        # Electrons that are 1 in the unit of the master.
+        one = _lamp(frame) if kind == "flat" else frame.exposure.exposure_time_s if kind == "dark" else 1.0
+        counted = frame.electrons() if kind == "bias" else _counted(frame, masters["bias"], masters["dark"])
+        stack[number] = counted / one
+        unit += one / len(frames)
+    reading = calibration.reading_variance(frames[0].scene, frames[0].applied)
+
+    def variance(expected: Float, rows: slice) -> Float:
+        counted = 0.0 if kind == "bias" else np.maximum(expected * unit[rows], 0.0)
+        return np.asarray((counted + reading[rows]) / unit[rows] ** 2)
+
+    return clipped_mean(stack, variance)
+
+
+def _counted(frame: Frame, bias: Combined, dark: Combined) -> Float:
+    """Electrons as they were counted, without bias and dark current."""
+    electrons = frame.electrons() - bias.mean
+    if "nonlinearity" in frame.applied:
+        electrons = calibration.linearised(electrons, frame.scene)
+    return np.asarray(electrons - dark.mean * frame.scene.exposure_time_s)
+
+
+def _lamp(frame: Frame) -> Float:
+    """Electrons [ny, nx] that the lamp of a flat would bring were all its light counted."""
+    electrons, *pattern = calibration_lamp.EFFECT.parameters(frame.scene)
+    return np.asarray(electrons * illumination.apply(np.ones((frame.scene.ny, frame.scene.nx)), *pattern))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints a line a master."""
+    parser = argparse.ArgumentParser(prog="python -m jobs.render.masters", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--lake", required=True, help="folder of the lake, with rendered calibration frames")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the masters")
+    parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all that have bias frames")
+    options = parser.parse_args(argv)
+    return command.status("masters", lambda: _written(options))
+
+
+def _written(options: argparse.Namespace) -> int:
+    out = user_files.folder(options.out)
+    found = frames_of.of_lake(layout.lake(options.lake), options.detectors)
+    some = {key: own for key, own in found.items() if options.detectors or frames_of.of_types(own, ("bias",))}
+    if not some:
+        raise BadInput(f"lake {options.lake} has no frames of the image type bias")
+    out.mkdir(parents=True, exist_ok=True)
+    for (_, detector), own in some.items():
+        with tempfile.TemporaryDirectory(dir=out, prefix=".frames-") as scratch:
+            for kind, master, frames in made(own, Path(scratch)):
+                path = files.master_name(out, own[0].exposure.channel, detector, kind)
+                files.write_master(path, master, kind, frames)
+                noise = float(np.median(master.uncertainty))
+                print(
+                    f"{path}: {len(frames)} frames, median {np.median(master.mean):.5g}, "
+                    f"uncertainty of a pixel {noise:.3g}"
+                )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

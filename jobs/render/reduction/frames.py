@@ -1,0 +1,144 @@
+"""Frames of a lake: which there are of a detector, what is known of each, and their electrons.
+
+Frame         one raw file of a detector, and what its exposure and its header say
+of_lake       those of the table `products`, by detector
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jobs.accuracy import Accuracy
+from jobs.fluxes.inputs import passband_of
+from jobs.render.camera import detectors
+from jobs.render.effects.scene import Scene
+from jobs.render.exposure import scene_of
+from jobs.render.planning import variants
+from jobs.render.products import read_back
+from jobs.render.reduction.calibration import of_pixels
+from lake_schema.arrays import Bool, Float
+from lake_schema.errors import BadInput
+from lake_schema.fits import images
+from lake_schema.fits.images import Card
+from lake_schema.mission.published import read_back as mission_of
+from lake_schema.store import read
+from lake_schema.tables.exposures import ExposureRow
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A raw file.
+
+    scene   : what effects may know of it, from the lake's plan and mission
+    applied : names of the effects that are in it, from its header
+    """
+
+    path: Path
+    exposure: ExposureRow
+    scene: Scene
+    applied: frozenset[str]
+    cards: tuple[Card, ...]
+
+    @property
+    def detector(self) -> str:
+        """Its name."""
+        assert self.scene.detector is not None
+        return self.scene.detector.name
+
+    @property
+    def stem(self) -> str:
+        """Of files made from it."""
+        return f"{self.exposure.exposure_id:06d}_{self.exposure.channel}_{self.exposure.band}_{self.detector}"
+
+    def card(self, keyword: str) -> Any:
+        """The value of a card of the common header."""
+        return next((value for key, value, _ in self.cards if key == keyword), None)
+
+    def electrons(self) -> Float:
+        """e- [ny, nx] above the level of each amplifier's overscan."""
+        return np.asarray(read_back.electrons(self.path).data, np.float64)
+
+    def full(self) -> Bool:
+        """Pixels [ny, nx] that read no less than a saturated one."""
+        levels = self._of_amplifiers("SATURATE")
+        adu = np.asarray(read_back.frame(self.path).data)
+        return np.asarray(adu >= of_pixels(levels, adu.shape, self.scene.middle))
+
+    def _of_amplifiers(self, keyword: str) -> float | Float:
+        """A card of the common header, else of the arrays' own, [q]."""
+        if (value := self.card(keyword)) is not None:
+            return float(value)
+        found = (dict((key, value) for key, value, _ in unit.cards) for unit in images.read_images(self.path)[1:])
+        return np.array([float(cards[keyword]) for cards in found])
+
+
+def of_lake(
+    root: Path, wanted: Sequence[str] = (), exposures: Iterable[int] = ()
+) -> dict[tuple[str, str], list[Frame]]:
+    """(camera, detector) -> its frames, by exposure; only those that are named where some are.
+
+    Errors : BadInput where the lake has no such frames
+    """
+    version = read.version(root, "products")
+    inputs = version.manifest["facts"]["inputs"]
+    planned = {
+        row.exposure_id: row
+        for row in map(ExposureRow.of, read.version(root, "exposures", inputs["exposures"]).rows().to_pylist())
+    }
+    mission = mission_of(read.version(root, "mission", inputs["mission"]))
+    fluxes = read.version(root, "galaxy_fluxes", inputs["galaxy_fluxes"]).manifest["facts"]
+    request, only = version.manifest["facts"]["request"], set(exposures)
+    forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
+    found: dict[tuple[str, str], list[Frame]] = {}
+    rows = sorted(version.rows().to_pylist(), key=lambda row: (row["exposure_id"], row["detector"]))
+    for row in rows:
+        if row["content"] != "science" or (wanted and row["detector"] not in wanted):
+            continue
+        if only and row["exposure_id"] not in only:
+            continue
+        exposed = planned[row["exposure_id"]]
+        own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
+        detector = detectors.detector(exposed.camera, row["detector"], own.mission)
+        scene = scene_of.scene_of(exposed, detector, own.mission, own.accuracy)
+        scene = replace(scene, band=passband_of(root, fluxes, exposed.band), forced=own.forced)
+        path = version.file(row["path"])
+        cards = header_of(path)
+        key = (exposed.camera, row["detector"])
+        found.setdefault(key, []).append(Frame(path, exposed, scene, _applied(cards), cards))
+    for name in wanted:
+        if not any(detector == name for _, detector in found):
+            raise BadInput(f"table products: no image of detector {name!r}")
+    for number in only:
+        if not any(frame.exposure.exposure_id == number for frames in found.values() for frame in frames):
+            raise BadInput(f"table products: no image of exposure {number}")
+    return found
+
+
+def header_of(path: Path) -> tuple[Card, ...]:
+    """Cards of the common header."""
+    return images.read_images(path)[0].cards
+
+
+def _applied(cards: Iterable[Card]) -> frozenset[str]:
+    """Names of the effects that a header has as `on`."""
+    texts = [str(value) for keyword, value, _ in cards if keyword.startswith("EFFECT")]
+    return frozenset(name for name, _, state in (text.partition(": ") for text in texts) if state.startswith("on"))
+
+
+def of_types(frames: Sequence[Frame], kinds: Sequence[str]) -> list[Frame]:
+    """Those of some image types."""
+    return [frame for frame in frames if frame.exposure.image_type in kinds]
+
+
+def common(frames: Sequence[Frame], keywords: Sequence[str]) -> Mapping[str, Any]:
+    """Values of cards that all frames share; BadInput names one in which they differ."""
+    for keyword in keywords:
+        values = {str(frame.card(keyword)) for frame in frames}
+        if len(values) > 1:
+            raise BadInput(f"frames of {frames[0].detector} differ in {keyword}: {', '.join(sorted(values)[:3])}")
+    return {keyword: frames[0].card(keyword) for keyword in keywords}

@@ -1,0 +1,189 @@
+"""Calibrated images of one field, in one band, onto one map of the sky.
+
+    python -m jobs.render.stack FILE .. --out FILE.fits [--scale ARCSEC] [--lake LAKE]
+
+The extensions are SCI (e-/s a pixel, the sky in it), WHT (inverse variance a pixel of sums over many pixels), FLG, and
+with --lake PSF: what a point source in the middle is, three samples a pixel. Neighbouring pixels share noise: the
+variance of a pixel alone is less than 1 / WHT by the factor in the card CORRVAR.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from astropy.wcs import WCS
+from scipy import ndimage
+
+from jobs.render.camera import astrometry
+from jobs.render.channels import registry
+from jobs.render.psf import from_file
+from jobs.render.reduction import files, stacking
+from jobs.render.reduction import frames as frames_of
+from jobs.render.reduction.calibration import COSMIC_RAY, Reduced
+from jobs.render.reduction.files import ImageFile
+from jobs.render.reduction.frames import Frame
+from jobs.render.reduction.resampling import Grid, Resampled, grid_of, pixel_map, resampled
+from jobs.render.reduction.stacking import Contribution, Stack
+from lake_schema import __version__, command, user_files
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.fits.images import Card, Image
+from lake_schema.store import layout
+
+# What all images of a stack share.
+_SAME = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
+# Places on a detector at which its PSF is known; the middle one is taken.
+_POSITIONS = 1
+
+
+def rate(image: ImageFile) -> Reduced:
+    """The image in e-/s."""
+    if image.card("BUNIT") == "electron/s":
+        return image.reduced
+    time = float(image.card("EXPTIME"))
+    one = image.reduced
+    return Reduced((one.image / time).astype(np.float32), (one.weight * time**2).astype(np.float32), one.flags)
+
+
+def stacked(images: Sequence[tuple[Reduced, WCS]], scale: float) -> tuple[Stack, Grid, list[float]]:
+    """Images in e-/s, with their systems -> their stack, its grid, their weights; scale : arcsec a pixel."""
+    grid = grid_of([(system, image.image.shape) for image, system in images], scale)
+    placed: list[Resampled] = []
+    weights = []
+    for image, system in images:
+        pixmap, area = pixel_map(system, image.image.shape, grid)
+        placed.append(resampled(image, pixmap, area, grid.shape))
+        good = image.weight > 0.0
+        weights.append(float(np.median(image.weight[good])) if good.any() else 0.0)
+    return stacking.combined(placed, weights), grid, weights
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints a line about the stack."""
+    parser = argparse.ArgumentParser(prog="python -m jobs.render.stack", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("images", nargs="+", type=Path, help="files that jobs.render.reduce has written")
+    parser.add_argument("--out", type=Path, required=True, help="FITS file of the stack")
+    parser.add_argument("--scale", type=float, help="arcsec a pixel (default: the detectors')")
+    parser.add_argument("--lake", help="folder of the lake that the images are of: for the PSF")
+    options = parser.parse_args(argv)
+    return command.status("stack", lambda: _written(options))
+
+
+def _written(options: argparse.Namespace) -> int:
+    out = user_files.target(options.out, (".fits",))
+    found = [files.read_image(path) for path in options.images]
+    _refuse_different(options.images, found)
+    systems = [astrometry.from_cards(image.cards) for image in found]
+    scale = options.scale or float(found[0].card("PIXSCALE"))
+    shapes = [image.reduced.image.shape for image in found]
+    stack, grid, weights = stacked(list(zip(map(rate, found), systems, strict=True)), scale)
+    more = []
+    if options.lake:
+        frames = _frames(layout.lake(options.lake), found)
+        parts = [
+            Contribution(system, shape, _profile(frame), frame.scene.detector.pixel_scale, weight)
+            for system, shape, frame, weight in zip(systems, shapes, frames, weights, strict=True)
+            if frame.scene.detector is not None
+        ]
+        more.append(_psf_of(parts, grid, stack))
+    correlation = stacking.noise_correlation(stack)
+    files.write_image(out, stack.reduced, _cards(found, grid, scale, correlation), more)
+    ny, nx = grid.shape
+    hit = float(((stack.reduced.flags & COSMIC_RAY) > 0).mean())
+    print(
+        f"{out}: {len(found)} images on {ny} x {nx} pixels of {scale:g} arcsec, "
+        f"{100 * hit:.2f} % with a value rejected, "
+        f"variance of 8x8 sums {correlation:.2f} times that of as many pixels alone"
+    )
+    return 0
+
+
+def _refuse_different(paths: Sequence[Path], found: Sequence[ImageFile]) -> None:
+    for path, image in zip(paths, found, strict=True):
+        for keyword in _SAME:
+            if image.card(keyword) != found[0].card(keyword):
+                what = f"{keyword} = {image.card(keyword)}, that of {paths[0].name} is {found[0].card(keyword)}"
+                raise BadInput(f"{user_files.shown(path)}: {what}: they make no stack")
+    seen = [(image.card("EXPOSURE"), image.card("DETECTOR")) for image in found]
+    for path, one in zip(paths, seen, strict=True):
+        if seen.count(one) > 1:
+            raise BadInput(f"{user_files.shown(path)}: exposure {one[0]}, detector {one[1]} is given twice")
+
+
+def _frames(root: Path, found: Sequence[ImageFile]) -> list[Frame]:
+    """The lake's frames of the images."""
+    numbers = {int(image.card("EXPOSURE")) for image in found}
+    names = sorted({str(image.card("DETECTOR")) for image in found})
+    known = {
+        (frame.exposure.exposure_id, frame.detector): frame
+        for frames in frames_of.of_lake(root, names, numbers).values()
+        for frame in frames
+    }
+    return [known[int(image.card("EXPOSURE")), str(image.card("DETECTOR"))] for image in found]
+
+
+def _profile(frame: Frame) -> object:
+    """The PSF in the middle of a frame's detector."""
+    scene, exposure = frame.scene, frame.exposure
+    assert scene.detector is not None
+    assert scene.band is not None
+    if exposure.psf:
+        file = from_file.file_of(exposure.psf, frame.detector)
+        return from_file.read(file, scene.detector, scene.band).profile
+    channel = registry.channel_of(exposure.channel, exposure.image_type, f"exposure {exposure.exposure_id}")
+    return channel.psf(exposure, scene.detector, scene.band, scene.mission, _POSITIONS).profile
+
+
+def _psf_of(parts: Sequence[Contribution], grid: Grid, stack: Stack) -> Image:
+    """Where the stack is deepest, as near to its middle as can be."""
+    x, y = _middle(stack.reduced.weight)
+    ra, dec = astrometry.sky_of_pixel(grid.wcs, [x], [y])
+    cards: tuple[Card, ...] = (
+        ("PSFSAMP", stacking.PSF_SAMPLES, "samples a pixel"),
+        ("PSFRA", float(ra[0]), "[deg] place that it is of"),
+        ("PSFDEC", float(dec[0]), "[deg] place that it is of"),
+    )
+    return Image(stacking.effective_psf(parts, grid, x, y).astype(np.float32), cards, "PSF")
+
+
+def _middle(weight: Float) -> tuple[float, float]:
+    """(x, y): of the deepest quarter of the pixels, away from edges if some are, the one nearest to their mean."""
+    if not weight.any():
+        return 0.0, 0.0
+    deep = weight >= np.percentile(weight[weight > 0.0], 75.0)
+    inside = deep & ndimage.binary_erosion(weight > 0.0, np.ones((3, 3), bool), iterations=stacking.PSF_SIDE // 2)
+    rows, columns = np.nonzero(inside if inside.any() else deep)
+    nearest = int(np.argmin((columns - columns.mean()) ** 2 + (rows - rows.mean()) ** 2))
+    return float(columns[nearest]), float(rows[nearest])
+
+
+def _cards(found: Sequence[ImageFile], grid: Grid, scale: float, correlation: float) -> tuple[Card, ...]:
+    first = found[0]
+    kept = {key: (key, value, comment) for key, value, comment in first.cards if key in (*_SAME, "SEED", "MISSION")}
+    exposures = sorted({(int(image.card("EXPOSURE")), float(image.card("EXPTIME"))) for image in found})
+    return (
+        *kept.values(),
+        ("IMAGETYP", "stack", "image type"),
+        ("BUNIT", "electron/s", "unit of SCI; of WHT its inverse square"),
+        ("GAIN", sum(time for _, time in exposures), "[electron/(electron/s)] of the deepest places"),
+        ("NCOMBINE", len(found), "images"),
+        ("TEXPTIME", sum(time for _, time in exposures), "[s] of all exposures"),
+        ("PIXSCALE", scale, "[arcsec/pix] pixel scale"),
+        *(
+            ()
+            if np.isnan(correlation)
+            else (("CORRVAR", round(correlation, 4), "variance of 8x8 sums / 64 x pixel's"),)
+        ),
+        *((f"EXPOS{i}", number, "exposure") for i, (number, _) in enumerate(exposures, start=1)),
+        *astrometry.cards(grid.wcs),
+        *files.flag_cards(),
+        ("TRUESKY", __version__, "version of the simulator"),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,36 @@
+"""A lake with calibration frames and dithers of a small detector, rendered by the jobs."""
+
+import tomllib
+
+from jobs.render import plan_exposures, render_exposures
+from jobs.request.from_toml import from_table
+from lake_schema.store import publish
+from tests import requests
+from tests.jobs.render.test_render_exposures_calibration import BLOCK, MODULES, small_detectors
+
+RAYS_OFF = ["cosmic_rays", "readout_cosmic_rays"]
+
+
+def request(bias=8, dark=4, flat=12, off=(), truth=("noise_free", "sky"), overrides=None, depth=(19.0, 19.0)):
+    """A visit of a field in four dithers, and frames that calibrate it."""
+    blocks = [{**BLOCK, "fields": 1, "dither": "S", "short": False, "flat": False}]
+    for kind, count in (("bias", bias), ("dark", dark), ("flat", flat)):
+        blocks.append({**BLOCK, "image_type": kind, "exposures": count})
+        if kind == "dark":
+            blocks[-1]["exposure_time_s"] = 1000.0
+    keys = f'accuracy = "draft"\n{requests.shallow(*depth)}[fluxes]\nbands = ["euclid_vis"]\n'
+    table = tomllib.loads(requests.text(keys, requests.FIELD.format(0.2), seed=11))
+    mission = {"mission": {"overrides": overrides}} if overrides else {}
+    products = {"products": {"truth": list(truth)}, "effects": {"off": list(off)}}
+    return from_table({**table, **mission, **products, "observation": blocks})
+
+
+def make(lake, wanted, side):
+    """All jobs of a request, detectors of side x side pixels."""
+    with small_detectors(side):
+        for job in MODULES:
+            for step in job.steps(lake, wanted):
+                publish.make(lake, step.plan, step.work)
+
+
+__all__ = ["RAYS_OFF", "make", "plan_exposures", "render_exposures", "request"]
