@@ -93,12 +93,12 @@ def test_a_box_may_cross_zero(ra, inside, outside):
 
 def test_a_table_s_columns_have_their_defaults(tmp_path):
     (tmp_path / "p.csv").write_text("ra,dec\n150.1,2.2\n")
-    block = {"channels": ["VIS"], "pointings": "p.csv", "mjd": 60990.0}
+    block = {"channels": ["VIS"], "pointings": "p.csv", "mjd": 61000.0}
     request = from_table({**BASE, "area": {"tile": 1}, "observation": [block]}, tmp_path)
     assert request.bands == ("euclid_vis",)
     _, exposures, _ = plan_exposures.plan(None, request)
     (row,) = exposures.to_pylist()
-    assert (row["camera"], row["band"], row["mjd"], row["image_type"]) == ("vis", "euclid_vis", 60990.0, "science")
+    assert (row["camera"], row["band"], row["mjd"], row["image_type"]) == ("vis", "euclid_vis", 61000.0, "science")
     assert row["exposure_time_s"] == 560.53
     (tmp_path / "p.csv").write_text("ra,dec\n150.2,2.2\n")
     changed = from_table({**BASE, "area": {"tile": 1}, "observation": [block]}, tmp_path)
