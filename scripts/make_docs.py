@@ -10,9 +10,13 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import json
+import os
 import re
 import shutil
 import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -31,7 +35,7 @@ from jobs.render.channels import ground, vis
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.readout import quadrants
 from jobs.render.effects.scene import Frame, Lights, Scene
-from jobs.request import from_toml
+from jobs.request import from_toml, observations, schema, toml_values
 from jobs.rng import stream
 from lake_schema.mission.configuration import MissionConfiguration, resolve
 
@@ -57,6 +61,9 @@ def notebooks(into: Path, run: bool) -> list[str]:
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
         if run:
+            # The field of `make demo`, which it has rendered.
+            os.environ.setdefault("TRUESKY_REQUEST", str(ROOT / "requests" / "demo.toml"))
+            os.environ.setdefault("TRUESKY_LAKE", str(ROOT / "out" / "demo" / "lake"))
             NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}}).execute()
         text, resources = MarkdownExporter().from_notebook_node(notebook)
         folder = into / "tutorials"
@@ -72,10 +79,70 @@ def notebooks(into: Path, run: bool) -> list[str]:
 # ------------------------------------------------------------------------------------------------ references
 
 
+# A request with one of each list, of which the parser asks every key.
+_ASKING = {
+    "name": "x",
+    "seed": 1,
+    "area": {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}},
+    "pointing": [{"channel": "VIS", "band": "euclid_vis", "ra": 0.0, "dec": 0.0, "mjd": 61000.0}],
+    "observation": [{"channels": ["VIS"]}],
+}
+# Functions that read one value: what they want.
+_KINDS = {
+    "number": "number",
+    "optional": "number",
+    "integer": "whole number",
+    "choice": "whole number",
+    "string": "text",
+    "strings": "list of texts",
+    "boolean": "true or false",
+}
+
+
 def request_page() -> str:
-    """The head of the parser: every key with what it takes."""
-    text = inspect.cleandoc(from_toml.__doc__ or "")
-    return f"# Keys of a request\n\n```text\n{text}\n```\n"
+    """Every key: the head of the parser, and a table of what it asks for while it reads."""
+    head = inspect.cleandoc(from_toml.__doc__ or "")
+    lines = ["# Keys of a request", "", "```text", head, "```", "", "## Values, bounds, defaults", ""]
+    lines += ["| key | is a | from, to, or one of | default |", "|---|---|---|---|"]
+    for path, (kind, bounds, default) in sorted(_keys_asked().items()):
+        lines.append(f"| `{path}` | {kind} | {bounds} | {default} |")
+    for record in (schema.Universe, schema.Stars, observations.Pointing, observations.Observation):
+        text = inspect.cleandoc(record.__doc__ or "")
+        lines += ["", f"## {record.__name__}", "", "```text", text, "```"]
+    return "\n".join(lines) + "\n"
+
+
+def _keys_asked() -> dict[str, tuple[str, str, str]]:
+    """Of each key that is one value: its kind, its bounds or legal values, its default."""
+    found: dict[str, tuple[str, str, str]] = {}
+
+    def noting(name: str, reads: Callable[..., object]) -> Callable[..., object]:
+        arguments = inspect.signature(reads)
+
+        def asked(*given: object, **named: object) -> object:
+            bound = arguments.bind(*given, **named).arguments
+            path = re.sub(r"\[0\]", "", str(bound["path"]))
+            legal = bound.get("legal") or ()
+            bounds = ", ".join(map(str, legal)) if legal else ""
+            if "lo" in bound and "hi" in bound:
+                bounds = f"{bound['lo']:g} to {bound['hi']:g}"
+            default = bound.get("default")
+            # NaN stands for a number that is not there.
+            shown = "" if default is None or default != default else f"`{json.dumps(default)}`"
+            found[path] = (_KINDS[name], bounds, shown)
+            return reads(*given, **named)
+
+        return asked
+
+    with ExitStack() as patched:
+        for module in (from_toml, observations):
+            for name in _KINDS:
+                for alias in (name, f"_{name}"):
+                    if getattr(module, alias, None) is getattr(toml_values, name):
+                        reads = noting(name, getattr(toml_values, name))
+                        patched.enter_context(patch.object(module, alias, reads))
+        from_toml.from_table(_ASKING)
+    return found
 
 
 def mission_page(mission: MissionConfiguration) -> str:
