@@ -49,6 +49,7 @@ CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 # What readers of a lake import.
 API = ("lake_schema.store.read", "lake_schema.store.layout", "jobs.explore.explorer", "jobs.render.products.read_back")
+_DEMO, _DEMO_LAKE = ROOT / "requests" / "demo.toml", ROOT / "out" / "demo" / "lake"
 # Side of the frame that effects are shown on, pixels.
 _SIDE = 320
 _FILE = re.compile(r"\[([^\]]*)\]\((?:\.\./)*(?:(?:jobs|lake_schema|requests|benchmarks|tests|scripts)/|README)[^)]*\)")
@@ -61,17 +62,17 @@ def notebooks(into: Path, run: bool) -> list[str]:
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
         if run:
-            # The field of `make demo`, which it has rendered.
-            os.environ.setdefault("TRUESKY_REQUEST", str(ROOT / "requests" / "demo.toml"))
-            os.environ.setdefault("TRUESKY_LAKE", str(ROOT / "out" / "demo" / "lake"))
-            NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}}).execute()
+            # Those that look at a field look at that of `make demo`, which it has rendered.
+            demo = {} if "shear" in path.stem else {"TRUESKY_REQUEST": str(_DEMO), "TRUESKY_LAKE": str(_DEMO_LAKE)}
+            client = NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}})
+            client.execute(env={**os.environ, **demo})
         text, resources = MarkdownExporter().from_notebook_node(notebook)
         folder = into / "tutorials"
         folder.mkdir(exist_ok=True)
         for name, data in resources["outputs"].items():
             (folder / f"{path.stem}_{name}").write_bytes(data)
             text = text.replace(f"]({name})", f"]({path.stem}_{name})")
-        (folder / f"{path.stem}.md").write_text(text, encoding="utf-8")
+        (folder / f"{path.stem}.md").write_text(text.replace("](../docs/", "](../"), encoding="utf-8")
         pages.append(f"tutorials/{path.stem}.md")
     return pages
 
