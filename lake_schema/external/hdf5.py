@@ -41,7 +41,10 @@ def batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
 
 
 def send(path: Path, columns: Sequence[str], texts: Sequence[str], out: IO[bytes]) -> None:
-    """Write the batches of a file as an Arrow stream; BadInput, whatever the library trips over."""
+    """Write the batches of a file as an Arrow stream; BadInput, whatever the library trips over.
+
+    path : of the file;  columns : wanted, of numbers;  texts : none, as other forms have them;  out : open to write
+    """
     import h5py
 
     try:

@@ -59,7 +59,10 @@ def holders(root: Path, table: str) -> dict[str, str]:
 
 
 def pin(root: Path, name: str, table: str, key: str) -> None:
-    """Give a request a version of a table; the caller holds the table's lock."""
+    """Give a request a version of a table; the caller holds the table's lock.
+
+    root : of the lake;  name : of the request;  table, key : of the version
+    """
     link = layout.pin(root, name, table)
     if not link.parent.is_dir():
         link.parent.mkdir(parents=True, exist_ok=True)

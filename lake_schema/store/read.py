@@ -254,6 +254,8 @@ def _in_ranges(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
 def version(root: Path, name: str, key: str | None = None, request: str | None = None) -> Version:
     """A published version of a table: the one of a key, or of a request; without these, the one published last.
 
+    root : of the lake;  name : of the table
+
     Errors : BadInput where the lake has no such table, version or request, or where several requests have versions of
              their own and none is named; Damaged where its manifest is missing, broken or another's; VersionMismatch
              where it was written with a declaration that this code cannot read

@@ -12,14 +12,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from astropy.io import fits
 
-from lake_schema.arrays import Array, Float
-from lake_schema.fits import write as fits_write
+from lake_schema.arrays import Float
+from lake_schema.fits import ldac
 
 _MAG_OVER_FLUX = 2.5 / np.log(10.0)
 _DEG = 1.0 / 3.6e6
-_CARD = 80
 
 
 def write(path: Path, rows: pa.Table) -> None:
@@ -28,16 +26,15 @@ def write(path: Path, rows: pa.Table) -> None:
     rows : columns source_id, ref_epoch, ra, dec (deg) and their errors (mas), pmra, pmdec and theirs (mas/yr),
            phot_g_mean_mag (Vega), phot_g_mean_flux_over_error
     """
-    objects = fits.BinTableHDU.from_columns(_columns(rows), name="LDAC_OBJECTS")
-    fits_write.write_staged(path, fits.HDUList([fits.PrimaryHDU(), _header(), objects]))
+    ldac.write(path, _columns(rows))
 
 
-def _columns(rows: pa.Table) -> list[fits.Column]:
+def _columns(rows: pa.Table) -> list[ldac.Values]:
     def values(name: str) -> Float:
         return np.asarray(pc.fill_null(rows[name], 0.0).to_numpy(), float)
 
     east, north = values("ra_error") * _DEG, values("dec_error") * _DEG
-    columns: list[tuple[str, str, str, Array]] = [
+    return [
         ("SOURCE_ID", "K", "", rows["source_id"].to_numpy()),
         ("X_WORLD", "D", "deg", values("ra")),
         ("Y_WORLD", "D", "deg", values("dec")),
@@ -53,23 +50,3 @@ def _columns(rows: pa.Table) -> list[fits.Column]:
         ("MAGERR", "E", "mag", _MAG_OVER_FLUX / values("phot_g_mean_flux_over_error")),
         ("OBSDATE", "D", "yr", values("ref_epoch")),
     ]
-    return [
-        fits.Column(name, code, array=array, **({"unit": unit} if unit else {})) for name, code, unit, array in columns
-    ]
-
-
-def _header() -> fits.BinTableHDU:
-    """The cards of a field's header as one text, as the form wants them: here none but the end."""
-    cards = b"".join(
-        text.ljust(_CARD)
-        for text in (
-            b"SIMPLE  =                    T",
-            b"BITPIX  =                    8",
-            b"NAXIS   =                    0",
-            b"END",
-        )
-    )
-    column = fits.Column("Field Header Card", f"{len(cards)}A", array=np.array([cards]))
-    unit = fits.BinTableHDU.from_columns([column], name="LDAC_IMHEAD")
-    unit.header["TDIM1"] = f"({_CARD}, {len(cards) // _CARD})"
-    return unit

@@ -43,7 +43,8 @@ _SCALE_BARS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 def previews(root: Path, out: Path, most: int | None = None, request: str | None = None) -> list[Path]:
     """A PNG beside each other in `out` for the science images of a request, or of the lake; returns their paths.
 
-    most : so many of them, as `shown` chooses, None = all;  request : its name, where the lake has several
+    root : of the lake;  most : so many of them, as `shown` chooses, None = all
+    request : its name, where the lake has several
     """
     version = read.version(root, "products", request=request)
     made_of = version.manifest["facts"]["inputs"]

@@ -41,6 +41,7 @@ class Label:
 def labels(root: Path, product: dict[str, Any], image: images.Image, made_of: Mapping[str, str]) -> list[Label]:
     """The brightest sources inside a product's frame, brightest first.
 
+    root    : of the lake;  product, image : a row of `products`, and what its file holds
     made_of : table -> key of the versions that the product was made of
     """
     system = astrometry.from_cards(image.cards)
