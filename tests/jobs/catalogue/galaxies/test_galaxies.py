@@ -91,7 +91,7 @@ def test_i_band_counts_of_the_mean_sky(mean_sky, limit, observed):
 def test_the_excess_at_i_25_is_what_is_said_of_it(mean_sky):
     """The mean sky has 15 % more than the 43 to 46 observed (LSST Science Book 2009 and others); others fit to 12 %.
 
-    Known, and said in the README: it may not grow, and where it is mended the line belongs to the test above.
+    Known, and said in docs/modelled.md: it may not grow, and where it is mended the line belongs to the test above.
     """
     _, i_band, _, weight = mean_sky
     assert 0.12 < weight[i_band < 25.0].sum() / 44.5 - 1.0 < 0.16
