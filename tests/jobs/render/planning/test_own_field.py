@@ -65,6 +65,15 @@ def test_the_area_that_is_named_would_do(ra, dec):
     assert area["cone"]["radius"] < 0.8
 
 
+def test_fields_far_from_one_another_are_named_one_by_one():
+    blocks = [{"channels": ["VIS"], "ra": ra, "dec": -45.0} for ra in (10.0, 60.0)]
+    elsewhere = {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}}
+    with pytest.raises(BadInput, match="this would do") as refused:
+        plan_exposures.check(from_table({**BASE, "area": elsewhere, "observation": blocks}))
+    area = tomllib.loads(re.search(r"\[area\] (.*)", str(refused.value))[1])
+    assert np.array(area["patches"]) == pytest.approx(np.array([[10, -45, 0.65], [60, -45, 0.65]]), abs=0.15)
+
+
 def test_offsets_are_taken_as_they_are():
     block = {"channels": ["VIS"], "ra": 150.0, "dec": 0.0, "position_angle": 90.0, "short": False, "flat": False}
     _, exposures, _ = plan_exposures.plan(None, made({**block, "dither": [[0, 0], [36.0, 0.0], [0.0, 72.0]]}))

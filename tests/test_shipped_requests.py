@@ -1,0 +1,81 @@
+"""Every request that is shipped goes through all jobs, made small by its keys: area, depth, detectors, exposures."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from jobs import shell
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+from jobs.render import plan_exposures, render_exposures
+from jobs.render.camera import detectors
+from jobs.render.planning import ground_surveys
+from jobs.request.from_toml import from_table
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+from lake_schema.store import layout, read
+from lake_schema.tables.exposures import RENDERED
+
+REQUESTS = Path(__file__).parents[1] / "requests"
+MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures)
+# The one with the fewest detectors that are rendered.
+SMALLEST = "sc8_deep"
+MISSION = resolve()
+
+
+def middle(camera):
+    """The detector nearest to the middle of a camera."""
+    return min(detectors.detectors(camera, MISSION), key=lambda d: d.x**2 + d.y**2).name
+
+
+def small(name):
+    """The table of a shipped request, with one detector of a camera, a field, a frame of each kind, bright sources."""
+    table = tomllib.loads((REQUESTS / f"{name}.toml").read_text())
+    table["accuracy"] = "draft"
+    table["universe"] = {"galaxy_limit": 18.0, "star_limit": 14.0, "box_cells": 192, "lensing_nside": 64}
+    for pointing in table.get("pointing", []):
+        pointing["detectors"] = [middle(pointing.get("camera", pointing["channel"].lower()))]
+    for block in table.get("observation", []):
+        ground = "EXT" in block["channels"]
+        camera = ground_surveys.camera_of(block["survey"], MISSION) if ground else "vis"
+        if ground or "VIS" in block["channels"]:
+            block["detectors"] = [middle(camera)]
+        block |= {key: 1 for key in ("fields", "visits", "exposures") if key in block}
+        if not ground:
+            block["dither"] = "none"
+    with pytest.raises(BadInput, match="this would do") as refused:
+        plan_exposures.check(from_table({**table, "area": {"cone": {"ra": 0.0, "dec": -60.0, "radius": 0.0}}}))
+    table["area"] = tomllib.loads(re.search(r"this would do: \[area\] (.*)", str(refused.value))[1])
+    for block in table.get("observation", []):
+        # Fields lie where they lay.
+        block.setdefault("area", tomllib.loads((REQUESTS / f"{name}.toml").read_text())["area"])
+    return table
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(path.stem, marks=[] if path.stem == SMALLEST else [pytest.mark.nightly])
+        for path in sorted(REQUESTS.glob("*.toml"))
+    ],
+)
+def test_a_shipped_request_goes_through_all_jobs(name, tmp_path, monkeypatch):
+    # The parts here, not in Spark's workers.
+    monkeypatch.setattr(shell, "_spark_map", lambda function, parts, *rest: map(function, parts))
+    request = from_table(small(name))
+    plan_exposures.check(request)
+    root = layout.lake(tmp_path / "lake")
+    for module in MODULES:
+        shell.run(module.JOB, root, request)
+    exposures = {row["exposure_id"]: row for row in read.version(root, "exposures").rows().to_pylist()}
+    tasks = read.version(root, "tasks").rows(["exposure_id", "detector"]).to_pylist()
+    rendered = {
+        (task["exposure_id"], task["detector"])
+        for task in tasks
+        if (row := exposures[task["exposure_id"]])["image_type"] in RENDERED.get(row["channel"], ())
+    }
+    products = read.version(root, "products").rows(["exposure_id", "detector"]).to_pylist()
+    assert rendered
+    assert {(row["exposure_id"], row["detector"]) for row in products} == rendered
