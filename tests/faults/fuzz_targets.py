@@ -191,7 +191,7 @@ def of_psf(path):
 
 
 def of_pointings(path):
-    ground_surveys.read(path, Observation(("EXT",), survey="lsst"), resolve())
+    ground_surveys.read(path, Observation(("EXT", "VIS"), survey="lsst"), resolve())
 
 
 def of_parquet(path):

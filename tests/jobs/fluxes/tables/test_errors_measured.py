@@ -5,11 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jobs import cache
+from jobs import cache, code_keys
 from jobs.accuracy import DRAFT, REFERENCE, SURVEY
 from jobs.fluxes import integration, passbands
-from jobs.fluxes.spectra import intergalactic, lines
-from jobs.fluxes.tables import build_tables, errors_measured, flux_tables, settings
+from jobs.fluxes.tables import errors_measured, flux_tables, settings
 
 
 @pytest.fixture
@@ -68,18 +67,15 @@ def test_errors_are_measured_on_every_template_and_law(library):
         assert (found.min() - first, last - found.max()) == pytest.approx((0.0, 0.0), abs=0.01 * (last - first))
 
 
-def test_numbers_of_the_files_beside_the_code_are_in_the_keys(library, mine, monkeypatch):
-    """Depths of hydrogen's lines in the tables' key, the galaxies' lines in that of the errors."""
-    absorbed = dataclasses.replace(library, intergalactic=True)
-    key = build_tables.library_key.__wrapped__
-    before, unabsorbed, keys = key(absorbed), key(library), []
+def test_numbers_of_the_files_beside_the_code_are_in_the_keys(library, mine, monkeypatch, request):
+    """Depths of hydrogen's lines, and the galaxies' own, are in the key of the errors."""
+    request.addfinalizer(code_keys.code_key.cache_clear)
+    keys, changed = [], {}
+    content = code_keys._content
     monkeypatch.setattr(cache, "cached_arrays", lambda name, key, make: keys.append(key) or {"errors": np.ones(2)})
-    errors_measured.measured(mine, settings.CANDIDATES[0], library)
-    found = lines.line_list()
-    monkeypatch.setattr(lines, "line_list", lambda: found[:-1])
-    errors_measured.measured(mine, settings.CANDIDATES[0], library)
-    assert len(set(keys)) == 2
-    deeper = tuple(tuple(2.0 * number for number in row) for row in intergalactic.series())
-    monkeypatch.setattr(intergalactic, "series", lambda: deeper)
-    assert key(absorbed) != before
-    assert key(library) == unabsorbed
+    monkeypatch.setattr(code_keys, "_content", lambda file: content(file) + changed.get(file.name, b""))
+    for name in ("", "lines.csv", "lyman_series.csv"):
+        changed = {name: b"\n"}
+        code_keys.code_key.cache_clear()
+        errors_measured.measured(mine, settings.CANDIDATES[0], library)
+    assert len(set(keys)) == 3
