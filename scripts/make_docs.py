@@ -308,7 +308,7 @@ def pages(into: Path, run: bool) -> None:
         path.write_text(_FILE.sub(r"`\1`", text).replace("](docs/", "]("), encoding="utf-8")
     with (into / "index.md").open("a", encoding="utf-8") as home:
         for title, names in CHAPTERS:
-            entries = [page for name in names for page in listed.get(name, [name]) if (into / page).exists()]
+            entries = [page for name in names for page in listed.get(name, [name])]
             home.write("\n".join(["", "```{toctree}", f":caption: {title}", ":hidden:", "", *entries, "```", ""]))
 
 

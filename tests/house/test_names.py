@@ -70,3 +70,19 @@ def test_files_that_are_named_are_there():
 
 def test_no_large_file():
     assert [path for path in files() if path.stat().st_size > MAX_BYTES] == []
+
+
+LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
+
+
+def test_links_of_pages_lead_somewhere():
+    """Relative links of the README, of docs/ and of the notebooks; those of the site's first page are tested with it."""
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*"), *(ROOT / "notebooks").glob("*")]
+    lost = [
+        f"{page.relative_to(ROOT)}: {link}"
+        for page in pages
+        if page.suffix in (".md", ".ipynb") and page.name != "index.md"
+        for link in LINK.findall(page.read_text())
+        if "\\" not in link and not (page.parent / link).exists()
+    ]
+    assert lost == []
