@@ -76,7 +76,7 @@ LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
 
 
 def test_links_of_pages_lead_somewhere():
-    """Relative links of the README, of docs/ and of the notebooks; those of the site's first page are tested with it."""
+    """Relative links of the README, of docs/ and of the notebooks; the first page of the site is tested with it."""
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*"), *(ROOT / "notebooks").glob("*")]
     lost = [
         f"{page.relative_to(ROOT)}: {link}"
