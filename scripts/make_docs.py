@@ -9,49 +9,43 @@ without figures. Nothing is downloaded.
 from __future__ import annotations
 
 import argparse
-import inspect
-import json
 import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import matplotlib
-import matplotlib.pyplot as plt
 import nbformat
-import numpy as np
 from nbclient import NotebookClient
 from nbconvert import MarkdownExporter
 from sphinx.application import Sphinx
 
-from benchmarks import effects as scene_of_effects
-from jobs.render.camera import detectors
-from jobs.render.channels import ground, vis
-from jobs.render.effects.effect import Effect
-from jobs.render.effects.readout import quadrants
-from jobs.render.effects.scene import Frame, Lights, Scene
-from jobs.request import from_toml, observations, schema, toml_values
-from jobs.rng import stream
-from lake_schema.mission.configuration import MissionConfiguration, resolve
+from lake_schema.mission.configuration import resolve
+from scripts import docs_references
 
 ROOT = Path(__file__).resolve().parents[1]
 # Chapters of the site: title, pages.  Those of docs/ that none names tell how to do something.
 CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Tutorials", ("notebooks",)),
     ("How to", ("others",)),
-    ("Reference", ("request.md", "tables.md", "mission.md", "effects.md", "modelled.md", "corrections.md", "api.md")),
+    (
+        "Reference",
+        (
+            "request.md",
+            "tables.md",
+            "mission.md",
+            "effects.md",
+            "accuracy.md",
+            "modelled.md",
+            "corrections.md",
+            "api.md",
+        ),
+    ),
     ("Contributing", ("contributing.md",)),
 )
-# What readers of a lake import.
-API = ("lake_schema.store.read", "lake_schema.store.layout", "jobs.explore.explorer", "jobs.render.products.read_back")
 _DEMO, _DEMO_LAKE = ROOT / "requests" / "demo.toml", ROOT / "out" / "demo" / "lake"
-# Side of the frame that effects are shown on, pixels.
-_SIDE = 320
 _FILE = re.compile(r"\[([^\]]*)\]\((?:\.\./)*(?:(?:jobs|lake_schema|requests|benchmarks|tests|scripts)/|README)[^)]*\)")
 _NOTEBOOK = re.compile(r"\]\((?:\.\./)*notebooks/([^)]*)\.ipynb\)")
 
@@ -77,212 +71,6 @@ def notebooks(into: Path, run: bool) -> list[str]:
     return pages
 
 
-# ------------------------------------------------------------------------------------------------ references
-
-
-# A request with one of each list, of which the parser asks every key.
-_ASKING = {
-    "name": "x",
-    "seed": 1,
-    "area": {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}},
-    "pointing": [{"channel": "VIS", "band": "euclid_vis", "ra": 0.0, "dec": 0.0, "mjd": 61000.0}],
-    "observation": [{"channels": ["VIS"]}],
-}
-# Functions that read one value: what they want.
-_KINDS = {
-    "number": "number",
-    "optional": "number",
-    "integer": "whole number",
-    "choice": "whole number",
-    "string": "text",
-    "strings": "list of texts",
-    "boolean": "true or false",
-}
-
-
-def request_page() -> str:
-    """Every key: the head of the parser, and a table of what it asks for while it reads."""
-    head = inspect.cleandoc(from_toml.__doc__ or "")
-    lines = ["# Keys of a request", "", "```text", head, "```", "", "## Values, bounds, defaults", ""]
-    lines += ["| key | is a | from, to, or one of | default |", "|---|---|---|---|"]
-    for path, (kind, bounds, default) in sorted(_keys_asked().items()):
-        lines.append(f"| `{path}` | {kind} | {bounds} | {default} |")
-    for record in (schema.Universe, schema.Stars, observations.Pointing, observations.Observation):
-        text = inspect.cleandoc(record.__doc__ or "")
-        lines += ["", f"## {record.__name__}", "", "```text", text, "```"]
-    return "\n".join(lines) + "\n"
-
-
-def _keys_asked() -> dict[str, tuple[str, str, str]]:
-    """Of each key that is one value: its kind, its bounds or legal values, its default."""
-    found: dict[str, tuple[str, str, str]] = {}
-
-    def noting(name: str, reads: Callable[..., object]) -> Callable[..., object]:
-        arguments = inspect.signature(reads)
-
-        def asked(*given: object, **named: object) -> object:
-            bound = arguments.bind(*given, **named).arguments
-            path = re.sub(r"\[0\]", "", str(bound["path"]))
-            legal = bound.get("legal") or ()
-            bounds = ", ".join(map(str, legal)) if legal else ""
-            if "lo" in bound and "hi" in bound:
-                bounds = f"{bound['lo']:g} to {bound['hi']:g}"
-            default = bound.get("default")
-            # NaN stands for a number that is not there.
-            shown = "" if default is None or default != default else f"`{json.dumps(default)}`"
-            found[path] = (_KINDS[name], bounds, shown)
-            return reads(*given, **named)
-
-        return asked
-
-    with ExitStack() as patched:
-        for module in (from_toml, observations):
-            for name in _KINDS:
-                for alias in (name, f"_{name}"):
-                    if getattr(module, alias, None) is getattr(toml_values, name):
-                        reads = noting(name, getattr(toml_values, name))
-                        patched.enter_context(patch.object(module, alias, reads))
-        from_toml.from_table(_ASKING)
-    return found
-
-
-def mission_page(mission: MissionConfiguration) -> str:
-    """Every parameter that the default ladder chooses."""
-    lines = [
-        "# The mission database",
-        "",
-        "What the default ladder of statuses chooses; a request replaces values under `[mission.overrides]`.",
-    ]
-    section = ""
-    for record in mission.parameters:
-        head = record.key.split(".")[0]
-        if head != section:
-            section = head
-            lines += ["", f"## {head}", "", "| parameter | value | unit | status | source |", "|---|---|---|---|---|"]
-        source = record.source.replace("|", "/")
-        lines.append(f"| `{record.key}` | {record.value:g} | {record.unit} | {record.status} | {source} |")
-    return "\n".join(lines) + "\n"
-
-
-def effects_page(into: Path, mission: MissionConfiguration) -> str:
-    """Every effect of every channel: what its module says, the parameters that it asks for, what it does to a frame."""
-    names = {"VIS": "science", "EXT": "science"}
-    channels = {"VIS": vis.CHANNEL.effects, "EXT": ground.CHANNEL.effects}
-    order: dict[str, Effect] = {}
-    users: dict[str, list[str]] = {}
-    for channel, types in channels.items():
-        for kind, effects in types.items():
-            for effect in effects:
-                order.setdefault(effect.name, effect)
-                users.setdefault(effect.name, []).append(f"{channel} {kind}")
-    lines = [
-        "# Effects",
-        "",
-        "In the order of physics. An image has what its scene needs: an effect whose largest change",
-    ]
-    lines += ["of a pixel is less than a tenth of its noise is left out, unless a request forces it.", ""]
-    for channel, kind in names.items():
-        listed = ", ".join(f"[{e.name}](#{e.name})" for e in channels[channel][kind])
-        lines += [f"**{channel}, {kind}:** {listed}", ""]
-    asked = _asked(list(order.values()), mission)
-    shown = _figures(into, mission)
-    for name, effect in order.items():
-        module = inspect.getmodule(effect.apply)
-        text = inspect.cleandoc((module.__doc__ if module else "") or "")
-        lines += [f"## {name}", "", "```text", text, "```", ""]
-        if asked[name]:
-            lines += ["| parameter | value | unit |", "|---|---|---|"]
-            lines += [f"| `{k}` | {mission.value(k):g} | {mission.parameter(k).unit} |" for k in asked[name]]
-            lines.append("")
-        if name in shown:
-            lines += [f"![What {name} does to a frame](effects/{name}.png)", ""]
-        lines += ["In: " + ", ".join(users[name]) + ".", ""]
-    return "\n".join(lines)
-
-
-def _scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """A small VIS detector with points, squares of light and a bright star whose ghost falls onto it."""
-    detector = detectors.detector("vis", "3-4", mission)
-    small = type(detector)("3-4", "vis", _SIDE, _SIDE, detector.x, detector.y, 0.0, detector.pixel_scale)
-    frame = scene_of_effects.light(_SIDE, _SIDE)
-    frame[200, 100] += 3e6
-    lights = Lights(np.array([150.0]), np.array([150.0 - mission.value("vis.ghost.offset_y", "pix")]), np.array([1e9]))
-    return frame, Scene(mission, "vis", 560.53, 0.25, float(frame.max()), small, lights)
-
-
-def _asked(effects: list[Effect], mission: MissionConfiguration) -> dict[str, list[str]]:
-    """The scalar parameters that each effect asks the mission for."""
-    _, scene = _scene(mission)
-    ground_scene = Scene(mission, "ext.lsstcam", 30.0, 50.0, 1e5)
-    found, value = {}, MissionConfiguration.value
-    for effect in effects:
-        keys: dict[str, None] = {}
-
-        def noted(*arguments: str, keys: dict[str, None] = keys) -> float:
-            keys[arguments[1]] = None
-            return value(*arguments)
-
-        with patch.object(MissionConfiguration, "value", noted):
-            effect.parameters(scene if effect in vis.SKY + vis.FLAT + vis.INJECTION else ground_scene)
-        found[effect.name] = list(keys)
-    return found
-
-
-def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
-    """A figure an effect of a VIS image: the frame before it, after it, and the difference."""
-    frame, scene = _scene(mission)
-    folder = into / "effects"
-    folder.mkdir()
-    drawn = set()
-    light = frame
-    for effect in dict.fromkeys((*vis.SKY, *vis.FLAT, *vis.INJECTION)):
-        before = frame if effect in vis.SKY else light
-        after = effect.apply(before, *effect.parameters(scene), rng=stream(1, effect.name))
-        # Some need more than a small frame to show.
-        if before.shape != after.shape or np.ptp(after - before) > 0.0:
-            _figure(folder / f"{effect.name}.png", _flat(before), _flat(after), effect.name)
-            drawn.add(effect.name)
-        frame = after if effect in vis.SKY else frame
-    return drawn
-
-
-def _flat(frame: Frame) -> Frame:
-    """As one image, the quadrants where they lie, with their pre- and overscan."""
-    if frame.ndim == 2:
-        return frame
-    placed = [quadrants.placed(frame[i], i) for i in range(4)]
-    return np.block([[placed[3], placed[2]], [placed[0], placed[1]]])
-
-
-def _figure(path: Path, before: Frame, after: Frame, name: str) -> None:
-    same = before.shape == after.shape and name != "adc"
-    figure, axes = plt.subplots(1, 3 if same else 2, figsize=(9 if same else 6, 3.2), layout="constrained")
-    middle = float(np.median(after))
-    for axis, image, title in zip(axes, (before, after), ("before", "after"), strict=False):
-        level = float(np.median(image)) if not same else middle
-        width = max(float(np.percentile(np.abs(image - level), 99.0)), 1.0)
-        axis.imshow(np.arcsinh((image - level) / (0.2 * width)), origin="lower", cmap="gray")
-        unit = "adu" if name == "adc" and title == "after" else "e⁻"
-        axis.set_title(f"{title}, median {np.median(image):.4g} {unit}", fontsize=9)
-    if same:
-        change = after - before
-        width = max(float(np.percentile(np.abs(change), 99.7)), 0.1 * float(np.abs(change).max()))
-        shown = axes[2].imshow(change, origin="lower", cmap="RdBu_r", vmin=-width, vmax=width)
-        axes[2].set_title("change, e⁻", fontsize=9)
-        figure.colorbar(shown, ax=axes[2], shrink=0.8)
-    for axis in axes:
-        axis.set(xticks=[], yticks=[])
-    figure.savefig(path, dpi=80)
-    plt.close(figure)
-
-
-def api_page() -> str:
-    lines = ["# Reading a lake from Python", ""]
-    for module in API:
-        lines += [f"## {module}", "", "```{eval-rst}", f".. automodule:: {module}", "```", ""]
-    return "\n".join(lines)
-
-
 # ------------------------------------------------------------------------------------------------ the site
 
 
@@ -291,10 +79,11 @@ def pages(into: Path, run: bool) -> None:
     shutil.copytree(ROOT / "docs", into, dirs_exist_ok=True)
     mission = resolve()
     made = {
-        "request.md": request_page(),
-        "mission.md": mission_page(mission),
-        "effects.md": effects_page(into, mission),
-        "api.md": api_page(),
+        "request.md": docs_references.request_page(),
+        "mission.md": docs_references.mission_page(mission),
+        "effects.md": docs_references.effects_page(into, mission),
+        "accuracy.md": docs_references.accuracy_page(into),
+        "api.md": docs_references.api_page(),
         "contributing.md": (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"),
     }
     for name, text in made.items():
