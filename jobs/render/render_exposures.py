@@ -7,6 +7,9 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
+from collections.abc import Mapping, Sequence, Set
+
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs import heap
@@ -40,14 +43,19 @@ from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """One part a detector of an exposure, the longest first; then what was drawn on each."""
+    """One part a detector of an exposure, the longest first; then what was drawn on each.
+
+    Detectors that are not asked for, and that the request's present version has as they would be rendered now, stay:
+    a part is added to what there is.
+    """
     inputs = {name: read.for_request(lake, name, request.name) for name in INPUTS}
     if (lenses := _lenses(lake, request, inputs["galaxies"])) is not None:
         inputs[LENSES] = lenses
     preconditions.refuse_other_plan(inputs, request)
     exposures = inputs["exposures"].rows()
-    tasks = planned.part(preconditions.rendered(exposures, inputs["tasks"].rows()), request)
-    places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in tasks if task["cells"]}
+    every = preconditions.rendered(exposures, inputs["tasks"].rows())
+    asked = planned.part(every, request)
+    places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in asked if task["cells"]}
     for name in ("galaxies", "stars"):
         of_task = [selection.needed(task, catalogue_rows.deflection_of(inputs[name])) for task in places.values()]
         preconditions.refuse_uncovered(inputs[name], {cell for cells in of_task for cell in cells})
@@ -56,24 +64,43 @@ def steps(lake: Path, request: Request) -> list[Step]:
         "mission": mission_of(request.mission).fingerprint,
         "inputs": {name: version.key for name, version in inputs.items()},
     }
-    if psfs := psf_files(exposures, tasks):
-        facts["psf"] = psfs
     if request.sources is not None:
         # Those of the tables are the only ones: no bodies move.
         facts["request"]["bodies"] = "none"
     if request.bodies is not None:
         facts["bodies"] = ephemeris_files(request.bodies, exposures)
-    keys = product_keys(facts, exposures, tasks, inputs, mission_of(request.mission))
+    held = reuse.held(lake, PRODUCTS.name, request.name)
+    wanted = {_part_name(task) for task in asked}
+    tasks = _with_held(wanted, every.to_pylist(), exposures, held)
+    psfs = psf_files(exposures, tasks)
+    keys = product_keys({**facts, "psf": psfs}, exposures, tasks, inputs, mission_of(request.mission))
     parts = tuple(
-        Part(
-            f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet",
-            {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: key},
-        )
+        Part(name, {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: key})
         for task, key in zip(tasks, keys, strict=True)
+        if (name := _part_name(task)) in wanted or held[name] == key
     )
+    if len(parts) < len(tasks):
+        stay = {part.name for part in parts}
+        psfs = psf_files(exposures, [task for task in tasks if _part_name(task) in stay])
+    facts |= {"psf": psfs} if psfs else {}
     plan = Plan(PRODUCTS, facts, parts)
     drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in parts)
     return [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
+
+
+def _part_name(task: Json) -> str:
+    return f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet"
+
+
+def _with_held(wanted: Set[str], every: Sequence[Json], exposures: pa.Table, held: Mapping[str, str]) -> list[Json]:
+    """Tasks of the parts that are wanted, and of those that are held whose PSF can still be read, in their order."""
+    psfs = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
+
+    def stays(task: Json) -> bool:
+        psf = psfs[task["exposure_id"]]
+        return _part_name(task) in held and (not psf or from_file.file_of(psf, task["detector"]).is_file())
+
+    return [task for task in every if _part_name(task) in wanted or stays(task)]
 
 
 def _lenses(lake: Path, request: Request, galaxies: read.Version) -> read.Version | None:

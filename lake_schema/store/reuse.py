@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lake_schema.errors import Damaged
-from lake_schema.store import manifest
+from lake_schema.store import layout, manifest, names
 from lake_schema.store.plan import Json, Part
 from lake_schema.store.provenance import file_sha256
 from lake_schema.store.stage import write_receipt
@@ -25,6 +25,26 @@ def files_of(part: Part, receipt: Json) -> Json:
     if PRODUCT not in part.facts:
         return {}
     return {"rows": receipt["rows"], "files": [f["path"] for f in receipt["files"]], "machine": receipt.get("machine")}
+
+
+def held(root: Path, table: str, request: str) -> Mapping[str, str]:
+    """The parts of a request's present version that can be used again: name -> PRODUCT; none where it has no version.
+
+    Where no request has one, an older truesky wrote the lake, and the version is the current one.  What cannot be read
+    holds nothing.
+
+    root : folder of the lake;  table : its name;  request : its name
+    """
+    key = names.key_of(root, request, table)
+    if key is None and not names.holders(root, table):
+        key = layout.current_key(root, table)
+    if key is None:
+        return {}
+    try:
+        parts = manifest.load(layout.version(root, table, key), table)["parts"]
+    except Damaged:
+        return {}
+    return {part["name"]: part["facts"][PRODUCT] for part in parts if "files" in part and PRODUCT in part["facts"]}
 
 
 def take(stage: Path, version: Path, table: str, parts: Sequence[Part]) -> None:

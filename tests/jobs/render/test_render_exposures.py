@@ -330,6 +330,41 @@ def test_what_an_older_version_holds_is_not_rendered_again(rendered):
     assert images(lake) == both
 
 
+def named(root, request, *modules):
+    """As `make`, for the request's name."""
+    for module in modules:
+        for step in module.steps(root, request):
+            publish.make(root, step.plan, step.work, name=request.name)
+
+
+def planned_parts(root, request):
+    """Of images and of what was drawn: the parts that the next version would have."""
+    return [sorted(part.name for part in step.plan.parts) for step in render_exposures.steps(root, request)]
+
+
+def test_a_part_is_added_to_what_the_request_has(rendered):
+    """Of a part that is asked for later nothing is lost; what has changed since does not stay."""
+    lake, whole = rendered, wanted()
+    named(lake, whole, plan_exposures, render_exposures)
+    before, key = images(lake), names.key_of(lake, whole.name, "products")
+    for part in ({"limit": 1}, {"detectors": ("R22_S12",)}):
+        named(lake, replace(whole, **part), render_exposures)
+        assert names.key_of(lake, whole.name, "products") == key
+    assert garbage.collect(lake, "products", delete=True) == []
+    assert images(lake) == before
+    one = ["000001-r22_s12.parquet"]
+    both = ["000001-r22_s11.parquet", *one]
+    # A later exposure of the plan: the first one's images stay beside it.
+    named(lake, two := wanted(pointings=2), plan_exposures)
+    assert planned_parts(lake, replace(two, limit=1)) == [both, both]
+    assert planned_parts(lake, replace(two, limit=3)) == [[*both, "000002-r22_s11.parquet"]] * 2
+    # Of another noise they are other images; and another request has none of them.
+    named(lake, other := replace(whole, noise_seed=8), plan_exposures)
+    assert planned_parts(lake, replace(other, detectors=("R22_S12",))) == [one, one]
+    named(lake, other := replace(whole, name="y"), plan_exposures)
+    assert planned_parts(lake, replace(other, detectors=("R22_S12",))) == [one, one]
+
+
 def test_a_damaged_image_of_an_older_version_is_not_taken(rendered):
     lake = rendered
     image = min(layout.current(lake, "products").resolve().glob("images/*/*R22_S12*science.fits"))
