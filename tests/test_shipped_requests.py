@@ -43,7 +43,7 @@ def small(name):
         if ground or "VIS" in block["channels"]:
             block["detectors"] = [middle(camera)]
         block |= {key: 1 for key in ("fields", "visits", "exposures") if key in block}
-        if not ground:
+        if not ground and block.get("image_type", "science") in ("science", "deep"):
             block["dither"] = "none"
         # Fields and calibrations lie where they lay.
         block.setdefault("area", table["area"])

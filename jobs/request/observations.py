@@ -47,6 +47,28 @@ _CALIBRATIONS = {
     "EXT": ("bias", "dark", "flat"),
 }
 _SKY_TYPES = ("science", "deep")
+# Kinds of block, as messages call them.
+_SURVEY, _OWN = "fields of a Euclid survey", "a Euclid field at ra, dec"
+_GROUND, _GROUND_OWN = "a ground survey's pattern", "a ground camera's field at ra, dec"
+_TIMED, _UNTIMED = "dark and flat frames", "bias and charge_injection frames"
+_DITHERED, _TABLE = "calibrations on the sky", "a table of pointings"
+_CALIBRATION = (_TIMED, _UNTIMED, _DITHERED)
+# The kinds that use a key; a key that is not here is used by all. EXT always has a survey, for its camera.
+_USERS = {
+    "survey": (_SURVEY, _TABLE),
+    "area": (_SURVEY, _GROUND, *_CALIBRATION),
+    "fields": (_SURVEY,),
+    "visits": (_SURVEY, _OWN),
+    "exposures": (_GROUND, _GROUND_OWN, *_CALIBRATION),
+    "dither": (_SURVEY, _OWN, _GROUND_OWN),
+    "short": (_SURVEY, _OWN),
+    "flat": (_SURVEY, _OWN),
+    "blue": (_SURVEY, _OWN),
+    "bands": (_SURVEY, _OWN, _GROUND, _GROUND_OWN, *_CALIBRATION),
+    "exposure_time_s": (_GROUND, _GROUND_OWN, _TIMED, _DITHERED, _TABLE),
+}
+# Exposures that only one channel has.
+_CHANNEL_OF = {"short": "VIS", "flat": "VIS", "blue": "NISP-S"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +188,7 @@ def _observation(value: object, path: str, folder: Path) -> Observation:
                 raise BadInput(f"{path}.image_type = {image_type!r} is none of {channel}'s: {legal}")
     surveys = GROUND_SURVEYS if ground else EUCLID_SURVEYS
     _refuse_two_places(table, path)
+    _refuse_unused(table, channels, image_type, path)
     file = _file(table, path, folder)
     return Observation(
         channels=channels,
@@ -206,6 +229,29 @@ def _refuse_two_places(table: Toml, path: str) -> None:
         for other in ("pointings", "area", "fields"):
             if key != other and key in table and other in table:
                 raise BadInput(f"{path}: {key} and {other} exclude each other")
+
+
+def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path: str) -> None:
+    """A key that would change nothing."""
+    ground = "EXT" in channels
+    kind = _kind(table, ground, image_type)
+    for key in table:
+        users = _USERS.get(key, (kind,))
+        if kind not in users and not (ground and key == "survey"):
+            raise BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(users)}")
+        if (channel := _CHANNEL_OF.get(key)) is not None and channel not in channels:
+            raise BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {channel}")
+
+
+def _kind(table: Toml, ground: bool, image_type: str) -> str:
+    if "pointings" in table:
+        return _TABLE
+    if image_type not in _SKY_TYPES:
+        kinds = {"dark": _TIMED, "flat": _TIMED, "bias": _UNTIMED, "charge_injection": _UNTIMED}
+        return kinds.get(image_type, _DITHERED)
+    if ground:
+        return _GROUND_OWN if "ra" in table else _GROUND
+    return _OWN if "ra" in table else _SURVEY
 
 
 def _file(table: Toml, path: str, folder: Path) -> Path | None:

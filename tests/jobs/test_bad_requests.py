@@ -78,7 +78,9 @@ BAD = {
     "an exposure before it begins": (GOOD + POINT + "exposure_time_s = -1\n", "pointing[0].exposure_time_s = -1"),
     "a hundred thousand and one pointings": (GOOD + "pointing = [" + "{}," * 100_001 + "]\n", "pointing"),
     "observations of nothing": (GOOD + "[[observation]]\n", "observation[0].channels is missing"),
-    "a billion exposures": (GOOD + BLOCK + "exposures = 1_000_000_000\n", "observation[0].exposures"),
+    "a billion exposures": (
+        GOOD + BLOCK + 'image_type = "bias"\nexposures = 1_000_000_000\n', "observation[0].exposures = 1000000000",
+    ),
     "a billion fields": (GOOD + BLOCK + "fields = 1_000_000_000\n", "observation[0].fields"),
     "a flat of no lamp": (GOOD + BLOCK + 'image_type = "planetary_nebula"\n', "observation[0].image_type"),
     "pointings from elsewhere": (GOOD + BLOCK + 'pointings = "../../etc/passwd"\n', "observation[0].pointings"),

@@ -24,6 +24,10 @@ GROUND = WIDE + '[[observation]]\nchannels = ["EXT"]\nsurvey = "des"\nra = 53.11
 TABLE = WIDE + '[[observation]]\nchannels = ["VIS"]\npointings = "p.csv"\n'
 CENTRE = POINT.replace("53.117", "266.4").replace("-27.808", "-28.9").replace("60905", "60760")
 
+BLOCK = WIDE + '[[observation]]\nchannels = ["VIS"]\n'
+EXT = WIDE + '[[observation]]\nchannels = ["EXT"]\nsurvey = "des"\n'
+BIAS = BLOCK + 'image_type = "bias"\nexposures = 2\n'
+
 
 def pointed(old, new):
     return GOOD.replace(old, new)
@@ -110,6 +114,16 @@ MISTAKES = {
     "fields that see more than the area": (
         HEAD + AREA + '[[observation]]\nchannels = ["VIS"]\nfields = 1\n', "this would do: [area] cone",
     ),
+    "dithers of a ground survey": (EXT + "dither = [[0, 0], [9, 9]]\n", "[0].dither is not for a ground survey's"),
+    "fields of a ground survey": (EXT + "fields = 2\n", "observation[0].fields is not for a ground survey's pattern"),
+    "visits from the ground": (GROUND + "visits = 3\n", "observation[0].visits is not for a ground camera's field"),
+    "visits of a bias": (BIAS + "visits = 5\n", "observation[0].visits is not for bias and charge_injection frames"),
+    "dithers of a bias": (BIAS + 'dither = "J"\n', "observation[0].dither is not for bias and charge_injection frames"),
+    "a long bias": (BIAS + "exposure_time_s = 9\n", "observation[0].exposure_time_s is not for bias and charge_"),
+    "frames of a survey's fields": (BLOCK + "exposures = 3\n", "[0].exposures is not for fields of a Euclid survey"),
+    "a longer exposure of a survey": (BLOCK + "exposure_time_s = 9\n", "[0].exposure_time_s is not for fields of a"),
+    "a survey of a place": (OWN + 'survey = "deep"\n', "observation[0].survey is not for a Euclid field at ra, dec"),
+    "the blue grism of VIS": (OWN + "blue = true\n", "observation[0].blue is not for VIS: used by NISP-S"),
     "no table of pointings": (TABLE.replace("p.csv", "q.csv"), "observation[0].pointings"),
 }  # fmt: skip
 TABLES = {
@@ -123,6 +137,16 @@ TABLES = {
 }
 CASES = {name: (text, "", words) for name, (text, words) in MISTAKES.items()}
 CASES |= {name: (TABLE, rows, words) for name, (rows, words) in TABLES.items()}
+UNUSED = {
+    "visits": 2, "dither": '"J"', "exposures": 2, "bands": '["euclid_vis"]', "short": "false", "flat": "false",
+    "blue": "true",
+}  # fmt: skip
+CASES |= {
+    f"{key} of a table": (
+        f"{TABLE}{key} = {value}\n", "ra,dec\n53.1,-27.8\n", f"[0].{key} is not for a table of pointings: used by "
+    )
+    for key, value in UNUSED.items()
+}  # fmt: skip
 
 
 def test_what_the_mistakes_are_made_in_is_good(tmp_path, capsys):
