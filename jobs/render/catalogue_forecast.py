@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -19,9 +19,12 @@ import numpy as np
 
 from jobs.render.planning.mission import mission_of
 from jobs.render.planning.source_counts import Densities
+from jobs.request.area import Area
+from jobs.request.files import SOURCES, GivenSources
 from jobs.request.schema import MissionChoice, Request, Universe
 from lake_schema import sky
 from lake_schema.errors import LakeError
+from lake_schema.external import rows as external_rows
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.store import read
 
@@ -48,18 +51,17 @@ class Line:
 
 
 def of_request(request: Request, factor: float = 1.0) -> list[Line]:
-    """The jobs that draw; what an external catalogue holds is not known, and left out.
+    """The jobs that draw; what an external catalogue holds is not known, and left out; of given sources their number.
 
     factor : CPU s of the machine that is asked about over those of the channels' costs
     Error  : over an area that no number was chosen on, of rows 3 %, of bytes 1 %, of seconds 7 % (galaxies) to 24 %
              (stars), where the cache holds what is computed once a machine
     """
-    densities = Densities(mission_of(request.mission), request.universe)
     cells = request.area.cells()
-    rows = {} if request.ingest.galaxies else _galaxies(request.universe.galaxy_limit, len(cells))
-    rows["stars"] = _stars(densities, cells)
+    rows = _drawn(request, cells) if request.sources is None else _given(request.sources, request.area)
     parts = dict.fromkeys(rows, _files(cells, FILE_ORDER))
-    parts["stars"] = max(_files(cells, _LARGEST), round(rows["stars"] / request.stars.rows_a_file))
+    if "stars" in rows:
+        parts["stars"] = max(_files(cells, _LARGEST), round(rows["stars"] / request.stars.rows_a_file))
     return _lines(rows, parts, dict.fromkeys(_CATALOGUE, len(request.bands)), factor)
 
 
@@ -100,6 +102,34 @@ def _held(lake: Path, table: str) -> read.Version | None:
         return read.version(lake, table)
     except LakeError:
         return None
+
+
+def _drawn(request: Request, cells: Sequence[int]) -> dict[str, float]:
+    """Rows of each catalogue that is drawn."""
+    rows = {} if request.ingest.galaxies else _galaxies(request.universe.galaxy_limit, len(cells))
+    if request.stars.catalogue is None:
+        mission, universe, brightest = mission_of(request.mission), request.universe, request.stars.bright_limit
+        rows["stars"] = _stars(Densities(mission, universe), cells)
+        if brightest is not None:
+            rows["stars"] -= _stars(Densities(mission, replace(universe, star_limit=brightest)), cells)
+    return rows
+
+
+def _given(own: GivenSources, area: Area) -> dict[str, float]:
+    """Rows of the tables, or on a grid as many as the circle about the area has places for."""
+    files = {"galaxies": own.galaxies, "stars": own.stars}
+    rows = {name: float(_rows_of(file)) for name, file in files.items() if file is not None}
+    if own.spacing:
+        radius = np.radians(area.bounds()[2])
+        places = 4.0 * np.pi * np.sin(0.5 * radius) ** 2 / np.radians(own.spacing / 3600.0) ** 2
+        total = sum(rows.values())
+        rows = {name: max(1.0, places * number / total) for name, number in rows.items()}
+    return rows
+
+
+def _rows_of(file: Path) -> int:
+    title = external_rows.titles(file, SOURCES)[0]
+    return sum(len(piece.columns[title]) for piece in external_rows.pieces(file, [title], kind=SOURCES))
 
 
 def _galaxies(limit: float, cells: int) -> dict[str, float]:

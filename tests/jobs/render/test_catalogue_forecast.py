@@ -4,12 +4,13 @@ import json
 import tomllib
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import catalogue_forecast
-from jobs.request.files import Catalogue, Ingest
+from jobs.request.files import Catalogue, GivenSources, Ingest
 from jobs.request.from_toml import from_table
 from lake_schema.store import publish
 from tests import requests
@@ -117,3 +118,28 @@ def test_an_external_catalogue_is_not_forecast(tmp_path):
     assert list(lines) == ["build_stars", "compute_fluxes"]
     assert lines["compute_fluxes"].rows == lines["build_stars"].rows
     assert "\n".join(catalogue_forecast.text(list(lines.values()))).count("\n") == 2
+
+
+def test_given_sources_are_as_many_as_their_tables_say(tmp_path):
+    """Neither the drawn depth of the sky nor halos: of a scene of a few rows hardly anything is written."""
+    (tmp_path / "g.csv").write_text("ra,dec,mag\n53,-28,20\n53,-28.01,21\n")
+    (tmp_path / "s.csv").write_text("mag\n18\n")
+    wanted = request((53.0, -28.0, 0.3), 24.0, 22.0, ["euclid_vis"])
+    own = GivenSources(tmp_path / "g.csv", None, "euclid_vis", 0.0)
+    lines = forecast(replace(wanted, sources=own))
+    assert {job: line.rows for job, line in lines.items()} == {"build_galaxies": 2, "compute_fluxes": 2}
+    # Every 36 arcsec on a circle of 0.3 deg, two places in three a galaxy.
+    lines = forecast(replace(wanted, sources=replace(own, stars=tmp_path / "s.csv", spacing=36.0)))
+    assert lines["compute_fluxes"].rows == pytest.approx(np.pi * 30**2, rel=1e-3)
+    assert lines["build_galaxies"].rows == pytest.approx(2 * lines["build_stars"].rows)
+
+
+def test_stars_that_are_left_out_are_not_forecast(tmp_path):
+    keys = (53.0, -28.0, 0.3), 24.0, 22.0, ["euclid_vis"]
+    whole = request(*keys)
+    faint = forecast(replace(whole, stars=replace(whole.stars, bright_limit=20.0)))["build_stars"].rows
+    brighter = forecast(request(keys[0], 24.0, 20.0, keys[3]))["build_stars"].rows
+    assert faint == pytest.approx(forecast(whole)["build_stars"].rows - brighter)
+    assert brighter > 0
+    own = replace(whole.stars, catalogue=tmp_path / "s.csv")
+    assert list(forecast(replace(whole, stars=own))) == ["build_galaxies", "compute_fluxes"]
