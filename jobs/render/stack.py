@@ -36,6 +36,8 @@ from lake_schema.store import layout
 
 # What all images of a stack share.
 _SAME = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
+# What each of them says besides; the second are numbers above 0.
+_SAID, _NUMBERS = ("IMAGETYP", "DETECTOR"), ("EXPOSURE", "EXPTIME", "PIXSCALE")
 # Places on a detector at which its PSF is known; the middle one is taken.
 _POSITIONS = 1
 
@@ -78,7 +80,7 @@ def _written(options: argparse.Namespace) -> int:
     found = [files.read_image(path) for path in options.images]
     _refuse_different(options.images, found)
     systems = [astrometry.from_cards(image.cards) for image in found]
-    scale = options.scale or float(found[0].card("PIXSCALE"))
+    scale = float(found[0].card("PIXSCALE")) if options.scale is None else options.scale
     shapes = [image.reduced.image.shape for image in found]
     stack, grid, weights = stacked(list(zip(map(rate, found), systems, strict=True)), scale)
     more = []
@@ -104,6 +106,7 @@ def _written(options: argparse.Namespace) -> int:
 
 def _refuse_different(paths: Sequence[Path], found: Sequence[ImageFile]) -> None:
     for path, image in zip(paths, found, strict=True):
+        _refuse_other(path, image)
         for keyword in _SAME:
             if image.card(keyword) != found[0].card(keyword):
                 what = f"{keyword} = {image.card(keyword)}, that of {paths[0].name} is {found[0].card(keyword)}"
@@ -112,6 +115,18 @@ def _refuse_different(paths: Sequence[Path], found: Sequence[ImageFile]) -> None
     for path, one in zip(paths, seen, strict=True):
         if seen.count(one) > 1:
             raise BadInput(f"{user_files.shown(path)}: exposure {one[0]}, detector {one[1]} is given twice")
+
+
+def _refuse_other(path: Path, image: ImageFile) -> None:
+    """What is no image of jobs.render.reduce."""
+    if image.card("IMAGETYP") == "stack":
+        raise BadInput(f"{user_files.shown(path)}: is a stack: give the images that it was made of")
+    for keyword in (*_SAME, *_SAID, *_NUMBERS):
+        value = image.card(keyword)
+        if value is None:
+            raise BadInput(f"{user_files.shown(path)}: has no card {keyword}")
+        if keyword in _NUMBERS and not (isinstance(value, int | float) and 0.0 < value < np.inf):
+            raise BadInput(f"{user_files.shown(path)}: {keyword} = {value!r} is no number above 0")
 
 
 def _frames(root: Path, found: Sequence[ImageFile]) -> list[Frame]:
@@ -123,7 +138,11 @@ def _frames(root: Path, found: Sequence[ImageFile]) -> list[Frame]:
         for frames in frames_of.of_lake(root, names, numbers).values()
         for frame in frames
     }
-    return [known[int(image.card("EXPOSURE")), str(image.card("DETECTOR"))] for image in found]
+    asked = [(int(image.card("EXPOSURE")), str(image.card("DETECTOR"))) for image in found]
+    for number, detector in asked:
+        if (number, detector) not in known:
+            raise BadInput(f"lake {root}: table products has no image of exposure {number}, detector {detector}")
+    return [known[one] for one in asked]
 
 
 def _profile(frame: Frame) -> object:

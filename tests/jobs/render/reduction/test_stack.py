@@ -1,6 +1,7 @@
 """Dithers onto one map: no light is lost, nothing moves, cosmic rays go, and the noise is what the header says."""
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import sep
 
 from jobs.render import stack
 from jobs.render.camera import astrometry
-from jobs.render.reduction import resampling, stacking
+from jobs.render.reduction import files, resampling, stacking
 from jobs.render.reduction.calibration import COSMIC_RAY, Reduced
 from lake_schema.errors import BadInput, OutOfRange
 from tests.jobs.render import nominal
@@ -186,3 +187,51 @@ def test_what_makes_no_grid_is_refused():
     with pytest.raises(BadInput, match="so far apart"):
         resampling.grid_of([(system, light.shape), (far, light.shape)], SCALE)
     assert resampling.grid_of([(system, light.shape)], 1.0).shape[0] < 60
+
+
+CARDS = (
+    ("INSTRUME", "vis", ""), ("CHANNEL", "VIS", ""), ("FILTER", "euclid_vis", ""), ("ZEROPNT", 25.0, ""),
+    ("IMAGETYP", "science", ""), ("EXPOSURE", 1, ""), ("DETECTOR", "3-4", ""), ("EXPTIME", 560.0, ""),
+    ("PIXSCALE", 0.1, ""),
+)  # fmt: skip
+
+
+def image_file(path, **changes):
+    """A small calibrated image; changes : of its cards, None = it has none of this name."""
+    detector = small("vis", "3-4", SIDE)
+    cards = [(key, changes.get(key, value), text) for key, value, text in CARDS]
+    cards = (*(card for card in cards if card[1] is not None), *astrometry.cards(astrometry.wcs(detector, 53, -28, 0)))
+    ones = np.ones((20, 20), np.float32)
+    files.write_image(path, Reduced(ones, ones, np.zeros(ones.shape, np.uint8)), cards)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"IMAGETYP": "stack", "EXPOSURE": None}, "is a stack: give the images that it was made of"),
+        *(({keyword: None}, f"has no card {keyword}") for keyword, *_ in CARDS),
+        ({"EXPTIME": 0.0}, "EXPTIME = 0.0 is no number above 0"),
+        ({"PIXSCALE": "0.1"}, "PIXSCALE = '0.1' is no number above 0"),
+    ],
+)
+def test_what_is_no_calibrated_image_is_refused(tmp_path, capsys, changes, words):
+    path = image_file(tmp_path / "a.fits", **changes)
+    assert stack.main([path, "--out", str(tmp_path / "b.fits")]) == 2
+    said = capsys.readouterr().err
+    assert (words in said, said.count("\n")) == (True, 1)
+
+
+def test_a_scale_of_nothing_is_refused(tmp_path, capsys):
+    path = image_file(tmp_path / "a.fits")
+    assert stack.main([path, "--out", str(tmp_path / "b.fits"), "--scale", "0"]) == 2
+    assert "arcsec = 0.0 is outside" in capsys.readouterr().err
+    assert not (tmp_path / "b.fits").exists()
+
+
+def test_an_image_that_the_lake_has_not_is_named(tmp_path, monkeypatch):
+    """The lake has its exposure and its detector, not the one on the other."""
+    monkeypatch.setattr(stack.frames_of, "of_lake", lambda root, names, numbers: {("vis", "3-4"): []})
+    image = files.read_image(Path(image_file(tmp_path / "a.fits")))
+    with pytest.raises(BadInput, match=r"table products has no image of exposure 1, detector 3-4"):
+        stack._frames(tmp_path, [image])
