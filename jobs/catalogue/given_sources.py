@@ -47,7 +47,8 @@ GALAXIES: Mapping[str, float | None] = {
 STARS: Mapping[str, float | None] = {"mag": None, "teff": 5800.0, "a_v": 0.0}
 _GALAXY_BOUNDS = {**GALAXY_BOUNDS, "sed": (0.0, 30.0)}
 _STAR_BOUNDS = {**KEYS, "mag": GALAXY_BOUNDS["mag"]}
-_MOST_PLACES = 1_000_000
+# Of a grid, on the square about the area.
+_MOST_PLACES = 4_000_000
 # Each galaxy says how much there is before it.
 _NO_DUST: Float32 = np.zeros(12, np.float32)
 
@@ -173,11 +174,11 @@ def _grid(area: Area, spacing: float) -> tuple[Float, Float]:
     """Places in an area, `spacing` arcsec apart to the east and north of its middle, from the south, west to east."""
     ra, dec, radius = area.bounds()
     half = int(radius * 3600.0 / spacing)
-    if (2 * half + 1) ** 2 > 4 * _MOST_PLACES:
-        raise BadInput(f"sources.spacing = {spacing:g}: the area has more than {_MOST_PLACES} places")
+    if (2 * half + 1) ** 2 > _MOST_PLACES:
+        raise BadInput(f"sources.spacing = {spacing:g}: the square about the area has more than {_MOST_PLACES} places")
     steps = np.radians(np.arange(-half, half + 1) * spacing / 3600.0)
-    north, east = (axis.ravel() for axis in np.meshgrid(steps, -steps, indexing="ij"))
-    places = lensing.displaced(np.full(east.size, ra), np.full(east.size, dec), -east, north)
+    north, east = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
+    places = lensing.displaced(np.full(east.size, ra), np.full(east.size, dec), east, north)
     inside = area.contains(*places)
     if not inside.any():
         raise BadInput("sources: no place of the grid lies in the area")

@@ -23,7 +23,7 @@ COMPRESSIONS = ("none", "rice")
 DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
-# As far as jobs/render/sources/galaxy_shapes.py draws a lensed ellipse (a test compares them).
+# Largest reduced shear: beyond it, near a critical line, a single source is not a lensed ellipse.
 MOST_SHEAR = 0.9
 # Of all channels that are rendered. A copy, since requests are read below the renderer (test_effect.py holds it to the
 # registry of channels).

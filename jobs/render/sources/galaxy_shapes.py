@@ -22,14 +22,13 @@ from scipy.special import gammaincc, gammaincinv, gammaln
 
 from jobs import sums
 from jobs.render.sources import sersic
+from jobs.request.schema import MOST_SHEAR
 from lake_schema.arrays import Float, Int
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 
 # Half-light radius of a face-on exponential disc in scale lengths: (1 + x) exp(-x) = 1/2.
 EXPONENTIAL_RADIUS = 1.6783469900166605
-# Reduced shear and inverse magnification near a critical line: beyond these a single source is not a lensed
-# ellipse.
-_MOST_SHEAR = 0.9
+# Inverse magnification near a critical line: beyond it, as beyond MOST_SHEAR, a single source is not a lensed ellipse.
 _LEAST_DETERMINANT = 1e-3
 # An ellipse has an area: thinner than this is a line.
 _SLIMMEST = 1e-4
@@ -94,7 +93,7 @@ def shapes(galaxies: pa.Table) -> Shapes:
     gamma = np.hypot(columns["gamma1"], columns["gamma2"])
     determinant = np.maximum(np.abs((stretch - gamma) * (stretch + gamma)), _LEAST_DETERMINANT)
     with np.errstate(divide="ignore", invalid="ignore"):
-        reduced = np.where(gamma > 0, np.minimum(1.0, _MOST_SHEAR * np.abs(stretch) / gamma) / stretch, 0.0)
+        reduced = np.where(gamma > 0, np.minimum(1.0, MOST_SHEAR * np.abs(stretch) / gamma) / stretch, 0.0)
     return Shapes(
         bulge_radius=columns["bulge_half_light_radius"],
         disk_radius=columns["disk_half_light_radius"],

@@ -134,5 +134,7 @@ def test_a_table_that_changes_while_it_is_read_is_refused(tmp_path):
 
 
 def test_a_grid_of_too_many_places_is_refused(tmp_path):
-    with pytest.raises(BadInput, match=r"sources.spacing = 0.01: the area has more than 1000000 places"):
+    with pytest.raises(
+        BadInput, match=r"sources.spacing = 0.01: the square about the area has more than 4000000 places"
+    ):
         made(tmp_path, 'only = "grid"\nspacing = 0.01', galaxies="mag\n20\n", stars=None)
