@@ -12,17 +12,19 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from jobs.render import catalogue_forecast
 from jobs.render.planning import speed
 from jobs.render.products import run_log
 from lake_schema import __version__, command
 from lake_schema.errors import BadInput, LakeError
-from lake_schema.store import layout, read
+from lake_schema.store import layout, names, read
+from lake_schema.store.provenance import canonical
 
 _ABOUT = (
     "seconds are of the clock, CPU s of all cores; failed are parts that could not be made and runs that ended badly, "
-    "stopped are runs that say of no end; the forecast is of what the lake holds now, made once"
+    "stopped are runs that say of no end; the forecast is of what the lake holds now, of all its requests, made once"
 )
 
 
@@ -83,14 +85,20 @@ def rows(root: Path) -> list[Line]:
 def _forecast(root: Path, factor: float) -> dict[str, tuple[float, float]]:
     """CPU seconds and GB of what the lake holds, made once, by the job that makes it."""
     jobs = {line.job: (line.seconds, line.gb) for line in catalogue_forecast.of_lake(root, factor)}
+    # By what shapes their bytes: what two requests share is rendered once.
+    own: dict[bytes, dict[str, Any]] = {}
     try:
-        products = read.version(root, "products")
-        tasks = read.version(root, "tasks", products.manifest["facts"]["inputs"]["tasks"]).rows().to_pylist()
+        for name in names.names(root) or [None]:
+            products = (
+                read.published_last(root, "products") if name is None else read.for_request(root, "products", name)
+            )
+            tasks = read.version(root, "tasks", products.manifest["facts"]["inputs"]["tasks"]).rows().to_pylist()
+            planned = {(task["exposure_id"], task["detector"]): task for task in tasks}
+            for facts in (part["facts"] for part in products.manifest["parts"]):
+                own.setdefault(canonical(facts), planned[facts["exposure_id"], facts["detector"]])
     except (LakeError, KeyError):
         return jobs
-    made = {(part["facts"]["exposure_id"], part["facts"]["detector"]) for part in products.manifest["parts"]}
-    own = [task for task in tasks if (task["exposure_id"], task["detector"]) in made]
-    seconds, size = (sum(task[name] for task in own) for name in ("seconds", "bytes"))
+    seconds, size = (sum(task[name] for task in own.values()) for name in ("seconds", "bytes"))
     return {**jobs, "render_exposures": (factor * seconds, size / 1e9)}
 
 

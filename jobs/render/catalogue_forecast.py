@@ -8,7 +8,7 @@ text         the table that a person reads
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
@@ -26,7 +26,7 @@ from lake_schema import sky
 from lake_schema.errors import LakeError
 from lake_schema.external import rows as external_rows
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
-from lake_schema.store import read
+from lake_schema.store import names, read
 
 # Lowest order of a file of stars, as of jobs/catalogue/build_stars.py.
 _LARGEST = 3
@@ -38,6 +38,7 @@ _JOBS = {
     "compute_fluxes": ("galaxy_fluxes", "star_fluxes"),
 }
 _CATALOGUE = {"galaxy_fluxes": "galaxies", "star_fluxes": "stars"}
+_TABLES = ("halos", "galaxies", "stars", *_CATALOGUE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +69,30 @@ def of_request(request: Request, factor: float = 1.0) -> list[Line]:
 def of_lake(lake: Path, factor: float = 1.0) -> list[Line]:
     """The jobs whose tables a lake holds, by what their manifests say of area and depth.
 
+    Versions of several requests add up; one that requests share is made once.
+
     factor : as of `of_request`
     """
-    held = {name: version for name in ("halos", "galaxies", "stars", *_CATALOGUE) if (version := _held(lake, name))}
+    found: dict[str, Line] = {}
+    counted: set[tuple[str, str]] = set()
+    for request in names.names(lake) or [None]:
+        held = {name: version for name in _TABLES if (version := _held(lake, name, request))}
+        new = {(name, version.key) for name, version in held.items()} - counted
+        for line in _of_versions(held, factor, {name for name, _ in new}):
+            before = found.get(line.job, Line(line.job, 0.0, 0.0, 0.0))
+            found[line.job] = Line(
+                line.job, before.rows + line.rows, before.seconds + line.seconds, before.gb + line.gb
+            )
+        counted |= new
+    return [found[job] for job in _JOBS if job in found]
+
+
+def _of_versions(held: Mapping[str, read.Version], factor: float, made: Collection[str]) -> list[Line]:
     rows: dict[str, float] = {}
     bands: dict[str, int] = {}
     for name, version in held.items():
-        facts, made = version.manifest["facts"], version.manifest["parts"]
-        cells = [cell for part in made for cell in part["facts"].get("generation_cells", ())]
+        facts, there = version.manifest["facts"], version.manifest["parts"]
+        cells = [cell for part in there for cell in part["facts"].get("generation_cells", ())]
         if name in ("halos", "galaxies") and "galaxy_limit" in facts:
             rows[name] = _galaxies(facts["galaxy_limit"], len(cells))[name]
         if name == "stars" and "star_limit" in facts:
@@ -83,7 +100,7 @@ def of_lake(lake: Path, factor: float = 1.0) -> list[Line]:
             rows[name] = _stars(Densities(mission, Universe(star_limit=facts["star_limit"])), cells)
         bands |= {name: len(facts["bands"])} if "bands" in facts else {}
     parts = {name: len(version.parts) for name, version in held.items()}
-    return _lines(rows, parts, bands, factor)
+    return _lines(rows, parts, bands, factor, made)
 
 
 def text(lines: Sequence[Line]) -> Iterator[str]:
@@ -97,9 +114,9 @@ def _files(cells: Sequence[int], order: int) -> int:
     return len({cell >> 2 * (GENERATION_ORDER - order) for cell in cells})
 
 
-def _held(lake: Path, table: str) -> read.Version | None:
+def _held(lake: Path, table: str, request: str | None) -> read.Version | None:
     try:
-        return read.version(lake, table)
+        return read.published_last(lake, table) if request is None else read.for_request(lake, table, request)
     except LakeError:
         return None
 
@@ -150,13 +167,20 @@ def _stars(densities: Densities, cells: Sequence[int]) -> float:
     return float(densities.at(*sky.cell_centres(GENERATION_ORDER, cells))[1].sum() * sky.cell_area(GENERATION_ORDER))
 
 
-def _lines(rows: Mapping[str, float], parts: Mapping[str, int], bands: Mapping[str, int], factor: float) -> list[Line]:
+def _lines(
+    rows: Mapping[str, float],
+    parts: Mapping[str, int],
+    bands: Mapping[str, int],
+    factor: float,
+    made: Collection[str] = _TABLES,
+) -> list[Line]:
+    """A line a job; made : the tables that it makes, of others the rows count alone where they are its input."""
     lines = []
     for job, tables in _JOBS.items():
         seconds = size = number = 0.0
         for table in tables:
             catalogue = _CATALOGUE.get(table, table)
-            if catalogue not in rows or (table in _CATALOGUE and table not in bands):
+            if table not in made or catalogue not in rows or (table in _CATALOGUE and table not in bands):
                 continue
             cost, n, in_bands = _costs()[table], parts.get(table, parts[catalogue]), bands.get(table, 1)
             number += rows[catalogue]

@@ -9,9 +9,12 @@ from jobs.request.from_toml import parse
 from jobs.shell import Job, Step
 from jobs.shell import run as run_job
 from lake_schema.errors import BadInput, Damaged, PartsFailed
-from lake_schema.store import layout
+from lake_schema.store import layout, publish
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.products import PRODUCTS
+from lake_schema.tables.tasks import TASKS
 from tests import requests
-from tests.universe import plain_plan, plain_work
+from tests.universe import plain_plan, plain_work, rows_of
 
 
 def log(root, name, *lines):
@@ -81,6 +84,32 @@ def test_what_a_job_writes_is_read(tmp_path):
         run_job(other, root, parse(request))
     line, _ = report.rows(root)
     assert (line.runs, line.failed_runs, line.parts, line.failed) == (2, 1, 3, 3)
+
+
+def rendered(lake, name, detectors):
+    """A lake's products of some detectors of exposure 0, (name, digest of what shapes it) each, and their tasks."""
+    n = len(detectors)
+    columns = {key: rows_of(TASKS, n)[key] for key in TASKS.names}
+    columns |= {"exposure_id": [0] * n, "detector": [detector for detector, _ in detectors]}
+    tasks = TASKS.build({**columns, "seconds": [10.0] * n, "bytes": [10**9] * n})
+    planned = Plan(TASKS, {"of": name}, (Part("all.parquet", {}),))
+    publish.make(lake, planned, lambda root, facts: Output(tasks), name=name)
+    parts = (Part(f"{d}.parquet", {"exposure_id": 0, "detector": d, "product": shape}) for d, shape in detectors)
+    plan = Plan(PRODUCTS, {"inputs": {"tasks": planned.key}}, tuple(parts))
+    publish.make(lake, plan, lambda root, facts: Output(PRODUCTS.empty()), name=name)
+
+
+def test_the_forecast_is_of_all_requests(lake):
+    """A detector that is the same in two of them is made once."""
+    log(lake, "1-products-1", {"job": "render_exposures"}, part("a", rows=1), {"seconds": 5.0, "status": "done"})
+    rendered(lake, "a", [("3-4", "x"), ("3-5", "y")])
+    line, _ = report.rows(lake)
+    factor = line.forecast_s / 20.0
+    assert line.forecast_gb == pytest.approx(2.0)
+    rendered(lake, "b", [("3-4", "x"), ("3-5", "z")])
+    line, total = report.rows(lake)
+    assert (line.forecast_s, line.forecast_gb) == pytest.approx((30.0 * factor, 3.0))
+    assert total.forecast_gb == pytest.approx(3.0)
 
 
 def test_a_lake_without_logs_and_a_damaged_log_are_refused(lake, capsys):

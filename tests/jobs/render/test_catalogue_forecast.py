@@ -12,8 +12,12 @@ from jobs.fluxes import compute_fluxes
 from jobs.render import catalogue_forecast
 from jobs.request.files import Catalogue, GivenSources, Ingest
 from jobs.request.from_toml import from_table
-from lake_schema.store import publish
+from lake_schema.store import layout, publish
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.fluxes import fluxes
+from lake_schema.tables.galaxies import GALAXIES
 from tests import requests
+from tests.universe import rows_of
 
 # Cone, limits and bands of three areas, and what their jobs made and took on an AMD EPYC whose calibration gave
 # FACTOR: rows, CPU seconds (None = arrays of the machine's own were computed, too), GB. The costs are of the first two.
@@ -108,6 +112,28 @@ def test_what_is_drawn_is_what_was_forecast(drawn):
         )
         manifests = [json.loads((lake / name / "current" / "manifest.json").read_text()) for name in tables]
         assert sum(one["rows"] for one in manifests) == pytest.approx(line.rows, rel=0.25)
+
+
+def test_requests_of_a_lake_add_up_and_what_they_share_is_made_once(lake):
+    def made(table, facts, name):
+        part = Part(layout.cell_file(5, 1607), {"generation_cells": [1607 << 6]})
+        plan = Plan(table, facts, (part,))
+        publish.make(lake, plan, lambda root, facts: Output(rows_of(table, 3)), name=name)
+        return plan.key
+
+    def lines():
+        return {line.job: line for line in catalogue_forecast.of_lake(lake)}
+
+    key = made(GALAXIES, {"galaxy_limit": 22.0}, "a")
+    made(fluxes("galaxy", ["x"]), {"input": key, "bands": ["x"]}, "a")
+    one = lines()
+    made(fluxes("galaxy", ["y"]), {"input": key, "bands": ["y"]}, "b")
+    two = lines()
+    assert two["build_galaxies"] == one["build_galaxies"]
+    assert two["compute_fluxes"].rows == 2 * one["compute_fluxes"].rows > 0.0
+    assert two["compute_fluxes"].seconds == pytest.approx(2.0 * one["compute_fluxes"].seconds)
+    made(GALAXIES, {"galaxy_limit": 22.5}, "b")
+    assert lines()["build_galaxies"].rows > 2.0 * one["build_galaxies"].rows
 
 
 def test_an_external_catalogue_is_not_forecast(tmp_path):
