@@ -1,6 +1,6 @@
 """Master bias, dark and flat of each detector, from the calibration frames of a lake.
 
-    python -m jobs.render.masters --lake LAKE --out FOLDER [--detectors 3-4 ..]
+    python -m jobs.render.masters --lake LAKE [--name REQUEST] --out FOLDER [--detectors 3-4 ..]
 
 FOLDER/VIS_3-4_bias.fits (e-), .._dark.fits (e-/s) and .._flat.fits (response; 1 = all light is counted), each with its
 uncertainty and the number of frames that a pixel is of. A flat is over its lamp's light as the mission declares it.
@@ -83,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Prints a line a master."""
     parser = argparse.ArgumentParser(prog="python -m jobs.render.masters", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lake", required=True, help="folder of the lake, with rendered calibration frames")
+    parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
     parser.add_argument("--out", type=Path, required=True, help="folder of the masters")
     parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all that have bias frames")
     options = parser.parse_args(argv)
@@ -91,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _written(options: argparse.Namespace) -> int:
     out = user_files.folder(options.out)
-    found = frames_of.of_lake(layout.lake(options.lake), options.detectors)
+    found = frames_of.of_lake(layout.lake(options.lake), options.detectors, request=options.name)
     some = {key: own for key, own in found.items() if options.detectors or frames_of.of_types(own, ("bias",))}
     if not some:
         raise BadInput(f"lake {options.lake} has no frames of the image type bias")

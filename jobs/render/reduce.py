@@ -1,6 +1,7 @@
 """Calibrated images from the raw frames of a lake: bias, dark, response of the amplifiers, flat, vignetting.
 
-    python -m jobs.render.reduce --lake LAKE --masters FOLDER --out FOLDER [--detectors ..] [--exposures ..] [--rate]
+    python -m jobs.render.reduce --lake LAKE [--name REQUEST] --masters FOLDER --out FOLDER [--detectors ..]
+                                 [--exposures ..] [--rate] [--without ..]
 
 A file a frame that sees the sky, with the extensions SCI (electrons, or e-/s), WHT (inverse variance) and FLG (bits).
 """
@@ -33,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Prints a line an image."""
     parser = argparse.ArgumentParser(prog="python -m jobs.render.reduce", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lake", required=True, help="folder of the lake, with rendered frames")
+    parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
     parser.add_argument("--masters", type=Path, help="folder that jobs.render.masters has written")
     parser.add_argument("--out", type=Path, required=True, help="folder of the calibrated images")
     parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all")
@@ -47,7 +49,7 @@ def _written(options: argparse.Namespace) -> int:
     out = user_files.folder(options.out)
     if options.masters is None and set(options.without) != set(files.KINDS):
         raise BadInput(f"--masters: which folder? Or --without {' '.join(files.KINDS)}")
-    found = frames_of.of_lake(layout.lake(options.lake), options.detectors, options.exposures)
+    found = frames_of.of_lake(layout.lake(options.lake), options.detectors, options.exposures, options.name)
     science = [own for frames in found.values() if (own := frames_of.of_types(frames, SKY_TYPES))]
     if not science:
         raise BadInput(f"lake {options.lake} has no such frame that sees the sky")

@@ -1,6 +1,6 @@
 """Calibrated images of one field, in one band, onto one map of the sky.
 
-    python -m jobs.render.stack FILE .. --out FILE.fits [--scale ARCSEC] [--lake LAKE]
+    python -m jobs.render.stack FILE .. --out FILE.fits [--scale ARCSEC] [--lake LAKE [--name REQUEST]]
 
 The extensions are SCI (e-/s a pixel, the sky in it), WHT (inverse variance a pixel of sums over many pixels), FLG, and
 with --lake PSF: what a point source in the middle is, three samples a pixel. Neighbouring pixels share noise: the
@@ -71,6 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="FITS file of the stack")
     parser.add_argument("--scale", type=float, help="arcsec a pixel (default: the detectors')")
     parser.add_argument("--lake", help="folder of the lake that the images are of: for the PSF")
+    parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
     options = parser.parse_args(argv)
     return command.status("stack", lambda: _written(options))
 
@@ -85,7 +86,7 @@ def _written(options: argparse.Namespace) -> int:
     stack, grid, weights = stacked(list(zip(map(rate, found), systems, strict=True)), scale)
     more = []
     if options.lake:
-        frames = _frames(layout.lake(options.lake), found)
+        frames = _frames(layout.lake(options.lake), found, options.name)
         parts = [
             Contribution(system, shape, _profile(frame), frame.scene.detector.pixel_scale, weight)
             for system, shape, frame, weight in zip(systems, shapes, frames, weights, strict=True)
@@ -129,13 +130,13 @@ def _refuse_other(path: Path, image: ImageFile) -> None:
             raise BadInput(f"{user_files.shown(path)}: {keyword} = {value!r} is no number above 0")
 
 
-def _frames(root: Path, found: Sequence[ImageFile]) -> list[Frame]:
+def _frames(root: Path, found: Sequence[ImageFile], request: str | None) -> list[Frame]:
     """The lake's frames of the images."""
     numbers = {int(image.card("EXPOSURE")) for image in found}
     names = sorted({str(image.card("DETECTOR")) for image in found})
     known = {
         (frame.exposure.exposure_id, frame.detector): frame
-        for frames in frames_of.of_lake(root, names, numbers).values()
+        for frames in frames_of.of_lake(root, names, numbers, request).values()
         for frame in frames
     }
     asked = [(int(image.card("EXPOSURE")), str(image.card("DETECTOR"))) for image in found]

@@ -78,13 +78,16 @@ class Frame:
 
 
 def of_lake(
-    root: Path, wanted: Sequence[str] = (), exposures: Iterable[int] = ()
+    root: Path, wanted: Sequence[str] = (), exposures: Iterable[int] = (), request: str | None = None
 ) -> dict[tuple[str, str], list[Frame]]:
     """(camera, detector) -> its frames, by exposure; only those that are named where some are.
 
-    Errors : BadInput where the lake has no such frames
+    root      : of the lake;  wanted : names of detectors
+    exposures : their numbers
+    request   : whose frames, where a lake has those of several
+    Errors    : BadInput where the lake has no such frames
     """
-    version = read.version(root, "products")
+    version = read.version(root, "products", request=request)
     inputs = version.manifest["facts"]["inputs"]
     planned = {
         row.exposure_id: row
@@ -92,8 +95,8 @@ def of_lake(
     }
     mission = mission_of(read.version(root, "mission", inputs["mission"]))
     fluxes = read.version(root, "galaxy_fluxes", inputs["galaxy_fluxes"]).manifest["facts"]
-    request, only = version.manifest["facts"]["request"], set(exposures)
-    forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
+    own_request, only = version.manifest["facts"]["request"], set(exposures)
+    forced = dict.fromkeys(own_request["effects"]["on"], True) | dict.fromkeys(own_request["effects"]["off"], False)
     found: dict[tuple[str, str], list[Frame]] = {}
     rows = sorted(version.rows().to_pylist(), key=lambda row: (row["exposure_id"], row["detector"]))
     for row in rows:
@@ -102,7 +105,7 @@ def of_lake(
         if only and row["exposure_id"] not in only:
             continue
         exposed = planned[row["exposure_id"]]
-        own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
+        own = variants.variant(exposed.settings, mission, Accuracy(**own_request["accuracy"]), forced)
         detector = detectors.detector(exposed.camera, row["detector"], own.mission)
         scene = scene_of.scene_of(exposed, detector, own.mission, own.accuracy)
         scene = replace(scene, band=passband_of(root, fluxes, exposed.band), forced=own.forced)

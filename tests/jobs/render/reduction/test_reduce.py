@@ -1,6 +1,7 @@
 """Masters and calibrated images through real rendered frames of a lake."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,6 +74,31 @@ def check(folder):
 
 def test_the_sky_comes_back_and_its_weight_is_its_inverse_variance(made):
     check(made)
+
+
+def test_of_two_requests_one_is_named(tmp_path, capsys):
+    """Each has its own frames: two bias frames, or three."""
+    root, side = layout.lake(tmp_path / "lake"), 64
+    for name, count in (("a", 2), ("b", 3)):
+        wanted = lakes.request(off=["all"], truth=(), bias=count, dark=0, flat=0, depth=(16.0, 10.0), dither="none")
+        lakes.make(root, replace(wanted, name=name), side, name)
+    masters_of, images_of = (["--lake", str(root), "--out", str(tmp_path / name)] for name in ("masters", "images"))
+    without = ["--without", "dark", "flat", "--masters", str(tmp_path / "masters")]
+    with small_detectors(side):
+        for name, count in (("a", 2), ("b", 3)):
+            capsys.readouterr()
+            assert masters.main([*masters_of, "--name", name]) == 0
+            assert f"VIS_3-4_bias.fits: {count} frames" in capsys.readouterr().out
+        assert reduce.main([*images_of, *without, "--name", "b"]) == 0
+        (image,) = (tmp_path / "images").iterdir()
+        call = [str(image), "--out", str(tmp_path / "stack.fits"), "--lake", str(root)]
+        assert stack.main([*call, "--name", "a"]) == 0
+        capsys.readouterr()
+        for main, arguments in ((masters.main, masters_of), (reduce.main, [*images_of, *without]), (stack.main, call)):
+            assert main(arguments) == 2
+            assert capsys.readouterr().err.endswith("of table products: name one of them\n")
+            assert main([*arguments, "--name", "c"]) == 2
+            assert capsys.readouterr().err.endswith(f"lake {root} has no request c; it has a, b\n")
 
 
 @pytest.mark.nightly
