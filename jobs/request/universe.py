@@ -7,11 +7,15 @@ refuse_others   a request of another universe than that of the requests which a 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from jobs.request.files import Catalogue
 from jobs.request.schema import Request
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
 from lake_schema.store import names, read
@@ -24,6 +28,8 @@ _LATER: Mapping[str, Mapping[str, Any]] = {
     "galaxies": {"lensing": None, "rotation": 0.0},
     "stars": {"bright_limit": None},
 }
+# What the formats of external catalogues are; some are of two files each.
+_FORMATS = Path(__file__).parents[1] / "catalogue" / "external" / "ingest_formats.toml"
 # What names files, or says how rows are filed.
 _NOT_VALUES = {"tycho2", "catalogue", "columns", "rows_a_file"}
 
@@ -65,35 +71,61 @@ def _difference(version: read.Version, request: Request) -> str:
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
         if canonical(facts.get(key)) != canonical(values[key]):
             return f"{key} {facts.get(key)}, the request {values[key]}"
-    for key, files in _files(version.table, request) if own is None else ():
-        if bool(files) != (key in facts):
-            return f"{'no ' if files else ''}files of {key}, the request {'some' if files else 'none'}"
-        if files and not _same(facts[key], files):
-            return f"other files of {key} than the request"
+    for key, given in _given(version.table, request) if own is None else ():
+        if (given is None) is (key in facts):
+            return f"{'no ' if given else ''}files of {key}, the request {'some' if given else 'none'}"
+        if given is not None:
+            for name, value in given.about.items():
+                # An older truesky may have written down less.
+                if name in facts[key] and canonical(facts[key][name]) != canonical(value):
+                    return f"{name} of {key} {facts[key][name] or 'none'}, the request {value or 'none'}"
+            if not _same(facts[key], given):
+                return f"other files of {key} than the request"
     return ""
 
 
-def _files(table: str, request: Request) -> Iterator[tuple[str, Sequence[Path]]]:
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """Files that a request names; about : how they are read; beside : of the names of files that are read in pairs."""
+
+    files: Sequence[Path]
+    about: Mapping[str, Any] = field(default_factory=dict)
+    beside: Sequence[str] = ()
+
+
+def _given(table: str, request: Request) -> Iterator[tuple[str, _Given | None]]:
     """What a catalogue's facts call files, and those that the request names."""
-    own = request.ingest
-    yield "dust", (own.dust.file,) if own.dust else ()
+    own, stars = request.ingest, request.stars
+    dust = {} if own.dust is None else {name: value for name, value in asdict(own.dust).items() if name != "file"}
+    yield "dust", _Given((own.dust.file,), dust) if own.dust else None
     if table == "stars":
-        yield "tycho2", request.stars.tycho2
-        yield "catalogue", (request.stars.catalogue,) if request.stars.catalogue else ()
+        yield "tycho2", _Given(stars.tycho2) if stars.tycho2 else None
+        yield "catalogue", _Given((stars.catalogue,), {"columns": dict(stars.columns)}) if stars.catalogue else None
         return
-    yield "ingest", own.galaxies.files if own.galaxies else ()
+    yield "ingest", _catalogue(own.galaxies, format=True) if own.galaxies else None
     if own.galaxies is None:
-        yield "halos", own.halos.files if own.halos else ()
-        yield "training", own.training.files if own.training else ()
+        yield "halos", _catalogue(own.halos) if own.halos else None
+        yield "training", _catalogue(own.training) if own.training else None
 
 
-def _same(facts: Json, files: Sequence[Path]) -> bool:
+def _catalogue(given: Catalogue, format: bool = False) -> _Given:
+    columns = dict(given.columns)
+    about = {"format": given.format, "columns": columns} if format else {"columns": columns}
+    known = user_files.toml_tables(_FORMATS.read_text(encoding="utf-8")).get(given.format, {})
+    beside = json.loads(columns["beside"]) if "beside" in columns else known.get("beside", ())
+    return _Given(given.files, about, beside)
+
+
+def _same(facts: Json, given: _Given) -> bool:
     """Are they the files that the facts have the sha256 of?  Those that have been moved away cannot be compared."""
-    if not all(path.exists() for path in files):
+    if not all(path.exists() for path in given.files):
         return True
+    every = [file for path in given.files for file in (external_rows.files(path) if path.is_dir() else [path])]
+    if given.beside:
+        # A folder of such pairs holds tables of other things as well.
+        first, second = given.beside
+        every = [file for file in every if file.name.startswith(first) and not file.name.startswith(second)]
+        every += [file.with_name(second + file.name.removeprefix(first)) for file in every]
     sums = facts["sha256"]
-    there = {sums} if isinstance(sums, str) else set(sums)
-    # A folder may hold other tables as well, and a file may have been read with another beside it.
-    every = (file for path in files for file in (external_rows.files(path) if path.is_dir() else [path]))
-    here = {file_sha256(file) for file in every}
-    return here <= there or there <= here
+    there = [sums] if isinstance(sums, str) else sums
+    return sorted(there) == sorted(file_sha256(file) for file in every if file.exists())

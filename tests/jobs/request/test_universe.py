@@ -1,10 +1,13 @@
 """Catalogues of one universe are used together, those of two are not."""
 
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import pytest
 
 from jobs import shell
+from jobs.catalogue import build_galaxies, build_stars
 from jobs.request import universe
 from jobs.request.files import Catalogue, DustMap, Ingest
 from jobs.request.from_toml import from_table, parse
@@ -18,6 +21,19 @@ from tests import requests
 from tests.universe import rows_of
 
 TABLES = {"galaxies": GALAXIES, "stars": STARS}
+# What a build job adds to the request's own.
+ADDED = {"code", "lensing_l_max"}
+
+
+@cache
+def keys():
+    """Of each catalogue, the keys of the facts that its job writes down."""
+    root, request = Path("/no/lake"), wanted()
+    with pytest.MonkeyPatch.context() as patch:
+        # The box would be made here; what is in the plan does not depend on it.
+        patch.setattr(build_galaxies, "_universe", lambda *args: None)
+        steps = [*build_galaxies.steps(root, request), *build_stars.steps(root, request)]
+    return {step.plan.table.name: step.plan.facts.keys() - ADDED for step in steps if step.plan.table.name in TABLES}
 
 
 def wanted(name="a", seed=11, **depth):
@@ -25,24 +41,18 @@ def wanted(name="a", seed=11, **depth):
     return from_table({"name": name, "seed": seed, "area": area, "universe": depth})
 
 
-def catalogue(lake, table, request, name=None, **facts):
-    """A catalogue as a build job would publish it for a request."""
-    own = {key: value for key, value in universe.wanted(request).items() if key in KEYS[table]}
+def catalogue(lake, table, request, name=None, without=(), **facts):
+    """A catalogue as a build job would publish it for a request; without : keys that an older one had not."""
+    own = {key: value for key, value in universe.wanted(request).items() if key in keys()[table] - {*without}}
     plan = Plan(TABLES[table], {**own, **facts}, (Part(layout.cell_file(5, 1607), {}),))
     publish.make(lake, plan, lambda root, facts: Output(rows_of(TABLES[table], 3)), name=name)
     return read.version(lake, table, plan.key)
 
 
-KEYS = {
-    "galaxies": {"seed", "galaxy_limit", "galaxy_band", "z_max", "box_cells", "lensing_nside"},
-    "stars": {"seed", "star_limit", "density", "brown_dwarf_boost", "plane_limit"},
-}
-
-
 def test_what_shapes_a_catalogue_is_in_the_universe():
     """A key that a build job writes down and this does not know would never be compared."""
     known = universe.wanted(wanted())
-    assert set().union(*KEYS.values()) <= known.keys()
+    assert set().union(*keys().values()) <= known.keys()
     assert not known.keys() & {"rows_a_file", "tycho2", "catalogue", "columns"}
 
 
@@ -69,7 +79,7 @@ def test_another_universe_is_refused_by_what_differs(lake, table, other, words):
 
 @pytest.mark.parametrize("depth", [{"lensing": "none"}, {"rotation": 90.0}])
 def test_a_catalogue_of_before_there_was_the_key(lake, depth):
-    version = catalogue(lake, "galaxies", wanted())
+    version = catalogue(lake, "galaxies", wanted(), without=depth)
     assert not depth.keys() & version.manifest["facts"].keys()
     with pytest.raises(BadInput, match=f"table galaxies has {next(iter(depth))} (None|0.0), the request"):
         universe.refuse_other([version], wanted(**depth))
@@ -84,8 +94,8 @@ def test_files_are_compared_by_what_they_hold(lake, tmp_path):
     for path, text in ((file, "1"), (same, "1"), (other, "2")):
         path.write_text(text)
 
-    def request(path):
-        return replace(wanted(), ingest=Ingest(galaxies=Catalogue((path,), "euclid")))
+    def request(*paths):
+        return replace(wanted(), ingest=Ingest(galaxies=Catalogue(paths, "euclid")))
 
     version = catalogue(lake, "galaxies", wanted(), ingest={"sha256": [file_sha256(file)], "format": "euclid"})
     for path in (file, same):
@@ -94,8 +104,51 @@ def test_files_are_compared_by_what_they_hold(lake, tmp_path):
         universe.refuse_other([version], request(other))
     with pytest.raises(BadInput, match="table galaxies has files of ingest, the request none"):
         universe.refuse_other([version], wanted())
+    # One more, or one fewer, is another catalogue.
+    with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
+        universe.refuse_other([version], request(file, other))
+    two = catalogue(lake, "galaxies", wanted(), ingest={"sha256": [file_sha256(f) for f in (file, other)]})
+    with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
+        universe.refuse_other([two], request(file))
     file.unlink()
     universe.refuse_other([version], request(file))
+
+
+def test_files_are_compared_by_how_they_are_read(lake, tmp_path):
+    (file := tmp_path / "file.csv").write_text("1")
+    sums = {"sha256": [file_sha256(file)]}
+
+    def request(columns, form="euclid", **kind):
+        given = Catalogue((file,), form, (("z_true", columns),))
+        return replace(wanted(), ingest=Ingest(**{kind.get("kind", "galaxies"): given}))
+
+    about = {**sums, "format": "euclid", "columns": {"z_true": '"z"'}}
+    version = catalogue(lake, "galaxies", wanted(), ingest=about)
+    universe.refuse_other([version], request('"z"'))
+    with pytest.raises(BadInput, match="table galaxies has format of ingest euclid, the request flagship2: run"):
+        universe.refuse_other([version], request('"z"', "flagship2"))
+    with pytest.raises(BadInput, match=r"table galaxies has columns of ingest .*, the request .*zz"):
+        universe.refuse_other([version], request('"zz"'))
+    for kind in ("halos", "training"):
+        version = catalogue(lake, "galaxies", wanted(), **{kind: {**sums, "columns": {"z_true": '"z"'}}})
+        universe.refuse_other([version], request('"z"', "", kind=kind))
+        with pytest.raises(BadInput, match=f"table galaxies has columns of {kind} "):
+            universe.refuse_other([version], request('"zz"', "", kind=kind))
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_files_in_pairs_and_others_in_their_folder(lake, tmp_path, listed):
+    names = ("galaxy_1.parquet", "galaxy_flux_1.parquet", "pointsource_1.parquet")
+    for name in names:
+        (tmp_path / name).write_text(name)
+    sums = [file_sha256(tmp_path / name) for name in names[:2]]
+    version = catalogue(lake, "galaxies", wanted(), ingest={"sha256": sums, "format": "skycatalogs", "columns": {}})
+    given = Catalogue((tmp_path / names[0] if listed else tmp_path,), "skycatalogs")
+    request = replace(wanted(), ingest=Ingest(galaxies=given))
+    universe.refuse_other([version], request)
+    (tmp_path / names[1]).write_text("other")
+    with pytest.raises(BadInput, match="other files of ingest"):
+        universe.refuse_other([version], request)
 
 
 def test_dust_is_of_both_catalogues(lake, tmp_path):
