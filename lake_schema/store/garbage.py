@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from lake_schema.errors import BadInput, Damaged, Superseded
@@ -31,9 +31,11 @@ def tables(root: Path) -> list[str]:
     return sorted({path.parent.name for path in root.glob("*/.lock*")} | set(layout.tables(root)))
 
 
-def kept(root: Path) -> dict[str, set[str]]:
+def kept(root: Path, known: Mapping[str, set[str]] | None = None) -> dict[str, set[str]]:
     """Table -> keys of the versions that stay.
 
+    root   : of the lake
+    known  : what this said before; only the manifests of other versions are read, and what stayed stays
     Errors : Damaged where a version that stays is missing or its manifest broken: what it was made of is not known
     """
     links = [(name, layout.current_key(root, name), layout.current(root, name)) for name in layout.tables(root)]
@@ -43,7 +45,7 @@ def kept(root: Path) -> dict[str, set[str]]:
     for name, key, link in links:
         if key is not None and not layout.version(root, name, key).exists():
             raise Damaged(f"{link} leads to v-{key}, which is missing: nothing is removed")
-    found: dict[str, set[str]] = defaultdict(set)
+    found: dict[str, set[str]] = defaultdict(set, {name: set(keys) for name, keys in (known or {}).items()})
     waiting = [(name, key) for name, key, _ in links if key is not None]
     there = tables(root)
     while waiting:
@@ -65,19 +67,27 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
     chosen = there if name is None else [layout.table(root, name).name]
     if not set(chosen) <= set(there):
         raise BadInput(f"lake {root} has no table {name}")
+    stays = kept(root)
     if not delete:
-        stays = kept(root)
         return [path for one in chosen for path in _left_over(root, one, stays[one])]
+    # What a death has left must not be in the way of a version that was made again since.
+    removed = _emptied(root, chosen)
     with contextlib.ExitStack() as stack:
-        # Nobody publishes while it is decided.
+        # Nobody publishes while it is decided: what has been linked since is looked at, and little else.
         for one in there:
             stack.enter_context(locks.table(layout.table(root, one)))
-        stays = kept(root)
-        removed = [path for one in chosen for path in _taken(root, one, stays[one])]
-    for one in chosen:
-        for path in layout.table(root, one).glob(_GONE):
-            shutil.rmtree(path, ignore_errors=True)
+        stays = kept(root, stays)
+        removed += [path for one in chosen for path in _taken(root, one, stays[one])]
+    _emptied(root, chosen)
     return removed
+
+
+def _emptied(root: Path, chosen: Iterable[str]) -> list[Path]:
+    """Remove what is on its way out of some tables."""
+    gone = [path for one in chosen for path in sorted(layout.table(root, one).glob(_GONE))]
+    for path in gone:
+        shutil.rmtree(path, ignore_errors=True)
+    return gone
 
 
 def _left_over(root: Path, name: str, stays: set[str]) -> list[Path]:
@@ -91,8 +101,6 @@ def _left_over(root: Path, name: str, stays: set[str]) -> list[Path]:
 def _taken(root: Path, name: str, stays: set[str]) -> Iterator[Path]:
     """Give what can go another name; stages that a run is working on stay."""
     folder = layout.table(root, name)
-    for path in sorted(folder.glob(_GONE)):
-        yield path
     for key in _keys(folder):
         lock = folder / f".lock-{key}"
         with contextlib.suppress(Superseded), locks.held(lock, "in use"):

@@ -13,6 +13,8 @@ from lake_schema.errors import Superseded
 
 # A table's own lock is held for a few renames; how long to wait for another holder, and how often to look, s.
 PATIENCE, _POLL = 10.0, 0.02
+# Who asks whether a lock is held, holds it for a moment; how long to wait for that, s.
+MOMENT = 1.0
 
 
 @contextlib.contextmanager

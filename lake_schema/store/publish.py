@@ -67,7 +67,7 @@ def make(
     folder.mkdir(parents=True, exist_ok=True)
     if name is not None:
         _pin_inputs(root, plan, name)
-    with locks.held(lock, f"table {table}: another run is making version {key}"):
+    with locks.held(lock, f"table {table}: another run is making version {key}", locks.MOMENT):
         if target.exists():
             _refuse_damaged(target, table)
         else:

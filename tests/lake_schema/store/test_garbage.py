@@ -1,6 +1,8 @@
 """What gc may remove: nothing that a name links to, nor what that was made of, however far back."""
 
+import fcntl
 import tempfile
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lake_schema.errors import Damaged
-from lake_schema.store import garbage, layout, locks, names, publish, read
+from lake_schema.store import garbage, layout, locks, manifest, names, publish, read
 from lake_schema.store.plan import Part, Plan
 from tests.universe import PLAIN, plain_plan, plain_work, toy_plan, toy_work
 
@@ -106,6 +108,52 @@ def test_a_stage_in_use_is_neither_said_nor_removed(lake):
         assert garbage.collect(lake) == garbage.collect(lake, delete=True) == []
     assert garbage.collect(lake) == garbage.collect(lake, delete=True) == [stage]
     assert not stage.exists()
+
+
+def test_nobody_waits_while_manifests_are_read(lake, monkeypatch):
+    """A lake of many versions takes longer to read than a run that publishes waits."""
+    for seed in (1, 2):
+        publish.make(lake, plain_plan(seed), plain_work, name="a")
+    load, held = manifest.load, []
+
+    def watched(*args):
+        held.append(locks.is_held(lake / "plain" / ".lock"))
+        return load(*args)
+
+    monkeypatch.setattr(manifest, "load", watched)
+    assert garbage.collect(lake, delete=True) == [layout.version(lake, "plain", plain_plan(1).key)]
+    assert held == [False]
+
+
+def test_what_is_published_while_manifests_are_read_stays_with_what_it_was_made_of(lake, monkeypatch):
+    first, second = (plan_of("first", number) for number in (1, 2))
+    for plan in (first, second):
+        publish.make(lake, plan, plain_work)
+    late, load = plan_of("second", 3, [first.key]), manifest.load
+
+    def watched(*args):
+        found = load(*args)
+        monkeypatch.undo()
+        publish.make(lake, late, plain_work)
+        return found
+
+    monkeypatch.setattr(manifest, "load", watched)
+    assert garbage.collect(lake, delete=True) == []
+    assert all(layout.version(lake, plan.table.name, plan.key).exists() for plan in (first, second, late))
+
+
+def test_who_asks_for_a_lock_is_in_nobodys_way(lake):
+    plan = plain_plan(1)
+    lock = layout.table(lake, "plain") / f".lock-{plan.key}"
+    lock.parent.mkdir()
+    with lock.open("a") as stream:
+        # What is_held does, for longer than it does.
+        fcntl.flock(stream.fileno(), fcntl.LOCK_EX)
+        timer = threading.Timer(0.2, fcntl.flock, (stream.fileno(), fcntl.LOCK_UN))
+        timer.start()
+        publish.make(lake, plan, plain_work)
+        timer.join()
+    assert read.version(lake, "plain").num_rows == 60
 
 
 def test_a_name_that_is_removed_by_hand_keeps_nothing(lake):
