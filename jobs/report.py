@@ -88,7 +88,8 @@ def _forecast(root: Path, factor: float) -> dict[str, tuple[float, float]]:
     # By what shapes their bytes: what two requests share is rendered once.
     own: dict[bytes, dict[str, Any]] = {}
     try:
-        for name in names.names(root) or [None]:
+        requests: list[str | None] = [*names.names(root)]
+        for name in requests or [None]:
             products = (
                 read.published_last(root, "products") if name is None else read.for_request(root, "products", name)
             )

@@ -75,7 +75,8 @@ def of_lake(lake: Path, factor: float = 1.0) -> list[Line]:
     """
     found: dict[str, Line] = {}
     counted: set[tuple[str, str]] = set()
-    for request in names.names(lake) or [None]:
+    requests: list[str | None] = [*names.names(lake)]
+    for request in requests or [None]:
         held = {name: version for name in _TABLES if (version := _held(lake, name, request))}
         new = {(name, version.key) for name, version in held.items()} - counted
         for line in _of_versions(held, factor, {name for name, _ in new}):
