@@ -112,11 +112,11 @@ def _run(query: Query, opened: Mapping[str, Opened], memory: int, parameters: di
     }
     datasets = {n: rows.dataset() if isinstance(rows, read.Version) else rows for n, rows in opened.items()}
     with duckdb.connect(":memory:", config=config) as session:
-        for name, rows in datasets.items():
-            _registered(session, name, rows)
-        for command in (*_MACROS, *_LOCKS):
-            session.execute(command)
         try:
+            for name, rows in datasets.items():
+                _registered(session, name, rows)
+            for command in (*_MACROS, *_LOCKS):
+                session.execute(command)
             relation = session.sql(query.text, params=parameters or None)
             if relation is None:
                 raise BadInput("SQL: gives no rows")

@@ -108,6 +108,8 @@ __all__ = ["Area", "Override", "Request", "parse"]
 _MOST_VARIANTS = 10_000
 _LARGEST_SEED = 2**63 - 1
 _ALL = "all"
+# A request's tables are a schema of its name in SQL (jobs/explore), where these have a meaning of their own.
+_TAKEN = ("information_schema", "main", "memory", "pg_catalog", "system", "temp")
 
 
 def parse(path: Path) -> Request:
@@ -123,6 +125,13 @@ def parse(path: Path) -> Request:
         return from_table(table, path.resolve().parent)
     except BadInput as error:
         raise BadInput(f"request {user_files.shown(path)}: {error}") from None
+
+
+def _name(table: Toml) -> str:
+    found = layout.name(_string(table, "name"))
+    if found in _TAKEN:
+        raise BadInput(f"name = {found!r} has a meaning of its own in SQL, with {', '.join(_TAKEN)}: take another")
+    return found
 
 
 def from_table(table: Toml, folder: Path = Path()) -> Request:
@@ -153,7 +162,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     bodies = files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
     universe = _universe(_section(table, "universe", set(Universe.__slots__)))
     request = Request(
-        name=layout.name(_string(table, "name")),
+        name=_name(table),
         seed=_integer(table, "seed", 0, _LARGEST_SEED),
         accuracy=_accuracy(table.get("accuracy"), "accuracy"),
         area=areas.parse(_section(table, "area", None)),

@@ -28,6 +28,8 @@ BAD = [
     ("pointing.realisations", 1.0, r"pointing\[0\].realisations"),
     ("name", "../x", "name"),
     ("name", 5, "name"),
+    *(("name", name, f"name = '{name}' has a meaning") for name in ("main", "temp", "system", "memory", "pg_catalog")),
+    ("name", "information_schema", "name = 'information_schema' has a meaning of its own in SQL"),
     ("accuracy", "sloppy", "accuracy"),
     ("accuracy", {"flux": 0.0, "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
     ("accuracy", {"flux": -1.0, "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
