@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import BadInput, OutOfRange
 
 DEEPEST = 29
@@ -50,6 +50,13 @@ def wrapped(angle: npt.ArrayLike) -> Float:
     # A tiny negative angle rounds up to exactly 360.
     within: Float = np.where(turned >= 360.0, 0.0, turned)[()]
     return within
+
+
+def position_angle(angle: npt.ArrayLike) -> Float32:
+    """Position angles [any shape] deg of axes -> float32, the same in [0, 180)."""
+    turned = np.mod(np.asarray(angle), 180.0).astype(np.float32)
+    # What lies below 180 by less than float32 tells, as tiny negative angles do, rounds up to it.
+    return np.where(turned >= 180.0, np.float32(0.0), turned)
 
 
 def _first(values: Float) -> float:

@@ -79,7 +79,7 @@ def load(own: GivenSources, area: Area, planned: Json | None = None) -> Given:
         found = _on_grid(found, area, own.spacing)
     _refuse_caustics(own.galaxies, found["galaxies"])
     for file, values in zip((own.galaxies, own.stars), found.values(), strict=True):
-        values["ra"] = np.mod(values["ra"], 360.0)
+        values["ra"] = sky.wrapped(values["ra"])
         cell = sky.cell_of(values["ra"], values["dec"], GENERATION_ORDER)
         outside = ~np.isin(cell, area.cells(GENERATION_ORDER))
         if outside.any():

@@ -5,7 +5,7 @@ import healpy as hp
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from lake_schema import sky
@@ -101,6 +101,17 @@ def test_a_wrapped_angle_is_below_a_full_turn(angle):
     for given_angle in (angle, -1e-300, np.float64(-1e-14)):
         assert 0.0 <= sky.wrapped(given_angle) < 360.0
     assert np.sin(np.radians(sky.wrapped(angle))) == pytest.approx(np.sin(np.radians(angle)), abs=1e-9)
+
+
+@given(st.floats(-1e4, 1e4), st.sampled_from([np.float32, np.float64]))
+@example(-1e-9, np.float32)
+@example(-1e-9, np.float64)
+@example(179.9999999, np.float64)
+def test_a_position_angle_is_below_half_a_turn(angle, kind):
+    found = sky.position_angle(np.array([angle], kind))
+    assert found.dtype == np.float32
+    assert 0.0 <= found[0] < 180.0
+    assert np.sin(np.radians(2.0 * (found[0] - float(kind(angle))))) == pytest.approx(0.0, abs=1e-4)
 
 
 @given(RA, DEC)

@@ -30,7 +30,7 @@ from jobs.catalogue.halos.population import SATELLITE
 from jobs.fluxes import cosmology, sources
 from jobs.fluxes.libraries import templates
 from jobs.rng import stream
-from lake_schema import ids
+from lake_schema import ids, sky
 from lake_schema.arrays import Array, Bool, Float, Float32, Int
 from lake_schema.errors import BadInput
 from lake_schema.tables.galaxies import GALAXIES
@@ -190,7 +190,7 @@ def _lensing(given: Given, n: int) -> dict[str, Array]:
     zeros = np.zeros(n)
     ra, dec = (given.get(f"{name}_lensed", given[name]) for name in ("ra", "dec"))
     shear = {name: given.get(name, zeros) for name in ("kappa", "gamma1", "gamma2")}
-    return {"ra_lensed": np.mod(ra, 360.0), "dec_lensed": dec, **shear}
+    return {"ra_lensed": sky.wrapped(ra), "dec_lensed": dec, **shear}
 
 
 def _seen(given: Given, universe: IngestModel, lens: Mapping[str, Array], a_v: Float) -> Float | None:
@@ -269,6 +269,6 @@ def _shapes(
         "bulge_axis_ratio": given.get("bulge_axis_ratio", morphology.bulge_axis_ratio(shapes.bulge, n, rng)),
         "disk_axis_ratio": thin,
         "inclination": given.get("inclination", morphology.inclination(thin, shapes.scale_height)),
-        "position_angle": np.mod(given.get("position_angle", morphology.position_angle(n, rng)), 180.0),
+        "position_angle": sky.position_angle(given.get("position_angle", morphology.position_angle(n, rng))),
     }
     return {name: np.asarray(values, np.float64) for name, values in found.items()}

@@ -158,7 +158,7 @@ def turned(rows: pa.Table, angle: float) -> pa.Table:
     if angle % 180.0 == 0.0:
         return rows
     number = rows.schema.get_field_index("position_angle")
-    angles = np.mod(rows["position_angle"].to_numpy() + angle, 180.0)
+    angles = sky.position_angle(rows["position_angle"].to_numpy() + angle)
     field = rows.schema.field(number)
     return rows.set_column(number, field, pa.array(angles, field.type))
 

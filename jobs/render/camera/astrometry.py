@@ -24,6 +24,7 @@ from jobs import sums
 from jobs.render.camera import distortion, pointing
 from jobs.render.camera.detectors import Detector
 from jobs.render.camera.pointing import ARCSEC
+from lake_schema import sky
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 
@@ -68,7 +69,7 @@ def _crpix(system: WCS) -> Float:
 def sky_of_pixel(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
     """0-based pixel coordinates [n] -> ra [n] in [0, 360), dec [n], deg."""
     ra, dec = system.all_pix2world(np.asarray(column, float), np.asarray(row, float), 0)
-    return np.mod(ra, 360.0), np.asarray(dec)
+    return sky.wrapped(ra), np.asarray(dec)
 
 
 def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import healpy as hp
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -205,3 +206,8 @@ def test_a_rotation_by_90_degrees_turns_the_intrinsic_ellipticity_alone(drawn_wi
 
 def test_requests_are_refused_where_ellipses_are_not_drawn():
     assert lensing.settings().caustic < 1.0 - MOST_SHEAR**2
+
+
+def test_an_axis_that_is_turned_by_next_to_nothing_stays_below_half_a_turn():
+    rows = pa.table({"position_angle": pa.array([0.0, 90.0], pa.float32())})
+    assert lensing.turned(rows, -1e-9)["position_angle"].to_pylist() == [0.0, 90.0]
