@@ -7,7 +7,6 @@ ldac   FITS_LDAC as SCAMP reads it (ASTREF_CATALOG FILE), with its own names of 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -85,14 +84,9 @@ def export(
     elif path.suffix.lower() == ".fits":
         table_to_fits(path, pa.concat_tables([part.select(declared.names) for part in parts]), declared)
     else:
-        temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
-        try:
-            with csv.CSVWriter(temporary, declared.arrow()) as writer:
-                for part in parts:
-                    writer.write_table(_as(part, declared))
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with user_files.staged(path) as temporary, csv.CSVWriter(temporary, declared.arrow()) as writer:
+            for part in parts:
+                writer.write_table(_as(part, declared))
     return version.num_rows
 
 

@@ -9,7 +9,6 @@ spectra, and takes those of the flux files where it is asked for an LSST band th
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +22,7 @@ import yaml
 from jobs.catalogue.exports import stellar_spectra, tophat
 from jobs.fluxes import cosmology, inputs, passbands
 from jobs.fluxes.spectra.extinction import MILKY_WAY_R_V
-from lake_schema import __version__, sky
+from lake_schema import __version__, sky, user_files
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, names, read
@@ -304,10 +303,6 @@ def _parquet(path: Path, rows: pa.Table, maker: _Maker) -> Path:
 
 
 def _replaced(path: Path, fill: Callable[[Path], Any]) -> Path:
-    temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
-    try:
+    with user_files.staged(path) as temporary:
         fill(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return path

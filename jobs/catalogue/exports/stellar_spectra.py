@@ -7,7 +7,6 @@ magnorm     AB magnitude of each star at 500 nm, before extinction
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import pyarrow as pa
 from jobs.fluxes.calibration import star_scale
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.sources import stars_of
-from lake_schema import units
+from lake_schema import units, user_files
 from lake_schema.arrays import Float
 from lake_schema.units import LIGHT_ANGSTROM_S
 
@@ -39,13 +38,9 @@ def write(folder: Path, library: Library, templates: Sequence[int]) -> list[Path
     written = []
     for k in templates:
         path = folder / file_of(k)
-        temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
         lines = (f"{at:.1f} {value:.7e}" for at, value in zip(wavelength / 10.0, flux[k], strict=True))
-        try:
+        with user_files.staged(path) as temporary:
             temporary.write_text(f"# {library.names[k]}: nm, f_lambda\n" + "\n".join(lines) + "\n", encoding="utf-8")
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
         written.append(path)
     return written
 
