@@ -17,7 +17,6 @@ from pathlib import Path
 from jobs.catalogue.stars import gaia
 from jobs.commands import space
 from jobs.render import plan_exposures
-from jobs.render.planning import preconditions
 from jobs.request import universe
 from jobs.request.from_toml import parse
 from jobs.request.schema import Request
@@ -107,12 +106,12 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
     # Whatever is wrong with the request, or with the room on the disc, is said before the first job runs.
     universe.refuse_others(root, request)
     rendered = wanted[-1].name == IMAGES[-1].name
-    tasks = None
+    plan = None
     if rendered:
-        tasks = preconditions.rendered(*plan_exposures.check(request, root))
+        plan = plan_exposures.check(request, root)
     else:
         plan_exposures.check_catalogues(request)
-    space.check(root, request, tasks)
+    space.check(root, request, plan)
     rows, began = [], time.perf_counter()
     for stage in wanted:
         started = time.perf_counter()

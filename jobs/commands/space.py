@@ -7,29 +7,34 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow as pa
 
+from jobs.fluxes import compute_fluxes
 from jobs.render import catalogue_forecast
+from jobs.render.planning import preconditions
 from jobs.render.planning import tasks as planned
-from jobs.render.products import run_log
+from jobs.request import universe
 from jobs.request.schema import Request
 from lake_schema.errors import BadInput, LakeError
-from lake_schema.store import layout
+from lake_schema.store import layout, read, reuse
+from lake_schema.store.provenance import code_version
 
 _GB = 1e9
 
 
-def check(root: Path, request: Request, tasks: pa.Table | None) -> None:
-    """Refuses a run whose forecast is larger than what is free; what an earlier run left of it is taken off.
+def check(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) -> None:
+    """Refuses a run whose forecast is larger than what is free; what it will take from the lake is taken off.
 
-    tasks : rows of the table `tasks` that have a simulator, None = nothing is rendered
+    plan : rows of the tables `exposures` and `tasks`, None = nothing is rendered
     """
     foreseen = {line.job: line.gb * _GB for line in catalogue_forecast.of_request(request)}
-    if tasks is not None:
-        foreseen["render_exposures"] = sum(row["bytes"] for row in planned.part(tasks, request))
-    total = max(sum(foreseen.values()) - _left(root, request), 0.0)
+    if plan is not None:
+        asked = planned.part(preconditions.rendered(*plan), request)
+        foreseen["render_exposures"] = sum(row["bytes"] for row in asked)
+    total = max(sum(foreseen.values()) - _there(root, request, plan), 0.0)
     free = shutil.disk_usage(next(path for path in (root, *root.parents) if path.exists())).free
     if total > free:
         parts = ", ".join(f"{name} {size / _GB:.2f}" for name, size in foreseen.items())
@@ -39,13 +44,59 @@ def check(root: Path, request: Request, tasks: pa.Table | None) -> None:
         )
 
 
-def _left(root: Path, request: Request) -> float:
-    """Bytes of the versions, whole or in the making, that the last runs of a request of this name made."""
-    keys: dict[str, str] = {}
-    for path in run_log.of_lake(root):
-        with contextlib.suppress(LakeError):
-            first = next(iter(run_log.lines(path)), {})
-            if first.get("request") == request.name:
-                keys[layout.name(first.get("table", ""))] = layout.name(first.get("key", ""))
-    folders = [place(root, *item) for item in keys.items() for place in (layout.version, layout.stage)]
-    return sum(file.stat().st_size for folder in folders for file in folder.rglob("*") if file.is_file())
+def _there(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) -> float:
+    """Bytes that are forecast and will not be written: of the request's tables that stay as they are.
+
+    Of catalogues that are in the making nothing is known, and nothing is taken off.
+    """
+    size = 0.0
+    with contextlib.suppress(LakeError):
+        for folder in _catalogues(root, request):
+            size += _bytes(folder)
+        # No image is kept of catalogues that are not.
+        if plan is not None:
+            size += _images(root, request, *plan)
+    return size
+
+
+def _catalogues(root: Path, request: Request) -> Iterator[Path]:
+    """Versions of the catalogues and their fluxes; LakeError at the first that the request would make anew."""
+    for kind, table in compute_fluxes.CATALOGUES:
+        version = read.for_request(root, table, request.name)
+        universe.refuse_other([version], request)
+        cells = {cell for part in version.manifest["parts"] for cell in part["facts"]["generation_cells"]}
+        if version.manifest["facts"].get("code") != code_version() or cells != set(request.area.cells()):
+            raise BadInput(f"table {table} is not that of the request")
+        yield version.folder
+        plan = compute_fluxes.step_of(kind, root, request).plan
+        yield read.version(root, plan.table.name, plan.key).folder
+    with contextlib.suppress(LakeError):
+        yield read.for_request(root, "halos", request.name).folder
+
+
+def _images(root: Path, request: Request, exposures: pa.Table, tasks: pa.Table) -> float:
+    """Bytes of the images that are asked for and need not be rendered."""
+    # All that renders: seconds that a lake without images need not wait for.
+    from jobs.render import render_exposures
+
+    inputs = render_exposures.inputs_of(root, request)
+    every = preconditions.rendered(exposures, tasks)
+    asked = planned.part(every, request)
+    made = render_exposures.products(root, request, inputs, exposures, every.to_pylist(), asked)
+    wanted = {(task["exposure_id"], task["detector"]) for task in asked}
+    own = [part for part in made.parts if (part.facts["exposure_id"], part.facts["detector"]) in wanted]
+    held = reuse.held(root, "products", request.name)
+    kept = {part.name for part in own if held.get(part.name) == part.facts[reuse.PRODUCT]}
+    # A stage has what was taken as well as what was rendered.
+    return max(_bytes(layout.stage(root, made.table.name, made.key)), _bytes_of(root, request, kept) if kept else 0.0)
+
+
+def _bytes_of(root: Path, request: Request, parts: set[str]) -> float:
+    version = read.for_request(root, "products", request.name)
+    sizes = {entry["path"]: entry["bytes"] for entry in version.manifest["files"]}
+    kept = (part for part in version.manifest["parts"] if part["name"] in parts)
+    return float(sum(sizes[path] for part in kept for path in part["files"]))
+
+
+def _bytes(folder: Path) -> float:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

@@ -48,9 +48,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     Detectors that are not asked for, and that the request's present version has as they would be rendered now, stay:
     a part is added to what there is.
     """
-    inputs = {name: read.for_request(lake, name, request.name) for name in INPUTS}
-    if (lenses := _lenses(lake, request, inputs["galaxies"])) is not None:
-        inputs[LENSES] = lenses
+    inputs = inputs_of(lake, request)
     preconditions.refuse_other_plan(inputs, request)
     exposures = inputs["exposures"].rows()
     every = preconditions.rendered(exposures, inputs["tasks"].rows())
@@ -59,6 +57,31 @@ def steps(lake: Path, request: Request) -> list[Step]:
     for name in ("galaxies", "stars"):
         of_task = [selection.needed(task, catalogue_rows.deflection_of(inputs[name])) for task in places.values()]
         preconditions.refuse_uncovered(inputs[name], {cell for cells in of_task for cell in cells})
+    plan = products(lake, request, inputs, exposures, every.to_pylist(), asked)
+    drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in plan.parts)
+    return [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
+
+
+def inputs_of(lake: Path, request: Request) -> dict[str, read.Version]:
+    """The versions of the tables that a request's images are made of, by name."""
+    inputs = {name: read.for_request(lake, name, request.name) for name in INPUTS}
+    lenses = _lenses(lake, request, inputs["galaxies"])
+    return inputs if lenses is None else {**inputs, LENSES: lenses}
+
+
+def products(
+    lake: Path,
+    request: Request,
+    inputs: Mapping[str, read.Version],
+    exposures: pa.Table,
+    every: Sequence[Json],
+    asked: Sequence[Json],
+) -> Plan:
+    """The plan of the table `products`: what is asked for, and what the request has and keeps.
+
+    lake, request : folder, and what is asked;  inputs : versions of the tables that are read
+    exposures     : rows of the table;  every, asked : rows of the table `tasks`, all and those to be rendered now
+    """
     facts = {
         **common_facts(request, "seed", "noise_seed", "accuracy", "mission", "effects", "truth", "compression"),
         "mission": mission_of(request.mission).fingerprint,
@@ -71,7 +94,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
         facts["bodies"] = ephemeris_files(request.bodies, exposures)
     held = reuse.held(lake, PRODUCTS.name, request.name)
     wanted = {_part_name(task) for task in asked}
-    tasks = _with_held(wanted, every.to_pylist(), exposures, held)
+    tasks = _with_held(wanted, every, exposures, held)
     psfs = psf_files(exposures, tasks)
     keys = product_keys({**facts, "psf": psfs}, exposures, tasks, inputs, mission_of(request.mission))
     parts = tuple(
@@ -82,10 +105,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     if len(parts) < len(tasks):
         stay = {part.name for part in parts}
         psfs = psf_files(exposures, [task for task in tasks if _part_name(task) in stay])
-    facts |= {"psf": psfs} if psfs else {}
-    plan = Plan(PRODUCTS, facts, parts)
-    drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in parts)
-    return [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
+    return Plan(PRODUCTS, {**facts, "psf": psfs} if psfs else facts, parts)
 
 
 def _part_name(task: Json) -> str:

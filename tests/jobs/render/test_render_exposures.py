@@ -20,6 +20,7 @@ from astropy.wcs import WCS
 from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars, build_strong_lenses
 from jobs.catalogue.galaxies import strong_lenses
+from jobs.commands import space
 from jobs.fluxes import compute_fluxes
 from jobs.render import archive, plan_exposures, render_exposures
 from jobs.render.camera import detectors
@@ -363,6 +364,30 @@ def test_a_part_is_added_to_what_the_request_has(rendered):
     assert planned_parts(lake, replace(other, detectors=("R22_S12",))) == [one, one]
     named(lake, other := replace(whole, name="y"), plan_exposures)
     assert planned_parts(lake, replace(other, detectors=("R22_S12",))) == [one, one]
+
+
+def size_of(root, *tables):
+    folders = [layout.current(root, table).resolve() for table in tables]
+    return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
+
+
+def test_what_is_used_again_needs_no_room(rendered):
+    """Catalogues that stay, and those images whose product keys stay; of another request nothing."""
+    lake, whole, files = rendered, wanted(), read.version(rendered, "products").manifest["files"]
+    catalogues = size_of(lake, "halos", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
+    products = sum(entry["bytes"] for entry in files)
+    one = sum(entry["bytes"] for entry in files if "R22_S12" in entry["path"] or "r22_s12" in entry["path"])
+
+    def there(request, limit=None, detectors=()):
+        plan = plan_exposures.plan(lake, request)[1:]
+        return space._there(lake, replace(request, limit=limit, detectors=detectors), plan)
+
+    assert there(whole) == there(wanted(pointings=2)) == catalogues + products
+    assert there(whole, detectors=("R22_S12",)) == catalogues + one
+    assert 0 < one < products
+    assert there(replace(whole, noise_seed=8)) == catalogues
+    assert there(replace(whole, area=replace(whole.area, radius=0.9))) == 0
+    assert there(replace(whole, seed=8)) == 0
 
 
 def test_a_damaged_image_of_an_older_version_is_not_taken(rendered):
