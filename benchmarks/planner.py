@@ -25,7 +25,7 @@ from jobs.fluxes import compute_fluxes
 from jobs.measured import forget_peak, peak_gb
 from jobs.render import plan_exposures, render_exposures
 from jobs.render.exposure import render, rendered, truth_maps, visible_sources
-from jobs.render.planning import speed
+from jobs.render.forecasting import speed
 from jobs.request.from_toml import from_table, parse
 from jobs.request.schema import Request
 from lake_schema import sky

@@ -14,8 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from jobs.render import catalogue_forecast
-from jobs.render.planning import speed
+from jobs.render.forecasting import catalogue_forecast, speed
 from jobs.render.products import run_log
 from lake_schema import __version__, command
 from lake_schema.errors import BadInput, LakeError

@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from jobs.fluxes import compute_fluxes
-from jobs.render import catalogue_forecast
+from jobs.render.forecasting import catalogue_forecast
 from jobs.render.planning import preconditions
 from jobs.render.planning import tasks as planned
 from jobs.request import universe

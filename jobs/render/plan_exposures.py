@@ -13,14 +13,12 @@ import pyarrow as pa
 
 from jobs.catalogue import request_checks
 from jobs.fluxes import inputs
-from jobs.render import catalogue_forecast
+from jobs.render.forecasting import catalogue_forecast, forecast, speed
 from jobs.render.planning import (
-    forecast,
     planned_exposures,
     preconditions,
     psf_files,
     source_counts,
-    speed,
     survey,
     tasks,
     variants,

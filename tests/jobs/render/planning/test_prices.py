@@ -9,7 +9,8 @@ from jobs.accuracy import DRAFT, REFERENCE, SURVEY
 from jobs.render import plan_exposures
 from jobs.render.channels import image_types, registry
 from jobs.render.exposure import truth_maps
-from jobs.render.planning import forecast, prices, speed, unrendered
+from jobs.render.forecasting import forecast, speed
+from jobs.render.planning import prices, unrendered
 from lake_schema.tables.exposures import CHANNELS
 from tests.jobs.render.planning.test_survey import VIS, planned
 

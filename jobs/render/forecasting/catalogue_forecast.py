@@ -195,4 +195,4 @@ def _lines(
 
 @cache
 def _costs() -> dict[str, Any]:
-    return tomllib.loads((files("jobs.render") / "catalogue_costs.toml").read_text(encoding="utf-8"))
+    return tomllib.loads((files("jobs.render.forecasting") / "catalogue_costs.toml").read_text(encoding="utf-8"))

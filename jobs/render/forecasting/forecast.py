@@ -12,8 +12,8 @@ from typing import Any
 
 import pyarrow as pa
 
+from jobs.render.forecasting.speed import Speed
 from jobs.render.planning import unrendered
-from jobs.render.planning.speed import Speed
 
 
 @dataclass(frozen=True, slots=True)

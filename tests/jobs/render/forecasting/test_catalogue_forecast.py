@@ -9,7 +9,7 @@ import pytest
 
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import catalogue_forecast
+from jobs.render.forecasting import catalogue_forecast
 from jobs.request.files import Catalogue, GivenSources, Ingest
 from jobs.request.from_toml import from_table
 from lake_schema.store import layout, publish

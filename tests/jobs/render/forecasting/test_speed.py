@@ -6,7 +6,7 @@ import pytest
 
 from jobs.measured import Measured
 from jobs.render import archive
-from jobs.render.planning import speed
+from jobs.render.forecasting import speed
 from lake_schema.errors import Damaged
 from lake_schema.store import layout, publish
 from lake_schema.store.plan import Output, Part, Plan
