@@ -73,8 +73,8 @@ def check(folder):
     left = left[np.isfinite(left)]
     product = [np.nanmean(residual**2 * weight) for residual, weight, _ in found]
     print(f"blocks: mean {left.mean():.5f}, rms {left.std():.5f}, largest {np.abs(left).max():.5f}; {product}")
-    # The sky's own noise leaves 0.09 % in the mean of four dithers: of many blocks a few lie beyond, beside bright stars
-    # that differ from dither to dither, too.
+    # The noise of the sky leaves 0.09 % in the mean of four dithers: of many blocks a few lie beyond, beside stars
+    # that fall elsewhere in each dither, too.
     assert np.mean(np.abs(left) <= 0.003) >= 0.98
     assert left.std() <= 0.0012
     assert np.mean(product) == pytest.approx(1.0, abs=0.02)
