@@ -231,7 +231,7 @@ def test_a_scale_of_nothing_is_refused(tmp_path, capsys):
 
 def test_an_image_that_the_lake_has_not_is_named(tmp_path, monkeypatch):
     """The lake has its exposure and its detector, not the one on the other."""
-    monkeypatch.setattr(stack.frames_of, "of_lake", lambda root, names, numbers: {("vis", "3-4"): []})
+    monkeypatch.setattr(stack.frames_of, "of_lake", lambda root, names, numbers, request: {("vis", "3-4"): []})
     image = files.read_image(Path(image_file(tmp_path / "a.fits")))
     with pytest.raises(BadInput, match=r"table products has no image of exposure 1, detector 3-4"):
-        stack._frames(tmp_path, [image])
+        stack._frames(tmp_path, [image], None)
