@@ -63,8 +63,11 @@ def blocks(values):
     return np.where(enough, np.nansum(each, axis=(1, 3)) / np.isfinite(each).sum(axis=(1, 3)).clip(1), np.nan)
 
 
-def check(folder):
-    """Of blocks of 64 pixels 98 % within 0.3 % of the sky in the mean of dithers; weight x variance 1 within 2 %."""
+def check(folder, within=1.0):
+    """Blocks of 64 pixels within 0.3 % of the sky in the mean of the dithers; weight times variance 1 within 2 %.
+
+    within : share of the blocks that must be
+    """
     found = list(residuals(folder))
     assert len(found) >= 3
     left = np.mean([blocks(residual) / blocks(sky) for residual, _, sky in found], axis=0)
@@ -73,9 +76,7 @@ def check(folder):
     left = left[np.isfinite(left)]
     product = [np.nanmean(residual**2 * weight) for residual, weight, _ in found]
     print(f"blocks: mean {left.mean():.5f}, rms {left.std():.5f}, largest {np.abs(left).max():.5f}; {product}")
-    # The noise of the sky leaves 0.09 % in the mean of four dithers: of many blocks a few lie beyond, beside stars
-    # that fall elsewhere in each dither, too.
-    assert np.mean(np.abs(left) <= 0.003) >= 0.98
+    assert np.mean(np.abs(left) <= 0.003) >= within
     assert left.std() <= 0.0012
     assert np.mean(product) == pytest.approx(1.0, abs=0.02)
 
@@ -111,7 +112,8 @@ def test_of_two_requests_one_is_named(tmp_path, capsys):
 
 @pytest.mark.nightly
 def test_a_sixteenth_of_a_detector(tmp_path):
-    check(build(tmp_path, 1024, bias=20, dark=3, flat=24))
+    # Noise leaves 0.09 % in the mean of four dithers: of many blocks a few lie beyond 0.3 %, and beside bright stars.
+    check(build(tmp_path, 1024, bias=20, dark=3, flat=24), within=0.98)
 
 
 def test_masters_are_what_the_detector_has(made):
