@@ -149,15 +149,16 @@ def _cells(psf: Psf, weights: Float, block: int) -> Float:
         image = drawn.array / drawn.array.sum(dtype=float)
     else:
         image = np.asarray(transfer.image_of(psf.planes, weights), float)
-    sides = [_shares(length, block) for length in image.shape]
+    samples = SAMPLES if psf.planes is None else psf.planes.samples
+    sides = [_shares(length, block, samples) for length in image.shape]
     out: Float = sums.product(sides[0].T, sums.product(image, sides[1]))
     out[len(out) // 2, len(out) // 2] -= 1.0
     return np.asarray(out)
 
 
-def _shares(length: int, block: int) -> Float:
-    """[samples, nodes] of a line of samples about its middle one."""
-    place = (np.arange(length) - length // 2) / (SAMPLES * block)
+def _shares(length: int, block: int, samples: int) -> Float:
+    """[length, nodes] of a line of samples about its middle one, `samples` of them a pixel."""
+    place = (np.arange(length) - length // 2) / (samples * block)
     node = np.rint(place).astype(int)
     off, pixel = place - node, 1.0 / (12.0 * block**2)
     half = int(np.abs(node).max()) + 2

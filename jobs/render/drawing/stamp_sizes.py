@@ -32,7 +32,7 @@ from jobs.render.drawing import outskirts, wings
 from jobs.render.drawing.settings import Settings
 from jobs.render.effects.scene import NOTICEABLE
 from jobs.render.psf import spikes as psf_spikes
-from jobs.render.psf.model import SIDE, Psf
+from jobs.render.psf.model import Psf
 from jobs.render.sources import galaxy_shapes, selection
 from jobs.render.sources.galaxy_shapes import Shapes
 from jobs.render.sources.source_list import Sources
@@ -112,7 +112,7 @@ def stamp_sizes(
         enough = (electrons[left] * (psf_edge + edge) < settings.edge * noise) & (wrapped < settings.aliased)
         enough &= size * psf.pixel_scale >= least[left]
         # A point has no light beyond the PSF's planes.
-        enough |= ~body & (psf.planes is not None) & (size >= SIDE)
+        enough |= ~body & (psf.planes is not None) & (size >= psf.side)
         found[left[enough]] = size
         left = left[~enough]
     if wider is None:
@@ -140,7 +140,7 @@ def _beyond_the_table(psf: Psf, light: Float, radius: Int) -> Float:
     """psf.surface or psf.rim at any radius, pixels: wings of r^-3 beyond the table, nothing beyond planes."""
     last = len(light) - 1
     wing = light[np.minimum(radius, last)] * (np.minimum(radius, last) / radius) ** 3
-    return np.where((radius < SIDE) | (psf.planes is None), wing, 0.0)
+    return np.where((radius < psf.side) | (psf.planes is None), wing, 0.0)
 
 
 def neglected_flux(electrons: Float, noise: float, settings: Settings) -> Float:
@@ -190,7 +190,7 @@ def has_far_light(electrons: Float, sizes: Int, shape: Int, picture: Int | None,
     shape, picture   : int64[n] as of Sources, -1 of points; picture None: there are none
     """
     point = shape < 0 if picture is None else (shape < 0) & (picture < 0)
-    return np.asarray(point & (sizes >= SIDE) & (electrons > BRIGHT) & (psf.edges is not None))
+    return np.asarray(point & (sizes >= psf.side) & (electrons > BRIGHT) & (psf.edges is not None))
 
 
 def reaches(

@@ -24,7 +24,7 @@ from jobs.render.drawing.kernels import fourier
 from jobs.render.drawing.kernels.frame import BULGE, DISK, accumulate, aliased_light, electrons_of, subtract_aliased
 from jobs.render.drawing.stamp_sizes import BRIGHT, ROUNDING, SIZES
 from jobs.render.drawing.transfer import Transfer
-from jobs.render.psf.model import SIDE, Psf
+from jobs.render.psf.model import Psf
 from jobs.render.sources import galaxy_shapes, selection, sersic
 from jobs.render.sources.galaxy_shapes import Forms, Shapes
 from jobs.render.sources.source_list import Sources
@@ -153,9 +153,10 @@ class _Prepared:
         """A point at rest, or pieces of one trail."""
         sources, first = self.sources, parts[0]
         electrons = float(sources.electrons[parts].sum())
+        photons = None if sources.photons is None else sources.photons[first]
         return far_light.Star(
             float(sources.column[parts].mean()), float(sources.row[parts].mean()), electrons,
-            None if sources.photons is None else sources.photons[first], SIDE, self.left_out[first] * electrons,
+            photons, self.psf.side, self.left_out[first] * electrons,
             self.psf.edges, self.trail[parts].sum(axis=0),
         )  # fmt: skip
 
@@ -207,7 +208,7 @@ def _batches(one: _Prepared, here: Bool, precise: Bool) -> Iterator[tuple[Int, T
                 chosen = together[i : i + batch]
                 yield chosen, shared, one.weights[chosen].astype(np.float32)
         if len(alone):
-            own = transfer.grid(size, float(one.cut[alone].max()) if size > SIDE else one.reach)
+            own = transfer.grid(size, float(one.cut[alone].max()) if size > psf.side else one.reach)
         for i in alone.tolist():
             dtype = np.float64 if precise[i] else np.float32
             seen = transfer.grid(size, float(one.cut[i])) if one.deep[i] else own

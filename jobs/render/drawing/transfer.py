@@ -24,15 +24,15 @@ from jobs import sums
 from jobs.render.drawing import far_light
 from jobs.render.drawing.kernels import fourier
 from jobs.render.effects.light import intra_pixel
-from jobs.render.psf.model import SAMPLES, SIDE, Planes, Psf, galsim_profile, spectrum_of
+from jobs.render.psf.model import SIDE, Planes, Psf, galsim_profile, spectrum_of
 from lake_schema.arrays import Array, Float, Float32, Int
 
 # radian / pixel between the samples of `passing`: those of a stamp of 32 pixels.
 STEP = 2 * np.pi / 32
 # What passes less than this in single precision passes nothing; in double precision that is less than this.
 NOTHING, LEAST = 1e-7, 1e-14
-# Frequencies beyond this are not looked at: twice the Nyquist frequency and a half (a plane has three times); of bright
-# sources through a PSF without planes, which has no last frequency, four times.
+# Frequencies beyond this are not looked at through a PSF without planes, which has no last frequency: two and a half
+# times the Nyquist frequency; of bright sources four times.
 HIGHEST, _HIGHEST_BRIGHT = 2.5 * np.pi, 4.0 * np.pi
 # Samples that the kernel takes together: their planes stay in the cache.
 _TOGETHER = 1024
@@ -133,14 +133,15 @@ def passing(psf: Psf, least: float = NOTHING) -> Float:
     least : below NOTHING of a PSF without planes, for what is drawn in double precision
     """
     bright = least < NOTHING
-    probe = grid(_PROBE, _HIGHEST_BRIGHT if bright else HIGHEST)
+    probe = grid(_PROBE, _HIGHEST_BRIGHT if bright else psf.planes.highest if psf.planes else HIGHEST)
     if psf.planes is None:
         planes = _planes(psf, probe, np.float64 if bright else np.float32)
     else:
         # A smooth edge: a sharp one passes some of every frequency.
-        window = np.hanning(SAMPLES * _PROBE + 1).astype(np.float32)
-        middle = _middle(psf.planes.images, SAMPLES * _PROBE)
-        planes = _on_grid(list(middle * window[:, None] * window), probe, psf.intra_pixel, np.float32)
+        samples = psf.planes.samples
+        window = np.hanning(samples * _PROBE + 1).astype(np.float32)
+        middle = _middle(psf.planes.images, samples * _PROBE)
+        planes = _on_grid(list(middle * window[:, None] * window), samples, probe, psf.intra_pixel, np.float32)
     modulus = np.hypot(planes[:, 0], planes[:, 1]).max(axis=0)
     ring = (np.hypot(probe.kx, probe.ky) / STEP).astype(int)
     rings = np.asarray(maximum(modulus, ring, np.arange(ring.max() + 1)), float)
@@ -162,23 +163,24 @@ def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any], fading: bo
     """
     if psf.planes is None:
         return Transfer(some, _planes(psf, some, dtype))
-    image = _image(psf.planes, weights, SAMPLES * some.size).astype(dtype)
+    samples = psf.planes.samples
+    image = _image(psf.planes, weights, samples * some.size).astype(dtype)
     if fading:
         # A stamp may be wider than the plane, for a trail.
-        left = far_light.left(SIDE, SAMPLES, len(image))
+        left = far_light.left(psf.side, samples, len(image))
         image *= left[:, None] * left
-    return Transfer(some, _on_grid([image], some, psf.intra_pixel, dtype))
+    return Transfer(some, _on_grid([image], samples, some, psf.intra_pixel, dtype))
 
 
 def profile_of(psf: Psf, weights: Float) -> Any:
     """A source's own PSF as a galsim object, arcsec."""
     if psf.planes is None:
         return psf.profile
-    return galsim_profile(image_of(psf.planes, weights), psf.pixel_scale, exact=True)
+    return galsim_profile(image_of(psf.planes, weights), psf.pixel_scale / psf.planes.samples, exact=True)
 
 
 def image_of(planes: Planes, weights: Float) -> Float32:
-    """A source's own PSF in samples of 1 / SAMPLES pixel."""
+    """A source's own PSF in the planes' samples."""
     return _image(planes, weights, planes.images.shape[1])
 
 
@@ -191,7 +193,8 @@ def _planes(psf: Psf, some: Grid, dtype: type[Any]) -> Array:
         _move_out(spectrum, psf, some.size)
         fourier.take(spectrum, some.runs, _pixel(some, psf.intra_pixel), out[0])
         return out
-    return _on_grid([*psf.planes.images, *psf.planes.drift], some, psf.intra_pixel, dtype)
+    images = [*psf.planes.images, *psf.planes.drift]
+    return _on_grid(images, psf.planes.samples, some, psf.intra_pixel, dtype)
 
 
 def _move_out(spectrum: Array, psf: Psf, size: int) -> None:
@@ -221,12 +224,12 @@ def _images(psf: Psf, size: int, x: float, y: float) -> float:
     return float(np.sum(light)) * psf.pixel_scale**2
 
 
-def _on_grid(images: list[Array], some: Grid, strength: float | None, dtype: type[Any]) -> Array:
+def _on_grid(images: list[Array], samples: int, some: Grid, strength: float | None, dtype: type[Any]) -> Array:
     out = np.empty((len(images), 2, len(some.kx)), dtype)
     columns = int(np.rint(np.abs(some.kx).max() * some.size / (2 * np.pi))) + 1
     pixel = _pixel(some, strength)
     for image, plane in zip(images, out, strict=True):
-        fourier.take(_spectrum(image, some.size, columns), some.runs, pixel, plane)
+        fourier.take(_spectrum(image, samples * some.size, columns), some.runs, pixel, plane)
     return out
 
 
@@ -255,13 +258,12 @@ def _middle(images: Float32, side: int) -> Float32:
     return images[:, margin : images.shape[1] - margin, margin : images.shape[2] - margin]
 
 
-def _spectrum(image: Array, size: int, columns: int) -> Array:
-    """Fourier transform of a plane on the grid of a stamp: complex[SAMPLES size, columns], its first columns.
+def _spectrum(image: Array, period: int, columns: int) -> Array:
+    """Fourier transform of a plane on the grid of a stamp of `period` samples: complex[period, columns], the first.
 
     A plane is cut to the stamp: its wings beyond would otherwise come in at the opposite edge. Rows and columns that
     are empty, or not asked for, are not transformed.
     """
-    period = SAMPLES * size
     image = _middle(image[None], period)[0]
     lines = scipy.fft.rfft(_from_middle(image, period, 1), axis=1)[:, :columns]
     return np.asarray(scipy.fft.fft(_from_middle(lines, period, 0), axis=0, overwrite_x=True))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jobs.render.drawing.kernels import frame
-from jobs.render.psf.model import SAMPLES, SIDE, Psf
+from jobs.render.psf.model import SIDE, Psf
 from jobs.render.sources import selection
 from lake_schema.arrays import Float, Float32, Int
 
@@ -38,9 +38,9 @@ def wings(
     out = _layer(nx, ny)
     if psf.planes is None:
         return out / unit
-    cells = _cells(psf.planes.images.mean(axis=0))
+    cells = _cells(psf.planes.images.mean(axis=0), psf.planes.samples)
     x, y = ((at - (BLOCK - 1) / 2) / BLOCK + MARGIN for at in (column, row))
-    for size in np.unique(sizes[sizes < SIDE]):
+    for size in np.unique(sizes[sizes < psf.side]):
         some = sizes == size
         frame.smooth(out, _beyond(cells, int(size)) / BLOCK**2, x[some], y[some], electrons[some], unit)
     return out / unit
@@ -82,9 +82,9 @@ def around(sides: Float) -> Float:
     return sides + 2.0 * _WIDER
 
 
-def _cells(plane: Float32) -> Float:
-    """A plane summed on squares of half a block, an even number of them about its middle."""
-    middle, step = len(plane) // 2, SAMPLES * BLOCK // 2
+def _cells(plane: Float32, samples: int) -> Float:
+    """A plane, `samples` a pixel, summed on squares of half a block, an even number of them about its middle."""
+    middle, step = len(plane) // 2, samples * BLOCK // 2
     count = (middle // step - 1) // 2 * 2 + 1
     kept = slice(middle - count * step, middle + count * step)
     whole = plane[kept, kept].reshape(2 * count, step, 2 * count, step)

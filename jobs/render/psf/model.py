@@ -15,10 +15,11 @@ from jobs.render.psf.spikes import Edges
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.errors import BadInput
 
-# Samples a pixel: the finest optical detail (lambda / D at 540 nm) is 2.8 samples wide; cycles a sample that are more.
+# Samples a pixel of VIS, of files and of profiles: the finest optical detail (lambda / D at 540 nm) is 2.8 samples
+# wide; cycles a sample that are more.
 SAMPLES, DETAIL = 3, 0.4
-# Side of the plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is drawn for bright
-# stars alone (drawing/far_light.py).
+# Largest side of a plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is drawn for
+# bright stars alone (drawing/far_light.py).
 SIDE = 512
 # Side and samples a pixel of the drawing that tells the width.
 _CORE, _FINE = 243, 9
@@ -26,7 +27,7 @@ _CORE, _FINE = 243, 9
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """A PSF by wavelength and place, in samples of 1 / SAMPLES pixel, centred on the middle sample.
+    """A PSF by wavelength and place, centred on the middle sample.
 
     PSF(source) = sum_w photons_w images_w + sum_j x^a_j y^b_j redder^c_j drift_j, (a, b, c) = powers, redder the mean
     wavelength of its photons above that of the planes, A.
@@ -35,6 +36,7 @@ class Planes:
     drift      : float32[d, t, t]; d = 0 for one PSF a detector
     powers     : [d] of x, y and redder
     half       : (columns, rows) half the detector: the unit of x and y
+    samples    : a pixel
     """
 
     wavelength: Float
@@ -42,6 +44,12 @@ class Planes:
     drift: Float32
     half: tuple[float, float]
     powers: tuple[tuple[int, int, int], ...] = ()
+    samples: int = SAMPLES
+
+    @property
+    def highest(self) -> float:
+        """Beyond it nothing is looked at, radian / pixel: a quarter of a cycle a pixel before the samples' last."""
+        return (self.samples - 0.5) * np.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +59,10 @@ class Psf:
     profile     : galsim object, arcsec, detector axes, without the pixel, for flat f_nu at the detector's centre; its
                   flux is what the model keeps of 1
     pixel_scale : arcsec
-    surface     : float64[SIDE / 2] fraction of the flux in a pixel at a distance of r pixels (azimuthal mean)
-    rim         : float64[SIDE / 2] the largest fraction in a pixel at r pixels or more along columns or rows: spikes of
+    surface     : float64[side / 2] fraction of the flux in a pixel at a distance of r pixels (azimuthal mean)
+    rim         : float64[side / 2] the largest fraction in a pixel at r pixels or more along columns or rows: spikes of
                   the pupil's bars rise above the mean
-    outside     : float64[SIDE / 2] fraction of the flux beyond r pixels
+    outside     : float64[side / 2] fraction of the flux beyond r pixels
     fwhm        : arcsec, pixel included
     planes      : by wavelength and place; None where `profile` is all
     intra_pixel : how much less a pixel's edges see than its centre (effects/intra_pixel), 0 = nothing; None: the PSF
@@ -72,6 +80,11 @@ class Psf:
     intra_pixel: float | None = 0.0
     edges: Edges | None = None
 
+    @property
+    def side(self) -> int:
+        """Of its planes, pixels."""
+        return 2 * len(self.surface)
+
 
 def of_colours(psf: Psf, colours: int) -> Psf:
     """The same PSF of so many wavelengths at most: each the mean of neighbours, which are of as many photons."""
@@ -85,13 +98,14 @@ def of_colours(psf: Psf, colours: int) -> Psf:
     return replace(psf, planes=replace(planes, wavelength=wavelength, images=images))
 
 
-def galsim_profile(image: Array, pixel_scale: float, exact: bool = False) -> galsim.GSObject:
+def galsim_profile(image: Array, sampling: float, exact: bool = False) -> galsim.GSObject:
     """A plane as a galsim object, arcsec.
 
+    sampling : arcsec between its samples
     exact : for the reference, between samples all but their Fourier series: what galsim's quintic makes of them is
             1e-4 wrong in the middle of steep bulges
     """
-    sampled = galsim.Image(np.asarray(image, float), scale=pixel_scale / SAMPLES)
+    sampled = galsim.Image(np.asarray(image, float), scale=sampling)
     # A plane that is empty at its border needs little padding; its extent in real and Fourier space is known.
     return galsim.InterpolatedImage(
         sampled,
@@ -103,28 +117,37 @@ def galsim_profile(image: Array, pixel_scale: float, exact: bool = False) -> gal
     )
 
 
-def sampled(planes: Planes, pixel_scale: float, has_pixel: bool) -> Psf:
-    """A PSF of planes; has_pixel : the detector's pixel is in them."""
+def sampled(planes: Planes, pixel_scale: float, has_pixel: bool, side: int = SIDE) -> Psf:
+    """A PSF of planes.
+
+    pixel_scale : arcsec;  has_pixel : the detector's pixel is in them
+    side        : of a point's largest stamp through them, pixels
+    """
     mean = planes.images.mean(axis=0, dtype=float)
-    return tabulated(galsim_profile(mean, pixel_scale), pixel_scale, planes, has_pixel)
+    return tabulated(galsim_profile(mean, pixel_scale / planes.samples), pixel_scale, planes, has_pixel, side)
 
 
 def tabulated(
-    profile: galsim.GSObject, pixel_scale: float, planes: Planes | None = None, has_pixel: bool = False
+    profile: galsim.GSObject,
+    pixel_scale: float,
+    planes: Planes | None = None,
+    has_pixel: bool = False,
+    side: int = SIDE,
 ) -> Psf:
     """With azimuthal means, and the largest values, of the profile sampled on pixels.
 
     profile     : of the PSF;  pixel_scale : arcsec;  planes : to draw through, None: the profile
     has_pixel   : whether the profile is averaged over a pixel already
+    side        : pixels as far as which it is tabulated, twice
     """
-    image = profile.drawImage(nx=SIDE + 1, ny=SIDE + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
-    grid = np.arange(SIDE + 1) - SIDE // 2
+    image = profile.drawImage(nx=side + 1, ny=side + 1, scale=pixel_scale, method="no_pixel", dtype=float).array
+    grid = np.arange(side + 1) - side // 2
     ring = np.rint(np.hypot(*np.meshgrid(grid, grid))).astype(int)
-    inside = ring < SIDE // 2
+    inside = ring < side // 2
     total = np.bincount(ring[inside], image[inside])
     surface = np.maximum(total / np.bincount(ring[inside]), 0.0)
     square = np.maximum(*np.meshgrid(np.abs(grid), np.abs(grid)))
-    around = np.asarray(maximum(image, square, np.arange(SIDE // 2)))
+    around = np.asarray(maximum(image, square, np.arange(side // 2)))
     rim = np.maximum(np.maximum.accumulate(around[::-1])[::-1], 0.0)
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
     core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / _FINE, method="no_pixel", dtype=float)

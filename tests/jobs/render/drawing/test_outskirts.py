@@ -211,7 +211,7 @@ def test_what_comes_into_a_stamp_is_the_light_of_all_images(index, ratio, angle,
 @given(st.integers(1, 60), st.sampled_from([4, 8]), st.floats(-4.0, 4.0), st.floats(-40.0, 40.0))
 def test_samples_on_nodes_keep_what_any_quartic_sees(half, block, curve, slope):
     """Of a sample spread over a pixel: its mean on the nodes is its mean on the sky."""
-    shares = outskirts._shares(2 * half + 1, block)
+    shares = outskirts._shares(2 * half + 1, block, SAMPLES)
     nodes = block * (np.arange(shares.shape[1]) - shares.shape[1] // 2)
     seen = np.linspace(-0.5, 0.5, 2001)
     at = (np.arange(-half, half + 1) / SAMPLES)[:, None] + 0.5 * (seen[1:] + seen[:-1])

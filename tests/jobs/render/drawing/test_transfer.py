@@ -23,7 +23,7 @@ def planes_psf(widths=(0.09, 0.13), place=0.0):
     images = np.stack([image / image.sum() for image in images]).astype(np.float32)
     drift = (place * (images[1] - images[0]))[None]
     planes = Planes(np.array([6000.0, 8000.0])[: len(widths)], images, drift, (79.5, 79.5), ((1, 0, 0),))
-    return model.tabulated(model.galsim_profile(images.mean(axis=0), 0.1), 0.1, planes)
+    return model.tabulated(model.galsim_profile(images.mean(axis=0), 0.1 / SAMPLES), 0.1, planes)
 
 
 def test_places_on_a_detector_are_in_units_of_its_own_sides():
