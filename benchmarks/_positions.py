@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,10 +63,8 @@ def optics() -> Callable[[tuple[float, float]], Float]:
             *euclid._field(detector, sign * place[0], sign * place[1], mission), detector.section, mission
         )
         scale = detector.pixel_scale / model.SAMPLES
-        size = euclid._CORE_TRANSFORM, euclid._CORE_SIDE
-        planes = [
-            euclid._plane(nm, float(w), *size, scale, blur, mission) for w, blur in zip(waves, blurs, strict=True)
-        ]
+        core = replace(euclid.VIS, transform=euclid.VIS.core_transform, side=euclid.VIS.core_side)
+        planes = [euclid._plane(nm, float(w), core, scale, blur, mission) for w, blur in zip(waves, blurs, strict=True)]
         return np.stack(planes).astype(float)[:, ::sign, ::sign]
 
     return at

@@ -1,9 +1,9 @@
-"""The point-spread function of Euclid VIS: the optics from their pupil, jitter and charge diffusion.
+"""The point-spread function of Euclid's cameras: the optics from their pupil, jitter and charge diffusion.
 
 Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), without the pixel, centred on the
 chief ray (coma moves the centroid by a few mas).
 
-vis_psf            -> Psf;  vis_edges : its diffraction far from a star
+vis_psf, nisp_psf     -> Psf;  vis_edges, nisp_edges : their diffraction far from a star
 pupil, wavefront   the parts of the model
 """
 
@@ -30,10 +30,26 @@ from jobs.render.psf.sub_bands import sub_bands
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.mission.configuration import MissionConfiguration
 
-# Side of the optical transform, samples; the 0.15 % of the light beyond its border is absent.
-_TRANSFORM = 2048
-# The same for what changes across a detector: the core alone.
-_CORE_TRANSFORM, _CORE_SIDE = 768, 160
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """How the PSF of a camera is computed.
+
+    samples         : a pixel;  side : of its planes, pixels
+    transform       : side of the optical transform, samples; the light beyond its border is absent (VIS: 0.15 %)
+    core_transform, core_side : the same, samples and pixels, for what changes across a detector: the core alone
+    """
+
+    samples: int
+    side: int
+    transform: int
+    core_transform: int
+    core_side: int
+
+
+VIS = Sampling(SAMPLES, SIDE, 2048, 768, 160)
+# The optics reach 1.84 cycles a pixel in Y: 0.37 a sample.
+NISP = Sampling(5, 256, 2048, 768, 96)
 # Of the drift, by the number of positions: degree in place of the mean PSF, and of its slope with wavelength.
 DEGREES = {1: (0, 0), 4: (1, 0), 9: (2, 1), 25: (4, 2)}
 _ARCSEC = np.pi / 180.0 / 3600.0
@@ -47,16 +63,39 @@ def vis_psf(detector: Detector, band: Passband, mission: MissionConfiguration, p
     Error     : second moments 2e-4 from the number of wavelengths; across the detector as measured (psf_positions.csv)
     Ref       : pupil, Liaudat et al. 2023; wavefront and diffusion, the mission database
     """
-    found = model.sampled(_vis_planes(detector, band, mission, positions), detector.pixel_scale, has_pixel=False)
-    return replace(found, edges=vis_edges(detector, band, mission))
+    return _psf(VIS, detector, band, mission, positions)
+
+
+def nisp_psf(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int = 9) -> Psf:
+    """The Euclid PSF of a NISP detector: optics, and pointing jitter with what else blurs.
+
+    detector, band, mission, positions : as of vis_psf
+    Ref       : pupil, Liaudat et al. 2023; wavefront, the mission database
+    """
+    return _psf(NISP, detector, band, mission, positions)
 
 
 def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
-    """What shines beyond the planes of the Euclid PSF."""
+    """What shines beyond the planes of the PSF of VIS."""
+    return _edges(VIS, detector, band, mission)
+
+
+def nisp_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
+    """What shines beyond the planes of the PSF of NISP."""
+    return _edges(NISP, detector, band, mission)
+
+
+def _psf(sampling: Sampling, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
+    planes = _planes(sampling, detector, band, mission, positions)
+    found = model.sampled(planes, detector.pixel_scale, has_pixel=False, side=sampling.side)
+    return replace(found, edges=_edges(sampling, detector, band, mission))
+
+
+def _edges(sampling: Sampling, detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
     parts = sub_bands(band)
     waves = np.concatenate([part.wavelength for part in parts])
     blur = float(np.sqrt(np.mean(_blur_variances(detector, float(waves.mean()), mission))))
-    return spikes.of_pupil(parts, blur, detector.pixel_scale, _TRANSFORM / SAMPLES, mission)
+    return spikes.of_pupil(parts, blur, detector.pixel_scale, sampling.transform / sampling.samples, mission)
 
 
 # ------------------------------------------------------------------------------------------------ the optics
@@ -101,14 +140,17 @@ def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -
     return nm * mission.value(f"{section}.psf.wavefront_scale")
 
 
-def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Planes:
+def _planes(
+    sampled: Sampling, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
+) -> Planes:
+    section = detector.section
     parts = sub_bands(band)
     # Second moments of diffraction go with the square of the wavelength.
     waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
     nodes, powers = _nodes(positions), _powers(positions)
-    places = ((0.0, 0.0), *nodes)
-    coefficients = [wavefront(*_field(detector, *place, mission), detector.section, mission) for place in places]
-    sampling = detector.pixel_scale / SAMPLES
+    places = [_field(detector, *place, mission) for place in ((0.0, 0.0), *nodes)]
+    coefficients = [wavefront(*place, section, mission) for place in places]
+    sampling = detector.pixel_scale / sampled.samples
     blurs = [_blur_variances(detector, float(wavelength), mission) for wavelength in waves]
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
     key = cache.content_key(
@@ -121,23 +163,22 @@ def _vis_planes(detector: Detector, band: Passband, mission: MissionConfiguratio
 
     def make() -> dict[str, Array]:
         centre = [
-            _plane(coefficients[0], w, _TRANSFORM, SIDE, sampling, blur, mission)
-            for w, blur in zip(waves, blurs, strict=True)
+            _plane(coefficients[0], w, sampled, sampling, blur, mission) for w, blur in zip(waves, blurs, strict=True)
         ]
         # Of the drift, a part in a hundred of the light, the mean's blur is blur enough.
         blur = tuple(np.mean(blurs, axis=0).tolist())
         return {
             "images": np.stack(centre).astype(np.float32),
-            "drift": _drift(coefficients, positions, waves, sampling, blur, mission).astype(np.float32),
+            "drift": _drift(coefficients, positions, waves, sampled, sampling, blur, mission).astype(np.float32),
         }
 
-    arrays = cache.cached_arrays("vis_psf", key, make)
+    arrays = cache.cached_arrays(f"{section}_psf", key, make)
     turned = slice(None, None, -1 if detector.upside_down else 1)
     # Upside down, both the planes and the places that the drift is written in are turned.
     sign = np.array([(-1) ** (i + j) for i, j, _ in powers], np.float32)[:, None, None]
     drift = arrays["drift"][:, turned, turned] * (sign if detector.upside_down else np.float32(1.0))
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
-    return Planes(waves, arrays["images"][:, turned, turned], drift, half, powers)
+    return Planes(waves, arrays["images"][:, turned, turned], drift, half, powers, sampled.samples)
 
 
 def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> tuple[float, float]:
@@ -153,9 +194,12 @@ def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration
 def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfiguration) -> tuple[float, float]:
     """Variance along x and y, arcsec2: pointing jitter, and charge diffusion.
 
-    Charge spreads wider of blue light (A), and the wider the thicker the detector is.
+    Charge spreads wider of blue light (A), and the wider the thicker the detector is; in the pixels of NISP it stays.
     """
     section = detector.section
+    if section == "nisp":
+        jitter = mission.value("nisp.psf.jitter", "arcsec")
+        return jitter**2, jitter**2
     redder = 0.1 * wavelength / mission.value(f"{section}.diffusion_wavelength", "nm")
     wider = redder ** mission.value(f"{section}.diffusion_slope") * _thickness(detector, mission)
     diffusion = wider * mission.value(f"{section}.diffusion_sigma", "pix") * detector.pixel_scale
@@ -192,20 +236,21 @@ def _drift(
     coefficients: Sequence[Float],
     positions: int,
     waves: Float,
+    sampled: Sampling,
     sampling: float,
     blur: tuple[float, float],
     mission: MissionConfiguration,
 ) -> Float:
     """Planes of Planes.drift in the focal plane's axes, by least squares; coefficients: of the centre and the nodes."""
     powers, weights = _powers(positions), _weights_of(blur, sampling)
-    side = _CORE_SIDE * SAMPLES + 1
+    side = sampled.core_side * sampled.samples + 1
     if not powers:
         return np.zeros((0, side, side))
     side += 2 * _margin(weights)
     mean, slope = np.zeros((2, len(coefficients), side, side))
     redder = (waves - waves.mean()) / np.sum((waves - waves.mean()) ** 2)
     for wavelength, tilt in zip(waves, redder, strict=True):
-        optics = _optics(float(wavelength), sampling, mission, _CORE_TRANSFORM)
+        optics = _optics(float(wavelength), sampling, mission, sampled.core_transform)
         for i, nm in enumerate(coefficients):
             image = _diffracted(nm, optics, side)
             mean[i] += image / len(waves)
@@ -223,13 +268,13 @@ def _drift(
 
 
 def _plane(
-    nm: Float, wavelength: float, transform: int, side: int, sampling: float, blur: tuple[float, float],
+    nm: Float, wavelength: float, sampled: Sampling, sampling: float, blur: tuple[float, float],
     mission: MissionConfiguration,
 ) -> Float32:  # fmt: skip
-    """One wavelength's PSF: [side * SAMPLES + 1] square, in the focal plane's axes."""
+    """One wavelength's PSF: [side * samples + 1] square, in the focal plane's axes."""
     weights = _weights_of(blur, sampling)
-    optics = _optics(wavelength, sampling, mission, transform)
-    return _blurred(_diffracted(nm, optics, side * SAMPLES + 1 + 2 * _margin(weights)), weights)
+    optics = _optics(wavelength, sampling, mission, sampled.transform)
+    return _blurred(_diffracted(nm, optics, sampled.side * sampled.samples + 1 + 2 * _margin(weights)), weights)
 
 
 def _blurred(image: Array, weights: tuple[Float, Float]) -> Float32:
