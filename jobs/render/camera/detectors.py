@@ -65,11 +65,9 @@ def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...
     """
     if camera == "vis":
         _refuse_odd("vis", mission)
-        planned = _grid(mission, "vis", lambda row, column: column >= _VIS_FIRST_ROTATED_COLUMN)
-        bending = distortion.terms("vis", mission)
-        return tuple(replace(d, bending=bending) for d in _mounted(planned, "vis", mission))
+        return _of_grid("vis", lambda row, column: column >= _VIS_FIRST_ROTATED_COLUMN, mission)
     if camera == "nisp":
-        return tuple(_grid(mission, "nisp", lambda row, column: row >= _NISP_FIRST_ROTATED_ROW))
+        return _of_grid("nisp", lambda row, column: row >= _NISP_FIRST_ROTATED_ROW, mission)
     if camera in CAMERAS:
         return _listed(f"ext.{camera}", mission)
     raise BadInput(f"camera {camera!r} is not one of vis, nisp, {', '.join(CAMERAS)}")
@@ -89,6 +87,14 @@ def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
         count = mission.value(f"{section}.fpa.{name}", "pix")
         if count % 2.0:
             raise BadInput(f"mission parameter {section}.fpa.{name} = {count:g}: must be an even number")
+
+
+def _of_grid(
+    section: str, upside_down: Callable[[int, int], bool], mission: MissionConfiguration
+) -> tuple[Detector, ...]:
+    """As mounted, behind the optics of their camera."""
+    planned, bending = _grid(mission, section, upside_down), distortion.terms(section, mission)
+    return tuple(replace(d, bending=bending) for d in _mounted(planned, section, mission))
 
 
 def _grid(mission: MissionConfiguration, section: str, upside_down: Callable[[int, int], bool]) -> Iterator[Detector]:

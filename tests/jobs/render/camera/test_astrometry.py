@@ -20,16 +20,17 @@ from lake_schema.mission.configuration import resolve
 # As drawn on paper: no distortion, every detector where the grid has it.
 MISSION = resolve(
     overrides={
-        "vis.fpa.distortion": (0.0, ""),
-        "vis.fpa.metrology_shift": (0.0, "pix"),
-        "vis.fpa.metrology_rotation": (0.0, "deg"),
+        f"{camera}.fpa.{key}": (0.0, unit)
+        for camera in ("vis", "nisp")
+        for key, unit in (("distortion", ""), ("metrology_shift", "pix"), ("metrology_rotation", "deg"))
     }
 )
 VIS, LSST, NISP = (detectors(camera, MISSION) for camera in ("vis", "lsstcam", "nisp"))
 BENT = detectors("vis", resolve())
+BENT_NISP = detectors("nisp", resolve())
 SKY = st.tuples(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(-180, 180))
 STRAIGHT = st.sampled_from([VIS[0], VIS[15], VIS[35], LSST[0], LSST[94], LSST[188]])
-ANY_DETECTOR = st.one_of(STRAIGHT, st.sampled_from([BENT[0], BENT[15], BENT[35]]))
+ANY_DETECTOR = st.one_of(STRAIGHT, st.sampled_from([BENT[0], BENT[15], BENT[35], BENT_NISP[0], BENT_NISP[10]]))
 
 
 # ------------------------------------------------------------------------------------------------ layouts
@@ -113,7 +114,7 @@ def test_decam_s_long_axis_runs_east_west():
     assert abs(dec[1] - dec[0]) < 1e-3
 
 
-@pytest.mark.parametrize("layout", [VIS, LSST, NISP])
+@pytest.mark.parametrize("layout", [VIS, LSST, NISP, BENT_NISP])
 def test_no_two_detectors_overlap(layout):
     x, y = (np.array([getattr(d, axis) for d in layout]) for axis in "xy")
     dx, dy = np.abs(x[:, None] - x), np.abs(y[:, None] - y)
