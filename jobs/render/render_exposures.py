@@ -83,7 +83,7 @@ def products(
     exposures     : rows of the table;  every, asked : rows of the table `tasks`, all and those to be rendered now
     """
     facts = {
-        **common_facts(request, "seed", "noise_seed", "accuracy", "mission", "effects", "truth", "compression"),
+        **common_facts(request, "seed", "noise_seed", "accuracy", "mission", "effects", "truth", "compression", "wcs"),
         "mission": mission_of(request.mission).fingerprint,
         "inputs": {name: version.key for name, version in inputs.items()},
     }
@@ -179,7 +179,8 @@ def work(lake: Path, facts: Json) -> Output:
         )
         aim, noise = Aim.of(exposed, detector, band), request.get("noise_seed")
         rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
-    rows, files = fits_files.products(rendered, request["truth"], request["compression"] == "rice")
+    rice = request["compression"] == "rice"
+    rows, files = fits_files.products(rendered, request["truth"], rice, request.get("wcs", "sip"))
     drawn = truth_table.truth(rendered)
     name = truth_file(facts["exposure_id"], facts["detector"])
     return Output(rows, {**files, name: lambda path: parquet.write(path, drawn, RENDERED_TRUTH)})

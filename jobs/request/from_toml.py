@@ -47,6 +47,7 @@
         detectors, mjd, exposure_time_s, realisations
     [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation"]
                    compression = "none" | "rice"   of images of whole numbers, without loss
+                   wcs = "sip" | "tpv"   how headers tell the distortion; SourceExtractor, SCAMP and SWarp read TPV
 
 Files are found from the folder of the request; their formats are in jobs/fluxes/libraries/spectrum_formats.toml.
 A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
@@ -71,6 +72,7 @@ from jobs.request.schema import (
     ALWAYS,
     BOX_CELLS,
     COMPRESSIONS,
+    CONVENTIONS,
     DENSITIES,
     EFFECTS,
     LADDER,
@@ -157,7 +159,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     curves = files.curves(fluxes, folder)
     bands = _strings(fluxes, "fluxes.bands")
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
-    products_ = _section(table, "products", {"truth", "compression"})
+    products_ = _section(table, "products", {"truth", "compression", "wcs"})
     solar_system = _section(table, "solar_system", {"bodies"})
     bodies = files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
     universe = _universe(_section(table, "universe", set(Universe.__slots__)))
@@ -173,6 +175,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         pointings=asked,
         truth=_truth(products_),
         compression=_string(products_, "products.compression", COMPRESSIONS, "none"),
+        wcs=_string(products_, "products.wcs", CONVENTIONS, "sip"),
         curves=curves,
         observations=blocks,
         effects=_effects(_section(table, "effects", {"on", "off"})),

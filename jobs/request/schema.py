@@ -20,6 +20,8 @@ STATUSES = tuple(code for code, _ in database.STATUSES)
 LADDER = database.LADDER
 TRUTH = tuple(code for code, _ in products.CONTENTS if code != "science")
 COMPRESSIONS = ("none", "rice")
+# As jobs/render/camera/tpv.py (a test compares them).
+CONVENTIONS = ("sip", "tpv")
 DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
@@ -121,6 +123,7 @@ class Request:
 
     explore : parameter -> the values (JSON) that it takes in turn
     psfs    : (band, file) of PSFs in place of ours
+    wcs     : how headers tell the distortion of the optics, one of CONVENTIONS
     bodies  : file of moving bodies in place of ours
     sources : the only sources that there are, in place of the universe
     noise_seed : of all that differs between exposures of the same sky with the same detectors; None = the seed
@@ -145,6 +148,7 @@ class Request:
     ingest: Ingest = _NOTHING_TAKEN
     strong_lens_boost: float = 1.0
     compression: str = "none"
+    wcs: str = "sip"
     psfs: tuple[tuple[str, str], ...] = ()
     bodies: Path | None = None
     noise_seed: int | None = None

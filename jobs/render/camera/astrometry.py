@@ -21,7 +21,7 @@ import numpy.typing as npt
 from astropy.wcs import WCS, Sip
 
 from jobs import sums
-from jobs.render.camera import distortion, pointing
+from jobs.render.camera import distortion, pointing, tpv
 from jobs.render.camera.detectors import Detector
 from jobs.render.camera.pointing import ARCSEC
 from lake_schema import sky
@@ -168,7 +168,7 @@ def shifted(system: WCS, columns: float, rows: float) -> WCS:
 
 
 def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
-    """The world coordinate system that `cards` wrote."""
+    """The world coordinate system that `cards` wrote, or `tpv.cards` of them."""
     values = {keyword: value for keyword, value, _ in header}
     try:
         system = WCS(naxis=2)
@@ -181,6 +181,9 @@ def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
         system.wcs.radesys = values["RADESYS"]
         if str(values["CTYPE1"]).endswith("-SIP"):
             system.sip = Sip(*(_coefficients(values, name) for name in "AB"), None, None, _crpix(system))
+        if str(values["CTYPE1"]).endswith("-TPV"):
+            system.wcs.ctype = [f"{axis}{_PROJECTIONS[True]}" for axis in ("RA---", "DEC--")]
+            system.sip = Sip(*tpv.sip_of(values), None, None, _crpix(system))
     except KeyError as error:
         raise BadInput(f"the header has no card {error.args[0]}") from None
     system.wcs.set()

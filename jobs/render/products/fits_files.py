@@ -9,12 +9,13 @@ products   rows, and a writer for each file
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
 
-from jobs.render.camera import astrometry
+from jobs.render.camera import astrometry, tpv
 from jobs.render.exposure.rendered import Rendered
 from jobs.render.products import headers
 from lake_schema.fits.images import Image, write_images
@@ -24,16 +25,20 @@ Writer = Callable[[Path], None]
 
 
 def products(
-    rendered: Rendered, truth: Sequence[str] = ("noise_free",), rice: bool = False
+    rendered: Rendered, truth: Sequence[str] = ("noise_free",), rice: bool = False, wcs: str = "sip"
 ) -> tuple[pa.Table, dict[str, Writer]]:
     """Rows of `products` and, by path, what writes each file.
 
+    rendered : a detector
     truth : truth maps that are wanted beside the science image;  rice : images of whole numbers are packed
+    wcs   : how headers tell the optics' distortion, one of tpv.CONVENTIONS
     """
     images = {"science": _science(rendered)}
     for content in truth:
         if content in rendered.maps:
             images[content] = [Image(rendered.maps[content], headers.truth_cards(rendered, content))]
+    if wcs == "tpv":
+        images = {key: [replace(unit, cards=tpv.cards(unit.cards)) for unit in units] for key, units in images.items()}
     exposure, detector = rendered.exposure, rendered.detector
     stem = f"images/{exposure.exposure_id:06d}/{exposure.channel}_{exposure.band}_{detector.name}"
     paths = {content: f"{stem}_{content}.fits" for content in images}

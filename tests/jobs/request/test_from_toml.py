@@ -105,6 +105,7 @@ BAD = [
     ("fluxes", {"stars": {"basel": ["x.cor"]}}, "fluxes.stars.basel wants text"),
     ("products", {"truth": ["everything"]}, "products.truth"),
     ("products", {"compression": "zip"}, "products.compression"),
+    ("products", {"wcs": "zpn"}, "products.wcs"),
     ("pointing", {}, "pointing wants a list"),
     ("pointing", [3], r"pointing\[0\]"),
     ("pointing.channel", "RADIO", r"pointing\[0\].channel"),

@@ -52,6 +52,20 @@ def test_truth_is_written_where_it_is_wanted(rendered):
     assert list(writers) == rows["path"].to_pylist()
 
 
+def test_headers_may_tell_the_distortion_as_tpv(rendered, tmp_path):
+    """Of every image with a place on the sky, which stays where it is."""
+    rows, writers = fits_files.products(rendered, ("noise_free",), wcs="tpv")
+    d = rendered.detector
+    for number, path in enumerate(rows["path"].to_pylist()):
+        writers[path](tmp_path / f"{number}.fits")
+        with astropy_fits.open(tmp_path / f"{number}.fits") as units:
+            assert not any(key.startswith(("A_", "B_")) for unit in units for key in unit.header)
+            assert {unit.header["CTYPE1"] for unit in units if "CTYPE1" in unit.header} == {"RA---TPV"}
+            header = units[0].header
+        centre = WCS(header).all_pix2world([(d.nx - 1) / 2], [(d.ny - 1) / 2], 0)
+        np.testing.assert_allclose(np.ravel(centre), astrometry.centre(d, rendered.wcs), atol=1e-9)
+
+
 def test_files_read_back(rendered, written):
     folder, rows = written
     paths = [folder / path for path in rows["path"].to_pylist()]
