@@ -24,6 +24,19 @@ _NISP_FIRST_ROTATED_ROW = 3
 
 
 @dataclass(frozen=True, slots=True)
+class FilterWheel:
+    """What a tilt of a camera's filter does (filter_wheel.py).
+
+    error : rad rms;  shift : arcsec on the sky for a tilt of 1 rad
+    bend  : the same times the square of the distance from the axis, rad on the sky
+    """
+
+    error: float
+    shift: float
+    bend: float
+
+
+@dataclass(frozen=True, slots=True)
 class Detector:
     """One detector of a camera.
 
@@ -34,6 +47,7 @@ class Detector:
     rotation    : deg, of its columns-rows axes against the focal plane's, from x to y
     pixel_scale : arcsec
     bending     : distortion of its camera's optics
+    wheel       : of its camera's filters; None: they stand still
     """
 
     name: str
@@ -46,6 +60,7 @@ class Detector:
     pixel_scale: float
     bending: distortion.Terms = ()
     middle: int = 0
+    wheel: FilterWheel | None = None
 
     @property
     def upside_down(self) -> bool:
@@ -94,7 +109,25 @@ def _of_grid(
 ) -> tuple[Detector, ...]:
     """As mounted, behind the optics of their camera."""
     planned, bending = _grid(mission, section, upside_down), distortion.terms(section, mission)
-    return tuple(replace(d, bending=bending) for d in _mounted(planned, section, mission))
+    wheel = _wheel(section, mission)
+    return tuple(replace(d, bending=bending, wheel=wheel) for d in _mounted(planned, section, mission))
+
+
+def _wheel(section: str, mission: MissionConfiguration) -> FilterWheel | None:
+    """A filter is a plane-parallel plate in the beam between collimator and camera."""
+    if f"{section}.filter_wheel_error" not in mission:
+        return None
+    thickness, n = (
+        mission.value(f"{section}.filter.thickness", "mm"),
+        mission.value(f"{section}.filter.refractive_index"),
+    )
+    plate_scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix") / mission.value(
+        f"{section}.fpa.pixel_size", "mm / pix"
+    )
+    wider = mission.value("plm.focal_length", "m") / mission.value(f"{section}.collimator_focal_length", "m")
+    third = (n**2 - 1.0) / (2.0 * n**3)
+    error = mission.value(f"{section}.filter_wheel_error", "rad")
+    return FilterWheel(error, plate_scale * thickness * (1.0 - 1.0 / n), plate_scale * thickness * third * wider**2)
 
 
 def _grid(mission: MissionConfiguration, section: str, upside_down: Callable[[int, int], bool]) -> Iterator[Detector]:

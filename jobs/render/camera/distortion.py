@@ -4,6 +4,7 @@ A focal-plane position P (arcsec) looks where a perfect camera has P + D(P); D i
 linear terms, so that the boresight stays, and the scale there. In pixels it is the polynomial of the SIP convention.
 
 terms      a camera's polynomial, from the mission database
+joined     the sum of two
 bent       P -> P + D(P)
 sip        the same in a detector's pixels: coefficients of the header's cards
 stretch    what it does to a pixel's area
@@ -46,6 +47,15 @@ def terms(section: str, mission: MissionConfiguration) -> Terms:
     if any(i + j < 2 for i, j, _, _ in found):
         raise BadInput(f"mission model {key}: a term of less than second order moves the boresight or turns the camera")
     return tuple(term for term in found if term[2] or term[3])
+
+
+def joined(some: Terms, more: Terms) -> Terms:
+    """The sum of two distortions."""
+    found: dict[tuple[int, int], tuple[float, float]] = {}
+    for i, j, to_x, to_y in (*some, *more):
+        x, y = found.get((i, j), (0.0, 0.0))
+        found[i, j] = x + to_x, y + to_y
+    return tuple((i, j, *sums_) for (i, j), sums_ in found.items())
 
 
 def bent(x: npt.ArrayLike, y: npt.ArrayLike, some: Terms) -> tuple[Float, Float]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from astropy.wcs import WCS
 
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
-from jobs.render.camera import astrometry
+from jobs.render.camera import astrometry, filter_wheel
 from jobs.render.camera.detectors import Detector
-from jobs.render.channels import registry
+from jobs.render.channels import image_types, registry
 from jobs.render.channels.channel import Channel
 from jobs.render.effects.effect import Effect
 from lake_schema import units
@@ -38,7 +38,9 @@ class Aim:
         """Of a planned exposure; band : None = the embedded one of its name.  BadInput where nothing renders it."""
         kind = exposure.image_type
         channel = registry.channel_of(exposure.channel, kind, f"exposure {exposure.exposure_id}")
-        system = astrometry.wcs(detector, exposure.ra, exposure.dec, exposure.position_angle)
+        # Exposures that differ in their noise alone see alike.
+        seen = filter_wheel.tilted(detector, image_types.identity(replace(exposure, realisation=None)))
+        system = astrometry.wcs(seen, exposure.ra, exposure.dec, exposure.position_angle)
         band = band or passbands.load(exposure.band)
         return cls(exposure, detector, system, band, channel, channel.effects[kind])
 

@@ -194,11 +194,12 @@ def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration
 def _blur_variances(detector: Detector, wavelength: float, mission: MissionConfiguration) -> tuple[float, float]:
     """Variance along x and y, arcsec2: pointing jitter, and charge diffusion.
 
-    Charge spreads wider of blue light (A), and the wider the thicker the detector is; in the pixels of NISP it stays.
+    Charge spreads wider of blue light (A), and the wider the thicker the detector is. Where the database has one width
+    for all that blurs the optics' image, no charge spreads.
     """
     section = detector.section
-    if section == "nisp":
-        jitter = mission.value("nisp.psf.jitter", "arcsec")
+    if f"{section}.psf.jitter" in mission:
+        jitter = mission.value(f"{section}.psf.jitter", "arcsec")
         return jitter**2, jitter**2
     redder = 0.1 * wavelength / mission.value(f"{section}.diffusion_wavelength", "nm")
     wider = redder ** mission.value(f"{section}.diffusion_slope") * _thickness(detector, mission)
