@@ -20,6 +20,7 @@ from jobs import sums
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
+from jobs.render.sky import thermal
 from lake_schema.arrays import Float
 from lake_schema.ecliptic import ecliptic
 from lake_schema.errors import BadInput, OutOfRange
@@ -72,13 +73,15 @@ def starlit_sky(detector: Detector, band: str, mission: MissionConfiguration, cu
 
 
 def thermal_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
-    """Zodiacal light, and thermal light of the instrument.
+    """Zodiacal light, thermal light of telescope and instrument, and what starlight they scatter.
 
     detector, band : of the camera, and the band's name;  mission : the mission database
     curve          : the passband, None = the embedded one
     """
-    thermal = mission.value(f"{detector.section}.{band}.thermal", "electron / (s pix)")
-    return SkyBand(thermal, *_zodiacal_of(detector, band, mission, curve))
+    section, key = detector.section, f"{detector.section}.{band}.scattered_light"
+    warm = thermal.rate(section, band, curve or passbands.load(band), mission)
+    scattered = mission.value(key, "electron / (s pix)") if key in mission else 0.0
+    return SkyBand(warm, *_zodiacal_of(detector, band, mission, curve), scattered)
 
 
 def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:

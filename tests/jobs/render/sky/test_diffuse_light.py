@@ -1,5 +1,7 @@
 """The diffuse sky against published surface brightnesses and astropy's ecliptic."""
 
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -158,3 +160,37 @@ def test_bands_share_the_sky_of_the_one_that_they_make_up():
     assert rates[3] == diffuse_light.sky_rate(
         diffuse_light.starlit_sky(detector, "euclid_vis", mission), 53.1, -27.8, 60905.0, mission
     )
+
+
+@pytest.mark.parametrize(
+    ("latitude", "rates"),
+    [
+        (0, (2.30, 2.81, 2.33)),
+        (10, (2.00, 2.44, 2.02)),
+        (15, (1.71, 2.09, 1.74)),
+        (20, (1.47, 1.80, 1.49)),
+        (30, (1.17, 1.43, 1.19)),
+        (45, (0.92, 1.13, 0.94)),
+        (60, (0.76, 0.93, 0.77)),
+        (90, (0.68, 0.84, 0.69)),
+    ],
+)
+def test_nisp_zodiacal_rates_at_quadrature(latitude, rates):
+    """e-/s in a NISP pixel in Y, J and H: Leinert et al. 1998, to the model's 10 %."""
+    nisp = detectors.detector("nisp", "DET11", MISSION)
+    for name, rate in zip(("euclid_y", "euclid_j", "euclid_h"), rates, strict=True):
+        sky = diffuse_light.thermal_sky(nisp, name, MISSION)
+        zodi = diffuse_light.sky_rate(replace(sky, constant=0.0, stars=0.0), *at(90, latitude), MISSION)
+        assert zodi == pytest.approx(rate, rel=0.10), name
+
+
+def test_what_an_infrared_camera_sees():
+    """Zodiacal light, half a percent to 2 % of thermal light in H and none in Y, a tenth of starlight."""
+    nisp, place = detectors.detector("nisp", "DET23", MISSION), at(90, 30)
+    for name, warm in (("euclid_y", 0.0), ("euclid_j", 0.001), ("euclid_h", 0.02)):
+        sky = diffuse_light.thermal_sky(nisp, name, MISSION)
+        assert sky.constant == pytest.approx(warm)
+        zodi = diffuse_light.zodiacal_rate(*place, passbands.load(name), 0.9926, 0.3, MISSION)
+        assert sky.stars == pytest.approx(0.1 * zodi, rel=0.2)
+        found = diffuse_light.sky_rate(sky, *place, MISSION)
+        assert found == pytest.approx(zodi + warm + sky.stars * diffuse_light.starlight(*place[:2], MISSION))
