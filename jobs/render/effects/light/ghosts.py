@@ -1,10 +1,14 @@
-"""Ghosts: light that went twice through the dichroic makes a defocused image of the pupil beside each bright star.
+"""Ghosts: light that is reflected twice in a plate makes a defocused image of the pupil beside each bright star.
 
 An annulus with the gaps of the three arms that hold the secondary mirror; of even surface brightness.
+
+EFFECT    of the dichroic
+FILTER    of the filter
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -100,12 +104,15 @@ def _add(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -> None:
                 frame[r, c] += electrons[i] * light
 
 
-def parameters(scene: Scene) -> tuple[Any, ...]:
-    """Of the mission database; the offset is along the focal plane's y axis, and the arms are the pupil's."""
+def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
+    """Of the mission database; the offset is along the focal plane's y axis, and the arms are the pupil's.
+
+    plate : whose ghosts, a prefix of their parameters
+    """
     turn = scene.detector.rotation if scene.detector is not None else 0.0
     cosine, sine = float(np.cos(np.radians(turn))), float(np.sin(np.radians(turn)))
-    length = scene.value("ghost.offset_y", "pix")
-    radius = scene.value("ghost.radius_out", "pix")
+    length = scene.value(f"{plate}.offset_y", "pix")
+    radius = scene.value(f"{plate}.radius_out", "pix")
     aperture = 0.5 * scene.mission.value("plm.aperture_diameter", "mm")
 
     def of(key: str, unit: str) -> float:
@@ -120,28 +127,36 @@ def parameters(scene: Scene) -> tuple[Any, ...]:
         for number, (x, y) in enumerate(places, start=1)
     )
     width = scale * of("spider_width", "mm")
-    ratio, hole = scene.value("ghost.flux_ratio", ""), scene.value("ghost.radius_in_ratio", "")
-    return noticeable(scene, ratio), ratio, (length * sine, length * cosine), Pupil(radius, hole, arms, width)
+    ratio, hole = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_in_ratio", "")
+    return noticeable(scene, ratio, plate), ratio, (length * sine, length * cosine), Pupil(radius, hole, arms, width)
 
 
-def noticeable(scene: Scene, ratio: float) -> Lights:
+def noticeable(scene: Scene, ratio: float, plate: str = "ghost") -> Lights:
     """The lights whose ghost, taken as a whole, is not lost in the noise of the pixels it covers."""
-    area = np.pi * scene.value("ghost.radius_out", "pix") ** 2
+    area = np.pi * scene.value(f"{plate}.radius_out", "pix") ** 2
     lights = scene.lights
     bright = ratio * lights.electrons > NOTICEABLE * scene.pixel_noise * np.sqrt(area)
     return Lights(lights.column[bright], lights.row[bright], lights.electrons[bright])
 
 
-def _contribution(scene: Scene) -> float:
+def _contribution(scene: Scene, plate: str = "ghost") -> float:
     """In a pixel, times the root of the pixels that share it: a ghost is one thing."""
-    ratio, radius = scene.value("ghost.flux_ratio", ""), scene.value("ghost.radius_out", "pix")
+    ratio, radius = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_out", "pix")
     brightest = float(scene.lights.electrons.max(initial=0.0))
     return ratio * brightest / float(np.sqrt(np.pi) * radius)
 
 
-def _level(scene: Scene) -> float:
+def _level(scene: Scene, plate: str = "ghost") -> float:
     """In a pixel: a mean over as many as share it is what it is judged by already."""
-    return _contribution(scene) / float(np.sqrt(np.pi) * scene.value("ghost.radius_out", "pix"))
+    return _contribution(scene, plate) / float(np.sqrt(np.pi) * scene.value(f"{plate}.radius_out", "pix"))
 
 
 EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=4.5e-3, repeated=_level)
+FILTER = Effect(
+    "filter_ghosts",
+    apply,
+    partial(parameters, plate="filter_ghost"),
+    partial(_contribution, plate="filter_ghost"),
+    cost=4.5e-3,
+    repeated=partial(_level, plate="filter_ghost"),
+)

@@ -130,6 +130,45 @@ def test_what_no_ghost_shows_is_left_out():
             assert image.sum() < NOTICEABLE * noise * np.sqrt((image > 0).sum()) * 1.1
 
 
+def infrared(lights):
+    """NISP's DET11 or, where it is upside down, DET33, in Y."""
+    return [
+        Scene(MISSION, "nisp", 87.24, 1.15, 1e4, detectors.detector("nisp", name, MISSION), lights=lights)
+        for name in ("DET11", "DET33")
+    ]
+
+
+@pytest.mark.parametrize(("effect", "radius", "offset"), [(ghosts.EFFECT, 19.0, 250.0), (ghosts.FILTER, 30.0, -60.0)])
+def test_ghosts_of_plates_before_the_infrared_detectors(effect, radius, offset):
+    """Of a star of 10 mag in Y some five times the noise, of one of 14 mag nothing."""
+    for magnitude, shown in ((10.0, True), (14.5, False)):
+        star = light(150, 130, 10 ** (0.4 * (25.0 - magnitude)) * 87.24)
+        for one in infrared(star):
+            assert effect.needed_if(one) == shown
+            image = effect.apply(EMPTY, *effect.parameters(one))
+            noise = one.pixel_noise * np.sqrt(np.pi) * radius
+            if not shown:
+                assert image.sum() == 0.0
+                continue
+            sign = -1.0 if one.detector.upside_down else 1.0
+            y, x = np.indices(image.shape)
+            inside = np.hypot(x - 150, y - (130 + sign * offset)) < radius + 2.5
+            assert image[~inside].sum() <= 1e-6 * image.sum()
+            if inside.sum() > 0.9 * np.pi * radius**2:
+                assert 3.0 < image.sum() / noise < 8.0
+    assert {effect.name for effect in (ghosts.EFFECT, ghosts.FILTER)} == {"ghosts", "filter_ghosts"}
+
+
+def test_the_halo_of_a_star_before_an_infrared_detector():
+    """1e-3 of a star of 8 mag in a halo of 60 arcsec: f / (2 pi s^2) of it in the pixel under it."""
+    star = light(150, 200, 10 ** (0.4 * (25.0 - 8.0)) * 87.24)
+    for one in infrared(star):
+        assert straylight.EFFECT.needed_if(one)
+        image = straylight.EFFECT.apply(EMPTY, *straylight.EFFECT.parameters(one))
+        assert image[200, 150] == pytest.approx(1e-3 * star.electrons[0] / (2 * np.pi * 200.0**2), rel=5e-3)
+        assert image[200, 150 + 140] / image[200, 150] == pytest.approx((1 + 0.7**2) ** -1.5, rel=5e-3)
+
+
 @pytest.mark.parametrize("wrong", [(-1.0, 56.0, 0.3), (1e-4, 0.0, 0.3), (1e-4, 56.0, 1.0), (np.nan, 56.0, 0.3)])
 def test_impossible_ghosts_are_refused(wrong):
     with pytest.raises(OutOfRange, match="ghost"):
