@@ -70,6 +70,7 @@ def nisp_psf(detector: Detector, band: Passband, mission: MissionConfiguration, 
     """The Euclid PSF of a NISP detector: optics, and pointing jitter with what else blurs.
 
     detector, band, mission, positions : as of vis_psf
+    Error     : second moments 4e-4 from the number of wavelengths; across the detector as psf_positions_nisp.csv
     Ref       : pupil, Liaudat et al. 2023; wavefront, the mission database
     """
     return _psf(NISP, detector, band, mission, positions)
