@@ -1,4 +1,4 @@
-"""Positions of the PSF on a VIS detector: what their number costs, and what error it leaves in a star.
+"""Positions of the PSF on a detector of VIS or NISP: what their number costs, and what error it leaves in a star.
 
 Polynomials through a few positions, as images are drawn, and the nearest of a grid, as it is usual.
 """
@@ -8,12 +8,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from benchmarks import _errors as errors
 from benchmarks import _scenes as scenes
-from benchmarks._scenes import VIS
+from benchmarks._scenes import NISP, VIS, Scene
 from jobs.render.camera import detectors
 from jobs.render.psf import euclid, model, sub_bands
 from lake_schema.arrays import Float
@@ -28,16 +29,19 @@ HELD = 48
 LENSED = 1.25**-2
 # Grids that the nearest position is taken of: positions along a side.
 _NEAREST = (1, 2, 3, 4, 6, 10, 15, 20, 30, 40)
+# Of NISP fewer, and where its table is.
+_FEW = (1, 2, 3, 4, 6, 10)
+_FILE = Path(model.__file__).parents[1] / "drawing" / "psf_positions_nisp.csv"
 _COLUMNS = (
     "positions,nearest,flux_rms,flux_error,position_rms,position_error,"
     "r2_rms,r2_error,ellipticity_rms,ellipticity_error,seconds,megabytes"
 )
 _ABOUT = f"""\
-# Error of the VIS PSF by the number of its positions on a detector: of {STARS} stars of other places and colours the
+# Error of the {{camera}} PSF by the number of its positions on a detector: of {STARS} stars of other places and \
+colours the
 # flux in 1" (relative), the position (pixels), R2 (relative) and the ellipticity under a Gaussian weight of 0.75" (rms
 # and largest); CPU seconds to compute its planes, and what they hold. nearest: 0 = polynomials through the positions
-# (euclid.DEGREES), 1 = the nearest of a grid, as in Serrano et al. 2024. Written by python -m benchmarks.trade
-# --positions.
+# (euclid.DEGREES), 1 = the nearest of a grid, as in Serrano et al. 2024. Written by {{writer}}.
 """
 
 
@@ -50,11 +54,11 @@ class Star:
     truth: Float
 
 
-def optics() -> Callable[[tuple[float, float]], Float]:
+def optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
     """The PSF at a place, computed: (x, y) in half sides -> [wavelengths, t, t], in the detector's axes."""
-    mission = resolve()
-    detector = detectors.detector("vis", "3-4", mission)
-    waves = scenes.psf_of(VIS, 1).planes.wavelength  # type: ignore[union-attr]
+    mission, sampled = resolve(), _SAMPLINGS[scene.name]
+    detector = detectors.detector(scene.name, scenes.SPACE[scene.name][0], mission)
+    waves = scenes.psf_of(scene, 1).planes.wavelength  # type: ignore[union-attr]
     blurs = [euclid._blur_variances(detector, float(waves[w]), mission) for w in range(len(waves))]
     sign = -1 if detector.upside_down else 1
 
@@ -62,17 +66,17 @@ def optics() -> Callable[[tuple[float, float]], Float]:
         nm = euclid.wavefront(
             *euclid._field(detector, sign * place[0], sign * place[1], mission), detector.section, mission
         )
-        scale = detector.pixel_scale / model.SAMPLES
-        core = replace(euclid.VIS, transform=euclid.VIS.core_transform, side=euclid.VIS.core_side)
+        scale = detector.pixel_scale / sampled.samples
+        core = replace(sampled, transform=sampled.core_transform, side=sampled.core_side)
         planes = [euclid._plane(nm, float(w), core, scale, blur, mission) for w, blur in zip(waves, blurs, strict=True)]
         return np.stack(planes).astype(float)[:, ::sign, ::sign]
 
     return at
 
 
-def rows(stars: int, nearest: tuple[int, ...] = _NEAREST) -> list[dict[str, float]]:
+def rows(stars: int, nearest: tuple[int, ...] = _NEAREST, scene: Scene = VIS) -> list[dict[str, float]]:
     """A row a way and number of positions: keys as _COLUMNS."""
-    at, rng = optics(), np.random.default_rng(_SEED)
+    at, rng = optics(scene), np.random.default_rng(_SEED)
     at((0.0, 0.0))
     start = time.process_time()
     centre = at((0.0, 0.0))
@@ -80,12 +84,12 @@ def rows(stars: int, nearest: tuple[int, ...] = _NEAREST) -> list[dict[str, floa
     some = [star(at, rng) for _ in range(stars)]
     out = []
     for positions in euclid.DEGREES:
-        cold, psf = _cold(positions)
-        found = np.array([errors_of(centre + drift(psf, one), one) for one in some])
+        cold, psf = _cold(positions, scene)
+        found = np.array([errors_of(centre + drift(psf, one), one, scene) for one in some])
         out.append(_row(positions, False, found, cold, (psf.images.nbytes + psf.drift.nbytes) / 1e6))
     for side in nearest:
         middles = (2 * np.arange(side) + 1) / side - 1
-        found = np.array([errors_of(at(_nearest(middles, one.place)), one) for one in some])
+        found = np.array([errors_of(at(_nearest(middles, one.place)), one, scene) for one in some])
         # The wings are the centre's everywhere: a position has the core alone.
         planes = side**2 * len(psf.wavelength)
         megabytes = (planes * centre[0].size * psf.images.itemsize + psf.images.nbytes) / 1e6
@@ -93,14 +97,18 @@ def rows(stars: int, nearest: tuple[int, ...] = _NEAREST) -> list[dict[str, floa
     return out
 
 
-def text(found: list[dict[str, float]]) -> str:
+def text(found: list[dict[str, float]], scene: Scene = VIS) -> str:
     """The table of positions."""
+    about = _ABOUT.format(camera=scene.name.upper(), writer=_WRITERS[scene.name])
     lines = [
         ",".join(f"{row[name]:.2g}" if name not in _EXACT else f"{row[name]:.0f}" for name in row) for row in found
     ]
-    return "\n".join([_ABOUT + _COLUMNS, *lines]) + "\n"
+    return "\n".join([about + _COLUMNS, *lines]) + "\n"
 
 
+# How each is sampled, and which command writes its table.
+_SAMPLINGS = {"vis": euclid.VIS, "nisp": euclid.NISP}
+_WRITERS = {"vis": "python -m benchmarks.trade\n# --positions", "nisp": "python -m benchmarks._positions"}
 _EXACT = ("positions", "nearest", "megabytes")
 
 
@@ -110,12 +118,13 @@ def star(at: Callable[[tuple[float, float]], Float], rng: np.random.Generator) -
     return Star((place[0], place[1]), photons / photons.sum(), at((place[0], place[1])))
 
 
-def errors_of(planes: Float, star: Star) -> tuple[float, float, float, float]:
+def errors_of(planes: Float, star: Star, scene: Scene = VIS) -> tuple[float, float, float, float]:
     """Of a star: |dF / F| in 1", the position's error in pixels, |dR2 / R2| and the ellipticity's error."""
     # Neighbouring sub-bands may have one plane.
     shares = star.shares.reshape(len(planes), -1).sum(axis=1)
-    found, truth = _moments(np.tensordot(shares, planes, 1)), _moments(np.tensordot(star.shares, star.truth, 1))
-    moved = float(np.hypot(*(found - truth)[1:3])) / VIS.scale
+    found = _moments(np.tensordot(shares, planes, 1), scene)
+    truth = _moments(np.tensordot(star.shares, star.truth, 1), scene)
+    moved = float(np.hypot(*(found - truth)[1:3])) / scene.scale
     return abs(found[0] / truth[0] - 1), moved, abs(found[3] / truth[3] - 1), float(np.hypot(*(found - truth)[4:6]))
 
 
@@ -133,9 +142,9 @@ def largest(seed: int, n: int, kinds: Sequence[tuple[int, int]]) -> dict[tuple[i
     return out
 
 
-def _moments(image: Float) -> Float:
+def _moments(image: Float, scene: Scene) -> Float:
     middle = image.shape[0] // 2
-    return errors.measured(image, VIS.scale / model.SAMPLES, middle, middle)
+    return errors.measured(image, scene.scale / _SAMPLINGS[scene.name].samples, middle, middle)
 
 
 def drift(psf: model.Planes, star: Star) -> Float:
@@ -153,11 +162,11 @@ def _nearest(middles: Float, place: tuple[float, float]) -> tuple[float, float]:
     return x, y
 
 
-def _cold(positions: int) -> tuple[float, model.Planes]:
+def _cold(positions: int, scene: Scene) -> tuple[float, model.Planes]:
     """CPU s to compute the planes, and they."""
     with scenes.empty_cache():
         start = time.process_time()
-        planes = scenes.psf_of(VIS, positions).planes
+        planes = scenes.psf_of(scene, positions).planes
         seconds = time.process_time() - start
     assert planes is not None
     return seconds, planes
@@ -168,3 +177,7 @@ def _row(positions: int, nearest: bool, found: Float, seconds: float, megabytes:
     both = np.column_stack([rms, worst]).ravel()
     values = positions, nearest, *both, seconds, megabytes
     return {name: float(value) for name, value in zip(_COLUMNS.split(","), values, strict=True)}
+
+
+if __name__ == "__main__":
+    _FILE.write_text(text(rows(STARS, _FEW, NISP), NISP), encoding="utf-8")

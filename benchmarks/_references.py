@@ -57,23 +57,21 @@ def by_series(one: Sources, psf: model.Psf, side: int) -> Float:
     its R2. A galaxy that is not small beside the frame folds: for those `image` is the better one.
     """
     assert psf.planes is not None
-    plane = psf.planes.images[0].astype(float)
-    wide = model.SAMPLES * 2 * -(-(len(plane) + model.SAMPLES * side) // (2 * model.SAMPLES))
+    plane, samples = psf.planes.images[0].astype(float), psf.planes.samples
+    wide = samples * 2 * -(-(len(plane) + samples * side) // (2 * samples))
     padded = np.zeros((wide, wide))
     padded[: len(plane), : len(plane)] = plane
     middle, frequency = len(plane) // 2, np.fft.fftfreq(wide)
     out = np.fft.fft2(padded)
     for axis, position in ((1, one.column[0]), (0, one.row[0])):
-        moved = np.exp(-2j * np.pi * frequency * (model.SAMPLES * position - middle)) * np.sinc(
-            model.SAMPLES * frequency
-        )
+        moved = np.exp(-2j * np.pi * frequency * (samples * position - middle)) * np.sinc(samples * frequency)
         out *= np.expand_dims(moved, 1 - axis)
     if one.shape[0] >= 0:
         body = galsim.JacobianWCS(*one.jacobian[0].ravel()).toImage(
             galaxy_shapes.profile(one.shapes, int(one.shape[0]), 1e-6)
         )
         tight = body.withGSParams(folding_threshold=ACCURACY, maxk_threshold=1e-6, kvalue_accuracy=1e-8)
-        drawn = tight.drawKImage(nx=wide, ny=wide, scale=2 * np.pi * model.SAMPLES / wide).array
+        drawn = tight.drawKImage(nx=wide, ny=wide, scale=2 * np.pi * samples / wide).array
         out *= np.fft.ifftshift(drawn) / tight.flux
-    image = np.fft.ifft2(out).real[:: model.SAMPLES, :: model.SAMPLES][:side, :side]
-    return np.asarray(one.electrons[0] * model.SAMPLES**2 * image)
+    image = np.fft.ifft2(out).real[::samples, ::samples][:side, :side]
+    return np.asarray(one.electrons[0] * samples**2 * image)

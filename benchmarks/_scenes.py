@@ -48,6 +48,10 @@ class Scene:
 
 
 VIS = Scene("vis", 4096, 4132, 0.1, 565.0, 25.7, 12.45, 4701, 300)
+# One signal of a photometric ramp in Y.
+NISP = Scene("nisp", 2040, 2040, 0.3, 87.24, 25.0, 12.0, 4701, 300)
+# Of cameras in space: what its PSF is of.
+SPACE = {"vis": ("3-4", "euclid_vis", euclid.vis_psf), "nisp": ("DET23", "euclid_y", euclid.nisp_psf)}
 LSST = Scene("lsst", 4096, 4004, 0.2, 30.0, 28.17, 38.3, 18223, 1160)
 
 
@@ -55,9 +59,9 @@ def psf_of(scene: Scene, positions: int = 9, colours: int = sub_bands.PARTS) -> 
     """The scene's PSF."""
     if scene.name == "lsst":
         return seeing.ground_psf(SEEING, BETA, scene.scale)
-    mission = resolve()
-    detector = detectors.detector("vis", "3-4", mission)
-    return model.of_colours(euclid.vis_psf(detector, passbands.load("euclid_vis"), mission, positions), colours)
+    mission, (name, band, psf) = resolve(), SPACE[scene.name]
+    detector = detectors.detector(scene.name, name, mission)
+    return model.of_colours(psf(detector, passbands.load(band), mission, positions), colours)
 
 
 def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | None = None) -> Sources:
@@ -168,7 +172,7 @@ def own(psf: model.Psf, some: Sources, i: int) -> model.Psf:
         return psf
     weights = transfer.basis_weights(psf, some.photons, some.column, some.row)[i]
     image = transfer.image_of(planes, weights)
-    alone = model.Planes(planes.wavelength[:1], image[None], planes.drift[:0], planes.half)
+    alone = replace(planes, wavelength=planes.wavelength[:1], images=image[None], drift=planes.drift[:0], powers=())
     return replace(psf, planes=alone, edges=None)
 
 

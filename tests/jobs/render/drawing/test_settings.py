@@ -10,7 +10,7 @@ import pytest
 from benchmarks import _errors as errors
 from benchmarks import _positions as positions
 from benchmarks import _scenes as scenes
-from benchmarks._scenes import VIS, psf_of
+from benchmarks._scenes import NISP, VIS, psf_of
 from jobs import accuracy
 from jobs.accuracy import DRAFT, PRESETS, QUICKLOOK, REFERENCE, SURVEY
 from jobs.render.drawing import stamp_sizes, stamps, transfer
@@ -112,17 +112,18 @@ def test_the_rim_is_the_brightest_pixel_farther_out():
     np.testing.assert_allclose(ground.rim[8:200], ground.surface[8:200], rtol=0.1)
 
 
-def test_between_its_positions_the_psf_is_as_wrong_as_the_table_says():
+@pytest.mark.parametrize(("scene", "file"), [(VIS, "psf_positions.csv"), (NISP, "psf_positions_nisp.csv")])
+def test_between_its_positions_the_psf_is_as_wrong_as_the_table_says(scene, file):
     """Against the optics computed at the place of a star."""
-    table = {row["positions"]: row for row in rows("psf_positions.csv") if row["nearest"] == 0}
-    at = positions.optics()
-    star, planes = positions.star(at, np.random.default_rng(8)), psf_of(VIS, 9).planes
-    flux, moved, r2, ellipticity = positions.errors_of(at((0.0, 0.0)) + positions.drift(planes, star), star)
+    table = {row["positions"]: row for row in rows(file) if row["nearest"] == 0}
+    at = positions.optics(scene)
+    star, planes = positions.star(at, np.random.default_rng(8)), psf_of(scene, 9).planes
+    flux, moved, r2, ellipticity = positions.errors_of(at((0.0, 0.0)) + positions.drift(planes, star), star, scene)
     assert flux <= table[9]["flux_error"]
     assert moved <= table[9]["position_error"]
     assert r2 <= table[9]["r2_error"]
     assert ellipticity <= table[9]["ellipticity_error"]
-    assert positions.errors_of(at((0.0, 0.0)), star)[2] > 3 * r2
+    assert positions.errors_of(at((0.0, 0.0)), star, scene)[2] > 3 * r2
 
 
 def test_a_row_counts_the_error_of_its_psf():

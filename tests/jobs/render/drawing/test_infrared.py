@@ -1,0 +1,124 @@
+"""Sources through NISP's PSF, five samples a pixel: against galsim and the Fourier series, and beyond its planes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+
+from benchmarks import _errors as errors
+from benchmarks import _references as references
+from benchmarks import _scenes as scenes
+from jobs.accuracy import SURVEY
+from jobs.fluxes import passbands
+from jobs.render.camera.astrometry import wcs
+from jobs.render.camera.detectors import detector
+from jobs.render.camera.pointing import boresight_for
+from jobs.render.drawing import far_light, stamps
+from jobs.render.drawing.kernels.frame import FIXED_POINT
+from jobs.render.drawing.settings import settings_for
+from jobs.render.psf import euclid, spikes
+from lake_schema.mission.configuration import resolve
+from tests.jobs.render.fields import one_source, small
+
+MISSION = resolve()
+# A pixel's noise of estimated signals, and magnitudes of 1 e-/s.
+NOISE = 12.0
+BANDS = {"euclid_y": 25.00, "euclid_h": 25.11}
+SIDE = euclid.NISP.side
+BRIGHT = 5e9
+
+
+@pytest.fixture(scope="module", params=BANDS)
+def band(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def psf(band):
+    return euclid.nisp_psf(detector("nisp", "DET23", MISSION), passbands.load(band), MISSION, 4)
+
+
+def held(band, psf, count, seed, side):
+    """Errors of galaxies and stars, 17 to 26 mag, as drawn for a survey, against the better of two references."""
+    scene = scenes.Scene("nisp", 2040, 2040, 0.3, 87.24, BANDS[band], NOISE, 0, 0)
+    stars = max(count // 5, 2)
+    some = scenes.sources(scene, seed, galaxies=count - stars, stars=stars)
+    found = []
+    for i in range(len(some)):
+        one, own = scenes.moved(some, i, side), scenes.own(psf, some, i)
+        star = one.shape[0] < 0
+        truth = references.by_series(one, own, side) if star else references.image(one, own, side)
+        if truth is not None:
+            found.append(errors.errors(scenes.draw(one, own, scene, settings_for(SURVEY), side), truth, scene, one))
+    return np.array(found), some
+
+
+@pytest.mark.nightly
+def test_sources_are_as_galsim_draws_them(band, psf):
+    """Sixty of a seed of their own."""
+    found, _ = held(band, psf, 60, 4711, 256)
+    assert len(found) >= 55
+    magnitude, position, r2, ellipticity, pixel = found.max(axis=0)
+    print(band, len(found), found.max(axis=0), np.sqrt((found**2).mean(axis=0)))
+    assert magnitude < 1e-4 * 1.0857
+    assert position < 0.03
+    assert r2 < 3e-4
+    assert ellipticity < 5e-5
+    assert pixel < 0.02
+
+
+def test_a_few_sources_are_as_galsim_draws_them(band, psf):
+    found, _ = held(band, psf, 6, 12, 128)
+    assert len(found) == 6
+    magnitude, position, r2, ellipticity, pixel = found.max(axis=0)
+    assert magnitude < 1e-4 * 1.0857
+    assert position < 0.03
+    assert r2 < 3e-4
+    assert ellipticity < 5e-5
+    assert pixel < 0.02
+
+
+def test_a_star_s_light_has_no_seam_where_its_plane_ends(band, psf):
+    """Between spikes it falls as r^-3, through the border of its plane; along a spike as r^-2."""
+    side = 900
+    field = replace(small("nisp", "DET23", side), nx=side, ny=side)
+    source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), BRIGHT, 450.3, 449.8)
+    image = stamps.draw(source, np.array([SIDE]), psf, side, side)
+    y, x = np.mgrid[:side, :side]
+    dx, dy = x - 450.3, y - 449.8
+    turns = psf.edges.bars[:, 0]
+    clear = np.min([np.abs(dx * np.cos(a) + dy * np.sin(a)) for a in turns], axis=0) > 20
+    radius = np.hypot(dx, dy)
+    law = spikes.ring(psf.edges, np.full(8, 1 / 8)) * BRIGHT
+    for inner, outer in ((70, 95), (95, 120), (120, 140), (140, 180), (180, 240), (240, 440)):
+        here = clear & (radius >= inner) & (radius < outer)
+        assert (image * radius**3)[here].mean() == pytest.approx(law, rel=0.08), (inner, outer)
+    assert image.min() > -1e-3 * NOISE
+    # The optics' transform on this side of the border, straight bars on that.
+    along, across = dy * np.cos(turns[2]) - dx * np.sin(turns[2]), np.abs(dx * np.cos(turns[2]) + dy * np.sin(turns[2]))
+    line = spikes.spikes(psf.edges, np.full(8, 1 / 8), 200.0)[2]
+    steps = spikes.LONG * np.arange(len(line)), spikes.STEP * np.arange(line.shape[1])
+    for inner, outer in ((90, 108), (108, 126), (130, 148), (148, 166)):
+        here = (across < 8) & (along >= inner) & (along < outer)
+        spike = RegularGridInterpolator(steps, line)(np.stack([along[here], across[here]], axis=1))
+        expected = BRIGHT * spike.sum() + (law / radius[here] ** 3).sum()
+        assert image[here].sum() == pytest.approx(expected, rel=0.1), (inner, outer)
+
+
+def test_no_light_of_a_star_is_lost_beyond_its_plane(psf):
+    side = 3000
+    frame = np.zeros((side, side), np.int64)
+    star = far_light.Star(side / 2, side / 2, BRIGHT, None, SIDE, 0.0, psf.edges)
+    far_light.add(frame, star)
+    equal = np.full(8, 1 / 8)
+    light = frame.sum() / FIXED_POINT / BRIGHT
+    beyond = spikes.ring(psf.edges, equal) * 4 * np.sqrt(2) / (side / 2)
+    wavelength = psf.edges.wavelength.mean() * 1e-7
+    for turn, _, length in psf.edges.bars:
+        border = side / 2 / max(abs(np.cos(turn)), abs(np.sin(turn)))
+        beyond += 2 * length * wavelength / (2 * np.pi**2 * psf.edges.area * 0.3 * spikes.ARCSEC * border)
+    left = far_light.left(SIDE, psf.planes.samples, psf.planes.images.shape[1])
+    kept = (psf.planes.images.mean(axis=0, dtype=float) * left[:, None] * left).sum()
+    assert 0.995 < kept < 0.9985
+    assert light + beyond == pytest.approx(1 - kept, rel=0.05)
