@@ -1,0 +1,74 @@
+"""Noise of a ramp's reads: each group's mean of r reads has the noise s / sqrt(r) of its own, and the outputs drift.
+
+A detector has 32 outputs, each of which reads its columns row by row.  What is left of their slow drift after the
+reference pixels were subtracted is noise of spectrum 1 / f along the order in which an output reads its pixels.  It is
+given by the width that it adds to the signal of a ramp and taken as linear in time over the ramp: a part in n of it goes
+to each of the n differences of groups, and none to their scatter.
+
+apply, EFFECT    noise of the reads
+apply_drift      1 / f noise of the outputs
+
+Ref : Kubik et al. 2025, NISP detectors on ground (7 and 9 e- of the estimated signal); Moseley et al. 2010, Proc. SPIE
+      7742, 77421B (1 / f of these outputs)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.fft
+
+from jobs.compiling import jit
+from jobs.render.effects import pixel_random
+from jobs.render.effects.scene import Frame
+from lake_schema.errors import OutOfRange
+
+OUTPUTS = 32
+
+
+def apply(frame: Frame, sigma: float, reads: int, rng: np.random.Generator) -> Frame:
+    """Groups [groups, ny, nx] e- -> with the noise of the mean of `reads` reads of sigma e- each."""
+    if not 0.0 <= sigma < 1e5:
+        raise OutOfRange("read noise", sigma, 0.0, 1e5)
+    out = np.empty_like(frame)
+    _add(frame.reshape(-1), out.reshape(-1), sigma / np.sqrt(reads), pixel_random.key(rng))
+    return out
+
+
+@jit
+def _add(frame: Any, out: Any, sigma: float, key: Any) -> None:
+    for i in range(len(frame)):
+        out[i] = frame[i] + sigma * pixel_random.normal(pixel_random.word(key, i))
+
+
+def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
+    """Groups [groups, ny, nx] e- -> with 1 / f noise of `width` e- rms in the last group above the first.
+
+    The columns are those of the outputs, neighbours together; their number need not be a multiple of 32.
+    """
+    if not 0.0 <= width < 1e5:
+        raise OutOfRange("1/f noise", width, 0.0, 1e5)
+    groups, ny, nx = frame.shape
+    edges = np.linspace(0, nx, OUTPUTS + 1).astype(int)
+    drift = np.empty((ny, nx), np.float32)
+    for first, last in zip(edges, edges[1:], strict=False):
+        drift[:, first:last] = _one_over_f(ny * (last - first), rng).reshape(ny, -1)
+    steps = (np.arange(groups) / (groups - 1.0)).astype(np.float32)
+    return frame + steps[:, None, None] * (np.float32(width) * drift)
+
+
+def _one_over_f(count: int, rng: np.random.Generator) -> Frame:
+    """float32[count] of spectrum 1 / f from one cycle a stream on, of rms 1 over the ensemble; its mean is 0."""
+    size = scipy.fft.next_fast_len(max(count, 2), real=True)
+    frequency = np.arange(size // 2 + 1)
+    amplitude = np.zeros(len(frequency), np.float32)
+    amplitude[1:] = 1.0 / np.sqrt(frequency[1:])
+    # Of a real stream all but the last frequency of an even size stand for two.
+    shares = np.where((frequency == size / 2) | (frequency == 0), 1.0, 2.0)
+    amplitude /= np.sqrt((shares * amplitude**2).sum())
+    parts = rng.standard_normal((2, len(frequency)), np.float32) * np.sqrt(np.float32(0.5))
+    spectrum = (parts[0] + 1j * parts[1]) * amplitude
+    if size % 2 == 0:
+        spectrum[-1] = np.sqrt(np.float32(2.0)) * spectrum[-1].real
+    return np.asarray(scipy.fft.irfft(spectrum, size, norm="forward")[:count])
