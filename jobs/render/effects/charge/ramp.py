@@ -134,15 +134,18 @@ def apply(
     if charge is None:
         charge = moment = np.zeros((0, light.shape[-1]))
     out = np.empty((mode.groups, *light.shape), np.float32)
-    keys = pixel_random.key(rng), pixel_random.key(rng)
-    shape = mode.groups, mode.reads, mode.drops
+    inputs = (light, charge, moment, nonlinearity)
+    expected, hit, when, bend = (np.ascontiguousarray(part, dtype=float).reshape(-1) for part in inputs)
     _accumulate(
-        *(np.ascontiguousarray(part, dtype=float).reshape(-1) for part in (light, charge, moment, nonlinearity)),
+        expected,
+        hit,
+        when,
+        bend,
         out.reshape(mode.groups, -1),
-        shape,
+        (mode.groups, mode.reads, mode.drops),
         mode.third_moments(),
         (full_well, linear_below),
-        keys,
+        (pixel_random.key(rng), pixel_random.key(rng)),
     )
     return out
 

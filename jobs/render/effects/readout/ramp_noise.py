@@ -55,7 +55,7 @@ def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
     for first, last in zip(edges, edges[1:], strict=False):
         drift[:, first:last] = _one_over_f(ny * (last - first), rng).reshape(ny, -1)
     steps = (np.arange(groups) / (groups - 1.0)).astype(np.float32)
-    return frame + steps[:, None, None] * (np.float32(width) * drift)
+    return np.asarray(frame + steps[:, None, None] * (np.float32(width) * drift))
 
 
 def _one_over_f(count: int, rng: np.random.Generator) -> Frame:
