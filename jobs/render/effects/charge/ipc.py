@@ -23,6 +23,7 @@ def apply(frame: Frame, side: float, diagonal: float, rng: np.random.Generator) 
     """Planes of charge [.., ny, nx] e- -> what is seen of it; the sum of each plane stays.
 
     side, diagonal : share of a pixel's charge that each neighbour sees, at its sides and at its corners
+    frame          : the planes;  rng : not used
     """
     for name, share in (("side", side), ("diagonal", diagonal)):
         if not 0.0 <= share <= 0.1:

@@ -127,6 +127,7 @@ def apply(
     full_well    : e- that a pixel holds, no more
     nonlinearity : [ny, nx] 1/e-: b of N (1 - b N), what is seen of N electrons
     linear_below : e- at the ramp's end up to which the linear law is used; 0 = every frame of every pixel is drawn
+    mode, rng    : how the ramp is read; random numbers
     """
     if not 0.0 < full_well < 1e9:
         raise OutOfRange("full well", full_well, 0.0, 1e9)

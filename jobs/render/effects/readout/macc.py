@@ -36,6 +36,7 @@ def beta(mode: Mode, read_noise: float) -> float:
 def apply(frame: Frame, mode: Mode, read_noise: float, rng: np.random.Generator) -> Frame:
     """Charge of the groups [groups, ny, nx] e- -> float64[2, ny, nx]: signal Q, e- in the integration; chi^2.
 
+    frame, mode : the groups, and how they were read;  rng : not used
     read_noise : e- of one read that the estimator expects
     Error      : Q is low by 0.1 to 0.5 e-, the estimator's own bias; two groups have no chi^2, 0
     """

@@ -28,7 +28,10 @@ OUTPUTS = 32
 
 
 def apply(frame: Frame, sigma: float, reads: int, rng: np.random.Generator) -> Frame:
-    """Groups [groups, ny, nx] e- -> with the noise of the mean of `reads` reads of sigma e- each."""
+    """Groups [groups, ny, nx] e- -> with the noise of the mean of `reads` reads of sigma e- each.
+
+    frame : the groups;  rng : random numbers
+    """
     if not 0.0 <= sigma < 1e5:
         raise OutOfRange("read noise", sigma, 0.0, 1e5)
     out = np.empty_like(frame)
