@@ -19,8 +19,8 @@ from jobs.render.camera import detectors
 from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim
 from jobs.render.drawing import stamp_sizes
-from jobs.render.exposure import render, visible_sources
-from jobs.render.exposure.records import Rows
+from jobs.render.exposure import persistence, render, visible_sources
+from jobs.render.exposure.records import Earlier, Rows
 from jobs.render.planning import preconditions, variants
 from jobs.render.planning import tasks as planned
 from jobs.render.planning.mission import mission_of
@@ -33,6 +33,7 @@ from jobs.render.sources.catalogue_rows import LENSES
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.published import read_back
 from lake_schema.store import layout, names, parquet, read, reuse
 from lake_schema.store.plan import Json, Output, Part, Plan
@@ -53,7 +54,9 @@ def steps(lake: Path, request: Request) -> list[Step]:
     exposures = inputs["exposures"].rows()
     every = preconditions.rendered(exposures, inputs["tasks"].rows())
     asked = planned.part(every, request)
-    places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in asked if task["cells"]}
+    earlier = _earlier_tasks(inputs, exposures, request)
+    needed = _with_earlier(asked, earlier)
+    places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in needed if task["cells"]}
     for name in ("galaxies", "stars"):
         of_task = [selection.needed(task, catalogue_rows.deflection_of(inputs[name])) for task in places.values()]
         preconditions.refuse_uncovered(inputs[name], {cell for cells in of_task for cell in cells})
@@ -95,8 +98,9 @@ def products(
     held = reuse.held(lake, PRODUCTS.name, request.name)
     wanted = {_part_name(task) for task in asked}
     tasks = _with_held(wanted, every, exposures, held)
-    psfs = psf_files(exposures, tasks)
-    keys = product_keys({**facts, "psf": psfs}, exposures, tasks, inputs, mission_of(request.mission))
+    earlier = _earlier_tasks(inputs, exposures, request)
+    psfs = psf_files(exposures, _with_earlier(tasks, earlier))
+    keys = product_keys({**facts, "psf": psfs}, exposures, tasks, inputs, mission_of(request.mission), earlier)
     parts = tuple(
         Part(name, {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: key})
         for task, key in zip(tasks, keys, strict=True)
@@ -104,8 +108,20 @@ def products(
     )
     if len(parts) < len(tasks):
         stay = {part.name for part in parts}
-        psfs = psf_files(exposures, [task for task in tasks if _part_name(task) in stay])
+        psfs = psf_files(exposures, _with_earlier([task for task in tasks if _part_name(task) in stay], earlier))
     return Plan(PRODUCTS, {**facts, "psf": psfs} if psfs else facts, parts)
+
+
+def _earlier_tasks(
+    inputs: Mapping[str, read.Version], exposures: pa.Table, request: Request
+) -> dict[tuple[int, str], list[Json]]:
+    """(exposure, detector) -> tasks that left something in the detector."""
+    rows = {row.exposure_id: row for row in map(ExposureRow.of, exposures.to_pylist())}
+    return persistence.earlier_of(inputs["tasks"].rows().to_pylist(), rows, mission_of(request.mission))
+
+
+def _with_earlier(tasks: Sequence[Json], earlier: Mapping[tuple[int, str], Sequence[Json]]) -> list[Json]:
+    return [*tasks, *(one for task in tasks for one in earlier.get((task["exposure_id"], task["detector"]), ()))]
 
 
 def _part_name(task: Json) -> str:
@@ -140,7 +156,8 @@ def work(lake: Path, facts: Json) -> Output:
     here = pc.field("exposure_id") == facts["exposure_id"]
     (exposed,) = map(ExposureRow.of, inputs["exposures"].rows(where=here).to_pylist())
     (task,) = inputs["tasks"].rows(where=here & (pc.field("detector") == facts["detector"])).to_pylist()
-    own = variants.variant(exposed.settings, read_back(inputs["mission"]), Accuracy(**request["accuracy"]), forced)
+    mission = read_back(inputs["mission"])
+    own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
     detector = detectors.detector(exposed.camera, task["detector"], own.mission)
     if exposed.psf:
         file = str(from_file.file_of(exposed.psf, task["detector"]))
@@ -176,6 +193,7 @@ def work(lake: Path, facts: Json) -> Output:
             if LENSES in inputs
             else None,
             bodies=bodies,
+            earlier=_earlier(lake, inputs, exposed, task, mission),
         )
         aim, noise = Aim.of(exposed, detector, band), request.get("noise_seed")
         rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
@@ -184,6 +202,43 @@ def work(lake: Path, facts: Json) -> Output:
     drawn = truth_table.truth(rendered)
     name = truth_file(facts["exposure_id"], facts["detector"])
     return Output(rows, {**files, name: lambda path: parquet.write(path, drawn, RENDERED_TRUTH)})
+
+
+def _earlier(
+    lake: Path, inputs: Mapping[str, read.Version], exposed: ExposureRow, task: Json, mission: MissionConfiguration
+) -> tuple[Earlier, ...]:
+    """Exposures of the task's detector that left something in it, with their bright sources."""
+    if registry.CHANNELS[exposed.channel].remembers is None:
+        return ()
+    window = mission.value(f"{exposed.camera}.persistence.window", "d")
+    near = (pc.field("mjd") >= exposed.mjd - window) & (pc.field("mjd") <= exposed.mjd)
+    found = inputs["exposures"].rows(where=near & (pc.field("camera") == exposed.camera)).to_pylist()
+    rows = {row.exposure_id: row for row in map(ExposureRow.of, found)}
+    here = pc.field("exposure_id").isin(list(rows)) & (pc.field("detector") == task["detector"])
+    tasks = inputs["tasks"].rows(where=here).to_pylist()
+    before = persistence.earlier_of(tasks, rows, mission)[exposed.exposure_id, task["detector"]]
+    return tuple(_drawn_again(lake, inputs, exposed, rows[one["exposure_id"]], one, mission) for one in before)
+
+
+def _drawn_again(
+    lake: Path,
+    inputs: Mapping[str, read.Version],
+    exposed: ExposureRow,
+    before: ExposureRow,
+    task: Json,
+    mission: MissionConfiguration,
+) -> Earlier:
+    least = persistence.least_flux(exposed, before)
+    found = [
+        catalogue_rows.bright(inputs[rows], inputs[fluxes], task, columns, before.band, least)
+        for rows, fluxes, columns in (
+            ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS),
+            ("stars", "star_fluxes", visible_sources.STAR_COLUMNS),
+        )
+    ]
+    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], before.band)
+    detector = detectors.detector(before.camera, task["detector"], mission)
+    return Earlier(Aim.of(before, detector, band), Rows(*found[0], *found[1]))
 
 
 def truth_work(lake: Path, facts: Json) -> Output:

@@ -12,6 +12,8 @@ CONTENTS = (
     ("sky", "expected electrons of the diffuse sky and of starlight that strays"),
     ("cosmic_rays", "electrons of cosmic rays, where they hit"),
     ("ghosts", "expected electrons of ghosts"),
+    ("persistence", "expected electrons that earlier exposures left"),
+    ("ramp", "groups of a ramp, as read"),
     ("saturation", "1 where a pixel or the converter is full"),
 )
 

@@ -37,6 +37,8 @@ class Channel:
     own_light  : effects that fill pixels besides the sky and its sources: lamps, injected charge
     tracks     : effects that leave tracks of charge, in the dark, too
     scattered  : whether bright sources beside a pixel shine into it: ghosts, stray light
+    ramp       : which of the mission's ramps its detectors are read up (Scene.ramp); "" = they are read once
+    remembers  : effect that brings what earlier exposures left; None: they leave nothing
     """
 
     effects: Mapping[str, tuple[Effect, ...]]
@@ -53,6 +55,8 @@ class Channel:
     own_light: tuple[Effect, ...] = ()
     tracks: tuple[Effect, ...] = ()
     scattered: bool = False
+    ramp: str = ""
+    remembers: Effect | None = None
 
     def __post_init__(self) -> None:
         for effects in self.effects.values():

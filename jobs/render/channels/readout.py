@@ -1,6 +1,7 @@
 """How a detector is read: the arrays that it gives, each with its unit and cards, and back from its files.
 
 FRAME       one array of pixels
+RAMP        the signal of a ramp, and whether it fits, in the frame of pixels that see no light
 QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan; quadrant_map: where each lies
 """
 
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from astropy.wcs import WCS
 
 from jobs.render.camera import astrometry
+from jobs.render.effects.charge import ramp
 from jobs.render.effects.readout import quadrants as layout
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.arrays import Array, Float
@@ -96,6 +98,54 @@ FRAME = ReadoutMode(
     assembled=lambda array, scene: array,
     pixels=lambda read: np.asarray(read[0].data),
     electrons=_frame_electrons,
+)
+
+
+# ---------------------------------------------------------------------------------------------- the signal of a ramp
+
+
+def _ramp(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
+    """Signal uint16 ADU and quality uint8, 1 where the ramp does not fit; two groups have no quality."""
+    mode, border = ramp.mode_of(scene), int(scene.value("fpa.reference_border", "pix"))
+    limit = scene.value(f"quality_limit_{scene.ramp}", "")
+    signal = found[0].astype(np.uint16)
+    level = np.uint16(scene.value("reference_level", "adu"))
+    cards: tuple[Card, ...] = (
+        ("READMODE", "MACC", "multiple accumulated groups"),
+        ("NG", mode.groups, "groups"),
+        ("NR", mode.reads, "reads in a group"),
+        ("ND", mode.drops, "frames dropped between two groups"),
+        ("FRTIME", ramp.frame_time(scene), "[s] from frame to frame"),
+        ("ELAPTIME", mode.frames * ramp.frame_time(scene), "[s] from the reset to the last read"),
+        ("REFPIX", border, "[pix] width of the border of reference pixels"),
+    )
+    place = astrometry.cards(astrometry.shifted(system, border, border))
+    planes = [Extension(f"{detector}.SCI", np.pad(signal, border, constant_values=level), "adu", place)]
+    if mode.groups > 2:
+        flag = (found[1] > limit).astype(np.uint8)
+        planes.append(Extension(f"{detector}.CHI2", np.pad(flag, border), "", place))
+        cards += (("QUALLIM", limit, "chi^2 above which a pixel's quality is 1"),)
+    else:
+        cards += (("QUALLIM", 0.0, "two groups have no chi^2: there is no quality"),)
+    return Readout(tuple(planes), signal, signal, cards)
+
+
+def _signal(read: Sequence[Image]) -> Array:
+    """Of the extensions after the header the first is the signal."""
+    border, data = int(_header(read[0])["REFPIX"]), np.asarray(read[1].data)
+    return data[border : len(data) - border, border : data.shape[1] - border]
+
+
+def _signal_electrons(read: Sequence[Image]) -> Float:
+    header = _header(read[0])
+    return np.asarray((_signal(read) - float(header["BIAS"])) * float(header["GAIN"]))
+
+
+RAMP = ReadoutMode(
+    arrays=_ramp,
+    assembled=lambda array, scene: array if array.ndim == 2 else array[0],
+    pixels=_signal,
+    electrons=_signal_electrons,
 )
 
 

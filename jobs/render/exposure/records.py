@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from jobs.accuracy import Accuracy
 from jobs.fluxes.libraries.templates import Library
+from jobs.render.channels.aim import Aim
 from jobs.render.sources.solar_system import Population
 from lake_schema.mission.configuration import MissionConfiguration
 
@@ -23,6 +24,7 @@ class Rows:
     bodies     : a day's moving bodies (ephemerides.Bodies.of_day); None = the embedded population
     library    : what the galaxies' sed_1 and sed_2 count;  stellar : what the stars' sed does; None = the embedded ones
     complete   : how far beyond the detector the rows have every source, arcsec
+    earlier    : exposures that left something in the detector
     """
 
     galaxies: pa.Table
@@ -34,6 +36,15 @@ class Rows:
     library: Library | None = None
     stellar: Library | None = None
     complete: float = 0.0
+    earlier: tuple[Earlier, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Earlier:
+    """An exposure of the same detector before; rows : of its bright sources."""
+
+    aim: Aim
+    rows: Rows
 
 
 @dataclass(frozen=True, slots=True)

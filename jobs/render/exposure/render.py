@@ -6,7 +6,7 @@ render          the whole of it
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.stamps import Tally
 from jobs.render.effects.effect import Effect, apply_all
 from jobs.render.effects.scene import Frame, Scene
-from jobs.render.exposure import limits, rendered, scene_of, truth_maps
+from jobs.render.exposure import limits, persistence, rendered, scene_of, truth_maps
 from jobs.render.exposure.records import Rows, Variant
 from jobs.render.exposure.rendered import Rendered
 from jobs.render.exposure.visible_sources import Light, visible_light
@@ -45,7 +45,7 @@ def render(
     aim      : the exposure and detector;  rows : catalogue rows that it may see
     variant  : mission, accuracy, and the effects that are forced on or off;  seed : of the request
     """
-    scene = scene_of.of_aim(aim, variant)
+    scene = replace(scene_of.of_aim(aim, variant), remembered=persistence.remembered(aim, rows.earlier, variant))
     light = visible_light(aim, rows, scene, seed)
     limits.refuse_too_large(aim, light)
     drawn, frame = _drawn(aim, light, truth, progress)

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 from jobs.accuracy import Accuracy
 from jobs.render.camera.detectors import Detector
+from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim
 from jobs.render.channels.channel import Channel
-from jobs.render.effects.charge import cosmic_rays
+from jobs.render.effects.charge import cosmic_rays, ramp
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
 from jobs.render.exposure.records import Variant
@@ -33,11 +34,16 @@ def scene_of(exposure: ExposureRow, detector: Detector, mission: MissionConfigur
 
     exposure : its row;  detector : of its camera
     mission  : the mission database;  accuracy : of the request
+    Errors   : BadInput for an exposure time that is too short for the channel's ramp
     """
-    return Scene(
+    channel = registry.CHANNELS.get(exposure.channel)
+    scene = Scene(
         mission, detector.section, exposure.exposure_time_s, exposure.sky, 0.0, detector,
-        lamp=exposure.lamp or 1, accuracy=accuracy,
+        lamp=exposure.lamp or 1, accuracy=accuracy, ramp=channel.ramp if channel else "",
     )  # fmt: skip
+    if scene.ramp:
+        ramp.mode_of(scene)
+    return scene
 
 
 def of_aim(aim: Aim, variant: Variant) -> Scene:

@@ -12,19 +12,25 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from jobs.render.channels.readout import ReadoutMode
-from jobs.render.effects.charge import bleeding
+from jobs.render.effects.charge import bleeding, ramp
 from jobs.render.effects.effect import Effect
+from jobs.render.effects.readout import adc
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.arrays import Array
 
 Maps = dict[str, Array]
 
 # Bytes a pixel of each map's file.
-BYTES = {"noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "saturation": 1}
+BYTES = {
+    "noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "persistence": 4, "saturation": 1,
+    # Four groups of a photometric ramp.
+    "ramp": 8,
+}  # fmt: skip
 # What adds to a map of the same name as an effect, or of another.
 _OF_EFFECT = {
     "ghosts": "ghosts", "background": "sky", "pixel_area": "sky", "straylight": "sky", "cosmic_rays": "cosmic_rays",
-    "readout_cosmic_rays": "cosmic_rays",
+    "readout_cosmic_rays": "cosmic_rays", "ramp_cosmic_rays": "cosmic_rays", "persistence": "persistence",
+    "macc": "ramp",
 }  # fmt: skip
 
 
@@ -50,8 +56,17 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode) -> 
             maps["ghosts"] = (after - before).astype(np.float32)
         if name in ("background", "pixel_area", "straylight") and "sky" in truth:
             maps["sky"] = (after - before).astype(np.float32) + maps.get("sky", np.float32(0.0))
+        if name == "persistence" and "persistence" in truth:
+            maps["persistence"] = (after - before).astype(np.float32)
         if name in ("bleeding", "full_well") and "saturation" in truth:
             maps["saturation"] = bleeding.saturated(after, scene.value("full_well", "electron")).astype(np.uint8)
+        if name == "ramp" and "saturation" in truth:
+            full = ramp.full(before, ramp.mode_of(scene), scene.value("full_well", "electron"))
+            maps["saturation"] = full.astype(np.uint8)
+        if name == "ramp_cosmic_rays" and "cosmic_rays" in truth and after.ndim == 3:
+            maps["cosmic_rays"] = np.rint(after[1]).astype(np.int32)
+        if name == "macc" and "ramp" in truth:
+            maps["ramp"] = adc.converted(before, scene)
         if name in ("cosmic_rays", "readout_cosmic_rays") and "cosmic_rays" in truth:
             # Traps may have held some of it back: to the electron.
             maps["cosmic_rays"] = np.rint(mode.assembled(after - before, scene)).astype(np.int32) + maps.get(
@@ -77,6 +92,7 @@ def complete(
         ("ghosts", np.float32),
         ("sky", np.float32),
         ("cosmic_rays", np.int32),
+        ("persistence", np.float32),
         ("saturation", np.uint8),
     ):
         if name in wanted and name not in maps:

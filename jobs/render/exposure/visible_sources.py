@@ -72,9 +72,9 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
         return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
     column = f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
-    galaxies, stars = (_fluxes(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs)
+    galaxies, stars = (fluxes_of(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs)
     settings, noise = settings_for(scene.accuracy), scene.pixel_noise
-    psf = of_colours(_psf(aim, scene, settings), settings.colours)
+    psf = psf_of(aim, scene, settings)
     sources, sizes = sources_of(rows, (galaxies, stars), aim, psf, noise, settings)
     bright = Lights()
     if aim.channel.moving:
@@ -87,10 +87,13 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     return Light(sources, sizes, neglected, psf, scene, decisions)
 
 
-def _psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
+def psf_of(aim: Aim, scene: Scene, settings: Settings) -> Psf:
+    """The exposure's own, or its channel's; of as many places and colours as the settings say."""
     if aim.exposure.psf:
-        return from_file.read(from_file.file_of(aim.exposure.psf, aim.detector.name), aim.detector, aim.band)
-    return aim.channel.psf(aim.exposure, aim.detector, aim.band, scene.mission, settings.positions)
+        found = from_file.read(from_file.file_of(aim.exposure.psf, aim.detector.name), aim.detector, aim.band)
+    else:
+        found = aim.channel.psf(aim.exposure, aim.detector, aim.band, scene.mission, settings.positions)
+    return of_colours(found, settings.colours)
 
 
 def _with_pixels(aim: Aim, scene: Scene, psf: Psf, electrons: Float) -> tuple[Psf, tuple[Decision, ...]]:
@@ -263,7 +266,8 @@ def _check(ids: Int, electrons: Float) -> None:
         raise BadInput(f"source {ids[np.argmax(bad)]}: {electrons[np.argmax(bad)]} electrons, outside 0 .. 1e17")
 
 
-def _fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
+def fluxes_of(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
+    """float64[n] f_nu of catalogue rows, microjansky; BadInput where the flux table is not of the same rows."""
     if column not in fluxes.column_names:
         raise BadInput(f"the flux table has no column {column}")
     if len(rows) != len(fluxes) or not np.array_equal(rows["id"].to_numpy(), fluxes["id"].to_numpy()):

@@ -32,22 +32,6 @@ class Unrendered:
 
 
 UNRENDERED: Mapping[str, Unrendered] = {
-    # Assumed: as VIS with smaller stamps.
-    "NISP-P": Unrendered(
-        Cost(
-            frame_s=6.0,
-            sky_s=0.0,
-            galaxy_s=1.0e-3,
-            star_s=1.0e-3,
-            base_gb=0.5,
-            held=80.0,
-            held_sky=80.0,
-            written=3.0,
-            assumed=True,
-        ),
-        bands.of_one("nisp", "euclid_y", "euclid_j", "euclid_h"),
-        diffuse_light.thermal_sky,
-    ),
     # Assumed: a spectrum is 512 pixels long.
     "NISP-S": Unrendered(
         Cost(

@@ -11,7 +11,8 @@ import numpy as np
 from jobs import accuracy, rng
 from jobs.render.camera import astrometry
 from jobs.render.channels.registry import effects_of
-from jobs.render.effects.readout import bias_structure, charge_transfer, nonlinearity, read_noise
+from jobs.render.effects.charge import ramp
+from jobs.render.effects.readout import bias_structure, charge_transfer, nonlinearity, ramp_noise, read_noise
 from jobs.render.exposure.rendered import Rendered, numbers_of
 from lake_schema import __version__
 from lake_schema.arrays import Float
@@ -19,6 +20,8 @@ from lake_schema.fits.images import Card
 
 # Of an amplifier's offset, a column's stripe and a reading: what next to no pixel is below.
 _SURE = 5.0
+# Effects that bring dark current.
+_DARK = {"dark_current", "dark_map"}
 # Of each number of an accuracy: the end of its keywords, and what it is of.
 _ERRORS = {
     "flux": ("FLUX", "fraction of a source's flux"),
@@ -38,7 +41,11 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
         *unit_cards(rendered.readout.unit),
         *((key, float(value), comment) for key, value, comment in _of_amplifiers(rendered) if np.ndim(value) == 0),
         ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
-        ("DARKRATE", ("dark_current" in applied) * scene.dark_rate, "[electron/s/pix] mean dark current in the image"),
+        (
+            "DARKRATE",
+            bool(_DARK & applied) * scene.dark_rate,
+            "[electron/s/pix] mean dark current in the image",
+        ),
         *_effect_cards(rendered),
     )
 
@@ -62,7 +69,8 @@ def amplifier_cards(rendered: Rendered, number: int | None) -> tuple[Card, ...]:
 def _of_amplifiers(rendered: Rendered) -> tuple[tuple[str, float | Float, str], ...]:
     """Keyword, value or values [q], comment."""
     scene = rendered.scene
-    noisy = any(decision.name == "read_noise" and decision.applied for decision in rendered.decisions)
+    noises = read_noise.EFFECT.name, ramp_noise.EFFECT.name
+    noisy = any(decision.name in noises and decision.applied for decision in rendered.decisions)
     return (
         ("GAIN", scene.of_amplifiers("gain", "electron / adu"), "[electron/adu] conversion gain"),
         ("RDNOISE", noisy * scene.of_amplifiers("read_noise", "electron"), "[electron] rms read noise in the image"),
@@ -77,6 +85,8 @@ _TRUTH = {
     "sky": ("electron", "unit of the pixels: expected, sky alone"),
     "cosmic_rays": ("electron", "unit of the pixels: cosmic rays alone"),
     "ghosts": ("electron", "unit of the pixels: expected, ghosts alone"),
+    "persistence": ("electron", "unit of the pixels: expected, persistence"),
+    "ramp": ("adu", "unit of the pixels: groups as read"),
     "saturation": ("", "1 where a pixel or the converter is saturated"),
 }
 
@@ -146,13 +156,13 @@ def _saturation(rendered: Rendered) -> float | Float:
     # The first of a column, or a row, finds all traps empty.
     losses = (charge_transfer.PARALLEL, charge_transfer.SERIAL)
     left = full - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
-    signal: float | Float = left
+    signal: float | Float = ramp.full_signal(scene) if scene.ramp else left
     if nonlinearity.EFFECT.name in applied:
         curve = nonlinearity.parameters(scene)
         parts = max(np.size(number) for number in curve)
         signal = nonlinearity.apply(np.full(parts, max(left, 0.0)), *curve)
         signal = signal if parts > 1 else float(signal[0])
-    noises = (bias_structure.EFFECT, read_noise.EFFECT)
+    noises = (bias_structure.EFFECT, read_noise.EFFECT, ramp_noise.EFFECT, ramp_noise.DRIFT)
     signal = signal - _SURE * sum(effect.contribution(scene) for effect in noises if effect.name in applied)
     level = signal / scene.of_amplifiers("gain", "electron / adu") + scene.of_amplifiers("bias", "adu")
     found = np.floor(np.clip(level, 0.0, scene.of_amplifiers("adc_max", "adu")))

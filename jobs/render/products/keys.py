@@ -27,12 +27,14 @@ def product_keys(
     tasks: Sequence[Json],
     inputs: Mapping[str, read.Version],
     mission: MissionConfiguration,
+    earlier: Mapping[tuple[int, str], Sequence[Json]],
 ) -> list[str]:
     """Of each task, the digest of everything that shapes its products, and of nothing else.
 
     facts : of the plan: request, mission, code
     exposures : rows of the table;  tasks : rows of the table, to be rendered
     inputs    : versions of the tables that are read, by name;  mission : the mission database
+    earlier   : tasks that left something in a detector, by exposure and detector
     """
     flux_facts = inputs["galaxy_fluxes"].manifest["facts"]
     shared = {
@@ -68,18 +70,19 @@ def product_keys(
             (files["bodies"],) = facts["bodies"].values()
         return files
 
-    return [
-        digest(
-            {
-                **shared,
-                "exposure": asdict(rows[task["exposure_id"]]),
-                "task": {name: task[name] for name in ("detector", "cells", "radius")},
-                "catalogues": catalogues(task) if task["cells"] else [],
-                **own(task),
-            }
-        )
-        for task in tasks
-    ]
+    def drawn(task: Json) -> Json:
+        return {
+            "exposure": asdict(rows[task["exposure_id"]]),
+            "task": {name: task[name] for name in ("detector", "cells", "radius")},
+            "catalogues": catalogues(task) if task["cells"] else [],
+            **own(task),
+        }
+
+    def before(task: Json) -> Json:
+        some = earlier.get((task["exposure_id"], task["detector"]), ())
+        return {"earlier": [drawn(one) for one in some]} if some else {}
+
+    return [digest({**shared, **drawn(task), **before(task)}) for task in tasks]
 
 
 def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:

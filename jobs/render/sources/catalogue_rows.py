@@ -71,6 +71,29 @@ def sources(
     return rows, light, complete
 
 
+def bright(
+    catalogue: read.Version,
+    fluxes: read.Version,
+    task: Mapping[str, Any],
+    columns: Sequence[str],
+    band: str,
+    least: float,
+) -> tuple[pa.Table, pa.Table]:
+    """(rows of a catalogue that are seen within a task's circle and shine brightly, their fluxes).
+
+    least : microjansky; infinite where no source shows
+    catalogue, fluxes : versions of the two tables;  task : its row
+    columns : that are wanted;  band : whose fluxes are
+    """
+    cells = selection.needed(task, deflection_of(catalogue)) if np.isfinite(least) else []
+    light = fluxes.in_cells(cells, GENERATION_ORDER, ["id", f"f_nu_{band}"])
+    light = light.filter(pc.greater_equal(light[f"f_nu_{band}"], least))
+    # Fluxes are small: only the parts of the catalogue that have some of these are read.
+    parts = [part["name"] for part in catalogue.manifest["parts"] if not set(cells).isdisjoint(part["facts"][CELLS])]
+    found = catalogue.rows(columns, parts if len(light) else [], pc.field("id").isin(light["id"]))
+    return found, light
+
+
 def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, least: float) -> pa.Table:
     """Strong lenses that are seen within a task's circle.
 

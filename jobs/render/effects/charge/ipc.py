@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
-from jobs.render.effects.effect import Effect
+from jobs.render.effects.effect import Effect, nothing
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import BadInput, OutOfRange
 
@@ -56,9 +56,9 @@ def _parameters(scene: Scene) -> tuple[float, float]:
 
 
 def _contribution(scene: Scene) -> float:
-    """Of the brightest pixel, what its neighbours see."""
+    """Of the brightest pixel, what its neighbours see: a cosmic ray may fill any."""
     side, diagonal = _parameters(scene)
-    return 4.0 * (side + diagonal) * max(scene.peak_electrons, 0.0)
+    return 4.0 * (side + diagonal) * scene.value("full_well", "electron")
 
 
-EFFECT = Effect("ipc", apply, _parameters, _contribution, cost=2e-3)
+EFFECT = Effect("ipc", apply, _parameters, _contribution, cost=2e-2, repeated=nothing)

@@ -31,6 +31,11 @@ ten electrons and its noise is that of its reads.
 Where a pixel is not linear in its counts (a cosmic ray, saturation, so much charge that the non-linearity of its noise
 shows) every frame is drawn.  Full well and non-linearity act on the charge of a frame, before groups are averaged.
 
+apply, EFFECT   expected light -> charge of the groups
+Mode, mode_of   how a ramp is read
+planes          a frame with room for what a ramp wants to know besides light
+full_signal     what is measured of a pixel that is full at the end
+
 Ref : Kubik et al. 2016, PASP 128, 104504 (groups, alpha); the moments above are those of sums of independent counts
 """
 
@@ -45,13 +50,16 @@ import numpy as np
 from jobs.compiling import jit
 from jobs.render.effects import pixel_random
 from jobs.render.effects.charge import poisson
-from jobs.render.effects.scene import Frame
-from lake_schema.arrays import Float
+from jobs.render.effects.effect import Effect, nothing
+from jobs.render.effects.scene import Frame, Scene
+from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput, OutOfRange
 
 # Electrons at a ramp's end above which the noise of a pixel is not linear in its charge, and every frame is drawn: there
 # 2 b N, the change of the noise, is 0.4 %.
 LINEAR_BELOW = 3000.0
+# Of a number of drops: exposure times that differ by less are the same.
+_SAME = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,11 +119,51 @@ class Mode:
         return float((total**3).sum()), float((total * g).sum()), float((g**2).sum())
 
 
+def mode_of(scene: Scene) -> Mode:
+    """That of the scene's ramp, with as many drops as its exposure time wants.
+
+    Errors : BadInput where the reads alone take longer
+    """
+    groups, reads, drops = (int(scene.value(f"macc.{scene.ramp}.{part}", "")) for part in ("groups", "reads", "drops"))
+    nominal, time = Mode(groups, reads, drops), scene.value("frame_time", "s")
+    wanted = scene.exposure_time_s / (time * nominal.differences) - reads
+    if abs(wanted - drops) < _SAME:
+        return nominal
+    if round(wanted) < 0:
+        least = time * nominal.differences * reads
+        raise BadInput(f"exposure time {scene.exposure_time_s:g} s: {nominal} takes {least:.4g} s without any drops")
+    return Mode(groups, reads, round(wanted))
+
+
+def frame_time(scene: Scene) -> float:
+    """Seconds from frame to frame: the mission's, where the exposure time is a multiple of it, else near it."""
+    return scene.exposure_time_s / mode_of(scene).integrated
+
+
+def planes(frame: Frame, count: int) -> Frame:
+    """A new [count, ny, nx] of `apply`: what the frame has, and zeros."""
+    out = np.zeros((count, *frame.shape[-2:]))
+    given = frame.reshape(-1, *frame.shape[-2:])
+    out[: len(given)] = given
+    return out
+
+
+def full_signal(scene: Scene) -> float:
+    """Electrons that are measured in the integration time of a pixel that is full at the ramp's end."""
+    mode, full = mode_of(scene), scene.value("full_well", "electron")
+    return full * (1.0 - scene.value("nonlinearity", "1 / electron") * full) * mode.integrated / mode.frames
+
+
+def full(frame: Frame, mode: Mode, full_well: float) -> Bool:
+    """[ny, nx] pixels of a frame of `apply` that are expected to be full at the ramp's end."""
+    light, charge = (frame[0], frame[1]) if frame.ndim == 3 else (frame, 0.0)
+    return np.asarray(light * (mode.frames / mode.integrated) + charge >= full_well)
+
+
 def apply(
     frame: Frame,
     mode: Mode,
     full_well: float,
-    nonlinearity: Frame,
     linear_below: float = LINEAR_BELOW,
     *,
     rng: np.random.Generator,
@@ -123,20 +171,18 @@ def apply(
     """Expected light -> charge of the groups, float32[groups, ny, nx] e-.
 
     frame        : [ny, nx] e- expected in the mode's integration time; or [3, ny, nx], with the charge that cosmic rays
-                   leave in a pixel, e-, and the moment of it as a fraction of the ramp, 0 <= moment < 1
+                   leave in a pixel, e-, and the moment of it as a fraction of the ramp, 0 <= moment < 1; or
+                   [4, ny, nx], with b of N (1 - b N), what is seen of N electrons, 1/e-
     full_well    : e- that a pixel holds, no more
-    nonlinearity : [ny, nx] 1/e-: b of N (1 - b N), what is seen of N electrons
     linear_below : e- at the ramp's end up to which the linear law is used; 0 = every frame of every pixel is drawn
     mode, rng    : how the ramp is read; random numbers
     """
     if not 0.0 < full_well < 1e9:
         raise OutOfRange("full well", full_well, 0.0, 1e9)
-    light, charge, moment = frame if frame.ndim == 3 else (frame, None, None)
-    if charge is None:
-        charge = moment = np.zeros((0, light.shape[-1]))
-    out = np.empty((mode.groups, *light.shape), np.float32)
-    inputs = (light, charge, moment, nonlinearity)
-    expected, hit, when, bend = (np.ascontiguousarray(part, dtype=float).reshape(-1) for part in inputs)
+    planes = [*frame] if frame.ndim == 3 else [frame]
+    out = np.empty((mode.groups, *planes[0].shape), np.float32)
+    inputs = [np.ascontiguousarray(part, dtype=float).reshape(-1) for part in planes]
+    expected, hit, when, bend = (*inputs, *[np.zeros(0)] * (4 - len(inputs)))
     _accumulate(
         expected,
         hit,
@@ -169,16 +215,17 @@ def _accumulate(
     for p in range(size):
         f = max(light[p], 0.0) / ((groups - 1) * (reads + drops))
         hit = charge[p] if len(charge) > 0 else 0.0
+        b = bend[p] if len(bend) > 0 else 0.0
         end = f * frames
         if hit != 0.0 or end > linear_below or end + 10.0 * math.sqrt(end) > full_well:
             when = int(moment[p] * frames) if len(charge) > 0 else 0
-            _every_frame(f, hit, when, shape, full_well, bend[p], keys[1], p, group)
+            _every_frame(f, hit, when, shape, full_well, b, keys[1], p, group)
         else:
             for i in range(groups + 1):
                 e[i] = pixel_random.normal(pixel_random.word(keys[0], p + i * size))
             _vector(f, shape, cumulants, e, group)
             for i in range(groups):
-                group[i] -= bend[p] * f * f * squares[i]
+                group[i] -= b * f * f * squares[i]
         for i in range(groups):
             out[i, p] = group[i]
 
@@ -240,3 +287,10 @@ def _every_frame(
         i = k // (reads + drops)
         if k - i * (reads + drops) < reads:
             group[i] += held * (1.0 - bend * held) / reads
+
+
+def _parameters(scene: Scene) -> tuple[Mode, float]:
+    return mode_of(scene), scene.value("full_well", "electron")
+
+
+EFFECT = Effect("ramp", apply, _parameters, poisson.EFFECT.contribution, optional=False, cost=3e-2, repeated=nothing)

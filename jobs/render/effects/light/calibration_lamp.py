@@ -1,4 +1,4 @@
-"""Flats: the calibration unit shines with one of its six LEDs; what it lights is far from even.
+"""Flats: the calibration unit shines with one of its LEDs; what it lights is far from even.
 
 Each has its own wavelengths: of as much light the band detects more or less.
 """
@@ -8,13 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from jobs.fluxes import passbands
-from jobs.render.camera.lamps import LEDS
+from jobs.render.camera.lamps import LAMPS
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import illumination
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import OutOfRange
 
-_BAND = "euclid_vis"
 # Standard deviations in a full width at half maximum.
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
@@ -34,30 +33,31 @@ def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
 
     scene : with the parameters of the unit;  led : its number;  nx, ny : pixels of the detector
     """
-    if not 1 <= led <= LEDS:
-        raise OutOfRange("LED", led, 1, LEDS)
-    angle = 2.0 * np.pi * (led - 1) / LEDS
+    leds, _ = LAMPS[scene.section]
+    if not 1 <= led <= leds:
+        raise OutOfRange("LED", led, 1, leds)
+    angle = 2.0 * np.pi * (led - 1) / leds
     slope = scene.value("flat.gradient", "")
     direction = (slope * float(np.cos(angle)), slope * float(np.sin(angle)))
     return illumination.pattern(scene, nx, ny, scene.value("flat.illumination", ""), direction)
 
 
 def seen(scene: Scene, led: int) -> float:
-    """What the band detects of an LED's photons, over what the embedded band would where it sees best; no unit.
+    """What the band detects of an LED's photons, over what the embedded bands would where they see best; no unit.
 
     led    : its number, from 1
     Error  : the LED's spectrum is taken as a Gaussian of its central wavelength and width
     Errors : OutOfRange for a number that no LED has
     """
-    if not 1 <= led <= LEDS:
-        raise OutOfRange("LED", led, 1, LEDS)
-    usual = passbands.load(_BAND)
-    band = scene.band or usual
+    leds, bands = LAMPS[scene.section]
+    if not 1 <= led <= leds:
+        raise OutOfRange("LED", led, 1, leds)
+    band = scene.band or passbands.load(bands[0])
     width = 10.0 * scene.value("flat.led_width", "nm") / _FWHM
     off = (band.wavelength - 10.0 * scene.value(f"flat.led_{led}", "nm")) / width
     # On wavelengths 1 A apart.
     detected = float(np.sum(band.response * np.exp(-0.5 * off**2)) / (width * np.sqrt(2.0 * np.pi)))
-    return detected / float(usual.response.max())
+    return detected / max(float(passbands.load(name).response.max()) for name in bands)
 
 
 def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:

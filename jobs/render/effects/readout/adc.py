@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from jobs.compiling import jit
 from jobs.render.effects.effect import Effect, by_pixel
@@ -30,6 +31,16 @@ def apply(
     return by_pixel(_convert, frame, gain, bias + 0.5, largest)
 
 
+def apply_signal(
+    frame: Frame, gain: float, bias: float, largest: float, rng: np.random.Generator | None = None
+) -> Frame:
+    """[2, ny, nx] signal of a ramp, e-, and its chi^2 -> the signal in ADU, and chi^2 as it is.
+
+    gain, bias, largest, rng : as of `apply`
+    """
+    return np.stack([apply(frame[0], gain, bias, largest), frame[1]])
+
+
 @jit
 def _convert(electrons: Any, numbers: Any, gain: float, offset: float, largest: float) -> None:
     for i in range(len(electrons)):
@@ -41,9 +52,16 @@ def _parameters(scene: Scene) -> tuple[float | Float, float | Float, float | Flo
     return gain, bias, scene.of_amplifiers("adc_max", "adu")
 
 
+def converted(groups: Frame, scene: Scene) -> npt.NDArray[np.uint16]:
+    """Groups of a ramp [groups, ny, nx] e- -> ADU."""
+    numbers = _parameters(scene)
+    return np.stack([apply(group, *numbers).astype(np.uint16) for group in groups])
+
+
 def _contribution(scene: Scene) -> float:
     gain, bias, _ = _parameters(scene)
     return float(np.max(gain * (bias + 0.5)))
 
 
 EFFECT = Effect("adc", apply, _parameters, _contribution, optional=False, cost=3e-3)
+SIGNAL = Effect("signal_adc", apply_signal, _parameters, _contribution, optional=False, cost=8e-3)

@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
-from jobs.render.effects.charge.ramp import Mode
-from jobs.render.effects.scene import Frame
+from jobs.render.effects.charge.ramp import Mode, mode_of
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import OutOfRange
 
 
@@ -67,3 +68,10 @@ def _estimate(groups: Any, out: Any, beta: float, a: float) -> None:
             out[1, p] = 2.0 / a * scatter / (root + mean) if root > 0.0 else 0.0
         else:
             out[1, p] = 2.0 / a * n * (root - mean)
+
+
+def _parameters(scene: Scene) -> tuple[Mode, float]:
+    return mode_of(scene), scene.value("read_noise", "electron")
+
+
+EFFECT = Effect("macc", apply, _parameters, lambda scene: scene.pixel_noise, optional=False, cost=1e-2)

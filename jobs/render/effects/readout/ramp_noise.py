@@ -5,8 +5,9 @@ reference pixels were subtracted is noise of spectrum 1 / f along the order in w
 given by the width that it adds to the signal of a ramp and taken as linear in time over the ramp: a part in n of it goes
 to each of the n differences of groups, and none to their scatter.
 
-apply, EFFECT    noise of the reads
-apply_drift      1 / f noise of the outputs
+apply, EFFECT        noise of the reads
+apply_drift, DRIFT   1 / f noise of the outputs
+apply_reset, RESET   the level that each pixel was reset to: the same in all groups, so that the signal has none of it
 
 Ref : Kubik et al. 2025, NISP detectors on ground (7 and 9 e- of the estimated signal); Moseley et al. 2010, Proc. SPIE
       7742, 77421B (1 / f of these outputs)
@@ -21,7 +22,8 @@ import scipy.fft
 
 from jobs.compiling import jit
 from jobs.render.effects import pixel_random
-from jobs.render.effects.scene import Frame
+from jobs.render.effects.effect import Effect, nothing
+from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import OutOfRange
 
 OUTPUTS = 32
@@ -61,6 +63,24 @@ def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
     return np.asarray(frame + steps[:, None, None] * (np.float32(width) * drift))
 
 
+def apply_reset(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
+    """Groups [groups, ny, nx] e- -> above the level of each pixel's reset, of sigma e- rms."""
+    if not 0.0 <= sigma < 1e6:
+        raise OutOfRange("reset noise", sigma, 0.0, 1e6)
+    out = np.empty_like(frame)
+    groups = np.ascontiguousarray(frame).reshape(len(frame), -1)
+    _lift(groups, out.reshape(len(frame), -1), sigma, pixel_random.key(rng))
+    return out
+
+
+@jit
+def _lift(groups: Any, out: Any, sigma: float, key: Any) -> None:
+    for p in range(groups.shape[1]):
+        level = sigma * pixel_random.normal(pixel_random.word(key, p))
+        for i in range(len(groups)):
+            out[i, p] = groups[i, p] + level
+
+
 def _one_over_f(count: int, rng: np.random.Generator) -> Frame:
     """float32[count] of spectrum 1 / f from one cycle a stream on, of rms 1 over the ensemble; its mean is 0."""
     size = scipy.fft.next_fast_len(max(count, 2), real=True)
@@ -75,3 +95,26 @@ def _one_over_f(count: int, rng: np.random.Generator) -> Frame:
     if size % 2 == 0:
         spectrum[-1] = np.sqrt(np.float32(2.0)) * spectrum[-1].real
     return np.asarray(scipy.fft.irfft(spectrum, size, norm="forward")[:count])
+
+
+def _reads(scene: Scene) -> tuple[float, int]:
+    return scene.value("read_noise", "electron"), int(scene.value(f"macc.{scene.ramp}.reads", ""))
+
+
+def _drift(scene: Scene) -> float:
+    return scene.value(f"drift_{scene.ramp}", "electron")
+
+
+def _reset(scene: Scene) -> float:
+    return scene.value("reset_noise", "adu") * scene.value("gain", "electron / adu")
+
+
+def _of_reads(scene: Scene) -> float:
+    """Of the difference of two groups."""
+    sigma, reads = _reads(scene)
+    return sigma * float(np.sqrt(2.0 / reads))
+
+
+EFFECT = Effect("group_noise", apply, _reads, _of_reads, cost=4e-2, repeated=nothing)
+DRIFT = Effect("drift", apply_drift, lambda scene: (_drift(scene),), _drift, cost=4e-2, repeated=nothing)
+RESET = Effect("reset_level", apply_reset, lambda scene: (_reset(scene),), _reset, cost=1e-2, repeated=nothing)

@@ -4,19 +4,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jobs.render.channels import ground, vis
+from jobs.render.channels import ground, nisp_p, vis
+from jobs.render.effects.charge.ramp import Mode
 from jobs.render.effects.light.ghosts import Pupil
 from jobs.render.effects.readout.traps import Sweeps, Traps
 from jobs.render.effects.scene import Lights
 from lake_schema.mission.configuration import resolve
 
 # Every effect of a channel, by its name.
-EFFECTS = {e.name: e for channel in (vis, ground) for effects in channel.EFFECTS.values() for e in effects}
+EFFECTS = {e.name: e for channel in (vis, nisp_p, ground) for effects in channel.EFFECTS.values() for e in effects}
 LIGHTS = Lights(np.array([3.2, 40.0]), np.array([2.0, -30.0]), np.array([1e8, 1e9]))
 END_OF_LIFE = Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
 EMPTY = Traps((0.0,), (1.0,), 2e5, 0.0, 0.58)
 TRACKS = np.array(resolve().numbers("env.cosmic_rays.vis_tracks"))
 DUST = (1e-2, 3.0, 0.2)
+PHOTOMETRIC = Mode(4, 16, 4)
 PAIRS = np.full((4, 4), 1e-4) - 1e-4 * np.eye(4)
 
 
@@ -27,6 +29,7 @@ class Case:
     name      : of the effect, and after a colon what this case of it is
     on, off   : apply(frame, *on, rng=) acts; apply(frame, *off, rng=) does nothing (None: it cannot)
     planes    : [4, ny, nx] is what it wants, not [ny, nx]
+    reshapes  : what it returns has another shape;  dtype : and what type
     linear    : apply(a x) = a apply(x)
     zero      : nothing comes of nothing
     conserves : the sum stays
@@ -42,6 +45,8 @@ class Case:
     conserves: bool = False
     whole: bool = False
     positive: bool = True
+    reshapes: bool = False
+    dtype: type = np.float64
 
     @property
     def apply(self):
@@ -59,6 +64,11 @@ def flat(shape):
 
 def stretched(strength):
     return lambda shape: (120.0, *(np.arange(float(n)) for n in shape[:-3:-1]), np.array([[0.0, strength], [0.0, 0.0]]))
+
+
+def remembering(electrons):
+    """Persistence in every other column."""
+    return lambda shape: (electrons * np.indices(shape)[1] % 2, 0.3)
 
 
 # `on` and `off` may depend on the frame's shape.
@@ -108,6 +118,19 @@ _CASES = (
     Case("bias_structure", (30.0, -9.0, 40.0, 1.0), (0.0, 0.0, 40.0, 0.0), planes=True, zero=False, positive=False),
     Case("read_noise", (4.4,), (0.0,), zero=False, positive=False),
     Case("adc", (3.48, 0.0, 65535.0), None, whole=True),
+    # Up the ramp.
+    Case("dark_map", (1.7, 0.3, 0.01, 400.0), (0.0, 0.3, 0.0, 400.0), zero=False),
+    Case("persistence", remembering(3.0), (None, 0.3), zero=False),
+    Case("ramp_cosmic_rays", (5.0, 0.4, 6e3, 0.5), (0.0, 0.4, 6e3, 0.5), zero=False, reshapes=True, positive=True),
+    Case("ramp_nonlinearity", (6e-7, 0.1), None, zero=False, reshapes=True),
+    Case("ramp", (PHOTOMETRIC, 1.3e5), None, positive=False, reshapes=True, dtype=np.float32),
+    Case("ipc", (6.5e-3, 4e-4), (0.0, 0.0), planes=True, linear=True, conserves=True),
+    Case("reset_level", (44.0,), (0.0,), planes=True, zero=False, positive=False),
+    Case("group_noise", (13.0, 16), (0.0, 16), planes=True, zero=False, positive=False),
+    Case("drift", (5.1,), (0.0,), planes=True, zero=False, positive=False),
+    Case("macc", (PHOTOMETRIC, 13.0), None, planes=True, zero=False, positive=False, reshapes=True),
+    Case("signal_nonlinearity", (6e-7, 0.1), (0.0, 0.1), planes=True),
+    Case("signal_adc", (1.92, 1024.0, 65535.0), None, planes=True, zero=False, reshapes=True),
 )
 CASES = {case.name: case for case in _CASES}
 # The sides of frames that a case can be asked for: quadrants want even ones.

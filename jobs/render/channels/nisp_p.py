@@ -1,0 +1,96 @@
+"""Euclid NISP-P: the order of physics.
+
+Light and dark current are expected electrons until they are counted up the ramp; then charge of its groups, as every
+pixel and its neighbours see it and as it is read; then the signal that is estimated of them on board, and its quality.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from jobs.fluxes.passbands import Passband
+from jobs.render.camera import bands
+from jobs.render.camera.detectors import Detector
+from jobs.render.channels import readout
+from jobs.render.channels.channel import Channel
+from jobs.render.channels.cost import Cost
+from jobs.render.channels.image_types import SKY_TYPES
+from jobs.render.effects.charge import (
+    dark_map,
+    ipc,
+    persistence,
+    pixel_response,
+    ramp,
+    ramp_cosmic_rays,
+    ramp_nonlinearity,
+)
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.light import background, calibration_lamp, pixel_area, straylight
+from jobs.render.effects.readout import adc, macc, ramp_noise
+from jobs.render.psf import euclid
+from jobs.render.psf.model import Psf
+from jobs.render.sky import diffuse_light
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
+
+_LIGHT = (
+    straylight.EFFECT,
+    background.EFFECT,
+    pixel_area.EFFECT,
+)
+_CURRENT = (
+    dark_map.EFFECT,
+    persistence.EFFECT,
+)
+_RAMP = (
+    ramp_cosmic_rays.EFFECT,
+    ramp_nonlinearity.EFFECT,
+    ramp.EFFECT,
+    ipc.EFFECT,
+    ramp_noise.RESET,
+    ramp_noise.EFFECT,
+    ramp_noise.DRIFT,
+    macc.EFFECT,
+    ramp_nonlinearity.SIGNAL,
+    adc.SIGNAL,
+)
+
+SKY = (*_LIGHT, pixel_response.EFFECT, *_CURRENT, *_RAMP)
+# Assumed to be taken on the way from field to field: neither sky nor stars are in a flat.
+FLAT = (calibration_lamp.EFFECT, pixel_response.EFFECT, *_CURRENT, *_RAMP)
+DARK = (*_CURRENT, *_RAMP)
+
+EFFECTS: Mapping[str, tuple[Effect, ...]] = {
+    "science": SKY,
+    "deep": SKY,
+    "self_calibration": SKY,
+    "standard_star": SKY,
+    "flat": FLAT,
+    "dark": DARK,
+}
+
+
+def _psf(
+    exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
+) -> Psf:
+    return euclid.nisp_psf(detector, band, mission, positions)
+
+
+# Not measured yet: as VIS.
+COST = Cost(frame_s=0.05, sky_s=0.3, galaxy_s=1.0e-4, star_s=1.0e-4, base_gb=0.5, held=80.0, held_sky=80.0, written=3.0)
+
+CHANNEL = Channel(
+    effects=EFFECTS,
+    psf=_psf,
+    readout=readout.RAMP,
+    bands=bands.of_one("nisp", "euclid_y", "euclid_j", "euclid_h"),
+    sky=diffuse_light.thermal_sky,
+    cost=COST,
+    sky_types=(*SKY_TYPES, "standard_star"),
+    pupil=euclid.nisp_edges,
+    moving=True,
+    own_light=(calibration_lamp.EFFECT,),
+    scattered=True,
+    ramp="photometric",
+    remembers=persistence.EFFECT,
+)
