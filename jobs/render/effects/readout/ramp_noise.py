@@ -2,8 +2,8 @@
 
 A detector has 32 outputs, each of which reads its columns row by row.  What is left of their slow drift after the
 reference pixels were subtracted is noise of spectrum 1 / f along the order in which an output reads its pixels.  It is
-given by the width that it adds to the signal of a ramp and taken as linear in time over the ramp: a part in n of it goes
-to each of the n differences of groups, and none to their scatter.
+given by the width that it adds to the signal of a ramp and taken as linear in time over the ramp: a part in n of it
+goes to each of the n differences of groups, and none to their scatter.
 
 apply, EFFECT        noise of the reads
 apply_drift, DRIFT   1 / f noise of the outputs
@@ -15,6 +15,7 @@ Ref : Kubik et al. 2025, NISP detectors on ground (7 and 9 e- of the estimated s
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import OutOfRange
 
 OUTPUTS = 32
+# Rows in which reference pixels follow a drift (assumed): what is slower was subtracted.
+_FOLLOWED = 64
 
 
 def apply(frame: Frame, sigma: float, reads: int, rng: np.random.Generator) -> Frame:
@@ -57,8 +60,8 @@ def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
     groups, ny, nx = frame.shape
     edges = np.linspace(0, nx, OUTPUTS + 1).astype(int)
     drift = np.empty((ny, nx), np.float32)
-    for first, last in zip(edges, edges[1:], strict=False):
-        drift[:, first:last] = _one_over_f(ny * (last - first), rng).reshape(ny, -1)
+    for first, last in pairwise(edges.tolist()):
+        drift[:, first:last] = _one_over_f(ny * (last - first), rng, max(ny // _FOLLOWED, 1)).reshape(ny, -1)
     steps = (np.arange(groups) / (groups - 1.0)).astype(np.float32)
     return np.asarray(frame + steps[:, None, None] * (np.float32(width) * drift))
 
@@ -81,12 +84,13 @@ def _lift(groups: Any, out: Any, sigma: float, key: Any) -> None:
             out[i, p] = groups[i, p] + level
 
 
-def _one_over_f(count: int, rng: np.random.Generator) -> Frame:
-    """float32[count] of spectrum 1 / f from one cycle a stream on, of rms 1 over the ensemble; its mean is 0."""
+def _one_over_f(count: int, rng: np.random.Generator, slowest: int = 1) -> Frame:
+    """float32[count] of spectrum 1 / f from `slowest` cycles a stream on, of rms 1 over the ensemble; its mean is 0."""
     size = scipy.fft.next_fast_len(max(count, 2), real=True)
     frequency = np.arange(size // 2 + 1)
     amplitude = np.zeros(len(frequency), np.float32)
-    amplitude[1:] = 1.0 / np.sqrt(frequency[1:])
+    slowest = min(slowest, size // 2)
+    amplitude[slowest:] = 1.0 / np.sqrt(frequency[slowest:])
     # Of a real stream all but the last frequency of an even size stand for two.
     shares = np.where((frequency == size / 2) | (frequency == 0), 1.0, 2.0)
     amplitude /= np.sqrt((shares * amplitude**2).sum())
