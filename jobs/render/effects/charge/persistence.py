@@ -48,10 +48,15 @@ class Traps:
     @classmethod
     def of(cls, scene: Scene) -> Traps:
         """Of the mission database."""
-        keys = ("p0", "electron"), ("p1", ""), ("p2", "electron"), ("time_power", ""), ("time_reference", "s")
-        numbers = (scene.value(f"persistence.{name}", unit) for name, unit in keys)
-        length = scene.value("persistence.exposure_time", "s")
-        return cls(*numbers, length, scene.value("full_well", "electron"))
+
+        def of(name: str, unit: str) -> float:
+            return scene.value(f"persistence.{name}", unit)
+
+        return cls(
+            p0=of("p0", "electron"), p1=of("p1", ""), p2=of("p2", "electron"), power=of("time_power", ""),
+            reference=of("time_reference", "s"), length=of("exposure_time", "s"),
+            full_well=scene.value("full_well", "electron"),
+        )  # fmt: skip
 
     def left(self, charge: Frame, delay: float, seconds: float) -> Frame:
         """Of charge [..] e- what comes `delay` s later in an exposure of `seconds` s, e-."""

@@ -182,7 +182,7 @@ def apply(
     planes = [*frame] if frame.ndim == 3 else [frame]
     out = np.empty((mode.groups, *planes[0].shape), np.float32)
     inputs = [np.ascontiguousarray(part, dtype=float).reshape(-1) for part in planes]
-    expected, hit, when, bend = (*inputs, *[np.zeros(0)] * (4 - len(inputs)))
+    expected, hit, when, bend = inputs + [np.zeros(0)] * (4 - len(inputs))
     _accumulate(
         expected,
         hit,
