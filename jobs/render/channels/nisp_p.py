@@ -25,7 +25,7 @@ from jobs.render.effects.charge import (
     ramp_nonlinearity,
 )
 from jobs.render.effects.effect import Effect
-from jobs.render.effects.light import background, calibration_lamp, pixel_area, straylight
+from jobs.render.effects.light import background, calibration_lamp, ghosts, pixel_area, straylight
 from jobs.render.effects.readout import adc, macc, ramp_noise
 from jobs.render.psf import euclid
 from jobs.render.psf.model import Psf
@@ -34,6 +34,8 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 
 _LIGHT = (
+    ghosts.EFFECT,
+    ghosts.FILTER,
     straylight.EFFECT,
     background.EFFECT,
     pixel_area.EFFECT,

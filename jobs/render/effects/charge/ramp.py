@@ -1,9 +1,9 @@
 """Up the ramp: an infrared detector is read without being emptied, and its charge is averaged in groups of reads.
 
 A ramp has n_g groups of r reads with d dropped frames between two groups, r n_g + d (n_g - 1) frames after the reset.
-The charge after frame k is N_k; a group is the mean of its r values, and what is measured of a pixel are the n = n_g - 1
-differences D_i of neighbouring groups.  Where f electrons a frame are expected and each frame's count is Poisson, a
-photon of the j-th frame of a group weighs (r - j + 1) / r in that group's mean, so that
+The charge after frame k is N_k; a group is the mean of its r values, and what is measured of a pixel are the
+n = n_g - 1 differences D_i of neighbouring groups.  Where f electrons a frame are expected and each frame's count is
+Poisson, a photon of the j-th frame of a group weighs (r - j + 1) / r in that group's mean, so that
 
     mean D_i          = f (r + d)
     var D_i       a   = f (r + d) (1 + alpha),      alpha = (1 - r^2) / (3 r (r + d))
@@ -55,8 +55,8 @@ from jobs.render.effects.scene import Frame, Scene
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput, OutOfRange
 
-# Electrons at a ramp's end above which the noise of a pixel is not linear in its charge, and every frame is drawn: there
-# 2 b N, the change of the noise, is 0.4 %.
+# Electrons at a ramp's end above which the noise of a pixel is not linear in its charge, and every frame is drawn:
+# there 2 b N, the change of the noise, is 0.4 %.
 LINEAR_BELOW = 3000.0
 # Of a number of drops: exposure times that differ by less are the same.
 _SAME = 1e-6

@@ -1,8 +1,8 @@
 """The signal of a ramp as it is computed on board, and how well the ramp fits it.
 
-With D_i (e-) the n differences of the groups' means plus beta, A = 1 + alpha, M = mean D_i^2 and m = mean D_i, the most
-likely signal is Q = n (x - beta) with x^2 + A x = M: in Kubik et al. x = A / 2 (sqrt(1 + 4 M / A^2) - 1), a difference of
-near-equal numbers where M is small, here its other form
+With D_i (e-) the n differences of the groups' means plus beta, A = 1 + alpha, M = mean D_i^2 and m = mean D_i, the
+most likely signal is Q = n (x - beta) with x^2 + A x = M: in Kubik et al. x = A / 2 (sqrt(1 + 4 M / A^2) - 1), a
+difference of near-equal numbers where M is small, here its other form
 
     x = 2 M / (A + hypot(A, 2 sqrt(M)))
     beta = 2 s^2 / (r A)
@@ -12,7 +12,8 @@ not fit is chi^2 = 2 n (sqrt(M) - m) / A, again without the difference: with SS 
 
     chi^2 = 2 / A * SS / (sqrt(M) + m)       where m >= 0
 
-Ref : Kubik et al. 2016, PASP 128, 104504, eqs. 15 to 26; Euclid Data Product Description Document (chi^2 without n_g - 2)
+Ref : Kubik et al. 2016, PASP 128, 104504, eqs. 15 to 26; Euclid Data Product Description Document (chi^2 without
+      n_g - 2)
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The signal of a ramp: against its definition in exact arithmetic, and its bias, width and quality."""
 
 from decimal import Decimal, getcontext
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ def exact(groups, mode, read_noise):
     getcontext().prec = 80
     a = 1 + Decimal(1 - mode.reads**2) / (3 * mode.reads * (mode.reads + mode.drops))
     offset = 2 * Decimal(read_noise) ** 2 / (mode.reads * a)
-    differences = [Decimal(float(y)) - Decimal(float(x)) + offset for x, y in zip(groups, groups[1:], strict=False)]
+    differences = [Decimal(float(y)) - Decimal(float(x)) + offset for x, y in pairwise(groups)]
     n = len(differences)
     square, mean = sum(d * d for d in differences) / n, sum(differences) / n
     x = a / 2 * ((1 + 4 * square / a**2).sqrt() - 1)
