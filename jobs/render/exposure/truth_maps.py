@@ -28,7 +28,7 @@ BYTES = {
 }  # fmt: skip
 # What adds to a map of the same name as an effect, or of another.
 _OF_EFFECT = {
-    "ghosts": "ghosts", "background": "sky", "pixel_area": "sky", "straylight": "sky", "cosmic_rays": "cosmic_rays",
+    "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "pixel_area": "sky", "straylight": "sky", "cosmic_rays": "cosmic_rays",
     "readout_cosmic_rays": "cosmic_rays", "ramp_cosmic_rays": "cosmic_rays", "persistence": "persistence",
     "macc": "ramp",
 }  # fmt: skip
@@ -52,8 +52,8 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode) -> 
     """
 
     def see(name: str, before: Frame, after: Frame) -> None:
-        if name == "ghosts" and "ghosts" in truth:
-            maps["ghosts"] = (after - before).astype(np.float32)
+        if name in ("ghosts", "filter_ghosts") and "ghosts" in truth:
+            maps["ghosts"] = (after - before).astype(np.float32) + maps.get("ghosts", np.float32(0.0))
         if name in ("background", "pixel_area", "straylight") and "sky" in truth:
             maps["sky"] = (after - before).astype(np.float32) + maps.get("sky", np.float32(0.0))
         if name == "persistence" and "persistence" in truth:

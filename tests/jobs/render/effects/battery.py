@@ -80,6 +80,12 @@ _CASES = (
         (LIGHTS, 0.0, (0.0, 5.0), Pupil(6.0, 0.33, (), 0.0)),
         zero=False,
     ),
+    Case(
+        "filter_ghosts",
+        (LIGHTS, 1e-4, (0.0, -4.0), Pupil(5.0, 0.33, ((2.6, 2.4, 16.8, 3.5),), 0.2)),
+        (LIGHTS, 0.0, (0.0, -4.0), Pupil(5.0, 0.33, (), 0.0)),
+        zero=False,
+    ),
     Case("pixel_area", stretched(1e-2), stretched(0.0), zero=False),
     Case("straylight", (LIGHTS, 5e-4, 40.0), (LIGHTS, 0.0, 40.0), zero=False),
     Case("illumination", bowl, flat, linear=True),

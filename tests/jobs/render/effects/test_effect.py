@@ -27,6 +27,7 @@ ORDER = (
     # Light falls on pixels, is counted once, and is charge from then on.
     ("ghosts", "background", "illumination", "shutter", "pixel_response", "poisson", "brighter_fatter", "dark_current"),
     ("straylight", "illumination"),
+    ("ghosts", "filter_ghosts", "background"),
     ("background", "pixel_area", "pixel_response"),
     ("readout_trail", "poisson"),
     ("calibration_lamp", "pixel_response"),

@@ -13,6 +13,7 @@ from jobs.render.effects.effect import apply_all
 from jobs.render.effects.scene import NOTICEABLE, STACK, Lights, Scene
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render import nominal
+from tests.jobs.render.effects import test_ramp_thresholds
 from tests.jobs.render.effects.battery import EFFECTS
 from tests.jobs.render.fields import small
 
@@ -84,7 +85,9 @@ def frame(name, one):
 def test_no_effect_is_left_out_here():
     """Each that a scene may do without has its test below."""
     optional = {name for name, effect in EFFECTS.items() if effect.optional}
-    assert optional == set(CASES) | {"cosmic_rays", "readout_cosmic_rays"}
+    up_the_ramp = {*test_ramp_thresholds.CASES, *test_ramp_thresholds.ALWAYS}
+    # Ghosts of another plate are ghosts.
+    assert optional == set(CASES) | up_the_ramp | {"cosmic_rays", "readout_cosmic_rays", "filter_ghosts"}
     assert vis.DRAWN.optional
 
 

@@ -1,0 +1,131 @@
+"""What earlier exposures leave: which of them, how much, and the same in whatever order exposures are rendered."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jobs.accuracy import SURVEY
+from jobs.render.channels.aim import Aim
+from jobs.render.effects.charge.persistence import Traps
+from jobs.render.exposure import persistence
+from jobs.render.exposure.records import Earlier, Rows, Variant
+from jobs.render.psf import euclid
+from lake_schema.errors import OutOfRange
+from tests.jobs.render import fields, infrared
+from tests.jobs.render.fields import MISSION, small
+
+DETECTOR = small("nisp", "DET22", 96)
+TRAPS = Traps(120.0, 150.0, 2e4, -0.9, 100.0, 87.24, 1.3e5)
+SECOND = 1.0 / 86400.0
+
+
+def earlier(before, mags, x, y, **columns):
+    """An exposure so many seconds before, with its stars."""
+    row = infrared.exposed(DETECTOR, mjd=infrared.MJD - before * SECOND, number=9, **columns)
+    return Earlier(Aim.of(fields.exposure(**row), DETECTOR), Rows(*infrared.tables(DETECTOR, row, mags, x, y)))
+
+
+def left(*before, **columns):
+    """[ny, nx] e- in an exposure now."""
+    aim = Aim.of(fields.exposure(**infrared.exposed(DETECTOR, **columns)), DETECTOR)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(euclid, "nisp_psf", lambda d, band, *_: infrared.psf_of(d, "euclid_h"))
+        return persistence.remembered(aim, before, Variant(MISSION, SURVEY, {}))
+
+
+def test_the_formula():
+    """Of 80, 20, 6 and 1.5 ke- 100 s later; falling as time to the power -0.9; nothing above the full well."""
+    found = TRAPS.left(np.array([8e4, 2e4, 6e3, 1.5e3, 0.0, -5.0]), 100.0, 87.24)
+    np.testing.assert_allclose(found, [236, 95, 33, 9, 0, 0], atol=0.8)
+    assert TRAPS.left(np.array([8e4]), 1000.0, 87.24) == pytest.approx(236 * 10**-0.9, rel=0.01)
+    assert TRAPS.left(np.array([1e9]), 100.0, 87.24) == TRAPS.left(np.array([1.3e5]), 100.0, 87.24)
+    assert TRAPS.left(np.array([8e4]), 100.0, 2 * 87.24) == pytest.approx(2 * 235.6, rel=0.01)
+    with pytest.raises(OutOfRange, match="delay"):
+        TRAPS.left(np.array([1.0]), 0.0, 87.24)
+
+
+def test_nothing_is_left_by_nothing():
+    assert left() is None
+
+
+def test_what_is_left_adds_up_and_fades():
+    star = [18.0], [40.0], [50.0]
+    first, second = earlier(134.0, *star), earlier(268.0, *star)
+    both = left(first, second)
+    np.testing.assert_allclose(both, left(first) + left(second), rtol=1e-12)
+    np.testing.assert_array_equal(both, left(first, second))
+    assert np.unravel_index(both.argmax(), both.shape) == (50, 40)
+    assert left(second).max() == pytest.approx(left(first).max() * 2**-0.9, rel=1e-3)
+
+
+@pytest.mark.parametrize("mag", [8.0, pytest.param(0.0, marks=pytest.mark.nightly)])
+def test_no_pixel_held_more_than_its_full_well(mag):
+    """A star of AB 0, and an hour later."""
+    least = TRAPS.left(np.array([1.3e5]), 3600.0, 87.24)[0]
+    assert left(earlier(3600.0, [mag], [40.0], [50.0])).max() == pytest.approx(least, rel=1e-6)
+
+
+def test_faint_sources_leave_nothing_that_is_missed():
+    """All sources drawn as in an image of their own, against the bright ones alone: 1.5 e- in any pixel."""
+    rng = np.random.default_rng(1)
+    count = 150
+    x, y = rng.uniform(0, 96, (2, count))
+    mags = rng.uniform(15.0, 24.0, count)
+    for before in (134.0, 1100.0):
+        row = infrared.exposed(DETECTOR, mjd=infrared.MJD - before * SECOND)
+        whole = infrared.rendered(mags, x, y, mjd=row["mjd"])
+        sky = infrared.SKY * infrared.TIME
+        expected = TRAPS.left(whole.noise_free.astype(float) + sky, before, infrared.TIME)
+        now = fields.exposure(**infrared.exposed(DETECTOR))
+        least = persistence.least_flux(now, fields.exposure(**row))
+        bright = 10 ** (-0.4 * (mags - 23.9)) >= least
+        assert 0 < bright.sum() < count
+        found = left(earlier(before, mags[bright], x[bright], y[bright]))
+        assert expected.max() > 20.0
+        assert np.abs(found - expected).max() < 1.5
+
+
+def test_a_flat_leaves_its_light_a_dark_nothing():
+    flat = left(earlier(134.0, [], [], [], kind="flat", lamp=5))
+    assert TRAPS.left(np.array([2e4]), 134.0, 87.24)[0] < np.median(flat)
+    assert (left(earlier(134.0, [], [], [], kind="dark", sky=0.0)) == 0.0).all()
+
+
+def test_an_image_has_it_and_says_so():
+    """As a current: what is left comes up the ramp; the truth map has a pixel's own share of it."""
+    before = earlier(134.0, [12.0], [40.0], [50.0])
+    found = infrared.rendered(earlier=(before,), truth=("persistence",))
+    without = infrared.rendered(truth=("persistence",))
+    again = infrared.rendered(earlier=(before,), truth=("persistence",))
+    np.testing.assert_array_equal(found.raw, again.raw)
+    assert (without.maps["persistence"] == 0.0).all()
+    about = np.s_[45:56, 35:46]
+    assert found.maps["persistence"][about].sum() > 300.0
+    change = infrared.electrons(found)[about] - infrared.electrons(without)[about]
+    noise = found.scene.pixel_noise * 11 * np.sqrt(2.0)
+    assert change.sum() == pytest.approx(found.maps["persistence"][about].sum(), abs=5 * noise)
+    assert {d.name: d.applied for d in found.decisions}["persistence"]
+
+
+def test_which_exposures_count():
+    """Of the same detector, camera and settings, within two hours, rendered; of realisations the first."""
+    nominal = fields.exposure(**infrared.exposed(DETECTOR))
+
+    def row(number, hours, **more):
+        return replace(nominal, exposure_id=number, mjd=infrared.MJD + hours / 24.0, **more)
+
+    rows = [
+        row(1, -3.0), row(2, -1.0), row(3, -1.0, realisation=2), row(4, -0.5, channel="NISP-S"),
+        row(5, -0.4, settings="{}"), row(6, 0.0), row(7, 0.0, realisation=2), row(8, 0.1), row(9, -0.3),
+    ]  # fmt: skip
+    tasks = [{"exposure_id": one.exposure_id, "detector": "DET22"} for one in rows[:8]]
+    tasks.append({"exposure_id": 9, "detector": "DET23"})
+    found = persistence.earlier_of(tasks, {one.exposure_id: one for one in rows}, MISSION)
+    numbers = {key: [task["exposure_id"] for task in some] for key, some in found.items()}
+    assert numbers[6, "DET22"] == numbers[7, "DET22"] == [2]
+    assert numbers[8, "DET22"] == [2, 6]
+    assert numbers[1, "DET22"] == []
+    assert numbers[9, "DET23"] == []
+    shuffled = persistence.earlier_of(tasks[::-1], {one.exposure_id: one for one in rows}, MISSION)
+    assert shuffled == found
