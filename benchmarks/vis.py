@@ -83,12 +83,12 @@ def full(wanted: Request) -> Request:
     return replace(wanted, effects=Effects(on=tuple(names)))
 
 
-def prepared(root: Path, wanted: Request) -> Json:
-    """Plans the request; facts of its detector's task."""
+def prepared(root: Path, wanted: Request, number: int = 0) -> Json:
+    """Plans the request; facts of a detector's task, by its number among those of the plan."""
     for step in plan_exposures.steps(root, wanted):
         publish.make(root, step.plan, step.work)
     step = render_exposures.steps(root, wanted)[0]
-    return {**step.plan.facts, **step.plan.parts[0].facts}
+    return {**step.plan.facts, **step.plan.parts[number].facts}
 
 
 def rendered(root: Path, facts: Json, folder: Path) -> tuple[float, float]:
@@ -116,7 +116,7 @@ def stages(seconds: dict[str, float]) -> Iterator[None]:
     """Adds up the CPU seconds of a render's stages and effects while it is open."""
     places: tuple[tuple[Any, str, str], ...] = (
         (catalogue_rows, "sources", "read"),
-        (visible_sources, "_psf", "psf"),
+        (visible_sources, "psf_of", "psf"),
         (visible_sources, "sources_of", "choose"),
         (stamps, "draw", "draw"),
     )

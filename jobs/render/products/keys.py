@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 
 import pyarrow as pa
 
@@ -27,7 +28,7 @@ def product_keys(
     tasks: Sequence[Json],
     inputs: Mapping[str, read.Version],
     mission: MissionConfiguration,
-    earlier: Mapping[tuple[int, str], Sequence[Json]],
+    earlier: Mapping[tuple[int, str], Sequence[Json]] = MappingProxyType({}),
 ) -> list[str]:
     """Of each task, the digest of everything that shapes its products, and of nothing else.
 

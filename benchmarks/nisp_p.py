@@ -1,0 +1,161 @@
+"""A NISP-P detector with everything: seconds from the catalogue to the file, of its ramp, and memory; an exposure of 16.
+
+One process, one thread, the demo's field in H. Each time is of a process that has rendered before, as a worker has;
+"cold" is without the PSF's planes in the cache, "warm" with them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks import report, vis
+from jobs import cache
+from jobs.accuracy import preset
+from jobs.render.channels import nisp_p
+from jobs.request.from_toml import parse
+from jobs.request.schema import Effects, Request
+
+RESULTS = vis.ROOT / "benchmarks" / "results" / "nisp_p.json"
+# As far from the exposure's centre as sources of a detector may lie, deg.
+_FIELD = 0.62
+_RAMP = nisp_p.SKY[nisp_p.SKY.index(nisp_p.persistence.EFFECT) + 1 :]
+_NOTES = {
+    "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed (target 5)",
+    "survey_warm_s": "the same, PSF planes from the cache (target 2.5)",
+    "draft_s": "the same at draft accuracy, its own choice of effects (target 1)",
+    "ramp_s": "CPU, of survey_warm_s, of the effects from cosmic rays to the converter",
+    "peak_gb": "largest memory of the process (target 1.2)",
+    "third_s": "as survey_warm_s, of the third exposure of a dither: with what two others left",
+    "exposure_s": "wall, 16 detectors by the Spark job on 2 cores (target 30)",
+}
+
+
+def request(quick: bool, detectors: str = 'detectors = ["DET22"]', exposures: int = 1) -> str:
+    """The demo's field with one of NISP's detectors, in H; or the third of three exposures 134 s apart."""
+    text = (vis.ROOT / "requests" / "demo.toml").read_text(encoding="utf-8").split("[[pointing]]")[0]
+    text = text.split("[products]")[0]
+    if quick:
+        text = text.replace("galaxy_limit = 26.0", "galaxy_limit = 19.0").replace(
+            "star_limit = 26.0", "star_limit = 14.0"
+        )
+    for number, band in enumerate(("h", "j", "y")[:exposures][::-1]):
+        text += f"""
+[[pointing]]
+channel = "NISP-P"
+camera = "nisp"
+band = "euclid_{band}"
+ra = 53.117
+dec = -27.808
+{'centre_on = "DET22"' if detectors else ""}
+{detectors}
+mjd = {60905.0 + number * 134.0 / 86400.0!r}
+"""
+    return text
+
+
+def full(wanted: Request) -> Request:
+    """With every effect of a science image forced on, but the non-linearity of the signal: that of the ramp is."""
+    names = [effect.name for effect in nisp_p.SKY if effect.optional and effect.name != "signal_nonlinearity"]
+    return replace(wanted, effects=Effects(on=tuple(names)))
+
+
+def without_planes() -> None:
+    """Empties the cache of PSF planes."""
+    for folder in cache.cache_dir().glob("nisp*_psf-*"):
+        for file in folder.iterdir():
+            file.unlink()
+        folder.rmdir()
+
+
+def _timed(seconds: list[float], function: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(*arguments: Any, **options: Any) -> Any:
+        started = time.process_time()
+        try:
+            return function(*arguments, **options)
+        finally:
+            seconds.append(time.process_time() - started)
+
+    return timed
+
+
+def ramp_seconds(render: Callable[[], object]) -> float:
+    """CPU s of the effects from cosmic rays on, in one rendering."""
+    seconds: list[float] = []
+    kept = nisp_p.EFFECTS["science"]
+    timed = tuple(replace(e, apply=_timed(seconds, e.apply)) if e in _RAMP else e for e in kept)
+    nisp_p.EFFECTS["science"] = timed  # type: ignore[index]
+    try:
+        render()
+    finally:
+        nisp_p.EFFECTS["science"] = kept  # type: ignore[index]
+    return sum(seconds)
+
+
+def detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
+    """All of a detector's figures."""
+    file = folder / "three.toml"
+    file.write_text(request(quick, exposures=3), encoding="utf-8")
+    three = parse(file)
+    one = replace(three, pointings=three.pointings[-1:])
+    root, out = vis.lake(folder, three), {}
+    everything = vis.prepared(root, full(one))
+    vis.rendered(root, everything, folder)  # Compiles, and fills the other caches.
+    for state in ("cold", "warm"):
+        seconds, peaks = [], []
+        for _ in range(repeats):
+            if state == "cold":
+                without_planes()
+            used, peak = vis.rendered(root, everything, folder)
+            seconds.append(used)
+            peaks.append(peak)
+        out |= {f"survey_{state}_s": min(seconds), "peak_gb": max(peaks)}
+    out["ramp_s"] = ramp_seconds(lambda: vis.rendered(root, everything, folder))
+    draft = vis.prepared(root, replace(one, accuracy=preset("draft")))
+    out["draft_s"] = min(vis.rendered(root, draft, folder)[0] for _ in range(repeats + 1))
+    last = vis.prepared(root, full(three), -1)
+    out["third_s"] = min(vis.rendered(root, last, folder)[0] for _ in range(repeats + 1))
+    return out
+
+
+def whole_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
+    """Wall s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
+    text = request(quick, 'detectors = ["DET22", "DET23"]' if quick else "")
+    file = folder / "exposure.toml"
+    file.write_text(text.replace("radius = 0.2", f"radius = {_FIELD}"), encoding="utf-8")
+    wanted = parse(file)
+    root = vis.lake(folder / "exposure", wanted)
+    vis.prepared(root, wanted)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = ["spark-submit", "--master", "local[2]", str(vis.ROOT / "jobs" / "render" / "render_exposures.py")]
+    started = time.perf_counter()
+    subprocess.run([*command, "--lake", str(root), "--request", str(file)], check=True, env=environment)
+    return {"exposure_s": time.perf_counter() - started}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measures and prints everything."""
+    own = argparse.ArgumentParser(add_help=False)
+    own.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
+    own.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
+    known, others = own.parse_known_args(argv)
+    options = report.options("nisp_p", __doc__ or "", others)
+    repeats = 1 if options.quick else known.repeats
+    with tempfile.TemporaryDirectory() as name:
+        figures = dict(detector(Path(name), options.quick, repeats))
+        if known.exposure:
+            figures |= whole_exposure(Path(name), options.quick)
+    report.finish("nisp_p", repeats, figures, _NOTES, options.json or (None if options.quick else RESULTS))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
