@@ -1,4 +1,4 @@
-"""A NISP-P detector with everything: seconds from the catalogue to the file, of its ramp, and memory; an exposure of 16.
+"""A NISP-P detector with everything: CPU seconds from the catalogue to the file, and memory; an exposure of 16.
 
 One process, one thread, the demo's field in H. Each time is of a process that has rendered before, as a worker has;
 "cold" is without the PSF's planes in the cache, "warm" with them.
