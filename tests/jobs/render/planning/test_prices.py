@@ -79,15 +79,15 @@ def test_what_a_request_asks_is_in_its_forecast(tmp_path):
 
 
 def test_the_forecast_adds_up(tmp_path):
-    block = [{"channels": ["VIS", "NISP-P"], "fields": 1}, {"channels": ["VIS"], "image_type": "bias", "exposures": 3}]
+    block = [{"channels": ["VIS", "NISP-S"], "fields": 1}, {"channels": ["VIS"], "image_type": "bias", "exposures": 3}]
     exposures, tasks = planned(tmp_path, observation=block)
     lines = forecast.rows(exposures, tasks)
     assert [(line.channel, line.survey, line.image_type) for line in lines] == [
-        ("NISP-P", "wide", "science"),
+        ("NISP-S", "wide", "science"),
         ("VIS", "calibration", "bias"), ("VIS", "wide", "flat"), ("VIS", "wide", "science"),
-        ("NISP-P", "all", ""), ("VIS", "all", ""), ("all", "all", ""),
+        ("NISP-S", "all", ""), ("VIS", "all", ""), ("all", "all", ""),
     ]  # fmt: skip
-    assert [line.exposures for line in lines] == [12, 3, 1, 5, 12, 9, 21]
+    assert [line.exposures for line in lines] == [4, 3, 1, 5, 4, 9, 13]
     for of_channel in lines[4:6]:
         own = [line for line in lines[:4] if line.channel == of_channel.channel]
         assert of_channel.detectors == sum(line.detectors for line in own)
@@ -98,8 +98,8 @@ def test_the_forecast_adds_up(tmp_path):
     *_, said = text = list(forecast.text(lines, speed.Speed(0.5, "as a test says")))
     assert len(text) == 9
     assert "as a test says: 0.50" in said
-    # Nothing renders NISP: what it costs is no measurement, and so is the sum.
-    assert [line.split()[0] for line in text if line.endswith(" assumed")] == ["NISP-P", "NISP-P", "all"]
+    # Nothing renders NISP-S: what it costs is no measurement, and so is the sum.
+    assert [line.split()[0] for line in text if line.endswith(" assumed")] == ["NISP-S", "NISP-S", "all"]
     assert [line.core_hours for line in forecast.rows(exposures, tasks, 0.5)] == [
         0.5 * line.core_hours for line in lines
     ]
