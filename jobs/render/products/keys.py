@@ -79,11 +79,9 @@ def product_keys(
             **own(task),
         }
 
-    def before(task: Json) -> Json:
-        some = earlier.get((task["exposure_id"], task["detector"]), ())
-        return {"earlier": [drawn(one) for one in some]} if some else {}
-
-    return [digest({**shared, **drawn(task), **before(task)}) for task in tasks]
+    before = ([drawn(one) for one in earlier.get((task["exposure_id"], task["detector"]), ())] for task in tasks)
+    also = ({"earlier": some} if some else {} for some in before)
+    return [digest({**shared, **drawn(task), **more}) for task, more in zip(tasks, also, strict=True)]
 
 
 def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:

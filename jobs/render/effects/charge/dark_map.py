@@ -24,6 +24,7 @@ def apply(
 ) -> Frame:
     """Expected e- [ny, nx] -> plus the dark current's.
 
+    frame         : expected e-
     electrons     : mean of all pixels but the hot ones;  spread : rms of its natural logarithm from pixel to pixel
     hot           : fraction of the pixels;  hot_electrons : mean of what they have more, exponentially distributed
     rng           : random numbers of the detector's pixels

@@ -70,6 +70,7 @@ class Traps:
 def apply(frame: Frame, remembered: Frame | None, spread: float, rng: np.random.Generator) -> Frame:
     """Expected e- [ny, nx] -> plus what earlier exposures left.
 
+    frame      : expected e-
     remembered : [ny, nx] e- of a usual pixel; None = nothing;  spread : rms of a pixel's own share, which is never < 0
     rng        : random numbers of the detector's pixels
     """

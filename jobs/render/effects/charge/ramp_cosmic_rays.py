@@ -23,6 +23,7 @@ def apply(
 ) -> Frame:
     """Expected light [ny, nx] e- -> [3, ny, nx] of ramp.apply, with the charge of hits and their moments.
 
+    frame     : expected e-
     expected  : mean number of particles in the ramp;  thickness : of the layer, pixels
     electrons : median that a particle leaves on a path of one pixel;  scatter : rms of its decimal logarithm
     Error     : a pixel that two particles hit has all of their charge at the moment of the second

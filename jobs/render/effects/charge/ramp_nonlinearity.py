@@ -25,7 +25,7 @@ from lake_schema.errors import OutOfRange
 def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) -> Frame:
     """Frame [ny, nx] or [3, ny, nx] of ramp.apply -> [4, ny, nx], with b of every pixel, 1/e-.
 
-    mean : of b, 1/e-;  spread : of b from pixel to pixel, as a fraction;  rng : random numbers of the detector's pixels
+    frame : of ramp.apply;  mean : of b, 1/e-;  spread : of b from pixel to pixel, as a fraction;  rng : random numbers of the detector's pixels
     """
     out = ramp.planes(frame, 4)
     _fill(out[3].reshape(-1), *_checked(mean, spread), pixel_random.key(rng))
@@ -35,6 +35,7 @@ def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) ->
 def apply_signal(frame: Frame, mean: float, spread: float, rng: np.random.Generator) -> Frame:
     """[2, ny, nx] signal of a ramp, e-, and its chi^2 -> with what is seen of the signal.
 
+    frame             : signal and chi^2
     mean, spread, rng : as of `apply`
     Error             : of more than 1 / 2 b electrons is seen what is seen of these, as the most
     """

@@ -36,7 +36,7 @@ def apply_signal(
 ) -> Frame:
     """[2, ny, nx] signal of a ramp, e-, and its chi^2 -> the signal in ADU, and chi^2 as it is.
 
-    gain, bias, largest, rng : as of `apply`
+    frame : signal and chi^2;  gain, bias, largest, rng : as of `apply`
     """
     return np.stack([apply(frame[0], gain, bias, largest), frame[1]])
 
