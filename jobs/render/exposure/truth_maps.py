@@ -28,9 +28,9 @@ BYTES = {
 }  # fmt: skip
 # What adds to a map of the same name as an effect, or of another.
 _OF_EFFECT = {
-    "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "pixel_area": "sky", "straylight": "sky", "cosmic_rays": "cosmic_rays",
-    "readout_cosmic_rays": "cosmic_rays", "ramp_cosmic_rays": "cosmic_rays", "persistence": "persistence",
-    "macc": "ramp",
+    "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "pixel_area": "sky", "straylight": "sky",
+    "cosmic_rays": "cosmic_rays", "readout_cosmic_rays": "cosmic_rays", "ramp_cosmic_rays": "cosmic_rays",
+    "persistence": "persistence", "macc": "ramp",
 }  # fmt: skip
 
 

@@ -25,7 +25,8 @@ from lake_schema.errors import OutOfRange
 def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) -> Frame:
     """Frame [ny, nx] or [3, ny, nx] of ramp.apply -> [4, ny, nx], with b of every pixel, 1/e-.
 
-    frame : of ramp.apply;  mean : of b, 1/e-;  spread : of b from pixel to pixel, as a fraction;  rng : random numbers of the detector's pixels
+    frame : of ramp.apply;  mean : of b, 1/e-;  spread : of b from pixel to pixel, as a fraction
+    rng   : random numbers of the detector's pixels
     """
     out = ramp.planes(frame, 4)
     _fill(out[3].reshape(-1), *_checked(mean, spread), pixel_random.key(rng))
