@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks import effects as scene_of_effects
 from jobs import accuracy
 from jobs.render.camera import detectors
-from jobs.render.channels import ground, vis
+from jobs.render.channels import ground, nisp_p, vis
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.readout import quadrants
 from jobs.render.effects.scene import Frame, Lights, Scene
@@ -116,8 +116,8 @@ def mission_page(mission: MissionConfiguration) -> str:
 
 def effects_page(into: Path, mission: MissionConfiguration) -> str:
     """Every effect of every channel: what its module says, the parameters that it asks for, what it does to a frame."""
-    names = {"VIS": "science", "EXT": "science"}
-    channels = {"VIS": vis.CHANNEL.effects, "EXT": ground.CHANNEL.effects}
+    names = {"VIS": "science", "NISP-P": "science", "EXT": "science"}
+    channels = {"VIS": vis.CHANNEL.effects, "NISP-P": nisp_p.CHANNEL.effects, "EXT": ground.CHANNEL.effects}
     order: dict[str, Effect] = {}
     users: dict[str, list[str]] = {}
     for channel, types in channels.items():
@@ -163,7 +163,7 @@ def _scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 def _asked(effects: list[Effect], mission: MissionConfiguration) -> dict[str, list[str]]:
     """The scalar parameters that each effect asks the mission for."""
     _, scene = _scene(mission)
-    ground_scene = Scene(mission, "ext.lsstcam", 30.0, 50.0, 1e5)
+    ground_scene, (_, infrared) = Scene(mission, "ext.lsstcam", 30.0, 50.0, 1e5), _infrared_scene(mission)
     found, value = {}, MissionConfiguration.value
     for effect in effects:
         keys: dict[str, None] = {}
@@ -173,7 +173,10 @@ def _asked(effects: list[Effect], mission: MissionConfiguration) -> dict[str, li
             return value(*arguments)
 
         with patch.object(MissionConfiguration, "value", noted):
-            effect.parameters(scene if effect in vis.SKY + vis.FLAT + vis.INJECTION else ground_scene)
+            if effect in vis.SKY + vis.FLAT + vis.INJECTION:
+                effect.parameters(scene)
+            else:
+                effect.parameters(infrared if effect in nisp_p.SKY + nisp_p.FLAT else ground_scene)
         found[effect.name] = list(keys)
     return found
 
@@ -193,7 +196,35 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
             _figure(folder / f"{effect.name}.png", _flat(before), _flat(after), effect.name)
             drawn.add(effect.name)
         frame = after if effect in vis.SKY else frame
+    frame, scene = _infrared_scene(mission)
+    for effect in nisp_p.SKY:
+        before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(1, effect.name))
+        images = _of_ramp(before, ""), _of_ramp(frame, effect.name)
+        if effect.name not in drawn and (before.shape != frame.shape or np.ptp(images[1] - images[0]) > 0.0):
+            _figure(folder / f"{effect.name}.png", *images, effect.name)
+            drawn.add(effect.name)
     return drawn
+
+
+def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
+    """A small NISP detector with points and squares of light, what an earlier one left, and a ghost of the filter."""
+    detector = detectors.detector("nisp", "DET22", mission)
+    small = type(detector)("DET22", "nisp", _SIDE, _SIDE, detector.x, detector.y, 0.0, detector.pixel_scale)
+    frame = scene_of_effects.light(_SIDE, _SIDE)
+    place = 150.0 - mission.value("nisp.filter_ghost.offset_y", "pix")
+    lights = Lights(np.array([150.0]), np.array([place]), np.array([1e9]))
+    left = 10.0 * (np.hypot(*(np.indices(frame.shape) - _SIDE / 2)) < _SIDE / 10)
+    scene = Scene(mission, "nisp", 87.24, 1.0, float(frame.max()), small, lights, ramp="photometric", remembered=left)
+    return frame, scene
+
+
+def _of_ramp(frame: Frame, name: str) -> Frame:
+    """As one image: of groups what the last has more than the first; else light, or what an effect sets beside it."""
+    if frame.ndim == 2:
+        return frame
+    if frame.dtype == np.float32:
+        return np.asarray(frame[0] if name == "reset_level" else frame[-1] - frame[0], float)
+    return np.asarray(frame[{"ramp_cosmic_rays": 1, "ramp_nonlinearity": 3}.get(name, 0)], float)
 
 
 def _flat(frame: Frame) -> Frame:
