@@ -182,7 +182,7 @@ def _prepared(sources: Sources, trail: Float, whole: Int, sizes: Int, psf: Psf, 
     left_out = np.zeros(len(sources)) if neglected is None else neglected
     body, fraction, bulge, disk, _, row, *_ = bodies
     bodied = body, fraction, bulge, disk, table, row
-    cut = fourier.reaches(passing, transfer.STEP, *bodied, left_out)
+    cut = fourier.reaches(passing, transfer.STEP, *bodied, transfer.folding(psf) * left_out)
     return _Prepared(
         sources, trail, whole, sizes, psf, transfer.basis_weights(psf, sources.photons, sources.column, sources.row),
         shapes, form, bodies, table, cut, deep=_ringing(cut, sources.electrons, sizes, left_out, psf, bodied),

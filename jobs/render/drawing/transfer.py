@@ -3,6 +3,7 @@
 basis_weights what each source takes of the PSF's planes: its colour, its place on the detector
 plane_count   how many there are
 passing       how much passes at most, by frequency
+folding       how much less may be left out where pixels are coarse
 grid          the samples of a stamp's half plane inside a disc, in the order in which the kernel takes them
 transfer      all planes of a PSF on such a grid
 collapsed     the one of a single source
@@ -36,6 +37,11 @@ NOTHING, LEAST = 1e-7, 1e-14
 HIGHEST, _HIGHEST_BRIGHT = 2.5 * np.pi, 4.0 * np.pi
 # Samples that the kernel takes together: their planes stay in the cache.
 _TOGETHER = 1024
+# A PSF, pixel included, of fewer pixels FWHM passes so much beyond half a cycle a pixel that what is left out there
+# folds onto the frequencies that sizes and shapes are measured at; and the part that may still be left out. Chosen on
+# 144 sources through NISP's PSF in Y and H: their R2 is then wrong by 1.2e-4 at the most, their ellipticity by 3.7e-5
+# (3.2e-4, 1.7e-4 with all of it), in no more time.
+_COARSE, _FOLDING = 1.3, 0.1
 # Stamp that `passing` is measured on, pixels.
 _PROBE = 64
 
@@ -147,6 +153,11 @@ def passing(psf: Psf, least: float = NOTHING) -> Float:
     rings = np.asarray(maximum(modulus, ring, np.arange(ring.max() + 1)), float)
     something = np.flatnonzero(rings > least)
     return rings[: something[-1] + 1]
+
+
+def folding(psf: Psf) -> float:
+    """Of the Fourier samples that may be left out of a source, the part that may be through this PSF."""
+    return _FOLDING if psf.fwhm < _COARSE * psf.pixel_scale else 1.0
 
 
 def transfer(psf: Psf, size: int, reach: float) -> Transfer:
