@@ -35,7 +35,7 @@ EUCLID_BANDS: Mapping[str, tuple[str, ...]] = {
 # requests are refused below the renderer (test_checks.py holds it to the registry of channels).
 RENDERED: Mapping[str, tuple[str, ...]] = {
     "VIS": ("science", "deep", "self_calibration", "flat", "dark", "charge_injection", "bias"),
-    "NISP-P": ("science", "deep", "self_calibration", "flat", "dark"),
+    "NISP-P": ("science", "deep", "self_calibration", "standard_star", "flat", "dark"),
     "EXT": ("science", "deep"),
 }
 

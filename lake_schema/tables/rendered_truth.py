@@ -26,7 +26,13 @@ RENDERED_TRUTH = Table(
     (
         Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure", lo=0),
         Column("detector", "string", ucd="meta.id;instr.det", doc="detector name"),
-        Column("id", "int64", ucd="meta.id;meta.main", doc="source, as in the catalogues; kind 6: a moving body", lo=0),
+        Column(
+            "id",
+            "int64",
+            ucd="meta.id;meta.main",
+            doc="source, as in the catalogues; kind 6: a moving body; kind 5, member 1: a standard star",
+            lo=0,
+        ),
         Column("x", "float64", "pix", "pos.cartesian.x;instr.det", "column, 0 = centre of the first pixel"),
         Column("y", "float64", "pix", "pos.cartesian.y;instr.det", "row, 0 = centre of the first pixel"),
         Column("expected", "float64", "electron", "phot.count", "in the exposure, on and off the detector", 0.0),

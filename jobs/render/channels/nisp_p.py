@@ -14,6 +14,7 @@ from jobs.render.camera.detectors import Detector
 from jobs.render.channels import readout
 from jobs.render.channels.channel import Channel
 from jobs.render.channels.cost import Cost
+from jobs.render.channels.image_types import SKY_TYPES
 from jobs.render.effects.charge import (
     dark_map,
     ipc,
@@ -65,6 +66,7 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "science": SKY,
     "deep": SKY,
     "self_calibration": SKY,
+    "standard_star": SKY,
     "flat": FLAT,
     "dark": DARK,
 }
@@ -89,6 +91,7 @@ CHANNEL = Channel(
     bands=bands.of_one("nisp", "euclid_y", "euclid_j", "euclid_h"),
     sky=diffuse_light.thermal_sky,
     cost=COST,
+    sky_types=(*SKY_TYPES, "standard_star"),
     pupil=euclid.nisp_edges,
     moving=True,
     own_light=(calibration_lamp.EFFECT,),

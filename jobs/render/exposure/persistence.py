@@ -24,7 +24,7 @@ from jobs.render.drawing import stamps
 from jobs.render.drawing.settings import settings_for
 from jobs.render.effects.charge.persistence import Traps
 from jobs.render.effects.scene import Frame, Scene
-from jobs.render.exposure import scene_of, visible_sources
+from jobs.render.exposure import scene_of, standard_stars, visible_sources
 from jobs.render.exposure.records import Earlier, Rows, Variant
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -114,7 +114,7 @@ def _charge(before: Earlier, scene: Scene, older: float) -> Frame:
 
 
 def _sources(aim: Aim, rows: Rows, scene: Scene, older: float) -> Frame:
-    detector = aim.detector
+    detector, rows = aim.detector, standard_stars.with_standards(rows, aim, scene.mission)
     column = f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
     galaxies, stars = (visible_sources.fluxes_of(*pair, column) * aim.electrons for pair in pairs)

@@ -22,7 +22,7 @@ from jobs.render.drawing import outskirts, stamp_sizes
 from jobs.render.drawing.settings import Settings, settings_for
 from jobs.render.effects.effect import Decision, decide
 from jobs.render.effects.scene import NOTICEABLE, Lights, Scene
-from jobs.render.exposure import bright_lights, scene_of
+from jobs.render.exposure import bright_lights, scene_of, standard_stars
 from jobs.render.exposure.records import Rows
 from jobs.render.psf import from_file, spikes, sub_bands
 from jobs.render.psf.model import Psf, of_colours
@@ -70,7 +70,7 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     """
     if not aim.sees_sky:
         return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
-    column = f"f_nu_{aim.exposure.band}"
+    rows, column = standard_stars.with_standards(rows, aim, scene.mission), f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
     galaxies, stars = (fluxes_of(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs)
     settings, noise = settings_for(scene.accuracy), scene.pixel_noise

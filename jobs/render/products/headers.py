@@ -105,6 +105,7 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("FILTER", exposure.band, "passband"),
         ("IMAGETYP", exposure.image_type, "image type"),
         *((("LAMP", exposure.lamp, "LED of the calibration unit"),) if exposure.lamp else ()),
+        *((("TARGET", exposure.target, "calibration source"),) if exposure.target else ()),
         ("EXPOSURE", exposure.exposure_id, "identifier of the exposure"),
         ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
         ("DATE-OBS", _date(exposure.mjd), "start of the exposure"),

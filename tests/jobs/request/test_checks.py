@@ -57,7 +57,7 @@ def test_the_check_takes_every_request_and_names_what_is_only_planned(path, caps
     assert [line.partition(": planned and forecast, skipped by rendering")[0] for line in more] == {
         "sc8_deep": ["sc8_deep: NISP-S"],
         "sc8_main": ["sc8_main: NISP-S"],
-        "sc8_pilot": ["sc8_pilot: NISP-S, NISP-P standard_star, EXT flat and EXT bias"],
+        "sc8_pilot": ["sc8_pilot: NISP-S, EXT flat and EXT bias"],
     }.get(path.stem, [])
 
 
@@ -69,7 +69,7 @@ def only(channels, kind):
 
 @pytest.mark.parametrize(
     ("channels", "kind", "first"),
-    [(("EXT",), "dark", "EXT"), (("NISP-S",), "science", "NISP-S"), (("NISP-P", "NISP-S"), "standard_star", "NISP-P")],
+    [(("EXT",), "dark", "EXT"), (("NISP-S",), "science", "NISP-S"), (("NISP-S",), "standard_star", "NISP-S")],
 )
 def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_first_job(
     channels, kind, first, tmp_path
