@@ -43,6 +43,7 @@ def check_bands(request: Request) -> None:
 
 def check_mission(request: Request) -> MissionConfiguration:
     """The mission that a request chooses: overrides and explored values must be of its names, units and ranges."""
+    from lake_schema.mission.checks import ramps
     from lake_schema.mission.configuration import resolve
 
     own = {key: (override.value, override.unit) for key, override in request.mission.overrides}
@@ -50,14 +51,18 @@ def check_mission(request: Request) -> MissionConfiguration:
         mission = resolve(ladder=request.mission.ladder, overrides=own)
     except BadInput as error:
         raise BadInput(f"mission: {error}") from None
+    for fault in ramps(mission):
+        raise BadInput(f"mission: {fault}")
     for key, values in request.explore:
         if key == "accuracy" or key.startswith("effects."):
             continue
         for value in values:
             try:
-                mission.overridden_with({key: tuple(json.loads(value))})
+                found = mission.overridden_with({key: tuple(json.loads(value))})
             except BadInput as error:
                 raise BadInput(f"explore.{key}: {error}") from None
+            for fault in ramps(found):
+                raise BadInput(f"explore.{key}: {fault}")
     return mission
 
 

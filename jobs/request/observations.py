@@ -28,7 +28,7 @@ from jobs.request.toml_values import (
     table_of,
     tables,
 )
-from lake_schema import user_files
+from lake_schema import ramps, user_files
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
 
@@ -65,10 +65,14 @@ _USERS = {
     "flat": (_SURVEY, _OWN),
     "blue": (_SURVEY, _OWN),
     "bands": (_SURVEY, _OWN, _GROUND, _GROUND_OWN, *_CALIBRATION),
+    "lamps": (_TIMED,),
+    "macc": (_SURVEY, _OWN, _TIMED, _DITHERED, _TABLE),
     "exposure_time_s": (_GROUND, _GROUND_OWN, _TIMED, _DITHERED, _TABLE),
 }
 # Exposures that only one channel has.
-_CHANNEL_OF = {"short": "VIS", "flat": "VIS", "blue": "NISP-S"}
+_CHANNEL_OF = {"short": "VIS", "flat": "VIS", "blue": "NISP-S", "macc": "NISP-P"}
+# LEDs of a calibration unit. A copy, since requests are read below the renderer (test_survey.py holds it to the lamps).
+LAMPS = {"VIS": 6, "NISP-P": 5, "NISP-S": 5}
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +116,8 @@ class Observation:
     blue      : with the blue grism besides the red ones
     mjd       : the earliest date, None = the mission's launch
     realisations : how many of each exposure, which differ in their noise alone
+    lamps     : of flats, numbers of the LEDs in their turn, () = all;  each in bands that see it
+    macc      : (groups, reads, drops) of NISP-P's ramps, () = the mission's
     """
 
     channels: tuple[str, ...]
@@ -135,6 +141,8 @@ class Observation:
     mjd: float | None = None
     exposure_time_s: float | None = None
     realisations: int = 1
+    lamps: tuple[int, ...] = ()
+    macc: tuple[int, ...] = ()
 
     @property
     def place(self) -> tuple[float, float] | None:
@@ -212,7 +220,41 @@ def _observation(value: object, path: str, folder: Path) -> Observation:
         mjd=optional(table, f"{path}.mjd", 40_000.0, 100_000.0),
         exposure_time_s=optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
         realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
+        lamps=_lamps(table, f"{path}.lamps", channels),
+        macc=_macc(table, f"{path}.macc"),
     )
+
+
+def _lamps(table: Toml, path: str, channels: tuple[str, ...]) -> tuple[int, ...]:
+    """Numbers of LEDs that all of the channels have."""
+    most = min(LAMPS.get(channel, 1) for channel in channels)
+    found = _integers(table, path, (), ((1, most),) * most)
+    if len(set(found)) < len(found):
+        raise BadInput(f"{path} = {shown(list(found))} names a lamp twice")
+    return found
+
+
+def _macc(table: Toml, path: str) -> tuple[int, ...]:
+    found = _integers(table, path, ("groups", "reads", "drops"), ((2, 1000), (1, 1000), (0, 1000)))
+    if found and (frames := ramps.frames(*found)) > ramps.MOST_FRAMES:
+        raise BadInput(f"{path} = {shown(list(found))} has {frames} frames, more than {ramps.MOST_FRAMES}")
+    return found
+
+
+def _integers(table: Toml, path: str, names: tuple[str, ...], bounds: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
+    """A list of whole numbers: as many as are named, or up to as many as have bounds; () where there is none."""
+    found = table.get(path.rpartition(".")[2])
+    if found is None:
+        return ()
+    if not isinstance(found, list) or not found or len(found) > len(bounds) or (names and len(found) != len(names)):
+        raise BadInput(f"{path} = {shown(found)} is not [{', '.join(names) or 'numbers'}]")
+    numbers = []
+    for i, (value, (least, most)) in enumerate(zip(found, bounds, strict=False)):
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            name = f"{names[i]} = " if names else ""
+            raise BadInput(f"{path}: {name}{shown(value)} is not a whole number from {least} to {most}")
+        numbers.append(value)
+    return tuple(numbers)
 
 
 def _turn(ra: float | None) -> float | None:
@@ -239,6 +281,8 @@ def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path
         users = _USERS.get(key, (kind,))
         if kind not in users and not (ground and key == "survey"):
             raise BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(users)}")
+        if key == "lamps" and image_type != "flat":
+            raise BadInput(f"{path}.lamps is not for {image_type}: used by flat")
         if (channel := _CHANNEL_OF.get(key)) is not None and channel not in channels:
             raise BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {channel}")
 

@@ -2,6 +2,7 @@
 
 check    raise BadInput with the first fault of a configuration
 faults   all of them, a sentence each
+ramps    those of its ramps
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import CAMERAS, convert, read_all
 from lake_schema.mission.places import split
+from lake_schema.ramps import MOST_FRAMES, frames
 
 # Quantities of which no chosen value may be worse than what is required, and which way worse is.
 _LOWER = ("*.read_noise", "*.dark_current", "*.prnu", "*.crosstalk", "*.jitter_?", "*.psf.fwhm", "*.ellipticity",
@@ -39,6 +41,7 @@ def faults(configuration: MissionConfiguration) -> Iterator[str]:
     yield from _amplifiers("vis.amplifiers", configuration)
     yield from _pitch("vis", configuration)
     yield from _pitch("nisp", configuration)
+    yield from ramps(configuration)
     for m in configuration.models:
         if m.key.endswith(".throughput"):
             yield from _throughput(m.key, configuration)
@@ -83,6 +86,16 @@ def _pitch(section: str, configuration: MissionConfiguration) -> Iterator[str]:
     for axis in ("x", "y"):
         if configuration.value(f"{section}.fpa.gap_{axis}", "arcsec") < 0:
             yield f"mission parameter {section}.fpa.gap_{axis}: detectors overlap"
+
+
+def ramps(configuration: MissionConfiguration) -> Iterator[str]:
+    """Ramps that have more frames than can be drawn."""
+    for kind in ("photometric", "spectroscopic"):
+        key = f"nisp.macc.{kind}"
+        groups, reads, drops = (int(configuration.value(f"{key}.{part}")) for part in ("groups", "reads", "drops"))
+        count = frames(groups, reads, drops)
+        if count > MOST_FRAMES:
+            yield f"mission parameter {key}: MACC({groups},{reads},{drops}) has {count} frames, more than {MOST_FRAMES}"
 
 
 def _amplifiers(key: str, configuration: MissionConfiguration) -> Iterator[str]:

@@ -14,7 +14,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import translate
+from fnmatch import fnmatchcase, translate
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -214,8 +214,17 @@ def bounds_of(key: str) -> tuple[tuple[float, float, str], ...]:
     return tuple((lo, hi, unit) for pattern, lo, hi, unit in _bounds() if pattern.fullmatch(key))
 
 
+@cache
+def is_whole(key: str) -> bool:
+    """Whether a parameter is a count, of which no fraction has a meaning."""
+    with (files("lake_schema.mission") / "counts.csv").open(encoding="utf-8") as stream:
+        return any(fnmatchcase(key, row["pattern"]) for row in csv.DictReader(stream))
+
+
 def _check_bounds(parameter: Parameter, key: str) -> None:
     """key : the parameter's name, without a place."""
+    if is_whole(key) and parameter.value % 1.0:
+        raise BadInput(f"mission parameter {parameter.key} = {parameter.value:g} is not a whole number")
     for lo, hi, unit in bounds_of(key):
         value = convert(parameter.value, parameter.unit, unit, f"mission parameter {parameter.key}")
         if not lo <= value <= hi:

@@ -26,7 +26,7 @@ from jobs.render.effects.charge import (
 )
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import background, calibration_lamp, ghosts, pixel_area, straylight
-from jobs.render.effects.readout import adc, macc, ramp_noise
+from jobs.render.effects.readout import adc, macc, output_gain, ramp_noise
 from jobs.render.psf import euclid
 from jobs.render.psf.model import Psf
 from jobs.render.sky import diffuse_light
@@ -52,6 +52,7 @@ _RAMP = (
     ramp_noise.RESET,
     ramp_noise.EFFECT,
     ramp_noise.DRIFT,
+    output_gain.EFFECT,
     macc.EFFECT,
     ramp_nonlinearity.SIGNAL,
     adc.SIGNAL,

@@ -11,8 +11,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from jobs import rng
+from jobs.fluxes import passbands
 from jobs.render.camera import pointing
-from jobs.render.camera.lamps import LEDS, NISP_LAMPS
+from jobs.render.camera.lamps import LAMPS
+from jobs.render.effects.light import calibration_lamp
 from jobs.render.planning import unrendered
 from jobs.render.planning.observing_sequence import FILTERS, RED, offsets
 from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
@@ -28,6 +30,8 @@ _STARS = ("Vega", "white dwarf DA")
 _GRISMS = ("RGS000", "RGS180", "RGS000", "RGS180")
 # From the end of a frame to the start of the next, s: the slowest of the read-outs.
 _PAUSE = 90.0
+# Of a lamp's light, over what the camera's bands see where they see best: with less a flat is not taken.
+_SEES = 0.05
 
 
 def exposures(
@@ -71,11 +75,34 @@ def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, 
         yield from _targets(in_bands, block, mission, seed)
     elif not block.exposures:
         raise BadInput(f"an observation of image_type {first.image_type} wants exposures = how many frames")
-    else:
-        lamps = {"nisp": NISP_LAMPS, "vis": LEDS}.get(first.camera, 1)
+    elif first.image_type == "flat" and first.camera in LAMPS:
+        lit = _lit(in_bands, block, mission)
         for i in range(block.exposures):
-            lamp = i % lamps + 1 if first.image_type == "flat" else None
+            turn, own = i // len(lit), lit[i % len(lit)]
+            yield own[turn % len(own)]
+    else:
+        lamp = 1 if first.image_type == "flat" else None
+        for i in range(block.exposures):
             yield replace(in_bands[i % len(in_bands)], lamp=lamp)
+
+
+def _lit(in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration) -> list[list[Exposure]]:
+    """Of each lamp a flat in every band that sees it; lamps that no band sees are not lit.
+
+    Errors : BadInput for a lamp of the block's that none of its bands sees, and where that are all of them
+    """
+    camera, found = in_bands[0].camera, []
+    curves = {frame.band: passbands.load(frame.band) for frame in in_bands}
+    for lamp in block.lamps or range(1, LAMPS[camera][0] + 1):
+        sees = {band: calibration_lamp.seen_in(curve, lamp, camera, mission) for band, curve in curves.items()}
+        own = [replace(frame, lamp=lamp) for frame in in_bands if sees[frame.band] > _SEES]
+        if block.lamps and not own:
+            raise BadInput(f"lamps: {lamp} does not shine in {', '.join(curves)}")
+        if own:
+            found.append(own)
+    if not found:
+        raise BadInput(f"bands: no lamp shines in {', '.join(curves)}")
+    return found
 
 
 def _chosen(wanted: Sequence[str], own: Sequence[str]) -> Sequence[str]:

@@ -18,6 +18,7 @@ from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import detectors
 from jobs.render.channels import image_types
+from jobs.render.effects.charge import ramp
 from jobs.render.planning import unrendered
 from jobs.render.sky.diffuse_light import SkyBand, sky_rate
 from lake_schema import units
@@ -81,11 +82,28 @@ def exposure_time(channel: str, camera: str, band: str, mission: MissionConfigur
     channel, camera, band : names;  mission : the mission database
     """
     if camera == "nisp":
-        kind = f"nisp.macc.{'spectroscopic' if channel == 'NISP-S' else 'photometric'}"
+        kind = f"nisp.macc.{_ramp_of(channel)}"
         groups, reads, drops = (mission.value(f"{kind}.{part}") for part in ("groups", "reads", "drops"))
         return (groups - 1) * (reads + drops) * mission.value("nisp.frame_time", "s")
     own = f"{image_types.section(camera)}.{band}.exposure_time"
     return mission.value(own if own in mission else f"{image_types.section(camera)}.exposure_time", "s")
+
+
+def check_ramp(channel: str, camera: str, seconds: float, mission: MissionConfiguration, where: str = "") -> None:
+    """Refuse an exposure time that the camera cannot be read up a ramp in.
+
+    channel, camera : names;  seconds : exposure time
+    mission : the mission database;  where : named in the refusal
+    """
+    if camera == "nisp":
+        try:
+            ramp.mode_for(_ramp_of(channel), seconds, camera, mission)
+        except BadInput as error:
+            raise BadInput(f"{where}: {error}" if where else str(error)) from None
+
+
+def _ramp_of(channel: str) -> str:
+    return "spectroscopic" if channel == "NISP-S" else "photometric"
 
 
 def table(

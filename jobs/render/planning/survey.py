@@ -6,10 +6,11 @@ exposures    pointings and observation blocks -> exposures, once for each varian
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from jobs.render.camera.pointing import boresight_for
 from jobs.render.channels.image_types import SKY_TYPES
 from jobs.render.planning import calibration_frames, ground_surveys, reference_survey, unrendered, variants
 from jobs.render.planning.observing_sequence import sequence
-from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
+from jobs.render.planning.planned_exposures import Exposure, bands_of, check_ramp, exposure_time
 from jobs.render.sky.solar_aspect import check_aspect
 from jobs.request.area import Area
 from jobs.request.observations import Observation, Pointing
@@ -26,6 +27,7 @@ from jobs.request.schema import Request
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
+_RAMP = ("groups", "reads", "drops")
 _DEEP = ("edf_north", "edf_south", "edf_fornax")
 _CALIBRATION = (
     "bias", "dark", "flat", "charge_injection", "self_calibration", "standard_star", "planetary_nebula"
@@ -36,26 +38,41 @@ def exposures(request: Request, mission: MissionConfiguration) -> list[tuple[Exp
     """Every exposure of a request with the mission it is planned with; BadInput names the pointing or observation."""
     found = []
     for values in request.variants():
-        settings = json.dumps(values, sort_keys=True) if values else None
-        own = variants.variant(settings, mission, request.accuracy, {}).mission
-        for exposure in _of_mission(request, own):
+        shared = _Settled.of(values, request, mission)
+        for exposure, own in _of_variant(request, values, shared):
             psf = exposure.psf or dict(request.psfs).get(exposure.band)
-            found.append((replace(exposure, settings=settings, psf=psf), own))
+            found.append((replace(exposure, settings=own.settings, psf=psf), own.mission))
     for band, _ in request.psfs:
         if band not in {exposure.band for exposure, _ in found}:
             raise BadInput(f"psf.{band}: no exposure is taken in this band")
     return found
 
 
-def _of_mission(request: Request, mission: MissionConfiguration) -> Iterator[Exposure]:
+@dataclass(frozen=True, slots=True)
+class _Settled:
+    """Values of a variant as the column `settings` has them, and the mission with them."""
+
+    settings: str | None
+    mission: MissionConfiguration
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any], request: Request, mission: MissionConfiguration) -> _Settled:
+        settings = json.dumps(values, sort_keys=True) if values else None
+        return cls(settings, variants.variant(settings, mission, request.accuracy, {}).mission)
+
+
+def _of_variant(request: Request, values: Mapping[str, Any], shared: _Settled) -> Iterator[tuple[Exposure, _Settled]]:
+    """Exposures, each with what it is planned with: of NISP-P, with its block's own ramp."""
     for i, pointing in enumerate(request.pointings):
-        yield from repeat(_pointing(pointing, f"pointing[{i}]", request, mission), pointing.realisations)
+        one = _pointing(pointing, f"pointing[{i}]", request, shared.mission)
+        yield from repeat((one, shared), pointing.realisations)
     for i, block in enumerate(request.observations):
-        where = f"observation[{i}]"
-        found = 0
-        for exposure in _block(block, request, mission, where):
+        where, found = f"observation[{i}]", 0
+        ramp = {f"nisp.macc.photometric.{part}": (n, "") for part, n in zip(_RAMP, block.macc, strict=False)}
+        own = _Settled.of({**values, **ramp}, request, shared.mission) if ramp else shared
+        for exposure in _block(block, request, own.mission, where):
             found += 1
-            yield from repeat(exposure, block.realisations)
+            yield from repeat((exposure, own if exposure.channel == "NISP-P" else shared), block.realisations)
         if not found:
             raise BadInput(f"{where} asks for no exposure")
 
@@ -79,6 +96,7 @@ def _pointing(pointing: Pointing, where: str, request: Request, mission: Mission
     seconds = pointing.exposure_time_s
     if seconds is None:
         seconds = exposure_time(pointing.channel, pointing.camera, pointing.band, mission)
+    check_ramp(pointing.channel, pointing.camera, seconds, mission, where)
     return Exposure(
         pointing.channel, pointing.camera, pointing.band, "science", ra, dec, angle, pointing.mjd, seconds,
         request.name, detectors=pointing.detectors,
@@ -106,6 +124,7 @@ def _block(block: Observation, request: Request, mission: MissionConfiguration, 
         found = _exposures(block, area, request.seed, start, mission)
         for exposure in found:
             known_detectors(exposure.camera, exposure.detectors, mission, "detectors")
+            check_ramp(exposure.channel, exposure.camera, exposure.exposure_time_s, mission)
             own = unrendered.of_channel(exposure.channel)
             if not own.on_ground and block.pointings and exposure.image_type in SKY_TYPES:
                 check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")

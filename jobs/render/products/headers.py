@@ -69,13 +69,30 @@ def amplifier_cards(rendered: Rendered, number: int | None) -> tuple[Card, ...]:
 def _of_amplifiers(rendered: Rendered) -> tuple[tuple[str, float | Float, str], ...]:
     """Keyword, value or values [q], comment."""
     scene = rendered.scene
-    noises = read_noise.EFFECT.name, ramp_noise.EFFECT.name
-    noisy = any(decision.name in noises and decision.applied for decision in rendered.decisions)
+    saturated = "[adu] lowest level of a saturated pixel"
+    if scene.ramp:
+        saturated = "[adu] full at the last read; if sooner: any"
     return (
         ("GAIN", scene.of_amplifiers("gain", "electron / adu"), "[electron/adu] conversion gain"),
-        ("RDNOISE", noisy * scene.of_amplifiers("read_noise", "electron"), "[electron] rms read noise in the image"),
+        *_read_noise(rendered),
         ("BIAS", scene.of_amplifiers("bias", "adu"), "[adu] bias level, added to every pixel"),
-        ("SATURATE", _saturation(rendered), "[adu] lowest level of a saturated pixel"),
+        ("SATURATE", _saturation(rendered), saturated),
+    )
+
+
+def _read_noise(rendered: Rendered) -> tuple[tuple[str, float | Float, str], ...]:
+    """Of the image; and of one read, where the image is the signal of a ramp."""
+    scene = rendered.scene
+    applied = {decision.name for decision in rendered.decisions if decision.applied}
+    of_read = scene.of_amplifiers("read_noise", "electron")
+    if not scene.ramp:
+        noise = (read_noise.EFFECT.name in applied) * of_read
+        return (("RDNOISE", noise, "[electron] rms read noise in the image"),)
+    parts = [effect for effect in (ramp_noise.EFFECT, ramp_noise.DRIFT) if effect.name in applied]
+    whole = math.hypot(*(effect.contribution(scene) for effect in parts))
+    return (
+        ("RDNOISE", whole, "[electron] rms of the signal that reading adds"),
+        ("FRNOISE", (ramp_noise.EFFECT in parts) * of_read, "[electron] rms noise of one read"),
     )
 
 

@@ -32,7 +32,7 @@ Where a pixel is not linear in its counts (a cosmic ray, saturation, so much cha
 shows) every frame is drawn.  Full well and non-linearity act on the charge of a frame, before groups are averaged.
 
 apply, EFFECT   expected light -> charge of the groups
-Mode, mode_of   how a ramp is read
+Mode, mode_of, mode_for   how a ramp is read
 planes          a frame with room for what a ramp wants to know besides light
 full_signal     what is measured of a pixel that is full at the end
 
@@ -52,14 +52,19 @@ from jobs.render.effects import pixel_random
 from jobs.render.effects.charge import poisson
 from jobs.render.effects.effect import Effect, nothing
 from jobs.render.effects.scene import Frame, Scene
+from lake_schema import ramps
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.ramps import MOST_FRAMES
 
 # Electrons at a ramp's end above which the noise of a pixel is not linear in its charge, and every frame is drawn:
 # there 2 b N, the change of the noise, is 0.4 %.
 LINEAR_BELOW = 3000.0
 # Of a number of drops: exposure times that differ by less are the same.
 _SAME = 1e-6
+# Groups, reads or drops of a ramp.
+_MOST = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +80,10 @@ class Mode:
 
     def __post_init__(self) -> None:
         for name, least in (("groups", 2), ("reads", 1), ("drops", 0)):
-            if not least <= getattr(self, name) <= 1000:
-                raise OutOfRange(f"{name} of a ramp", getattr(self, name), least, 1000)
-        if self.frames > 4000:
-            raise BadInput(f"{self}: {self.frames} frames are more than 4000")
+            if not least <= getattr(self, name) <= _MOST:
+                raise OutOfRange(f"{name} of a ramp", getattr(self, name), least, _MOST)
+        if self.frames > MOST_FRAMES:
+            raise BadInput(f"{self}: {self.frames} frames are more than {MOST_FRAMES}")
 
     def __str__(self) -> str:
         return f"MACC({self.groups},{self.reads},{self.drops})"
@@ -91,7 +96,7 @@ class Mode:
     @property
     def frames(self) -> int:
         """From the reset to the last read."""
-        return self.groups * self.reads + self.differences * self.drops
+        return ramps.frames(self.groups, self.reads, self.drops)
 
     @property
     def integrated(self) -> int:
@@ -120,18 +125,28 @@ class Mode:
 
 
 def mode_of(scene: Scene) -> Mode:
-    """That of the scene's ramp, with as many drops as its exposure time wants.
+    """That of the scene's ramp, with as many drops as its exposure time wants; errors as of `mode_for`."""
+    return mode_for(scene.ramp, scene.exposure_time_s, scene.section, scene.mission)
 
-    Errors : BadInput where the reads alone take longer
+
+def mode_for(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> Mode:
+    """How an exposure of a length is read: the mission's mode, with as many drops as it takes.
+
+    kind    : "photometric" or "spectroscopic";  seconds : exposure time
+    section : of the camera, "nisp";  mission : the mission database
+    Errors  : BadInput where the reads alone take longer, or the frames are too many
     """
-    groups, reads, drops = (int(scene.value(f"macc.{scene.ramp}.{part}", "")) for part in ("groups", "reads", "drops"))
-    nominal, time = Mode(groups, reads, drops), scene.value("frame_time", "s")
-    wanted = scene.exposure_time_s / (time * nominal.differences) - reads
+    key = f"{section}.macc.{kind}"
+    groups, reads, drops = (int(mission.value(f"{key}.{part}")) for part in ("groups", "reads", "drops"))
+    nominal, time = Mode(groups, reads, drops), mission.value(f"{section}.frame_time", "s")
+    wanted = seconds / (time * nominal.differences) - reads
     if abs(wanted - drops) < _SAME:
         return nominal
     if round(wanted) < 0:
         least = time * nominal.differences * reads
-        raise BadInput(f"exposure time {scene.exposure_time_s:g} s: {nominal} takes {least:.4g} s without any drops")
+        raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {least:.4g} s without any drops")
+    if round(wanted) > _MOST:
+        raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {wanted:.4g} drops, more than {_MOST}")
     return Mode(groups, reads, round(wanted))
 
 

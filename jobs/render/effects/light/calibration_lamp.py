@@ -8,11 +8,13 @@ from __future__ import annotations
 import numpy as np
 
 from jobs.fluxes import passbands
+from jobs.fluxes.passbands import Passband
 from jobs.render.camera.lamps import LAMPS
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import illumination
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import OutOfRange
+from lake_schema.mission.configuration import MissionConfiguration
 
 # Standard deviations in a full width at half maximum.
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
@@ -43,18 +45,24 @@ def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
 
 
 def seen(scene: Scene, led: int) -> float:
-    """What the band detects of an LED's photons, over what the embedded bands would where they see best; no unit.
+    """What the scene's band detects of an LED's photons, as `seen_in`."""
+    band = scene.band or passbands.load(LAMPS[scene.section][1][0])
+    return seen_in(band, led, scene.section, scene.mission)
 
-    led    : its number, from 1
-    Error  : the LED's spectrum is taken as a Gaussian of its central wavelength and width
-    Errors : OutOfRange for a number that no LED has
+
+def seen_in(band: Passband, led: int, section: str, mission: MissionConfiguration) -> float:
+    """What a band detects of an LED's photons, over what the embedded bands would where they see best; no unit.
+
+    led     : its number, from 1;  band : passband
+    section : of the camera, "vis" or "nisp";  mission : the mission database
+    Error   : the LED's spectrum is taken as a Gaussian of its central wavelength and width
+    Errors  : OutOfRange for a number that no LED has
     """
-    leds, bands = LAMPS[scene.section]
+    leds, bands = LAMPS[section]
     if not 1 <= led <= leds:
         raise OutOfRange("LED", led, 1, leds)
-    band = scene.band or passbands.load(bands[0])
-    width = 10.0 * scene.value("flat.led_width", "nm") / _FWHM
-    off = (band.wavelength - 10.0 * scene.value(f"flat.led_{led}", "nm")) / width
+    width = 10.0 * mission.value(f"{section}.flat.led_width", "nm") / _FWHM
+    off = (band.wavelength - 10.0 * mission.value(f"{section}.flat.led_{led}", "nm")) / width
     # On wavelengths 1 A apart.
     detected = float(np.sum(band.response * np.exp(-0.5 * off**2)) / (width * np.sqrt(2.0 * np.pi)))
     return detected / max(float(passbands.load(name).response.max()) for name in bands)

@@ -25,11 +25,17 @@ from jobs.compiling import jit
 from jobs.render.effects import pixel_random
 from jobs.render.effects.effect import Effect, nothing
 from jobs.render.effects.scene import Frame, Scene
+from lake_schema.arrays import Int
 from lake_schema.errors import OutOfRange
 
 OUTPUTS = 32
 # Rows in which reference pixels follow a drift (assumed): what is slower was subtracted.
 _FOLLOWED = 64
+
+
+def edges(columns: int) -> Int:
+    """int[33]: the first column of each output, and the end of the last."""
+    return np.linspace(0, columns, OUTPUTS + 1).astype(int)
 
 
 def apply(frame: Frame, sigma: float, reads: int, rng: np.random.Generator) -> Frame:
@@ -58,9 +64,8 @@ def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
     if not 0.0 <= width < 1e5:
         raise OutOfRange("1/f noise", width, 0.0, 1e5)
     groups, ny, nx = frame.shape
-    edges = np.linspace(0, nx, OUTPUTS + 1).astype(int)
     drift = np.empty((ny, nx), np.float32)
-    for first, last in pairwise(edges.tolist()):
+    for first, last in pairwise(edges(nx).tolist()):
         drift[:, first:last] = _one_over_f(ny * (last - first), rng, max(ny // _FOLLOWED, 1)).reshape(ny, -1)
     steps = (np.arange(groups) / (groups - 1.0)).astype(np.float32)
     return np.asarray(frame + steps[:, None, None] * (np.float32(width) * drift))

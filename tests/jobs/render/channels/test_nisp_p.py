@@ -12,7 +12,7 @@ from lake_schema.mission.configuration import resolve
 from tests.jobs.render import infrared
 from tests.jobs.render.fields import small
 
-QUIET = dict.fromkeys(("ramp_cosmic_rays", "drift", "group_noise", "dark_map", "pixel_response"), False)
+QUIET = dict.fromkeys(("ramp_cosmic_rays", "drift", "group_noise", "output_gain", "dark_map", "pixel_response"), False)
 MACC = "nisp.macc.photometric"
 
 
@@ -44,6 +44,8 @@ def test_the_file(tmp_path):
     assert (header["READMODE"], header["NG"], header["NR"], header["ND"]) == ("MACC", 4, 16, 4)
     assert (header["FRTIME"], header["EXPTIME"]) == (pytest.approx(1.454), pytest.approx(87.24))
     assert header["ELAPTIME"] == pytest.approx(76 * 1.454)
+    # What reading adds to the signal, and the noise of one of its reads.
+    assert (header["RDNOISE"], header["FRNOISE"]) == (pytest.approx(7.0, abs=0.2), 13.0)
     assert own["CRPIX1"] == pytest.approx(header["CRPIX1"] + 4)
     signal, flag = (unit.data for unit in read[1:])
     border = np.ones(signal.shape, bool)

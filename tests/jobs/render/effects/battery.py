@@ -134,6 +134,7 @@ _CASES = (
     Case("reset_level", (44.0,), (0.0,), planes=True, zero=False, positive=False),
     Case("group_noise", (13.0, 16), (0.0, 16), planes=True, zero=False, positive=False),
     Case("drift", (5.1,), (0.0,), planes=True, zero=False, positive=False),
+    Case("output_gain", (0.01,), (0.0,), planes=True, linear=True),
     Case("macc", (PHOTOMETRIC, 13.0), None, planes=True, zero=False, positive=False, reshapes=True),
     Case("signal_nonlinearity", (6e-7, 0.1), (0.0, 0.1), planes=True),
     Case("signal_adc", (1.92, 1024.0, 65535.0), None, planes=True, zero=False, reshapes=True),

@@ -43,7 +43,8 @@ ORDER = (
     ("calibration_lamp", "pixel_response", "dark_map"),
     ("ramp_cosmic_rays", "ramp_nonlinearity", "ramp", "ipc"),
     # Neighbours see charge, not the noise of reading; the signal is estimated of groups as read, then converted.
-    ("ramp", "ipc", "reset_level", "group_noise", "drift", "macc", "signal_nonlinearity", "signal_adc"),
+    ("ramp", "ipc", "reset_level", "group_noise", "drift", "output_gain", "macc", "signal_nonlinearity"),
+    ("macc", "signal_adc"),
 )
 
 

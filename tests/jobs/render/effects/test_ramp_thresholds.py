@@ -36,6 +36,7 @@ CASES = {
     "ipc": lambda x: scene(ipc__side=min(1e-6 * x, 0.05), ipc__diagonal=0.0),
     "group_noise": lambda x: scene(sky=10.0, read_noise=x),
     "drift": lambda x: scene(drift_photometric=x),
+    "output_gain": lambda x: scene(gain_spread=min(1e-5 * x, 1.0)),
 }
 ALWAYS = ("ramp_cosmic_rays", "reset_level")
 

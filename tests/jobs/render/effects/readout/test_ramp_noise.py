@@ -1,9 +1,10 @@
-"""Noise of a ramp's reads and drifts: widths, spectrum, independence."""
+"""Noise of a ramp's reads and drifts: widths, spectrum, independence; gains of the outputs."""
 
 import numpy as np
 import pytest
 
-from jobs.render.effects.readout import ramp_noise
+from jobs.render.effects.readout import output_gain, ramp_noise
+from lake_schema.errors import OutOfRange
 
 
 def test_reads():
@@ -41,3 +42,18 @@ def test_without_noise_nothing_changes():
     frame = np.random.default_rng(2).normal(size=(3, 8, 64)).astype(np.float32)
     np.testing.assert_array_equal(ramp_noise.apply(frame, 0.0, 16, np.random.default_rng(1)), frame)
     np.testing.assert_array_equal(ramp_noise.apply_drift(frame, 0.0, np.random.default_rng(1)), frame)
+
+
+def test_each_output_has_a_gain_of_its_own():
+    """One for all of its columns, within the spread, the mean near 1; of the numbers of the detector."""
+    charge = np.full((2, 3, 2040), 1000.0, np.float32)
+    seen = output_gain.apply(charge, 0.01, np.random.default_rng(1))
+    assert (seen == seen[0, 0]).all()
+    gains = seen[0, 0] / 1000.0
+    assert len(np.unique(gains)) == ramp_noise.OUTPUTS
+    assert (np.diff(np.flatnonzero(np.diff(gains))) >= 63).all()
+    assert np.abs(gains - 1.0).max() < 0.0051
+    assert gains.mean() == pytest.approx(1.0, abs=0.002)
+    assert output_gain.EFFECT.fixed
+    with pytest.raises(OutOfRange, match="gains"):
+        output_gain.apply(charge, 1.1, np.random.default_rng(1))

@@ -1,0 +1,14 @@
+"""How many frames a ramp has, and may have.
+
+Ref : Euclid Collaboration: Serrano et al. 2024 (MACC: multiple accumulated groups)
+"""
+
+from __future__ import annotations
+
+# Of a ramp: more are not drawn.
+MOST_FRAMES = 4000
+
+
+def frames(groups: int, reads: int, drops: int) -> int:
+    """Of groups of reads, with drops between two groups: from the reset to the last read."""
+    return groups * reads + (groups - 1) * drops

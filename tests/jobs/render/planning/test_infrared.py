@@ -1,0 +1,135 @@
+"""What NISP-P is asked for: flats by lamps in bands that see them, ramps of a block's own, and what is refused."""
+
+import copy
+from collections import Counter
+
+import pytest
+
+from jobs.fluxes import passbands
+from jobs.render.camera.lamps import LAMPS
+from jobs.render.effects.light import calibration_lamp
+from jobs.render.plan_exposures import plan
+from jobs.render.planning import survey, variants
+from jobs.request import observations
+from jobs.request.from_toml import from_table
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+
+MISSION = resolve()
+BASE = {"name": "x", "seed": 7, "area": {"cone": {"ra": 150.0, "dec": 20.0, "radius": 0.5}}}
+FLAT = {"channels": ["NISP-P"], "image_type": "flat"}
+POINTING = {"channel": "NISP-P", "band": "euclid_h", "ra": 53.117, "dec": -27.808, "mjd": 60905.0}
+
+
+def exposures(*blocks, **sections):
+    wanted = from_table(copy.deepcopy({**BASE, "observation": list(blocks), **sections}))
+    return survey.exposures(wanted, MISSION)
+
+
+def flats(**more):
+    return Counter((e.lamp, e.band) for e, _ in exposures({**FLAT, **more}))
+
+
+def test_a_lamp_shines_in_bands_that_see_it():
+    """All lamps as often as one another; 1190 nm, where Y and J overlap, in both."""
+    assert flats(exposures=10) == {
+        (1, "euclid_y"): 2, (2, "euclid_j"): 1, (2, "euclid_y"): 1, (3, "euclid_j"): 2, (4, "euclid_h"): 2,
+        (5, "euclid_h"): 2,
+    }  # fmt: skip
+    assert flats(exposures=4, bands=["euclid_h"]) == {(4, "euclid_h"): 2, (5, "euclid_h"): 2}
+    assert flats(exposures=4, lamps=[5, 3]) == {(5, "euclid_h"): 2, (3, "euclid_j"): 2}
+    for lamp, band in flats(exposures=30):
+        assert calibration_lamp.seen_in(passbands.load(band), lamp, "nisp", MISSION) > 0.05
+
+
+def test_lamps_that_cannot_be_lit():
+    with pytest.raises(BadInput, match=r"observation\[0\]: lamps: 5 does not shine in euclid_y"):
+        flats(exposures=1, bands=["euclid_y"], lamps=[5])
+    for lamps, message in (
+        ([6], "6 is not a whole number from 1 to 5"),
+        ([1, 1], "names a lamp twice"),
+        ([], "is not"),
+    ):
+        with pytest.raises(BadInput, match=rf"observation\[0\]\.lamps.*{message}"):
+            flats(exposures=1, lamps=lamps)
+    with pytest.raises(BadInput, match="lamps is not for dark: used by flat"):
+        exposures({"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "lamps": [1]})
+
+
+def test_requests_know_how_many_lamps_there_are():
+    assert {"VIS": LAMPS["vis"][0], "NISP-P": LAMPS["nisp"][0], "NISP-S": LAMPS["nisp"][0]} == observations.LAMPS
+
+
+def test_a_block_has_its_own_ramp():
+    """So long are its exposures; VIS, beside it, and other blocks know nothing of it."""
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1}
+    fields = {"channels": ["VIS", "NISP-P"], "fields": 1, "dither": "none", "short": False, "flat": False}
+    found = exposures({**dark, "macc": [15, 16, 11]}, dark, {**fields, "macc": [2, 1, 0]})
+    frame = MISSION.value("nisp.frame_time", "s")
+    times = [(e.channel, e.exposure_time_s) for e, _ in found]
+    assert times[:2] == [("NISP-P", pytest.approx(378 * frame)), ("NISP-P", pytest.approx(60 * frame))]
+    assert [time for channel, time in times[2:] if channel == "NISP-P"] == [pytest.approx(frame)] * 3
+    for exposure, own in found:
+        with_own = variants.variant(exposure.settings, MISSION, None, {}).mission
+        assert with_own.fingerprint == own.fingerprint
+        assert (exposure.settings is None) == (exposure.channel == "VIS" or exposure is found[1][0])
+
+
+def test_an_exploration_and_a_block_s_ramp():
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "macc": [3, 2, 1]}
+    explored = {"nisp.gain": {"values": [1.0, 2.0], "unit": "electron / adu"}}
+    own = [mission for _, mission in exposures(dark, explore=explored)]
+    assert [mission.value("nisp.gain") for mission in own] == [1.0, 2.0]
+    assert {mission.value("nisp.macc.photometric.groups") for mission in own} == {3.0}
+
+
+MACC = r"observation\[0\]\.macc"
+
+
+@pytest.mark.parametrize(
+    ("macc", "message"),
+    [
+        ([0, 16, 4], rf"{MACC}: groups = 0 is not a whole number from 2 to 1000"),
+        ([4, 16, -1], rf"{MACC}: drops = -1 is not"),
+        ([4, 16.0, 4], rf"{MACC}: reads = 16.0 is not"),
+        ([4, True, 4], rf"{MACC}: reads = True is not"),
+        ([4, 16], rf"{MACC} = \[4, 16\] is not \[groups, reads, drops\]"),
+        ("4,16,4", rf"{MACC} = '4,16,4' is not"),
+        ([100, 30, 30], rf"{MACC} = \[100, 30, 30\] has 5970 frames, more than 4000"),
+    ],
+)
+def test_ramps_that_cannot_be_asked_for(macc, message):
+    with pytest.raises(BadInput, match=message):
+        exposures({**FLAT, "exposures": 1, "macc": macc})
+
+
+def test_only_nisp_p_has_a_ramp_of_a_request():
+    with pytest.raises(BadInput, match="macc is not for VIS: used by NISP-P"):
+        exposures({"channels": ["VIS"], "image_type": "dark", "exposures": 1, "macc": [4, 16, 4]})
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, -4.0, 3.5])
+def test_the_mission_s_ramp_is_of_whole_numbers(value):
+    """A request that overrides it, or explores it, is refused before anything is made."""
+    key = "nisp.macc.photometric.groups"
+    for sections in (
+        {"mission": {"overrides": {key: {"value": value, "unit": ""}}}},
+        {"explore": {key: {"values": [value], "unit": ""}}},
+    ):
+        with pytest.raises(BadInput, match=key):
+            from_table({**BASE, "pointing": [POINTING], **sections})
+
+
+def test_a_ramp_of_too_many_frames_is_refused_with_the_request():
+    overrides = {"nisp.macc.photometric.groups": {"value": 400, "unit": ""}}
+    with pytest.raises(BadInput, match=r"nisp\.macc\.photometric: MACC\(400,16,4\) has 7996 frames, more than 4000"):
+        from_table({**BASE, "pointing": [POINTING], "mission": {"overrides": overrides}})
+
+
+@pytest.mark.parametrize(("seconds", "message"), [(20.0, "takes 69.79 s without any drops"), (1e5, "more than 1000")])
+def test_an_exposure_time_that_no_ramp_has_is_refused_by_name(tmp_path, seconds, message):
+    one = from_table({**BASE, "pointing": [{**POINTING, "exposure_time_s": seconds}]})
+    with pytest.raises(BadInput, match=rf"pointing\[0\]: exposure time .*{message}"):
+        plan(tmp_path, one)
+    with pytest.raises(BadInput, match=rf"observation\[0\]: exposure time .*{message}"):
+        exposures({**FLAT, "exposures": 1, "exposure_time_s": seconds})
