@@ -196,13 +196,14 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
             _figure(folder / f"{effect.name}.png", _flat(before), _flat(after), effect.name)
             drawn.add(effect.name)
         frame = after if effect in vis.SKY else frame
-    frame, scene = _infrared_scene(mission)
-    for effect in nisp_p.SKY:
-        before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(1, effect.name))
-        images = _of_ramp(before, ""), _of_ramp(frame, effect.name)
-        if effect.name not in drawn and (before.shape != frame.shape or np.ptp(images[1] - images[0]) > 0.0):
-            _figure(folder / f"{effect.name}.png", *images, effect.name)
-            drawn.add(effect.name)
+    for effects in (nisp_p.SKY, nisp_p.FLAT):
+        frame, scene = _infrared_scene(mission)
+        for effect in effects:
+            before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(1, effect.name))
+            images = _of_ramp(before, ""), _of_ramp(frame, effect.name)
+            if effect.name not in drawn and (before.shape != frame.shape or np.ptp(images[1] - images[0]) > 0.0):
+                _figure(folder / f"{effect.name}.png", *images, effect.name)
+                drawn.add(effect.name)
     return drawn
 
 

@@ -39,6 +39,7 @@ class Channel:
     scattered  : whether bright sources beside a pixel shine into it: ghosts, stray light
     ramp       : which of the mission's ramps its detectors are read up (Scene.ramp); "" = they are read once
     remembers  : effect that brings what earlier exposures left; None: they leave nothing
+    coloured   : effect by which pixels see the colours of sources (Scene.tints); None: all see them alike
     """
 
     effects: Mapping[str, tuple[Effect, ...]]
@@ -57,6 +58,7 @@ class Channel:
     scattered: bool = False
     ramp: str = ""
     remembers: Effect | None = None
+    coloured: Effect | None = None
 
     def __post_init__(self) -> None:
         for effects in self.effects.values():

@@ -25,7 +25,14 @@ from jobs.render.effects.charge import (
     ramp_nonlinearity,
 )
 from jobs.render.effects.effect import Effect
-from jobs.render.effects.light import background, calibration_lamp, ghosts, pixel_area, straylight
+from jobs.render.effects.light import (
+    background,
+    calibration_lamp,
+    chromatic_response,
+    ghosts,
+    pixel_area,
+    straylight,
+)
 from jobs.render.effects.readout import adc, macc, output_gain, ramp_noise
 from jobs.render.psf import euclid
 from jobs.render.psf.model import Psf
@@ -58,9 +65,9 @@ _RAMP = (
     adc.SIGNAL,
 )
 
-SKY = (*_LIGHT, pixel_response.EFFECT, *_CURRENT, *_RAMP)
+SKY = (*_LIGHT, chromatic_response.EFFECT, pixel_response.EFFECT, *_CURRENT, *_RAMP)
 # Assumed to be taken on the way from field to field: neither sky nor stars are in a flat.
-FLAT = (calibration_lamp.EFFECT, pixel_response.EFFECT, *_CURRENT, *_RAMP)
+FLAT = (calibration_lamp.EFFECT, chromatic_response.LAMP, pixel_response.EFFECT, *_CURRENT, *_RAMP)
 DARK = (*_CURRENT, *_RAMP)
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {
@@ -99,4 +106,5 @@ CHANNEL = Channel(
     scattered=True,
     ramp="photometric",
     remembers=persistence.EFFECT,
+    coloured=chromatic_response.EFFECT,
 )

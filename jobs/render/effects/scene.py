@@ -10,7 +10,7 @@ import numpy as np
 from jobs.accuracy import SURVEY, Accuracy
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Float32
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.places import Place
@@ -76,6 +76,8 @@ class Scene:
     ramp           : which of the mission's ramps the detector is read up, "photometric" or "spectroscopic"; "" = it is
                      read once
     remembered     : [ny, nx] e- that earlier exposures leave in this one; None = nothing
+    tints          : float32[2, ny, nx] of `chromatic_response`: sources of which pixels see the colour; None = of none
+    tint_electrons : the most that this changes in a pixel, e- rms
     """
 
     mission: MissionConfiguration
@@ -92,6 +94,8 @@ class Scene:
     track_electrons: float = 0.0
     ramp: str = ""
     remembered: Frame | None = None
+    tints: Float32 | None = None
+    tint_electrons: float = 0.0
 
     def value(self, key: str, unit: str) -> float:
         """A parameter of the detector."""

@@ -16,7 +16,7 @@ from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.stamps import Tally
 from jobs.render.effects.effect import Effect, apply_all
 from jobs.render.effects.scene import Frame, Scene
-from jobs.render.exposure import limits, persistence, rendered, scene_of, truth_maps
+from jobs.render.exposure import limits, persistence, rendered, scene_of, tints, truth_maps
 from jobs.render.exposure.records import Rows, Variant
 from jobs.render.exposure.rendered import Rendered
 from jobs.render.exposure.visible_sources import Light, visible_light
@@ -81,7 +81,7 @@ def _drawn(
     frame = stamps.draw(
         sources, sizes, light.psf, detector.nx, detector.ny, progress, light.neglected, Tally(drawn, scene.unread)
     )
-    scene = scene_of.with_peak(scene, frame)
+    scene = tints.with_tints(scene_of.with_peak(scene, frame), aim, light)
     if "stars" in truth:
         of_stars = kind_of(sources.ids) == _STAR
         some, neglected = sources.take(of_stars), light.neglected[of_stars]

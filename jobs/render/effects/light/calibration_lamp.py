@@ -13,6 +13,7 @@ from jobs.render.camera.lamps import LAMPS
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import illumination
 from jobs.render.effects.scene import Frame, Scene
+from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 
@@ -58,14 +59,27 @@ def seen_in(band: Passband, led: int, section: str, mission: MissionConfiguratio
     Error   : the LED's spectrum is taken as a Gaussian of its central wavelength and width
     Errors  : OutOfRange for a number that no LED has
     """
-    leds, bands = LAMPS[section]
+    _, bands = LAMPS[section]
+    width = _width(section, mission)
+    detected = float(np.sum(photons(band, led, section, mission)) / (width * np.sqrt(2.0 * np.pi)))
+    return detected / max(float(passbands.load(name).response.max()) for name in bands)
+
+
+def photons(band: Passband, led: int, section: str, mission: MissionConfiguration) -> Float:
+    """float64[n] what a band detects of an LED's photons, at its wavelengths 1 A apart, on any scale; as `seen_in`.
+
+    band, led, section, mission : of `seen_in`
+    """
+    leds, _ = LAMPS[section]
     if not 1 <= led <= leds:
         raise OutOfRange("LED", led, 1, leds)
-    width = 10.0 * mission.value(f"{section}.flat.led_width", "nm") / _FWHM
-    off = (band.wavelength - 10.0 * mission.value(f"{section}.flat.led_{led}", "nm")) / width
-    # On wavelengths 1 A apart.
-    detected = float(np.sum(band.response * np.exp(-0.5 * off**2)) / (width * np.sqrt(2.0 * np.pi)))
-    return detected / max(float(passbands.load(name).response.max()) for name in bands)
+    off = (band.wavelength - 10.0 * mission.value(f"{section}.flat.led_{led}", "nm")) / _width(section, mission)
+    return np.asarray(band.response * np.exp(-0.5 * off**2))
+
+
+def _width(section: str, mission: MissionConfiguration) -> float:
+    """Standard deviation, A."""
+    return float(10.0 * mission.value(f"{section}.flat.led_width", "nm") / _FWHM)
 
 
 def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:

@@ -4,16 +4,19 @@ The efficiency of pixel p is that of the passband times
 
     1 + s_p f1(lambda) + c_p f2(lambda)
 
-beside its grey part, which is `pixel_response`.  The mission database has f1, a slope, and f2, a curvature, by
-wavelength; s and c are maps of the detector, each the sum of a smooth map and of one from pixel to pixel.  Light whose
-photons have the shares w in wavelengths meets F = sum w f, told from that of flat f_nu, which is in the grey part.
-Sources are drawn three times: as they are, and with each photon times f1, and times f2.
+beside its grey part, which is `pixel_response`; never less than 0.  The mission database has f1, a slope, and f2, a
+curvature, by wavelength; s and c are maps of the detector, each the sum of a smooth map and of one from pixel to pixel.
+Light whose photons have the shares w in wavelengths meets F = sum w f, told from that of flat f_nu, which is in the
+grey part. Sources are drawn three times: as they are, and with each photon times f1, and times f2.
 
+What is not noticed in its source's brightest pixel is not drawn again.
+
+EFFECT, LAMP   the light of the sky and its sources, and of a lamp, as the pixels see it
 maps       s and c of a detector
 table      f1 and f2 in the parts of a band
 colours    F1 and F2 of lights;  of_lines : of light at given wavelengths
-planes     the light of sources, drawn three times;  seen : what the pixels see of it
-largest    the most that the colours of sources change
+tints      the light of sources, each photon times f1, and times f2
+changes    the most that the colour of each source changes
 """
 
 from __future__ import annotations
@@ -25,16 +28,37 @@ import numpy as np
 
 from jobs import sums
 from jobs.compiling import jit
+from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
+from jobs.render.camera.lamps import LAMPS
 from jobs.render.effects import pixel_random
-from jobs.render.effects.scene import Frame
+from jobs.render.effects.effect import Effect
+from jobs.render.effects.light import calibration_lamp, illumination
+from jobs.render.effects.scene import Frame, Scene
 from jobs.render.psf.sub_bands import sub_bands
-from lake_schema.arrays import Float
+from jobs.render.sky import diffuse_light
+from lake_schema.arrays import Float, Float32
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 
 # Nodes of a smooth map along a side of the detector; between them it is bilinear.
 _NODES = 9
+# By what part of the rms of f over a band the light in a PSF's middle, and in its wings, differs in colour from all of
+# it: measured of NISP's, 0.07 to 0.1.
+_PSF_COLOUR = 0.1
+
+
+def apply(frame: Frame, lit: Frame, slope: float, curvature: float, rng: np.random.Generator) -> Frame:
+    """frame [ny, nx] expected e- -> as the pixels see it.
+
+    lit : [2, ny, nx] e- of the frame's light, each photon of it times f1, and times f2
+    slope, curvature, rng : as of `maps`
+    """
+    out = np.array(frame, float)
+    up, across = _ends(out.shape)
+    for part, nodes, rms, key in _patterns(slope, curvature, rng):
+        _add(out, np.ascontiguousarray(lit[part]), nodes, up, across, rms, key)
+    return np.asarray(np.maximum(out, 0.0, out=out))
 
 
 def maps(shape: tuple[int, int], slope: float, curvature: float, rng: np.random.Generator) -> Frame:
@@ -43,22 +67,36 @@ def maps(shape: tuple[int, int], slope: float, curvature: float, rng: np.random.
     shape : ny, nx;  slope, curvature : rms of s and c
     rng   : random numbers of the detector's pixels
     """
-    for name, value in (("slope", slope), ("curvature", curvature)):
-        if not 0.0 <= value <= 0.5:
-            raise OutOfRange(f"chromatic response, {name}", value, 0.0, 0.5)
-    out = np.empty((2, *shape))
-    ends = [np.linspace(0.0, _NODES - 1.0, max(n, 2))[:n] for n in shape]
-    for plane, rms in zip(out, (slope, curvature), strict=True):
-        nodes = rng.standard_normal((_NODES, _NODES))
-        # To the mean and the rms that are asked for, of so few numbers.
-        nodes = (nodes - nodes.mean()) / nodes.std()
-        _fill(plane, nodes, ends[0], ends[1], rms * np.sqrt(0.5), pixel_random.key(rng))
+    out = np.zeros((2, *shape))
+    up, across = _ends(shape)
+    for part, nodes, rms, key in _patterns(slope, curvature, rng):
+        _add(out[part], np.ones(shape), nodes, up, across, rms, key)
     return out
 
 
+def _patterns(slope: float, curvature: float, rng: np.random.Generator) -> list[tuple[int, Float, float, Any]]:
+    """(0 or 1, nodes of its smooth map, rms, key of the random numbers of its pixels) of s, and of c."""
+    found = []
+    for part, (name, value) in enumerate((("slope", slope), ("curvature", curvature))):
+        if not 0.0 <= value <= 0.5:
+            raise OutOfRange(f"chromatic response, {name}", value, 0.0, 0.5)
+        nodes = rng.standard_normal((_NODES, _NODES))
+        # To the mean and the rms that are asked for, of so few numbers.
+        nodes = (nodes - nodes.mean()) / nodes.std()
+        found.append((part, nodes, value * float(np.sqrt(0.5)), pixel_random.key(rng)))
+    return found
+
+
+def _ends(shape: tuple[int, ...]) -> tuple[Float, Float]:
+    """Of each row and of each column its place among the nodes."""
+    up, across = (np.linspace(0.0, _NODES - 1.0, max(n, 2))[:n] for n in shape)
+    return up, across
+
+
 @jit
-def _fill(plane: Any, nodes: Any, up: Any, across: Any, rms: float, key: Any) -> None:
-    ny, nx = plane.shape
+def _add(out: Any, light: Any, nodes: Any, up: Any, across: Any, rms: float, key: Any) -> None:
+    """Adds light times the map."""
+    ny, nx = out.shape
     for y in range(ny):
         j = min(int(up[y]), len(nodes) - 2)
         v = up[y] - j
@@ -69,7 +107,7 @@ def _fill(plane: Any, nodes: Any, up: Any, across: Any, rms: float, key: Any) ->
             high = (1.0 - u) * nodes[j + 1, i] + u * nodes[j + 1, i + 1]
             # Of numbers between nodes the variance is 4/9 of that at the nodes, in both directions together.
             smooth = 1.5 * ((1.0 - v) * low + v * high)
-            plane[y, x] = rms * (smooth + pixel_random.normal(pixel_random.word(key, y * nx + x)))
+            out[y, x] += light[y, x] * rms * (smooth + pixel_random.normal(pixel_random.word(key, y * nx + x)))
 
 
 def table(section: str, band: Passband, mission: MissionConfiguration) -> Float:
@@ -106,39 +144,106 @@ def colours(shares: Float, components: Float) -> Float:
     return np.asarray(sums.product(shares, components))
 
 
-def planes(
-    drawn: Frame, electrons: Float, shares: Float, components: Float, draw: Callable[[Float, Float], Frame]
-) -> Frame:
-    """float64[3, ny, nx]: the light of sources, and each photon of it times f1, and times f2.
+def tints(electrons: Float, shares: Float, components: Float, draw: Callable[[Float, Float], Frame]) -> Float32:
+    """float32[2, ny, nx]: the light of sources, each photon of it times f1, and times f2.
 
     Blue light is concentrated in the middle of the PSF: what two colours change of a pixel is not the colour of the
     source alone.
-    drawn     : [ny, nx] their light;  electrons : [n] of each
-    shares, components : as of `colours`
-    draw      : (electrons, 0 or more, and shares of sources) -> [ny, nx] their light
+    electrons : [n] of each;  shares, components : as of `colours`
+    draw      : (electrons, 0 or more, and shares of the sources) -> [ny, nx] their light
     """
-    out = np.empty((3, *drawn.shape))
-    out[0] = drawn
+    drawn = draw(electrons, shares)
+    out = np.empty((2, *drawn.shape), np.float32)
     for k in (0, 1):
         # No part has less than no light.
         least = float(components[:, k].min())
         weighted = shares * (components[:, k] - least)
         part = weighted.sum(axis=1)
         own = np.divide(weighted, part[:, None], out=shares.copy(), where=part[:, None] > 0.0)
-        out[1 + k] = draw(electrons * part, own) + least * drawn
+        out[k] = draw(electrons * part, own) + least * drawn
     return out
 
 
-def seen(light: Frame, response: Frame) -> Frame:
-    """Three planes of light e- -> [ny, nx] what pixels of these maps see of it; response : of `maps`."""
-    return np.asarray(light[0] + response[0] * light[1] + response[1] * light[2])
+def changes(peak: Float, own: Float, components: Float, strength: tuple[float, float]) -> Float:
+    """[n] the most that the colour of each source changes in a pixel, e- rms.
 
-
-def largest(peak: Float, own: Float, slope: float, curvature: float) -> float:
-    """The most that the colours of sources change in a pixel, e- rms, without what the PSF's own colour adds to it.
-
-    peak  : [n] e- in the brightest pixel of each;  own : [n, 2] of `colours`
-    slope, curvature : rms of the maps
+    peak : [n] e- in the brightest pixel of each;  own, components : of `colours` and `table`
+    strength : slope and curvature, rms of the maps
     """
-    change = np.hypot(slope * own[:, 0], curvature * own[:, 1])
-    return float((peak * change).max(initial=0.0))
+    largest = np.abs(own) + _PSF_COLOUR * components.std(axis=0)
+    return np.asarray(peak * np.hypot(*(largest * np.array(strength)).T))
+
+
+def strength(scene: Scene) -> tuple[float, float]:
+    """rms of s and of c."""
+    return scene.value("response.slope", ""), scene.value("response.curvature", "")
+
+
+def band_of(scene: Scene) -> Passband:
+    """The exposure's passband; without one, the first of the camera's."""
+    return scene.band or passbands.load(LAMPS[scene.section][1][0])
+
+
+# ---------------------------------------------------------------------------------------------- the sky, and a lamp
+
+
+def _colour(scene: Scene, photons: Float) -> Float:
+    """F1 and F2 of light of which the band detects photons [n] by wavelength; 0 where it detects none."""
+    band = band_of(scene)
+    if not photons.sum() > 0.0:
+        return np.zeros(2)
+    return of_lines(scene.section, band, band.wavelength, photons, scene.mission)
+
+
+def _sky(scene: Scene) -> Float:
+    """e- of the sky times F1, and F2.  Error: of its light all but the thermal is taken as the Sun's."""
+    if not scene.sky_rate > 0.0:
+        return np.zeros(2)
+    photons = diffuse_light.photons(scene.section, scene.sky_rate, band_of(scene), scene.mission)
+    return scene.sky_electrons * _colour(scene, photons)
+
+
+def _parameters(scene: Scene) -> tuple[Frame | Float32, float, float]:
+    lit = np.empty((2, scene.ny, scene.nx), np.float32)
+    lit[:] = _sky(scene)[:, None, None]
+    if scene.tints is not None:
+        lit += scene.tints
+    return lit, *strength(scene)
+
+
+def _of_sky(scene: Scene) -> float:
+    return float(np.hypot(*(np.array(strength(scene)) * _sky(scene))))
+
+
+def _lamp(scene: Scene) -> Float:
+    """e- of a lamp, where it shines straight, times F1, and F2."""
+    band = band_of(scene)
+    level = calibration_lamp.EFFECT.contribution(scene)
+    return level * _colour(scene, calibration_lamp.photons(band, scene.lamp, scene.section, scene.mission))
+
+
+def _lamp_parameters(scene: Scene) -> tuple[Float32, float, float]:
+    columns, rows = calibration_lamp.pattern(scene, scene.lamp, scene.nx, scene.ny)
+    even = illumination.apply(np.ones((scene.ny, scene.nx)), columns, rows)
+    return (_lamp(scene)[:, None, None] * even).astype(np.float32), *strength(scene)
+
+
+EFFECT = Effect(
+    "chromatic_response",
+    apply,
+    _parameters,
+    lambda scene: max(scene.tint_electrons, _of_sky(scene)),
+    fixed=True,
+    # What a source changes is not there again in the next dither.
+    repeated=_of_sky,
+    cost=2.5e-2,
+)
+LAMP = Effect(
+    "lamp_response",
+    apply,
+    _lamp_parameters,
+    lambda scene: float(np.hypot(*(np.array(strength(scene)) * _lamp(scene)))),
+    fixed=True,
+    numbers=EFFECT.name,
+    cost=2.5e-2,
+)

@@ -8,15 +8,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import _scenes as scenes
+from jobs import rng
+from jobs.accuracy import SURVEY
 from jobs.fluxes import passbands
 from jobs.render.camera.detectors import detector
-from jobs.render.drawing import stamps
-from jobs.render.effects.light import chromatic_response
+from jobs.render.channels.aim import Aim
+from jobs.render.drawing import stamp_sizes, stamps
+from jobs.render.drawing.settings import settings_for
+from jobs.render.effects.light import calibration_lamp, chromatic_response
 from jobs.render.effects.scene import NOTICEABLE
+from jobs.render.exposure import scene_of, tints, visible_sources
+from jobs.render.exposure.records import Variant
+from jobs.render.exposure.visible_sources import Light
 from jobs.render.psf import euclid
 from jobs.render.psf.sub_bands import PARTS, sub_bands
+from jobs.render.sky import diffuse_light, thermal
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render import fields, infrared
 
 MISSION = resolve()
 Y = passbands.load("euclid_y")
@@ -96,34 +105,150 @@ def field():
     return some, draw
 
 
-def test_three_planes_are_a_plane_for_each_wavelength(field):
-    """The slow way: every part of the band drawn by itself, times what pixels see of it."""
-    some, draw = field
-    response = drawn_maps((200, 200))
-    light = chromatic_response.planes(draw(some.electrons), some.electrons, some.photons, TABLE, draw)
-    found = chromatic_response.seen(light, response)
+def slowly(some, response, draw):
+    """Every part of the band drawn by itself, times what pixels see of it."""
     each = 0.0
     for part in range(PARTS):
         alone = np.zeros((len(some), PARTS))
         alone[:, part] = 1.0
         factor = 1.0 + response[0] * TABLE[part, 0] + response[1] * TABLE[part, 1]
         each = each + factor * draw(some.electrons * some.photons[:, part], alone)
-    change = np.abs(found - light[0])
+    return each
+
+
+def test_three_drawings_are_one_for_each_wavelength(field):
+    some, draw = field
+    response = drawn_maps((200, 200))
+    light = draw(some.electrons)
+    lit = chromatic_response.tints(some.electrons, some.photons, TABLE, draw)
+    found = chromatic_response.apply(light, lit, SLOPE, CURVATURE, np.random.default_rng(3))
+    each = slowly(some, response, draw)
+    change = np.abs(each - light)
     np.testing.assert_allclose(found, each, atol=1e-3 * change.max())
     # The colours of whole sources are not all of it: blue light is in the middle of the PSF.
     own = chromatic_response.colours(some.photons, TABLE)
-    whole = sum(response[k] * draw(some.electrons * (own[:, k] + 1.0)) - response[k] * light[0] for k in (0, 1))
-    assert np.abs(light[0] + whole - each).max() > 0.02 * change.max()
-    assert np.abs(light[0] + whole - each).max() < change.max()
+    whole = sum(response[k] * draw(some.electrons * (own[:, k] + 1.0)) - response[k] * light for k in (0, 1))
+    assert np.abs(light + whole - each).max() > 0.02 * change.max()
+    assert np.abs(light + whole - each).max() < change.max()
 
 
 def test_ordinary_sources_do_not_need_it():
-    """Fainter than 18 mag, of the colours of galaxies and stars: less than a tenth of the noise in a pixel."""
+    """Fainter than 18.2 mag, of the colours of galaxies and stars: less than a tenth of the noise in a pixel."""
     shares = scenes.colours(400, np.random.default_rng(1))
     own = chromatic_response.colours(shares / shares.sum(axis=1, keepdims=True), TABLE)
-    for magnitude, needed in ((18.0, False), (14.0, True)):
+    for magnitude, needed in ((18.2, False), (14.0, True)):
         peak = np.full(400, 0.3 * 87.24 * 10 ** (0.4 * (25.0 - magnitude)))
-        change = chromatic_response.largest(peak, own, SLOPE, CURVATURE)
+        change = chromatic_response.changes(peak, own, TABLE, (SLOPE, CURVATURE)).max()
         noise = np.hypot(NOISE, np.sqrt(peak[0]))
         print(magnitude, f"{change:.2f} e- in a pixel of {peak[0]:.0f}, noise {noise:.1f}")
         assert (change > NOTICEABLE * noise) == needed
+
+
+# ------------------------------------------------------------------------------------------------ in an exposure
+
+
+def test_an_exposure_draws_again_what_is_noticed():
+    """A few of its sources, on small stamps; pixel by pixel within a tenth of the noise of all of them drawn slowly."""
+    side = 256
+    small_one = fields.small("nisp", "DET22", side)
+    row = infrared.exposed(small_one, band="euclid_y")
+    aim = Aim.of(fields.exposure(**row), small_one)
+    psf = euclid.nisp_psf(small_one, Y, MISSION, 4)
+    some = scenes.stratified(scenes.Scene("nisp", side, side, 0.3, 87.24, 25.0, NOISE, 0, 0), 5, 12)
+    settings, mission = settings_for(SURVEY), resolve(overrides={"nisp.response.slope": (0.05, "")})
+    scene = replace(scene_of.of_aim(aim, Variant(mission, SURVEY, {})))
+    sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, psf, scene.pixel_noise, settings)
+    neglected = stamp_sizes.neglected_flux(some.electrons, scene.pixel_noise, settings)
+    light = Light(some, sizes, neglected, psf, scene)
+
+    def draw(electrons, photons=some.photons):
+        return stamps.draw(replace(some, electrons=electrons, photons=photons), sizes, psf, side, side, None, neglected)
+
+    with pytest.MonkeyPatch.context() as patch:
+        counted = []
+        patch.setattr(stamps, "draw", lambda *args, kept=stamps.draw: counted.append(len(args[0])) or kept(*args))
+        found = tints.with_tints(scene, aim, light)
+    assert len(counted) == 3
+    assert 5 < counted[0] < 0.8 * len(some)
+    response = drawn_maps((side, side), slope=0.05)
+    frame = draw(some.electrons)
+    change = slowly(some, response, draw) - frame
+    fast = response[0] * found.tints[0] + response[1] * found.tints[1]
+    noise = np.sqrt(scene.pixel_noise**2 + frame)
+    wrong = np.abs((fast - change) / noise).max()
+    print(f"change {np.abs(change / noise).max():.2f} sigma, wrong by {wrong:.3f}")
+    assert np.abs(change / noise).max() > 0.8
+    assert wrong < NOTICEABLE
+    assert np.abs(fast - change).max() < 0.03 * np.abs(change).max()
+    # The most that is told is about the most that there is, of maps with 5 sigma.
+    assert found.tint_electrons < 5 * np.abs(change).max() < 25 * found.tint_electrons
+    assert tints.with_tints(replace(scene, forced={"chromatic_response": False}), aim, light).tints is None
+
+
+def test_a_flat_has_the_colour_of_its_lamp():
+    """An LED at the band's edge: its frame without noise is another than of pixels that see all colours alike."""
+    quiet = dict.fromkeys(
+        ("ramp_cosmic_rays", "drift", "group_noise", "dark_map", "pixel_response", "ramp_nonlinearity", "ipc"), False
+    )
+    both = [
+        infrared.rendered(kind="flat", lamp=2, band="euclid_y", sky=0.0, forced={**quiet, "lamp_response": on})
+        for on in (False, True)
+    ]
+    before, after = (infrared.electrons(one) for one in both)
+    led = calibration_lamp.photons(Y, 2, "nisp", MISSION)
+    own = chromatic_response.of_lines("nisp", Y, Y.wavelength, led, MISSION)
+    maps = chromatic_response.maps(
+        (96, 96), SLOPE, CURVATURE, rng.stream(infrared.SEED, "nisp", "DET22", "chromatic_response")
+    )
+    expected = own[0] * maps[0] + own[1] * maps[1]
+    change = after / before - 1.0
+    # Noise is drawn anew where the light differs, by half a part in a hundred of itself; and rounding.
+    assert np.corrcoef(change.ravel(), expected.ravel())[0, 1] > 0.95
+    assert (change * expected).sum() / (expected**2).sum() == pytest.approx(1.0, abs=0.05)
+    assert {d.name: d.applied for d in infrared.rendered(kind="flat", lamp=2, band="euclid_y", sky=0.0).decisions}[
+        "lamp_response"
+    ]
+    # What no LED of the band shines has no colour.
+    dark = infrared.rendered(kind="flat", lamp=1, band="euclid_h", sky=0.0)
+    assert not {d.name: d.applied for d in dark.decisions}["lamp_response"]
+
+
+def test_stars_have_their_colours_in_an_image():
+    """A bright red star: what is drawn again of it is its colour times its light."""
+    one = infrared.rendered([20.0], [48.0], [48.0], band="euclid_y")
+    assert not {d.name: d.applied for d in one.decisions}["chromatic_response"]
+    assert one.scene.tints is None
+    shares = np.linspace(0.5, 1.5, PARTS)[None] / PARTS
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(visible_sources, "_colours", lambda kept, *_: np.tile(shares, (len(kept), 1)))
+        red = infrared.rendered([14.0], [48.0], [48.0], band="euclid_y")
+    assert {d.name: d.applied for d in red.decisions}["chromatic_response"]
+    middle = np.s_[46:51, 46:51]
+    seen, light = red.scene.tints[0][middle].sum(), red.noise_free[middle].sum()
+    assert seen / light == pytest.approx(chromatic_response.colours(shares, TABLE)[0, 0], rel=0.3)
+
+
+def test_pixels_that_see_nothing_are_dark():
+    """A sensitivity that differs from pixel to pixel by as much as it is leaves every sixth without any."""
+    mission = resolve(overrides={"nisp.prnu": (1.0, ""), "nisp.response.slope": (0.5, "")})
+    one = infrared.rendered(
+        kind="flat", lamp=2, band="euclid_y", sky=0.0, mission=mission,
+        forced={"ramp_cosmic_rays": False, "dark_map": False, "ipc": False},
+    )  # fmt: skip
+    signal = infrared.electrons(one)
+    assert 0.1 < np.mean(signal < 50.0) < 0.2
+    assert signal.min() > -50.0
+    assert np.median(signal) > 1e4
+
+
+def test_the_sky_has_the_colour_of_its_light():
+    """Of the Sun, bluer than flat f_nu in H; of a warm telescope redder."""
+    h = passbands.load("euclid_h")
+    warm = resolve(overrides={"nisp.thermal.telescope_temperature": (170.0, "K")})
+    for band, mission, red in ((h, MISSION, False), (h, warm, True)):
+        rate = 1.0 + thermal.rate("nisp", band.name, band, mission)
+        photons = diffuse_light.photons("nisp", rate, band, mission)
+        assert photons.sum() == pytest.approx(rate)
+        assert (photons >= 0).all()
+        own = chromatic_response.of_lines("nisp", band, band.wavelength, photons, mission)
+        assert (own[0] > 0) == red

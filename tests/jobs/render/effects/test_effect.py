@@ -39,8 +39,17 @@ ORDER = (
     # Charge is read before it is amplified and converted.
     ("serial_cti", "nonlinearity", "crosstalk", "bias_structure", "read_noise", "adc"),
     # A ramp counts all that is expected, and what hits meanwhile; a pixel's capacity bends what it holds.
-    ("background", "pixel_area", "pixel_response", "dark_map", "persistence", "ramp_cosmic_rays", "ramp"),
-    ("calibration_lamp", "pixel_response", "dark_map"),
+    (
+        "background",
+        "pixel_area",
+        "chromatic_response",
+        "pixel_response",
+        "dark_map",
+        "persistence",
+        "ramp_cosmic_rays",
+        "ramp",
+    ),
+    ("calibration_lamp", "lamp_response", "pixel_response", "dark_map"),
     ("ramp_cosmic_rays", "ramp_nonlinearity", "ramp", "ipc"),
     # Neighbours see charge, not the noise of reading; the signal is estimated of groups as read, then converted.
     ("ramp", "ipc", "reset_level", "group_noise", "drift", "output_gain", "macc", "signal_nonlinearity"),

@@ -29,6 +29,7 @@ def scene(sky=1.0, peak=2e4, remembered=None, **values):
 
 # For each effect what makes it large, from far below its threshold to far above.
 CASES = {
+    "chromatic_response": lambda x: scene(sky=100.0, response__slope=min(1e-4 * x, 0.5), response__curvature=0.0),
     "dark_map": lambda x: scene(dark_current=2e-3 * x, hot_pixels=0.0),
     "persistence": lambda x: scene(remembered=np.full((N, N), 0.03 * x)),
     "ramp_nonlinearity": lambda x: scene(nonlinearity=min(1e-9 * x, 1e-5)),

@@ -1,0 +1,78 @@
+"""The light of sources by colour, for pixels that do not see all colours alike.
+
+with_tints   a scene with it
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from jobs.render.channels.aim import Aim
+from jobs.render.drawing import stamp_sizes, stamps
+from jobs.render.drawing.settings import settings_for
+from jobs.render.effects.light import chromatic_response
+from jobs.render.effects.scene import NOTICEABLE, Frame, Scene
+from jobs.render.exposure import visible_sources
+from jobs.render.exposure.visible_sources import Light
+from jobs.render.psf.model import Psf, of_colours
+from lake_schema.arrays import Float
+
+# Colours of the PSF that they are drawn through, in the detector's centre; and the light that may be aliased in them,
+# and left out, as parts of a source: what they change is a part in a hundred of it.
+_COLOURS, _PART = 4, 1e-2
+
+
+def with_tints(scene: Scene, aim: Aim, light: Light) -> Scene:
+    """The scene with the light of those sources whose colour changes a pixel by what is noticed.
+
+    scene : with what is drawn;  aim : the exposure and detector;  light : what shines onto it
+    Error : of what they change in a pixel, 3 %: the PSF is that of the detector's centre. Where an accuracy wants a PSF
+            of one colour those of the sources are not known: they change nothing
+    """
+    effect, sources, psf = aim.channel.coloured, light.sources, light.psf
+    unwanted = effect is None or effect not in aim.effects or not scene.forced.get(effect.name, True)
+    if unwanted or psf is None or sources.photons is None or not len(sources):
+        return scene
+    components = chromatic_response.table(scene.section, aim.band, scene.mission)
+    own = chromatic_response.colours(sources.photons, components)
+    part = _middle(psf)
+    change = chromatic_response.changes(sources.electrons * part, own, components, chromatic_response.strength(scene))
+    some = visible_sources.touching(sources, light.sizes, aim.detector) & (change > NOTICEABLE * scene.pixel_noise)
+    if not some.any():
+        return scene
+    chosen, shares, change = sources.take(some), sources.photons[some], change[some]
+    settings = replace(settings_for(scene.accuracy), edge=NOTICEABLE, aliased=_PART, floor=_PART)
+    noise = scene.pixel_noise
+    sizes = stamp_sizes.stamp_sizes(change / part, chosen.shape, chosen.shapes, psf, noise, settings)
+    # A picture and a trail are as wide as they are.
+    wide = (chosen.length > 0.0) | (np.zeros(len(chosen), bool) if chosen.picture is None else chosen.picture >= 0)
+    sizes = np.where(wide, light.sizes[some], np.minimum(sizes, light.sizes[some]))
+    neglected, seen = stamp_sizes.neglected_flux(change / part, noise, settings), _central(psf)
+
+    def draw(electrons: Float, photons: Float) -> Frame:
+        one = replace(chosen, electrons=electrons, photons=photons)
+        return stamps.draw(one, sizes, seen, aim.detector.nx, aim.detector.ny, None, neglected)
+
+    drawn = chromatic_response.tints(chosen.electrons, shares, components, draw)
+    return replace(scene, tints=drawn, tint_electrons=float(change.max()))
+
+
+def _middle(psf: Psf) -> float:
+    """The most of a point's light that is in a pixel, of any colour."""
+    if psf.planes is None:
+        return 1.0
+    images, samples = psf.planes.images, psf.planes.samples
+    first = images.shape[1] // 2 - samples // 2
+    core = slice(first, first + samples)
+    return min(float(images[:, core, core].sum(axis=(1, 2)).max()), 1.0)
+
+
+def _central(psf: Psf) -> Psf:
+    """The PSF of the detector's centre, of few colours, as far as its planes go."""
+    if psf.planes is None:
+        return psf
+    planes = replace(psf.planes, drift=psf.planes.drift[:0], powers=())
+    few = min(_COLOURS, len(planes.wavelength))
+    return of_colours(replace(psf, planes=planes, edges=None), few)
