@@ -19,8 +19,8 @@ import numpy.typing as npt
 
 from lake_schema.arrays import Array, Float
 
-# Up to so many terms a sum is made of whole arrays, without compiled code.
-_FEW = 8
+# Up to so many terms a sum is made of whole arrays, without compiled code; but for matrices of so many numbers.
+_FEW, _LARGE = 8, 1 << 18
 # Columns from which on it is faster to add rows of the second factor than to follow rows of the first.
 _WIDE = 16
 
@@ -37,7 +37,8 @@ def product(one: npt.ArrayLike, other: npt.ArrayLike) -> Any:
     left, right = (left[None] if rows else left), (right[:, None] if columns else right)
     if left.shape[-1] != right.shape[-2]:
         raise ValueError(f"shapes {left.shape} and {right.shape} do not fit")
-    if left.shape[-1] <= _FEW:
+    large = left.ndim == right.ndim == 2 and len(left) * right.shape[1] >= _LARGE
+    if left.shape[-1] <= _FEW and not large:
         out = _of_few(left, right)
     else:
         out = _of_many(left.reshape(-1, left.shape[-1]), right).reshape(*left.shape[:-1], right.shape[-1])

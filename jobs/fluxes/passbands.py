@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import importlib.metadata
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +71,7 @@ def load(name: str) -> Passband:
     if name not in rows:
         raise BadInput(f"passband {name!r} is not one of {', '.join(rows)}")
     row = rows[name]
-    key = cache.content_key(code_key(__name__), repr(row), importlib.metadata.version("speclite"))
+    key = cache.content_key(code_key(__name__), repr(row), _speclite())
     arrays = cache.cached_arrays(f"passband_{name}", key, lambda: _curve(row["source"], float(row["shift"])))
     return Passband(name, arrays["wavelength"], arrays["response"], row["medium"])
 
@@ -115,6 +116,11 @@ def ab_flux(band: Passband, wavelength: npt.ArrayLike, f_lambda: npt.ArrayLike) 
     part = (band.wavelength - at[index]) / (at[index + 1] - at[index])
     between = spectra[..., index] * (1.0 - part) + spectra[..., index + 1] * part
     return np.asarray(sums.product(between, weights(band)))
+
+
+@lru_cache
+def _speclite() -> str:
+    return importlib.metadata.version("speclite")
 
 
 def _rows() -> dict[str, dict[str, str]]:

@@ -7,20 +7,20 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs import heap
-from jobs.accuracy import Accuracy
+from jobs.accuracy import SURVEY, Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
 from jobs.render.camera import detectors
 from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim
 from jobs.render.drawing import stamp_sizes
 from jobs.render.exposure import persistence, render, visible_sources
-from jobs.render.exposure.records import Earlier, Rows
+from jobs.render.exposure.records import Earlier, EarlierSky, Rows
 from jobs.render.planning import preconditions, variants
 from jobs.render.planning import tasks as planned
 from jobs.render.planning.mission import mission_of
@@ -55,7 +55,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     every = preconditions.rendered(exposures, inputs["tasks"].rows())
     asked = planned.part(every, request)
     earlier = _earlier_tasks(inputs, exposures, request)
-    needed = _with_earlier(asked, earlier)
+    needed = _with_earlier(asked, earlier, exposures)
     places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in needed if task["cells"]}
     for name in ("galaxies", "stars"):
         of_task = [selection.needed(task, catalogue_rows.deflection_of(inputs[name])) for task in places.values()]
@@ -97,9 +97,9 @@ def products(
         facts["bodies"] = ephemeris_files(request.bodies, exposures)
     held = reuse.held(lake, PRODUCTS.name, request.name)
     wanted = {_part_name(task) for task in asked}
-    tasks = _with_held(wanted, every, exposures, held)
     earlier = _earlier_tasks(inputs, exposures, request)
-    psfs = psf_files(exposures, _with_earlier(tasks, earlier))
+    tasks = _with_held(wanted, every, exposures, held, earlier)
+    psfs = psf_files(exposures, _with_earlier(tasks, earlier, exposures))
     keys = product_keys({**facts, "psf": psfs}, exposures, tasks, inputs, mission_of(request.mission), earlier)
     parts = tuple(
         Part(name, {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: key})
@@ -108,33 +108,57 @@ def products(
     )
     if len(parts) < len(tasks):
         stay = {part.name for part in parts}
-        psfs = psf_files(exposures, _with_earlier([task for task in tasks if _part_name(task) in stay], earlier))
+        kept = [task for task in tasks if _part_name(task) in stay]
+        psfs = psf_files(exposures, _with_earlier(kept, earlier, exposures))
     return Plan(PRODUCTS, {**facts, "psf": psfs} if psfs else facts, parts)
 
 
 def _earlier_tasks(
     inputs: Mapping[str, read.Version], exposures: pa.Table, request: Request
 ) -> dict[tuple[int, str], list[Json]]:
-    """(exposure, detector) -> tasks that left something in the detector."""
+    """(exposure, detector) -> tasks that left something in the detector, also of exposures that nothing renders."""
+    names = exposures["channel"].unique().to_pylist()
+    if all(name not in registry.CHANNELS or registry.CHANNELS[name].remembers is None for name in names):
+        return {}
     rows = {row.exposure_id: row for row in map(ExposureRow.of, exposures.to_pylist())}
-    return persistence.earlier_of(inputs["tasks"].rows().to_pylist(), rows, mission_of(request.mission))
+    return persistence.earlier_of(inputs["tasks"].rows().to_pylist(), rows, _own(mission_of(request.mission)))
 
 
-def _with_earlier(tasks: Sequence[Json], earlier: Mapping[tuple[int, str], Sequence[Json]]) -> list[Json]:
-    return [*tasks, *(one for task in tasks for one in earlier.get((task["exposure_id"], task["detector"]), ()))]
+def _own(mission: MissionConfiguration) -> Callable[[str | None], MissionConfiguration]:
+    """An exposure's settings -> its mission."""
+    return lambda settings: variants.variant(settings, mission, SURVEY, {}).mission
+
+
+def _with_earlier(
+    tasks: Sequence[Json], earlier: Mapping[tuple[int, str], Sequence[Json]], exposures: pa.Table
+) -> list[Json]:
+    """The tasks, and those before them whose sources are drawn again."""
+    if not earlier:
+        return list(tasks)
+    rows = map(ExposureRow.of, exposures.to_pylist())
+    drawn = {row.exposure_id for row in rows if persistence.is_drawn(row)}
+    before = (one for task in tasks for one in earlier.get((task["exposure_id"], task["detector"]), ()))
+    return [*tasks, *(one for one in before if one["exposure_id"] in drawn)]
 
 
 def _part_name(task: Json) -> str:
     return f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet"
 
 
-def _with_held(wanted: Set[str], every: Sequence[Json], exposures: pa.Table, held: Mapping[str, str]) -> list[Json]:
-    """Tasks of the parts that are wanted, and of those that are held whose PSF can still be read, in their order."""
+def _with_held(
+    wanted: Set[str],
+    every: Sequence[Json],
+    exposures: pa.Table,
+    held: Mapping[str, str],
+    earlier: Mapping[tuple[int, str], Sequence[Json]],
+) -> list[Json]:
+    """Tasks of the parts that are wanted, and of those that are held whose PSFs can still be read, in their order."""
     psfs = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
 
     def stays(task: Json) -> bool:
-        psf = psfs[task["exposure_id"]]
-        return _part_name(task) in held and (not psf or from_file.file_of(psf, task["detector"]).is_file())
+        drawn = [task, *earlier.get((task["exposure_id"], task["detector"]), ())]
+        read = [from_file.file_of(psf, one["detector"]) for one in drawn if (psf := psfs[one["exposure_id"]])]
+        return _part_name(task) in held and all(file.is_file() for file in read)
 
     return [task for task in every if _part_name(task) in wanted or stays(task)]
 
@@ -159,10 +183,12 @@ def work(lake: Path, facts: Json) -> Output:
     mission = read_back(inputs["mission"])
     own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
     detector = detectors.detector(exposed.camera, task["detector"], own.mission)
-    if exposed.psf:
-        file = str(from_file.file_of(exposed.psf, task["detector"]))
-        if file_sha256(Path(file)) != facts["psf"][file]:
-            raise BadInput(f"{file}: has changed since the rendering began")
+    earlier = _earlier(lake, inputs, exposed, task, mission)
+    for one in (exposed, *(before.exposure for before in earlier if isinstance(before, Earlier))):
+        if one.psf:
+            file = str(from_file.file_of(one.psf, task["detector"]))
+            if file_sha256(Path(file)) != facts["psf"][file]:
+                raise BadInput(f"{file}: has changed since the rendering began")
     bodies = solar_system.nobody if request.get("bodies") == "none" else None
     if registry.CHANNELS[exposed.channel].sees_bodies(exposed.image_type):
         for file, sha256 in facts.get("bodies", {}).items():
@@ -193,7 +219,7 @@ def work(lake: Path, facts: Json) -> Output:
             if LENSES in inputs
             else None,
             bodies=bodies,
-            earlier=_earlier(lake, inputs, exposed, task, mission),
+            earlier=earlier,
         )
         aim, noise = Aim.of(exposed, detector, band), request.get("noise_seed")
         rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
@@ -206,18 +232,23 @@ def work(lake: Path, facts: Json) -> Output:
 
 def _earlier(
     lake: Path, inputs: Mapping[str, read.Version], exposed: ExposureRow, task: Json, mission: MissionConfiguration
-) -> tuple[Earlier, ...]:
+) -> tuple[Earlier | EarlierSky, ...]:
     """Exposures of the task's detector that left something in it, with their bright sources."""
     if registry.CHANNELS[exposed.channel].remembers is None:
         return ()
-    window = mission.value(f"{exposed.camera}.persistence.window", "d")
-    near = (pc.field("mjd") >= exposed.mjd - window) & (pc.field("mjd") <= exposed.mjd)
+    own = _own(mission)(exposed.settings)
+    since = exposed.mjd - persistence.window(exposed.camera, own)
+    near = (pc.field("mjd") >= since) & (pc.field("mjd") <= exposed.mjd)
     found = inputs["exposures"].rows(where=near & (pc.field("camera") == exposed.camera)).to_pylist()
     rows = {row.exposure_id: row for row in map(ExposureRow.of, found)}
     here = pc.field("exposure_id").isin(list(rows)) & (pc.field("detector") == task["detector"])
     tasks = inputs["tasks"].rows(where=here).to_pylist()
-    before = persistence.earlier_of(tasks, rows, mission)[exposed.exposure_id, task["detector"]]
-    return tuple(_drawn_again(lake, inputs, exposed, rows[one["exposure_id"]], one, mission) for one in before)
+    before = persistence.earlier_of(tasks, rows, _own(mission))[exposed.exposure_id, task["detector"]]
+    pairs = ((rows[one["exposure_id"]], one) for one in before)
+    return tuple(
+        _drawn_again(lake, inputs, exposed, row, one, own) if persistence.is_drawn(row) else EarlierSky(row)
+        for row, one in pairs
+    )
 
 
 def _drawn_again(
@@ -232,13 +263,15 @@ def _drawn_again(
     found = [
         catalogue_rows.bright(inputs[rows], inputs[fluxes], task, columns, before.band, least)
         for rows, fluxes, columns in (
-            ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS),
+            # Their colours are taken as flat.
+            ("galaxies", "galaxy_fluxes", visible_sources.SHAPE_COLUMNS),
             ("stars", "star_fluxes", visible_sources.STAR_COLUMNS),
         )
     ]
     band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], before.band)
     detector = detectors.detector(before.camera, task["detector"], mission)
-    return Earlier(Aim.of(before, detector, band), Rows(*found[0], *found[1]))
+    stellar = stars_of(lake, inputs["star_fluxes"].manifest["facts"])
+    return Earlier(Aim.of(before, detector, band), Rows(*found[0], *found[1], stellar=stellar))
 
 
 def truth_work(lake: Path, facts: Json) -> Output:

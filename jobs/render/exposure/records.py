@@ -12,6 +12,7 @@ from jobs.fluxes.libraries.templates import Library
 from jobs.render.channels.aim import Aim
 from jobs.render.sources.solar_system import Population
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,7 @@ class Rows:
     library: Library | None = None
     stellar: Library | None = None
     complete: float = 0.0
-    earlier: tuple[Earlier, ...] = ()
+    earlier: tuple[Earlier | EarlierSky, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,17 @@ class Earlier:
 
     aim: Aim
     rows: Rows
+
+    @property
+    def exposure(self) -> ExposureRow:
+        return self.aim.exposure
+
+
+@dataclass(frozen=True, slots=True)
+class EarlierSky:
+    """An exposure of the same detector before that nothing renders: of what shone there the sky alone is known."""
+
+    exposure: ExposureRow
 
 
 @dataclass(frozen=True, slots=True)

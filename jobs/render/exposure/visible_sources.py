@@ -35,9 +35,8 @@ from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 
 # What is read of the catalogues; fluxes are read besides.
-GALAXY_COLUMNS = tuple(
-    dict.fromkeys(("id", "kind", "ra_lensed", "dec_lensed", *galaxy_shapes.COLUMNS, *colours.GALAXY_COLUMNS))
-)
+SHAPE_COLUMNS = ("id", "kind", "ra_lensed", "dec_lensed", *galaxy_shapes.COLUMNS)
+GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, *colours.GALAXY_COLUMNS)))
 STAR_COLUMNS = ("id", "ra", "dec", *colours.STAR_COLUMNS)
 # Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
 _MOST_ELECTRONS = 1e17

@@ -11,6 +11,7 @@ import pyarrow as pa
 from jobs.render.camera import detectors
 from jobs.render.channels import registry
 from jobs.render.drawing import stamp_sizes
+from jobs.render.exposure import persistence
 from jobs.render.psf import from_file
 from jobs.render.sources import catalogue_rows, ephemerides, selection
 from jobs.render.sources.catalogue_rows import CATALOGUES, CELLS, FARTHEST, LENSES
@@ -63,25 +64,31 @@ def product_keys(
             for name, (deflection, found) in files.items()
         ]
 
-    def own(task: Json) -> Json:
-        exposure, files = rows[task["exposure_id"]], {}
-        if psf := exposure.psf:
-            files["psf"] = facts["psf"][str(from_file.file_of(psf, task["detector"]))]
-        if "bodies" in facts and registry.CHANNELS[exposure.channel].sees_bodies(exposure.image_type):
-            (files["bodies"],) = facts["bodies"].values()
-        return files
-
     def drawn(task: Json) -> Json:
         return {
             "exposure": asdict(rows[task["exposure_id"]]),
             "task": {name: task[name] for name in ("detector", "cells", "radius")},
             "catalogues": catalogues(task) if task["cells"] else [],
-            **own(task),
+            **_own_files(facts, rows[task["exposure_id"]], task["detector"]),
         }
 
-    before = ([drawn(one) for one in earlier.get((task["exposure_id"], task["detector"]), ())] for task in tasks)
+    def left(task: Json) -> Json:
+        row = rows[task["exposure_id"]]
+        return drawn(task) if persistence.is_drawn(row) else {"exposure": asdict(row)}
+
+    before = ([left(one) for one in earlier.get((task["exposure_id"], task["detector"]), ())] for task in tasks)
     also = ({"earlier": some} if some else {} for some in before)
     return [digest({**shared, **drawn(task), **more}) for task, more in zip(tasks, also, strict=True)]
+
+
+def _own_files(facts: Json, exposure: ExposureRow, detector: str) -> Json:
+    """sha256 of the user's files that an image is made of."""
+    files = {}
+    if psf := exposure.psf:
+        files["psf"] = facts["psf"][str(from_file.file_of(psf, detector))]
+    if "bodies" in facts and registry.CHANNELS[exposure.channel].sees_bodies(exposure.image_type):
+        (files["bodies"],) = facts["bodies"].values()
+    return files
 
 
 def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:

@@ -64,7 +64,15 @@ class Traps:
             raise OutOfRange("delay of persistence", delay, 0.0, np.inf)
         held = np.clip(charge, 0.0, self.full_well)
         faded = (delay / self.reference) ** self.power * seconds / self.length
-        return np.asarray((self.p0 + 1e-5 * self.p1 * held) * -np.expm1(-held / self.p2) * faded)
+        # Most pixels have the sky alone, all the same.
+        least = held.min(initial=self.full_well)
+        more = held > least
+        found = np.full(held.shape, self._of(least) * faded)
+        found[more] = self._of(held[more]) * faded
+        return found
+
+    def _of(self, held: Frame) -> Frame:
+        return np.asarray((self.p0 + 1e-5 * self.p1 * held) * -np.expm1(-held / self.p2))
 
 
 def apply(frame: Frame, remembered: Frame | None, spread: float, rng: np.random.Generator) -> Frame:

@@ -156,10 +156,10 @@ def frame_time(scene: Scene) -> float:
 
 
 def planes(frame: Frame, count: int) -> Frame:
-    """A new [count, ny, nx] of `apply`: what the frame has, and zeros."""
-    out = np.zeros((count, *frame.shape[-2:]))
+    """A new float32[count, ny, nx] of `apply`: what the frame has, and zeros."""
+    out = np.empty((count, *frame.shape[-2:]), np.float32)
     given = frame.reshape(-1, *frame.shape[-2:])
-    out[: len(given)] = given
+    out[: len(given)], out[len(given) :] = given, 0.0
     return out
 
 
@@ -189,6 +189,7 @@ def apply(
                    leave in a pixel, e-, and the moment of it as a fraction of the ramp, 0 <= moment < 1; or
                    [4, ny, nx], with b of N (1 - b N), what is seen of N electrons, 1/e-
     full_well    : e- that a pixel holds, no more
+    Error        : all of it in single precision, 6e-8
     linear_below : e- at the ramp's end up to which the linear law is used; 0 = every frame of every pixel is drawn
     mode, rng    : how the ramp is read; random numbers
     """
@@ -196,8 +197,8 @@ def apply(
         raise OutOfRange("full well", full_well, 0.0, 1e9)
     planes = [*frame] if frame.ndim == 3 else [frame]
     out = np.empty((mode.groups, *planes[0].shape), np.float32)
-    inputs = [np.ascontiguousarray(part, dtype=float).reshape(-1) for part in planes]
-    expected, hit, when, bend = inputs + [np.zeros(0)] * (4 - len(inputs))
+    inputs = [np.ascontiguousarray(part, dtype=np.float32).reshape(-1) for part in planes]
+    expected, hit, when, bend = inputs + [np.zeros(0, np.float32)] * (4 - len(inputs))
     _accumulate(
         expected,
         hit,

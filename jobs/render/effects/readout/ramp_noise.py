@@ -67,8 +67,16 @@ def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
     drift = np.empty((ny, nx), np.float32)
     for first, last in pairwise(edges(nx).tolist()):
         drift[:, first:last] = _one_over_f(ny * (last - first), rng, max(ny // _FOLLOWED, 1)).reshape(ny, -1)
-    steps = (np.arange(groups) / (groups - 1.0)).astype(np.float32)
-    return np.asarray(frame + steps[:, None, None] * (np.float32(width) * drift))
+    out = np.empty_like(frame)
+    for group, read, step in zip(frame, out, (np.arange(groups) / (groups - 1.0)).tolist(), strict=True):
+        _shift(np.ascontiguousarray(group).reshape(-1), drift.reshape(-1), step * width, read.reshape(-1))
+    return out
+
+
+@jit
+def _shift(group: Any, drift: Any, width: float, out: Any) -> None:
+    for i in range(len(group)):
+        out[i] = group[i] + width * drift[i]
 
 
 def apply_reset(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:

@@ -9,7 +9,7 @@ from jobs.accuracy import SURVEY
 from jobs.render.channels.aim import Aim
 from jobs.render.effects.charge.persistence import Traps
 from jobs.render.exposure import persistence
-from jobs.render.exposure.records import Earlier, Rows, Variant
+from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
 from jobs.render.psf import euclid
 from lake_schema.errors import OutOfRange
 from tests.jobs.render import fields, infrared
@@ -92,6 +92,19 @@ def test_a_flat_leaves_its_light_a_dark_nothing():
     assert (left(earlier(134.0, [], [], [], kind="dark", sky=0.0)) == 0.0).all()
 
 
+def test_the_sky_of_a_spectrum_leaves_something():
+    """1.1 e- of 600 e- 400 s before, all over; a dark's nothing."""
+    row = infrared.exposed(DETECTOR, mjd=infrared.MJD - 400 * SECOND, number=9, seconds=550.0, sky=1.09)
+    spectrum = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red"})
+    assert not persistence.is_drawn(spectrum)
+    assert persistence.is_drawn(fields.exposure(**row))
+    found = left(EarlierSky(spectrum))
+    np.testing.assert_allclose(found, 1.1, atol=0.15)
+    np.testing.assert_array_equal(found, found[0, 0])
+    dark = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red", "image_type": "dark"})
+    assert (left(EarlierSky(dark)) == 0.0).all()
+
+
 def test_an_image_has_it_and_says_so():
     """As a current: what is left comes up the ramp; the truth map has a pixel's own share of it."""
     before = earlier(134.0, [12.0], [40.0], [50.0])
@@ -109,7 +122,7 @@ def test_an_image_has_it_and_says_so():
 
 
 def test_which_exposures_count():
-    """Of the same detector, camera and settings, within two hours, rendered; of realisations the first."""
+    """Of the same detector, camera and settings, within two hours, also spectra; of realisations the first."""
     nominal = fields.exposure(**infrared.exposed(DETECTOR))
 
     def row(number, hours, **more):
@@ -121,11 +134,12 @@ def test_which_exposures_count():
     ]  # fmt: skip
     tasks = [{"exposure_id": one.exposure_id, "detector": "DET22"} for one in rows[:8]]
     tasks.append({"exposure_id": 9, "detector": "DET23"})
-    found = persistence.earlier_of(tasks, {one.exposure_id: one for one in rows}, MISSION)
+    found = persistence.earlier_of(tasks, {one.exposure_id: one for one in rows}, lambda settings: MISSION)
     numbers = {key: [task["exposure_id"] for task in some] for key, some in found.items()}
-    assert numbers[6, "DET22"] == numbers[7, "DET22"] == [2]
-    assert numbers[8, "DET22"] == [2, 6]
+    assert numbers[6, "DET22"] == numbers[7, "DET22"] == [2, 4]
+    assert numbers[8, "DET22"] == [2, 4, 6]
+    assert (4, "DET22") not in numbers
     assert numbers[1, "DET22"] == []
     assert numbers[9, "DET23"] == []
-    shuffled = persistence.earlier_of(tasks[::-1], {one.exposure_id: one for one in rows}, MISSION)
+    shuffled = persistence.earlier_of(tasks[::-1], {one.exposure_id: one for one in rows}, lambda settings: MISSION)
     assert shuffled == found
