@@ -1,7 +1,7 @@
 """The point-spread function of Euclid's cameras: the optics from their pupil, jitter and charge diffusion.
 
 Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows), without the pixel, centred on the
-chief ray (coma moves the centroid by a few mas).
+chief ray (coma moves the centroid by a few mas, of NISP by tens).
 
 vis_psf, nisp_psf     -> Psf;  vis_edges, nisp_edges : their diffraction far from a star
 pupil, wavefront   the parts of the model

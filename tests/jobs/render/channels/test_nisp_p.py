@@ -139,12 +139,16 @@ def test_both_orders_of_non_linearity():
 @pytest.mark.parametrize("numbers", [(2, 1, 0), (15, 16, 11), (100, 1, 0)], ids=str)
 def test_any_ramp(numbers):
     own, seconds = mode(*numbers)
-    found = infrared.rendered([20.0], [48.0], [48.0], mission=own, seconds=seconds)
+    found = infrared.rendered([20.0], [48.0], [48.0], mission=own, seconds=seconds, truth=("cosmic_rays",))
     names = [extension.name for extension in found.readout.extensions]
     assert names == ["DET22.SCI"] + ["DET22.CHI2"] * (numbers[0] > 2)
     # Two groups have no quality, and the header says so.
     cards = {key: (value, text) for key, value, text in found.readout.cards}
     assert ("no quality" in cards["QUALLIM"][1]) == (numbers[0] == 2)
+    # Of all numbers of groups as few good pixels are flagged.
+    hits = found.maps["cosmic_rays"] > 0
+    if numbers[0] > 2:
+        assert found.readout.extensions[1].data[4:-4, 4:-4][~hits].mean() < 0.02
     assert np.median(infrared.electrons(found)) == pytest.approx(seconds * 1.02, abs=6.0 + 0.03 * seconds)
 
 
