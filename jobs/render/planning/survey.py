@@ -66,12 +66,16 @@ def _of_variant(request: Request, values: Mapping[str, Any], shared: _Settled) -
     for i, pointing in enumerate(request.pointings):
         one = _pointing(pointing, f"pointing[{i}]", request, shared.mission)
         yield from repeat((one, shared), pointing.realisations)
+    # Of calibrations that have no date: NISP's come after those before have ended, and have left nothing in it.
+    free = shared.mission.value("svm.launch", "d")
     for i, block in enumerate(request.observations):
         where, found = f"observation[{i}]", 0
         ramp = {f"nisp.macc.photometric.{part}": (n, "") for part, n in zip(_RAMP, block.macc, strict=False)}
         own = _Settled.of({**values, **ramp}, request, shared.mission) if ramp else shared
-        for exposure in _block(block, request, own.mission, where):
+        for exposure in _block(block, request, own.mission, where, free):
             found += 1
+            if exposure.camera == "nisp" and exposure.image_type in _CALIBRATION:
+                free = max(free, _forgotten(exposure, own.mission))
             yield from repeat((exposure, own if exposure.channel == "NISP-P" else shared), block.realisations)
         if not found:
             raise BadInput(f"{where} asks for no exposure")
@@ -117,9 +121,19 @@ def known_detectors(camera: str, names: tuple[str, ...], mission: MissionConfigu
         raise BadInput(f"{where}: camera {camera} has no detector {unknown[0]!r}")
 
 
-def _block(block: Observation, request: Request, mission: MissionConfiguration, where: str) -> Iterator[Exposure]:
+def _forgotten(exposure: Exposure, mission: MissionConfiguration) -> float:
+    """MJD from which nothing is seen of what an exposure leaves in NISP's detectors."""
+    return exposure.mjd + exposure.exposure_time_s / 86400.0 + mission.value("nisp.persistence.window", "d")
+
+
+def _block(
+    block: Observation, request: Request, mission: MissionConfiguration, where: str, free: float
+) -> Iterator[Exposure]:
+    """free : MJD from which NISP may calibrate."""
     area = block.area or request.area
-    start = block.mjd if block.mjd is not None else mission.value("svm.launch", "d")
+    start = mission.value("svm.launch", "d") if block.mjd is None else block.mjd
+    if block.mjd is None and block.image_type in _CALIBRATION and {"NISP-P", "NISP-S"} & {*block.channels}:
+        start = free
     try:
         found = _exposures(block, area, request.seed, start, mission)
         for exposure in found:

@@ -60,6 +60,24 @@ def test_requests_know_how_many_lamps_there_are():
     assert {"VIS": LAMPS["vis"][0], "NISP-P": LAMPS["nisp"][0], "NISP-S": LAMPS["nisp"][0]} == observations.LAMPS
 
 
+def test_calibrations_without_a_date_follow_one_another():
+    """A dark taken while a flat is would show what that leaves in the detector."""
+    found = exposures(
+        {**FLAT, "exposures": 3}, {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2},
+        {"channels": ["VIS"], "image_type": "dark", "exposures": 1},
+        {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "mjd": 60200.0},
+        {"channels": ["NISP-P"], "image_type": "self_calibration", "exposures": 1},
+    )  # fmt: skip
+    launch, hours = MISSION.value("svm.launch", "d"), MISSION.value("nisp.persistence.window", "d")
+    flats, darks, (vis,), (dated,), sky = (
+        [e for e, _ in found[i:j]] for i, j in ((0, 3), (3, 5), (5, 6), (6, 7), (7, 10))
+    )
+    assert flats[0].mjd == vis.mjd == launch
+    assert dated.mjd == 60200.0
+    assert darks[0].mjd >= flats[-1].mjd + flats[-1].exposure_time_s / 86400 + hours
+    assert sky[0].mjd >= 60200.0 + hours
+
+
 def test_a_block_has_its_own_ramp():
     """So long are its exposures; VIS, beside it, and other blocks know nothing of it."""
     dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1}
