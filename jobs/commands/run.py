@@ -69,7 +69,8 @@ def stages(request: Request, lenses: bool = False, with_gaia: bool = False) -> l
     plan, render = IMAGES
     part = ("--detectors", *request.detectors) * bool(request.detectors)
     limit = ("--limit", str(request.limit)) * (request.limit is not None)
-    return [*found, plan, replace(render, options=(*part, *limit))]
+    tables = (*render.tables, "exposure_files") if request.files == "exposure" else render.tables
+    return [*found, plan, replace(render, tables=tables, options=(*part, *limit))]
 
 
 def main(argv: Sequence[str], start: Start) -> int:

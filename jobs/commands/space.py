@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -20,6 +20,7 @@ from jobs.request import universe
 from jobs.request.schema import Request
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.store import layout, read, reuse
+from lake_schema.store.plan import Part, Plan
 from lake_schema.store.provenance import code_version
 
 _GB = 1e9
@@ -78,6 +79,7 @@ def _images(root: Path, request: Request, exposures: pa.Table, tasks: pa.Table) 
     """Bytes of the images that are asked for and need not be rendered."""
     # All that renders: seconds that a lake without images need not wait for.
     from jobs.render import render_exposures
+    from jobs.render.products import exposure_files
 
     inputs = render_exposures.inputs_of(root, request)
     every = preconditions.rendered(exposures, tasks)
@@ -85,14 +87,24 @@ def _images(root: Path, request: Request, exposures: pa.Table, tasks: pa.Table) 
     made = render_exposures.products(root, request, inputs, exposures, every.to_pylist(), asked)
     wanted = {(task["exposure_id"], task["detector"]) for task in asked}
     own = [part for part in made.parts if (part.facts["exposure_id"], part.facts["detector"]) in wanted]
-    held = reuse.held(root, "products", request.name)
-    kept = {part.name for part in own if held.get(part.name) == part.facts[reuse.PRODUCT]}
+    size = _kept(root, request, made, own)
+    if request.files == "exposure":
+        whole, numbers = exposure_files.plan(made, every.to_pylist()), {number for number, _ in wanted}
+        size += _kept(root, request, whole, [part for part in whole.parts if part.facts["exposure_id"] in numbers])
+    return size
+
+
+def _kept(root: Path, request: Request, plan: Plan, parts: Sequence[Part]) -> float:
+    """Bytes of a plan's parts that need not be made."""
+    table = plan.table.name
+    held = reuse.held(root, table, request.name)
+    kept = {part.name for part in parts if held.get(part.name) == part.facts[reuse.PRODUCT]}
     # A stage has what was taken as well as what was rendered.
-    return max(_bytes(layout.stage(root, made.table.name, made.key)), _bytes_of(root, request, kept) if kept else 0.0)
+    return max(_bytes(layout.stage(root, table, plan.key)), _bytes_of(root, request, table, kept) if kept else 0.0)
 
 
-def _bytes_of(root: Path, request: Request, parts: set[str]) -> float:
-    version = read.for_request(root, "products", request.name)
+def _bytes_of(root: Path, request: Request, table: str, parts: set[str]) -> float:
+    version = read.for_request(root, table, request.name)
     sizes = {entry["path"]: entry["bytes"] for entry in version.manifest["files"]}
     kept = (part for part in version.manifest["parts"] if part["name"] in parts)
     return float(sum(sizes[path] for part in kept for path in part["files"]))

@@ -1,10 +1,11 @@
 """The archive of a lake's images: what there is, of what, made when, with what, and what could not be made.
 
     python -m jobs.render.archive --lake LAKE [--name REQUEST] [--at RA DEC] [--sql "select .. from products"]
-                                  [--failures]
+                                  [--failures | --exposures]
     python -m jobs.render.archive --lake LAKE --again PATH --out FILE.fits [--version KEY]
 
 products    the published products, each with its sha256, seconds and peak memory
+exposures   the files of whole exposures, likewise
 failures    detectors that a run could not render
 covering    those products whose footprint holds a place
 again       renders one of them anew, from the tables and the mission that it was made from
@@ -65,6 +66,20 @@ def products(root: Path, request: str | None = None) -> pa.Table:
             rows.append({**row, **{key: files[row["path"]][key] for key in ("sha256", "bytes")}, **measured})
     own = [("sha256", pa.string()), ("bytes", pa.int64()), ("seconds", pa.float64()), ("peak_gb", pa.float64())]
     return pa.Table.from_pylist(rows, pa.schema([*version.schema, *(pa.field(*column) for column in own)]))
+
+
+def exposures(root: Path, request: str | None = None) -> pa.Table:
+    """Rows of the table `exposure_files` with sha256 and bytes.
+
+    request : whose files, where a lake has those of several
+    Errors  : BadInput where there are none, or none of the detectors' present images
+    """
+    version, images = (read.version(root, name, request=request) for name in ("exposure_files", "products"))
+    if version.manifest["facts"]["products"] != images.key:
+        raise BadInput('table exposure_files is of other images: run render_exposures with files = "exposure"')
+    rows, files = version.rows(), {entry["path"]: entry for entry in version.manifest["files"]}
+    found = [[files[path][key] for path in rows["path"].to_pylist()] for key in ("sha256", "bytes")]
+    return rows.append_column("sha256", pa.array(found[0], pa.string())).append_column("bytes", pa.array(found[1]))
 
 
 def failures(root: Path, request: str | None = None) -> pa.Table:
@@ -165,12 +180,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--at", nargs=2, type=float, metavar=("RA", "DEC"), help="only what holds this place, deg")
     parser.add_argument("--sql", help="a query of the table products")
     parser.add_argument("--failures", action="store_true", help="what could not be made, in place of the products")
+    parser.add_argument("--exposures", action="store_true", help="files of whole exposures, in place of the detectors'")
     parser.add_argument("--again", metavar="PATH", help="render this product again, as it was made")
     parser.add_argument("--out", type=Path, metavar="FILE", help="where to; wanted with --again")
     parser.add_argument("--version", metavar="KEY", help="of an older version of the table products")
     options = parser.parse_args(argv)
-    if options.failures and options.at is not None:
-        parser.error("failures have no place")
+    if (options.failures or options.exposures) and options.at is not None:
+        parser.error("failures and whole exposures have no place")
+    if options.failures and options.exposures:
+        parser.error("--failures and --exposures exclude each other")
     if (options.again is None) != (options.out is None):
         parser.error("--again and --out belong together")
     return command.status("archive", lambda: _answered(options))
@@ -185,7 +203,7 @@ def _answered(options: argparse.Namespace) -> int:
     if options.at is not None:
         sky.checked(*([value] for value in options.at))
     own = None if options.name is None else names.checked(root, options.name)
-    rows = (failures if options.failures else products)(root, own)
+    rows = (failures if options.failures else exposures if options.exposures else products)(root, own)
     rows = rows if options.at is None else covering(rows, *options.at)
     rows = rows if options.sql is None else search(rows, options.sql)
     for line in _objects(rows):

@@ -56,7 +56,8 @@ def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.
     catalogues = [] if lake is None else _catalogues(lake, request)
     densities = source_counts.Densities(mission, request.universe, catalogues)
     wanted = [exposure.detectors for exposure, _ in found]
-    rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, variants.forced(request))
+    forced, files = variants.forced(request), request.files
+    rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, forced, files)
     return mission, exposures, rows
 
 
@@ -74,7 +75,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **user_filters(request)[1]}
     # What they cost depends on more than which they are.
     counts = {v.table: v.key for v in _catalogues(lake, request)}
-    costs = {**facts, "counts": counts, "rendered": request.facts("accuracy", "effects")}
+    costs = {**facts, "counts": counts, "rendered": request.facts("accuracy", "effects", "files")}
     about = {
         "mission": mission.fingerprint,
         "ladder": list(mission.ladder),

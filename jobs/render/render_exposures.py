@@ -25,7 +25,7 @@ from jobs.render.planning import preconditions, variants
 from jobs.render.planning import tasks as planned
 from jobs.render.planning.mission import mission_of
 from jobs.render.planning.preconditions import INPUTS
-from jobs.render.products import fits_files, truth_table
+from jobs.render.products import exposure_files, fits_files, truth_table
 from jobs.render.products.keys import ephemeris_files, product_keys, psf_files, truth_file
 from jobs.render.psf import from_file
 from jobs.render.sources import catalogue_rows, ephemerides, selection, solar_system
@@ -44,7 +44,7 @@ from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """One part a detector of an exposure, the longest first; then what was drawn on each.
+    """One part a detector of an exposure, the longest first; then what was drawn on each, and files of whole exposures.
 
     Detectors that are not asked for, and that the request's present version has as they would be rendered now, stay:
     a part is added to what there is.
@@ -62,7 +62,10 @@ def steps(lake: Path, request: Request) -> list[Step]:
         preconditions.refuse_uncovered(inputs[name], {cell for cells in of_task for cell in cells})
     plan = products(lake, request, inputs, exposures, every.to_pylist(), asked)
     drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in plan.parts)
-    return [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
+    steps = [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
+    if request.files == "exposure":
+        steps.append(Step(exposure_files.plan(plan, every.to_pylist()), exposure_files.work, unit="exposure"))
+    return steps
 
 
 def inputs_of(lake: Path, request: Request) -> dict[str, read.Version]:

@@ -48,6 +48,7 @@
     [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation"]
                    compression = "none" | "rice"   of images of whole numbers, without loss
                    wcs = "sip" | "tpv"   how headers tell the distortion; SourceExtractor, SCAMP and SWarp read TPV
+                   files = "detector" | "exposure"   also one file of all of an exposure's science images
 
 Files are found from the folder of the request; their formats are in jobs/fluxes/libraries/spectrum_formats.toml.
 A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
@@ -75,6 +76,7 @@ from jobs.request.schema import (
     CONVENTIONS,
     DENSITIES,
     EFFECTS,
+    FILES,
     LADDER,
     LENSING_NSIDES,
     MOST_SHEAR,
@@ -159,7 +161,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     curves = files.curves(fluxes, folder)
     bands = _strings(fluxes, "fluxes.bands")
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
-    products_ = _section(table, "products", {"truth", "compression", "wcs"})
+    products_ = _section(table, "products", {"truth", "compression", "wcs", "files"})
     solar_system = _section(table, "solar_system", {"bodies"})
     bodies = files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
     universe = _universe(_section(table, "universe", set(Universe.__slots__)))
@@ -176,6 +178,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         truth=_truth(products_),
         compression=_string(products_, "products.compression", COMPRESSIONS, "none"),
         wcs=_string(products_, "products.wcs", CONVENTIONS, "sip"),
+        files=_string(products_, "products.files", FILES, "detector"),
         curves=curves,
         observations=blocks,
         effects=_effects(_section(table, "effects", {"on", "off"})),

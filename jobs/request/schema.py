@@ -22,6 +22,7 @@ TRUTH = tuple(code for code, _ in products.CONTENTS if code != "science")
 COMPRESSIONS = ("none", "rice")
 # As jobs/render/camera/tpv.py (a test compares them).
 CONVENTIONS = ("sip", "tpv")
+FILES = ("detector", "exposure")
 DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
@@ -126,6 +127,7 @@ class Request:
 
     explore : parameter -> the values (JSON) that it takes in turn
     psfs    : (band, file) of PSFs in place of ours
+    files   : what has a file of its own, one of FILES
     wcs     : how headers tell the distortion of the optics, one of CONVENTIONS
     bodies  : file of moving bodies in place of ours
     sources : the only sources that there are, in place of the universe
@@ -152,6 +154,7 @@ class Request:
     strong_lens_boost: float = 1.0
     compression: str = "none"
     wcs: str = "sip"
+    files: str = "detector"
     psfs: tuple[tuple[str, str], ...] = ()
     bodies: Path | None = None
     noise_seed: int | None = None

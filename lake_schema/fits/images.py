@@ -24,7 +24,7 @@ from lake_schema.fits import write
 from lake_schema.fits.write import MOST_BYTES
 
 Card = tuple[str, str | int | float | bool, str]
-_STRUCTURE = {
+STRUCTURE = {
     "SIMPLE",
     "XTENSION",
     "BITPIX",
@@ -36,7 +36,7 @@ _STRUCTURE = {
     "PCOUNT",
     "GCOUNT",
 }
-_STRUCTURE |= {"BZERO", "BSCALE", "EXTNAME", "CHECKSUM", "DATASUM"}
+STRUCTURE |= {"BZERO", "BSCALE", "EXTNAME", "CHECKSUM", "DATASUM"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,11 +60,11 @@ def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> Non
     """
     if not images:
         raise BadInput(f"{path}: a FITS file wants at least one image")
-    make = [_packed if rice and _is_whole(image) else _extension for image in images]
+    make = [_packed if rice and _is_whole(image) else extension for image in images]
     if make[0] is _packed:
         first, rest = [fits.PrimaryHDU()], zip(make, images, strict=True)
     else:
-        first, rest = [_primary(images[0])], zip(make[1:], images[1:], strict=True)
+        first, rest = [primary(images[0])], zip(make[1:], images[1:], strict=True)
     write.write_staged(path, fits.HDUList([*first, *(function(image) for function, image in rest)]))
 
 
@@ -88,21 +88,21 @@ def read_images(path: Path, most_bytes: int = MOST_BYTES) -> list[Image]:
             if missing:
                 raise Damaged(f"{path}: no checksum in {', '.join(missing)}")
             if not any(write.is_packed(unit) for unit in units):
-                return [_image(unit) for unit in units]
+                return [image_of(unit) for unit in units]
             hollow = write.is_packed(units[1]) and _is_hollow(units[0])
         with fits.open(path, memmap=False) as units:
-            return [_image(unit) for unit in units[hollow:]]
+            return [image_of(unit) for unit in units[hollow:]]
 
 
 # ------------------------------------------------------------------------------------------------ writing
 
 
-def _primary(image: Image) -> fits.PrimaryHDU:
+def primary(image: Image) -> fits.PrimaryHDU:
     unit = fits.PrimaryHDU(data=None if image.data is None else _big_enough(image.data))
     return _dressed(unit, image)
 
 
-def _extension(image: Image) -> fits.ImageHDU:
+def extension(image: Image) -> fits.ImageHDU:
     return _dressed(fits.ImageHDU(data=None if image.data is None else _big_enough(image.data)), image)
 
 
@@ -121,12 +121,12 @@ def _is_whole(image: Image) -> bool:
 
 def _is_hollow(unit: Any) -> bool:
     """Whether a primary unit stands there only because a file must begin with one."""
-    return unit.header["NAXIS"] == 0 and all(card.keyword in _STRUCTURE for card in unit.header.cards)
+    return unit.header["NAXIS"] == 0 and all(card.keyword in STRUCTURE for card in unit.header.cards)
 
 
 def _dressed(unit: Any, image: Image) -> Any:
     for keyword, value, comment in image.cards:
-        if keyword.upper() in _STRUCTURE:
+        if keyword.upper() in STRUCTURE:
             raise BadInput(f"FITS card {keyword} is set by the writer")
         try:
             with warnings.catch_warnings():
@@ -148,11 +148,11 @@ def _big_enough(data: Array) -> Array:
     return np.ascontiguousarray(data)
 
 
-def _image(unit: Any) -> Image:
+def image_of(unit: Any) -> Image:
     data = None if unit.data is None else np.asarray(unit.data)
     if data is not None:
         data = data.astype(data.dtype.newbyteorder("="), copy=False)
     cards = tuple(
-        (card.keyword, card.value, card.comment) for card in unit.header.cards if card.keyword not in _STRUCTURE
+        (card.keyword, card.value, card.comment) for card in unit.header.cards if card.keyword not in STRUCTURE
     )
     return Image(data, cards, unit.header.get("EXTNAME", ""))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -17,6 +18,7 @@ from lake_schema.errors import BadInput, Damaged, LakeError
 
 # A header that promises more than this is a mistake or an attack; the largest product is far below.
 MOST_BYTES = 8 << 30
+_BLOCK = 2880
 
 
 def is_packed(unit: Any) -> bool:
@@ -24,14 +26,35 @@ def is_packed(unit: Any) -> bool:
 
 
 def write_staged(path: Path, units: fits.HDUList) -> None:
-    # The comments that astropy would add hold the time of day.
     for unit in units:
-        unit.add_datasum(when="checksum of the data")
-        unit.add_checksum(when="checksum of header and data", override_datasum=True)
+        _seal(unit)
+    with _staged(path) as stream:
+        _write_units(stream, units, path)
+
+
+def write_one_by_one(path: Path, units: Iterable[Any]) -> None:
+    """As `write_staged`, of units that need not be in memory at the same time; the first is the primary one."""
+    with _staged(path) as stream:
+        for number, unit in enumerate(units):
+            _seal(unit)
+            alone = io.BytesIO()
+            _write_units(alone, fits.HDUList([unit] if number == 0 else [fits.PrimaryHDU(), unit]), path)
+            # An extension is written behind a primary unit without any pixels, a block long.
+            stream.write(alone.getbuffer()[0 if number == 0 else _BLOCK :])
+
+
+def _seal(unit: Any) -> None:
+    # The comments that astropy would add hold the time of day.
+    unit.add_datasum(when="checksum of the data")
+    unit.add_checksum(when="checksum of header and data", override_datasum=True)
+
+
+@contextmanager
+def _staged(path: Path) -> Iterator[IO[bytes]]:
     handle, temporary = tempfile.mkstemp(suffix=".part", prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as stream:
-            _write_units(stream, units, path)
+            yield stream
             stream.flush()
             os.fsync(stream.fileno())
         # mkstemp makes files private; a product is as readable as anything else that is written here.

@@ -22,7 +22,7 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.halos import HALOS
     from lake_schema.tables.mission import MISSION
     from lake_schema.tables.passbands import PASSBANDS
-    from lake_schema.tables.products import PRODUCTS
+    from lake_schema.tables.products import EXPOSURE_FILES, PRODUCTS
     from lake_schema.tables.quarantine import QUARANTINE
     from lake_schema.tables.rendered_truth import RENDERED_TRUTH
     from lake_schema.tables.stars import STARS
@@ -32,7 +32,8 @@ def declared(bands: Sequence[str]) -> list[Table]:
 
     galaxies, stars = (fluxes(kind, bands) for kind in ("galaxy", "star"))
     skies = [HALOS, GALAXIES, QUARANTINE, STRONG_LENSES, STARS, galaxies, stars, GAIA]
-    return [*skies, TEMPLATES, EXTINCTION_LAWS, PASSBANDS, MISSION, EXPOSURES, TASKS, PRODUCTS, RENDERED_TRUTH]
+    plans = [MISSION, EXPOSURES, TASKS]
+    return [*skies, TEMPLATES, EXTINCTION_LAWS, PASSBANDS, *plans, PRODUCTS, RENDERED_TRUTH, EXPOSURE_FILES]
 
 
 def markdown() -> str:

@@ -1,4 +1,4 @@
-"""Table `products`: the archive, one row a file."""
+"""The archive: table `products`, one row a file of a detector; `exposure_files`, one row a file of a whole exposure."""
 
 from __future__ import annotations
 
@@ -34,5 +34,24 @@ PRODUCTS = Table(
         Column("sources", "int64", ucd="meta.number", doc="number of sources drawn", lo=0),
     ),
     "Published images and truth maps.",
+    key=("path",),
+)
+
+EXPOSURE_FILES = Table(
+    "exposure_files",
+    1,
+    (
+        Column("path", "string", ucd="meta.ref.uri", doc="file, relative to this version of the table"),
+        Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure", lo=0),
+        Column("channel", "string", ucd="instr", doc="channel", codes=CHANNELS),
+        Column("band", "string", ucd="instr.bandpass", doc="passband name"),
+        Column("ra", "float64", "deg", "pos.eq.ra", "right ascension of the boresight", 0.0, 360.0),
+        Column("dec", "float64", "deg", "pos.eq.dec", "declination of the boresight", -90.0, 90.0),
+        Column("detectors", "int32", ucd="meta.number", doc="detectors in the file", lo=1),
+        Column("planned", "int32", ucd="meta.number", doc="detectors of the exposure that are planned", lo=1),
+        Column("mission", "string", ucd="meta.code", doc="fingerprint of the mission configuration"),
+        Column("sources", "int64", ucd="meta.number", doc="number of sources drawn, on each detector", lo=0),
+    ),
+    "Published images of whole exposures: the science images of their detectors, one after the other.",
     key=("path",),
 )

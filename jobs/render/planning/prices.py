@@ -58,11 +58,12 @@ def price(
     effects: Sequence[Effect] | None,
     accuracy: Accuracy = SURVEY,
     truth: Sequence[str] = (),
+    files: str = "detector",
 ) -> Price:
     """What detectors of one kind of exposure cost.
 
     looks   : whether the sky is drawn;  effects : that are applied; None = nothing renders the channel yet
-    truth   : maps that are wanted
+    truth   : maps that are wanted;  files : what has a file of its own (jobs.request.schema.FILES)
     channel : its name;  accuracy : of the request
     Error   : 30 % where the sources are as those that it was measured with
     """
@@ -70,6 +71,8 @@ def price(
     maps = truth_maps.made(truth, None if effects is None else [e.name for e in effects], looks)
     tier = settings.seconds_for(accuracy) / settings.seconds_for(SURVEY)
     mapped = sum(truth_maps.BYTES[name] for name in maps)
+    # An exposure's file has the science image a second time.
+    images = 2 if files == "exposure" else 1
     names = [effect.name for effect in applied]
     filled = sum(cost for name in maps for by, cost in _FILLED_S.get(name, {}).items() if by in names)
     filled += _STARS_S * ("stars" in maps)
@@ -80,6 +83,6 @@ def price(
         star_s=looks * own.star_s * tier * (1 + ("stars" in maps)),
         start_gb=own.base_gb,
         pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + mapped),
-        start_bytes=_HEADER_BYTES * (1 + len(maps)),
-        pixel_bytes=own.written + mapped,
+        start_bytes=_HEADER_BYTES * (images + len(maps)),
+        pixel_bytes=images * own.written + mapped,
     )

@@ -43,11 +43,12 @@ def table(
     truth: Sequence[str] = (),
     accuracy: Accuracy = SURVEY,
     forced: Mapping[str, bool] | None = None,
+    files: str = "detector",
 ) -> pa.Table:
     """Rows of the table `tasks`.
 
     exposures  : rows of the table `exposures`;  detectors : of each exposure, () = all of its camera
-    truth      : truth maps that are wanted
+    truth      : truth maps that are wanted;  files : what has a file of its own
     forced     : effects that the request forces on or off
     mission    : the mission database;  densities : of galaxies and stars;  accuracy : of the request
     """
@@ -62,7 +63,8 @@ def table(
             shared[where] = camera.places(*where[1:], densities)
         kind = (row.camera, row.channel, row.image_type, row.exposure_time_s, row.lamp, row.settings)
         if kind not in prices:
-            prices[kind] = _price(row, variants.variant(row.settings, mission, accuracy, forced or {}), truth)
+            own = variants.variant(row.settings, mission, accuracy, forced or {})
+            prices[kind] = _price(row, own, truth, files)
         _append(columns, row, wanted, camera, shared[where], prices[kind])
     seconds = np.array(columns["seconds"], float)
     numbers = np.array(columns["exposure_id"], np.int64)
@@ -151,7 +153,7 @@ def _append(
         columns["bytes"].append(cost.bytes(pixels))
 
 
-def _price(row: ExposureRow, own: Variant, truth: Sequence[str]) -> Price:
+def _price(row: ExposureRow, own: Variant, truth: Sequence[str], files: str) -> Price:
     """Of the detectors of an exposure.
 
     Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
@@ -163,4 +165,4 @@ def _price(row: ExposureRow, own: Variant, truth: Sequence[str]) -> Price:
         scene = replace(scene_of.scene_of(row, first, own.mission, own.accuracy), forced=own.forced)
         scene = scene_of.with_own_light(scene, registry.CHANNELS[channel], effects)
         effects = tuple(e for e in effects if own.forced.get(e.name, looks or e.needed_if(scene)))
-    return price(channel, looks, effects, own.accuracy, truth)
+    return price(channel, looks, effects, own.accuracy, truth, files)

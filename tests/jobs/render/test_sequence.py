@@ -54,6 +54,7 @@ band = "euclid_h"
 stars = "stars.csv"
 [products]
 truth = ["noise_free", "sky", "ghosts", "persistence"]
+files = "exposure"
 """
 
 
@@ -136,7 +137,7 @@ def test_the_same_bytes_in_any_order_and_after_a_kill(spark, lake, whole, folder
     left = len(list(layout.table(lake, "products").glob(".receipts-*/*.json")))
     assert 0 < left < len(BEFORE)
     shell.run(render_exposures.JOB, lake, request)
-    for name in ("products", "rendered_truth"):
+    for name in ("products", "rendered_truth", "exposure_files"):
         assert read.version(lake, name).manifest == read.version(whole, name).manifest
         assert read.verify(read.version(lake, name), deep=True) == []
 

@@ -106,6 +106,7 @@ BAD = [
     ("products", {"truth": ["everything"]}, "products.truth"),
     ("products", {"compression": "zip"}, "products.compression"),
     ("products", {"wcs": "zpn"}, "products.wcs"),
+    ("products", {"files": "quadrant"}, "products.files = 'quadrant'"),
     ("pointing", {}, "pointing wants a list"),
     ("pointing", [3], r"pointing\[0\]"),
     ("pointing.channel", "RADIO", r"pointing\[0\].channel"),

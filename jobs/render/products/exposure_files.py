@@ -1,0 +1,90 @@
+"""Science images of an exposure's detectors -> one file of the exposure: a header, and every array of each detector.
+
+plan   the plan of the table `exposure_files`: one part an exposure
+work   makes one of them, from files of a version of the table `products`
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pyarrow.compute as pc
+
+from lake_schema.errors import Damaged
+from lake_schema.fits import joined
+from lake_schema.fits.images import Card
+from lake_schema.store import read, reuse
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.provenance import digest
+from lake_schema.tables.products import EXPOSURE_FILES
+
+# Keywords of detectors' headers that are the exposure's.
+_OF_EXPOSURE = (
+    "INSTRUME", "CHANNEL", "FILTER", "IMAGETYP", "LAMP", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS", "TIMESYS",
+    "SEEING", "ZEROPNT", "SEED", "NOISSEED", "REALIS", "MISSION", "TRUESKY", "ACCFLUX", "ACCSHAPE", "ACCPOS", "ACCBACK",
+    "READMODE", "NG", "NR", "ND", "FRTIME", "ELAPTIME", "REFPIX", "QUALLIM", "PRESCAN", "OVERSCAN", "OVERROWS",
+    "INJROWS", "BUNIT",
+)  # fmt: skip
+
+
+def plan(products: Plan, every: Sequence[Json]) -> Plan:
+    """One part an exposure, of the detectors that the products' plan has of it, by name.
+
+    products : the plan of the detectors' files;  every : rows of the table `tasks`: all that are planned
+    """
+    planned: dict[int, int] = defaultdict(int)
+    for task in every:
+        planned[task["exposure_id"]] += 1
+    held: dict[int, dict[str, str]] = defaultdict(dict)
+    for part in products.parts:
+        held[part.facts["exposure_id"]][part.facts["detector"]] = part.facts[reuse.PRODUCT]
+    parts = []
+    for number, keys in sorted(held.items()):
+        detectors = sorted(keys)
+        about = {"exposure_id": number, "detectors": detectors, "planned": planned[number]}
+        key = digest({**about, "products": [keys[name] for name in detectors]})
+        parts.append(Part(f"{number:06d}.parquet", {**about, reuse.PRODUCT: key}))
+    return Plan(EXPOSURE_FILES, {"products": products.key}, tuple(parts))
+
+
+def work(lake: Path, facts: Json) -> Output:
+    """One exposure's file, from those of its detectors."""
+    products = read.version(lake, "products", facts["products"])
+    where = (pc.field("exposure_id") == facts["exposure_id"]) & (pc.field("content") == "science")
+    rows = {row["detector"]: row for row in products.rows(where=where).to_pylist()}
+    if sorted(rows) != facts["detectors"]:
+        raise Damaged(f"table products: version {products.key} lacks detectors of exposure {facts['exposure_id']}")
+    exposures = read.version(lake, "exposures", products.manifest["facts"]["inputs"]["exposures"])
+    (exposure,) = exposures.rows(where=pc.field("exposure_id") == facts["exposure_id"]).to_pylist()
+    first = rows[facts["detectors"][0]]
+    path = f"images/{exposure['exposure_id']:06d}/{exposure['channel']}_{exposure['band']}_science.fits"
+    table = EXPOSURE_FILES.build(
+        {
+            "path": [path],
+            **{name: [exposure[name]] for name in ("exposure_id", "channel", "band", "ra", "dec")},
+            "detectors": [len(rows)],
+            "planned": [facts["planned"]],
+            "mission": [first["mission"]],
+            "sources": [sum(row["sources"] for row in rows.values())],
+        }
+    )
+    files = [(name, products.file(rows[name]["path"])) for name in facts["detectors"]]
+    return Output(table, {path: partial(_write, files, _cards(exposure, facts))})
+
+
+def _cards(exposure: dict[str, Any], facts: Json) -> tuple[Card, ...]:
+    return (
+        ("RA", exposure["ra"], "[deg] boresight"),
+        ("DEC", exposure["dec"], "[deg] boresight"),
+        ("POSANGLE", exposure["position_angle"], "[deg] of the focal plane, north through east"),
+        ("NDETECT", len(facts["detectors"]), "detectors in this file"),
+        ("NPLANNED", facts["planned"], "detectors of the exposure that are planned"),
+    )
+
+
+def _write(files: Sequence[tuple[str, Path]], cards: Sequence[Card], path: Path) -> None:
+    joined.join(path, files, _OF_EXPOSURE, cards)
