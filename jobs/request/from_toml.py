@@ -45,7 +45,8 @@
         pointings = "file.csv"     a table of pointings instead of either (jobs/request/pointing_tables.py)
         dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
         detectors, mjd, exposure_time_s, realisations
-    [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation"]
+        lamps = [..] of flats      macc = [groups, reads, drops] of NISP-P
+    [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation", "persistence", "ramp"]
                    compression = "none" | "rice"   of images of whole numbers, without loss
                    wcs = "sip" | "tpv"   how headers tell the distortion; SourceExtractor, SCAMP and SWarp read TPV
                    files = "detector" | "exposure"   also one file of all of an exposure's science images

@@ -39,6 +39,20 @@ mjd = 60905.0
 [products]
 truth = []
 """
+# Two of NISP's, as small, and a dark.
+INFRARED = (
+    SMALL.replace("vis.fpa.nx", "nisp.fpa.nx").replace("vis.fpa.ny", "nisp.fpa.ny").replace("130", "60")
+    .replace('"vis.ghost.offset_y" = { value = 250', '"nisp.ghost.offset_y" = { value = 100')
+    .replace('"VIS"', '"NISP-P"').replace('"vis"', '"nisp"').replace("euclid_vis", "euclid_h")
+    .replace('["3-3", "3-4"]\nposition_angle = 0.0', '["DET22"]')
+    + """
+[[observation]]
+channels = ["NISP-P"]
+image_type = "dark"
+exposures = 1
+detectors = ["DET22"]
+"""
+)  # fmt: skip
 
 
 def run(monkeypatch, name, **environment):
@@ -70,8 +84,9 @@ def test_the_shear_of_known_galaxies_is_measured_as_in_galsim_s_images(tmp_path,
 
 
 @pytest.mark.nightly
-def test_every_cell_runs(tmp_path, monkeypatch):
-    (tmp_path / "small.toml").write_text(SMALL)
+@pytest.mark.parametrize("request_text", [SMALL, INFRARED], ids=["VIS", "NISP-P"])
+def test_every_cell_runs(tmp_path, monkeypatch, request_text):
+    (tmp_path / "small.toml").write_text(request_text)
     outputs = run(
         monkeypatch,
         "03_render_one_field",
