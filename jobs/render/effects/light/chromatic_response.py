@@ -236,7 +236,8 @@ EFFECT = Effect(
     fixed=True,
     # What a source changes is not there again in the next dither.
     repeated=_of_sky,
-    cost=2.5e-2,
+    # Most of it for the light that is drawn again.
+    cost=5e-2,
 )
 LAMP = Effect(
     "lamp_response",
@@ -245,5 +246,5 @@ LAMP = Effect(
     lambda scene: float(np.hypot(*(np.array(strength(scene)) * _lamp(scene)))),
     fixed=True,
     numbers=EFFECT.name,
-    cost=2.5e-2,
+    cost=1.5e-2,
 )

@@ -133,8 +133,8 @@ _CASES = (
     # Up the ramp.
     Case("dark_map", (1.7, 0.3, 0.01, 400.0), (0.0, 0.3, 0.0, 400.0), zero=False),
     Case("persistence", remembering(3.0), (None, 0.3), zero=False),
-    Case("ramp_cosmic_rays", (5.0, 0.4, 6e3, 0.5), (0.0, 0.4, 6e3, 0.5), zero=False, reshapes=True, positive=True),
-    Case("ramp_nonlinearity", (6e-7, 0.1), None, zero=False, reshapes=True),
+    Case("ramp_cosmic_rays", (5.0, 0.4, 6e3, 0.5), (0.0, 0.4, 6e3, 0.5), zero=False, reshapes=True, dtype=np.float32),
+    Case("ramp_nonlinearity", (6e-7, 0.1), None, zero=False, reshapes=True, dtype=np.float32),
     Case("ramp", (PHOTOMETRIC, 1.3e5), None, positive=False, reshapes=True, dtype=np.float32),
     Case("ipc", (6.5e-3, 4e-4), (0.0, 0.0), planes=True, linear=True, conserves=True),
     Case("reset_level", (44.0,), (0.0,), planes=True, zero=False, positive=False),

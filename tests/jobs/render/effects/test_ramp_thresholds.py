@@ -30,6 +30,9 @@ def scene(sky=1.0, peak=2e4, remembered=None, **values):
 # For each effect what makes it large, from far below its threshold to far above.
 CASES = {
     "chromatic_response": lambda x: scene(sky=100.0, response__slope=min(1e-4 * x, 0.5), response__curvature=0.0),
+    "lamp_response": lambda x: replace(
+        scene(sky=0.0, flat__signal=300.0, response__slope=min(1e-4 * x, 0.5), response__curvature=0.0), lamp=2
+    ),
     "dark_map": lambda x: scene(dark_current=2e-3 * x, hot_pixels=0.0),
     "persistence": lambda x: scene(remembered=np.full((N, N), 0.03 * x)),
     "ramp_nonlinearity": lambda x: scene(nonlinearity=min(1e-9 * x, 1e-5)),
@@ -46,8 +49,9 @@ def signal(one, name, applied):
     """float64[ny, nx] e- of a star on the sky: with what cannot be left out, and the effect or not."""
     y, x = np.mgrid[:N, :N]
     star = one.peak_electrons * np.exp(-((x - 64) ** 2 + (y - 64) ** 2) / (2 * 0.7**2))
-    forced = {effect.name: False for effect in nisp_p.SKY if effect.optional} | {"background": True, name: applied}
-    some = [effect for effect in nisp_p.SKY if effect.name != "signal_adc"]
+    chain, light = (nisp_p.FLAT, "calibration_lamp") if name == "lamp_response" else (nisp_p.SKY, "background")
+    forced = {effect.name: False for effect in chain if effect.optional} | {light: True, name: applied}
+    some = [effect for effect in chain if effect.name != "signal_adc"]
     found, _ = apply_all(star, some, replace(one, forced=forced), lambda e: rng.stream(1, e.name))
     return found[0]
 
