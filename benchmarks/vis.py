@@ -123,9 +123,9 @@ def stages(seconds: dict[str, float]) -> Iterator[None]:
     kept = [(module, name, getattr(module, name)) for module, name, _ in places]
     effects = vis.EFFECTS["science"]
     for module, name, stage in places:
-        setattr(module, name, _timed(getattr(module, name), f"stage_{stage}_s", seconds))
-    timed = tuple(replace(e, apply=_timed(e.apply, f"effect_{e.name}_s", seconds)) for e in effects)
-    vis.EFFECTS["science"] = timed  # type: ignore[index]
+        setattr(module, name, timed(getattr(module, name), f"stage_{stage}_s", seconds))
+    measured = tuple(replace(e, apply=timed(e.apply, f"effect_{e.name}_s", seconds)) for e in effects)
+    vis.EFFECTS["science"] = measured  # type: ignore[index]
     try:
         yield
     finally:
@@ -134,15 +134,17 @@ def stages(seconds: dict[str, float]) -> Iterator[None]:
             setattr(module, name, function)
 
 
-def _timed(function: Callable[..., Any], name: str, seconds: dict[str, float]) -> Callable[..., Any]:
-    def timed(*arguments: Any, **options: Any) -> Any:
+def timed(function: Callable[..., Any], name: str, seconds: dict[str, float]) -> Callable[..., Any]:
+    """The function, which adds its CPU seconds to those of a name."""
+
+    def measured(*arguments: Any, **options: Any) -> Any:
         started = time.process_time()
         try:
             return function(*arguments, **options)
         finally:
             seconds[name] += time.process_time() - started
 
-    return timed
+    return measured
 
 
 def detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:

@@ -36,8 +36,9 @@ from lake_schema.tables.exposures import ExposureRow
 
 _DAY_S = 86400.0
 # Electrons of the faintest source that is drawn again so many seconds later, and of a pixel's light that stamps leave
-# out; more where more time has passed.  A star of so many leaves 0.7 e- in a pixel, and less is wrong elsewhere.
-_LEAST, _LEFT_OUT, _SECONDS = 350.0, 100.0, 134.0
+# out; more where more time has passed.  A star of so many leaves 0.8 e- in a pixel; of two exposures of the demo's sky
+# before one, 1.2 e- are missed in a pixel at the most.
+_LEAST, _LEFT_OUT, _SECONDS = 400.0, 300.0, 134.0
 # Electrons that light brings to some pixel at least, to be worth a look: ten leave 0.05.
 _WORTH = 10.0
 

@@ -60,4 +60,4 @@ def _contribution(scene: Scene) -> float:
     return electrons + hot_electrons * (hot > 0.0)
 
 
-EFFECT = Effect("dark_map", apply, _parameters, _contribution, fixed=True, cost=1.5e-2)
+EFFECT = Effect("dark_map", apply, _parameters, _contribution, fixed=True, cost=1e-2)

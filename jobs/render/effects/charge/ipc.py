@@ -61,4 +61,4 @@ def _contribution(scene: Scene) -> float:
     return 4.0 * (side + diagonal) * scene.value("full_well", "electron")
 
 
-EFFECT = Effect("ipc", apply, _parameters, _contribution, cost=2e-2, repeated=nothing)
+EFFECT = Effect("ipc", apply, _parameters, _contribution, cost=1.1e-2, repeated=nothing)

@@ -309,4 +309,4 @@ def _parameters(scene: Scene) -> tuple[Mode, float]:
     return mode_of(scene), scene.value("full_well", "electron")
 
 
-EFFECT = Effect("ramp", apply, _parameters, poisson.EFFECT.contribution, optional=False, cost=3e-2, repeated=nothing)
+EFFECT = Effect("ramp", apply, _parameters, poisson.EFFECT.contribution, optional=False, cost=8e-2, repeated=nothing)

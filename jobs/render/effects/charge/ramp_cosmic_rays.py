@@ -70,4 +70,4 @@ def _contribution(scene: Scene) -> float:
     return electrons * thickness * (expected > _FEW)
 
 
-EFFECT = Effect("ramp_cosmic_rays", apply, _parameters, _contribution, cost=2e-2, repeated=nothing)
+EFFECT = Effect("ramp_cosmic_rays", apply, _parameters, _contribution, cost=1e-2, repeated=nothing)

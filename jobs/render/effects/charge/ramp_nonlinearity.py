@@ -93,7 +93,7 @@ def _contribution_to_signal(scene: Scene) -> float:
     return _change(scene.brightest_electrons, scene) if _of_signal(scene) else 0.0
 
 
-EFFECT = Effect("ramp_nonlinearity", apply, _parameters, _contribution, fixed=True, cost=2e-2)
+EFFECT = Effect("ramp_nonlinearity", apply, _parameters, _contribution, fixed=True, cost=1e-2)
 SIGNAL = Effect(
     "signal_nonlinearity",
     apply_signal,

@@ -132,6 +132,6 @@ def _of_reads(scene: Scene) -> float:
     return sigma * float(np.sqrt(2.0 / reads))
 
 
-EFFECT = Effect("group_noise", apply, _reads, _of_reads, cost=4e-2, repeated=nothing)
-DRIFT = Effect("drift", apply_drift, lambda scene: (_drift(scene),), _drift, cost=4e-2, repeated=nothing)
+EFFECT = Effect("group_noise", apply, _reads, _of_reads, cost=1.7e-2, repeated=nothing)
+DRIFT = Effect("drift", apply_drift, lambda scene: (_drift(scene),), _drift, cost=3.2e-2, repeated=nothing)
 RESET = Effect("reset_level", apply_reset, lambda scene: (_reset(scene),), _reset, cost=1e-2, repeated=nothing)
