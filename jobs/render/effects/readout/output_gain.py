@@ -36,4 +36,4 @@ def _contribution(scene: Scene) -> float:
     return 0.5 * _parameters(scene)[0] * scene.brightest_electrons
 
 
-EFFECT = Effect("output_gain", apply, _parameters, _contribution, fixed=True, cost=5e-3)
+EFFECT = Effect("output_gain", apply, _parameters, _contribution, fixed=True, cost=7e-3)
