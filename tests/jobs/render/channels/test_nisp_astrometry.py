@@ -144,7 +144,7 @@ def check(name, pitch, count, psf, folder):
 
 def test_light_lies_where_the_header_says_from_dither_to_dither(tmp_path):
     detector = detectors.detector("nisp", "DET11", MISSION)
-    check("DET11", 400, 2, infrared.psf_of(detector, "euclid_h"), tmp_path)
+    check("DET11", 500, 2, infrared.psf_of(detector, "euclid_h"), tmp_path)
 
 
 @pytest.mark.nightly
