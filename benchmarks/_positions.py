@@ -67,6 +67,7 @@ def optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
             *euclid._field(detector, sign * place[0], sign * place[1], mission), detector.section, mission
         )
         scale = detector.pixel_scale / sampled.samples
+        nm = euclid.centred(nm, waves, sampled, scale, mission)
         core = replace(sampled, transform=sampled.core_transform, side=sampled.core_side)
         planes = [euclid._plane(nm, float(w), core, scale, blur, mission) for w, blur in zip(waves, blurs, strict=True)]
         return np.stack(planes).astype(float)[:, ::sign, ::sign]

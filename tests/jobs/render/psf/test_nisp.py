@@ -5,12 +5,17 @@ from dataclasses import replace
 import galsim
 import numpy as np
 import pytest
+import sep
 
 from benchmarks._errors import measured
 from jobs.fluxes import passbands
+from jobs.render.camera.astrometry import wcs
 from jobs.render.camera.detectors import detector, detectors
+from jobs.render.camera.pointing import boresight_for
+from jobs.render.drawing import stamps
 from jobs.render.psf import euclid, sub_bands
 from lake_schema.mission.configuration import resolve
+from tests.jobs.render import fields
 
 MISSION, REQUIRED = resolve(), resolve(ladder=("REQ", "CBE", "BLT", "DES", "SIM"))
 # arcsec: FWHM of the optics; FWHM, EE50 and EE80 of a pixel's light, of galsim's diffraction with 70 nm.
@@ -135,3 +140,22 @@ def test_eight_sub_bands_are_as_good_as_many(name):
         assert few[0] == pytest.approx(many[0], rel=5e-5)
         assert few[3] == pytest.approx(many[3], rel=4e-4)
         np.testing.assert_allclose(few[4:], many[4:], atol=5e-5)
+
+
+@pytest.mark.parametrize("name", WIDTHS)
+def test_stars_are_found_where_they_are(name):
+    """sep's windowed positions over all places within a pixel, in the middle and in a corner of a detector."""
+    d = detector("nisp", "DET11", MISSION)
+    psf = euclid.nisp_psf(d, passbands.load(name), MISSION, 9)
+    system = wcs(d, *boresight_for(d, 10.0, 20.0, 0.0))
+    within = (np.arange(6) + 0.5) / 6 - 0.5
+    for column, row in ((1020.0, 1020.0), (60.0, 1980.0)):
+        off = []
+        for x, y in ((column + u, row + v) for u in within for v in within):
+            star = fields.one_source(d, system, 1e6, x, y)
+            frame = stamps.draw(star, np.array([64]), psf, 2040, 2040)
+            left, low = int(column) - 30, int(row) - 30
+            cut = np.ascontiguousarray(frame[low : low + 60, left : left + 60])
+            found_x, found_y, _ = sep.winpos(cut, x - left, y - low, euclid.NISP.window / 0.3)
+            off.append((found_x + left - x, found_y + low - y))
+        assert np.hypot(*np.mean(off, axis=0)) * 300.0 < 1.5
