@@ -295,7 +295,7 @@ def centred(nm: Float, waves: Float, sampled: Sampling, sampling: float, mission
     def centroid(own: Float) -> Float:
         light = np.sum([_diffracted(own, one, side) for one in optics], axis=0, dtype=float)
         seen = uniform_filter(light, sampled.samples, mode="nearest") * window * window[:, None]
-        return np.array([(seen * axis).sum(), (seen * axis[:, None]).sum()]) / seen.sum()
+        return np.asarray(np.array([(seen * axis).sum(), (seen * axis[:, None]).sum()]) / seen.sum())
 
     own, step = nm.copy(), 10.0
     at = centroid(own)
