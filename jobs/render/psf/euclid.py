@@ -4,7 +4,7 @@ Frame: a PSF is held in the *detector's own axes* (x along columns, y along rows
 chief ray (coma moves the centroid by a few mas), that of NISP on its centroid.
 
 vis_psf, nisp_psf     -> Psf;  vis_edges, nisp_edges : their diffraction far from a star
-pupil, wavefront   the parts of the model;  centred : a wavefront whose light has its centroid at the source's place
+wavefront   of a field position;  centred : one whose light has its centroid at the source's place
 """
 
 from __future__ import annotations
@@ -14,9 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import galsim
 import numpy as np
-import scipy.fft
 from scipy.ndimage import uniform_filter
 
 from jobs import cache, sums
@@ -25,6 +23,7 @@ from jobs.compiling import jit
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector, detectors
 from jobs.render.psf import model, spikes
+from jobs.render.psf.diffraction import diffracted, optics_of
 from jobs.render.psf.model import DETAIL, SAMPLES, SIDE, Planes, Psf
 from jobs.render.psf.spikes import Edges
 from jobs.render.psf.sub_bands import sub_bands
@@ -58,7 +57,6 @@ VIS = Sampling(SAMPLES, SIDE, 2048, 768, 160)
 NISP = Sampling(5, 256, 2048, 768, 96, window=0.2)
 # Of the drift, by the number of positions: degree in place of the mean PSF, and of its slope with wavelength.
 DEGREES = {1: (0, 0), 4: (1, 0), 9: (2, 1), 25: (4, 2)}
-_ARCSEC = np.pi / 180.0 / 3600.0
 # Of its rms, as far as which a window is looked through.
 _WINDOWS = 5.0
 
@@ -108,33 +106,6 @@ def _edges(sampling: Sampling, detector: Detector, band: Passband, mission: Miss
 
 
 # ------------------------------------------------------------------------------------------------ the optics
-
-
-def pupil(x: Float, y: Float, softness: float, mission: MissionConfiguration) -> Float:
-    """Transmission of the entrance pupil: aperture stop, decentred central stop, three spider bars.
-
-    x, y     : [...] mm;  softness : width of the edges, mm (one sample: an edge then covers its pixels by
-               area)
-    mission  : the mission database
-    returns  : [...] 0 .. 1
-    """
-    radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
-    stop, stop_y = mission.value("plm.pupil.stop_radius", "mm"), mission.value("plm.pupil.stop_y", "mm")
-    clear = _step(radius - np.hypot(x, y), softness) * _step(np.hypot(x, y - stop_y) - stop, softness)
-    width = mission.value("plm.pupil.spider_width", "mm")
-    reach = mission.value("plm.pupil.spider_half_length", "mm")
-    for bar in ("spider1", "spider2", "spider3"):
-        bar_x, bar_y = mission.value(f"plm.pupil.{bar}.x", "mm"), mission.value(f"plm.pupil.{bar}.y", "mm")
-        angle = mission.value(f"plm.pupil.{bar}.angle", "rad")
-        # Normal form: no singular angle.
-        across = np.abs(-np.sin(angle) * (x - bar_x) + np.cos(angle) * (y - bar_y))
-        blocked = _step(width / 2 - across, softness) * _step(reach - np.hypot(x - bar_x, y - bar_y), softness)
-        clear = clear * (1.0 - blocked)
-    return np.asarray(clear)
-
-
-def _step(depth: Float, softness: float) -> Float:
-    return np.clip(0.5 + depth / softness, 0.0, 1.0)
 
 
 def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -> Float:
@@ -260,9 +231,9 @@ def _drift(
     mean, slope = np.zeros((2, len(coefficients), side, side))
     redder = (waves - waves.mean()) / np.sum((waves - waves.mean()) ** 2)
     for wavelength, tilt in zip(waves, redder, strict=True):
-        optics = _optics(float(wavelength), sampling, mission, sampled.core_transform)
+        optics = optics_of(float(wavelength), sampling, mission, sampled.core_transform)
         for i, nm in enumerate(coefficients):
-            image = _diffracted(nm, optics, side)
+            image = diffracted(nm, optics, side)
             mean[i] += image / len(waves)
             slope[i] += image * tilt
     x, y = np.array(_nodes(positions)).T
@@ -287,13 +258,13 @@ def centred(nm: Float, waves: Float, sampled: Sampling, sampling: float, mission
         return nm
     # Of a band two wavelengths tell the mean.
     off = 0.58 * 0.5 * (waves.max() - waves.min())
-    optics = [_optics(float(waves.mean() + part), sampling, mission, sampled.core_transform) for part in (-off, off)]
+    optics = [optics_of(float(waves.mean() + part), sampling, mission, sampled.core_transform) for part in (-off, off)]
     side = 2 * round(_WINDOWS * sampled.window / sampling) + 1
     axis = sampling * (np.arange(side) - side // 2)
     window = np.exp(-0.5 * (axis / sampled.window) ** 2)
 
     def centroid(own: Float) -> Float:
-        light = np.sum([_diffracted(own, one, side) for one in optics], axis=0, dtype=float)
+        light = np.sum([diffracted(own, one, side) for one in optics], axis=0, dtype=float)
         seen = uniform_filter(light, sampled.samples, mode="nearest") * window * window[:, None]
         return np.asarray(np.array([(seen * axis).sum(), (seen * axis[:, None]).sum()]) / seen.sum())
 
@@ -314,8 +285,8 @@ def _plane(
 ) -> Float32:  # fmt: skip
     """One wavelength's PSF: [side * samples + 1] square, in the focal plane's axes."""
     weights = _weights_of(blur, sampling)
-    optics = _optics(wavelength, sampling, mission, sampled.transform)
-    return _blurred(_diffracted(nm, optics, sampled.side * sampled.samples + 1 + 2 * _margin(weights)), weights)
+    optics = optics_of(wavelength, sampling, mission, sampled.transform)
+    return _blurred(diffracted(nm, optics, sampled.side * sampled.samples + 1 + 2 * _margin(weights)), weights)
 
 
 def _blurred(image: Array, weights: tuple[Float, Float]) -> Float32:
@@ -369,60 +340,3 @@ def _weights(sigma: float) -> Float:
         outer = sums.least_squares(basis, lost)
         if np.abs(sums.product(basis, outer) - lost).max() < 1e-7:
             return np.concatenate([outer[::-1] / 2, [1.0 - outer.sum()], outer / 2])
-
-
-@dataclass(frozen=True, slots=True)
-class _Optics:
-    """The pupil as light of a wavelength samples it.
-
-    transmission : [n, n];  x, y : [lit samples] of its radius;  wavelength : A
-    """
-
-    transform: int
-    transmission: Float
-    x: Float
-    y: Float
-    wavelength: float
-
-
-def _optics(wavelength: float, sampling: float, mission: MissionConfiguration, transform: int) -> _Optics:
-    """The pupil's sampling follows the wavelength, so that the image's does not; its edges are one sample wide."""
-    step = wavelength * 1e-7 / (transform * sampling * _ARCSEC)
-    radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
-    n = 2 * (int(np.ceil(radius / step)) + 1)
-    axis = (np.arange(n) - n // 2) * step
-    x, y = np.meshgrid(axis, axis)
-    transmission = pupil(x, y, step, mission)
-    lit = transmission > 0
-    return _Optics(transform, transmission, x[lit] / radius, y[lit] / radius, wavelength)
-
-
-def _diffracted(nm: Float, optics: _Optics, side: int | None = None) -> Float32:
-    """|FFT of the pupil|^2 of unit flux over the whole sky, the soft edges' loss made good: [side, side].
-
-    nm   : by Noll number;  side : samples about the middle, side // 2; None: the whole transform's
-    Error : 5e-4 of what is in a sample, 5e-6 in the core: it is in single precision
-    """
-    transmission, transform = optics.transmission, optics.transform
-    side = transform if side is None else side
-    lit = transmission > 0
-    phase = galsim.zernike.Zernike(nm * (2 * np.pi / (optics.wavelength / 10.0)))(optics.x, optics.y).astype(np.float32)
-    field = np.zeros(transmission.shape, np.complex64)
-    field.real[lit] = transmission[lit] * np.cos(phase)
-    field.imag[lit] = transmission[lit] * np.sin(phase)
-    middle = (np.arange(side) - side // 2) % transform
-    # First along the rows that have light; then the columns that are wanted.
-    lines = scipy.fft.ifft(field, transform, axis=1, overwrite_x=True)[:, middle]
-    parts = scipy.fft.ifft(lines, transform, axis=0, overwrite_x=True)[middle].view(np.float32)
-    parts *= parts
-    power = parts[:, 0::2] + parts[:, 1::2]
-    power *= _edge_gain(transform, side)
-    power *= np.float32(transform**2 / transmission.sum())
-    return np.asarray(power)
-
-
-@lru_cache(maxsize=4)
-def _edge_gain(transform: int, side: int) -> Float32:
-    """One over what the soft edges of `pupil` leave of the diffracted light, by angle: sinc^2(angle / side)."""
-    angle = (np.arange(side) - side // 2) / transform
-    return np.asarray(np.sinc(np.hypot(angle[:, None], angle)) ** -2.0, np.float32)

@@ -16,7 +16,7 @@ from jobs.render.drawing import settings, stamps, transfer
 from jobs.render.exposure import visible_sources
 from jobs.render.exposure.records import Rows
 from jobs.render.products import headers, truth_table
-from jobs.render.psf import euclid, sub_bands
+from jobs.render.psf import diffraction, euclid, sub_bands
 from jobs.render.sources.source_list import Sources
 from tests.jobs.render import calibrated, nominal
 from tests.jobs.render.fields import MISSION, aimed, galaxies, psf_of, small, stars
@@ -118,7 +118,7 @@ def oversampled(detector, column, row, side, strength):
     ]
     nm, n = euclid.wavefront(*field, "vis", MISSION), PUPIL
     axis = (np.arange(n) - n / 2 + 0.5) * 1200.0 / n
-    clear = galsim.Image(euclid.pupil(*np.meshgrid(axis, axis), 1200.0 / n, MISSION).round(), scale=1.2 / n)
+    clear = galsim.Image(diffraction.pupil(*np.meshgrid(axis, axis), 1200.0 / n, MISSION).round(), scale=1.2 / n)
     fine, scale = np.zeros((side * OVER, side * OVER)), detector.pixel_scale / OVER
     dx, dy = (np.rint(position) - position for position in (column, row))
     parts = sub_bands.sub_bands(BAND)

@@ -14,7 +14,7 @@ from jobs.render.drawing import cost, far_light, stamp_sizes, stamps
 from jobs.render.drawing.kernels.far_light import left_compiled, remove_aliased_compiled
 from jobs.render.drawing.kernels.frame import FIXED_POINT
 from jobs.render.drawing.settings import settings_for
-from jobs.render.psf import euclid, spikes, sub_bands
+from jobs.render.psf import diffraction, spikes, sub_bands
 from jobs.render.psf.model import SIDE
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render.fields import one_source, small
@@ -73,7 +73,7 @@ def test_a_spike_is_the_pupil_s_transform(bar):
     turn, step, along = own.bars[bar, 0], 0.25, 1.0
     axis, other = np.arange(-602.0, 602.1, step), np.arange(-602.0, 602.1, along)
     u, v = np.meshgrid(other, axis)
-    clear = euclid.pupil(u * np.cos(turn) - v * np.sin(turn), u * np.sin(turn) + v * np.cos(turn), step, MISSION)
+    clear = diffraction.pupil(u * np.cos(turn) - v * np.sin(turn), u * np.sin(turn) + v * np.cos(turn), step, MISSION)
     projected = clear.sum(axis=1) * along
     radius = np.linspace(30.0, 60.0, 61)
     found = np.zeros(len(radius))

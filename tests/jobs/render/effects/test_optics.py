@@ -16,7 +16,7 @@ from jobs.render.effects.light import calibration_lamp, ghosts, illumination, in
 from jobs.render.effects.readout import readout_trail
 from jobs.render.effects.scene import NOTICEABLE, STACK, Lights, Scene
 from jobs.render.exposure import rendered
-from jobs.render.psf import euclid
+from jobs.render.psf import diffraction
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render.fields import exposure
@@ -74,7 +74,7 @@ def test_the_ghost_s_arms_are_the_pupil_s(name):
     y, x = np.mgrid[:400, :300] - np.array([200.0, 150.0])[:, None, None]
     turn, mm = np.radians(shown.detector.rotation), 600.0 / pupil.radius
     place = mm * (x * np.cos(turn) - y * np.sin(turn)), mm * (x * np.sin(turn) + y * np.cos(turn))
-    clear = euclid.pupil(*place, mm, MISSION)
+    clear = diffraction.pupil(*place, mm, MISSION)
     # Outside the central stop, which the ghost has in its own size and place, and inside the edge.
     seen = (np.hypot(*place) > 270.0) & (np.hypot(*place) < 580.0)
     np.testing.assert_allclose(image[seen] / image.max(), clear[seen], atol=0.25)

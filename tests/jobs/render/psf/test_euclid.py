@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter
 
 from jobs.fluxes import passbands
 from jobs.render.camera.detectors import detector
-from jobs.render.psf import euclid, sub_bands
+from jobs.render.psf import diffraction, euclid, sub_bands
 from jobs.render.psf.seeing import ground_psf
 from lake_schema.mission.configuration import resolve
 
@@ -31,7 +31,7 @@ def test_the_pupil_has_the_published_area():
     step = 1.0
     axis = np.arange(-605, 606, step)
     x, y = np.meshgrid(axis, axis)
-    clear = euclid.pupil(x, y, step, MISSION)
+    clear = diffraction.pupil(x, y, step, MISSION)
     assert clear.min() == 0.0
     assert clear.max() == 1.0
     area = clear.sum() * step**2 / 100
@@ -42,7 +42,7 @@ def test_the_pupil_has_the_published_area():
 def test_the_pupil_is_decentred():
     x = np.array([0.0, 0.0, 0.0, 0.0])
     y = np.array([51.0, 51 + 190.0, 51 - 190.0, -160.0])
-    np.testing.assert_array_equal(euclid.pupil(x, y, 1.0, MISSION), [0, 0, 0, 1])
+    np.testing.assert_array_equal(diffraction.pupil(x, y, 1.0, MISSION), [0, 0, 0, 1])
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1))
@@ -61,7 +61,7 @@ def test_wavefront_error_over_the_field():
 
 
 def plane(nm, wavelength):
-    return euclid._diffracted(nm, euclid._optics(wavelength, SAMPLING, MISSION, 2048), 513)
+    return diffraction.diffracted(nm, diffraction.optics_of(wavelength, SAMPLING, MISSION, 2048), 513)
 
 
 def test_diffraction_is_galsims():
@@ -69,7 +69,7 @@ def test_diffraction_is_galsims():
     n, nm, wavelength = 1024, euclid.wavefront(0.5, -0.3, "vis", MISSION), 700.0
     step = 1200.0 / n
     axis = (np.arange(n) - n / 2 + 0.5) * step
-    clear = euclid.pupil(*np.meshgrid(axis, axis), step, MISSION) > 0.5
+    clear = diffraction.pupil(*np.meshgrid(axis, axis), step, MISSION) > 0.5
     theirs = galsim.OpticalPSF(
         lam=wavelength,
         diam=1.2,
@@ -93,10 +93,10 @@ def test_wings_hold_what_edges_diffract(wavelength):
     """
     axis = np.arange(-605, 606, 1.0)
     x, y = np.meshgrid(axis, axis)
-    clear = euclid.pupil(x, y, 1.0, MISSION)
+    clear = diffraction.pupil(x, y, 1.0, MISSION)
     perimeter = np.hypot(*np.gradient(clear)).sum()
-    optics = euclid._optics(wavelength, SAMPLING, MISSION, 2048)
-    image = euclid._diffracted(np.zeros(12), optics).astype(float)
+    optics = diffraction.optics_of(wavelength, SAMPLING, MISSION, 2048)
+    image = diffraction.diffracted(np.zeros(12), optics).astype(float)
     grid = (np.arange(len(image)) - len(image) // 2) * SAMPLING
     radius = np.hypot(*np.meshgrid(grid, grid))
     for angle in (5.0, 10.0, 25.0):
@@ -105,8 +105,8 @@ def test_wings_hold_what_edges_diffract(wavelength):
 
 
 def test_a_part_of_the_light_is_a_part_of_the_whole():
-    nm, optics = euclid.wavefront(-0.4, 0.8, "vis", MISSION), euclid._optics(6000.0, SAMPLING, MISSION, 768)
-    whole, part = euclid._diffracted(nm, optics), euclid._diffracted(nm, optics, 201)
+    nm, optics = euclid.wavefront(-0.4, 0.8, "vis", MISSION), diffraction.optics_of(6000.0, SAMPLING, MISSION, 768)
+    whole, part = diffraction.diffracted(nm, optics), diffraction.diffracted(nm, optics, 201)
     np.testing.assert_allclose(part, whole[284:485, 284:485], rtol=1e-5, atol=1e-12)
 
 
@@ -114,11 +114,11 @@ def test_a_part_of_the_light_is_a_part_of_the_whole():
 def test_blur_is_a_gaussian_in_fourier_space(blur):
     """arcsec2 along x and y; against the product of transforms, of the light as diffracted."""
     nm, n = euclid.wavefront(0.6, 0.3, "vis", MISSION), 768
-    optics, weights = euclid._optics(5500.0, SAMPLING, MISSION, n), euclid._weights_of(blur, SAMPLING)
-    found = euclid._blurred(euclid._diffracted(nm, optics, 301 + 2 * euclid._margin(weights)), weights)
+    optics, weights = diffraction.optics_of(5500.0, SAMPLING, MISSION, n), euclid._weights_of(blur, SAMPLING)
+    found = euclid._blurred(diffraction.diffracted(nm, optics, 301 + 2 * euclid._margin(weights)), weights)
     k = 2 * np.pi * np.fft.fftfreq(n, SAMPLING)
     passed = np.exp(-0.5 * (blur[0] * k**2 + blur[1] * k[:, None] ** 2))
-    sky = np.fft.fft2(euclid._diffracted(nm, optics).astype(float)) * passed
+    sky = np.fft.fft2(diffraction.diffracted(nm, optics).astype(float)) * passed
     expected = np.fft.ifft2(sky).real[n // 2 - 150 : n // 2 + 151, n // 2 - 150 : n // 2 + 151]
     assert found.sum() == pytest.approx(expected.sum(), rel=1e-6)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * expected.max())
