@@ -78,19 +78,17 @@ def _of_signal(scene: Scene) -> bool:
     return scene.value("nonlinearity_of_signal", "") > 0.5
 
 
-def _change(electrons: float, scene: Scene) -> float:
-    held = min(max(electrons, 0.0), scene.value("full_well", "electron"))
-    return _parameters(scene)[0] * held**2
+def _change(scene: Scene) -> float:
+    """Of a full pixel: a hot pixel or a cosmic ray may fill any, also where nothing shines."""
+    return _parameters(scene)[0] * scene.value("full_well", "electron") ** 2
 
 
 def _contribution(scene: Scene) -> float:
-    mode = ramp.mode_of(scene)
-    most = scene.brightest_electrons * mode.frames / mode.integrated
-    return 0.0 if _of_signal(scene) else _change(most, scene)
+    return 0.0 if _of_signal(scene) else _change(scene)
 
 
 def _contribution_to_signal(scene: Scene) -> float:
-    return _change(scene.brightest_electrons, scene) if _of_signal(scene) else 0.0
+    return _change(scene) if _of_signal(scene) else 0.0
 
 
 EFFECT = Effect("ramp_nonlinearity", apply, _parameters, _contribution, fixed=True, cost=1e-2)

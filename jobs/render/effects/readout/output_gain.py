@@ -33,7 +33,8 @@ def _parameters(scene: Scene) -> tuple[float]:
 
 
 def _contribution(scene: Scene) -> float:
-    return 0.5 * _parameters(scene)[0] * scene.brightest_electrons
+    """Of a full pixel: a hot pixel or a cosmic ray may fill any, also where nothing shines."""
+    return 0.5 * _parameters(scene)[0] * scene.value("full_well", "electron")
 
 
 EFFECT = Effect("output_gain", apply, _parameters, _contribution, fixed=True, cost=7e-3)

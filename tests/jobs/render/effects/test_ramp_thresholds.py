@@ -74,6 +74,21 @@ def test_what_is_left_out_is_not_noticed(name):
     assert len(set(needed)) == 2
 
 
+@pytest.mark.parametrize("name", ["ramp_nonlinearity", "signal_nonlinearity", "output_gain"])
+def test_hot_pixels_and_hits_are_read_as_any_light(name):
+    """Without a star or sky: what is left out of a dark is not noticed in any of its pixels."""
+    of_signal = {"nonlinearity_of_signal": 1.0} if name == "signal_nonlinearity" else {}
+    one = replace(scene(sky=0.0, peak=0.0, hot_pixels=0.1, hot_current=100.0, **of_signal), exposure_time_s=561.15)
+    frame, forced = np.zeros((N, N)), {effect.name: False for effect in nisp_p.DARK if effect.optional}
+    found = []
+    for applied in (True, False):
+        some = [effect for effect in nisp_p.DARK if effect.name != "signal_adc"]
+        given = replace(one, forced={**forced, "dark_map": True, "ramp_cosmic_rays": True, name: applied})
+        found.append(apply_all(frame, some, given, lambda e: rng.stream(1, e.name))[0][0])
+    assert np.abs(found[0] - found[1]).max() > one.pixel_noise
+    assert EFFECTS[name].needed_if(one)
+
+
 @pytest.mark.parametrize("name", ALWAYS)
 def test_what_is_always_there(name):
     assert EFFECTS[name].needed_if(scene(sky=0.0, peak=0.0))
