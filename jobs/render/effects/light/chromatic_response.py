@@ -6,13 +6,16 @@ The efficiency of pixel p is that of the passband times
 
 beside its grey part, which is `pixel_response`; never less than 0.  The mission database has f1, a slope, and f2, a
 curvature, by wavelength; s and c are maps of the detector, each the sum of a smooth map and of one from pixel to pixel.
-Light whose photons have the shares w in wavelengths meets F = sum w f, told from that of flat f_nu, which is in the
-grey part. Sources are drawn three times: as they are, and with each photon times f1, and times f2.
+Light whose photons have the shares w in wavelengths meets sum w f.  That of flat f_nu meets the means of f over the
+band: all light in a band sees this difference of the pixels, and a flat of another band has another.  What a light
+meets besides is F, its sum w f less these means. Sources are drawn three times: as they are, and with each photon times
+f1, and times f2, less the means.
 
-What is not noticed in its source's brightest pixel is not drawn again.
+What F changes by less than is noticed in its source's brightest pixel is not drawn again.
 
 EFFECT, LAMP   the light of the sky and its sources, and of a lamp, as the pixels see it
 maps       s and c of a detector
+means      f1 and f2 over a band
 table      f1 and f2 in the parts of a band
 colours    F1 and F2 of lights;  of_lines : of light at given wavelengths
 tints      the light of sources, each photon times f1, and times f2
@@ -48,16 +51,17 @@ _NODES = 9
 _PSF_COLOUR = 0.1
 
 
-def apply(frame: Frame, lit: Frame, slope: float, curvature: float, rng: np.random.Generator) -> Frame:
+def apply(frame: Frame, lit: Frame, even: Float, slope: float, curvature: float, rng: np.random.Generator) -> Frame:
     """frame [ny, nx] expected e- -> as the pixels see it.
 
-    lit : [2, ny, nx] e- of the frame's light, each photon of it times f1, and times f2
+    lit  : [2, ny, nx] e- of the frame's light, each photon of it times f1, and times f2, told from their means
+    even : [2] these means, as of `means`
     slope, curvature, rng : as of `maps`
     """
     out = np.array(frame, float)
     up, across = _ends(out.shape)
     for part, nodes, rms, key in _patterns(slope, curvature, rng):
-        _add(out, np.ascontiguousarray(lit[part]), nodes, up, across, rms, key)
+        _add(out, np.ascontiguousarray(lit[part] + even[part] * frame), nodes, up, across, rms, key)
     return np.asarray(np.maximum(out, 0.0, out=out))
 
 
@@ -110,14 +114,27 @@ def _add(out: Any, light: Any, nodes: Any, up: Any, across: Any, rms: float, key
             out[y, x] += light[y, x] * rms * (smooth + pixel_random.normal(pixel_random.word(key, y * nx + x)))
 
 
+def _in_parts(section: str, band: Passband, mission: MissionConfiguration) -> Float:
+    """float64[PARTS, 2]: f1 and f2 in the parts of a band."""
+    parts = sub_bands(band)
+    return np.array([_mean(section, part.wavelength, part.response / part.wavelength, mission) for part in parts])
+
+
+def means(section: str, band: Passband, mission: MissionConfiguration) -> Float:
+    """float64[2]: f1 and f2 that light of flat f_nu meets in a band.
+
+    section, mission : of the camera in the mission database;  band : a passband
+    """
+    return np.asarray(np.mean(_in_parts(section, band, mission), axis=0))
+
+
 def table(section: str, band: Passband, mission: MissionConfiguration) -> Float:
     """float64[PARTS, 2]: f1 and f2 in the parts of a band, told from their means over it.
 
     section, mission : of the camera in the mission database;  band : a passband
     """
-    parts = sub_bands(band)
-    found = [_mean(section, part.wavelength, part.response / part.wavelength, mission) for part in parts]
-    return np.asarray(np.array(found) - np.mean(found, axis=0))
+    found = _in_parts(section, band, mission)
+    return np.asarray(found - np.mean(found, axis=0))
 
 
 def of_lines(section: str, band: Passband, wavelength: Float, photons: Float, mission: MissionConfiguration) -> Float:
@@ -126,9 +143,7 @@ def of_lines(section: str, band: Passband, wavelength: Float, photons: Float, mi
     section, mission    : of the camera in the mission database;  band : a passband
     wavelength, photons : of the light
     """
-    parts = sub_bands(band)
-    even = [_mean(section, part.wavelength, part.response / part.wavelength, mission) for part in parts]
-    return np.asarray(_mean(section, wavelength, photons, mission) - np.mean(even, axis=0))
+    return np.asarray(_mean(section, wavelength, photons, mission) - means(section, band, mission))
 
 
 def _mean(section: str, wavelength: Float, photons: Float, mission: MissionConfiguration) -> Float:
@@ -203,16 +218,31 @@ def _sky(scene: Scene) -> Float:
     return scene.sky_electrons * _colour(scene, photons)
 
 
-def _parameters(scene: Scene) -> tuple[Frame | Float32, float, float]:
+def _even(scene: Scene) -> Float:
+    return means(scene.section, band_of(scene), scene.mission)
+
+
+def _rms(scene: Scene, light: Float) -> float:
+    """e- rms that the maps change of light [2], e- times f1, and f2."""
+    return float(np.hypot(*(np.array(strength(scene)) * light)))
+
+
+def _parameters(scene: Scene) -> tuple[Frame | Float32, Float, float, float]:
     lit = np.empty((2, scene.ny, scene.nx), np.float32)
     lit[:] = _sky(scene)[:, None, None]
     if scene.tints is not None:
         lit += scene.tints
-    return lit, *strength(scene)
+    return lit, _even(scene), *strength(scene)
+
+
+def _contribution(scene: Scene) -> float:
+    brightest = scene.peak_electrons + scene.sky_electrons
+    return max(scene.tint_electrons, _rms(scene, brightest * _even(scene)), _of_sky(scene))
 
 
 def _of_sky(scene: Scene) -> float:
-    return float(np.hypot(*(np.array(strength(scene)) * _sky(scene))))
+    """What a source changes is not there again in the next dither."""
+    return _rms(scene, _sky(scene) + scene.sky_electrons * _even(scene))
 
 
 def _lamp(scene: Scene) -> Float:
@@ -222,29 +252,16 @@ def _lamp(scene: Scene) -> Float:
     return level * _colour(scene, calibration_lamp.photons(band, scene.lamp, scene.section, scene.mission))
 
 
-def _lamp_parameters(scene: Scene) -> tuple[Float32, float, float]:
+def _lamp_parameters(scene: Scene) -> tuple[Float32, Float, float, float]:
     columns, rows = calibration_lamp.pattern(scene, scene.lamp, scene.nx, scene.ny)
-    even = illumination.apply(np.ones((scene.ny, scene.nx)), columns, rows)
-    return (_lamp(scene)[:, None, None] * even).astype(np.float32), *strength(scene)
+    shape = illumination.apply(np.ones((scene.ny, scene.nx)), columns, rows)
+    return (_lamp(scene)[:, None, None] * shape).astype(np.float32), _even(scene), *strength(scene)
 
 
-EFFECT = Effect(
-    "chromatic_response",
-    apply,
-    _parameters,
-    lambda scene: max(scene.tint_electrons, _of_sky(scene)),
-    fixed=True,
-    # What a source changes is not there again in the next dither.
-    repeated=_of_sky,
-    # Most of it for the light that is drawn again.
-    cost=5e-2,
-)
-LAMP = Effect(
-    "lamp_response",
-    apply,
-    _lamp_parameters,
-    lambda scene: float(np.hypot(*(np.array(strength(scene)) * _lamp(scene)))),
-    fixed=True,
-    numbers=EFFECT.name,
-    cost=1.5e-2,
-)
+def _of_lamp(scene: Scene) -> float:
+    return _rms(scene, _lamp(scene) + calibration_lamp.EFFECT.contribution(scene) * _even(scene))
+
+
+# Most of the cost of the first is for the light that is drawn again.
+EFFECT = Effect("chromatic_response", apply, _parameters, _contribution, fixed=True, repeated=_of_sky, cost=5e-2)
+LAMP = Effect("lamp_response", apply, _lamp_parameters, _of_lamp, fixed=True, numbers=EFFECT.name, cost=1.5e-2)

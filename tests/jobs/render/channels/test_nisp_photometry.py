@@ -6,6 +6,7 @@ import sep
 from scipy import ndimage
 
 from jobs.render.effects.charge import dark_map, pixel_response, ramp, ramp_nonlinearity
+from jobs.render.effects.light import chromatic_response
 from jobs.render.effects.readout import output_gain
 from jobs.render.products import truth_table
 from jobs.render.sky import diffuse_light
@@ -49,6 +50,11 @@ def undone(one):
         response = pixel_response.apply(
             response, *pixel_response.EFFECT.parameters(scene), fixed(pixel_response.EFFECT)
         )
+    if "chromatic_response" in applied:
+        # Of light of flat f_nu: what the colour of a star changes stays.
+        _, even, *strength = chromatic_response.EFFECT.parameters(scene)
+        maps = chromatic_response.maps(found.shape, *strength, fixed(chromatic_response.EFFECT))
+        response *= 1.0 + even[0] * maps[0] + even[1] * maps[1]
     flag = one.readout.extensions[1].data[4:-4, 4:-4] if len(one.readout.extensions) > 1 else 0
     dark = dark_map.apply(np.zeros(found.shape), *dark_map.EFFECT.parameters(scene), fixed(dark_map.EFFECT))
     good = (response > 0.7) & (flag == 0) & (dark < HOT)

@@ -71,8 +71,8 @@ def remembering(electrons):
     return lambda shape: (electrons * np.indices(shape)[1] % 2, 0.3)
 
 
-def tinted(electrons):
-    return lambda shape: (np.full((2, *shape), electrons, np.float32), 0.1, 0.1)
+def tinted(electrons, even=(0.0, 0.0)):
+    return lambda shape: (np.full((2, *shape), electrons, np.float32), np.array(even), 0.1, 0.1)
 
 
 # `on` and `off` may depend on the frame's shape.
@@ -94,8 +94,8 @@ _CASES = (
     Case("straylight", (LIGHTS, 5e-4, 40.0), (LIGHTS, 0.0, 40.0), zero=False),
     Case("illumination", bowl, flat, linear=True),
     Case("pixel_response", (0.01, 1e-2, 1.0, DUST), (0.0, 0.0, 0.0, (0.0, 3.0, 0.2)), linear=True),
-    Case("chromatic_response", tinted(30.0), tinted(0.0), zero=False),
-    Case("lamp_response", tinted(-30.0), tinted(0.0), zero=False),
+    Case("chromatic_response", tinted(30.0, (-0.4, 0.1)), tinted(0.0), zero=False),
+    Case("lamp_response", tinted(-30.0, (0.3, -0.2)), tinted(0.0), zero=False),
     Case("calibration_lamp", lambda shape: (500.0, *bowl(shape)), lambda shape: (0.0, *bowl(shape)), zero=False),
     Case("readout_trail", (6e-5, 2, (0.01, 1e-2, 1.0, DUST)), (0.0, 2), linear=True),
     Case("poisson", (), None, whole=True),

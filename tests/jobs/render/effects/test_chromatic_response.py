@@ -31,6 +31,7 @@ MISSION = resolve()
 Y = passbands.load("euclid_y")
 SLOPE, CURVATURE = (MISSION.value(f"nisp.response.{key}", "") for key in ("slope", "curvature"))
 TABLE = chromatic_response.table("nisp", Y, MISSION)
+EVEN = chromatic_response.means("nisp", Y, MISSION)
 # rms of a signal without a source.
 NOISE = 12.0
 
@@ -111,7 +112,8 @@ def slowly(some, response, draw):
     for part in range(PARTS):
         alone = np.zeros((len(some), PARTS))
         alone[:, part] = 1.0
-        factor = 1.0 + response[0] * TABLE[part, 0] + response[1] * TABLE[part, 1]
+        f = TABLE[part] + EVEN
+        factor = 1.0 + response[0] * f[0] + response[1] * f[1]
         each = each + factor * draw(some.electrons * some.photons[:, part], alone)
     return each
 
@@ -121,13 +123,14 @@ def test_three_drawings_are_one_for_each_wavelength(field):
     response = drawn_maps((200, 200))
     light = draw(some.electrons)
     lit = chromatic_response.tints(some.electrons, some.photons, TABLE, draw)
-    found = chromatic_response.apply(light, lit, SLOPE, CURVATURE, np.random.default_rng(3))
+    found = chromatic_response.apply(light, lit, EVEN, SLOPE, CURVATURE, np.random.default_rng(3))
     each = slowly(some, response, draw)
-    change = np.abs(each - light)
+    # Told from what all light of the band meets.
+    change = np.abs(each - light * (1.0 + response[0] * EVEN[0] + response[1] * EVEN[1]))
     np.testing.assert_allclose(found, each, atol=1e-3 * change.max())
     # The colours of whole sources are not all of it: blue light is in the middle of the PSF.
     own = chromatic_response.colours(some.photons, TABLE)
-    whole = sum(response[k] * draw(some.electrons * (own[:, k] + 1.0)) - response[k] * light for k in (0, 1))
+    whole = sum(response[k] * (draw(some.electrons * (own[:, k] + 1.0)) + (EVEN[k] - 1.0) * light) for k in (0, 1))
     assert np.abs(light + whole - each).max() > 0.02 * change.max()
     assert np.abs(light + whole - each).max() < change.max()
 
@@ -172,7 +175,7 @@ def test_an_exposure_draws_again_what_is_noticed():
     assert 5 < counted[0] < 0.8 * len(some)
     response = drawn_maps((side, side), slope=0.05)
     frame = draw(some.electrons)
-    change = slowly(some, response, draw) - frame
+    change = slowly(some, response, draw) - frame * (1.0 + response[0] * EVEN[0] + response[1] * EVEN[1])
     fast = response[0] * found.tints[0] + response[1] * found.tints[1]
     noise = np.sqrt(scene.pixel_noise**2 + frame)
     wrong = np.abs((fast - change) / noise).max()
@@ -200,6 +203,7 @@ def test_a_flat_has_the_colour_of_its_lamp():
     maps = chromatic_response.maps(
         (96, 96), SLOPE, CURVATURE, rng.stream(infrared.SEED, "nisp", "DET22", "chromatic_response")
     )
+    own = own + EVEN
     expected = own[0] * maps[0] + own[1] * maps[1]
     change = after / before - 1.0
     # Noise is drawn anew where the light differs, by half a part in a hundred of itself; and rounding.
@@ -208,15 +212,75 @@ def test_a_flat_has_the_colour_of_its_lamp():
     assert {d.name: d.applied for d in infrared.rendered(kind="flat", lamp=2, band="euclid_y", sky=0.0).decisions}[
         "lamp_response"
     ]
-    # What no LED of the band shines has no colour.
+    # Where no LED of the band shines there is nothing to see.
     dark = infrared.rendered(kind="flat", lamp=1, band="euclid_h", sky=0.0)
     assert not {d.name: d.applied for d in dark.decisions}["lamp_response"]
+
+
+BRIGHT = {"nisp.flat.signal": (9e4, "electron")}
+# What hides the response of pixels.
+NOISY = dict.fromkeys(
+    ("ramp_cosmic_rays", "drift", "group_noise", "dark_map", "output_gain", "ramp_nonlinearity", "ipc"), False
+)
+
+
+def flat(band, lamp, mission=MISSION):
+    """Light of a flat, told from its lamp's pattern."""
+    one = infrared.rendered(kind="flat", lamp=lamp, band=band, sky=0.0, forced=NOISY, mission=mission)
+    return infrared.electrons(one) / calibration_lamp.apply(
+        np.zeros((96, 96)), *calibration_lamp.EFFECT.parameters(one.scene)
+    )
+
+
+def met(band, lamp):
+    """[2] f1 and f2 that the light of a lamp meets."""
+    curve = passbands.load(band)
+    light = calibration_lamp.photons(curve, lamp, "nisp", MISSION)
+    return chromatic_response.of_lines("nisp", curve, curve.wavelength, light, MISSION) + chromatic_response.means(
+        "nisp", curve, MISSION
+    )
+
+
+def test_flats_of_two_bands_differ_by_the_response_to_their_light():
+    """By half a part in a hundred from pixel to pixel: LED 1 in Y and LED 5 in H; counted with many electrons."""
+    bright = resolve(overrides={"nisp.response.slope": (0.02, ""), **BRIGHT})
+    ratio = flat("euclid_y", 1, bright) / flat("euclid_h", 5, bright) - 1.0
+    maps = chromatic_response.maps(
+        (96, 96), 0.02, CURVATURE, rng.stream(infrared.SEED, "nisp", "DET22", "chromatic_response")
+    )
+    y, h = ((own[:, None, None] * maps).sum(axis=0) for own in (met("euclid_y", 1), met("euclid_h", 5)))
+    # Pixels that are dead, or whose charge is too much for the mean.
+    good = np.abs(ratio - np.median(ratio)) < 0.08
+    expected = (1.0 + y) / (1.0 + h) - 1.0
+    assert good.mean() > 0.98
+    assert expected.std() > 0.01
+    found, expected = (part[good] - part[good].mean() for part in (ratio, expected))
+    assert (found * expected).sum() / (expected**2).sum() == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_flat_of_the_band_flattens_the_sky():
+    """What pixels make of the sky's light and of a lamp's is the same but for the colours of the two."""
+    strong = resolve(overrides={"nisp.response.slope": (0.1, "")})
+    level = 9e4 / infrared.TIME
+    sky = infrared.electrons(infrared.rendered(sky=level, band="euclid_y", mission=strong, forced=NOISY))
+    parts = {}
+    for band, lamp in (("euclid_y", 1), ("euclid_h", 5)):
+        ratio = sky / flat(band, lamp, resolve(overrides={"nisp.response.slope": (0.1, ""), **BRIGHT}))
+        ratio /= np.median(ratio)
+        parts[band] = ratio[np.abs(ratio - 1.0) < 0.5].std()
+    print(parts)
+    assert parts["euclid_y"] < 0.3 * parts["euclid_h"]
+
+
+def test_a_dark_has_no_colour():
+    names = {d.name for d in infrared.rendered(kind="dark", sky=0.0).decisions}
+    assert not names & {"chromatic_response", "lamp_response", "pixel_response"}
 
 
 def test_stars_have_their_colours_in_an_image():
     """A bright red star: what is drawn again of it is its colour times its light."""
     one = infrared.rendered([20.0], [48.0], [48.0], band="euclid_y")
-    assert not {d.name: d.applied for d in one.decisions}["chromatic_response"]
+    assert {d.name: d.applied for d in one.decisions}["chromatic_response"]
     assert one.scene.tints is None
     shares = np.linspace(0.5, 1.5, PARTS)[None] / PARTS
     with pytest.MonkeyPatch.context() as patch:
