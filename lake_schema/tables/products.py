@@ -50,7 +50,7 @@ EXPOSURE_FILES = Table(
         Column("detectors", "int32", ucd="meta.number", doc="detectors in the file", lo=1),
         Column("planned", "int32", ucd="meta.number", doc="detectors of the exposure that are planned", lo=1),
         Column("mission", "string", ucd="meta.code", doc="fingerprint of the mission configuration"),
-        Column("sources", "int64", ucd="meta.number", doc="number of sources drawn, on each detector", lo=0),
+        Column("sources", "int64", ucd="meta.number", doc="number of sources drawn, summed over the detectors", lo=0),
     ),
     "Published images of whole exposures: the science images of their detectors, one after the other.",
     key=("path",),

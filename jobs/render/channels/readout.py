@@ -128,7 +128,8 @@ def _ramp(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
     planes = [Extension(f"{detector}.SCI", np.pad(signal, border, constant_values=level), "adu", place)]
     if mode.groups > 2:
         flag = (found[1] > limit).astype(np.uint8)
-        planes.append(Extension(f"{detector}.CHI2", np.pad(flag, border), "", place))
+        meaning = ("QUALFLAG", 1, "value where chi^2 exceeds QUALLIM, else 0")
+        planes.append(Extension(f"{detector}.CHI2", np.pad(flag, border), "", (meaning, *place)))
         cards += (("QUALLIM", limit, "chi^2 above which a pixel's quality is 1"),)
     else:
         cards += (("QUALLIM", 0.0, "two groups have no chi^2: there is no quality"),)

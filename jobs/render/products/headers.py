@@ -11,7 +11,7 @@ import numpy as np
 from jobs import accuracy, rng
 from jobs.render.camera import astrometry
 from jobs.render.channels.registry import effects_of
-from jobs.render.effects.charge import ramp
+from jobs.render.effects.charge import ramp, ramp_nonlinearity
 from jobs.render.effects.readout import bias_structure, charge_transfer, nonlinearity, ramp_noise, read_noise
 from jobs.render.exposure.rendered import Rendered, numbers_of
 from lake_schema import __version__
@@ -29,6 +29,16 @@ _ERRORS = {
     "position": ("POS", "[pix]"),
     "background": ("BACK", "fraction of a sky pixel's noise"),
 }
+# Of the readout and of amplifiers, what holds for groups; they have no border of reference pixels.
+_OF_RAMP = {"READMODE", "NG", "NR", "ND", "FRTIME", "ELAPTIME"}
+_OF_GROUPS = {"GAIN", "FRNOISE", "BIAS"}
+_GROUP_AXIS: tuple[Card, ...] = (
+    ("WCSAXES", 3, "number of world coordinate axes"),
+    ("CTYPE3", "GROUP", "number of the group"),
+    ("CRVAL3", 1.0, "first group"),
+    ("CRPIX3", 1.0, "first plane = 1"),
+    ("CD3_3", 1.0, ""),
+)
 _MJD_ZERO = datetime(1858, 11, 17)
 
 
@@ -44,7 +54,7 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
         (
             "DARKRATE",
             bool(_DARK & applied) * scene.dark_rate,
-            "[electron/s/pix] mean dark current in the image",
+            "[electron/s/pix] dark current of usual pixels",
         ),
         *_effect_cards(rendered),
     )
@@ -71,7 +81,7 @@ def _of_amplifiers(rendered: Rendered) -> tuple[tuple[str, float | Float, str], 
     scene = rendered.scene
     saturated = "[adu] lowest level of a saturated pixel"
     if scene.ramp:
-        saturated = "[adu] full at the last read; if sooner: any"
+        saturated = "[adu] full at last read; earlier: see CHI2"
     return (
         ("GAIN", scene.of_amplifiers("gain", "electron / adu"), "[electron/adu] conversion gain"),
         *_read_noise(rendered),
@@ -110,7 +120,18 @@ _TRUTH = {
 
 def truth_cards(rendered: Rendered, content: str) -> tuple[Card, ...]:
     """Header of a truth map: what one thing adds to the exposure, before the rest of the detector."""
-    return (*_common(rendered), ("BUNIT", *_TRUTH[content]))
+    own = _group_cards(rendered) if content == "ramp" else _common(rendered)
+    return (*own, ("BUNIT", *_TRUTH[content]))
+
+
+def _group_cards(rendered: Rendered) -> tuple[Card, ...]:
+    """Of the groups as they are read: common cards with an axis of groups, how they were read, and electrons of ADU."""
+    out: list[Card] = []
+    for card in _common(rendered):
+        out += _GROUP_AXIS if card[0] == "WCSAXES" else [card]
+    out += [card for card in rendered.readout.cards if card[0] in _OF_RAMP]
+    found = ((key, value, text) for key, value, text in _of_amplifiers(rendered) if key in _OF_GROUPS)
+    return (*out, *((key, float(value), text) for key, value, text in found if np.ndim(value) == 0))
 
 
 def _common(rendered: Rendered) -> tuple[Card, ...]:
@@ -174,7 +195,13 @@ def _saturation(rendered: Rendered) -> float | Float:
     # The first of a column, or a row, finds all traps empty.
     losses = (charge_transfer.PARALLEL, charge_transfer.SERIAL)
     left = full - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
-    signal: float | Float = ramp.full_signal(scene) if scene.ramp else left
+    signal: float | Float = left
+    if scene.ramp:
+        b = scene.value("nonlinearity", "1 / electron")
+        of_charge, of_signal = (
+            b * (effect.name in applied) for effect in (ramp_nonlinearity.EFFECT, ramp_nonlinearity.SIGNAL)
+        )
+        signal = ramp.full_signal(scene, of_charge, of_signal)
     if nonlinearity.EFFECT.name in applied:
         curve = nonlinearity.parameters(scene)
         parts = max(np.size(number) for number in curve)

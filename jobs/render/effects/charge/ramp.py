@@ -163,10 +163,16 @@ def planes(frame: Frame, count: int) -> Frame:
     return out
 
 
-def full_signal(scene: Scene) -> float:
-    """Electrons that are measured in the integration time of a pixel that is full at the ramp's end."""
+def full_signal(scene: Scene, of_charge: float = 0.0, of_signal: float = 0.0) -> float:
+    """Electrons that are measured in the integration time of a pixel that is full at the ramp's end.
+
+    of_charge, of_signal : b of N (1 - b N), what is seen of N electrons in a frame, and of those of the signal, 1/e-
+    """
     mode, full = mode_of(scene), scene.value("full_well", "electron")
-    return full * (1.0 - scene.value("nonlinearity", "1 / electron") * full) * mode.integrated / mode.frames
+    signal = full * (1.0 - of_charge * full) * mode.integrated / mode.frames
+    # Of more than 1 / 2 b is seen what is seen of these.
+    signal = min(signal, 0.5 / of_signal) if of_signal > 0.0 else signal
+    return signal * (1.0 - of_signal * signal)
 
 
 def full(frame: Frame, mode: Mode, full_well: float) -> Bool:

@@ -60,6 +60,8 @@ def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
     """Groups [groups, ny, nx] e- -> with 1 / f noise of `width` e- rms in the last group above the first.
 
     The columns are those of the outputs, neighbours together; their number need not be a multiple of 32.
+    Error : the mission's width is what was measured of a signal beyond the noise of its reads, all of it taken as 1 / f
+            noise; a ramp of other groups or another length has as much of it
     """
     if not 0.0 <= width < 1e5:
         raise OutOfRange("1/f noise", width, 0.0, 1e5)

@@ -34,17 +34,21 @@ def test_a_star_of_ab_0():
     assert np.isfinite(found.noise_free).all()
 
 
-def test_the_level_of_saturation():
+@pytest.mark.parametrize(
+    ("choice", "off", "error"), [(0.0, (), 0.02), (1.0, (), 5e-3), (0.0, ("ramp_nonlinearity",), 5e-3)]
+)
+def test_the_level_of_saturation(choice, off, error):
     """A pixel that is full at the ramp's end reads what SATURATE says; sooner, its ramp does not fit."""
     quiet = dict.fromkeys(("ramp_cosmic_rays", "dark_map", "pixel_response", "output_gain", "ipc"), False)
-    own = resolve(overrides={"nisp.nonlinearity_spread": (0.0, "")})
+    quiet |= dict.fromkeys(off, False)
+    own = resolve(overrides={"nisp.nonlinearity_spread": (0.0, ""), "nisp.nonlinearity_of_signal": (choice, "")})
     signals, flags = {}, {}
     for part in (0.1, 1.0, 1.5):
         found = infrared.rendered(sky=part * 1.3e5 / (76 * 1.454), forced=quiet, mission=own)
         signals[part], flags[part] = np.median(found.science), flag(found).mean()
     level = dict((key, value) for key, value, _ in headers.science_cards(found))["SATURATE"]
     # What bends a ramp adds to the mean of its squared differences.
-    assert signals[1.0] == pytest.approx(level, rel=0.02)
+    assert signals[1.0] == pytest.approx(level, rel=error)
     assert flags[0.1] < 0.01
     assert flags[1.5] == 1.0
     assert signals[1.5] > level

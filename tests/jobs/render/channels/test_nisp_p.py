@@ -4,7 +4,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.wcs import WCS
 
+from jobs.fluxes import passbands
+from jobs.render.effects.charge import ramp
+from jobs.render.effects.charge.persistence import Traps
+from jobs.render.effects.readout import macc, ramp_noise
 from jobs.render.products import fits_files, read_back
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
@@ -32,7 +38,7 @@ def one():
 def test_the_file(tmp_path):
     """Signal and its quality, each in the border of reference pixels, which are 0; the sky is where it is drawn."""
     found = one()
-    _, writers = fits_files.products(found, ("ramp",))
+    _, writers = fits_files.products(found, ("ramp", "sky"))
     (science,) = (path for path in writers if "science" in path)
     writers[science](tmp_path / "science.fits")
     read = images.read_images(tmp_path / "science.fits")
@@ -56,9 +62,53 @@ def test_the_file(tmp_path):
     np.testing.assert_array_equal(read_back.frame(tmp_path / "science.fits").data, found.science)
     back = read_back.electrons(tmp_path / "science.fits").data
     assert np.median(back) == pytest.approx(infrared.SKY * 87.24, abs=5.0)
-    assert found.maps["ramp"].shape == (4, 96, 96)
+    assert ("QUALFLAG", 1) in {card[:2] for card in read[2].cards}
+    groups, sky = (
+        write(tmp_path / "map.fits") or images.read_images(tmp_path / "map.fits")[0]
+        for content in ("ramp", "sky")
+        for path, write in writers.items()
+        if content in path
+    )
+    assert groups.data.shape == (4, 96, 96)
+    # Read as the signal is, without its border; the third axis counts groups.
+    of_groups = {key: value for key, value, _ in groups.cards}
+    for key in ("GAIN", "BIAS", "FRNOISE", "NG", "NR", "ND", "FRTIME", "ELAPTIME"):
+        assert of_groups[key] == header[key]
+    assert "REFPIX" not in of_groups
+    assert {"GAIN", "NG", "CTYPE3"} & {key for key, *_ in sky.cards} == set()
+    # Whoever reads it names the planes: astropy bends two axes only.
+    place = WCS(fits.Header(groups.cards), naxis=2)
+    assert WCS(fits.Header([card for card in groups.cards if "_ORDER" not in card[0]])).naxis == 3
+    sky_place = WCS(fits.Header(sky.cards))
+    np.testing.assert_array_equal(place.all_pix2world([[5.0, 60.0]], 0), sky_place.all_pix2world([[5.0, 60.0]], 0))
     # Above the level of its reset a pixel's charge grows.
     assert (np.diff(np.median(found.maps["ramp"].astype(float), axis=(1, 2))) > 5.0).all()
+
+
+@pytest.mark.parametrize("kind", ["photometric", "spectroscopic"])
+def test_the_signal_is_as_noisy_as_was_measured(kind):
+    """In the dark, by the estimator."""
+    own, rng = resolve(), np.random.default_rng(1)
+    shape = ramp.Mode(*(int(own.value(f"nisp.macc.{kind}.{part}")) for part in ("groups", "reads", "drops")))
+    rate, read_noise = own.value("nisp.dark_current"), own.value("nisp.read_noise", "electron")
+    dark = np.full((256, 1024), rate * shape.integrated * own.value("nisp.frame_time", "s"), np.float32)
+    groups = ramp_noise.apply(ramp.apply(dark, shape, 1e8, rng=rng), read_noise, shape.reads, rng)
+    groups = ramp_noise.apply_drift(groups, own.value(f"nisp.drift_{kind}", "electron"), rng)
+    signal, _ = macc.apply(groups, shape, read_noise, rng)
+    assert signal.std() == pytest.approx(own.value(f"nisp.noise_{kind}", "electron"), rel=0.03)
+
+
+def test_detectors_are_no_worse_than_is_required():
+    """Bad pixels in all; what charge leaves; light that is seen, by the quantum efficiency and its cutoff."""
+    own = resolve()
+    assert own.value("nisp.dead_pixels") + own.value("nisp.hot_pixels") <= own.value("nisp.bad_pixels")
+    for name in ("euclid_y", "euclid_j", "euclid_h"):
+        band = passbands.load(name)
+        assert band.response.max() < own.value("nisp.quantum_efficiency")
+        assert band.wavelength[band.response > 0.01].max() < own.value("nisp.cutoff", "Angstrom")
+    traps = Traps.of(infrared.rendered().scene)
+    left = traps.left(np.array([0.0, 8e4]), traps.reference, traps.length)[1]
+    assert 0.5 < left / 8e4 / own.value("nisp.persistence.fraction") < 1.0
 
 
 def test_reference_pixels_may_have_a_level():
@@ -161,8 +211,9 @@ def test_without_read_noise():
 def test_all_pixels_full():
     found = infrared.rendered(sky=1e5, truth=("saturation",))
     assert (found.maps["saturation"] == 1).all()
-    # A ramp that stands still has no signal, and does not fit.
-    assert np.isfinite(infrared.electrons(found)).all()
+    # A ramp that stands still has no signal, and no sign that it is one.
+    assert abs(np.median(infrared.electrons(found))) < 2.0
+    assert found.readout.extensions[1].data[4:-4, 4:-4].mean() < 0.02
 
 
 def test_a_pixel_that_sees_nothing():

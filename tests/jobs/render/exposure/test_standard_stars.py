@@ -9,9 +9,10 @@ from jobs.fluxes.libraries import templates
 from jobs.render.channels.aim import Aim
 from jobs.render.exposure import persistence
 from jobs.render.exposure.records import Earlier, Rows, Variant
-from jobs.render.products import headers, truth_table
+from jobs.render.products import exposure_files, fits_files, headers, truth_table
 from jobs.render.psf import euclid
 from lake_schema.errors import BadInput
+from lake_schema.fits import images
 from tests.jobs.render import fields, infrared
 from tests.jobs.render.fields import MISSION, small
 
@@ -43,6 +44,16 @@ def f_nu(target, band):
     library, curve = templates.stellar_library(), passbands.load(band)
     flux = np.interp(curve.wavelength, library.wavelength, library.flux[library.names.index(target)])
     return (flux * curve.response * curve.wavelength).sum() / (curve.response / curve.wavelength).sum()
+
+
+def test_the_star_is_named_once_in_a_file_of_the_exposure(tmp_path):
+    _, writers = fits_files.products(rendered("Vega"), ())
+    (write,) = writers.values()
+    write(tmp_path / "one.fits")
+    exposure_files._write([(name, tmp_path / "one.fits") for name in ("DET22", "DET23")], (), tmp_path / "all.fits")
+    first, *arrays = images.read_images(tmp_path / "all.fits")
+    assert "Vega" in [value for key, value, _ in first.cards if key == "TARGET"]
+    assert "TARGET" not in {key for unit in arrays for key, *_ in unit.cards}
 
 
 @pytest.mark.parametrize("target", ["Vega", "white dwarf DA"])
