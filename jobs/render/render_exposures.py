@@ -186,7 +186,7 @@ def work(lake: Path, facts: Json) -> Output:
     mission = read_back(inputs["mission"])
     own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
     detector = detectors.detector(exposed.camera, task["detector"], own.mission)
-    earlier = _earlier(lake, inputs, exposed, task, mission)
+    earlier = _earlier(lake, inputs, exposed, task, mission, request["seed"])
     for one in (exposed, *(before.exposure for before in earlier if isinstance(before, Earlier))):
         if one.psf:
             file = str(from_file.file_of(one.psf, task["detector"]))
@@ -224,7 +224,7 @@ def work(lake: Path, facts: Json) -> Output:
             bodies=bodies,
             earlier=earlier,
         )
-        aim, noise = Aim.of(exposed, detector, band), request.get("noise_seed")
+        aim, noise = Aim.of(exposed, detector, band, request["seed"]), request.get("noise_seed")
         rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
     rice = request["compression"] == "rice"
     rows, files = fits_files.products(rendered, request["truth"], rice, request.get("wcs", "sip"))
@@ -234,7 +234,12 @@ def work(lake: Path, facts: Json) -> Output:
 
 
 def _earlier(
-    lake: Path, inputs: Mapping[str, read.Version], exposed: ExposureRow, task: Json, mission: MissionConfiguration
+    lake: Path,
+    inputs: Mapping[str, read.Version],
+    exposed: ExposureRow,
+    task: Json,
+    mission: MissionConfiguration,
+    seed: int,
 ) -> tuple[Earlier | EarlierSky, ...]:
     """Exposures of the task's detector that left something in it, with their bright sources."""
     if registry.CHANNELS[exposed.channel].remembers is None:
@@ -249,7 +254,7 @@ def _earlier(
     before = persistence.earlier_of(tasks, rows, _own(mission))[exposed.exposure_id, task["detector"]]
     pairs = ((rows[one["exposure_id"]], one) for one in before)
     return tuple(
-        _drawn_again(lake, inputs, exposed, row, one, own) if persistence.is_drawn(row) else EarlierSky(row)
+        _drawn_again(lake, inputs, exposed, row, one, own, seed) if persistence.is_drawn(row) else EarlierSky(row)
         for row, one in pairs
     )
 
@@ -261,6 +266,7 @@ def _drawn_again(
     before: ExposureRow,
     task: Json,
     mission: MissionConfiguration,
+    seed: int,
 ) -> Earlier:
     least = persistence.least_flux(exposed, before)
     found = [
@@ -274,7 +280,7 @@ def _drawn_again(
     band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], before.band)
     detector = detectors.detector(before.camera, task["detector"], mission)
     stellar = stars_of(lake, inputs["star_fluxes"].manifest["facts"])
-    return Earlier(Aim.of(before, detector, band), Rows(*found[0], *found[1], stellar=stellar))
+    return Earlier(Aim.of(before, detector, band, seed), Rows(*found[0], *found[1], stellar=stellar))
 
 
 def truth_work(lake: Path, facts: Json) -> Output:

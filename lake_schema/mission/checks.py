@@ -89,13 +89,16 @@ def _pitch(section: str, configuration: MissionConfiguration) -> Iterator[str]:
 
 
 def ramps(configuration: MissionConfiguration) -> Iterator[str]:
-    """Ramps that have more frames than can be drawn."""
+    """Ramps that cannot be drawn: of too many frames, or of pixels of which others see more than half."""
     for kind in ("photometric", "spectroscopic"):
         key = f"nisp.macc.{kind}"
         groups, reads, drops = (int(configuration.value(f"{key}.{part}")) for part in ("groups", "reads", "drops"))
         count = frames(groups, reads, drops)
         if count > MOST_FRAMES:
             yield f"mission parameter {key}: MACC({groups},{reads},{drops}) has {count} frames, more than {MOST_FRAMES}"
+    seen = 4.0 * sum(configuration.value(f"nisp.ipc.{part}") for part in ("side", "diagonal"))
+    if seen > 0.5:
+        yield f"mission parameter nisp.ipc: {seen:g} of a pixel's charge is seen by others, more than 0.5"
 
 
 def _amplifiers(key: str, configuration: MissionConfiguration) -> Iterator[str]:

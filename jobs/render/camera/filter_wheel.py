@@ -28,18 +28,18 @@ from jobs.render.camera.detectors import Detector
 from jobs.render.camera.pointing import ARCSEC
 
 
-def tilted(detector: Detector, exposure: str) -> Detector:
+def tilted(detector: Detector, exposure: str, seed: int) -> Detector:
     """The detector as the exposure's filter lets it see: displaced, and behind another distortion.
 
     The tilt is normally distributed, of the wheel's error in both directions together.
     Error : 3e-4 of the shift, of fourth order in the angle of the ray
 
-    detector : of the camera;  exposure : what its tilt is keyed by
+    detector : of the camera;  exposure : what its tilt is keyed by;  seed : of the request
     """
     wheel = detector.wheel
     if wheel is None or not wheel.error:
         return detector
-    stream = rng.stream("filter_wheel", exposure)
+    stream = rng.stream(seed, "filter_wheel", exposure)
     across, up = (float(part) for part in stream.normal(0.0, wheel.error * 0.5**0.5, 2))
     return displaced(detector, across, up)
 

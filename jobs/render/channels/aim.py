@@ -34,12 +34,16 @@ class Aim:
     effects: tuple[Effect, ...]
 
     @classmethod
-    def of(cls, exposure: ExposureRow, detector: Detector, band: Passband | None = None) -> Aim:
-        """Of a planned exposure; band : None = the embedded one of its name.  BadInput where nothing renders it."""
+    def of(cls, exposure: ExposureRow, detector: Detector, band: Passband | None = None, seed: int = 0) -> Aim:
+        """Of a planned exposure; BadInput where nothing renders it.
+
+        exposure : its row;  detector : of its camera
+        band     : None = the embedded one of its name;  seed : of the request
+        """
         kind = exposure.image_type
         channel = registry.channel_of(exposure.channel, kind, f"exposure {exposure.exposure_id}")
         # Exposures that differ in their noise alone see alike.
-        seen = filter_wheel.tilted(detector, image_types.identity(replace(exposure, realisation=None)))
+        seen = filter_wheel.tilted(detector, image_types.identity(replace(exposure, realisation=None)), seed)
         system = astrometry.wcs(seen, exposure.ra, exposure.dec, exposure.position_angle)
         band = band or passbands.load(exposure.band)
         return cls(exposure, detector, system, band, channel, channel.effects[kind])

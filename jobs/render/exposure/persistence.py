@@ -1,8 +1,10 @@
 """What earlier exposures of a detector left in it: each is drawn again from the catalogue, without noise.
 
 No exposure needs the image of another, so that they are rendered in any order: what is left is a function of the
-planned exposures and the catalogue alone.  Of an earlier exposure are drawn the sources that leave something, its sky
-and its lamp; of one that nothing renders, such as a spectroscopic one, its mean sky alone counts.
+planned exposures and the catalogue alone.  Of an earlier exposure are drawn the stars and galaxies that leave something,
+its sky and its lamp; of one that nothing renders, such as a spectroscopic one, its mean sky alone counts.
+Error : cosmic rays, moving bodies and lensed arcs of earlier exposures are not drawn again.  A pixel that a hit gave
+        2300 e- lacks 10 e- of what it leaves after 134 s
 
 earlier_of        the tasks before a task
 window            how long before, days
@@ -16,15 +18,16 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim, electron_rate
-from jobs.render.channels.image_types import SKY_TYPES
 from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.settings import settings_for
+from jobs.render.effects.charge import ramp
 from jobs.render.effects.charge.persistence import Traps
 from jobs.render.effects.scene import Frame, Scene
 from jobs.render.exposure import scene_of, standard_stars, visible_sources
@@ -35,6 +38,10 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 
 _DAY_S = 86400.0
+# Of a date, s: more than its rounding.
+_SAME_S = 1e-3
+# Images of which nothing of the sky is on a detector.
+_STARLESS = ("bias", "dark", "flat", "charge_injection")
 # Electrons of the faintest source that is drawn again so many seconds later, and of a pixel's light that stamps leave
 # out; more where more time has passed.  A star of so many leaves 0.8 e- in a pixel; of two exposures of the demo's sky
 # before one, 1.2 e- are missed in a pixel at the most.
@@ -53,7 +60,8 @@ def earlier_of(
     """(exposure, detector) of each task -> tasks of the same detector that left something in it, in order of time.
 
     exposures  : by their number;  mission_of : an exposure's settings -> its mission database
-    Error     : of exposures that differ in their noise alone the first counts
+    Error      : of exposures that differ in their noise alone the first counts
+    Errors     : BadInput where a detector is exposed before an exposure of it has ended
     """
     by_detector: dict[tuple[Any, ...], list[Task]] = defaultdict(list)
     cameras = {row.camera for row in exposures.values() if _remembers(row)}
@@ -62,9 +70,11 @@ def earlier_of(
         if row.camera in cameras:
             by_detector[row.camera, row.settings, task["detector"]].append(task)
     found = {}
-    for (camera, settings, _), some in by_detector.items():
-        days = window(camera, mission_of(settings))
+    for (camera, settings, detector), some in by_detector.items():
+        mission = mission_of(settings)
+        days = window(camera, mission)
         some.sort(key=lambda task: (exposures[task["exposure_id"]].mjd, task["exposure_id"]))
+        _check_one_at_a_time([exposures[task["exposure_id"]] for task in some], detector, mission)
         began = np.array([exposures[task["exposure_id"]].mjd for task in some])
         for task, now in zip(some, began.tolist(), strict=True):
             if not _remembers(exposures[task["exposure_id"]]):
@@ -74,6 +84,23 @@ def earlier_of(
             first = [one for one in before if (exposures[one["exposure_id"]].realisation or 1) == 1]
             found[task["exposure_id"], task["detector"]] = first
     return found
+
+
+def _check_one_at_a_time(rows: Sequence[ExposureRow], detector: str, mission: MissionConfiguration) -> None:
+    """Refuse exposures of a detector, in order of time, of which one begins before another has ended.
+
+    Such as begin at once are alternatives of one another.
+    """
+    for before, now in pairwise(rows):
+        channel, seconds = registry.CHANNELS.get(before.channel), before.exposure_time_s
+        apart = (now.mjd - before.mjd) * _DAY_S
+        if channel is not None and channel.ramp and apart > 0.0:
+            seconds = ramp.elapsed(channel.ramp, seconds, before.camera, mission)
+        if 0.0 < apart < seconds - _SAME_S:
+            raise BadInput(
+                f"exposures {before.exposure_id} and {now.exposure_id} of detector {detector}: the second begins "
+                f"{apart:.1f} s after the first, which takes {seconds:.1f} s"
+            )
 
 
 def _remembers(exposure: ExposureRow) -> bool:
@@ -127,9 +154,13 @@ def remembered(aim: Aim, earlier: Sequence[Earlier | EarlierSky], variant: Varia
 
 
 def _charge(before: Earlier | EarlierSky, variant: Variant, older: float) -> Frame:
-    """Expected electrons of its light: sources that leave something, sky and lamp [ny, nx]; or of a mean pixel []."""
+    """Expected electrons of its light: sources that leave something, sky and lamp [ny, nx]; or of a mean pixel [].
+
+    Counted over its exposure time, as its signal is, of which the traps' parameters are told: what comes before a
+    ramp's first group fills traps, too, and is not counted apart.
+    """
     if isinstance(before, EarlierSky):
-        shines = before.exposure.image_type in SKY_TYPES
+        shines = before.exposure.image_type not in _STARLESS
         return np.asarray(shines * before.exposure.sky * before.exposure.exposure_time_s)
     aim, scene = before.aim, scene_of.of_aim(before.aim, variant)
     frame = _sources(aim, before.rows, scene, older)

@@ -17,7 +17,7 @@ from jobs.render.camera.lamps import LAMPS
 from jobs.render.effects.light import calibration_lamp
 from jobs.render.planning import unrendered
 from jobs.render.planning.observing_sequence import FILTERS, RED, offsets
-from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
+from jobs.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time
 from jobs.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
 from jobs.request.observations import Observation
 from lake_schema.arrays import Float
@@ -59,7 +59,8 @@ def exposures(
         )
         for frame in _frames(first, block, mission, seed):
             yield replace(frame, mjd=now)
-            now += (frame.exposure_time_s + _PAUSE) / _DAY_S
+            # A ramp is read out meanwhile, and longer where it has few groups.
+            now += max(frame.exposure_time_s + _PAUSE, elapsed_time(frame, mission)) / _DAY_S
 
 
 def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, seed: int) -> Iterator[Exposure]:

@@ -16,6 +16,7 @@ import numpy as np
 from jobs import rng
 from jobs.render.camera import pointing
 from jobs.render.camera.lamps import LEDS
+from jobs.render.effects.charge import ramp
 from jobs.render.planning.planned_exposures import Exposure, exposure_time
 from jobs.render.planning.reference_survey import Field
 from jobs.request.observations import Observation
@@ -73,11 +74,15 @@ def sequence(
 
 def _dither_time(mission: MissionConfiguration) -> float:
     """Seconds from the start of a dither to the end of its last filter."""
-    spectrum, photometry = (
-        mission.value(f"nisp.commanded_time_{kind}", "s") for kind in ("spectroscopic", "photometric")
-    )
+    spectrum, photometry = (_commanded(kind, mission) for kind in ("spectroscopic", "photometric"))
     settle, to_filter, wheel = _moves(mission)
     return settle + spectrum + to_filter + len(FILTERS) * photometry + (len(FILTERS) - 1) * wheel
+
+
+def _commanded(kind: str, mission: MissionConfiguration) -> float:
+    """Seconds that NISP is commanded to take; more where its ramps take longer."""
+    seconds = exposure_time("NISP-S" if kind == "spectroscopic" else "NISP-P", "nisp", "", mission)
+    return max(mission.value(f"nisp.commanded_time_{kind}", "s"), ramp.elapsed(kind, seconds, "nisp", mission))
 
 
 def _moves(mission: MissionConfiguration) -> tuple[float, float, float]:
@@ -110,8 +115,8 @@ class _At:
             yield self._one("VIS", "euclid_vis", settle)
         if "NISP-S" in block.channels:
             yield self._spectrum(settle)
-        begin = settle + mission.value("nisp.commanded_time_spectroscopic", "s") + to_filter
-        step = mission.value("nisp.commanded_time_photometric", "s") + wheel
+        begin = settle + _commanded("spectroscopic", mission) + to_filter
+        step = _commanded("photometric", mission) + wheel
         for i, band in enumerate(FILTERS):
             if "NISP-P" in block.channels and band in bands:
                 yield self._one("NISP-P", band, begin + i * step)

@@ -21,6 +21,7 @@ from jobs.render.channels import image_types
 from jobs.render.effects.charge import ramp
 from jobs.render.planning import unrendered
 from jobs.render.sky.diffuse_light import SkyBand, sky_rate
+from jobs.request.observations import Observation
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -89,6 +90,13 @@ def exposure_time(channel: str, camera: str, band: str, mission: MissionConfigur
     return mission.value(own if own in mission else f"{image_types.section(camera)}.exposure_time", "s")
 
 
+def elapsed_time(exposure: Exposure, mission: MissionConfiguration) -> float:
+    """Seconds from the start of an exposure until its detectors may be exposed again: of a ramp, to its last read."""
+    if exposure.camera != "nisp":
+        return exposure.exposure_time_s
+    return ramp.elapsed(_ramp_of(exposure.channel), exposure.exposure_time_s, exposure.camera, mission)
+
+
 def check_ramp(channel: str, camera: str, seconds: float, mission: MissionConfiguration, where: str = "") -> None:
     """Refuse an exposure time that the camera cannot be read up a ramp in.
 
@@ -100,6 +108,18 @@ def check_ramp(channel: str, camera: str, seconds: float, mission: MissionConfig
             ramp.mode_for(_ramp_of(channel), seconds, camera, mission)
         except BadInput as error:
             raise BadInput(f"{where}: {error}" if where else str(error)) from None
+
+
+def check_macc(block: Observation, mission: MissionConfiguration) -> None:
+    """Refuse an observation that asks for a ramp, and for an exposure time that this ramp does not take.
+
+    block : of the request;  mission : with the block's ramp
+    """
+    if not block.macc or block.exposure_time_s is None:
+        return
+    takes = exposure_time("NISP-P", "nisp", "", mission)
+    if abs(block.exposure_time_s / takes - 1.0) > ramp.FRAME_TOLERANCE:
+        raise BadInput(f"macc = {[*block.macc]} takes {takes:.4g} s, not exposure_time_s = {block.exposure_time_s:g}")
 
 
 def _ramp_of(channel: str) -> str:

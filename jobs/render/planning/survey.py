@@ -19,7 +19,14 @@ from jobs.render.camera.pointing import boresight_for
 from jobs.render.channels.image_types import SKY_TYPES
 from jobs.render.planning import calibration_frames, ground_surveys, reference_survey, unrendered, variants
 from jobs.render.planning.observing_sequence import sequence
-from jobs.render.planning.planned_exposures import Exposure, bands_of, check_ramp, exposure_time
+from jobs.render.planning.planned_exposures import (
+    Exposure,
+    bands_of,
+    check_macc,
+    check_ramp,
+    elapsed_time,
+    exposure_time,
+)
 from jobs.render.sky.solar_aspect import check_aspect
 from jobs.request.area import Area
 from jobs.request.observations import Observation, Pointing
@@ -62,11 +69,14 @@ class _Settled:
 
 
 def _of_variant(request: Request, values: Mapping[str, Any], shared: _Settled) -> Iterator[tuple[Exposure, _Settled]]:
-    """Exposures, each with what it is planned with: of NISP-P, with its block's own ramp."""
+    """Exposures, each with what it is planned with: of NISP, with its block's own ramp.
+
+    Of NISP-S, too, which has another ramp: what it leaves is in the exposures of its own block.
+    """
     for i, pointing in enumerate(request.pointings):
         one = _pointing(pointing, f"pointing[{i}]", request, shared.mission)
         yield from repeat((one, shared), pointing.realisations)
-    # Of calibrations that have no date: NISP's come after those before have ended, and have left nothing in it.
+    # Of blocks that have no date NISP's begin when those before have ended, and what they left is gone.
     free = shared.mission.value("svm.launch", "d")
     for i, block in enumerate(request.observations):
         where, found = f"observation[{i}]", 0
@@ -74,9 +84,9 @@ def _of_variant(request: Request, values: Mapping[str, Any], shared: _Settled) -
         own = _Settled.of({**values, **ramp}, request, shared.mission) if ramp else shared
         for exposure in _block(block, request, own.mission, where, free):
             found += 1
-            if exposure.camera == "nisp" and exposure.image_type in _CALIBRATION:
+            if exposure.camera == "nisp" and (exposure.image_type in _CALIBRATION or _undated(block)):
                 free = max(free, _forgotten(exposure, own.mission))
-            yield from repeat((exposure, own if exposure.channel == "NISP-P" else shared), block.realisations)
+            yield from repeat((exposure, own if exposure.camera == "nisp" else shared), block.realisations)
         if not found:
             raise BadInput(f"{where} asks for no exposure")
 
@@ -123,18 +133,24 @@ def known_detectors(camera: str, names: tuple[str, ...], mission: MissionConfigu
 
 def _forgotten(exposure: Exposure, mission: MissionConfiguration) -> float:
     """MJD from which nothing is seen of what an exposure leaves in NISP's detectors."""
-    return exposure.mjd + exposure.exposure_time_s / 86400.0 + mission.value("nisp.persistence.window", "d")
+    return exposure.mjd + elapsed_time(exposure, mission) / 86400.0 + mission.value("nisp.persistence.window", "d")
+
+
+def _undated(block: Observation) -> bool:
+    """Whether the survey says when a block is observed."""
+    return block.mjd is None and not block.pointings
 
 
 def _block(
     block: Observation, request: Request, mission: MissionConfiguration, where: str, free: float
 ) -> Iterator[Exposure]:
-    """free : MJD from which NISP may calibrate."""
+    """free : MJD from which NISP may observe."""
     area = block.area or request.area
     start = mission.value("svm.launch", "d") if block.mjd is None else block.mjd
-    if block.mjd is None and block.image_type in _CALIBRATION and {"NISP-P", "NISP-S"} & {*block.channels}:
+    if _undated(block) and {"NISP-P", "NISP-S"} & {*block.channels}:
         start = free
     try:
+        check_macc(block, mission)
         found = _exposures(block, area, request.seed, start, mission)
         for exposure in found:
             known_detectors(exposure.camera, exposure.detectors, mission, "detectors")

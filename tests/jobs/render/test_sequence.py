@@ -29,7 +29,7 @@ FIELDS = (57.5, -27.808), (53.117, -27.808)
 SECOND = 1.0 / 86400.0
 # Channel, band, field, seconds before the last.  More than two hours before nothing counts.
 SEQUENCE = [
-    ("NISP-P", "euclid_y", 0, 9000.0), ("NISP-S", "nisp_red", 1, 700.0), ("NISP-P", "euclid_y", 0, 268.0),
+    ("NISP-P", "euclid_y", 0, 9000.0), ("NISP-S", "nisp_red", 1, 900.0), ("NISP-P", "euclid_y", 0, 268.0),
     ("NISP-P", "euclid_j", 1, 134.0), ("NISP-P", "euclid_h", 1, 0.0),
 ]  # fmt: skip
 BEFORE = {1: [], 3: [2], 4: [2, 3], 5: [2, 3, 4]}
@@ -213,7 +213,7 @@ def test_what_is_left_is_what_whole_images_leave(whole, folder):
     version = read.version(whole, "products")
     files = {(row["exposure_id"], row["content"]): version.file(row["path"]) for row in version.rows().to_pylist()}
     now = exposures[5]
-    earlier = render_exposures._earlier(whole, inputs, now, tasks[5], mission)
+    earlier = render_exposures._earlier(whole, inputs, now, tasks[5], mission, 5)
     assert [before.exposure.exposure_id for before in earlier] == BEFORE[5]
     assert [isinstance(before, EarlierSky) for before in earlier] == [True, False, False]
     aim = replace(earlier[-1].aim, exposure=now)

@@ -32,7 +32,7 @@ Where a pixel is not linear in its counts (a cosmic ray, saturation, so much cha
 shows) every frame is drawn.  Full well and non-linearity act on the charge of a frame, before groups are averaged.
 
 apply, EFFECT   expected light -> charge of the groups
-Mode, mode_of, mode_for   how a ramp is read
+Mode, mode_of, mode_for   how a ramp is read;  elapsed : how long it takes
 planes          a frame with room for what a ramp wants to know besides light
 full_signal     what is measured of a pixel that is full at the end
 
@@ -61,6 +61,8 @@ from lake_schema.ramps import MOST_FRAMES
 # Electrons at a ramp's end above which the noise of a pixel is not linear in its charge, and every frame is drawn:
 # there 2 b N, the change of the noise, is 0.4 %.
 LINEAR_BELOW = 3000.0
+# By what part a frame's time may differ from the mission's, so that a ramp takes an exposure time.
+FRAME_TOLERANCE = 0.02
 # Of a number of drops: exposure times that differ by less are the same.
 _SAME = 1e-6
 # Groups, reads or drops of a ramp.
@@ -134,7 +136,8 @@ def mode_for(kind: str, seconds: float, section: str, mission: MissionConfigurat
 
     kind    : "photometric" or "spectroscopic";  seconds : exposure time
     section : of the camera, "nisp";  mission : the mission database
-    Errors  : BadInput where the reads alone take longer, or the frames are too many
+    Errors  : BadInput where the reads alone take longer, the frames are too many, or no number of drops takes about as
+              long
     """
     key = f"{section}.macc.{kind}"
     groups, reads, drops = (int(mission.value(f"{key}.{part}")) for part in ("groups", "reads", "drops"))
@@ -147,7 +150,19 @@ def mode_for(kind: str, seconds: float, section: str, mission: MissionConfigurat
         raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {least:.4g} s without any drops")
     if round(wanted) > _MOST:
         raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {wanted:.4g} drops, more than {_MOST}")
-    return Mode(groups, reads, round(wanted))
+    found = Mode(groups, reads, round(wanted))
+    if abs(seconds / (time * found.integrated) - 1.0) > FRAME_TOLERANCE:
+        raise BadInput(
+            f"exposure time {seconds:g} s: {found} takes {time * found.integrated:.4g} s, which differs by more than "
+            f"{FRAME_TOLERANCE:.0%}"
+        )
+    return found
+
+
+def elapsed(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> float:
+    """Seconds from the reset to the last read of an exposure of a length; arguments and errors as of `mode_for`."""
+    mode = mode_for(kind, seconds, section, mission)
+    return seconds * mode.frames / mode.integrated
 
 
 def frame_time(scene: Scene) -> float:

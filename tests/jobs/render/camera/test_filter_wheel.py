@@ -69,10 +69,17 @@ def test_the_header_knows_it():
     assert 1e-4 * np.hypot(*mean) < np.abs(first - mean).max() < 0.03 * np.hypot(*mean)
 
 
+def test_another_seed_is_another_tilt():
+    row = exposure(camera="nisp", channel="NISP-P", band="euclid_y")
+    first, again, other = (Aim.of(row, NISP[3], seed=seed).wcs.wcs.crpix for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 0.01
+
+
 def test_the_error_is_the_mission_s():
     tilts = []
     for number in range(400):
-        seen = filter_wheel.tilted(NISP[5], str(number))
+        seen = filter_wheel.tilted(NISP[5], str(number), 1)
         tilts.append([(NISP[5].x - seen.x) / NISP[5].wheel.shift, (NISP[5].y - seen.y) / NISP[5].wheel.shift])
     rms = np.sqrt((np.array(tilts) ** 2).sum(axis=1).mean())
     assert np.degrees(rms) * 60 == pytest.approx(6.0, rel=0.08)
@@ -81,9 +88,9 @@ def test_the_error_is_the_mission_s():
 
 def test_other_cameras_and_a_still_wheel_change_nothing():
     still = detectors("nisp", resolve(overrides={"nisp.filter_wheel_error": (0.0, "arcmin")}))[3]
-    assert filter_wheel.tilted(still, "1") is still
+    assert filter_wheel.tilted(still, "1", 1) is still
     vis = detectors("vis", MISSION)[3]
-    assert filter_wheel.tilted(vis, "1") is vis
+    assert filter_wheel.tilted(vis, "1", 1) is vis
     assert filter_wheel.displaced(vis, 1e-3, 0.0) is vis
 
 

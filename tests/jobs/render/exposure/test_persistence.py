@@ -11,7 +11,7 @@ from jobs.render.effects.charge.persistence import Traps
 from jobs.render.exposure import persistence
 from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
 from jobs.render.psf import euclid
-from lake_schema.errors import OutOfRange
+from lake_schema.errors import BadInput, OutOfRange
 from tests.jobs.render import fields, infrared
 from tests.jobs.render.fields import MISSION, small
 
@@ -101,8 +101,11 @@ def test_the_sky_of_a_spectrum_leaves_something():
     found = left(EarlierSky(spectrum))
     np.testing.assert_allclose(found, 1.1, atol=0.15)
     np.testing.assert_array_equal(found, found[0, 0])
-    dark = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red", "image_type": "dark"})
-    assert (left(EarlierSky(dark)) == 0.0).all()
+    for kind, seen in (
+        ("dark", False), ("flat", False), ("standard_star", True), ("planetary_nebula", True), ("deep", True)
+    ):  # fmt: skip
+        other = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red", "image_type": kind})
+        np.testing.assert_array_equal(left(EarlierSky(other)), found * seen)
 
 
 def test_an_image_has_it_and_says_so():
@@ -119,6 +122,24 @@ def test_an_image_has_it_and_says_so():
     noise = found.scene.pixel_noise * 11 * np.sqrt(2.0)
     assert change.sum() == pytest.approx(found.maps["persistence"][about].sum(), abs=5 * noise)
     assert {d.name: d.applied for d in found.decisions}["persistence"]
+
+
+def test_a_detector_has_one_exposure_at_a_time():
+    """A ramp of 87 s takes 110.5 s from its reset; other settings and detectors are others' exposures."""
+    nominal = fields.exposure(**infrared.exposed(DETECTOR))
+
+    def asked(seconds, detector="DET22", **more):
+        rows = [nominal, replace(nominal, exposure_id=2, mjd=infrared.MJD + seconds * SECOND, **more)]
+        tasks = [{"exposure_id": n, "detector": name} for n, name in ((1, "DET22"), (2, detector))]
+        return persistence.earlier_of(tasks, {one.exposure_id: one for one in rows}, lambda settings: MISSION)
+
+    for seconds in (0.0, 110.6, 134.0):
+        asked(seconds)
+    for seconds in (30.0, 100.0, 110.4):
+        with pytest.raises(BadInput, match=rf"exposures 1 and 2 of detector DET22: .* begins {seconds} s .* 110\.5 s"):
+            asked(seconds)
+    asked(30.0, detector="DET23")
+    asked(30.0, settings="{}")
 
 
 def test_which_exposures_count():

@@ -2,6 +2,8 @@
 
 import copy
 from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
@@ -76,6 +78,79 @@ def test_calibrations_without_a_date_follow_one_another():
     assert dated.mjd == 60200.0
     assert darks[0].mjd >= flats[-1].mjd + flats[-1].exposure_time_s / 86400 + hours
     assert sky[0].mjd >= 60200.0 + hours
+
+
+def test_no_two_undated_blocks_expose_nisp_at_once():
+    """Fields and calibrations in whatever order: each begins when what is before it has ended, and is forgotten."""
+    field = {"channels": ["NISP-P"], "ra": 53.117, "dec": -27.808, "dither": "none"}
+    sky = {"channels": ["NISP-P"], "image_type": "self_calibration", "exposures": 2}
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2}
+    hours = MISSION.value("nisp.persistence.window", "d")
+    for blocks in ((field, sky, dark), (dark, field, field, sky)):
+        wanted = from_table(copy.deepcopy({**BASE, "observation": list(blocks)}))
+        ends = -1.0
+        for i in range(len(blocks)):
+            before = survey.exposures(replace(wanted, observations=wanted.observations[:i]), MISSION) if i else []
+            upto = survey.exposures(replace(wanted, observations=wanted.observations[: i + 1]), MISSION)
+            own = [e for e, _ in upto[len(before) :]]
+            assert min(e.mjd for e in own) >= ends
+            ends = max(e.mjd + e.exposure_time_s / 86400 for e in own) + hours
+    vis, *_ = exposures({**field, "channels": ["VIS"]}, {**field, "channels": ["VIS"]})
+    assert vis[0].mjd < MISSION.value("svm.launch", "d") + 365.0
+
+
+def test_exposures_of_long_ramps_follow_one_another():
+    """Ramps that take longer to read than to integrate; spectra's numbers in filters."""
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 3}
+    fields = {"channels": ["NISP-P"], "fields": 1, "dither": "none"}
+    for block, macc in ((dark, [2, 1000, 0]), (fields, [15, 16, 11])):
+        found = [e for e, _ in exposures({**block, "macc": macc})]
+        groups, reads, drops = macc
+        frames = groups * reads + (groups - 1) * drops
+        for before, now in pairwise(found):
+            assert now.mjd - before.mjd > frames * MISSION.value("nisp.frame_time", "s") / 86400 - 1e-9
+
+
+def test_spectra_of_a_block_with_a_ramp_leave_what_they_leave():
+    """The same settings: a block's own exposures are in one another's past."""
+    fields = {"channels": ["NISP-P", "NISP-S"], "fields": 1, "dither": "none", "macc": [4, 16, 5]}
+    found = [e for e, _ in exposures(fields)]
+    assert {e.channel for e in found} == {"NISP-P", "NISP-S"}
+    assert len({e.settings for e in found}) == 1
+    (spectrum,) = (e for e in found if e.channel == "NISP-S")
+    assert spectrum.exposure_time_s == pytest.approx(378 * MISSION.value("nisp.frame_time", "s"))
+
+
+@pytest.mark.parametrize(("macc", "seconds"), [([4, 16, 4], 200.0), ([2, 1, 0], 2.0)])
+def test_a_ramp_and_another_exposure_time_are_refused(macc, seconds):
+    block = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "macc": macc}
+    with pytest.raises(BadInput, match=r"observation\[0\]: macc = .* takes .* s, not exposure_time_s"):
+        exposures({**block, "exposure_time_s": seconds})
+    own = (macc[0] - 1) * (macc[1] + macc[2]) * MISSION.value("nisp.frame_time", "s")
+    ((found, _),) = exposures({**block, "exposure_time_s": round(own, 2)})
+    assert found.exposure_time_s == pytest.approx(own, abs=0.01)
+
+
+def test_an_exposure_time_between_two_ramps_is_refused():
+    """98.1 s are 67.5 frames in three differences of 16 reads: 22 or 23 frames each are 2 % off."""
+    with pytest.raises(BadInput, match=r"exposure time 98\.1 s: MACC\(4,16,6\) takes 95\.96 s, .* more than 2%"):
+        exposures({**FLAT, "exposures": 1, "exposure_time_s": 98.1})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "unit"),
+    [("nisp.frame_time", 0.0, "s"), ("nisp.ipc.side", 0.11, ""), ("nisp.ipc.diagonal", 0.2, "")],
+)
+def test_numbers_that_no_ramp_can_be_drawn_with_are_refused_with_the_request(key, value, unit):
+    overrides = {key: {"value": value, "unit": unit}}
+    with pytest.raises(BadInput, match=key):
+        from_table({**BASE, "pointing": [POINTING], "mission": {"overrides": overrides}})
+
+
+def test_too_much_capacitance_is_refused_with_the_request():
+    overrides = {f"nisp.ipc.{part}": {"value": 0.07, "unit": ""} for part in ("side", "diagonal")}
+    with pytest.raises(BadInput, match=r"nisp\.ipc: 0\.56 of a pixel's charge"):
+        from_table({**BASE, "pointing": [POINTING], "mission": {"overrides": overrides}})
 
 
 def test_a_block_has_its_own_ramp():
