@@ -1,8 +1,8 @@
 """What earlier exposures of a detector left in it: each is drawn again from the catalogue, without noise.
 
 No exposure needs the image of another, so that they are rendered in any order: what is left is a function of the
-planned exposures and the catalogue alone.  Of an earlier exposure are drawn the stars and galaxies that leave something,
-its sky and its lamp; of one that nothing renders, such as a spectroscopic one, its mean sky alone counts.
+planned exposures and the catalogue alone.  Of an earlier exposure are drawn the stars and galaxies that leave
+something, its sky and its lamp; of one that nothing renders, such as a spectroscopic one, its mean sky alone counts.
 Error : cosmic rays, moving bodies and lensed arcs of earlier exposures are not drawn again.  A pixel that a hit gave
         2300 e- lacks 10 e- of what it leaves after 134 s
 

@@ -173,7 +173,7 @@ def changed(lake, folder, sequence):
 def test_products_change_with_exposures_before_them(lake, folder, number):
     """And with no others; those of a spectrum, which nothing renders, are none themselves."""
     channel, band, field, before = SEQUENCE[number - 1]
-    other = [*SEQUENCE[: number - 1], (channel, band, field, before + 30.0), *SEQUENCE[number:]]
+    other = [*SEQUENCE[: number - 1], (channel, band, field, before + 20.0), *SEQUENCE[number:]]
     later = {one for one, some in BEFORE.items() if number in some}
     assert changed(lake, folder, other) == later | ({number} & set(BEFORE))
 
