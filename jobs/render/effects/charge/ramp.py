@@ -160,7 +160,10 @@ def mode_for(kind: str, seconds: float, section: str, mission: MissionConfigurat
 
 
 def elapsed(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> float:
-    """Seconds from the reset to the last read of an exposure of a length; arguments and errors as of `mode_for`."""
+    """Seconds from the reset to the last read of an exposure of a length; errors as of `mode_for`.
+
+    kind, seconds, section, mission : of `mode_for`
+    """
     mode = mode_for(kind, seconds, section, mission)
     return seconds * mode.frames / mode.integrated
 
