@@ -14,7 +14,7 @@ from jobs.render.effects.readout import quadrants, traps
 from jobs.render.effects.scene import Lights, Scene
 from jobs.rng import stream
 from lake_schema.errors import OutOfRange
-from lake_schema.mission.configuration import bounds_of, resolve
+from lake_schema.mission.configuration import bounds_of, is_whole, resolve
 from tests.extremes.test_effects import scenes
 from tests.jobs.render import nominal
 from tests.jobs.render.fields import small
@@ -75,7 +75,8 @@ def test_what_a_configuration_may_hold_every_effect_takes(key, unit):
         one = scene_of(shape, light=1e8, peak=1e5, **{key: (value, unit)})
         assert vis.DRAWN.apply(0.0, 0.0, *vis.DRAWN.parameters(one)) == pytest.approx(1.0)
         assert np.isfinite(through(np.zeros(shape), one)).all()
-    for value in (least - 0.25, most + 0.25):
+    beyond = 1.0 if is_whole(key) else 0.25
+    for value in (least - beyond, most + beyond):
         with pytest.raises(OutOfRange, match=key):
             resolve(overrides={key: (value, unit)})
 
