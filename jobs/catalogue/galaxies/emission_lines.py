@@ -21,6 +21,7 @@ from jobs import sums
 from jobs.catalogue import parameters
 from jobs.catalogue.interpolation import bracket
 from jobs.fluxes import cosmology
+from jobs.keyed import Draws
 from lake_schema.arrays import Bool, Float
 from lake_schema.units import LIGHT_KM_S
 
@@ -117,7 +118,7 @@ def unmatched(z: Float, log_l: Float, shift: Float) -> LineModel:
     )
 
 
-def raw_halpha(law: Halpha, dust: float, log_sfr: Float, ebv: Float, rng: np.random.Generator) -> Float:
+def raw_halpha(law: Halpha, dust: float, log_sfr: Float, ebv: Float, rng: Draws) -> Float:
     """log10 of the observed H alpha luminosity[n], erg/s.
 
     log_sfr : float[n] log10 Msun/yr, Salpeter;  ebv : float[n] mag, internal;  dust : k(H alpha)
@@ -141,7 +142,7 @@ def matched(lines: LineModel, z: Float, log_l: Float) -> Float:
 
 
 def fluxes(
-    lines: LineModel, z: Float, log_mass: Float, log_sfr: Float, red: Bool, ebv: Float, rng: np.random.Generator
+    lines: LineModel, z: Float, log_mass: Float, log_sfr: Float, red: Bool, ebv: Float, rng: Draws
 ) -> dict[str, Float]:
     """Flux[n] of the primary component of each line, erg s-1 cm-2, before magnification and the Milky Way.
 
@@ -203,7 +204,7 @@ def _brighter(law: Pozzetti, z: Float, log_l: Float) -> Float:
     return np.asarray(np.interp(log_l - log_star, log_y, above))
 
 
-def _nitrogen(ratios: Ratios, log_mass: Float, log_sfr: Float, rng: np.random.Generator) -> Float:
+def _nitrogen(ratios: Ratios, log_mass: Float, log_sfr: Float, rng: Draws) -> Float:
     """log10 [N II] 6585 / H alpha, from the metallicity that mass and star formation give."""
     m, s = log_mass - 10.0, log_sfr + ratios.chabrier
     terms = np.stack([np.ones(m.size), m, s, m**2, m * s, s**2])
@@ -212,13 +213,13 @@ def _nitrogen(ratios: Ratios, log_mass: Float, log_sfr: Float, rng: np.random.Ge
     return np.asarray(n2 + ratios.nii_scatter * rng.standard_normal(m.size))
 
 
-def _oxygen(ratios: Ratios, n2: Float, z: Float, rng: np.random.Generator) -> Float:
+def _oxygen(ratios: Ratios, n2: Float, z: Float, rng: Draws) -> Float:
     """log10 [O III] 5008 / H beta on the star-forming sequence."""
     sequence = ratios.oiii_rate / (np.minimum(n2, ratios.oiii_n2) + ratios.oiii_pole) + ratios.oiii_zero
     limited = np.clip(sequence + ratios.oiii_z * z, *ratios.oiii_limits)
     return np.asarray(limited + ratios.oiii_scatter * rng.standard_normal(z.size))
 
 
-def _sulphur(ratios: Ratios, n2: Float, rng: np.random.Generator) -> Float:
+def _sulphur(ratios: Ratios, n2: Float, rng: Draws) -> Float:
     mean = ratios.sii_zero + ratios.sii_rate * (n2 + ratios.sii_pivot)
     return np.asarray(mean + ratios.sii_scatter * rng.standard_normal(n2.size))

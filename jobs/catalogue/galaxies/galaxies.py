@@ -4,7 +4,7 @@ model        every table that the draws need, made once
 draw         members of halos -> colours, dust, spectra -> selection -> masses, shapes, lensing
 halo_table   table `halos` of the same cell
 
-Each step draws from a stream of its own, so that a new column leaves the others' numbers as they are.
+Numbers are keyed by galaxy and step, so that a new column leaves the others as they are, and so does a deeper request.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from jobs.catalogue.halos.luminosity_function import Schechter
 from jobs.catalogue.halos.population import Cells, Members, Population
 from jobs.fluxes import cosmology
 from jobs.fluxes.libraries import templates
+from jobs.keyed import Keyed
 from jobs.request.schema import Universe
-from jobs.rng import stream
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.tables.galaxies import GALAXIES
@@ -160,11 +160,11 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
     """
     seed = universe.population.seed
     members = population.members(cells, cell)
-    drawn = select(universe, *_light(cell, seed, universe, members))
+    drawn = select(universe, *_light(seed, universe, members))
     distance_modulus = cosmology.distance_modulus(drawn.z)
     log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, drawn.colour)
     log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
-    rng = stream(seed, "galaxies.lines", cell)
+    rng = Keyed(members.id[drawn.row], seed, "galaxies.lines")
     columns = {
         **_places(universe.lens, members, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
@@ -174,7 +174,7 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
         "log_sfr": log_sfr,
         **sed_assignment.columns(drawn.sed),
         **emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, drawn.red, drawn.sed.ebv, rng),
-        **_shape_columns(cell, seed, universe.shapes, drawn, log_mass),
+        **_shape_columns(members.id[drawn.row], seed, universe.shapes, drawn, log_mass),
     }
     rows = [GALAXIES.build(columns)]
     rows += [high_redshift.draw(cell, seed, kind, universe.lens, dust) for kind in universe.distant]
@@ -222,16 +222,18 @@ def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
     return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
 
 
-def _light(cell: int, seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Bool, Sed]:
+def _light(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Bool, Sed]:
     """Candidates of a cell: z, M_r, on the red sequence, spectra."""
     m_r = universe.population.halos.matching.magnitude(members.z, members.proxy)
     red, colour = sed_assignment.draw_colour(
-        universe.colours, m_r, members.z, members.kind, stream(seed, "galaxies.colour", cell)
+        universe.colours, m_r, members.z, members.kind, Keyed(members.id, seed, "galaxies.colour")
     )
     if universe.training is not None:
-        rng = stream(seed, "galaxies.nearest", cell)
+        rng = Keyed(members.id, seed, "galaxies.nearest")
         return members.z, m_r, red, nearest_sed.assign(universe.training, colour, m_r, members.z, rng)
-    law, ebv = sed_assignment.draw_dust(universe.colours.dust, m_r, red, colour, stream(seed, "galaxies.dust", cell))
+    law, ebv = sed_assignment.draw_dust(
+        universe.colours.dust, m_r, red, colour, Keyed(members.id, seed, "galaxies.dust")
+    )
     return members.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
 
 
@@ -254,17 +256,17 @@ def _places(lens: Lens, members: Members, row: Int, dust: Float32) -> dict[str, 
 
 
 def _shape_columns(
-    cell: int, seed: int, shapes: Shapes, drawn: Drawn, log_mass: Float
+    source: Int, seed: int, shapes: Shapes, drawn: Drawn, log_mass: Float
 ) -> dict[str, npt.NDArray[np.generic]]:
     scale = cosmology.kpc_per_arcsec(drawn.z)
-    rng = stream(seed, "galaxies.size", cell)
+    rng = Keyed(source, seed, "galaxies.size")
     radius = morphology.half_light_radius(shapes.size, drawn.z, log_mass, drawn.red, scale, rng)
-    rng = stream(seed, "galaxies.bulge", cell)
+    rng = Keyed(source, seed, "galaxies.bulge")
     fraction = morphology.bulge_fraction(shapes.bulge, log_mass, drawn.red, rng)
     sersic = morphology.sersic_index(shapes.bulge, drawn.red, rng)
     ratio = morphology.radius_ratio(shapes.bulge, drawn.red, rng)
     bulge_radius, disc_radius = morphology.component_radii(shapes, radius, fraction, ratio, sersic)
-    rng = stream(seed, "galaxies.shape", cell)
+    rng = Keyed(source, seed, "galaxies.shape")
     disc_ratio = morphology.disc_axis_ratio(shapes, drawn.z.size, rng)
     return {
         "bulge_half_light_radius": bulge_radius,

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.special import gammainc, gammaincinv, ndtr, ndtri
 
 from jobs.catalogue import parameters
+from jobs.keyed import Draws
 from lake_schema.arrays import Bool, Float
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 
@@ -114,7 +115,7 @@ def _log_nodes(limits: tuple[float, float], number: int) -> Float:
 
 
 def half_light_radius(
-    size: Size, z: Float, log_stellar_mass: Float, red: Bool, kpc_per_arcsec: Float, rng: np.random.Generator
+    size: Size, z: Float, log_stellar_mass: Float, red: Bool, kpc_per_arcsec: Float, rng: Draws
 ) -> Float:
     """Half-light semi-major axis[n] of the total light, arcsec.
 
@@ -137,7 +138,7 @@ def _at(size: Size, values: tuple[float, ...], z: Float) -> Float:
     return np.interp(z, size.z, values)
 
 
-def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: np.random.Generator) -> Float:
+def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: Draws) -> Float:
     """Flux of the bulge / total, [n] in [0, 1].
 
     log_stellar_mass : float[n] log10 Msun;  red : bool[n]
@@ -149,7 +150,7 @@ def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: np.ran
     return rng.beta(a, b)
 
 
-def sersic_index(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
+def sersic_index(bulge: Bulge, red: Bool, rng: Draws) -> Float:
     """Sersic index[n] of the bulge.
 
     red : bool[n] on the red sequence
@@ -158,7 +159,7 @@ def sersic_index(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
     return np.clip(10.0 ** (log_n + bulge.sersic_scatter * rng.standard_normal(red.size)), *bulge.sersic_limits)
 
 
-def radius_ratio(bulge: Bulge, red: Bool, rng: np.random.Generator) -> Float:
+def radius_ratio(bulge: Bulge, red: Bool, rng: Draws) -> Float:
     """Half-light radius of the bulge / that of the disc, [n].
 
     red : bool[n] on the red sequence
@@ -216,13 +217,13 @@ def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
     return np.asarray(np.sqrt(low * high))
 
 
-def disc_axis_ratio(model: Shapes, n: int, rng: np.random.Generator) -> Float:
+def disc_axis_ratio(model: Shapes, n: int, rng: Draws) -> Float:
     """Apparent minor / major axis[n] of discs.  Ref: Miller et al. 2013"""
     e = np.interp(rng.random(n), model.disc_cdf, model.disc_e)
     return (1.0 - e) / (1.0 + e)
 
 
-def bulge_axis_ratio(bulge: Bulge, n: int, rng: np.random.Generator) -> Float:
+def bulge_axis_ratio(bulge: Bulge, n: int, rng: Draws) -> Float:
     """Minor / major axis[n] of bulges: a truncated normal, by its inverse."""
     limits = (np.array(bulge.axis_ratio_limits) - bulge.axis_ratio_mean) / bulge.axis_ratio_scatter
     low, high = ndtr(limits)
@@ -244,7 +245,7 @@ def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
     return np.degrees(np.arctan2(across, along))
 
 
-def position_angle(n: int, rng: np.random.Generator) -> Float:
+def position_angle(n: int, rng: Draws) -> Float:
     """Position angle[n] of the major axis, deg in [0, 180)."""
     return 180.0 * rng.random(n)
 

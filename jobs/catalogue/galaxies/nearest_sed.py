@@ -25,6 +25,7 @@ from jobs.catalogue.galaxies import sed_assignment
 from jobs.catalogue.galaxies.band_ratios import Sed
 from jobs.code_keys import code_key
 from jobs.fluxes.libraries import templates
+from jobs.keyed import Draws
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 
@@ -91,7 +92,7 @@ def training(values: dict[str, Array], last: int) -> Training:
     return Training(law, tree, values["sed"], values["ext_law"], values["ebv"], last)
 
 
-def assign(given: Training, colour: Float, m_r: Float, z: Float, rng: np.random.Generator) -> Sed:
+def assign(given: Training, colour: Float, m_r: Float, z: Float, rng: Draws) -> Sed:
     """Spectra[n] of galaxies of 0.1(g - r), M_r and z.
 
     colour, m_r, z : float[n] 0.1(g - r) mag, M_r mag, redshift

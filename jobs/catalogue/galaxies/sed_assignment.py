@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from jobs.catalogue import parameters
 from jobs.catalogue.galaxies.band_ratios import BandRatios, Sed, ebv_weights, offset
+from jobs.keyed import Draws
 from lake_schema.arrays import Bool, Float, Int
 
 _FILE = "sed_assignment.toml"
@@ -110,7 +111,7 @@ def red_fraction(law: RedFraction, m_r: Float, z: Float, kind: Int) -> Float:
     return np.asarray(np.minimum(evolved * 10.0 ** (-law.dwarf_rate * np.maximum(m_r - law.dwarf, 0.0)), law.highest))
 
 
-def draw_colour(model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.Generator) -> tuple[Bool, Float]:
+def draw_colour(model: Colours, m_r: Float, z: Float, kind: Int, rng: Draws) -> tuple[Bool, Float]:
     """(on the red sequence[n], 0.1(g - r)[n]).
 
     m_r, z : float[n] M_r mag, redshift;  kind : int[n] 0 central, 1 satellite
@@ -127,7 +128,7 @@ def draw_colour(model: Colours, m_r: Float, z: Float, kind: Int, rng: np.random.
     return red, np.clip(mean + scatter * rng.standard_normal(m_r.size), *law.limits)
 
 
-def draw_dust(dust: Dust, m_r: Float, red: Bool, colour: Float, rng: np.random.Generator) -> tuple[Int, Float]:
+def draw_dust(dust: Dust, m_r: Float, red: Bool, colour: Float, rng: Draws) -> tuple[Int, Float]:
     """(extinction law[n], E(B-V)[n] mag); red galaxies have no dust.
 
     m_r : float[n] mag;  red : bool[n] on the red sequence;  colour : float[n] 0.1(g - r) mag
