@@ -96,6 +96,7 @@ class Table:
     key   : columns that together identify a row
     order : HEALPix order of its files (nested), None for a table that is not on the sky
     finest : the highest order of its files, where they differ in order so as to hold about as many rows
+    former : columns of earlier versions, which are passed over where a lake has them
     """
 
     name: str
@@ -105,6 +106,7 @@ class Table:
     key: tuple[str, ...] = ("id",)
     order: int | None = None
     finest: int | None = None
+    former: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         names = [column.name for column in self.columns]

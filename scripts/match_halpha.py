@@ -43,7 +43,7 @@ def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
     found = []
     for cell in range(0, cells * 5000, 5000):
         hosts = halos.draw(flat, SEED, GENERATION_ORDER, cell)
-        own = satellites.draw(flat, universe.population.masses, hosts, stream(SEED, "satellites", cell))
+        own = satellites.draw(flat, universe.population.masses, hosts, SEED)
         chi, proxy = np.concatenate([hosts.chi, own.chi]), np.concatenate([hosts.proxy, own.proxy])
         kind = np.repeat([population.CENTRAL, population.SATELLITE], [hosts.chi.size, own.chi.size])
         z = flat.distances.redshift(chi)

@@ -1,4 +1,4 @@
-"""Build tables `halos`, `galaxies` and `quarantine` of a request.
+"""Build tables `halos`, `halo_limits`, `galaxies` and `quarantine` of a request.
 
 spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQUEST
 """
@@ -34,7 +34,7 @@ from lake_schema.store import layout, parquet, read
 from lake_schema.store.plan import Json, Output, Part, Plan
 from lake_schema.store.provenance import code_version
 from lake_schema.tables.galaxies import GALAXIES
-from lake_schema.tables.halos import HALOS
+from lake_schema.tables.halos import HALO_LIMITS, HALOS
 from lake_schema.tables.quarantine import QUARANTINE
 
 _HALO_FACTS = ("galaxy_limit", "z_max", "box_cells")
@@ -72,14 +72,19 @@ def _drawn(lake: Path, request: Request) -> list[Step]:
     theirs |= {"training": _about(own.training, mapping.training(dict(own.training.columns)))} if own.training else {}
     facts = {"seed": request.seed, **universe, **theirs, **dust_map.facts(own.dust), "code": code_version()}
     parts = cells.parts(request.area)
-    halos = Plan(HALOS, {key: facts[key] for key in ("seed", *_HALO_FACTS, "galaxy_band", *theirs, "code")}, parts)
+    of_halos = {key: facts[key] for key in ("seed", *_HALO_FACTS, "galaxy_band", *theirs, "code")}
+    halos, limits = Plan(HALOS, of_halos, parts), Plan(HALO_LIMITS, of_halos, (Part("all.parquet", {}),))
     # Up to this multipole the lensing has the power of linear theory within 10 %.
     reach = {"lensing_l_max": facts["lensing_nside"]} if request.universe.lensing is None else {}
     plan = Plan(GALAXIES, {**facts, **reach}, parts)
     if not layout.version(lake, GALAXIES.name, plan.key).exists():
         # The box and its lensing are made here, once, and only mapped by the workers.
         _universe(facts, own)
-    return [Step(halos, partial(halo_work, own=own)), Step(plan, partial(work, own=own))]
+    return [
+        Step(halos, partial(halo_work, own=own)),
+        Step(limits, partial(limit_work, own=own), on_driver=True),
+        Step(plan, partial(work, own=own)),
+    ]
 
 
 def halo_work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
@@ -88,6 +93,13 @@ def halo_work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
     found = galaxies.halos_and_galaxies(facts["seed"], _wanted(facts, _HALO_FACTS), light_cone, training)
     drawn = population.Cells(found)
     return Output(cells.rows(facts, HALOS, lambda cell: galaxies.halo_table(cell, found, drawn)))
+
+
+def limit_work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
+    """From which mass on all halos are listed."""
+    light_cone, training = _external(facts, own)
+    found = galaxies.halos_and_galaxies(facts["seed"], _wanted(facts, _HALO_FACTS), light_cone, training)
+    return Output(galaxies.halo_limits(found))
 
 
 def work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:

@@ -50,8 +50,8 @@ class Universe:
     """How deep and how fine.
 
     galaxy_limit, galaxy_band : faintest magnitude (AB, before the Milky Way's dust and intergalactic hydrogen), in
-                               which of the embedded passbands; another limit draws its cells anew: a shallow request
-                               has as many bright galaxies as a deep one has, not the same
+                               which of the embedded passbands; a shallower or nearer request has the same galaxies
+                               as a deeper one has to its limit
     star_limit               : H (Vega, as observed);  z_max : highest redshift
     box_cells                : cells of 4 Mpc/h a side of the box of matter
     lensing_nside            : HEALPix resolution of the lensing maps

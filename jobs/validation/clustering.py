@@ -27,7 +27,6 @@ from jobs.catalogue.halos.population import Population
 from jobs.catalogue.matter import convergence, density_box, lightcone
 from jobs.catalogue.matter.density_box import Box
 from jobs.fluxes import cosmology
-from jobs.rng import stream
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Int
 
@@ -130,8 +129,7 @@ def tracers(universe: Population, order: int, block: int) -> Tracers:
         first = block << 2 * (level - order) if level >= order else block >> 2 * (order - level)
         for cell in range(first, first + many):
             hosts = halos.draw(universe.halos, universe.seed, level, cell)
-            rng = stream(universe.seed, "satellites", level, cell)
-            found = satellites.draw(universe.halos, universe.masses, hosts, rng)
+            found = satellites.draw(universe.halos, universe.masses, hosts, universe.seed)
             ra, dec = sky.positions(hosts.index)
             z = universe.halos.distances.redshift(hosts.chi)
             x = universe.masses.at(universe.masses.bias, z, hosts.log_mass) * density_box.growth(z)

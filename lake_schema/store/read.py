@@ -332,7 +332,7 @@ def _difference(stored: pa.Schema, table: Table, was: int) -> str:
     if not stored.names:
         return ""
     for name in stored.names:
-        if name not in table.names:
+        if name not in table.names and not (name in table.former and was < table.version):
             return f"column {name} is not declared"
     for column in table.columns:
         if column.name not in stored.names:

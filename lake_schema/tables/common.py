@@ -20,7 +20,7 @@ ID = Column(
     "int64",
     ucd="meta.id;meta.main",
     lo=0,
-    doc="source identifier: kind, order-5 cell, parent halo and member (lake_schema.ids)",
+    doc="source identifier: kind, order-8 cell, parent halo and member (lake_schema.ids)",
 )
 RA = Column("ra", "float64", "deg", "pos.eq.ra;meta.main", "right ascension, ICRS, true (unlensed)", 0.0, 360.0)
 DEC = Column("dec", "float64", "deg", "pos.eq.dec;meta.main", "declination, ICRS, true (unlensed)", -90.0, 90.0)

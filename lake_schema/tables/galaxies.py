@@ -52,7 +52,7 @@ GALAXIES = Table(
             "halo_id",
             "int64",
             ucd="meta.id.parent",
-            doc="parent halo: the id with its kind and member bits cleared",
+            doc="parent halo: its row in table halos, and the id of its central galaxy",
             lo=0,
         ),
         # 2 positions

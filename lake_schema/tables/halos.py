@@ -1,4 +1,4 @@
-"""Table `halos`: the dark-matter halos that the galaxies of the True Universe live in."""
+"""Tables `halos`, the dark-matter halos that the galaxies of the True Universe live in, and `halo_limits`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from lake_schema.tables.common import DEC, HEALPIX_29, RA, id_of_kinds
 
 HALOS = Table(
     "halos",
-    1,
+    2,
     (
         id_of_kinds(0, 0),
         RA,
@@ -19,14 +19,29 @@ HALOS = Table(
         Column(
             "concentration", "float32", "", "src.morph.param", "R_200m / scale radius of the NFW profile", 0.5, 100.0
         ),
+    ),
+    "Halos of the True Universe; a galaxy's halo_id is the id of a row here, also the id of its central galaxy. "
+    "From which mass on all are listed: table halo_limits.",
+    order=5,
+    former=("complete",),
+)
+
+HALO_LIMITS = Table(
+    "halo_limits",
+    1,
+    (
+        Column("z_true", "float64", "", "src.redshift", "cosmological redshift", 0.0, 15.0),
         Column(
-            "complete",
-            "bool",
+            "log_mass",
+            "float64",
             "",
-            "meta.code",
-            "above the mass limit of its redshift: all are listed there, below it only what may be seen",
+            "phys.mass;stat.min",
+            "log10 of M_200m / (Msun/h) from which on table halos lists all of this redshift; of lighter ones it lists "
+            "those whose central may be seen",
+            5.0,
+            17.0,
         ),
     ),
-    "Halos of the True Universe; a galaxy's halo_id is the id of a row here, also the id of its central galaxy.",
-    order=5,
+    "Completeness of table halos: the mass, against redshift, that the request's faintest galaxies need.",
+    key=("z_true",),
 )

@@ -27,6 +27,43 @@ def test_an_id_is_positive_and_carries_kind_and_halo(parts):
     assert ids.halo_of(one) == ids.halo_of(ids.source_id(0, cell, number, 0)) == ids.source_id(0, cell, number, 0)
 
 
+DRAWN = st.tuples(
+    st.integers(0, 12 * 4**8 - 1), st.integers(0, ids.BLOCKS - 1), st.integers(0, 7), st.floats(8.0, 16.0),
+    st.integers(0, 127),
+)  # fmt: skip
+
+
+@given(DRAWN, DRAWN)
+def test_members_of_drawn_halos_have_their_own_ids(a, b):
+    made = []
+    for cell, block, number, mass, member in (a, b):
+        bits = ids.member_bits(mass)
+        halo = ids.drawn_halo_id(cell, np.array([block]), np.array([number]), bits)
+        one = ids.satellite_id(halo, np.array([member]), bits)
+        assert 0 <= halo[0] < 1 << 60 <= one[0]
+        assert ids.kind_of(one) == 1
+        assert one[0] >> ids.BLOCK_BITS == 1 << 20 | cell
+        # None of those that are numbered in their cells beyond the blocks.
+        assert halo[0] & (1 << ids.BLOCK_BITS) - 1 < ids.FIRST_NUMBER << ids.MEMBER_BITS
+        made.append((int(one[0]), int(bits)))
+    if made[0][1] == made[1][1]:
+        same = all(a[i] == b[i] for i in (0, 1, 2, 4))
+        assert (made[0][0] == made[1][0]) == same
+
+
+@pytest.mark.parametrize(
+    ("mass", "most", "members"), [(8.5, 65535, 127), (11.5, 8191, 1023), (13.5, 63, 131071), (15.0, 7, 1048575)]
+)
+def test_an_overflow_of_a_block_is_refused(mass, most, members):
+    bits, block = ids.member_bits(np.array([mass])), np.array([3])
+    halo = ids.drawn_halo_id(0, block, np.array([most]), bits)
+    assert ids.satellite_id(halo, np.array([members]), bits) > 0
+    with pytest.raises(BadInput, match=f"number in its block {most + 1} is not in 0 .. {most}"):
+        ids.drawn_halo_id(0, block, np.array([most + 1]), bits)
+    with pytest.raises(BadInput, match=f"member {members + 1} is not in 0 .. {members}"):
+        ids.satellite_id(halo, np.array([members + 1]), bits)
+
+
 @pytest.mark.parametrize(
     ("args", "word"),
     [

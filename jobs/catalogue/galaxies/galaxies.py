@@ -2,7 +2,7 @@
 
 model        every table that the draws need, made once
 draw         members of halos -> colours, dust, spectra -> selection -> masses, shapes, lensing
-halo_table   table `halos` of the same cell
+halo_table   table `halos` of the same cell;  halo_limits : from which mass on all are in it
 
 Numbers are keyed by galaxy and step, so that a new column leaves the others as they are, and so does a deeper request.
 """
@@ -44,7 +44,7 @@ from jobs.request.schema import Universe
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.tables.galaxies import GALAXIES
-from lake_schema.tables.halos import HALOS
+from lake_schema.tables.halos import HALO_LIMITS, HALOS
 
 # Candidates are drawn this much deeper than the brightest SED needs, mag: more than the tables' errors.
 _MARGIN = 0.02
@@ -95,13 +95,13 @@ def model(
     """The embedded universe of a seed: its galaxies brighter than a limit in a band, and with z < z_max.
 
     light_cone, training : external tables of halos and of observed galaxies, in place of ours
-    The matter is the same to any limit, halos and galaxies are drawn anew for each: those that are brighter than a
-    shallow limit are as many in a deeper universe, not the same.
+    Halos and galaxies of a nearer or shallower universe are those of a deeper one, bit by bit: whatever is drawn from
+    is the same for all, and numbers are keyed by what is drawn.
     1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
     seed                   : of the request;  wanted : section `universe` of the request
     """
     library, colours = templates.galaxy_library(), sed_assignment.colours_model()
-    selection, z_max = _selection(wanted, training), wanted.z_max
+    selection = _selection(wanted, training)
     dustiest = float(selection.ebv[-1])
     found = halos_and_galaxies(seed, wanted, light_cone, training)
     distant = high_redshift.model(wanted.high_redshift_boost, wanted.quasar_boost)
@@ -113,7 +113,7 @@ def model(
         luminosities=luminosity_function.schechter(),
         colours=colours,
         selection=selection,
-        reference=band_ratios.load(library, band_ratios.REFERENCE_BAND, z_max, dustiest),
+        reference=band_ratios.load(library, band_ratios.REFERENCE_BAND, matching.Z_LAST, dustiest),
         colour=band_ratios.load(library, "sdss_g01", 0.0, dustiest),
         shapes=morphology.shapes(),
         masses=stellar_mass.mass_to_light(),
@@ -149,7 +149,7 @@ def _lens(found: Population, wanted: Universe, far: bool) -> Lens:
 
 def _selection(wanted: Universe, training: Training | None) -> BandRatios:
     dustiest = max(sed_assignment.colours_model().dust.highest, training.dustiest if training else 0.0)
-    return band_ratios.load(templates.galaxy_library(), wanted.galaxy_band, wanted.z_max, dustiest)
+    return band_ratios.load(templates.galaxy_library(), wanted.galaxy_band, matching.Z_LAST, dustiest)
 
 
 def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Table:
@@ -183,12 +183,12 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
 
 def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
     """Table `halos` of one order-8 cell, sorted by _healpix_29."""
-    hosts, own_ids = population.halos_of(cells, cell)
+    hosts = population.halos_of(cells, cell)
     ra, dec = sky.positions(hosts.index)
     z = universe.halos.distances.redshift(hosts.chi)
     return HALOS.build(
         {
-            "id": own_ids,
+            "id": hosts.id,
             "ra": ra,
             "dec": dec,
             "_healpix_29": hosts.index,
@@ -196,7 +196,18 @@ def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
             "z_obs": population.observed_redshift(z, hosts.velocity),
             "log_mass": hosts.log_mass,
             "concentration": universe.masses.at(universe.masses.concentration, z, hosts.log_mass),
-            "complete": hosts.log_mass >= universe.halos.mass_limit(hosts.chi),
+        }
+    )
+
+
+def halo_limits(universe: Population) -> pa.Table:
+    """Table `halo_limits`, from the nearest halos to the request's end."""
+    chi = universe.halos.line.middle
+    chi = np.append(chi[chi < universe.halos.far], universe.halos.far)
+    return HALO_LIMITS.build(
+        {
+            "z_true": universe.halos.distances.redshift(chi),
+            "log_mass": universe.halos.mass_limit(chi) + universe.halos.host_offset,
         }
     )
 

@@ -39,8 +39,6 @@ from lake_schema.tables.galaxies import GALAXIES
 
 _FILE = "high_redshift.toml"
 _STREAM = {HIGH_REDSHIFT: "high_redshift", QUASAR: "quasars"}
-# Running numbers that no halo has.
-_FIRST_NUMBER = (1 << 21) + (1 << 20) + (1 << 19)
 _Z_STEP, _M_STEP, _M_BRIGHTEST = 0.02, 0.02, -32.0
 
 
@@ -84,7 +82,7 @@ def draw(cell: int, seed: int, kind: Kind, lens: Lens, dust: Float32) -> pa.Tabl
     z = kind.z[row] + _Z_STEP * rng.random(n)
     m = kind.m[column] + _M_STEP * rng.random(n)
     index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, n, rng)
-    source = ids.source_id(np.full(n, kind.code), cell, _FIRST_NUMBER + np.arange(n))
+    source = ids.source_id(np.full(n, kind.code), cell, ids.FIRST_NUMBER + np.arange(n))
     zeros = np.zeros(n)
     columns = {
         "id": source,

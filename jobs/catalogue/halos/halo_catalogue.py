@@ -20,14 +20,15 @@ from jobs.cache import cached_arrays, content_key
 from jobs.catalogue.external import mapping
 from jobs.catalogue.external.mapping import Columns
 from jobs.catalogue.halos import halos
-from jobs.catalogue.halos.halos import FIRST_NUMBER, HaloModel, Halos
+from jobs.catalogue.halos.halos import HaloModel, Halos
 from jobs.catalogue.halos.matching import Masses
 from jobs.code_keys import code_key
 from jobs.fluxes import cosmology
-from jobs.rng import stream
-from lake_schema import sky
+from jobs.keyed import Keyed
+from lake_schema import ids, sky
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
+from lake_schema.ids import GENERATION_ORDER
 from lake_schema.units import LIGHT_KM_S
 
 
@@ -65,15 +66,16 @@ def draw(model: HaloModel, masses: Masses, cone: LightCone, seed: int, order: in
     rows = slice(*np.searchsorted(cone.index, sky.cell_range(order, cell)))
     index, velocity = cone.index[rows], cone.velocity[rows]
     chi, log_mass = cone.chi[rows], cone.log_mass[rows]
-    proxy = log_mass + model.matching.occupation.scatter * stream(seed, "halos", order, cell).standard_normal(chi.size)
+    # Numbered in their generation cells as the file has them, whatever is kept.
+    home = index >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    own = ids.source_id(0, home, np.arange(home.size) - np.searchsorted(home, home))
+    proxy = log_mass + model.matching.occupation.scatter * Keyed(own, seed, "halos").standard_normal()
+    kept = halos.levels(masses.radius(log_mass) / np.maximum(chi, 1e-3)) == order
     limit = model.mass_limit(chi)
-    kept = (halos.levels(masses.radius(log_mass) / np.maximum(chi, 1e-3)) == order) & (
-        (log_mass >= limit) | (proxy >= limit)
-    )
-    kept &= (chi > model.line.edge[0]) & (chi < model.line.edge[-1])
-    row = np.flatnonzero(kept)
-    number = FIRST_NUMBER[order] + np.arange(row.size)
-    return Halos(index[row], chi[row], log_mass[row], proxy[row], velocity[row], number)
+    kept &= (log_mass >= limit + model.host_offset) | (proxy >= limit)
+    kept &= (chi > model.line.edge[0]) & (chi < model.far + model.box.model.cell)
+    found = Halos(index, chi, log_mass, proxy, velocity, own, np.full(own.size, ids.MEMBER_BITS))
+    return found.part(np.flatnonzero(kept))
 
 
 def _read(found: Sequence[Path], columns: Columns) -> dict[str, Array]:

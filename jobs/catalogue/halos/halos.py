@@ -2,11 +2,14 @@
 
 model       every table that the draws need
 draw        halos of one cell of one level
-limits      the mass from which halos are drawn, against redshift
+levels      which cells draw a halo, by the angle that its radius spans
 
 A halo belongs to one of three levels, by the angle that its radius spans.  Halos of a level are drawn by the cells
 of its order, so that the satellites of a halo end in its cell or in one of the cells about it: near and massive
 halos, which span degrees, by wide cells.
+
+Halos are drawn by blocks: a cell, a step along the line of sight and a bin of mass. The number of a block and all that
+its halos are is keyed by the block, so that a deeper or farther request draws the same halos and more of them.
 Ref: Tinker et al. 2008, 2010; the numbers are in halos.toml.
 """
 
@@ -14,42 +17,38 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
+from jobs import keyed
 from jobs.catalogue import parameters
-from jobs.catalogue.halos.matching import Masses, Matching
+from jobs.catalogue.halos import compiled_halos
+from jobs.catalogue.halos.luminosity_function import Volume
+from jobs.catalogue.halos.matching import Z_LAST, Masses, Matching
 from jobs.catalogue.matter import density_box, lightcone
 from jobs.catalogue.matter.density_box import Box
 from jobs.catalogue.matter.lightcone import Distances, Replicas, Steps, Voxels
 from jobs.fluxes import cosmology
-from jobs.rng import stream
-from lake_schema import sky
+from lake_schema import ids, sky
 from lake_schema.arrays import Bool, Float, Int
+from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 
 LEVELS = (GENERATION_ORDER, 5, 2)
 # Any two cells of an order that do not touch are further apart than this, in units of the side of a cell.
 _APART = 0.5
-# Where the running numbers of a level begin (22 bits in all).
-FIRST_NUMBER = {LEVELS[0]: 0, LEVELS[1]: 1 << 21, LEVELS[2]: (1 << 21) + (1 << 20)}
-# Radial steps whose voxels are drawn together: few enough that they share their mass bins.
-_STEPS_A_BLOCK = 64
-# Random bits of a position inside a cell.
-_BITS = 62
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HaloModel:
-    """What halos are drawn from.
+    """What halos are drawn from: tables that are the same for every request, and the limits of one.
 
     line    : radial steps;  log_mass : [bins + 1] edges
     number  : [s, bins] comoving (Mpc/h)^-3 in a bin;  ratio : [s, bins] ln of the density at its edges, low / high
     x       : [s, bins] bias times growth;  field, amplitude : int[s, bins] which smoothed field, and how much of it
-    level   : int[s, bins] order of the cells that a halo of this bin is drawn by, -1 = not drawn
-    limit   : [s] log10 of the proxy mass of the faintest galaxy;  depth, scatter : dex
+    level   : int[s, bins] order of the cells that a halo of this bin is drawn by, -1 = wider than any
+    limit   : [s] log10 of the proxy mass of the faintest galaxy;  far : Mpc/h, where the request ends
     """
 
     box: Box
@@ -64,11 +63,38 @@ class HaloModel:
     amplitude: Float
     level: Int
     limit: Float
+    far: float
     matching: Matching
 
     def mass_limit(self, chi: Float) -> Float:
         """log10 of the proxy mass[n] of the faintest galaxy at chi[n]."""
-        return np.asarray(np.interp(chi, self.line.middle, self.limit))
+        middle, last = self.line.middle, self.limit.size - 2
+        # Steps are all as deep as a cell of the box, but for the first.
+        row = np.clip(((chi - middle[1]) / self.box.model.cell).astype(np.int64) + 1, 1, last)
+        row = np.where(chi < middle[1], 0, row)
+        part = np.clip((chi - middle[row]) / (middle[row + 1] - middle[row]), 0.0, 1.0)
+        return np.asarray(self.limit[row] * (1.0 - part) + self.limit[row + 1] * part)
+
+    @property
+    def host_offset(self) -> float:
+        """Every halo above `mass_limit` plus this, dex, is drawn: it may have a satellite, which may be seen."""
+        return float(np.log10(self.matching.occupation.least)) - self.matching.occupation.depth
+
+    @property
+    def least(self) -> Float:
+        """log10 of the mass[s] below which no halo holds a galaxy of the request; infinite beyond its end.
+
+        Galaxies end at `far`, their hosts one step behind it.
+        """
+        near = np.minimum(
+            self.limit, np.minimum(np.append(self.limit[1:], np.inf), np.insert(self.limit[:-1], 0, np.inf))
+        )
+        visited = self.line.edge[:-1] < self.far + self.box.model.cell
+        return np.where(visited, near - self.matching.occupation.depth, np.inf)
+
+    def drawn(self, least: Float) -> Bool:
+        """Blocks, [s, bins], that hold halos of at least log10 mass least[s] and have a level."""
+        return np.asarray((self.level >= 0) & (self.log_mass[None, 1:] >= least[:, None]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +102,7 @@ class Halos:
     """n halos, sorted by index.
 
     index : order-29 cell;  chi : Mpc/h;  velocity : km/s, receding;  log_mass : log10 M_200m / (Msun/h)
-    proxy : log_mass with the scatter that its central has
+    proxy : log_mass with the scatter that its central has;  id : its identifier;  bits : of a member of it
     """
 
     index: Int
@@ -84,38 +110,36 @@ class Halos:
     log_mass: Float
     proxy: Float
     velocity: Float
-    number: Int
+    id: Int
+    bits: Int
 
     def part(self, keep: npt.NDArray[np.generic]) -> Halos:
         """The halos that are kept: keep : bool or int[m] rows."""
         return Halos(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
-def model(
-    box: Box, near: float, far: float, masses: Masses, matching: Matching, faintest: Callable[[Float], Float]
-) -> HaloModel:
-    """Tables of halos between two redshifts.
+def model(box: Box, space: Volume, masses: Masses, matching: Matching, faintest: Callable[[Float], Float]) -> HaloModel:
+    """Tables of halos, and the limits of a request.
 
     faintest : z[n] -> the faintest M_r[n] that is wanted there
-    box              : of matter;  near, far : redshifts
+    box              : of matter;  space : redshifts of the request
     masses, matching : tables of halos by mass, and of luminosities by mass
     """
-    table = lightcone.distances(far)
-    line = lightcone.steps(box.model.cell, float(cosmology.comoving_distance(near)), float(table.chi[-1]), table)
+    line, table = _line(box.model.cell, float(cosmology.comoving_distance(space.z_min)))
     low = parameters.section("halos.toml", "mass_function")
     bins = round((low["highest"] - low["lowest"]) / low["bin"])
     edge = low["lowest"] + low["bin"] * np.arange(bins + 1)
+    if line.z.size * bins > ids.BLOCKS:
+        raise BadInput(
+            f"{line.z.size} steps of {bins} bins of mass are more blocks than identifiers have: {ids.BLOCKS}"
+        )
     at_edge = np.exp(masses.interpolate(masses.ln_density, line.z, edge))
-    ratio = np.maximum(np.log(at_edge[:, :-1] / at_edge[:, 1:]), 1e-6)
+    # Where nothing is left of the mass function, the logarithm of what is left has no meaning.
+    ratio = np.maximum(np.log(np.maximum(at_edge[:, :-1], 1e-300) / np.maximum(at_edge[:, 1:], 1e-300)), 1e-6)
     number = low["bin"] * (at_edge[:, :-1] - at_edge[:, 1:]) / ratio
-    limit = matching.mass_of(line.z, faintest(line.z))
-    depth = matching.occupation.depth
     x = masses.interpolate(masses.bias, line.z, edge[:-1] + 0.5 * low["bin"])
     x = x * density_box.growth(line.z)[:, None]
     field, amplitude = density_box.biased(box.model, x)
-    wide = masses.radius(edge[1:])[None, :] / line.edge[:-1, None]
-    level = levels(wide)
-    level[edge[None, 1:] < limit[:, None] - depth] = -1
     return HaloModel(
         box=box,
         turned=lightcone.replicas(box, float(line.edge[-1])),
@@ -127,10 +151,18 @@ def model(
         x=x,
         field=field,
         amplitude=amplitude,
-        level=level,
-        limit=limit,
+        level=levels(masses.radius(edge[1:])[None, :] / line.edge[:-1, None]),
+        limit=matching.mass_of(line.z, faintest(line.z)),
+        far=float(cosmology.comoving_distance(space.z_max)),
         matching=matching,
     )
+
+
+def _line(cell: float, near: float) -> tuple[Steps, Distances]:
+    """Steps of `cell` Mpc/h from `near` to a step behind the tables' last redshift, and the distances of these."""
+    last = (np.ceil(float(cosmology.comoving_distance(Z_LAST)) / cell) + 1.0) * cell
+    table = lightcone.distances(float(cosmology.redshift(last)) + 1e-6)
+    return lightcone.steps(cell, near, float(last), table), table
 
 
 def reach(order: int) -> float:
@@ -138,28 +170,37 @@ def reach(order: int) -> float:
     return float(_APART * np.radians(np.sqrt(sky.cell_area(order))))
 
 
-def draw(halos: HaloModel, seed: int, order: int, cell: int) -> Halos:
+def draw(halos: HaloModel, seed: int, order: int, cell: int, least: Float | None = None) -> Halos:
     """Halos of one level in a nested cell of its order, a Poisson sample of the biased field.
 
-    Kept are those above the mass limit, and those below it whose central is scattered above it.
     halos : tables of `model`;  seed : of the request;  order, cell : of the nested cell
+    least : [s] log10 of the mass from which on all halos are wanted, infinite where none are, whatever the limit;
+            None = those that may hold galaxies of the request: a satellite, or a central above `mass_limit`
     """
-    used = halos.level == order
+    used = halos.drawn(halos.least if least is None else least) & (halos.level == order)
     space = lightcone.voxels(halos.box, halos.turned, halos.line, order, cell, used.any(1))
-    rng = stream(seed, "halos", order, cell)
-    voxel, column = _occupied(halos, used, space, rng)
+    voxel, column, place, numbers = _blocks(
+        halos, used, space, int(keyed.keys(np.array([cell]), seed, "halos", order)[0])
+    )
     step = space.step[voxel]
-    log_mass, proxy, kept = _masses(halos, step, column, rng)
-    voxel, step, log_mass, proxy = voxel[kept], step[kept], log_mass[kept], proxy[kept]
-    chi = _between(halos.line.edge[step], halos.line.edge[step + 1], rng.random(step.size))
+    fall, width = halos.ratio[step, column], halos.log_mass[1] - halos.log_mass[0]
+    # Inside a bin dn/dlogM falls exponentially.
+    log_mass = halos.log_mass[column] - width * np.log1p(numbers[:, 1] * np.expm1(-fall)) / fall
+    proxy = log_mass + halos.matching.occupation.scatter * numbers[:, 2]
+    near, far = halos.line.edge[step], halos.line.edge[step + 1]
+    chi = np.cbrt(near**3 + numbers[:, 0] * (far**3 - near**3))
     shift = 2 * (sky.DEEPEST - space.order[voxel])
-    offset = rng.integers(0, 1 << _BITS, step.size, dtype=np.int64) & ((np.int64(1) << shift) - 1)
-    index = (space.cell[voxel] << shift) | offset
+    index = (space.cell[voxel] << shift) | (place >> np.uint64(2)).astype(np.int64) & ((np.int64(1) << shift) - 1)
     factor = density_box.velocity_factor(halos.box.model, halos.line.z)
-    velocity = factor[step] * space.velocity[voxel]
-    row = np.lexsort((chi, index))
-    number = FIRST_NUMBER[order] + np.arange(row.size)
-    return Halos(index[row], chi[row], log_mass[row], proxy[row], velocity[row], number)
+    own, bits = _identifiers(halos, step, column, index)
+    found = Halos(index, chi, log_mass, proxy, factor[step] * space.velocity[voxel], own, bits)
+    if least is None:
+        limit = halos.mass_limit(chi)
+        kept = (log_mass >= limit + halos.host_offset) | (proxy >= limit)
+    else:
+        kept = log_mass >= least[step]
+    row = np.flatnonzero(kept)
+    return found.part(row[np.lexsort((own[row], index[row]))])
 
 
 def levels(wide: Float) -> Int:
@@ -173,51 +214,29 @@ def levels(wide: Float) -> Int:
     return level
 
 
-def _occupied(halos: HaloModel, used: Bool, space: Voxels, rng: np.random.Generator) -> tuple[Int, Int]:
-    """(voxel[n], mass bin[n]) of the halos."""
-    pieces = [_block(halos, used, space, rng, rows) for rows in _blocks(space.step)]
-    none = np.zeros(0, np.int64)
-    return np.concatenate([none, *(p[0] for p in pieces)]), np.concatenate([none, *(p[1] for p in pieces)])
-
-
-def _blocks(step: Int) -> list[slice]:
-    """Rows of voxels, which are sorted by step within an order, in stretches of neighbouring steps."""
-    change = np.flatnonzero(np.diff(step // _STEPS_A_BLOCK)) + 1
-    edges = [0, *change.tolist(), step.size]
-    return [slice(first, last) for first, last in pairwise(edges) if last > first]
-
-
-def _block(halos: HaloModel, used: Bool, space: Voxels, rng: np.random.Generator, rows: slice) -> tuple[Int, Int]:
-    """Halos of some voxels: a Poisson number, spread over voxels and bins by their means."""
-    first, last = int(space.step[rows].min()), int(space.step[rows].max()) + 1
-    columns = np.flatnonzero(used[first:last].any(0))
-    cut = (slice(first, last), slice(columns[0], columns[-1] + 1))
-    amplitude, field = halos.amplitude[cut].astype(np.float32), halos.field[cut]
+def _blocks(halos: HaloModel, used: Bool, space: Voxels, key: int) -> tuple[Int, Int, npt.NDArray[np.uint64], Float]:
+    """(voxel[n], mass bin[n], random bits[n], [n, 3] numbers) of the halos of a cell, block after block."""
+    steps, first = np.unique(space.step, return_index=True)
+    first = np.append(first, space.step.size)
+    amplitude, field = halos.amplitude[steps], halos.field[steps]
+    volume = np.pi / 3.0 * halos.line.volume[steps] / 4.0 ** space.order[first[:-1]]
     with np.errstate(divide="ignore"):
-        ln_number = np.log(np.where(used[cut], halos.number[cut], 0.0)) - 0.5 * amplitude**2 * halos.box.variance[field]
-    ln_number += np.log(np.pi / 3.0 * halos.line.volume[first:last])[:, None]
-    step, box = space.step[rows] - first, space.box[rows]
-    g = np.stack([smooth.ravel()[box] for smooth in halos.box.smoothed], 1)
-    exponent = amplitude[step] * np.take_along_axis(g, field[step], 1)
-    exponent += ln_number.astype(np.float32)[step]
-    exponent -= (np.log(4.0) * space.order[rows]).astype(np.float32)[:, None]
-    total = np.cumsum(np.exp(exponent), dtype=float)
-    where = np.searchsorted(total, np.sort(rng.random(rng.poisson(total[-1]))) * total[-1], side="right")
-    voxel, column = np.divmod(np.minimum(where, total.size - 1), columns[-1] + 1 - columns[0])
-    return voxel + rows.start, column + columns[0]
-
-
-def _masses(halos: HaloModel, step: Int, column: Int, rng: np.random.Generator) -> tuple[Float, Float, Bool]:
-    """Masses inside their bins, where dn/dlogM falls exponentially, and proxies."""
-    fall = halos.ratio[step, column]
-    width = halos.log_mass[1] - halos.log_mass[0]
-    log_mass = halos.log_mass[column] - width * np.log1p(rng.random(step.size) * np.expm1(-fall)) / fall
+        ln_number = np.log(halos.number[steps] * volume[:, None]) - 0.5 * amplitude**2 * halos.box.variance[field]
+    g = np.stack([smooth.ravel()[space.box] for smooth in halos.box.smoothed], 1)
+    tables = (ln_number, amplitude, field, g)
+    number = compiled_halos.counts(np.uint64(key), first, steps, used[steps], *tables)
+    n = int(number.sum())
+    out = (*np.empty((3, n), np.int64), np.empty(n, np.uint64), np.empty((n, 3)))
     occupation = halos.matching.occupation
-    proxy = log_mass + occupation.scatter * rng.standard_normal(step.size)
-    limit = halos.limit[step]
-    return log_mass, proxy, (log_mass >= limit) | (proxy >= limit)
+    cut = occupation.depth / occupation.scatter
+    compiled_halos.halos(np.uint64(key), first, steps, number, *tables, cut, out)
+    return out[0], out[2], out[3], out[4]
 
 
-def _between(near: Float, far: Float, u: Float) -> Float:
-    """Distances uniform in the volume of their steps."""
-    return np.asarray(np.cbrt(near**3 + u * (far**3 - near**3)))
+def _identifiers(halos: HaloModel, step: Int, column: Int, index: Int) -> tuple[Int, Int]:
+    """(identifiers[n], bits of a member[n]) of all halos of some blocks, in the order of their keys."""
+    block, cell = step * (halos.log_mass.size - 1) + column, index >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    number = np.empty(block.size, np.int64)
+    compiled_halos.numbered(block, cell, number)
+    bits = ids.member_bits(halos.log_mass[column])
+    return ids.drawn_halo_id(cell, block, number, bits), bits

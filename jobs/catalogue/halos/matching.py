@@ -152,7 +152,7 @@ def proxies(halos: Masses, occupation: Occupation) -> Float:
     satellites = sums.product(number, satellites_above(halos.log_mass, occupation).T)
     # Of the cumulative count of satellites, what lies in each interval.
     inside = number + np.concatenate([satellites[:, :-1] - satellites[:, 1:], satellites[:, -1:]], axis=1)
-    half = int(np.ceil(6.0 * occupation.scatter / step))
+    half = round(occupation.depth / step)
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * step / occupation.scatter) ** 2)
     kernel /= kernel.sum()
     padded = np.pad(inside, ((0, 0), (half, half)), mode="reflect", reflect_type="odd")

@@ -6,7 +6,7 @@ members     halos and candidate galaxies of one generation cell
 
 Galaxies belong to the cell of their own true position. Halos of the cells about it are drawn as well, and of their
 satellites those that land inside are kept: none is lost and none is there twice. What a cell holds depends on the
-seed and the cell only, never on which other cells are drawn.
+seed and the cell only, never on which other cells are drawn; a nearer or shallower request has fewer of the same.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from jobs.catalogue.halos.luminosity_function import Inverse, Volume
 from jobs.catalogue.halos.matching import Masses
 from jobs.catalogue.halos.satellites import Satellites
 from jobs.catalogue.matter import density_box
-from jobs.rng import stream
 from lake_schema import ids, sky
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.ids import GENERATION_ORDER
@@ -54,7 +53,6 @@ class Members:
     """
 
     halos: Halos
-    halo_ids: Int
     id: Int
     halo_id: Int
     kind: Int
@@ -84,8 +82,7 @@ class Cells:
                 hosts = halos.draw(own.halos, own.seed, order, cell)
             else:
                 hosts = halo_catalogue.draw(own.halos, own.masses, own.light_cone, own.seed, order, cell)
-            rng = stream(own.seed, "satellites", order, cell)
-            self.drawn[place] = hosts, satellites.draw(own.halos, own.masses, hosts, rng)
+            self.drawn[place] = hosts, satellites.draw(own.halos, own.masses, hosts, own.seed)
             if len(self.drawn) > _KEPT:
                 self.drawn.popitem(last=False)
         self.drawn.move_to_end(place)
@@ -114,36 +111,36 @@ def model(
         return np.minimum(faintest(z), space.m_faintest)
 
     box = density_box.load(seed, box_cells)
-    drawn_from = halos.model(box, space.z_min, space.z_max, masses, matched, wanted)
+    drawn_from = halos.model(box, space, masses, matched, wanted)
     return Population(seed, drawn_from, masses, light_cone)
 
 
-def halos_of(cells: Cells, cell: int) -> tuple[Halos, Int]:
-    """(halos that lie in a generation cell, their identifiers), sorted by position.
+def halos_of(cells: Cells, cell: int) -> Halos:
+    """Halos of the request that lie in a generation cell, sorted by position.
 
-    returns : n halos, int64[n]
+    cells : what has been drawn;  cell : nested index at order 8
     """
-    own = []
+    own, far = [], cells.population.halos.far
     for order in LEVELS:
         hosts, _ = cells.at(order, cell >> 2 * (GENERATION_ORDER - order))
-        own.append(hosts.part(hosts.index >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell))
+        own.append(hosts.part((hosts.index >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell) & (hosts.chi < far)))
     together = Halos(*(np.concatenate([getattr(part, name) for part in own]) for name in Halos.__slots__))
-    ordered = together.part(np.lexsort((together.number, together.index)))
-    return ordered, ids.source_id(np.zeros(ordered.number.size), cell, ordered.number)
+    return together.part(np.lexsort((together.id, together.index)))
 
 
 def members(cells: Cells, cell: int) -> Members:
     """Halos and candidate galaxies of one generation cell."""
-    own, own_ids = halos_of(cells, cell)
+    own = halos_of(cells, cell)
+    lit = own.part(own.proxy >= cells.population.halos.mass_limit(own.chi))
     landed = [_landed(cells, order, around, cell) for order in LEVELS for around in _around(order, cell)]
-    ra, dec = sky.positions(own.index)
-    central = (own_ids, own_ids, own.index, ra, dec, own.chi, own.velocity, own.proxy, own.log_mass)
+    ra, dec = sky.positions(lit.index)
+    central = (lit.id, lit.id, lit.index, ra, dec, lit.chi, lit.velocity, lit.proxy, lit.log_mass)
     columns = [np.concatenate(column) for column in zip(central, *landed, strict=True)]
     order = np.lexsort((columns[0], columns[2]))
     source, halo_id, index, ra, dec, chi, velocity, proxy, mass = (column[order] for column in columns)
     z = cells.population.halos.distances.redshift(chi)
     z_obs = observed_redshift(z, velocity)
-    return Members(own, own_ids, source, halo_id, ids.kind_of(source), index, ra, dec, chi, z, z_obs, proxy, mass)
+    return Members(own, source, halo_id, ids.kind_of(source), index, ra, dec, chi, z, z_obs, proxy, mass)
 
 
 def observed_redshift(z: Float, velocity: Float) -> Float:
@@ -162,16 +159,15 @@ def _around(order: int, cell: int) -> list[int]:
 def _landed(cells: Cells, order: int, around: int, cell: int) -> tuple[npt.NDArray[np.generic], ...]:
     """Satellites of one cell's halos that lie in the generation cell: the columns of `members`."""
     hosts, found = cells.at(order, around)
-    edge = cells.population.halos.line.edge
-    found = found.part(_near(found, cell) & (found.chi > edge[0]) & (found.chi < edge[-1]))
+    model = cells.population.halos
+    found = found.part(_near(found, cell) & (found.chi > model.line.edge[0]) & (found.chi < model.far))
     index = sky.healpix_29(found.ra, found.dec)
     inside = index >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell
     found, index = found.part(inside), index[inside]
-    home = hosts.index[found.host] >> 2 * (sky.DEEPEST - GENERATION_ORDER)
-    number = hosts.number[found.host]
-    source = ids.source_id(np.full(home.size, SATELLITE), home, number, found.member)
+    halo = hosts.id[found.host]
+    source = ids.satellite_id(halo, found.member, hosts.bits[found.host])
     mass = hosts.log_mass[found.host]
-    return source, ids.halo_of(source), index, found.ra, found.dec, found.chi, found.velocity, found.proxy, mass
+    return source, halo, index, found.ra, found.dec, found.chi, found.velocity, found.proxy, mass
 
 
 def _near(found: Satellites, cell: int) -> Bool:

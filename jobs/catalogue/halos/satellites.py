@@ -1,6 +1,7 @@
 """Satellite galaxies: how many a halo has, of which sub-mass, where, and how fast.
 
-draw    satellites of halos, a Poisson sample with an NFW profile
+draw        satellites of halos, a Poisson sample with an NFW profile
+nfw_radius  that holds a share of the mass
 
 Error: isotropic, spherical halos that are cut at R_200m
 Ref: Navarro, Frenk & White 1997, ApJ 490, 493; Evrard et al. 2008; the numbers are in halos.toml
@@ -13,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from jobs import keyed
+from jobs.catalogue.halos import compiled_halos
 from jobs.catalogue.halos.halos import HaloModel, Halos
 from jobs.catalogue.halos.matching import Masses
 from jobs.catalogue.interpolation import bracket
@@ -28,8 +31,8 @@ _X_NODES = np.linspace(0.0, 1.0, 2001) ** 2
 class Satellites:
     """n satellites, by host.
 
-    host : int[n] row of the host;  member : int[n] from 1;  proxy : log10 of the scattered sub-mass
-    ra, dec : deg;  chi : Mpc/h;  velocity : km/s, receding, with the host's
+    host : int[n] row of the host;  member : int[n] from 1, by falling sub-mass
+    proxy : log10 of the scattered sub-mass;  ra, dec : deg;  chi : Mpc/h;  velocity : km/s, receding, with the host's
     """
 
     host: Int
@@ -45,28 +48,38 @@ class Satellites:
         return Satellites(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
-def draw(halos: HaloModel, masses: Masses, hosts: Halos, rng: np.random.Generator) -> Satellites:
+def draw(halos: HaloModel, masses: Masses, hosts: Halos, seed: int) -> Satellites:
     """The satellites of hosts that reach the limit of their distance.
 
-    halos, masses : tables of halos, and by mass;  hosts : n halos;  rng : of numbers, masses and places
+    A host's satellites are drawn by falling sub-mass, each with numbers of its own: a deeper request goes on with them.
+    halos, masses : tables of halos, and by mass;  hosts : n halos;  seed : of the request
     """
-    occupation = halos.matching.occupation
-    limit = halos.mass_limit(hosts.chi)
-    over = 10.0 ** (hosts.log_mass - limit + occupation.depth)
-    # Below the limit, halos are only a sample that their centrals chose.
-    rich = (over > occupation.least) & (hosts.log_mass >= limit)
-    count = rng.poisson(np.where(rich, (over - occupation.least) / occupation.ratio, 0.0))
-    host = np.repeat(np.arange(count.size), count)
-    ratio = occupation.least + (over[host] - occupation.least) * rng.random(host.size)
-    proxy = hosts.log_mass[host] - np.log10(ratio) + occupation.scatter * rng.standard_normal(host.size)
-    bright = proxy >= limit[host]
-    host, proxy = host[bright], proxy[bright]
-    member = 1 + np.arange(host.size) - np.searchsorted(host, host)
+    own, limit = halos.matching.occupation, halos.mass_limit(hosts.chi)
+    about = (
+        keyed.keys(hosts.id, seed, "satellites"),
+        hosts.log_mass,
+        limit,
+        own.least,
+        own.ratio,
+        own.scatter,
+        own.depth,
+    )
+    over = 10.0 ** np.maximum(hosts.log_mass - limit + own.depth, np.log10(own.least))
+    out = _room(int(np.sum(over - own.least) / own.ratio))
+    count = compiled_halos.satellites(*about, out)
+    if count > out[0].size:
+        out = _room(count)
+        compiled_halos.satellites(*about, out)
+    host, member, proxy, numbers = out[0][:count], out[1][:count], out[2][:count], out[3][:count]
     z = halos.distances.redshift(hosts.chi)
-    offset = _offsets(masses, occupation.concentration, hosts.log_mass, z, host, rng)
-    kick = masses.dispersion(hosts.log_mass, z)[host] * rng.standard_normal(host.size)
+    offset = _offsets(masses, own.concentration, hosts.log_mass, z, host, numbers)
+    kick = masses.dispersion(hosts.log_mass, z)[host] * numbers[:, 3]
     ra, dec, chi = _moved(hosts, host, offset)
     return Satellites(host, member, proxy, ra, dec, chi, hosts.velocity[host] + kick)
+
+
+def _room(count: int) -> tuple[Int, Int, Float, Float]:
+    return np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count), np.empty((count, 4))
 
 
 def nfw_radius(concentration: Float, enclosed: Float) -> Float:
@@ -91,12 +104,13 @@ def _squares() -> Float:
     return np.array([np.interp(_U_NODES, row / row[-1], _X_NODES**2) for row in inside])
 
 
-def _offsets(masses: Masses, times: float, log_mass: Float, z: Float, host: Int, rng: np.random.Generator) -> Float:
+def _offsets(masses: Masses, times: float, log_mass: Float, z: Float, host: Int, numbers: Float) -> Float:
     """Offsets from the hosts' centres, [n, 3] comoving Mpc/h."""
     c = times * masses.at(masses.concentration, z, log_mass)
-    radius = masses.radius(log_mass)[host] * nfw_radius(np.clip(c, 1.0, 60.0)[host], rng.random(host.size))
-    direction = rng.standard_normal((host.size, 3))
-    return np.asarray(direction * (radius / np.sqrt(np.sum(direction**2, 1)))[:, None])
+    radius = masses.radius(log_mass)[host] * nfw_radius(np.clip(c, 1.0, 60.0)[host], numbers[:, 0])
+    up, around = 2.0 * numbers[:, 1] - 1.0, 2.0 * np.pi * numbers[:, 2]
+    flat = np.sqrt((1.0 - up) * (1.0 + up))
+    return np.asarray(np.stack([flat * np.cos(around), flat * np.sin(around), up], 1) * radius[:, None])
 
 
 def _moved(hosts: Halos, host: Int, offset: Float) -> tuple[Float, Float, Float]:

@@ -24,7 +24,8 @@ from lake_schema.arrays import Bool, Float, Int
 
 # Side of a HEALPix cell in units of 1 / nside, rad, and how much wider than a cell of the box a voxel may be.
 _SIDE, _WIDEST = 1.023, 1.2
-_Z_NODES = 20_000
+# Of the table of redshifts, Mpc/h.
+_CHI_STEP = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,20 +78,24 @@ class Voxels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Distances:
-    """Redshift against comoving distance, tabulated: z(chi) within 1e-8."""
+    """Redshift against comoving distance, tabulated at uniform chi from 0: z(chi) within 1e-8."""
 
     chi: Float
     z: Float
 
     def redshift(self, chi: npt.ArrayLike) -> Float:
-        """Redshift[n] of chi : float[n] Mpc/h."""
-        return np.asarray(np.interp(np.asarray(chi, float), self.chi, self.z))
+        """Redshift[n] of chi : float[n] Mpc/h, within the table."""
+        at = np.asarray(chi, float) / _CHI_STEP
+        node = np.minimum(at.astype(np.int64), self.z.size - 2)
+        low = self.z[node]
+        return np.asarray(low + (at - node) * (self.z[node + 1] - low))
 
 
 def distances(z_max: float) -> Distances:
-    """The table out to z_max."""
-    z = np.linspace(0.0, z_max, _Z_NODES)
-    return Distances(cosmology.comoving_distance(z), z)
+    """The table out to z_max, or a step of it further."""
+    steps = int(np.ceil(float(cosmology.comoving_distance(z_max)) / _CHI_STEP))
+    chi = np.asarray(_CHI_STEP * np.arange(steps + 1), float)
+    return Distances(chi, cosmology.redshift(chi))
 
 
 def replicas(box: Box, chi_max: float) -> Replicas:

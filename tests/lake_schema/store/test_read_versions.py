@@ -81,6 +81,14 @@ def test_any_other_difference_is_refused_naming_both_versions(old, name):
     assert words in str(caught.value)
 
 
+def test_a_column_that_went_is_passed_over_where_it_is_said(old):
+    """In lakes that have it; a lake of this version may not."""
+    table = replace(later(PLAIN.columns[0]), former=("value",))
+    assert read.as_declared(old, table).rows().column_names == ["id"]
+    with pytest.raises(VersionMismatch, match="column value is not declared"):
+        read.as_declared(old, replace(table, version=1))
+
+
 def test_a_table_from_the_future_is_refused(lake):
     plan = plain_plan()
     publish.make(lake, replace(plan, table=replace(PLAIN, version=3)), plain_work)

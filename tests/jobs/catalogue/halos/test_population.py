@@ -28,12 +28,10 @@ def falling_in(universe, block):
         wide = {int(c) for cell in ring for c in sky.margin_cells(order, cell, order)} if order == 8 else set()
         for cell in sorted(own | ring | wide):
             hosts, found = drawn.at(order, cell)
-            home = sky.cell_of(*sky.positions(hosts.index), 8)[found.host]
             inside = np.isin(sky.cell_of(found.ra, found.dec, 8), block)
-            edge = universe.population.halos.line.edge
-            inside &= (found.chi > edge[0]) & (found.chi < edge[-1])
-            number, member = hosts.number[found.host], found.member
-            found_in.append(ids.source_id(np.ones(home.size), home, number, member)[inside])
+            inside &= (found.chi > universe.population.halos.line.edge[0]) & (found.chi < universe.population.halos.far)
+            own = ids.satellite_id(hosts.id[found.host], found.member, hosts.bits[found.host])
+            found_in.append(own[inside])
     return np.sort(np.concatenate(found_in))
 
 
@@ -73,7 +71,11 @@ def test_members_lie_in_their_cell_sorted(block):
         assert np.all(members.index >> 2 * (29 - 8) == cell)
         assert np.all(np.diff(members.index) >= 0)
         assert np.array_equal(sky.healpix_29(members.ra, members.dec), members.index)
-        assert np.array_equal(ids.halo_of(members.id), members.halo_id)
+        # What tells a galaxy from its halo is its kind and its member.
+        own = members.id & ((1 << 60) - 1)
+        member = own - members.halo_id
+        assert np.all(member[members.kind == 0] == 0)
+        assert np.all((member[members.kind == 1] > 0) & (own & members.halo_id == members.halo_id)[members.kind == 1])
 
 
 def test_a_cell_alone_is_the_same(universe, block):
@@ -94,7 +96,7 @@ def test_satellites_follow_their_profile(universe, rng):
 def test_satellites_lie_within_their_halo(universe):
     model = universe.population
     hosts = halos.draw(model.halos, 3, 8, 1234)
-    found = satellites.draw(model.halos, model.masses, hosts, np.random.default_rng(1))
+    found = satellites.draw(model.halos, model.masses, hosts, 1)
     ra, dec = sky.positions(hosts.index)
     angle = np.radians(sky.separation(found.ra, found.dec, ra[found.host], dec[found.host]))
     apart = np.hypot(hosts.chi[found.host] * angle, found.chi - hosts.chi[found.host])

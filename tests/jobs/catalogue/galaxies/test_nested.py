@@ -1,0 +1,110 @@
+"""A shallower or nearer request is a part of a deeper one: all rows to its limits, the same bit by bit."""
+
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+
+from jobs.catalogue.galaxies import band_ratios, galaxies
+from jobs.catalogue.halos import halos, population
+from jobs.request.schema import Universe
+from tests.jobs.catalogue.conftest import SEED, SMALL
+
+# A corner of a base cell, a pole, the first meridian, and cells anywhere.
+CELLS = (303_117, 0, 65_535, 5_000, 524_288, 700_001)
+LIMITS, REDSHIFTS = (20.0, 23.0, 26.0), (1.0, 2.3)
+
+
+@cache
+def model(limit, z_max, seed=SEED):
+    maps = {} if seed == SEED else {"lensing": (0.02, -0.01)}
+    universe = galaxies.model(seed, Universe(galaxy_limit=limit, z_max=z_max, **SMALL, **maps))
+    return universe, population.Cells(universe.population)
+
+
+def tables(limit, z_max, cell, dust, seed=SEED):
+    """Galaxies of the light-cone, and halos."""
+    universe, cells = model(limit, z_max, seed)
+    rows = galaxies.draw(cell, universe, cells, dust)
+    return rows.filter(pc.less(rows["kind"], 2)), galaxies.halo_table(cell, universe.population, cells)
+
+
+def of(rows, wanted):
+    """The rows of these identifiers, in the order of the table."""
+    return rows.filter(pa.array(np.isin(rows["id"].to_numpy(), wanted["id"].to_numpy())))
+
+
+def magnitude(universe, rows):
+    """In the limit's band."""
+    z, m_r = (rows[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01"))
+    names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
+    return galaxies.apparent(universe, z, m_r, band_ratios.Sed(*(rows[name].to_numpy() for name in names)))
+
+
+def same(one, other):
+    assert one.num_rows == other.num_rows
+    assert one.schema.equals(other.schema)
+    for name in one.column_names:
+        a, b = (table[name].combine_chunks() for table in (one, other))
+        assert a.equals(b), name
+        if not a.null_count:
+            # Zeros of either sign are equal, but not the same.
+            assert a.to_numpy(zero_copy_only=False).tobytes() == b.to_numpy(zero_copy_only=False).tobytes(), name
+
+
+def check(shallow, deep, cell, dust):
+    (few, some), (many, every) = tables(*shallow, cell, dust), tables(*deep, cell, dust)
+    same(few, of(many, few))
+    same(some, of(every, some))
+    # And it is all that there is: what a deeper table has to the shallower limits.
+    universe, _ = model(*shallow)
+    # Columns are single precision.
+    z = many["z_true"].to_numpy()
+    seen = (magnitude(universe, many) < shallow[0] - 1e-3) & (z < np.float32(shallow[1]) - 1e-6)
+    assert np.isin(many["id"].to_numpy()[seen], few["id"].to_numpy()).all()
+    limits = galaxies.halo_limits(universe.population)
+    z, mass = every["z_true"].to_numpy(), every["log_mass"].to_numpy()
+    least = np.interp(z, limits["z_true"].to_numpy(), limits["log_mass"].to_numpy()) + 1e-4
+    listed = (mass > least) & (z < np.float32(shallow[1]) - 1e-6)
+    assert np.isin(every["id"].to_numpy()[listed], some["id"].to_numpy()).all()
+    return few.num_rows, some.num_rows
+
+
+def test_a_shallower_and_a_nearer_request_are_parts_of_a_deeper_one(dust):
+    deep = (23.0, 2.3)
+    for shallow in ((20.0, 2.3), (23.0, 1.0), (20.0, 1.0)):
+        few, some = check(shallow, deep, CELLS[0], dust)
+        assert few > 50
+        assert some > few
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("cell", CELLS)
+def test_every_pair_of_limits(dust, cell):
+    requests = [(limit, z_max) for limit in LIMITS for z_max in REDSHIFTS]
+    pairs = [(a, b) for a in requests for b in requests if a != b and a[0] <= b[0] and a[1] <= b[1]]
+    assert len(pairs) == 12
+    for shallow, deep in pairs:
+        check(shallow, deep, cell, dust)
+
+
+def test_hosts_behind_the_end_of_a_request_have_their_satellites_before_it():
+    """Those of the step behind it, which a farther request draws anyway."""
+    (near, of_near), (_, of_far) = ((one.population, cells) for one, cells in (model(23.0, 0.3), model(23.0, 0.6)))
+    for cell in range(303_104, 303_120):
+        a, b = population.members(of_near, cell), population.members(of_far, cell)
+        assert np.array_equal(a.id, b.id[b.chi < near.halos.far])
+    hosts, _ = of_near.at(halos.LEVELS[0], 303_117)
+    assert hosts.chi.max() > near.halos.far
+    assert np.all(hosts.chi < near.halos.far + 2 * near.halos.box.model.cell)
+
+
+@pytest.mark.parametrize("seed", [0, 2**63 - 1])
+@pytest.mark.parametrize(("limit", "z_max"), [(16.0, 0.01), (16.0, 0.3), (20.0, 0.05)])
+def test_extreme_requests(dust, seed, limit, z_max):
+    few, some = tables(limit, z_max, CELLS[0], dust, seed)
+    many, every = tables(20.0, 0.3, CELLS[0], dust, seed)
+    same(few, of(many, few))
+    same(some, of(every, some))
