@@ -1,7 +1,7 @@
 """Galaxies of one generation cell: table `galaxies`, a pure function of (seed, cell, model); and its halos.
 
 model        every table that the draws need, made once
-draw         members of halos -> colours, dust, spectra -> selection -> masses, shapes, lensing
+draw         members of halos -> colours, dust, spectra, masses, lines -> selection -> shapes, lensing
 halo_table   table `halos` of the same cell;  halo_limits : from which mass on all are in it
 
 Numbers are keyed by galaxy and step, so that a new column leaves the others as they are, and so does a deeper request.
@@ -22,6 +22,7 @@ from jobs.catalogue.galaxies import (
     emission_lines,
     high_redshift,
     lensing,
+    line_light,
     morphology,
     nearest_sed,
     sed_assignment,
@@ -37,8 +38,9 @@ from jobs.catalogue.halos import luminosity_function, matching, population
 from jobs.catalogue.halos.halo_catalogue import LightCone
 from jobs.catalogue.halos.luminosity_function import Schechter
 from jobs.catalogue.halos.population import Cells, Members, Population
-from jobs.fluxes import cosmology
+from jobs.fluxes import cosmology, passbands
 from jobs.fluxes.libraries import templates
+from jobs.fluxes.passbands import Passband
 from jobs.keyed import Keyed
 from jobs.request.schema import Universe
 from lake_schema import sky
@@ -46,21 +48,23 @@ from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALO_LIMITS, HALOS
 
-# Candidates are drawn this much deeper than the brightest SED needs, mag: more than the tables' errors.
-_MARGIN = 0.02
+# Candidates are drawn this much deeper than the brightest SED needs, mag: emission lines brighten them, but for one
+# galaxy in 10^4 by no more (tests).  Of candidates, those are given lines whose continuum is so near to the limit.
+_MARGIN, _LINES = 0.25, 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GalaxyModel:
     """Everything that galaxies are drawn from; a few MB, made once by `model`.
 
-    limit     : faintest magnitude, AB, before the Milky Way's dust and intergalactic hydrogen
-    rotation  : deg, added to every position angle, before lensing
+    limit     : faintest magnitude, AB, before the Milky Way's dust and intergalactic hydrogen, with emission lines
+    band      : the limit's;  rotation : deg, added to every position angle, before lensing
     selection : the limit's band against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
     training  : observed galaxies whose spectra ours have, None = spectra that have the colours
     """
 
     limit: float
+    band: Passband
     population: Population
     lens: Lens
     rotation: float
@@ -79,14 +83,20 @@ class GalaxyModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """Galaxies after selection: rows of the members, z, M_r, on the red sequence, realised 0.1(g - r), spectra; [n]."""
+    """Selected galaxies, [n]: rows of members, z, M_r, as of `apparent`, on the red sequence, 0.1(g - r), spectra."""
 
     row: Int
     z: Float
     m_r: Float
+    magnitude: Float
     red: Bool
     colour: Float
     sed: Sed
+
+    def part(self, keep: Bool) -> Drawn:
+        """The galaxies that are kept: keep : bool[n]."""
+        colours = self.red[keep], self.colour[keep], self.sed.part(keep)
+        return Drawn(self.row[keep], self.z[keep], self.m_r[keep], self.magnitude[keep], *colours)
 
 
 def model(
@@ -107,6 +117,7 @@ def model(
     distant = high_redshift.model(wanted.high_redshift_boost, wanted.quasar_boost)
     return GalaxyModel(
         limit=wanted.galaxy_limit,
+        band=passbands.load(wanted.galaxy_band),
         population=found,
         lens=_lens(found, wanted, far=bool(distant)),
         rotation=wanted.rotation,
@@ -160,21 +171,16 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
     """
     seed = universe.population.seed
     members = population.members(cells, cell)
-    drawn = select(universe, *_light(seed, universe, members))
+    drawn, physical = _bright(universe, members, select(universe, *_light(seed, universe, members), _LINES))
     distance_modulus = cosmology.distance_modulus(drawn.z)
-    log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, drawn.colour)
-    log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
-    rng = Keyed(members.id[drawn.row], seed, "galaxies.lines")
     columns = {
         **_places(universe.lens, members, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
         "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
         "color_gr_01": drawn.colour,
-        "log_stellar_mass": log_mass,
-        "log_sfr": log_sfr,
+        **physical,
         **sed_assignment.columns(drawn.sed),
-        **emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, drawn.red, drawn.sed.ebv, rng),
-        **_shape_columns(members.id[drawn.row], seed, universe.shapes, drawn, log_mass),
+        **_shape_columns(members.id[drawn.row], seed, universe.shapes, drawn, physical["log_stellar_mass"]),
     }
     rows = [GALAXIES.build(columns)]
     rows += [high_redshift.draw(cell, seed, kind, universe.lens, dust) for kind in universe.distant]
@@ -212,19 +218,33 @@ def halo_limits(universe: Population) -> pa.Table:
     )
 
 
-def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed) -> Drawn:
-    """The galaxies brighter than the limit, with their realised colours.
+def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed, deeper: float = 0.0) -> Drawn:
+    """The galaxies whose continuum is brighter than the limit, with their realised colours.
 
     z, m_r : float[n] redshift, M_r mag;  red : bool[n] on the red sequence;  sed : n spectra
-    universe : whose limit and passband hold
+    universe : whose limit and passband hold;  deeper : mag, beyond the limit
     """
-    row = np.flatnonzero(apparent(universe, z, m_r, sed) < universe.limit)
+    magnitude = apparent(universe, z, m_r, sed)
+    row = np.flatnonzero(magnitude < universe.limit + deeper)
     kept = sed.part(row)
-    return Drawn(row, z[row], m_r[row], red[row], sed_assignment.colours(universe.colour, kept), kept)
+    colour = sed_assignment.colours(universe.colour, kept)
+    return Drawn(row, z[row], m_r[row], magnitude[row], red[row], colour, kept)
+
+
+def _bright(universe: GalaxyModel, members: Members, drawn: Drawn) -> tuple[Drawn, dict[str, Float]]:
+    """Those that are brighter than the limit with their lines; their masses, star formation rates and line fluxes."""
+    log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, drawn.colour)
+    log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
+    rng = Keyed(members.id[drawn.row], universe.population.seed, "galaxies.lines")
+    fluxes = emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, drawn.red, drawn.sed.ebv, rng)
+    light = line_light.added(universe.band, members.z_obs[drawn.row], fluxes)
+    kept = line_light.brightened(drawn.magnitude, light) < universe.limit
+    columns = {"log_stellar_mass": log_mass, "log_sfr": log_sfr, **fluxes}
+    return drawn.part(kept), {name: column[kept] for name, column in columns.items()}
 
 
 def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
-    """Magnitude[n] in the limit's band, AB, unmagnified, before intergalactic hydrogen and the Milky Way's dust.
+    """Magnitude[n] of the continuum in the limit's band, AB, unmagnified, before hydrogen and dust on the way to us.
 
     z, m_r : float[n] redshift, M_r mag;  sed : n spectra
     universe : whose passband holds

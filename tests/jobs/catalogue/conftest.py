@@ -8,10 +8,10 @@ import pyarrow as pa
 import pytest
 
 from jobs.catalogue import dust_map
-from jobs.catalogue.galaxies import band_ratios, galaxies
+from jobs.catalogue.galaxies import band_ratios, galaxies, line_light
 from jobs.catalogue.halos import population
 from jobs.catalogue.matter import density_box
-from jobs.fluxes import cosmology
+from jobs.fluxes import cosmology, passbands
 from jobs.fluxes.libraries import templates
 from jobs.request.schema import Universe
 from lake_schema import sky
@@ -63,7 +63,7 @@ def drawn():
 
 @cache
 def sky_drawn():
-    """Five blocks of four cells spread over the sky (1.05 deg2): rows, columns by name, and magnitudes by band."""
+    """Five blocks of four cells spread over the sky (1.05 deg2): rows, columns by name, magnitudes by band."""
     universe, library = made(), templates.galaxy_library()
     cells, dust = population.Cells(universe.population), dust_map.load(SEED)
     places = [4 * block + i for block in range(25, 3 << 16, (3 << 16) // 5) for i in range(4)]
@@ -78,7 +78,8 @@ def sky_drawn():
 
     def mag(band):
         table = band_ratios.load(library, band, 2.3, 0.5)
-        return m_r + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed)
+        continuum = m_r + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed)
+        return line_light.brightened(continuum, line_light.added(passbands.load(band), columns["z_obs"], columns))
 
     area = len(places) * sky.cell_area(GENERATION_ORDER)
     bands = ("euclid_vis", "euclid_y", "euclid_j", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 
 from jobs.catalogue import build_galaxies, dust_map
-from jobs.catalogue.galaxies import band_ratios, galaxies, sed_assignment
+from jobs.catalogue.galaxies import band_ratios, galaxies, line_light, sed_assignment
 from jobs.catalogue.halos import luminosity_function, population
 from jobs.catalogue.matter import lightcone
 from jobs.fluxes import cosmology
@@ -290,7 +290,10 @@ def test_a_limit_in_another_band(drawn, dust, band, limit):
     sed = band_ratios.Sed(
         *(rows[name].to_numpy() for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1"))
     )
-    seen = galaxies.apparent(there, z, m_r, sed)
+    names = [name for name in rows.column_names if name.startswith("flux_")]
+    lines = {name: rows[name].to_numpy() for name in names}
+    light = line_light.added(there.band, rows["z_obs"].to_numpy(), lines)
+    seen = line_light.brightened(galaxies.apparent(there, z, m_r, sed), light)
     assert limit - 0.1 < seen.max() < limit + 1e-3
     halos = sum(galaxies.halo_table(cell, there.population, cells).num_rows for cell in places)
     assert halos < 0.5 * drawn.halos.num_rows * len(places) / len(drawn.places)

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from jobs.catalogue.galaxies import band_ratios, galaxies
+from jobs.catalogue.galaxies import band_ratios, galaxies, line_light
 from jobs.catalogue.halos import halos, population
 from jobs.request.schema import Universe
 from tests.jobs.catalogue.conftest import SEED, SMALL
@@ -40,7 +40,9 @@ def magnitude(universe, rows):
     """In the limit's band."""
     z, m_r = (rows[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01"))
     names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
-    return galaxies.apparent(universe, z, m_r, band_ratios.Sed(*(rows[name].to_numpy() for name in names)))
+    continuum = galaxies.apparent(universe, z, m_r, band_ratios.Sed(*(rows[name].to_numpy() for name in names)))
+    lines = {name: rows[name].to_numpy() for name in rows.column_names if name.startswith("flux_")}
+    return line_light.brightened(continuum, line_light.added(universe.band, rows["z_obs"].to_numpy(), lines))
 
 
 def same(one, other):
@@ -78,6 +80,20 @@ def test_a_shallower_and_a_nearer_request_are_parts_of_a_deeper_one(dust):
         few, some = check(shallow, deep, CELLS[0], dust)
         assert few > 50
         assert some > few
+
+
+def test_nothing_is_missing_at_the_limit(dust):
+    """Galaxies that lines alone lift above it are there: all that a limit 1 mag deeper has, but for one in 10^4."""
+    (few, _), (many, _) = (tables(limit, 2.3, CELLS[0], dust) for limit in (23.0, 24.0))
+    universe, _ = model(23.0, 2.3)
+    seen = magnitude(universe, many) < 23.0 - 1e-3
+    last = seen & (magnitude(universe, many) > 22.8)
+    assert last.sum() > 200
+    assert np.isin(many["id"].to_numpy()[seen], few["id"].to_numpy()).all()
+    z, m_r = (few[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01"))
+    names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
+    continuum = galaxies.apparent(universe, z, m_r, band_ratios.Sed(*(few[name].to_numpy() for name in names)))
+    assert 0.005 < np.mean(continuum > 23.0) < 0.05
 
 
 @pytest.mark.nightly
