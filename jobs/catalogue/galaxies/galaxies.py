@@ -20,6 +20,7 @@ from jobs.catalogue.cells import in_order
 from jobs.catalogue.galaxies import (
     band_ratios,
     emission_lines,
+    halo_lensing,
     high_redshift,
     lensing,
     line_light,
@@ -30,6 +31,7 @@ from jobs.catalogue.galaxies import (
 )
 from jobs.catalogue.galaxies.band_ratios import BandRatios, Sed
 from jobs.catalogue.galaxies.emission_lines import LineModel
+from jobs.catalogue.galaxies.halo_lensing import Neighbourhood
 from jobs.catalogue.galaxies.high_redshift import Kind
 from jobs.catalogue.galaxies.lensing import Lens, Shear
 from jobs.catalogue.galaxies.morphology import Shapes
@@ -173,8 +175,9 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
     members = population.members(cells, cell)
     drawn, physical = _bright(universe, members, select(universe, *_light(seed, universe, members), _LINES))
     distance_modulus = cosmology.distance_modulus(drawn.z)
+    lens = halo_lensing.around(universe.lens, cells, cell)
     columns = {
-        **_places(universe.lens, members, drawn.row, dust),
+        **_places(lens, members, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
         "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
         "color_gr_01": drawn.colour,
@@ -183,7 +186,7 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
         **_shape_columns(members.id[drawn.row], seed, universe.shapes, drawn, physical["log_stellar_mass"]),
     }
     rows = [GALAXIES.build(columns)]
-    rows += [high_redshift.draw(cell, seed, kind, universe.lens, dust) for kind in universe.distant]
+    rows += [high_redshift.draw(cell, seed, kind, lens, dust) for kind in universe.distant]
     return in_order(lensing.turned(pa.concat_tables(rows), universe.rotation))
 
 
@@ -268,7 +271,9 @@ def _light(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, F
     return members.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
 
 
-def _places(lens: Lens, members: Members, row: Int, dust: Float32) -> dict[str, npt.NDArray[np.generic]]:
+def _places(
+    lens: Lens | Neighbourhood, members: Members, row: Int, dust: Float32
+) -> dict[str, npt.NDArray[np.generic]]:
     ra, dec = members.ra[row], members.dec[row]
     return {
         "id": members.id[row],
@@ -276,7 +281,7 @@ def _places(lens: Lens, members: Members, row: Int, dust: Float32) -> dict[str, 
         "ra": ra,
         "dec": dec,
         "_healpix_29": members.index[row],
-        **lensing.columns(lens, ra, dec, members.chi[row]),
+        **halo_lensing.columns(lens, ra, dec, members.chi[row]),
         "kind": members.kind[row],
         "density_boost": np.ones(row.size),
         "z_true": members.z[row],

@@ -1,4 +1,14 @@
-"""Convergence, shear and deflection by halos, summed halo by halo in small pieces of the sky."""
+"""Convergence, shear and deflection by halos: compiled sums.
+
+add_halos   to sources, the part of each halo that ends near it
+add_smooth  to nodes of a grid, the rest of it
+add_nodes   to sources, what lies between nodes
+
+Tables of halos have rows X .. CONCENTRATION: place in the plane of the sources, distance in Mpc/h (rising), amplitude,
+and angles in rad. Sources have places [2, n] in the same plane, rad, and near[n] = 1 / distance, h/Mpc. Sums are
+[5, n]: kappa, gamma1, gamma2, deflection along x and y. What a halo does to a source depends on these two alone, and
+halos are added in the order that they come in.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +18,7 @@ from jobs.catalogue.halos import projected_nfw
 from jobs.compiling import exact_jit
 from lake_schema.arrays import Float, Int
 
+X, Y, CHI, AMPLITUDE, SIZE, CLOSE, WIDE, CONCENTRATION = range(8)
 _profile, _total = projected_nfw.profile, projected_nfw.total
 # Closer to a centre than this, in units of theta_200, everything is as here: behind it are shear and deflection 0.
 _CENTRE = 1e-6
@@ -16,61 +27,46 @@ _ROUNDED = 1e-9
 
 
 @exact_jit
-def add_halos(place: Float, near: Float, first: Int, frame: Float, halo: Float, out: Float) -> None:
-    """Add to out[5, n] what each halo does to the sources behind it, in pieces of the sky with a tangent plane each.
+def add_halos(place: Float, near: Float, first: Int, halo: Float, out: Float) -> None:
+    """Add to out[5, n] what each halo does to the sources behind it, with its mass taken away again within theta_s.
 
-    kappa and gamma1, gamma2 and the deflection are in the frame of the piece; what a halo does to a source depends on
-    these two alone, and halos are added in the order that they come in.
-    place : [2, n] stereographic coordinates of sources, rad, piece by piece;  near : [n] 1 / distance, h/Mpc, rising
-            within a piece
-    first : [pieces + 1] row of the first source of each piece
-    frame : [pieces, 3, 3] east, north and centre of each piece
-    halo  : [8, h] centre (3), distance Mpc/h (rising), amplitude, theta_200, theta_c, concentration
+    place, near, out : sources, piece by piece of the plane, in each the farthest first
+    first            : [pieces + 1] row of the first source of each piece
+    halo             : [8, h]
     """
     for piece in range(first.size - 1):
         start, stop = first[piece], first[piece + 1]
+        if stop == start:
+            continue
         x, y, inverse, found = place[0, start:stop], place[1, start:stop], near[start:stop], out[:, start:stop]
-        radius = _ROUNDED
-        for j in range(x.size):
-            radius = max(radius, np.sqrt(x[j] ** 2 + y[j] ** 2) + _ROUNDED)
-        east, north, out_of = frame[piece, 0], frame[piece, 1], frame[piece, 2]
+        at_x, at_y = 0.5 * (x.min() + x.max()), 0.5 * (y.min() + y.max())
+        radius = np.sqrt(np.max((x - at_x) ** 2 + (y - at_y) ** 2)) + _ROUNDED
         behind = x.size
         for h in range(halo.shape[1]):
-            vx, vy, vz = halo[0, h], halo[1, h], halo[2, h]
-            while behind > 0 and inverse[behind - 1] * halo[3, h] >= 1.0:
+            while behind > 0 and inverse[behind - 1] * halo[CHI, h] >= 1.0:
                 behind -= 1
             if behind == 0:
                 break
-            reach = max(halo[5, h], halo[6, h]) + radius
-            along = vx * out_of[0] + vy * out_of[1] + vz * out_of[2]
-            # A chord is shorter than its stereographic image.
-            if 2.0 - 2.0 * along > reach * reach:
-                continue
-            scale = 2.0 / (1.0 + along)
-            at_x = scale * (vx * east[0] + vy * east[1] + vz * east[2])
-            at_y = scale * (vx * north[0] + vy * north[1] + vz * north[2])
-            away = at_x * at_x + at_y * at_y
-            if away > reach * reach:
-                continue
-            _add_point(x[:behind], y[:behind], inverse[:behind], at_x, at_y, halo[3:, h], found)
-            if away <= (halo[5, h] + radius) ** 2:
-                _add_inside(x[:behind], y[:behind], inverse[:behind], at_x, at_y, halo[3:, h], found)
+            away = (halo[X, h] - at_x) ** 2 + (halo[Y, h] - at_y) ** 2
+            if away <= (max(halo[SIZE, h], halo[CLOSE, h]) + radius) ** 2:
+                _add_point(x[:behind], y[:behind], inverse[:behind], halo[:, h], found)
+                if away <= (halo[SIZE, h] + radius) ** 2:
+                    _add_inside(x[:behind], y[:behind], inverse[:behind], halo[:, h], found)
 
 
 @exact_jit
-def _add_point(x: Float, y: Float, inverse: Float, at_x: float, at_y: float, halo: Float, found: Float) -> None:
-    """A point of the halo's mass, whose mass is taken away again within theta_c: nothing is left beyond."""
-    chi, amplitude, size, wide = halo[0], halo[1], halo[2], halo[3]
+def _add_point(x: Float, y: Float, inverse: Float, halo: Float, found: Float) -> None:
+    """A point of the halo's mass, whose mass is taken away again within theta_s: nothing is left beyond."""
     kappa, gamma1, gamma2, along_x, along_y = found[0], found[1], found[2], found[3], found[4]
-    least, flat = (_CENTRE * size) ** 2, 1.0 / (wide * wide)
+    at_x, at_y, chi, amplitude = halo[X], halo[Y], halo[CHI], halo[AMPLITUDE]
+    least, flat = (_CENTRE * halo[SIZE]) ** 2, 1.0 / halo[CLOSE] ** 2
     for j in range(x.size):
         dx, dy = x[j] - at_x, y[j] - at_y
         square = dx * dx + dy * dy
         square = square if square > least else least
         rest = 1.0 - square * flat
         rest = rest if rest > 0.0 else 0.0
-        strength = amplitude * (1.0 - chi * inverse[j])
-        over = strength * rest * rest
+        over = amplitude * (1.0 - chi * inverse[j]) * rest * rest
         here = -3.0 * flat * over
         one = 1.0 / square
         mean = over * rest * one
@@ -83,20 +79,20 @@ def _add_point(x: Float, y: Float, inverse: Float, at_x: float, at_y: float, hal
 
 
 @exact_jit
-def _add_inside(x: Float, y: Float, inverse: Float, at_x: float, at_y: float, halo: Float, found: Float) -> None:
+def _add_inside(x: Float, y: Float, inverse: Float, halo: Float, found: Float) -> None:
     """What the halo's profile is more than the point of its mass, inside R_200m."""
-    chi, amplitude, size, concentration = halo[0], halo[1], halo[2], halo[4]
+    size, concentration = halo[SIZE], halo[CONCENTRATION]
     least, most = (_CENTRE * size) ** 2, size * size
     whole = _total(concentration)
     peak = 0.5 * concentration * concentration / (whole * most)
     for j in range(x.size):
-        dx, dy = x[j] - at_x, y[j] - at_y
+        dx, dy = x[j] - halo[X], y[j] - halo[Y]
         square = dx * dx + dy * dy
         if square >= most:
             continue
         square = max(square, least)
         surface, enclosed = _profile(concentration * np.sqrt(square) / size, concentration)
-        strength = amplitude * (1.0 - chi * inverse[j])
+        strength = halo[AMPLITUDE] * (1.0 - halo[CHI] * inverse[j])
         here = strength * peak * surface
         mean = strength * (enclosed / whole - 1.0) / square
         shear = (mean - here) / square
@@ -105,3 +101,70 @@ def _add_inside(x: Float, y: Float, inverse: Float, at_x: float, at_y: float, ha
         found[2, j] -= shear * (2.0 * dx * dy)
         found[3, j] += mean * dx
         found[4, j] += mean * dy
+
+
+@exact_jit
+def add_smooth(place: Float, near: Float, halo: Float, out: Float) -> None:
+    """Add to out[5, n] what halos do with their mass within theta_s and taken away again within theta_c.
+
+    place, near, out : nodes, the farthest first;  halo : [8, h]
+    """
+    for h in range(halo.shape[1]):
+        behind = near.size
+        while behind > 0 and near[behind - 1] * halo[CHI, h] >= 1.0:
+            behind -= 1
+        at_x, at_y, chi, amplitude = halo[X, h], halo[Y, h], halo[CHI, h], halo[AMPLITUDE, h]
+        least, close, wide = (_CENTRE * halo[SIZE, h]) ** 2, 1.0 / halo[CLOSE, h] ** 2, 1.0 / halo[WIDE, h] ** 2
+        for j in range(behind):
+            dx, dy = place[0, j] - at_x, place[1, j] - at_y
+            square = dx * dx + dy * dy
+            square = square if square > least else least
+            inner, outer = 1.0 - square * close, 1.0 - square * wide
+            inner, outer = inner if inner > 0.0 else 0.0, outer if outer > 0.0 else 0.0
+            strength = amplitude * (1.0 - chi * near[j])
+            here = 3.0 * strength * (close * inner * inner - wide * outer * outer)
+            one = 1.0 / square
+            mean = strength * (outer * outer * outer - inner * inner * inner) * one
+            shear = (mean - here) * one
+            out[0, j] += here
+            out[1, j] -= shear * (dx * dx - dy * dy)
+            out[2, j] -= shear * (2.0 * dx * dy)
+            out[3, j] += mean * dx
+            out[4, j] += mean * dy
+
+
+@exact_jit
+def add_nodes(place: Float, near: Float, planes: Float, step: float, table: Float, out: Float) -> None:
+    """Add to out[5, n] the table's values at sources: cubic on the grid, linear in 1 / distance between planes.
+
+    planes : [p] 1 / distance, rising from 0;  step : rad between nodes
+    table  : [p, side, side, 5] at nodes of a square about the origin; sources outside have what its border has
+    Ref: Keys 1981, IEEE Trans. Acoust. Speech Signal Process. 29, 1153
+    """
+    side = table.shape[1]
+    across, along = np.empty(4), np.empty(4)
+    for j in range(near.size):
+        if near[j] >= planes[-1]:
+            continue
+        upper = np.searchsorted(planes, near[j], side="right")
+        part = (near[j] - planes[upper - 1]) / (planes[upper] - planes[upper - 1])
+        left, low = _node(place[0, j], step, side, along), _node(place[1, j], step, side, across)
+        for plane, share in ((upper - 1, 1.0 - part), (upper, part)):
+            for b in range(4):
+                for a in range(4):
+                    weight = share * across[b] * along[a]
+                    for field in range(5):
+                        out[field, j] += weight * table[plane, low + b, left + a, field]
+
+
+@exact_jit
+def _node(at: float, step: float, side: int, weight: Float) -> int:
+    """The first of four nodes about a place, and their weights."""
+    where = min(max(at / step + 0.5 * (side - 1), 1.0), side - 2.000001)
+    node = int(where)
+    t = where - node
+    weight[0] = t * (t * (1.0 - 0.5 * t) - 0.5)
+    weight[1] = 1.0 + t * t * (1.5 * t - 2.5)
+    weight[2] = t * (0.5 + t * (2.0 - 1.5 * t))
+    weight[3] = 0.5 * t * t * (t - 1.0)
+    return node - 1

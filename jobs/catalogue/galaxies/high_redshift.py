@@ -19,7 +19,8 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.catalogue import dust_map, parameters
-from jobs.catalogue.galaxies import lensing, morphology
+from jobs.catalogue.galaxies import halo_lensing, morphology
+from jobs.catalogue.galaxies.halo_lensing import Neighbourhood
 from jobs.catalogue.galaxies.lensing import Lens
 from jobs.fluxes import cosmology
 from jobs.fluxes.high_redshift import (
@@ -68,12 +69,12 @@ def model(galaxy_boost: float = 1.0, quasar_boost: float = 1.0) -> tuple[Kind, .
     return tuple(_kind(code, parameters.section(_FILE, name), boost) for code, name, boost in wanted if boost > 0.0)
 
 
-def draw(cell: int, seed: int, kind: Kind, lens: Lens, dust: Float32) -> pa.Table:
+def draw(cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Float32) -> pa.Table:
     """Rows of one kind in a generation cell, sorted by _healpix_29.
 
     dust : float32[pixel] map of A(V), mag (jobs.catalogue.dust_map)
     cell   : nested index at order 8;  seed : of the request;  kind : the objects' luminosity function and boost
-    lens   : maps, or one shear for all
+    lens   : halos and maps, maps alone, or one shear for all
     """
     rng = stream(seed, _STREAM[kind.code], cell)
     n = int(rng.poisson(kind.boost * kind.per_deg2 * sky.cell_area(GENERATION_ORDER)))
@@ -90,7 +91,7 @@ def draw(cell: int, seed: int, kind: Kind, lens: Lens, dust: Float32) -> pa.Tabl
         "ra": ra,
         "dec": dec,
         "_healpix_29": index,
-        **lensing.columns(lens, ra, dec, cosmology.comoving_distance(z)),
+        **halo_lensing.columns(lens, ra, dec, cosmology.comoving_distance(z)),
         "kind": np.full(n, kind.code),
         "density_boost": np.full(n, kind.boost),
         "z_true": z,

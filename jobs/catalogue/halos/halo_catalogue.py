@@ -3,8 +3,8 @@
 load   the halos of a request's files, checked, from the cache or read now
 draw   those of one cell and level, with the scatter that decides which galaxies they hold
 
-Masses are M_200m in Msun/h. Galaxies, their abundance and their lensing stay those of our own universe: what is left
-of the structure in the lensing maps is not that of these halos.
+Masses are M_200m in Msun/h. Galaxies and their abundance stay those of our own universe. These halos lens as ours do;
+the structure in the lensing maps is not theirs.
 """
 
 from __future__ import annotations

@@ -68,10 +68,14 @@ class Members:
 
 @dataclass(slots=True, eq=False)
 class Cells:
-    """Cells of one population that have been drawn: (order, cell) -> halos and all their satellites."""
+    """Cells of one population that have been drawn: (order, cell) -> halos and all their satellites.
+
+    lenses : what halos of (order, cell) above a mass do to light
+    """
 
     population: Population
     drawn: OrderedDict[tuple[int, int], tuple[Halos, Satellites]] = field(default_factory=OrderedDict)
+    lenses: OrderedDict[tuple[int, int, float], tuple[Float, Int]] = field(default_factory=OrderedDict)
 
     def at(self, order: int, cell: int) -> tuple[Halos, Satellites]:
         """Halos drawn by a cell of a level, and their satellites, wherever these are."""
