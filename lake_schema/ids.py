@@ -6,8 +6,9 @@ Of halos that are drawn, and of the galaxies in them (member 0 is the central), 
     block (17) << 23 | number of the halo in its block and cell << bits of a member | member
 where a block is a step along the line of sight and a bin of mass: an identifier does not depend on which other halos
 are drawn. Massive halos are few and have many members: more bits are a member's in them (`member_bits`).
-Of all other sources these bits are
+Of most other sources these bits are
     running number (22) << 18 | member (18)
+and of strong lenses bits of a number of their own.
 """
 
 from __future__ import annotations
@@ -78,6 +79,15 @@ def satellite_id(halo: Int, member: Int, bits: npt.ArrayLike = MEMBER_BITS) -> I
     """
     _refuse_beyond("member", member, 1 << np.asarray(bits, np.int64))
     return np.asarray(np.int64(1) << 60 | halo | member)
+
+
+def hashed_id(kind: int, cell: int, words: npt.NDArray[np.uint64]) -> Int:
+    """Identifiers[n] of rare sources that have no number, of 40 bits of a word of their own.
+
+    kind, cell : of all;  words : uint64[n], random: of a thousand in a cell two are the same once in two million cells
+    """
+    own = np.asarray(words, np.uint64) & np.uint64((1 << BLOCK_BITS) - 1)
+    return np.asarray(np.int64(kind) << 60 | _cell(cell) | own.astype(np.int64))
 
 
 def halo_of(ids: Int) -> Int:

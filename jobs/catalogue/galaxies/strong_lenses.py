@@ -25,12 +25,14 @@ import numpy.typing as npt
 import pyarrow as pa
 from scipy.optimize import brentq
 
+from jobs import keyed
 from jobs.catalogue import parameters
+from jobs.catalogue.galaxies import lens_pairs
 from jobs.catalogue.halos import luminosity_function
 from jobs.fluxes import cosmology
-from jobs.rng import stream
+from jobs.keyed import Keyed
 from lake_schema import ids, sky
-from lake_schema.arrays import Array, Float, Float32
+from lake_schema.arrays import Array, Float, Float32, Int
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from lake_schema.units import LIGHT_KM_S
@@ -47,8 +49,8 @@ _GLANCE = 0.7
 _B = 1.6783469900166605
 # Angles in which sign changes are looked for: images closer than this merge at a caustic.
 _ANGLES = 4096
-# As table `galaxies` numbers what is drawn in a cell besides its halos.
-_FIRST_NUMBER = (1 << 21) + (1 << 20) + (3 << 18)
+# Share of the sources that a lens is paired with; all of them where the boost makes the chance of each larger.
+_WINDOW = 1.0 / 64.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,18 @@ class Laws:
     least_magnification: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """Rows of lens and source; dispersion, km/s; Einstein radius, arcsec; key and numbers of the pair's own."""
+
+    lens: int
+    source: int
+    sigma: float
+    radius: float
+    key: int
+    numbers: Float
+
+
 @dataclass(frozen=True, slots=True)
 class Stamps:
     """How pictures are taken (strong_lenses.toml, [stamp])."""
@@ -114,12 +128,11 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
                anywhere else on as much sky
     cell     : nested index at order 8;  seed : of the request
     """
-    law, shape, rng = laws(), stamps(), stream(seed, "strong_lenses", cell)
+    law, shape = laws(), stamps()
     columns = {name: galaxies[name].to_numpy() for name in COLUMNS}
-    pairs = _pairs(law, columns, boost, sky.cell_area(GENERATION_ORDER) * 3600.0**2, rng)
     rows = []
-    for lens_row, source_row, sigma, radius in pairs:
-        system = _system(law, columns, lens_row, source_row, radius, rng)
+    for pair in _pairs(law, columns, boost, sky.cell_area(GENERATION_ORDER) * 3600.0**2, seed):
+        system = _system(law, columns, pair)
         side = _side(shape, *system)
         # A glance with few rays tells most of those that are too faint.
         if shoot(*system, replace(shape, samples=(1, 1)), side).sum() < _GLANCE * law.least_magnification:
@@ -127,7 +140,7 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
         picture = shoot(*system, shape, side)
         found = float(picture.sum())
         if found > law.least_magnification:
-            rows.append((lens_row, source_row, sigma, *system, picture, found))
+            rows.append((pair, *system, picture, found))
     return _table(cell, columns, rows, boost)
 
 
@@ -222,45 +235,59 @@ def shoot(lens: Lens, source: Disc, shape: Stamps, side: int) -> Float32:
 # ------------------------------------------------------------------------------------------------ a cell
 
 
-def _pairs(
-    law: Laws, columns: dict[str, Array], boost: float, area: float, rng: np.random.Generator
-) -> list[tuple[int, int, float, float]]:
-    """(lens, source, sigma, Einstein radius) of what is drawn; area : of the cell, arcsec2."""
+def _pairs(law: Laws, columns: dict[str, Array], boost: float, area: float, seed: int) -> list[Pair]:
+    """What is drawn of lenses and the sources behind them; area : of the cell, arcsec2.
+
+    A pair is drawn or not whichever others there are, so that a deeper catalogue has the same lenses, and more.
+    """
     usual = columns["kind"] < 2
     lens = np.flatnonzero(usual & (columns["color_gr_01"] > law.reddest_blue) & (columns["z_true"] > 0.02))
-    source = np.flatnonzero(usual)
-    source = source[np.argsort(columns["z_true"][source], kind="stable")]
-    z_source = columns["z_true"][source].astype(float)
-    z_lens = columns["z_true"][lens].astype(float)
+    z_lens, rng = columns["z_true"][lens].astype(float), Keyed(columns["id"][lens], seed, "strong_lenses")
     m_star, _, _ = luminosity_function.schechter().at(z_lens)
     brighter = m_star - columns["abs_mag_r01"][lens]
-    sigma = law.sigma_star * 10.0 ** (0.1 * brighter + law.scatter * rng.standard_normal(lens.size))
+    sigma = law.sigma_star * 10.0 ** (0.1 * brighter + law.scatter * rng.standard_normal())
     # However far its source, a lens has no larger radius.
     most = _full_radius(sigma)
-    behind = source.size - np.searchsorted(z_source, z_lens + law.least_z_apart)
-    number = rng.poisson(boost * behind * np.pi * most**2 / area)
-    found = []
-    for i in np.flatnonzero(number):
-        chosen = source.size - 1 - rng.integers(0, behind[i], number[i])
-        radius = einstein_radius(sigma[i], z_lens[i], z_source[chosen])
-        kept = (rng.random(number[i]) * most[i] ** 2 < radius**2) & (radius > law.least_radius)
-        found += [
-            (int(lens[i]), int(source[c]), float(sigma[i]), float(r))
-            for c, r in zip(chosen[kept], radius[kept], strict=True)
-        ]
-    return found
+    chance = boost * np.pi * most**2 / area
+    window = np.where(chance < _WINDOW, _WINDOW, 1.0)
+    lenses = keyed.keys(columns["id"][lens], seed, "strong_lenses", "pair"), rng.random(), window, chance, z_lens
+
+    source = np.flatnonzero(usual)
+    place = Keyed(columns["id"][source], seed, "strong_lenses", "source").random()
+    source, place = source[np.argsort(place)], np.sort(place)
+    of_source = keyed.keys(columns["id"][source], seed, "strong_lenses", "source")
+    sources = of_source, place, columns["z_true"][source].astype(float)
+    out = _room(0)
+    while (count := lens_pairs.found(lenses, sources, law.least_z_apart, out)) > out[0].size:
+        out = _room(count)
+    radius = einstein_radius(sigma[out[0]], z_lens[out[0]], columns["z_true"][source[out[1]]])
+    kept = (out[3][:, 0] * most[out[0]] ** 2 < radius**2) & (radius > law.least_radius)
+    return [
+        Pair(
+            int(lens[out[0][i]]),
+            int(source[out[1][i]]),
+            float(sigma[out[0][i]]),
+            float(radius[i]),
+            int(out[2][i]),
+            out[3][i],
+        )
+        for i in np.flatnonzero(kept)
+    ]
 
 
-def _system(
-    law: Laws, columns: dict[str, Array], lens_row: int, source_row: int, radius: float, rng: np.random.Generator
-) -> tuple[Lens, Disc]:
+def _room(count: int) -> tuple[Int, Int, npt.NDArray[np.uint64], Float]:
+    return np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.uint64), np.empty((count, 4))
+
+
+def _system(law: Laws, columns: dict[str, Array], pair: Pair) -> tuple[Lens, Disc]:
     """Mass follows light in angle; the source lies anywhere within the Einstein radius."""
-    q = float(np.clip(law.axis_ratio + law.axis_ratio_scatter * rng.standard_normal(), *law.axis_ratio_limits))
-    off, phi = radius * np.sqrt(rng.random()), 2.0 * np.pi * rng.random()
-    size = max(float(columns["disk_half_light_radius"][source_row]), 0.01)
-    thin, angle = float(columns["disk_axis_ratio"][source_row]), float(columns["position_angle"][source_row])
+    _, shape, off, around = pair.numbers.tolist()
+    q = float(np.clip(law.axis_ratio + law.axis_ratio_scatter * shape, *law.axis_ratio_limits))
+    off, phi = pair.radius * np.sqrt(off), 2.0 * np.pi * around
+    size = max(float(columns["disk_half_light_radius"][pair.source]), 0.01)
+    thin, angle = float(columns["disk_axis_ratio"][pair.source]), float(columns["position_angle"][pair.source])
     disc = Disc(float(off * np.cos(phi)), float(off * np.sin(phi)), size, thin, angle)
-    return Lens(radius, q, float(columns["position_angle"][lens_row])), disc
+    return Lens(pair.radius, q, float(columns["position_angle"][pair.lens])), disc
 
 
 def _side(shape: Stamps, lens: Lens, source: Disc) -> int:
@@ -270,9 +297,10 @@ def _side(shape: Stamps, lens: Lens, source: Disc) -> int:
 
 
 def _table(cell: int, columns: dict[str, Array], rows: list[Any], boost: float) -> pa.Table:
-    rows.sort(key=lambda row: int(columns["_healpix_29"][row[0]]))
-    lens = np.array([row[0] for row in rows], np.int64)
-    source = np.array([row[1] for row in rows], np.int64)
+    own = ids.hashed_id(STRONG_LENS, cell, np.array([row[0].key for row in rows], np.uint64))
+    lens, source = (np.array([getattr(row[0], name) for row in rows], np.int64) for name in ("lens", "source"))
+    order = np.lexsort((own, columns["_healpix_29"][lens]))
+    own, lens, source, rows = own[order], lens[order], source[order], [rows[i] for i in order]
     n = len(rows)
     placed = ("ra", "dec", "_healpix_29", "ra_lensed", "dec_lensed")
 
@@ -281,7 +309,7 @@ def _table(cell: int, columns: dict[str, Array], rows: list[Any], boost: float) 
 
     return STRONG_LENSES.build(
         {
-            "id": ids.source_id(np.full(n, STRONG_LENS), cell, _FIRST_NUMBER + np.arange(n)),
+            "id": own,
             **{name: columns[name][lens] for name in placed},
             "kind": np.full(n, STRONG_LENS),
             "lens_id": columns["id"][lens],
@@ -289,16 +317,16 @@ def _table(cell: int, columns: dict[str, Array], rows: list[Any], boost: float) 
             "density_boost": np.full(n, boost),
             "z_lens": columns["z_true"][lens],
             "z_source": columns["z_true"][source],
-            "velocity_dispersion": each(lambda row: row[2]),
-            "einstein_radius": each(lambda row: row[3].radius),
-            "axis_ratio": each(lambda row: row[3].axis_ratio),
-            "position_angle": each(lambda row: row[3].angle),
-            "source_east": each(lambda row: row[4].east),
-            "source_north": each(lambda row: row[4].north),
-            "images": each(lambda row: max(1, len(image_positions(row[3], row[4].east, row[4].north)))).astype(int),
-            "magnification": each(lambda row: row[6]),
-            "stamp_side": each(lambda row: row[5].shape[0]).astype(int),
-            "stamp": pa.array([row[5].ravel() for row in rows], STRONG_LENSES.column("stamp").arrow_type),
+            "velocity_dispersion": each(lambda row: row[0].sigma),
+            "einstein_radius": each(lambda row: row[1].radius),
+            "axis_ratio": each(lambda row: row[1].axis_ratio),
+            "position_angle": each(lambda row: row[1].angle),
+            "source_east": each(lambda row: row[2].east),
+            "source_north": each(lambda row: row[2].north),
+            "images": each(lambda row: max(1, len(image_positions(row[1], row[2].east, row[2].north)))).astype(int),
+            "magnification": each(lambda row: row[4]),
+            "stamp_side": each(lambda row: row[3].shape[0]).astype(int),
+            "stamp": pa.array([row[3].ravel() for row in rows], STRONG_LENSES.column("stamp").arrow_type),
         }
     )
 

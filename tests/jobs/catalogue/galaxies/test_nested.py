@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from jobs.catalogue.galaxies import band_ratios, galaxies, line_light
+from jobs.catalogue.galaxies import band_ratios, galaxies, line_light, strong_lenses
 from jobs.catalogue.halos import halos, population
 from jobs.request.schema import Universe
 from tests.jobs.catalogue.conftest import SEED, SMALL
@@ -25,10 +25,9 @@ def model(limit, z_max, seed=SEED):
 
 
 def tables(limit, z_max, cell, dust, seed=SEED):
-    """Galaxies of the light-cone, and halos."""
+    """Galaxies of all kinds, and halos."""
     universe, cells = model(limit, z_max, seed)
-    rows = galaxies.draw(cell, universe, cells, dust)
-    return rows.filter(pc.less(rows["kind"], 2)), galaxies.halo_table(cell, universe.population, cells)
+    return galaxies.draw(cell, universe, cells, dust), galaxies.halo_table(cell, universe.population, cells)
 
 
 def of(rows, wanted):
@@ -51,6 +50,7 @@ def same(one, other):
     for name in one.column_names:
         a, b = (table[name].combine_chunks() for table in (one, other))
         assert a.equals(b), name
+        a, b = (column.flatten() if pa.types.is_list(column.type) else column for column in (a, b))
         if not a.null_count:
             # Zeros of either sign are equal, but not the same.
             assert a.to_numpy(zero_copy_only=False).tobytes() == b.to_numpy(zero_copy_only=False).tobytes(), name
@@ -62,6 +62,7 @@ def check(shallow, deep, cell, dust):
     same(some, of(every, some))
     # And it is all that there is: what a deeper table has to the shallower limits.
     universe, _ = model(*shallow)
+    few, many = (rows.filter(pc.less(rows["kind"], 2)) for rows in (few, many))
     # Columns are single precision.
     z = many["z_true"].to_numpy()
     seen = (magnitude(universe, many) < shallow[0] - 1e-3) & (z < np.float32(shallow[1]) - 1e-6)
@@ -84,7 +85,8 @@ def test_a_shallower_and_a_nearer_request_are_parts_of_a_deeper_one(dust):
 
 def test_nothing_is_missing_at_the_limit(dust):
     """Galaxies that lines alone lift above it are there: all that a limit 1 mag deeper has, but for one in 10^4."""
-    (few, _), (many, _) = (tables(limit, 2.3, CELLS[0], dust) for limit in (23.0, 24.0))
+    found = (tables(limit, 2.3, CELLS[0], dust)[0] for limit in (23.0, 24.0))
+    few, many = (rows.filter(pc.less(rows["kind"], 2)) for rows in found)
     universe, _ = model(23.0, 2.3)
     seen = magnitude(universe, many) < 23.0 - 1e-3
     last = seen & (magnitude(universe, many) > 22.8)
@@ -115,6 +117,16 @@ def test_hosts_behind_the_end_of_a_request_have_their_satellites_before_it():
     hosts, _ = of_near.at(halos.LEVELS[0], 303_117)
     assert hosts.chi.max() > near.halos.far
     assert np.all(hosts.chi < near.halos.far + 2 * near.halos.box.model.cell)
+
+
+def test_strong_lenses_of_a_shallower_catalogue_are_among_those_of_a_deeper_one(dust):
+    few, many = (tables(limit, 2.3, CELLS[0], dust)[0] for limit in (23.0, 24.0))
+    some, every = (strong_lenses.draw(CELLS[0], rows, SEED, 1000.0) for rows in (few, many))
+    assert 5 < some.num_rows < every.num_rows
+    same(some, of(every, some))
+    lost = ~np.isin(every["id"].to_numpy(), some["id"].to_numpy())
+    there = [np.isin(every[name].to_numpy()[lost], few["id"].to_numpy()) for name in ("lens_id", "source_id")]
+    assert not np.any(there[0] & there[1])
 
 
 @pytest.mark.parametrize("seed", [0, 2**63 - 1])
