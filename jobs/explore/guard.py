@@ -5,6 +5,7 @@ The text is parsed by DuckDB itself, into the tree that it would run; nothing is
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -58,10 +59,10 @@ class Query:
     columns: Origins
 
 
-def checked(text: str, known: Collection[str]) -> Query:
+def checked(text: str, known: Collection[str], opened: duckdb.DuckDBPyConnection | None = None) -> Query:
     """The query, if it is harmless.  Errors: BadInput says what it may not do.
 
-    known : names of the lake's tables
+    known : names of the lake's tables;  opened : a parser to use, None = a new one
     """
     if len(text) > _MOST_CHARACTERS or "\0" in text:
         raise BadInput(f"SQL: a query has at most {_MOST_CHARACTERS} characters and no NUL")
@@ -69,7 +70,7 @@ def checked(text: str, known: Collection[str]) -> Query:
         text.encode()
     except UnicodeEncodeError as error:
         raise BadInput(f"SQL: {one_line(error)}") from None
-    tree = _parsed(text)
+    tree = _parsed(text, opened)
     used: set[str] = set()
     for node, visible in _nodes(tree):
         if "cte_map" in node and node.get("type") not in _QUERIES:
@@ -81,14 +82,19 @@ def checked(text: str, known: Collection[str]) -> Query:
     return Query(text, tuple(sorted(used)), _origins(tree, used, {}))
 
 
-def _parsed(text: str) -> Tree:
-    with duckdb.connect(":memory:", config={"threads": 1}) as parser:
+def parser() -> duckdb.DuckDBPyConnection:
+    """A database without tables: opening one takes a hundred times as long as parsing a query."""
+    return duckdb.connect(":memory:", config={"threads": 1})
+
+
+def _parsed(text: str, opened: duckdb.DuckDBPyConnection | None) -> Tree:
+    with contextlib.nullcontext(opened) if opened is not None else parser() as database:
         try:
-            kinds = [statement.type for statement in parser.extract_statements(text)]
+            kinds = [statement.type for statement in database.extract_statements(text)]
             if kinds != [duckdb.StatementType.SELECT]:
                 names = ", ".join(str(kind).rpartition(".")[2] for kind in kinds) or "nothing"
                 raise BadInput(f"SQL: exactly one SELECT is possible, got {names[:100]}")
-            row = parser.execute("SELECT json_serialize_sql($text::VARCHAR)", {"text": text}).fetchone()
+            row = database.execute("SELECT json_serialize_sql($text::VARCHAR)", {"text": text}).fetchone()
         except (duckdb.Error, UnicodeError) as error:
             raise BadInput(f"SQL: {one_line(error)}") from None
     try:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import selectors
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pyarrow as pa
 
@@ -21,6 +22,9 @@ _ROOT = Path(__file__).resolve().parents[2]
 MEMORY, TIMEOUT = 4e9, 300.0
 _MEMORY_LO, _MEMORY_HI = 1e7, 1e15
 TIMEOUT_HI = 1e6
+# Of the memory the part that a result may fill that is wanted in one piece.
+_RESULT = 0.5
+_BUFFER = 1 << 20
 _ERRORS = {"BadInput": BadInput, "Damaged": Damaged}
 
 
@@ -33,6 +37,7 @@ class Process:
 
     def __init__(self, root: Path, tables: Sequence[str], memory: float = MEMORY) -> None:
         check("memory", memory, _MEMORY_LO, _MEMORY_HI)
+        self.most_bytes = int(memory * _RESULT)
         self.command = [sys.executable, "-m", "jobs.explore.worker", str(root), str(int(memory)), *tables]
         self._worker: subprocess.Popen[bytes] | None = None
 
@@ -45,12 +50,30 @@ class Process:
 
     def ask(self, text: str, parameters: dict[str, object], timeout: float = TIMEOUT) -> pa.Table:
         """The result of a SELECT, which is stopped after `timeout` s.  Errors: BadInput, Damaged, as of Explorer.sql"""
+        batches = list(self.batches(text, parameters, timeout, most_bytes=self.most_bytes))
+        return pa.Table.from_batches(batches)
+
+    def batches(
+        self,
+        text: str,
+        parameters: Mapping[str, object] | None = None,
+        timeout: float = TIMEOUT,
+        rows: int | None = None,
+        most_bytes: int | None = None,
+    ) -> Iterator[pa.RecordBatch]:
+        """The same piece by piece, at least one; whoever reads no further stops the query.
+
+        text, parameters : as of `ask`;  timeout : s until the last piece
+        rows             : at most so many, None = all;  most_bytes : refuse a larger result, None = any size
+        Errors           : as of `ask`, also after some pieces have come
+        """
         check("timeout", timeout, 0.0, TIMEOUT_HI)
+        question = {"sql": text, "parameters": dict(parameters or {}), "rows": rows, "bytes": most_bytes}
         try:
-            line = json.dumps({"sql": text, "parameters": parameters}, allow_nan=False)
+            line = json.dumps(question, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise BadInput(f"SQL: a parameter is not a number, text, boolean or list of them: {error}") from None
-        deadline = time.monotonic() + timeout
+        stopped = BadInput(f"SQL: stopped after {timeout:g} s")
         worker = self._running()
         assert worker.stdin is not None
         assert worker.stdout is not None
@@ -58,24 +81,24 @@ class Process:
         try:
             worker.stdin.write(line.encode() + b"\n")
             worker.stdin.flush()
-            if not _readable(worker, deadline):
-                raise BadInput(f"SQL: stopped after {timeout:g} s")
-            head = worker.stdout.readline()
-            if not head:
-                raise BadInput("SQL: the query needs more memory than it may have, or brought its process down")
-            answer = json.loads(head)
+            out = io.BufferedReader(_Timed(worker.stdout.fileno(), time.monotonic() + timeout), _BUFFER)
+            answer = _line(out)
             if not answer:
-                with pa.ipc.open_stream(worker.stdout) as stream:
-                    found = stream.read_all()
+                with pa.ipc.open_stream(out) as stream:
+                    yield from stream
+                answer = _line(out)
             whole = True
+        except TimeoutError:
+            raise stopped from None
         except BrokenPipeError:
             raise BadInput("SQL: the process that answers queries has ended; ask again") from None
+        except (pa.ArrowException, OSError, EOFError):
+            raise BadInput("SQL: the query needs more memory than it may have, or brought its process down") from None
         finally:
             if not whole:
                 self.close()
         if answer:
             raise _ERRORS.get(answer["kind"], LakeError)(answer["error"])
-        return found
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._worker is None or self._worker.poll() is not None:
@@ -86,6 +109,30 @@ class Process:
         return self._worker
 
 
+class _Timed(io.RawIOBase):
+    """What a pipe says until a moment of the monotonic clock; later TimeoutError."""
+
+    def __init__(self, pipe: int, deadline: float) -> None:
+        self.pipe, self.deadline = pipe, deadline
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        with selectors.DefaultSelector() as selector:
+            selector.register(self.pipe, selectors.EVENT_READ)
+            if not selector.select(max(self.deadline - time.monotonic(), 0.0)):
+                raise TimeoutError
+        return os.readv(self.pipe, [buffer])
+
+
+def _line(out: IO[bytes]) -> dict[str, str]:
+    if not (line := out.readline()):
+        raise EOFError
+    said: dict[str, str] = json.loads(line)
+    return said
+
+
 def check(name: str, value: float, lo: float, hi: float) -> None:
     """Refuse a number outside its bounds.
 
@@ -94,10 +141,3 @@ def check(name: str, value: float, lo: float, hi: float) -> None:
     if not lo <= value <= hi:
         raise OutOfRange(name, value, lo, hi)
 
-
-def _readable(worker: subprocess.Popen[bytes], deadline: float) -> bool:
-    """Has the process said anything, or ended, before the deadline?"""
-    assert worker.stdout is not None
-    with selectors.DefaultSelector() as selector:
-        selector.register(worker.stdout, selectors.EVENT_READ)
-        return bool(selector.select(max(deadline - time.monotonic(), 0.0)))

@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from jobs.catalogue.build_galaxies import quarantine_file, quarantine_work
-from jobs.explore import worker
 from jobs.explore.guard import checked
+from jobs.explore.session import Session
 from jobs.render.products.keys import truth_file
 from jobs.render.render_exposures import truth_work
 from lake_schema.errors import Damaged
@@ -47,7 +47,13 @@ def published(root, table, rows, name="a"):
 def asking(version, text):
     """What the explorer's process does with a query that it let through."""
     query = checked(text, {version.table: version.key})
-    return lambda: worker._run(query, {version.table: version}, MEMORY, {})
+    root = version.folder.parents[1]
+
+    def asked():
+        session = Session(root, {version.table: version.key}, MEMORY)
+        return pa.Table.from_batches(list(session.run(query, {})))
+
+    return asked
 
 
 def readers(version, table):

@@ -7,7 +7,9 @@ import pytest
 
 from jobs.explore import guard
 from jobs.explore.explorer import Explorer
+from jobs.explore.session import Session
 from lake_schema.errors import BadInput
+from lake_schema.store import read
 
 SECRET = "the content of a file outside"
 # {file} is a file outside the lake, {part} one of the lake, {new} a file that must not come into being.
@@ -159,17 +161,15 @@ def test_enough_of_them():
 @pytest.mark.parametrize("text", HOSTILE, ids=lambda text: text[:50])
 def test_the_locked_session_is_a_second_fence(explored, outside, before, text, monkeypatch):
     """Were the guard blind, DuckDB itself would still reach nothing outside."""
-    from jobs.explore import worker
-    from lake_schema.store import read
-
     if any(word in text for word in ("POINTER", "5000", "(" * 100, "+1+1", "x" * 100)):
         return
-    opened = {name: read.version(explored, name) for name in ("galaxies", "plain")}
-    part = opened["galaxies"].path(opened["galaxies"].parts[0])
+    galaxies = read.version(explored, "galaxies")
+    part = galaxies.path(galaxies.parts[0])
+    keys = {"galaxies": galaxies.key, "plain": read.version(explored, "plain").key}
     text = text.replace("{file}", str(outside / "secret.csv")).replace("{new}", str(outside / "new"))
-    query = guard.Query(text.replace("{part}", str(part)), ("galaxies", "plain"), None)
+    query = guard.Query(text.replace("{part}", str(part)), ("galaxies", "plain"), guard.Origins(None))
     try:
-        answer = str(worker._run(query, opened, 1 << 30, {}).to_pylist())
+        answer = str([batch.to_pylist() for batch in Session(explored, keys, 1 << 30).run(query, {})])
     except (BadInput, UnicodeError) as error:
         answer = str(error)
     assert SECRET not in answer
