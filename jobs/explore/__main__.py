@@ -1,6 +1,6 @@
 """Ask a lake: python -m jobs.explore "SELECT ..." --lake LAKE [--name REQUEST] [--out FILE].
 
-FILE is .csv, .parquet or .fits.
+FILE is .csv, .parquet, .fits or .vot.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("sql", nargs="?", help="a SELECT, in DuckDB's SQL")
     parser.add_argument("--lake", required=True, help="folder of the lake")
     parser.add_argument("--name", help="of the request whose tables are meant, where the lake has several")
-    parser.add_argument("--out", type=Path, help="write to this .csv, .parquet or .fits file")
+    parser.add_argument("--out", type=Path, help="write to this .csv, .parquet, .fits or .vot file")
     limit = MEMORY / _GIGABYTE
     parser.add_argument("--memory", type=float, default=limit, help=f"GB that it may take (default {limit:g})")
     parser.add_argument("--timeout", type=float, default=TIMEOUT, help=f"s that it may take (default {TIMEOUT:g})")

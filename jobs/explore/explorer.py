@@ -48,7 +48,8 @@ class Explorer:
         versions = [f"{name}={version.key}" for name, version in self.versions.items()]
         # Whoever asks for one of these is told what is wrong with it.
         versions += [f"{name}=?{request or name.rpartition('.')[0]}" for name in (*self.damaged, *self._unclear)]
-        self._process = Process(self.root, versions, memory)
+        self._named, self._memory = versions, memory
+        self._process = self.process()
         check("timeout", timeout, 0.0, TIMEOUT_HI)
         self.timeout = timeout
 
@@ -59,6 +60,13 @@ class Explorer:
             self._unclear[name] = error
         except LakeError as error:
             self.damaged[name] = error
+
+    def process(self, more: Sequence[str] = ()) -> Process:
+        """Another process that answers queries of these versions, for who asks several questions at a time.
+
+        more : NAME=@FILE of Arrow files that are tables, too
+        """
+        return Process(self.root, [*self._named, *more], self._memory)
 
     def __enter__(self) -> Explorer:
         return self
@@ -84,19 +92,19 @@ class Explorer:
                 "meaning": (version.schema.metadata or {}).get(b"description", b"").decode(),
             }
             for name, version in self.versions.items()
-            if self._is_listed(name)
+            if self.is_listed(name)
         ]
         rows += [
             {"table": name, "version": "damaged", "meaning": str(error)}
             for name, error in self.damaged.items()
-            if self._is_listed(name)
+            if self.is_listed(name)
         ]
         columns = ["table", "rows", "MB", "files", "version", "meaning"]
         frame = pd.DataFrame(rows, columns=columns).astype({"rows": "Int64", "files": "Int64"})
         return frame.set_index("table").sort_index()
 
-    def _is_listed(self, name: str) -> bool:
-        """Tables go by their own names; where requests have versions of their own, by both."""
+    def is_listed(self, name: str) -> bool:
+        """Whether a table is listed by this name: by its own; where requests have versions of their own, by both."""
         table = name.rpartition(".")[2]
         return name == table or table in self._unclear
 
@@ -143,7 +151,7 @@ class Explorer:
         return results.converted(self._version(table).cone(ra, dec, radius, columns, on), into)
 
     def export(self, text: str, path: str | Path, /, **parameters: object) -> Path:
-        """Write the result of a SELECT to a .csv, .parquet or .fits file; returns its path."""
+        """Write the result of a SELECT to a .csv, .parquet, .fits or .vot file; returns its path."""
         results.write(self.sql(text, into="arrow", **parameters), Path(path))
         return Path(path)
 

@@ -82,6 +82,20 @@ def checked(text: str, known: Collection[str], opened: duckdb.DuckDBPyConnection
     return Query(text, tuple(sorted(used)), _origins(tree, used, {}))
 
 
+def check_expression(text: str, opened: duckdb.DuckDBPyConnection | None = None) -> None:
+    """Refuse what is not one expression, which could be more than its place in a query gives it room for.
+
+    text : SQL;  opened : a parser to use, None = a new one;  Errors: BadInput
+    """
+    if not 0 < len(text.strip()) <= _MOST_CHARACTERS or "\0" in text:
+        raise BadInput(f"SQL: an expression has 1 to {_MOST_CHARACTERS} characters and no NUL")
+    tree = _parsed(f"SELECT ({text}\n)", opened)
+    alone = tree.get("type") == "SELECT_NODE" and len(tree["select_list"]) == 1 and not tree["select_list"][0]["alias"]
+    more = ("where_clause", "group_expressions", "having", "qualify", "sample", "modifiers")
+    if not alone or tree["from_table"]["type"] != "EMPTY" or any(tree.get(key) for key in more):
+        raise BadInput(f"SQL: {one_line(text)[:100]!r} is not one expression")
+
+
 def parser() -> duckdb.DuckDBPyConnection:
     """A database without tables: opening one takes a hundred times as long as parsing a query."""
     return duckdb.connect(":memory:", config={"threads": 1})

@@ -48,6 +48,11 @@ class Process:
             self._worker.communicate()
             self._worker = None
 
+    def stop(self) -> None:
+        """End what it is doing, from another thread than the one that waits for it; a later query starts another."""
+        if self._worker is not None:
+            self._worker.kill()
+
     def ask(self, text: str, parameters: dict[str, object], timeout: float = TIMEOUT) -> pa.Table:
         """The result of a SELECT, which is stopped after `timeout` s.  Errors: BadInput, Damaged, as of Explorer.sql"""
         batches = list(self.batches(text, parameters, timeout, most_bytes=self.most_bytes))
@@ -60,15 +65,23 @@ class Process:
         timeout: float = TIMEOUT,
         rows: int | None = None,
         most_bytes: int | None = None,
+        expressions: Sequence[str] = (),
     ) -> Iterator[pa.RecordBatch]:
         """The same piece by piece, at least one; whoever reads no further stops the query.
 
         text, parameters : as of `ask`;  timeout : s until the last piece
         rows             : at most so many, None = all;  most_bytes : refuse a larger result, None = any size
+        expressions      : parts of the text that must each be one expression, whoever wrote them
         Errors           : as of `ask`, also after some pieces have come
         """
         check("timeout", timeout, 0.0, TIMEOUT_HI)
-        question = {"sql": text, "parameters": dict(parameters or {}), "rows": rows, "bytes": most_bytes}
+        question: dict[str, Any] = {
+            "sql": text,
+            "parameters": dict(parameters or {}),
+            "rows": rows,
+            "bytes": most_bytes,
+        }
+        question["expressions"] = [*expressions]
         try:
             line = json.dumps(question, allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -140,4 +153,3 @@ def check(name: str, value: float, lo: float, hi: float) -> None:
     """
     if not lo <= value <= hi:
         raise OutOfRange(name, value, lo, hi)
-

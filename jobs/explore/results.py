@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import io
+import itertools
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
+from jobs.explore import votables
 from lake_schema import user_files
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
@@ -62,7 +65,7 @@ def _facts(field: pa.Field) -> dict[str, str]:
 
 
 def write(rows: pa.Table, path: Path) -> None:
-    """Write rows to a file of the kind that its ending says: .csv, .parquet or .fits; replaced in one rename.
+    """Write rows to a file of the kind that its ending says: .csv, .parquet, .fits or .vot; replaced in one rename.
 
     Errors : BadInput for another ending, or names the column that such a file cannot hold; OSError where the disc
              refuses
@@ -121,5 +124,74 @@ def _kind(kind: pa.DataType) -> str:
     return "bool" if pa.types.is_boolean(kind) else "string"
 
 
-_WRITERS: dict[str, Callable[[pa.Table, Path], None]] = {".csv": _csv, ".parquet": _parquet, ".fits": _fits}
+def _votable(rows: pa.Table, path: Path) -> None:
+    with path.open("wb") as file:
+        for piece in votables.pieces([pa.RecordBatch.from_pylist([], rows.schema), *rows.to_batches()]):
+            file.write(piece)
+
+
+_WRITERS: dict[str, Callable[[pa.Table, Path], None]] = {
+    ".csv": _csv, ".parquet": _parquet, ".fits": _fits, ".vot": _votable,
+}  # fmt: skip
 ENDINGS = tuple(_WRITERS)
+
+
+def streamed(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[bytes]:
+    """The bytes of a .csv, .parquet or .vot file of any number of rows, piece by piece.
+
+    batches : at least one;  Errors: BadInput before the first piece where such a file cannot hold the columns
+    """
+    first = next(batches)
+    _refuse_same_names(pa.Table.from_batches([first]))
+    both = itertools.chain([first], batches)
+    if ending == ".vot":
+        yield from votables.pieces(both)
+    elif ending == ".csv":
+        yield from _written(both, lambda sink: pa.csv.CSVWriter(sink, first.schema))
+    elif ending == ".parquet":
+        yield from _written(both, lambda sink: _groups(sink, first.schema))
+    else:
+        raise BadInput(f"a file of {ending} is not written piece by piece")
+
+
+def _groups(sink: Any, schema: pa.Schema) -> pq.ParquetWriter:
+    return pq.ParquetWriter(sink, schema, compression="zstd", write_page_checksum=True)
+
+
+def _written(batches: Iterator[pa.RecordBatch], opened: Callable[[Any], Any]) -> Iterator[bytes]:
+    """What a writer puts into its file, as it comes."""
+    sink = _Sink()
+    try:
+        writer = opened(sink)
+        for batch in batches:
+            writer.write_batch(batch)
+            if piece := sink.taken():
+                yield piece
+    except (pa.ArrowException, TypeError) as error:
+        raise BadInput(f"such a file cannot hold the result: {' '.join(str(error).split())[:300]}") from None
+    writer.close()
+    yield sink.taken()
+
+
+class _Sink(io.RawIOBase):
+    """Keeps what is written until it is taken."""
+
+    def __init__(self) -> None:
+        self._kept, self._at = bytearray(), 0
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self._kept += data
+        self._at += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._at
+
+    def taken(self) -> bytes:
+        """What was written since it was last asked."""
+        piece = bytes(self._kept)
+        self._kept.clear()
+        return piece

@@ -11,7 +11,8 @@ import duckdb
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from jobs.explore.guard import Query, checked, one_line, parser
+from jobs.explore import adql
+from jobs.explore.guard import Query, check_expression, checked, one_line, parser
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import read
 
@@ -57,6 +58,10 @@ class Session:
     def checked(self, text: str) -> Query:
         """The query, if it may run.  Errors: BadInput"""
         return checked(text, self.known, self._parser)
+
+    def check_expression(self, text: str) -> None:
+        """Refuse what is not one expression.  Errors: BadInput"""
+        check_expression(text, self._parser)
 
     def close(self) -> None:
         """Forget every table; the next query opens those that it names."""
@@ -106,7 +111,7 @@ class Session:
                 "threads": os.cpu_count() or 1,
             }
             self._database = duckdb.connect(":memory:", config=config)
-            for command in (*_MACROS, *_LOCKS):
+            for command in (*_MACROS, *adql.MACROS, *_LOCKS):
                 self._database.execute(command)
         return self._database
 

@@ -66,6 +66,8 @@ def _batches(session: Session, question: dict[str, Any]) -> Iterator[pa.RecordBa
     """The answer up to its row `rows`, if that is given; BadInput where it is larger than `bytes`, if that is."""
     most_rows, most_bytes = question.get("rows"), question.get("bytes")
     rows = size = 0
+    for text in question.get("expressions", ()):
+        session.check_expression(text)
     for batch in session.run(session.checked(question["sql"]), question["parameters"]):
         piece = batch if most_rows is None else batch.slice(0, most_rows - rows)
         rows, size = rows + piece.num_rows, size + piece.nbytes

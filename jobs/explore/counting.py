@@ -1,0 +1,156 @@
+"""Counts of many rows for several charts at once, each under the limits that are set in the others.
+
+Chart       what is counted of which columns
+counted     all charts in one pass over kept columns
+span        a range that holds nearly all of a column
+
+A row counts in a chart if it lies within the limits of every column that is not the chart's own, and within the
+chart's spans. A missing value (NaN) is in no bin, and within no limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+
+from jobs.compiling import exact_jit
+from lake_schema.arrays import Bool, Float, Float32, Int
+from lake_schema.errors import BadInput
+
+# Rows that are counted at a time: a few columns of them stay in a processor's own cache.
+_BLOCK = 8192
+_MOST_COLUMNS, MOST_CELLS = 62, 8_000_000
+_MOST_AXES = 3
+# Rows that tell a span, and the part of them that may lie outside on each side.
+_LOOKED_AT, _OUTSIDE = 200_000, 2e-3
+
+Limits = Mapping[int, tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """Counts in a grid of equal bins.
+
+    columns : numbers of the kept columns along its axes, one to three;  spans : lowest and highest value of each
+    bins    : of each axis;  own : columns whose limits do not hold here, None = those of its axes
+    """
+
+    columns: tuple[int, ...]
+    spans: tuple[tuple[float, float], ...]
+    bins: tuple[int, ...]
+    own: frozenset[int] | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.columns) == len(self.spans) == len(self.bins) <= _MOST_AXES:
+            raise BadInput("a chart has one to three axes, each with a span and a number of bins")
+        if not all(np.isfinite([lo, hi]).all() and lo < hi for lo, hi in self.spans):
+            raise BadInput(f"spans = {self.spans} are not from a finite number to a larger one")
+        if not (min(self.bins) >= 1 and self.cells <= MOST_CELLS):
+            raise BadInput(f"bins = {self.bins} are not between 1 and {MOST_CELLS} in all")
+
+    @property
+    def cells(self) -> int:
+        return int(np.prod(self.bins))
+
+
+def counted(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1) -> list[Int]:
+    """int64[bins of the first axis, of the second ...] of each chart.
+
+    columns : float32[n] each;  charts : what to count
+    limits  : number of a column -> lowest and highest value that count, both included
+    threads : that count side by side
+    """
+    if not 1 <= len(columns) <= _MOST_COLUMNS or len({len(column) for column in columns}) != 1:
+        raise BadInput(f"counting wants 1 to {_MOST_COLUMNS} columns of the same rows")
+    tables = _tables(len(columns), charts, limits)
+    rows = len(columns[0])
+    edges = np.linspace(0, rows, threads + 1).astype(np.int64)
+
+    def part(number: int) -> Int:
+        counts = np.zeros(sum(chart.cells for chart in charts), np.int64)
+        for first in range(int(edges[number]), int(edges[number + 1]), _BLOCK):
+            last = min(first + _BLOCK, int(edges[number + 1]))
+            _count(np.stack([column[first:last] for column in columns]), *tables, counts)
+        return counts
+
+    if threads == 1:
+        total = part(0)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            total = reduce(np.add, pool.map(part, range(threads)))
+    ends = np.cumsum([chart.cells for chart in charts])
+    return [piece.reshape(chart.bins) for piece, chart in zip(np.split(total, ends[:-1]), charts, strict=True)]
+
+
+def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float, Bool, Int, Float, Int, Int, Int]:
+    """Limits [column, 2], which of them are set [column], and of each chart: axes, spans, bins, the limits it heeds."""
+    bounds, is_set = np.zeros((number, 2)), np.zeros(number, np.bool_)
+    for column, (lo, hi) in limits.items():
+        bounds[column], is_set[column] = (lo, hi), True
+    axes = np.full((len(charts), _MOST_AXES), -1, np.int64)
+    spans, bins = np.zeros((len(charts), _MOST_AXES, 2)), np.ones((len(charts), _MOST_AXES), np.int64)
+    heeded = np.zeros(len(charts), np.int64)
+    for k, chart in enumerate(charts):
+        size = len(chart.columns)
+        axes[k, :size], spans[k, :size], bins[k, :size] = chart.columns, chart.spans, chart.bins
+        own = frozenset(chart.columns) if chart.own is None else chart.own
+        heeded[k] = sum(1 << column for column in range(number) if column not in own)
+    starts = np.append(0, np.cumsum([chart.cells for chart in charts])[:-1]).astype(np.int64)
+    return bounds, is_set, axes, spans, bins, heeded, starts
+
+
+@exact_jit
+def _count(
+    values: Float32,
+    bounds: Float,
+    is_set: Bool,
+    axes: Int,
+    spans: Float,
+    bins: Int,
+    heeded: Int,
+    starts: Int,
+    counts: Int,
+) -> None:
+    """Add the rows of a block, float32[column, n], to the counts."""
+    rows = values.shape[1]
+    fails = np.zeros(rows, np.int64)
+    for c in range(values.shape[0]):
+        if is_set[c]:
+            lo, hi = bounds[c, 0], bounds[c, 1]
+            for i in range(rows):
+                if not (values[c, i] >= lo and values[c, i] <= hi):
+                    fails[i] |= np.int64(1) << c
+    for k in range(axes.shape[0]):
+        for i in range(rows):
+            if fails[i] & heeded[k] == 0:
+                cell = np.int64(0)
+                inside = True
+                for a in range(axes.shape[1]):
+                    if axes[k, a] >= 0:
+                        x = np.float64(values[axes[k, a], i])
+                        lo, hi = spans[k, a, 0], spans[k, a, 1]
+                        if not (x >= lo and x <= hi):
+                            inside = False
+                            break
+                        cell = cell * bins[k, a] + min(np.int64((x - lo) / (hi - lo) * bins[k, a]), bins[k, a] - 1)
+                if inside:
+                    counts[starts[k] + cell] += 1
+
+
+def span(column: Float32) -> tuple[float, float]:
+    """A range that holds nearly all finite values of a column, judged by some of its rows; (0, 1) where it has none.
+
+    column : float32[n]
+    """
+    some = np.asarray(column[:: max(len(column) // _LOOKED_AT, 1)], float)
+    some = some[np.isfinite(some)]
+    if not len(some):
+        return 0.0, 1.0
+    lo, hi = np.quantile(some, [_OUTSIDE, 1.0 - _OUTSIDE])
+    margin = 0.02 * (hi - lo)
+    lo, hi = max(lo - margin, some.min()), min(hi + margin, some.max())
+    return (float(lo), float(hi)) if hi > lo else (float(lo) - 0.5, float(hi) + 0.5)

@@ -1,0 +1,154 @@
+"""VOTables of any number of rows, piece by piece: what TAP answers with, and TOPCAT, Aladin and astropy read.
+
+pieces      batches of rows -> the bytes of a VOTable
+refusal     an error as a VOTable
+
+Ref: IVOA Recommendation VOTable 1.4; DALI 1.1, section 4.4 (QUERY_STATUS)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+from xml.sax.saxutils import escape, quoteattr
+
+import pyarrow as pa
+
+_OPEN = (
+    '<?xml version="1.0" encoding="UTF-8"?>\n<VOTABLE version="1.4" xmlns="http://www.ivoa.net/xml/VOTable/v1.3">\n'
+    '<RESOURCE type="results">\n'
+)
+_CLOSE = "</RESOURCE>\n</VOTABLE>\n"
+_TYPES = {
+    pa.bool_(): "boolean", pa.int8(): "short", pa.int16(): "short", pa.int32(): "int", pa.int64(): "long",
+    pa.uint8(): "short", pa.uint16(): "int", pa.uint32(): "long", pa.uint64(): "long",
+    pa.float32(): "float", pa.float64(): "double",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What a client is told of a field beside its name and type."""
+
+    unit: str = ""
+    ucd: str = ""
+    description: str = ""
+    xtype: str = ""
+    utype: str = ""
+
+
+@dataclass(slots=True)
+class Cut:
+    """How many rows may be sent, and whether there were more.
+
+    most : None = all;  overflowed : set when the last piece has been made
+    """
+
+    most: int | None = None
+    overflowed: bool = field(default=False)
+
+
+def pieces(batches: Iterable[pa.RecordBatch], cut: Cut | None = None, infos: Sequence[str] = ()) -> Iterator[bytes]:
+    """The bytes of a VOTable of the rows, serialised as TABLEDATA; at least the first batch is asked for at once.
+
+    batches : at least one;  cut : how many rows;  infos : further INFO elements, XML
+    """
+    cut = cut or Cut()
+    waiting = iter(batches)
+    batch = next(waiting, None)
+    schema = batch.schema if batch is not None else pa.schema([])
+    status = '<INFO name="QUERY_STATUS" value="OK"/>\n'
+    fields = "".join(_field(column) for column in schema)
+    yield f"{_OPEN}{status}{''.join(infos)}<TABLE>\n{fields}<DATA><TABLEDATA>\n".encode()
+    sent = 0
+    while batch is not None:
+        left = batch.num_rows if cut.most is None else max(cut.most - sent, 0)
+        cut.overflowed |= batch.num_rows > left
+        if rows := _rows(batch.slice(0, left)):
+            yield rows
+        sent += min(left, batch.num_rows)
+        batch = next(waiting, None)
+    tail = '<INFO name="QUERY_STATUS" value="OVERFLOW"/>\n' if cut.overflowed else ""
+    yield f"</TABLEDATA></DATA>\n</TABLE>\n{tail}{_CLOSE}".encode()
+
+
+def refusal(message: str) -> bytes:
+    """A VOTable that says why there is none."""
+    return f'{_OPEN}<INFO name="QUERY_STATUS" value="ERROR">{_text(message)}</INFO>\n{_CLOSE}'.encode()
+
+
+def facts_of(column: pa.Field) -> Facts:
+    """Of a field its unit, UCD and sentence."""
+    known = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
+    return Facts(*(known.get(key, "") for key in ("unit", "ucd", "description", "xtype", "utype")))
+
+
+def datatype(kind: pa.DataType) -> tuple[str, str]:
+    """VOTable's datatype and arraysize ("" of a scalar) of an Arrow type."""
+    if pa.types.is_list(kind):
+        inner, size = datatype(kind.value_type)
+        # Texts in an array have no form there.
+        return ("char", "*") if size else (inner, "*")
+    if kind in _TYPES:
+        return _TYPES[kind], ""
+    return ("double", "") if pa.types.is_decimal(kind) else ("char", "*")
+
+
+def _field(column: pa.Field) -> str:
+    about = facts_of(column)
+    kind, size = datatype(column.type)
+    given = {"name": column.name, "datatype": kind, "arraysize": size, "unit": about.unit, "ucd": about.ucd}
+    given |= {"xtype": about.xtype, "utype": about.utype}
+    words = " ".join(f"{key}={_quoted(value)}" for key, value in given.items() if value)
+    null = f'<VALUES null="{_NULLS[kind]}"/>' if kind in _NULLS and not size else ""
+    description = f"<DESCRIPTION>{_text(about.description)}</DESCRIPTION>" if about.description else ""
+    return f"<FIELD {words}>{description}{null}</FIELD>\n"
+
+
+# What stands for a missing whole number; VOTable 1.4 also lets a cell be empty, which older readers take for zero.
+_NULLS = {"short": -32768, "int": -2147483648, "long": -9223372036854775808}
+
+
+def _rows(batch: pa.RecordBatch) -> bytes:
+    if not batch.num_rows:
+        return b""
+    cells = [_cells(column) for column in batch.columns]
+    return "".join(f"<TR>{''.join(row)}</TR>\n" for row in zip(*cells, strict=True)).encode()
+
+
+def _cells(column: pa.Array) -> list[str]:
+    shown = _shown(column.type)
+    null = f"<TD>{_NULLS.get(datatype(column.type)[0], '')}</TD>" if not datatype(column.type)[1] else "<TD/>"
+    return [null if value is None else f"<TD>{shown(value)}</TD>" for value in column.to_pylist()]
+
+
+def _shown(kind: pa.DataType) -> Callable[[Any], str]:
+    if pa.types.is_list(kind) and not datatype(kind.value_type)[1]:
+        inner = _shown(kind.value_type)
+        return lambda values: " ".join("NaN" if value is None else inner(value) for value in values)
+    if pa.types.is_boolean(kind):
+        return lambda value: "T" if value else "F"
+    if pa.types.is_integer(kind):
+        return str
+    if pa.types.is_float32(kind):
+        return lambda value: _number(value, ".9g")
+    if pa.types.is_floating(kind) or pa.types.is_decimal(kind):
+        return lambda value: _number(float(value), ".17g") if value == value else "NaN"
+    return lambda value: _text(str(value))
+
+
+def _number(value: float, form: str) -> str:
+    if math.isfinite(value):
+        return repr(value) if form == ".17g" else format(value, form)
+    return "NaN" if math.isnan(value) else ("+Inf" if value > 0 else "-Inf")
+
+
+def _text(text: str) -> str:
+    """XML has no form for most control characters."""
+    return escape("".join(c if c >= " " or c in "\t\n\r" else "\N{REPLACEMENT CHARACTER}" for c in text))
+
+
+def _quoted(text: str) -> str:
+    return quoteattr(_text(text).replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))

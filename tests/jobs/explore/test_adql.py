@@ -1,0 +1,98 @@
+"""ADQL becomes DuckDB's SQL: what differs is changed, what is quoted stays, what cannot be is named."""
+
+import contextlib
+
+import duckdb
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from jobs.explore import adql, session
+from lake_schema.errors import BadInput
+
+
+@pytest.fixture(scope="module")
+def database():
+    with duckdb.connect() as opened:
+        for macro in (*session._MACROS, *adql.MACROS):
+            opened.execute(macro)
+        yield opened
+
+
+@pytest.mark.parametrize(
+    ("query", "sql"),
+    [
+        ("SELECT 1", "SELECT 1"),
+        ("SELECT TOP 3 a FROM t", "SELECT a FROM t LIMIT 3"),
+        ("select distinct top 3 a FROM t ORDER BY a;", "select distinct a FROM t ORDER BY a LIMIT 3"),
+        ("SELECT TOP 3 a FROM t OFFSET 5", "SELECT a FROM t LIMIT 3 OFFSET 5"),
+        ("SELECT * FROM (SELECT TOP 2 a FROM t) AS s", "SELECT * FROM (SELECT a FROM t LIMIT 2 ) AS s"),
+        ("SELECT TOP 1 (SELECT TOP 2 b FROM u) FROM t", "SELECT (SELECT b FROM u LIMIT 2 ) FROM t LIMIT 1"),
+        ("SELECT 'TOP 3', \"POINT\" -- TOP 2\nFROM t", "SELECT 'TOP 3', \"POINT\" FROM t"),
+        ('SELECT LOG(a), LOG10(a), "LOG"(a), log FROM t', 'SELECT ln(a), LOG10(a), "LOG"(a), log FROM t'),
+        ("SELECT top FROM t", "SELECT top FROM t"),
+    ],
+)
+def test_in_sql(query, sql):
+    assert adql.in_sql(query).split() == sql.split()
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ("SELECT BOX('', 1, 2, 3, 4) FROM t", "BOX is not possible"),
+        ("SELECT POINT(1, 2) FROM t", "POINT is not possible alone"),
+        ("SELECT CONTAINS(POINT(1, 2)) FROM t", "wants 2 arguments, got 1"),
+        ("SELECT CONTAINS(POINT(1, 2), CIRCLE(1, 2)) FROM t", "two coordinates and a radius"),
+        ("SELECT CONTAINS(POINT(1), CIRCLE(1, 2, 3)) FROM t", "two coordinates"),
+        ("SELECT CONTAINS(CIRCLE(1, 2, 3), POINT(1, 2)) FROM t", "wants a POINT"),
+        ("SELECT CONTAINS(POINT(1, 2), POLYGON(1, 2, 3, 4)) FROM t", "three corners"),
+        ("SELECT CONTAINS(POINT(1, 2), REGION('x')) FROM t", "REGION is not possible"),
+        ("SELECT DISTANCE(POINT(1, 2) FROM t", "bracket is not closed"),
+        ("SELECT DISTANCE(, ) FROM t", "wants a POINT"),
+        ("SELECT " + "x" * 60_000, "at most"),
+    ],
+)
+def test_refusals(query, words):
+    with pytest.raises(BadInput, match=words):
+        adql.in_sql(query)
+
+
+def value(database, expression):
+    return database.sql(adql.in_sql(f"SELECT {expression} AS a")).fetchall()[0][0]
+
+
+def test_polygons(database):
+    square = "POLYGON(10, -5, 20, -5, 20, 5, 10, 5)"
+    for ra, dec, inside in ((15, 0, 1), (10.1, 4.9, 1), (9.9, 0, 0), (15, 5.2, 0), (195, 0, 0), (375, 0, 1)):
+        assert value(database, f"CONTAINS(POINT({ra}, {dec}), {square})") == inside
+        text = "'POLYGON ICRS 10 -5 20 -5 20 5 10 5'"
+        assert value(database, f"CONTAINS(POINT({ra}, {dec}), ({text}))") == inside
+    assert value(database, "CONTAINS(POINT(0.5, 0), POLYGON('ICRS', 359, -1, 1, -1, 1, 1, 359, 1))") == 1
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=15)
+@given(
+    st.floats(0, 360), st.floats(-89, 89), st.floats(0.01, 5), st.floats(0, 6.28), st.floats(0, 0.9) | st.floats(1.1, 2)
+)
+def test_a_ring_of_corners(database, ra, dec, radius, angle, share):
+    """What lies clearly within or beyond it is told apart."""
+
+    def beside(turn, r):
+        d, b = np.radians(r), np.radians(dec)
+        lat = np.arcsin(np.sin(b) * np.cos(d) + np.cos(b) * np.sin(d) * np.cos(turn))
+        lon = np.arctan2(np.sin(turn) * np.sin(d) * np.cos(b), np.cos(d) - np.sin(b) * np.sin(lat))
+        return float(ra + np.degrees(lon)), float(np.degrees(lat))
+
+    corners = [beside(turn, radius) for turn in np.linspace(0, 2 * np.pi, 12, endpoint=False)]
+    polygon = ", ".join(f"{a!r}, {d!r}" for a, d in corners)
+    point = beside(angle, share * radius)
+    found = value(database, f"CONTAINS(POINT({point[0]!r}, {point[1]!r}), POLYGON({polygon}))")
+    assert found == int(share < 1)
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_one_or_refused(text):
+    with contextlib.suppress(BadInput):
+        assert isinstance(adql.in_sql(text), str)
