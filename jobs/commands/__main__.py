@@ -4,6 +4,7 @@
     truesky check REQUEST                   whether a request is valid and all of it can be rendered
     truesky build | fluxes | lenses | gaia | plan | render  --lake LAKE --request REQUEST
                                             one job: catalogues, fluxes, strong lenses, Gaia's view, plan, images
+    truesky page LAKE                       the lake in the browser, and a TAP service for other tools
     truesky sql QUERY --lake LAKE           a SELECT over the lake's tables
     truesky list | verify | gc | describe LAKE      what is there, whether it is whole, what no longer serves
     truesky report LAKE                     what the runs took, beside the forecast
@@ -42,6 +43,7 @@ MODULES = {
     "describe": ("lake_schema.__main__", True),
     "mission": ("lake_schema.__main__", True),
     "report": ("jobs.report", False),
+    "page": ("jobs.page.__main__", False),
     "examples": ("jobs.commands.examples", False),
 }
 # What a job answers without Spark.

@@ -54,7 +54,7 @@ def previews(root: Path, out: Path, most: int | None = None, request: str | None
         image = read_back.electrons(version.file(row["path"]))
         if _frame_of(row) in hits:
             (truth,) = images.read_images(version.file(hits[_frame_of(row)]))
-            image = images.Image(_mended(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
+            image = images.Image(mended(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
         path = out / f"{row['channel']}_{row['band']}_{row['detector']}_{row['exposure_id']}.png".lower()
         picture(path, np.asarray(image.data), image.cards, preview_labels.labels(root, row, image, made_of))
         made.append(path)
@@ -76,7 +76,7 @@ def _frame_of(row: dict[str, Any]) -> tuple[Any, ...]:
     return row["exposure_id"], row["detector"]
 
 
-def _mended(image: Float, hit: Bool) -> Float:
+def mended(image: Float, hit: Bool) -> Float:
     """Pixels that cosmic rays hit take the median of those around them that none did."""
     rows, columns = np.nonzero(hit)
     whole = np.where(hit, np.nan, image)

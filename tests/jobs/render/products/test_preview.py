@@ -68,10 +68,10 @@ def test_cosmic_rays_are_mended_from_around_them():
     hit = np.zeros(image.shape, bool)
     hit[20, 3:25] = hit[0, 0] = True
     spoiled = np.where(hit, 1e5, image)
-    mended = preview._mended(spoiled, hit)
+    mended = preview.mended(spoiled, hit)
     np.testing.assert_array_equal(mended[~hit], image[~hit])
     assert np.abs(mended - image).max() <= 1.0
-    everything = preview._mended(spoiled, np.ones(image.shape, bool))
+    everything = preview.mended(spoiled, np.ones(image.shape, bool))
     np.testing.assert_array_equal(everything, spoiled)
 
 

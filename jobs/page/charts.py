@@ -1,0 +1,109 @@
+"""Charts that filter each other: counts of all of them in one pass over kept columns."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from jobs.explore import columns, counting
+from jobs.explore.columns import Selection
+from jobs.explore.counting import Chart
+from jobs.page.opened import Lake
+from lake_schema import tables as declarations
+from lake_schema.arrays import Float32
+from lake_schema.errors import BadInput
+
+# Rows a core that are counted at every move; of more a part is counted first.
+ROWS_A_CORE = 25_000_000
+PART = 64
+_MOST_AXES, _MOST_CHARTS = 16, 16
+Json = dict[str, Any]
+
+
+async def counts(lake: Lake, question: Json) -> bytes:
+    """4 bytes: length of the head; the head, JSON; then the counts of every chart, uint32, first axis slowest.
+
+    question : source, where; axes, each an expression; charts, each with axes (numbers), bins, spans (or null) and,
+               if need be, own (numbers of axes whose limits do not hold in it); limits, [axis, lowest, highest] each;
+               part, one row in so many, or null
+    """
+    source, where = str(question.get("source", "")), str(question.get("where") or "true")
+    axes = [str(axis) for axis in question.get("axes", ())]
+    if not 0 < len(axes) <= _MOST_AXES or not 0 < len(question.get("charts", ())) <= _MOST_CHARTS:
+        raise BadInput(f"charts: wanted 1 to {_MOST_AXES} axes and 1 to {_MOST_CHARTS} charts")
+    keys = _keys(lake, source)
+    part = _part(lake, source, keys, question.get("part"))
+    async with lake.own.process() as process:
+
+        def kept() -> list[Float32]:
+            selection = Selection(lake.key, source, where, keys, part)
+            found = columns.kept(
+                selection, axes, lambda text, own: process.batches(text, {}, lake.timeout, expressions=own)
+            )
+            columns.trim()
+            return found
+
+        held = await asyncio.to_thread(kept)
+    return await asyncio.to_thread(_counted, lake, held, question, part)
+
+
+def _keys(lake: Lake, source: str) -> tuple[str, ...]:
+    """What tells the rows of a table apart; of anything else than a table nothing."""
+    if source not in lake.versions:
+        return ()
+    version = lake.versions[source]
+    known = declarations.find(version.table, version.schema.names)
+    return tuple(f'"{name}"' for name in known.key) if known else ()
+
+
+def _part(lake: Lake, source: str, keys: tuple[str, ...], asked: object) -> int:
+    if isinstance(asked, int) and not isinstance(asked, bool) and asked in (1, PART):
+        return asked if keys else 1
+    many = source in lake.versions and lake.versions[source].num_rows > ROWS_A_CORE * lake.threads
+    return PART if many and keys else 1
+
+
+def _counted(lake: Lake, held: list[Float32], question: Json, part: int) -> bytes:
+    try:
+        spans = [counting.span(column) for column in held]
+        charts = [_chart(chart, spans) for chart in question["charts"]]
+        limits = {int(axis): (float(lo), float(hi)) for axis, lo, hi in question.get("limits") or ()}
+        if any(not 0 <= axis < len(held) for axis in [*limits, *(axis for chart in charts for axis in chart.columns)]):
+            raise BadInput("charts: an axis has no expression")
+    except (TypeError, ValueError, LookupError) as error:
+        raise BadInput(f"charts: {error}") from None
+    rows = len(held[0])
+    threads = lake.threads if rows > 1_000_000 else 1
+    found = counting.counted(held, charts, limits, threads) if rows else [np.zeros(c.bins, np.int64) for c in charts]
+    head = {
+        "rows": rows,
+        "part": part,
+        "missing": [int(rows - np.count_nonzero(np.isfinite(column))) for column in held],
+        "charts": [
+            {"axes": chart.columns, "bins": chart.bins, "spans": chart.spans, "total": int(counts.sum())}
+            for chart, counts in zip(charts, found, strict=True)
+        ],
+    }
+    text = json.dumps(head).encode()
+    # What follows begins at a multiple of four bytes.
+    text += b" " * (-len(text) % 4)
+    return b"".join([struct.pack("<I", len(text)), text, *(counts.astype("<u4").tobytes() for counts in found)])
+
+
+def _chart(asked: Json, spans: list[tuple[float, float]]) -> Chart:
+    axes = tuple(int(axis) for axis in asked["axes"])
+    given = asked.get("spans") or [None] * len(axes)
+    own = asked.get("own")
+    return Chart(
+        axes,
+        tuple(
+            spans[axis] if span is None else (float(span[0]), float(span[1]))
+            for axis, span in zip(axes, given, strict=True)
+        ),
+        tuple(int(bins) for bins in asked["bins"]),
+        None if own is None else frozenset(int(axis) for axis in own),
+    )

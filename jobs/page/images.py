@@ -1,0 +1,65 @@
+"""The images of a lake as files: where they are, and how ObsCore describes them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jobs.page.opened import Lake
+from jobs.page.pictures import pictures
+from jobs.page.tap_tables import image_row
+from lake_schema import sky
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.store import read
+
+# A passband's response at its ends, of its largest.
+_FAINTEST = 0.01
+
+
+def obscore(lake: Lake, address: str) -> list[dict[str, Any]]:
+    """Rows of ivoa.obscore.
+
+    address : of the service from which the files can be had
+    """
+    exposures = {row["exposure_id"]: row for version in lake.named("exposures") for row in version.rows().to_pylist()}
+    bands = _bands(lake)
+    found = []
+    for number, one in enumerate(pictures(lake)):
+        entry = next(entry for entry in one.version.manifest["files"] if entry["path"] == one.row["path"])
+        corners = np.array([float(text) for text in one.row["s_region"].split()[2:]]).reshape(-1, 2)
+        header = {key: value for key, value, _ in one.cards}
+        about = {
+            "url": f"{address}/file/{lake.key}/{number}", "kbyte": entry["bytes"] // 1024, "version": one.version.key,
+            "fov": _diameter(one.row["ra"], one.row["dec"], corners), "wavelengths": bands.get(one.row["band"]),
+            "nx": header.get("NAXIS1"), "ny": header.get("NAXIS2"),
+        }  # fmt: skip
+        found.append(image_row(number, one.row, exposures.get(one.row["exposure_id"], {}), about))
+    return found
+
+
+def _diameter(ra: float, dec: float, corners: Float) -> float:
+    return 2.0 * float(np.max(sky.separation(corners[:, 0], corners[:, 1], ra, dec)))
+
+
+def _bands(lake: Lake) -> dict[str, tuple[float, float]]:
+    """Passband -> shortest and longest wavelength, angstrom."""
+    found = {}
+    for version in lake.named("passbands"):
+        for row in version.rows(["name", "first_wavelength", "wavelength_step", "response"]).to_pylist():
+            response = np.array(row["response"])
+            seen = np.flatnonzero(response >= _FAINTEST * response.max(initial=0.0))
+            ends = row["first_wavelength"] + row["wavelength_step"] * seen[[0, -1]]
+            found[str(row["name"])] = float(ends[0]), float(ends[1])
+    return found
+
+
+def file(lake: Lake, number: int) -> Path:
+    """A FITS file, compared with its sha256.  Errors: BadInput where the lake has none of that number"""
+    known = pictures(lake)
+    if not 0 <= number < len(known):
+        raise BadInput(f"the lake has no image {number}; it has {len(known)}")
+    version: read.Version = known[number].version
+    return version.file(known[number].row["path"])

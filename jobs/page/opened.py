@@ -1,0 +1,157 @@
+"""A lake as it is shown: its tables as they were when it was opened, and the processes that answer questions of them.
+
+Whatever is kept of it goes by its key. A lake that is published anew is said to be changed, and shown as it was until
+it is opened again; nothing of the one is mixed with the other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import pyarrow as pa
+
+from jobs.explore.explorer import Explorer
+from jobs.explore.process import MEMORY, TIMEOUT, Process
+from lake_schema.errors import BadInput, LakeError
+from lake_schema.store import read
+from lake_schema.store.provenance import digest
+
+# Questions that wait for a process; those beyond are refused.
+MOST_WAITING = 8
+_KEY_LENGTH = 16
+Item = TypeVar("Item")
+
+
+class Busy(LakeError):
+    """Too many questions wait already."""
+
+
+class Lane:
+    """Processes that answer questions, each one at a time.
+
+    make : a process;  number : how many
+    """
+
+    def __init__(self, make: Callable[[], Process], number: int) -> None:
+        self._make, self._waiting = make, 0
+        self._all = {make() for _ in range(number)}
+        self._free: asyncio.Queue[Process] = asyncio.Queue()
+        for process in self._all:
+            self._free.put_nowait(process)
+
+    @asynccontextmanager
+    async def process(self) -> AsyncIterator[Process]:
+        """A process that is free; where its user is cancelled another takes its place.
+
+        Errors : Busy where too many wait
+        """
+        if self._free.empty() and self._waiting >= MOST_WAITING:
+            raise Busy(f"{MOST_WAITING} questions are waiting: ask again later")
+        self._waiting += 1
+        try:
+            process = await self._free.get()
+        finally:
+            self._waiting -= 1
+        try:
+            yield process
+        except LakeError:
+            raise
+        except BaseException:
+            # Its user went away in the midst of an answer: whoever asks next must meet nothing of that.
+            process.stop()
+            self._all.discard(process)
+            process = self._make()
+            self._all.add(process)
+            raise
+        finally:
+            self._free.put_nowait(process)
+
+    async def warm(self) -> None:
+        """Start them all."""
+        async with AsyncExitStack() as taken:
+            processes = [await taken.enter_async_context(self.process()) for _ in range(len(self._all))]
+            await asyncio.gather(*(asyncio.to_thread(process.ask, "SELECT 1", {}) for process in processes))
+
+    def close(self) -> None:
+        """End them all."""
+        for process in self._all:
+            process.stop()
+
+
+class Lake:
+    """One opened lake.
+
+    root    : of the lake;  request : whose tables, where the lake has those of several
+    memory  : bytes that each process may take;  timeout : s that a question may take
+    key     : of the versions of its tables
+    """
+
+    def __init__(
+        self, root: Path, request: str | None = None, memory: float = MEMORY, timeout: float = TIMEOUT
+    ) -> None:
+        self.explorer = Explorer(root, memory, timeout, request)
+        self.root, self.request, self.timeout = self.explorer.root, request, timeout
+        self.key = digest({name: version.key for name, version in self.explorer.versions.items()})[:_KEY_LENGTH]
+        # What a user asks may take minutes: it holds up neither the other nor what the page itself asks.
+        self.questions = Lane(self.explorer.process, 2)
+        self.own = Lane(self.explorer.process, 1)
+        self.threads = min(os.cpu_count() or 1, 8)
+
+    @property
+    def versions(self) -> Mapping[str, read.Version]:
+        return self.explorer.versions
+
+    @property
+    def listed(self) -> Mapping[str, read.Version]:
+        """Every table once: by its own name where that is clear."""
+        return {name: version for name, version in sorted(self.versions.items()) if self.explorer.is_listed(name)}
+
+    def version(self, table: str) -> read.Version:
+        """A table of the lake.  Errors: BadInput where there is none."""
+        if table not in self.versions:
+            raise BadInput(f"the lake has no table {table}")
+        return self.versions[table]
+
+    def named(self, table: str) -> list[read.Version]:
+        """A table, or where requests have versions of their own, that of each of them."""
+        if table in self.versions:
+            return [self.versions[table]]
+        return [version for name, version in sorted(self.versions.items()) if name.rpartition(".")[2] == table]
+
+    def is_changed(self) -> bool:
+        """Whether a table has been published since it was opened."""
+        try:
+            for name, version in self.versions.items():
+                own, _, table = name.rpartition(".")
+                if read.version(self.root, table, request=own or self.request).key != version.key:
+                    return True
+        except LakeError:
+            return True
+        return False
+
+    async def rows(self, text: str, parameters: Mapping[str, object] | None = None) -> pa.Table:
+        """The answer to a question of the page's own."""
+        async with self.own.process() as process:
+            return await asyncio.to_thread(process.ask, text, dict(parameters or {}), self.timeout)
+
+    async def warm(self) -> None:
+        """Start the processes: the first question of each would wait for it."""
+        await asyncio.gather(*(lane.warm() for lane in (self.own, self.questions)))
+
+    def close(self) -> None:
+        """End its processes."""
+        self.questions.close()
+        self.own.close()
+        self.explorer.close()
+
+
+async def pieces(batches: Iterator[Item]) -> AsyncIterator[Item]:
+    """What an iterator that waits gives, without holding up anything else."""
+    nothing = object()
+    while (piece := await asyncio.to_thread(next, batches, nothing)) is not nothing:
+        yield piece  # type: ignore[misc]

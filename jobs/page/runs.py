@@ -1,0 +1,90 @@
+"""What was done for a lake: tasks, seconds and GB beside forecasts, failures, the mission, where an image is from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+from jobs import report
+from jobs.page import pictures
+from jobs.page.answers import plain
+from jobs.page.opened import Lake
+from jobs.render import archive
+from lake_schema.errors import LakeError
+from lake_schema.mission.configuration import resolve
+from lake_schema.store import names as named
+from lake_schema.store import read
+
+_DEEPEST = 8
+Json = dict[str, Any]
+
+
+def runs(lake: Lake) -> Json:
+    """Jobs with their forecasts, tasks done of all, failures, and what of the mission is not as truesky has it."""
+    found: Json = {"jobs": [], "tasks": [], "failures": [], "mission": []}
+    try:
+        found["jobs"] = [
+            {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(line).items()}
+            for line in report.rows(lake.root)
+        ]
+    except LakeError as error:
+        found["said"] = str(error)
+    done = {(one.row["exposure_id"], one.row["detector"]) for one in pictures.pictures(lake)}
+    for version in lake.named("tasks"):
+        rows = version.rows(["exposure_id", "detector", "seconds", "bytes"]).to_pylist()
+        own = [row for row in rows if (row["exposure_id"], row["detector"]) in done]
+        found["tasks"].append(
+            {"done": len(own), "all": len(rows), "seconds_left": sum(r["seconds"] for r in rows if r not in own)}
+        )
+    if done or found["tasks"]:
+        found["failures"] = [{k: plain(v) for k, v in row.items()} for row in _failures(lake)]
+    for version in lake.named("mission"):
+        found["mission"] += _changed(version)
+    return found
+
+
+def _failures(lake: Lake) -> list[Json]:
+    try:
+        rows: list[Json] = archive.failures(lake.root, lake.request).to_pylist()
+    except LakeError:
+        return []
+    return rows
+
+
+def _changed(version: read.Version) -> list[Json]:
+    """Parameters that a request gave another value than they have in the mission database of this truesky."""
+    rows = version.rows(["name", "value", "unit", "overridden"]).to_pylist()
+    usual = resolve()
+    return [
+        {"name": row["name"], "value": plain(row["value"]), "unit": row["unit"],
+         "usual": plain(usual.parameter(row["name"]).value) if row["name"] in usual else None}
+        for row in rows
+        if row["overridden"]
+    ]  # fmt: skip
+
+
+def provenance(lake: Lake, number: int) -> Json:
+    """A tree: the image, the version of the table that it is of, what that was made of, and so on.
+
+    number : of the image
+    """
+    one = pictures.picture(lake, number)
+    return {
+        "name": one.row["path"].rpartition("/")[2],
+        "about": f"sha256 {one.version.sha256(one.row['path'])}",
+        "from": [_tree(lake, one.version, 0)],
+    }
+
+
+def _tree(lake: Lake, version: read.Version, depth: int) -> Json:
+    keys = set(named.keys_in(version.manifest.get("facts", {})))
+    made_of = []
+    for table in read.tables(lake.root) if depth < _DEEPEST else []:
+        for key in sorted(keys):
+            try:
+                made_of.append(_tree(lake, read.version(lake.root, table, key), depth + 1))
+            except LakeError:
+                continue
+    about = f"version {version.key}, {version.num_rows:,} rows, truesky {version.manifest.get('truesky', '')}"
+    return {"name": version.table, "about": about, "from": made_of}

@@ -1,0 +1,160 @@
+"""The sky of a lake: densities in HEALPix cells, sources of a small field, footprints of what is planned or done."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from jobs.page.answers import is_catalogue
+from jobs.page.opened import Lake
+from jobs.render import archive
+from lake_schema import sky
+from lake_schema.arrays import Float, Int
+from lake_schema.errors import BadInput, LakeError
+from lake_schema.store import layout
+
+MOST_CELLS, MOST_SOURCES = 200_000, 20_000
+_DEEPEST_SHOWN = 16
+# Cells of a cover of the part in view are about this part of its radius wide.
+_CELLS_A_RADIUS = 4
+Json = dict[str, Any]
+# Of the sources of a field: what is shown beside the place, where a table has it.
+_MAGNITUDES = ("mag_r01", "mag_h", "phot_g_mean_mag", "log_mass")
+
+
+def parts(lake: Lake, table: str) -> bytes:
+    """Densities in the files' own cells, from the manifest: no row is read."""
+    version = lake.version(table)
+    if not is_catalogue(version):
+        raise BadInput(f"table {table} has no positions")
+    own = [(*layout.cell_of_file(part), version.part_rows(part)) for part in version.parts]
+    corners = [sky.cell_corners(order, [cell]) for order, cell, _ in own]
+    density = [rows / sky.cell_area(order) for order, _, rows in own]
+    return _packed(
+        np.concatenate(corners) if corners else np.zeros((0, 4, 2)), np.array(density), {"rows": version.num_rows}
+    )
+
+
+async def density(lake: Lake, table: str, order: int, where: str, view: Float | None) -> bytes:
+    """4 bytes: length of the head; the head, JSON; float32 corners [n, 4, 2] deg; float32 number per deg2 [n].
+
+    order : of the cells;  where : SQL condition of the rows that count;  view : ra, dec, radius deg; None: everything
+    """
+    if not 0 <= order <= _DEEPEST_SHOWN:
+        raise BadInput(f"order = {order} is outside [0, {_DEEPEST_SHOWN}]")
+    shift = 2 * (sky.DEEPEST - order)
+    text = f"""SELECT _healpix_29 >> {shift} AS cell, count(*) AS n FROM {_table(lake, table)}
+               WHERE ({where}\n) AND {_within(view)} GROUP BY cell ORDER BY cell LIMIT {MOST_CELLS + 1}"""
+    found = await _asked(lake, text, where)
+    if found.num_rows > MOST_CELLS:
+        raise BadInput(f"more than {MOST_CELLS:,} cells hold rows: look at a part, or at larger cells")
+    cells, number = found["cell"].to_numpy(), found["n"].to_numpy()
+    head = {"order": order, "rows": int(number.sum()), "cells": len(cells)}
+    corners = sky.cell_corners(order, cells) if len(cells) else np.zeros((0, 4, 2))
+    return _packed(corners, number / sky.cell_area(order), head)
+
+
+async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
+    """Rows of a catalogue in a field: places, identifiers, a magnitude, a kind; the brightest where they are many.
+
+    view : ra, dec, radius deg;  where : SQL condition
+    """
+    names = lake.version(table).schema.names
+    lon, lat, radius = (float(number) for number in view)
+    mag = next((name for name in _MAGNITUDES if name in names), None)
+    key = "id" if "id" in names else names[0]
+    ra, dec = ("ra_lensed", "dec_lensed") if "ra_lensed" in names else ("ra", "dec")
+    chosen = [f'"{key}" AS id', f"{ra} AS ra", f"{dec} AS dec", f"{mag or 'NULL'} AS mag"]
+    chosen += ["kind" if "kind" in names else "NULL AS kind"]
+    text = f"""SELECT {", ".join(chosen)} FROM {_table(lake, table)} WHERE ({where}\n) AND {_within(view)}
+               AND separation(ra, dec, {lon!r}, {lat!r}) <= {radius!r}
+               ORDER BY {"mag" if mag else "1"} LIMIT {MOST_SOURCES}"""
+    found = await _asked(lake, text, where)
+    columns = {name: found[name].to_pylist() for name in ("ra", "dec", "mag", "kind")}
+    return {**columns, "id": [str(value) for value in found["id"].to_pylist()], "by": mag}
+
+
+async def _asked(lake: Lake, text: str, where: str) -> pa.Table:
+    async with lake.own.process() as process:
+
+        def ask() -> pa.Table:
+            return pa.Table.from_batches(list(process.batches(text, {}, lake.timeout, expressions=[where])))
+
+        return await asyncio.to_thread(ask)
+
+
+def _table(lake: Lake, table: str) -> str:
+    if not is_catalogue(lake.version(table)):
+        raise BadInput(f"table {table} has no positions")
+    return ".".join(f'"{name}"' for name in table.split("."))
+
+
+def _within(view: Float | None) -> str:
+    """The condition that a row lies in cells that the view touches: files and row groups outside are not read."""
+    if view is None:
+        return "true"
+    ra, dec, radius = view
+    order = int(np.clip(np.ceil(np.log2(np.sqrt(sky.cell_area(0)) * _CELLS_A_RADIUS / max(radius, 1e-6))), 0, 20))
+    ranges = _ranges(sky.cells_in_cone(ra, dec, min(radius, 180.0), order), order)
+    return f"({' OR '.join(f'(_healpix_29 >= {first} AND _healpix_29 < {last})' for first, last in ranges)})"
+
+
+def _ranges(cells: Int, order: int, most: int = 24) -> list[tuple[int, int]]:
+    """Half-open stretches of order-29 indices that cover sorted cells, the widest gaps left out."""
+    gaps = np.diff(cells)
+    cuts = np.flatnonzero(gaps > 1)
+    if len(cuts) >= most:
+        cuts = np.sort(cuts[np.argsort(gaps[cuts])[-most + 1 :]])
+    firsts, lasts = cells[np.append(0, cuts + 1)], cells[np.append(cuts, len(cells) - 1)]
+    return [(sky.cell_range(order, a)[0], sky.cell_range(order, b)[1]) for a, b in zip(firsts, lasts, strict=True)]
+
+
+def _packed(corners: Float, density: Float, head: Json) -> bytes:
+    text = json.dumps({**head, "cells": len(density)}).encode()
+    text += b" " * (-len(text) % 4)
+    arrays = (np.asarray(corners, "<f4"), np.asarray(density, "<f4"))
+    return b"".join([struct.pack("<I", len(text)), text, *(array.tobytes() for array in arrays)])
+
+
+# ------------------------------------------------------------------------------------------------ footprints
+
+
+def regions(lake: Lake) -> list[Json]:
+    """Footprints of detectors: what was planned, what is done, what failed."""
+    found: dict[tuple[int, str], Json] = {}
+    for row in _rows(lake, "tasks", ("exposure_id", "detector", "channel", "s_region")):
+        found[row["exposure_id"], row["detector"]] = {**_polygon(row), "state": "planned", "images": []}
+    for number, row in enumerate(_rows(lake, "products", _PRODUCT)):
+        place = row["exposure_id"], row["detector"]
+        region = found.setdefault(place, {**_polygon(row), "images": []})
+        region["state"] = "observed"
+        region["images"].append(number)
+        region["band"] = row["band"]
+    try:
+        failed = archive.failures(lake.root, lake.request).to_pylist() if found else []
+    except LakeError:
+        failed = []
+    lost = {str(row["part"]): str(row["error"]) for row in failed}
+    for (exposure, detector), region in found.items():
+        if region["state"] == "planned" and (error := lost.get(f"{exposure:06d}-{detector}.parquet".lower())):
+            region |= {"state": "failed", "error": error}
+    return list(found.values())
+
+
+_PRODUCT = ("path", "content", "exposure_id", "detector", "channel", "band", "s_region")
+
+
+def _rows(lake: Lake, table: str, names: Sequence[str]) -> list[Json]:
+    return [row for version in lake.named(table) for row in version.rows(names).to_pylist()]
+
+
+def _polygon(row: Json) -> Json:
+    numbers = [float(text) for text in row["s_region"].split()[2:]]
+    polygon = [numbers[k : k + 2] for k in range(0, len(numbers), 2)]
+    return {key: row[key] for key in ("exposure_id", "detector", "channel")} | {"polygon": polygon}

@@ -1,0 +1,166 @@
+"""One source: its rows, its spectrum as it is observed, where it was drawn, and small pictures of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from jobs.fluxes import band_fluxes, inputs, passbands
+from jobs.fluxes.spectra import lines
+from jobs.page import pictures
+from jobs.page.answers import plain
+from jobs.page.opened import Lake
+from lake_schema import ids, sky
+from lake_schema.errors import BadInput, LakeError
+from lake_schema.store import read
+
+_TABLES = {**{kind: ("galaxies", "galaxy_fluxes") for kind in range(5)}, 5: ("stars", "star_fluxes")}
+# A spectrum is shown at so many wavelengths.
+_SAMPLES = 2400
+_CUTOUT = 64
+Json = dict[str, Any]
+
+
+def source(lake: Lake, text: str) -> Json:
+    """Its kind, its rows by table with units, and where it was drawn.
+
+    text : identifier, decimal
+    """
+    identifier = _identifier(text)
+    kind = int(ids.kind_of(np.array([identifier]))[0])
+    found: Json = {"id": text, "kind": pictures.KINDS.get(kind, str(kind)), "tables": {}, "drawn": []}
+    for table in _TABLES.get(kind, ()):
+        for version in lake.named(table):
+            if (rows := _rows(version, identifier)).num_rows:
+                found["tables"][table] = _facts(rows)
+    rows = found["tables"].get(_TABLES.get(kind, ("",))[0])
+    if rows:
+        values = {row["name"]: row["value"] for row in rows}
+        ra, dec = (float(values.get(f"{name}_lensed", values.get(name, 0.0))) for name in ("ra", "dec"))
+        found["place"] = [ra, dec]
+        found["images"] = [
+            {"number": number, "x": x, "y": y, "is_north_up": pictures.is_north_up(lake, number)}
+            for number, x, y in pictures.covering(lake, ra, dec)
+        ]
+    for version in lake.named("rendered_truth"):
+        drawn = version.rows(where=pa.compute.field("id") == identifier)
+        found["drawn"] += [{key: plain(value) for key, value in row.items()} for row in drawn.to_pylist()]
+    if not found["tables"] and not found["drawn"]:
+        raise BadInput(f"the lake has no source {text}")
+    return found
+
+
+def _identifier(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) <= 19 and int(text) < 1 << 63):
+        raise BadInput(f"{text[:40]!r} is not an identifier of a source")
+    return int(text)
+
+
+def _rows(version: read.Version, identifier: int) -> pa.Table:
+    """The row of a source: of the files only that of its cell is read."""
+    cell = identifier >> ids.BLOCK_BITS & ((1 << 2 * ids.GENERATION_ORDER + 4) - 1)
+    rows = version.in_cells([int(sky.parent(cell, ids.GENERATION_ORDER, ids.FILE_ORDER))], ids.FILE_ORDER)
+    rows = rows.filter(pa.compute.equal(rows["id"], identifier))
+    # A lensed source, or one at a cell's edge, may lie in a neighbour's file.
+    return rows if rows.num_rows else version.rows(where=pa.compute.field("id") == identifier)
+
+
+def _facts(rows: pa.Table) -> list[Json]:
+    about = [{key.decode(): value.decode() for key, value in (field.metadata or {}).items()} for field in rows.schema]
+    return [
+        {"name": field.name, "value": plain(rows[field.name][0].as_py()), "unit": facts.get("unit", ""),
+         "meaning": facts.get("description", "")}
+        for field, facts in zip(rows.schema, about, strict=True)
+    ]  # fmt: skip
+
+
+def spectrum(lake: Lake, text: str) -> Json:
+    """f_lambda as it arrives, its lines, and the passbands of the lake with the fluxes through them.
+
+    text : identifier, decimal;  wavelengths in angstrom, f_lambda in erg s-1 cm-2 A-1, f_nu in microjansky
+    """
+    identifier = _identifier(text)
+    kind = int(ids.kind_of(np.array([identifier]))[0])
+    if kind not in (0, 1, 4, 5):
+        raise BadInput(f"no spectrum is made of a {pictures.KINDS.get(kind, kind)}")
+    table, flux_table = _TABLES[kind]
+    fluxes = lake.version(flux_table)
+    made_of = fluxes.manifest["facts"]
+    row = _rows(lake.version(table), identifier)
+    if not row.num_rows:
+        raise BadInput(f"the lake has no source {text}")
+    if kind == 5:
+        library = inputs.stars_of(lake.root, made_of)
+        whole, grid = band_fluxes.star_spectra(row, library)[0], np.asarray(library.wavelength, float)
+    else:
+        whole, grid = band_fluxes.galaxy_spectra(row, inputs.library_of(lake.root, made_of))[0], passbands.grid()
+    step = max(len(grid) // _SAMPLES, 1)
+    size = len(grid) // step * step
+    # Means, so that no line falls between two samples.
+    found: Json = {
+        "wavelength": np.round(grid[:size].reshape(-1, step).mean(axis=1), 2).tolist(),
+        "f_lambda": [float(f"{value:.5g}") for value in whole[:size].reshape(-1, step).mean(axis=1)],
+        "lines": [], "bands": _bands(lake, _rows(fluxes, identifier)),
+    }  # fmt: skip
+    if kind != 5:
+        z = float(row["z_obs"][0].as_py())
+        found["z"] = z
+        found["lines"] = [
+            {"name": line.name, "wavelength": line.vacuum * (1.0 + z)}
+            for line in lines.line_list()
+            if (row[line.column][0].as_py() or 0.0) > 0.0
+        ]
+    return found
+
+
+def _bands(lake: Lake, row: pa.Table) -> list[Json]:
+    named = {name: row[name][0].as_py() for name in row.column_names if name.startswith("f_nu_")} if len(row) else {}
+    try:
+        curves = lake.version("passbands").rows(["name", "pivot_wavelength", "log_width"]).to_pylist()
+    except LakeError:
+        return []
+    return [
+        {"name": one["name"], "wavelength": one["pivot_wavelength"], "f_nu": named[f"f_nu_{one['name']}"],
+         "width": one["pivot_wavelength"] * one["log_width"]}
+        for one in curves
+        if f"f_nu_{one['name']}" in named
+    ]  # fmt: skip
+
+
+def cutout(lake: Lake, number: int, x: float, y: float) -> bytes:
+    """float32 [64, 64] pixels about a place of an image, NaN beyond its edge.
+
+    lake, number : of the image;  x, y : column and row, 0 = centre of the first pixel
+    """
+    image = pictures.picture(lake, number).levels(mended=True)[0]
+    if not (np.isfinite([x, y]).all() and abs(x) < 1e6 and abs(y) < 1e6):
+        raise BadInput("x, y: wanted pixels")
+    out = np.full((_CUTOUT, _CUTOUT), np.nan, np.float32)
+    column, row = round(x) - _CUTOUT // 2, round(y) - _CUTOUT // 2
+    top, left = max(row, 0), max(column, 0)
+    piece = image[top : max(row + _CUTOUT, 0), left : max(column + _CUTOUT, 0)]
+    out[top - row : top - row + piece.shape[0], left - column : left - column + piece.shape[1]] = piece
+    return out.tobytes()
+
+
+def nearest(lake: Lake, ra: float, dec: float, radius: float) -> Json:
+    """The source of the catalogues that is nearest to a place, of those within a radius.
+
+    lake : whose catalogues;  ra, dec, radius : deg
+    """
+    best: Json = {}
+    for table in ("galaxies", "stars"):
+        for version in lake.named(table):
+            lensed = "ra_lensed" in version.schema.names
+            names = ("ra_lensed", "dec_lensed") if lensed else ("ra", "dec")
+            rows = version.cone(ra, dec, radius, ["id", *names], "lensed" if lensed else "true")
+            if not rows.num_rows:
+                continue
+            lon, lat = (rows[name].to_numpy() for name in names)
+            away = sky.separation(lon, lat, ra, dec)
+            first = int(np.argmin(away))
+            if not best or away[first] < best["separation"]:
+                best = {"id": str(rows["id"][first].as_py()), "separation": float(away[first])}
+    return best

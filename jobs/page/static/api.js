@@ -1,0 +1,147 @@
+// Questions to the server, each of the lake as it was opened; and small helpers of the page.
+
+export const lake = { key: "", tables: [], tap: "", limits: {} };
+
+/** Say something in the corner; what went wrong stays longer. */
+export function say(text, bad = false) {
+  const line = document.getElementById("said").appendChild(document.createElement("p"));
+  line.textContent = text;
+  line.className = bad ? "bad" : "";
+  setTimeout(() => line.remove(), bad ? 12000 : 3000);
+}
+
+async function answered(address, options) {
+  const answer = await fetch(address, { credentials: "same-origin", ...options });
+  if (answer.ok) return answer;
+  let said = answer.statusText;
+  try {
+    said = (await answer.json()).error;
+  } catch { /* no JSON: the status says it */ }
+  if (answer.status === 409) document.getElementById("changed").hidden = false;
+  throw new Error(said);
+}
+
+const address = (path) => `/api/${lake.key}/${path}`;
+
+/** Learn what the lake holds. */
+export async function open(again = false) {
+  const answer = again ? await answered("/api/reopen", { method: "POST" }) : await answered("/api/lake");
+  Object.assign(lake, await answer.json());
+  document.getElementById("changed").hidden = !lake.is_changed;
+  return lake;
+}
+
+export async function get(path, signal) {
+  return (await answered(address(path), { signal })).json();
+}
+
+export async function bytes(path, signal) {
+  return (await answered(address(path), { signal })).arrayBuffer();
+}
+
+export async function post(path, question, signal) {
+  const answer = await answered(address(path), { method: "POST", body: JSON.stringify(question), signal });
+  return answer.headers.get("Content-Type").startsWith("application/json") ? answer.json() : answer.arrayBuffer();
+}
+
+/** The head of a binary answer, and where its numbers begin. */
+export function headed(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  return [JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length))), 4 + length];
+}
+
+export function downloadAddress(format, sql) {
+  return `${address("export")}?${new URLSearchParams({ format, sql })}`;
+}
+
+/** An element: h("td", {class: "text"}, "x", child). Texts become text, never markup. */
+export function h(tag, facts = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(facts)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (value !== undefined && value !== null && value !== false) made.setAttribute(name, value === true ? "" : value);
+  }
+  made.append(...children.filter((child) => child !== null && child !== undefined));
+  return made;
+}
+
+/** A number as people read it. */
+export function number(value, digits = 5) {
+  if (value === null || value === undefined) return "";
+  if (typeof value !== "number") return String(value);
+  if ((Number.isInteger(value) || Math.abs(value) >= 1e5) && Math.abs(value) < 1e12) return Math.round(+value.toPrecision(Math.max(digits, Number.isInteger(value) ? 15 : 3))).toLocaleString("en-US").replace(/,/g, "\u202f");
+  const size = Math.abs(value);
+  return size !== 0 && (size >= 1e12 || size < 1e-3) ? (+value.toPrecision(digits)).toExponential() : String(+value.toPrecision(digits));
+}
+
+/** Right ascension and declination, sexagesimal beside degrees. */
+export function place(ra, dec) {
+  const two = (x) => String(Math.floor(x)).padStart(2, "0");
+  const split = (value, last) => {
+    const unit = 10 ** last, all = Math.round(value * 3600 * unit);
+    const seconds = ((all % (60 * unit)) / unit).toFixed(last).padStart(3 + last, "0");
+    return [two(all / (3600 * unit)), two((all / (60 * unit)) % 60), seconds];
+  };
+  const hours = split((((ra % 360) + 360) % 360) / 15, 2), degrees = split(Math.abs(dec), 1);
+  return `${hours.join(":")} ${dec < 0 ? "\u2212" : "+"}${degrees.join(":")}   ${ra.toFixed(5)} ${dec.toFixed(5)} deg`;
+}
+
+export async function copy(text, what) {
+  try {
+    await navigator.clipboard.writeText(text);
+    say(`${what} copied`);
+  } catch {
+    say(text);
+  }
+}
+
+export function table(columns, rows, caption) {
+  const head = h("tr", {}, ...columns.map((c) => h("th", { scope: "col", title: c.meaning || null, class: c.text ? "text" : null },
+    c.name, c.unit ? h("small", {}, ` ${c.unit}`) : null)));
+  const body = rows.map((row) => h("tr", {}, ...row.map((value, k) =>
+    h("td", { class: columns[k].text ? "text" : null }, value instanceof Node ? value : number(value, 7)))));
+  return h("table", {}, caption ? h("caption", {}, caption) : null, h("thead", {}, head), h("tbody", {}, ...body));
+}
+
+/** Run the newest question; while one is under way only the last of the others waits. */
+export function newest(ask) {
+  let busy = false, waiting = null;
+  return async function run(...given) {
+    if (busy) {
+      waiting = given;
+      return;
+    }
+    busy = true;
+    try {
+      await ask(...given);
+    } catch (error) {
+      if (error.name !== "AbortError") say(error.message, true);
+    } finally {
+      busy = false;
+      if (waiting) {
+        const next = waiting;
+        waiting = null;
+        run(...next);
+      }
+    }
+  };
+}
+
+/** Make a canvas as fine as the screen; returns its size in the page's pixels. */
+export function fit(canvas) {
+  const ratio = window.devicePixelRatio || 1, box = canvas.getBoundingClientRect();
+  const width = Math.max(1, Math.round(box.width * ratio)), height = Math.max(1, Math.round(box.height * ratio));
+  if (canvas.width !== width || canvas.height !== height) {
+    canvas.width = width;
+    canvas.height = height;
+  }
+  return [box.width, box.height, ratio];
+}
+
+/** Ticks at round numbers. */
+export function ticks(low, high, about) {
+  const step0 = (high - low) / Math.max(about, 1), power = 10 ** Math.floor(Math.log10(step0));
+  const step = power * [1, 2, 5, 10].find((m) => m * power >= step0 * 0.999), out = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + step * 1e-9; k++) out.push(+(k * step).toPrecision(12));
+  return out;
+}

@@ -1,0 +1,450 @@
+// Images: tiles of every product, stretched and coloured by the graphics processor; the truth on them.
+
+import * as api from "/static/api.js";
+import { NAMES, ink, lutTexture, program } from "/static/colour.js";
+import { pin, pinned, onPin } from "/static/pin.js";
+import { Plate } from "/static/sphere.js";
+
+const $ = (id) => document.getElementById(id);
+const VERTEX = `in vec2 corner; uniform mat3 toScreen; uniform vec4 box; out vec2 at;
+void main() {
+  at = corner;
+  vec3 p = toScreen * vec3(box.xy + corner * box.zw, 1.0);
+  gl_Position = vec4(p.xy, 0.0, 1.0);
+}`;
+const FRAGMENT = `in vec2 at; uniform sampler2D pixels; uniform sampler2D colours; uniform vec3 levels; uniform int stretch; out vec4 colour;
+void main() {
+  float v = texture(pixels, at).r;
+  float x = v - levels.x, w = levels.y - levels.x, k = levels.z, t;
+  if (stretch == 0) t = asinh(x / k) / asinh(w / k);
+  else if (stretch == 1) t = x / w;
+  else if (stretch == 2) t = log(1.0 + max(x, 0.0) / k) / log(1.0 + w / k);
+  else t = sqrt(max(x, 0.0) / w);
+  colour = isnan(v) ? vec4(0.25, 0.0, 0.25, 1.0) : texture(colours, vec2(clamp(t, 0.0, 1.0), 0.5));
+}`;
+const STRETCHES = ["asinh", "linear", "log", "sqrt"];
+// Tiles that are kept, 1 MB each; sigmas at which asinh turns from linear to logarithmic; milliseconds of a blink.
+const MOST_TILES = 120, KNEE = 4, BLINK_MS = 750;
+const view = { one: -1, two: -1, x: 0, y: 0, zoom: 0 };
+const opened = new Map(), truths = new Map(), tiles = new Map();
+let page, list = null, gl, drawing, quad, colours, other = false, blinking = null, wanted = null, asked = false, hovered = null;
+
+export function start(given) {
+  page = given;
+  const canvas = $("image-canvas");
+  gl = canvas.getContext("webgl2");
+  if (!gl) return;
+  drawing = program(gl, VERTEX, FRAGMENT);
+  quad = gl.createBuffer();
+  gl.bindBuffer(gl.ARRAY_BUFFER, quad);
+  gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([0, 0, 1, 0, 0, 1, 1, 1]), gl.STATIC_DRAW);
+  $("image-map").append(...NAMES.map((name) => api.h("option", {}, name)));
+  $("image-map").value = "gray";
+  colours = lutTexture(gl, "gray");
+  $("image-map").addEventListener("change", () => {
+    colours = lutTexture(gl, $("image-map").value, colours);
+    redraw();
+  });
+  for (const name of ["image-stretch", "image-black", "image-white", "image-mended", "image-truth"]) $(name).addEventListener("input", redraw);
+  $("image-one").addEventListener("change", () => choose(Number($("image-one").value)));
+  $("image-two").addEventListener("change", async () => {
+    view.two = Number($("image-two").value);
+    if (view.two >= 0) await open(view.two);
+    redraw();
+  });
+  $("image-blink").addEventListener("click", blink);
+  $("image-all").addEventListener("click", () => whole());
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    zoom(Math.exp(-Math.sign(event.deltaY) * Math.min(Math.abs(event.deltaY), 120) * 0.002), event);
+  }, { passive: false });
+  canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
+  canvas.addEventListener("pointermove", moved);
+  canvas.addEventListener("pointerleave", () => ($("image-tip").hidden = true));
+  let from = [0, 0];
+  canvas.addEventListener("pointerdown", (event) => (from = [event.clientX, event.clientY]));
+  canvas.addEventListener("click", (event) => Math.hypot(event.clientX - from[0], event.clientY - from[1]) < 4 && pinAt(...pixelAt(event)));
+  onPin(redraw);
+}
+
+/** Show an image at a place of the sky, deg. */
+export function goTo(number, place) {
+  wanted = { number, place };
+}
+
+export async function show() {
+  list ??= await api.get("images");
+  if (!list.length) return api.say("The lake holds no images.");
+  if (!$("image-one").childElementCount) {
+    const name = (one) => `${one.exposure_id} ${one.channel} ${one.band} ${one.detector}: ${one.content.replace("_", " ")}`;
+    $("image-one").append(...list.map((one) => api.h("option", { value: one.number }, name(one))));
+    $("image-two").append(api.h("option", { value: -1 }, "nothing"), ...list.map((one) => api.h("option", { value: one.number }, name(one))));
+  }
+  if (wanted) {
+    const { number, place } = wanted;
+    wanted = null;
+    await choose(number, place);
+  } else if (view.one < 0 || view.one >= list.length) await choose(list.findIndex((one) => one.content === "science"));
+  else await choose(view.one, null, true);
+}
+
+async function open(number) {
+  if (!opened.has(number)) {
+    $("image-place").textContent = "The tiles of this image are being made, once.";
+    const about = await api.get(`image/${number}`);
+    $("image-place").textContent = "";
+    opened.set(number, { ...about, plate: new Plate(about.grid) });
+  }
+  return opened.get(number);
+}
+
+/** Show another image; the place on the sky stays where both have it. */
+async function choose(number, place = null, same = false) {
+  const before = opened.get(view.one), sky = place ?? (before && !same ? before.plate.sky(view.x, view.y) : null);
+  const now = await open(Math.max(0, number));
+  if (view.two >= 0) await open(view.two).catch(() => (view.two = -1));
+  view.one = now.number;
+  $("image-one").value = view.one;
+  $("image-two").value = view.two;
+  const at = sky && now.plate.pixel(...sky);
+  if (at && at[0] > 0 && at[1] > 0 && at[0] < now.nx && at[1] < now.ny) {
+    [view.x, view.y] = at;
+    if (place) view.zoom = 4;
+    else if (before) view.zoom *= scaleOf(now) / scaleOf(before);
+  } else if (!same || !view.zoom) whole(now);
+  $("image-mended").disabled = !now.is_mendable;
+  redraw();
+}
+
+const scaleOf = (image) => {
+  const a = image.plate.plane(image.nx / 2, image.ny / 2), b = image.plate.plane(image.nx / 2 + 1, image.ny / 2);
+  return Math.hypot(a[0] - b[0], a[1] - b[1]);
+};
+
+function whole(image = opened.get(view.one)) {
+  const canvas = $("image-canvas");
+  Object.assign(view, { x: (image.nx - 1) / 2, y: (image.ny - 1) / 2, zoom: 0.98 * Math.min(canvas.clientWidth / image.nx, canvas.clientHeight / image.ny) });
+  redraw();
+}
+
+// ---------------------------------------------------------------------------------------------- tiles
+
+function tile(image, level, row, column, mended) {
+  const name = [image.number, mended, level, row, column].join("/");
+  const known = tiles.get(name);
+  if (known) {
+    tiles.delete(name);
+    tiles.set(name, known);
+    return known;
+  }
+  const width = Math.min(image.tile, image.levels[level][0] - column * image.tile), height = Math.min(image.tile, image.levels[level][1] - row * image.tile);
+  const made = { width, height, texture: null, data: null };
+  tiles.set(name, made);
+  api.bytes(`tile/${image.number}/${level}/${row}/${column}${mended ? "?mended=1" : ""}`).then((buffer) => {
+    made.data = new Float32Array(buffer);
+    made.texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, made.texture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32F, width, height, 0, gl.RED, gl.FLOAT, made.data);
+    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
+    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
+    redraw();
+  }).catch((error) => {
+    tiles.delete(name);
+    api.say(error.message, true);
+  });
+  for (const [old, value] of tiles) {
+    if (tiles.size <= MOST_TILES) break;
+    if (value.texture) gl.deleteTexture(value.texture);
+    tiles.delete(old);
+  }
+  return made;
+}
+
+// ---------------------------------------------------------------------------------------------- drawing
+
+/** [a, b, c, d, e, f]: x' = a x + b y + c, y' = d x + e y + f, from an image's pixels to those of the first. */
+function toFirst(image) {
+  const first = opened.get(view.one);
+  if (image === first) return [1, 0, 0, 0, 1, 0];
+  const at = image.plate.pixel(...first.plate.sky(view.x, view.y)), back = (x, y) => first.plate.pixel(...image.plate.sky(x, y));
+  const o = back(...at), p = back(at[0] + 100, at[1]), q = back(at[0], at[1] + 100);
+  const a = (p[0] - o[0]) / 100, d = (p[1] - o[1]) / 100, b = (q[0] - o[0]) / 100, e = (q[1] - o[1]) / 100;
+  return [a, b, o[0] - a * at[0] - b * at[1], d, e, o[1] - d * at[0] - e * at[1]];
+}
+
+/** 1, or -1 where the first image has south at its top: it is then shown turned by 180 deg, as detectors are mounted. */
+function turn() {
+  const { plate, nx, ny } = opened.get(view.one);
+  return plate.plane(nx / 2, ny / 2 + 1)[1] >= plate.plane(nx / 2, ny / 2)[1] ? 1 : -1;
+}
+
+const current = () => opened.get(other && view.two >= 0 ? view.two : view.one);
+
+export function redraw() {
+  if (asked || !gl || $("images").hidden || !opened.has(view.one)) return;
+  asked = true;
+  requestAnimationFrame(() => {
+    asked = false;
+    paint();
+    marks();
+    page.remember();
+  });
+}
+
+function paint() {
+  const canvas = $("image-canvas"), image = current(), [width, height] = api.fit(canvas);
+  gl.viewport(0, 0, canvas.width, canvas.height);
+  gl.clearColor(0.02, 0.024, 0.04, 1);
+  gl.clear(gl.COLOR_BUFFER_BIT);
+  gl.useProgram(drawing);
+  const [a, b, c, d, e, f] = toFirst(image), scale = 2 * view.zoom * turn(), sx = scale / width, sy = scale / height;
+  const matrix = [a * sx, b * sx, (c - view.x) * sx, d * sy, e * sy, (f - view.y) * sy, 0, 0, 1];
+  const uniform = (name) => gl.getUniformLocation(drawing, name);
+  gl.uniformMatrix3fv(uniform("toScreen"), true, matrix);
+  const black = image.sky + Number($("image-black").value) * image.noise, white = image.sky + image.noise * 10 ** Number($("image-white").value);
+  gl.uniform3f(uniform("levels"), black, Math.max(white, black + 1e-6 * image.noise), KNEE * image.noise);
+  gl.uniform1i(uniform("stretch"), STRETCHES.indexOf($("image-stretch").value));
+  gl.uniform1i(uniform("pixels"), 0);
+  gl.uniform1i(uniform("colours"), 1);
+  gl.activeTexture(gl.TEXTURE1);
+  gl.bindTexture(gl.TEXTURE_2D, colours);
+  gl.activeTexture(gl.TEXTURE0);
+  gl.bindBuffer(gl.ARRAY_BUFFER, quad);
+  const corner = gl.getAttribLocation(drawing, "corner");
+  gl.enableVertexAttribArray(corner);
+  gl.vertexAttribPointer(corner, 2, gl.FLOAT, false, 0, 0);
+  // The coarsest level lies below: until finer tiles are there, it is seen.
+  const best = Math.max(0, Math.min(image.levels.length - 1, Math.floor(Math.log2(1 / (view.zoom * Math.hypot(a, d) * (devicePixelRatio || 1))))));
+  for (const level of new Set([image.levels.length - 1, best])) drawLevel(image, level, [width, height], [a, b, c, d, e, f], uniform("box"));
+}
+
+function drawLevel(image, level, [width, height], [a, b, c, d, e, f], box) {
+  const size = 2 ** level, step = image.tile * size, det = a * e - b * d, mended = image.is_mendable && $("image-mended").checked;
+  const corners = [[-1, -1], [1, -1], [-1, 1], [1, 1]].map(([u, v]) => {
+    const x = view.x + (u * width) / 2 / view.zoom - c, y = view.y + (v * height) / 2 / view.zoom - f;
+    return [(e * x - b * y) / det, (a * y - d * x) / det];
+  });
+  const range = (k, count) => [Math.max(0, Math.floor((Math.min(...corners.map((p) => p[k])) + 0.5) / step)),
+    Math.min(count - 1, Math.floor((Math.max(...corners.map((p) => p[k])) + 0.5) / step))];
+  const [c0, c1] = range(0, Math.ceil(image.levels[level][0] / image.tile)), [r0, r1] = range(1, Math.ceil(image.levels[level][1] / image.tile));
+  for (let row = r0; row <= r1; row++) {
+    for (let column = c0; column <= c1; column++) {
+      const found = tile(image, level, row, column, mended);
+      if (!found.texture) continue;
+      gl.bindTexture(gl.TEXTURE_2D, found.texture);
+      gl.uniform4f(box, column * step - 0.5, row * step - 0.5, found.width * size, found.height * size);
+      gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    }
+  }
+}
+
+/** What lies on the image: true sources, the pinned one, a compass, a scale. */
+function marks() {
+  const canvas = $("image-marks"), [width, height, ratio] = api.fit(canvas), c = canvas.getContext("2d"), image = current();
+  c.setTransform(ratio, 0, 0, ratio, 0, 0);
+  c.clearRect(0, 0, width, height);
+  const [a, b, e0, d, e, f] = toFirst(image);
+  const scale = view.zoom * turn(), at = (x, y) => [width / 2 + (a * x + b * y + e0 - view.x) * scale, height / 2 - (d * x + e * y + f - view.y) * scale];
+  if ($("image-truth").checked) {
+    const truth = sourcesOf(image);
+    if (truth) {
+      c.lineWidth = 1.3;
+      truth.x.forEach((x, k) => {
+        const p = at(x, truth.y[k]);
+        if (p[0] < -20 || p[1] < -20 || p[0] > width + 20 || p[1] > height + 20) return;
+        c.strokeStyle = colourOf(truth.kind[k]);
+        c.beginPath();
+        c.arc(...p, Math.min(28, 3 + 1.6 * Math.log10(1 + truth.expected[k])), 0, 7);
+        c.stroke();
+      });
+    }
+  }
+  const own = pinned()?.place && image.plate.pixel(...pinned().place);
+  if (own) {
+    const p = at(...own);
+    c.strokeStyle = "#ffd27d";
+    c.lineWidth = 2;
+    c.beginPath();
+    for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
+      c.moveTo(p[0] + 9 * u, p[1] + 9 * v);
+      c.lineTo(p[0] + 22 * u, p[1] + 22 * v);
+    }
+    c.stroke();
+  }
+  compass(c, image, at, width, height);
+}
+
+const colourOf = (kind) => ({ star: "#9fd3ff", QSO: "#d9a7ff", "strong lens": "#9be0a8", "moving body": "#ff9a8d" })[kind] ?? "#ffd27d";
+
+function compass(c, image, at, width, height) {
+  const x = view.x, y = view.y, [a0, d0] = image.plate.sky(x, y), pixel = scaleOf(image) * 3600, o = at(x, y);
+  c.font = "12px DejaVu Sans, sans-serif";
+  c.lineWidth = 1.5;
+  c.strokeStyle = c.fillStyle = "#e8e6df";
+  c.textAlign = "center";
+  for (const [name, da, dd] of [["N", 0, 1], ["E", 1, 0]]) {
+    const q = image.plate.pixel(a0 + (da * 0.001) / Math.cos((d0 * Math.PI) / 180), d0 + dd * 0.001);
+    const p = at(...q), size = Math.hypot(p[0] - o[0], p[1] - o[1]) || 1, u = [(p[0] - o[0]) / size, (p[1] - o[1]) / size], from = [width - 58, height - 58];
+    c.beginPath();
+    c.moveTo(...from);
+    c.lineTo(from[0] + 30 * u[0], from[1] + 30 * u[1]);
+    c.stroke();
+    c.fillText(name, from[0] + 40 * u[0], from[1] + 40 * u[1] + 4);
+  }
+  const nice = [0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200].filter((s) => (s / pixel) * view.zoom < width / 4).pop() ?? 0.5;
+  const long = (nice / pixel) * view.zoom;
+  c.fillRect(width - 110 - long, height - 22, long, 2);
+  c.fillText(nice >= 60 ? `${nice / 60}′` : `${nice}″`, width - 110 - long / 2, height - 28);
+}
+
+function sourcesOf(image) {
+  if (!truths.has(image.number)) {
+    truths.set(image.number, null);
+    api.get(`truth/${image.number}`).then((found) => {
+      truths.set(image.number, found);
+      redraw();
+    }, (error) => api.say(error.message, true));
+  }
+  return truths.get(image.number);
+}
+
+// ---------------------------------------------------------------------------------------------- moves
+
+/** Column and row, of the image that is seen, under the cursor. */
+function pixelAt(event) {
+  const box = $("image-canvas").getBoundingClientRect(), image = current(), [a, b, c, d, e, f] = toFirst(image), det = a * e - b * d;
+  const scale = view.zoom * turn();
+  const x = view.x + (event.clientX - box.left - box.width / 2) / scale - c, y = view.y - (event.clientY - box.top - box.height / 2) / scale - f;
+  return [(e * x - b * y) / det, (a * y - d * x) / det];
+}
+
+function moved(event) {
+  if (!opened.has(view.one)) return;
+  if (event.buttons & 1) {
+    view.x -= (event.movementX / view.zoom) * turn();
+    view.y += (event.movementY / view.zoom) * turn();
+    return redraw();
+  }
+  const image = current(), [x, y] = pixelAt(event);
+  $("image-place").textContent = x > -0.5 && y > -0.5 && x < image.nx - 0.5 && y < image.ny - 0.5
+    ? `${api.place(...image.plate.sky(x, y))}\npixel ${Math.round(x)}, ${Math.round(y)}   ${valueAt(image, Math.round(x), Math.round(y))}` : "";
+  tip(event, image, x, y);
+}
+
+function valueAt(image, x, y) {
+  const mended = image.is_mendable && $("image-mended").checked;
+  for (let level = 0; level < image.levels.length; level++) {
+    const u = Math.floor(x / 2 ** level), v = Math.floor(y / 2 ** level);
+    const found = tiles.get([image.number, mended, level, Math.floor(v / image.tile), Math.floor(u / image.tile)].join("/"));
+    if (found?.data) {
+      const value = found.data[(v % image.tile) * found.width + (u % image.tile)];
+      return `${api.number(value, 5)} ${image.unit}${level ? `, mean of ${4 ** level} pixels` : ""}`;
+    }
+  }
+  return "";
+}
+
+function tip(event, image, x, y) {
+  const box = $("image-canvas").getBoundingClientRect(), near = $("image-truth").checked && truths.get(image.number);
+  let best = -1, least = 10 / view.zoom;
+  if (near) near.x.forEach((sx, k) => {
+    const away = Math.hypot(sx - x, near.y[k] - y);
+    if (away < least) [best, least] = [k, away];
+  });
+  $("image-tip").hidden = best < 0;
+  if (best < 0) return (hovered = null);
+  $("image-tip").style.left = `${Math.min(event.clientX - box.left + 14, box.width - 240)}px`;
+  $("image-tip").style.top = `${event.clientY - box.top + 14}px`;
+  const text = `${near.kind[best]} ${near.id[best]}\n${api.number(near.expected[best])} electrons expected, ${api.number(near.drawn[best])} drawn`;
+  if (hovered?.id !== near.id[best]) {
+    hovered = { id: near.id[best] };
+    const mine = hovered;
+    api.get(`source/${mine.id}`).then((found) => {
+      if (hovered !== mine) return;
+      const values = Object.fromEntries(Object.values(found.tables).flat().map((row) => [row.name, row]));
+      const known = ["z_obs", "mag_r01", "log_stellar_mass", "disk_half_light_radius", "mag_h", "teff"].filter((name) => values[name]);
+      $("image-tip").textContent = [text, ...known.map((name) => `${name} ${api.number(values[name].value, 4)} ${values[name].unit}`)].join("\n");
+    }, () => {});
+  }
+  $("image-tip").textContent = text;
+}
+
+function zoom(by, event) {
+  if (!opened.has(view.one)) return;
+  const box = $("image-canvas").getBoundingClientRect(), was = view.zoom;
+  view.zoom = Math.min(64, Math.max(0.02, view.zoom * by));
+  if (event) {
+    const dx = event.clientX - box.left - box.width / 2, dy = event.clientY - box.top - box.height / 2;
+    view.x += (dx / was - dx / view.zoom) * turn();
+    view.y -= (dy / was - dy / view.zoom) * turn();
+  }
+  redraw();
+}
+
+async function pinAt(x, y) {
+  const image = current(), near = truths.get(image.number);
+  let id = null, least = 8 / view.zoom + 2;
+  if (near) near.x.forEach((sx, k) => {
+    const away = Math.hypot(sx - x, near.y[k] - y);
+    if (away < least) [id, least] = [near.id[k], away];
+  });
+  try {
+    if (!id) {
+      const [ra, dec] = image.plate.sky(x, y);
+      id = (await api.get(`nearest?${new URLSearchParams({ ra, dec, radius: Math.max(3, 8 / view.zoom) * scaleOf(image) })}`)).id;
+    }
+    if (id) await pin(id);
+  } catch (error) {
+    api.say(error.message, true);
+  }
+}
+
+function blink() {
+  if (view.two < 0) return api.say("Choose a second image to blink with.");
+  clearInterval(blinking);
+  blinking = blinking ? null : setInterval(() => {
+    other = !other;
+    redraw();
+  }, BLINK_MS);
+  if (matchMedia("(prefers-reduced-motion: reduce)").matches) {
+    // Nothing moves by itself: each press shows the other.
+    clearInterval(blinking);
+    blinking = null;
+    other = !other;
+  } else if (!blinking) other = false;
+  $("image-blink").setAttribute("aria-pressed", String(Boolean(blinking) || other));
+  redraw();
+}
+
+export function key(event) {
+  if (!opened.has(view.one)) return;
+  const step = (80 / view.zoom) * turn(), move = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] }[event.key];
+  if (move) {
+    view.x += move[0];
+    view.y += move[1];
+    redraw();
+  } else if (event.key === "+" || event.key === "=") zoom(1.4);
+  else if (event.key === "-") zoom(1 / 1.4);
+  else if (event.key === "0") whole();
+  else if (event.key === "b" || event.key === "B") blink();
+  else if (event.key === "Enter" && event.target === $("image-canvas")) pinAt(view.x, view.y);
+  else if ("cCtT".includes(event.key)) {
+    const box = $("cC".includes(event.key) ? "image-mended" : "image-truth");
+    box.checked = !box.checked;
+    redraw();
+  } else return;
+  event.preventDefault();
+}
+
+export const state = () => ({ ...view, zoom: +view.zoom.toPrecision(4), x: +view.x.toFixed(2), y: +view.y.toFixed(2), map: $("image-map").value, stretch: $("image-stretch").value,
+  black: $("image-black").value, white: $("image-white").value, mended: $("image-mended").checked, truth: $("image-truth").checked, pin: pinned()?.id });
+export function restore(was) {
+  for (const name of ["one", "two", "x", "y", "zoom"]) if (Number.isFinite(was[name])) view[name] = was[name];
+  if (NAMES.includes(was.map)) {
+    $("image-map").value = was.map;
+    if (gl) colours = lutTexture(gl, was.map, colours);
+  }
+  for (const name of ["stretch", "black", "white"]) if (was[name] !== undefined) $(`image-${name}`).value = was[name];
+  for (const name of ["mended", "truth"]) if (typeof was[name] === "boolean") $(`image-${name}`).checked = was[name];
+  if (was.pin && was.pin !== pinned()?.id) pin(was.pin).catch((error) => api.say(error.message, true));
+}

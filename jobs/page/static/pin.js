@@ -1,0 +1,140 @@
+// One source: its rows, its spectrum with lines and passbands, its pictures, and where it was drawn.
+
+import * as api from "/static/api.js";
+import { ink, lut } from "/static/colour.js";
+
+const $ = (id) => document.getElementById(id);
+const SIDE = 64, SHOWN = ["ra", "dec", "ra_lensed", "dec_lensed", "z_obs", "z_true", "mag_r01", "abs_mag_r01", "color_gr_01", "log_stellar_mass", "log_sfr",
+  "bulge_fraction", "bulge_half_light_radius", "disk_half_light_radius", "inclination", "position_angle", "kappa", "gamma1", "gamma2", "a_v", "mag_h", "distance"];
+let source = null;
+const listeners = [];
+
+export const pinned = () => source;
+export const onPin = (listener) => listeners.push(listener);
+
+export async function pin(id) {
+  source = await api.get(`source/${id}`);
+  const panel = $("pin");
+  panel.replaceChildren(api.h("h2", {}, `${source.kind} ${source.id}`));
+  if (source.place) panel.append(api.h("p", { class: "quiet" }, api.place(...source.place)));
+  panel.append(api.h("div", { class: "bar" },
+    api.h("button", { onclick: () => api.copy(source.id, "Identifier") }, "Copy id"),
+    api.h("button", { onclick: () => api.copy(`SELECT * FROM ${Object.keys(source.tables)[0] ?? "rendered_truth"} WHERE id = ${source.id}`, "SQL") }, "Copy as SQL")));
+  const spectrum = api.h("div", {}), pictures = api.h("div", { class: "cutouts" });
+  panel.append(spectrum, api.h("h3", {}, "Pictures, north up"), pictures);
+  for (const [name, rows] of Object.entries(source.tables)) {
+    const first = rows.filter((row) => SHOWN.includes(row.name) || row.name.startsWith("f_nu_"));
+    panel.append(api.h("h3", {}, name), facts(first.length ? first : rows.slice(0, 12)));
+    panel.append(api.h("details", {}, api.h("summary", {}, `all ${rows.length} columns`), facts(rows)));
+  }
+  panel.append(api.h("h3", {}, "Drawn in"), source.drawn.length ? api.table(
+    [{ name: "exposure" }, { name: "detector", text: 1 }, { name: "x", unit: "pix" }, { name: "y", unit: "pix" }, { name: "expected", unit: "electron" }, { name: "drawn", unit: "electron" }],
+    source.drawn.map((d) => [d.exposure_id, d.detector, +d.x.toFixed(2), +d.y.toFixed(2), +d.expected.toPrecision(5), +d.drawn.toPrecision(5)]))
+    : api.h("p", { class: "quiet" }, "No image."));
+  listeners.forEach((listener) => listener());
+  const own = source;
+  api.get(`spectrum/${id}`).then((found) => own === source && drawSpectrum(spectrum, found),
+    (error) => spectrum.append(api.h("p", { class: "quiet" }, error.message)));
+  cutouts(pictures, own);
+}
+
+function facts(rows) {
+  return api.table([{ name: "column", text: 1 }, { name: "value" }, { name: "unit", text: 1 }], rows.map((row) =>
+    [api.h("span", { title: row.meaning || null }, row.name), Array.isArray(row.value) ? `[${row.value.length}]` : row.value, row.unit]));
+}
+
+async function cutouts(panel, own) {
+  const list = await api.get("images");
+  for (const { number, x, y, is_north_up: up } of own.images ?? []) {
+    const about = list[number];
+    if (!["science", "noise_free"].includes(about.content)) continue;
+    const pixels = new Float32Array(await api.bytes(`cutout/${number}?${new URLSearchParams({ x, y })}`));
+    if (own !== source) return;
+    const canvas = api.h("canvas", { width: SIDE, height: SIDE, role: "img", "aria-label": `${about.band}, ${about.content}` });
+    canvas.getContext("2d").putImageData(stretched(up ? pixels : pixels.reverse()), 0, 0);
+    panel.append(api.h("figure", {}, canvas, api.h("figcaption", { class: "quiet" }, `${about.band} ${about.content.replace("_", " ")}`)));
+  }
+  if (!panel.childElementCount) panel.append(api.h("p", { class: "quiet" }, "No image holds its place."));
+}
+
+function stretched(pixels) {
+  const sorted = pixels.filter(Number.isFinite).sort(), at = (share) => sorted[Math.floor(share * (sorted.length - 1))] ?? 0;
+  const sky = at(0.5), noise = Math.max((sky - at(0.16)), 1e-6 * Math.abs(at(1)), 1e-9), top = Math.max(at(0.9995), sky + 8 * noise);
+  const colours = lut("gray"), image = new ImageData(SIDE, SIDE);
+  for (let row = 0; row < SIDE; row++) {
+    for (let column = 0; column < SIDE; column++) {
+      const value = pixels[row * SIDE + column], share = Math.asinh((value - sky + 1.5 * noise) / (3 * noise)) / Math.asinh((top - sky + 1.5 * noise) / (3 * noise));
+      const k = Number.isFinite(value) ? 4 * Math.round(255 * Math.min(1, Math.max(0, share))) : 0;
+      image.data.set(colours.subarray(k, k + 4), 4 * ((SIDE - 1 - row) * SIDE + column));
+    }
+  }
+  return image;
+}
+
+/** A line as it is written: halpha, nii_2 -> Hα, [N II]. */
+function named(name) {
+  const stem = name.split("_")[0];
+  return { halpha: "Hα", hbeta: "Hβ", oii: "[O II]", oiii: "[O III]", nii: "[N II]", sii: "[S II]" }[stem] ?? name;
+}
+
+/** f_lambda against wavelength, the passbands below it, its lines above. */
+function drawSpectrum(panel, found) {
+  const canvas = api.h("canvas", { class: "spectrum", role: "img", tabindex: 0 });
+  const data = api.h("div", { class: "data", hidden: true });
+  panel.replaceChildren(api.h("h3", {}, "Spectrum as it arrives"), canvas, api.h("button", { onclick: () => (data.hidden = !data.hidden) }, "Table of bands"), data);
+  data.append(api.table([{ name: "band", text: 1 }, { name: "pivot", unit: "nm" }, { name: "f_nu", unit: "uJy" }, { name: "AB", unit: "mag" }], found.bands.map((b) =>
+    [b.name, b.wavelength / 10, b.f_nu, b.f_nu > 0 ? +(23.9 - 2.5 * Math.log10(b.f_nu)).toFixed(3) : null])));
+  const [width, height, ratio] = api.fit(canvas), c = canvas.getContext("2d"), x0 = 44, x1 = width - 6, y0 = height - 32, y1 = 14;
+  c.setTransform(ratio, 0, 0, ratio, 0, 0);
+  c.font = "11px DejaVu Sans, sans-serif";
+  const low = Math.log(found.wavelength[0]), high = Math.log(found.wavelength.at(-1)), x = (l) => x0 + ((Math.log(l) - low) / (high - low)) * (x1 - x0);
+  const sorted = [...found.f_lambda].sort((a, b) => a - b), top = Math.min(sorted.at(-1), 3 * sorted[Math.floor(0.99 * sorted.length)]) * 1.05 || 1;
+  const y = (f) => y0 - Math.min(1, f / top) * (y0 - y1);
+  for (const band of found.bands) {
+    c.fillStyle = `color-mix(in srgb, ${ink("second")} 14%, transparent)`;
+    const a = x(band.wavelength - band.width / 2), b = x(band.wavelength + band.width / 2);
+    c.fillRect(a, y1, b - a, y0 - y1);
+    c.fillStyle = ink("second");
+    // f_nu of microjansky to f_lambda of erg s-1 cm-2 A-1.
+    const f = (band.f_nu * 1e-29 * 2.99792458e18) / band.wavelength ** 2;
+    c.beginPath();
+    c.arc((a + b) / 2, y(f), 3, 0, 7);
+    c.fill();
+    c.save();
+    c.translate((a + b) / 2 + 3, y0 - 4);
+    c.rotate(-Math.PI / 2);
+    c.fillText(band.name, 0, 0);
+    c.restore();
+  }
+  c.strokeStyle = ink("accent");
+  c.lineWidth = 1;
+  c.beginPath();
+  found.wavelength.forEach((l, k) => (k ? c.lineTo(x(l), y(found.f_lambda[k])) : c.moveTo(x(l), y(found.f_lambda[k]))));
+  c.stroke();
+  c.fillStyle = c.strokeStyle = ink("quiet");
+  // Of lines that lie close the one that is named first in the table has the room.
+  const taken = [];
+  for (const line of found.lines) {
+    const at = x(line.wavelength);
+    if (at < x0 || at > x1) continue;
+    c.fillRect(at, y1 - 2, 1, 5);
+    if (taken.every((other) => Math.abs(other - at) > 36)) {
+      c.textAlign = "center";
+      c.fillText(named(line.name), at, y1 - 4);
+      taken.push(at);
+    }
+  }
+  c.textAlign = "center";
+  for (const l of [2000, 3000, 5000, 10000, 20000]) if (x(l) > x0 && x(l) < x1) c.fillText(String(l / 10), x(l), y0 + 13);
+  c.fillText("wavelength / nm", (x0 + x1) / 2, y0 + 27);
+  c.textAlign = "left";
+  c.fillText(top.toExponential(1), 0, y1 + 8);
+  c.save();
+  c.translate(11, (y0 + y1) / 2 + 50);
+  c.rotate(-Math.PI / 2);
+  c.fillText("erg s⁻¹ cm⁻² Å⁻¹", 0, 0);
+  c.restore();
+  c.strokeStyle = ink("line");
+  c.strokeRect(x0, y1, x1 - x0, y0 - y1);
+  canvas.setAttribute("aria-label", `Spectrum${found.z === undefined ? "" : ` at redshift ${found.z.toFixed(3)}`}; lines ${found.lines.map((l) => `${named(l.name)} at ${(l.wavelength / 10).toFixed(0)} nm`).join(", ")}`);
+}

@@ -1,0 +1,416 @@
+// Histograms and maps whose brushes filter each other: every move is counted anew, in one pass for all charts; while a
+// brush is held, the others are counted once for each of its pixels, and a move only adds up.
+
+import * as api from "/static/api.js";
+import { ink, lut } from "/static/colour.js";
+
+const $ = (id) => document.getElementById(id);
+const BINS = 120, MAP_BINS = 96, CUBE_BINS = 256, CUBE_MAP_BINS = 32;
+const LEFT = 52, BOTTOM = 36, TOP = 8, RIGHT = 10;
+// charts: {axes: [{expression, log}], spans, brush: [[lo, hi], ...] | null, counts, whole, element ...}
+let page, source = "", where = "", charts = [], part = null, head = null, cube = null, drag = null;
+
+export function start(given) {
+  page = given;
+  $("plot-sources").append(...sources().map((name) => api.h("option", { value: name })));
+  if (!source) usual();
+  $("plot-source").addEventListener("change", () => usePlot($("plot-source").value, suggested($("plot-source").value)));
+  $("plot-where").addEventListener("change", () => {
+    where = $("plot-where").value;
+    for (const chart of charts) chart.spans = null;
+    part = null;
+    ask();
+  });
+  $("plot-add-button").addEventListener("click", add);
+  $("plot-add").addEventListener("keydown", (event) => event.key === "Enter" && add());
+  $("plot-clear").addEventListener("click", () => {
+    for (const chart of charts) chart.brush = null;
+    ask();
+  });
+  $("plot-python").addEventListener("click", () => api.copy(python(), "Python"));
+  $("plot-sql").addEventListener("click", () => api.copy(query(), "SQL"));
+}
+
+/** Show charts of other rows: `lists` has the expressions of each chart's axes. */
+export function usePlot(rows, lists) {
+  source = rows;
+  where = "";
+  part = null;
+  charts = lists.map((axes) => ({ axes: axes.map((expression) => ({ expression, log: false })), spans: null, brush: null }));
+  built = false;
+  if (!$("plots").hidden) show();
+}
+
+let built = false;
+
+function sources() {
+  const names = api.lake.tables.map((table) => table.name);
+  const joined = [["galaxies", "galaxy_fluxes"], ["stars", "star_fluxes"]].filter((pair) => pair.every((name) => names.includes(name)));
+  return [...names, ...joined.map(([a, b]) => `${a} JOIN ${b} USING (id)`)];
+}
+
+function usual() {
+  const name = ["galaxies", "stars"].find((own) => api.lake.tables.some((table) => table.name === own)) ?? api.lake.tables[0]?.name;
+  if (name) usePlot(name, suggested(name));
+}
+
+function suggested(rows) {
+  if (rows.startsWith("galaxies")) {
+    const flux = rows.includes("galaxy_fluxes") ? columnsOf(rows).find((c) => c.name.startsWith("f_nu_")) : null;
+    return flux ? [["z_obs"], [`mag_ab(${flux.name})`], ["color_gr_01"], [`mag_ab(${flux.name})`, "color_gr_01"]]
+      : [["z_obs"], ["mag_r01"], ["color_gr_01"], ["log_stellar_mass"], ["z_obs", "mag_r01"], ["abs_mag_r01", "color_gr_01"]];
+  }
+  const numbers = columnsOf(rows).filter((c) => /int|float|double/.test(c.type) && !/^list|(^|_)id$|^_healpix/.test(`${c.type}`) && !/(^|_)id$|^_healpix/.test(c.name)).map((c) => `"${c.name}"`);
+  return [...numbers.slice(0, 4).map((name) => [name]), ...(numbers.length > 1 ? [numbers.slice(0, 2)] : [])];
+}
+
+function columnsOf(rows) {
+  return api.lake.tables.filter((table) => new RegExp(`(^|[^\\w.])${table.name}($|[^\\w])`).test(rows)).flatMap((table) => table.columns);
+}
+
+function facts(expression) {
+  const name = expression.replace(/^"(.*)"$/, "$1");
+  const found = columnsOf(source).find((column) => column.name === name);
+  return found ?? { name, unit: expression.startsWith("mag_ab(") ? "mag" : "", meaning: "" };
+}
+
+function label(axis) {
+  const about = facts(axis.expression);
+  return `${axis.log ? "log10 " : ""}${about.name}${about.unit ? ` / ${about.unit}` : ""}`;
+}
+
+const sqlOf = (axis) => axis.log ? `CASE WHEN (${axis.expression}\n) > 0 THEN log10(${axis.expression}\n) END` : axis.expression;
+
+function add() {
+  const one = $("plot-add").value.trim(), other = $("plot-against").value.trim();
+  if (!one) return;
+  charts.push({ axes: [one, other].filter(Boolean).map((expression) => ({ expression, log: false })), spans: null, brush: null });
+  $("plot-add").value = $("plot-against").value = "";
+  built = false;
+  show();
+}
+
+// ---------------------------------------------------------------------------------------------- questions
+
+/** All different axes, in the order in which charts name them. */
+function axes() {
+  return [...new Set(charts.flatMap((chart) => chart.axes.map(sqlOf)))];
+}
+
+function limits(except = null) {
+  const names = axes(), found = new Map();
+  for (const chart of charts) {
+    if (!chart.brush || chart === except) continue;
+    chart.axes.forEach((axis, k) => {
+      const at = names.indexOf(sqlOf(axis)), [lo, hi] = chart.brush[k], was = found.get(at);
+      found.set(at, was ? [Math.max(was[0], lo), Math.min(was[1], hi)] : [lo, hi]);
+    });
+  }
+  return [...found].map(([at, [lo, hi]]) => [at, lo, hi]);
+}
+
+function bins(chart) {
+  return chart.axes.length > 1 ? [MAP_BINS, MAP_BINS] : [BINS];
+}
+
+const ask = api.newest(async () => {
+  if (!charts.length) return;
+  const started = performance.now(), own = charts, names = axes();
+  const buffer = await api.post("charts", {
+    source, where: where || "true", axes: names, part, limits: limits(),
+    charts: own.map((chart) => ({ axes: chart.axes.map((axis) => names.indexOf(sqlOf(axis))), bins: bins(chart), spans: chart.spans })),
+  });
+  if (own !== charts) return;
+  let at;
+  [head, at] = api.headed(buffer);
+  own.forEach((chart, k) => {
+    const about = head.charts[k], size = about.bins.reduce((a, b) => a * b);
+    chart.counts = new Uint32Array(buffer, at, size);
+    chart.spans = about.spans;
+    chart.total = about.total;
+    chart.missing = names.map((name, n) => head.missing[n])[names.indexOf(sqlOf(chart.axes[0]))];
+    if (!charts.some((other) => other.brush)) chart.whole = chart.counts;
+    at += 4 * size;
+  });
+  drawAll();
+  tell(performance.now() - started);
+  if (head.part > 1 && !charts.some((chart) => chart.brush)) {
+    // The whole follows the sample.
+    part = 1;
+    ask();
+  }
+  page.remember();
+});
+
+function tell(ms) {
+  const sample = head.part > 1 ? ` a sample, 1 row in ${head.part}: counts are scaled, with the Poisson error of the sample;` : "";
+  const brushed = charts.some((chart) => chart.brush) ? "drag to brush, Escape clears a brush" : "drag in a chart to brush: the others follow";
+  $("plot-state").textContent = `${api.number(head.rows)} rows;${sample} counted and drawn in ${ms.toFixed(0)} ms; ${brushed}.`;
+}
+
+/** While a brush is held: counts of the other charts for each of its bins. */
+async function hold(chart) {
+  cube = null;
+  const names = axes(), axis = names.indexOf(sqlOf(chart.axes[0])), others = charts.filter((one) => one !== chart);
+  if (chart.axes.length > 1 || !others.length || !chart.spans) return;
+  const asked = others.map((one) => {
+    const own = one.axes.map((a) => names.indexOf(sqlOf(a)));
+    return { axes: [axis, ...own], own: [axis, ...own], spans: [chart.spans[0], ...one.spans],
+      bins: [CUBE_BINS, ...(own.length > 1 ? [CUBE_MAP_BINS * 3, CUBE_MAP_BINS * 3] : [BINS])] };
+  });
+  if (asked.some((one) => one.bins.reduce((a, b) => a * b) > 8e6)) return;
+  const held = drag;
+  const buffer = await api.post("charts", { source, where: where || "true", axes: names, part, limits: limits(chart), charts: asked });
+  if (drag !== held) return;
+  let [about, at] = api.headed(buffer);
+  cube = { chart, parts: others.map((one, k) => {
+    const size = about.charts[k].bins.reduce((a, b) => a * b), inner = size / CUBE_BINS, counts = new Uint32Array(buffer, at, size);
+    at += 4 * size;
+    const sums = new Float64Array(size + inner);
+    for (let i = 0; i < size; i++) sums[i + inner] = sums[i] + counts[i];
+    return { one, inner, sums };
+  }) };
+}
+
+/** The other charts under the held brush, from the cube: no question is asked. */
+function moveHeld() {
+  const [[lo, hi]] = cube.chart.brush, [[low, high]] = cube.chart.spans;
+  const bin = (x) => Math.min(CUBE_BINS, Math.max(0, Math.round(((x - low) / (high - low)) * CUBE_BINS)));
+  const a = bin(lo), b = bin(hi);
+  for (const { one, inner, sums } of cube.parts) {
+    const out = new Uint32Array(inner);
+    for (let i = 0; i < inner; i++) out[i] = sums[b * inner + i] - sums[a * inner + i];
+    one.counts = out;
+  }
+  drawAll();
+}
+
+// ---------------------------------------------------------------------------------------------- drawing
+
+export function show() {
+  $("plot-source").value = source;
+  $("plot-where").value = where;
+  $("plot-columns").replaceChildren(...columnsOf(source).map((c) => api.h("option", { value: c.name }, [c.unit, c.meaning].filter(Boolean).join(", "))));
+  if (!built) {
+    $("plot-grid").replaceChildren(...charts.map(figure));
+    built = true;
+  }
+  ask();
+}
+
+function figure(chart) {
+  const canvas = api.h("canvas", { tabindex: 0, role: "img" });
+  const range = api.h("div", { class: "range", "aria-live": "polite" }), data = api.h("div", { class: "data", hidden: true });
+  const names = chart.axes.map((axis) => facts(axis.expression));
+  const logs = chart.axes.map((axis, k) => api.h("button", { "aria-pressed": String(axis.log), onclick: () => {
+    axis.log = !axis.log;
+    chart.spans = chart.brush = chart.whole = null;
+    built = false;
+    show();
+  } }, chart.axes.length > 1 ? `log ${"xy"[k]}` : "log"));
+  const toTable = api.h("button", { onclick: () => {
+    data.hidden = !data.hidden;
+    if (!data.hidden) data.replaceChildren(asTable(chart));
+  } }, "Table");
+  const gone = api.h("button", { "aria-label": `Remove ${names.map((n) => n.name).join(" against ")}`, onclick: () => {
+    charts = charts.filter((one) => one !== chart);
+    built = false;
+    show();
+  } }, "×");
+  const caption = api.h("figcaption", {}, api.h("strong", { title: names.map((n) => n.meaning).filter(Boolean).join("; ") || null },
+    names.map((n) => n.name).reverse().join(" against ")), api.h("span", { class: "quiet grow" }, names.length > 1 ? "" : names[0].meaning), ...logs, toTable, gone);
+  Object.assign(chart, { canvas, range, data });
+  canvas.addEventListener("pointerdown", (event) => grab(chart, event));
+  canvas.addEventListener("pointermove", (event) => drag?.chart === chart && pull(event));
+  canvas.addEventListener("pointerup", (event) => drag?.chart === chart && release(event));
+  canvas.addEventListener("keydown", (event) => nudge(chart, event));
+  return api.h("figure", { class: chart.axes.length > 1 ? "map" : null }, caption, canvas, range, data);
+}
+
+function asTable(chart) {
+  const [span] = chart.spans, n = bins(chart)[0], scale = head.part;
+  const edge = (k) => span[0] + ((span[1] - span[0]) * k) / n;
+  if (chart.axes.length === 1) {
+    return api.table([{ name: "from" }, { name: "to", unit: facts(chart.axes[0].expression).unit }, { name: "number" }],
+      [...chart.counts].map((count, k) => [edge(k), edge(k + 1), count * scale]));
+  }
+  const size = Math.round(Math.sqrt(chart.counts.length)), [x, y] = chart.spans, at = (s, k) => s[0] + ((s[1] - s[0]) * (k + 0.5)) / size;
+  const rows = [];
+  chart.counts.forEach((count, k) => count && rows.push([at(x, Math.floor(k / size)), at(y, k % size), count * scale]));
+  return api.table([{ name: label(chart.axes[0]) }, { name: label(chart.axes[1]) }, { name: "number" }], rows.sort((a, b) => b[2] - a[2]).slice(0, 500));
+}
+
+function drawAll() {
+  for (const chart of charts) if (chart.canvas && chart.counts) draw(chart);
+}
+
+function frame(chart) {
+  const [width, height, ratio] = api.fit(chart.canvas), context = chart.canvas.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  context.font = "11px DejaVu Sans, sans-serif";
+  return { context, x0: LEFT, x1: width - RIGHT, y0: height - BOTTOM, y1: TOP, width, height };
+}
+
+function draw(chart) {
+  const f = frame(chart), [span] = chart.spans;
+  const text = chart.axes.length > 1 ? drawMap(chart, f) : drawBars(chart, f);
+  drawAxes(chart, f, span, text);
+  if (chart.brush) drawBrush(chart, f);
+  const shown = chart.brush ? chart.brush.map(([lo, hi], k) => `${label(chart.axes[k])} ${api.number(lo, 4)} to ${api.number(hi, 4)}`).join(", ") : "";
+  const sum = chart.counts.reduce((a, b) => a + b, 0), scale = head.part;
+  const error = scale > 1 ? ` ± ${api.number(Math.round(Math.sqrt(sum) * scale))}` : "";
+  chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, chart.missing ? `${api.number(chart.missing)} missing` : "", shown].filter(Boolean).join("; ");
+  chart.canvas.setAttribute("aria-label", `${label(chart.axes[0])}${chart.axes[1] ? ` and ${label(chart.axes[1])}` : ""}: ${chart.range.textContent}`);
+}
+
+function drawBars(chart, f) {
+  const scale = head.part, behind = chart.whole ?? chart.counts, most = Math.max(...behind, 1);
+  const step = (f.x1 - f.x0) / chart.counts.length, y = (n) => f.y0 - ((f.y0 - f.y1) * n) / most;
+  for (const [counts, colour] of [[behind, ink("bar-off")], [chart.counts, ink("bar")]]) {
+    f.context.fillStyle = colour;
+    counts.forEach((n, k) => n && f.context.fillRect(f.x0 + k * step, y(n), Math.max(step - 0.5, 0.5), f.y0 - y(n)));
+  }
+  return [[0, most * scale], "number"];
+}
+
+function drawMap(chart, f) {
+  const size = Math.round(Math.sqrt(chart.counts.length)), image = new ImageData(size, size), colours = lut("cividis");
+  const most = Math.max(...chart.counts, 1), top = Math.log1p(most);
+  for (let i = 0; i < size; i++) {
+    for (let j = 0; j < size; j++) {
+      const n = chart.counts[i * size + j];
+      if (!n) continue;
+      const c = 4 * Math.round(40 + (215 * Math.log1p(n)) / top), at = 4 * ((size - 1 - j) * size + i);
+      image.data.set(colours.subarray(c, c + 4), at);
+    }
+  }
+  const small = new OffscreenCanvas(size, size);
+  small.getContext("2d").putImageData(image, 0, 0);
+  f.context.imageSmoothingEnabled = false;
+  f.context.drawImage(small, f.x0, f.y1, f.x1 - f.x0, f.y0 - f.y1);
+  return [chart.spans[1], label(chart.axes[1])];
+}
+
+function drawAxes(chart, f, span, [ySpan, yLabel]) {
+  const c = f.context;
+  c.strokeStyle = ink("line");
+  c.fillStyle = ink("quiet");
+  c.lineWidth = 1;
+  c.beginPath();
+  c.moveTo(f.x0, f.y1);
+  c.lineTo(f.x0, f.y0);
+  c.lineTo(f.x1, f.y0);
+  c.stroke();
+  c.textAlign = "center";
+  for (const tick of api.ticks(...span, (f.x1 - f.x0) / 70)) {
+    const x = f.x0 + ((tick - span[0]) / (span[1] - span[0])) * (f.x1 - f.x0);
+    c.fillText(api.number(tick), x, f.y0 + 13);
+    c.fillRect(x, f.y0, 1, 3);
+  }
+  c.textAlign = "right";
+  for (const tick of api.ticks(...ySpan, (f.y0 - f.y1) / 40)) {
+    const y = f.y0 - ((tick - ySpan[0]) / (ySpan[1] - ySpan[0])) * (f.y0 - f.y1);
+    c.fillText(tick >= 1e5 ? tick.toExponential(0) : api.number(tick), f.x0 - 5, y + 4);
+    c.fillRect(f.x0 - 3, y, 3, 1);
+  }
+  c.fillStyle = ink("ink");
+  c.textAlign = "center";
+  c.fillText(label(chart.axes[0]), (f.x0 + f.x1) / 2, f.y0 + 29);
+  c.save();
+  c.translate(11, (f.y0 + f.y1) / 2);
+  c.rotate(-Math.PI / 2);
+  c.fillText(yLabel, 0, 0);
+  c.restore();
+}
+
+function drawBrush(chart, f) {
+  const place = (value, k) => {
+    const [lo, hi] = chart.spans[k], share = (value - lo) / (hi - lo);
+    return k ? f.y0 - share * (f.y0 - f.y1) : f.x0 + share * (f.x1 - f.x0);
+  };
+  const [a, b] = chart.brush[0].map((value) => place(value, 0));
+  const [bottom, top] = chart.brush[1] ? chart.brush[1].map((value) => place(value, 1)) : [f.y0, f.y1];
+  f.context.strokeStyle = ink("accent");
+  f.context.lineWidth = 1.5;
+  f.context.strokeRect(a, top, b - a, bottom - top);
+}
+
+// ---------------------------------------------------------------------------------------------- brushes
+
+function valueAt(chart, event) {
+  const box = chart.canvas.getBoundingClientRect(), share = [(event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT),
+    (box.bottom - BOTTOM - event.clientY) / (box.height - TOP - BOTTOM)];
+  return chart.spans.map(([lo, hi], k) => lo + Math.min(1, Math.max(0, share[k])) * (hi - lo));
+}
+
+function grab(chart, event) {
+  if (!chart.spans || event.button) return;
+  chart.canvas.setPointerCapture(event.pointerId);
+  const from = valueAt(chart, event), inside = chart.brush?.every(([lo, hi], k) => from[k] > lo && from[k] < hi);
+  drag = { chart, from, moved: inside ? chart.brush.map((pair) => [...pair]) : null, far: false };
+  hold(chart).catch((error) => api.say(error.message, true));
+}
+
+function pull(event) {
+  const { chart, from, moved } = drag, to = valueAt(chart, event);
+  drag.far ||= to.some((value, k) => Math.abs(value - from[k]) > 0.005 * (chart.spans[k][1] - chart.spans[k][0]));
+  if (!drag.far) return;
+  chart.brush = moved ? moved.map(([lo, hi], k) => [lo + to[k] - from[k], hi + to[k] - from[k]])
+    : from.map((value, k) => [Math.min(value, to[k]), Math.max(value, to[k])]);
+  if (cube?.chart === chart) moveHeld();
+  else {
+    draw(chart);
+    ask();
+  }
+}
+
+function release() {
+  if (!drag.far) drag.chart.brush = null;
+  drag = cube = null;
+  ask();
+}
+
+/** A brush by keys: arrows move it by a fiftieth of the axis, with Shift they widen or narrow it. */
+function nudge(chart, event) {
+  const step = { ArrowRight: [0, 1], ArrowLeft: [0, -1], ArrowUp: [1, 1], ArrowDown: [1, -1] }[event.key];
+  if (event.key === "Escape") chart.brush = null;
+  else if (!step || !chart.spans || !chart.spans[step[0]]) return;
+  else {
+    const size = chart.spans.map(([lo, hi]) => (hi - lo) / 50);
+    chart.brush ??= chart.spans.map(([lo, hi]) => [lo + 0.4 * (hi - lo), lo + 0.6 * (hi - lo)]);
+    const pair = chart.brush[step[0]], by = step[1] * size[step[0]];
+    chart.brush[step[0]] = event.shiftKey ? [pair[0] - by, pair[1] + by].sort((a, b) => a - b) : [pair[0] + by, pair[1] + by];
+  }
+  event.preventDefault();
+  event.stopPropagation();
+  draw(chart);
+  ask();
+}
+
+// ---------------------------------------------------------------------------------------------- as text
+
+function conditions() {
+  const own = charts.filter((chart) => chart.brush).flatMap((chart) => chart.axes.map((axis, k) =>
+    `(${sqlOf(axis)})::FLOAT BETWEEN ${chart.brush[k][0]} AND ${chart.brush[k][1]}`));
+  return [...(where ? [`(${where})`] : []), ...own].join("\n  AND ") || "true";
+}
+
+function query() {
+  return `SELECT *\nFROM ${source}\nWHERE ${conditions()}\n`;
+}
+
+function python() {
+  const [x, y] = charts.find((chart) => chart.axes.length > 1)?.axes ?? charts[0].axes;
+  const call = y ? `heatmap(${[source, sqlOf(x), sqlOf(y)].map((text) => JSON.stringify(text)).join(", ")}` : `hist(${JSON.stringify(source)}, ${JSON.stringify(sqlOf(x))}`;
+  return `from jobs.explore import plots\nfrom jobs.explore.explorer import Explorer\n\nwith Explorer(${JSON.stringify(api.lake.lake)}) as lake:\n    plots.${y ? "heatmap" : "hist"}(*lake.${call}, where=${JSON.stringify(conditions())}))\n`;
+}
+
+export const redraw = () => head && drawAll();
+export const state = () => ({ source, where, charts: charts.map(({ axes: own, spans, brush }) => ({ axes: own, spans, brush })) });
+export function restore(was) {
+  if (typeof was.source !== "string" || !Array.isArray(was.charts)) return;
+  ({ source, where } = was);
+  charts = was.charts.map((chart) => ({ ...chart }));
+  built = false;
+}

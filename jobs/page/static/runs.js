@@ -1,0 +1,41 @@
+// What was done for the lake: jobs beside their forecasts, tasks, failures, the mission, and where each image is from.
+
+import * as api from "/static/api.js";
+
+export async function show() {
+  const [found, images] = await Promise.all([api.get("runs"), api.get("images")]);
+  const parts = [api.h("h2", {}, "Jobs")];
+  if (found.said) parts.push(api.h("p", { class: "quiet" }, found.said));
+  else parts.push(jobs(found.jobs));
+  for (const task of found.tasks) {
+    parts.push(api.h("h2", {}, "Images"), api.h("p", {}, api.h("progress", { max: task.all, value: task.done, "aria-label": "detectors done" }),
+      ` ${task.done} of ${task.all} detectors done`, task.done < task.all ? `, ${api.number(task.seconds_left, 3)} s of one core to come` : ""));
+  }
+  parts.push(api.h("h2", {}, "Failures"), found.failures.length ? api.table(
+    [{ name: "part", text: 1 }, { name: "error", text: 1 }, { name: "attempt" }, { name: "run", text: 1 }],
+    found.failures.map((f) => [f.part, f.error, f.attempt, f.run])) : api.h("p", { class: "quiet" }, "None."));
+  parts.push(api.h("h2", {}, "Mission values that differ from the default"), found.mission.length ? api.table(
+    [{ name: "name", text: 1 }, { name: "value" }, { name: "default" }, { name: "unit", text: 1 }],
+    found.mission.map((m) => [m.name, m.value, m.usual, m.unit])) : api.h("p", { class: "quiet" }, "None: all are as truesky has them."));
+  parts.push(api.h("h2", {}, "Where images are from"));
+  for (const image of images) {
+    const details = api.h("details", { class: "tree" }, api.h("summary", {}, image.path.split("/").pop()));
+    details.addEventListener("toggle", async () => {
+      if (details.open && details.childElementCount === 1) details.append(tree(await api.get(`provenance/${image.number}`)));
+    });
+    parts.push(details);
+  }
+  document.getElementById("runs-content").replaceChildren(...parts);
+}
+
+function jobs(rows) {
+  const columns = [{ name: "job", text: 1 }, { name: "runs" }, { name: "failed" }, { name: "parts" }, { name: "rows" },
+    { name: "elapsed", unit: "s" }, { name: "CPU", unit: "s" }, { name: "forecast", unit: "s" }, { name: "written", unit: "GB" },
+    { name: "forecast", unit: "GB" }, { name: "peak memory", unit: "GB" }];
+  return api.table(columns, rows.map((r) => [r.job, r.runs, r.failed + r.failed_runs, r.parts, r.rows,
+    ...[r.seconds, r.cpu_s, r.forecast_s, r.gb, r.forecast_gb, r.peak_gb].map((value) => value === null ? "–" : +value.toPrecision(3))]));
+}
+
+function tree(node) {
+  return api.h("ul", {}, api.h("li", {}, api.h("strong", {}, node.name), api.h("span", { class: "quiet" }, ` ${node.about}`), ...node.from.map(tree)));
+}

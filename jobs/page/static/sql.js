@@ -1,0 +1,92 @@
+// A query, with the names it can use beside it; its result as a table, as a plot, as a file.
+
+import * as api from "/static/api.js";
+import { usePlot } from "/static/plots.js";
+
+const $ = (id) => document.getElementById(id);
+let page, ran = null;
+
+export function start(given) {
+  page = given;
+  $("sql-text").value = first();
+  for (const table of api.lake.tables) {
+    const columns = table.columns.map((column) => api.h("button", { title: column.ucd || null, onclick: () => insert(column.name) },
+      column.name, api.h("small", {}, ` ${[column.unit, column.type].filter(Boolean).join(", ")}${column.meaning ? `: ${column.meaning}` : ""}`)));
+    $("sql-schema").append(api.h("details", {}, api.h("summary", {}, api.h("strong", {}, table.name), ` ${api.number(table.rows)} rows`),
+      api.h("p", { class: "quiet" }, table.meaning), ...columns));
+  }
+  $("sql-run").addEventListener("click", run);
+  $("sql-text").addEventListener("keydown", (event) => {
+    if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) run();
+  });
+  $("sql-text").addEventListener("input", page.remember);
+  $("sql-plot").addEventListener("click", plot);
+  for (const button of document.querySelectorAll("#sql [data-format]")) button.addEventListener("click", () => download(button.dataset.format));
+  $("sql-python").addEventListener("click", () => api.copy(python(), "Python"));
+  $("sql-request").addEventListener("click", () => api.copy(
+    `truesky sql ${quoted($("sql-text").value)} --lake ${quoted(api.lake.lake)}`, "Command"));
+  $("sql-tap").addEventListener("click", () => api.copy(
+    `import pyvo\npyvo.dal.TAPService(${JSON.stringify(api.lake.tap)}).search(${JSON.stringify($("sql-text").value)}).to_table()\n`, "Python"));
+}
+
+const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
+
+function first() {
+  const names = api.lake.tables.map((table) => table.name);
+  if (names.includes("galaxies")) return "SELECT id, ra, dec, z_obs, mag_r01, log_stellar_mass\nFROM galaxies\nWHERE z_obs < 0.5\nORDER BY mag_r01\nLIMIT 100";
+  return names.length ? `SELECT * FROM ${names[0]} LIMIT 100` : "SELECT 1";
+}
+
+function insert(name) {
+  const field = $("sql-text"), at = field.selectionStart;
+  field.setRangeText(name, at, field.selectionEnd, "end");
+  field.focus();
+  page.remember();
+}
+
+function python() {
+  return `from jobs.explore.explorer import Explorer\n\nwith Explorer(${JSON.stringify(api.lake.lake)}) as lake:\n    rows = lake.sql(${JSON.stringify($("sql-text").value)}, into="astropy")\n`;
+}
+
+async function run() {
+  $("sql-state").textContent = "…";
+  try {
+    ran = await api.post("sql", { sql: $("sql-text").value });
+  } catch (error) {
+    $("sql-state").textContent = error.message;
+    $("sql-state").className = "bad-text";
+    return;
+  }
+  $("sql-state").className = "quiet";
+  const more = ran.more ? `the first ${ran.rows.length} rows; a download has all` : `${ran.rows.length} rows`;
+  $("sql-state").textContent = `${more}, ${(ran.seconds * 1000).toFixed(0)} ms`;
+  const columns = ran.columns.map((c) => ({ ...c, text: c.type === "string" }));
+  $("sql-result").replaceChildren(api.table(columns, ran.rows.map((row) => row.map((value) => Array.isArray(value) ? `[${value.length} values]` : value))));
+  page.remember();
+}
+
+/** The first two columns of numbers, one against the other. */
+async function plot() {
+  if (!ran) await run();
+  const numbers = (ran?.columns ?? []).filter((c) => /int|float|double/.test(c.type) && c.name !== "id").map((c) => `"${c.name}"`);
+  if (!numbers.length) return api.say("The result has no column of numbers.", true);
+  const text = $("sql-text").value.trim().replace(/;$/, "");
+  usePlot(`(${text}\n) AS result`, numbers.length > 1 ? [[numbers[0]], [numbers[1]], [numbers[0], numbers[1]]] : [[numbers[0]]]);
+  page.show("plots");
+}
+
+function download(format) {
+  // A refusal is said here instead of becoming a file.
+  const link = api.h("a", { href: api.downloadAddress(format, $("sql-text").value), download: `result.${format}` });
+  document.body.append(link);
+  link.click();
+  link.remove();
+}
+
+export function show() {
+  if (!ran) run();
+}
+export const state = () => ({ text: $("sql-text").value });
+export function restore(was) {
+  if (typeof was.text === "string") $("sql-text").value = was.text;
+}

@@ -1,0 +1,327 @@
+"""What the page is told equals what the lake holds."""
+
+import csv
+import io
+import json
+import struct
+import time
+from urllib.parse import quote
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from jobs.page import charts
+from lake_schema.store import publish, read
+from tests.jobs.page.conftest import GALAXIES_N, NX, NY, published, serving, system
+from tests.universe import plain_plan, plain_work
+
+QUERY = "SELECT id, ra, z_obs, flux_halpha, kind, 'a,\"<&>' || kind AS name FROM galaxies ORDER BY id LIMIT 700"
+
+
+def unpacked(body):
+    (length,) = struct.unpack("<I", body[:4])
+    return json.loads(body[4 : 4 + length]), body[4 + length :]
+
+
+def asked(page, **question):
+    status, _, body = page.of_lake("charts", method="POST", body=json.dumps(question).encode())
+    assert status == 200, body
+    head, rest = unpacked(body)
+    found, at = [], 0
+    for chart in head["charts"]:
+        size = int(np.prod(chart["bins"]))
+        found.append(np.frombuffer(rest, "<u4", size, at).reshape(chart["bins"]))
+        at += 4 * size
+    assert at == len(rest)
+    return head, found
+
+
+def test_tables_are_described(page):
+    told = json.loads(page.ask("/api/lake")[2])
+    tables = {table["name"]: table for table in told["tables"]}
+    assert set(tables) == {"galaxies", "galaxy_fluxes", "stars", "products", "rendered_truth", "plain"}
+    (ra,) = (column for column in tables["galaxies"]["columns"] if column["name"] == "ra")
+    assert (ra["unit"], ra["ucd"]) == ("deg", "pos.eq.ra;meta.main")
+    assert tables["galaxies"]["rows"] == GALAXIES_N
+    assert tables["galaxies"]["is_catalogue"]
+    assert not tables["plain"]["is_catalogue"]
+    assert told["is_changed"] is False
+    assert page.gate.token not in json.dumps(told)
+
+
+def test_rows_of_a_query(page, shown):
+    body = json.dumps({"sql": "SELECT id, ra FROM galaxies ORDER BY id"}).encode()
+    found = page.json("sql", method="POST", body=body)
+    stored = read.version(shown, "galaxies").rows(["id", "ra"]).sort_by("id")
+    assert found["more"] is True
+    assert [row[0] for row in found["rows"]] == [str(i) for i in stored["id"].to_pylist()[:500]]
+    assert [row[1] for row in found["rows"]] == stored["ra"].to_pylist()[:500]
+    assert [column["unit"] for column in found["columns"]] == ["", "deg"]
+
+
+def test_values_that_json_lacks(page):
+    body = json.dumps(
+        {"sql": "SELECT 'nan'::FLOAT a, 'inf'::DOUBLE b, NULL c, [1, NULL] d, true e, 9007199254740993 f"}
+    )
+    assert page.json("sql", method="POST", body=body.encode())["rows"] == [
+        ["nan", "inf", None, [1, None], True, "9007199254740993"]
+    ]
+
+
+def test_counts_are_those_of_the_rows(page, shown):
+    rows = read.version(shown, "galaxies").rows(["z_obs", "mag_r01", "flux_halpha"])
+    z, mag = (rows[name].to_numpy() for name in ("z_obs", "mag_r01"))
+    head, (one, both) = asked(
+        page, source="galaxies", axes=["z_obs", "mag_r01", "flux_halpha"], limits=[[1, 10.0, 30.0]],
+        charts=[{"axes": [0], "bins": [50], "spans": [[0, 5]]},
+                {"axes": [0, 1], "bins": [7, 9], "spans": [[0, 5], [0, 40]]}],
+    )  # fmt: skip
+    inside = (mag >= 10) & (mag <= 30)
+    np.testing.assert_array_equal(one, np.histogram(z[inside].astype(float), 50, (0, 5))[0])
+    np.testing.assert_array_equal(
+        both, np.histogram2d(z.astype(float), mag.astype(float), (7, 9), ((0, 5), (0, 40)))[0]
+    )
+    assert head["missing"] == [0, 0, rows["flux_halpha"].null_count]
+    assert (head["rows"], head["part"]) == (GALAXIES_N, 1)
+
+
+def test_a_join_is_counted(page):
+    source = "galaxies JOIN galaxy_fluxes USING (id)"
+    _, (counts,) = asked(page, source=source, axes=["f_nu_euclid_vis - bulge_fraction"],
+                            charts=[{"axes": [0], "bins": [3], "spans": [[-1, 1]]}])  # fmt: skip
+    # The flux was made of that very column: row by row the difference is nothing.
+    assert counts.tolist() == [0, GALAXIES_N, 0]
+
+
+def test_many_rows_are_sampled_first(page, monkeypatch):
+    monkeypatch.setattr(charts, "ROWS_A_CORE", 10)
+    question = {"source": "galaxies", "axes": ["z_obs"], "charts": [{"axes": [0], "bins": [5]}]}
+    head, _ = asked(page, **question)
+    assert head["part"] == charts.PART
+    assert 0 < head["rows"] < GALAXIES_N / 16
+    head, _ = asked(page, **question, part=1)
+    assert (head["part"], head["rows"]) == (1, GALAXIES_N)
+
+
+def test_densities(page):
+    status, _, body = page.of_lake("sky/galaxies/parts")
+    head, _ = unpacked(body)
+    assert (status, head["rows"], head["cells"]) == (200, GALAXIES_N, 1)
+    _, _, body = page.of_lake("sky/galaxies/density?order=9")
+    head, rest = unpacked(body)
+    density = np.frombuffer(rest, "<f4", head["cells"], 32 * head["cells"])
+    assert head["rows"] == GALAXIES_N
+    assert density.sum() * 41252.96 / 12 / 4**9 == pytest.approx(GALAXIES_N, rel=1e-5)
+    _, _, body = page.of_lake("sky/galaxies/density?order=9&where=z_obs%20%3C%202%20--%20near")
+    assert 0 < unpacked(body)[0]["rows"] < GALAXIES_N
+
+
+def test_sources_of_a_field(page, shown):
+    from lake_schema import sky
+
+    rows = read.version(shown, "stars").rows(["id", "ra", "dec"])
+    ra, dec, radius = rows["ra"][0].as_py(), rows["dec"][0].as_py(), 0.004
+    found = page.json(f"sky/stars/sources?ra={ra}&dec={dec}&radius={radius}")
+    inside = sky.separation(rows["ra"].to_numpy(), rows["dec"].to_numpy(), ra, dec) <= radius
+    assert 1 < inside.sum() < len(rows)
+    assert set(found["id"]) == {str(i) for i in rows.filter(pa.array(inside))["id"].to_pylist()}
+
+
+# ------------------------------------------------------------------------------------------------ downloads
+
+
+def test_the_same_rows_in_all_four(page, shown):
+    from astropy.io.votable import parse_single_table
+    from astropy.table import Table
+
+    files = {}
+    for form in ("csv", "parquet", "vot", "fits"):
+        status, _, files[form] = page.of_lake(f"export?format={form}&sql={quote(QUERY)}")
+        assert status == 200
+    stored = (
+        read.version(shown, "galaxies").rows(["id", "ra", "z_obs", "flux_halpha", "kind"]).sort_by("id").slice(0, 700)
+    )
+    parquet = pq.read_table(pa.BufferReader(files["parquet"]))
+    vot, fits = (
+        parse_single_table(io.BytesIO(files["vot"])).to_table(),
+        Table.read(io.BytesIO(files["fits"]), format="fits"),
+    )
+    text = list(csv.DictReader(io.StringIO(files["csv"].decode())))
+    for name in ("id", "ra", "z_obs", "kind"):
+        expected = stored[name].to_numpy()
+        np.testing.assert_array_equal(parquet[name].to_numpy(), expected)
+        np.testing.assert_array_equal(np.asarray(vot[name]), expected)
+        np.testing.assert_array_equal(np.asarray(fits[name]), expected)
+        np.testing.assert_array_equal(np.array([row[name] for row in text]).astype(expected.dtype), expected)
+    missing = stored["flux_halpha"].is_null().to_numpy()
+    assert missing.any() or stored["flux_halpha"].null_count == 0
+    names = [f'a,"<&>{kind}' for kind in stored["kind"].to_pylist()]
+    assert (
+        parquet["name"].to_pylist()
+        == list(vot["name"])
+        == [n.strip() for n in fits["name"]]
+        == [r["name"] for r in text]
+        == names
+    )
+    assert str(vot["ra"].unit) == str(fits["ra"].unit) == parquet.schema.field("ra").metadata[b"unit"].decode() == "deg"
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "vot", "fits"])
+@pytest.mark.parametrize(
+    "sql", ["SELECT nothing FROM galaxies", "SELECT 1 AS a, 2 AS a", "SELECT * FROM '/etc/passwd'"]
+)
+def test_an_error_is_no_file(page, form, sql):
+    status, headers, body = page.of_lake(f"export?format={form}&sql={quote(sql)}")
+    assert status == 400
+    assert "Content-Disposition" not in headers
+    assert json.loads(body)["error"]
+
+
+def test_an_error_in_the_midst_is_no_whole_file(page):
+    """The first pieces have been sent when the 200,000th row fails: the connection ends without its end."""
+    import http.client
+
+    sql = "SELECT CASE WHEN range = 900000 THEN error('no') ELSE range END AS a FROM range(1000000)"
+    with pytest.raises((http.client.IncompleteRead, ConnectionError)):
+        page.of_lake(f"export?format=csv&sql={quote(sql)}")
+    assert page.of_lake("export?format=csv&sql=SELECT+1+AS+a")[2] == b'"a"\n1\n'
+
+
+# ------------------------------------------------------------------------------------------------ images
+
+
+def test_tiles_are_the_pixels(page):
+    about = page.json("image/1")
+    assert (about["nx"], about["ny"], about["levels"]) == (NX, NY, [[700, 600], [350, 300]])
+    pixels = np.zeros((NY, NX), np.float32)
+    for row in range(2):
+        for column in range(2):
+            piece = np.frombuffer(page.of_lake(f"tile/1/0/{row}/{column}")[2], "<f4")
+            view = pixels[512 * row : 512 * row + 512, 512 * column : 512 * column + 512]
+            view[:] = piece.reshape(view.shape)
+    coarse = np.frombuffer(page.of_lake("tile/1/1/0/0")[2], "<f4").reshape(300, 350)
+    np.testing.assert_allclose(coarse, pixels.reshape(300, 2, 350, 2).mean((1, 3)), rtol=1e-5, atol=1e-4)
+    # The true places of the brightest stars are where the pixels peak.
+    truth = page.json("truth/1")
+    for x, y in zip(truth["x"][:60], truth["y"][:60], strict=True):
+        c, r = round(x), round(y)
+        if not (8 < c < NX - 8 and 8 < r < NY - 8):
+            continue
+        others = np.hypot(np.array(truth["x"]) - x, np.array(truth["y"]) - y)
+        if (others < 16).sum() > 1:
+            continue
+        peak = np.unravel_index(pixels[r - 3 : r + 4, c - 3 : c + 4].argmax(), (7, 7))
+        assert abs(peak[1] - 3 + c - x) <= 0.5 + 1e-6
+        assert abs(peak[0] - 3 + r - y) <= 0.5 + 1e-6
+    assert truth["kind"][0] == "star"
+
+
+def test_cosmic_rays_on_and_off(page):
+    with_, without = (
+        np.frombuffer(page.of_lake(f"tile/0/0/0/0{words}")[2], "<f4").reshape(512, 512) for words in ("", "?mended=1")
+    )
+    hit = np.zeros((512, 512), bool)
+    hit[200:205, 100:140] = True
+    np.testing.assert_array_equal(with_[~hit], without[~hit])
+    assert with_[hit].mean() > 4000
+    assert 50 < np.median(without[hit]) < 200
+
+
+def test_the_grid_gives_the_sky(page):
+    """What the browser makes of the nodes, here in Python, against the header."""
+    from jobs.render.camera import astrometry
+    from lake_schema import sky
+
+    grid = page.json("image/0")["grid"]
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, NX - 1, 50), rng.uniform(0, NY - 1, 50)
+    xi, eta = (np.array(grid[name]).reshape(33, 33) for name in ("xi", "eta"))
+    u, v = ((value - grid[axis][0]) / (grid[axis][1] - grid[axis][0]) for axis, value in (("x", x), ("y", y)))
+    i, j = u.astype(int), v.astype(int)
+    plane = [
+        (1 - (v - j)) * ((1 - (u - i)) * t[j, i] + (u - i) * t[j, i + 1])
+        + (v - j) * ((1 - (u - i)) * t[j + 1, i] + (u - i) * t[j + 1, i + 1])
+        for t in (xi, eta)
+    ]
+    ra, dec = astrometry.sky_of_pixel(system(), x, y)
+    a, d = np.radians([grid["ra"], grid["dec"]])
+    east, north = (
+        np.array([-np.sin(a), np.cos(a), 0]),
+        np.array([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)]),
+    )
+    centre = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
+    x, y, z = (np.radians(plane[0])[:, None] * east + np.radians(plane[1])[:, None] * north + centre).T
+    found = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
+    # To 0.001 pixel.
+    assert sky.separation(*found, ra, dec).max() < 3e-8
+
+
+def test_a_source(page, shown):
+    star = read.version(shown, "rendered_truth").rows()["id"][0].as_py()
+    found = page.json(f"source/{star}")
+    assert found["kind"] == "star"
+    assert {row["name"]: row["value"] for row in found["tables"]["stars"]}["id"] == str(star)
+    assert len(found["drawn"]) == 1
+    assert {image["number"] for image in found["images"]} <= {0, 1, 2}
+    x, y = found["images"][0]["x"], found["images"][0]["y"]
+    assert (x, y) == pytest.approx((found["drawn"][0]["x"], found["drawn"][0]["y"]), abs=1e-3)
+    assert found["images"][0]["is_north_up"] is False
+    assert len(page.of_lake(f"cutout/0?x={x}&y={y}")[2]) == 64 * 64 * 4
+    near = page.json(f"nearest?ra={found['place'][0]}&dec={found['place'][1]}&radius=0.001")
+    assert near["id"] == str(star)
+    assert page.of_lake("source/1")[0] == 400
+
+
+def test_footprints_and_runs(page):
+    (region,) = page.json("regions")
+    assert (region["state"], region["images"], len(region["polygon"])) == ("observed", [0, 1, 2], 4)
+    assert page.json("runs")["failures"] == []
+    tree = page.json("provenance/0")
+    assert tree["from"][0]["name"] == "products"
+
+
+# ------------------------------------------------------------------------------------------------ processes
+
+
+def test_a_killed_process_is_replaced(page):
+    for process in page.server.lake.questions._all:
+        process.stop()
+    for _ in range(3):
+        page.of_lake("sql", method="POST", body=b'{"sql": "SELECT 1"}')
+    assert page.json("sql", method="POST", body=b'{"sql": "SELECT 7 AS a"}')["rows"] == [[7]]
+
+
+def test_who_goes_away_stops_the_query(page):
+    import socket
+
+    body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
+    with socket.create_connection(("127.0.0.1", page.gate.port)) as connection:
+        head = f"POST /api/{page.server.lake.key}/sql HTTP/1.1\r\nHost: 127.0.0.1:{page.gate.port}\r\n"
+        connection.sendall(f"{head}Cookie: {page.cookie}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body)
+        time.sleep(0.5)
+    for _ in range(3):
+        started = time.monotonic()
+        assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
+        assert time.monotonic() - started < 15.0
+
+
+def test_a_lake_that_is_published_anew_is_announced(tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    published(root)
+    with serving(root) as page:
+        old = page.server.lake.key
+        assert json.loads(page.ask("/api/lake")[2])["is_changed"] is False
+        publish.make(root, plain_plan(2), plain_work)
+        told = json.loads(page.ask("/api/lake")[2])
+        assert (told["is_changed"], told["key"]) == (True, old)
+        sums = b'{"sql": "SELECT sum(value) AS s FROM plain"}'
+        assert page.json("sql", method="POST", body=sums)["rows"] == [[60.0]]
+        status, _, body = page.ask("/api/reopen", method="POST", body=b"")
+        told = json.loads(body)
+        assert (status, told["is_changed"]) == (200, False)
+        assert told["key"] != old
+        assert page.ask(f"/api/{old}/sql", method="POST", body=sums)[0] == 409
+        assert page.json("sql", method="POST", body=sums)["rows"] == [[120.0]]
