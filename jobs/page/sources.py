@@ -79,8 +79,16 @@ def _facts(rows: pa.Table) -> list[Json]:
 def spectrum(lake: Lake, text: str) -> Json:
     """f_lambda as it arrives, its lines, and the passbands of the lake with the fluxes through them.
 
-    text : identifier, decimal;  wavelengths in angstrom, f_lambda in erg s-1 cm-2 A-1, f_nu in microjansky
+    text    : identifier, decimal
+    returns : wavelengths in angstrom, f_lambda in erg s-1 cm-2 A-1, f_nu in microjansky; or `said`, why there is none
     """
+    try:
+        return _spectrum(lake, text)
+    except BadInput as error:
+        return {"said": str(error)}
+
+
+def _spectrum(lake: Lake, text: str) -> Json:
     identifier = _identifier(text)
     kind = int(ids.kind_of(np.array([identifier]))[0])
     if kind not in (0, 1, 4, 5):

@@ -33,7 +33,7 @@ export async function pin(id) {
     : api.h("p", { class: "quiet" }, "No image."));
   listeners.forEach((listener) => listener());
   const own = source;
-  api.get(`spectrum/${id}`).then((found) => own === source && drawSpectrum(spectrum, found),
+  api.get(`spectrum/${id}`).then((found) => own === source && (found.said ? spectrum.append(api.h("p", { class: "quiet" }, `No spectrum: ${found.said}`)) : drawSpectrum(spectrum, found)),
     (error) => spectrum.append(api.h("p", { class: "quiet" }, error.message)));
   cutouts(pictures, own);
 }

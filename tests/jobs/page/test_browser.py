@@ -1,0 +1,267 @@
+"""The page in a browser: every view, brushes, keys, images, the address; no error, and no request to another host."""
+
+import os
+import shutil
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from lake_schema.store import read
+from tests.jobs.page.conftest import GALAXIES_N
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra browser)")
+CHROMIUM = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium (Debian: apt install chromium)")
+VIEWS = ("sky", "plots", "sql", "images", "runs")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as started:
+        running = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+def until(tab, expression, seconds=30.0):
+    """Wait without eval, which the page's policy refuses."""
+    end = time.monotonic() + seconds
+    while not (value := tab.evaluate(expression)):
+        assert time.monotonic() < end, expression
+        time.sleep(0.03)
+    return value
+
+
+@contextmanager
+def tab_of(browser, page, address="/", **context):
+    """The page in a tab that has its cookie; at its end nothing may have gone wrong."""
+    faults = []
+    opened = browser.new_context(viewport={"width": 1280, "height": 800}, **context)
+    tab = opened.new_page()
+    tab.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: faults.append(str(error)))
+
+    def lost(request):
+        # What is under way when an address is left is given up.
+        if request.failure != "net::ERR_ABORTED":
+            faults.append(f"{request.url} {request.failure}")
+
+    tab.on("requestfailed", lost)
+    tab.on("response", lambda answer: faults.append(f"{answer.url} {answer.status}") if answer.status >= 400 else None)
+    own = (page.origin + "/", "data:", "blob:")
+    tab.on("request", lambda request: None if request.url.startswith(own) else faults.append(request.url))
+    tab.goto(f"{page.origin}/?token={page.gate.token}")
+    if address != "/":
+        tab.goto(page.origin + address)
+        tab.reload()
+    until(tab, "document.body.dataset.ready === '1'")
+    yield tab
+    opened.close()
+    assert faults == []
+
+
+@pytest.fixture
+def tab(browser, page):
+    with tab_of(browser, page) as opened:
+        yield opened
+
+
+def canvas_colours(tab, selector):
+    """How many colours a picture of an element has."""
+    import io
+
+    from PIL import Image
+
+    pixels = np.asarray(Image.open(io.BytesIO(tab.locator(selector).first.screenshot())).convert("RGB"))
+    return len(np.unique(pixels.reshape(-1, 3), axis=0))
+
+
+def test_every_view_is_drawn(tab):
+    for number, view in enumerate(VIEWS, start=1):
+        tab.keyboard.press(str(number))
+        until(tab, f"!document.getElementById('{view}').hidden")
+        assert tab.get_attribute(f"#tab-{view}", "aria-selected") == "true"
+        if view == "sky":
+            until(tab, "document.getElementById('sky-legend').textContent.includes('deg')")
+            assert canvas_colours(tab, "#sky .stage") > 30
+        if view == "plots":
+            until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
+            assert canvas_colours(tab, "#plot-grid figure.map canvas") > 20
+        if view == "sql":
+            until(tab, "document.querySelectorAll('#sql-result td').length > 0")
+        if view == "images":
+            until(tab, "document.getElementById('image-one').childElementCount === 3")
+            time.sleep(1.0)
+            assert canvas_colours(tab, "#image-canvas") > 30
+        if view == "runs":
+            until(tab, "document.querySelectorAll('#runs-content h2').length > 2")
+
+
+def drag(tab, selector, first, last):
+    """Drag over a canvas, from and to parts of its width."""
+    box = tab.locator(selector).first.bounding_box()
+    y = box["y"] + 0.4 * box["height"]
+    tab.mouse.move(box["x"] + first * box["width"], y)
+    tab.mouse.down()
+    for part in np.linspace(first, last, 12):
+        tab.mouse.move(box["x"] + part * box["width"], y)
+    return tab.mouse
+
+
+def test_brushes_filter_the_other_charts(tab, shown):
+    tab.keyboard.press("2")
+    ranges = "[...document.querySelectorAll('#plot-grid .range')].map((one) => one.textContent)"
+    until(tab, f"{ranges}.every((text) => text.includes('rows'))")
+    whole = tab.evaluate(ranges)
+    drag(tab, "#plot-grid canvas", 0.3, 0.6).up()
+    until(tab, f"{ranges}[1] !== {whole[1]!r}")
+    time.sleep(0.5)
+    brush = tab.evaluate("JSON.parse(decodeURIComponent(location.hash.slice(1))).plots.charts[0].brush[0]")
+    z, mag = (read.version(shown, "galaxies").rows([name])[name].to_numpy() for name in ("z_obs", "mag_r01"))
+    spans = tab.evaluate("JSON.parse(decodeURIComponent(location.hash.slice(1))).plots.charts[1].spans[0]")
+    inside = (z >= brush[0]) & (z <= brush[1]) & (mag >= spans[0]) & (mag <= spans[1])
+    assert 0 < inside.sum() < GALAXIES_N
+    assert tab.evaluate(ranges)[1].replace("\N{NARROW NO-BREAK SPACE}", "").startswith(f"{inside.sum()} rows")
+    tab.locator("#plot-grid canvas").first.focus()
+    tab.keyboard.press("Escape")
+    until(tab, f"{ranges}[1] === {whole[1]!r}")
+    for _ in range(3):
+        tab.keyboard.press("Shift+ArrowRight")
+    until(tab, f"{ranges}[1] !== {whole[1]!r}")
+
+
+def test_a_held_brush_asks_nothing(tab):
+    tab.keyboard.press("2")
+    until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
+    asked = []
+    mouse = drag(tab, "#plot-grid canvas", 0.3, 0.35)
+    time.sleep(1.5)
+    tab.on("request", lambda request: asked.append(request.url))
+    ranges = "[...document.querySelectorAll('#plot-grid .range')].map((one) => one.textContent)[1]"
+    before, box = tab.evaluate(ranges), tab.locator("#plot-grid canvas").first.bounding_box()
+    for part in np.linspace(0.35, 0.8, 20):
+        mouse.move(box["x"] + part * box["width"], box["y"] + 50)
+    assert tab.evaluate(ranges) != before
+    assert asked == []
+    mouse.up()
+
+
+def test_a_query_and_its_refusal(browser, page):
+    with tab_of(browser, page) as tab:
+        tab.keyboard.press("3")
+        tab.fill("#sql-text", "SELECT id, ra, '<b>x</b>' AS text FROM galaxies ORDER BY id LIMIT 3")
+        tab.press("#sql-text", "Control+Enter")
+        until(tab, "document.getElementById('sql-state').textContent.startsWith('3 rows')")
+        assert "ra deg" in tab.inner_text("#sql-result thead").replace("\t", " ").replace("\n", " ")
+        # Text stays text.
+        assert tab.locator("#sql-result b").count() == 0
+        first = tab.inner_text("#sql-result tbody tr td")
+        assert first.isdigit()
+        assert len(first) > 16
+        tab.click("#sql-plot")
+        until(tab, "document.querySelectorAll('#plot-grid figure').length >= 1")
+        until(tab, "document.getElementById('plot-state').textContent.startsWith('3 rows')")
+
+
+def test_an_image_its_places_and_a_pinned_source(tab, page):
+    tab.keyboard.press("4")
+    until(tab, "document.getElementById('image-one').childElementCount === 3")
+    tab.check("#image-truth")
+    time.sleep(1.0)
+    box = tab.locator("#image-canvas").bounding_box()
+    truth = page.json("truth/0")
+    zoom = 0.98 * min(box["width"] / 700, box["height"] / 600)
+    # North is down in the file: it is shown turned.
+    star = next(k for k in range(20) if 100 < truth["x"][k] < 600 and 100 < truth["y"][k] < 500)
+    at = (box["x"] + box["width"] / 2 - (truth["x"][star] - 349.5) * zoom,
+          box["y"] + box["height"] / 2 + (truth["y"][star] - 299.5) * zoom)  # fmt: skip
+    tab.mouse.move(*at)
+    place = until(tab, "document.getElementById('image-place').textContent")
+    column, row = (int(text) for text in place.split("pixel ")[1].split("   ")[0].split(","))
+    assert abs(column - truth["x"][star]) <= 1
+    assert abs(row - truth["y"][star]) <= 1
+    found = page.json(f"source/{truth['id'][star]}")
+    ra, dec = (float(text) for text in place.split("\n")[0].split()[-3:-1])
+    assert (ra, dec) == pytest.approx(found["place"], abs=2 * 0.1 / 3600)
+    assert "electron" in place
+    tab.mouse.click(*at)
+    until(tab, f"document.getElementById('pin').textContent.includes('{truth['id'][star]}')")
+    until(tab, "document.querySelectorAll('#pin .cutouts canvas').length === 2")
+
+
+def test_the_address_holds_the_view(browser, page):
+    with tab_of(browser, page) as tab:
+        tab.keyboard.press("4")
+        until(tab, "document.getElementById('image-one').childElementCount === 3")
+        tab.select_option("#image-one", "1")
+        tab.select_option("#image-map", "magma")
+        tab.click("#theme")
+        for _ in range(3):
+            tab.keyboard.press("+")
+        time.sleep(0.6)
+        address = tab.evaluate("location.hash")
+        assert page.gate.token not in address
+        was = tab.evaluate("JSON.parse(decodeURIComponent(location.hash.slice(1))).images")
+    with tab_of(browser, page, f"/{address}") as tab:
+        until(tab, "!document.getElementById('images').hidden")
+        until(tab, "document.getElementById('image-one').value === '1'")
+        time.sleep(0.6)
+        assert tab.evaluate("document.documentElement.dataset.theme") == "light"
+        assert tab.evaluate("JSON.parse(decodeURIComponent(location.hash.slice(1))).images") == was
+
+
+CONTRAST = """() => {
+  const part = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+  const style = getComputedStyle(document.documentElement);
+  const luminance = (name) => {
+    const hex = style.getPropertyValue('--' + name).trim();
+    return [1, 3, 5].map((k) => part(parseInt(hex.substr(k, 2), 16) / 255))
+      .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
+  };
+  const ratio = (a, b) => (Math.max(luminance(a), luminance(b)) + 0.05) / (Math.min(luminance(a), luminance(b)) + 0.05);
+  return ['ink', 'quiet', 'accent', 'second', 'bad', 'good']
+    .flatMap((a) => ['paper', 'panel', 'raised'].map((b) => [a, b, ratio(a, b)]));
+}"""
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_contrast(tab, theme):
+    if tab.evaluate("document.documentElement.dataset.theme") != theme:
+        tab.click("#theme")
+    assert [found for found in tab.evaluate(CONTRAST) if found[2] < 4.5] == []
+
+
+def test_everything_is_reached_by_keys(tab):
+    """Tab leads to every control of a view, and what has the focus can be seen."""
+    for view in VIEWS[:4]:
+        tab.click(f"#tab-{view}")
+        time.sleep(0.8)
+        wanted = tab.evaluate(
+            f"[...document.querySelectorAll('#{view} button, #{view} input, #{view} select, #{view} canvas[tabindex]')]"
+            ".filter((one) => one.checkVisibility() && !one.disabled).length"
+        )
+        reached = set()
+        for _ in range(wanted + 40):
+            tab.keyboard.press("Tab")
+            reached.add(tab.evaluate(
+                f"(() => {{ const a = document.activeElement, all = [...document.querySelectorAll('#{view} *')];"
+                "return all.indexOf(a); })()"
+            ))  # fmt: skip
+            if tab.evaluate("document.activeElement !== document.body"):
+                assert tab.evaluate("getComputedStyle(document.activeElement).outlineStyle !== 'none'")
+        assert len(reached - {-1}) >= wanted
+
+
+def test_nothing_moves_where_that_is_asked_for(browser, page):
+    with tab_of(browser, page, reduced_motion="reduce") as tab:
+        tab.keyboard.press("4")
+        until(tab, "document.getElementById('image-one').childElementCount === 3")
+        tab.select_option("#image-two", "1")
+        time.sleep(1.0)
+        tab.click("#image-blink")
+        time.sleep(0.8)
+        once = tab.locator("#image-canvas").screenshot()
+        time.sleep(1.7)
+        assert tab.locator("#image-canvas").screenshot() == once
