@@ -22,9 +22,11 @@ from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.errors import BadInput
 
 # Rows that are counted at a time: a few columns of them stay in a processor's own cache.
-_BLOCK = 8192
-_MOST_COLUMNS, MOST_CELLS = 62, 8_000_000
+_BLOCK = 32768
+_MOST_COLUMNS, MOST_CELLS = 30, 8_000_000
 _MOST_AXES = 3
+# A grid of more cells than so many a row of a block is counted in directly.
+_SPARSE = 4
 # Rows that tell a span, and the part of them that may lie outside on each side.
 _LOOKED_AT, _OUTSIDE = 200_000, 2e-3
 
@@ -86,11 +88,11 @@ def counted(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits,
     return [piece.reshape(chart.bins) for piece, chart in zip(np.split(total, ends[:-1]), charts, strict=True)]
 
 
-def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float, Bool, Int, Float, Int, Int, Int]:
+def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float32, Bool, Int, Float, Int, Int, Int]:
     """Limits [column, 2], which of them are set [column], and of each chart: axes, spans, bins, the limits it heeds."""
-    bounds, is_set = np.zeros((number, 2)), np.zeros(number, np.bool_)
+    bounds, is_set = np.zeros((number, 2), np.float32), np.zeros(number, np.bool_)
     for column, (lo, hi) in limits.items():
-        bounds[column], is_set[column] = (lo, hi), True
+        bounds[column], is_set[column] = (_single(lo, up=True), _single(hi, up=False)), True
     axes = np.full((len(charts), _MOST_AXES), -1, np.int64)
     spans, bins = np.zeros((len(charts), _MOST_AXES, 2)), np.ones((len(charts), _MOST_AXES), np.int64)
     heeded = np.zeros(len(charts), np.int64)
@@ -103,42 +105,63 @@ def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float
     return bounds, is_set, axes, spans, bins, heeded, starts
 
 
+def _single(limit: float, up: bool) -> np.float32:
+    """The float32 next to a limit, not below or not above it: float32 values are on the same side of both."""
+    with np.errstate(over="ignore"):
+        near = np.float32(limit)
+    beyond = float(near) < limit if up else float(near) > limit
+    return np.nextafter(near, np.float32(np.inf if up else -np.inf)) if beyond else near
+
+
 @exact_jit
 def _count(
-    values: Float32,
-    bounds: Float,
-    is_set: Bool,
-    axes: Int,
-    spans: Float,
-    bins: Int,
-    heeded: Int,
-    starts: Int,
+    values: Float32, bounds: Float32, is_set: Bool, axes: Int, spans: Float, bins: Int, heeded: Int, starts: Int,
     counts: Int,
-) -> None:
-    """Add the rows of a block, float32[column, n], to the counts."""
+) -> None:  # fmt: skip
+    """Add the rows of a block, float32[column, n], to the counts.
+
+    Loops over rows have no branches, so that several are done at a time: what does not count is counted in a cell that
+    is thrown away.
+    """
     rows = values.shape[1]
-    fails = np.zeros(rows, np.int64)
+    fails = np.zeros(rows, np.int32)
     for c in range(values.shape[0]):
         if is_set[c]:
-            lo, hi = bounds[c, 0], bounds[c, 1]
+            lo, hi, bit = bounds[c, 0], bounds[c, 1], np.int32(1 << c)
             for i in range(rows):
-                if not (values[c, i] >= lo and values[c, i] <= hi):
-                    fails[i] |= np.int64(1) << c
+                fails[i] |= np.int32(0) if (values[c, i] >= lo) & (values[c, i] <= hi) else bit
+    cell, out = np.empty(rows, np.int32), np.empty(rows, np.int32)
     for k in range(axes.shape[0]):
+        own, cells = np.int32(heeded[k]), np.int32(1)
         for i in range(rows):
-            if fails[i] & heeded[k] == 0:
-                cell = np.int64(0)
-                inside = True
-                for a in range(axes.shape[1]):
-                    if axes[k, a] >= 0:
-                        x = np.float64(values[axes[k, a], i])
-                        lo, hi = spans[k, a, 0], spans[k, a, 1]
-                        if not (x >= lo and x <= hi):
-                            inside = False
-                            break
-                        cell = cell * bins[k, a] + min(np.int64((x - lo) / (hi - lo) * bins[k, a]), bins[k, a] - 1)
-                if inside:
-                    counts[starts[k] + cell] += 1
+            cell[i] = 0
+            out[i] = fails[i] & own
+        for a in range(axes.shape[1]):
+            c = axes[k, a]
+            if c < 0:
+                continue
+            low, high, n = spans[k, a, 0], spans[k, a, 1], np.int32(bins[k, a])
+            width, size, last = high - low, np.float64(n), np.float64(n - 1)
+            for i in range(rows):
+                x = np.float64(values[c, i])
+                inside = (x >= low) & (x <= high)
+                place = (x - low) / width * size
+                place = place if place < last else last
+                cell[i] = cell[i] * n + np.int32(place if inside else 0.0)
+                out[i] |= np.int32(0) if inside else np.int32(1)
+            cells *= n
+        if cells > _SPARSE * rows:
+            for i in range(rows):
+                if out[i] == 0:
+                    counts[starts[k] + cell[i]] += 1
+        else:
+            for i in range(rows):
+                cell[i] = cell[i] if out[i] == 0 else cells
+            found = np.zeros(cells + 1, np.int32)
+            for i in range(rows):
+                found[cell[i]] += 1
+            for m in range(cells):
+                counts[starts[k] + m] += found[m]
 
 
 def span(column: Float32) -> tuple[float, float]:
