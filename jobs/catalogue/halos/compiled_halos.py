@@ -54,16 +54,19 @@ def halos(
     amplitude: Any,
     field: Any,
     g: Any,
-    cut: Any,
+    wanted: Any,
     out: Any,
-) -> None:
-    """Fills out with the halos of each block, number[s, bins] of them.
+) -> int:
+    """Fills out with the halos of each block, number[s, bins] of them but for those that are not wanted; how many.
 
     key, first, steps, ln_number, amplitude, field, g : as of `counts`
-    cut : of the scatter, standard deviations
-    out : voxel, step (row), bin, place (uint64 random bits); float64[n, 3] uniform in volume, uniform in mass, scatter
+    wanted : upper edges [bins] of mass; host, central [s], log10 of mass and proxy: either is enough; the scatter
+             of proxies, dex, and where it is cut, standard deviations
+    out : voxel, step (row), bin, number in the block; place (uint64 random bits)
+          float64[n, 3] uniform in volume, uniform in mass, scatter
     """
-    voxel, row, column, place, drawn = out
+    voxel, row, column, which, place, drawn = out
+    most, host, central, scatter, cut = wanted
     bins, at = number.shape[1], 0
     for s in range(steps.size):
         for b in range(bins):
@@ -74,6 +77,9 @@ def halos(
                     total += np.exp(ln_number[s, b] + amplitude[s, b] * np.float64(g[v, field[s, b]]))
             for j in range(number[s, b]):
                 own = following(block, j + 1)
+                off = cut_normal(own, SCATTER, cut)
+                if most[b] < host[s] and most[b] + scatter * off < central[s]:
+                    continue
                 left = uniform(following(own, VOXEL)) * total
                 v = first[s]
                 while v < first[s + 1] - 1:
@@ -81,12 +87,13 @@ def halos(
                     if left < 0.0:
                         break
                     v += 1
-                voxel[at], row[at], column[at] = v, s, b
+                voxel[at], row[at], column[at], which[at] = v, s, b, j
                 place[at] = following(own, PLACE)
                 drawn[at, 0] = uniform(following(own, DISTANCE))
                 drawn[at, 1] = uniform(following(own, MASS))
-                drawn[at, 2] = cut_normal(own, SCATTER, cut)
+                drawn[at, 2] = off
                 at += 1
+    return at
 
 
 @exact_jit

@@ -81,16 +81,14 @@ class HaloModel:
         return float(np.log10(self.matching.occupation.least)) - self.matching.occupation.depth
 
     @property
-    def least(self) -> Float:
-        """log10 of the mass[s] below which no halo holds a galaxy of the request; infinite beyond its end.
+    def lowest(self) -> Float:
+        """Least `mass_limit`[s] anywhere in a step; infinite beyond the request's end.
 
         Galaxies end at `far`, their hosts one step behind it.
         """
-        near = np.minimum(
-            self.limit, np.minimum(np.append(self.limit[1:], np.inf), np.insert(self.limit[:-1], 0, np.inf))
-        )
-        visited = self.line.edge[:-1] < self.far + self.box.model.cell
-        return np.where(visited, near - self.matching.occupation.depth, np.inf)
+        padded = np.pad(self.limit, 1, constant_values=np.inf)
+        lowest = np.minimum(np.minimum(padded[:-2], padded[2:]), self.limit)
+        return np.where(self.line.edge[:-1] < self.far + self.box.model.cell, lowest, np.inf)
 
     def drawn(self, least: Float) -> Bool:
         """Blocks, [s, bins], that hold halos of at least log10 mass least[s] and have a level."""
@@ -177,22 +175,26 @@ def draw(halos: HaloModel, seed: int, order: int, cell: int, least: Float | None
     least : [s] log10 of the mass from which on all halos are wanted, infinite where none are, whatever the limit;
             None = those that may hold galaxies of the request: a satellite, or a central above `mass_limit`
     """
-    used = halos.drawn(halos.least if least is None else least) & (halos.level == order)
+    occupation, lowest = halos.matching.occupation, halos.lowest
+    used = halos.drawn(lowest - occupation.depth if least is None else least) & (halos.level == order)
     space = lightcone.voxels(halos.box, halos.turned, halos.line, order, cell, used.any(1))
-    voxel, column, place, numbers = _blocks(
-        halos, used, space, int(keyed.keys(np.array([cell]), seed, "halos", order)[0])
+    # Either is enough; of wide cells all halos are numbered.
+    wanted = (lowest + halos.host_offset, lowest) if least is None else (least, least)
+    wanted = wanted if order == GENERATION_ORDER else (np.full(lowest.size, -np.inf), lowest)
+    voxel, column, which, place, numbers = _blocks(
+        halos, used, space, wanted, int(keyed.keys(np.array([cell]), seed, "halos", order)[0])
     )
     step = space.step[voxel]
     fall, width = halos.ratio[step, column], halos.log_mass[1] - halos.log_mass[0]
     # Inside a bin dn/dlogM falls exponentially.
     log_mass = halos.log_mass[column] - width * np.log1p(numbers[:, 1] * np.expm1(-fall)) / fall
-    proxy = log_mass + halos.matching.occupation.scatter * numbers[:, 2]
+    proxy = log_mass + occupation.scatter * numbers[:, 2]
     near, far = halos.line.edge[step], halos.line.edge[step + 1]
     chi = np.cbrt(near**3 + numbers[:, 0] * (far**3 - near**3))
     shift = 2 * (sky.DEEPEST - space.order[voxel])
     index = (space.cell[voxel] << shift) | (place >> np.uint64(2)).astype(np.int64) & ((np.int64(1) << shift) - 1)
     factor = density_box.velocity_factor(halos.box.model, halos.line.z)
-    own, bits = _identifiers(halos, step, column, index)
+    own, bits = _identifiers(halos, step, column, index, which if order == GENERATION_ORDER else None)
     found = Halos(index, chi, log_mass, proxy, factor[step] * space.velocity[voxel], own, bits)
     if least is None:
         limit = halos.mass_limit(chi)
@@ -214,8 +216,13 @@ def levels(wide: Float) -> Int:
     return level
 
 
-def _blocks(halos: HaloModel, used: Bool, space: Voxels, key: int) -> tuple[Int, Int, npt.NDArray[np.uint64], Float]:
-    """(voxel[n], mass bin[n], random bits[n], [n, 3] numbers) of the halos of a cell, block after block."""
+def _blocks(
+    halos: HaloModel, used: Bool, space: Voxels, wanted: tuple[Float, Float], key: int
+) -> tuple[Int, Int, Int, npt.NDArray[np.uint64], Float]:
+    """(voxel[n], mass bin[n], number in the block[n], random bits[n], [n, 3] numbers) of halos, block after block.
+
+    wanted : [s] log10 of mass and proxy of which either is enough
+    """
     steps, first = np.unique(space.step, return_index=True)
     first = np.append(first, space.step.size)
     amplitude, field = halos.amplitude[steps], halos.field[steps]
@@ -226,17 +233,18 @@ def _blocks(halos: HaloModel, used: Bool, space: Voxels, key: int) -> tuple[Int,
     tables = (ln_number, amplitude, field, g)
     number = compiled_halos.counts(np.uint64(key), first, steps, used[steps], *tables)
     n = int(number.sum())
-    out = (*np.empty((3, n), np.int64), np.empty(n, np.uint64), np.empty((n, 3)))
-    occupation = halos.matching.occupation
-    cut = occupation.depth / occupation.scatter
-    compiled_halos.halos(np.uint64(key), first, steps, number, *tables, cut, out)
-    return out[0], out[2], out[3], out[4]
+    out = (*np.empty((4, n), np.int64), np.empty(n, np.uint64), np.empty((n, 3)))
+    own = halos.matching.occupation
+    limits = halos.log_mass[1:], *(limit[steps] for limit in wanted), own.scatter, own.depth / own.scatter
+    found = slice(compiled_halos.halos(np.uint64(key), first, steps, number, *tables, limits, out))
+    return out[0][found], out[2][found], out[3][found], out[4][found], out[5][found]
 
 
-def _identifiers(halos: HaloModel, step: Int, column: Int, index: Int) -> tuple[Int, Int]:
-    """(identifiers[n], bits of a member[n]) of all halos of some blocks, in the order of their keys."""
+def _identifiers(halos: HaloModel, step: Int, column: Int, index: Int, number: Int | None) -> tuple[Int, Int]:
+    """(identifiers[n], bits of a member[n]) of halos; of wide cells they have no number yet, and are all of a block."""
     block, cell = step * (halos.log_mass.size - 1) + column, index >> 2 * (sky.DEEPEST - GENERATION_ORDER)
-    number = np.empty(block.size, np.int64)
-    compiled_halos.numbered(block, cell, number)
+    if number is None:
+        number = np.empty(block.size, np.int64)
+        compiled_halos.numbered(block, cell, number)
     bits = ids.member_bits(halos.log_mass[column])
     return ids.drawn_halo_id(cell, block, number, bits), bits

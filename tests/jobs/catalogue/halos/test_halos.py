@@ -34,7 +34,7 @@ def test_a_reach_never_leads_beyond_the_cells_about(order, rng):
 
 def test_every_halo_has_one_level(model):
     """Each mass bin above the limit is drawn by one order; less than one halo of the sky is too wide for all."""
-    wanted = model.log_mass[None, 1:] >= model.least[:, None]
+    wanted = model.log_mass[None, 1:] >= (model.lowest - model.matching.occupation.depth)[:, None]
     left_out = wanted & (model.level == -1)
     expected = np.sum(np.where(left_out, model.number, 0.0) * model.line.volume[:, None]) * 4 * np.pi
     assert expected < 1.0
