@@ -137,7 +137,7 @@ def add_smooth(place: Float, near: Float, halo: Float, out: Float) -> None:
 def add_nodes(place: Float, near: Float, planes: Float, step: float, table: Float, out: Float) -> None:
     """Add to out[5, n] the table's values at sources: cubic on the grid, linear in 1 / distance between planes.
 
-    planes : [p] 1 / distance, rising from 0;  step : rad between nodes
+    place, near : of sources;  planes : [p] 1 / distance, rising from 0;  step : rad between nodes
     table  : [p, side, side, 5] at nodes of a square about the origin; sources outside have what its border has
     Ref: Keys 1981, IEEE Trans. Acoust. Speech Signal Process. 29, 1153
     """
