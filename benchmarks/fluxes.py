@@ -181,9 +181,11 @@ def stars(n: int) -> dict[str, float]:
 
     library = templates.stellar_library()
     rng = np.random.default_rng(_SEED_TEST)
+    # As most stars are: of four templates each.
     rows = Stars(
-        rng.integers(0, len(library), n), rng.uniform(5.0, 26.0, n), rng.uniform(0.0, build_tables.STAR_A_V_LAST, n)
-    )
+        rng.integers(0, len(library), (4, n)), rng.dirichlet(np.ones(4), n).T, rng.uniform(5.0, 26.0, n),
+        rng.uniform(0.0, build_tables.STAR_A_V_LAST, n),
+    )  # fmt: skip
     curves = [passbands.load(name) for name in BANDS]
     found, truth = flux_tables.stars(rows, curves, library), integration.stars(rows, curves, library)
     seconds = _cpu(lambda: flux_tables.stars(rows, curves, library), 3)

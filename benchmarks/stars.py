@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks import report
 from jobs.catalogue import build_stars, dust_map
-from jobs.catalogue.stars import gaia, milky_way, stars
+from jobs.catalogue.stars import gaia, stars
 from jobs.fluxes import band_fluxes, compute_fluxes, passbands
 from jobs.fluxes.libraries import templates
 from jobs.fluxes.libraries.vega import vega_magnitude
@@ -58,27 +58,7 @@ def far_from_the_plane(step: int) -> float:
 
 def brighter_than_11(step: int, dust: Float32) -> float:
     """Stars of the whole sky to expect with V < 11, behind the dust, from every step-th cell of order 4."""
-    universe, order = stars.model(), 4
-    galaxy, types = universe.galaxy, universe.types
-    by_teff, m_h = np.argsort(types.teff), 0.5 * (galaxy.m_h[1:] + galaxy.m_h[:-1])
-    distance = milky_way.middles(galaxy)
-    color = np.stack(
-        [
-            np.interp(np.interp(m_h, sequence.m_h, sequence.teff), types.teff[by_teff], types.v_minus_h[by_teff])
-            for sequence in galaxy.sequences
-            for _ in galaxy.components
-        ]
-    )
-    v = (m_h + color)[:, None, :] + 5.0 * np.log10(distance)[:, None] - 5.0
-    total = 0.0
-    cells = np.arange(step // 2, 12 << 2 * order, step)
-    for ra, dec in zip(*sky.cell_centres(order, cells), strict=True):
-        lon, lat = sky.galactic([ra], [dec])
-        far = dust_map.a_v(dust, np.array([ra]), np.array([dec]))
-        a_v = dust_map.a_v_at(far, distance, lat, universe.layer, universe.sin_b_min)
-        number = milky_way.expected(galaxy, float(lon[0]), float(lat[0]), sky.cell_area(order), 30.0)
-        total += float(number[v + a_v[:, None] < 11.0].sum())
-    return total * (12 << 2 * order) / cells.size
+    return star_counts.whole_sky(stars.model(), 11.0, dust, step)
 
 
 def pole(cells: int, dust: Float32) -> dict[str, float]:

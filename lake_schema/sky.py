@@ -219,7 +219,7 @@ def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     """ICRS ra, dec [n] deg -> Galactic l, b [n] deg (matrix of the Hipparcos catalogue, ESA 1997, eq. 1.5.11)."""
     ra_rad, dec_rad = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     vector = np.stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)])
-    x, y, z = _turned(_TO_GALACTIC, vector)
+    x, y, z = _turned(TO_GALACTIC, vector)
     return wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
@@ -227,7 +227,7 @@ def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
     """Galactic l, b [n] deg -> ICRS ra, dec [n] deg; the inverse of `galactic`."""
     l_rad, b_rad = np.radians(np.asarray(lon, float)), np.radians(np.asarray(lat, float))
     vector = np.stack([np.cos(b_rad) * np.cos(l_rad), np.cos(b_rad) * np.sin(l_rad), np.sin(b_rad)])
-    x, y, z = _turned(_TO_GALACTIC.T, vector)
+    x, y, z = _turned(TO_GALACTIC.T, vector)
     return wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
@@ -236,7 +236,7 @@ def _turned(matrix: Float, vector: Float) -> Float:
     return np.stack([row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2] for row in matrix])
 
 
-_TO_GALACTIC = np.array(
+TO_GALACTIC = np.array(
     [
         [-0.0548755604162154, -0.8734370902348850, -0.4838350155487132],
         [+0.4941094278755837, -0.4448296299600112, +0.7469822444972189],

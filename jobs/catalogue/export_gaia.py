@@ -46,8 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", required=True, type=Path, help="file to write: .csv or .fits; ldac .fits, .cat, .ldac")
     parser.add_argument("--form", default="table", choices=FORMS)
     parser.add_argument("--release", default="dr2", choices=RELEASES, help="whose columns; the values are those of DR2")
-    parser.add_argument("--epoch", type=float, help="year at which the images are taken: stars carried there by their "
-                        "proper motions come to lie where images show them")  # fmt: skip
+    parser.add_argument("--epoch", type=float, help="year to which stars are carried by their measured motions: "
+                        "for programs that take references where they are")  # fmt: skip
     options = parser.parse_args(argv)
 
     def exported() -> int:
@@ -69,7 +69,7 @@ def export(
     path     : of the file, with an ending of its form
     declared : the columns of form "table"
     form     : "table" or "ldac"
-    epoch    : year at which stars lie where images show them, None = that of the catalogue
+    epoch    : year to which stars are carried by their proper motions, None = that of the catalogue
     request  : whose stars, where a lake has those of several
     Errors   : BadInput for another ending than those of FORMS, an epoch that no proper motion reaches, and where the
                table is one without proper motions
@@ -102,9 +102,9 @@ def _named(version: read.Version, part: str, epoch: float | None) -> pa.Table:
     columns: dict[str, Any] = {name: rows[name] for name in rows.column_names}
     columns |= {"source_id": rows["id"], "bp_rp": pc.subtract(rows["phot_bp_mean_mag"], rows["phot_rp_mean_mag"])}
     own_epoch = parameters.section("gaia.toml", "astrometry")["epoch"]
-    columns["ref_epoch"] = pa.array(np.full(rows.num_rows, own_epoch))
+    columns["ref_epoch"] = pa.array(np.full(rows.num_rows, own_epoch if epoch is None else epoch))
     if epoch is not None:
-        columns["ra"], columns["dec"] = map(pa.array, _before(rows, epoch - own_epoch))
+        columns["ra"], columns["dec"] = map(pa.array, _after(rows, epoch - own_epoch))
     known = pc.is_valid(rows["pmra"])
     columns |= _correlations(known)
     for band, short in enumerate(("g", "bp", "rp")):
@@ -129,9 +129,9 @@ def _correlations(known: pa.ChunkedArray) -> dict[str, Any]:
     return {f"{one}_{other}_corr": position if (one, other) == ("ra", "dec") else zero for one, other in pairs}
 
 
-def _before(rows: pa.Table, years: float) -> tuple[Any, Any]:
-    """Positions from which the proper motions lead to the rows' own in so many years."""
-    east, north = (-_MAS * years * pc.fill_null(rows[name], 0.0).to_numpy() for name in ("pmra", "pmdec"))
+def _after(rows: pa.Table, years: float) -> tuple[Any, Any]:
+    """Positions to which the proper motions lead in so many years."""
+    east, north = (_MAS * years * pc.fill_null(rows[name], 0.0).to_numpy() for name in ("pmra", "pmdec"))
     return lensing.displaced(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
 
 

@@ -113,7 +113,7 @@ def stars(given: Given, band: str) -> StarCatalogue:
     library, values = templates.stellar_library(), dict(given.stars)
     temperatures = stellar.types().teff
     none = np.zeros(temperatures.size)
-    rows = Stars(np.arange(none.size), none, none)
+    rows = Stars.of_templates(np.arange(none.size), none, none)
     ab = units.mag_of_f_nu(integration.stars(rows, [passbands.load(band)], library)[:, 0])
     values["mag_h"] = values.pop("mag") - ab[nearest_template(temperatures, values["teff"])]
     return StarCatalogue(values.pop("index"), values)

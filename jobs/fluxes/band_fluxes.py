@@ -72,7 +72,10 @@ def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum")
 def star_spectra(stars: pa.Table, library: Library) -> Float:
     """f_lambda of stars, float64[n, 23401] erg s-1 cm-2 A-1; `stars`: rows of the table `stars`."""
     rows = stars_of(stars, library)
-    spectra = library.flux[rows.sed].astype(float) * star_scale(rows, library)[:, None]
+    spectra = np.zeros((len(rows), len(library.wavelength)))
+    for sed, share in zip(rows.sed, rows.frac, strict=True):
+        spectra += library.flux[sed] * share[:, None]
+    spectra *= star_scale(rows, library)[:, None]
     return np.asarray(spectra * milky_way_transmission(library.wavelength, rows.a_v))
 
 
@@ -161,7 +164,7 @@ def prepare(
         grid = flux_tables.open_grid([curve for curve, _ in chosen], [setting for _, setting in chosen], library)
         flux_tables.compile_kernels(grid)
     if stars_tabulated(accuracy):
-        flux_tables.stars(Stars(np.zeros(1, np.int64), np.zeros(1), np.zeros(1)), curves, stars)
+        flux_tables.stars(Stars.of_templates(np.zeros(1, np.int64), np.zeros(1), np.zeros(1)), curves, stars)
 
 
 def _galaxies(

@@ -34,7 +34,7 @@ def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
 
 
 def star_scale(stars: Stars, library: Library) -> Float:
-    """Factor for each star's template, from its H magnitude before extinction.
+    """Factor for each star's mixture of templates, from its H magnitude before extinction.
 
     The catalogue's H is Vega, 1.37 mag below AB; Serrano et al. 2024, appendix B, read it by the AB formula.
     """
@@ -42,4 +42,4 @@ def star_scale(stars: Stars, library: Library) -> Float:
     seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
     template = sums.product(seen, passbands.weights(band))
     mag_ab = stars.mag_h + vega.vega_magnitude(band)
-    return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_ab)) / template[stars.sed])
+    return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_ab)) / (stars.frac * template[stars.sed]).sum(0))

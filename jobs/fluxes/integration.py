@@ -90,8 +90,10 @@ def stars(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
         spectra = np.ascontiguousarray(library.flux[:, low : low + len(stretch)])
         for part in _blocks(np.arange(len(rows)), len(stretch)):
             dimmed = extinction.transmitted(stretch.milky_way, rows.a_v[part].astype(np.float32)[:, None])
-            dimmed *= spectra[rows.sed[part]]
-            f_nu[part] += sums.product(dimmed, stretch.weights)
+            mixed = np.zeros_like(dimmed)
+            for sed, share in zip(rows.sed, rows.frac, strict=True):
+                mixed += spectra[sed[part]] * share[part].astype(np.float32)[:, None]
+            f_nu[part] += sums.product(dimmed * mixed, stretch.weights)
     return units.ujy_of_cgs(f_nu * scale[:, None])
 
 

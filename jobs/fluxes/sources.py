@@ -25,6 +25,8 @@ from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 
 MAGNIFICATION_MAX = 100.0
+# Numbers of the templates that a star's spectrum is mixed of beside `sed`.
+STAR_PARTS = (2, 3, 4)
 # Kinds whose templates are in the galaxy library: central, satellite, strong lens.
 GALAXY_KINDS = (0, 1, 4)
 
@@ -61,17 +63,26 @@ class Galaxies:
 
 @dataclass(frozen=True, slots=True)
 class Stars:
-    """n stars: sed int64[n]; mag_h (Vega, before extinction), a_v float64[n]."""
+    """n stars: mag_h (Vega, before extinction), a_v float64[n].
+
+    sed, frac : int64[k, n] templates that a spectrum is mixed of, float64[k, n] their shares of f_lambda at 5500 A
+    """
 
     sed: Int
+    frac: Float
     mag_h: Float
     a_v: Float
 
     def __len__(self) -> int:
-        return len(self.sed)
+        return self.sed.shape[1]
 
     def rows(self, chosen: Int | slice) -> Stars:
-        return Stars(self.sed[chosen], self.mag_h[chosen], self.a_v[chosen])
+        return Stars(self.sed[:, chosen], self.frac[:, chosen], self.mag_h[chosen], self.a_v[chosen])
+
+    @classmethod
+    def of_templates(cls, sed: Int, mag_h: Float, a_v: Float) -> Stars:
+        """Of one template each."""
+        return cls(sed[None, :], np.ones((1, sed.size)), mag_h, a_v)
 
 
 def galaxies_of(table: pa.Table, library: Library) -> Galaxies:
@@ -96,12 +107,24 @@ def galaxies_of(table: pa.Table, library: Library) -> Galaxies:
 
 def stars_of(table: pa.Table, library: Library) -> Stars:
     """Rows of the table `stars`, checked; errors as `galaxies_of`."""
-    sed, mag_h, a_v = (column(table, name) for name in ("sed", "mag_h", "a_v"))
-    within("sed", sed, 0, len(library) - 1)
+    mag_h, a_v = (column(table, name) for name in ("mag_h", "a_v"))
     for name, values in (("mag_h", mag_h), ("a_v", a_v)):
         declared = STARS.column(name)
         within(name, values, _bound(declared.lo), _bound(declared.hi))
-    return Stars(sed.astype(np.int64), mag_h, a_v)
+    sed, frac = [column(table, "sed")], []
+    for k in STAR_PARTS:
+        if f"sed_{k}" not in table.column_names or table[f"sed_{k}"].null_count == table.num_rows:
+            continue
+        frac.append(np.nan_to_num(_floats(table, f"frac_{k}"), nan=0.0, posinf=np.inf))
+        within(f"frac_{k}", frac[-1], 0.0, 1.0)
+        other = _floats(table, f"sed_{k}")
+        sed.append(np.where(frac[-1] > 0.0, other, sed[0]))
+    for values in sed:
+        within("sed", values, 0, len(library) - 1)
+    shares = np.stack([np.ones(table.num_rows), *frac])
+    shares[0] = 1.0 - shares[1:].sum(0)
+    within("frac_2", shares[0], -1e-6, 1.0)
+    return Stars(np.stack(sed).astype(np.int64), np.maximum(shares, 0.0), mag_h, a_v)
 
 
 def magnification(

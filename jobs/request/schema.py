@@ -83,7 +83,7 @@ class Stars:
     tycho2            : files of Tycho-2, which replace the model brighter than V = 11
     catalogue         : file of other stars to be taken instead of the model's; columns: (ours, theirs)
     bright_limit      : brightest H (Vega, as observed) that is drawn; None = all
-    plane_limit       : faintest H (Vega, as observed) within 5 deg of the plane; None = an area there is refused
+    plane_limit       : faintest H (Vega, as observed) within 5 deg of the plane and at the bulge; None = refused there
     rows_a_file       : above so many expected rows a cell's file is split into those of the next HEALPix order
     """
 

@@ -1,15 +1,21 @@
 """Stars and dwarfs drawn, against counts that other code published.
 
 counts, dwarf_counts : a deg2 at a Galactic latitude, as in COUNTS and DWARFS;  around : the cells that are drawn
+brighter, whole_sky  : to expect brighter than V, a deg2 and on the whole sky;  absolute_v : M_V of what is drawn
 """
 
 from __future__ import annotations
 
-import numpy as np
-import pyarrow as pa
+from collections.abc import Sequence
 
+import numpy as np
+
+from jobs.catalogue import dust_map
 from jobs.catalogue.stars import brown_dwarfs, milky_way, stars
+from jobs.catalogue.stars.density_laws import density
+from jobs.catalogue.stars.stellar_populations import BROWN_DWARF, WHITE_DWARF
 from jobs.fluxes.libraries import brown_dwarfs as spectra_of_dwarfs
+from jobs.fluxes.libraries import model_stars
 from jobs.rng import stream
 from lake_schema import sky
 from lake_schema.arrays import Float, Float32
@@ -17,15 +23,18 @@ from lake_schema.ids import GENERATION_ORDER
 
 SEED = 7
 AREA = sky.cell_area(GENERATION_ORDER)
-# Northern latitude -> stars deg-2 to I = 18, 20, 22, 24.5 and H = 18, 22, 26 (Vega), mean over longitude, without dust.
+# Of the cells in which the whole sky is looked at.
+_SKY_ORDER = 4
+# Northern latitude -> stars deg-2 to H = 18, 22, 26 (Vega), mean over longitude, without dust, companions and white
+# dwarfs: the same laws of density and masses, with the tables of BaSTI (Pietrinferni et al. 2004) above 0.55 Msun.
 COUNTS = {
-    90: (898, 2248, 5119, 12869, 2149, 10947, 36451),
-    60: (1174, 2984, 6864, 17121, 2833, 14687, 47254),
-    45: (1708, 4439, 10413, 25723, 4154, 22374, 67569),
-    30: (3250, 8707, 21375, 52519, 7870, 46724, 124538),
-    20: (6699, 18113, 46740, 116048, 15669, 104824, 249659),
+    90: (1997, 10951, 36048),
+    60: (2650, 14683, 46733),
+    45: (3938, 22341, 66843),
+    30: (7664, 46523, 123315),
+    20: (15541, 104005, 247463),
 }
-LIMITS = {"I": (18.0, 20.0, 22.0, 24.5), "H": (18.0, 22.0, 26.0)}
+LIMITS = (18.0, 22.0, 26.0)
 # L, then T dwarfs deg-2 to J = 22, 24, 26 (Vega).
 DWARFS = {30: (62, 267, 458, 6, 60, 330), 60: (32, 81, 105, 5, 35, 116), 90: (25, 57, 69, 5, 29, 83)}
 # mas at G = 15, 17, 20: the law of PyGaia scaled to DR2, which publishes 0.04, 0.1, 0.7.
@@ -44,20 +53,70 @@ def around(b: float, cells: int, south: bool = False) -> list[int]:
 
 
 def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Float:
-    """Stars drawn deg-2 at a latitude, as in COUNTS.
+    """Stars drawn deg-2 at a latitude, as in COUNTS: primaries and single ones.
 
     b        : Galactic latitude, deg;  cells : that are drawn there
     universe : the model of stars;  dust : float32[pixel] map of A(V), mag
     """
-    types, drawn = universe.types, around(b, cells)
-    total = np.zeros(sum(map(len, LIMITS.values())))
+    drawn, total = around(b, cells), np.zeros(len(LIMITS))
     for cell in drawn:
         rows = stars.draw(cell, SEED, universe, dust)
-        rows = rows.filter(pa.array(rows["component"].to_numpy() != stars.BROWN))
-        h = rows["mag_h"].to_numpy().astype(float)
-        mags = {"H": h, "I": h + (types.v_minus_h - types.color_vi)[rows["sed"].to_numpy()]}
-        total += [np.sum(mags[band] < limit) for band, limits in LIMITS.items() for limit in limits]
+        stage = rows["stage"].fill_null(0).to_numpy()
+        wanted = rows["companion_of"].is_null().to_numpy() & ~np.isin(stage, (WHITE_DWARF, BROWN_DWARF))
+        h = rows["mag_h"].to_numpy()[wanted]
+        total += [np.sum(h < limit) for limit in LIMITS]
     return np.asarray(total / (len(drawn) * AREA))
+
+
+def absolute_v(universe: stars.StarModel) -> Float:
+    """M_V[n] of the stretches of isochrones and of white dwarfs that stars are drawn on, in their middles."""
+    galaxy, own = universe.galaxy, universe.galaxy.pieces
+    metals = np.where(own.track < 0, 0.0, galaxy.tracks.metallicity[own.track])
+    teff, log_g = 10.0 ** own.log_teff.mean(0), own.log_g.mean(0)
+    found = model_stars.mixture(universe.types, universe.models, teff, log_g, metals)
+    lot = {
+        f"{name}_{k + 1}": values[k] for name, values in (("sed", found.sed), ("frac", found.frac)) for k in range(4)
+    }
+    return stars.mag_v(universe, lot | {"sed": found.sed[0], "mag_h": own.m_h.mean(0), "a_v": np.zeros(teff.size)})
+
+
+def brighter(
+    universe: stars.StarModel, place: tuple[float, float], limits: Sequence[float], a_v: Float | None = None
+) -> Float:
+    """Single stars and primaries deg-2 to expect brighter than V (Vega), [limit].
+
+    universe : the model of stars;  place : Galactic l, b, deg
+    limits   : V, mag;  a_v : [s] mag of dust before the shells of distance, None = there is none
+    """
+    galaxy = universe.galaxy
+    m_v, owner = (
+        absolute_v(universe),
+        np.searchsorted(galaxy.first[:, 0], np.arange(galaxy.pieces.number.size), "right") - 1,
+    )
+    r, z, azimuth = milky_way.cylindrical(galaxy, *place, milky_way.middles(galaxy))
+    volume, total = milky_way.volumes(galaxy, 1.0), np.zeros(len(limits))
+    far = 5.0 * np.log10(galaxy.distance) - 5.0 + (0.0 if a_v is None else np.append(a_v, a_v[-1]))
+    for k, component in enumerate(galaxy.components):
+        inside = np.append(0.0, np.cumsum(density(component.law, galaxy.sun, r, z, azimuth) * volume))
+        own = owner == k
+        for i, limit in enumerate(limits):
+            total[i] += galaxy.pieces.number[own] @ np.interp(limit - m_v[own], far, inside)
+    return total
+
+
+def whole_sky(universe: stars.StarModel, limit: float, dust: Float32, step: int) -> float:
+    """Single stars and primaries of the whole sky to expect brighter than V, behind the dust, from every step-th cell.
+
+    universe : the model of stars;  limit : V, mag;  dust : float32[pixel] map of A(V), mag;  step : of order-4 cells
+    """
+    cells, total = np.arange(step // 2, 12 << 2 * _SKY_ORDER, step), 0.0
+    distance = milky_way.middles(universe.galaxy)
+    for ra, dec in zip(*sky.cell_centres(_SKY_ORDER, cells), strict=True):
+        lon, lat = sky.galactic([ra], [dec])
+        far = dust_map.a_v(dust, np.array([ra]), np.array([dec]))
+        a_v = dust_map.a_v_at(far, distance, lat, universe.layer, universe.sin_b_min)
+        total += float(brighter(universe, (float(lon[0]), float(lat[0])), [limit], a_v)[0])
+    return total * sky.cell_area(_SKY_ORDER) * (12 << 2 * _SKY_ORDER) / cells.size
 
 
 def dwarf_counts(b: float, area: float) -> Float:

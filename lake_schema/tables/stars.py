@@ -13,18 +13,33 @@ COMPONENTS = (
     (4, "brown dwarf"),
     (5, "bulge"),
 )
-STAGES = ((0, "main sequence"), (1, "giant"), (2, "white dwarf"), (3, "brown dwarf"))
+STAGES = ((0, "main sequence"), (1, "giant"), (2, "white dwarf"), (3, "brown dwarf"), (4, "subgiant"))
+
+# Year (Julian) of the positions.
+EPOCH = 2015.5
+
+
+def _mixed(k: int) -> tuple[Column, ...]:
+    return (
+        Column(f"sed_{k}", "int16", "", "meta.code", f"template {k} that the spectrum is mixed of", 0, nullable=True,
+               since=3),
+        Column(f"frac_{k}", "float32", "", "arith.ratio",
+               f"share of template {k} in f_lambda at 5500 A; sed has what is left by all", 0.0, 1.0, True, since=3),
+    )  # fmt: skip
+
 
 STARS = Table(
     "stars",
-    2,
+    3,
     (
         id_of_kinds(5, 5),
         RA,
         DEC,
         HEALPIX_29,
         Column("component", "int8", ucd="src.class", doc="population", codes=COMPONENTS, lo=0, hi=5),
-        Column("sed", "int16", ucd="meta.code", doc="template index in the stellar library", lo=0),
+        Column(
+            "sed", "int16", ucd="meta.code", doc="template index in the stellar library, of the largest share", lo=0
+        ),
         Column(
             "mag_h",
             "float32",
@@ -50,9 +65,56 @@ STARS = Table(
             lo=1e-3,
             hi=1e6,
         ),
-        Column("stage", "int8", "", "src.class", "stage of evolution", 0, 3, nullable=True, codes=STAGES, since=2),
+        Column("stage", "int8", "", "src.class", "stage of evolution", 0, 4, nullable=True, codes=STAGES, since=2),
+        *(column for k in (2, 3, 4) for column in _mixed(k)),
+        Column("mass", "float32", "solMass", "phys.mass", "mass at birth", 0.0, 200.0, True, since=3),
+        Column("age", "float32", "Gyr", "time.age", "age of its population", 0.0, 14.5, True, since=3),
+        Column(
+            "pm_ra",
+            "float32",
+            "mas yr-1",
+            "pos.pm;pos.eq.ra",
+            "proper motion in right ascension times cos(dec)",
+            -1e5,
+            1e5,
+            True,
+            since=3,
+        ),
+        Column(
+            "pm_dec",
+            "float32",
+            "mas yr-1",
+            "pos.pm;pos.eq.dec",
+            "proper motion in declination",
+            -1e5,
+            1e5,
+            True,
+            since=3,
+        ),
+        Column(
+            "radial_velocity",
+            "float32",
+            "km s-1",
+            "spect.dopplerVeloc;pos.heliocentric",
+            "radial velocity, positive away from the Sun",
+            -2e3,
+            2e3,
+            True,
+            since=3,
+        ),
+        Column(
+            "companion_of",
+            "int64",
+            "",
+            "meta.id.assoc",
+            "identifier of the star it orbits, whether or not that is in the table; orbits do not move it",
+            5 << 60,
+            (6 << 60) - 1,
+            True,
+            since=3,
+        ),
     ),
-    "Stars of the True Universe.",
+    "Stars of the True Universe, where they are at J2015.5; proper motions carry them to other times.",
     order=3,
     finest=8,
 )

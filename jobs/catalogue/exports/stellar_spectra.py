@@ -50,7 +50,7 @@ def magnorm(stars: pa.Table, library: Library) -> Float:
     rows = stars_of(stars, library)
     wavelength, flux = _sampled(library)
     level = flux[:, int(np.searchsorted(wavelength, _LEVEL))]
-    f_nu = star_scale(rows, library) * level[rows.sed] * _LEVEL**2 / LIGHT_ANGSTROM_S
+    f_nu = star_scale(rows, library) * (rows.frac * level[rows.sed]).sum(0) * _LEVEL**2 / LIGHT_ANGSTROM_S
     return np.asarray(-2.5 * np.log10(f_nu) - units.AB_CGS)
 
 

@@ -30,13 +30,15 @@ _FILE = "milky_way.toml"
 class BrownDwarfs:
     """Everything that they are drawn from.
 
-    law         : of density; log_g : of cm s-2; boost : how many times denser than in nature
+    law         : of density; log_g : of cm s-2; metallicity : mean and scatter of [M/H]
+    boost       : how many times denser than in nature
     first       : index of the first template in the stellar library
     local       : [365] pc^-3 at the Sun, before the boost; teff : [365] K; m_h : [365] mag, Vega
     """
 
     law: Exponential
     log_g: float
+    metallicity: tuple[float, float]
     boost: float
     first: int
     local: Float
@@ -60,7 +62,9 @@ def brown_dwarfs(boost: float) -> BrownDwarfs:
     local = (np.array(numbers["local"]) * share)[templates.subtype]
     law = Exponential(np.inf, numbers["height"])
     first = len(stellar.types().names)
-    return BrownDwarfs(law, numbers["log_g"], boost, first, local, templates.teff, templates.abs_mag_h)
+    return BrownDwarfs(
+        law, numbers["log_g"], numbers["metallicity"], boost, first, local, templates.teff, templates.abs_mag_h
+    )
 
 
 def numbers(dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float) -> Float:
@@ -73,7 +77,7 @@ def numbers(dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area:
     for limit in np.unique(h_limit):
         chosen = np.flatnonzero(h_limit == limit)
         per_shell = (_seen(dwarfs, galaxy, float(limit)) * dwarfs.local[:, None]).sum(0)
-        r, z = milky_way.cylindrical(galaxy, lon[chosen, None], lat[chosen, None], milky_way.middles(galaxy))
+        r, z, _ = milky_way.cylindrical(galaxy, lon[chosen, None], lat[chosen, None], milky_way.middles(galaxy))
         total[chosen] = sums.product(density(dwarfs.law, galaxy.sun, r, z), per_shell * milky_way.volumes(galaxy, area))
     return dwarfs.boost * total
 
@@ -86,7 +90,7 @@ def draw(
     lon, lat : Galactic, of the cell's centre, deg; area : deg2
     dwarfs, galaxy : as of `numbers`;  h_limit : mag, Vega;  rng : random numbers
     """
-    r, z = milky_way.cylindrical(galaxy, lon, lat, milky_way.middles(galaxy))
+    r, z, _ = milky_way.cylindrical(galaxy, lon, lat, milky_way.middles(galaxy))
     per_shell = dwarfs.boost * density(dwarfs.law, galaxy.sun, r, z) * milky_way.volumes(galaxy, area)
     mean = _seen(dwarfs, galaxy, h_limit) * dwarfs.local[:, None] * per_shell
     template, distance = milky_way.in_shells(galaxy, mean, rng)

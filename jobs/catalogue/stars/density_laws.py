@@ -3,9 +3,10 @@
 Exponential, PowerLaw                     Juric et al. 2008
 Aged, Young, Parabolic, CoredPowerLaw     Robin et al. 2003, the Besancon model: bins of age of the thin disc, the
                                           thick disc, the spheroid
+Bar                                       Robin et al. 2012: the bulge, relative to its own density at the centre
 density                                   any of them
 
-Lengths are in pc; R, z are Galactocentric and cylindrical. The numbers are in milky_way.toml.
+Lengths are in pc; R, azimuth, z are Galactocentric and cylindrical. The numbers are in milky_way.toml.
 """
 
 from __future__ import annotations
@@ -79,19 +80,46 @@ class CoredPowerLaw:
     core: float
 
 
-Law = Exponential | PowerLaw | Aged | Young | Parabolic | CoredPowerLaw
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """sech^2(s), s^parallel = [(x / length)^perpendicular + (y / width)^perpendicular]^(parallel / perpendicular)
+    + (z / height)^parallel, x along the bar, whose near end lies `angle` deg from the Sun, towards positive longitudes.
+    """
+
+    angle: float
+    length: float
+    width: float
+    height: float
+    parallel: float
+    perpendicular: float
 
 
-def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike) -> Float:
-    """Density at R, z (broadcast) relative to the one at the Sun, never negative.
+Law = Bar | Exponential | PowerLaw | Aged | Young | Parabolic | CoredPowerLaw
+
+
+def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike, azimuth: npt.ArrayLike = 0.0) -> Float:
+    """Density at R, z (broadcast) relative to the one at the Sun, a bar's to that at the centre; never negative.
 
     radius, height : float[...] pc, galactocentric
+    azimuth : float[...] rad from the Sun's direction, positive where Galactic longitudes are; for bars alone
     law : of the component;  sun : where the Sun is
     """
     r, z = np.asarray(radius, float), np.asarray(height, float)
+    if isinstance(law, Bar):
+        return _bar(law, r, z, np.asarray(azimuth, float))
     at_sun = _log(law, np.asarray(sun.radius), np.asarray(sun.height))
     # A difference of logarithms: far out the densities themselves are not numbers any more.
     return np.asarray(np.exp(_log(law, r, z) - at_sun))
+
+
+def _bar(law: Bar, r: Float, z: Float, azimuth: Float) -> Float:
+    along = azimuth - np.radians(law.angle)
+    flat = np.abs(r * np.cos(along) / law.length) ** law.perpendicular
+    flat = flat + np.abs(r * np.sin(along) / law.width) ** law.perpendicular
+    s = (flat ** (law.parallel / law.perpendicular) + np.abs(z / law.height) ** law.parallel) ** (1.0 / law.parallel)
+    # sech^2 without overflow.
+    falling = np.exp(-s)
+    return np.asarray((2.0 * falling / (1.0 + falling**2)) ** 2)
 
 
 def _log(law: Law, r: Float, z: Float) -> Float:

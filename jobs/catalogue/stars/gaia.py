@@ -6,7 +6,7 @@ mean_flux  of a magnitude as measured
 ab_minus_vega   of BANDS
 
 Random numbers are keyed by the star, so that it is measured alike in whichever file it lies; errors are not correlated.
-Velocities are drawn here (jobs.catalogue.stars.kinematics): table `stars` has none, and images show no star move.
+Positions and proper motions are those of table `stars`, which has DR2's epoch.
 Ref: Gaia Collaboration, Brown et al. 2018; the numbers and their sources are in gaia.toml.
 """
 
@@ -22,21 +22,20 @@ from scipy.special import chdtri, erfc, ndtri
 
 from jobs.catalogue import parameters
 from jobs.catalogue.galaxies import lensing
-from jobs.catalogue.stars import kinematics
 from jobs.rng import uniforms
 from lake_schema import sky, units
 from lake_schema.arrays import Float
 from lake_schema.tables.gaia import GAIA
 
 BANDS = ("gaia_g", "gaia_bp", "gaia_rp")
-STAR_COLUMNS = ["id", "ra", "dec", "distance", "component"]
+STAR_COLUMNS = ["id", "ra", "dec", "distance", "pm_ra", "pm_dec"]
 FLUX_COLUMNS = [f"f_nu_{band}" for band in BANDS]
 _FILE = "gaia.toml"
 _MAS = 1.0 / 3.6e6
 _MAG_OVER_FLUX = 2.5 / np.log(10.0)
 # Of a star's random numbers.
-_RA, _DEC, _PARALLAX, _G, _BP, _RP, _LISTED, _PMRA, _PMDEC, _RUWE, _VELOCITY = range(11)
-_COUNT = _VELOCITY + 3
+_RA, _DEC, _PARALLAX, _G, _BP, _RP, _LISTED, _PMRA, _PMDEC, _RUWE = range(10)
+_COUNT = _RUWE + 1
 
 
 def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
@@ -129,11 +128,8 @@ def _astrometry(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
 
 
 def _motion(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
-    """Of stars without a distance nothing is known."""
-    distance = np.asarray(pc.fill_null(stars["distance"], np.nan).to_numpy(), float)
-    ra, dec = (stars[name].to_numpy() for name in ("ra", "dec"))
-    component = stars["component"].to_numpy().astype(np.int64)
-    true = kinematics.proper_motions(ra, dec, distance, component, noise[_VELOCITY:])
+    """Of stars that have none nothing is known."""
+    true = [np.asarray(pc.fill_null(stars[name], np.nan).to_numpy(), float) for name in ("pm_ra", "pm_dec")]
     errors, found = proper_motion_errors(g), {}
     for name, value, error, own in zip(("pmra", "pmdec"), true, errors, noise[_PMRA : _PMDEC + 1], strict=True):
         found[name] = np.ma.masked_invalid(value + error * own)

@@ -1,73 +1,100 @@
-"""Proper motions of the Milky Way's stars, drawn from the velocity ellipsoid of each population.
+"""Velocities of the Milky Way's stars, drawn from the ellipsoid of each population and age.
 
-proper_motions   of stars at their places and distances, mas/yr
+velocities   proper motions, mas/yr, and radial velocities, km/s, of stars at their places and distances
+ellipsoid    which of the ellipsoids is a star's
 
 Every star moves with its population's mean rotation about the Galactic centre, plus a normal deviate along each axis of
-the ellipsoid, as seen from the moving Sun. The ellipsoids point to the centre and do not change with radius.
+the ellipsoid, as seen from the moving Sun. The ellipsoids point to the centre; those of discs are larger nearer to it,
+and lag behind the more.
 Ref: Robin et al. 2003, Section 2.2.5; the numbers and their sources are in kinematics.toml.
 """
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+
 import numpy as np
 
 from jobs.catalogue import parameters
+from jobs.compiling import exact_jit
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
 
 _FILE = "kinematics.toml"
 # One AU a year, km/s: what 1 mas/yr is at 1 kpc (IAU 2012 astronomical unit, Julian year).
 _KM_S = 4.740470463533349
-# The Galactic pole, ICRS, deg: ESA 1997, The Hipparcos Catalogue, Vol. 1, Section 1.5.3.
-_POLE_RA, _POLE_DEC = 192.85948, 27.12825
+_THIN = 0
 
 
-def proper_motions(ra: Float, dec: Float, distance: Float, component: Int, deviates: Float) -> tuple[Float, Float]:
-    """(mu_ra cos(dec), mu_dec), float64[n] mas/yr each; NaN where the distance is.
+def velocities(
+    ra: Float, dec: Float, distance: Float, component: Int, age: Float, deviates: Float
+) -> tuple[Float, Float, Float]:
+    """(mu_ra cos(dec), mu_dec, v_r), float64[n] mas/yr, mas/yr, km/s; NaN where the distance is.
 
     ra, dec   : float64[n] deg, ICRS
     distance  : float64[n] pc, > 0
-    component : int[n] population, as in table `stars`
+    component : int[n] population, as in table `stars`;  age : float64[n] Gyr, NaN = unknown
     deviates  : float64[3, n] standard normal
     """
-    lon, lat = (np.radians(angle) for angle in sky.galactic(ra, dec))
-    east, north = _seen(lon, lat, _velocity(lon, lat, distance, component, deviates))
-    scale = 1.0 / (_KM_S * 1e-3 * distance)
-    return _equatorial(np.radians(ra), np.radians(dec), east * scale, north * scale)
+    table, motion, _, gradient = _numbers()
+    out = np.empty((3, ra.size))
+    _velocities(
+        ra, dec, distance, ellipsoid(component, age), np.ascontiguousarray(deviates), table, motion,
+        sky.TO_GALACTIC, gradient, out,
+    )  # fmt: skip
+    return out[0], out[1], out[2]
 
 
-def _velocity(lon: Float, lat: Float, distance: Float, component: Int, deviates: Float) -> Float:
-    """Velocity[3, n] relative to the Sun: along the Sun's axes to the centre, the rotation, the pole; km/s."""
+def ellipsoid(component: Int, age: Float) -> Int:
+    """Column[n] of the table: of the thin disc by age, the others behind, in the order of their codes."""
+    edges = _numbers()[2]
+    with np.errstate(invalid="ignore"):
+        by_age = np.clip(np.searchsorted(edges, age, side="right") - 1, 0, edges.size - 2)
+    return np.where((component == _THIN) & ~np.isnan(age), by_age, edges.size - 1 + component)
+
+
+def sun_motion() -> Float:
+    """[3] km/s beside the circular velocity: towards the centre, along the rotation, towards the pole."""
+    return _numbers()[1][:3]
+
+
+@lru_cache(maxsize=1)
+def _numbers() -> tuple[Float, Float, Float, float]:
+    """Table [6, ellipsoid]; the Sun's motion, radius and circular velocity; edges of ages; gradient, pc^-1."""
     law, sun = parameters.section(_FILE, "ellipsoids"), parameters.section(_FILE, "sun")
-    axes = (law["towards_centre"], law["along_rotation"], law["towards_pole"])
-    inwards, forwards, up = (np.array(axis)[component] * own for axis, own in zip(axes, deviates, strict=True))
-    forwards = forwards + sun["circular"] - np.array(law["lag"])[component]
-    # From the centre to the star; what turns the axes at the Sun into those at the star.
-    x = distance * np.cos(lat) * np.cos(lon) - sun["radius"]
-    y = distance * np.cos(lat) * np.sin(lon)
-    radius = np.maximum(np.hypot(x, y), 1.0)
-    outwards = np.stack([x, y]) / radius
-    moving = np.stack(
-        [-inwards * outwards[0] + forwards * outwards[1], -inwards * outwards[1] - forwards * outwards[0]]
-    )
-    ours = np.array(sun["motion"]) + np.array([0.0, sun["circular"], 0.0])
-    return np.asarray(np.stack([moving[0], moving[1], up]) - ours[:, None])
+    names = ("towards_centre", "along_rotation", "towards_pole", "lag", "grows", "turns_from")
+    motion = np.array([*sun["motion"], sun["radius"], sun["circular"]], float)
+    return np.array([law[name] for name in names], float), motion, np.array(law["age"]), law["gradient"] / 1e3
 
 
-def _seen(lon: Float, lat: Float, velocity: Float) -> tuple[Float, Float]:
-    """Velocity along Galactic longitude and latitude."""
-    x, y, z = velocity
-    outwards = x * np.cos(lon) + y * np.sin(lon)
-    return y * np.cos(lon) - x * np.sin(lon), z * np.cos(lat) - outwards * np.sin(lat)
-
-
-def _equatorial(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, Float]:
-    """What goes along Galactic longitude and latitude, along right ascension and declination.
-
-    ra, dec : rad;  Ref: Poleski 2013, arXiv:1306.2945
-    """
-    pole_ra, pole_dec = np.radians(_POLE_RA), np.radians(_POLE_DEC)
-    cos = np.sin(pole_dec) * np.cos(dec) - np.cos(pole_dec) * np.sin(dec) * np.cos(ra - pole_ra)
-    sin = np.cos(pole_dec) * np.sin(ra - pole_ra)
-    turn = np.arctan2(sin, cos)
-    return east * np.cos(turn) - north * np.sin(turn), east * np.sin(turn) + north * np.cos(turn)
+@exact_jit
+def _velocities(
+    ra: Float, dec: Float, distance: Float, which: Int, deviates: Float, table: Float, motion: Float, turn: Float,
+    gradient: float, out: Float,
+) -> None:  # fmt: skip
+    """Fills out[3, n]; table [6, ellipsoid], motion (U, V, W, R, V_c), turn [3, 3] equatorial to Galactic."""
+    axis = np.empty((3, 3))
+    for i in range(ra.size):
+        a, d, far = math.radians(ra[i]), math.radians(dec[i]), distance[i]
+        sin_a, cos_a, sin_d, cos_d = math.sin(a), math.cos(a), math.sin(d), math.cos(d)
+        # East, north, outwards; along the Sun's axes to the centre, the rotation, the pole.
+        for k in range(3):
+            axis[0, k] = -turn[k, 0] * sin_a + turn[k, 1] * cos_a
+            axis[1, k] = (-turn[k, 0] * cos_a - turn[k, 1] * sin_a) * sin_d + turn[k, 2] * cos_d
+            axis[2, k] = (turn[k, 0] * cos_a + turn[k, 1] * sin_a) * cos_d + turn[k, 2] * sin_d
+        # From the centre to the star: what turns the axes at the Sun into those at the star.
+        x, y = far * axis[2, 0] - motion[3], far * axis[2, 1]
+        radius = max(math.sqrt(x * x + y * y), 1.0)
+        w = which[i]
+        wider = math.exp(-0.5 * gradient * (radius - motion[3])) if table[4, w] > 0.0 else 1.0
+        inwards = table[0, w] * wider * deviates[0, i]
+        forwards = table[1, w] * wider * deviates[1, i]
+        forwards += (motion[4] - table[3, w] * wider * wider) * min(radius / max(table[5, w], 1.0), 1.0)
+        u = (-inwards * x + forwards * y) / radius - motion[0]
+        v = (-inwards * y - forwards * x) / radius - motion[1] - motion[4]
+        z = table[2, w] * wider * deviates[2, i] - motion[2]
+        scale = 1.0 / (_KM_S * 1e-3 * far)
+        out[0, i] = (u * axis[0, 0] + v * axis[0, 1] + z * axis[0, 2]) * scale
+        out[1, i] = (u * axis[1, 0] + v * axis[1, 1] + z * axis[1, 2]) * scale
+        out[2, i] = u * axis[2, 0] + v * axis[2, 1] + z * axis[2, 2] if far == far else math.nan

@@ -4,8 +4,8 @@ model    the Milky Way or a catalogue of stars, L and T dwarfs, Tycho-2, the dus
 numbers  how many stars to expect, without drawing them: what can not be drawn is refused
 draw     numbers by distance and luminosity -> places -> dust on the way -> labels, spectra -> selection
 
-Three lots make a cell: the model's stars, L and T dwarfs, and, where it is given, Tycho-2 instead of the model's bright
-stars.
+Four lots make a cell: the model's stars, their companions, L and T dwarfs, and, where it is given, Tycho-2 instead of
+the model's bright stars.
 """
 
 from __future__ import annotations
@@ -20,13 +20,17 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.catalogue import dust_map, parameters
-from jobs.catalogue.stars import bright_stars, brown_dwarfs, from_catalogue, milky_way
+from jobs.catalogue.galaxies import lensing
+from jobs.catalogue.stars import bright_stars, brown_dwarfs, companions, from_catalogue, kinematics, milky_way
 from jobs.catalogue.stars.bright_stars import BrightStars
 from jobs.catalogue.stars.brown_dwarfs import BrownDwarfs
 from jobs.catalogue.stars.from_catalogue import StarCatalogue
 from jobs.catalogue.stars.milky_way import MilkyWay
-from jobs.fluxes.libraries import stellar
+from jobs.fluxes import passbands
+from jobs.fluxes.calibration import STAR_BAND
+from jobs.fluxes.libraries import model_stars, stellar, templates
 from jobs.fluxes.libraries.stellar import StellarTypes
+from jobs.fluxes.libraries.vega import vega_magnitude
 from jobs.rng import stream
 from lake_schema import ids, sky
 from lake_schema.arrays import Bool, Float, Float32, Int
@@ -44,8 +48,10 @@ BRIGHT, BROWN = 3, 4
 _BROWN_DWARF = 3
 # A generation cell is drawn whole: 3e6 stars take 1.1 GB, and fewer than the 22 bits of an id can number.
 _MOST_STARS = 3e6
-# Nearer to the Galactic plane, deg, cells are drawn to a limit of their own.
-PLANE = 5.0
+# Nearer to the Galactic plane than so many deg, and before the bulge (|l|, |b|), cells have a limit of their own.
+PLANE, BULGE = 5.0, (20.0, 10.0)
+# One AU, seen from a pc, deg.
+_AU_PC = 1.0 / 3600.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,12 +59,13 @@ class StarModel:
     """Everything that stars are drawn from, made once by `model`.
 
     limit, plane_limit : faintest H, Vega, with the Milky Way's extinction; of cells with their centre nearer to the
-                         plane than PLANE; None = not to be drawn
+                         plane than PLANE, or inside BULGE; None = not to be drawn
     brightest  : brighter H are left out
     galaxy     : whose stars are drawn, unless there is a
     catalogue  : of other stars
     brown      : L and T dwarfs, None = none; bright : Tycho-2, None = the model's own bright stars
-    h_over_v   : A(H) / A(V); types : of the stellar library's first templates
+    h_over_v   : A(H) / A(V); types : of the stellar library's first templates; models : index of its first model
+    v_minus_h  : [template] of the types and the models
     """
 
     limit: float
@@ -72,6 +79,8 @@ class StarModel:
     sin_b_min: float
     h_over_v: float
     types: StellarTypes
+    models: int
+    v_minus_h: Float
 
 
 def model(
@@ -83,13 +92,14 @@ def model(
     bright: BrightStars | None = None,
     brightest: float = -math.inf,
 ) -> StarModel:
-    """The embedded universe's stars with brightest <= H < limit (70 ms).
+    """The embedded universe's stars with brightest <= H < limit (0.2 s).
 
     density           : one of milky_way.MODELS
     brown_dwarf_boost : how many times denser than in nature L and T dwarfs are, 0 = not at all
     limit, plane_limit : faintest H, mag, Vega, plane_limit in the Galactic plane; None: cells there are refused
     catalogue, bright  : external stars in place of the drawn ones, and of those that are bright
     """
+    types, vega = stellar.types(), [vega_magnitude(passbands.load(band)) for band in ("bessell_v", STAR_BAND)]
     return StarModel(
         limit=limit,
         plane_limit=plane_limit,
@@ -101,7 +111,9 @@ def model(
         layer=dust_map.layer(),
         sin_b_min=dust_map.cosecant().sin_b_min,
         h_over_v=float(parameters.section("milky_way.toml", "extinction")["h_over_v"]),
-        types=stellar.types(),
+        types=types,
+        models=templates.first_model(),
+        v_minus_h=model_stars.v_minus_h(types, (vega[0], vega[1])),
     )
 
 
@@ -112,7 +124,7 @@ def numbers(cells: npt.ArrayLike, universe: StarModel) -> Float:
     Errors: BadInput where stars are not to be drawn, or are too many
     """
     lon, lat = _centres(cells)
-    limit = _limits(lat, universe)
+    limit = _limits(lon, lat, universe)
     where = (lon, lat, sky.cell_area(GENERATION_ORDER), limit)
     if universe.catalogue is None:
         found = milky_way.numbers(universe.galaxy, *where)
@@ -122,7 +134,7 @@ def numbers(cells: npt.ArrayLike, universe: StarModel) -> Float:
         found += brown_dwarfs.numbers(universe.brown, universe.galaxy, *where)
     if found.max(initial=0.0) > _MOST_STARS:
         worst = int(found.argmax())
-        key = "universe.star_limit" if abs(lat[worst]) >= PLANE else "stars.plane_limit"
+        key = "stars.plane_limit" if _crowded(lon[worst], lat[worst]) else "universe.star_limit"
         raise BadInput(
             f"{np.sum(found > _MOST_STARS)} of the area's cells hold more than {_MOST_STARS:.3g} stars, the one at l = "
             f"{lon[worst]:.1f}, b = {lat[worst]:.1f} {found[worst]:.3g} to H = {limit[worst]:g}: ask for a brighter "
@@ -136,15 +148,22 @@ def _centres(cells: npt.ArrayLike) -> tuple[Float, Float]:
     return sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
 
 
-def _limits(lat: Float, universe: StarModel) -> Float:
-    """Faintest H[n] of cells at Galactic latitudes."""
-    in_plane = np.abs(lat) < PLANE
+def _crowded(lon: npt.ArrayLike, lat: npt.ArrayLike) -> Bool:
+    """Is a cell near the Galactic plane, or before the bulge?"""
+    beside = np.abs((np.asarray(lon) + 180.0) % 360.0 - 180.0) < BULGE[0]
+    return np.asarray((np.abs(lat) < PLANE) | (beside & (np.abs(lat) < BULGE[1])))
+
+
+def _limits(lon: Float, lat: Float, universe: StarModel) -> Float:
+    """Faintest H[n] of cells at Galactic coordinates."""
+    in_plane = _crowded(lon, lat)
     if not in_plane.any():
         return np.full(lat.size, universe.limit)
     if universe.plane_limit is None:
         raise BadInput(
-            f"{in_plane.sum()} of the area's cells lie within {PLANE:g} deg of the Galactic plane, where stars are too "
-            "many: move the area, or say with stars.plane_limit to which H they are to be drawn there"
+            f"{in_plane.sum()} of the area's cells lie within {PLANE:g} deg of the Galactic plane or {BULGE[1]:g} deg "
+            "of the bulge, where stars are too many: move the area, or say with stars.plane_limit to which H they are "
+            "to be drawn there"
         )
     return np.where(in_plane, universe.plane_limit, universe.limit)
 
@@ -158,12 +177,12 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
     Error: the density is that of the cell's centre: 2 % at its edges at |b| = 20 deg
     """
     lon, lat = _centres([cell])
-    limit = float(_limits(lat, universe)[0])
+    limit = float(_limits(lon, lat, universe)[0])
     where = (float(lon[0]), float(lat[0]), sky.cell_area(GENERATION_ORDER), limit)
     if universe.catalogue is None:
-        lots = [_drawn(cell, seed, universe, dust, where)]
+        lots = _drawn(cell, seed, universe, dust, where)
     else:
-        lots = [_given(cell, universe.catalogue, universe, dust)]
+        lots = [_given(cell, seed, universe.catalogue, universe, dust)]
     if universe.brown is not None:
         lots.append(_brown(cell, seed, universe, universe.brown, dust, where))
     kept = [_selected(universe, lot, limit) for lot in lots]
@@ -173,7 +192,7 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
     first = np.cumsum([0, *(len(lot["ra"]) for lot in lots)])
     tables = [
         STARS.build(
-            {"id": ids.source_id(STAR, cell, start + np.flatnonzero(keep)), **{k: v[keep] for k, v in lot.items()}}
+            {"id": ids.source_id(STAR, cell, start + np.flatnonzero(keep)), **{k: v[..., keep] for k, v in lot.items()}}
         )
         for start, lot, keep in zip(first[:-1], lots, kept, strict=True)
     ]
@@ -181,41 +200,91 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
     return rows if len(lots) == 1 else rows.sort_by([("_healpix_29", "ascending"), ("id", "ascending")])
 
 
-def _drawn(cell: int, seed: int, universe: StarModel, dust: Float32, where: Where) -> Lot:
-    """Stars of the Milky Way's model."""
+def _drawn(cell: int, seed: int, universe: StarModel, dust: Float32, where: Where) -> list[Lot]:
+    """Stars of the Milky Way's model, and their companions."""
     galaxy = universe.galaxy
-    stars = milky_way.draw(galaxy, milky_way.expected(galaxy, *where), stream(seed, "stars.luminosity", cell))
-    metals = milky_way.metallicity(galaxy, stars.component, stream(seed, "stars.metallicity", cell))
-    teff = milky_way.teff(galaxy, stars)
-    return {
-        **_placed(cell, universe, dust, stars.distance, stream(seed, "stars.position", cell)),
+    rngs = (stream(seed, f"stars.{what}", cell) for what in ("luminosity", "metallicity"))
+    stars = milky_way.draw(galaxy, milky_way.expected(galaxy, *where), *rngs)
+    place = _placed(cell, universe, dust, stars.distance, stream(seed, "stars.position", cell))
+    deviates = stream(seed, "stars.velocity", cell).standard_normal((3, stars.distance.size))
+    common = {
         "component": stars.component,
-        "sed": nearest_template(universe.types.teff, teff),
-        "mag_h": stars.m_h + _modulus(stars.distance),
-        "abs_mag_h": stars.m_h,
-        "teff": teff,
-        "log_g": milky_way.log_g(galaxy, stars),
-        "metallicity": metals,
-        "density_boost": np.ones(teff.size),
-        "stage": stars.stage,
+        "metallicity": stars.metallicity,
+        "age": np.ma.masked_invalid(stars.age),
+        "density_boost": np.ones(stars.age.size),
+        **_moving(place, stars.component, stars.age, deviates),
     }
+    own = {"stage": stars.stage, "mass": np.ma.masked_invalid(stars.mass)}
+    lot = (
+        place | common | own | _spectra(universe, stars.m_h, stars.distance, stars.teff, stars.log_g, stars.metallicity)
+    )
+    rng = stream(seed, "stars.companions", cell)
+    found = companions.draw(galaxy.tracks, stars.track, stars.mass, rng)
+    of = found.primary
+    offset = companions.separation(stars.mass[of], found.mass, rng)
+    second = {name: values[of] for name, values in (place | common).items()}
+    second |= _beside(cell, place, of, offset)
+    second |= _spectra(universe, found.m_h, stars.distance[of], found.teff, found.log_g, stars.metallicity[of])
+    second |= {"stage": np.zeros(of.size, np.int64), "mass": found.mass, "companion_of": ids.source_id(STAR, cell, of)}
+    return [lot | {"companion_of": bright_stars.unknown(stars.age.size)}, second]
+
+
+def _spectra(universe: StarModel, m_h: Float, distance: Float, teff: Float, log_g: Float, metallicity: Float) -> Lot:
+    """Magnitudes, labels and what the spectra are mixed of; white dwarfs take the dwarfs of their temperature."""
+    found = model_stars.mixture(universe.types, universe.models, teff, log_g, metallicity)
+    lot: Lot = {
+        "sed": found.sed[0],
+        "mag_h": m_h + _modulus(distance),
+        "abs_mag_h": m_h,
+        "teff": teff,
+        "log_g": log_g,
+    }
+    for k in range(1, model_stars.PARTS):
+        lot |= {f"sed_{k + 1}": found.sed[k], f"frac_{k + 1}": found.frac[k]}
+    return lot
+
+
+def _moving(place: Lot, component: Int, age: Float, deviates: Float) -> Lot:
+    ra, dec, far = (np.asarray(place[name], float) for name in ("ra", "dec", "distance"))
+    motion = kinematics.velocities(ra, dec, far, component, age, deviates)
+    return {
+        name: np.ma.masked_invalid(v) for name, v in zip(("pm_ra", "pm_dec", "radial_velocity"), motion, strict=True)
+    }
+
+
+def _beside(cell: int, place: Lot, of: Int, offset: tuple[Float, Float]) -> Lot:
+    """Where companions are: on the other side of their star where they would leave the cell, else on it."""
+    ra, dec, index = (place[name][of].copy() for name in ("ra", "dec", "_healpix_29"))
+    east, north = (np.radians(_AU_PC * axis / place["distance"][of]) for axis in offset)
+    todo = np.arange(of.size)
+    for side in (1.0, -1.0):
+        there = lensing.displaced(place["ra"][of[todo]], place["dec"][of[todo]], side * east[todo], side * north[todo])
+        at = sky.healpix_29(*there)
+        inside = at >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell
+        chosen = todo[inside]
+        ra[chosen], dec[chosen], index[chosen] = there[0][inside], there[1][inside], at[inside]
+        todo = todo[~inside]
+    return {"ra": ra, "dec": dec, "_healpix_29": index}
 
 
 def _brown(cell: int, seed: int, universe: StarModel, dwarfs: BrownDwarfs, dust: Float32, where: Where) -> Lot:
     """L and T dwarfs."""
     found = brown_dwarfs.draw(dwarfs, universe.galaxy, *where, stream(seed, "brown_dwarfs.number", cell))
     n = found.template.size
-    thin = np.full(n, milky_way.THIN)
     m_h = dwarfs.m_h[found.template]
+    place = _placed(cell, universe, dust, found.distance, stream(seed, "brown_dwarfs.position", cell))
+    deviates = stream(seed, "brown_dwarfs.velocity", cell).standard_normal((3, n))
+    rng, metals = stream(seed, "brown_dwarfs.metallicity", cell), dwarfs.metallicity
     return {
-        **_placed(cell, universe, dust, found.distance, stream(seed, "brown_dwarfs.position", cell)),
+        **place,
+        **_moving(place, np.full(n, BROWN), np.full(n, np.nan), deviates),
         "component": np.full(n, BROWN),
         "sed": dwarfs.first + found.template,
         "mag_h": m_h + _modulus(found.distance),
         "abs_mag_h": m_h,
         "teff": dwarfs.teff[found.template],
         "log_g": np.full(n, dwarfs.log_g),
-        "metallicity": milky_way.metallicity(universe.galaxy, thin, stream(seed, "brown_dwarfs.metallicity", cell)),
+        "metallicity": np.clip(rng.normal(*metals, n), *universe.galaxy.limits),
         "density_boost": np.full(n, dwarfs.boost),
         "stage": np.full(n, _BROWN_DWARF),
     }
@@ -228,8 +297,8 @@ def _placed(cell: int, universe: StarModel, dust: Float32, distance: Float, rng:
     return {"_healpix_29": index, "ra": ra, "dec": dec, "distance": distance, "a_v": a_v}
 
 
-def _given(cell: int, catalogue: StarCatalogue, universe: StarModel, dust: Float32) -> Lot:
-    """Stars of an external catalogue; what it does not say is null, dust is ours."""
+def _given(cell: int, seed: int, catalogue: StarCatalogue, universe: StarModel, dust: Float32) -> Lot:
+    """Stars of an external catalogue; what it does not say is null, dust and velocities are ours."""
     values = from_catalogue.of_cell(catalogue, cell)
     n = len(values["ra"])
     unknown = bright_stars.unknown(n)
@@ -239,11 +308,15 @@ def _given(cell: int, catalogue: StarCatalogue, universe: StarModel, dust: Float
     if a_v is None:
         a_v = _extinction(universe, values.get("distance", far), dust, values["ra"], values["dec"])
     known = "distance" in values
+    component = values.get("component", np.full(n, milky_way.THIN))
+    if known:
+        deviates = stream(seed, "stars.velocity", cell).standard_normal((3, n))
+        lot |= _moving(values, component, np.full(n, np.nan), deviates)
     return lot | {
         "_healpix_29": values["index"],
         "ra": values["ra"],
         "dec": values["dec"],
-        "component": values.get("component", np.full(n, milky_way.THIN)),
+        "component": component,
         "sed": nearest_template(universe.types.teff, values["teff"]),
         "mag_h": values["mag_h"],
         "abs_mag_h": values["mag_h"] - _modulus(values["distance"]) if known else unknown,
@@ -275,13 +348,27 @@ def _selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> Bool
     seen = (mag < limit) & (mag >= universe.brightest)
     if universe.bright is None:
         return np.asarray(seen)
-    return np.asarray(seen & (mag_v(universe.types, lot) >= universe.bright.hand_over))
+    return np.asarray(seen & (mag_v(universe, lot) >= universe.bright.hand_over))
 
 
-def mag_v(types: StellarTypes, lot: Mapping[str, Any]) -> Float:
+def mag_v(universe: StarModel, lot: Mapping[str, Any]) -> Float:
     """V[n] as observed, Vega; of L and T dwarfs fainter than can be seen."""
-    colors = np.append(types.v_minus_h, np.inf)
-    return np.asarray(lot["mag_h"] + colors[np.minimum(lot["sed"], len(types.names))] + lot["a_v"])
+    n, dwarfs = universe.types.teff.size, universe.v_minus_h
+    light = np.zeros(universe.models + dwarfs.size - n)
+    light[:n], light[universe.models :] = 10.0 ** (0.4 * dwarfs[:n]), 10.0 ** (0.4 * dwarfs[n:])
+    # Light in H for as much in V; of L and T dwarfs there is none in V.
+    light[n : universe.models] = np.inf
+    seen = _of_main(lot) * light[lot["sed"]]
+    for k in range(2, model_stars.PARTS + 1):
+        if f"sed_{k}" in lot:
+            seen = seen + lot[f"frac_{k}"] * light[lot[f"sed_{k}"]]
+    return np.asarray(lot["mag_h"] + 2.5 * np.log10(seen) + lot["a_v"])
+
+
+def _of_main(lot: Mapping[str, Any]) -> Float:
+    """Share of the template of each star's largest share."""
+    others = [lot[name] for name in (f"frac_{k}" for k in range(2, model_stars.PARTS + 1)) if name in lot]
+    return 1.0 - sum(others, np.zeros(len(lot["sed"])))
 
 
 def _modulus(distance: Float) -> Float:

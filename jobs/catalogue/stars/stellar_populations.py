@@ -1,57 +1,55 @@
-"""Which stars there are at the Sun: masses to luminosities, giants, white dwarfs, temperatures.
+"""Which stars there are: masses and ages to luminosities, temperatures, gravities, and their numbers.
 
-dwarf_sequence, giant_sequence, white_dwarf_sequence    temperature, gravity, mass against M_H
-luminosity                                              stars pc^-3 per bin of M_H, by stage and component
-mass_below, giants_below, white_dwarfs_below            the distributions it is made of
+Population     ages and metallicities of a component
+Pieces         short stretches of isochrones and of the cooling sequence of white dwarfs, each inside a bin of M_H
+Tracks         the isochrones' main sequences, for companions
+tracks, pieces_of, white_dwarfs   made of populations
+mass_below, white_dwarfs_below    the distributions that they are made of
 
-Types later than M9 are brown dwarfs, a population of their own. Magnitudes are 2MASS H, Vega.
-Ref: Kroupa 2001 (masses), Pecaut & Mamajek 2013 (mass to luminosity); numbers and their sources are in
-milky_way.toml.
+Above 0.7 Msun stars lie on isochrones, below 0.5 Msun on the mean sequence of nearby dwarfs, where metal-poor ones are
+hotter by as much as isochrones have them at 0.5 Msun; in between the two go over into one another. Types later than M9
+are brown dwarfs, a population of their own. Magnitudes are 2MASS H, Vega.
+Ref: Kroupa 2001 (masses), Pecaut & Mamajek 2013 (nearby dwarfs); numbers and their sources are in milky_way.toml.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
 
 from jobs.catalogue import parameters
-from jobs.fluxes.libraries import stellar
-from lake_schema.arrays import Float, Int
+from jobs.catalogue.stars import isochrones
+from jobs.fluxes import passbands
+from jobs.fluxes.calibration import STAR_BAND
+from jobs.fluxes.libraries import model_stars, stellar
+from jobs.fluxes.libraries.vega import vega_magnitude
+from lake_schema.arrays import Bool, Float, Int
 
+DWARF, GIANT, WHITE_DWARF, BROWN_DWARF, SUBGIANT = range(5)
 _FILE = "milky_way.toml"
 # Of the cooling sequence.
 _STEPS = 500
 # Nominal values of the Sun (IAU 2015).
 _SUN_TEFF, _SUN_M_BOL = 5772.0, 4.74
+# Masses, Msun, between which nearby dwarfs go over into isochrones.
+_NEARBY, _MODELLED = 0.5, 0.7
+# An evolved star is a subgiant as long as log g is larger.
+_GIANT_LOG_G = 3.5
+# Cells of a normal distribution of metallicity reach to so many standard deviations.
+_REACH = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class MassFunction:
-    """Broken power law of stellar systems (milky_way.toml, [mass_function])."""
+    """Broken power law of stellar systems as they are born (milky_way.toml, [mass_function])."""
 
     lightest: float
     reference: float
     breaks: tuple[float, ...]
     slopes: tuple[float, ...]
     local: float
-    heaviest: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Giants:
-    """Luminosity function of giants (milky_way.toml, [giants])."""
-
-    local: float
-    relative: tuple[float, ...]
-    clump_fraction: float
-    clump_m_h: float
-    clump_scatter: float
-    slope: float
-    brightest: float
-    faintest: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,39 +64,163 @@ class WhiteDwarfs:
     log_g: float
 
 
+@dataclass(frozen=True, slots=True)
+class Population:
+    """k cells of age and metallicity of a component.
+
+    age, metallicity : [k] Gyr, [M/H];  width : [k] of the cell in [M/H];  share : [k] of the systems born, sum 1
+    """
+
+    age: Float
+    metallicity: Float
+    width: Float
+    share: Float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Sequence:
-    """Temperature (K), log gravity (cm s-2) and log mass (Msun; dwarfs alone, else 0) against M_H (ascending)."""
+class Tracks:
+    """k isochrones of q points by ascending initial mass.
 
-    m_h: Float
-    teff: Float
-    log_g: Float
+    age, metallicity : [k] Gyr, [M/H];  evolved : first point after the main sequence
+    log_mass, log_teff, log_g, m_h : [k, q] log10 Msun, log10 K, cm s-2, mag
+    """
+
+    age: Float
+    metallicity: Float
+    evolved: int
     log_mass: Float
+    log_teff: Float
+    log_g: Float
+    m_h: Float
 
 
-def dwarf_sequence() -> Sequence:
-    """The main sequence, bright to faint.  Ref: Pecaut & Mamajek 2013, Table 5 and its updates."""
-    types = stellar.types()
-    order = np.argsort(types.abs_mag_h)
+@dataclass(frozen=True, slots=True, eq=False)
+class Pieces:
+    """n stretches, along which log mass, log Teff, log g and M_H are linear; [2, n] at both ends.
+
+    track  : [n] index of the isochrone, -1 of white dwarfs;  stage : [n] DWARF, ..;  bin : [n] of M_H
+    number : [n] pc^-3
+    """
+
+    track: Int
+    stage: Int
+    bin: Int
+    number: Float
+    log_mass: Float
+    log_teff: Float
+    log_g: Float
+    m_h: Float
+
+    def take(self, chosen: Int | Bool) -> Pieces:
+        return Pieces(*(getattr(self, field.name)[..., chosen] for field in fields(self)))
+
+
+def joined(parts: list[Pieces]) -> Pieces:
+    """All of them, one after another."""
+    return Pieces(*(np.concatenate([getattr(part, f.name) for part in parts], -1) for f in fields(Pieces)))
+
+
+def population(ages: Float, shares: Float, mean: Float, scatter: Float, cells: int) -> Population:
+    """Ages[a] Gyr with their shares, and about each mean[a] of [M/H] a normal law, cut at 3 sigma, in cells."""
+    edges = np.linspace(-_REACH, _REACH, cells + 1)
+    middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
+    normal = np.exp(-0.5 * middle**2)
+    metals = mean[:, None] + scatter[:, None] * middle
+    share = (shares / shares.sum())[:, None] * normal / normal.sum()
+    return Population(np.repeat(ages, cells), metals.ravel(), np.repeat(scatter * step, cells), share.ravel())
+
+
+def tracks(age: Float, metallicity: Float) -> Tracks:
+    """Of ages[k] Gyr and metallicities[k]."""
+    found, types = isochrones.isochrones(age, metallicity), stellar.types()
+    solar = isochrones.isochrones(age, np.zeros(age.size))
+    nearby = _nearby(types)
+    light = nearby.log_mass[0] < np.log10(_NEARBY) - 1e-9
+    known = (nearby.log_mass, nearby.log_teff, nearby.log_g, nearby.m_h)
+    low = [np.tile(values[0, light], (age.size, 1)) for values in known]
+    log_mass = np.log10(found.mass)
+    # What is known of nearby dwarfs at the isochrones' masses, and its share.
+    own = np.clip((_MODELLED - found.mass) / (_MODELLED - _NEARBY), 0.0, 1.0)
+    hotter = (found.log_teff - solar.log_teff)[:, :1]
+    at = [np.interp(log_mass, nearby.log_mass[0], values[0]) for values in (nearby.log_teff, nearby.log_g, nearby.m_h)]
+    vega = vega_magnitude(passbands.load(STAR_BAND))
+    shape = log_mass.shape
+    correction = model_stars.bolometric_h(
+        types, vega, 10.0 ** found.log_teff.ravel(), found.log_g.ravel(), np.repeat(metallicity, shape[1])
+    )
+    m_h = _SUN_M_BOL - 2.5 * found.log_l - correction.reshape(shape)
+    log_teff = own * (at[0] + hotter) + (1.0 - own) * found.log_teff
+    parts = (log_mass, log_teff, own * at[1] + (1.0 - own) * found.log_g, own * at[2] + (1.0 - own) * m_h)
+    low[1] = low[1] + hotter
+    values = [np.concatenate(pair, 1) for pair in zip(low, parts, strict=True)]
+    return Tracks(age, metallicity, int(light.sum()) + found.main_sequence, *values)
+
+
+def _nearby(types: stellar.StellarTypes) -> Tracks:
+    """The mean dwarf sequence.  Ref: Pecaut & Mamajek 2013, Table 5 and its updates."""
+    order = np.argsort(-types.abs_mag_h)
     log_mass = np.log10(types.mass[order])
     # Types of nearly equal mass are not in order: half-way between the two monotone envelopes.
-    down = np.minimum.accumulate(log_mass)
-    up = np.maximum.accumulate(log_mass[::-1])[::-1]
-    return Sequence(types.abs_mag_h[order], types.teff[order], types.log_g[order], 0.5 * (down + up))
+    up = np.maximum.accumulate(log_mass)
+    down = np.minimum.accumulate(log_mass[::-1])[::-1]
+    mass = 0.5 * (up + down) + 1e-9 * np.arange(order.size)
+    values = (mass, np.log10(types.teff[order]), types.log_g[order], types.abs_mag_h[order])
+    return Tracks(np.zeros(1), np.zeros(1), order.size, *(v[None, :] for v in values))
 
 
-def giant_sequence() -> Sequence:
-    """The giant branch and the red clump, bright to faint."""
-    numbers = parameters.section(_FILE, "giant_sequence")
-    m_h, teff, log_g = (np.array(numbers[name]) for name in ("m_h", "teff", "log_g"))
-    return Sequence(m_h, teff, log_g, np.zeros(m_h.size))
+def pieces_of(found: Tracks, share: Float, masses: MassFunction, m_h: Float) -> Pieces:
+    """Stretches of isochrones, with the systems of a mass function whose integral below `reference` is 1 if all live.
+
+    share : [k] of the systems that each isochrone has;  m_h : [b + 1] edges of the bins, ascending
+    """
+    born = _power_law(masses, np.maximum(10.0**found.log_mass, masses.lightest))
+    number = np.diff(born, axis=1) / _power_law(masses, np.asarray(masses.reference)) * share[:, None]
+    q = number.shape[1]
+    step = np.arange(q)
+    living = np.broadcast_to(step != found.evolved - 1 + isochrones.FLASH, number.shape) & (number > 0.0)
+    row, at = np.nonzero(living)
+    along = (found.log_mass, found.log_teff, found.log_g, found.m_h)
+    ends = [np.stack([values[row, at], values[row, at + 1]]) for values in along]
+    stage = np.where(at >= found.evolved - 1, GIANT, DWARF)
+    cut = _in_bins(Pieces(row, stage, np.zeros(row.size, np.int64), number[row, at], *ends), m_h)
+    young = (cut.stage == GIANT) & (cut.log_g.mean(0) > _GIANT_LOG_G)
+    return replace(cut, stage=np.where(young, SUBGIANT, cut.stage))
 
 
-def white_dwarf_sequence() -> Sequence:
-    """Cooling white dwarfs of one radius, bright to faint."""
+def _in_bins(whole: Pieces, edges: Float) -> Pieces:
+    """The stretches cut at the edges of the bins; what lies outside of all is left out."""
+    step, first = edges[1] - edges[0], edges[0]
+    place = (whole.m_h - first) / step
+    low, high = place.min(0), place.max(0)
+    start = np.floor(low).astype(np.int64)
+    count = np.maximum(np.ceil(high).astype(np.int64) - start, 1)
+    of = np.repeat(np.arange(start.size), count)
+    which = start[of] + np.arange(of.size) - np.repeat(np.cumsum(count) - count, count)
+    span = np.maximum(high - low, 1e-12)[of]
+    # Along the stretch, from its fainter or brighter end.
+    part = np.clip((np.stack([which, which + 1]) - low[of]) / span, 0.0, 1.0)
+    part[:, count[of] == 1] = np.array([0.0, 1.0])[:, None]
+    falling = place[0, of] > place[1, of]
+    along = np.where(falling, 1.0 - part, part)
+    ends = [
+        values[0, of] + (values[1, of] - values[0, of]) * along
+        for values in (whole.log_mass, whole.log_teff, whole.log_g, whole.m_h)
+    ]
+    out = Pieces(whole.track[of], whole.stage[of], which, whole.number[of] * (part[1] - part[0]), *ends)
+    return out.take((which >= 0) & (which < edges.size - 1) & (out.number > 0.0))
+
+
+def white_dwarfs(m_h: Float) -> Pieces:
+    """Cooling white dwarfs of one radius, in bins of M_H with these edges[b + 1]."""
     numbers = WhiteDwarfs(**parameters.section(_FILE, "white_dwarfs"))
-    m_bol, m_h = _white_dwarf_magnitudes(numbers)
-    return Sequence(m_h, _white_dwarf_teff(numbers, m_bol), np.full(m_h.size, numbers.log_g), np.zeros(m_h.size))
+    m_bol, at = _white_dwarf_magnitudes(numbers)
+    number = np.diff(white_dwarfs_below(numbers, m_h))
+    kept = np.flatnonzero(number > 0.0)
+    edges = np.stack([m_h[kept], m_h[kept + 1]])
+    log_teff = np.log10(np.interp(edges, at, _white_dwarf_teff(numbers, m_bol)))
+    none, g = np.zeros(edges.shape), np.full(edges.shape, numbers.log_g)
+    stage = np.full(kept.size, WHITE_DWARF)
+    return Pieces(np.full(kept.size, -1), stage, kept, number[kept], none, log_teff, g, edges)
 
 
 def _white_dwarf_magnitudes(numbers: WhiteDwarfs) -> tuple[Float, Float]:
@@ -115,25 +237,8 @@ def _white_dwarf_teff(numbers: WhiteDwarfs, m_bol: Float) -> Float:
     return np.asarray(_SUN_TEFF * 10.0 ** (-0.1 * (m_bol - _SUN_M_BOL)) / np.sqrt(numbers.radius))
 
 
-def luminosity(m_h: Float, dwarfs: Sequence, share: Float, component: Int) -> Float:
-    """Stars pc^-3 at the Sun in each bin of M_H, [3 n, b]: dwarfs of n laws of density, their giants, white dwarfs.
-
-    m_h       : [b + 1] edges
-    share     : [n] of each law in the density at the Sun, summing to 1
-    component : [n] thin disc, thick disc or halo, 0 .. 2
-    """
-    masses = MassFunction(**parameters.section(_FILE, "mass_function"))
-    giants = Giants(**parameters.section(_FILE, "giants"))
-    mass = 10.0 ** np.interp(m_h, dwarfs.m_h, dwarfs.log_mass)
-    main = [-np.diff(mass_below(masses, np.minimum(mass, masses.heaviest[k]))) for k in component]
-    branch = np.diff(giants_below(giants, m_h))
-    evolved = [giants.relative[k] * branch for k in component]
-    cooling = np.diff(white_dwarfs_below(WhiteDwarfs(**parameters.section(_FILE, "white_dwarfs")), m_h))
-    return np.stack([*main, *evolved, *[cooling] * len(component)]) * np.tile(share, 3)[:, None]
-
-
 def mass_below(masses: MassFunction, m: npt.ArrayLike) -> Float:
-    """Systems pc^-3 at the Sun lighter than m, all components together.
+    """Systems pc^-3 at the Sun born lighter than m, all components together.
 
     m : float[n] Msun
     Ref: Kroupa 2001
@@ -150,18 +255,6 @@ def _power_law(masses: MassFunction, m: Float) -> Float:
         total = total + height * low * np.expm1(rise * np.log(top / low)) / rise
         height *= (edges[i + 1] / low) ** slope if np.isfinite(edges[i + 1]) else 1.0
     return np.asarray(total)
-
-
-def giants_below(giants: Giants, m_h: Float) -> Float:
-    """Giants pc^-3 at the Sun brighter than M_H, thin disc.
-
-    m_h : float[n] mag, Vega
-    """
-    clump = ndtr((m_h - giants.clump_m_h) / giants.clump_scatter)
-    rise = giants.slope * np.log(10.0)
-    inside = np.clip(m_h, giants.brightest, giants.faintest) - giants.brightest
-    branch = np.expm1(rise * inside) / np.expm1(rise * (giants.faintest - giants.brightest))
-    return np.asarray(giants.local * (giants.clump_fraction * clump + (1.0 - giants.clump_fraction) * branch))
 
 
 def white_dwarfs_below(numbers: WhiteDwarfs, m_h: Float) -> Float:

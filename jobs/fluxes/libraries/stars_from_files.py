@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from jobs.fluxes import passbands
-from jobs.fluxes.libraries import from_files, stellar, templates
+from jobs.fluxes.libraries import from_files, model_stars, stellar, templates
 from jobs.fluxes.libraries.from_files import ANGSTROM, Curve, check, resampled
 from jobs.fluxes.libraries.stellar import StellarTypes, normalised
 from jobs.fluxes.libraries.templates import Library
@@ -64,7 +64,10 @@ def library(models: Path | None, infrared: Sequence[Path]) -> tuple[Library, Int
     chosen = np.full(n, -1)
     if infrared:
         flux, chosen = splice(grid, flux, [from_files.read(path, "irtf") for path in infrared])
-    own = np.concatenate([normalised(grid, flux).astype(np.float32), embedded.flux[n:]])
+    # The models are of other files: dwarfs of their temperatures stand for them.
+    first, flux = templates.first_model(), normalised(grid, flux)
+    models = normalised(grid, model_stars.of_dwarfs(flux, types))
+    own = np.concatenate([flux, embedded.flux[n:first], models]).astype(np.float32)
     return replace(embedded, flux=own, own=True), chosen
 
 

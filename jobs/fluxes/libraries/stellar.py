@@ -146,7 +146,7 @@ def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Fl
     pivots = np.log([passbands.pivot_wavelength(band) for band in bands])
     out = []
     for teff, colors in zip(stars.teff, stars.colors, strict=True):
-        start = planck(grid, teff) * _absorbed(grid, teff)
+        start = planck(grid, teff) * absorbed(grid, teff)
         out.append(_matched(np.log(grid), start, response / vega, pivots, colors))
     return normalised(grid, np.stack(out))
 
@@ -213,7 +213,7 @@ def corrected(log_wavelength: Float, start: Float, pivots: Float, correction: Fl
     return np.asarray(start * 10.0 ** (-0.4 * PchipInterpolator(pivots, correction)(inside)))
 
 
-def _absorbed(wavelength: Float, teff: float) -> Float:
+def absorbed(wavelength: Float, teff: float) -> Float:
     """Transmission of the features (stellar_features.csv) at a temperature: texture, colours come after."""
     transmission = np.ones_like(wavelength)
     hydrogen = np.exp(-0.5 * (np.log(teff / _HYDROGEN_PEAK) / _HYDROGEN_WIDTH) ** 2)

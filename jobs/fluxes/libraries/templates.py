@@ -1,7 +1,8 @@
 """The embedded libraries of spectra: 31 galaxies, and the stars.
 
 galaxy_library     early to late, mixed from the four spectra of Coleman, Wu & Weedman 1980 and a young burst
-stellar_library    O9 to T8, shaped until their colours are those of Pecaut & Mamajek 2013, and standards
+stellar_library    O9 to T8, shaped until their colours are those of Pecaut & Mamajek 2013, standards, and models by
+                   temperature, gravity and metallicity;  first_model : where these begin
 GALAXY_LIBRARY_SIZE, rest_grid, emission_wavelengths
 anchors_of, spectrum_file   what they are made of
 
@@ -20,7 +21,7 @@ import numpy as np
 from jobs import cache
 from jobs.code_keys import code_key
 from jobs.fluxes import passbands
-from jobs.fluxes.libraries import brown_dwarfs, rest_grid, standards, stellar, vega
+from jobs.fluxes.libraries import brown_dwarfs, model_stars, rest_grid, standards, stellar, vega
 from jobs.fluxes.libraries.stellar import normalised, planck
 from lake_schema.arrays import Float, Float32
 
@@ -96,17 +97,24 @@ def anchors_of(template: int) -> tuple[str, str]:
 @lru_cache(maxsize=1)
 def stellar_library() -> Library:
     """On the observed grid: 0 .. 75 the dwarfs O9V .. M9V, hottest first (with their table of types), 76 .. 440 the L
-    and T dwarfs, 441 .. 443 Vega, a white dwarf, a planetary nebula.
+    and T dwarfs, 441 .. 443 Vega, a white dwarf, a planetary nebula, from 444 the models of model_stars.
     """
     types = stellar.types()
-    names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES)
-    key = cache.content_key(code_key(__name__), vega.spectrum_file("vega.txt").read_bytes(), stellar.fingerprint())
+    names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES, *model_stars.names())
+    files = vega.spectrum_file("vega.txt").read_bytes(), model_stars.TABLE.read_bytes()
+    key = cache.content_key(code_key(__name__), *files, stellar.fingerprint())
     arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": _stars(types)})
     return Library(passbands.grid(), arrays["flux"], names, types)
 
 
+def first_model() -> int:
+    """Index of the first of model_stars in the stellar library."""
+    return len(stellar.types().names) + brown_dwarfs.COUNT + len(standards.NAMES)
+
+
 def _stars(types: stellar.StellarTypes) -> Float32:
-    parts = [stellar.spectra(types, *vega.vega()), brown_dwarfs.spectra(), standards.spectra(*vega.vega())]
+    dwarfs = stellar.spectra(types, *vega.vega())
+    parts = [dwarfs, brown_dwarfs.spectra(), standards.spectra(*vega.vega()), model_stars.spectra(dwarfs, types)]
     return np.concatenate(parts).astype(np.float32)
 
 

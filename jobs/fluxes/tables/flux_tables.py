@@ -144,7 +144,7 @@ def stars(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
     f_nu = np.empty((len(bands), len(rows)))
     for k, band in enumerate(bands):
         table = build_tables.star_table(band, library, key)
-        f_nu[k] = np.exp(np.einsum("ij,ij->i", table[rows.sed], basis)) * scale
+        kernels.mix_stars(table, rows.sed, rows.frac, basis, scale, f_nu[k])
     return units.ujy_of_cgs(f_nu).T
 
 

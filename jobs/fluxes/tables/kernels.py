@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jobs.compiling import jit
+from jobs.compiling import exact_jit, jit
 from lake_schema.arrays import Float, Float32, Int, Int32, UInt32
 
 
@@ -170,3 +170,20 @@ def add_up(
                 total[b] += flux[i, j, medium[b]] * (narrow + wider * (wide - narrow))
         for b in range(n_band):
             out[rows[i], b] = total[b] * magnification[i]
+
+
+@exact_jit
+def mix_stars(table: Float32, sed: Int, frac: Float, basis: Float, scale: Float, out: Float) -> None:
+    """Fills out[n]: the sum over a star's templates of share times exp(coefficients . basis), times scale.
+
+    table : float32[n_template, m] coefficients;  sed, frac : [k, n];  basis : [n, m];  scale, out : [n]
+    """
+    for i in range(len(out)):
+        total = 0.0
+        for k in range(len(sed)):
+            if frac[k, i] > 0.0:
+                log = 0.0
+                for c in range(basis.shape[1]):
+                    log += table[sed[k, i], c] * basis[i, c]
+                total += frac[k, i] * np.exp(log)
+        out[i] = total * scale[i]

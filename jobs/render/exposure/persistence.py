@@ -30,7 +30,7 @@ from jobs.render.drawing.settings import settings_for
 from jobs.render.effects.charge import ramp
 from jobs.render.effects.charge.persistence import Traps
 from jobs.render.effects.scene import Frame, Scene
-from jobs.render.exposure import scene_of, standard_stars, visible_sources
+from jobs.render.exposure import scene_of, visible_sources
 from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
 from jobs.render.psf.model import Psf
 from lake_schema.errors import BadInput
@@ -174,7 +174,7 @@ def _charge(before: Earlier | EarlierSky, variant: Variant, older: float) -> Fra
 
 
 def _sources(aim: Aim, rows: Rows, scene: Scene, older: float) -> Frame:
-    detector, rows = aim.detector, standard_stars.with_standards(rows, aim, scene.mission)
+    detector, rows = aim.detector, visible_sources.rows_of(rows, aim, scene.mission)
     column = f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
     galaxies, stars = (visible_sources.fluxes_of(*pair, column) * aim.electrons for pair in pairs)

@@ -26,7 +26,7 @@ from jobs.render.exposure import bright_lights, scene_of, standard_stars
 from jobs.render.exposure.records import Rows
 from jobs.render.psf import from_file, spikes, sub_bands
 from jobs.render.psf.model import Psf, of_colours
-from jobs.render.sources import colours, galaxy_shapes, lensed_arcs, selection, solar_system
+from jobs.render.sources import catalogue_rows, colours, galaxy_shapes, lensed_arcs, selection, solar_system
 from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.errors import BadInput
@@ -37,7 +37,7 @@ from lake_schema.tables.strong_lenses import STRONG_LENSES
 # What is read of the catalogues; fluxes are read besides.
 SHAPE_COLUMNS = ("id", "kind", "ra_lensed", "dec_lensed", *galaxy_shapes.COLUMNS)
 GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, *colours.GALAXY_COLUMNS)))
-STAR_COLUMNS = ("id", "ra", "dec", *colours.STAR_COLUMNS)
+STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
 # Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
 _MOST_ELECTRONS = 1e17
 
@@ -69,7 +69,7 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     """
     if not aim.sees_sky:
         return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
-    rows, column = standard_stars.with_standards(rows, aim, scene.mission), f"f_nu_{aim.exposure.band}"
+    rows, column = rows_of(rows, aim, scene.mission), f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
     galaxies, stars = (fluxes_of(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs)
     settings, noise = settings_for(scene.accuracy), scene.pixel_noise
@@ -84,6 +84,17 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     psf, decisions = _with_pixels(aim, scene, psf, sources.electrons[touching(sources, sizes, aim.detector)])
     neglected = stamp_sizes.neglected_flux(sources.electrons, noise, settings)
     return Light(sources, sizes, neglected, psf, scene, decisions)
+
+
+def rows_of(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
+    """Rows with the stars where they are in the middle of an exposure, and the standard star's if it is of one.
+
+    rows : of the catalogues;  aim : the exposure and detector;  mission : the mission database
+    Errors : BadInput for a target that is no standard star
+    """
+    middle = aim.exposure.mjd + 0.5 * aim.exposure.exposure_time_s / 86400.0
+    rows = replace(rows, stars=catalogue_rows.at_time(rows.stars, middle))
+    return standard_stars.with_standards(rows, aim, mission)
 
 
 def psf_of(aim: Aim, scene: Scene, settings: Settings) -> Psf:

@@ -1,4 +1,4 @@
-"""The catalogue rows that a task reads: in its circle, and the bright ones beyond it."""
+"""The catalogue rows that a task reads: in its circle, and the bright ones beyond it; stars where they are then."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,10 +7,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from jobs.catalogue.galaxies import lensing
 from jobs.render.psf import spikes
 from jobs.render.sources import lensed_arcs, selection
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
+from lake_schema.tables.stars import EPOCH
 
 # Each with its fluxes.
 CATALOGUES = (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes"))
@@ -18,6 +20,9 @@ CATALOGUES = (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes"))
 LENSES = "strong_lenses"
 # How far beyond a detector sources are looked for that shine so far, arcsec: spikes of stars, outskirts of galaxies.
 FARTHEST = max(spikes.FARTHEST, selection.FARTHEST)
+# How far a star has moved at most that is looked for, deg: 3"/yr over 12 years; Julian years and days, of J2000.
+_FARTHEST_MOVED = 0.01
+_JULIAN_2000, _MJD_2000, _DAYS_A_YEAR, _MAS_A_DEG = 2000.0, 51544.5, 365.25, 3.6e6
 # What the parts of catalogues say of themselves.
 CELLS = "generation_cells"
 
@@ -28,8 +33,27 @@ def drawn_cells(catalogue: read.Version) -> set[int]:
 
 
 def deflection_of(catalogue: read.Version) -> float:
-    """How far a source may be seen from where its cell says, deg; stars are not lensed."""
-    return catalogue.deflection() if "ra_lensed" in catalogue.schema.names else 0.0
+    """How far a source may be seen from where its cell says, deg: galaxies by lenses, stars as they move.
+
+    Error: a star that has moved farther is missed where its cell is not read
+    """
+    if "ra_lensed" in catalogue.schema.names:
+        return catalogue.deflection()
+    return _FARTHEST_MOVED if "pm_ra" in catalogue.schema.names else 0.0
+
+
+def at_time(stars: pa.Table, mjd: float) -> pa.Table:
+    """Rows of table `stars` where their proper motions have led at a time, MJD; parallaxes are left out."""
+    if not {"pm_ra", "pm_dec"} <= set(stars.column_names):
+        return stars
+    years = _JULIAN_2000 + (mjd - _MJD_2000) / _DAYS_A_YEAR - EPOCH
+    motion = (pc.fill_null(stars[name], 0.0).to_numpy().astype(float) for name in ("pm_ra", "pm_dec"))
+    east, north = (np.radians(years * each / _MAS_A_DEG) for each in motion)
+    moved = lensing.displaced(stars["ra"].to_numpy(), stars["dec"].to_numpy(), east, north)
+    for name, values in zip(("ra", "dec"), moved, strict=True):
+        at = stars.schema.get_field_index(name)
+        stars = stars.set_column(at, stars.schema.field(name), pa.array(values))
+    return stars
 
 
 def sources(

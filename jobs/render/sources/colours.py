@@ -10,7 +10,6 @@ Whose spectrum the table does not hold has flat f_nu.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 
 import numpy as np
 import pyarrow as pa
@@ -19,7 +18,7 @@ from jobs.fluxes import high_redshift, integration, passbands
 from jobs.fluxes.libraries import templates
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.passbands import Passband
-from jobs.fluxes.sources import GALAXY_KINDS, Stars, galaxies_of, stars_of
+from jobs.fluxes.sources import GALAXY_KINDS, STAR_PARTS, galaxies_of, stars_of
 from jobs.fluxes.spectra.continuum import COMPONENTS
 from jobs.fluxes.spectra.lines import line_list
 from jobs.fluxes.tables import flux_tables
@@ -36,7 +35,7 @@ GALAXY_COLUMNS = (
     *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS),
     *sorted({line.column for line in line_list()}),
 )
-STAR_COLUMNS = ("sed", "mag_h", "a_v")
+STAR_COLUMNS = ("sed", "mag_h", "a_v", *(f"{name}_{k}" for k in STAR_PARTS for name in ("sed", "frac")))
 
 
 def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
@@ -71,7 +70,7 @@ def _usual(rows: pa.Table, parts: Sequence[Passband], library: Library) -> Float
 
 def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
     """float64[n, PARTS] fractions of the detected photons of rows of the table `stars`; library as in `galaxies`."""
-    if not len(rows) or not set(STAR_COLUMNS) <= set(rows.column_names):
+    if not len(rows) or not {"sed", "mag_h", "a_v"} <= set(rows.column_names):
         return _flat(len(rows))
     library, parts = library or templates.stellar_library(), sub_bands.sub_bands(band)
     found = stars_of(rows, library)
@@ -79,8 +78,7 @@ def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Flo
     f_nu = np.empty((len(found), len(parts)))
     for chosen, kernel in ((tabulated, flux_tables.stars), (~tabulated, integration.stars)):
         if chosen.any():
-            part = Stars(*(getattr(found, field.name)[chosen] for field in fields(found)))
-            f_nu[chosen] = kernel(part, parts, library)
+            f_nu[chosen] = kernel(found.rows(np.flatnonzero(chosen)), parts, library)
     return _shares(f_nu, parts)
 
 

@@ -9,8 +9,8 @@ from jobs.catalogue.stars import milky_way as mw
 from jobs.catalogue.stars.density_laws import density
 
 JURIC, BESANCON = (mw.milky_way(model) for model in mw.MODELS)
-LAWS = st.sampled_from([(galaxy.sun, c.law) for galaxy in (JURIC, BESANCON) for c in galaxy.components])
-THIN, THICK, HALO = (component.law for component in JURIC.components)
+LAWS = st.sampled_from([(galaxy.sun, c.law) for galaxy in (JURIC, BESANCON) for c in galaxy.components[:-1]])
+THIN, THICK, HALO, BULGE = (component.law for component in JURIC.components)
 
 
 @given(LAWS, st.floats(0.0, 1e5), st.floats(-1e5, 1e5))
@@ -76,3 +76,22 @@ def test_the_thick_disc_has_no_kink():
     height = 400.0 + np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
     slope = np.diff(np.log(density(BESANCON.components[7].law, BESANCON.sun, 8500.0, height)))
     assert slope == pytest.approx(slope[0], rel=0.01)
+
+
+def test_the_bar():
+    """sech^2 along its axes: 0.42 at one half axis; its near end is seen at positive longitudes."""
+    at = [(1460.0, 0.0, np.radians(22.0)), (490.0, 0.0, np.radians(112.0)), (0.0, 390.0, 0.0)]
+    for radius, height, azimuth in at:
+        assert density(BULGE, JURIC.sun, radius, height, azimuth) == pytest.approx(1 / np.cosh(1.0) ** 2)
+    assert density(BULGE, JURIC.sun, 0.0, 0.0) == 1.0
+    assert density(BULGE, JURIC.sun, 1e5, 1e5) == pytest.approx(0.0, abs=1e-30)
+    _, _, azimuth = mw.cylindrical(JURIC, 10.0, 0.0, np.array([7000.0]))
+    assert azimuth > 0
+
+
+def test_the_bar_s_mass():
+    """Its volume, 7.1 half axes' product, times 3.8 Msun pc^-3: 1.5e10 Msun."""
+    edge = np.linspace(-6000.0, 6000.0, 161)
+    x, y, z = np.meshgrid(edge, edge, edge[::2], indexing="ij")
+    inside = density(BULGE, JURIC.sun, np.hypot(x, y), z, np.arctan2(y, x)).sum() * 75.0**2 * 150.0
+    assert 3.8 * inside == pytest.approx(1.5e10, rel=0.1)

@@ -144,8 +144,11 @@ def test_what_lies_beyond_the_tables_is_integrated_not_extrapolated(galaxies, li
 def test_stars_fast_are_slow(stars_library):
     rng = np.random.default_rng(4)
     n = 2000
+    frac = rng.dirichlet(np.ones(3), n).T
+    frac[1:, : n // 2] = 0.0
     rows = Stars(
-        rng.integers(0, len(stars_library), n),
+        rng.integers(0, len(stars_library), (3, n)),
+        frac,
         rng.uniform(5.0, 26.0, n),
         rng.uniform(0.0, build_tables.STAR_A_V_LAST, n),
     )

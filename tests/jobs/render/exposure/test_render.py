@@ -445,3 +445,27 @@ def test_a_lamp_s_light_is_moved_and_squeezed_like_a_star_s():
         assert min(lit[name] for name in ("nonlinearity", "crosstalk", "parallel_cti", named)) > 1.0
         # A flat is open to the sky.
         assert all(lit[name] > 10.0 * dark[name] for name in ("nonlinearity", "crosstalk", "parallel_cti"))
+
+
+def test_a_star_is_drawn_where_it_is_on_the_day():
+    """100 mas/yr to the east, 1000 to the north, ten years after 2015.5; the one without a motion stays."""
+    (_, exposed, _, points), n = field("VIS"), 30
+    still = render("VIS")
+    motion = np.zeros((2, n), np.float32)
+    motion[:, :10] = np.array([[100.0], [1000.0]])
+    unknown = np.arange(n) >= 20
+    moving = points.append_column("pm_ra", pa.array(motion[0], mask=unknown))
+    moving = moving.append_column("pm_dec", pa.array(motion[1], mask=unknown))
+    moved = render("VIS", points=moving)
+    years = (exposed["mjd"] + 50 / 86400 - 51544.5) / 365.25 - 15.5
+    shared, one, other = np.intersect1d(still.sources.ids, moved.sources.ids, return_indices=True)
+    star = np.searchsorted(points["id"].to_numpy(), shared).clip(max=n - 1)
+    is_star = points["id"].to_numpy()[star] == shared
+    fast = is_star & (star < 10)
+    assert fast.sum() > 4
+    step = np.hypot(
+        moved.sources.column[other] - still.sources.column[one], moved.sources.row[other] - still.sources.row[one]
+    )
+    assert step[fast] == pytest.approx(years * np.hypot(0.1, 1.0) / 0.1, rel=0.01)
+    assert step[~fast].max() < 1e-6
+    assert 9 < years < 11

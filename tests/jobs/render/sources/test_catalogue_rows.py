@@ -267,3 +267,29 @@ def test_a_product_is_of_what_it_may_show_from_far_away():
     assert ext_stars == ext
     assert vis_galaxies != vis
     assert ext_galaxies != ext
+
+
+@given(st.floats(-89.9, 89.9), st.floats(-5000.0, 5000.0), st.floats(-5000.0, 5000.0), st.floats(51544.5, 70000.0))
+def test_stars_move_along_great_circles(dec, east, north, mjd):
+    """As astropy carries them (without parallax and radial velocity); one whose motion is not known stays."""
+    from astropy import units as u
+    from astropy.coordinates import SkyCoord
+    from astropy.time import Time
+
+    rows = stars([10.0, 10.0], [dec, dec])
+    rows = rows.append_column("pm_ra", pa.array([east, None], pa.float32()))
+    rows = rows.append_column("pm_dec", pa.array([north, None], pa.float32()))
+    found = catalogue_rows.at_time(rows, mjd)
+    assert (found["ra"][1].as_py(), found["dec"][1].as_py()) == pytest.approx((10.0, dec), abs=1e-12)
+    there = SkyCoord(
+        10.0 * u.deg,
+        dec * u.deg,
+        pm_ra_cosdec=np.float32(east) * u.mas / u.yr,
+        pm_dec=np.float32(north) * u.mas / u.yr,
+        obstime=Time(2015.5, format="jyear"),
+    ).apply_space_motion(Time(mjd, format="mjd"))
+    apart = sky.separation(found["ra"].to_numpy()[:1], found["dec"].to_numpy()[:1], there.ra.deg, there.dec.deg)
+    # astropy's path is straight in space: a millionth of its length beside the circle's.
+    assert 3.6e6 * apart[0] < 0.1
+    assert found.schema.equals(rows.schema)
+    assert catalogue_rows.at_time(stars([10.0], [dec]), mjd).equals(stars([10.0], [dec]))

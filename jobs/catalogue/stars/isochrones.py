@@ -1,0 +1,128 @@
+"""Isochrones: mass, luminosity and temperature along evolutionary phases, as a fit to published ones.
+
+isochrones    those of given ages and metallicities, at the same points of evolution
+FIXED         initial masses of the first points, Msun;  AGES  log10 of the ages, yr, at the fit's knots
+UPPER, PHASES fractions of the upper main sequence, and the equivalent evolutionary points after it
+
+Of each point log L, log Teff, and of those from the end of the main sequence on the initial mass, are quartics in [M/H]
+whose coefficients are linear in log age between knots (isochrones.csv, where sources and residuals stand; made by
+scripts/fit_isochrones.py).
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.arrays import Float, Int
+
+TABLE = Path(__file__).with_name("isochrones.csv")
+# Main sequence: these masses, and from the last of them fractions of the logarithm up to the mass that leaves it.
+FIXED = (0.5, 0.6)
+UPPER = (0.2, 0.4, 0.55, 0.68, 0.78, 0.86, 0.91, 0.94, 0.96, 0.98, 1.0)
+# Ends of the main sequence (454), of the red giant branch (605), start and end of core helium burning (631, 707), the
+# first thermal pulse (808), and points between.  Ref: Dotter 2016, ApJS 222, 8, Table 2
+PHASES = (
+    454, 462, 470, 480, 490, 500, 510, 522, 535, 550, 565, 580, 592, 600, 605, 631, 650, 670, 690, 707, 730, 760, 790,
+    808,
+)  # fmt: skip
+# After which point nothing is found before the next: the helium flash.
+FLASH = PHASES.index(605)
+AGES = (7.8, 8.2, 8.5, 8.75, 8.9, 9.0, 9.1, 9.2, 9.4, 9.6, 9.8, 10.0, 10.2)
+# Younger than 1 Gyr, the fit reaches down to the second of these.
+METALLICITIES = (-2.5, -0.75, 0.5)
+_YOUNG = 9.0
+DEGREE = 4
+# Nominal values of the Sun (IAU 2015).
+_SUN_TEFF, _SUN_LOG_G = 5772.0, 4.438
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Isochrones:
+    """k isochrones at p points, from the lightest mass on; ages Gyr, [M/H].
+
+    age, metallicity : [k];  mass : [k, p] initial, Msun, ascending
+    log_l, log_teff, log_g : [k, p] Lsun, K, cm s-2
+
+    Error: log g is that of the initial mass; a tenth of it is lost on the red giant branch
+    """
+
+    age: Float
+    metallicity: Float
+    mass: Float
+    log_l: Float
+    log_teff: Float
+    log_g: Float
+
+    @property
+    def main_sequence(self) -> int:
+        """Number of points on the main sequence."""
+        return len(FIXED) + len(UPPER)
+
+
+@lru_cache(maxsize=1)
+def coefficients() -> dict[str, Float]:
+    """[point, age, power of [M/H]] of quantities `log_l`, `log_teff`, `mass`; NaN where the mass is known."""
+    with TABLE.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    names = ("log_l", "log_teff", "mass")
+    shape = (points(), len(AGES), DEGREE + 1)
+    return {
+        name: np.array([[float(row[f"{name}_{k}"] or "nan") for k in range(DEGREE + 1)] for row in rows]).reshape(shape)
+        for name in names
+    }
+
+
+def points() -> int:
+    """Of an isochrone."""
+    return len(FIXED) + len(UPPER) + len(PHASES) - 1
+
+
+def isochrones(age: npt.ArrayLike, metallicity: npt.ArrayLike) -> Isochrones:
+    """Of ages[k] Gyr and metallicities[k]; both are taken to the nearest ends of the fit."""
+    ages, given = np.asarray(age, float), np.asarray(metallicity, float)
+    log_age = np.log10(ages) + 9.0
+    metals = np.clip(given, lowest(log_age), METALLICITIES[-1])
+    knots, weight = place(log_age)
+    found = {name: _value(each, knots, weight, metals) for name, each in coefficients().items()}
+    mass = masses(found["mass"])
+    log_g = _SUN_LOG_G + np.log10(mass) + 4.0 * (found["log_teff"] - np.log10(_SUN_TEFF)) - found["log_l"]
+    return Isochrones(ages, metals, mass, found["log_l"], found["log_teff"], log_g)
+
+
+def masses(fitted: Float) -> Float:
+    """Initial masses [k, p], Msun, from what is fitted of them: log10 of the one that leaves the main sequence, and
+    of its multiples by which the masses of later points differ from the points before.
+    """
+    first = len(FIXED) + len(UPPER) - 1
+    leaves = 10.0 ** fitted[:, first]
+    out = np.empty_like(fitted)
+    out[:, : len(FIXED)] = FIXED
+    out[:, len(FIXED) : first + 1] = FIXED[-1] * (leaves / FIXED[-1])[:, None] ** np.array(UPPER)
+    out[:, first + 1 :] = leaves[:, None] * (1.0 + np.cumsum(10.0 ** fitted[:, first + 1 :], 1))
+    return out
+
+
+def lowest(log_age: Float) -> Float:
+    """[M/H] down to which the fit reaches at log10 of ages, yr."""
+    return np.where(log_age < _YOUNG, METALLICITIES[1], METALLICITIES[0])
+
+
+def place(log_age: Float) -> tuple[Int, Float]:
+    """(knot before, share of the one after) of log10 of ages, yr."""
+    at = np.clip(log_age, AGES[0], AGES[-1])
+    before = np.clip(np.searchsorted(AGES, at, side="right") - 1, 0, len(AGES) - 2)
+    low, high = np.array(AGES)[before], np.array(AGES)[before + 1]
+    return before, (at - low) / (high - low)
+
+
+def _value(each: Float, knot: Int, weight: Float, metallicity: Float) -> Float:
+    powers = metallicity[:, None] ** np.arange(DEGREE + 1)
+    at = (1.0 - weight)[:, None, None] * each[:, knot].swapaxes(0, 1)
+    at += weight[:, None, None] * each[:, knot + 1].swapaxes(0, 1)
+    return np.asarray(np.einsum("kpd,kd->kp", at, powers))
