@@ -7,6 +7,7 @@ cells_in_cone       cells that a circle touches (never misses one)
 cells_in_polygon    cells that a spherical polygon touches
 cells_in_box        cells between two meridians and two parallels
 random_in_cell      uniform positions inside one cell, sorted
+displaced           moved along great circles
 """
 
 from __future__ import annotations
@@ -196,6 +197,22 @@ def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2
     # The complement keeps its digits near the antipode, where 1 - near has lost them.
     far = np.sin((lat1 + lat2) / 2) ** 2 + np.cos(lat1) * np.cos(lat2) * np.cos((lon2 - lon1) / 2) ** 2
     return np.asarray(np.degrees(2 * np.arctan2(np.sqrt(near), np.sqrt(far))))
+
+
+def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, Float]:
+    """Positions moved along great circles by (east, north) rad; all [n], ra, dec deg.
+
+    ra, dec : float[n] deg;  east, north : float[n] rad
+    """
+    angle = np.hypot(east, north)
+    # sin(angle) / angle without the division by zero.
+    ratio = np.sinc(angle / np.pi)
+    lat, lon = np.radians(dec), np.radians(ra)
+    forward = np.cos(angle) * np.cos(lat) - ratio * north * np.sin(lat)
+    up = np.cos(angle) * np.sin(lat) + ratio * north * np.cos(lat)
+    sideways = ratio * east
+    moved = lon + np.arctan2(sideways, forward)
+    return wrapped(np.degrees(moved)), np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
 
 
 def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> tuple[Int, Float, Float]:

@@ -19,9 +19,8 @@ from pyarrow import csv
 
 from jobs.catalogue import parameters
 from jobs.catalogue.exports import ldac
-from jobs.catalogue.galaxies import lensing
 from jobs.catalogue.stars import gaia
-from lake_schema import __version__, command, user_files
+from lake_schema import __version__, command, sky, user_files
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput
 from lake_schema.fits.tables import table_to_fits
@@ -132,7 +131,7 @@ def _correlations(known: pa.ChunkedArray) -> dict[str, Any]:
 def _after(rows: pa.Table, years: float) -> tuple[Any, Any]:
     """Positions to which the proper motions lead in so many years."""
     east, north = (_MAS * years * pc.fill_null(rows[name], 0.0).to_numpy() for name in ("pmra", "pmdec"))
-    return lensing.displaced(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
+    return sky.displaced(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 from jobs import cache
 from jobs.code_keys import code_key
 from jobs.fluxes import high_redshift, passbands
-from jobs.fluxes.libraries import brown_dwarfs, from_files, standards, stars_from_files, stellar, templates
+from jobs.fluxes.libraries import brown_dwarfs, from_files, model_stars, standards, stars_from_files, stellar, templates
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.libraries.vega import spectrum_file
 from jobs.fluxes.passbands import Passband
@@ -141,7 +141,7 @@ def template_rows(own: Own) -> pa.Table:
         "galaxy": given or [_galaxy_origin(k) for k in range(len(own.library))],
         "qso": [quasars] * len(libraries["qso"]),
         "high_redshift": [_origin("power laws", Path(high_redshift.__file__))] * len(libraries["high_redshift"]),
-        "star": [*own.dwarfs, *_star_origins()[len(own.dwarfs) :]],
+        "star": _star_origins(own.dwarfs),
     }
     return template_table.rows(libraries, origins)
 
@@ -255,12 +255,19 @@ def _galaxy_origin(template: int) -> Origin:
     return _origin("Coleman, Wu & Weedman 1980, as GalSim has them" + ", and a burst" * (code in files), *files)
 
 
-def _star_origins() -> list[Origin]:
+def _star_origins(own: Sequence[Origin]) -> list[Origin]:
+    """Of the stellar library; own : of its dwarfs, () = embedded."""
     dwarfs = _origin("Pecaut & Mamajek 2013, as MeanStars has them", stellar.table_file())
-    count = len(stellar.types().names) + len(brown_dwarfs.template_names())
+    first = [*own] or [dwarfs] * len(stellar.types().names)
+    colours = _origin("Castelli & Kurucz 2003, as astroARIADNE has them", model_stars.TABLE)
+    # Models go over into dwarfs; a request's own dwarfs stand for them, or lend them their infrared.
+    models = (
+        [own[k] for k in model_stars.nearest_dwarfs(stellar.types())] if own else [colours] * len(model_stars.names())
+    )
     vega = _origin("CALSPEC, as GalSim has it", spectrum_file("vega.txt"))
     white_dwarf = _origin("Bohlin, Hubeny & Rauch 2020", Path(standards.__file__))
-    return [dwarfs] * count + [vega, white_dwarf, _origin("the references in the file", standards.NEBULA)]
+    nebula = _origin("the references in the file", standards.NEBULA)
+    return [*first, *[dwarfs] * brown_dwarfs.COUNT, vega, white_dwarf, nebula, *models]
 
 
 def _passband_origin(name: str) -> Origin:

@@ -74,7 +74,7 @@ class Stars:
     a_v: Float
 
     def __len__(self) -> int:
-        return self.sed.shape[1]
+        return len(self.mag_h)
 
     def rows(self, chosen: Int | slice) -> Stars:
         return Stars(self.sed[:, chosen], self.frac[:, chosen], self.mag_h[chosen], self.a_v[chosen])
@@ -112,15 +112,14 @@ def stars_of(table: pa.Table, library: Library) -> Stars:
         declared = STARS.column(name)
         within(name, values, _bound(declared.lo), _bound(declared.hi))
     sed, frac = [column(table, "sed")], []
+    within("sed", sed[0], 0, len(library) - 1)
     for k in STAR_PARTS:
         if f"sed_{k}" not in table.column_names or table[f"sed_{k}"].null_count == table.num_rows:
             continue
         frac.append(np.nan_to_num(_floats(table, f"frac_{k}"), nan=0.0, posinf=np.inf))
         within(f"frac_{k}", frac[-1], 0.0, 1.0)
-        other = _floats(table, f"sed_{k}")
-        sed.append(np.where(frac[-1] > 0.0, other, sed[0]))
-    for values in sed:
-        within("sed", values, 0, len(library) - 1)
+        sed.append(np.where(frac[-1] > 0.0, _floats(table, f"sed_{k}"), sed[0]))
+        within(f"sed_{k}", sed[-1], 0, len(library) - 1)
     shares = np.stack([np.ones(table.num_rows), *frac])
     shares[0] = 1.0 - shares[1:].sum(0)
     within("frac_2", shares[0], -1e-6, 1.0)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jobs import sums
 from jobs.catalogue.stars import isochrones, kinematics, milky_way, stars
 from jobs.catalogue.stars.stellar_populations import DWARF, GIANT, WHITE_DWARF, tracks
 from jobs.fluxes import passbands
@@ -86,7 +87,7 @@ def _clump(galaxy: milky_way.MilkyWay) -> float:
     own, thin = galaxy.pieces, np.arange(galaxy.pieces.number.size) < galaxy.first[1, 0]
     edges = np.arange(-3.0, 0.01, 0.1)
     number, _ = np.histogram(own.m_h.mean(0), edges, weights=own.number * thin * (own.stage == GIANT))
-    smooth = np.convolve(number, np.ones(3), "same")
+    smooth = number + np.append(0.0, number[:-1]) + np.append(number[1:], 0.0)
     return float(edges[smooth.argmax()] + 0.05)
 
 
@@ -116,7 +117,8 @@ def colours(universe: stars.StarModel, area: float = 40.0) -> dict[str, float]:
     light = {}
     for name in ("sdss_g", "sdss_r", "twomass_h"):
         band = passbands.load(name)
-        each = library.flux[:, band.first : band.first + len(band.wavelength)] @ passbands.weights(band)
+        seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
+        each = sums.product(seen, passbands.weights(band))
         light[name] = (found.frac * each[found.sed]).sum(0)
     mag_h = drawn.m_h + 5.0 * np.log10(drawn.distance) - 5.0 + vega_magnitude(passbands.load("twomass_h"))
     mag_r = mag_h - 2.5 * np.log10(light["sdss_r"] / light["twomass_h"])
@@ -168,7 +170,7 @@ def _along(lon: Float, far: float, deviates: Float, age: Float) -> Float:
     beside = sky.equatorial(lon + 1e-3, np.zeros(lon.size))
     step = np.stack([((beside[0] - ra + 180.0) % 360.0 - 180.0) * np.cos(np.radians(dec)), beside[1] - dec])
     step /= np.hypot(*step)
-    return east * step[0] + north * step[1]
+    return np.asarray(east * step[0] + north * step[1])
 
 
 def bulge(galaxy: milky_way.MilkyWay) -> dict[str, float]:

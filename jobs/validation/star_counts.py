@@ -100,7 +100,7 @@ def brighter(
         inside = np.append(0.0, np.cumsum(density(component.law, galaxy.sun, r, z, azimuth) * volume))
         own = owner == k
         for i, limit in enumerate(limits):
-            total[i] += galaxy.pieces.number[own] @ np.interp(limit - m_v[own], far, inside)
+            total[i] += (galaxy.pieces.number[own] * np.interp(limit - m_v[own], far, inside)).sum()
     return total
 
 

@@ -137,20 +137,8 @@ def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Float]:
     return {"ra_lensed": ra_lensed, "dec_lensed": dec_lensed, **shear}
 
 
-def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, Float]:
-    """Positions moved along great circles by (east, north) rad; all [n], ra, dec deg.
-
-    ra, dec : float[n] deg;  east, north : float[n] rad
-    """
-    angle = np.hypot(east, north)
-    # sin(angle) / angle without the division by zero.
-    ratio = np.sinc(angle / np.pi)
-    lat, lon = np.radians(dec), np.radians(ra)
-    forward = np.cos(angle) * np.cos(lat) - ratio * north * np.sin(lat)
-    up = np.cos(angle) * np.sin(lat) + ratio * north * np.cos(lat)
-    sideways = ratio * east
-    moved = lon + np.arctan2(sideways, forward)
-    return sky.wrapped(np.degrees(moved)), np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
+# Where deflections lead.
+displaced = sky.displaced
 
 
 def turned(rows: pa.Table, angle: float) -> pa.Table:

@@ -53,7 +53,11 @@ def expected(tracks: Tracks, pieces: Pieces, m_h: Float) -> Float:
 
 
 def draw(tracks: Tracks, track: Int, mass: Float, rng: np.random.Generator) -> Companions:
-    """Of stars on tracks[n] (-1 = none has one) with masses[n] at birth; lighter than stars there are none."""
+    """Companions of stars; lighter than stars there are none.
+
+    tracks : isochrones;  track : int[n] which of them is a star's, -1 = it has no companion
+    mass   : float[n] Msun at birth;  rng : random numbers
+    """
     law = _law()
     chance, ratio = rng.random((2, track.size))
     with np.errstate(invalid="ignore"):
@@ -89,7 +93,7 @@ def _law() -> dict[str, Any]:
 
 
 def _fraction(law: dict[str, Any], log_mass: Float) -> Float:
-    return np.interp(log_mass, np.log10(law["mass"]), law["fraction"])
+    return np.asarray(np.interp(log_mass, np.log10(law["mass"]), law["fraction"]))
 
 
 def _ratio(law: dict[str, Any], log_mass: Float, chance: Float) -> Float:

@@ -136,6 +136,8 @@ def _log(law: Law, r: Float, z: Float) -> Float:
         case Young():
             a2 = _a2(law.flattening, r, z)
             return _log_difference(a2 / law.outer**2, a2 / law.inner**2)
+        case Bar():
+            return np.asarray(np.log(_bar(law, r, z, np.zeros(()))))
         case Parabolic():
             return np.asarray(-r / law.length + _log_parabolic(law, np.abs(z)))
 

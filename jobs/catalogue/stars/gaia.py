@@ -21,7 +21,6 @@ import pyarrow.compute as pc
 from scipy.special import chdtri, erfc, ndtri
 
 from jobs.catalogue import parameters
-from jobs.catalogue.galaxies import lensing
 from jobs.rng import uniforms
 from lake_schema import sky, units
 from lake_schema.arrays import Float
@@ -113,7 +112,7 @@ def photometric_errors(mag: npt.ArrayLike, kind: str) -> Float:
 def _astrometry(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
     errors = astrometric_errors(g)
     east, north = (_MAS * error * noise[k] for error, k in zip(errors[:2], (_RA, _DEC), strict=True))
-    ra, dec = lensing.displaced(stars["ra"].to_numpy(), stars["dec"].to_numpy(), np.radians(east), np.radians(north))
+    ra, dec = sky.displaced(stars["ra"].to_numpy(), stars["dec"].to_numpy(), np.radians(east), np.radians(north))
     distance = np.asarray(pc.fill_null(stars["distance"], np.nan).to_numpy(), float)
     parallax = 1e3 / distance + errors[2] * noise[_PARALLAX]
     return {

@@ -20,7 +20,6 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from jobs.catalogue import dust_map, parameters
-from jobs.catalogue.galaxies import lensing
 from jobs.catalogue.stars import bright_stars, brown_dwarfs, companions, from_catalogue, kinematics, milky_way
 from jobs.catalogue.stars.bright_stars import BrightStars
 from jobs.catalogue.stars.brown_dwarfs import BrownDwarfs
@@ -258,7 +257,7 @@ def _beside(cell: int, place: Lot, of: Int, offset: tuple[Float, Float]) -> Lot:
     east, north = (np.radians(_AU_PC * axis / place["distance"][of]) for axis in offset)
     todo = np.arange(of.size)
     for side in (1.0, -1.0):
-        there = lensing.displaced(place["ra"][of[todo]], place["dec"][of[todo]], side * east[todo], side * north[todo])
+        there = sky.displaced(place["ra"][of[todo]], place["dec"][of[todo]], side * east[todo], side * north[todo])
         at = sky.healpix_29(*there)
         inside = at >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell
         chosen = todo[inside]

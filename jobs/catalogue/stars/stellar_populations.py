@@ -121,7 +121,11 @@ def joined(parts: list[Pieces]) -> Pieces:
 
 
 def population(ages: Float, shares: Float, mean: Float, scatter: Float, cells: int) -> Population:
-    """Ages[a] Gyr with their shares, and about each mean[a] of [M/H] a normal law, cut at 3 sigma, in cells."""
+    """Ages[a] Gyr with their shares, and about each mean[a] of [M/H] a normal law, cut at 3 sigma, in cells.
+
+    ages, shares   : float[a] Gyr, and of the systems born;  cells : of each age
+    mean, scatter  : float[a] of [M/H]
+    """
     edges = np.linspace(-_REACH, _REACH, cells + 1)
     middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
     normal = np.exp(-0.5 * middle**2)
@@ -171,7 +175,8 @@ def _nearby(types: stellar.StellarTypes) -> Tracks:
 def pieces_of(found: Tracks, share: Float, masses: MassFunction, m_h: Float) -> Pieces:
     """Stretches of isochrones, with the systems of a mass function whose integral below `reference` is 1 if all live.
 
-    share : [k] of the systems that each isochrone has;  m_h : [b + 1] edges of the bins, ascending
+    found : k isochrones;  share : [k] of the systems that each has
+    masses : the mass function;  m_h : [b + 1] edges of the bins, ascending
     """
     born = _power_law(masses, np.maximum(10.0**found.log_mass, masses.lightest))
     number = np.diff(born, axis=1) / _power_law(masses, np.asarray(masses.reference)) * share[:, None]

@@ -122,6 +122,11 @@ def of_dwarfs(dwarfs: Float, types: StellarTypes) -> Float:
     return np.repeat(found, LOG_G.size * METALLICITY.size, axis=0)
 
 
+def nearest_dwarfs(types: StellarTypes) -> Int:
+    """Index of the hotter of the two dwarfs that stand beside each model."""
+    return np.repeat(_between(types, TEFF)[0][0], LOG_G.size * METALLICITY.size)
+
+
 def mixture(types: StellarTypes, first: int, teff: Float, log_g: Float, metallicity: Float) -> Mixture:
     """What stars are made of, the largest share first.
 
@@ -130,13 +135,17 @@ def mixture(types: StellarTypes, first: int, teff: Float, log_g: Float, metallic
     """
     n = teff.size
     sed, frac = np.zeros((PARTS, n), np.int64), np.zeros((PARTS, n))
-    rows = [np.ascontiguousarray(values, float) for values in (teff, log_g, metallicity)]
-    _mix(*rows, np.log(TEFF), LOG_G, METALLICITY, np.log(types.teff), first, _GIANT, sed, frac)
+    t, g, z = (np.ascontiguousarray(values, float) for values in (teff, log_g, metallicity))
+    _mix(t, g, z, np.log(TEFF), LOG_G, METALLICITY, np.log(types.teff), first, _GIANT, sed, frac)
     return Mixture(sed, frac)
 
 
 def bolometric_h(types: StellarTypes, vega: float, teff: Float, log_g: Float, metallicity: Float) -> Float:
-    """M_bol - M_H (Vega)[n]; vega : AB magnitude of Vega in H."""
+    """M_bol - M_H (Vega)[n].
+
+    types : the dwarfs;  vega : AB magnitude of Vega in H
+    teff, log_g, metallicity : float64[n] K, cm s-2, [M/H]
+    """
     found = mixture(types, types.teff.size, teff, log_g, metallicity)
     own = own_share() * (models().bolometric_h + vega)
     dwarf = np.interp(-np.log(TEFF), -np.log(types.teff), types.bolometric_h)
@@ -177,7 +186,7 @@ def _mix(
     for i in range(teff.size):
         t = math.log(teff[i])
         if t > ln_teff[-1] or (t < ln_teff[0] and log_g[i] > giant):
-            k = min(max(np.searchsorted(-dwarfs, -t), 1), dwarfs.size - 1)
+            k = min(max(int(np.searchsorted(-dwarfs, -t)), 1), dwarfs.size - 1)
             w = min(max((dwarfs[k - 1] - t) / (dwarfs[k - 1] - dwarfs[k]), 0.0), 1.0)
             sed[0, i], sed[1, i], frac[0, i], frac[1, i] = k - 1, k, 1.0 - w, w
         else:
@@ -208,5 +217,5 @@ def _mix(
 @exact_jit
 def _place(nodes: Float, value: float) -> tuple[int, float]:
     """(node before, share of the way to the next), inside the nodes."""
-    low = min(max(np.searchsorted(nodes, value, side="right") - 1, 0), nodes.size - 2)
+    low = min(max(int(np.searchsorted(nodes, value, side="right")) - 1, 0), nodes.size - 2)
     return low, min(max((value - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0), 1.0)

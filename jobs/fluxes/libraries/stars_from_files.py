@@ -62,12 +62,17 @@ def library(models: Path | None, infrared: Sequence[Path]) -> tuple[Library, Int
     grid, n = embedded.wavelength, len(types.names)
     flux = embedded.flux[:n].astype(float) if models is None else dwarfs(models, types, grid)
     chosen = np.full(n, -1)
+    first = templates.first_model()
+    others = embedded.flux[first:].astype(float)
     if infrared:
-        flux, chosen = splice(grid, flux, [from_files.read(path, "irtf") for path in infrared])
-    # The models are of other files: dwarfs of their temperatures stand for them.
-    first, flux = templates.first_model(), normalised(grid, flux)
-    models = normalised(grid, model_stars.of_dwarfs(flux, types))
-    own = np.concatenate([flux, embedded.flux[n:first], models]).astype(np.float32)
+        curves = [from_files.read(path, "irtf") for path in infrared]
+        flux, chosen = splice(grid, flux, curves)
+        others, _ = splice(grid, others, curves)
+    flux = normalised(grid, flux)
+    if models is not None:
+        # A file is of one metallicity: its dwarfs stand for the stars of any.
+        others = model_stars.of_dwarfs(flux, types)
+    own = np.concatenate([flux, embedded.flux[n:first], normalised(grid, others)]).astype(np.float32)
     return replace(embedded, flux=own, own=True), chosen
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from jobs.catalogue.galaxies import lensing
 from jobs.render.psf import spikes
 from jobs.render.sources import lensed_arcs, selection
+from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from lake_schema.tables.stars import EPOCH
@@ -49,7 +49,7 @@ def at_time(stars: pa.Table, mjd: float) -> pa.Table:
     years = _JULIAN_2000 + (mjd - _MJD_2000) / _DAYS_A_YEAR - EPOCH
     motion = (pc.fill_null(stars[name], 0.0).to_numpy().astype(float) for name in ("pm_ra", "pm_dec"))
     east, north = (np.radians(years * each / _MAS_A_DEG) for each in motion)
-    moved = lensing.displaced(stars["ra"].to_numpy(), stars["dec"].to_numpy(), east, north)
+    moved = sky.displaced(stars["ra"].to_numpy(), stars["dec"].to_numpy(), east, north)
     for name, values in zip(("ra", "dec"), moved, strict=True):
         at = stars.schema.get_field_index(name)
         stars = stars.set_column(at, stars.schema.field(name), pa.array(values))

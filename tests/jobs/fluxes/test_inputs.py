@@ -39,7 +39,7 @@ def own(tmp_path, **changes):
 def test_embedded_templates_say_where_they_are_from(embedded):
     rows = inputs.template_rows(embedded)
     check(rows, TEMPLATES)
-    assert rows.num_rows == 31 + 9 + 15 + 444
+    assert rows.num_rows == 31 + 9 + 15 + 768
     vega = next(row for row in rows.select(["name", "source", "sha256"]).to_pylist() if row["name"] == "Vega")
     assert vega["source"].startswith("vega.txt")
     assert vega["sha256"] == hashlib.sha256(spectrum_file("vega.txt").read_bytes()).hexdigest()

@@ -41,12 +41,33 @@ def test_numbers_outside_the_tables_bounds_are_refused(galaxies, library, name, 
         sources.galaxies_of(galaxies(**{name: value}), library)
 
 
-@pytest.mark.parametrize(("name", "value"), [("sed", 444), ("mag_h", 41.0), ("a_v", -0.1)])
+@pytest.mark.parametrize(("name", "value"), [("sed", 768), ("mag_h", 41.0), ("a_v", -0.1)])
 def test_impossible_stars_are_refused(stars, stars_library, name, value):
     with pytest.raises(OutOfRange, match=name):
         sources.stars_of(stars(**{name: value}), stars_library)
     with pytest.raises(BadInput, match=f"{name}.*source 2"):
         sources.stars_of(null_at(stars(), name, 2), stars_library)
+
+
+@pytest.mark.parametrize(
+    ("sed", "frac", "name"), [(768, 0.5, "sed_2"), (3, 1.5, "frac_2"), (3, -0.1, "frac_2"), (3, 0.6, "frac_2")]
+)
+def test_impossible_mixtures_are_refused(stars, stars_library, sed, frac, name):
+    """The last has shares that are together more than all."""
+    table = stars(sed_2=sed, frac_2=frac, sed_3=5, frac_3=0.5 if frac == 0.6 else 0.0)
+    with pytest.raises(OutOfRange, match=name):
+        sources.stars_of(table, stars_library)
+
+
+def test_a_mixture_is_what_its_columns_say(stars, stars_library):
+    """Parts without a share may be missing, or null; `sed` has what is left by the others."""
+    table = stars(n=2, sed=[7, 8], sed_2=[1, 2], frac_2=[0.25, 0.0])
+    table = table.append_column("sed_3", pa.array([None, 9])).append_column("frac_3", pa.array([None, 0.125]))
+    found = sources.stars_of(table, stars_library)
+    assert found.frac.tolist() == [[0.75, 0.875], [0.25, 0.0], [0.0, 0.125]]
+    assert found.sed[:, 0].tolist() == [7, 1, 7]
+    assert found.sed[:, 1].tolist() == [8, 8, 9]
+    assert len(found.rows(np.array([1]))) == 1
 
 
 def test_kinds_of_other_libraries_are_refused(galaxies, library):
