@@ -8,7 +8,7 @@ import pyarrow.compute as pc
 import pytest
 
 from jobs.catalogue.galaxies import band_ratios, galaxies, line_light, strong_lenses
-from jobs.catalogue.halos import halos, population
+from jobs.catalogue.halos import halos, matching, population
 from jobs.request.schema import Universe
 from tests.jobs.catalogue.conftest import SEED, SMALL
 
@@ -106,6 +106,16 @@ def test_every_pair_of_limits(dust, cell):
     assert len(pairs) == 12
     for shallow, deep in pairs:
         check(shallow, deep, cell, dust)
+
+
+@pytest.mark.nightly
+def test_the_deepest_and_farthest_request_holds_a_usual_one(dust):
+    deepest = (29.0, min(6.0, matching.Z_LAST))
+    few, some = check((26.0, 2.3), deepest, CELLS[0], dust)
+    many, every = tables(*deepest, CELLS[0], dust)
+    for rows, least in ((many, few), (every, some)):
+        assert rows.num_rows > 3 * least
+        assert np.unique(rows["id"].to_numpy()).size == rows.num_rows
 
 
 def test_hosts_behind_the_end_of_a_request_have_their_satellites_before_it():
