@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 Float = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
+Complex = npt.NDArray[np.complex128]
 Complex64 = npt.NDArray[np.complex64]
 Int = npt.NDArray[np.int64]
 Int32 = npt.NDArray[np.int32]

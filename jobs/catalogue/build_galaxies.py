@@ -39,7 +39,7 @@ from lake_schema.tables.quarantine import QUARANTINE
 
 _HALO_FACTS = ("galaxy_limit", "z_max", "box_cells")
 _LENS_FACTS = ("lensing", "rotation")
-_GALAXY_FACTS = (*_HALO_FACTS, "lensing_nside", *_LENS_FACTS, "high_redshift_boost", "quasar_boost")
+_GALAXY_FACTS = (*_HALO_FACTS, "lensing_nside", "alignment", *_LENS_FACTS, "high_redshift_boost", "quasar_boost")
 
 
 def steps(lake: Path, request: Request) -> list[Step]:

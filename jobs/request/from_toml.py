@@ -5,7 +5,7 @@
     [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
     [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
-                   high_redshift_boost, quasar_boost
+                   high_redshift_boost, quasar_boost, alignment
                    lensing = "box" | "none" | {g1, g2}   a constant reduced shear of all galaxies, frame (east, north)
                    rotation       deg, added to the position angle of every galaxy, before lensing
     [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
@@ -225,6 +225,7 @@ def _universe(table: Toml) -> Universe:
         quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),
         lensing_nside=_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
         lensing=_lensing(table.get("lensing", "box")),
+        alignment=_number(table, "universe.alignment", 0.0, 10.0, default.alignment),
         rotation=_number(table, "universe.rotation", -360.0, 360.0, default.rotation),
     )
 

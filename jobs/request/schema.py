@@ -58,6 +58,8 @@ class Universe:
     lensing                  : (g1, g2), a constant reduced shear of all galaxies in place of the box's lensing, in the
                                frame (east, north): g1 > 0 stretches east-west, g2 > 0 from the south-west to the
                                north-east; None = the box's
+    alignment                : how many times more strongly than in nature galaxies are aligned with the matter about
+                               them, 0 = not at all
     rotation                 : deg, added to the position angle of every galaxy, before lensing
     high_redshift_boost, quasar_boost : how many times denser than in nature these kinds are drawn, 0 = not at all
     """
@@ -67,8 +69,9 @@ class Universe:
     star_limit: float = 26.0
     z_max: float = 2.3
     box_cells: int = 256
-    lensing_nside: int = 512
+    lensing_nside: int = 1024
     lensing: tuple[float, float] | None = None
+    alignment: float = 1.0
     rotation: float = 0.0
     high_redshift_boost: float = 1.0
     quasar_boost: float = 1.0

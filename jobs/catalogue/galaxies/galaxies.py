@@ -18,6 +18,7 @@ import pyarrow as pa
 from jobs.catalogue import dust_map
 from jobs.catalogue.cells import in_order
 from jobs.catalogue.galaxies import (
+    alignments,
     band_ratios,
     emission_lines,
     halo_lensing,
@@ -29,6 +30,7 @@ from jobs.catalogue.galaxies import (
     sed_assignment,
     stellar_mass,
 )
+from jobs.catalogue.galaxies.alignments import Alignments
 from jobs.catalogue.galaxies.band_ratios import BandRatios, Sed
 from jobs.catalogue.galaxies.emission_lines import LineModel
 from jobs.catalogue.galaxies.halo_lensing import Neighbourhood
@@ -46,7 +48,7 @@ from jobs.fluxes.passbands import Passband
 from jobs.keyed import Keyed
 from jobs.request.schema import Universe
 from lake_schema import sky
-from lake_schema.arrays import Bool, Float, Float32, Int
+from lake_schema.arrays import Bool, Complex, Float, Float32, Int
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALO_LIMITS, HALOS
 
@@ -63,6 +65,7 @@ class GalaxyModel:
     band      : the limit's;  rotation : deg, added to every position angle, before lensing
     selection : the limit's band against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
     training  : observed galaxies whose spectra ours have, None = spectra that have the colours
+    alignments : with the matter about galaxies, None = none
     """
 
     limit: float
@@ -70,6 +73,7 @@ class GalaxyModel:
     population: Population
     lens: Lens
     rotation: float
+    alignments: Alignments | None
     luminosities: Schechter
     colours: sed_assignment.Colours
     selection: BandRatios
@@ -123,6 +127,7 @@ def model(
         population=found,
         lens=_lens(found, wanted, far=bool(distant)),
         rotation=wanted.rotation,
+        alignments=alignments.model(found.halos.box, found.halos.turned, wanted.alignment),
         luminosities=luminosity_function.schechter(),
         colours=colours,
         selection=selection,
@@ -183,7 +188,7 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
         "color_gr_01": drawn.colour,
         **physical,
         **sed_assignment.columns(drawn.sed),
-        **_shape_columns(members.id[drawn.row], seed, universe.shapes, drawn, physical["log_stellar_mass"]),
+        **_shape_columns(universe, members, drawn, physical["log_stellar_mass"]),
     }
     rows = [GALAXIES.build(columns)]
     rows += [high_redshift.draw(cell, seed, kind, lens, dust) for kind in universe.distant]
@@ -292,8 +297,9 @@ def _places(
 
 
 def _shape_columns(
-    source: Int, seed: int, shapes: Shapes, drawn: Drawn, log_mass: Float
+    universe: GalaxyModel, members: Members, drawn: Drawn, log_mass: Float
 ) -> dict[str, npt.NDArray[np.generic]]:
+    source, seed, shapes = members.id[drawn.row], universe.population.seed, universe.shapes
     scale = cosmology.kpc_per_arcsec(drawn.z)
     rng = Keyed(source, seed, "galaxies.size")
     radius = morphology.half_light_radius(shapes.size, drawn.z, log_mass, drawn.red, scale, rng)
@@ -312,5 +318,22 @@ def _shape_columns(
         "bulge_axis_ratio": morphology.bulge_axis_ratio(shapes.bulge, drawn.z.size, rng),
         "disk_axis_ratio": disc_ratio,
         "inclination": morphology.inclination(disc_ratio, shapes.scale_height),
-        "position_angle": morphology.position_angle(drawn.z.size, rng),
+        "position_angle": alignments.position_angles(
+            universe.alignments, rng.random(drawn.z.size), _aligned(universe, members, drawn), drawn.red
+        ),
     }
+
+
+def _aligned(universe: GalaxyModel, members: Members, drawn: Drawn) -> Complex:
+    """Mean ellipticities that the places of galaxies ask for."""
+    mean, own = np.zeros(drawn.row.size, complex), universe.alignments
+    if own is None:
+        return mean
+    lone = members.kind[drawn.row] == population.CENTRAL
+    row, red = drawn.row[lone], drawn.red[lone]
+    mean[lone] = alignments.of_centrals(own, members.ra[row], members.dec[row], members.chi[row], drawn.m_r[lone], red)
+    row, red = drawn.row[~lone], drawn.red[~lone]
+    towards, apart = alignments.direction(members.ra[row], members.dec[row], members.host_index[row])
+    radius = universe.population.masses.radius(members.host_mass[row]) / members.chi[row]
+    mean[~lone] = alignments.of_satellites(own, towards, apart / radius, red)
+    return mean

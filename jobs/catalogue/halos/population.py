@@ -49,7 +49,7 @@ class Population:
 class Members:
     """Halos of a cell, and candidate galaxies: centrals, then satellites by host, sorted by index.
 
-    halo_id, host_mass : of each galaxy's halo;  index, ra, dec : order-29 cell and position, deg
+    halo_id, host_mass, host_index : of each galaxy's halo;  index, ra, dec : order-29 cell and position, deg
     """
 
     halos: Halos
@@ -64,6 +64,7 @@ class Members:
     z_obs: Float
     proxy: Float
     host_mass: Float
+    host_index: Int
 
 
 @dataclass(slots=True, eq=False)
@@ -138,13 +139,13 @@ def members(cells: Cells, cell: int) -> Members:
     lit = own.part(own.proxy >= cells.population.halos.mass_limit(own.chi))
     landed = [_landed(cells, order, around, cell) for order in LEVELS for around in _around(order, cell)]
     ra, dec = sky.positions(lit.index)
-    central = (lit.id, lit.id, lit.index, ra, dec, lit.chi, lit.velocity, lit.proxy, lit.log_mass)
+    central = (lit.id, lit.id, lit.index, ra, dec, lit.chi, lit.velocity, lit.proxy, lit.log_mass, lit.index)
     columns = [np.concatenate(column) for column in zip(central, *landed, strict=True)]
     order = np.lexsort((columns[0], columns[2]))
-    source, halo_id, index, ra, dec, chi, velocity, proxy, mass = (column[order] for column in columns)
+    source, halo_id, index, ra, dec, chi, velocity, proxy, mass, home = (column[order] for column in columns)
     z = cells.population.halos.distances.redshift(chi)
     z_obs = observed_redshift(z, velocity)
-    return Members(own, source, halo_id, ids.kind_of(source), index, ra, dec, chi, z, z_obs, proxy, mass)
+    return Members(own, source, halo_id, ids.kind_of(source), index, ra, dec, chi, z, z_obs, proxy, mass, home)
 
 
 def observed_redshift(z: Float, velocity: Float) -> Float:
@@ -170,8 +171,8 @@ def _landed(cells: Cells, order: int, around: int, cell: int) -> tuple[npt.NDArr
     found, index = found.part(inside), index[inside]
     halo = hosts.id[found.host]
     source = ids.satellite_id(halo, found.member, hosts.bits[found.host])
-    mass = hosts.log_mass[found.host]
-    return source, halo, index, found.ra, found.dec, found.chi, found.velocity, found.proxy, mass
+    mass, home = hosts.log_mass[found.host], hosts.index[found.host]
+    return source, halo, index, found.ra, found.dec, found.chi, found.velocity, found.proxy, mass, home
 
 
 def _near(found: Satellites, cell: int) -> Bool:

@@ -63,17 +63,22 @@ def sample():
     )
 
 
-def test_mean_convergence_and_its_least(sample):
-    """Weighted by 1 / magnification^-1 as places behind are, the mean is 0; no line of sight is emptier than empty."""
+def magnification(sample):
+    """Of each source; 0 at a caustic."""
     shear = sample.by_box + sample.by_halos
     determinant = sources.determinant(sample.kappa, shear.real, shear.imag)
     good = (determinant > 0.05) & (sample.kappa < 1)
-    weight = np.where(good, 1 / np.where(good, determinant, 1), 0)
+    return np.where(good, 1 / np.where(good, determinant, 1), 0)
+
+
+def test_mean_convergence_and_its_least(sample):
+    """Where places count alike, those of images, the mean is 0; and no line of sight is emptier than empty."""
+    weight = magnification(sample)
     patch = np.arange(weight.size) * 64 // weight.size
     mean = np.bincount(patch, sample.kappa * weight) / np.bincount(patch, weight)
     assert abs(mean.mean()) < 3 * mean.std(ddof=1) / 8
     assert -0.067 < sample.kappa.min() < -0.02
-    assert np.mean(~good) < 1e-4
+    assert np.mean(weight == 0) < 1e-4
 
 
 # ------------------------------------------------------------------------------------------------ about halos
@@ -118,10 +123,10 @@ def test_shear_about_halos(sample, low, high):
 # ------------------------------------------------------------------------------------------------ correlations
 
 
-def correlations(place, gamma):
+def correlations(place, gamma, weight):
     """xi+, xi- of shear at places [2, n] arcmin of a plane: pair by pair up to 3.7', of pixels beyond."""
-    pairs, (plus, minus) = pixelised(place, gamma)
-    count, near = np.zeros(2), np.zeros((2, 2))
+    pairs, (plus, minus) = pixelised(place, gamma, weight)
+    count, near, gamma = np.zeros(2), np.zeros((2, 2)), gamma * weight
     for cut in np.array_split(np.arange(gamma.size), 64):
         one, other = cKDTree(place[:, cut].T).query_pairs(EDGES[2], output_type="ndarray").T
         dx, dy = place[:, cut[other]] - place[:, cut[one]]
@@ -129,13 +134,13 @@ def correlations(place, gamma):
         turned = gamma[cut[one]] * gamma[cut[other]] * np.exp(-4j * np.arctan2(dy, dx))
         values = (gamma[cut[one]] * np.conj(gamma[cut[other]])).real, turned.real
         near += [np.bincount(ring[ring >= 0], value[ring >= 0], 2) for value in values]
-        count += np.bincount(ring[ring >= 0], minlength=2)
+        count += np.bincount(ring[ring >= 0], (weight[cut[one]] * weight[cut[other]])[ring >= 0], 2)
     plus[:2], minus[:2] = near / count
     assert np.all(pairs > 0)
     return plus, minus
 
 
-def pixelised(place, gamma):
+def pixelised(place, gamma, weight):
     """(pairs, (xi+, xi-)) by ring, from Fourier transforms of sums in pixels."""
     at = ((place - place.min(1, keepdims=True)) / PIXEL).astype(int)
     shape = [fft.next_fast_len(int(n) + int(1.1 * EDGES[-1] / PIXEL)) for n in at.max(1) + 1]
@@ -151,7 +156,7 @@ def pixelised(place, gamma):
     ring = np.digitize(np.hypot(x[:, None], y[None]), EDGES) - 1
     inside = (ring >= 0) & (ring < EDGES.size - 1)
     ring, phase = ring[inside], np.exp(-4j * np.arctan2(y[None], x[:, None])[inside])
-    number, field, mirrored = (transformed(values) for values in (np.ones(gamma.size), gamma, np.conj(gamma)))
+    number, field, mirrored = (transformed(weight * values) for values in (1.0 + 0.0 * gamma, gamma, np.conj(gamma)))
     maps = (number * np.conj(number), field * np.conj(field), field * np.conj(mirrored))
     pairs, plus, minus = (fft.ifft2(one)[inside] for one in maps)
     pairs, plus, minus = (np.bincount(ring, one.real) for one in (pairs, plus, minus * phase))
@@ -167,19 +172,26 @@ def expected(ell, c_l):
 
 
 def test_correlations_of_shear_are_those_of_non_linear_theory(sample):
-    """xi+ within 15 %, xi- within 20 % for 1.3' to 83'; the variance of the box is replaced by its theory."""
+    """As a screen has them, whose places count alike: sources are weighted by their magnification.
+
+    xi+ within 15 % from 2' to 120' (20 % below), xi- within 15 % from 15' (25 % below); the variance of the box is
+    replaced by its theory. On 215 deg2 clusters make an error of 3 % at 5' to 10'.
+    """
     centre = sample.frame[:, 2].mean(0)
     lon, lat = np.degrees([np.arctan2(centre[1], centre[0]), np.arctan2(centre[2], np.hypot(*centre[:2]))])
     frame = halo_lensing._frames(np.array([lon]), np.array([lat]))[0]
     place = halo_lensing._stereographic(frame, sample.frame[:, 2]) / ARCMIN
     turn = sample.frame[:, 0] @ frame[0] + 1j * (sample.frame[:, 0] @ frame[1])
     turn = (turn / np.abs(turn)) ** 2
-    whole, of_box = (correlations(place, gamma * turn) for gamma in (sample.by_box + sample.by_halos, sample.by_box))
+    whole, of_box = (
+        correlations(place, gamma * turn, magnification(sample))
+        for gamma in (sample.by_box + sample.by_halos, sample.by_box)
+    )
     ell = np.unique(np.geomspace(5, 3e5, 500))
     linear = nonlinear.convergence(ell, CHI, nonlinear.linear)
     box, wanted = expected(ell, np.where(ell < 1.5 * NSIDE, linear, 0)), expected(ell, nonlinear.convergence(ell, CHI))
     plus, minus = (
         (one - other + mean) / theory for one, other, mean, theory in zip(whole, of_box, box, wanted, strict=True)
     )
-    assert plus == pytest.approx(np.ones(7), abs=0.15)
-    assert minus == pytest.approx(np.ones(7), abs=0.20)
+    assert np.all(np.abs(plus - 1) < [0.20, *[0.15] * 6])
+    assert np.all(np.abs(minus - 1) < [*[0.25] * 4, *[0.15] * 3])
