@@ -2,8 +2,8 @@
 
     python -m scripts.make_docs [--out out/site] [--notebooks]
 
---notebooks runs them (on the lake that `make demo` leaves in out/demo); without it they are shown as they are kept,
-without figures. Nothing is downloaded.
+--notebooks runs them (on the lake that `make demo` leaves in out/demo), and takes pictures of the page over that lake;
+without it they are shown as they are kept, without figures. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from nbconvert import MarkdownExporter
 from sphinx.application import Sphinx
 
 from lake_schema.mission.configuration import resolve
-from scripts import docs_references
+from scripts import docs_references, page_pictures
 
 ROOT = Path(__file__).resolve().parents[1]
 # Chapters of the site: title, pages.  Those of docs/ that none names tell how to do something.
@@ -89,6 +89,8 @@ def pages(into: Path, run: bool) -> None:
     for name, text in made.items():
         (into / name).write_text(text, encoding="utf-8")
     tutorials = notebooks(into, run)
+    if run:
+        _with_pictures(into)
     named = {page for _, names in CHAPTERS for page in names} | {"index.md"}
     listed = {"notebooks": tutorials, "others": sorted({path.name for path in into.glob("*.md")} - named)}
     for path in into.glob("*.md"):
@@ -99,6 +101,16 @@ def pages(into: Path, run: bool) -> None:
         for title, names in CHAPTERS:
             entries = [page for name in names for page in listed.get(name, [name])]
             home.write("\n".join(["", "```{toctree}", f":caption: {title}", ":hidden:", "", *entries, "```", ""]))
+
+
+def _with_pictures(into: Path) -> None:
+    """The page over a lake as a browser shows it, where there is one."""
+    if why := page_pictures.missing():
+        print(f"docs: no pictures of the page: {why}")
+        return
+    with (into / "page.md").open("a", encoding="utf-8") as page:
+        for name, caption in page_pictures.pictures(into):
+            page.write(f"\n![{caption}]({name})\n\n*{caption}.*\n")
 
 
 def build(source: Path, out: Path) -> int:

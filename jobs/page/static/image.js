@@ -1,9 +1,11 @@
 // Images: tiles of every product, stretched and coloured by the graphics processor; the truth on them.
 
 import * as api from "/static/api.js";
-import { NAMES, ink, lutTexture, program } from "/static/colour.js";
+import { NAMES, lutTexture, program } from "/static/colour.js";
 import { pin, pinned, onPin } from "/static/pin.js";
+import { colourOf, compass, radiusOf, scaleOf } from "/static/marks.js";
 import { Plate } from "/static/sphere.js";
+import { Tiles } from "/static/tiles.js";
 
 const $ = (id) => document.getElementById(id);
 const VERTEX = `in vec2 corner; uniform mat3 toScreen; uniform vec4 box; out vec2 at;
@@ -23,11 +25,11 @@ void main() {
   colour = isnan(v) ? vec4(0.25, 0.0, 0.25, 1.0) : texture(colours, vec2(clamp(t, 0.0, 1.0), 0.5));
 }`;
 const STRETCHES = ["asinh", "linear", "log", "sqrt"];
-// Tiles that are kept, 1 MB each; sigmas at which asinh turns from linear to logarithmic; milliseconds of a blink.
-const MOST_TILES = 120, KNEE = 4, BLINK_MS = 750;
+// Sigmas at which asinh turns from linear to logarithmic; milliseconds of a blink.
+const KNEE = 4, BLINK_MS = 750;
 const view = { one: -1, two: -1, x: 0, y: 0, zoom: 0 };
-const opened = new Map(), truths = new Map(), tiles = new Map();
-let page, list = null, gl, drawing, quad, colours, other = false, blinking = null, wanted = null, asked = false, hovered = null;
+const opened = new Map(), truths = new Map();
+let page, list = null, gl, drawing, quad, colours, other = false, blinking = null, wanted = null, asked = false, hovered = null, tiles;
 
 export function start(given) {
   page = given;
@@ -35,6 +37,7 @@ export function start(given) {
   gl = canvas.getContext("webgl2");
   if (!gl) return;
   drawing = program(gl, VERTEX, FRAGMENT);
+  tiles = new Tiles(gl, redraw);
   quad = gl.createBuffer();
   gl.bindBuffer(gl.ARRAY_BUFFER, quad);
   gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([0, 0, 1, 0, 0, 1, 1, 1]), gl.STATIC_DRAW);
@@ -116,48 +119,10 @@ async function choose(number, place = null, same = false) {
   redraw();
 }
 
-const scaleOf = (image) => {
-  const a = image.plate.plane(image.nx / 2, image.ny / 2), b = image.plate.plane(image.nx / 2 + 1, image.ny / 2);
-  return Math.hypot(a[0] - b[0], a[1] - b[1]);
-};
-
 function whole(image = opened.get(view.one)) {
   const canvas = $("image-canvas");
   Object.assign(view, { x: (image.nx - 1) / 2, y: (image.ny - 1) / 2, zoom: 0.98 * Math.min(canvas.clientWidth / image.nx, canvas.clientHeight / image.ny) });
   redraw();
-}
-
-// ---------------------------------------------------------------------------------------------- tiles
-
-function tile(image, level, row, column, mended) {
-  const name = [image.number, mended, level, row, column].join("/");
-  const known = tiles.get(name);
-  if (known) {
-    tiles.delete(name);
-    tiles.set(name, known);
-    return known;
-  }
-  const width = Math.min(image.tile, image.levels[level][0] - column * image.tile), height = Math.min(image.tile, image.levels[level][1] - row * image.tile);
-  const made = { width, height, texture: null, data: null };
-  tiles.set(name, made);
-  api.bytes(`tile/${image.number}/${level}/${row}/${column}${mended ? "?mended=1" : ""}`).then((buffer) => {
-    made.data = new Float32Array(buffer);
-    made.texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, made.texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32F, width, height, 0, gl.RED, gl.FLOAT, made.data);
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
-    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
-    redraw();
-  }).catch((error) => {
-    tiles.delete(name);
-    api.say(error.message, true);
-  });
-  for (const [old, value] of tiles) {
-    if (tiles.size <= MOST_TILES) break;
-    if (value.texture) gl.deleteTexture(value.texture);
-    tiles.delete(old);
-  }
-  return made;
 }
 
 // ---------------------------------------------------------------------------------------------- drawing
@@ -229,7 +194,7 @@ function drawLevel(image, level, [width, height], [a, b, c, d, e, f], box) {
   const [c0, c1] = range(0, Math.ceil(image.levels[level][0] / image.tile)), [r0, r1] = range(1, Math.ceil(image.levels[level][1] / image.tile));
   for (let row = r0; row <= r1; row++) {
     for (let column = c0; column <= c1; column++) {
-      const found = tile(image, level, row, column, mended);
+      const found = tiles.get(image, level, row, column, mended);
       if (!found.texture) continue;
       gl.bindTexture(gl.TEXTURE_2D, found.texture);
       gl.uniform4f(box, column * step - 0.5, row * step - 0.5, found.width * size, found.height * size);
@@ -254,7 +219,7 @@ function marks() {
         if (p[0] < -20 || p[1] < -20 || p[0] > width + 20 || p[1] > height + 20) return;
         c.strokeStyle = colourOf(truth.kind[k]);
         c.beginPath();
-        c.arc(...p, Math.min(28, 3 + 1.6 * Math.log10(1 + truth.expected[k])), 0, 7);
+        c.arc(...p, radiusOf(truth.expected[k]), 0, 7);
         c.stroke();
       });
     }
@@ -271,30 +236,7 @@ function marks() {
     }
     c.stroke();
   }
-  compass(c, image, at, width, height);
-}
-
-const colourOf = (kind) => ({ star: "#9fd3ff", QSO: "#d9a7ff", "strong lens": "#9be0a8", "moving body": "#ff9a8d" })[kind] ?? "#ffd27d";
-
-function compass(c, image, at, width, height) {
-  const x = view.x, y = view.y, [a0, d0] = image.plate.sky(x, y), pixel = scaleOf(image) * 3600, o = at(x, y);
-  c.font = "12px DejaVu Sans, sans-serif";
-  c.lineWidth = 1.5;
-  c.strokeStyle = c.fillStyle = "#e8e6df";
-  c.textAlign = "center";
-  for (const [name, da, dd] of [["N", 0, 1], ["E", 1, 0]]) {
-    const q = image.plate.pixel(a0 + (da * 0.001) / Math.cos((d0 * Math.PI) / 180), d0 + dd * 0.001);
-    const p = at(...q), size = Math.hypot(p[0] - o[0], p[1] - o[1]) || 1, u = [(p[0] - o[0]) / size, (p[1] - o[1]) / size], from = [width - 58, height - 58];
-    c.beginPath();
-    c.moveTo(...from);
-    c.lineTo(from[0] + 30 * u[0], from[1] + 30 * u[1]);
-    c.stroke();
-    c.fillText(name, from[0] + 40 * u[0], from[1] + 40 * u[1] + 4);
-  }
-  const nice = [0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200].filter((s) => (s / pixel) * view.zoom < width / 4).pop() ?? 0.5;
-  const long = (nice / pixel) * view.zoom;
-  c.fillRect(width - 110 - long, height - 22, long, 2);
-  c.fillText(nice >= 60 ? `${nice / 60}′` : `${nice}″`, width - 110 - long / 2, height - 28);
+  compass(c, image, view, at, [width, height]);
 }
 
 function sourcesOf(image) {
@@ -332,16 +274,8 @@ function moved(event) {
 }
 
 function valueAt(image, x, y) {
-  const mended = image.is_mendable && $("image-mended").checked;
-  for (let level = 0; level < image.levels.length; level++) {
-    const u = Math.floor(x / 2 ** level), v = Math.floor(y / 2 ** level);
-    const found = tiles.get([image.number, mended, level, Math.floor(v / image.tile), Math.floor(u / image.tile)].join("/"));
-    if (found?.data) {
-      const value = found.data[(v % image.tile) * found.width + (u % image.tile)];
-      return `${api.number(value, 5)} ${image.unit}${level ? `, mean of ${4 ** level} pixels` : ""}`;
-    }
-  }
-  return "";
+  const found = tiles.value(image, x, y, image.is_mendable && $("image-mended").checked);
+  return found ? `${api.number(found.value, 5)} ${image.unit}${found.level ? `, mean of ${4 ** found.level} pixels` : ""}` : "";
 }
 
 function tip(event, image, x, y) {
@@ -382,13 +316,16 @@ function zoom(by, event) {
 }
 
 async function pinAt(x, y) {
-  const image = current(), near = truths.get(image.number);
-  let id = null, least = 8 / view.zoom + 2;
-  if (near) near.x.forEach((sx, k) => {
-    const away = Math.hypot(sx - x, near.y[k] - y);
-    if (away < least) [id, least] = [near.id[k], away];
-  });
+  const image = current();
+  let id = null, least = 1;
   try {
+    if (!truths.get(image.number)) truths.set(image.number, await api.get(`truth/${image.number}`));
+    const near = truths.get(image.number);
+    // Of sources side by side the brighter one is meant: the distance counts in radii of its mark.
+    near.x.forEach((sx, k) => {
+      const away = (Math.hypot(sx - x, near.y[k] - y) * view.zoom) / (6 + 2 * radiusOf(near.expected[k]));
+      if (away < least) [id, least] = [near.id[k], away];
+    });
     if (!id) {
       const [ra, dec] = image.plate.sky(x, y);
       id = (await api.get(`nearest?${new URLSearchParams({ ra, dec, radius: Math.max(3, 8 / view.zoom) * scaleOf(image) })}`)).id;

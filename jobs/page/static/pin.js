@@ -87,7 +87,8 @@ function drawSpectrum(panel, found) {
   const [width, height, ratio] = api.fit(canvas), c = canvas.getContext("2d"), x0 = 44, x1 = width - 6, y0 = height - 32, y1 = 14;
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
   c.font = "11px DejaVu Sans, sans-serif";
-  const low = Math.log(found.wavelength[0]), high = Math.log(found.wavelength.at(-1)), x = (l) => x0 + ((Math.log(l) - low) / (high - low)) * (x1 - x0);
+  const bright = found.f_lambda.reduce((a, b) => Math.max(a, b), 0), begin = Math.max(0, found.f_lambda.findIndex((f) => f > 1e-3 * bright));
+  const low = Math.log(found.wavelength[begin]), high = Math.log(found.wavelength.at(-1)), x = (l) => x0 + ((Math.log(l) - low) / (high - low)) * (x1 - x0);
   const sorted = [...found.f_lambda].sort((a, b) => a - b), top = Math.min(sorted.at(-1), 3 * sorted[Math.floor(0.99 * sorted.length)]) * 1.05 || 1;
   const y = (f) => y0 - Math.min(1, f / top) * (y0 - y1);
   for (const band of found.bands) {
@@ -109,7 +110,7 @@ function drawSpectrum(panel, found) {
   c.strokeStyle = ink("accent");
   c.lineWidth = 1;
   c.beginPath();
-  found.wavelength.forEach((l, k) => (k ? c.lineTo(x(l), y(found.f_lambda[k])) : c.moveTo(x(l), y(found.f_lambda[k]))));
+  found.wavelength.forEach((l, k) => k >= begin && (k > begin ? c.lineTo(x(l), y(found.f_lambda[k])) : c.moveTo(x(l), y(found.f_lambda[k]))));
   c.stroke();
   c.fillStyle = c.strokeStyle = ink("quiet");
   // Of lines that lie close the one that is named first in the table has the room.

@@ -3,6 +3,7 @@
 
 import * as api from "/static/api.js";
 import { ink, lut } from "/static/colour.js";
+import { columnsOf, sources, suggested } from "/static/suggestions.js";
 
 const $ = (id) => document.getElementById(id);
 const BINS = 120, MAP_BINS = 96, CUBE_BINS = 256, CUBE_MAP_BINS = 32;
@@ -43,29 +44,9 @@ export function usePlot(rows, lists) {
 
 let built = false;
 
-function sources() {
-  const names = api.lake.tables.map((table) => table.name);
-  const joined = [["galaxies", "galaxy_fluxes"], ["stars", "star_fluxes"]].filter((pair) => pair.every((name) => names.includes(name)));
-  return [...names, ...joined.map(([a, b]) => `${a} JOIN ${b} USING (id)`)];
-}
-
 function usual() {
   const name = ["galaxies", "stars"].find((own) => api.lake.tables.some((table) => table.name === own)) ?? api.lake.tables[0]?.name;
   if (name) usePlot(name, suggested(name));
-}
-
-function suggested(rows) {
-  if (rows.startsWith("galaxies")) {
-    const flux = rows.includes("galaxy_fluxes") ? columnsOf(rows).find((c) => c.name.startsWith("f_nu_")) : null;
-    return flux ? [["z_obs"], [`mag_ab(${flux.name})`], ["color_gr_01"], [`mag_ab(${flux.name})`, "color_gr_01"]]
-      : [["z_obs"], ["mag_r01"], ["color_gr_01"], ["log_stellar_mass"], ["z_obs", "mag_r01"], ["abs_mag_r01", "color_gr_01"]];
-  }
-  const numbers = columnsOf(rows).filter((c) => /int|float|double/.test(c.type) && !/^list|(^|_)id$|^_healpix/.test(`${c.type}`) && !/(^|_)id$|^_healpix/.test(c.name)).map((c) => `"${c.name}"`);
-  return [...numbers.slice(0, 4).map((name) => [name]), ...(numbers.length > 1 ? [numbers.slice(0, 2)] : [])];
-}
-
-function columnsOf(rows) {
-  return api.lake.tables.filter((table) => new RegExp(`(^|[^\\w.])${table.name}($|[^\\w])`).test(rows)).flatMap((table) => table.columns);
 }
 
 function facts(expression) {
@@ -109,21 +90,28 @@ function limits(except = null) {
   return [...found].map(([at, [lo, hi]]) => [at, lo, hi]);
 }
 
+/** Axes whose limits do not hold in a chart: those that it alone limits. */
+function own(chart) {
+  const names = axes(), of = (one) => (one.brush ? one.axes.map((axis) => names.indexOf(sqlOf(axis))) : []);
+  const others = charts.filter((one) => one !== chart).flatMap(of);
+  return of(chart).filter((axis) => !others.includes(axis));
+}
+
 function bins(chart) {
   return chart.axes.length > 1 ? [MAP_BINS, MAP_BINS] : [BINS];
 }
 
 const ask = api.newest(async () => {
   if (!charts.length) return;
-  const started = performance.now(), own = charts, names = axes();
+  const started = performance.now(), shown = charts, names = axes();
   const buffer = await api.post("charts", {
     source, where: where || "true", axes: names, part, limits: limits(),
-    charts: own.map((chart) => ({ axes: chart.axes.map((axis) => names.indexOf(sqlOf(axis))), bins: bins(chart), spans: chart.spans })),
+    charts: shown.map((chart) => ({ axes: chart.axes.map((axis) => names.indexOf(sqlOf(axis))), bins: bins(chart), spans: chart.spans, own: own(chart) })),
   });
-  if (own !== charts) return;
+  if (shown !== charts) return;
   let at;
   [head, at] = api.headed(buffer);
-  own.forEach((chart, k) => {
+  shown.forEach((chart, k) => {
     const about = head.charts[k], size = about.bins.reduce((a, b) => a * b);
     chart.counts = new Uint32Array(buffer, at, size);
     chart.spans = about.spans;
@@ -154,9 +142,9 @@ async function hold(chart) {
   const names = axes(), axis = names.indexOf(sqlOf(chart.axes[0])), others = charts.filter((one) => one !== chart);
   if (chart.axes.length > 1 || !others.length || !chart.spans) return;
   const asked = others.map((one) => {
-    const own = one.axes.map((a) => names.indexOf(sqlOf(a)));
-    return { axes: [axis, ...own], own: [axis, ...own], spans: [chart.spans[0], ...one.spans],
-      bins: [CUBE_BINS, ...(own.length > 1 ? [CUBE_MAP_BINS * 3, CUBE_MAP_BINS * 3] : [BINS])] };
+    const places = one.axes.map((a) => names.indexOf(sqlOf(a)));
+    return { axes: [axis, ...places], own: own(one), spans: [chart.spans[0], ...one.spans],
+      bins: [CUBE_BINS, ...(places.length > 1 ? [CUBE_MAP_BINS * 3, CUBE_MAP_BINS * 3] : [BINS])] };
   });
   if (asked.some((one) => one.bins.reduce((a, b) => a * b) > 8e6)) return;
   const held = drag;
@@ -297,11 +285,7 @@ function drawAxes(chart, f, span, [ySpan, yLabel]) {
   c.strokeStyle = ink("line");
   c.fillStyle = ink("quiet");
   c.lineWidth = 1;
-  c.beginPath();
-  c.moveTo(f.x0, f.y1);
-  c.lineTo(f.x0, f.y0);
-  c.lineTo(f.x1, f.y0);
-  c.stroke();
+  c.stroke(new Path2D(`M${f.x0} ${f.y1}V${f.y0}H${f.x1}`));
   c.textAlign = "center";
   for (const tick of api.ticks(...span, (f.x1 - f.x0) / 70)) {
     const x = f.x0 + ((tick - span[0]) / (span[1] - span[0])) * (f.x1 - f.x0);
@@ -391,9 +375,9 @@ function nudge(chart, event) {
 // ---------------------------------------------------------------------------------------------- as text
 
 function conditions() {
-  const own = charts.filter((chart) => chart.brush).flatMap((chart) => chart.axes.map((axis, k) =>
+  const brushed = charts.filter((chart) => chart.brush).flatMap((chart) => chart.axes.map((axis, k) =>
     `(${sqlOf(axis)})::FLOAT BETWEEN ${chart.brush[k][0]} AND ${chart.brush[k][1]}`));
-  return [...(where ? [`(${where})`] : []), ...own].join("\n  AND ") || "true";
+  return [...(where ? [`(${where})`] : []), ...brushed].join("\n  AND ") || "true";
 }
 
 function query() {

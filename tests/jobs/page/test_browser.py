@@ -124,6 +124,8 @@ def test_brushes_filter_the_other_charts(tab, shown):
     inside = (z >= brush[0]) & (z <= brush[1]) & (mag >= spans[0]) & (mag <= spans[1])
     assert 0 < inside.sum() < GALAXIES_N
     assert tab.evaluate(ranges)[1].replace("\N{NARROW NO-BREAK SPACE}", "").startswith(f"{inside.sum()} rows")
+    # The map of the same column against another is cut, too.
+    assert tab.evaluate(ranges)[4] != whole[4]
     tab.locator("#plot-grid canvas").first.focus()
     tab.keyboard.press("Escape")
     until(tab, f"{ranges}[1] === {whole[1]!r}")

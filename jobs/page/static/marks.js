@@ -1,0 +1,34 @@
+// What is drawn over an image: marks of sources, a compass, a scale.
+
+/** Of the mark of a source of so many electrons, pixels of the screen. */
+export const radiusOf = (electrons) => Math.min(28, 3 + 1.6 * Math.log10(1 + Math.max(0, electrons)));
+
+export const colourOf = (kind) => ({ star: "#9fd3ff", QSO: "#d9a7ff", "strong lens": "#9be0a8", "moving body": "#ff9a8d" })[kind] ?? "#ffd27d";
+
+/** Size of a pixel of an image, deg. */
+export function scaleOf(image) {
+  const a = image.plate.plane(image.nx / 2, image.ny / 2), b = image.plate.plane(image.nx / 2 + 1, image.ny / 2);
+  return Math.hypot(a[0] - b[0], a[1] - b[1]);
+}
+
+/** North and east as they are at the centre of the view, and a bar of a round angle; `at`: pixels -> screen. */
+export function compass(c, image, view, at, [width, height]) {
+  const x = view.x, y = view.y, [a0, d0] = image.plate.sky(x, y), pixel = scaleOf(image) * 3600, o = at(x, y);
+  c.font = "12px DejaVu Sans, sans-serif";
+  c.lineWidth = 1.5;
+  c.strokeStyle = c.fillStyle = "#e8e6df";
+  c.textAlign = "center";
+  for (const [name, da, dd] of [["N", 0, 1], ["E", 1, 0]]) {
+    const q = image.plate.pixel(a0 + (da * 0.001) / Math.cos((d0 * Math.PI) / 180), d0 + dd * 0.001);
+    const p = at(...q), size = Math.hypot(p[0] - o[0], p[1] - o[1]) || 1, u = [(p[0] - o[0]) / size, (p[1] - o[1]) / size], from = [width - 58, height - 58];
+    c.beginPath();
+    c.moveTo(...from);
+    c.lineTo(from[0] + 30 * u[0], from[1] + 30 * u[1]);
+    c.stroke();
+    c.fillText(name, from[0] + 40 * u[0], from[1] + 40 * u[1] + 4);
+  }
+  const nice = [0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200].filter((s) => (s / pixel) * view.zoom < width / 4).pop() ?? 0.5;
+  const long = (nice / pixel) * view.zoom;
+  c.fillRect(width - 110 - long, height - 22, long, 2);
+  c.fillText(nice >= 60 ? `${nice / 60}′` : `${nice}″`, width - 110 - long / 2, height - 28);
+}

@@ -1,0 +1,26 @@
+// What there is to plot: sources of rows, their columns, and charts to begin with.
+
+import * as api from "/static/api.js";
+
+/** Tables, and those that belong together joined. */
+export function sources() {
+  const names = api.lake.tables.map((table) => table.name);
+  const joined = [["galaxies", "galaxy_fluxes"], ["stars", "star_fluxes"]].filter((pair) => pair.every((name) => names.includes(name)));
+  return [...names, ...joined.map(([a, b]) => `${a} JOIN ${b} USING (id)`)];
+}
+
+/** Expressions of the axes of each chart to begin with. */
+export function suggested(rows) {
+  if (rows.startsWith("galaxies")) {
+    const flux = rows.includes("galaxy_fluxes") ? columnsOf(rows).find((c) => c.name.startsWith("f_nu_")) : null;
+    return flux ? [["z_obs"], [`mag_ab(${flux.name})`], ["color_gr_01"], [`mag_ab(${flux.name})`, "color_gr_01"]]
+      : [["z_obs"], ["mag_r01"], ["color_gr_01"], ["log_stellar_mass"], ["z_obs", "mag_r01"], ["abs_mag_r01", "color_gr_01"]];
+  }
+  const numbers = columnsOf(rows).filter((c) => /int|float|double/.test(c.type) && !/^list|(^|_)id$|^_healpix/.test(`${c.type}`) && !/(^|_)id$|^_healpix/.test(c.name)).map((c) => `"${c.name}"`);
+  return [...numbers.slice(0, 4).map((name) => [name]), ...(numbers.length > 1 ? [numbers.slice(0, 2)] : [])];
+}
+
+/** Columns of all the tables that a source of rows names. */
+export function columnsOf(rows) {
+  return api.lake.tables.filter((table) => new RegExp(`(^|[^\\w.])${table.name}($|[^\\w])`).test(rows)).flatMap((table) => table.columns);
+}

@@ -1,0 +1,143 @@
+"""Pictures of the page over the lake of `make demo`, for the documentation: python -m scripts.page_pictures FOLDER.
+
+They are taken in a chromium of the system's, driven by playwright (extra `browser`); without these there are none.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+LAKE = ROOT / "out" / "demo" / "lake"
+CHROMIUM = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
+_TOKEN, _SIZE, _LONGEST = "a-token-of-the-pictures", {"width": 1400, "height": 860}, 60.0
+
+
+def missing() -> str:
+    """What there is not, "" where pictures can be taken."""
+    if importlib.util.find_spec("playwright") is None:
+        return "playwright is not installed (make .venv/installed-browser)"
+    if CHROMIUM is None:
+        return "there is no chromium (Debian: apt install chromium)"
+    return "" if LAKE.is_dir() else f"there is no {LAKE} (make demo)"
+
+
+@contextmanager
+def served(lake: Path) -> Iterator[str]:
+    """Address of a page over a lake, while the block lasts."""
+    command = [sys.executable, "-m", "jobs.page", str(lake), "--no-open", "--token", _TOKEN]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            yield server.stdout.readline().split()[-1]
+        finally:
+            server.terminate()
+
+
+def until(tab: Any, expression: str) -> Any:
+    """Wait until JavaScript says something that is true; a page that refuses eval can be waited for only so."""
+    end = time.monotonic() + _LONGEST
+    while not (value := tab.evaluate(expression)):
+        if time.monotonic() > end:
+            raise TimeoutError(expression)
+        time.sleep(0.05)
+    return value
+
+
+def _sky(tab: Any) -> None:
+    until(tab, "document.getElementById('sky-legend').textContent !== ''")
+    time.sleep(2.0)
+
+
+def _plots(tab: Any) -> None:
+    until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
+    box = tab.locator("#plot-grid canvas").first.bounding_box()
+    tab.mouse.move(box["x"] + 0.35 * box["width"], box["y"] + 80)
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 80, steps=6)
+    tab.mouse.up()
+    time.sleep(1.5)
+
+
+def _sql(tab: Any) -> None:
+    until(tab, "document.querySelectorAll('#sql-result td').length > 0")
+    tab.locator("#sql-schema details summary").nth(2).click()
+
+
+def _images(tab: Any) -> None:
+    until(tab, "document.getElementById('image-one').childElementCount > 0")
+    tab.check("#image-truth")
+    time.sleep(4.0)
+    box = tab.locator("#image-canvas").bounding_box()
+    # A bright star, and a galaxy beside it.
+    x, y = box["x"] + 0.755 * box["width"], box["y"] + 0.823 * box["height"]
+    tab.mouse.move(x, y)
+    for _ in range(8):
+        tab.mouse.wheel(0, -120)
+        time.sleep(0.15)
+    time.sleep(1.5)
+    tab.mouse.click(x, y)
+    until(tab, "document.querySelectorAll('#pin .cutouts canvas').length > 0")
+    until(tab, "document.querySelector('#pin canvas.spectrum') !== null")
+    time.sleep(2.0)
+
+
+def _runs(tab: Any) -> None:
+    until(tab, "document.querySelectorAll('#runs-content h2').length > 2")
+    tab.locator("#runs-content details summary").first.click()
+    time.sleep(1.0)
+
+
+VIEWS: tuple[tuple[str, str, Callable[[Any], None]], ...] = (
+    ("sky", "Galaxies a square degree, and what of the sky is observed", _sky),
+    ("plots", "Histograms and maps under a brush in redshift", _plots),
+    ("sql", "A query, with the names that it can use", _sql),
+    ("images", "A VIS image without its cosmic rays, the true sources on it, one of them pinned", _images),
+    ("runs", "What the jobs took, and what an image was made of", _runs),
+)
+
+
+def pictures(into: Path) -> list[tuple[str, str]]:
+    """Take them; returns file names and captions.  Errors: RuntimeError where the page has an error"""
+    from playwright.sync_api import sync_playwright
+
+    taken = []
+    faults: list[str] = []
+    with served(LAKE) as address, sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        tab = browser.new_page(viewport=_SIZE)
+        tab.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+        tab.on("pageerror", lambda error: faults.append(str(error)))
+        tab.goto(address)
+        until(tab, "document.body.dataset.ready === '1'")
+        for name, caption, show in VIEWS:
+            tab.click(f"#tab-{name}")
+            show(tab)
+            tab.screenshot(path=into / f"page_{name}.png")
+            taken.append((f"page_{name}.png", caption))
+        browser.close()
+    if faults:
+        raise RuntimeError(f"the page has errors: {faults}")
+    return taken
+
+
+def main() -> None:
+    if why := missing():
+        raise SystemExit(f"truesky: {why}")
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, _ in pictures(folder):
+        print(folder / name)
+
+
+if __name__ == "__main__":
+    main()
