@@ -168,12 +168,14 @@ def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -
     z, ebv : float[n] redshift, E(B-V) mag;  template, law : int[n]
     table  : of `build`
     """
-    step = np.log1p(z) / _STEP
-    row = np.clip(step.astype(np.int64), 0, table.values.shape[0] - 2)
-    part = (step - row)[:, None]
-    curve = np.maximum(law, 1) - 1
-    nodes = (1.0 - part) * table.values[row, curve, template] + part * table.values[row + 1, curve, template]
-    return np.asarray(np.sum(nodes * ebv_weights(table.ebv, np.where(law > 0, ebv, 0.0)), axis=1))
+    # Compiled code is imported where it is wanted.
+    from jobs.catalogue.galaxies import ratio_sums
+
+    redshift, dust = np.ascontiguousarray(z, np.float64), np.ascontiguousarray(ebv, np.float64)
+    kinds = np.ascontiguousarray(template, np.int64), np.ascontiguousarray(law, np.int64)
+    out = np.empty(redshift.size)
+    ratio_sums.ln_ratios(table.values, _STEP, table.ebv, redshift, *kinds, dust, out)
+    return out
 
 
 def ebv_weights(nodes: Float, ebv: Float) -> Float:

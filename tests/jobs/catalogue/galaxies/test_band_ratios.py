@@ -109,6 +109,25 @@ def test_weights_of_the_nodes_reproduce_a_quartic(ebv):
     )
 
 
+@pytest.mark.parametrize("band", ["euclid_vis", "lsst_g"])
+def test_the_compiled_reading_is_that_of_arrays(library, band, rng):
+    """Five nodes of E(B-V) and more, redshifts at nodes, at 0 and behind the last."""
+    table, n = band_ratios.load(library, band, 3.0, 0.5), 2000
+    z, template, law = 3.2 * rng.random(n), rng.integers(0, 31, n), rng.integers(0, 5, n)
+    z[:2], ebv = (0.0, np.expm1(0.005 * 7)), 0.5 * rng.random(n)
+    ebv[5:9] = table.ebv[:4]
+    step = np.log1p(z) / 0.005
+    row = np.minimum(step.astype(int), table.values.shape[0] - 2)
+    part, curve = (step - row)[:, None], np.maximum(law, 1) - 1
+    nodes = (1.0 - part) * table.values[row, curve, template] + part * table.values[row + 1, curve, template]
+    expected = np.sum(nodes * band_ratios.ebv_weights(table.ebv, np.where(law > 0, ebv, 0.0)), axis=1)
+    assert band_ratios.ln_ratio(table, z, template, law, ebv) == pytest.approx(expected, abs=1e-9)
+    # Whole columns of a table, and one of them alone.
+    found = band_ratios.ln_ratio(table, z.astype(np.float32), template.astype(np.int16), law.astype(np.int8), ebv)
+    alone = band_ratios.ln_ratio(table, z[3:4].astype(np.float32), template[3:4], law[3:4], ebv[3:4])
+    assert found[3] == alone[0]
+
+
 def test_law_0_has_no_dust_whatever_its_excess(vis):
     z, template = np.array([0.7]), np.array([20])
     dustless = band_ratios.ln_ratio(vis, z, template, np.array([0]), np.array([0.4]))
