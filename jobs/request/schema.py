@@ -54,8 +54,8 @@ class Universe:
                                as a deeper one has to its limit
     star_limit               : H (Vega, as observed);  z_max : highest redshift
     box_cells                : cells of 4 Mpc/h a side of the box of matter
-    lensing_nside            : HEALPix resolution of the lensing maps
-    lensing                  : (g1, g2), a constant reduced shear of all galaxies in place of the box's lensing, in the
+    lensing_nside            : HEALPix resolution of the box's lensing maps: 5 GB of the cache for 1024
+    lensing                  : (g1, g2), a constant reduced shear of all galaxies in place of box and halos, in the
                                frame (east, north): g1 > 0 stretches east-west, g2 > 0 from the south-west to the
                                north-east; None = the box's
     alignment                : how many times more strongly than in nature galaxies are aligned with the matter about
