@@ -28,6 +28,8 @@ _LATER: Mapping[str, Mapping[str, Any]] = {
     "galaxies": {"lensing": None, "rotation": 0.0},
     "stars": {"bright_limit": None},
 }
+# And of those that were drawn by us.
+_LATER_DRAWN: Mapping[str, Any] = {"alignment": 0.0}
 # What the formats of external catalogues are; some are of two files each.
 _FORMATS = Path(__file__).parents[1] / "catalogue" / "external" / "ingest_formats.toml"
 # What names files, or says how rows are filed.
@@ -63,6 +65,8 @@ def refuse_others(root: Path, request: Request) -> None:
 def _difference(version: read.Version, request: Request) -> str:
     """What tells a catalogue's universe from the request's; empty where nothing does."""
     facts = {**_LATER[version.table], **version.manifest["facts"]}
+    if version.table == "galaxies" and "galaxy_limit" in facts:
+        facts = {**_LATER_DRAWN, **facts}
     values, own = wanted(request), request.sources
     theirs = None if own is None else own.facts(request.area.bounds())
     if canonical(facts.get("sources")) != canonical(theirs):

@@ -77,7 +77,7 @@ def test_another_universe_is_refused_by_what_differs(lake, table, other, words):
         universe.refuse_other([version], other)
 
 
-@pytest.mark.parametrize("depth", [{"lensing": "none"}, {"rotation": 90.0}])
+@pytest.mark.parametrize("depth", [{"lensing": "none"}, {"rotation": 90.0}, {"alignment": 2.0}])
 def test_a_catalogue_of_before_there_was_the_key(lake, depth):
     version = catalogue(lake, "galaxies", wanted(), without=depth)
     assert not depth.keys() & version.manifest["facts"].keys()
