@@ -33,7 +33,7 @@ class Densities:
         counts = np.array(mission.numbers("survey.galaxy_counts"))
         self.galaxies = float(np.exp(np.interp(universe.galaxy_limit, counts[:, 0], np.log(counts[:, 1]))))
         stars = np.array(mission.numbers("survey.star_counts"))
-        # Columns: l, |b|, then counts to H = 8, 10, .., 26.
+        # Columns: l, b, then counts to H = 8, 10, .., 26.
         limits = 8.0 + 2.0 * np.arange(stars.shape[1] - 2)
         at_limit = [np.interp(universe.star_limit, limits, np.log(row)) for row in stars[:, 2:]]
         self.lon, self.lat = np.unique(stars[:, 0]), np.unique(stars[:, 1])
@@ -50,11 +50,11 @@ class Densities:
 
     def _model(self, ra: Float, dec: Float) -> Float:
         lon, lat = sky.galactic(ra, dec)
-        folded, height = np.abs((lon + 180.0) % 360.0 - 180.0), np.abs(lat)
-        i = np.clip(np.searchsorted(self.lon, folded, "right") - 1, 0, self.lon.size - 2)
-        j = np.clip(np.searchsorted(self.lat, height, "right") - 1, 0, self.lat.size - 2)
-        s = (folded - self.lon[i]) / (self.lon[i + 1] - self.lon[i])
-        t = (height - self.lat[j]) / (self.lat[j + 1] - self.lat[j])
+        beside = (lon + 180.0) % 360.0 - 180.0
+        i = np.clip(np.searchsorted(self.lon, beside, "right") - 1, 0, self.lon.size - 2)
+        j = np.clip(np.searchsorted(self.lat, lat, "right") - 1, 0, self.lat.size - 2)
+        s = (beside - self.lon[i]) / (self.lon[i + 1] - self.lon[i])
+        t = (lat - self.lat[j]) / (self.lat[j + 1] - self.lat[j])
         low = (1 - s) * self.stars[i, j] + s * self.stars[i + 1, j]
         high = (1 - s) * self.stars[i, j + 1] + s * self.stars[i + 1, j + 1]
         return np.stack([np.full(lon.shape, self.galaxies), np.exp((1 - t) * low + t * high)])
