@@ -53,6 +53,7 @@ async def counts(lake: Lake, question: Json) -> bytes:
 
 def _keys(lake: Lake, source: str) -> tuple[str, ...]:
     """What tells the rows of a table apart; of anything else than a table nothing."""
+    source = source.replace('"', "")
     if source not in lake.versions:
         return ()
     version = lake.versions[source]
@@ -63,7 +64,8 @@ def _keys(lake: Lake, source: str) -> tuple[str, ...]:
 def _part(lake: Lake, source: str, keys: tuple[str, ...], asked: object) -> int:
     if isinstance(asked, int) and not isinstance(asked, bool) and asked in (1, PART):
         return asked if keys else 1
-    many = source in lake.versions and lake.versions[source].num_rows > ROWS_A_CORE * lake.threads
+    table = source.replace('"', "")
+    many = table in lake.versions and lake.versions[table].num_rows > ROWS_A_CORE * lake.threads
     return PART if many and keys else 1
 
 

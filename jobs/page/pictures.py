@@ -15,10 +15,11 @@ from astropy.wcs import WCS
 from jobs import cache
 from jobs.page.answers import plain
 from jobs.page.opened import Lake
+from jobs.render import archive
 from jobs.render.camera import astrometry
 from jobs.render.products import preview, read_back
 from jobs.render.products.keys import truth_file
-from lake_schema import ids, sky
+from lake_schema import ids
 from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput
 from lake_schema.store import read
@@ -217,10 +218,12 @@ def is_north_up(lake: Lake, number: int) -> bool:
 
 def covering(lake: Lake, ra: float, dec: float) -> list[tuple[int, float, float]]:
     """Images that hold a place: number, column and row, 0 = centre of the first pixel."""
+    known = pictures(lake)
+    regions = pa.table({"number": range(len(known)), "s_region": [str(one.row["s_region"]) for one in known]})
     found = []
-    for number, one in enumerate(pictures(lake)):
-        if sky.separation(one.row["ra"], one.row["dec"], ra, dec) > 1.0:
-            continue
+    # Only what may hold it is opened.
+    for number in archive.covering(regions, ra, dec)["number"].to_pylist() if known else []:
+        one = known[number]
         (x,), (y,) = astrometry.pixel_of_sky(one.system, [ra], [dec])
         ny, nx = one.levels()[0].shape
         if -0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5:

@@ -156,7 +156,14 @@ async def _parts(lake: Lake, request: web.Request) -> web.StreamResponse:
 async def _density(lake: Lake, request: web.Request) -> web.StreamResponse:
     view = _view(request) if "ra" in request.query else None
     where = request.query.get("where") or "true"
-    return _bytes(await sky_maps.density(lake, request.match_info["table"], _whole(request, "order"), where, view))
+    value = request.query.get("value") or None
+    table, order = request.match_info["table"], _whole(request, "order")
+    return _bytes(await sky_maps.density(lake, table, order, where, view, value))
+
+
+async def _coverage(lake: Lake, request: web.Request) -> web.StreamResponse:
+    view, band = _view(request) if "ra" in request.query else None, request.query.get("band") or None
+    return _bytes(await asyncio.to_thread(sky_maps.coverage, lake, _whole(request, "order"), view, band))
 
 
 async def _sources(lake: Lake, request: web.Request) -> web.StreamResponse:
@@ -198,6 +205,8 @@ _ROUTES: tuple[tuple[str, str, Answer], ...] = (
     ("GET", "sky/{table}/parts", _parts),
     ("GET", "sky/{table}/density", _density),
     ("GET", "sky/{table}/sources", _sources),
+    ("GET", "coverage", _coverage),
+    ("GET", "bands", _told(sky_maps.bands)),
     ("GET", "regions", _told(sky_maps.regions)),
     ("GET", "images", _told(pictures.listed)),
     ("GET", "image/{number}", _told(pictures.described, "number")),

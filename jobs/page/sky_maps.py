@@ -10,15 +10,18 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from jobs.page.answers import is_catalogue
 from jobs.page.opened import Lake
 from jobs.render import archive
+from jobs.render import coverage as coverage_maps
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.store import layout
 
+_TASK = ("exposure_id", "ra", "dec", "radius", "s_region")
 MOST_CELLS, MOST_SOURCES = 200_000, 20_000
 _DEEPEST_SHOWN = 16
 # Cells of a cover of the part in view are about this part of its radius wide.
@@ -41,23 +44,65 @@ def parts(lake: Lake, table: str) -> bytes:
     )
 
 
-async def density(lake: Lake, table: str, order: int, where: str, view: Float | None) -> bytes:
+async def density(
+    lake: Lake, table: str, order: int, where: str, view: Float | None, value: str | None = None
+) -> bytes:
     """4 bytes: length of the head; the head, JSON; float32 corners [n, 4, 2] deg; float32 number per deg2 [n].
 
     order : of the cells;  where : SQL condition of the rows that count;  view : ra, dec, radius deg; None: everything
+    table : of the rows;  value : SQL whose mean over the rows of a cell is told instead of their number
     """
     if not 0 <= order <= _DEEPEST_SHOWN:
         raise BadInput(f"order = {order} is outside [0, {_DEEPEST_SHOWN}]")
     shift = 2 * (sky.DEEPEST - order)
-    text = f"""SELECT _healpix_29 >> {shift} AS cell, count(*) AS n FROM {_table(lake, table)}
+    told = "count(*)::DOUBLE" if value is None else f"avg(TRY_CAST(({value}\n) AS DOUBLE))"
+    text = f"""SELECT _healpix_29 >> {shift} AS cell, count(*) AS n, {told} AS told FROM {_table(lake, table)}
                WHERE ({where}\n) AND {_within(view)} GROUP BY cell ORDER BY cell LIMIT {MOST_CELLS + 1}"""
-    found = await _asked(lake, text, where)
-    if found.num_rows > MOST_CELLS:
-        raise BadInput(f"more than {MOST_CELLS:,} cells hold rows: look at a part, or at larger cells")
-    cells, number = found["cell"].to_numpy(), found["n"].to_numpy()
-    head = {"order": order, "rows": int(number.sum()), "cells": len(cells)}
-    corners = sky.cell_corners(order, cells) if len(cells) else np.zeros((0, 4, 2))
-    return _packed(corners, number / sky.cell_area(order), head)
+    found = await _asked(lake, text, where, *([value] if value is not None else []))
+    _refuse_many(found.num_rows)
+    head = {"order": order, "rows": int(found["n"].to_numpy().sum())}
+    found = found.filter(pc.is_finite(found["told"]))
+    area = sky.cell_area(order) if value is None else 1.0
+    return _packed(_corners(order, found["cell"].to_numpy()), found["told"].to_numpy() / area, head)
+
+
+def coverage(lake: Lake, order: int, view: Float | None, band: str | None) -> bytes:
+    """The same with how many of the planned exposures see the centre of each cell.
+
+    order : of the cells;  view : ra, dec, radius deg; None: everything;  band : of the exposures, None = all
+    """
+    if not 0 <= order <= _DEEPEST_SHOWN:
+        raise BadInput(f"order = {order} is outside [0, {_DEEPEST_SHOWN}]")
+    tasks = pa.concat_tables([version.rows(_TASK) for version in lake.named("tasks")] or [pa.table({})])
+    if band is not None:
+        rows = _rows(lake, "exposures", ("exposure_id", "band"))
+        own = [row["exposure_id"] for row in rows if row["band"] == band]
+        tasks = tasks.filter(pc.is_in(tasks["exposure_id"], pa.array(own, pa.int64())))
+    cells = np.zeros(0, np.int64)
+    if view is not None:
+        cells = sky.cells_in_cone(float(view[0]), float(view[1]), min(float(view[2]), 180.0), order)
+    else:
+        for row in tasks.select(["ra", "dec", "radius"]).to_pylist() if tasks.num_rows else []:
+            cells = np.union1d(cells, sky.cells_in_cone(row["ra"], row["dec"], row["radius"], order))
+            _refuse_many(len(cells))
+    seen = coverage_maps.counts(tasks, *sky.cell_centres(order, cells)) if tasks.num_rows and len(cells) else cells * 0
+    cells, seen = cells[seen > 0], seen[seen > 0]
+    _refuse_many(len(cells))
+    return _packed(_corners(order, cells), seen.astype(float), {"order": order, "rows": tasks.num_rows})
+
+
+def bands(lake: Lake) -> list[str]:
+    """Passbands in which exposures are planned."""
+    return sorted({row["band"] for row in _rows(lake, "exposures", ("band",))})
+
+
+def _refuse_many(cells: int) -> None:
+    if cells > MOST_CELLS:
+        raise BadInput(f"more than {MOST_CELLS:,} cells hold something: look at a part, or at larger cells")
+
+
+def _corners(order: int, cells: Int) -> Float:
+    return sky.cell_corners(order, cells) if len(cells) else np.zeros((0, 4, 2))
 
 
 async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
@@ -80,11 +125,11 @@ async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
     return {**columns, "id": [str(value) for value in found["id"].to_pylist()], "by": mag}
 
 
-async def _asked(lake: Lake, text: str, where: str) -> pa.Table:
+async def _asked(lake: Lake, text: str, *expressions: str) -> pa.Table:
     async with lake.own.process() as process:
 
         def ask() -> pa.Table:
-            return pa.Table.from_batches(list(process.batches(text, {}, lake.timeout, expressions=[where])))
+            return pa.Table.from_batches(list(process.batches(text, {}, lake.timeout, expressions=expressions)))
 
         return await asyncio.to_thread(ask)
 

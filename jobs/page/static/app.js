@@ -103,7 +103,7 @@ $("reopen").addEventListener("click", async () => {
   location.reload();
 });
 document.addEventListener("keydown", keys);
-addEventListener("hashchange", () => location.hash !== last && restore());
+addEventListener("hashchange", () => document.body.dataset.ready && location.hash !== last && restore());
 addEventListener("resize", () => VIEWS[shown]?.redraw?.());
 setInterval(() => document.hidden || api.open().catch(() => {}), 30000);
 start().catch((error) => api.say(error.message, true));

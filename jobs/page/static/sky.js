@@ -2,17 +2,18 @@
 
 import * as api from "/static/api.js";
 import { NAMES, bar, ink, lutTexture, program } from "/static/colour.js";
+import { graticule, line } from "/static/graticule.js";
 import { goTo } from "/static/image.js";
 import { pin, pinned } from "/static/pin.js";
 import { frame, project, unproject, vector } from "/static/sphere.js";
 
 const $ = (id) => document.getElementById(id);
-const VERTEX = `in vec3 place; in float value; uniform mat3 turn; uniform vec2 scale; uniform vec2 range; out float level;
+const VERTEX = `in vec3 place; in float value; uniform mat3 turn; uniform vec2 scale; uniform vec2 range; uniform bool linear; out float level;
 void main() {
   vec3 v = turn * place;
   float k = sqrt(2.0 / max(1.0 + v.z, 1e-6)) * 57.29577951308232;
   gl_Position = v.z < -0.9 ? vec4(9.0, 9.0, 9.0, 1.0) : vec4(-v.x * k * scale.x, v.y * k * scale.y, 0.0, 1.0);
-  level = clamp((log(value) - range.x) / max(range.y - range.x, 1e-6), 0.0, 1.0);
+  level = clamp(((linear ? value : log(value)) - range.x) / max(range.y - range.x, 1e-6), 0.0, 1.0);
 }`;
 const FRAGMENT = `in float level; uniform sampler2D colours; uniform float alpha; out vec4 colour;
 void main() { colour = vec4(texture(colours, vec2(level, 0.5)).rgb, 1.0) * alpha; }`;
@@ -20,7 +21,7 @@ const STATES = { planned: "quiet", observed: "second", failed: "bad" };
 // Below this height of the view, deg, sources are shown one by one.
 const SINGLE = 0.35, ROWS_A_CELL = 50;
 const view = { ra: 0, dec: 0, height: 180 };
-let page, gl, parts, overlay, cells = null, dots = null, regions = [], shownTable = "", where = "", held = "", colours;
+let page, gl, parts, overlay, cells = null, dots = null, regions = [], shownTable = "", where = "", value = "", held = "", colours;
 
 export function start(given) {
   page = given;
@@ -38,6 +39,13 @@ export function start(given) {
   $("sky-table").value = shownTable;
   $("sky-table").addEventListener("change", () => again($("sky-table").value, where));
   $("sky-where").addEventListener("change", () => again(shownTable, $("sky-where").value.trim()));
+  api.get("bands").then((bands) => bands.length && $("sky-table").append(api.h("optgroup", { label: "planned exposures" },
+    api.h("option", { value: "coverage of" }, "all bands"), ...bands.map((band) => api.h("option", { value: `coverage of ${band}` }, band)))),
+    (error) => api.say(error.message, true)).then(() => ($("sky-table").value = shownTable));
+  $("sky-value").addEventListener("change", () => {
+    value = $("sky-value").value.trim();
+    again(shownTable, where);
+  });
   $("sky-map").addEventListener("change", () => {
     colours = lutTexture(gl, $("sky-map").value, colours);
     redraw();
@@ -72,17 +80,24 @@ export async function show() {
   else redraw();
 }
 
+const isCoverage = () => shownTable.startsWith("coverage of");
+
+function addressOf(words) {
+  if (isCoverage()) return `coverage?${new URLSearchParams({ ...words, band: shownTable.slice(12) })}`;
+  return `sky/${shownTable}/density?${new URLSearchParams({ where: where || "true", ...(value ? { value } : {}), ...words })}`;
+}
+
 /** First the files' own cells, which cost nothing; then what suits the view. */
 async function load(all) {
   if (!shownTable) return;
   try {
-    if (!where && !cells) {
+    if (!where && !value && !cells && !isCoverage()) {
       use(await api.bytes(`sky/${shownTable}/parts`));
       if (all) whole(false);
       redraw();
     }
-    if (where && !cells) {
-      use(await api.bytes(`sky/${shownTable}/density?${new URLSearchParams({ order: 6, where })}`));
+    if (!cells) {
+      use(await api.bytes(addressOf({ order: isCoverage() ? 9 : 6 })));
       if (all) whole(false);
     }
   } catch (error) {
@@ -95,21 +110,22 @@ async function load(all) {
 
 function order() {
   const size = (view.height / Math.max(1, $("sky-canvas").clientHeight)) * 5;
+  if (isCoverage()) return Math.max(3, Math.min(13, Math.round(Math.log2(58.6 / size))));
   // Cells of some pixels, and of some rows: smaller ones would show nothing but their Poisson noise.
-  const [low, high] = cells?.range ?? [1e4, 1e4], filled = 0.5 * Math.log2((41253 * Math.sqrt(low * high)) / (12 * ROWS_A_CELL));
+  const filled = 0.5 * Math.log2((41253 * (cells?.rows ?? 1e4)) / (12 * ROWS_A_CELL));
   return Math.max(3, Math.min(14, Math.round(Math.log2(58.6 / size)), Math.floor(filled)));
 }
 
 const finer = api.newest(async () => {
   const box = $("sky-canvas"), radius = Math.min(180, 0.75 * Math.hypot(view.height, (view.height * box.clientWidth) / Math.max(1, box.clientHeight)));
-  const wanted = order(), near = { ra: view.ra, dec: view.dec, radius, where: where || "true" };
-  const grid = Math.max(radius / 4, 1e-6), name = [shownTable, where, wanted, Math.round(view.ra / grid), Math.round(view.dec / grid), Math.round(Math.log2(radius) * 2)].join();
+  const wanted = order(), near = { ra: view.ra, dec: view.dec, radius };
+  const grid = Math.max(radius / 4, 1e-6), name = [shownTable, where, value, wanted, Math.round(view.ra / grid), Math.round(view.dec / grid), Math.round(Math.log2(radius) * 2)].join();
   if (name === held) return redraw();
   held = name;
-  if (view.height < SINGLE) dots = await api.get(`sky/${shownTable}/sources?${new URLSearchParams(near)}`);
+  if (view.height < SINGLE && !isCoverage()) dots = await api.get(`sky/${shownTable}/sources?${new URLSearchParams({ ...near, where: where || "true" })}`);
   else {
     dots = null;
-    use(await api.bytes(`sky/${shownTable}/density?${new URLSearchParams({ order: wanted, ...(radius < 60 ? near : { where: near.where }) })}`));
+    use(await api.bytes(addressOf({ order: wanted, ...(radius < 60 ? near : {}) })));
   }
   redraw();
 });
@@ -121,12 +137,16 @@ function use(buffer) {
     const own = [0, 1, 2, 3].map((c) => vector(corners[8 * k + 2 * c], corners[8 * k + 2 * c + 1]));
     [0, 1, 2, 0, 2, 3].forEach((c, n) => data.set([...own[c], density[k]], 24 * k + 4 * n));
   }
-  const filled = [...density].filter((d) => d > 0).sort((a, b) => a - b), at5 = (share) => filled[Math.floor(share * (filled.length - 1))] ?? 1;
-  cells = { head, density, corners, count: head.cells * 6, buffer: cells?.buffer ?? gl.createBuffer(), range: [at5(0.01), at5(0.995)] };
-  if (cells.range[0] >= cells.range[1]) cells.range = [cells.range[0] / 2, cells.range[1] * 1.01];
+  const linear = isCoverage() || Boolean(value), filled = [...density].filter((d) => linear || d > 0).sort((a, b) => a - b), at5 = (share) => filled[Math.floor(share * (filled.length - 1))] ?? 1;
+  cells = { head, density, corners, count: head.cells * 6, buffer: cells?.buffer ?? gl.createBuffer(), linear,
+    range: isCoverage() ? [0, filled.at(-1) ?? 1] : [at5(0.01), at5(0.995)], rows: rowsOf(head, density) };
+  if (cells.range[0] >= cells.range[1]) cells.range = linear ? [cells.range[0] - 0.5, cells.range[1] + 0.5] : [cells.range[0] / 2, cells.range[1] * 1.01];
   gl.bindBuffer(gl.ARRAY_BUFFER, cells.buffer);
   gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
 }
+
+/** Rows a square degree, of the cells that have any. */
+const rowsOf = (head, density) => (head.rows * 12 * 4 ** (head.order ?? 5)) / (41253 * Math.max(1, density.length));
 
 /** Show everything that the table has. */
 function whole(load_) {
@@ -173,15 +193,21 @@ export function redraw() {
     const uniform = (name) => gl.getUniformLocation(parts, name);
     gl.uniformMatrix3fv(uniform("turn"), true, turn);
     gl.uniform2fv(uniform("scale"), scale());
-    gl.uniform2fv(uniform("range"), cells.range.map(Math.log));
+    gl.uniform2fv(uniform("range"), cells.linear ? cells.range : cells.range.map(Math.log));
+    gl.uniform1i(uniform("linear"), cells.linear ? 1 : 0);
     gl.uniform1f(uniform("alpha"), dots ? 0.25 : 1);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, colours);
     gl.drawArrays(gl.TRIANGLES, 0, cells.count);
-    $("sky-legend").replaceChildren(...bar($("sky-map").value, api.number(cells.range[0], 3), api.number(cells.range[1], 3), `${shownTable}: number / deg²`));
+    $("sky-legend").replaceChildren(...bar($("sky-map").value, api.number(cells.range[0], 3), api.number(cells.range[1], 3), legend()));
   }
   drawOver(turn);
   page.remember();
+}
+
+function legend() {
+  if (isCoverage()) return `${shownTable.slice(12) || "all bands"}: planned exposures`;
+  return value ? `${shownTable}: mean of ${value}` : `${shownTable}: number / deg²`;
 }
 
 function drawOver(turn) {
@@ -192,7 +218,7 @@ function drawOver(turn) {
     const p = project(turn, ra, dec);
     return p && [width / 2 + p[0] * unit, height / 2 - p[1] * unit];
   };
-  drawGrid(c, at, width, height);
+  graticule(c, view, at, [width, height]);
   if (dots) drawDots(c, at);
   if ($("sky-regions").checked) {
     c.lineWidth = 1.6;
@@ -222,42 +248,6 @@ function drawOver(turn) {
     c.beginPath();
     c.arc(...own, 9, 0, 7);
     c.stroke();
-  }
-}
-
-function line(c, points) {
-  c.beginPath();
-  let on = false;
-  for (const point of points) {
-    if (point && on) c.lineTo(...point);
-    else if (point) c.moveTo(...point);
-    on = Boolean(point);
-  }
-  c.stroke();
-}
-
-function drawGrid(c, at, width, height) {
-  const step = [30, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005].find((s) => s <= view.height / 3.5) ?? 0.0005;
-  const near = Math.min(89.9, view.dec > 0 ? view.dec : -view.dec), wide = Math.min(180, (view.height * Math.max(1, width / height)) / Math.cos((near * Math.PI) / 180));
-  const raStep = step * Math.max(1, 2 ** Math.round(Math.log2(1 / Math.max(0.02, Math.cos((near * Math.PI) / 180)))));
-  const digits = Math.max(0, Math.ceil(-Math.log10(step) - 1e-9));
-  c.strokeStyle = `color-mix(in srgb, ${ink("line")} 55%, transparent)`;
-  c.fillStyle = ink("quiet");
-  c.font = "11px DejaVu Sans, sans-serif";
-  c.lineWidth = 1;
-  const decs = [], ras = [];
-  for (let d = Math.ceil((view.dec - view.height) / step) * step; d <= view.dec + view.height; d += step) if (Math.abs(d) <= 90) decs.push(d);
-  for (let a = Math.ceil((view.ra - wide) / raStep) * raStep; a < view.ra + Math.min(wide, 180) - 1e-9; a += raStep) ras.push(a);
-  const steps = 48;
-  for (const dec of decs) {
-    line(c, Array.from({ length: steps + 1 }, (_, k) => at(view.ra - wide + (2 * wide * k) / steps, dec)));
-    const label = at(view.ra, dec);
-    if (label) c.fillText(`${dec < -1e-9 ? "−" : "+"}${Math.abs(dec).toFixed(digits)}°`, 4, label[1] - 3);
-  }
-  for (const ra of ras) {
-    line(c, Array.from({ length: steps + 1 }, (_, k) => at(ra, Math.max(-89.99, Math.min(89.99, view.dec - view.height + (2 * view.height * k) / steps)))));
-    const label = at(ra, view.dec);
-    if (label && label[0] > 45 && label[0] < width - 45) c.fillText(`${(((ra % 360) + 360) % 360).toFixed(digits)}°`, label[0] + 3, 13);
   }
 }
 
@@ -364,7 +354,7 @@ function asTable() {
   data.hidden = !data.hidden;
   if (data.hidden || !cells) return redraw();
   const rows = [...cells.density].map((d, k) => [cells.corners[8 * k], cells.corners[8 * k + 1], d]).sort((a, b) => b[2] - a[2]).slice(0, 500);
-  data.replaceChildren(api.table([{ name: "RA of a corner", unit: "deg" }, { name: "Dec of a corner", unit: "deg" }, { name: "density", unit: "deg-2" }], rows));
+  data.replaceChildren(api.table([{ name: "RA of a corner", unit: "deg" }, { name: "Dec of a corner", unit: "deg" }, { name: legend() }], rows));
   redraw();
 }
 
@@ -377,10 +367,12 @@ export function key(event) {
   else return;
   event.preventDefault();
 }
-export const state = () => ({ ...view, table: shownTable, where, map: $("sky-map").value });
+export const state = () => ({ ...view, table: shownTable, where, value, map: $("sky-map").value });
 export function restore(was) {
   for (const name of ["ra", "dec", "height"]) if (Number.isFinite(was[name])) view[name] = was[name];
   if (api.lake.tables.some((table) => table.name === was.table)) $("sky-table").value = shownTable = was.table;
+  if (typeof was.table === "string" && was.table.startsWith("coverage of")) shownTable = was.table;
+  if (typeof was.value === "string") $("sky-value").value = value = was.value;
   if (typeof was.where === "string") $("sky-where").value = where = was.where;
   if (NAMES.includes(was.map)) {
     $("sky-map").value = was.map;

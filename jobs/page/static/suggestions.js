@@ -6,7 +6,9 @@ import * as api from "/static/api.js";
 export function sources() {
   const names = api.lake.tables.map((table) => table.name);
   const joined = [["galaxies", "galaxy_fluxes"], ["stars", "star_fluxes"]].filter((pair) => pair.every((name) => names.includes(name)));
-  return [...names, ...joined.map(([a, b]) => `${a} JOIN ${b} USING (id)`)];
+  // A name that is no plain word of SQL stands in quotes.
+  const quoted = names.map((name) => name.split(".").map((part) => (/^[a-z_][a-z0-9_]*$/.test(part) ? part : `"${part}"`)).join("."));
+  return [...quoted, ...joined.map(([a, b]) => `${a} JOIN ${b} USING (id)`)];
 }
 
 /** Expressions of the axes of each chart to begin with. */

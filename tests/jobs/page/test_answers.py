@@ -325,3 +325,51 @@ def test_a_lake_that_is_published_anew_is_announced(tmp_path):
         assert told["key"] != old
         assert page.ask(f"/api/{old}/sql", method="POST", body=sums)[0] == 409
         assert page.json("sql", method="POST", body=sums)["rows"] == [[120.0]]
+
+
+def test_the_mean_of_an_expression(page, shown):
+    _, _, body = page.of_lake("sky/galaxies/density?order=5&value=z_obs%20%2B%201%20--%20one")
+    head, rest = unpacked(body)
+    mean = np.frombuffer(rest, "<f4", head["cells"], 32 * head["cells"])
+    z = read.version(shown, "galaxies").rows(["z_obs"])["z_obs"].to_numpy().astype(float)
+    assert mean == pytest.approx([z.mean() + 1], rel=1e-5)
+    assert page.of_lake("sky/galaxies/density?order=5&value=1)%20FROM%20stars%20--")[0] == 400
+
+
+def test_coverage(page, shown, tmp_path):
+    """Two detectors side by side, one of them twice: how often each cell is seen."""
+    from lake_schema import sky
+    from lake_schema.store.plan import Output, Part, Plan
+    from lake_schema.tables.exposures import EXPOSURES
+    from lake_schema.tables.tasks import TASKS
+    from tests.universe import rows_of
+
+    def square(ra, dec):
+        return f"POLYGON ICRS {ra} {dec} {ra + 1} {dec} {ra + 1} {dec + 1} {ra} {dec + 1}"
+
+    corners = [(10, 0), (10, 0), (11, 0)]
+    columns = {name: rows_of(TASKS, 3)[name] for name in TASKS.names}
+    columns |= {"exposure_id": [1, 2, 2], "ra": [10.5, 10.5, 11.5], "dec": [0.5] * 3, "radius": [0.8] * 3}
+    columns |= {"detector": ["a", "a", "b"], "s_region": [square(*corner) for corner in corners]}
+    exposures = {name: rows_of(EXPOSURES, 2)[name] for name in EXPOSURES.names} | {
+        "exposure_id": [1, 2],
+        "band": ["r", "i"],
+    }
+    root = tmp_path / "lake"
+    root.mkdir()
+    for table, rows in ((TASKS, TASKS.build(columns)), (EXPOSURES, EXPOSURES.build(exposures))):
+        publish.make(root, Plan(table, {}, (Part("0.parquet", {}),)), lambda lake, facts, rows=rows: Output(rows))
+    with serving(root) as page:
+        assert page.json("bands") == ["i", "r"]
+        assert {region["state"] for region in page.json("regions")} == {"planned"}
+        area = {}
+        for words in ("", "&band=i", "&band=r", "&ra=10.5&dec=0.5&radius=0.2"):
+            _, _, body = page.of_lake(f"coverage?order=9{words}")
+            head, rest = unpacked(body)
+            seen = np.frombuffer(rest, "<f4", head["cells"], 32 * head["cells"])
+            area[words] = [float((seen == n).sum() * sky.cell_area(9)) for n in (1, 2, 3)]
+        # To the width of the cells along the edges.
+        assert area[""] == pytest.approx([1.0, 1.0, 0.0], abs=0.11)
+        assert area["&band=i"] == pytest.approx([2.0, 0.0, 0.0], abs=0.21)
+        assert area["&band=r"] == pytest.approx([1.0, 0.0, 0.0], abs=0.11)
+        assert area["&ra=10.5&dec=0.5&radius=0.2"][1] > 0.1
