@@ -69,7 +69,8 @@ async def density(
 def coverage(lake: Lake, order: int, view: Float | None, band: str | None) -> bytes:
     """The same with how many of the planned exposures see the centre of each cell.
 
-    lake : whose plan;  order : of the cells;  view : ra, dec, radius deg; None: everything;  band : of the exposures, None = all
+    lake : whose plan;  order : of the cells
+    view : ra, dec, radius deg; None: everything;  band : of the exposures, None = all
     """
     if not 0 <= order <= _DEEPEST_SHOWN:
         raise BadInput(f"order = {order} is outside [0, {_DEEPEST_SHOWN}]")
