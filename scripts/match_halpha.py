@@ -19,16 +19,15 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 
-from jobs.catalogue.galaxies import emission_lines, galaxies, sed_assignment, stellar_mass
-from jobs.catalogue.halos import halos, population, satellites
+from jobs.catalogue.galaxies import emission_lines, galaxies
 from jobs.fluxes import cosmology
 from jobs.request.schema import Universe
-from jobs.rng import stream
+from jobs.validation import mean_sky
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 
-SEED, WANTED = 2016, Universe(galaxy_limit=26.0, z_max=3.0, box_cells=192, lensing_nside=64)
-EDGES = np.concatenate([[0.03, 0.2], np.arange(0.3, 3.01, 0.1)])
+SEED, WANTED = 2016, Universe(galaxy_limit=26.0, z_max=6.0, lensing=(0.0, 0.0), box_cells=192)
+EDGES = np.concatenate([[0.03, 0.2], np.arange(0.3, 3.01, 0.1), [3.3, 3.7, 4.2, 5.0, 6.0]])
 LOG_L = np.linspace(39.0, 43.6, 47)
 # A luminosity that fewer have takes the shift of the last that enough have.
 ENOUGH = 15
@@ -37,27 +36,13 @@ CM_PER_MPC = 3.0856775814913673e24
 
 def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
     """(z, raw log L) of galaxies with I_E < WANTED.galaxy_limit in so many cells' area."""
-    universe = galaxies.model(SEED, WANTED)
-    flat = replace(universe.population.halos, amplitude=np.zeros_like(universe.population.halos.amplitude))
     lines = emission_lines.unmatched(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
-    found = []
-    for cell in range(0, cells * 5000, 5000):
-        hosts = halos.draw(flat, SEED, GENERATION_ORDER, cell)
-        own = satellites.draw(flat, universe.population.masses, hosts, SEED)
-        chi, proxy = np.concatenate([hosts.chi, own.chi]), np.concatenate([hosts.proxy, own.proxy])
-        kind = np.repeat([population.CENTRAL, population.SATELLITE], [hosts.chi.size, own.chi.size])
-        z = flat.distances.redshift(chi)
-        m_r = flat.matching.magnitude(z, proxy)
-        red, colour = sed_assignment.draw_colour(universe.colours, m_r, z, kind, stream(SEED, "colour", cell))
-        law, ebv = sed_assignment.draw_dust(universe.colours.dust, m_r, red, colour, stream(SEED, "dust", cell))
-        drawn = galaxies.select(universe, z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv))
-        log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
-        raw = emission_lines.raw_halpha(
-            lines.halpha, lines.dust["halpha"], log_sfr, drawn.sed.ebv, stream(SEED, "lines", cell)
-        )
-        shines = ~(drawn.red & (log_sfr < np.log10(lines.halpha.red_sfr)))
-        found.append((drawn.z[shines], raw[shines]))
-    return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+    universe = replace(mean_sky.flat(galaxies.model(SEED, WANTED)), lines=lines)
+    rows = mean_sky.rows(universe, 0, cells)
+    z, flux = (rows[name].to_numpy().astype(float) for name in ("z_true", "flux_halpha"))
+    shines = flux > 0.0
+    distance = cosmology.luminosity_distance(z[shines]) / cosmology.HUBBLE * CM_PER_MPC
+    return z[shines], np.log10(flux[shines] * 4.0 * np.pi * distance**2)
 
 
 def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:

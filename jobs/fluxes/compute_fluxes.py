@@ -35,6 +35,7 @@ from lake_schema.store.plan import Json, Output, Part, Plan
 from lake_schema.store.provenance import code_version
 from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
 from lake_schema.tables.fluxes import fluxes
+from lake_schema.tables.galaxies import EMISSION_LINES
 from lake_schema.tables.passbands import PASSBANDS
 from lake_schema.tables.templates import TEMPLATES
 
@@ -66,13 +67,18 @@ def step_of(kind: str, lake: Path, request: Request) -> Step:
 
 
 def source_steps(own: Own) -> list[Step]:
-    """The tables `templates`, `extinction_laws` and `passbands`."""
+    """The tables `templates`, `extinction_laws`, `emission_lines` and `passbands`."""
 
     def step(table: Table, rows: Callable[[Own], pa.Table]) -> Step:
         plan = Plan(table, {"files": own.sha256(), "code": code_version()}, (Part("all.parquet", {}),))
         return Step(plan, lambda lake, facts: Output(rows(own)), on_driver=True)
 
-    tables = ((TEMPLATES, inputs.template_rows), (EXTINCTION_LAWS, inputs.law_rows), (PASSBANDS, inputs.passband_rows))
+    tables = (
+        (TEMPLATES, inputs.template_rows),
+        (EXTINCTION_LAWS, inputs.law_rows),
+        (EMISSION_LINES, inputs.line_rows),
+        (PASSBANDS, inputs.passband_rows),
+    )
     return [step(table, rows) for table, rows in tables]
 
 

@@ -10,6 +10,7 @@ distance_modulus        of d_L / 10 pc, with H0 = 100
 comoving_volume         per steradian, between two redshifts
 redshift                z of chi
 kpc_per_arcsec          physical (h = 0.67)
+age                     of a flat universe at z, Gyr
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ Z_MAX = 20.0
 
 # 24 nodes: 1e-12 relative up to z = 20.
 _NODES, _WEIGHTS = sums.gauss_legendre(24)
+# 1 / (100 km/s/Mpc).
+_HUBBLE_TIME_GYR = 9.777922
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
@@ -101,6 +104,16 @@ def kpc_per_arcsec(z: npt.ArrayLike) -> Float:
     """Physical kpc (h = 0.67) that one arcsec spans at redshift z."""
     angular = comoving_distance(z) / (1.0 + np.asarray(z, float))
     return angular * (1000.0 / HUBBLE * _ARCSEC)
+
+
+def age(z: npt.ArrayLike, omega_m: float = OMEGA_M, hubble: float = HUBBLE) -> Float:
+    """Age of a flat universe at z, Gyr, in closed form: ours, or that of a study whose relations are used.
+
+    omega_m, hubble : of that universe
+    """
+    rest = 1.0 - omega_m
+    ratio = np.sqrt(rest / omega_m) * (1.0 + np.asarray(z, float)) ** -1.5
+    return np.asarray(2.0 / (3.0 * np.sqrt(rest)) * np.arcsinh(ratio) * _HUBBLE_TIME_GYR / hubble)
 
 
 def _checked(name: str, z: npt.ArrayLike) -> Float:

@@ -1,4 +1,4 @@
-"""Quasars and galaxies beyond z = 6: their templates, and their fluxes by direct integration (they are few).
+"""Quasars, and galaxies beyond z = 6: their templates, and their fluxes by direct integration (they are few).
 
 quasar_library       3 slopes x 3 strengths of the lines: template 3 i + j
 high_redshift_library  5 slopes of the ultraviolet x 3 strengths of Lyman alpha: template 3 i + j
@@ -25,7 +25,7 @@ from jobs.fluxes import cosmology, passbands
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.sources import column, ids_of, magnification_of
-from jobs.fluxes.spectra import extinction
+from jobs.fluxes.spectra import extinction, intergalactic
 from jobs.fluxes.spectra.continuum import within
 from lake_schema import units
 from lake_schema.arrays import Float, Int
@@ -39,11 +39,13 @@ Z_MAX = 15.0
 
 # Rest frame: 600 A seen at z = 15, and 24000 A seen at z = 0.
 _REST_FIRST, _REST_LAST = 36, 24500
-# Nothing is left below Lyman alpha: the intergalactic medium beyond z = 6.
+# Of the galaxies nothing is left below Lyman alpha, beyond z = 6; quasars are seen through the intergalactic medium.
 _LYMAN_ALPHA = 1215.67
 
 # Vanden Berk et al. 2001: slopes of f_lambda below and above 5000 A; the 3 x 3 of Barnett et al. 2019.
 _QUASAR_SLOPE, _QUASAR_RED_SLOPE, _QUASAR_BREAK = -1.56, 0.45, 5000.0
+# Below Lyman alpha f_nu falls as nu^-1.7: Lusso et al. 2015, MNRAS 449, 4204.
+_QUASAR_FAR_SLOPE = -0.3
 QUASAR_OFFSETS, QUASAR_STRENGTHS = (-0.3, 0.0, 0.3), (0.5, 1.0, 2.0)
 QUASAR_LINES = Path(__file__).with_name("quasar_lines.csv")
 
@@ -115,6 +117,8 @@ def spectra(galaxies: pa.Table) -> Float:
         for i, factor in zip(chosen, factors, strict=True):
             spectrum = templates.flux[sed[i]].astype(float)
             out[i] = factor * np.interp(grid / (1.0 + z[i]), templates.wavelength, spectrum)
+        if code == QUASAR:
+            out[chosen] *= intergalactic.transmission(grid, z[chosen])
     out *= magnification_of(galaxies)[:, None]
     out *= extinction.transmitted(extinction.milky_way(grid), a_v[:, None])
     return out
@@ -146,13 +150,16 @@ def _rest() -> Float:
 def _quasar(wavelength: Float, slope: float, strength: float) -> Float:
     ratio = wavelength / _QUASAR_BREAK
     continuum = np.where(ratio < 1.0, ratio**slope, ratio**_QUASAR_RED_SLOPE)
+    edge = (_LYMAN_ALPHA / _QUASAR_BREAK) ** slope
+    far = edge * (wavelength / _LYMAN_ALPHA) ** _QUASAR_FAR_SLOPE
+    continuum = np.where(wavelength < _LYMAN_ALPHA, far, continuum)
     flux = continuum.copy()
     with QUASAR_LINES.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             centre, width, sigma = (float(row[name]) for name in ("wavelength", "equivalent_width", "sigma"))
             profile = np.exp(-0.5 * ((wavelength - centre) / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
             flux += strength * width * np.interp(centre, wavelength, continuum) * profile
-    return np.where(wavelength < _LYMAN_ALPHA, 0.0, flux)
+    return flux
 
 
 def _star_forming(wavelength: Float, slope: float, width: float) -> Float:

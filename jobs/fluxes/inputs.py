@@ -2,7 +2,7 @@
 
 Own, read             the files that a request names, checked;  filters : those of passbands alone
 curves                passbands by name
-template_rows, law_rows, passband_rows   tables `templates`, `extinction_laws`, `passbands`
+template_rows, law_rows, line_rows, passband_rows   tables `templates`, `extinction_laws`, `emission_lines`, `passbands`
 library_of, stars_of, passband_of     back from these tables, wherever a worker runs
 published_library, published_stars, published_passband
 """
@@ -29,7 +29,7 @@ from jobs.fluxes.libraries import brown_dwarfs, from_files, model_stars, standar
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.libraries.vega import spectrum_file
 from jobs.fluxes.passbands import Passband
-from jobs.fluxes.spectra import extinction
+from jobs.fluxes.spectra import extinction, lines
 from jobs.fluxes.spectra.continuum import dust_of
 from jobs.request.files import Curves, UserCurves
 from lake_schema.arrays import Array
@@ -37,6 +37,7 @@ from lake_schema.errors import BadInput
 from lake_schema.store import read as lake_read
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables import extinction_laws
+from lake_schema.tables import galaxies as line_table
 from lake_schema.tables import passbands as passband_table
 from lake_schema.tables import templates as template_table
 from lake_schema.tables.common import Origin
@@ -157,6 +158,12 @@ def law_rows(own: Own) -> pa.Table:
     )
     origins = [own.origins.get(f"{_LAWS}{law}", origin) for law, origin in enumerate(embedded)]
     return extinction_laws.rows(own.library.wavelength, dust_of(own.library), origins)
+
+
+def line_rows(own: Own) -> pa.Table:
+    """Table `emission_lines`; own : the request's files, none of which are lines."""
+    found = lines.line_list()
+    return line_table.line_rows(found, lines.width_law(), [_origin(line.source, lines.TABLE) for line in found])
 
 
 def passband_rows(own: Own) -> pa.Table:

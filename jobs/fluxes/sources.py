@@ -36,7 +36,7 @@ class Galaxies:
     """n galaxies.
 
     mag_r01, abs_mag_r01 : float64[n] apparent and absolute (- 5 log10 h) magnitude in the reference band
-    lines                : float64[n, 10] flux of each line of lines.line_list(), 0 where there is none
+    lines                : float64[n, n_line] flux of each line of lines.line_list(), 0 where there is none
     magnification, a_v   : float64[n]
     """
 
@@ -159,7 +159,7 @@ def magnification_of(table: pa.Table) -> Float:
 
 
 def _line_fluxes(table: pa.Table) -> Float:
-    """Fluxes of the ten lines; a missing column, null or NaN is a line that was not modelled."""
+    """Fluxes of all lines; a missing column, null or NaN is a line that was not modelled."""
     out = np.zeros((table.num_rows, len(lines.line_list())))
     for k, line in enumerate(lines.line_list()):
         if line.column not in table.column_names:

@@ -219,7 +219,7 @@ def _universe(table: Toml) -> Universe:
         galaxy_limit=_number(table, "universe.galaxy_limit", 10.0, 30.0, default.galaxy_limit),
         galaxy_band=_string(table, "universe.galaxy_band", default=default.galaxy_band),
         star_limit=_number(table, "universe.star_limit", 0.0, 30.0, default.star_limit),
-        z_max=_number(table, "universe.z_max", 0.01, 3.0, default.z_max),
+        z_max=_number(table, "universe.z_max", 0.01, 6.0, default.z_max),
         box_cells=_choice(table, "universe.box_cells", BOX_CELLS, default.box_cells),
         high_redshift_boost=_number(table, "universe.high_redshift_boost", 0.0, 1e5, default.high_redshift_boost),
         quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),

@@ -67,7 +67,7 @@ class Universe:
     galaxy_limit: float = 26.0
     galaxy_band: str = "euclid_vis"
     star_limit: float = 26.0
-    z_max: float = 2.3
+    z_max: float = 6.0
     box_cells: int = 256
     lensing_nside: int = 1024
     lensing: tuple[float, float] | None = None

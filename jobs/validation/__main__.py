@@ -1,7 +1,10 @@
-"""Is what is simulated what it should be: python -m jobs.validation [--quick] [--json FILE] [--figures FOLDER].
+"""Is what is simulated what it should be: python -m jobs.validation [--quick | --lake LAKE] [--json FILE] ...
 
-Each figure that expectations.csv has an expectation of is printed with it and with PASS or FAIL. The exit status is 1
-where one fails that its column known_to_fail gives no reason for. results.json holds the figures of the last full run.
+Each figure that expectations.csv has an expectation of, or observed.csv an observation, is printed with it and with
+PASS or FAIL; near or far, where the number is remembered and gates nothing. The exit status is 1 where one fails that
+its column known_to_fail gives no reason for. results.json holds the figures of the last full run.
+
+--lake  the galaxies of a lake beside what was observed, in place of everything else
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from pathlib import Path
 # Before numpy is imported by anything.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from jobs.validation import checks, universe
+from jobs.validation import checks, observed, universe
 from lake_schema import command, user_files
 from lake_schema.store import manifest, provenance
 
@@ -28,6 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--quick", action="store_true", help="a few small blocks and no second box: 20 s, and too little sky to pass"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
+    parser.add_argument("--lake", type=Path, metavar="LAKE", help="compare the galaxies of this lake with observations")
+    parser.add_argument("--name", help="of the request whose galaxies are taken, where a lake has several")
     parser.add_argument("--figures", type=Path, metavar="FOLDER", help="draw them into this folder")
     options = parser.parse_args(argv)
     return command.status("validation", lambda: _validated(options))
@@ -39,7 +44,10 @@ def _validated(options: argparse.Namespace) -> int:
         user_files.target(options.json)
     if options.figures is not None:
         user_files.folder(options.figures)
-    figures = universe.run(universe.QUICK if options.quick else universe.FULL, options.figures)
+    if options.lake is not None:
+        figures = observed.figures(observed.in_lake(options.lake, options.name))
+    else:
+        figures = universe.run(universe.QUICK if options.quick else universe.FULL, options.figures)
     results = checks.checks(figures)
     failed = checks.report(figures, results)
     if options.json is not None:

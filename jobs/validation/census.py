@@ -14,9 +14,10 @@ import pyarrow as pa
 
 from jobs.catalogue.galaxies import band_ratios, emission_lines, galaxies, morphology
 from jobs.catalogue.galaxies.galaxies import GalaxyModel
-from jobs.catalogue.halos import luminosity_function, population
+from jobs.catalogue.halos import luminosity_function, matching, population
 from jobs.fluxes import cosmology
 from jobs.fluxes.libraries import templates
+from jobs.validation import observed
 from lake_schema import sky
 from lake_schema.arrays import Array, Bool, Float, Float32, Int
 from lake_schema.ids import GENERATION_ORDER
@@ -25,22 +26,16 @@ ARCMIN2 = 3600.0
 AREA = sky.cell_area(GENERATION_ORDER)
 BANDS = ("euclid_vis", "euclid_y", "euclid_j", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")
 COLUMNS = (
-    "ra", "dec", "kind", "z_true", "z_obs", "abs_mag_r01", "color_gr_01", "sed_1", "frac_1", "sed_2", "frac_2",
-    "ext_law_1", "ebv_1", "flux_halpha", "flux_hbeta", "flux_nii", "flux_oiii", "bulge_half_light_radius",
-    "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index",
+    *observed.COLUMNS, "ra", "dec", "z_obs", "bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction",
+    "bulge_sersic_index",
 )  # fmt: skip
 HALO_COLUMNS = ("z_true", "log_mass")
-# Of I_E and of i behind E(B - V) = 0.02 of the Milky Way, mag: a galaxy at high latitude.
-DUST, I_DUST = 2.27 * 0.02, 2.10 * 0.02
-# Limits of the i band whose observed counts are known.
-I_LIMITS = (20, 21, 22, 23, 24, 25, 26)
 HALPHA_LIMITS, HALPHA_SHELLS = (5e-17, 1e-16, 2e-16, 3e-16), ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0))
 SIZE_BINS = ((19, 20), (21, 22), (22, 23), (23, 24), (24, 24.5), (25, 26))
 # Redshift, half width, and the reddest I_E - M_r - DM there, which every galaxy that is counted has to afford.
 SHELLS = ((0.1, 0.05, 0.2), (0.5, 0.1, 0.4), (1.0, 0.15, 1.5), (2.0, 0.15, 4.0))
 HALO_MASSES, HALO_SHELLS = (11.0, 12.0, 13.0), ((0.5, 0.1), (1.0, 0.1), (2.0, 0.1))
 _SIZED = 20_000
-_Z_MAX = 2.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +71,7 @@ def draw(universe: GalaxyModel, dust: Float32, places: Sequence[Sequence[int]]) 
         found = pa.concat_tables([galaxies.draw(cell, universe, drawn, dust).select(COLUMNS) for cell in place])
         found = found.filter(pa.array(found["kind"].to_numpy() < 2))
         rows.append({name: found[name].to_numpy() for name in COLUMNS})
-        mags.append(magnitudes(rows[-1], library, _Z_MAX))
+        mags.append(magnitudes(rows[-1], library, matching.Z_LAST))
         table = pa.concat_tables([galaxies.halo_table(cell, universe.population, drawn) for cell in place])
         hosts.append({name: table[name].to_numpy() for name in HALO_COLUMNS})
 
@@ -116,38 +111,29 @@ def _with_errors(found: dict[str, Float]) -> dict[str, float]:
 
 
 def counts(census: Census) -> dict[str, float]:
-    """Galaxies per arcmin2, their slope and their redshifts."""
-    vis, i_band, z = census.mags["euclid_vis"], census.mags["lsst_i"], census.rows["z_true"]
-    found = {f"vis_{limit}": census.per_deg2(vis < limit) / ARCMIN2 for limit in (24.5, 26.0)}
-    found |= {f"i_{limit}": census.per_deg2(i_band < limit) / ARCMIN2 for limit in I_LIMITS}
-    found |= {f"i_{limit}_behind_dust": census.per_deg2(i_band < limit - I_DUST) / ARCMIN2 for limit in I_LIMITS}
-    found["vis_24.5_behind_dust"] = census.per_deg2(vis < 24.5 - DUST) / ARCMIN2
+    """Galaxies per arcmin2, their slope, and how many are satellites."""
+    vis = census.mags["euclid_vis"]
+    found = {"vis_26": census.per_deg2(vis < 26.0) / ARCMIN2}
     bright = vis < 24.5
     number = [np.sum(np.abs(vis - at) < 0.5) for at in (20, 21, 22, 23)]
     return _with_errors(found) | {
         "vis_slope_20_23": float(np.mean(np.diff(np.log10(number)))),
-        "median_z_24.5": float(np.median(z[bright])),
         "satellites_24.5": float(np.mean(census.rows["kind"][bright])),
-        "red_24.5": float(np.mean(census.rows["color_gr_01"][bright] > 0.75)),
     }
 
 
 def colours(census: Census) -> dict[str, float]:
-    """Medians of I_E < 24.5, and percentiles in thin shells."""
-    mags, z = census.mags, census.rows["z_true"]
+    """Medians of I_E < 24.5."""
+    mags = census.mags
     bright = mags["euclid_vis"] < 24.5
     pairs = {
-        "g_r": ("lsst_g", "lsst_r"), "r_i": ("lsst_r", "lsst_i"), "i_z": ("lsst_i", "lsst_z"),
-        "vis_h": ("euclid_vis", "euclid_h"), "y_j": ("euclid_y", "euclid_j"), "j_h": ("euclid_j", "euclid_h"),
-        "vis_y": ("euclid_vis", "euclid_y"),
+        "g_r": ("lsst_g", "lsst_r"), "r_i": ("lsst_r", "lsst_i"), "vis_h": ("euclid_vis", "euclid_h"),
+        "j_h": ("euclid_j", "euclid_h"),
     }  # fmt: skip
-    colour = {name: mags[blue][bright] - mags[red][bright] for name, (blue, red) in pairs.items()}
-    figures = {f"median_{name}": float(np.median(value)) for name, value in colour.items() if name != "vis_y"}
-    for name, at in (("g_r", 0.3), ("r_i", 0.6), ("i_z", 1.0), ("vis_y", 1.0)):
-        shell = np.abs(z[bright] - at) < 0.05
-        for percent, value in zip((16, 50, 84), np.percentile(colour[name][shell], (16, 50, 84)), strict=True):
-            figures[f"{name}_z{at}_p{percent}"] = float(value)
-    return figures
+    return {
+        f"median_{name}": float(np.median(mags[blue][bright] - mags[red][bright]))
+        for name, (blue, red) in pairs.items()
+    }
 
 
 def half_light(rows: Mapping[str, Array], part: Int) -> Float:
@@ -192,7 +178,7 @@ def sizes(census: Census) -> dict[str, float]:
 
 
 def halpha(census: Census) -> dict[str, float]:
-    """H alpha emitters / the published numbers, with Poisson's error, and the place of line ratios on the locus."""
+    """H alpha emitters / the published numbers, with Poisson's error."""
     z, flux = census.rows["z_true"], census.rows["flux_halpha"]
     figures = {}
     for near, far in HALPHA_SHELLS:
@@ -201,11 +187,7 @@ def halpha(census: Census) -> dict[str, float]:
             found = float(np.sum((z > near) & (z < far) & (flux > limit)))
             name = f"halpha_{limit:g}_{near}_{far}"
             figures[name], figures[f"{name}_error"] = found / expected, np.sqrt(found) / expected
-    bright = flux > 5e-17
-    line = {name: census.rows[f"flux_{name}"][bright].astype(float) for name in ("halpha", "hbeta", "nii", "oiii")}
-    n2, o3 = np.log10(line["nii"] / line["halpha"]), np.log10(line["oiii"] / line["hbeta"])
-    locus = np.clip(0.61 / (np.minimum(n2, -0.25) + 0.08) + 1.1 + 0.03 * z[bright], -1.0, 0.95)
-    return figures | {"oiii_off_locus": float(np.median(o3 - locus)), "oiii_scatter": float(np.std(o3 - locus))}
+    return figures
 
 
 def luminosities(census: Census, law: luminosity_function.Schechter, near: float, far: float) -> dict[str, float]:

@@ -50,16 +50,14 @@ def draw(
 
 
 def _counts(ax: Any, seen: census.Census, figures: Mapping[str, float]) -> None:
-    found = np.array([figures[f"i_{limit}"] for limit in census.I_LIMITS])
-    error = np.array([figures[f"i_{limit}_error"] for limit in census.I_LIMITS])
-    ax.errorbar(census.I_LIMITS, found, error, fmt="-", label="drawn")
+    ax.plot(list(_OBSERVED), [figures[f"i_{limit}"] for limit in _OBSERVED], "-", label="drawn")
     ax.plot(list(_OBSERVED), list(_OBSERVED.values()), "ko", label="observed")
     ax.set(yscale="log", xlabel="i / AB mag", ylabel="brighter / arcmin$^2$")
     ax.legend()
 
 
 def _redshifts(ax: Any, seen: census.Census, figures: Mapping[str, float]) -> None:
-    bins = np.arange(0.0, 2.35, 0.05)
+    bins = np.arange(0.0, 6.05, 0.05)
     for limit in (26.0, 24.5, 23.0):
         z = seen.rows["z_true"][seen.mags["euclid_vis"] < limit]
         ax.hist(z, bins, weights=np.full(z.size, 20.0 / seen.area / 3600.0), histtype="step", label=f"$I_E$ < {limit}")

@@ -27,7 +27,7 @@ from jobs.catalogue.stars import stars as milky_way_stars
 from jobs.fluxes import cosmology
 from jobs.fluxes.libraries import rest_grid, templates
 from jobs.request.schema import Universe
-from jobs.validation import census, clustering, pictures, shear, star_counts
+from jobs.validation import census, clustering, observed, pictures, shear, star_counts
 from lake_schema import sky
 from lake_schema.arrays import Float
 
@@ -140,6 +140,7 @@ def counted(size: Size) -> tuple[dict[str, float], census.Census]:
     seen = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
     figures = {"galaxies": float(seen.block.size), "galaxies_deg2": seen.area}
     figures |= census.counts(seen) | census.colours(seen) | census.sizes(seen) | census.halpha(seen)
+    figures |= observed.figures(observed.of_columns(seen.rows, seen.area))
     figures |= census.halos(seen, published_halos()) | census.luminosities(seen, law, 0.0, 1.5)
     if size.deep:
         deep = galaxies.model(SEED, replace(size.settings, galaxy_limit=28.0))

@@ -18,7 +18,7 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
     from lake_schema.tables.fluxes import fluxes
     from lake_schema.tables.gaia import GAIA
-    from lake_schema.tables.galaxies import GALAXIES
+    from lake_schema.tables.galaxies import EMISSION_LINES, GALAXIES
     from lake_schema.tables.halos import HALO_LIMITS, HALOS
     from lake_schema.tables.mission import MISSION
     from lake_schema.tables.passbands import PASSBANDS
@@ -33,7 +33,7 @@ def declared(bands: Sequence[str]) -> list[Table]:
     galaxies, stars = (fluxes(kind, bands) for kind in ("galaxy", "star"))
     skies = [HALOS, GALAXIES, QUARANTINE, STRONG_LENSES, STARS, galaxies, stars, GAIA]
     plans = [MISSION, EXPOSURES, TASKS]
-    tables = [*skies, HALO_LIMITS, TEMPLATES, EXTINCTION_LAWS, PASSBANDS, *plans]
+    tables = [*skies, HALO_LIMITS, TEMPLATES, EXTINCTION_LAWS, EMISSION_LINES, PASSBANDS, *plans]
     return [*tables, PRODUCTS, RENDERED_TRUTH, EXPOSURE_FILES]
 
 

@@ -1,4 +1,6 @@
-"""Table `galaxies`: the True Universe's galaxies, the ten groups of columns of Serrano et al. 2024, section 4.1.
+"""Tables `galaxies`, and `emission_lines`: where its lines are, and how wide.
+
+`galaxies`: the True Universe's galaxies, the ten groups of columns of Serrano et al. 2024, section 4.1.
 
 The SED is held in the two-component form (Flagship 2); one mixed template with one law and one E(B-V) (Flagship 1) is
 the case of equal laws and E(B-V).
@@ -6,8 +8,14 @@ the case of equal laws and E(B-V).
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+import pyarrow as pa
+
 from lake_schema.columns import Column, Table
-from lake_schema.tables.common import DEC, HEALPIX_29, KINDS, RA, id_of_kinds
+from lake_schema.tables.common import DEC, HEALPIX_29, KINDS, RA, Origin, id_of_kinds
 
 LAWS = ((0, "none"), (1, "Prevot"), (2, "Calzetti"), (3, "Calzetti + 2175 A bump"), (4, "Calzetti + double bump"))
 
@@ -21,8 +29,9 @@ _LINE = (
 )
 
 
-def _line(name: str, which: str, ucd: str = "phot.flux;spect.line") -> Column:
-    return Column(f"flux_{name}", "float32", "erg s-1 cm-2", ucd, f"{which}: {_LINE}", 0.0, 1e-5, True)
+def _line(name: str, which: str, since: int = 1) -> Column:
+    about = "phot.flux;spect.line", f"{which}: {_LINE}"
+    return Column(f"flux_{name}", "float32", "erg s-1 cm-2", *about, 0.0, 1e-5, True, since=since)
 
 
 def _component(k: int) -> tuple[Column, ...]:
@@ -44,7 +53,7 @@ def _component(k: int) -> tuple[Column, ...]:
 
 GALAXIES = Table(
     "galaxies",
-    2,
+    3,
     (
         # 1 identity
         id_of_kinds(0, 4),
@@ -105,7 +114,14 @@ GALAXIES = Table(
             60.0,
         ),
         Column(
-            "color_gr_01", "float32", "mag", "phot.color;em.opt.B;em.opt.R", "rest-frame colour 0.1(g - r)", -2.0, 4.0
+            "color_gr_01",
+            "float32",
+            "mag",
+            "phot.color;em.opt.B;em.opt.R",
+            "rest-frame colour 0.1(g - r); missing of kinds 2 (QSO) and 3 (high redshift)",
+            -2.0,
+            4.0,
+            True,
         ),
         Column(
             "log_halo_mass", "float32", "", "phys.mass", "log10 of M_200m / (Msun/h) of the host halo", 5.0, 17.0, True
@@ -115,7 +131,7 @@ GALAXIES = Table(
             "float32",
             "",
             "phys.mass",
-            "log10 of the stellar mass / Msun (h = 0.67)",
+            "log10 of the stellar mass / Msun (h = 0.67), Chabrier",
             0.0,
             14.0,
             True,
@@ -125,7 +141,7 @@ GALAXIES = Table(
             "float32",
             "",
             "phys.SFR",
-            "log10 of the star formation rate / (Msun/yr), Salpeter",
+            "log10 of the star formation rate / (Msun/yr), Chabrier or Kroupa; before version 3 Salpeter (0.20 more)",
             -10.0,
             5.0,
             True,
@@ -137,9 +153,18 @@ GALAXIES = Table(
         _line("halpha", "H alpha 6564.6"),
         _line("hbeta", "H beta 4862.7"),
         _line("oii", "[O II] 3727.1 (the doublet's other line has the same flux)"),
-        _line("oiii", "[O III] 5008.2 (4960.3 has a third of it)"),
-        _line("nii", "[N II] 6585.3 (6549.9 has a third of it)"),
+        _line("oiii", "[O III] 5008.2 (4960.3 has 1 / 2.98 of it)"),
+        _line("nii", "[N II] 6585.3 (6549.9 has 1 / 3.05 of it)"),
         _line("sii", "[S II] 6718.3 (the doublet's other line has the same flux)"),
+        _line("hgamma", "H gamma 4341.7", 3),
+        _line("hdelta", "H delta 4102.9", 3),
+        _line("paalpha", "Paschen alpha 18756", 3),
+        _line("pabeta", "Paschen beta 12822", 3),
+        _line("pagamma", "Paschen gamma 10941", 3),
+        _line("padelta", "Paschen delta 10052", 3),
+        _line("siii", "[S III] 9533.2 (9071.1 has 1 / 2.47 of it)", 3),
+        _line("hei", "He I 10833", 3),
+        _line("hei_5877", "He I 5877.2", 3),
         # 8 morphology
         Column(
             "bulge_half_light_radius",
@@ -221,3 +246,61 @@ GALAXIES = Table(
     "Galaxies of the True Universe: central, satellite, QSO, high-redshift and strongly lensed.",
     order=5,
 )
+
+_WIDTH = "of log10 sigma/(km/s) = (width_slope + width_slope_z z_obs) (abs_mag_r01 - width_magnitude) + width_z z_obs"
+
+EMISSION_LINES = Table(
+    "emission_lines",
+    1,
+    (
+        Column("name", "string", ucd="meta.id;spect.line", doc="name of the line"),
+        Column("flux_column", "string", ucd="meta.code", doc="column of table galaxies with the flux of its primary"),
+        Column("ratio", "float64", "", "phot.flux;arith.ratio", "flux / that of the column", 0.0, 1e3),
+        Column("vacuum_wavelength", "float64", "Angstrom", "em.wl", "in a vacuum, at rest", 100.0, 1e6),
+        Column("air_wavelength", "float64", "Angstrom", "em.wl", "in air, at rest", 100.0, 1e6),
+        Column("width_slope", "float64", "", "stat.fit.param", _WIDTH, -10.0, 10.0),
+        Column("width_slope_z", "float64", "", "stat.fit.param", _WIDTH, -10.0, 10.0),
+        Column("width_magnitude", "float64", "mag", "stat.fit.param", _WIDTH, -50.0, 50.0),
+        Column("width_z", "float64", "", "stat.fit.param", _WIDTH, -10.0, 10.0),
+        Column("width_least", "float64", "km / s", "spect.line.width;stat.min", "least sigma", 0.0, 1e5),
+        Column("width_most", "float64", "km / s", "spect.line.width;stat.max", "largest sigma", 0.0, 1e5),
+        Column("source", "string", ucd="meta.ref", doc="of wavelength and ratio; file that it was made from"),
+        Column("sha256", "string", ucd="meta.checksum", doc="of that file, hexadecimal"),
+    ),
+    "Emission lines of galaxies: Gaussian in wavelength, of the integral that table galaxies gives.",
+    key=("name",),
+)
+
+
+class Line(Protocol):
+    """A line: column of the flux, flux relative to it, wavelengths in vacuum and air, A."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def column(self) -> str: ...
+    @property
+    def ratio(self) -> float: ...
+    @property
+    def vacuum(self) -> float: ...
+    @property
+    def air(self) -> float: ...
+
+
+def line_rows(lines: Sequence[Line], width: Mapping[str, float], origins: Sequence[Origin]) -> pa.Table:
+    """Table `emission_lines`.
+
+    lines : n lines, a row each;  width : numbers of the law of widths by column;  origins : where each is from
+    """
+    return EMISSION_LINES.build(
+        {
+            "name": [line.name for line in lines],
+            "flux_column": [line.column for line in lines],
+            "ratio": np.array([line.ratio for line in lines]),
+            "vacuum_wavelength": np.array([line.vacuum for line in lines]),
+            "air_wavelength": np.array([line.air for line in lines]),
+            **{name: np.full(len(lines), value) for name, value in width.items()},
+            "source": [origin.source for origin in origins],
+            "sha256": [origin.sha256 for origin in origins],
+        }
+    )

@@ -129,6 +129,8 @@ def _high_redshift(galaxies: pa.Table) -> Float:
         which = sed[here].astype(np.int64)
         within("sed_1", sed[here], 0, len(templates) - 1)
         out[here] = high_redshift.scale(code, templates, which, mag[here], z[here])[:, None] * spectra[which]
+        if code == high_redshift.QUASAR and here.any():
+            out[here] *= _between_galaxies(z[here])
     return out
 
 

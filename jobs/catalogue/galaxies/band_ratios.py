@@ -7,6 +7,8 @@ load        the same, from the cache where it is there
 ln_ratio    read it for one component of an SED
 offset      m_b - M_r - DM(z) of two-component SEDs
 brightest   the smallest offset that any SED has, against redshift
+invert      the SED that has a colour: two neighbouring templates and their shares;  colours : 0.1(g - r) of SEDs
+between     the SED of a real template index;  columns : an SED as columns of table `galaxies`
 
 A small table for the catalogue's own needs: selection in one band, and the reference magnitude. Fluxes are
 not computed from it.
@@ -206,3 +208,55 @@ def brightest(table: BandRatios) -> tuple[Float, Float]:
     z = np.expm1(_STEP * np.arange(table.values.shape[0]))
     highest = table.values.astype(np.float64).max(axis=(1, 2, 3))
     return z, -2.5 / np.log(10.0) * highest
+
+
+def invert(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
+    """The spectra that have the wanted colours; the end of the library where dust leaves none that has.
+
+    colour : float[n] 0.1(g - r) mag;  law : int[n];  ebv : float[n] mag
+    table : of 0.1g at z = 0. Mixing templates i and i - 1 with shares 1 - f and f of the 0.1r flux mixes
+            their 0.1g / 0.1r ratios with the same shares, so the inversion is exact.
+    """
+    weights = ebv_weights(table.ebv, np.where(law > 0, ebv, 0.0))
+    by_law = table.values[0].astype(np.float64)[np.maximum(law, 1) - 1]
+    ratio = np.exp(np.einsum("nte,ne->nt", by_law, weights))
+    target = 10.0 ** (-0.4 * colour)
+    last = ratio.shape[1] - 1
+    template = np.clip(np.sum(ratio < target[:, None], axis=1), 1, last)
+    row = np.arange(colour.size)
+    late, early = ratio[row, template], ratio[row, template - 1]
+    share = np.clip((late - target) / (late - early), 0.0, 1.0)
+    return Sed(template, 1.0 - share, template - 1, share, law, ebv)
+
+
+def between(index: Float, law: Int, ebv: Float) -> Sed:
+    """Of real template indices t[n] >= 0: i = max(ceil(t), 1) and i - 1, with shares 1 - f and f = i - t.
+
+    index : float[n];  law : int[n];  ebv : float[n] mag
+    Ref: Serrano et al. 2024, appendix B
+    """
+    upper = np.maximum(np.ceil(index), 1.0).astype(np.int64)
+    share = np.asarray(upper - index, np.float64)
+    return Sed(upper, 1.0 - share, upper - 1, share, law, ebv)
+
+
+def columns(sed: Sed) -> dict[str, npt.NDArray[np.generic]]:
+    """Spectra as columns of table `galaxies`: both components behind the same dust.
+
+    returns : [n] each
+    """
+    return {
+        "sed_1": sed.template_1,
+        "frac_1": sed.frac_1,
+        "ext_law_1": sed.law,
+        "ebv_1": sed.ebv,
+        "sed_2": sed.template_2,
+        "frac_2": sed.frac_2,
+        "ext_law_2": sed.law,
+        "ebv_2": sed.ebv,
+    }
+
+
+def colours(table: BandRatios, sed: Sed) -> Float:
+    """0.1(g - r)[n] of two-component spectra; table : of 0.1g at z = 0."""
+    return offset(table, np.zeros(sed.ebv.size), sed)

@@ -21,11 +21,19 @@ import pyarrow as pa
 from jobs.catalogue import cells, dust_map
 from jobs.catalogue.external.ingest import Split
 from jobs.catalogue.external.mapping import Columns
-from jobs.catalogue.galaxies import band_ratios, emission_lines, lensing, morphology, sed_assignment, stellar_mass
+from jobs.catalogue.galaxies import (
+    band_ratios,
+    emission_lines,
+    lensing,
+    morphology,
+    sequences,
+    stellar_mass,
+)
 from jobs.catalogue.galaxies.band_ratios import BandRatios, Sed
 from jobs.catalogue.galaxies.emission_lines import LineModel
 from jobs.catalogue.galaxies.lensing import Shear
 from jobs.catalogue.galaxies.morphology import Shapes
+from jobs.catalogue.galaxies.sequences import Colour, Colours, Limits
 from jobs.catalogue.halos.population import SATELLITE
 from jobs.fluxes import cosmology, sources
 from jobs.fluxes.libraries import templates
@@ -53,13 +61,14 @@ class IngestModel:
     lens: Shear | None
     rotation: float
     templates: int
-    colours: sed_assignment.Colours
+    colours: Colours
+    ends: Limits
     reference: BandRatios
     colour: BandRatios
     seen: BandRatios | None
     shapes: Shapes
     masses: stellar_mass.MassToLight
-    light: stellar_mass.Light
+    star_formation: stellar_mass.StarFormation
     lines: LineModel
 
 
@@ -71,20 +80,21 @@ def model(seed: int, columns: Columns, given: Split, lens: Shear | None = None, 
     # In steps, so that similar catalogues share their tables.
     dustiest, z_max = (float(np.ceil(10.0 * x) / 10.0) for x in (max(_LEAST_EBV, given.ebv_max), given.z_max + 0.1))
     library = templates.galaxy_library()
-    reference = band_ratios.load(library, band_ratios.REFERENCE_BAND, z_max, dustiest)
+    colours, colour = sequences.model(), band_ratios.load(library, "sdss_g01", 0.0, dustiest)
     return IngestModel(
         seed,
         columns,
         lens,
         rotation,
         library.flux.shape[0],
-        sed_assignment.colours_model(),
-        reference,
-        band_ratios.load(library, "sdss_g01", 0.0, dustiest),
+        colours,
+        sequences.limits(colour, colours.dust),
+        band_ratios.load(library, band_ratios.REFERENCE_BAND, z_max, dustiest),
+        colour,
         band_ratios.load(library, columns.band, z_max, dustiest) if "mag" in columns.fields else None,
         morphology.shapes(),
         stellar_mass.mass_to_light(),
-        stellar_mass.light(library, reference.ebv),
+        stellar_mass.star_formation(),
         emission_lines.model(),
     )
 
@@ -107,12 +117,11 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Ta
         given = {**given, **{name: given[name] * _shrinking(lens) for name in given if name.startswith("flux_")}}
     lens_seen = lens if universe.lens is None else lensing.columns(universe.lens, given["ra"] % 360.0, given["dec"], z)
     a_v = given["a_v"] if "a_v" in given else dust_map.a_v(dust, given["ra"], given["dec"])
-    m_r, red, sed, law_2, ebv_2 = _light(given, universe, z, kind, _seen(given, universe, lens, a_v), rng)
-    colour = given["color_gr_01"] if "color_gr_01" in given else sed_assignment.colours(universe.colour, sed)
+    m_r, colour, sed, law_2, ebv_2 = _light(given, universe, z, kind, _seen(given, universe, lens, a_v), rng)
     seen = m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.reference, z, sed)
-    log_mass = _known(given, "log_stellar_mass", stellar_mass.log_stellar_mass(universe.masses, m_r, colour))
-    log_sfr = _known(given, "log_sfr", stellar_mass.log_sfr(universe.light, m_r, sed))
-    drawn = emission_lines.fluxes(universe.lines, z, log_mass, log_sfr, red, sed.ebv, rng("lines"))
+    log_mass = _known(given, "log_stellar_mass", stellar_mass.log_stellar_mass(universe.masses, m_r, colour.colour, z))
+    log_sfr = _known(given, "log_sfr", _star_formation(universe.star_formation, z, log_mass, colour, rng))
+    drawn = emission_lines.fluxes(universe.lines, z, log_mass, log_sfr, colour.red, rng("lines"))
     columns: dict[str, Any] = {
         **_identity(given, cell, kind),
         **{name: given[name] for name in ("ra", "dec")},
@@ -124,15 +133,15 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Ta
         "z_obs": _first(given, "z_obs", "z_true"),
         "abs_mag_r01": m_r,
         "mag_r01": given.get("mag_r01", seen),
-        "color_gr_01": colour,
+        "color_gr_01": colour.colour,
         "log_halo_mass": _or_missing(given, "log_halo_mass", n),
         "log_stellar_mass": log_mass,
         "log_sfr": log_sfr,
-        **sed_assignment.columns(sed),
+        **band_ratios.columns(sed),
         "ext_law_2": law_2,
         "ebv_2": ebv_2,
         **{name: _or_missing(given, name, n) if _has_lines(given) else values for name, values in drawn.items()},
-        **_shapes(given, universe.shapes, z, log_mass, red, rng("shape")),
+        **_shapes(given, universe.shapes, z, log_mass, colour.red, rng("shape")),
         "a_v": a_v,
     }
     if "origin_id" in given:
@@ -211,33 +220,42 @@ def _shrinking(lens: Mapping[str, Array]) -> Float:
 
 def _light(
     given: Given, universe: IngestModel, z: Float, kind: Int, seen: Float | None, rng: Any
-) -> tuple[Float, Bool, Sed, Int, Float]:
-    """M_r, on the red sequence, spectra, and law and E(B-V) of the second component."""
+) -> tuple[Float, Colour, Sed, Int, Float]:
+    """M_r, colours, spectra, and law and E(B-V) of the second component."""
     m_r = given.get("abs_mag_r01")
     # Without an absolute magnitude, colours are drawn for that of a flat spectrum.
     apparent = given.get("mag_r01", seen)
     guess = m_r if m_r is not None else np.asarray(apparent) - cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
-    red, colour = sed_assignment.draw_colour(universe.colours, guess, z, kind, rng("colour"))
+    fraction = sequences.red_fraction(universe.colours.fraction, guess, z, kind)
+    found = sequences.draw(universe.colours, universe.ends, guess, z, fraction, rng("colour"))
     if "color_gr_01" in given:
         colour = given["color_gr_01"]
-        fraction = sed_assignment.red_fraction(universe.colours.fraction, guess, z, kind)
         red = colour > np.quantile(colour, 1.0 - float(np.mean(fraction)))
+        found = sequences.known(universe.colours, guess, z, colour, red)
     if "sed" in given or "sed_1" in given:
         sed = _spectra(given, universe.templates)
         if "color_gr_01" not in given:
-            red = sed.ebv <= 0.0
+            realised = band_ratios.colours(universe.colour, sed)
+            found = sequences.known(universe.colours, guess, z, realised, sed.ebv <= 0.0)
     else:
-        law, ebv = sed_assignment.draw_dust(universe.colours.dust, guess, red, colour, rng("dust"))
-        sed = sed_assignment.invert(universe.colour, colour, law, ebv)
+        law, ebv = sequences.dust(universe.colours, universe.ends, guess, z, found, rng("dust"))
+        sed = band_ratios.invert(universe.colour, found.colour, law, ebv)
+        if "color_gr_01" not in given:
+            found = Colour(found.sequence, band_ratios.colours(universe.colour, sed), found.deviate)
     if m_r is None:
         table = universe.reference if "mag_r01" in given or universe.seen is None else universe.seen
         m_r = np.asarray(apparent) - cosmology.distance_modulus(z) - band_ratios.offset(table, z, sed)
-    return m_r, red, sed, given.get("ext_law_2", sed.law), given.get("ebv_2", sed.ebv)
+    return m_r, found, sed, given.get("ext_law_2", sed.law), given.get("ebv_2", sed.ebv)
+
+
+def _star_formation(law: stellar_mass.StarFormation, z: Float, log_mass: Float, colour: Colour, rng: Any) -> Float:
+    main = stellar_mass.main_sequence(law, log_mass, z)
+    return stellar_mass.log_sfr(law, main, colour.sequence, colour.deviate, rng("star_formation"))
 
 
 def _spectra(given: Given, count: int) -> Sed:
     if "sed" in given:
-        sed = sed_assignment.between(given["sed"], given["ext_law"], given["ebv"])
+        sed = band_ratios.between(given["sed"], given["ext_law"], given["ebv"])
     else:
         sed = Sed(*(given[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
     highest = max(int(sed.template_1.max()), int(sed.template_2.max()))

@@ -9,7 +9,7 @@ Numbers are keyed by galaxy and step, so that a new column leaves the others as 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,10 +24,9 @@ from jobs.catalogue.galaxies import (
     halo_lensing,
     high_redshift,
     lensing,
-    line_light,
     morphology,
     nearest_sed,
-    sed_assignment,
+    sequences,
     stellar_mass,
 )
 from jobs.catalogue.galaxies.alignments import Alignments
@@ -38,7 +37,8 @@ from jobs.catalogue.galaxies.high_redshift import Kind
 from jobs.catalogue.galaxies.lensing import Lens, Shear
 from jobs.catalogue.galaxies.morphology import Shapes
 from jobs.catalogue.galaxies.nearest_sed import Training
-from jobs.catalogue.halos import luminosity_function, matching, population
+from jobs.catalogue.galaxies.sequences import Colour, Colours, Limits
+from jobs.catalogue.halos import luminosity_function, matching, population, quenching
 from jobs.catalogue.halos.halo_catalogue import LightCone
 from jobs.catalogue.halos.luminosity_function import Schechter
 from jobs.catalogue.halos.population import Cells, Members, Population
@@ -64,6 +64,7 @@ class GalaxyModel:
     limit     : faintest magnitude, AB, before the Milky Way's dust and intergalactic hydrogen, with emission lines
     band      : the limit's;  rotation : deg, added to every position angle, before lensing
     selection : the limit's band against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
+    ends : of the templates' colours;  halo_shares : what halos make red
     training  : observed galaxies whose spectra ours have, None = spectra that have the colours
     alignments : with the matter about galaxies, None = none
     """
@@ -75,13 +76,15 @@ class GalaxyModel:
     rotation: float
     alignments: Alignments | None
     luminosities: Schechter
-    colours: sed_assignment.Colours
+    colours: Colours
+    ends: Limits
+    halo_shares: quenching.Shares
     selection: BandRatios
     reference: BandRatios
     colour: BandRatios
     shapes: Shapes
     masses: stellar_mass.MassToLight
-    light: stellar_mass.Light
+    star_formation: stellar_mass.StarFormation
     lines: LineModel
     distant: tuple[Kind, ...]
     training: Training | None
@@ -89,20 +92,19 @@ class GalaxyModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """Selected galaxies, [n]: rows of members, z, M_r, as of `apparent`, on the red sequence, 0.1(g - r), spectra."""
+    """Selected galaxies, [n]: rows of members, z, M_r, as of `apparent`, colours that the spectra have, spectra."""
 
     row: Int
     z: Float
     m_r: Float
     magnitude: Float
-    red: Bool
-    colour: Float
+    colour: Colour
     sed: Sed
 
     def part(self, keep: Bool) -> Drawn:
         """The galaxies that are kept: keep : bool[n]."""
-        colours = self.red[keep], self.colour[keep], self.sed.part(keep)
-        return Drawn(self.row[keep], self.z[keep], self.m_r[keep], self.magnitude[keep], *colours)
+        found = self.row[keep], self.z[keep], self.m_r[keep], self.magnitude[keep]
+        return Drawn(*found, self.colour.part(keep), self.sed.part(keep))
 
 
 def model(
@@ -116,11 +118,13 @@ def model(
     1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
     seed                   : of the request;  wanted : section `universe` of the request
     """
-    library, colours = templates.galaxy_library(), sed_assignment.colours_model()
+    library, colours = templates.galaxy_library(), sequences.model()
     selection = _selection(wanted, training)
     dustiest = float(selection.ebv[-1])
     found = halos_and_galaxies(seed, wanted, light_cone, training)
-    distant = high_redshift.model(wanted.high_redshift_boost, wanted.quasar_boost)
+    boosts = wanted.high_redshift_boost, wanted.quasar_boost
+    distant = high_redshift.model(*boosts, wanted.galaxy_limit, wanted.z_max)
+    colour = band_ratios.load(library, "sdss_g01", 0.0, dustiest)
     return GalaxyModel(
         limit=wanted.galaxy_limit,
         band=passbands.load(wanted.galaxy_band),
@@ -130,12 +134,14 @@ def model(
         alignments=alignments.model(found.halos.box, found.halos.turned, wanted.alignment),
         luminosities=luminosity_function.schechter(),
         colours=colours,
+        ends=sequences.limits(colour, colours.dust),
+        halo_shares=quenching.shares(quenching.model(), found.masses, found.halos.matching.occupation),
         selection=selection,
         reference=band_ratios.load(library, band_ratios.REFERENCE_BAND, matching.Z_LAST, dustiest),
-        colour=band_ratios.load(library, "sdss_g01", 0.0, dustiest),
+        colour=colour,
         shapes=morphology.shapes(),
         masses=stellar_mass.mass_to_light(),
-        light=stellar_mass.light(library, selection.ebv),
+        star_formation=stellar_mass.star_formation(),
         lines=emission_lines.model(),
         distant=distant,
         training=training,
@@ -166,7 +172,7 @@ def _lens(found: Population, wanted: Universe, far: bool) -> Lens:
 
 
 def _selection(wanted: Universe, training: Training | None) -> BandRatios:
-    dustiest = max(sed_assignment.colours_model().dust.highest, training.dustiest if training else 0.0)
+    dustiest = max(sequences.model().dust.highest, training.dustiest if training else 0.0)
     return band_ratios.load(templates.galaxy_library(), wanted.galaxy_band, matching.Z_LAST, dustiest)
 
 
@@ -185,9 +191,9 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
         **_places(lens, members, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
         "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
-        "color_gr_01": drawn.colour,
+        "color_gr_01": drawn.colour.colour,
         **physical,
-        **sed_assignment.columns(drawn.sed),
+        **band_ratios.columns(drawn.sed),
         **_shape_columns(universe, members, drawn, physical["log_stellar_mass"]),
     }
     rows = [GALAXIES.build(columns)]
@@ -226,27 +232,30 @@ def halo_limits(universe: Population) -> pa.Table:
     )
 
 
-def select(universe: GalaxyModel, z: Float, m_r: Float, red: Bool, sed: Sed, deeper: float = 0.0) -> Drawn:
+def select(universe: GalaxyModel, z: Float, m_r: Float, colour: Colour, sed: Sed, deeper: float = 0.0) -> Drawn:
     """The galaxies whose continuum is brighter than the limit, with their realised colours.
 
-    z, m_r : float[n] redshift, M_r mag;  red : bool[n] on the red sequence;  sed : n spectra
+    z, m_r : float[n] redshift, M_r mag;  colour, sed : of n galaxies, their colours as drawn and spectra
     universe : whose limit and passband hold;  deeper : mag, beyond the limit
     """
     magnitude = apparent(universe, z, m_r, sed)
     row = np.flatnonzero(magnitude < universe.limit + deeper)
     kept = sed.part(row)
-    colour = sed_assignment.colours(universe.colour, kept)
-    return Drawn(row, z[row], m_r[row], magnitude[row], red[row], colour, kept)
+    realised = replace(colour.part(row), colour=band_ratios.colours(universe.colour, kept))
+    return Drawn(row, z[row], m_r[row], magnitude[row], realised, kept)
 
 
 def _bright(universe: GalaxyModel, members: Members, drawn: Drawn) -> tuple[Drawn, dict[str, Float]]:
     """Those that are brighter than the limit with their lines; their masses, star formation rates and line fluxes."""
-    log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, drawn.colour)
-    log_sfr = stellar_mass.log_sfr(universe.light, drawn.m_r, drawn.sed)
-    rng = Keyed(members.id[drawn.row], universe.population.seed, "galaxies.lines")
-    fluxes = emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, drawn.red, drawn.sed.ebv, rng)
-    light = line_light.added(universe.band, members.z_obs[drawn.row], fluxes)
-    kept = line_light.brightened(drawn.magnitude, light) < universe.limit
+    seed, own_ids, colour = universe.population.seed, members.id[drawn.row], drawn.colour
+    log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, colour.colour, drawn.z)
+    main = stellar_mass.main_sequence(universe.star_formation, log_mass, drawn.z)
+    rng = Keyed(own_ids, seed, "galaxies.star_formation")
+    log_sfr = stellar_mass.log_sfr(universe.star_formation, main, colour.sequence, colour.deviate, rng)
+    rng = Keyed(own_ids, seed, "galaxies.lines")
+    fluxes = emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, colour.red, rng)
+    light = emission_lines.added(universe.band, members.z_obs[drawn.row], fluxes)
+    kept = emission_lines.brightened(drawn.magnitude, light) < universe.limit
     columns = {"log_stellar_mass": log_mass, "log_sfr": log_sfr, **fluxes}
     return drawn.part(kept), {name: column[kept] for name, column in columns.items()}
 
@@ -261,19 +270,19 @@ def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
     return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
 
 
-def _light(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Bool, Sed]:
-    """Candidates of a cell: z, M_r, on the red sequence, spectra."""
-    m_r = universe.population.halos.matching.magnitude(members.z, members.proxy)
-    red, colour = sed_assignment.draw_colour(
-        universe.colours, m_r, members.z, members.kind, Keyed(members.id, seed, "galaxies.colour")
-    )
+def _light(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Colour, Sed]:
+    """Candidates of a cell: z, M_r, colours, spectra."""
+    z, colours, ends = members.z, universe.colours, universe.ends
+    m_r = universe.population.halos.matching.magnitude(z, members.proxy)
+    satellites = quenching.satellite_share(universe.halo_shares, members)
+    share = sequences.red_fraction(colours.fraction, m_r, z, satellites)
+    odds = quenching.odds(universe.halo_shares, members, share)
+    found = sequences.draw(colours, ends, m_r, z, odds, Keyed(members.id, seed, "galaxies.colour"))
     if universe.training is not None:
         rng = Keyed(members.id, seed, "galaxies.nearest")
-        return members.z, m_r, red, nearest_sed.assign(universe.training, colour, m_r, members.z, rng)
-    law, ebv = sed_assignment.draw_dust(
-        universe.colours.dust, m_r, red, colour, Keyed(members.id, seed, "galaxies.dust")
-    )
-    return members.z, m_r, red, sed_assignment.invert(universe.colour, colour, law, ebv)
+        return z, m_r, found, nearest_sed.assign(universe.training, found.colour, m_r, z, rng)
+    law, ebv = sequences.dust(colours, ends, m_r, z, found, Keyed(members.id, seed, "galaxies.dust"))
+    return z, m_r, found, band_ratios.invert(universe.colour, found.colour, law, ebv)
 
 
 def _places(
@@ -302,11 +311,11 @@ def _shape_columns(
     source, seed, shapes = members.id[drawn.row], universe.population.seed, universe.shapes
     scale = cosmology.kpc_per_arcsec(drawn.z)
     rng = Keyed(source, seed, "galaxies.size")
-    radius = morphology.half_light_radius(shapes.size, drawn.z, log_mass, drawn.red, scale, rng)
+    radius = morphology.half_light_radius(shapes.size, drawn.z, log_mass, drawn.colour.red, scale, rng)
     rng = Keyed(source, seed, "galaxies.bulge")
-    fraction = morphology.bulge_fraction(shapes.bulge, log_mass, drawn.red, rng)
-    sersic = morphology.sersic_index(shapes.bulge, drawn.red, rng)
-    ratio = morphology.radius_ratio(shapes.bulge, drawn.red, rng)
+    fraction = morphology.bulge_fraction(shapes.bulge, log_mass, drawn.colour.red, rng)
+    sersic = morphology.sersic_index(shapes.bulge, drawn.colour.red, rng)
+    ratio = morphology.radius_ratio(shapes.bulge, drawn.colour.red, rng)
     bulge_radius, disc_radius = morphology.component_radii(shapes, radius, fraction, ratio, sersic)
     rng = Keyed(source, seed, "galaxies.shape")
     disc_ratio = morphology.disc_axis_ratio(shapes, drawn.z.size, rng)
@@ -319,7 +328,7 @@ def _shape_columns(
         "disk_axis_ratio": disc_ratio,
         "inclination": morphology.inclination(disc_ratio, shapes.scale_height),
         "position_angle": alignments.position_angles(
-            universe.alignments, rng.random(drawn.z.size), _aligned(universe, members, drawn), drawn.red
+            universe.alignments, rng.random(drawn.z.size), _aligned(universe, members, drawn), drawn.colour.red
         ),
     }
 
@@ -330,9 +339,9 @@ def _aligned(universe: GalaxyModel, members: Members, drawn: Drawn) -> Complex:
     if own is None:
         return mean
     lone = members.kind[drawn.row] == population.CENTRAL
-    row, red = drawn.row[lone], drawn.red[lone]
+    row, red = drawn.row[lone], drawn.colour.red[lone]
     mean[lone] = alignments.of_centrals(own, members.ra[row], members.dec[row], members.chi[row], drawn.m_r[lone], red)
-    row, red = drawn.row[~lone], drawn.red[~lone]
+    row, red = drawn.row[~lone], drawn.colour.red[~lone]
     towards, apart = alignments.direction(members.ra[row], members.dec[row], members.host_index[row])
     radius = universe.population.masses.radius(members.host_mass[row]) / members.chi[row]
     mean[~lone] = alignments.of_satellites(own, towards, apart / radius, red)

@@ -1,12 +1,13 @@
-"""Galaxies and quasars beyond redshift 6: rows of table `galaxies` of kinds 3 and 2.
+"""Quasars, and galaxies beyond redshift 6: rows of table `galaxies` of kinds 2 and 3.
 
 model       the luminosity functions, tabulated
 draw        rows of one generation cell
 per_deg2    how many there are
 
-They are drawn at random places: no structure beyond the galaxies' light-cone. `density_boost` says how many times
-more were drawn than there are.
-Ref: Bouwens et al. 2021, AJ 162, 47; Matsuoka et al. 2018, ApJ 869, 150; the numbers are in high_redshift.toml.
+They are drawn at random places: no structure. `density_boost` says how many times more were drawn than there are. Each
+magnitude is drawn by itself, so that a shallower request has the brighter ones of a deeper one.
+Ref: Palanque-Delabrouille et al. 2016; Bouwens et al. 2021, AJ 162, 47; Matsuoka et al. 2018, ApJ 869, 150; the numbers
+are in high_redshift.toml.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from jobs.fluxes.high_redshift import (
     QUASAR_STRENGTHS,
     ultraviolet_magnitude,
 )
+from jobs.keyed import Draws, Keyed
 from jobs.rng import stream
 from lake_schema import ids, sky
 from lake_schema.arrays import Float, Float32, Int
@@ -41,13 +43,18 @@ from lake_schema.tables.galaxies import GALAXIES
 _FILE = "high_redshift.toml"
 _STREAM = {HIGH_REDSHIFT: "high_redshift", QUASAR: "quasars"}
 _Z_STEP, _M_STEP, _M_BRIGHTEST = 0.02, 0.02, -32.0
+# Where the light-cone of galaxies ends and other populations begin, and the brightest magnitude that is drawn.
+_BEYOND, _FIRST_MAGNITUDE = 6.0, 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kind:
-    """One of the two kinds: numbers of the file, and counts per deg2 of cells of (z, M).
+    """One of the two kinds: numbers of the file, and counts per deg2 of cells of (z, M), by apparent magnitude.
 
-    z : [r] lower edges;  m : [c] lower edges;  counts : [r, c]
+    limit : faintest ultraviolet magnitude, AB;  z_end : redshift at which a nearer universe ends (what is beyond
+            z = 6 stays)
+    z : [r] lower edges;  m : [c] lower edges;  first : of the magnitudes
+    cells, counts : of each whole magnitude, int[k] places in [r, c] and float[k] their numbers, cumulative
     """
 
     code: int
@@ -55,18 +62,34 @@ class Kind:
     boost: float
     z: Float
     m: Float
-    counts: Float
+    limit: float
+    z_end: float
+    first: int
+    cells: tuple[Int, ...]
+    counts: tuple[Float, ...]
 
-    @property
-    def per_deg2(self) -> float:
-        """In nature."""
-        return float(self.counts.sum())
+    def per_deg2(self, near: float = 0.0, far: float = np.inf) -> float:
+        """How many there are in nature between two redshifts, deg-2: near, far, of whole steps of the table."""
+        number = 0.0
+        for cells, counts in zip(self.cells, self.counts, strict=True):
+            z, m = (nodes[i] for nodes, i in zip((self.z, self.m), np.divmod(cells, self.m.size), strict=True))
+            seen = ultraviolet_magnitude(m + 0.5 * _M_STEP, z + 0.5 * _Z_STEP) < self.limit
+            kept = (z > near - 1e-6) & (z < far - 1e-6) & ((z < self.z_end) | (z > _BEYOND - 1e-6)) & seen
+            number += float(np.diff(counts, prepend=0.0)[kept].sum())
+        return number
 
 
-def model(galaxy_boost: float = 1.0, quasar_boost: float = 1.0) -> tuple[Kind, ...]:
-    """The kinds that are drawn; a boost of 0 leaves one out."""
+def model(
+    galaxy_boost: float = 1.0, quasar_boost: float = 1.0, limit: float = 26.0, z_end: float = 6.0
+) -> tuple[Kind, ...]:
+    """The kinds that are drawn; a boost of 0 leaves one out.
+
+    galaxy_boost, quasar_boost : how many times denser than in nature
+    limit : faintest magnitude, AB, at 1500 or 1450 A in the rest frame;  z_end : of the universe's galaxies
+    """
     wanted = ((HIGH_REDSHIFT, "galaxies", galaxy_boost), (QUASAR, "quasars", quasar_boost))
-    return tuple(_kind(code, parameters.section(_FILE, name), boost) for code, name, boost in wanted if boost > 0.0)
+    drawn = ((code, parameters.section(_FILE, name), boost) for code, name, boost in wanted if boost > 0.0)
+    return tuple(_kind(*about, limit, z_end) for about in drawn)
 
 
 def draw(cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Float32) -> pa.Table:
@@ -76,15 +99,20 @@ def draw(cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Flo
     cell   : nested index at order 8;  seed : of the request;  kind : the objects' luminosity function and boost
     lens   : halos and maps, maps alone, or one shear for all
     """
-    rng = stream(seed, _STREAM[kind.code], cell)
-    n = int(rng.poisson(kind.boost * kind.per_deg2 * sky.cell_area(GENERATION_ORDER)))
-    at = np.searchsorted(np.cumsum(kind.counts), rng.random(n) * kind.per_deg2, side="right")
-    row, column = np.divmod(np.minimum(at, kind.counts.size - 1), kind.m.size)
-    z = kind.z[row] + _Z_STEP * rng.random(n)
-    m = kind.m[column] + _M_STEP * rng.random(n)
-    index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, n, rng)
-    source = ids.source_id(np.full(n, kind.code), cell, ids.FIRST_NUMBER + np.arange(n))
-    zeros = np.zeros(n)
+    found, number = [], 0
+    for step in range(len(kind.cells)):
+        drawn = _of_magnitude(cell, seed, kind, step)
+        # Numbered before anything is left out.
+        own = ids.FIRST_NUMBER + number + np.arange(drawn[0].size)
+        number += own.size
+        kept = (ultraviolet_magnitude(drawn[1], drawn[0]) < kind.limit) & (
+            (drawn[0] < kind.z_end) | (drawn[0] >= _BEYOND)
+        )
+        found.append([column[kept] for column in (own, *drawn)])
+    own, z, m, index, ra, dec = (np.concatenate(column) for column in zip(*found, strict=True))
+    source = ids.source_id(np.full(own.size, kind.code), cell, own)
+    rng = Keyed(source, seed, _STREAM[kind.code])
+    zeros = np.zeros(own.size)
     columns = {
         "id": source,
         "halo_id": ids.halo_of(source),
@@ -92,13 +120,12 @@ def draw(cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Flo
         "dec": dec,
         "_healpix_29": index,
         **halo_lensing.columns(lens, ra, dec, cosmology.comoving_distance(z)),
-        "kind": np.full(n, kind.code),
-        "density_boost": np.full(n, kind.boost),
+        "kind": np.full(own.size, kind.code),
+        "density_boost": np.full(own.size, kind.boost),
         "z_true": z,
         "z_obs": z,
         "abs_mag_r01": m - 5.0 * np.log10(cosmology.HUBBLE),
         "mag_r01": ultraviolet_magnitude(m, z),
-        "color_gr_01": zeros,
         "sed_1": _templates(kind, m, rng),
         "frac_1": zeros + 1.0,
         "sed_2": zeros.astype(int),
@@ -111,17 +138,28 @@ def draw(cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Flo
     return GALAXIES.build(columns)
 
 
+def _of_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float, Float, Int, Float, Float]:
+    """Redshifts[n], M[n] and places (index, ra, dec) of one whole magnitude."""
+    rng, counts = stream(seed, _STREAM[kind.code], cell, kind.first + step), kind.counts[step]
+    total = float(counts[-1]) if counts.size else 0.0
+    n = int(rng.poisson(kind.boost * total * sky.cell_area(GENERATION_ORDER)))
+    at = np.searchsorted(counts, rng.random(n) * total, side="right")
+    row, column = np.divmod(kind.cells[step][np.minimum(at, counts.size - 1)], kind.m.size)
+    z, m = kind.z[row] + _Z_STEP * rng.random(n), kind.m[column] + _M_STEP * rng.random(n)
+    return z, m, *sky.random_in_cell(GENERATION_ORDER, cell, n, rng)
+
+
 def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:
     """dn/dM, Mpc^-3 mag^-1.
 
     m : float[...] absolute ultraviolet AB mag;  z : float[...]
     code    : kind of object;  numbers : constants of its luminosity function
     """
-    since = z - 6.0
+    since = z - _BEYOND
     if code == QUASAR:
-        x = 0.4 * (m - numbers["m_star"])
-        slopes = 10.0 ** ((numbers["faint"] + 1.0) * x) + 10.0 ** ((numbers["bright"] + 1.0) * x)
-        return np.asarray(numbers["phi"] * 10.0 ** (numbers["rate"] * since) / slopes)
+        beyond = numbers["phi"] * 10.0 ** (numbers["rate"] * since)
+        far = _double_power(beyond, numbers, m - numbers["m_star"])
+        return np.where(since < 0.0, _near_quasars(parameters.section(_FILE, "near_quasars"), m, z), far)
     star = numbers["m_star"] + numbers["m_star_rate"] * since
     phi = numbers["phi_star"] * 10.0 ** (numbers["phi_rate"] * since + numbers["phi_curve"] * since**2)
     alpha = numbers["alpha"] + numbers["alpha_rate"] * since
@@ -129,17 +167,36 @@ def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:
     return np.asarray(0.4 * np.log(10.0) * phi * np.exp((alpha + 1.0) * ln_x - np.exp(ln_x)))
 
 
-def _kind(code: int, numbers: dict[str, Any], boost: float) -> Kind:
-    z = np.arange(numbers["z_min"], numbers["z_max"] - 1e-9, _Z_STEP)
+def _near_quasars(numbers: dict[str, Any], m: Float, z: Float) -> Float:
+    d = z - numbers["z_pivot"]
+    before, after = np.minimum(d, 0.0), np.maximum(d, 0.0)
+    star = numbers["m_star"] + numbers["near_rate"] * before + numbers["near_curve"] * before**2
+    star = star + numbers["far_rate"] * after
+    log_phi = numbers["log_phi"] + numbers["phi_rate"] * after + numbers["phi_curve"] * after**2
+    return _double_power(10.0**log_phi, numbers, m - star)
+
+
+def _double_power(phi: Float, numbers: dict[str, Any], brighter: Float) -> Float:
+    x = 0.4 * brighter
+    return np.asarray(phi / (10.0 ** ((numbers["faint"] + 1.0) * x) + 10.0 ** ((numbers["bright"] + 1.0) * x)))
+
+
+def _kind(code: int, numbers: dict[str, Any], boost: float, limit: float, z_end: float) -> Kind:
+    near = parameters.section(_FILE, "near_quasars")["z_min"] if code == QUASAR else _BEYOND
+    z = np.arange(near, numbers["z_max"] - 1e-9, _Z_STEP)
     m = np.arange(_M_BRIGHTEST, -12.0, _M_STEP)
     middle_z, middle_m = z[:, None] + 0.5 * _Z_STEP, m[None, :] + 0.5 * _M_STEP
     volume = cosmology.comoving_volume(z, z + _Z_STEP)[:, None] * np.radians(1.0) ** 2 / cosmology.HUBBLE**3
     counts = density(code, numbers, middle_m, middle_z) * volume * _M_STEP
-    bright = ultraviolet_magnitude(middle_m, middle_z) < numbers["limit"]
-    return Kind(code, numbers, boost, z, m, np.where(bright, counts, 0.0))
+    # Of a whole magnitude all are drawn, a little more than the limit takes.
+    mag = np.floor(ultraviolet_magnitude(middle_m, middle_z))
+    last = int(np.ceil(limit + 2.0 * _M_STEP))
+    cells = tuple(np.flatnonzero(mag == step) for step in range(_FIRST_MAGNITUDE, last))
+    each = tuple(np.cumsum(counts.ravel()[place]) for place in cells)
+    return Kind(code, numbers, boost, z, m, limit, z_end, _FIRST_MAGNITUDE, cells, each)
 
 
-def _templates(kind: Kind, m: Float, rng: np.random.Generator) -> Int:
+def _templates(kind: Kind, m: Float, rng: Draws) -> Int:
     """Index of the template: slope, then strength of the lines."""
     if kind.code == QUASAR:
         slope = rng.integers(0, len(QUASAR_OFFSETS), m.size)
@@ -153,7 +210,7 @@ def _templates(kind: Kind, m: Float, rng: np.random.Generator) -> Int:
     return np.asarray(nearest * len(LYMAN_ALPHA_WIDTHS) + width, np.int64)
 
 
-def _shapes(kind: Kind, z: Float, m: Float, rng: np.random.Generator) -> dict[str, npt.NDArray[np.generic]]:
+def _shapes(kind: Kind, z: Float, m: Float, rng: Draws) -> dict[str, npt.NDArray[np.generic]]:
     """One Sersic component: everything is in the bulge."""
     law, n = kind.numbers, z.size
     if kind.code == QUASAR:

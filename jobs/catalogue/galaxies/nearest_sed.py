@@ -21,7 +21,7 @@ from jobs.cache import cached_arrays, content_key
 from jobs.catalogue import parameters
 from jobs.catalogue.external import mapping
 from jobs.catalogue.external.mapping import Columns
-from jobs.catalogue.galaxies import sed_assignment
+from jobs.catalogue.galaxies import band_ratios
 from jobs.catalogue.galaxies.band_ratios import Sed
 from jobs.code_keys import code_key
 from jobs.fluxes.libraries import templates
@@ -104,7 +104,7 @@ def assign(given: Training, colour: Float, m_r: Float, z: Float, rng: Draws) -> 
     # Without a law there is no dust to scatter.
     dusty = given.ext_law[nearest] > 0
     ebv = np.clip(given.ebv[nearest] + law.ebv * rng.standard_normal(n), 0.0, given.dustiest)
-    return sed_assignment.between(index, given.ext_law[nearest], np.where(dusty, ebv, 0.0))
+    return band_ratios.between(index, given.ext_law[nearest], np.where(dusty, ebv, 0.0))
 
 
 def _scaled(law: Nearness, colour: Float, m_r: Float, z: Float) -> Float:

@@ -1,10 +1,12 @@
 """Stellar masses and star formation rates of galaxies.
 
-log_stellar_mass    from luminosity and colour
-light, log_sfr      from the template's ultraviolet light, internal dust undone
+log_stellar_mass    from luminosity, colour and redshift
+main_sequence       the median rate of galaxies that form stars, from mass and redshift
+log_sfr             drawn about it, by sequence and colour
 
-Luminosities are physical here: M = M_r + 5 log10 h, h = 0.67.
-Ref: Bell et al. 2003, Kennicutt 1998; the numbers are in stellar_mass.toml.
+Luminosities are physical here: M = M_r + 5 log10 h, h = 0.67. Masses and rates are of the initial mass functions of
+Chabrier 2003 and Kroupa 2001, which give the same ones.
+Ref: Davidzon et al. 2017, Leja et al. 2020, Popesso et al. 2023; the numbers are in stellar_mass.toml.
 """
 
 from __future__ import annotations
@@ -13,18 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jobs import sums
 from jobs.catalogue import parameters
-from jobs.catalogue.galaxies import band_ratios
-from jobs.catalogue.galaxies.band_ratios import Sed
-from jobs.fluxes.cosmology import HUBBLE
-from jobs.fluxes.libraries.templates import Library
+from jobs.catalogue.galaxies.sequences import GREEN, RED
+from jobs.fluxes import cosmology
+from jobs.keyed import Draws
 from lake_schema.arrays import Float, Int
-from lake_schema.units import AB_CGS, LIGHT_ANGSTROM_S
 
 _FILE = "stellar_mass.toml"
-# 10 pc, IAU 2015 resolution B2.
-_TEN_PARSEC_CM = 3.0856775814913673e19
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,34 +30,34 @@ class MassToLight:
 
     sun: float
     intercept: float
+    intercept_l: float
+    intercept_l2: float
     slope: float
-    initial_mass: float
+    slope_l: float
+    z_last: float
     to_rest: float
     limits: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class StarFormation:
-    """Ultraviolet luminosity to star formation rate (stellar_mass.toml, [star_formation])."""
+    """The main sequence, and the galaxies about and below it (stellar_mass.toml, [star_formation])."""
 
-    per_luminosity: float
-    first: float
-    last: float
-    calibration: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Light:
-    """What star formation rates are read from, made once by `light`.
-
-    ultraviolet : [template] dust-free mean f_nu of the ultraviolet / f_nu in 0.1r
-    dimming     : [4, template, e] ln of what laws 1 .. 4 let through in 0.1r, at E(B-V) nodes ebv
-    """
-
-    law: StarFormation
-    ultraviolet: Float
-    ebv: Float
-    dimming: Float
+    sequence: float
+    sequence_t: float
+    bend: float
+    bend_mass: float
+    bend_mass_t: float
+    median: float
+    blue_scatter: float
+    blue_colour: float
+    blue_own: float
+    green: float
+    green_scatter: float
+    red: float
+    red_scatter: float
+    omega_m: float
+    hubble: float
 
 
 def mass_to_light() -> MassToLight:
@@ -68,50 +65,43 @@ def mass_to_light() -> MassToLight:
     return MassToLight(**parameters.section(_FILE, "mass_to_light"))
 
 
-def light(library: Library, ebv: Float) -> Light:
-    """Tables of a template library; ebv : nodes of E(B-V).
-
-    ebv : float[e] mag
-    """
-    law = StarFormation(**parameters.section(_FILE, "star_formation"))
-    spectra = library.flux.astype(np.float64)
-    weights = band_ratios.band_weights(library, band_ratios.REFERENCE_BAND, 0.0)
-    reference = sums.product(spectra, weights)
-    inside = (library.wavelength >= law.first) & (library.wavelength <= law.last)
-    f_nu = spectra[:, inside] * library.wavelength[inside] ** 2 / LIGHT_ANGSTROM_S
-    through = sums.product(band_ratios.dusty(library, ebv) * weights, spectra.T)
-    dimming = np.log(through / reference).transpose(0, 2, 1)
-    return Light(law, f_nu.mean(1) / reference, ebv, np.ascontiguousarray(dimming))
+def star_formation() -> StarFormation:
+    """The star formation rates of the embedded universe."""
+    return StarFormation(**parameters.section(_FILE, "star_formation"))
 
 
-def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float) -> Float:
-    """log10 of the stellar mass[n] / Msun.
+def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float, z: Float) -> Float:
+    """log10 of the stellar mass[n] / Msun, Chabrier.
 
-    m_r : M_r[n]; colour : 0.1(g - r)[n]
+    m_r : float[n] M_r mag;  colour : float[n] 0.1(g - r) mag;  z : float[n];  law : constants
     Ref: Bell et al. 2003, appendix 2
     """
     g_r = np.clip(colour - law.to_rest, *law.limits)
-    return -0.4 * (_physical(m_r) - law.sun) + law.intercept + law.slope * g_r + law.initial_mass
+    since = np.log10(1.0 + np.minimum(z, law.z_last))
+    zero = law.intercept + law.intercept_l * since + law.intercept_l2 * since**2
+    light = -0.4 * (m_r + 5.0 * np.log10(cosmology.HUBBLE) - law.sun)
+    return np.asarray(light + zero + (law.slope + law.slope_l * since) * g_r)
 
 
-def log_sfr(table: Light, m_r: Float, sed: Sed) -> Float:
-    """log10 of the star formation rate[n] / (Msun/yr).
+def main_sequence(law: StarFormation, log_mass: Float, z: Float) -> Float:
+    """log10 of the median star formation rate[n] / (Msun/yr) of star-forming galaxies.
 
-    m_r : float[n] M_r mag;  sed : n spectra
-    Ref: Kennicutt 1998
+    log_mass : float[n] log10 Msun;  z : float[n];  law : constants
+    Ref: Popesso et al. 2023, eq. 10
     """
-    total = sed.frac_1 * _undimmed(table, sed.template_1, sed) + sed.frac_2 * _undimmed(table, sed.template_2, sed)
-    area = 4.0 * np.pi * _TEN_PARSEC_CM**2
-    log_l_nu = -0.4 * (_physical(m_r) + AB_CGS) + np.log10(area * total)
-    return np.asarray(np.log10(table.law.per_luminosity) + log_l_nu + table.law.calibration)
+    age = cosmology.age(z, law.omega_m, law.hubble)
+    below = law.bend * (law.bend_mass - law.bend_mass_t * age - log_mass)
+    bent = np.logaddexp(0.0, np.log(10.0) * below) / np.log(10.0)
+    return np.asarray(law.sequence - law.sequence_t * age - bent + law.median)
 
 
-def _undimmed(table: Light, template: Int, sed: Sed) -> Float:
-    """Dust-free ultraviolet f_nu for a unit flux in 0.1r that has passed the dust, [n]."""
-    nodes = table.dimming[np.maximum(sed.law, 1) - 1, template]
-    weights = band_ratios.ebv_weights(table.ebv, np.where(sed.law > 0, sed.ebv, 0.0))
-    return np.asarray(table.ultraviolet[template] * np.exp(-np.sum(nodes * weights, axis=1)))
+def log_sfr(law: StarFormation, main: Float, sequence: Int, deviate: Float, rng: Draws) -> Float:
+    """log10 of the star formation rate[n] / (Msun/yr), Kroupa: bluer galaxies of the blue sequence form more.
 
-
-def _physical(m_r: Float) -> Float:
-    return np.asarray(m_r + 5.0 * np.log10(HUBBLE))
+    main     : float[n] of `main_sequence`;  sequence : int[n];  deviate : float[n] of the colour on it
+    law      : constants;  rng : of the scatter
+    """
+    normal = rng.standard_normal(main.size)
+    blue = law.blue_scatter * (law.blue_own * normal - law.blue_colour * deviate)
+    green, red = law.green + law.green_scatter * normal, law.red + law.red_scatter * normal
+    return np.asarray(main + np.where(sequence == RED, red, np.where(sequence == GREEN, green, blue)))

@@ -26,7 +26,8 @@ _Z_MAX_LIMIT = 6.0
 
 # Resolution of the tables: chosen so that the stated errors hold.
 _SMALLEST_A = 1e-5
-_A_NODES, _A_MARGIN = 128, 0.01
+_ONE_STEP = -0.95
+_A_NODES, _A_MARGIN = 384, 0.01
 _LN_X_RANGE, _X_NODES, _X_STEP = (-20.0, 6.4), 3001, 5
 
 
@@ -43,6 +44,10 @@ class Schechter:
     alpha: float
     alpha_rate: float
     alpha_z_max: float
+    far_z: tuple[float, ...]
+    far_m_star: tuple[float, ...]
+    far_phi_star: tuple[float, ...]
+    far_alpha: tuple[float, ...]
 
     def at(self, z: npt.ArrayLike) -> tuple[Float, Float, Float]:
         """z[n] -> M*[n] mag, phi*[n] (Mpc/h)^-3, alpha[n]."""
@@ -50,7 +55,15 @@ class Schechter:
         since = redshift - self.z_anchor
         m_star = self.m_star + self.m_star_rate * self.m_star_scale * np.expm1(-since / self.m_star_scale)
         phi_star = self.phi_star * 10.0 ** (-self.phi_star_rate * since)
-        return m_star, phi_star, self.alpha - self.alpha_rate * np.minimum(redshift, self.alpha_z_max)
+        alpha = self.alpha - self.alpha_rate * np.minimum(redshift, self.alpha_z_max)
+        far = redshift > self.far_z[0]
+        if not far.any():
+            return m_star, phi_star, alpha
+        knots = (self.far_m_star, np.log(self.far_phi_star), self.far_alpha)
+        m_far, ln_phi_far, alpha_far = (np.interp(redshift, self.far_z, knot) for knot in knots)
+        beyond = ((m_far, m_star), (np.exp(ln_phi_far), phi_star), (alpha_far, alpha))
+        m_star, phi_star, alpha = (np.where(far, there, here) for there, here in beyond)
+        return m_star, phi_star, alpha
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,19 +128,25 @@ def number_density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
 
 
 def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
-    """Gamma(a, x) for a > -1 and x > 0; scipy's own needs a > 0.
+    """Gamma(a, x) for a > -2 and x > 0; scipy's own needs a > 0.
 
     a, x : float[...]
-    Error: relative 1e-9 where |a| > 1e-2 and x < 300, 1e-4 where |a| < 1e-5
+    Error: relative 1e-9 where |a|, |a + 1| > 1e-2 and x < 300 (a > -0.9) or x < 30, 1e-4 where |a|, |a + 1| < 1e-5
            (tests/jobs/catalogue/halos/test_luminosity_function.py)
     Ref: Abramowitz & Stegun 1972, 6.5.22: Gamma(a, x) = [Gamma(a + 1, x) - x^a e^-x] / a
     """
     order, at = np.asarray(a, float), np.asarray(x, float)
-    if order.size and order.min() <= -1.0:
-        raise OutOfRange("a", float(order.min()), -1.0, "infinity")
-    # At a = 0 the recurrence divides zero by zero; so small a step moves Gamma by less than 1e-4.
+    if order.size and order.min() <= -2.0:
+        raise OutOfRange("a", float(order.min()), -2.0, "infinity")
+    # At a = 0 and -1 the recurrence divides zero by zero; so small a step moves Gamma by less than 1e-4.
     order = np.where(np.abs(order) < _SMALLEST_A, _SMALLEST_A, order)
-    above = gamma(order + 1.0) * gammaincc(order + 1.0, at)
+    order = np.where(np.abs(order + 1.0) < _SMALLEST_A, _SMALLEST_A - 1.0, order)
+    # Each step up loses digits at large x: two only where one would not do.
+    second = order < _ONE_STEP
+    start = np.where(second, order + 2.0, order + 1.0)
+    above = gamma(start) * gammaincc(start, at)
+    middle = np.where(second, order + 1.0, 1.0)
+    above = np.where(second, (above - np.exp(middle * np.log(at) - at)) / middle, above)
     return np.asarray(np.maximum((above - np.exp(order * np.log(at) - at)) / order, 0.0))
 
 

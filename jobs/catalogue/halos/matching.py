@@ -23,8 +23,8 @@ from jobs.catalogue.matter import linear_theory
 from jobs.fluxes import cosmology
 from lake_schema.arrays import Float, Int
 
-# Tables reach redshift 3, uniform in ln(1 + z), and 0.02 dex.
-Z_LAST, _Z_NODES = 3.0, 49
+# Tables reach beyond redshift 6, uniform in ln(1 + z), and 0.02 dex.
+Z_LAST, _Z_NODES = 6.1, 69
 _LOG_MASS = np.linspace(8.0, 16.4, 421)
 
 
@@ -126,7 +126,7 @@ class Matching:
 
 
 def masses() -> Masses:
-    """The halos of the embedded universe, 0 <= z <= 3."""
+    """The halos of the embedded universe, 0 <= z <= 6.1."""
     z = np.expm1(np.linspace(0.0, np.log1p(Z_LAST), _Z_NODES))
     tables = linear_theory.halo_tables(_LOG_MASS, z)
     shape = HaloShape(**parameters.section("halos.toml", "halo"))
@@ -152,14 +152,22 @@ def proxies(halos: Masses, occupation: Occupation) -> Float:
     satellites = sums.product(number, satellites_above(halos.log_mass, occupation).T)
     # Of the cumulative count of satellites, what lies in each interval.
     inside = number + np.concatenate([satellites[:, :-1] - satellites[:, 1:], satellites[:, -1:]], axis=1)
+    smooth = scattered(inside, step, occupation)
+    above = np.cumsum(smooth[:, ::-1], axis=1)[:, ::-1]
+    return np.maximum(above - 0.5 * smooth, 1e-30)
+
+
+def scattered(number: Float, step: float, occupation: Occupation) -> Float:
+    """[z, m] in bins of the proxy mass, of numbers in bins of the mass.
+
+    number : float[z, m];  step : width of a bin, dex;  occupation : of which the scatter is
+    """
     half = round(occupation.depth / step)
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * step / occupation.scatter) ** 2)
     kernel /= kernel.sum()
-    padded = np.pad(inside, ((0, 0), (half, half)), mode="reflect", reflect_type="odd")
-    padded = np.maximum(padded, 0.0)
-    smooth: Float = sums.product(sliding_window_view(padded, kernel.size, axis=1), kernel)
-    above = np.cumsum(smooth[:, ::-1], axis=1)[:, ::-1]
-    return np.maximum(above - 0.5 * smooth, 1e-30)
+    padded = np.pad(number, ((0, 0), (half, half)), mode="reflect", reflect_type="odd")
+    smooth: Float = sums.product(sliding_window_view(np.maximum(padded, 0.0), kernel.size, axis=1), kernel)
+    return smooth
 
 
 def satellites_above(log_mass: Float, occupation: Occupation) -> Float:

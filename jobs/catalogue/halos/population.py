@@ -49,7 +49,8 @@ class Population:
 class Members:
     """Halos of a cell, and candidate galaxies: centrals, then satellites by host, sorted by index.
 
-    halo_id, host_mass, host_index : of each galaxy's halo;  index, ra, dec : order-29 cell and position, deg
+    halo_id, host_mass, host_index : of each galaxy's halo, log10 M_200m / (Msun/h);  index : order-29 cell
+    ra, dec : deg;  radius : from the halo's centre / R_200m, 0 of centrals
     """
 
     halos: Halos
@@ -65,6 +66,7 @@ class Members:
     proxy: Float
     host_mass: Float
     host_index: Int
+    radius: Float
 
 
 @dataclass(slots=True, eq=False)
@@ -139,13 +141,15 @@ def members(cells: Cells, cell: int) -> Members:
     lit = own.part(own.proxy >= cells.population.halos.mass_limit(own.chi))
     landed = [_landed(cells, order, around, cell) for order in LEVELS for around in _around(order, cell)]
     ra, dec = sky.positions(lit.index)
-    central = (lit.id, lit.id, lit.index, ra, dec, lit.chi, lit.velocity, lit.proxy, lit.log_mass, lit.index)
+    places = (lit.id, lit.id, lit.index, ra, dec, lit.chi, lit.velocity, lit.proxy, lit.log_mass, lit.index)
+    central = (*places, np.zeros(lit.chi.size))
     columns = [np.concatenate(column) for column in zip(central, *landed, strict=True)]
     order = np.lexsort((columns[0], columns[2]))
-    source, halo_id, index, ra, dec, chi, velocity, proxy, mass, home = (column[order] for column in columns)
+    source, halo_id, index, ra, dec, chi, velocity, proxy, mass, home, radius = (column[order] for column in columns)
     z = cells.population.halos.distances.redshift(chi)
     z_obs = observed_redshift(z, velocity)
-    return Members(own, source, halo_id, ids.kind_of(source), index, ra, dec, chi, z, z_obs, proxy, mass, home)
+    kind = ids.kind_of(source)
+    return Members(own, source, halo_id, kind, index, ra, dec, chi, z, z_obs, proxy, mass, home, radius)
 
 
 def observed_redshift(z: Float, velocity: Float) -> Float:
@@ -172,7 +176,8 @@ def _landed(cells: Cells, order: int, around: int, cell: int) -> tuple[npt.NDArr
     halo = hosts.id[found.host]
     source = ids.satellite_id(halo, found.member, hosts.bits[found.host])
     mass, home = hosts.log_mass[found.host], hosts.index[found.host]
-    return source, halo, index, found.ra, found.dec, found.chi, found.velocity, found.proxy, mass, home
+    place = found.ra, found.dec, found.chi
+    return source, halo, index, *place, found.velocity, found.proxy, mass, home, found.radius
 
 
 def _near(found: Satellites, cell: int) -> Bool:

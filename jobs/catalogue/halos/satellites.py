@@ -33,6 +33,7 @@ class Satellites:
 
     host : int[n] row of the host;  member : int[n] from 1, by falling sub-mass
     proxy : log10 of the scattered sub-mass;  ra, dec : deg;  chi : Mpc/h;  velocity : km/s, receding, with the host's
+    radius : from the host's centre / R_200m
     """
 
     host: Int
@@ -42,6 +43,7 @@ class Satellites:
     dec: Float
     chi: Float
     velocity: Float
+    radius: Float
 
     def part(self, keep: npt.NDArray[np.generic]) -> Satellites:
         """The satellites that are kept: keep : bool or int[m] rows."""
@@ -75,7 +77,8 @@ def draw(halos: HaloModel, masses: Masses, hosts: Halos, seed: int) -> Satellite
     offset = _offsets(masses, own.concentration, hosts.log_mass, z, host, numbers)
     kick = masses.dispersion(hosts.log_mass, z)[host] * numbers[:, 3]
     ra, dec, chi = _moved(hosts, host, offset)
-    return Satellites(host, member, proxy, ra, dec, chi, hosts.velocity[host] + kick)
+    radius = np.sqrt(np.sum(offset**2, 1)) / masses.radius(hosts.log_mass)[host]
+    return Satellites(host, member, proxy, ra, dec, chi, hosts.velocity[host] + kick, radius)
 
 
 def _room(count: int) -> tuple[Int, Int, Float, Float]:

@@ -23,7 +23,7 @@ from lake_schema.arrays import Float
 MASS_DEFINITION = "200m"
 _POWER, _MASS_FUNCTION, _BIAS, _CONCENTRATION = "eisenstein98", "tinker08", "tinker10", "diemer19"
 # Concentrations are slow to make (0.1 s a redshift and mass): at fewer redshifts, and every so many masses.
-_Z_COARSE, _COARSE = 7, 20
+_Z_COARSE, _COARSE = 10, 20
 
 
 def power(k: Float) -> Float:

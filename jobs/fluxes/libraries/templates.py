@@ -119,9 +119,9 @@ def _stars(types: stellar.StellarTypes) -> Float32:
 
 
 def emission_wavelengths() -> Float:
-    """Vacuum wavelengths of the ten emission lines, float64[10] A (lines.csv)."""
+    """Vacuum wavelengths of the lines that the observed spectra show and are freed of, float64[10] A (lines.csv)."""
     with (files("jobs.fluxes.spectra") / "lines.csv").open(encoding="utf-8") as file:
-        return np.array([float(row["vacuum"]) for row in csv.DictReader(file)])
+        return np.array([float(row["vacuum"]) for row in csv.DictReader(file) if int(row["bridged"])])
 
 
 def galaxies(wavelength: Float, bridged: float = _LINE_MASK) -> Float:

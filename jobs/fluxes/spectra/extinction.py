@@ -21,6 +21,7 @@ from jobs import sums
 from lake_schema.arrays import Float
 
 LAW_COUNT = 5
+PREVOT, CALZETTI = 1, 2
 # Cardelli, Clayton & Mathis 1989: the mean of the diffuse Milky Way. A(V) = R_V E(B-V).
 MILKY_WAY_R_V = 3.1
 # Wavelengths over which O'Donnell 1994 is defined (0.3 .. 10 per micrometre).

@@ -1,6 +1,7 @@
 """Emission lines: where they are seen, how wide they are, and their profiles on the grid.
 
-line_list            the ten lines of Serrano et al. 2024, table "Emission lines" (lines.csv)
+line_list            the ten lines of Serrano et al. 2024, table "Emission lines", and ten more (lines.csv)
+width_law            numbers of the velocity dispersion
 velocity_dispersion  from the luminosity
 observed_wavelength  in vacuum, or in air
 Profiles, profiles   bins of the grid and the flux that falls into each
@@ -21,7 +22,7 @@ from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_KM_S
 
-_TABLE = Path(__file__).with_suffix(".csv")
+TABLE = Path(__file__).with_suffix(".csv")
 
 # Serrano et al. 2024, appendix B: log10 sigma = (A + B z) (M_r - C) + D z. The upper bound is adopted: below
 # M_r = -23 the relation gives more than any galaxy has.
@@ -37,12 +38,14 @@ _REACH = 5.6
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """name; column of the table `galaxies`; flux relative to that column; vacuum wavelength, A."""
+    """name; column of the table `galaxies`; flux relative to that column; wavelengths in vacuum and air, A; source."""
 
     name: str
     column: str
     ratio: float
     vacuum: float
+    air: float
+    source: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,15 +63,25 @@ class Profiles:
 
 
 def line_list() -> tuple[Line, ...]:
-    """The ten lines, primaries before their secondaries."""
-    with _TABLE.open(newline="", encoding="utf-8") as file:
+    """All lines, primaries before their secondaries."""
+    with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    return tuple(Line(row["name"], row["column"], float(row["ratio"]), float(row["vacuum"])) for row in rows)
+    return tuple(
+        Line(row["name"], row["column"], float(row["ratio"]), float(row["vacuum"]), float(row["air"]), row["source"])
+        for row in rows
+    )
 
 
 def columns() -> tuple[str, ...]:
     """Columns of the table `galaxies` with line fluxes."""
     return tuple(dict.fromkeys(line.column for line in line_list()))
+
+
+def width_law() -> dict[str, float]:
+    """Numbers of `velocity_dispersion` by their name in table `emission_lines`."""
+    names = ("width_slope", "width_slope_z", "width_magnitude", "width_z", "width_least", "width_most")
+    numbers = (_SLOPE, _SLOPE_EVOLUTION, _MAGNITUDE_ZERO, _EVOLUTION, SIGMA_MIN, SIGMA_MAX)
+    return dict(zip(names, numbers, strict=True))
 
 
 def velocity_dispersion(abs_mag_r01: npt.ArrayLike, z_obs: npt.ArrayLike) -> Float:
@@ -114,7 +127,7 @@ def profiles(
 ) -> Profiles:
     """Lines with flux that reach into [first_wanted, last_wanted] A, integrated over each bin of 1 A.
 
-    fluxes : float64[n, 10] erg s-1 cm-2, observed, of each line of `line_list`; NaN or 0 where there is none
+    fluxes : float64[n, n_line] erg s-1 cm-2, observed, of each line of `line_list`; NaN or 0 where there is none
     sigma  : float64[n] km/s
     In the observed frame a line is a Gaussian of centre lambda_i = mu_i (1 + z) and width sigma / c lambda_i,
     whose integral is the flux. Serrano et al. 2024 (appendix B, eq. f_el) print the un-redshifted centre and

@@ -8,8 +8,8 @@ import pyarrow as pa
 import pytest
 
 from jobs.catalogue import dust_map
-from jobs.catalogue.galaxies import band_ratios, galaxies, line_light
-from jobs.catalogue.halos import population
+from jobs.catalogue.galaxies import band_ratios, emission_lines, galaxies
+from jobs.catalogue.halos import matching, population
 from jobs.catalogue.matter import density_box
 from jobs.fluxes import cosmology, passbands
 from jobs.fluxes.libraries import templates
@@ -77,9 +77,11 @@ def sky_drawn():
     sed = band_ratios.Sed(*(columns[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
 
     def mag(band):
-        table = band_ratios.load(library, band, 2.3, 0.5)
+        table = band_ratios.load(library, band, matching.Z_LAST, 0.5)
         continuum = m_r + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed)
-        return line_light.brightened(continuum, line_light.added(passbands.load(band), columns["z_obs"], columns))
+        return emission_lines.brightened(
+            continuum, emission_lines.added(passbands.load(band), columns["z_obs"], columns)
+        )
 
     area = len(places) * sky.cell_area(GENERATION_ORDER)
     bands = ("euclid_vis", "euclid_y", "euclid_j", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")

@@ -6,6 +6,7 @@ import pyarrow.parquet as pq
 from astropy.table import Table
 
 from jobs.catalogue.external import mapping
+from jobs.fluxes.spectra.lines import columns as columns_of_lines
 
 RA, DEC = 53.1, -27.8
 
@@ -51,7 +52,7 @@ def columns(number=300, seed=3):
     }
 
 
-LINES = ("halpha", "hbeta", "oii", "oiii", "nii", "sii")
+LINES = tuple(column.removeprefix("flux_") for column in columns_of_lines())
 
 
 def _component(rng, number):

@@ -49,7 +49,7 @@ def test_lines_hold_their_flux_in_the_spectrum(bare, library, medium):
     table = bare(flux_halpha=1e-15, flux_oiii=3e-16, z_obs=0.7, mag_r01=28.0)
     without = band_fluxes.galaxy_spectra(bare(z_obs=0.7, mag_r01=28.0), library, medium)
     only = band_fluxes.galaxy_spectra(table, library, medium) - without
-    assert only.sum() == pytest.approx(1e-15 + 4.0 / 3.0 * 3e-16, rel=1e-6, abs=0.0)
+    assert only.sum() == pytest.approx(1e-15 + (1.0 + 1.0 / 2.98) * 3e-16, rel=1e-6, abs=0.0)
     centre = float(lines.observed_wavelength(6564.614, 0.7, medium))
     near = np.abs(GRID - centre) < 60.0
     assert only[0, near].sum() == pytest.approx(1e-15, rel=1e-6, abs=0.0)

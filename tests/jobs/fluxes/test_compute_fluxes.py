@@ -110,7 +110,7 @@ def test_the_accuracy_of_the_request_rules(filled, library):
 def test_what_they_were_made_with_is_published_with_them(filled):
     run(filled, wanted(), sources=True)
     made = read.version(filled, "galaxy_fluxes").manifest["facts"]["sources"]
-    for name in ("templates", "extinction_laws", "passbands"):
+    for name in ("templates", "extinction_laws", "emission_lines", "passbands"):
         version = read.version(filled, name)
         assert version.key == made[name]
         assert all(len(row["sha256"]) == 64 and row["source"] for row in version.rows(["source", "sha256"]).to_pylist())

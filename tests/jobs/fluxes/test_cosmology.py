@@ -79,3 +79,13 @@ def test_ends():
         cosmology.luminosity_distance(np.nan)
     with pytest.raises(OutOfRange, match="comoving distance"):
         cosmology.redshift(1e5)
+
+
+def test_ages():
+    """Closed form against the integral of dt = dz / ((1 + z) H); 13.47 Gyr with h = 0.7, Omega_m = 0.3."""
+    from scipy.integrate import quad
+
+    for z in (0.0, 1.0, 5.0):
+        whole = quad(lambda x: 1.0 / ((1.0 + x) * float(cosmology.expansion_rate(x))), z, np.inf)[0]
+        assert float(cosmology.age(z)) == pytest.approx(whole * 9.777922 / 0.67, rel=1e-6)
+    assert float(cosmology.age(0.0, 0.3, 0.7)) == pytest.approx(13.47, abs=0.01)

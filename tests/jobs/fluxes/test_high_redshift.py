@@ -33,7 +33,6 @@ def test_libraries():
     assert (len(quasars), len(distant)) == (9, 15)
     for library in (quasars, distant):
         assert (library.flux >= 0.0).all()
-        assert not library.flux[:, library.wavelength < 1215.0].any()
         assert library.flux[:, library.wavelength > 1217.0].all()
         assert len(set(library.names)) == len(library)
 
@@ -88,6 +87,21 @@ def test_nothing_is_left_below_lyman_alpha(distant):
     f_lambda = high_redshift.spectra(distant(3, z_obs=7.0))
     assert not f_lambda[:, GRID < 1215.0 * 8.0].any()
     assert (f_lambda[:, GRID > 1217.0 * 8.0] > 0.0).all()
+
+
+def test_quasars_are_seen_through_the_intergalactic_medium(distant):
+    """Inoue et al. 2014: of the light below Lyman alpha little is taken at z = 1, a third at z = 3, most at z = 6."""
+    z = np.array([1.0, 3.0, 6.0])
+    f_lambda = high_redshift.spectra(distant(3, 2, z_obs=z, sed_1=4))
+    left = []
+    for row, redshift in zip(f_lambda, z, strict=True):
+        rest = GRID / (1.0 + redshift)
+        forest, above = (rest > 1050.0) & (rest < 1170.0), (rest > 1320.0) & (rest < 1380.0)
+        continuum = np.median(row[above]) * (1216.0 / 1350.0) ** -1.56 * (1110.0 / 1216.0) ** -0.3
+        left.append(np.mean(row[forest]) / continuum)
+    assert left[0] > 0.85
+    assert left[1] == pytest.approx(0.68, abs=0.08)
+    assert left[2] < 0.1
 
 
 def test_apparent_magnitude():

@@ -5,13 +5,14 @@ import hashlib
 import numpy as np
 import pytest
 
-from jobs.fluxes import inputs, passbands
+from jobs.fluxes import inputs, passbands, sources
 from jobs.fluxes.libraries.vega import spectrum_file
-from jobs.fluxes.spectra import continuum
+from jobs.fluxes.spectra import continuum, lines
 from jobs.request.files import Curves, UserCurves
 from lake_schema.errors import BadInput
 from lake_schema.store.validate import check
 from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
+from lake_schema.tables.galaxies import EMISSION_LINES
 from lake_schema.tables.passbands import PASSBANDS
 from lake_schema.tables.templates import TEMPLATES
 from tests.jobs.fluxes.libraries.test_from_files import BAND, FLUX, RESPONSE, WAVELENGTH, ascii_file, votable
@@ -119,3 +120,24 @@ def test_a_votable_without_its_own_unit_is_in_angstrom(tmp_path):
     path = votable(tmp_path / "filter.xml")
     mine = inputs.read(UserCurves(passbands=(("svo", Curves((path,), "passband_svo", "vacuum")),)))
     assert passbands.pivot_wavelength(mine.passbands["svo"]) == pytest.approx(5985.0, abs=20.0)
+
+
+def test_lines_are_published_with_wavelength_ratio_and_width(embedded, galaxies, library):
+    """A reader with the lake alone has every line: the light that spectra have of it, and where, and how wide."""
+    published = inputs.line_rows(embedded)
+    check(published, EMISSION_LINES)
+    rows = published.to_pylist()
+    assert len(rows) == 20
+    assert {row["flux_column"] for row in rows} == set(lines.columns())
+    assert all(len(row["sha256"]) == 64 and row["source"] for row in rows)
+    table = galaxies(1, seed=3, abs_mag_r01=-20.5, z_obs=0.8)
+    (seen,) = sources.galaxies_of(table, library).lines
+    assert seen == pytest.approx(
+        [row["ratio"] * table[row["flux_column"]][0].as_py() for row in rows], rel=1e-6, abs=0.0
+    )
+    row = rows[0]
+    log_sigma = (row["width_slope"] + row["width_slope_z"] * 0.8) * (-20.5 - row["width_magnitude"])
+    sigma = np.clip(10.0 ** (log_sigma + row["width_z"] * 0.8), row["width_least"], row["width_most"])
+    assert sigma == pytest.approx(float(lines.velocity_dispersion(-20.5, 0.8)), rel=1e-12)
+    for row in rows:
+        assert float(lines.air_wavelength(row["vacuum_wavelength"])) == pytest.approx(row["air_wavelength"], abs=0.006)

@@ -67,9 +67,10 @@ def test_luminosities(seen):
 
 
 def test_a_figure_that_is_off_fails():
-    good, bad = {"sigma_8": 0.833, "half_light_worst": 0.009, "vis_24.5": 31.0}, {"sigma_8": 0.81, "vis_24.5": 29.5}
-    assert failed({**good, "vis_24.5_error": 0.0}) == []
-    assert [name for name, _ in failed({**bad, "vis_24.5_error": 0.1})] == ["sigma_8", "vis_24.5"]
+    good = {"sigma_8": 0.833, "half_light_worst": 0.009, "log_i_21.75": 4.0}
+    bad = {"sigma_8": 0.81, "log_i_21.75": 3.9}
+    assert failed({**good, "log_i_21.75_error": 0.0}) == []
+    assert [name for name, _ in failed({**bad, "log_i_21.75_error": 0.03})] == ["sigma_8", "log_i_21.75"]
     # The share of emitters is given the error of their number.
     counted = {"halpha_2e-16_0.9_1.8": 1.07, "halpha_2e-16_0.9_1.8_error": 0.03}
     (check,) = checks.checks(counted)

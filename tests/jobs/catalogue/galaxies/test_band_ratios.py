@@ -140,3 +140,36 @@ def test_the_cache_returns_what_was_built(library):
     loaded = band_ratios.load(library, "sdss_g01", 0.0, 0.5)
     assert np.array_equal(built.values, loaded.values)
     assert np.array_equal(built.ebv, loaded.ebv)
+
+
+@pytest.fixture(scope="module")
+def rest_gr(library):
+    return band_ratios.load(library, "sdss_g01", 0.0, 0.5)
+
+
+def test_templates_grow_bluer_along_the_library_for_every_dust(rest_gr):
+    assert np.diff(rest_gr.values[0], axis=1).min() > 0.01
+
+
+def test_spectra_have_the_wanted_colours(rest_gr, rng):
+    n = 5000
+    wanted, law, ebv = rng.uniform(-0.2, 1.01, n), rng.integers(0, 5, n), rng.uniform(0.0, 0.5, n)
+    spectra = band_ratios.invert(rest_gr, wanted, law, ebv)
+    realised = band_ratios.colours(rest_gr, spectra)
+    inside = (spectra.frac_1 > 0) & (spectra.frac_1 < 1)
+    assert inside.mean() > 0.5
+    assert realised[inside] == pytest.approx(wanted[inside], abs=1e-6)
+    # Where dust leaves none, the end of the library: the bluest for colours too blue.
+    too_blue = realised > wanted + 1e-5
+    assert np.all((spectra.template_1 == 30)[too_blue] & (spectra.frac_1 == 1)[too_blue])
+    too_red = realised < wanted - 1e-5
+    assert np.all((spectra.template_2 == 0)[too_red] & (spectra.frac_2 == 1)[too_red])
+
+
+@given(st.floats(-0.5, 1.5), st.integers(0, 4), st.floats(0.0, 0.5))
+def test_every_spectrum_is_two_neighbours_with_shares(rest_gr, colour, law, ebv):
+    spectrum = band_ratios.invert(rest_gr, np.array([colour]), np.array([law]), np.array([ebv]))
+    assert 1 <= spectrum.template_1[0] <= 30
+    assert spectrum.template_2[0] == spectrum.template_1[0] - 1
+    assert 0.0 <= spectrum.frac_1[0] <= 1.0
+    assert spectrum.frac_1[0] + spectrum.frac_2[0] == pytest.approx(1.0)

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from jobs.catalogue.galaxies import band_ratios, galaxies, line_light, strong_lenses
+from jobs.catalogue.galaxies import band_ratios, emission_lines, galaxies, strong_lenses
 from jobs.catalogue.halos import halos, matching, population
 from jobs.request.schema import Universe
 from tests.jobs.catalogue.conftest import SEED, SMALL
@@ -41,7 +41,7 @@ def magnitude(universe, rows):
     names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
     continuum = galaxies.apparent(universe, z, m_r, band_ratios.Sed(*(rows[name].to_numpy() for name in names)))
     lines = {name: rows[name].to_numpy() for name in rows.column_names if name.startswith("flux_")}
-    return line_light.brightened(continuum, line_light.added(universe.band, rows["z_obs"].to_numpy(), lines))
+    return emission_lines.brightened(continuum, emission_lines.added(universe.band, rows["z_obs"].to_numpy(), lines))
 
 
 def same(one, other):

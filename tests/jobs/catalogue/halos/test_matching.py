@@ -35,15 +35,23 @@ def test_concentrations():
 
 
 @pytest.mark.parametrize(
-    ("z", "expected"),
-    [(0.1, (-19.8, -21.2, -22.0)), (0.5, (-20.4, -21.8, -22.6)), (2.0, (-21.5, -23.1, -24.2))],
+    ("z", "halos", "most"),
+    [
+        (0.0, (4.75e-3, 5.39e-4, 3.55e-5), (1.45, 1.5, 1.7)),
+        (0.5, (4.39e-3, 3.93e-4, 1.38e-5), (1.4, 1.5, 2.0)),
+        (2.0, (1.86e-3, 4.53e-5), (1.4, 2.0)),
+    ],
 )
-def test_luminosities_of_masses(z, expected):
-    found = MATCHED.magnitude(np.full(3, z), np.array([12.0, 13.0, 14.0]))
-    assert found == pytest.approx(expected, abs=0.15)
+def test_luminosities_of_masses(z, halos, most):
+    """Galaxies brighter than the central of a halo are as many as the halos above (Tinker et al. 2008), or more:
+    satellites and scatter add up to a half, more where the mass function is steep."""
+    m_r = MATCHED.magnitude(np.full(len(halos), z), np.array([12.0, 13.0, 14.0])[: len(halos)])
+    ratio = luminosity_function.number_density(LF, m_r, z) / np.array(halos)
+    assert np.all(ratio > 1.0)
+    assert np.all(ratio < np.array(most))
 
 
-@pytest.mark.parametrize("z", [0.1, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("z", [0.1, 0.5, 1.0, 2.0, 4.0])
 def test_the_luminosity_function_comes_out(z, rng):
     """Drawn centrals and satellites, scattered and matched: counted against the Schechter function."""
     occupation, volume = MATCHED.occupation, 3e6

@@ -26,7 +26,7 @@ def bins(found: lines.Profiles) -> np.ndarray:
     return found.first[:, None] + np.arange(found.f_lambda.shape[1])
 
 
-@given(st.integers(0, 9), st.floats(0.0, 2.6), st.floats(50.0, 400.0), st.sampled_from(["air", "vacuum"]))
+@given(st.integers(0, len(LINES) - 1), st.floats(0.0, 2.6), st.floats(50.0, 400.0), st.sampled_from(["air", "vacuum"]))
 def test_the_integral_is_the_flux_and_the_width_is_sigma(line, z, sigma, medium):
     # The printed exponent, with its stray 1 / (1 + z), would hold sqrt(1 + z) times the flux.
     found = lines.profiles(one(line, 3e-16), np.array([z]), np.array([sigma]), medium)
@@ -91,12 +91,21 @@ def test_brighter_galaxies_have_no_narrower_lines(z, one_mag, other_mag):
 def test_doublets():
     ratios = {line.name: line.ratio for line in LINES}
     assert ratios["oii_2"] == ratios["sii_2"] == 1.0
-    assert ratios["oiii_2"] == ratios["nii_2"] == pytest.approx(1.0 / 3.0)
-    assert len(lines.columns()) == 6
+    # Storey & Zeippen 2000; [S III] by the transition probabilities.
+    expected = {"oiii_2": 1 / 2.98, "nii_2": 1 / 3.05, "siii_2": 1 / 2.47}
+    assert {name: ratios[name] for name in expected} == pytest.approx(expected)
+    assert len(lines.columns()) == 15
     # A column holds the primary alone: were it the total, as the text may be read, a doublet would sum to 1.
     totals = {column: sum(line.ratio for line in LINES if line.column == column) for column in lines.columns()}
     assert totals == pytest.approx(
-        {"flux_halpha": 1, "flux_hbeta": 1, "flux_oii": 2, "flux_oiii": 4 / 3, "flux_nii": 4 / 3, "flux_sii": 2}
+        {
+            **dict.fromkeys(totals, 1.0),
+            "flux_oii": 2,
+            "flux_oiii": 1 + 1 / 2.98,
+            "flux_nii": 1 + 1 / 3.05,
+            "flux_sii": 2,
+            "flux_siii": 1 + 1 / 2.47,
+        }
     )
     # The paper's table of lines has [S II], its catalogue does not.
     assert set(totals) <= set(GALAXIES.names)
@@ -106,7 +115,10 @@ def test_doublets():
 
 
 def test_lines_that_share_a_bin_add_up():
-    fluxes = np.array([[1.0, 0, 0, 0, 0, 0, 2.0, 4.0, 0, 0], np.zeros(10), [np.nan, 0, 0, 0, 0, 0, 0, 0, 8.0, 0]])
+    place = {line.name: k for k, line in enumerate(LINES)}
+    fluxes = np.zeros((3, len(LINES)))
+    fluxes[0, [place["halpha"], place["nii"], place["nii_2"]]] = 1.0, 2.0, 4.0
+    fluxes[2, [place["halpha"], place["sii"]]] = np.nan, 8.0
     found = lines.profiles(fluxes, np.array([0.1, 0.1, 0.3]), np.array([400.0, 400.0, 100.0]), "vacuum")
     assert found.row.tolist() == [0, 0, 0, 2]
     spectra = lines.add(np.zeros((3, 4000)), 6000, found)
@@ -123,8 +135,15 @@ def test_lines_at_the_edge_of_the_grid_are_cut_not_moved():
 
 
 def test_lines_outside_the_wanted_range_are_not_made():
-    fluxes = np.ones((1, 10))
+    fluxes = np.ones((1, len(LINES)))
     found = lines.profiles(fluxes, np.array([0.5]), np.array([100.0]), "vacuum", 9000.0, 12000.0)
     # H alpha 9847, the two [N II], the two [S II].
     assert len(found.row) == 5
     assert lines.profiles(fluxes, np.array([0.5]), np.array([100.0]), "vacuum", 1e5).f_lambda.size == 0
+
+
+def test_a_grism_sees_a_line_at_every_redshift():
+    """Some line is in 0.95 - 2.0 um at any z < 3: no redshift at which slitless spectra of emitters are empty."""
+    z = np.arange(0.0, 3.0, 0.01)[:, None]
+    seen = np.array([line.vacuum for line in LINES]) * (1.0 + z)
+    assert ((seen > 9500.0) & (seen < 20_000.0)).any(1).all()

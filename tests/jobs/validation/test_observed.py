@@ -1,0 +1,124 @@
+"""The mean sky beside what was observed, and what a wrong recipe does to it."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jobs.catalogue.galaxies import high_redshift
+from jobs.catalogue.halos import quenching
+from jobs.validation import checks, mean_sky, observed
+from lake_schema import sky
+from lake_schema.ids import GENERATION_ORDER
+from tests.jobs.catalogue.conftest import made
+
+LIST = Path(observed.__file__).with_suffix(".csv")
+# Cells without structure: a few degrees of a survey would be needed to tell as much.
+MANY, FEW = 20, 4
+
+
+def seen(universe, cells):
+    return observed.sky_of(mean_sky.rows(universe, 0, cells), cells * sky.cell_area(GENERATION_ORDER))
+
+
+@pytest.fixture(scope="module")
+def flat():
+    return mean_sky.flat(made())
+
+
+@pytest.fixture(scope="module")
+def whole(flat):
+    return observed.figures(seen(flat, MANY))
+
+
+def off(figures):
+    """Names of what is not as observed."""
+    return {check.name for check in checks.checks(figures, 2.0) if not check.passed}
+
+
+def test_the_list_says_where_its_numbers_are_from():
+    rows = list(csv.DictReader(LIST.open(newline="")))
+    assert len(rows) >= 60
+    assert len({row["name"] for row in rows}) == len(rows)
+    assert {row["confidence"] for row in rows} == {"P", "M"}
+    assert sum(row["confidence"] == "P" for row in rows) >= 40
+    assert all(row["source"] and row["why"] and float(row["tolerance"]) > 0.0 for row in rows)
+
+
+def test_every_row_is_measured(whole):
+    rows = list(csv.DictReader(LIST.open(newline="")))
+    assert {row["name"] for row in rows} <= set(whole)
+
+
+def test_the_mean_sky_is_as_observed(whole):
+    """A degree2: within two Poisson errors more than the list says."""
+    results = checks.checks(whole, 2.0)
+    assert [(check.name, check.found) for check in results if check.unexpected] == []
+    # Numbers from memory gate nothing one by one; were many of them off, so would be the sky.
+    remembered = [check for check in results if not check.gates]
+    assert sum(check.passed for check in remembered) > 0.85 * len(remembered)
+
+
+def old_metals(flat):
+    """Two scales of metallicity in one: 0.25 dex apart."""
+    return replace(flat, lines=replace(flat.lines, metals=replace(flat.lines.metals, sun=8.44)))
+
+
+def unmatched_lines(flat):
+    return replace(flat, lines=replace(flat.lines, shift=np.zeros_like(flat.lines.shift)))
+
+
+def light_stars(flat):
+    """Mass-to-light ratios of half of what they are."""
+    return replace(flat, masses=replace(flat.masses, intercept=flat.masses.intercept - 0.3))
+
+
+def template_rates(flat):
+    """The rates that the ultraviolet light of empirical templates gives are lower."""
+    return replace(flat, star_formation=replace(flat.star_formation, median=-0.6))
+
+
+def wide_colours(flat):
+    """Doubled scatters of the sequences."""
+    law = flat.colours.sequence
+    wide = replace(
+        law, red_scatter=0.14, red_scatter_limits=(0.06, 0.20), blue_scatter=0.24, blue_scatter_limits=(0.10, 0.40)
+    )
+    return replace(flat, colours=replace(flat.colours, sequence=wide))
+
+
+def idle_halos(flat):
+    """Halos that quench nothing."""
+    law = replace(flat.halo_shares.law, highest=0.0)
+    shares = quenching.shares(law, flat.population.masses, flat.population.halos.matching.occupation)
+    return replace(flat, halo_shares=shares)
+
+
+def hole(flat):
+    """Nothing from z = 2.3 on."""
+    return replace(flat, population=replace(flat.population, halos=replace(flat.population.halos, far=3844.0)))
+
+
+def far_quasars(flat):
+    """None below z = 6."""
+    return replace(flat, distant=high_redshift.model(0.0, 1.0, 26.0, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("mutant", "name"),
+    [
+        (old_metals, "oiii_2e-16"),
+        (unmatched_lines, "halpha_nii_2e-16"),
+        (light_stars, "mass_function_11_z0.95"),
+        (template_rates, "main_sequence_z1.0"),
+        (wide_colours, "main_sequence_scatter_z0.4"),
+        (idle_halos, "red_centrals_13.5_z1"),
+        (hole, "uv_21_z3.8"),
+        (far_quasars, "quasars_r_22.5"),
+    ],
+)
+def test_a_wrong_recipe_is_seen(flat, whole, mutant, name):
+    assert name not in off(whole)
+    assert name in off(observed.figures(seen(mutant(flat), FEW)))
