@@ -24,6 +24,7 @@ from jobs.render.effects.light import pixel_area
 from jobs.render.effects.readout import charge_transfer, quadrants
 from jobs.render.effects.scene import Scene
 from jobs.render.products import preview_labels, read_back
+from jobs.render.sources import catalogue_rows
 from jobs.request.from_toml import parse
 from lake_schema import sky
 from lake_schema.mission.configuration import resolve
@@ -160,7 +161,9 @@ def sources(field, header):
         ("galaxies", "galaxy_fluxes", "ra_lensed", "dec_lensed"),
         ("stars", "star_fluxes", "ra", "dec"),
     ):
-        where = read.version(field, catalogue).rows([ra, dec])
+        motion = ["pm_ra", "pm_dec"] if catalogue == "stars" else []
+        middle = header["MJD-OBS"] + 0.5 * header["EXPTIME"] / 86400.0
+        where = catalogue_rows.at_time(read.version(field, catalogue).rows([ra, dec, *motion]), middle)
         flux = read.version(field, fluxes).rows([f"f_nu_{header['FILTER']}"])
         x, y = system.all_world2pix(where[ra].to_numpy(), where[dec].to_numpy(), 0)
         microjansky = flux.column(0).to_numpy().astype(float)

@@ -45,8 +45,8 @@ Where = tuple[float, float, float, float]
 STAR = 5
 BRIGHT, BROWN = 3, 4
 _BROWN_DWARF = 3
-# A generation cell is drawn whole: 3e6 stars take 1.1 GB, and fewer than the 22 bits of an id can number.
-_MOST_STARS = 3e6
+# A generation cell is drawn whole: 2e6 stars take 1.6 GB, and fewer than the 22 bits of an id can number.
+_MOST_STARS = 2e6
 # Nearer to the Galactic plane than so many deg, and before the bulge (|l|, |b|), cells have a limit of their own.
 PLANE, BULGE = 5.0, (20.0, 10.0)
 # One AU, seen from a pc, deg.
@@ -239,16 +239,16 @@ def _spectra(universe: StarModel, m_h: Float, distance: Float, teff: Float, log_
         "log_g": log_g,
     }
     for k in range(1, model_stars.PARTS):
-        lot |= {f"sed_{k + 1}": found.sed[k], f"frac_{k + 1}": found.frac[k]}
+        # As they are stored: a crowded cell is large.
+        lot |= {f"sed_{k + 1}": found.sed[k].astype(np.int16), f"frac_{k + 1}": found.frac[k].astype(np.float32)}
     return lot
 
 
 def _moving(place: Lot, component: Int, age: Float, deviates: Float) -> Lot:
     ra, dec, far = (np.asarray(place[name], float) for name in ("ra", "dec", "distance"))
     motion = kinematics.velocities(ra, dec, far, component, age, deviates)
-    return {
-        name: np.ma.masked_invalid(v) for name, v in zip(("pm_ra", "pm_dec", "radial_velocity"), motion, strict=True)
-    }
+    names = ("pm_ra", "pm_dec", "radial_velocity")
+    return {name: np.ma.masked_invalid(v.astype(np.float32)) for name, v in zip(names, motion, strict=True)}
 
 
 def _beside(cell: int, place: Lot, of: Int, offset: tuple[Float, Float]) -> Lot:

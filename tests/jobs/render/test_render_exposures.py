@@ -169,8 +169,15 @@ def test_every_planned_detector_has_its_products_and_every_source_its_row(render
         assert onto.sum() > 0.97 * electrons.sum()
         assert (onto <= expected * 1.001).all()
         sky = {}
-        for name, ra, dec in (("galaxies", "ra_lensed", "dec_lensed"), ("stars", "ra", "dec")):
-            found = read.version(rendered, name).rows(["id", ra, dec]).to_pydict()
+        exposed = read.version(rendered, "exposures").rows(where=pc.field("exposure_id") == row["exposure_id"])
+        (middle,) = (one["mjd"] + 0.5 * one["exposure_time_s"] / 86400.0 for one in exposed.to_pylist())
+        moving = read.version(rendered, "stars").rows(["id", "ra", "dec", "pm_ra", "pm_dec"])
+        lensed = read.version(rendered, "galaxies").rows(["id", "ra_lensed", "dec_lensed"])
+        for rows_, ra, dec in (
+            (lensed, "ra_lensed", "dec_lensed"),
+            (catalogue_rows.at_time(moving, middle), "ra", "dec"),
+        ):
+            found = rows_.to_pydict()
             sky |= dict(zip(found["id"], zip(found[ra], found[dec], strict=True), strict=True))
         own = system.all_world2pix([sky[i] for i in ids.tolist()], 0)
         np.testing.assert_allclose(own, np.stack([x, y], 1), atol=1e-6)
