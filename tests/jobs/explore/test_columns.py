@@ -62,8 +62,9 @@ def test_a_join_is_one_query(ask):
     assert len(z) == len(flux)
 
 
-def test_rows_in_another_order_are_not_mixed():
+def test_rows_in_another_order_are_not_mixed(monkeypatch, tmp_path):
     """A made engine that gives the rows of each query in an order of its own."""
+    monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path))
     asked = []
 
     def ask(text, expressions):

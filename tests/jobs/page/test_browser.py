@@ -235,6 +235,7 @@ def test_contrast(tab, theme):
     assert [found for found in tab.evaluate(CONTRAST) if found[2] < 4.5] == []
 
 
+@pytest.mark.nightly
 def test_everything_is_reached_by_keys(tab):
     """Tab leads to every control of a view, and what has the focus can be seen."""
     for view in VIEWS[:4]:
@@ -256,6 +257,7 @@ def test_everything_is_reached_by_keys(tab):
         assert len(reached - {-1}) >= wanted
 
 
+@pytest.mark.nightly
 def test_nothing_moves_where_that_is_asked_for(browser, page):
     with tab_of(browser, page, reduced_motion="reduce") as tab:
         tab.keyboard.press("4")
