@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 # What follows from the models' own sources, and what surveys observed.
-_LISTS = tuple(Path(__file__).with_name(f"{name}.csv") for name in ("expectations", "observed"))
+_LISTS = (Path(__file__).with_name("expectations.csv"), Path(__file__).with_name("observed.csv"))
 
 
 @dataclass(frozen=True, slots=True)

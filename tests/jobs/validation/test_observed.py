@@ -9,9 +9,12 @@ import pytest
 
 from jobs.catalogue.galaxies import high_redshift
 from jobs.catalogue.halos import quenching
-from jobs.validation import checks, mean_sky, observed
+from jobs.validation import __main__, checks, mean_sky, observed
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
+from lake_schema.store import layout, publish
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.galaxies import GALAXIES
 from tests.jobs.catalogue.conftest import made
 
 LIST = Path(observed.__file__).with_suffix(".csv")
@@ -59,6 +62,19 @@ def test_the_mean_sky_is_as_observed(whole):
     # Numbers from memory gate nothing one by one; were many of them off, so would be the sky.
     remembered = [check for check in results if not check.gates]
     assert sum(check.passed for check in remembered) > 0.85 * len(remembered)
+
+
+def test_a_lake_is_compared(flat, tmp_path, capsys):
+    """By the command: the same figures as of the rows themselves, and the exit status of what is off."""
+    rows = mean_sky.rows(flat, 0, 2)
+    plan = Plan(GALAXIES, {}, (Part(layout.cell_file(5, 0), {}),))
+    publish.make(tmp_path, plan, lambda root, facts: Output(rows))
+    found = observed.figures(observed.in_lake(tmp_path))
+    assert found == observed.figures(observed.sky_of(rows, 2 * sky.cell_area(GENERATION_ORDER)))
+    status = __main__.main(["--lake", str(tmp_path)])
+    said = capsys.readouterr().out
+    assert status == int(any(check.unexpected for check in checks.checks(found)))
+    assert " i_24 " in said
 
 
 def old_metals(flat):
