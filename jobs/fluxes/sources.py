@@ -122,7 +122,7 @@ def stars_of(table: pa.Table, library: Library) -> Stars:
         within(f"sed_{k}", sed[-1], 0, len(library) - 1)
     shares = np.stack([np.ones(table.num_rows), *frac])
     shares[0] = 1.0 - shares[1:].sum(0)
-    within("frac_2", shares[0], -1e-6, 1.0)
+    within("what frac_2, frac_3, frac_4 leave to sed", shares[0], -1e-6, 1.0)
     return Stars(np.stack(sed).astype(np.int64), np.maximum(shares, 0.0), mag_h, a_v)
 
 

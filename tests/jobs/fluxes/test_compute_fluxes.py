@@ -61,7 +61,8 @@ def filled(lake):
     }
     galaxy |= dict.fromkeys(lines.columns(), 1e-17)
     catalogue(lake, GALAXIES, galaxy | {"frac_1": 0.3, "frac_2": 0.7, "a_v": 0.2, "ebv_1": 0.1, "ebv_2": 0.1})
-    catalogue(lake, STARS, {"sed": 20, "a_v": 0.3, "mag_h": 18.0})
+    mixed = {"sed_2": 450, "frac_2": 0.3, "sed_3": 21, "frac_3": 0.1, "sed_4": 22, "frac_4": 0.0}
+    catalogue(lake, STARS, {"sed": 20, "a_v": 0.3, "mag_h": 18.0, **mixed})
     return lake
 
 

@@ -205,7 +205,7 @@ def _published(column):
 def test_standards(stars_library):
     names = stars_library.names
     assert names[441:444] == ("Vega", "white dwarf DA", "planetary nebula")
-    vega, dwarf, nebula = stars_library.flux[441:].astype(float)
+    vega, dwarf, nebula = stars_library.flux[441:444].astype(float)
     wavelength = stars_library.wavelength
     for band, zero in (("twomass_j", 0.90), ("twomass_h", 1.37)):
         # V is almost AB.
