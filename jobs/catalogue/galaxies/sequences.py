@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import gammainc, ndtr, ndtri
 
+from jobs import sums
 from jobs.catalogue import parameters
 from jobs.catalogue.galaxies.band_ratios import BandRatios, ebv_weights
 from jobs.fluxes.spectra.extinction import CALZETTI, LAW_COUNT, PREVOT
@@ -172,7 +173,7 @@ def limits(table: BandRatios, dust: Dust) -> Limits:
     ebv = np.linspace(0.0, dust.highest, _EBV_NODES)
     ln_ratio = table.values[0].astype(np.float64)
     bare = -2.5 / np.log(10.0) * ln_ratio[0, :, 0]
-    behind = -2.5 / np.log(10.0) * (ln_ratio[:, -1, :] @ ebv_weights(table.ebv, ebv).T)
+    behind = -2.5 / np.log(10.0) * sums.product(ln_ratio[:, -1, :], ebv_weights(table.ebv, ebv).T)
     return Limits(float(bare[-1]), float(bare[0]), ebv, np.maximum.accumulate(behind, axis=1))
 
 
