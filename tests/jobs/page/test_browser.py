@@ -72,9 +72,9 @@ def canvas_colours(tab, selector):
     """How many colours a picture of an element has."""
     import io
 
-    from PIL import Image
+    from matplotlib.image import imread
 
-    pixels = np.asarray(Image.open(io.BytesIO(tab.locator(selector).first.screenshot())).convert("RGB"))
+    pixels = imread(io.BytesIO(tab.locator(selector).first.screenshot()), format="png")[..., :3]
     return len(np.unique(pixels.reshape(-1, 3), axis=0))
 
 
