@@ -23,6 +23,7 @@ import numpy as np
 import pyarrow as pa
 
 from jobs import cache
+from jobs.code_keys import code_key
 from lake_schema.arrays import Array, Float32
 
 # (query, texts that must each be an expression) -> its rows
@@ -69,7 +70,7 @@ def kept(selection: Selection, expressions: Sequence[str], ask: Ask) -> list[Flo
 
 def _column(selection: Selection, expressions: Sequence[str], ask: Ask) -> dict[str, Array]:
     about: tuple[str | int, ...] = (selection.lake, selection.source, selection.where, *selection.keys, selection.part)
-    key = cache.content_key(*about, "of", *expressions)
+    key = cache.content_key(code_key(__name__), *about, "of", *expressions)
     return cache.cached_arrays(_NAME, key, lambda: _filled(selection, expressions, ask))
 
 
