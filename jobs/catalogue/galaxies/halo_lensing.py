@@ -150,7 +150,7 @@ def _lenses(chosen: Settings, box: Planes, cells: Cells, order: int, cell: int, 
 def _grid(chosen: Settings, halos: Float) -> tuple[Float, Float]:
     """(planes[p], smooth[p, side, side, 5]) of the halos that reach into a cell."""
     # Its compiler takes a second to import.
-    from jobs.catalogue.galaxies import halo_lensing_sums as sums
+    from jobs.catalogue.halos import halo_lensing_sums as sums
 
     step = np.radians(chosen.step / 60.0)
     half = int(np.ceil((np.radians(sky.cell_radius(GENERATION_ORDER)) + _BEYOND) / step)) + 1
@@ -170,7 +170,7 @@ def _grid(chosen: Settings, halos: Float) -> tuple[Float, Float]:
 
 def _summed(lens: Neighbourhood, place: Float, near: Float, cell: Int) -> Float:
     """[5, n] in the tangent plane; sources by cell, in each the farthest first."""
-    from jobs.catalogue.galaxies import halo_lensing_sums as sums
+    from jobs.catalogue.halos import halo_lensing_sums as sums
 
     first = np.append(np.unique(cell, return_index=True)[1], cell.size)
     found = np.zeros((5, cell.size))

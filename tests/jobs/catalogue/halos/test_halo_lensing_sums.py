@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from jobs.catalogue.galaxies import halo_lensing_sums as sums
+from jobs.catalogue.halos import halo_lensing_sums as sums
 from jobs.catalogue.halos import projected_nfw
 
 ARCMIN = np.radians(1 / 60)
