@@ -12,20 +12,19 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from astropy.wcs import WCS
 
-from jobs import cache
 from jobs.page.answers import plain
 from jobs.page.opened import Lake
 from jobs.render import archive
 from jobs.render.camera import astrometry
-from jobs.render.products import preview, read_back
+from jobs.render.products import pyramids, read_back
 from jobs.render.products.keys import truth_file
+from jobs.render.products.pyramids import TILE
 from lake_schema import ids
 from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput
 from lake_schema.store import read
 from lake_schema.tables.galaxies import GALAXIES
 
-TILE = 512
 # Nodes along each side at which the place on the sky is given; between them it is interpolated.
 _NODES = 33
 MOST_SOURCES = 4000
@@ -51,25 +50,10 @@ class Picture:
 
     def levels(self, mended: bool = False) -> list[Array]:
         """Its pixels, and each time the means of 2 x 2 of them, until one tile holds all: float32 [ny, nx], mapped."""
-        mended = mended and self.is_mendable
-        key = cache.content_key(self.version.sha256(self.row["path"]), self._hits_sha256() if mended else "", TILE)
-        found = cache.cached_arrays("pyramid", key, lambda: self._pyramid(mended))
-        return [found[str(level)] for level in range(len(found))]
-
-    def _hits_sha256(self) -> str:
-        return self.version.sha256(str(self.hits))
-
-    def _pyramid(self, mended: bool) -> dict[str, Array]:
-        path = self.version.file(self.row["path"])
-        has_unit = self.row["content"] != "saturation"
-        image = np.asarray((read_back.electrons(path) if has_unit else read_back.frame(path)).data)
-        if mended:
-            truth = np.asarray(read_back.frame(self.version.file(str(self.hits))).data)
-            image = preview.mended(image.astype(float), truth > 0)
-        levels = [image.astype(np.float32)]
-        while max(levels[-1].shape) > TILE:
-            levels.append(_halved(levels[-1]))
-        return {str(number): level for number, level in enumerate(levels)}
+        hits = str(self.hits) if mended and self.is_mendable else ""
+        contents = self.version.sha256(self.row["path"]), self.version.sha256(hits) if hits else ""
+        path, has_unit = self.version.file(self.row["path"]), self.row["content"] != "saturation"
+        return pyramids.levels(path, has_unit, self.version.file(hits) if hits else None, contents)
 
     @cached_property
     def cards(self) -> tuple[tuple[str, Any, str], ...]:
@@ -93,14 +77,6 @@ class Picture:
         if row < 0 or column < 0 or not found.size:
             raise BadInput(f"the image has no tile {row}, {column} at level {level}")
         return found
-
-
-def _halved(image: Array) -> Array:
-    """Means of 2 x 2 pixels; of an odd last row or column those that are there."""
-    ny, nx = image.shape
-    even = np.pad(image, ((0, ny % 2), (0, nx % 2)), mode="edge")
-    mean: Array = even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).mean(axis=(1, 3), dtype=np.float32)
-    return mean
 
 
 @lru_cache(maxsize=4)
