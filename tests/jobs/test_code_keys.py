@@ -132,7 +132,7 @@ KEEPING = {
 RECORDS = {
     "jobs.request.files.Curves", "jobs.request.files.DustMap", "jobs.request.files.UserCurves",
     "lake_schema.mission.configuration.MissionConfiguration", "lake_schema.mission.parameter.CAMERAS",
-    "lake_schema.mission.places",
+    "lake_schema.mission.places", "lake_schema.mission.places.Place",
 }  # fmt: skip
 
 
