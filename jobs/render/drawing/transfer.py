@@ -240,7 +240,7 @@ def _on_grid(images: list[Array], samples: int, some: Grid, strength: float | No
     columns = int(np.rint(np.abs(some.kx).max() * some.size / (2 * np.pi))) + 1
     pixel = _pixel(some, strength)
     for image, plane in zip(images, out, strict=True):
-        fourier.take(_spectrum(image, samples * some.size, columns), some.runs, pixel, plane)
+        fourier.take(spectrum(image, samples * some.size, columns), some.runs, pixel, plane)
     return out
 
 
@@ -269,7 +269,7 @@ def _middle(images: Float32, side: int) -> Float32:
     return images[:, margin : images.shape[1] - margin, margin : images.shape[2] - margin]
 
 
-def _spectrum(image: Array, period: int, columns: int) -> Array:
+def spectrum(image: Array, period: int, columns: int) -> Array:
     """Fourier transform of a plane on the grid of a stamp of `period` samples: complex[period, columns], the first.
 
     A plane is cut to the stamp: its wings beyond would otherwise come in at the opposite edge. Rows and columns that

@@ -78,7 +78,7 @@ def nyquist_zones(
             for p in range(len(inner) - 1, -1, -1):
                 outer = inner[p] if inner[p] >= cut[i] else outer
             most_square = 1.01 * (outer + 2.0 * step) ** 2 * np.sum(bulge[i] ** 2)
-            _interpolate(sersic, row[i], row_weights[i], 0.99 * step**2 * smaller(bulge[i]), most_square, tables[i])
+            interpolate(sersic, row[i], row_weights[i], 0.99 * step**2 * smaller(bulge[i]), most_square, tables[i])
     re, im = np.empty(most, planes.dtype), np.empty(most, planes.dtype)
     profile, square = np.empty(most, np.float32), np.empty(most, np.float32)
     bits = square.view(np.int32)
@@ -91,7 +91,7 @@ def nyquist_zones(
                 continue
             _collapse(planes, weights[i], first, last, some_re, some_im)
             if body[i]:
-                _profile(
+                profile_at(
                     fraction[i], bulge[i], disk[i], thick[i], tables[i], kx[first:last], ky[first:last], square, bits,
                     some,
                 )  # fmt: skip
@@ -143,7 +143,7 @@ def _add_turned(column: Any, cosine: Any, sine: Any, re: Any, im: Any, sum_re: A
 
 
 @jit
-def _profile(
+def profile_at(
     fraction: float, bulge: Float, disk: Float, thick: Float, table: Float32, kx: Float32, ky: Float32,
     square: Float32, bits: Any, out: Float32,
 ) -> None:  # fmt: skip
@@ -233,7 +233,7 @@ def reaches(
 
 
 @jit
-def _interpolate(sersic: Float32, row: int, row_weights: Float, least: float, most: float, table: Float32) -> None:
+def interpolate(sersic: Float32, row: int, row_weights: Float, least: float, most: float, table: Float32) -> None:
     """One index's transform, where the source needs it."""
     ends = np.array([least, most], np.float32)
     bits = ends.view(np.int32)

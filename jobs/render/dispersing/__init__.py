@@ -1,0 +1,1 @@
+"""Spectra without a slit: every source's light, spread out by a grism."""
