@@ -18,6 +18,7 @@ coefficients       of sources
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy.fft
@@ -94,13 +95,17 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
     return Planes(sampling, (2 * np.pi * fx).astype(np.float32), (2 * np.pi * fy).astype(np.float32), found)
 
 
-def coefficients(
-    some: Planes, weights: Float, shapes: Shapes, form: Forms, i: int, body: bool
-) -> Float32:
+@lru_cache(maxsize=1)
+def _sersic() -> Float32:
+    return sersic.table()
+
+
+def coefficients(some: Planes, weights: Float, shapes: Shapes, form: Forms, i: int) -> Float32:
     """float32[b, along, n across, n] of kernels.disperse: of one source of one electron.
 
-    weights : [b, p] of the planes, for each node;  shapes, form, i : its profile, where it has a body
+    weights : [b, p] of the planes, for each node;  shapes, form, i : of galaxies, and which it is, -1 = a point
     """
+    body = i >= 0
     row, row_weights = sersic.row_of(shapes.sersic_index[i : i + 1]) if body else (np.zeros(1, int), np.zeros((1, 4)))
     own = (
         (float(shapes.bulge_fraction[i]), form.bulge[i], form.disk[i], form.thick[i])
@@ -108,7 +113,10 @@ def coefficients(
         else (0.0, np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2))
     )
     zones = np.empty((len(weights), *some.planes.shape[1:]), np.complex64)
-    kernels.zones(some.planes, weights.astype(np.float32), some.kx, some.ky, body, *own, sersic.table(), int(row[0]), row_weights[0], zones)
+    kernels.zones(
+        some.planes, weights.astype(np.float32), some.kx, some.ky, body, *own, _sersic(), int(row[0]), row_weights[0],
+        zones,
+    )  # fmt: skip
     n, along, across = some.sampling.n, some.sampling.along, some.sampling.across
     images = scipy.fft.irfft2(zones, s=(n * across, n * along), overwrite_x=True)
     return np.ascontiguousarray(images.reshape(len(weights), n * across, n, along).transpose(0, 3, 1, 2))

@@ -1,7 +1,8 @@
 """The inner loops of dispersing, compiled.
 
 zones      profile x PSF of a source on a stamp's Fourier grid
-lay        a spectrum onto samples of its trace, by quintic splines
+electrons_of  what is detected of a spectrum
+lay        it onto the samples of its trace, by quintic splines
 disperse   a source's image at every sample of its trace, by cubic splines across
 add        a piece of the image onto the frame, in fixed point
 """
@@ -54,17 +55,39 @@ def zones(
 
 
 @jit
-def lay(position: Float, electrons: Float, share: Float, first: int, out: Float) -> None:
-    """Adds electrons [k] at positions [k] to out [b, m], whose first sample lies at `first`, by shares [k, b].
+def electrons_of(spectrum: Float32, response: Float, factor: float, wavelengths: int, out: Float) -> float:
+    """Fills out [w] with factor x spectrum x response; returns the largest sum of `wavelengths` neighbours."""
+    most, running = 0.0, 0.0
+    for i in range(len(out)):
+        out[i] = factor * np.float64(spectrum[i]) * response[i]
+        running += out[i]
+        if i >= wavelengths:
+            running -= out[i - wavelengths]
+        most = max(most, running)
+    return most
 
-    A quintic spline keeps the total, the mean and the higher moments; samples outside `out` are left out.
+
+@jit
+def lay(
+    electrons: Float, along: Float, times: tuple[float, float], start: float, samples: int, share: Float, first: int,
+    out: Float,
+) -> None:  # fmt: skip
+    """Adds electrons [w] of each wavelength to the samples of a trace, out [b, m], by shares [w, b].
+
+    along   : coefficients of t^i, pixels from `start`;  times : t of the first wavelength, and its step
+    samples : a pixel;  first : place of out's first sample, in samples
+    A quintic spline keeps the total, the mean and the higher moments.
     """
-    count = out.shape[1]
-    for i in range(len(position)):
+    count, last = out.shape[1], len(along) - 1
+    for i in range(len(electrons)):
         if electrons[i] == 0.0:
             continue
-        whole = int(np.floor(position[i]))
-        t = position[i] - whole
+        place, power = along[last], times[0] + times[1] * i
+        for j in range(last - 1, -1, -1):
+            place = place * power + along[j]
+        place = samples * (start + place)
+        whole = int(np.floor(place))
+        t = place - whole
         s = 1.0 - t
         t2, s2 = t * t, s * s
         w0, w5 = s2 * s2 * s, t2 * t2 * t
@@ -148,17 +171,18 @@ def disperse(
 def _add_rows(image: Any, whole: int, step: int, weights: Any, out: Any, left: int, low: int) -> None:
     """Rows whole + i step of an image, between its samples, onto rows low + i of out."""
     tall, n = image.shape
+    height, width = out.shape
     w0, w1, w2, w3 = weights
-    begin, end = max(0, -left), min(n, out.shape[1] - left)
-    for i in range(n):
-        if low + i < 0 or low + i >= out.shape[0]:
-            continue
+    begin, end = max(0, -left), min(n, width - left)
+    # Flat, and counted without a sign: so the compiler uses whole vectors of as few as 16 pixels.
+    flat, line = image.reshape(-1), out.reshape(-1)
+    for i in range(max(0, -low), min(n, height - low)):
         j = whole + i * step
-        a0, a1 = image[(j - 1) % tall, begin:end], image[j % tall, begin:end]
-        a2, a3 = image[(j + 1) % tall, begin:end], image[(j + 2) % tall, begin:end]
-        line = out[low + i, left + begin : left + end]
-        for c in range(len(line)):
-            line[c] += w0 * a0[c] + w1 * a1[c] + w2 * a2[c] + w3 * a3[c]
+        a0, a1 = np.uint64((j - 1) % tall * n + begin), np.uint64(j % tall * n + begin)
+        a2, a3 = np.uint64((j + 1) % tall * n + begin), np.uint64((j + 2) % tall * n + begin)
+        to = np.uint64((low + i) * width + left + begin)
+        for c in range(np.uint64(end - begin)):
+            line[to + c] += w0 * flat[a0 + c] + w1 * flat[a1 + c] + w2 * flat[a2 + c] + w3 * flat[a3 + c]
 
 
 @jit

@@ -10,6 +10,7 @@ plane; a grism that is turned turns them, and a detector has them in its own pix
 
 Trace             one order on a detector
 traces            of all orders of a grism
+throughput        how much light an order has
 source_rectangle  where sources lie whose light reaches a detector
 
 Ref : Pirzkal & Ryan 2017, STScI WFC3 ISR 2017-01 (the form); laws of the orders, the mission database
@@ -72,16 +73,17 @@ def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfigur
     found = []
     for order in sorted({int(row["order"]) for row in rows}, reverse=True):
         own = [row for row in rows if int(row["order"]) == order]
-        along, across = (_coefficients(own, axis, to_field) for axis in ("along", "across"))
+        highest = max(int(row["power"]) for row in own)
+        along, across = (_coefficients(own, axis, highest, to_field) for axis in ("along", "across"))
         first, last = (float(own[0][name]) * 10.0 for name in ("first_nm", "last_nm"))
         found.append(Trace(order, first, last, along * cosine - across * sine, along * sine + across * cosine))
     return tuple(found)
 
 
-def _coefficients(rows: list[dict[str, str]], axis: str, to_field: Float) -> Float:
-    """float64[i, 3] pixels of t^i, of (1, x0, y0)."""
+def _coefficients(rows: list[dict[str, str]], axis: str, highest: int, to_field: Float) -> Float:
+    """float64[highest + 1, 3] pixels of t^i, of (1, x0, y0)."""
     powers = {int(row["power"]): row for row in rows if row["axis"] == axis}
-    out = np.zeros((1 + max(powers), 3))
+    out = np.zeros((highest + 1, 3))
     for power, row in powers.items():
         # Of 1, and of both field coordinates.
         own = np.array([float(row[name]) for name in ("constant", "slope_x", "slope_y")])
@@ -102,7 +104,21 @@ def _field(detector: Detector, mission: MissionConfiguration) -> Float:
     return out
 
 
-def source_rectangle(trace: Trace, nx: int, ny: int, wavelength: tuple[float, float]) -> tuple[float, float, float, float]:
+def throughput(grism: str, order: int, wavelength: Float, detector: Detector, mission: MissionConfiguration) -> Float:
+    """float64[n] light of an order at wavelengths [n] A, of what the passband of the first order detects there."""
+    rows = [
+        (float(row["wavelength_nm"]) * 10.0, float(row["throughput"]))
+        for row in mission.rows(f"{detector.section}.orders")
+        if row["grism"] == grism and int(row["order"]) == order
+    ]
+    if not rows:
+        return np.ones(len(wavelength))
+    return np.interp(wavelength, *zip(*sorted(rows), strict=True))
+
+
+def source_rectangle(
+    trace: Trace, nx: int, ny: int, wavelength: tuple[float, float]
+) -> tuple[float, float, float, float]:
     """(left, right, low, high) pixels within which sources lie whose light in a stretch of A falls onto nx x ny pixels.
 
     The field's slopes are taken at the detector's corners: farther out the trace differs by less than a pixel in 100.

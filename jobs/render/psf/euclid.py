@@ -82,6 +82,15 @@ def nisp_psf(detector: Detector, band: Passband, mission: MissionConfiguration, 
     return _psf(NISP, detector, band, mission, positions)
 
 
+def nisp_psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, positions: int = 9) -> Psf:
+    """That of a NISP detector at wavelengths [w] A, without what lies beyond its planes.
+
+    detector, mission, positions : as of vis_psf
+    """
+    planes = _planes(NISP, detector, waves, mission, positions)
+    return model.sampled(planes, detector.pixel_scale, has_pixel=False, side=NISP.side)
+
+
 def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
     """What shines beyond the planes of the PSF of VIS."""
     return _edges(VIS, detector, band, mission)
@@ -93,7 +102,10 @@ def nisp_edges(detector: Detector, band: Passband, mission: MissionConfiguration
 
 
 def _psf(sampling: Sampling, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
-    planes = _planes(sampling, detector, band, mission, positions)
+    # Second moments of diffraction go with the square of the wavelength.
+    parts = sub_bands(band)
+    waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
+    planes = _planes(sampling, detector, waves, mission, positions)
     found = model.sampled(planes, detector.pixel_scale, has_pixel=False, side=sampling.side)
     return replace(found, edges=_edges(sampling, detector, band, mission))
 
@@ -121,12 +133,10 @@ def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -
 
 
 def _planes(
-    sampled: Sampling, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
+    sampled: Sampling, detector: Detector, waves: Float, mission: MissionConfiguration, positions: int
 ) -> Planes:
+    """Of wavelengths [w] A."""
     section = detector.section
-    parts = sub_bands(band)
-    # Second moments of diffraction go with the square of the wavelength.
-    waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
     nodes, powers = _nodes(positions), _powers(positions)
     places = [_field(detector, *place, mission) for place in ((0.0, 0.0), *nodes)]
     sampling = detector.pixel_scale / sampled.samples

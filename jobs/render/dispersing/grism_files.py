@@ -1,0 +1,71 @@
+"""Traces and sensitivities of a grism as files that extraction software reads: grismconf's text and its FITS tables.
+
+configuration   the text file
+sensitivity     of an order, a table of two columns
+write           all of them into a folder
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+from jobs.render.dispersing.draw import Order
+from jobs.render.dispersing.traces import Trace
+from lake_schema.arrays import Float
+
+# Of 1, x, y, x^2, x y, y^2: grismconf has no polynomial of four powers of t without the squares.
+_TERMS = 6
+
+
+def configuration(grism: str, traces: Sequence[Trace], shape: tuple[int, int], files: Sequence[str]) -> str:
+    """Text of a configuration; shape : ny, nx;  files : of the sensitivity of each order.
+
+    Offsets are from the undispersed image's place, 0-based pixels; wavelengths in A.
+    """
+    ny, nx = shape
+    lines = [f"# {grism}, simulated", f"NAXIS {ny} {nx}"]
+    for trace, file in zip(traces, files, strict=True):
+        name = f"{trace.order:+d}" if trace.order else "0"
+        # A source may lie outside the detector and its light on it.
+        reach = float(np.abs(trace.polynomials(0.0, 0.0)[0]).sum())
+        lines += ["", f"BEAM_{name}", f"SENSITIVITY_{name} {file}"]
+        lines += [f"XRANGE_{name} {-reach:.1f} {reach:.1f}", f"YRANGE_{name} {-reach:.1f} {reach:.1f}"]
+        for axis, rows in (("X", trace.x), ("Y", trace.y)):
+            lines += [f"DISP{axis}_{name}_{i} {_terms(row)}" for i, row in enumerate(rows)]
+        lines += [f"DISPL_{name}_0 {trace.first!r}", f"DISPL_{name}_1 {trace.last - trace.first!r}"]
+    return "\n".join(lines) + "\n"
+
+
+def _terms(row: Float) -> str:
+    return " ".join(repr(float(value)) for value in np.pad(row, (0, _TERMS - len(row))))
+
+
+def sensitivity(order: Order, seconds: float) -> fits.BinTableHDU:
+    """Electrons a second for each erg s-1 cm-2 A-1, in bins of 1 A.
+
+    order : whose response is of an exposure of so many seconds
+    The first and the last two values are 0: extraction software sets them so.
+    """
+    response = np.pad(order.response / seconds, 2)
+    wavelength = order.first - 2 + np.arange(float(len(response)))
+    columns = [
+        fits.Column("WAVELENGTH", "D", "Angstrom", array=wavelength),
+        fits.Column("SENSITIVITY", "D", "electron cm2 erg-1", array=response),
+        fits.Column("ERROR", "D", "electron cm2 erg-1", array=np.zeros(len(response))),
+    ]
+    return fits.BinTableHDU.from_columns(columns, name="SENSITIVITY")
+
+
+def write(folder: Path, grism: str, orders: Sequence[Order], shape: tuple[int, int], seconds: float) -> Path:
+    """Writes a configuration and its tables; returns the configuration."""
+    files = [f"{grism}_{order.trace.order:+d}.fits" for order in orders]
+    for order, file in zip(orders, files, strict=True):
+        table = fits.HDUList([fits.PrimaryHDU(), sensitivity(order, seconds)])
+        table.writeto(folder / file, overwrite=True, checksum=True)
+    path = folder / f"{grism}.conf"
+    path.write_text(configuration(grism, [order.trace for order in orders], shape, files), encoding="utf-8")
+    return path

@@ -1,0 +1,196 @@
+"""Spectra on the detector: against the Fourier series of every wavelength, and what must be kept."""
+
+import numpy as np
+import pytest
+
+from benchmarks import _scenes as scenes
+from jobs.render.dispersing import draw, images, kernels
+from jobs.render.drawing import transfer
+from jobs.render.drawing.kernels import fourier
+from jobs.render.sources import galaxy_shapes, sersic
+from tests.jobs.render.dispersing.made import FIRST, LAST, one, order, psf, trace
+
+WAVES = np.arange(float(FIRST), LAST + 1.0)
+FINE = draw.Settings(edge=1e-9, faint=0.0, along=3)
+
+
+def series(sources, spectrum, orders, through, shape):
+    """The frame of the only source by the Fourier series of its light, wavelength by wavelength: periodic, [ny, nx]."""
+    (ny, nx), fine = shape, 3
+    fy, fx = np.fft.fftfreq(ny * fine, 1.0 / (ny * fine)) / ny, np.arange(nx * fine // 2 + 1) / nx
+    planes, samples = through.planes, through.planes.samples
+    spectra = []
+    for image in (*planes.images, *planes.drift):
+        at = (np.arange(len(image)) - len(image) // 2) / samples
+        left, right = np.exp(-2j * np.pi * np.outer(fy, at)), np.exp(-2j * np.pi * np.outer(at, fx))
+        spectra.append(left @ image.astype(float) @ right)
+    nodes = planes.wavelength
+    own = [
+        np.tensordot(transfer.basis_weights(through, part[None], sources.column, sources.row)[0], spectra, 1)
+        for part in np.eye(len(nodes))
+    ]
+    total = np.zeros((len(fy), len(fx)), complex)
+    column, row = float(sources.column[0]), float(sources.row[0])
+    for part in orders:
+        x, y = part.trace.offsets(column, row, part.wavelength)
+        electrons, share = spectrum * part.response, images.shares(part.wavelength, nodes)
+        for i in np.flatnonzero(electrons):
+            turned = np.exp(-2j * np.pi * fy * (row + y[i]))[:, None] * np.exp(-2j * np.pi * fx * (column + x[i]))
+            total += electrons[i] * np.tensordot(share[i], own, 1) * turned
+    total *= np.sinc(fx) * np.sinc(fy)[:, None]
+    if sources.shape[0] >= 0:
+        total *= profile(sources, fx, fy)
+    return fine**2 * np.fft.irfft2(total, s=(ny * fine, nx * fine))[::fine, ::fine]
+
+
+def profile(sources, fx, fy):
+    shapes = sources.shapes.take(sources.shape)
+    form = galaxy_shapes.forms(shapes, sources.jacobian)
+    row, weights = sersic.row_of(shapes.sersic_index)
+    table = np.empty(sersic.table().shape[1], np.float32)
+    fourier.interpolate(sersic.table(), int(row[0]), weights[0], 0.0, 1e9, table)
+    out, square = np.ones((len(fy), len(fx)), np.float32), np.empty(len(fx), np.float32)
+    for line, f in zip(out, fy, strict=True):
+        fourier.profile_at(
+            float(shapes.bulge_fraction[0]), form.bulge[0], form.disk[0], form.thick[0], table,
+            (2 * np.pi * fx).astype(np.float32), np.full(len(fx), 2 * np.pi * f, np.float32), square,
+            square.view(np.int32), line,
+        )  # fmt: skip
+    return out
+
+
+def placed(seed, i, column, row, galaxies=4, stars=1):
+    source = one(scenes.sources(scenes.NISP, seed, galaxies=galaxies, stars=stars), i)
+    source.column[:], source.row[:] = column, row
+    return source
+
+
+def continuum_and_line(line=0.0, every=20):
+    """One electron every so many A, and a line at 1.5 um."""
+    spectrum = np.zeros(len(WAVES))
+    spectrum[::every] = every
+    spectrum[int(15000 - FIRST)] += line
+    return spectrum
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.07])
+@pytest.mark.parametrize("i", [0, 1, 4])
+def test_spectra_are_the_series_of_every_wavelength(i, slope):
+    """A first order of 64 pixels; galaxies and a star."""
+    source, through, short = placed(8, i, 47.3, 33.6), psf(), trace((-10.0, 64.0), slope)
+    spectrum = continuum_and_line(3000.0)
+    shape = (72, 160)
+    wanted = series(source, spectrum, [order(short)], through, shape)
+    settings = draw.Settings(edge=1e-9, faint=0.0, least=64)
+    found = draw.draw(
+        source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, settings
+    )
+    assert np.abs(found - wanted).max() < 5e-3 * wanted.max()
+    fine = draw.draw(source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, FINE)
+    assert np.abs(fine - wanted).max() < 1.5e-3 * wanted.max()
+
+
+def test_laying_keeps_the_total_and_the_mean_of_a_line():
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        electrons, along = rng.random(50), np.array([rng.uniform(0, 3), rng.uniform(5, 40), rng.uniform(-2, 2)])
+        laid = np.zeros((1, 400))
+        times = (rng.uniform(-0.1, 0.1), 0.02)
+        kernels.lay(electrons, along, times, 7.25, 3, np.ones((50, 1)), -20, laid)
+        t = times[0] + times[1] * np.arange(50)
+        places = 3 * (7.25 + np.polynomial.polynomial.polyval(t, along))
+        samples = -20 + np.arange(400)
+        assert laid.sum() == pytest.approx(electrons.sum(), rel=1e-13)
+        assert (laid[0] * samples).sum() == pytest.approx((electrons * places).sum(), rel=1e-12)
+        # A spline of degree 5 broadens by 6 / 12 of a sample squared, and by nothing else.
+        spread = (electrons * places**2).sum() + 0.5 * electrons.sum()
+        assert (laid[0] * samples**2).sum() == pytest.approx(spread, rel=1e-12)
+
+
+def test_shares_of_the_nodes_sum_to_one_and_are_one_at_each():
+    nodes = images.nodes(FIRST, LAST, 4)
+    share = images.shares(WAVES, nodes)
+    np.testing.assert_allclose(share.sum(axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(images.shares(nodes, nodes), np.eye(4), atol=1e-12)
+
+
+def test_all_light_of_an_order_is_on_a_frame_that_holds_it():
+    """But for what the PSF has outside its planes; and a tally says so."""
+    source, through = placed(8, 1, 140.0, 60.0), psf()
+    spectrum = continuum_and_line()
+    orders = [order(trace((-60.0, 120.0), 0.03)), order(trace((-70.0, 3.0, 1.0, -0.5), order=0), 0.1)]
+    tally = draw.Tally(np.zeros((1, 2)))
+    settings = draw.Settings(edge=1e-9, faint=0.0, least=96)
+    frame = draw.draw(
+        source, lambda some: spectrum[None].astype(np.float32), orders, through, (160, 300), 1.0, settings, tally
+    )
+    assert tally.electrons[0].sum() == pytest.approx(frame.sum(), rel=1e-9)
+    for electrons, part in zip(tally.electrons[0], orders, strict=True):
+        assert electrons == pytest.approx((spectrum * part.response).sum(), rel=0.02)
+
+
+def test_sources_add_up_in_any_order_bit_by_bit():
+    all_of_them = scenes.sources(scenes.NISP, 3, galaxies=6, stars=2)
+    all_of_them.column[:], all_of_them.row[:] = np.linspace(20, 220, 8), np.linspace(10, 90, 8)
+    all_of_them.electrons[:] = 1.0
+    spectrum, through, orders = continuum_and_line(500.0), psf(), [order(trace((-30.0, 90.0), 0.05))]
+
+    def drawn(sources):
+        made = lambda some: np.tile(spectrum, (len(some), 1)).astype(np.float32)  # noqa: E731
+        return draw.draw(sources, made, orders, through, (100, 240), 1.0, draw.Settings())
+
+    wanted = drawn(all_of_them)
+    np.testing.assert_array_equal(drawn(all_of_them.take(np.arange(8)[::-1])), wanted)
+    np.testing.assert_array_equal(sum(drawn(all_of_them.take(np.array([i]))) for i in range(8)), wanted)
+
+
+def test_nothing_is_drawn_of_orders_beside_the_detector_or_lost_in_the_noise():
+    source, through = placed(8, 1, 140.0, 60.0), psf()
+    spectrum = continuum_and_line().astype(np.float32)[None]
+    beside = [order(trace((5000.0, 100.0)))]
+    assert draw.draw(source, lambda some: spectrum, beside, through, (100, 240), 1.0, draw.Settings()).sum() == 0.0
+    here = [order(trace((-30.0, 90.0)))]
+    assert draw.draw(source, lambda some: spectrum, here, through, (100, 240), 1e6, draw.Settings()).sum() == 0.0
+
+
+def test_a_line_lies_where_its_wavelength_does():
+    """Centroids of a narrow line, drawn with and without, at many places: 0.01 pixel."""
+    through, rng = psf(), np.random.default_rng(7)
+    off = []
+    for _ in range(12):
+        source = placed(int(rng.integers(1000)), int(rng.integers(4)), rng.uniform(60, 64), rng.uniform(40, 44))
+        path = trace((-30.0, 90.0), rng.uniform(-0.07, 0.07), sag=rng.uniform(-1, 1))
+        spectrum = np.zeros((1, len(WAVES)), np.float32)
+        spectrum[0, 3000] = 1000.0
+        frame = draw.draw(
+            source,
+            lambda some, of=spectrum: of,
+            [order(path)],
+            through,
+            (84, 160),
+            1.0,
+            draw.Settings(edge=1e-6, least=64),
+        )
+        x, y = path.offsets(float(source.column[0]), float(source.row[0]), WAVES[3000:3001])
+        rows, columns = np.indices(frame.shape)
+        own = frame.sum()
+        wanted = draw_of_all(source, through, float(source.column[0] + x[0]), float(source.row[0] + y[0]))
+        off.append(((frame * columns).sum() / own - wanted[0], (frame * rows).sum() / own - wanted[1]))
+    assert np.abs(off).max() < 0.01
+
+
+def draw_of_all(source, through, column, row):
+    """Centroid of the same source undispersed at a place, in the light of its line."""
+    still = placed_at(source, column, row)
+    flat = [order(trace((0.0, 1e-6)))]
+    spectrum = np.zeros((1, len(WAVES)), np.float32)
+    spectrum[0, 3000] = 1000.0
+    frame = draw.draw(still, lambda some: spectrum, flat, through, (84, 160), 1.0, draw.Settings(edge=1e-6, least=64))
+    rows, columns = np.indices(frame.shape)
+    return (frame * columns).sum() / frame.sum(), (frame * rows).sum() / frame.sum()
+
+
+def placed_at(source, column, row):
+    moved = source.take(np.array([0]))
+    moved.column[:], moved.row[:] = column, row
+    return moved

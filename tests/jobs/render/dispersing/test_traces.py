@@ -1,0 +1,114 @@
+"""Traces of NISP's grisms: the laws that they are made of, and grismconf's reading of them."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jobs.render.camera.detectors import detector, detectors
+from jobs.render.dispersing import grism_files, traces
+from jobs.render.dispersing.draw import Order
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+
+MISSION = resolve()
+DETECTOR = detector("nisp", "DET23", MISSION)
+
+
+def place(trace, column, row, wavelength):
+    x, y = trace.offsets(column, row, np.array([wavelength]))
+    return float(x[0]), float(y[0])
+
+
+@pytest.mark.parametrize("grism", ["RGS000", "RGS180", "BGS000"])
+def test_the_first_order_has_the_missions_dispersion_and_the_zeroth_hardly_any(grism):
+    found = {trace.order: trace for trace in traces.traces(grism, 0.0, DETECTOR, MISSION)}
+    assert sorted(found) == [-1, 0, 1, 2]
+    low, high = (MISSION.value(f"nisp.{grism.lower()}.{end}", "Angstrom") for end in ("low", "high"))
+    wanted = {"RGS000": 13.4, "RGS180": 13.4, "BGS000": 12.4}[grism]
+    length = np.hypot(*np.subtract(place(found[1], 1000, 1000, high), place(found[1], 1000, 1000, low)))
+    # Within the field's gradients of 1 %.
+    assert (high - low) / length == pytest.approx(wanted, rel=0.02)
+    second = np.hypot(*np.subtract(place(found[2], 1000, 1000, high), place(found[2], 1000, 1000, low)))
+    assert second == pytest.approx(2.0 * length, rel=1e-3)
+    zeroth = np.hypot(*np.subtract(place(found[0], 1000, 1000, high), place(found[0], 1000, 1000, low)))
+    assert zeroth == pytest.approx((high - low) / 700.0, rel=0.1)
+
+
+def test_grisms_half_a_turn_apart_disperse_to_opposite_sides():
+    one, other = (
+        {trace.order: trace for trace in traces.traces(grism, tilt, DETECTOR, MISSION)}[1]
+        for grism, tilt in (("RGS000", 4.0), ("RGS180", 4.0))
+    )
+    for wavelength in (12060.0, 18920.0):
+        here, there = place(one, 1000, 1000, wavelength), place(other, 1000, 1000, wavelength)
+        np.testing.assert_allclose(here, -np.array(there), atol=4.5)
+
+
+def test_a_turned_grism_turns_its_traces():
+    straight, turned = (
+        {trace.order: trace for trace in traces.traces("RGS000", tilt, DETECTOR, MISSION)} for tilt in (0.0, 4.0)
+    )
+    angle = np.radians(4.0)
+    for number, trace in straight.items():
+        x, y = trace.offsets(700.0, 1500.0, np.linspace(trace.first, trace.last, 9))
+        found = turned[number].offsets(700.0, 1500.0, np.linspace(trace.first, trace.last, 9))
+        np.testing.assert_allclose(found[0], x * np.cos(angle) - y * np.sin(angle), atol=1e-9)
+        np.testing.assert_allclose(found[1], x * np.sin(angle) + y * np.cos(angle), atol=1e-9)
+
+
+def test_a_detector_upside_down_sees_the_same_light_in_the_focal_plane():
+    """At one place of the focal plane, from either side of the line between two detectors."""
+    for name in ("DET22", "DET32"):
+        d = detector("nisp", name, MISSION)
+        turn = np.radians(d.rotation)
+        (trace,) = (one for one in traces.traces("RGS000", 0.0, d, MISSION) if one.order == 1)
+        x, y = place(trace, (d.nx - 1) / 2, (d.ny - 1) / 2, 18920.0)
+        along = x * np.cos(turn) - y * np.sin(turn)
+        assert along == pytest.approx(292.5, rel=0.012)
+
+
+def test_an_unknown_grism_is_refused_by_name():
+    with pytest.raises(BadInput, match="'RGS270' is not one of BGS000, RGS000, RGS180"):
+        traces.traces("RGS270", 0.0, DETECTOR, MISSION)
+
+
+@given(st.floats(-4.0, 4.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.sampled_from([-1, 0, 1, 2]))
+def test_sources_of_light_on_a_detector_lie_in_the_rectangle(tilt, u, v, number):
+    (trace,) = (one for one in traces.traces("RGS000", tilt, DETECTOR, MISSION) if one.order == number)
+    left, right, low, high = traces.source_rectangle(trace, 2040, 2040, (trace.first, trace.last))
+    # Somewhere about the detector; where its light falls on it, it is inside.
+    column, row = -5000.0 + 12000.0 * u, -400.0 + 2900.0 * v
+    x, y = trace.offsets(column, row, np.linspace(trace.first, trace.last, 40))
+    inside = (column + x >= 0) & (column + x <= 2039) & (row + y >= 0) & (row + y <= 2039)
+    # Slopes of 1 % over the field, beyond the corners.
+    slack = 60.0
+    if inside.any():
+        assert left - slack <= column <= right + slack
+        assert low - slack <= row <= high + slack
+
+
+def test_orders_share_the_light_as_the_mission_has_it():
+    waves = np.array([12060.0, 15000.0, 18920.0])
+    assert traces.throughput("RGS000", 1, waves, DETECTOR, MISSION).tolist() == [1.0, 1.0, 1.0]
+    for number, low, high in ((0, 0.01, 0.03), (2, 0.01, 0.04), (-1, 0.004, 0.006)):
+        found = traces.throughput("RGS000", number, waves, DETECTOR, MISSION)
+        assert (low <= found).all()
+        assert (found <= high).all()
+
+
+def test_grismconf_reads_the_same_places(tmp_path):
+    grismconf = pytest.importorskip("grismconf")
+    for grism, tilt, one in (("RGS000", 0.0, DETECTOR), ("RGS180", 4.0, detectors("nisp", MISSION)[-1])):
+        found = traces.traces(grism, tilt, one, MISSION)
+        orders = [Order(trace, 12060, np.full(6861, 3.0)) for trace in found]
+        read = grismconf.Config(str(grism_files.write(tmp_path, grism, orders, (2040, 2040), 2.0)))
+        t = np.linspace(0.0, 1.0, 11)
+        for trace in found:
+            name = f"{trace.order:+d}" if trace.order else "0"
+            for column, row in ((0.0, 0.0), (1000.0, 30.0), (2039.0, 2039.0), (-500.0, 100.0)):
+                waves = read.DISPL(name, column, row, t)
+                x, y = trace.offsets(column, row, waves)
+                np.testing.assert_allclose(read.DISPX(name, column, row, t), x, atol=1e-6)
+                np.testing.assert_allclose(read.DISPY(name, column, row, t), y, atol=1e-6)
+            assert read.SENS[name](15000.0) == 1.5
