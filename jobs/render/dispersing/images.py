@@ -1,12 +1,12 @@
 """Images of sources in the light of a few wavelengths, as spline coefficients: what is spread along a trace.
 
-The PSF at a wavelength is sum_b l_b(lambda) PSF_b, l_b the Lagrange polynomials of a few nodes.  Of a stamp of N pixels,
-periodic, the image through each PSF_b,
+The PSF at a wavelength is sum_b l_b(lambda) PSF_b, l_b the Lagrange polynomials of a few nodes.  Of a stamp of N
+pixels, periodic, the image through each PSF_b,
 
     I_b(x, y) = 1 / N^2 sum_k profile(k) PSF_b(k) pixel(k) exp(i k r),
 
-is wanted at any place, not at the pixels alone.  It is held by ox samples a pixel along the rows and oy across, unfolded
-(all |kx| <= pi ox, |ky| <= pi oy), as coefficients of splines: I = sum_j C_j B5(ox x - j) B3(oy y - j), so that
+is wanted at any place, not at the pixels alone.  It is held by ox samples a pixel along the rows and oy across,
+unfolded (all |kx| <= pi ox, |ky| <= pi oy), as coefficients of splines: I = sum_j C_j B5(ox x - j) B3(oy y - j), so that
 C(k) = ox oy I(k) / (sinc(f / ox)^6 sinc(fy / oy)^4), f = k / 2 pi, and no resolution is lost to the splines.  The
 quintic spline lies along the trace, of slope s: f = fx + s fy.
 
