@@ -56,7 +56,10 @@ def galaxies(rows: Galaxies, first: int, count: int, library: Library) -> Float3
 
 
 def stars(rows: Stars, first: int, count: int, library: Library) -> Float32:
-    """f_lambda, float32[n, count] erg s-1 cm-2 A-1 at whole angstroms from `first`; as `galaxies`."""
+    """f_lambda, float32[n, count] erg s-1 cm-2 A-1 at whole angstroms from `first`, vacuum.
+
+    rows : stars;  first, count : of the stretch, A;  library : templates of stars
+    """
     low = first - int(library.wavelength[0])
     milky_way = extinction.milky_way(first + np.arange(float(count)))
     scale = star_scale(rows, library)

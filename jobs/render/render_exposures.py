@@ -16,20 +16,22 @@ from jobs import heap
 from jobs.accuracy import SURVEY, Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
 from jobs.render.camera import detectors
+from jobs.render.camera.detectors import Detector
 from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim
 from jobs.render.drawing import stamp_sizes
-from jobs.render.exposure import persistence, render, visible_sources
-from jobs.render.exposure.records import Earlier, EarlierSky, Rows
+from jobs.render.exposure import persistence, render, visible_sources, visible_spectra
+from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
 from jobs.render.planning import preconditions, variants
 from jobs.render.planning import tasks as planned
 from jobs.render.planning.mission import mission_of
 from jobs.render.planning.preconditions import INPUTS
 from jobs.render.products import exposure_files, fits_files, truth_table
-from jobs.render.products.keys import ephemeris_files, product_keys, psf_files, truth_file
+from jobs.render.products.keys import ephemeris_files, product_keys, psf_files, spectra_file, truth_file
 from jobs.render.psf import from_file
 from jobs.render.sources import catalogue_rows, ephemerides, selection, solar_system
 from jobs.render.sources.catalogue_rows import LENSES
+from jobs.render.sources.solar_system import Population
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema.errors import BadInput
@@ -40,7 +42,7 @@ from lake_schema.store.plan import Json, Output, Part, Plan
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.products import PRODUCTS
-from lake_schema.tables.rendered_truth import RENDERED_TRUTH
+from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
@@ -63,9 +65,23 @@ def steps(lake: Path, request: Request) -> list[Step]:
     plan = products(lake, request, inputs, exposures, every.to_pylist(), asked)
     drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in plan.parts)
     steps = [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
+    spread = _dispersed(exposures)
+    spectra = tuple(own for own, part in zip(drawn, plan.parts, strict=True) if part.facts["exposure_id"] in spread)
+    if spectra:
+        steps.append(Step(Plan(RENDERED_SPECTRA, {"products": plan.key}, spectra), spectra_work))
     if request.files == "exposure":
         steps.append(Step(exposure_files.plan(plan, every.to_pylist()), exposure_files.work, unit="exposure"))
     return steps
+
+
+def _dispersed(exposures: pa.Table) -> set[int]:
+    """Exposures whose sources are spread out by a grism."""
+    found = set()
+    for row in map(ExposureRow.of, exposures.to_pylist()):
+        channel = registry.CHANNELS.get(row.channel)
+        if channel is not None and channel.disperses is not None and channel.sees_sky(row.image_type):
+            found.add(row.exposure_id)
+    return found
 
 
 def inputs_of(lake: Path, request: Request) -> dict[str, read.Version]:
@@ -198,39 +214,62 @@ def work(lake: Path, facts: Json) -> Output:
             if file_sha256(Path(file)) != sha256:
                 raise BadInput(f"{file}: has changed since the rendering began")
             bodies = ephemerides.read(Path(file), sha256).of_day
-    margin = own.mission.value("survey.selection_margin", "arcsec")
-    farther = max(stamp_sizes.reach(detector.pixel_scale) - margin, 0.0)
-    least = visible_sources.least_flux(exposed, detector, own.mission, own.accuracy)
-    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
-    spikes = visible_sources.spike_flux(exposed, detector, own.mission, own.accuracy, band)
-    outer = visible_sources.outer_flux(exposed, detector, own.mission, own.accuracy)
-    found = [
-        catalogue_rows.sources(inputs[rows], inputs[fluxes], task, columns, exposed.band, farther, least, limit)
-        for rows, fluxes, columns, limit in (
-            ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS, outer),
-            ("stars", "star_fluxes", visible_sources.STAR_COLUMNS, spikes),
-        )
-    ]
     with heap.kept():
-        rows_ = Rows(
-            *found[0][:2],
-            *found[1][:2],
-            library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
-            stellar=stars_of(lake, inputs["star_fluxes"].manifest["facts"]),
-            complete=margin + min(complete for *_, complete in found),
-            lenses=catalogue_rows.lenses(inputs[LENSES], task, catalogue_rows.deflection_of(inputs["galaxies"]), least)
-            if LENSES in inputs
-            else None,
-            bodies=bodies,
-            earlier=earlier,
-        )
+        rows_ = _rows(lake, inputs, exposed, task, detector, own, bodies, earlier)
+        band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
         aim, noise = Aim.of(exposed, detector, band, request["seed"]), request.get("noise_seed")
         rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
     rice = request["compression"] == "rice"
     rows, files = fits_files.products(rendered, request["truth"], rice, request.get("wcs", "sip"))
     drawn = truth_table.truth(rendered)
-    name = truth_file(facts["exposure_id"], facts["detector"])
-    return Output(rows, {**files, name: lambda path: parquet.write(path, drawn, RENDERED_TRUTH)})
+    place = facts["exposure_id"], facts["detector"]
+    files = {**files, truth_file(*place): lambda path: parquet.write(path, drawn, RENDERED_TRUTH)}
+    spectra = truth_table.spectra(rendered)
+    if spectra is not None:
+        files[spectra_file(*place)] = lambda path: parquet.write(path, spectra, RENDERED_SPECTRA)
+    return Output(rows, files)
+
+
+def _rows(
+    lake: Path,
+    inputs: Mapping[str, read.Version],
+    exposed: ExposureRow,
+    task: Json,
+    detector: Detector,
+    own: Variant,
+    bodies: Callable[[int], Population] | None,
+    earlier: tuple[Earlier | EarlierSky, ...],
+) -> Rows:
+    """The sources of a detector, from its own cells and, where they shine so far, from those about."""
+    margin = registry.CHANNELS[exposed.channel].margin(detector.section, own.mission)
+    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
+    reach = max(stamp_sizes.reach(detector.pixel_scale), visible_spectra.beyond(exposed, detector, own.mission, band))
+    farther = max(reach - margin, 0.0)
+    least = visible_sources.least_flux(exposed, detector, own.mission, own.accuracy)
+    spikes = visible_sources.spike_flux(exposed, detector, own.mission, own.accuracy, band)
+    outer = visible_sources.outer_flux(exposed, detector, own.mission, own.accuracy)
+    found = []
+    for rows, fluxes, columns, limit in (
+        ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS, outer),
+        ("stars", "star_fluxes", visible_sources.STAR_COLUMNS, spikes),
+    ):
+        bands = visible_spectra.bands(exposed, inputs[fluxes].schema.names)
+        versions = inputs[rows], inputs[fluxes]
+        found.append(catalogue_rows.sources(*versions, task, columns, bands, farther, least, limit))
+    lenses = None
+    if LENSES in inputs:
+        deflection = catalogue_rows.deflection_of(inputs["galaxies"])
+        lenses = catalogue_rows.lenses(inputs[LENSES], task, deflection, least)
+    return Rows(
+        *found[0][:2],
+        *found[1][:2],
+        library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
+        stellar=stars_of(lake, inputs["star_fluxes"].manifest["facts"]),
+        complete=margin + min(complete for *_, complete in found),
+        lenses=lenses,
+        bodies=bodies,
+        earlier=earlier,
+    )
 
 
 def _earlier(
@@ -285,9 +324,18 @@ def _drawn_again(
 
 def truth_work(lake: Path, facts: Json) -> Output:
     """What was drawn on one detector, from beside its images."""
+    return _beside(lake, facts, truth_file)
+
+
+def spectra_work(lake: Path, facts: Json) -> Output:
+    """Where spectra lie on one detector, likewise."""
+    return _beside(lake, facts, spectra_file)
+
+
+def _beside(lake: Path, facts: Json, file_of: Callable[[int, str], str]) -> Output:
     products = read.version(lake, "products", facts["products"])
     (row, *_) = products.rows(["exposure_id", "detector"], [facts["part"]]).to_pylist()
-    return Output(products.beside(truth_file(row["exposure_id"], row["detector"])))
+    return Output(products.beside(file_of(row["exposure_id"], row["detector"])))
 
 
 JOB = Job(

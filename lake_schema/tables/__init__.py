@@ -24,7 +24,7 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.passbands import PASSBANDS
     from lake_schema.tables.products import EXPOSURE_FILES, PRODUCTS
     from lake_schema.tables.quarantine import QUARANTINE
-    from lake_schema.tables.rendered_truth import RENDERED_TRUTH
+    from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
     from lake_schema.tables.stars import STARS
     from lake_schema.tables.strong_lenses import STRONG_LENSES
     from lake_schema.tables.tasks import TASKS
@@ -32,9 +32,8 @@ def declared(bands: Sequence[str]) -> list[Table]:
 
     galaxies, stars = (fluxes(kind, bands) for kind in ("galaxy", "star"))
     skies = [HALOS, GALAXIES, QUARANTINE, STRONG_LENSES, STARS, galaxies, stars, GAIA]
-    plans = [MISSION, EXPOSURES, TASKS]
-    tables = [*skies, HALO_LIMITS, TEMPLATES, EXTINCTION_LAWS, EMISSION_LINES, PASSBANDS, *plans]
-    return [*tables, PRODUCTS, RENDERED_TRUTH, EXPOSURE_FILES]
+    plans, images = [MISSION, EXPOSURES, TASKS], [PRODUCTS, RENDERED_TRUTH, RENDERED_SPECTRA, EXPOSURE_FILES]
+    return [*skies, HALO_LIMITS, TEMPLATES, EXTINCTION_LAWS, EMISSION_LINES, PASSBANDS, *plans, *images]
 
 
 def markdown() -> str:

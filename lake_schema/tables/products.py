@@ -15,6 +15,10 @@ CONTENTS = (
     ("persistence", "expected electrons that earlier exposures left"),
     ("ramp", "groups of a ramp, as read"),
     ("saturation", "1 where a pixel or the converter is full"),
+    ("order_1", "expected electrons of the sources' first order"),
+    ("order_0", "the same of order 0"),
+    ("order_2", "the same of order 2"),
+    ("order_m1", "the same of order -1"),
 )
 
 PRODUCTS = Table(

@@ -1,4 +1,4 @@
-"""Table `rendered_truth`: what was drawn where, one row a source of a detector.
+"""Tables `rendered_truth`: what was drawn where, one row a source of a detector; `rendered_spectra`: one an order.
 
 Of sources beside it that send in no more than the faint wings beyond their stamps there is none, but of stars whose
 spikes may be noticed.
@@ -46,4 +46,55 @@ RENDERED_TRUTH = Table(
     ),
     "Sources of the rendered images: true places and electrons.",
     key=("exposure_id", "detector", "id"),
+)
+
+_ORDERS = ((-1, "order -1"), (0, "order 0"), (1, "order 1: the spectrum that is measured"), (2, "order 2"))
+
+
+def _place(axis: str, end: str, text: str) -> Column:
+    return Column(f"{axis}_{end}", "float64", "pix", f"pos.cartesian.{axis};instr.det", text)
+
+
+RENDERED_SPECTRA = Table(
+    "rendered_spectra",
+    1,
+    (
+        Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure", lo=0),
+        Column("detector", "string", ucd="meta.id;instr.det", doc="detector name"),
+        Column("id", "int64", ucd="meta.id;meta.main", doc="source, as in rendered_truth", lo=0),
+        Column("order", "int8", "", "instr.order", "of the grism", codes=_ORDERS),
+        Column("wavelength_first", "float64", "Angstrom", "em.wl", "of t = 0, in vacuum", 0.0),
+        Column("wavelength_last", "float64", "Angstrom", "em.wl", "of t = 1; the wavelength is linear in t", 0.0),
+        _place("x", "first", "column of t = 0, 0 = centre of the first pixel"),
+        _place("y", "first", "row of t = 0"),
+        _place("x", "last", "column of t = 1"),
+        _place("y", "last", "row of t = 1"),
+        Column("trace_x", "list<float64>", "pix", "pos.cartesian.x;instr.det", "columns: coefficients of t^0, t^1, .."),
+        Column("trace_y", "list<float64>", "pix", "pos.cartesian.y;instr.det", "rows: coefficients of t^0, t^1, .."),
+        Column("expected", "float64", "electron", "phot.count", "in the exposure, on and off the detector", 0.0),
+        Column("drawn", "float64", "electron", "phot.count;instr.det", "of its stamps, on the detector"),
+        Column(
+            "overlapped",
+            "float64",
+            "",
+            "arith.ratio",
+            "part of a first order's length on the detector beside which a trace of another source lies, noticed and "
+            "nearer than both are wide; of other orders null",
+            0.0,
+            1.0,
+            nullable=True,
+        ),
+        Column("contaminants", "list<int64>", "", "meta.id;src", "sources of these traces, ascending"),
+        Column("line_wavelength", "list<float64>", "Angstrom", "em.wl", "a first order's emission lines, in vacuum"),
+        Column("line_expected", "list<float64>", "electron", "phot.count;em.line", "of each of these lines"),
+        Column(
+            "line_snr",
+            "list<float64>",
+            "",
+            "stat.snr;em.line",
+            "of each: weighted by the source's image, sky and continuum for noise, without contaminants",
+        ),
+    ),
+    "Spectra of the rendered images: true traces, electrons, lines, and what overlaps.",
+    key=("exposure_id", "detector", "id", "order"),
 )

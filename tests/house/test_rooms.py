@@ -153,7 +153,10 @@ TOUCHED = {"channels/dummy.py": DUMMY, "channels/registry.py": None}
 def with_the_dummy(monkeypatch):
     """The renderer with the files of TOUCHED, and nothing else, added or changed; the dummy's module."""
     text = (ROOT / "jobs" / "render" / "channels" / "registry.py").read_text()
-    for old, new in (("import ground", "import dummy, ground"), ('= {"VIS"', '= {"DUMMY": dummy.CHANNEL, "VIS"')):
+    for old, new in (
+        ("import ground", "import dummy, ground"),
+        ('= {\n    "VIS"', '= {\n    "DUMMY": dummy.CHANNEL,\n    "VIS"'),
+    ):
         assert text.count(old) == 1
         text = text.replace(old, new)
     made = {name: types.ModuleType(f"jobs.render.channels.{name}") for name in ("dummy", "registry")}

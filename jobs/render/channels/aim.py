@@ -42,8 +42,9 @@ class Aim:
         """
         kind = exposure.image_type
         channel = registry.channel_of(exposure.channel, kind, f"exposure {exposure.exposure_id}")
-        # Exposures that differ in their noise alone see alike.
-        seen = filter_wheel.tilted(detector, image_types.identity(replace(exposure, realisation=None)), seed)
+        # Exposures that differ in their noise alone see alike; no filter is in front of a grism.
+        identity = image_types.identity(replace(exposure, realisation=None))
+        seen = filter_wheel.tilted(detector, identity, seed) if channel.disperses is None else detector
         system = astrometry.wcs(seen, exposure.ra, exposure.dec, exposure.position_angle)
         band = band or passbands.load(exposure.band)
         return cls(exposure, detector, system, band, channel, channel.effects[kind])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
+from jobs.render.camera.traces import Trace
 from jobs.render.channels.cost import Cost
 from jobs.render.channels.image_types import SKY_TYPES
 from jobs.render.channels.readout import ReadoutMode
@@ -14,9 +15,33 @@ from jobs.render.effects.effect import Effect
 from jobs.render.psf.model import Psf
 from jobs.render.psf.spikes import Edges
 from jobs.render.sky.diffuse_light import SkyBand
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
+
+
+@dataclass(frozen=True, slots=True)
+class Dispersion:
+    """How a channel spreads the light of sources out, without a slit.
+
+    traces     : (exposure, detector, mission) -> where each order puts it
+    throughput : (exposure, order, wavelengths [n] A, detector, mission) -> [n] light of an order, of what the
+                 passband detects
+    vignetted  : (exposure, detector, columns [n], rows [n] of undispersed images, mission) -> [n] part of the sources'
+                 light that is let through
+    psf        : (detector, wavelengths [n] A, mission, positions on the detector) -> PSF
+    reach      : (section, mission) -> arcsec beyond a detector, as far as all sources are read: those whose first order
+                 is on it
+    chosen_by  : band in which sources are bright enough, where the mission says how bright they are to be
+    """
+
+    traces: Callable[[ExposureRow, Detector, MissionConfiguration], tuple[Trace, ...]]
+    throughput: Callable[[ExposureRow, int, Float, Detector, MissionConfiguration], Float]
+    vignetted: Callable[[ExposureRow, Detector, Float, Float, MissionConfiguration], Float]
+    psf: Callable[[Detector, Float, MissionConfiguration, int], Psf]
+    reach: Callable[[str, MissionConfiguration], float]
+    chosen_by: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +65,7 @@ class Channel:
     ramp       : which of the mission's ramps its detectors are read up (Scene.ramp); "" = they are read once
     remembers  : effect that brings what earlier exposures left; None: they leave nothing
     coloured   : effect by which pixels see the colours of sources (Scene.tints); None: all see them alike
+    disperses  : how the light of sources is spread out; None: it is not
     """
 
     effects: Mapping[str, tuple[Effect, ...]]
@@ -59,6 +85,7 @@ class Channel:
     ramp: str = ""
     remembers: Effect | None = None
     coloured: Effect | None = None
+    disperses: Dispersion | None = None
 
     def __post_init__(self) -> None:
         for effects in self.effects.values():
@@ -70,6 +97,11 @@ class Channel:
     def sees_sky(self, image_type: str) -> bool:
         """Whether sources shine on the detectors."""
         return image_type in self.sky_types
+
+    def margin(self, section: str, mission: MissionConfiguration) -> float:
+        """How far beyond a detector all sources are read, arcsec; section : of its camera in the mission database."""
+        spread = 0.0 if self.disperses is None else self.disperses.reach(section, mission)
+        return mission.value("survey.selection_margin", "arcsec") + spread
 
     def sees_bodies(self, image_type: str) -> bool:
         """Whether moving bodies are drawn."""

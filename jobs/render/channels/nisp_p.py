@@ -47,11 +47,12 @@ _LIGHT = (
     background.EFFECT,
     pixel_area.EFFECT,
 )
-_CURRENT = (
+# Of any of the channels that these detectors are read for.
+CURRENT = (
     dark_map.EFFECT,
     persistence.EFFECT,
 )
-_RAMP = (
+RAMP = (
     ramp_cosmic_rays.EFFECT,
     ramp_nonlinearity.EFFECT,
     ramp.EFFECT,
@@ -65,10 +66,10 @@ _RAMP = (
     adc.SIGNAL,
 )
 
-SKY = (*_LIGHT, chromatic_response.EFFECT, pixel_response.EFFECT, *_CURRENT, *_RAMP)
+SKY = (*_LIGHT, chromatic_response.EFFECT, pixel_response.EFFECT, *CURRENT, *RAMP)
 # Assumed to be taken on the way from field to field: neither sky nor stars are in a flat.
-FLAT = (calibration_lamp.EFFECT, chromatic_response.LAMP, pixel_response.EFFECT, *_CURRENT, *_RAMP)
-DARK = (*_CURRENT, *_RAMP)
+FLAT = (calibration_lamp.EFFECT, chromatic_response.LAMP, pixel_response.EFFECT, *CURRENT, *RAMP)
+DARK = (*CURRENT, *RAMP)
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "science": SKY,

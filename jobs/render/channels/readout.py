@@ -2,13 +2,15 @@
 
 FRAME       one array of pixels
 RAMP        the signal of a ramp, and whether it fits, in the frame of pixels that see no light
+RAMP_AND_CHI2  the same, with chi^2 itself
 QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan; quadrant_map: where each lies
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -104,9 +106,14 @@ FRAME = ReadoutMode(
 
 # ---------------------------------------------------------------------------------------------- the signal of a ramp
 
+# Of eight bits.
+_MOST_CHI2 = 255.0
 
-def _ramp(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
+
+def _ramp(found: Frame, scene: Scene, detector: str, system: WCS, whole: bool) -> Readout:
     """Signal uint16 ADU and quality uint8, 1 where the ramp does not fit; two groups have no quality.
+
+    whole : the quality is chi^2 itself, rounded, 255 = as much or more
 
     Error : reads that are correlated, and expected noise, make of a chance of 1e-3 up to 8e-3
     """
@@ -127,10 +134,11 @@ def _ramp(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
     place = astrometry.cards(astrometry.shifted(system, border, border))
     planes = [Extension(f"{detector}.SCI", np.pad(signal, border, constant_values=level), "adu", place)]
     if mode.groups > 2:
-        flag = (found[1] > limit).astype(np.uint8)
-        meaning = ("QUALFLAG", 1, "value where chi^2 exceeds QUALLIM, else 0")
-        planes.append(Extension(f"{detector}.CHI2", np.pad(flag, border), "", (meaning, *place)))
-        cards += (("QUALLIM", limit, "chi^2 above which a pixel's quality is 1"),)
+        flag = np.rint(np.minimum(found[1], _MOST_CHI2)) if whole else found[1] > limit
+        meaning = () if whole else (("QUALFLAG", 1, "value where chi^2 exceeds QUALLIM, else 0"),)
+        planes.append(Extension(f"{detector}.CHI2", np.pad(flag.astype(np.uint8), border), "", (*meaning, *place)))
+        text = "chi^2 above which a ramp does not fit" if whole else "chi^2 above which a pixel's quality is 1"
+        cards += (("QUALLIM", limit, text),)
     else:
         cards += (("QUALLIM", 0.0, "two groups have no chi^2: there is no quality"),)
     return Readout(tuple(planes), signal, signal, cards)
@@ -148,11 +156,12 @@ def _signal_electrons(read: Sequence[Image]) -> Float:
 
 
 RAMP = ReadoutMode(
-    arrays=_ramp,
+    arrays=partial(_ramp, whole=False),
     assembled=lambda array, scene: array if array.ndim == 2 else array[0],
     pixels=_signal,
     electrons=_signal_electrons,
 )
+RAMP_AND_CHI2 = replace(RAMP, arrays=partial(_ramp, whole=True))
 
 
 # ---------------------------------------------------------------------------------------------- quadrants

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from jobs.render.channels import ground, nisp_p, vis
+from jobs.render.channels import ground, nisp_p, nisp_s, vis
 from jobs.render.channels.channel import Channel
 from jobs.render.effects.effect import Effect
 from lake_schema.errors import BadInput
 
-CHANNELS: Mapping[str, Channel] = {"VIS": vis.CHANNEL, "NISP-P": nisp_p.CHANNEL, "EXT": ground.CHANNEL}
+CHANNELS: Mapping[str, Channel] = {
+    "VIS": vis.CHANNEL,
+    "NISP-P": nisp_p.CHANNEL,
+    "NISP-S": nisp_s.CHANNEL,
+    "EXT": ground.CHANNEL,
+}
 
 
 def channel_of(name: str, image_type: str, where: str) -> Channel:

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
+from jobs.render.camera.traces import Trace
 from jobs.render.dispersing.draw import Order
-from jobs.render.dispersing.traces import Trace
 from lake_schema.arrays import Float
 
 # Of 1, x, y, x^2, x y, y^2: grismconf has no polynomial of four powers of t without the squares.
@@ -22,8 +22,9 @@ _TERMS = 6
 
 
 def configuration(grism: str, traces: Sequence[Trace], shape: tuple[int, int], files: Sequence[str]) -> str:
-    """Text of a configuration; shape : ny, nx;  files : of the sensitivity of each order.
+    """Text of a configuration.
 
+    grism, traces : its name, and its orders;  shape : ny, nx;  files : of the sensitivity of each order
     Offsets are from the undispersed image's place, 0-based pixels; wavelengths in A.
     """
     ny, nx = shape
@@ -61,7 +62,11 @@ def sensitivity(order: Order, seconds: float) -> fits.BinTableHDU:
 
 
 def write(folder: Path, grism: str, orders: Sequence[Order], shape: tuple[int, int], seconds: float) -> Path:
-    """Writes a configuration and its tables; returns the configuration."""
+    """Writes a configuration and its tables; returns the configuration.
+
+    folder : where to;  grism, orders : its name, and its orders
+    shape  : ny, nx;  seconds : of the exposure that the orders' responses are of
+    """
     files = [f"{grism}_{order.trace.order:+d}.fits" for order in orders]
     for order, file in zip(orders, files, strict=True):
         table = fits.HDUList([fits.PrimaryHDU(), sensitivity(order, seconds)])

@@ -6,9 +6,9 @@ pixels, periodic, the image through each PSF_b,
     I_b(x, y) = 1 / N^2 sum_k profile(k) PSF_b(k) pixel(k) exp(i k r),
 
 is wanted at any place, not at the pixels alone.  It is held by ox samples a pixel along the rows and oy across,
-unfolded (all |kx| <= pi ox, |ky| <= pi oy), as coefficients of splines: I = sum_j C_j B5(ox x - j) B3(oy y - j), so that
-C(k) = ox oy I(k) / (sinc(f / ox)^6 sinc(fy / oy)^4), f = k / 2 pi, and no resolution is lost to the splines.  The
-quintic spline lies along the trace, of slope s: f = fx + s fy.
+unfolded (all |kx| <= pi ox, |ky| <= pi oy), as coefficients of splines: I = sum_j C_j B5(ox x - j) B3(oy y - j), so
+that C(k) = ox oy I(k) / (sinc(f / ox)^6 sinc(fy / oy)^4), f = k / 2 pi, and no resolution is lost to the splines.
+The quintic spline lies along the trace, of slope s: f = fx + s fy.
 
 Nodes, nodes       wavelengths of the PSFs, and the share of each at any wavelength
 Planes, planes     PSF times pixel over splines, for stamps of a size
@@ -100,23 +100,28 @@ def _sersic() -> Float32:
     return sersic.table()
 
 
-def coefficients(some: Planes, weights: Float, shapes: Shapes, form: Forms, i: int) -> Float32:
+def coefficients(
+    some: Planes, weights: Float, shapes: Shapes, form: Forms, i: int, spread: Array | None = None
+) -> Float32:
     """float32[b, along, n across, n] of kernels.disperse: of one source of one electron.
 
     weights : [b, p] of the planes, for each node;  shapes, form, i : of galaxies, and which it is, -1 = a point
+    some    : the planes;  spread : [rows, columns] the transform of what a point is spread over; None: nothing
     """
     body = i >= 0
     row, row_weights = sersic.row_of(shapes.sersic_index[i : i + 1]) if body else (np.zeros(1, int), np.zeros((1, 4)))
-    own = (
+    fraction, bulge, disk, thick = (
         (float(shapes.bulge_fraction[i]), form.bulge[i], form.disk[i], form.thick[i])
         if body
         else (0.0, np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2))
     )
     zones = np.empty((len(weights), *some.planes.shape[1:]), np.complex64)
     kernels.zones(
-        some.planes, weights.astype(np.float32), some.kx, some.ky, body, *own, _sersic(), int(row[0]), row_weights[0],
-        zones,
+        some.planes, weights.astype(np.float32), some.kx, some.ky, body, fraction, bulge, disk, thick, _sersic(),
+        int(row[0]), row_weights[0], zones,
     )  # fmt: skip
+    if spread is not None:
+        zones *= spread
     n, along, across = some.sampling.n, some.sampling.along, some.sampling.across
     images = scipy.fft.irfft2(zones, s=(n * across, n * along), overwrite_x=True)
     return np.ascontiguousarray(images.reshape(len(weights), n * across, n, along).transpose(0, 3, 1, 2))

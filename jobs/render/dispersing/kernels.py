@@ -75,7 +75,7 @@ def lay(
     """Adds electrons [w] of each wavelength to the samples of a trace, out [b, m], by shares [w, b].
 
     along   : coefficients of t^i, pixels from `start`;  times : t of the first wavelength, and its step
-    samples : a pixel;  first : place of out's first sample, in samples
+    samples : a pixel;  first : place of out's first sample, in samples;  share : of each PSF, by wavelength
     A quintic spline keeps the total, the mean and the higher moments.
     """
     count, last = out.shape[1], len(along) - 1

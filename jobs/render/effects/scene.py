@@ -77,6 +77,7 @@ class Scene:
                      read once
     remembered     : [ny, nx] e- that earlier exposures leave in this one; None = nothing
     tints          : float32[2, ny, nx] of `chromatic_response`: sources of which pixels see the colour; None = of none
+    spread_sky     : [gy, gx] e- that a grism changes of the sky, at places evenly over the detector; None = nothing
     tint_electrons : the most that this changes in a pixel, e- rms
     """
 
@@ -96,6 +97,7 @@ class Scene:
     remembered: Frame | None = None
     tints: Float32 | None = None
     tint_electrons: float = 0.0
+    spread_sky: Frame | None = None
 
     def value(self, key: str, unit: str) -> float:
         """A parameter of the detector."""

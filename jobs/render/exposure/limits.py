@@ -16,7 +16,8 @@ _MOST_SECONDS = 6 * 3600.0
 
 def refuse_too_large(aim: Aim, light: Light) -> None:
     """Before anything is drawn: a task must fit into its memory, and end."""
-    if light.psf is None:
+    # Spectra are held a few at a time, whatever the scene.
+    if light.psf is None or light.dispersed is not None:
         return
     exposure, detector, sources, sizes = aim.exposure, aim.detector, light.sources, light.sizes
     here = visible_sources.touching(sources, sizes, detector)

@@ -12,14 +12,17 @@ import numpy as np
 
 from jobs import rng
 from jobs.render.channels.aim import Aim
+from jobs.render.dispersing import draw as dispersing
 from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.stamps import Tally
 from jobs.render.effects.effect import Effect, apply_all
 from jobs.render.effects.scene import Frame, Scene
-from jobs.render.exposure import limits, persistence, rendered, scene_of, tints, truth_maps
+from jobs.render.exposure import limits, persistence, rendered, scene_of, spread_sky, tints, truth_maps
 from jobs.render.exposure.records import Rows, Variant
 from jobs.render.exposure.rendered import Rendered
+from jobs.render.exposure.traced import Columns, traced
 from jobs.render.exposure.visible_sources import Light, visible_light
+from jobs.render.exposure.visible_spectra import visible_spectra
 from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.ids import kind_of
@@ -46,9 +49,11 @@ def render(
     variant  : mission, accuracy, and the effects that are forced on or off;  seed : of the request
     """
     scene = replace(scene_of.of_aim(aim, variant), remembered=persistence.remembered(aim, rows.earlier, variant))
-    light = visible_light(aim, rows, scene, seed)
+    scene = replace(scene, spread_sky=spread_sky.spread_sky(scene, aim))
+    spread = aim.channel.disperses is not None and aim.sees_sky
+    light = (visible_spectra if spread else visible_light)(aim, rows, scene, seed)
     limits.refuse_too_large(aim, light)
-    drawn, frame = _drawn(aim, light, truth, progress)
+    drawn, frame = _drawn(aim, light, truth, progress) if light.dispersed is None else _spread(aim, rows, light, truth)
     return _detected(aim, rows, light, drawn, frame, (seed, noise_seed, truth))
 
 
@@ -59,6 +64,7 @@ class _Drawn:
     sources, sizes, electrons : those with light of their stamps on pixels that are read, and what of it fell there
     maps  : truth by its name
     scene : with the brightest pixel
+    spectra : columns of the table `rendered_spectra`; None: nothing is dispersed
     """
 
     sources: Sources
@@ -66,6 +72,7 @@ class _Drawn:
     electrons: Float
     maps: dict[str, Array]
     scene: Scene
+    spectra: Columns | None = None
 
 
 def _drawn(
@@ -94,6 +101,28 @@ def _drawn(
     return _Drawn(sources.take(listed), sizes[listed], drawn[listed], maps, scene), [frame]
 
 
+def _spread(aim: Aim, rows: Rows, light: Light, truth: Sequence[str]) -> tuple[_Drawn, list[Frame]]:
+    """The same of sources whose light a grism spreads out; what is listed has light of some order on the detector."""
+    assert light.dispersed is not None
+    assert light.psf is not None
+    sources, dispersed, psf, noise = light.sources, light.dispersed, light.psf, light.scene.pixel_noise
+    shape, tally = (aim.detector.ny, aim.detector.nx), dispersing.Tally.of(len(sources), len(dispersed.orders))
+    layers: dict[int, Float] = {}
+    asked = {order: name for order, name in truth_maps.ORDERS.items() if name in truth}
+    frame = dispersing.draw(sources, dispersed, psf, shape, noise, tally, layers if asked else None)
+    maps: dict[str, Array] = {"noise_free": frame.astype(np.float32)}
+    for order, name in asked.items():
+        maps[name] = layers.get(order, np.zeros(shape)).astype(np.float32)
+    if "stars" in truth:
+        of_stars = np.flatnonzero(kind_of(sources.ids) == _STAR)
+        some = replace(dispersed, spectra=lambda chosen: dispersed.spectra(of_stars[chosen]))
+        maps["stars"] = dispersing.draw(sources.take(of_stars), some, psf, shape, noise).astype(np.float32)
+    fallen, scene = tally.electrons.sum(axis=1), scene_of.with_peak(light.scene, frame)
+    listed, expected = fallen > 0.0, replace(sources, electrons=tally.expected.sum(axis=1))
+    spectra = traced(light, tally, aim, rows, scene)
+    return _Drawn(expected.take(listed), tally.sizes[listed], fallen[listed], maps, scene, spectra), [frame]
+
+
 def _detected(
     aim: Aim, rows: Rows, light: Light, drawn: _Drawn, frame: list[Frame], asked: tuple[int, int | None, Sequence[str]]
 ) -> Rendered:
@@ -112,5 +141,5 @@ def _detected(
     return Rendered(
         exposure, detector, aim.wcs, light.psf, readout, drawn.maps, drawn.sources, drawn.sizes, drawn.electrons,
         exposure.zero_point, scene, (*light.decisions, *decisions), scene.accuracy, seed, rows.complete,
-        noise_seed,
+        noise_seed, drawn.spectra,
     )  # fmt: skip

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from astropy.wcs import WCS
 
@@ -34,6 +35,7 @@ class Rendered:
     zero_point : AB magnitude of one electron per second
     complete   : how far beyond the detector every source was known that may reach it, arcsec
     noise_seed : of the noise, None = the seed
+    spectra    : columns of the table `rendered_spectra`; None where nothing is dispersed
     """
 
     exposure: ExposureRow
@@ -52,6 +54,7 @@ class Rendered:
     seed: int
     complete: float
     noise_seed: int | None = None
+    spectra: Mapping[str, Any] | None = None
 
     @property
     def raw(self) -> Array:

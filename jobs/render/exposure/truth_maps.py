@@ -20,15 +20,20 @@ from lake_schema.arrays import Array
 
 Maps = dict[str, Array]
 
+# Of each order of a grism its own light.
+ORDERS = {1: "order_1", 0: "order_0", 2: "order_2", -1: "order_m1"}
 # Bytes a pixel of each map's file.
 BYTES = {
     "noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "persistence": 4, "saturation": 1,
     # Four groups of a photometric ramp.
-    "ramp": 8,
+    "ramp": 8, **dict.fromkeys(ORDERS.values(), 4),
 }  # fmt: skip
+# Of an image that a grism is in the beam of.
+_GRISM = "dispersed_sky"
 # What adds to a map of the same name as an effect, or of another.
 _OF_EFFECT = {
-    "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "pixel_area": "sky", "straylight": "sky",
+    "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "dispersed_sky": "sky", "pixel_area": "sky",
+    "straylight": "sky",
     "cosmic_rays": "cosmic_rays", "readout_cosmic_rays": "cosmic_rays", "ramp_cosmic_rays": "cosmic_rays",
     "persistence": "persistence", "macc": "ramp",
 }  # fmt: skip
@@ -41,6 +46,8 @@ def made(truth: Sequence[str], effects: Sequence[str] | None, looks: bool) -> li
     """
     found = {_OF_EFFECT[name] for name in effects or () if name in _OF_EFFECT}
     found |= {"noise_free", "saturation"} | ({"stars"} if looks else set())
+    if looks and _GRISM in (effects or ()):
+        found |= set(ORDERS.values())
     return [name for name in truth if effects is None or name in found]
 
 
@@ -54,7 +61,7 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode) -> 
     def see(name: str, before: Frame, after: Frame) -> None:
         if name in ("ghosts", "filter_ghosts") and "ghosts" in truth:
             maps["ghosts"] = (after - before).astype(np.float32) + maps.get("ghosts", np.float32(0.0))
-        if name in ("background", "pixel_area", "straylight") and "sky" in truth:
+        if name in ("background", "dispersed_sky", "pixel_area", "straylight") and "sky" in truth:
             maps["sky"] = (after - before).astype(np.float32) + maps.get("sky", np.float32(0.0))
         if name == "persistence" and "persistence" in truth:
             maps["persistence"] = (after - before).astype(np.float32)

@@ -3,11 +3,12 @@
 least_flux      what a source beyond the margin must have to be read
 spike_flux, outer_flux   and a star, a galaxy still farther out
 sources_of      the rows that shine onto the detector, as what is drawn
+Listed, listed  all rows, as what may be drawn
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +19,7 @@ from jobs.render.camera import astrometry
 from jobs.render.camera.detectors import Detector
 from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim, electron_rate
+from jobs.render.dispersing.draw import Dispersed
 from jobs.render.drawing import outskirts, stamp_sizes
 from jobs.render.drawing.settings import Settings, settings_for
 from jobs.render.effects.effect import Decision, decide
@@ -40,6 +42,8 @@ GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, *colours.GALAXY_COLUMNS)))
 STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
 # Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
 _MOST_ELECTRONS = 1e17
+# Light of a spectrum that may be noticed, of a pixel's noise: all in one line it has a signal-to-noise ratio of 0.7.
+LEAST_SPECTRUM = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,9 @@ class Light:
     psf       : None in the dark
     scene     : with bright sources on and about the detector
     decisions : of effects that act while sources are drawn
+    dispersed : what a grism makes of the sources; None: there is none
+    of        : int[n] whose spectrum each has: the row, counted from the galaxies on to the stars; -1 = the Sun's
+    let_through : float64[n] part of its light that the grism lets through
     """
 
     sources: Sources
@@ -59,6 +66,53 @@ class Light:
     psf: Psf | None
     scene: Scene
     decisions: tuple[Decision, ...] = ()
+    dispersed: Dispersed | None = None
+    of: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+    let_through: Float = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """Galaxies, stars and arcs, [n] each.
+
+    electrons : expected;  shape, picture : as of Sources
+    of        : whose spectrum each has, counted from the galaxies on to the stars
+    """
+
+    ids: Int
+    ra: Float
+    dec: Float
+    electrons: Float
+    shape: Int
+    picture: Int
+    of: Int
+    form: galaxy_shapes.Shapes
+    pictures: tuple[lensed_arcs.Picture, ...]
+
+
+def listed(rows: Rows, electrons: tuple[Float, Float]) -> Listed:
+    """All rows, as what may be drawn; electrons : expected of each of the galaxies, and of the stars.
+
+    Errors : BadInput where a source is given twice, or shines too brightly
+    """
+    catalogue, points = rows.galaxies, rows.stars
+    form, n, stars = galaxy_shapes.shapes(catalogue), len(catalogue), len(points)
+    arcs = _arcs(rows.lenses, catalogue, electrons[0], form)
+    ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy(), arcs.ids]).astype(np.int64)
+    light = np.concatenate([*electrons, arcs.electrons])
+    _check(ids, light)
+    return Listed(
+        ids,
+        np.concatenate([catalogue["ra_lensed"].to_numpy(), points["ra"].to_numpy(), arcs.ra]),
+        np.concatenate([catalogue["dec_lensed"].to_numpy(), points["dec"].to_numpy(), arcs.dec]),
+        light,
+        np.concatenate([np.arange(n), np.full(stars + len(arcs.ids), -1)]).astype(np.int64),
+        np.concatenate([np.full(n + stars, -1), np.arange(len(arcs.ids))]).astype(np.int64),
+        # Arcs have the colour of what they are an image of.
+        np.concatenate([np.arange(n + stars), arcs.source]).astype(np.int64),
+        form,
+        arcs.pictures,
+    )
 
 
 def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
@@ -133,9 +187,12 @@ def least_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfig
     mission  : the mission database;  accuracy : of the request
     Error : of the fainter out there each leaves out less than the settings' `edge` of a pixel's noise
     """
-    time = exposure.exposure_time_s
-    if time == 0.0 or not registry.CHANNELS[exposure.channel].sees_sky(exposure.image_type):
+    time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
+    if time == 0.0 or not channel.sees_sky(exposure.image_type):
         return float("inf")
+    if channel.disperses is not None:
+        noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
+        return LEAST_SPECTRUM * noise / (electron_rate(exposure) * time)
     margin = mission.value("survey.selection_margin", "arcsec")
     noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
     return stamp_sizes.least_electrons(margin, detector.pixel_scale, noise, settings_for(accuracy)) / (
@@ -166,8 +223,8 @@ def outer_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfig
 
     exposure, detector, mission, accuracy : as of `least_flux`
     """
-    time = exposure.exposure_time_s
-    if time == 0.0 or not registry.CHANNELS[exposure.channel].sees_sky(exposure.image_type):
+    time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
+    if time == 0.0 or not channel.sees_sky(exposure.image_type) or channel.disperses is not None:
         return float("inf")
     noise, scale = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise, detector.pixel_scale
     return outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / (electron_rate(exposure) * time)
@@ -182,35 +239,24 @@ def sources_of(
     rows : catalogue rows that the detector may see;  aim : the exposure and detector
     psf  : of the detector;  settings : of the accuracy
     """
-    catalogue, points, detector, system = rows.galaxies, rows.stars, aim.detector, aim.wcs
-    form = galaxy_shapes.shapes(catalogue)
-    arcs = _arcs(rows.lenses, catalogue, electrons[0], form)
-    ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy(), arcs.ids]).astype(np.int64)
-    ra = np.concatenate([catalogue["ra_lensed"].to_numpy(), points["ra"].to_numpy(), arcs.ra])
-    dec = np.concatenate([catalogue["dec_lensed"].to_numpy(), points["dec"].to_numpy(), arcs.dec])
-    light = np.concatenate([*electrons, arcs.electrons])
-    rest = len(points) + len(arcs.ids)
-    shape = np.concatenate([np.arange(len(catalogue)), np.full(rest, -1)]).astype(np.int64)
-    picture = np.concatenate([np.full(len(catalogue) + len(points), -1), np.arange(len(arcs.ids))]).astype(np.int64)
-    _check(ids, light)
+    detector, system, every = aim.detector, aim.wcs, listed(rows, electrons)
+    light, shape, picture, form = every.electrons, every.shape, every.picture, every.form
     farthest = np.where((shape < 0) & (picture < 0), _spikes(light, detector, psf, noise), 0.0)
-    farthest[: len(catalogue)] = _outskirts(light[: len(catalogue)], form, detector, noise)
+    farthest[: len(form)] = _outskirts(light[: len(form)], form, detector, noise)
     reach = detector.half_diagonal + np.maximum(farthest, stamp_sizes.reach(detector.pixel_scale))
-    seen = selection.near(ra, dec, astrometry.centre(detector, system), reach / 3600.0) & (light > 0)
-    kept = np.flatnonzero(seen)[np.argsort(ids[seen], kind="stable")]
-    column, row = astrometry.pixel_of_sky(system, ra[kept], dec[kept])
-    wide = np.array([0.0, *(found.diagonal for found in arcs.pictures)])[picture[kept] + 1] / detector.pixel_scale
+    seen = selection.near(every.ra, every.dec, astrometry.centre(detector, system), reach / 3600.0) & (light > 0)
+    kept = np.flatnonzero(seen)[np.argsort(every.ids[seen], kind="stable")]
+    column, row = astrometry.pixel_of_sky(system, every.ra[kept], every.dec[kept])
+    wide = np.array([0.0, *(found.diagonal for found in every.pictures)])[picture[kept] + 1] / detector.pixel_scale
     sizes = stamp_sizes.stamp_sizes(light[kept], shape[kept], form, psf, noise, settings, wide)
     found = Sources(
-        ids[kept], column, row, np.zeros((len(kept), 2, 2)), light[kept], shape[kept], form, None, picture[kept],
-        arcs.pictures,
+        every.ids[kept], column, row, np.zeros((len(kept), 2, 2)), light[kept], shape[kept], form, None,
+        picture[kept], every.pictures,
     )  # fmt: skip
     here = stamp_sizes.touching_frame(found, sizes, psf, noise, detector.nx, detector.ny)
     kept, found = kept[here], found.take(here)
-    # Arcs have the colour of what they are an image of.
-    coloured = np.concatenate([np.arange(len(catalogue) + len(points)), arcs.source])[kept]
     colourful = psf.planes is not None and len(psf.planes.wavelength) > 1
-    photons = _colours(coloured, rows, aim.band) if colourful else None
+    photons = _colours(every.of[kept], rows, aim.band) if colourful else None
     jacobian = astrometry.jacobian(system, found.column, found.row)
     return replace(found, jacobian=jacobian, photons=photons), sizes[here]
 

@@ -52,15 +52,16 @@ def table(
     forced     : effects that the request forces on or off
     mission    : the mission database;  densities : of galaxies and stars;  accuracy : of the request
     """
-    cameras = {camera: _Camera(camera, mission) for camera in set(exposures["camera"].to_pylist())}
+    pairs = set(zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True))
+    cameras = {pair: _Camera(*pair, mission) for pair in pairs}
     shared: dict[tuple[Any, ...], _Places] = {}
     prices: dict[tuple[Any, ...], Price] = {}
     columns: dict[str, list[Any]] = {name: [] for name in TASKS.names}
     for row, wanted in zip(map(ExposureRow.of, exposures.to_pylist()), detectors, strict=True):
-        camera = cameras[row.camera]
-        where = (row.camera, row.ra, row.dec, row.position_angle)
+        camera = cameras[row.camera, row.channel]
+        where = (row.camera, camera.margin, row.ra, row.dec, row.position_angle)
         if where not in shared:
-            shared[where] = camera.places(*where[1:], densities)
+            shared[where] = camera.places(*where[2:], densities)
         kind = (row.camera, row.channel, row.image_type, row.exposure_time_s, row.lamp, row.settings)
         if kind not in prices:
             own = variants.variant(row.settings, mission, accuracy, forced or {})
@@ -100,17 +101,20 @@ class _Places:
 
 
 class _Camera:
-    """Detectors of a camera, and what of them does not depend on the pointing."""
+    """Detectors of a camera, and what of them does not depend on the pointing.
 
-    def __init__(self, camera: str, mission: MissionConfiguration) -> None:
+    margin : arcsec beyond a detector, as far as the channel reads all sources
+    """
+
+    def __init__(self, camera: str, channel: str, mission: MissionConfiguration) -> None:
         self.detectors = camera_detectors.detectors(camera, mission)
         self.index = {detector.name: i for i, detector in enumerate(self.detectors)}
         self.x, self.y = pointing.outline(self.detectors)
-        margin = mission.value("survey.selection_margin", "arcsec")
+        self.margin = unrendered.of_channel(channel).margin(self.detectors[0].section, mission)
         # On the tangent plane, where a detector that the optics distort is larger than it is.
         corner = np.hypot(self.x[:, 1:] - self.x[:, :1], self.y[:, 1:] - self.y[:, :1]).max(axis=1)
         reach = np.array([max(d.half_diagonal, c) for d, c in zip(self.detectors, corner, strict=True)])
-        self.radius = (reach + margin) / 3600.0
+        self.radius = (reach + self.margin) / 3600.0
         self.pixels = np.array([detector.nx * detector.ny for detector in self.detectors])
         self.area = np.array([d.nx * d.ny * (d.pixel_scale / 3600.0) ** 2 for d in self.detectors])
 

@@ -9,13 +9,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from jobs.fluxes.passbands import Passband
-from jobs.render.camera import bands
 from jobs.render.camera.detectors import Detector
 from jobs.render.channels import registry
 from jobs.render.channels.channel import Channel
 from jobs.render.channels.cost import Cost
 from jobs.render.channels.image_types import SKY_TYPES
-from jobs.render.sky import diffuse_light
 from jobs.render.sky.diffuse_light import SkyBand
 from lake_schema.mission.configuration import MissionConfiguration
 
@@ -30,25 +28,13 @@ class Unrendered:
     on_ground: bool = False
     sky_types: tuple[str, ...] = SKY_TYPES
 
+    def margin(self, section: str, mission: MissionConfiguration) -> float:
+        """How far beyond a detector all sources are read, arcsec."""
+        return mission.value("survey.selection_margin", "arcsec")
 
-UNRENDERED: Mapping[str, Unrendered] = {
-    # Assumed: a spectrum is 512 pixels long.
-    "NISP-S": Unrendered(
-        Cost(
-            frame_s=30.0,
-            sky_s=0.0,
-            galaxy_s=5.0e-3,
-            star_s=5.0e-3,
-            base_gb=0.7,
-            held=80.0,
-            held_sky=80.0,
-            written=3.0,
-            assumed=True,
-        ),
-        bands.of_one("nisp", "nisp_red", "nisp_blue"),
-        diffuse_light.thermal_sky,
-    ),
-}
+
+# There is a simulator for all of them.
+UNRENDERED: Mapping[str, Unrendered] = {}
 
 
 def of_channel(name: str) -> Channel | Unrendered:

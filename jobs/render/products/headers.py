@@ -13,6 +13,7 @@ from jobs.render.camera import astrometry
 from jobs.render.channels.registry import effects_of
 from jobs.render.effects.charge import ramp, ramp_nonlinearity
 from jobs.render.effects.readout import bias_structure, charge_transfer, nonlinearity, ramp_noise, read_noise
+from jobs.render.exposure import truth_maps
 from jobs.render.exposure.rendered import Rendered, numbers_of
 from lake_schema import __version__
 from lake_schema.arrays import Float
@@ -113,6 +114,10 @@ _TRUTH = {
     "cosmic_rays": ("electron", "unit of the pixels: cosmic rays alone"),
     "ghosts": ("electron", "unit of the pixels: expected, ghosts alone"),
     "persistence": ("electron", "unit of the pixels: expected, persistence"),
+    **{
+        content: ("electron", f"unit of the pixels: expected, sources in order {order}")
+        for order, content in truth_maps.ORDERS.items()
+    },
     "ramp": ("adu", "unit of the pixels: groups as read"),
     "saturation": ("", "1 where a pixel or the converter is saturated"),
 }
@@ -141,6 +146,8 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("CHANNEL", exposure.channel, "channel"),
         ("DETECTOR", rendered.detector.name, "detector"),
         ("FILTER", exposure.band, "passband"),
+        *((("GRISM", exposure.grism, "grism"),) if exposure.grism else ()),
+        *((("GRISMPA", exposure.grism_angle, "[deg] of the dispersion, x to y"),) if exposure.grism else ()),
         ("IMAGETYP", exposure.image_type, "image type"),
         *((("LAMP", exposure.lamp, "LED of the calibration unit"),) if exposure.lamp else ()),
         *((("TARGET", exposure.target, "calibration source"),) if exposure.target else ()),

@@ -56,8 +56,9 @@ def product_keys(
         reach = stamp_sizes.reach(detectors.detector(exposure.camera, detector, mission).pixel_scale)
         reaches = {name: reach for name in files}
         reaches["galaxies"] = max(FARTHEST, reach)
-        # Of the sources stars alone have spikes.
-        if registry.CHANNELS[exposure.channel].pupil is not None:
+        channel = registry.CHANNELS[exposure.channel]
+        # Of the sources stars alone have spikes; a grism puts any source's light far from it.
+        if channel.pupil is not None or channel.disperses is not None:
             reaches["stars"] = max(FARTHEST, reach)
         return [
             sorted({sums for cell in selection.within(task, deflection, reaches[name]) for sums in found.get(cell, ())})
@@ -116,6 +117,11 @@ def _files_of_cells(*tables: read.Version) -> Mapping[int, list[tuple[str, ...]]
         for cell in part["facts"][CELLS]:
             found[cell].append(sums)
     return found
+
+
+def spectra_file(exposure_id: int, detector: str) -> str:
+    """Where a version of `products` keeps where spectra lie on a detector."""
+    return f"spectra/{exposure_id:06d}/{detector}.parquet"
 
 
 def truth_file(exposure_id: int, detector: str) -> str:

@@ -1,6 +1,7 @@
-"""What was drawn on a detector, as rows of the table `rendered_truth`.
+"""What was drawn on a detector, as rows of the tables `rendered_truth` and `rendered_spectra`.
 
 truth      rows of the table `rendered_truth`
+spectra    rows of the table `rendered_spectra`
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import pyarrow as pa
 from jobs.render.exposure.rendered import Rendered
 from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Int
-from lake_schema.tables.rendered_truth import RENDERED_TRUTH
+from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
 
 # Codes of `method` in the table `rendered_truth`.
 POINT, PROFILE, PICTURE, TRAIL = 0, 1, 2, 3
@@ -34,6 +35,20 @@ def truth(rendered: Rendered) -> pa.Table:
             "method": _methods(sources),
             "trail_x": trail[:, 0],
             "trail_y": trail[:, 1],
+        }
+    )
+
+
+def spectra(rendered: Rendered) -> pa.Table | None:
+    """One row a source and order with light on the detector; None where nothing is dispersed."""
+    if rendered.spectra is None:
+        return None
+    n = len(rendered.spectra["id"])
+    return RENDERED_SPECTRA.build(
+        {
+            "exposure_id": np.full(n, rendered.exposure.exposure_id, np.int64),
+            "detector": [rendered.detector.name] * n,
+            **rendered.spectra,
         }
     )
 

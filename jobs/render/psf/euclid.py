@@ -83,7 +83,7 @@ def nisp_psf(detector: Detector, band: Passband, mission: MissionConfiguration, 
 
 
 def nisp_psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, positions: int = 9) -> Psf:
-    """That of a NISP detector at wavelengths [w] A, without what lies beyond its planes.
+    """That of a NISP detector at wavelengths `waves` [w] A, without what lies beyond its planes.
 
     detector, mission, positions : as of vis_psf
     """

@@ -1,7 +1,7 @@
 """The diffuse sky: electrons per second in a pixel.
 
 starlit_sky, thermal_sky, ground_sky   of a band, as different cameras see it
-sky_rate              of a band, at a position and date;  photons : by wavelength
+sky_rate              of a band, at a position and date;  photons : by wavelength;  warm : the thermal ones of them
 zodiacal_intensity    W m-2 sr-1 um-1 at 500 nm
 zodiacal_rate         through a passband
 starlight             of a field's stars, of which the telescope scatters some
@@ -115,14 +115,19 @@ def photons(section: str, rate: float, band: Passband, mission: MissionConfigura
     rate    : of all of the sky, e-/s;  band : passband;  mission : the mission database
     Error   : what is not thermal is taken as zodiacal light 90 deg from the Sun
     """
-    warm = np.zeros(len(band.wavelength))
-    if f"{section}.{band.name}.thermal" in mission:
-        warm = thermal.photons(section, band.name, band, mission)
+    warm_light = warm(section, band, mission)
     red, blue = _reddening(90.0, mission)
     decades = np.log10(band.wavelength / (10.0 * mission.value("env.zodi.reference_wavelength", "nm")))
     reddened = 1.0 + red * np.maximum(decades, 0.0) + blue * np.minimum(decades, 0.0)
     sun = solar(band.wavelength / 10.0, mission) * band.response * band.wavelength * reddened
-    return np.asarray(warm + max(rate - float(warm.sum()), 0.0) * sun / sun.sum())
+    return np.asarray(warm_light + max(rate - float(warm_light.sum()), 0.0) * sun / sun.sum())
+
+
+def warm(section: str, band: Passband, mission: MissionConfiguration) -> Float:
+    """float64[n] what of `photons` is thermal light: 0 where the mission has none in the band."""
+    if f"{section}.{band.name}.thermal" not in mission:
+        return np.zeros(len(band.wavelength))
+    return thermal.photons(section, band.name, band, mission)
 
 
 def starlight(ra: float, dec: float, mission: MissionConfiguration) -> float:

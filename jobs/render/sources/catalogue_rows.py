@@ -61,7 +61,7 @@ def sources(
     fluxes: read.Version,
     task: Mapping[str, Any],
     columns: Sequence[str],
-    band: str,
+    bands: Sequence[str],
     farther: float,
     least: float,
     bright: float = float("inf"),
@@ -72,9 +72,9 @@ def sources(
     least   : microjansky, of sources beyond the cells of the circle; infinite where no source at all shows
     bright  : microjansky, of sources still farther out, as far as spikes and outskirts go; infinite where none do
     catalogue, fluxes : versions of the two tables;  task : its row
-    columns : that are wanted;  band : whose fluxes are
+    columns : that are wanted;  bands : whose fluxes are, those of the first are limited
     """
-    deflection, flux = deflection_of(catalogue), ["id", f"f_nu_{band}"]
+    deflection, flux = deflection_of(catalogue), ["id", *(f"f_nu_{band}" for band in bands)]
     near: list[int] = []
     far: list[int] = []
     farthest: list[int] = []

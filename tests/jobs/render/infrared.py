@@ -27,14 +27,15 @@ def psf_of(detector, band):
 
 
 def exposed(
-    detector, kind="science", band="euclid_h", seconds=TIME, sky=SKY, number=1, mjd=MJD, mission=MISSION, lamp=None
-):
+    detector, kind="science", band="euclid_h", seconds=TIME, sky=SKY, number=1, mjd=MJD, mission=MISSION, lamp=None,
+    **more,
+):  # fmt: skip
     """Columns of an exposure that a detector sees a field at high latitude in."""
     ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
     return {
         "exposure_id": number, "channel": "NISP-P", "camera": "nisp", "band": band, "image_type": kind, "ra": ra,
         "dec": dec, "position_angle": angle, "mjd": mjd, "exposure_time_s": seconds, "seeing": 0.0, "sky": sky,
-        "zero_point": planned_exposures.zero_point_of("nisp", band, mission), "lamp": lamp,
+        "zero_point": planned_exposures.zero_point_of("nisp", band, mission), "lamp": lamp, **more,
     }  # fmt: skip
 
 

@@ -55,9 +55,7 @@ def test_the_check_takes_every_request_and_names_what_is_only_planned(path, caps
     good, *more = said.out.splitlines()
     assert good.startswith(f"{path.stem}: good: ")
     assert [line.partition(": planned and forecast, skipped by rendering")[0] for line in more] == {
-        "sc8_deep": ["sc8_deep: NISP-S"],
-        "sc8_main": ["sc8_main: NISP-S"],
-        "sc8_pilot": ["sc8_pilot: NISP-S, EXT flat and EXT bias"],
+        "sc8_pilot": ["sc8_pilot: NISP-S planetary_nebula, EXT flat and EXT bias"],
     }.get(path.stem, [])
 
 
@@ -69,7 +67,7 @@ def only(channels, kind):
 
 @pytest.mark.parametrize(
     ("channels", "kind", "first"),
-    [(("EXT",), "dark", "EXT"), (("NISP-S",), "science", "NISP-S"), (("NISP-S",), "standard_star", "NISP-S")],
+    [(("EXT",), "dark", "EXT"), (("NISP-S",), "planetary_nebula", "NISP-S")],
 )
 def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_first_job(
     channels, kind, first, tmp_path
@@ -89,7 +87,7 @@ def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_
 
 @pytest.mark.parametrize(
     ("channels", "kind", "said"),
-    [(("EXT",), "science", ""), (("VIS", "NISP-S"), "flat", "NISP-S: "), (("VIS",), "bias", ""), ((), "", "")],
+    [(("EXT",), "science", ""), (("VIS", "EXT"), "flat", "EXT"), (("VIS",), "bias", ""), ((), "", "")],
 )
 def test_what_is_rendered_in_part_is_taken_and_the_rest_named(channels, kind, said):
     request = only(channels, kind)
@@ -99,19 +97,23 @@ def test_what_is_rendered_in_part_is_taken_and_the_rest_named(channels, kind, sa
 
 
 def test_the_command_refuses_in_one_line_and_plans_on_demand(tmp_path, capsys):
-    path = requests.written(tmp_path, '[[observation]]\nchannels = ["NISP-S"]\n')
+    path = requests.written(tmp_path, '[[observation]]\nchannels = ["NISP-S"]\nimage_type = "planetary_nebula"\n')
     assert __main__.main(["check", str(path)]) == 2
     said = capsys.readouterr().err
-    assert re.fullmatch(r"request: .*observation\[0\]\.channels: no simulator renders NISP-S science yet: .*\n", said)
+    text = r"request: .*observation\[0\]\.channels: no simulator renders NISP-S planetary_nebula yet: .*\n"
+    assert re.fullmatch(text, said)
     assert __main__.main(["check", str(path), "--plan"]) == 0
-    assert "NISP-S: planned and forecast, skipped by rendering" in capsys.readouterr().out
+    assert "NISP-S planetary_nebula: planned and forecast, skipped by rendering" in capsys.readouterr().out
 
 
 def test_every_job_says_what_is_only_planned(tmp_path, capsys):
-    path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS", "NISP-S"]\n')
+    nebula = '[[observation]]\nchannels = ["NISP-S"]\nimage_type = "planetary_nebula"\n'
+    path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\n' + nebula)
     job = shell.Job("sleep", "", lambda lake, request: [])
     assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 0
-    assert capsys.readouterr().err == ("sleep: NISP-S: planned and forecast, skipped by rendering (no simulator yet)\n")
+    assert capsys.readouterr().err == (
+        "sleep: NISP-S planetary_nebula: planned and forecast, skipped by rendering (no simulator yet)\n"
+    )
 
 
 @pytest.mark.parametrize("words", [[], ["check"], ["check", "a", "--plans"], ["check", "a", "b"], ["a", "b", "--plan"]])

@@ -147,7 +147,10 @@ def profile_at(
     fraction: float, bulge: Float, disk: Float, thick: Float, table: Float32, kx: Float32, ky: Float32,
     square: Float32, bits: Any, out: Float32,
 ) -> None:  # fmt: skip
-    """Fills `out` with the profile's transform at (kx, ky); square and its bits are scratch."""
+    """Fills `out` with the profile's transform at (kx, ky); square and its bits are scratch.
+
+    fraction, bulge, disk, thick : of one galaxy, as of `nyquist_zones`;  table : of its Sersic index (`interpolate`)
+    """
     one, share = np.float32(1.0), np.float32(1.0 - fraction)
     if fraction < 1.0:
         u0, u1 = np.float32(disk[0, 0]), np.float32(disk[1, 0])
@@ -234,7 +237,11 @@ def reaches(
 
 @jit
 def interpolate(sersic: Float32, row: int, row_weights: Float, least: float, most: float, table: Float32) -> None:
-    """One index's transform, where the source needs it."""
+    """One index's transform, where the source needs it, into `table`.
+
+    sersic      : of all indices;  row, row_weights : of the four about the one that is wanted
+    least, most : squared frequencies, times the square of the radius
+    """
     ends = np.array([least, most], np.float32)
     bits = ends.view(np.int32)
     last = sersic.shape[1] - 1

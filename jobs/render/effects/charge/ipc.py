@@ -52,7 +52,10 @@ def _coupled(plane: Any, seen: Any, side: float, diagonal: float) -> None:
 
 
 def _parameters(scene: Scene) -> tuple[float, float]:
-    return scene.value("ipc.side", ""), scene.value("ipc.diagonal", "")
+    """A mission may have it in one of its ramps and not in the other."""
+    key = f"ipc_{scene.ramp}"
+    own = scene.value(key, "") if f"{scene.section}.{key}" in scene.mission else 1.0
+    return own * scene.value("ipc.side", ""), own * scene.value("ipc.diagonal", "")
 
 
 def _contribution(scene: Scene) -> float:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from jobs.render.camera.detectors import detector
-from jobs.render.dispersing import images
+from jobs.render.camera.traces import Trace
+from jobs.render.dispersing import draw, images
 from jobs.render.dispersing.draw import Order
-from jobs.render.dispersing.traces import Trace
 from jobs.render.psf import euclid
 from lake_schema.mission.configuration import resolve
 
@@ -40,3 +40,8 @@ def order(of_trace, response=1.0, first=FIRST, count=LAST - FIRST + 1):
 def one(sources, i):
     """Source i alone, of one unit of its spectrum."""
     return replace(sources.take(np.array([i])), electrons=np.ones(1))
+
+
+def drawn(sources, spectra, orders, through, shape, noise, settings, tally=None):
+    """The frame of sources with their spectra."""
+    return draw.draw(sources, draw.Dispersed(spectra, tuple(orders), settings), through, shape, noise, tally)

@@ -8,7 +8,7 @@ from jobs.render.dispersing import draw, images, kernels
 from jobs.render.drawing import transfer
 from jobs.render.drawing.kernels import fourier
 from jobs.render.sources import galaxy_shapes, sersic
-from tests.jobs.render.dispersing.made import FIRST, LAST, one, order, psf, trace
+from tests.jobs.render.dispersing.made import FIRST, LAST, drawn, one, order, psf, trace
 
 WAVES = np.arange(float(FIRST), LAST + 1.0)
 FINE = draw.Settings(edge=1e-9, faint=0.0, along=3)
@@ -82,11 +82,9 @@ def test_spectra_are_the_series_of_every_wavelength(i, slope):
     shape = (72, 160)
     wanted = series(source, spectrum, [order(short)], through, shape)
     settings = draw.Settings(edge=1e-9, faint=0.0, least=64)
-    found = draw.draw(
-        source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, settings
-    )
+    found = drawn(source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, settings)
     assert np.abs(found - wanted).max() < 5e-3 * wanted.max()
-    fine = draw.draw(source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, FINE)
+    fine = drawn(source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, FINE)
     assert np.abs(fine - wanted).max() < 1.5e-3 * wanted.max()
 
 
@@ -119,9 +117,9 @@ def test_all_light_of_an_order_is_on_a_frame_that_holds_it():
     source, through = placed(8, 1, 140.0, 60.0), psf()
     spectrum = continuum_and_line()
     orders = [order(trace((-60.0, 120.0), 0.03)), order(trace((-70.0, 3.0, 1.0, -0.5), order=0), 0.1)]
-    tally = draw.Tally(np.zeros((1, 2)))
+    tally = draw.Tally.of(1, 2)
     settings = draw.Settings(edge=1e-9, faint=0.0, least=96)
-    frame = draw.draw(
+    frame = drawn(
         source, lambda some: spectrum[None].astype(np.float32), orders, through, (160, 300), 1.0, settings, tally
     )
     assert tally.electrons[0].sum() == pytest.approx(frame.sum(), rel=1e-9)
@@ -135,22 +133,22 @@ def test_sources_add_up_in_any_order_bit_by_bit():
     all_of_them.electrons[:] = 1.0
     spectrum, through, orders = continuum_and_line(500.0), psf(), [order(trace((-30.0, 90.0), 0.05))]
 
-    def drawn(sources):
+    def of(sources):
         made = lambda some: np.tile(spectrum, (len(some), 1)).astype(np.float32)  # noqa: E731
-        return draw.draw(sources, made, orders, through, (100, 240), 1.0, draw.Settings())
+        return drawn(sources, made, orders, through, (100, 240), 1.0, draw.Settings())
 
-    wanted = drawn(all_of_them)
-    np.testing.assert_array_equal(drawn(all_of_them.take(np.arange(8)[::-1])), wanted)
-    np.testing.assert_array_equal(sum(drawn(all_of_them.take(np.array([i]))) for i in range(8)), wanted)
+    wanted = of(all_of_them)
+    np.testing.assert_array_equal(of(all_of_them.take(np.arange(8)[::-1])), wanted)
+    np.testing.assert_array_equal(sum(of(all_of_them.take(np.array([i]))) for i in range(8)), wanted)
 
 
 def test_nothing_is_drawn_of_orders_beside_the_detector_or_lost_in_the_noise():
     source, through = placed(8, 1, 140.0, 60.0), psf()
     spectrum = continuum_and_line().astype(np.float32)[None]
     beside = [order(trace((5000.0, 100.0)))]
-    assert draw.draw(source, lambda some: spectrum, beside, through, (100, 240), 1.0, draw.Settings()).sum() == 0.0
+    assert drawn(source, lambda some: spectrum, beside, through, (100, 240), 1.0, draw.Settings()).sum() == 0.0
     here = [order(trace((-30.0, 90.0)))]
-    assert draw.draw(source, lambda some: spectrum, here, through, (100, 240), 1e6, draw.Settings()).sum() == 0.0
+    assert drawn(source, lambda some: spectrum, here, through, (100, 240), 1e6, draw.Settings()).sum() == 0.0
 
 
 def test_a_line_lies_where_its_wavelength_does():
@@ -162,7 +160,7 @@ def test_a_line_lies_where_its_wavelength_does():
         path = trace((-30.0, 90.0), rng.uniform(-0.07, 0.07), sag=rng.uniform(-1, 1))
         spectrum = np.zeros((1, len(WAVES)), np.float32)
         spectrum[0, 3000] = 1000.0
-        frame = draw.draw(
+        frame = drawn(
             source,
             lambda some, of=spectrum: of,
             [order(path)],
@@ -185,7 +183,7 @@ def draw_of_all(source, through, column, row):
     flat = [order(trace((0.0, 1e-6)))]
     spectrum = np.zeros((1, len(WAVES)), np.float32)
     spectrum[0, 3000] = 1000.0
-    frame = draw.draw(still, lambda some: spectrum, flat, through, (84, 160), 1.0, draw.Settings(edge=1e-6, least=64))
+    frame = drawn(still, lambda some: spectrum, flat, through, (84, 160), 1.0, draw.Settings(edge=1e-6, least=64))
     rows, columns = np.indices(frame.shape)
     return (frame * columns).sum() / frame.sum(), (frame * rows).sum() / frame.sum()
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jobs.render.channels import ground, nisp_p, vis
+from jobs.render.channels import ground, nisp_p, nisp_s, vis
 from jobs.render.effects.charge.ramp import Mode
 from jobs.render.effects.light.ghosts import Pupil
 from jobs.render.effects.readout.traps import Sweeps, Traps
@@ -12,7 +12,9 @@ from jobs.render.effects.scene import Lights
 from lake_schema.mission.configuration import resolve
 
 # Every effect of a channel, by its name.
-EFFECTS = {e.name: e for channel in (vis, nisp_p, ground) for effects in channel.EFFECTS.values() for e in effects}
+EFFECTS = {
+    e.name: e for channel in (vis, nisp_p, nisp_s, ground) for effects in channel.EFFECTS.values() for e in effects
+}
 LIGHTS = Lights(np.array([3.2, 40.0]), np.array([2.0, -30.0]), np.array([1e8, 1e9]))
 END_OF_LIFE = Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
 EMPTY = Traps((0.0,), (1.0,), 2e5, 0.0, 0.58)
@@ -91,6 +93,7 @@ _CASES = (
         zero=False,
     ),
     Case("pixel_area", stretched(1e-2), stretched(0.0), zero=False),
+    Case("dispersed_sky", (np.array([[0.0, 3.0, 2.0], [1.0, 20.0, 5.0]]),), (None,), zero=False),
     Case("straylight", (LIGHTS, 5e-4, 40.0), (LIGHTS, 0.0, 40.0), zero=False),
     Case("illumination", bowl, flat, linear=True),
     Case("pixel_response", (0.01, 1e-2, 1.0, DUST), (0.0, 0.0, 0.0, (0.0, 3.0, 0.2)), linear=True),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jobs.render.channels import ground, nisp_p, registry, vis
+from jobs.render.channels import ground, nisp_p, nisp_s, registry, vis
 from jobs.render.effects.effect import apply_all, decide
 from jobs.render.effects.scene import Scene
 from jobs.request import schema
@@ -41,6 +41,7 @@ ORDER = (
     # A ramp counts all that is expected, and what hits meanwhile; a pixel's capacity bends what it holds.
     (
         "background",
+        "dispersed_sky",
         "pixel_area",
         "chromatic_response",
         "pixel_response",
@@ -57,7 +58,7 @@ ORDER = (
 )
 
 
-CHAINS = dict.fromkeys(effects for channel in (vis, nisp_p, ground) for effects in channel.EFFECTS.values())
+CHAINS = dict.fromkeys(effects for channel in (vis, nisp_p, nisp_s, ground) for effects in channel.EFFECTS.values())
 
 
 @pytest.mark.parametrize("effects", CHAINS)

@@ -42,6 +42,7 @@ def star(electrons):
 CASES = {
     "background": lambda x: scene(sky=0.01 * x),
     "pixel_area": lambda x: scene(sky=0.01 * x),
+    "dispersed_sky": lambda x: replace(scene(), spread_sky=np.full((3, 3), 0.01 * x)),
     "illumination": lambda x: scene(illumination=min(1e-4 * x, 0.5)),
     "shutter": lambda x: scene(shutter_map=min(0.05 * x, 280.0)),
     "pixel_response": lambda x: scene(

@@ -75,7 +75,7 @@ def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
         wanted = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist()) if drawn is None else drawn(task)
         least = visible_sources.least_flux(exposure(**exposed), DETECTOR, MISSION, SURVEY)
         body, light, complete = catalogue_rows.sources(
-            Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], BAND, FARTHER, least
+            Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], [BAND], FARTHER, least
         )
     tables = body, light, nothing, fluxes(nothing, BAND, 1.0)
     return fields.rendered(exposed, DETECTOR, tables, MISSION, SURVEY, complete=MARGIN + complete)
@@ -162,7 +162,7 @@ def test_a_frame_that_no_source_shows_in_reads_none(dark):
     cells = sky.cell_of([task["ra"]], [task["dec"]], 8)
     assert np.isfinite(visible_sources.least_flux(exposure(**field_of("VIS")[1]), detector, MISSION, SURVEY))
     body = Catalogue(galaxies(task["ra"], task["dec"], **GIANT), cells, set(cells.tolist()))
-    rows, light, complete = catalogue_rows.sources(body, body, task, [], BAND, FARTHER, least)
+    rows, light, complete = catalogue_rows.sources(body, body, task, [], [BAND], FARTHER, least)
     assert len(rows) == len(light) == 0
     assert complete == FARTHER
 
@@ -182,7 +182,7 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
     least = visible_sources.least_flux(exposure(**exposed), detector, MISSION, SURVEY)
     for limit, wanted in ((spikes, [0]), (np.inf, [])):
-        found, light, complete = catalogue_rows.sources(*catalogues, task, [], "euclid_vis", 85.0, least, limit)
+        found, light, complete = catalogue_rows.sources(*catalogues, task, [], ["euclid_vis"], 85.0, least, limit)
         assert found.equals(rows.take(pa.array(wanted, pa.int64())))
         assert light["id"].equals(found["id"])
         assert complete == 85.0
@@ -224,7 +224,7 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     cells = sky.cell_of(np.full(3, task["ra"]), np.full(3, task["dec"] - 0.3), 8)
     drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
-    found, light, _ = catalogue_rows.sources(*catalogues, task, [], "euclid_vis", 85.0, limit, limit)
+    found, light, _ = catalogue_rows.sources(*catalogues, task, [], ["euclid_vis"], 85.0, limit, limit)
     assert found["id"].to_pylist() == rows["id"].to_pylist()[:2]
     assert light["id"].equals(found["id"])
     system = astrometry.wcs(detector, *pointing.boresight_for(detector, task["ra"], task["dec"], 0.0))

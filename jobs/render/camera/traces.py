@@ -10,6 +10,7 @@ plane; a grism that is turned turns them, and a detector has them in its own pix
 
 Trace             one order on a detector
 traces            of all orders of a grism
+direction         in which a grism disperses
 throughput        how much light an order has
 source_rectangle  where sources lie whose light reaches a detector
 
@@ -49,7 +50,8 @@ class Trace:
         """(columns, rows) [n] from the undispersed place (column, row) to light of wavelengths [n] A."""
         t = (np.asarray(wavelength, float) - self.first) / (self.last - self.first)
         along, across = self.polynomials(column, row)
-        return np.polynomial.polynomial.polyval(t, along), np.polynomial.polynomial.polyval(t, across)
+        columns, rows = (np.asarray(np.polynomial.polynomial.polyval(t, part), float) for part in (along, across))
+        return columns, rows
 
     def polynomials(self, column: float, row: float) -> tuple[Float, Float]:
         """Coefficients [i] of t^i of a source's own trace, columns and rows, pixels."""
@@ -60,12 +62,11 @@ class Trace:
 def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfiguration) -> tuple[Trace, ...]:
     """Of all orders of a grism that is turned by `tilt` deg from its own direction, by falling order.
 
+    grism, tilt       : its name, and by how much it is turned
+    detector, mission : of the camera, and the mission database
     Error : field coordinates of a source are those of its pixel, without the optics' distortion
     """
-    rows = [row for row in mission.rows(f"{detector.section}.traces") if row["grism"] == grism]
-    if not rows:
-        known = sorted({row["grism"] for row in mission.rows(f"{detector.section}.traces")})
-        raise BadInput(f"grism {grism!r} is not one of {', '.join(known)}")
+    rows = _rows(grism, detector.section, mission)
     to_field = _field(detector, mission)
     # From the grism's direction to the detector's columns and rows.
     turn = np.radians(float(rows[0]["direction_deg"]) + tilt - detector.rotation)
@@ -78,6 +79,20 @@ def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfigur
         first, last = (float(own[0][name]) * 10.0 for name in ("first_nm", "last_nm"))
         found.append(Trace(order, first, last, along * cosine - across * sine, along * sine + across * cosine))
     return tuple(found)
+
+
+def direction(grism: str, section: str, mission: MissionConfiguration) -> float:
+    """Of the spectra of a grism that is not turned, deg from the focal plane's x axis to y."""
+    return float(_rows(grism, section, mission)[0]["direction_deg"])
+
+
+def _rows(grism: str, section: str, mission: MissionConfiguration) -> list[dict[str, str]]:
+    """Of a grism's laws; BadInput where there is none of that name."""
+    rows = mission.rows(f"{section}.traces")
+    own = [row for row in rows if row["grism"] == grism]
+    if not own:
+        raise BadInput(f"grism {grism!r} is not one of {', '.join(sorted({row['grism'] for row in rows}))}")
+    return own
 
 
 def _coefficients(rows: list[dict[str, str]], axis: str, highest: int, to_field: Float) -> Float:
@@ -105,7 +120,11 @@ def _field(detector: Detector, mission: MissionConfiguration) -> Float:
 
 
 def throughput(grism: str, order: int, wavelength: Float, detector: Detector, mission: MissionConfiguration) -> Float:
-    """float64[n] light of an order at wavelengths [n] A, of what the passband of the first order detects there."""
+    """float64[n] light of an order at wavelengths [n] A, of what the passband of the first order detects there.
+
+    grism, order      : its name, and which;  wavelength : float64[n] A
+    detector, mission : of the camera, and the mission database
+    """
     rows = [
         (float(row["wavelength_nm"]) * 10.0, float(row["throughput"]))
         for row in mission.rows(f"{detector.section}.orders")
@@ -113,7 +132,8 @@ def throughput(grism: str, order: int, wavelength: Float, detector: Detector, mi
     ]
     if not rows:
         return np.ones(len(wavelength))
-    return np.interp(wavelength, *zip(*sorted(rows), strict=True))
+    waves, light = np.array(sorted(rows)).T
+    return np.asarray(np.interp(wavelength, waves, light))
 
 
 def source_rectangle(
@@ -121,6 +141,7 @@ def source_rectangle(
 ) -> tuple[float, float, float, float]:
     """(left, right, low, high) pixels within which sources lie whose light in a stretch of A falls onto nx x ny pixels.
 
+    trace : of an order;  nx, ny : columns and rows;  wavelength : first and last, A
     The field's slopes are taken at the detector's corners: farther out the trace differs by less than a pixel in 100.
     """
     waves = np.linspace(*wavelength, 33)

@@ -1,13 +1,12 @@
-"""Traces of NISP's grisms: the laws that they are made of, and grismconf's reading of them."""
+"""Traces of NISP's grisms: the laws that they are made of, and where sources lie."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs.render.camera.detectors import detector, detectors
-from jobs.render.dispersing import grism_files, traces
-from jobs.render.dispersing.draw import Order
+from jobs.render.camera import traces
+from jobs.render.camera.detectors import detector
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 
@@ -95,20 +94,3 @@ def test_orders_share_the_light_as_the_mission_has_it():
         found = traces.throughput("RGS000", number, waves, DETECTOR, MISSION)
         assert (low <= found).all()
         assert (found <= high).all()
-
-
-def test_grismconf_reads_the_same_places(tmp_path):
-    grismconf = pytest.importorskip("grismconf")
-    for grism, tilt, one in (("RGS000", 0.0, DETECTOR), ("RGS180", 4.0, detectors("nisp", MISSION)[-1])):
-        found = traces.traces(grism, tilt, one, MISSION)
-        orders = [Order(trace, 12060, np.full(6861, 3.0)) for trace in found]
-        read = grismconf.Config(str(grism_files.write(tmp_path, grism, orders, (2040, 2040), 2.0)))
-        t = np.linspace(0.0, 1.0, 11)
-        for trace in found:
-            name = f"{trace.order:+d}" if trace.order else "0"
-            for column, row in ((0.0, 0.0), (1000.0, 30.0), (2039.0, 2039.0), (-500.0, 100.0)):
-                waves = read.DISPL(name, column, row, t)
-                x, y = trace.offsets(column, row, waves)
-                np.testing.assert_allclose(read.DISPX(name, column, row, t), x, atol=1e-6)
-                np.testing.assert_allclose(read.DISPY(name, column, row, t), y, atol=1e-6)
-            assert read.SENS[name](15000.0) == 1.5

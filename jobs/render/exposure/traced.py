@@ -1,0 +1,222 @@
+"""Truth of spectra: where each source's orders lie on a detector, what of them overlaps, how well lines are seen.
+
+traced     rows of it
+overlaps   which traces lie beside which
+lines_of   emission lines of galaxies in a first order
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jobs.fluxes.libraries import templates
+from jobs.fluxes.sources import GALAXY_KINDS, galaxies_of
+from jobs.fluxes.spectra import extinction, lines
+from jobs.render.channels.aim import Aim
+from jobs.render.dispersing.draw import Tally
+from jobs.render.effects.scene import NOTICEABLE, Scene
+from jobs.render.exposure.records import Rows
+from jobs.render.exposure.visible_sources import Light
+from jobs.render.sources import colours, galaxy_shapes
+from lake_schema.arrays import Bool, Float, Int
+from lake_schema.units import LIGHT_ANGSTROM_S, PLANCK_ERG_S
+
+# Pixels of a trace that are compared at a time; places along a trace between which it is taken as straight; the widest
+# a trace is taken to be, half, pixels.
+_BIN, _PLACES, _WIDEST = 8, 33, 20.0
+_FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
+
+Columns = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Paths:
+    """Traces of n orders of sources on a detector.
+
+    source : int[n] which;  order : int[n]
+    along  : [n] polynomials: columns of t^i;  across : rows
+    half   : float64[n] half of their widths, pixels
+    level  : float64[n] electrons a column on the detector, in the mean
+    """
+
+    source: Int
+    order: Int
+    along: list[Float]
+    across: list[Float]
+    half: Float
+    level: Float
+
+
+def traced(light: Light, tally: Tally, aim: Aim, rows: Rows, scene: Scene) -> Columns:
+    """Columns of the table `rendered_spectra`, but for exposure and detector, one row an order with light there.
+
+    light : what shines onto the detector;  tally : what each source brought to it
+    aim, rows, scene : the exposure and detector, the catalogue rows, and what effects know
+    """
+    assert light.dispersed is not None
+    sources, orders = light.sources, light.dispersed.orders
+    numbers = np.array([order.trace.order for order in orders])
+    # Ascending identifier, ascending order.
+    by_order = np.argsort(numbers)
+    source, at = np.nonzero(tally.electrons[:, by_order] > 0.0)
+    which = by_order[at]
+    paths = _paths(light, tally, source, which, aim)
+    part, beside = overlaps(paths, aim.detector.nx, NOTICEABLE * scene.pixel_noise)
+    seen = lines_of(light, source, paths, aim, rows, scene)
+    first = paths.order == 1
+    return {
+        "id": sources.ids[source],
+        "order": paths.order,
+        "wavelength_first": np.array([orders[m].trace.first for m in which], float),
+        "wavelength_last": np.array([orders[m].trace.last for m in which], float),
+        **{f"{axis}_first": np.array([p[0] for p in found], float) for axis, found in _axes(paths)},
+        **{f"{axis}_last": np.array([p.sum() for p in found], float) for axis, found in _axes(paths)},
+        **{f"trace_{axis}": found for axis, found in _axes(paths)},
+        "expected": tally.expected[source, which],
+        "drawn": tally.electrons[source, which],
+        "overlapped": np.ma.masked_array(part, ~first),
+        "contaminants": [np.unique(sources.ids[other]) for other in beside],
+        **seen,
+    }
+
+
+def _axes(paths: Paths) -> tuple[tuple[str, list[Float]], tuple[str, list[Float]]]:
+    return ("x", paths.along), ("y", paths.across)
+
+
+def _paths(light: Light, tally: Tally, source: Int, which: Int, aim: Aim) -> Paths:
+    assert light.dispersed is not None
+    assert light.psf is not None
+    sources, scale = light.sources, light.psf.pixel_scale
+    body = sources.shape >= 0
+    half = np.full(len(sources), 0.5 * light.psf.fwhm / scale)
+    half[body] += galaxy_shapes.half_light(sources.shapes.take(sources.shape[body])) / scale
+    half += 0.5 * sources.length
+    along, across, columns = [], [], []
+    for i, m in zip(source.tolist(), which.tolist(), strict=True):
+        column, row = float(sources.column[i]), float(sources.row[i])
+        x, y = light.dispersed.orders[m].trace.polynomials(column, row)
+        x, y = x + column * (np.arange(len(x)) == 0), y + row * (np.arange(len(y)) == 0)
+        low, high = sorted((float(x[0]), float(x.sum())))
+        columns.append(max(min(high, aim.detector.nx - 1.0) - max(low, 0.0), 1.0))
+        along.append(x)
+        across.append(y)
+    order = np.array([light.dispersed.orders[m].trace.order for m in which], np.int64)
+    level = tally.electrons[source, which] / np.array(columns, float)
+    return Paths(source, order, along, across, np.minimum(half, _WIDEST)[source], level)
+
+
+# ---------------------------------------------------------------------------------------------- what overlaps
+
+
+def overlaps(paths: Paths, nx: int, least: float) -> tuple[Float, list[Int]]:
+    """(float64[n] part of each first order beside which others lie, their sources), 0 and none of other orders.
+
+    paths : traces on a detector of nx columns;  least : electrons a column of a trace that counts
+    Error : in steps of 8 pixels of the trace's length
+    """
+    path, at, row = _bins(paths, nx)
+    order = np.argsort(at, kind="stable")
+    path, at, row = path[order], at[order], row[order]
+    ends = np.searchsorted(at, np.arange(at.max(initial=-1) + 2))
+    covered, pairs = np.zeros(len(paths.order)), [np.zeros((0, 2), np.int64)]
+    for start, stop in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        target, other = _near(paths, path[start:stop], row[start:stop], least)
+        covered[np.unique(target)] += 1.0
+        pairs.append(np.stack([target, paths.source[other]], axis=1))
+    length = np.bincount(path, minlength=len(covered))
+    found = np.unique(np.concatenate(pairs), axis=0)
+    split = np.searchsorted(found[:, 0], np.arange(1, len(covered)))
+    return covered / np.maximum(length, 1), np.split(found[:, 1], split) if len(covered) else []
+
+
+def _near(paths: Paths, path: Int, row: Float, least: float) -> tuple[Int, Int]:
+    """(first orders, traces of other sources beside them) of those that pass one bin at rows."""
+    loud = np.flatnonzero(paths.level[path] >= least)
+    loud = loud[np.argsort(row[loud], kind="stable")]
+    first = np.flatnonzero(paths.order[path] == 1)
+    widest = float(paths.half[path[loud]].max(initial=0.0))
+    reach = paths.half[path[first]] + widest
+    low = np.searchsorted(row[loud], row[first] - reach)
+    count = np.searchsorted(row[loud], row[first] + reach, "right") - low
+    target = np.repeat(first, count)
+    begin = np.repeat(low - (np.cumsum(count) - count), count)
+    other = loud[begin + np.arange(len(target))] if len(target) else loud[:0]
+    apart = np.abs(row[target] - row[other])
+    touch = apart < paths.half[path[target]] + paths.half[path[other]]
+    touch &= paths.source[path[target]] != paths.source[path[other]]
+    return path[target[touch]], path[other[touch]]
+
+
+def _bins(paths: Paths, nx: int) -> tuple[Int, Int, Float]:
+    """(path, bin of 8 columns, row there) of all traces on the detector."""
+    t, found = np.linspace(0.0, 1.0, _PLACES), []
+    for i, (x, y) in enumerate(zip(paths.along, paths.across, strict=True)):
+        column, row = (np.polynomial.polynomial.polyval(t, part) for part in (x, y))
+        order = np.argsort(column)
+        low, high = max(column.min(), 0.0), min(column.max(), nx - 1.0)
+        bins = np.arange(int(low) // _BIN, int(high) // _BIN + 1) if high >= low else np.zeros(0, np.int64)
+        rows = np.interp((bins + 0.5) * _BIN, column[order], row[order])
+        found.append((np.full(len(bins), i), bins, rows))
+    if not found:
+        none = np.zeros(0, np.int64)
+        return none, none, np.zeros(0)
+    path, at, rows = (np.concatenate(part) for part in zip(*found, strict=True))
+    return path, at, rows
+
+
+# ---------------------------------------------------------------------------------------------- lines
+
+
+def lines_of(light: Light, source: Int, paths: Paths, aim: Aim, rows: Rows, scene: Scene) -> Columns:
+    """Columns of emission lines, of first orders of galaxies whose lines are known.
+
+    light, source, paths : sources, and those of the traces;  aim, rows, scene : as of `traced`
+    Error : of the signal-to-noise ratio 10 %: a source's image is taken as a Gaussian, or an exponential disc
+    """
+    names = ("line_wavelength", "line_expected", "line_snr")
+    found: Columns = {name: [np.zeros(0)] * len(source) for name in names}
+    known = _with_lines(light, source, paths, rows)
+    if not known.any():
+        return found
+    at = np.flatnonzero(known)
+    own = galaxies_of(rows.galaxies.take(light.of[source[at]]), rows.library or templates.galaxy_library())
+    vacuum = np.array([line.vacuum for line in lines.line_list()])
+    wavelength = lines.observed_wavelength(vacuum[None], own.mix.z_obs[:, None], "vacuum")
+    curve = extinction.milky_way(wavelength.ravel()).reshape(wavelength.shape)
+    dimmed = own.magnification[:, None] * extinction.transmitted(curve, own.a_v[:, None])
+    response = np.interp(wavelength, aim.band.wavelength, aim.band.response, left=0.0, right=0.0)
+    area = scene.mission.value("plm.collecting_area", "cm2") * scene.exposure_time_s
+    electrons = own.lines * dimmed * response * area * wavelength / (PLANCK_ERG_S * LIGHT_ANGSTROM_S)
+    electrons *= light.let_through[source[at]][:, None]
+    continuum = paths.level[at] / np.maximum(2.0 * paths.half[at], 1.0)
+    noise = _image_area(light, source[at]) * (scene.pixel_noise**2 + continuum)
+    snr = electrons / np.sqrt(noise[:, None] + np.maximum(electrons, 1e-30))
+    for i, own_wave, own_light, own_snr in zip(at.tolist(), wavelength, electrons, snr, strict=True):
+        some = own_light > 0.0
+        for name, values in zip(names, (own_wave, own_light, own_snr), strict=True):
+            found[name][i] = values[some]
+    return found
+
+
+def _with_lines(light: Light, source: Int, paths: Paths, rows: Rows) -> Bool:
+    """[n] First orders of galaxies; pictures of lenses are not told apart by their lines."""
+    if not len(rows.galaxies) or not set(colours.GALAXY_COLUMNS) <= set(rows.galaxies.column_names):
+        return np.zeros(len(source), bool)
+    kinds = rows.galaxies["kind"].to_numpy() if "kind" in rows.galaxies.column_names else np.zeros(len(rows.galaxies))
+    body = light.sources.shape[source] >= 0
+    usual = np.isin(kinds[np.where(body, light.of[source], 0)], GALAXY_KINDS)
+    return np.asarray((paths.order == 1) & body & usual)
+
+
+def _image_area(light: Light, source: Int) -> Float:
+    """[n] pixels: one over the sum of the squares of a source's image, of unit sum."""
+    assert light.psf is not None
+    scale = light.psf.pixel_scale
+    radius = galaxy_shapes.half_light(light.sources.shapes.take(light.sources.shape[source])) / scale
+    sigma = light.psf.fwhm / scale / _FWHM
+    # Of an exponential disc 8 pi of its scale length squared, which is the half-light radius over 1.678.
+    return np.asarray(4.0 * np.pi * sigma**2 + 8.0 * np.pi * (radius / 1.678) ** 2)

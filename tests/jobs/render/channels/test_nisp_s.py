@@ -1,0 +1,200 @@
+"""NISP-S: what a file holds, where light of a source lies, which sources count, and what cannot be asked for."""
+
+import itertools
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from jobs.accuracy import DRAFT
+from jobs.fluxes import passbands
+from jobs.render.camera import detectors
+from jobs.render.channels import registry
+from jobs.render.exposure import persistence, visible_spectra
+from jobs.render.products import fits_files, read_back
+from lake_schema.errors import BadInput
+from lake_schema.fits import images
+from lake_schema.mission.configuration import resolve
+from tests.jobs.render import fields, infrared, spectroscopic
+from tests.jobs.render.spectroscopic import MISSION, QUIET, TIME, strip
+
+CHANNEL = registry.CHANNELS["NISP-S"]
+BAND = passbands.load("nisp_red")
+
+
+@cache
+def one():
+    return spectroscopic.rendered([18.0, 21.0], [290.2, 350.7], [30.6, 70.1], truth=("cosmic_rays", "sky", "stars"))
+
+
+def test_the_file(tmp_path):
+    """Slope of 16 bits and chi^2 of 8, each in the border of reference pixels; the grism is named."""
+    found = one()
+    _, writers = fits_files.products(found, ())
+    (science,) = (path for path in writers if "science" in path)
+    writers[science](tmp_path / "science.fits")
+    read = images.read_images(tmp_path / "science.fits")
+    assert [(unit.name, unit.data.shape, unit.data.dtype) for unit in read[1:]] == [
+        ("DET22.SCI", (104, 648), np.uint16),
+        ("DET22.CHI2", (104, 648), np.uint8),
+    ]
+    header = {key: value for key, value, _ in read[0].cards}
+    assert (header["READMODE"], header["NG"], header["NR"], header["ND"]) == ("MACC", 15, 16, 11)
+    assert (header["GRISM"], header["GRISMPA"], header["FILTER"]) == ("RGS000", 0.0, "nisp_red")
+    assert (header["EXPTIME"], header["RDNOISE"]) == (
+        pytest.approx(549.6, abs=0.1),
+        pytest.approx(np.hypot(13.0 * 8**-0.5, 6.7), abs=0.05),
+    )
+    np.testing.assert_array_equal(read_back.frame(tmp_path / "science.fits").data, found.science)
+    # Of thirteen degrees of freedom and noise of reads that is correlated; cosmic rays and bright pixels beyond.
+    quality = read[2].data[4:-4, 4:-4][found.maps["cosmic_rays"] == 0]
+    assert 10.0 < quality.mean() < 16.0
+    assert quality.max() > 30
+    np.testing.assert_array_equal(found.maps["stars"], found.noise_free)
+
+
+def test_an_order_has_the_light_of_the_table_where_its_trace_runs():
+    """Of a star in the middle of a strip: nearly all of its first order, and of the others what is on it."""
+    found = one()
+    detector, row = strip(), fields.exposure(**spectroscopic.exposed(strip()))
+    total = 10 ** (-0.4 * (18.0 - row.zero_point)) * TIME
+    assert found.drawn[0] == pytest.approx(total, rel=0.03)
+    (first,) = (trace for trace in CHANNEL.disperses.traces(row, detector, MISSION) if trace.order == 1)
+    x, y = first.offsets(290.2, 30.6, BAND.wavelength)
+    photons = BAND.response / BAND.wavelength
+    columns = np.arange(640)
+    light = found.noise_free[:60].sum(axis=0)
+    centre = 290.2 + np.average(x, weights=photons)
+    assert np.average(columns, weights=light) == pytest.approx(centre, abs=2.0)
+    middle = int(290.2 + x[len(x) // 2])
+    rows = np.average(np.arange(96), weights=found.noise_free[:, middle - 5 : middle + 6].sum(axis=1) + 0.0)
+    assert rows == pytest.approx(30.6 + y[len(y) // 2], abs=4.0)
+
+
+def test_sources_beside_the_detector_shine_onto_it_by_their_first_order():
+    """250 px before its first column: farther than images are read."""
+    beside = spectroscopic.rendered([18.0], [-250.0], [48.0])
+    assert len(beside.sources) == 1
+    assert beside.noise_free.sum() > 1e3
+    # Of order 2 so far on the other side that first and zeroth miss it.
+    second = spectroscopic.rendered([16.0], [-1200.0], [48.0])
+    assert second.noise_free.sum() > 1e3
+    assert len(spectroscopic.rendered([16.0], [5000.0], [48.0]).sources) == 0
+
+
+def test_the_margin_holds_the_first_order_and_the_rest_is_looked_for_as_far_as_any_order_goes():
+    whole = detectors.detector("nisp", "DET22", MISSION)
+    exposure = fields.exposure(**spectroscopic.exposed(whole))
+    assert CHANNEL.margin("nisp", MISSION) == pytest.approx(60.0 + 293 * 0.3, rel=0.02)
+    assert registry.CHANNELS["NISP-P"].margin("nisp", MISSION) == 60.0
+    assert 2019 * 0.3 < visible_spectra.beyond(exposure, whole, MISSION, BAND) < 1200.0
+    assert visible_spectra.beyond(replace(exposure, image_type="dark"), whole, MISSION, BAND) == 0.0
+
+
+def test_the_wheel_turns_each_exposure_a_little_and_its_realisations_alike():
+    rows = [fields.exposure(**spectroscopic.exposed(strip(), mjd=infrared.MJD + i)) for i in range(200)]
+    tilts = []
+    for row in rows:
+        (first,) = (trace for trace in CHANNEL.disperses.traces(row, strip(), MISSION) if trace.order == 1)
+        along, across = first.polynomials(0.0, 0.0)
+        tilts.append(np.degrees(np.arctan2(across[1:].sum(), along[1:].sum())))
+    assert np.std(tilts) == pytest.approx(0.1, rel=0.2)
+    again = replace(rows[0], realisation=3)
+    one, other = (CHANNEL.disperses.traces(row, strip(), MISSION)[0].y for row in (rows[0], again))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_turned_grisms_darken_the_side_that_they_are_turned_to():
+    """10 % at 0.385 deg of a tilt of 4 deg, nothing without one; sources only."""
+    (top, bottom) = (detectors.detector("nisp", name, MISSION) for name in ("DET12", "DET42"))
+    x, y = np.full(2, 1000.0), np.array([0.0, 2039.0])
+    for grism, angle, loses in (("RGS000", 0.0, 0), ("RGS000", -4.0, -1), ("RGS180", 184.0, -1), ("RGS180", 180.0, 0)):
+        rows = [fields.exposure(**spectroscopic.exposed(one, grism, angle)) for one in (top, bottom)]
+        left = [CHANNEL.disperses.vignetted(*pair, x, y, MISSION) for pair in zip(rows, (top, bottom), strict=True)]
+        assert [one.min() < 1.0 for one in left] == [loses > 0, loses < 0]
+        assert np.min(left) >= 0.9
+    exact = CHANNEL.disperses.vignetted(
+        fields.exposure(**spectroscopic.exposed(top, "RGS000", 4.0)),
+        replace(top, x=0.0, y=0.385 * 3600, rotation=0.0),
+        np.array([(top.nx - 1) / 2]), np.array([(top.ny - 1) / 2]), MISSION,
+    )  # fmt: skip
+    assert exact == pytest.approx(0.9, abs=1e-3)
+
+
+def test_the_paper_s_selection_is_one_value_of_a_parameter():
+    chosen = resolve(overrides={"env.solar_system.density": (0.0, "deg-2"), "nisp.spectra.selection": (1.0, "")})
+    mags, x, y = [22.5, 23.5], [300.0, 310.0], [30.0, 60.0]
+    assert len(spectroscopic.rendered(mags, x, y).sources) == 2
+    assert len(spectroscopic.rendered(mags, x, y, mission=chosen).sources) == 1
+
+
+def test_capacitance_between_pixels_or_none():
+    """As the mission says: of a bright star's light its neighbours see a part."""
+    none = resolve(overrides={"env.solar_system.density": (0.0, "deg-2"), "nisp.ipc_spectroscopic": (0.0, "")})
+    peaks = [
+        infrared.electrons(spectroscopic.rendered([16.0], [300.0], [48.0], forced=QUIET, mission=own)).max()
+        for own in (MISSION, none)
+    ]
+    assert peaks[0] < 0.995 * peaks[1]
+
+
+def test_a_pixel_is_sky_dark_and_noise():
+    found = spectroscopic.rendered(forced=dict.fromkeys(("ramp_cosmic_rays", "dark_map", "pixel_response"), False))
+    signal = infrared.electrons(found)
+    assert signal.mean() == pytest.approx(TIME, rel=0.01)
+    assert signal.std() == pytest.approx(np.hypot(found.scene.pixel_noise, 1.92 * 12**-0.5), rel=0.08)
+
+
+def test_neighbours_and_their_order_change_no_bit_of_another_s_light():
+    mags, x, y = [18.0, 19.0, 20.0], [250.0, 300.0, 350.0], [20.0, 48.0, 70.0]
+    alone = [spectroscopic.rendered([m], [a], [b], accuracy=DRAFT) for m, a, b in zip(mags, x, y, strict=True)]
+    together = spectroscopic.rendered(mags, x, y, accuracy=DRAFT)
+    np.testing.assert_allclose(together.noise_free, sum(one.noise_free.astype(float) for one in alone), atol=1e-3)
+    assert together.drawn.sum() == pytest.approx(sum(float(one.drawn.sum()) for one in alone), rel=1e-9)
+
+
+def test_layers_of_orders_add_up_to_the_frame():
+    """One star whose first order is on the strip, one whose second is."""
+    layers = ("order_1", "order_0", "order_2", "order_m1")
+    mags, x, y = [18.0, 16.0], [300.0, -1100.0], [30.0, 60.0]
+    found = spectroscopic.rendered(mags, x, y, truth=layers)
+    np.testing.assert_array_equal(found.noise_free, spectroscopic.rendered(mags, x, y).noise_free)
+    np.testing.assert_allclose(sum(found.maps[name].astype(float) for name in layers), found.noise_free, atol=1e-3)
+    assert found.maps["order_1"][:45].sum() > 0.99 * found.maps["order_1"].sum() > 1e4
+    assert found.maps["order_2"][45:].sum() > 0.99 * found.maps["order_2"].sum() > 1e3
+    assert found.maps["order_0"].sum() == found.maps["order_m1"].sum() == 0.0
+
+
+def test_image_types():
+    dark = spectroscopic.rendered(kind="dark", sky=0.0, forced={"ramp_cosmic_rays": False})
+    assert np.median(infrared.electrons(dark)) == pytest.approx(0.02 * TIME, abs=2.0)
+    flat = spectroscopic.rendered(kind="flat", lamp=4, sky=0.0)
+    assert np.median(infrared.electrons(flat)) > 1e4
+
+
+def test_spectra_before_an_image_leave_their_mean_sky():
+    spectrum = fields.exposure(**spectroscopic.exposed(strip()))
+    assert not persistence.is_drawn(spectrum)
+    assert persistence.is_drawn(replace(spectrum, image_type="flat"))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"grism": None}, "a spectrum wants a grism and its angle"),
+        ({"grism": "RGS270"}, "'RGS270' is not one of"),
+        ({"angle": 90.0}, "turns RGS000 by 90 deg, more than 45"),
+        ({"psf": "psf.fits"}, "spectra are drawn through the camera's own PSF alone"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(change, said):
+    with pytest.raises(BadInput, match=said):
+        spectroscopic.rendered([18.0], [300.0], [48.0], **change)
+
+
+@pytest.mark.parametrize(("angle", "mag"), list(itertools.product((0.0, 30.0), (2.0,))))
+def test_extremes(angle, mag):
+    """A star of AB 2, whose zeroth order is on the strip, and a grism turned by 30 deg."""
+    found = spectroscopic.rendered([mag], [1400.0], [48.0], angle=angle)
+    assert np.isfinite(infrared.electrons(found)).all()

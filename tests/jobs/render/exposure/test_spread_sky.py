@@ -1,0 +1,78 @@
+"""The sky through a grism: light of other orders, and none from beyond the field stop."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jobs.accuracy import SURVEY
+from jobs.render.camera.detectors import detector
+from jobs.render.channels.aim import Aim
+from jobs.render.effects.light import dispersed_sky
+from jobs.render.exposure import scene_of, spread_sky
+from jobs.render.exposure.records import Variant
+from jobs.render.sky import diffuse_light
+from tests.jobs.render import fields, spectroscopic
+from tests.jobs.render.spectroscopic import MISSION
+
+
+def seen(name, mission=MISSION, **columns):
+    """(scene, aim, what orders change)."""
+    own = detector("nisp", name, mission)
+    aim = Aim.of(fields.exposure(**spectroscopic.exposed(own, **columns)), own)
+    scene = scene_of.of_aim(aim, Variant(mission, SURVEY, {}))
+    return scene, aim, spread_sky.spread_sky(scene, aim)
+
+
+def exact(scene, aim, column, row):
+    """The same at one pixel, angstrom by angstrom."""
+    band, own = aim.band, aim.detector
+    zodi = diffuse_light.photons("nisp", scene.sky_rate, band, MISSION) - diffuse_light.warm("nisp", band, MISSION)
+    total = -zodi.sum()
+    for trace in aim.channel.disperses.traces(aim.exposure, own, MISSION):
+        light = zodi * aim.channel.disperses.throughput(aim.exposure, trace.order, band.wavelength, own, MISSION)
+        x, y = trace.offsets(column, row, band.wavelength)
+        sign = -1.0 if own.upside_down else 1.0
+        across = own.x + sign * 0.3 * (column - x - 1019.5)
+        up = own.y + sign * 0.3 * (row - y - 1019.5)
+        total += light[(np.abs(across) <= 0.395 * 3600) & (np.abs(up) <= 0.58 * 3600)].sum()
+    return total * scene.exposure_time_s
+
+
+@pytest.mark.parametrize("name", ["DET22", "DET14", "DET41"])
+def test_it_is_the_sum_over_orders_of_what_the_field_stop_lets_through(name):
+    """Wavelengths 100 A apart: 2 % of what the second order brings."""
+    scene, aim, found = seen(name)
+    for i, j in ((0, 0), (0, -1), (16, 16), (-1, 0), (-1, -1)):
+        column, row = (np.linspace(0.0, 2039.0, n)[k] for n, k in ((found.shape[1], j), (found.shape[0], i)))
+        assert found[i, j] == pytest.approx(exact(scene, aim, column, row), abs=0.002 * scene.sky_electrons)
+
+
+def test_in_the_middle_other_orders_add_a_few_percent_and_at_the_edge_they_are_gone():
+    _, _, middle = seen("DET22")
+    scene, _, edge = seen("DET14")
+    assert 0.03 < middle.max() / scene.sky_electrons < 0.08
+    assert edge.min() < middle.max() - 0.01 * scene.sky_electrons
+
+
+def test_no_sky_and_no_grism_change_nothing():
+    assert seen("DET22", sky=0.0)[2] is None
+    assert seen("DET22", kind="dark")[2] is None
+    _, aim, _ = seen("DET22")
+    image = replace(aim.exposure, channel="NISP-P", band="euclid_h")
+    other = Aim.of(image, aim.detector)
+    assert spread_sky.spread_sky(scene_of.of_aim(other, Variant(MISSION, SURVEY, {})), other) is None
+
+
+def test_it_is_in_the_image_and_in_the_truth_of_the_sky():
+    found = spectroscopic.rendered(truth=("sky",))
+    added = found.maps["sky"].mean() / found.scene.sky_electrons
+    assert {d.name: d.applied for d in found.decisions}["dispersed_sky"]
+    assert 1.03 < added < 1.08
+
+
+def test_between_the_nodes_it_is_linear():
+    nodes = np.array([[0.0, 2.0], [4.0, 6.0]])
+    found = dispersed_sky.apply(np.ones((5, 3)), nodes)
+    np.testing.assert_allclose(found[0], [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(found[:, 0], [1.0, 2.0, 3.0, 4.0, 5.0])

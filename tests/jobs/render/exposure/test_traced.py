@@ -1,0 +1,98 @@
+"""Truth of spectra: traces, electrons, what overlaps, how well lines are seen."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from jobs.render.exposure import traced
+from jobs.render.exposure.traced import Paths
+from jobs.render.products import truth_table
+from tests.jobs.render import spectroscopic
+from tests.jobs.render.spectroscopic import strip
+
+
+@cache
+def pair():
+    """Two stars in one row, 60 px apart, one alone, and one whose second order alone is there."""
+    return spectroscopic.rendered([18.0, 18.5, 19.0, 16.0], [260.0, 320.0, 300.0, -1100.0], [24.0, 24.5, 75.0, 50.0])
+
+
+def rows(found):
+    return truth_table.spectra(found).to_pylist()
+
+
+def test_a_row_for_each_order_with_light_on_the_detector():
+    found = rows(pair())
+    ids = pair().sources.ids.tolist()
+    assert [(row["id"], row["order"]) for row in found] == sorted((row["id"], row["order"]) for row in found)
+    assert {row["order"] for row in found if row["id"] in ids[:3]} == {1}
+    assert {row["order"] for row in found if row["id"] == ids[3]} == {2}
+    assert sum(row["drawn"] for row in found) == pytest.approx(pair().noise_free.sum(dtype=float), rel=1e-5)
+    for one in ids:
+        drawn = sum(row["drawn"] for row in found if row["id"] == one)
+        assert drawn == pytest.approx(float(pair().drawn[ids.index(one)]), rel=1e-9)
+    for row in found:
+        assert row["drawn"] <= 1.001 * row["expected"]
+
+
+def test_the_trace_runs_through_the_light():
+    """The row of the light at some columns, and the ends."""
+    (row,) = (row for row in rows(pair()) if row["id"] == pair().sources.ids[2])
+    image = pair().noise_free.astype(float)
+    t = np.linspace(0.2, 0.8, 5)
+    x, y = (np.polynomial.polynomial.polyval(t, row[f"trace_{axis}"]) for axis in "xy")
+    for column, wanted in zip(np.rint(x).astype(int), y, strict=True):
+        light = image[60:92, column - 3 : column + 4].sum(axis=1)
+        assert np.average(np.arange(60, 92), weights=light) == pytest.approx(wanted, abs=0.3)
+    for axis in "xy":
+        assert row[f"{axis}_first"] == row[f"trace_{axis}"][0]
+        assert row[f"{axis}_last"] == pytest.approx(sum(row[f"trace_{axis}"]))
+
+
+def test_who_overlaps_whom():
+    found = {(row["id"], row["order"]): row for row in rows(pair())}
+    one, other, alone, beside = pair().sources.ids.tolist()
+    assert found[one, 1]["contaminants"] == [other]
+    assert found[other, 1]["contaminants"] == [one]
+    # 60 of some 500 columns are its own.
+    assert 0.8 < found[one, 1]["overlapped"] < 0.95
+    assert found[alone, 1]["overlapped"] == 0.0
+    assert found[beside, 2]["overlapped"] is None
+    assert found[beside, 2]["contaminants"] == []
+
+
+def crowd(seed=3, n=40):
+    rng = np.random.default_rng(seed)
+    order = rng.choice([0, 1, 1, 2], n)
+    along = [np.array([rng.uniform(-300, 600), rng.choice([12.0, 512.0])]) for _ in range(n)]
+    across = [np.array([rng.uniform(0, 96), rng.uniform(-20, 20)]) for _ in range(n)]
+    return Paths(rng.integers(0, 30, n), order, along, across, rng.uniform(1, 4, n), rng.uniform(0, 10, n))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_overlaps_are_those_of_every_pair_of_traces(seed):
+    """Against all pairs, bin by bin."""
+    paths, nx, least = crowd(seed), 640, 3.0
+    part, beside = traced.overlaps(paths, nx, least)
+    path, at, row = traced._bins(paths, nx)
+    for i in range(len(paths.order)):
+        bins, covered, others = at[path == i], 0, set()
+        for place, own in zip(bins, row[path == i], strict=True):
+            near = [
+                j
+                for j, there in zip(path[at == place], row[at == place], strict=True)
+                if paths.source[j] != paths.source[i] and paths.level[j] >= least
+                and abs(there - own) < paths.half[i] + paths.half[j]
+            ]  # fmt: skip
+            covered += bool(near)
+            others |= {int(paths.source[j]) for j in near}
+        wanted = covered / len(bins) if paths.order[i] == 1 and len(bins) else 0.0
+        assert part[i] == pytest.approx(wanted)
+        assert set(beside[i].tolist()) == (others if paths.order[i] == 1 else set())
+
+
+def test_nothing_shines():
+    found = spectroscopic.rendered(detector=strip())
+    assert truth_table.spectra(found).num_rows == 0
+    assert truth_table.spectra(spectroscopic.rendered(kind="dark", sky=0.0)) is None
