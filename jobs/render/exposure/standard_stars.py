@@ -1,6 +1,6 @@
-"""Standard stars: what exposures of that image type are of, at five places of every detector at once.
+"""Standard stars and planetary nebulae: what exposures of these types are of, at five places of every detector at once.
 
-with_standards   catalogue rows, and the standard star's among them
+with_standards   catalogue rows, and the standard's among them
 
 Ref : Euclid Collaboration: Serrano et al. 2024 (the stars, how bright they are, five places)
 """
@@ -24,7 +24,7 @@ from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER, source_id
 from lake_schema.mission.configuration import MissionConfiguration
 
-IMAGE_TYPE = "standard_star"
+IMAGE_TYPES = ("standard_star", "planetary_nebula")
 # Assumed: in parts of the detector's sides.
 _PLACES = ((0.25, 0.25), (0.75, 0.25), (0.5, 0.5), (0.25, 0.75), (0.75, 0.75))
 # Their magnitude is of this band.
@@ -39,7 +39,7 @@ def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
     rows : of the catalogues;  aim : the exposure and detector;  mission : the mission database
     Errors : BadInput for a target that is no standard star
     """
-    if aim.exposure.image_type != IMAGE_TYPE:
+    if aim.exposure.image_type not in IMAGE_TYPES:
         return rows
     target, nx, ny = aim.exposure.target, aim.detector.nx, aim.detector.ny
     if target not in standards.NAMES:

@@ -161,7 +161,10 @@ def _selected(every: Listed, rows: Rows, aim: Aim, scene: Scene) -> Bool:
     column = f"f_nu_{_of(aim).chosen_by}"
     if not all(column in table.column_names for table in tables):
         column = f"f_nu_{aim.exposure.band}"
-    f_nu = np.concatenate([table[column].to_numpy() for table in tables])
+    own = f"f_nu_{aim.exposure.band}"
+    f_nu, seen = (np.concatenate([table[name].to_numpy() for table in tables]) for name in (column, own))
+    # A standard star has no fluxes but in the exposure's band.
+    f_nu = np.where(np.isnan(f_nu), seen, f_nu)
     bright = f_nu >= 10.0 ** (0.4 * (units.AB_UJY - scene.value("spectra.faintest", "mag")))
     if _HALPHA in rows.galaxies.column_names:
         flux = np.nan_to_num(rows.galaxies[_HALPHA].to_numpy(zero_copy_only=False).astype(float))

@@ -55,7 +55,7 @@ def test_the_check_takes_every_request_and_names_what_is_only_planned(path, caps
     good, *more = said.out.splitlines()
     assert good.startswith(f"{path.stem}: good: ")
     assert [line.partition(": planned and forecast, skipped by rendering")[0] for line in more] == {
-        "sc8_pilot": ["sc8_pilot: NISP-S planetary_nebula, EXT flat and EXT bias"],
+        "sc8_pilot": ["sc8_pilot: EXT flat and EXT bias"],
     }.get(path.stem, [])
 
 
@@ -67,7 +67,7 @@ def only(channels, kind):
 
 @pytest.mark.parametrize(
     ("channels", "kind", "first"),
-    [(("EXT",), "dark", "EXT"), (("NISP-S",), "planetary_nebula", "NISP-S")],
+    [(("EXT",), "dark", "EXT"), (("EXT",), "flat", "EXT")],
 )
 def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_first_job(
     channels, kind, first, tmp_path
@@ -97,22 +97,24 @@ def test_what_is_rendered_in_part_is_taken_and_the_rest_named(channels, kind, sa
 
 
 def test_the_command_refuses_in_one_line_and_plans_on_demand(tmp_path, capsys):
-    path = requests.written(tmp_path, '[[observation]]\nchannels = ["NISP-S"]\nimage_type = "planetary_nebula"\n')
+    path = requests.written(
+        tmp_path, '[[observation]]\nchannels = ["EXT"]\nsurvey = "des"\nimage_type = "flat"\nexposures = 2\n'
+    )
     assert __main__.main(["check", str(path)]) == 2
     said = capsys.readouterr().err
-    text = r"request: .*observation\[0\]\.channels: no simulator renders NISP-S planetary_nebula yet: .*\n"
+    text = r"request: .*observation\[0\]\.channels: no simulator renders EXT flat yet: .*\n"
     assert re.fullmatch(text, said)
     assert __main__.main(["check", str(path), "--plan"]) == 0
-    assert "NISP-S planetary_nebula: planned and forecast, skipped by rendering" in capsys.readouterr().out
+    assert "EXT flat: planned and forecast, skipped by rendering" in capsys.readouterr().out
 
 
 def test_every_job_says_what_is_only_planned(tmp_path, capsys):
-    nebula = '[[observation]]\nchannels = ["NISP-S"]\nimage_type = "planetary_nebula"\n'
-    path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\n' + nebula)
+    flat = '[[observation]]\nchannels = ["EXT"]\nsurvey = "des"\nimage_type = "flat"\nexposures = 2\n'
+    path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\n' + flat)
     job = shell.Job("sleep", "", lambda lake, request: [])
     assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 0
     assert capsys.readouterr().err == (
-        "sleep: NISP-S planetary_nebula: planned and forecast, skipped by rendering (no simulator yet)\n"
+        "sleep: EXT flat: planned and forecast, skipped by rendering (no simulator yet)\n"
     )
 
 

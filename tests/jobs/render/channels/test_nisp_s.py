@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from jobs.accuracy import DRAFT
@@ -12,7 +13,7 @@ from jobs.fluxes import passbands
 from jobs.render.camera import detectors
 from jobs.render.channels import registry
 from jobs.render.exposure import persistence, visible_spectra
-from jobs.render.products import fits_files, read_back
+from jobs.render.products import fits_files, read_back, truth_table
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
@@ -171,6 +172,26 @@ def test_image_types():
     assert np.median(infrared.electrons(dark)) == pytest.approx(0.02 * TIME, abs=2.0)
     flat = spectroscopic.rendered(kind="flat", lamp=4, sky=0.0)
     assert np.median(infrared.electrons(flat)) > 1e4
+
+
+def test_a_planetary_nebula_is_at_five_places_and_its_light_in_lines():
+    """Along its trace the brightest column has several times the light of the usual one, more than of a white dwarf."""
+    whole, contrast = strip(nx=1400, ny=300), []
+    body, points = fields.galaxies([], []), fields.stars([], [])
+    for name in ("sed", "mag_h", "a_v"):
+        points = points.append_column(name, pa.array([], pa.int64() if name == "sed" else pa.float64()))
+    nothing = body, fields.fluxes(body, BAND.name, 0.0), points, fields.fluxes(points, BAND.name, 0.0)
+    for kind, target in (("planetary_nebula", "planetary nebula"), ("standard_star", "white dwarf DA")):
+        row = spectroscopic.exposed(whole, kind=kind, target=target)
+        found = fields.rendered(row, whole, nothing, MISSION, DRAFT)
+        assert len(found.sources) == 5
+        first = (row for row in truth_table.spectra(found).to_pylist() if row["order"] == 1)
+        row = max(first, key=lambda one: one["drawn"])
+        low, high = sorted((round(row["x_first"]), round(row["x_last"])))
+        middle = round(0.5 * (row["y_first"] + row["y_last"]))
+        light = found.noise_free[middle - 8 : middle + 9, max(low, 0) + 20 : high - 20].sum(axis=0)
+        contrast.append(light.max() / np.median(light))
+    assert contrast[0] > 1.5 * contrast[1]
 
 
 def test_spectra_before_an_image_leave_their_mean_sky():

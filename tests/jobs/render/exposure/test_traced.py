@@ -3,13 +3,21 @@
 from functools import cache
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
+from jobs.fluxes import passbands, stretches
+from jobs.fluxes.libraries import templates
+from jobs.fluxes.sources import galaxies_of
 from jobs.render.exposure import traced
 from jobs.render.exposure.traced import Paths
 from jobs.render.products import truth_table
+from jobs.render.sources import colours
+from lake_schema import units
 from tests.jobs.render import spectroscopic
 from tests.jobs.render.spectroscopic import strip
+
+BAND = passbands.load("nisp_red")
 
 
 @cache
@@ -96,3 +104,36 @@ def test_nothing_shines():
     found = spectroscopic.rendered(detector=strip())
     assert truth_table.spectra(found).num_rows == 0
     assert truth_table.spectra(spectroscopic.rendered(kind="dark", sky=0.0)) is None
+
+
+def with_line(flux):
+    """A galaxy of half-light radius 0.25" with H alpha of a flux at 1.6 um, as bright as its spectrum is."""
+    column = dict.fromkeys(colours.GALAXY_COLUMNS, 0.0)
+    column |= {
+        "kind": 0, "z_obs": 16000.0 / 6564.614 - 1.0, "mag_r01": 24.0, "abs_mag_r01": -20.0, "frac_1": 1.0, "sed_1": 8,
+        "flux_halpha": flux, "disk_half_light_radius": 0.25,
+    }  # fmt: skip
+    table = pa.table({name: [value] for name, value in {**column, "id": 1}.items()})
+    library = templates.galaxy_library()
+    found = galaxies_of(table, library)
+    (spectrum,) = stretches.galaxies(found, int(BAND.wavelength[0]), len(BAND.wavelength), library)
+    mag = units.AB_UJY - 2.5 * np.log10(units.ujy_of_cgs(passbands.ab_flux(BAND, BAND.wavelength, spectrum)))
+    return spectroscopic.rendered([mag], [300.0], [48.0], body=column)
+
+
+def test_a_line_has_its_electrons_and_is_seen_as_well_as_is_required():
+    """2e-16 erg s-1 cm-2 at 1.6 um: 3.5 times the noise of four exposures; and as many electrons as are drawn of it."""
+    seen, without = with_line(2e-16), with_line(0.0)
+    (row,) = (row for row in rows(seen) if row["order"] == 1)
+    at = int(np.argmin(np.abs(np.array(row["line_wavelength"]) - 16000.0)))
+    assert row["line_wavelength"][at] == pytest.approx(16000.0)
+    t = (16000.0 - row["wavelength_first"]) / (row["wavelength_last"] - row["wavelength_first"])
+    x, y = (round(float(np.polynomial.polynomial.polyval(t, row[f"trace_{axis}"]))) for axis in "xy")
+    box = np.s_[y - 12 : y + 13, x - 12 : x + 13]
+    image = (seen.noise_free - without.noise_free)[box].astype(float)
+    # Some of its light is outside the box.
+    assert 0.93 < image.sum() / row["line_expected"][at] < 1.0
+    assert 2.0 * row["line_snr"][at] > 3.5
+    # Of a matched filter on the line's own image, sky and reading for noise.
+    continuum = without.noise_free[box] + seen.scene.pixel_noise**2
+    assert row["line_snr"][at] == pytest.approx(np.sqrt((image**2 / (continuum + image)).sum()), rel=0.15)
