@@ -141,7 +141,8 @@ def test_capacitance_between_pixels_or_none():
 
 
 def test_a_pixel_is_sky_dark_and_noise():
-    found = spectroscopic.rendered(forced=dict.fromkeys(("ramp_cosmic_rays", "dark_map", "pixel_response"), False))
+    off = ("dispersed_sky", "ramp_cosmic_rays", "dark_map", "pixel_response")
+    found = spectroscopic.rendered(forced=dict.fromkeys(off, False))
     signal = infrared.electrons(found)
     assert signal.mean() == pytest.approx(TIME, rel=0.01)
     assert signal.std() == pytest.approx(np.hypot(found.scene.pixel_noise, 1.92 * 12**-0.5), rel=0.08)
