@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks import effects as scene_of_effects
 from jobs import accuracy
 from jobs.render.camera import detectors
-from jobs.render.channels import ground, nisp_p, vis
+from jobs.render.channels import nisp_p, registry, vis
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.readout import quadrants
 from jobs.render.effects.scene import Frame, Lights, Scene
@@ -116,8 +116,8 @@ def mission_page(mission: MissionConfiguration) -> str:
 
 def effects_page(into: Path, mission: MissionConfiguration) -> str:
     """Every effect of every channel: what its module says, the parameters that it asks for, what it does to a frame."""
-    names = {"VIS": "science", "NISP-P": "science", "EXT": "science"}
-    channels = {"VIS": vis.CHANNEL.effects, "NISP-P": nisp_p.CHANNEL.effects, "EXT": ground.CHANNEL.effects}
+    names = {"VIS": "science", "NISP-P": "science", "NISP-S": "science", "EXT": "science"}
+    channels = {name: channel.effects for name, channel in registry.CHANNELS.items()}
     order: dict[str, Effect] = {}
     users: dict[str, list[str]] = {}
     for channel, types in channels.items():
