@@ -67,5 +67,8 @@ def stars(rows: Stars, first: int, count: int, library: Library) -> Float32:
     for start in range(0, len(rows), _ROWS):
         some = slice(start, start + _ROWS)
         dimmed = extinction.transmitted(milky_way, rows.a_v[some][:, None])
-        out[some] = library.flux[rows.sed[some], low : low + count] * dimmed * scale[some, None]
+        mixed = np.zeros(dimmed.shape)
+        for sed, share in zip(rows.sed[:, some], rows.frac[:, some], strict=True):
+            mixed += library.flux[sed, low : low + count] * share[:, None]
+        out[some] = mixed * dimmed * scale[some, None]
     return out

@@ -25,7 +25,7 @@ from jobs.render.channels.channel import Dispersion
 from jobs.render.dispersing import draw, images
 from jobs.render.dispersing.draw import Dispersed, Order
 from jobs.render.effects.scene import Scene
-from jobs.render.exposure import standard_stars, visible_sources
+from jobs.render.exposure import visible_sources
 from jobs.render.exposure.records import Rows
 from jobs.render.exposure.visible_sources import LEAST_SPECTRUM, Light, Listed
 from jobs.render.sky.diffuse_light import solar
@@ -54,7 +54,7 @@ def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     exposure, mission, band, dispersion = aim.exposure, scene.mission, aim.band, _of(aim)
     if exposure.psf:
         raise BadInput(f"exposure {exposure.exposure_id}: psf: spectra are drawn through the camera's own PSF alone")
-    rows, settings = standard_stars.with_standards(rows, aim, mission), draw.settings_for(scene.accuracy)
+    rows, settings = visible_sources.rows_of(rows, aim, mission), draw.settings_for(scene.accuracy)
     found = dispersion.traces(exposure, aim.detector, mission)
     orders = tuple(
         Order(

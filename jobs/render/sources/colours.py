@@ -35,7 +35,9 @@ GALAXY_COLUMNS = (
     *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS),
     *sorted({line.column for line in line_list()}),
 )
-STAR_COLUMNS = ("sed", "mag_h", "a_v", *(f"{name}_{k}" for k in STAR_PARTS for name in ("sed", "frac")))
+# What a star must have for a spectrum; older catalogues and a user's own have no second template.
+OF_ONE_TEMPLATE = ("sed", "mag_h", "a_v")
+STAR_COLUMNS = (*OF_ONE_TEMPLATE, *(f"{name}_{k}" for k in STAR_PARTS for name in ("sed", "frac")))
 
 
 def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
@@ -70,7 +72,7 @@ def _usual(rows: pa.Table, parts: Sequence[Passband], library: Library) -> Float
 
 def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
     """float64[n, PARTS] fractions of the detected photons of rows of the table `stars`; library as in `galaxies`."""
-    if not len(rows) or not {"sed", "mag_h", "a_v"} <= set(rows.column_names):
+    if not len(rows) or not set(OF_ONE_TEMPLATE) <= set(rows.column_names):
         return _flat(len(rows))
     library, parts = library or templates.stellar_library(), sub_bands.sub_bands(band)
     found = stars_of(rows, library)

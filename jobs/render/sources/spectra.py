@@ -78,7 +78,7 @@ def _galaxies(rows: pa.Table, band: Passband, library: Library | None) -> Spectr
 
 
 def _stars(rows: pa.Table, band: Passband, library: Library | None) -> Spectra:
-    if not len(rows) or not set(colours.STAR_COLUMNS) <= set(rows.column_names):
+    if not len(rows) or not set(colours.OF_ONE_TEMPLATE) <= set(rows.column_names):
         return _flat(band)
     library = library or templates.stellar_library()
     found = stars_of(rows, library)

@@ -168,6 +168,22 @@ def test_layers_of_orders_add_up_to_the_frame():
     assert found.maps["order_0"].sum() == found.maps["order_m1"].sum() == 0.0
 
 
+def test_a_star_s_spectrum_is_where_the_star_is_on_the_day():
+    """300 mas/yr to the north, ten years after 2015.5: ten rows or columns away, the trace with it."""
+    row = spectroscopic.exposed(strip())
+    body, none, points, f_nu = infrared.tables(strip(), row, [18.0], [290.2], [30.6])
+    moving = points.append_column("pm_ra", pa.array([0.0])).append_column("pm_dec", pa.array([300.0]))
+    still, moved = (
+        fields.rendered(row, strip(), (body, none, stars, f_nu), MISSION, DRAFT) for stars in (points, moving)
+    )
+    step = np.hypot(moved.sources.column[0] - still.sources.column[0], moved.sources.row[0] - still.sources.row[0])
+    assert step == pytest.approx(10.1, abs=0.3)
+    first, then = (truth_table.spectra(found).to_pylist()[0] for found in (still, moved))
+    assert np.hypot(then["x_first"] - first["x_first"], then["y_first"] - first["y_first"]) == pytest.approx(
+        step, abs=0.1
+    )
+
+
 def test_image_types():
     dark = spectroscopic.rendered(kind="dark", sky=0.0, forced={"ramp_cosmic_rays": False})
     assert np.median(infrared.electrons(dark)) == pytest.approx(0.02 * TIME, abs=2.0)

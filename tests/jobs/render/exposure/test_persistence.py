@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from jobs.accuracy import SURVEY
+from jobs.render.camera import astrometry
 from jobs.render.channels.aim import Aim
 from jobs.render.effects.charge.persistence import Traps
 from jobs.render.exposure import persistence
@@ -106,6 +108,22 @@ def test_the_sky_of_a_spectrum_leaves_something():
     ):  # fmt: skip
         other = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red", "image_type": kind})
         np.testing.assert_array_equal(left(EarlierSky(other)), found * seen)
+
+
+def test_a_star_left_its_light_where_it_was_that_day():
+    """300 mas/yr to the north, ten years after 2015.5: ten pixels."""
+    still = earlier(134.0, [14.0], [40.0], [50.0])
+    motion = {"pm_ra": 0.0, "pm_dec": 300.0}
+    stars = still.rows.stars
+    for name, value in motion.items():
+        stars = stars.append_column(name, pa.array([value]))
+    years = (still.exposure.mjd - 51544.5) / 365.25 - 15.5
+    dec = stars["dec"].to_numpy() + years * motion["pm_dec"] / 3.6e6
+    column, row = astrometry.pixel_of_sky(still.aim.wcs, stars["ra"].to_numpy(), dec)
+    assert np.hypot(column[0] - 40.0, row[0] - 50.0) == pytest.approx(10.0, abs=0.5)
+    found = left(replace(still, rows=replace(still.rows, stars=stars)))
+    lit = np.unravel_index(found.argmax(), found.shape)
+    assert np.hypot(lit[0] - row[0], lit[1] - column[0]) < 1.0
 
 
 def test_an_image_has_it_and_says_so():
