@@ -115,7 +115,7 @@ _TRUTH = {
     "ghosts": ("electron", "unit of the pixels: expected, ghosts alone"),
     "persistence": ("electron", "unit of the pixels: expected, persistence"),
     **{
-        content: ("electron", f"unit of the pixels: expected, sources in order {order}")
+        content: ("electron", f"unit of the pixels: expected, order {order} alone")
         for order, content in truth_maps.ORDERS.items()
     },
     "ramp": ("adu", "unit of the pixels: groups as read"),

@@ -11,11 +11,11 @@ from jobs import accuracy
 from jobs.render.camera import astrometry, detectors
 from jobs.render.effects.readout import charge_transfer
 from jobs.render.effects.scene import Scene
-from jobs.render.products import fits_files, read_back
+from jobs.render.products import fits_files, headers, read_back
 from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import validate
-from lake_schema.tables.products import PRODUCTS
+from lake_schema.tables.products import CONTENTS, PRODUCTS
 from tests.jobs.render import nominal
 from tests.jobs.render.exposure.test_render import render
 from tests.jobs.render.fields import small
@@ -50,6 +50,15 @@ def test_truth_is_written_where_it_is_wanted(rendered):
     rows, writers = fits_files.products(rendered, truth=())
     assert rows["content"].to_pylist() == ["science"]
     assert list(writers) == rows["path"].to_pylist()
+
+
+@pytest.mark.parametrize("content", [name for name, _ in CONTENTS if name != "science"])
+def test_the_unit_of_a_truth_map_fits_its_card(rendered, content):
+    """A comment that is too long for a card is refused when the file is written."""
+    keyword, unit, comment = headers.truth_cards(rendered, content)[-1]
+    assert keyword == "BUNIT"
+    assert unit in ("electron", "adu", "")
+    assert len(f"{keyword:8}= {repr(unit):20} / {comment}") <= 80
 
 
 def test_headers_may_tell_the_distortion_as_tpv(rendered, tmp_path):
