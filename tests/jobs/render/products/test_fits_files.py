@@ -58,7 +58,7 @@ def test_the_unit_of_a_truth_map_fits_its_card(rendered, content):
     keyword, unit, comment = headers.truth_cards(rendered, content)[-1]
     assert keyword == "BUNIT"
     assert unit in ("electron", "adu", "")
-    assert len(f"{keyword:8}= {repr(unit):20} / {comment}") <= 80
+    assert len(f"{keyword:8}= {unit!r:20} / {comment}") <= 80
 
 
 def test_headers_may_tell_the_distortion_as_tpv(rendered, tmp_path):
