@@ -185,7 +185,24 @@ GALAXIES = Table(
             120.0,
         ),
         Column(
-            "bulge_fraction", "float32", ucd="phot.flux;arith.ratio", doc="flux of the bulge / total", lo=0.0, hi=1.0
+            "bulge_fraction",
+            "float32",
+            ucd="phot.flux;arith.ratio",
+            doc="flux of the bulge / total, in the rest-frame 0.1r; in other bands by bulge_color",
+            lo=0.0,
+            hi=1.0,
+        ),
+        Column(
+            "bulge_color",
+            "float32",
+            "mag",
+            "phot.color;em.opt.B;em.opt.R",
+            "rest-frame 0.1(g - r) of the bulge less that of the disc, as far as there are templates that are redder "
+            "than the galaxy's own; missing where both have one spectrum",
+            -2.0,
+            2.0,
+            True,
+            since=3,
         ),
         Column(
             "bulge_sersic_index", "float32", ucd="src.morph.scLength", doc="Sersic index of the bulge", lo=0.3, hi=6.2

@@ -3,8 +3,8 @@
 write    galaxy_N.parquet, galaxy_flux_N.parquet, pointsource_N.parquet, pointsource_flux_N.parquet for each Nside-32
          pixel N (ring) of the place that is observed, seds/ with the spectra of the stars, and skyCatalog.yaml
 
-Components of a galaxy are bulge and disk, of one spectrum; there are no knots. The reader computes fluxes from the
-spectra, and takes those of the flux files where it is asked for an LSST band that they have.
+Components of a galaxy are bulge and disk, whose spectra add up to the galaxy's; there are no knots. The reader computes
+fluxes from the spectra, and takes those of the flux files where it is asked for an LSST band that they have.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 import yaml
 
 from jobs.catalogue.exports import stellar_spectra, tophat
-from jobs.fluxes import cosmology, inputs, passbands
+from jobs.fluxes import bulges, cosmology, inputs, passbands
 from jobs.fluxes.spectra.extinction import MILKY_WAY_R_V
 from lake_schema import __version__, sky, user_files
 from lake_schema.arrays import Float
@@ -168,7 +168,7 @@ def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
 
     def rows(given: pa.Table) -> pa.Table:
         light = tophat.luminosities(given, library)
-        share = given["bulge_fraction"].to_numpy().astype(float)[:, None]
+        share = bulges.in_bins(given, tophat.templates_in_bins(library), library)
         spectra = {"sed_val_bulge": _lists(light * share), "sed_val_disk": _lists(light * (1.0 - share))}
         return pa.table({**_shapes(given), **spectra})
 

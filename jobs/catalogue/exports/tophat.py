@@ -2,6 +2,7 @@
 
 edges          of the bins: equal in the logarithm between breaks and windows about the emission lines
 luminosities   rows of `galaxies` -> L_nu of each bin
+templates_in_bins   of a library, behind no dust
 
 The reader makes f_lambda constant in each bin, dims it by its luminosity distance, redshifts it, and puts the Milky
 Way's dust before it. A bin holds the photons of the spectrum inside it, so a band that is smooth over a bin sees
@@ -111,6 +112,11 @@ def _galaxies(rows: Galaxies, library: Library) -> Float:
     if library.intergalactic:
         total *= _between_galaxies(z)
     return total + _line_light(rows.lines) / (1.0 + z)[:, None]
+
+
+def templates_in_bins(library: Library) -> Float:
+    """f_lambda of each template in each bin, float64[template, bins]."""
+    return _in_bins(library)[0]
 
 
 @lru_cache(maxsize=2)

@@ -289,4 +289,7 @@ def _shapes(
         "inclination": given.get("inclination", morphology.inclination(thin, shapes.scale_height)),
         "position_angle": sky.position_angle(given.get("position_angle", morphology.position_angle(n, rng))),
     }
+    # A catalogue's own fraction stands for every band, unless it has a colour as well.
+    colour = np.full(n, np.nan) if "bulge_fraction" in given else morphology.bulge_colour(shapes.bulge, n, rng)
+    found["bulge_color"] = given.get("bulge_color", colour)
     return {name: np.asarray(values, np.float64) for name, values in found.items()}

@@ -317,12 +317,14 @@ def _shape_columns(
     sersic = morphology.sersic_index(shapes.bulge, drawn.colour.red, rng)
     ratio = morphology.radius_ratio(shapes.bulge, drawn.colour.red, rng)
     bulge_radius, disc_radius = morphology.component_radii(shapes, radius, fraction, ratio, sersic)
+    colour = morphology.bulge_colour(shapes.bulge, source.size, Keyed(source, seed, "galaxies.bulge_colour"))
     rng = Keyed(source, seed, "galaxies.shape")
     disc_ratio = morphology.disc_axis_ratio(shapes, drawn.z.size, rng)
     return {
         "bulge_half_light_radius": bulge_radius,
         "disk_half_light_radius": disc_radius,
         "bulge_fraction": fraction,
+        "bulge_color": colour,
         "bulge_sersic_index": sersic,
         "bulge_axis_ratio": morphology.bulge_axis_ratio(shapes.bulge, drawn.z.size, rng),
         "disk_axis_ratio": disc_ratio,

@@ -1,7 +1,7 @@
 """Sizes and shapes of galaxies: a Sersic bulge and an inclined exponential disc with one position angle.
 
 half_light_radius   of the total light, from redshift, stellar mass and type
-bulge_fraction, sersic_index, radius_ratio   of the bulge
+bulge_fraction, sersic_index, radius_ratio, bulge_colour   of the bulge
 component_radii     the two half-light radii whose sum of light has the total's
 disc_axis_ratio, bulge_axis_ratio, inclination, position_angle
 
@@ -63,6 +63,9 @@ class Bulge:
     axis_ratio_mean: float
     axis_ratio_scatter: float
     axis_ratio_limits: tuple[float, float]
+    colour_mean: float
+    colour_scatter: float
+    colour_limits: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,6 +169,11 @@ def radius_ratio(bulge: Bulge, red: Bool, rng: Draws) -> Float:
     """
     log_ratio = np.where(red, bulge.early_log_ratio, bulge.late_log_ratio)
     return np.clip(10.0 ** (log_ratio + bulge.log_ratio_scatter * rng.standard_normal(red.size)), *bulge.ratio_limits)
+
+
+def bulge_colour(bulge: Bulge, n: int, rng: Draws) -> Float:
+    """0.1(g - r) of the bulge less that of the disc, [n] mag."""
+    return np.asarray(np.clip(bulge.colour_mean + bulge.colour_scatter * rng.standard_normal(n), *bulge.colour_limits))
 
 
 def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float, sersic: Float) -> tuple[Float, Float]:

@@ -47,7 +47,8 @@ def transmission(wavelength: npt.ArrayLike, z: npt.ArrayLike) -> Float:
         # The part of a bin in which there are clouds: behind us, and in front of the source.
         inside = np.clip(line * stretch[:, None] - at[:seen] + 0.5, 0.0, 1.0) * (cloud > 1.0)
         depth[:, :seen] += deep * inside
-    return np.asarray(np.exp(-depth - _continuum(at, stretch)))
+    # Far below the limit the approximation's depth is less than nothing.
+    return np.asarray(np.exp(-np.maximum(depth + _continuum(at, stretch), 0.0)))
 
 
 def sees(band: Passband, z: float) -> bool:

@@ -14,6 +14,8 @@ import numpy as np
 import pyarrow as pa
 
 from jobs.accuracy import Accuracy
+from jobs.fluxes import bulges
+from jobs.fluxes.libraries import templates
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import astrometry
 from jobs.render.camera.detectors import Detector
@@ -38,7 +40,7 @@ from lake_schema.tables.strong_lenses import STRONG_LENSES
 
 # What is read of the catalogues; fluxes are read besides.
 SHAPE_COLUMNS = ("id", "kind", "ra_lensed", "dec_lensed", *galaxy_shapes.COLUMNS)
-GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, *colours.GALAXY_COLUMNS)))
+GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, *colours.GALAXY_COLUMNS, *bulges.COLUMNS)))
 STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
 # Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
 _MOST_ELECTRONS = 1e17
@@ -141,13 +143,17 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
 
 
 def rows_of(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
-    """Rows with the stars where they are in the middle of an exposure, and the standard star's if it is of one.
+    """Rows as an exposure sees them.
+
+    Bulges have their share of the light in its band, stars are where they are in its middle, and the standard star's
+    is there if it is of one.
 
     rows : of the catalogues;  aim : the exposure and detector;  mission : the mission database
     Errors : BadInput for a target that is no standard star
     """
     middle = aim.exposure.mjd + 0.5 * aim.exposure.exposure_time_s / 86400.0
-    rows = replace(rows, stars=catalogue_rows.at_time(rows.stars, middle))
+    galaxies = bulges.in_band(rows.galaxies, aim.band, rows.library or templates.galaxy_library())
+    rows = replace(rows, galaxies=galaxies, stars=catalogue_rows.at_time(rows.stars, middle))
     return standard_stars.with_standards(rows, aim, mission)
 
 

@@ -62,6 +62,7 @@ def galaxies(n=40, seed=4):
         "bulge_half_light_radius": rng.uniform(0.05, 0.5, n),
         "disk_half_light_radius": rng.uniform(0.3, 1.5, n),
         "bulge_fraction": rng.uniform(0.0, 1.0, n),
+        "bulge_color": np.full(n, 0.25),
         "bulge_sersic_index": rng.uniform(0.5, 6.0, n),
         "bulge_axis_ratio": rng.uniform(0.4, 1.0, n),
         "disk_axis_ratio": rng.uniform(0.2, 1.0, n),
@@ -90,6 +91,7 @@ def _to_be_drawn(values, rows):
     """One that is long and not lensed, two that are round and sheared; their light ends soon."""
     values["bulge_fraction"][rows], values["bulge_sersic_index"][rows] = 0.3, 1.0
     values["bulge_half_light_radius"][rows], values["disk_half_light_radius"][rows] = 0.3, 0.5
+    values["bulge_color"][rows] = 0.0
     values["bulge_axis_ratio"][rows] = values["disk_axis_ratio"][rows] = [0.4, 1.0, 1.0]
     values["position_angle"][rows] = 25.0
     values["kappa"][rows], values["gamma1"][rows], values["gamma2"][rows] = 0.0, [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]

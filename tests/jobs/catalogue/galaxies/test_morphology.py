@@ -133,3 +133,11 @@ def test_thinner_discs_are_more_inclined(q1, q2):
 def test_inclination_keeps_its_digits_where_a_disc_is_nearly_round():
     """i = sqrt(2 (1 - q) / 0.99) for 1 - q << 1."""
     assert np.radians(morphology.inclination(1 - 1e-12, 0.1)) == pytest.approx(np.sqrt(2e-12 / 0.99), rel=1e-3)
+
+
+def test_bulges_are_redder_than_discs_as_near_galaxies_are(rng):
+    """0.1 - 0.3 mag in g - r, remembered of decompositions of near galaxies."""
+    colour = morphology.bulge_colour(SHAPES.bulge, 20_000, rng)
+    assert 0.1 < np.mean(colour) < 0.3
+    assert np.mean(colour > 0.0) > 0.9
+    assert np.std(colour) == pytest.approx(SHAPES.bulge.colour_scatter, rel=0.1)

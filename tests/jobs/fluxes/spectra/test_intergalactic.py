@@ -125,3 +125,11 @@ def test_tables_know_their_errors_behind_it(library):
     assert found[1] == settings.choose(["des_i"], SURVEY)[0]
     assert settings.MARGIN * found[0].largest <= SURVEY.flux
     assert differing(u, found[0].setting, behind, 9) < SURVEY.flux
+
+
+@pytest.mark.parametrize("z", [0.0, 0.5, 2.0, 6.4])
+def test_nothing_is_brighter_for_it(z):
+    """Down to where the published approximation has gone over to negative depths."""
+    passed = intergalactic.transmission(np.arange(1.0, 10_000.0), [z])
+    assert (passed <= 1.0).all()
+    assert (passed >= 0.0).all()
