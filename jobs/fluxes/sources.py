@@ -47,6 +47,12 @@ class Galaxies:
     magnification: Float
     a_v: Float
 
+    def __post_init__(self) -> None:
+        # Compiled code reads all of them, and looks at no bounds.
+        wanted = len(self.mix), len(lines.line_list())
+        if self.lines.shape != wanted:
+            raise ValueError(f"lines are of shape {self.lines.shape}, not {wanted}")
+
     def __len__(self) -> int:
         return len(self.mix)
 

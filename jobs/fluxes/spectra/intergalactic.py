@@ -29,6 +29,9 @@ _FOREST_LINES, _DAMPED_LINES = ((1.2, 3.7, 5.5), (2.2, 5.7)), ((2.0, 3.0), (3.0,
 # in the forest (its amplitude 0.3248 x 0.9), damped systems are opaque but for a part in lambda^-0.3.
 _FOREST, _FOREST_SECTION = (0.29232, (-1.9, 0.6, 2.4), (2.2, 5.7)), 2.1
 _OPAQUE, _CLEARER, _CLEARER_SECTION = (0.4226, (1.0, 2.0), (3.0,)), (0.176203, (1.3, 2.3), (3.0,)), -0.3
+# A damped system of 1 + z lets through, by these laws, more than falls onto it below 912 A (1 + z) / 18.5: nothing is
+# absorbed there.
+_TRANSPARENT = (_CLEARER[0] / _OPAQUE[0]) ** (1.0 / _CLEARER_SECTION)
 
 
 def transmission(wavelength: npt.ArrayLike, z: npt.ArrayLike) -> Float:
@@ -70,14 +73,16 @@ def _continuum(at: Float, stretch: Float) -> Float:
     seen = int(np.searchsorted(at, LYMAN_LIMIT * stretch.max(initial=0.0) + 0.5))
     if not seen:
         return depth
-    x = at[:seen] / LYMAN_LIMIT
+    x, whole = at[:seen] / LYMAN_LIMIT, np.maximum(stretch, 1.0)[:, None]
     # Clouds between us and the source whose limit lies redwards of the wavelength.
-    near = np.minimum(np.maximum(x, 1.0), np.maximum(stretch, 1.0)[:, None])
+    near = np.minimum(np.maximum(x, 1.0), whole)
+    damped = np.maximum(np.minimum(whole, _TRANSPARENT * x), near) if _TRANSPARENT * x[0] < whole.max() else whole
 
-    def between(law: tuple[float, tuple[float, ...], tuple[float, ...]]) -> Float:
-        return np.asarray(_integral(np.maximum(stretch, 1.0), *law)[:, None] - _integral(near, *law))
+    def between(law: tuple[float, tuple[float, ...], tuple[float, ...]], far: Float) -> Float:
+        return np.asarray(_integral(far, *law) - _integral(near, *law))
 
-    depth[:, :seen] = x**_FOREST_SECTION * between(_FOREST) + between(_OPAQUE) - x**_CLEARER_SECTION * between(_CLEARER)
+    depth[:, :seen] = x**_FOREST_SECTION * between(_FOREST, whole) + between(_OPAQUE, damped)
+    depth[:, :seen] -= x**_CLEARER_SECTION * between(_CLEARER, damped)
     return depth
 
 

@@ -1,5 +1,7 @@
 """What is refused before any spectrum is made, and the lens."""
 
+import dataclasses
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -75,6 +77,14 @@ def test_kinds_of_other_libraries_are_refused(galaxies, library):
     kinds[7] = 2
     with pytest.raises(BadInput, match="source 107 has kind 2"):
         sources.galaxies_of(galaxies(kind=kinds), library)
+
+
+def test_as_many_lines_as_are_listed_are_held(galaxies, library):
+    """Compiled code would read beyond the end of fewer."""
+    rows = sources.galaxies_of(galaxies(5), library)
+    for given in (rows.lines[:, :-1], rows.lines[:4]):
+        with pytest.raises(ValueError, match="lines are of shape"):
+            dataclasses.replace(rows, lines=given)
 
 
 def test_a_line_may_be_missing(galaxies, library):

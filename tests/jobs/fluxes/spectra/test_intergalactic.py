@@ -49,11 +49,12 @@ def test_the_continuum_is_the_published_one(z, x):
     assert found == pytest.approx(published(z, x), rel=2e-3, abs=1e-3)
 
 
-@given(st.floats(0.0, 3.0), st.floats(0.0, 0.2), st.floats(600.0, 5000.0))
+@given(st.floats(0.0, 20.0), st.floats(0.0, 0.2), st.floats(0.1, 24000.0))
 def test_more_clouds_let_less_through(z, further, wavelength):
     """Seen at one wavelength, of ever farther sources; redwards of Lyman alpha nothing is lost."""
     near, far = intergalactic.transmission([wavelength], [z, z + further])[:, 0]
-    assert 0.0 <= far <= near <= 1.0
+    assert 0.0 <= far <= near * (1.0 + 1e-12)
+    assert near <= 1.0
     assert near == 1.0 or wavelength < 1215.67 * (1.0 + z) + 0.5
 
 

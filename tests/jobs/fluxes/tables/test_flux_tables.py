@@ -13,6 +13,7 @@ from jobs.fluxes import band_fluxes, integration, passbands, sources
 from jobs.fluxes.libraries import templates
 from jobs.fluxes.libraries.templates import Library
 from jobs.fluxes.sources import Galaxies, Stars
+from jobs.fluxes.spectra import lines
 from jobs.fluxes.spectra.continuum import Mix
 from jobs.fluxes.tables import build_tables, errors_measured, flux_tables
 from jobs.fluxes.tables.settings import choose
@@ -59,7 +60,7 @@ def test_fast_is_slow_within_the_accuracy(library, accuracy):
 def test_fast_is_slow_for_any_galaxy(library, grid, z, sed, law, ebv, frac, a_v, line, abs_mag):
     mix = Mix(*(np.array(x)[..., None] for x in (z, sed, law, (frac, 1.0 - frac), ebv)))
     one = np.ones(1)
-    rows = Galaxies(mix, abs_mag * one, 20.0 * one, np.full((1, 10), line), one, a_v * one)
+    rows = Galaxies(mix, abs_mag * one, 20.0 * one, np.full((1, len(lines.line_list())), line), one, a_v * one)
     assert flux_tables.covered(rows).all()
     slow = integration.galaxies(rows, CURVES, library)
     np.testing.assert_allclose(flux_tables.galaxies(rows, grid), slow, rtol=SURVEY.flux)
