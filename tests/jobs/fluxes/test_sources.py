@@ -82,9 +82,9 @@ def test_kinds_of_other_libraries_are_refused(galaxies, library):
 def test_as_many_lines_as_are_listed_are_held(galaxies, library):
     """Compiled code would read beyond the end of fewer."""
     rows = sources.galaxies_of(galaxies(5), library)
-    for given in (rows.lines[:, :-1], rows.lines[:4]):
+    for fewer in (rows.lines[:, :-1], rows.lines[:4]):
         with pytest.raises(ValueError, match="lines are of shape"):
-            dataclasses.replace(rows, lines=given)
+            dataclasses.replace(rows, lines=fewer)
 
 
 def test_a_line_may_be_missing(galaxies, library):
