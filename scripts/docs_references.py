@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -15,14 +16,17 @@ import numpy as np
 
 from benchmarks import effects as scene_of_effects
 from jobs import accuracy
-from jobs.render.camera import detectors
-from jobs.render.channels import nisp_p, registry, vis
+from jobs.render.camera import detectors, traces
+from jobs.render.channels import nisp_p, nisp_s, registry, vis
+from jobs.render.channels.aim import Aim
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.readout import quadrants
 from jobs.render.effects.scene import Frame, Lights, Scene
+from jobs.render.exposure import spread_sky
 from jobs.request import from_toml, observations, schema, toml_values
 from jobs.rng import stream
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
 
 # What readers of a lake import.
 API = ("lake_schema.store.read", "lake_schema.store.layout", "jobs.explore.explorer", "jobs.render.products.read_back")
@@ -196,8 +200,8 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
             _figure(folder / f"{effect.name}.png", _flat(before), _flat(after), effect.name)
             drawn.add(effect.name)
         frame = after if effect in vis.SKY else frame
-    for effects in (nisp_p.SKY, nisp_p.FLAT):
-        frame, scene = _infrared_scene(mission)
+    infrared, spectral = _infrared_scene(mission), _spectral_scene(mission)
+    for effects, (frame, scene) in ((nisp_p.SKY, infrared), (nisp_p.FLAT, infrared), (nisp_s.SKY, spectral)):
         for effect in effects:
             before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(1, effect.name))
             images = _of_ramp(before, ""), _of_ramp(frame, effect.name)
@@ -217,6 +221,23 @@ def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
     left = 10.0 * (np.hypot(*(np.indices(frame.shape) - _SIDE / 2)) < _SIDE / 10)
     scene = Scene(mission, "nisp", 87.24, 1.0, float(frame.max()), small, lights, ramp="photometric", remembered=left)
     return frame, scene
+
+
+def _spectral_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
+    """A small NISP detector where light of the zeroth order comes from the field stop's edge."""
+    frame, scene = _infrared_scene(mission)
+    assert scene.detector is not None
+    exposure = ExposureRow(
+        exposure_id=1, channel="NISP-S", camera="nisp", band="nisp_red", image_type="science", ra=0.0, dec=60.0,
+        position_angle=0.0, mjd=61000.0, exposure_time_s=549.6, sky=1.09, grism="RGS000", grism_angle=0.0,
+        seeing=0.0, zero_point=25.0, survey="own",
+    )  # fmt: skip
+    (zeroth,) = (t for t in traces.traces("RGS000", 0.0, scene.detector, mission) if t.order == 0)
+    moved = zeroth.polynomials(0.0, 0.0)[0][0] * scene.detector.pixel_scale
+    edge = 0.5 * mission.value("plm.unvignetted_x", "arcsec")
+    detector = replace(scene.detector, x=np.copysign(edge, -moved) + moved, y=0.0, rotation=0.0)
+    scene = replace(scene, exposure_time_s=549.6, sky_rate=1.09, detector=detector, ramp="spectroscopic")
+    return frame, replace(scene, spread_sky=spread_sky.spread_sky(scene, Aim.of(exposure, detector)))
 
 
 def _of_ramp(frame: Frame, name: str) -> Frame:

@@ -27,7 +27,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.ge
 _SPARK = (
     "tests/faults/test_spark.py", "tests/jobs/test_session.py", "tests/test_field.py",
     "tests/jobs/render/test_render_exposures_calibration.py",
-    "tests/jobs/render/test_render_exposures_infrared.py",
+    "tests/jobs/render/test_render_exposures_infrared.py", "tests/jobs/render/test_render_exposures_spectra.py",
     "tests/jobs/render/test_sequence.py",
 )  # fmt: skip
 _SKY = ("tests/jobs/catalogue/", "tests/jobs/validation/")

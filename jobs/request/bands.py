@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 from jobs.request.observations import Observation
 from jobs.request.schema import Request
 from lake_schema.errors import BadInput
-from lake_schema.tables.exposures import EUCLID_BANDS
+from lake_schema.tables.exposures import CHOSEN_BY, EUCLID_BANDS
 
 if TYPE_CHECKING:
     from lake_schema.mission.configuration import MissionConfiguration
 
 
 def of_request(request: Request, mission: MissionConfiguration) -> tuple[str, ...]:
-    """Each passband once, in the order in which the request names them.
+    """Each passband once, in the order in which the request names them; then those in which sources are chosen.
 
     Errors : BadInput names the observation that asks for a band which its channels do not have
     """
@@ -29,7 +29,15 @@ def of_request(request: Request, mission: MissionConfiguration) -> tuple[str, ..
             found += of_block(block, mission)
         except BadInput as error:
             raise BadInput(f"observation[{i}].bands: {error}") from None
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys([*found, *_choosing(request)]))
+
+
+def _choosing(request: Request) -> list[str]:
+    """Passbands that no exposure need be taken in: sources are chosen by their fluxes in these."""
+    channels = [pointing.channel for pointing in request.pointings]
+    for block in request.observations:
+        channels += block.channels if block.table is None else [channel for channel, _ in block.table.kinds]
+    return [CHOSEN_BY[channel] for channel in dict.fromkeys(channels) if channel in CHOSEN_BY]
 
 
 def of_block(block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:

@@ -35,6 +35,7 @@
                    off = ["all"]          all that are not in `on`, but for the conversion to whole numbers
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
     [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s,
+                   grism_angle    of NISP-S, deg at which spectra run in the focal plane: -4, 0, 180, 184
                    realisations   how many exposures, which differ in their noise alone
     [[observation]]
         channels = ["VIS", "NISP-P", "NISP-S"] | ["EXT"]

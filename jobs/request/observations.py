@@ -84,6 +84,7 @@ class Pointing:
     detectors       : names, () = all of the camera
     exposure_time_s : None = the mission's
     realisations    : how many exposures, which differ in their noise alone
+    grism_angle     : deg, of NISP-S, at which spectra run in the focal plane, None = 0
     """
 
     channel: str
@@ -97,6 +98,7 @@ class Pointing:
     centre_on: str | None = None
     exposure_time_s: float | None = None
     realisations: int = 1
+    grism_angle: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +173,7 @@ def _pointing(value: object, path: str) -> Pointing:
         centre_on=string(table, f"{path}.centre_on") if "centre_on" in table else None,
         exposure_time_s=optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
         realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
+        grism_angle=optional(table, f"{path}.grism_angle", -360.0, 360.0),
     )
 
 

@@ -40,6 +40,7 @@ COLUMNS = (
     ("seeing", "arcsec", "FWHM of the atmosphere, of ground cameras", "the mission's"),
     ("zero_point", "mag", "AB magnitude of 1 electron/s", "the mission's"),
     ("psf", "", "file of a PSF, found from the table's folder", "the request's `[psf]`, else the model's"),
+    ("grism_angle", "deg", "at which the spectra of NISP-S run, in the focal plane: -4, 0, 180 or 184", "0"),
 )
 _REQUIRED = tuple(name for name, _, _, default in COLUMNS if not default)
 _NAMES = tuple(name for name, *_ in COLUMNS)
@@ -68,6 +69,7 @@ class Row:
     seeing: float | None
     zero_point: float | None
     psf: str | None
+    grism_angle: float | None
     detectors: tuple[str, ...]
 
 
@@ -178,5 +180,6 @@ def _of_line(row: Mapping[str, str], path: Path, line: int, channels: Sequence[s
         seeing=optional("seeing", 0.01, 10.0) if channel == "EXT" else None,
         zero_point=optional("zero_point", 0.0, 50.0),
         psf=str(user_files.expanded(row["psf"], path.parent)) if row.get("psf") else None,
+        grism_angle=optional("grism_angle", -360.0, 360.0),
         detectors=tuple(row.get("detectors", "").split()),
     )

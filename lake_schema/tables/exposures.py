@@ -31,6 +31,8 @@ EUCLID_BANDS: Mapping[str, tuple[str, ...]] = {
     "NISP-P": ("euclid_y", "euclid_j", "euclid_h"),
     "NISP-S": ("nisp_red", "nisp_blue"),
 }
+# Of a channel without a slit, the passband in which the sources are chosen that it draws: of these it wants the fluxes.
+CHOSEN_BY: Mapping[str, str] = {"NISP-S": "euclid_h"}
 # What there is a simulator for: channel -> image types. All others can be planned and forecast. A copy, since
 # requests are refused below the renderer (test_checks.py holds it to the registry of channels).
 RENDERED: Mapping[str, tuple[str, ...]] = {

@@ -14,6 +14,9 @@ from jobs.render.camera import traces
 from lake_schema.arrays import Float
 from lake_schema.mission.configuration import MissionConfiguration
 
+# Spectra are followed along the columns: a grism that is turned by more is none of NISP's, deg.
+MOST_TURNED = 45.0
+
 
 def tilt(grism: str, angle: float, section: str, mission: MissionConfiguration) -> float:
     """By which a grism is turned from its own direction, deg, -180 .. 180.

@@ -27,7 +27,7 @@ from jobs.render.sky import diffuse_light
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.tables.exposures import ExposureRow
+from lake_schema.tables.exposures import CHOSEN_BY, ExposureRow
 
 SKY = (
     background.EFFECT,
@@ -51,8 +51,6 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "flat": FLAT,
     "dark": DARK,
 }
-# Spectra are followed along the columns: a grism that is turned by more is none of NISP's, deg.
-_MOST_TURNED = 45.0
 
 
 def _turned(exposure: ExposureRow, section: str, mission: MissionConfiguration) -> tuple[str, float]:
@@ -61,9 +59,11 @@ def _turned(exposure: ExposureRow, section: str, mission: MissionConfiguration) 
     if exposure.grism is None or exposure.grism_angle is None:
         raise BadInput(f"{where}: a spectrum wants a grism and its angle")
     asked = grism_wheel.tilt(exposure.grism, exposure.grism_angle, section, mission)
-    if abs(asked) > _MOST_TURNED:
+    if abs(asked) > grism_wheel.MOST_TURNED:
         angle = f"grism_angle = {exposure.grism_angle:g} deg"
-        raise BadInput(f"{where}: {angle} turns {exposure.grism} by {asked:g} deg, more than {_MOST_TURNED:g}")
+        raise BadInput(
+            f"{where}: {angle} turns {exposure.grism} by {asked:g} deg, more than {grism_wheel.MOST_TURNED:g}"
+        )
     return exposure.grism, asked
 
 
@@ -136,5 +136,5 @@ CHANNEL = Channel(
     own_light=(calibration_lamp.EFFECT,),
     ramp="spectroscopic",
     remembers=persistence.EFFECT,
-    disperses=Dispersion(_traces, _throughput, _vignetted, euclid.nisp_psf_at, _reach, "euclid_h"),
+    disperses=Dispersion(_traces, _throughput, _vignetted, euclid.nisp_psf_at, _reach, CHOSEN_BY["NISP-S"]),
 )

@@ -11,12 +11,25 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
+import pyarrow as pa
 
 from jobs.render.camera.traces import Trace
 from jobs.render.dispersing.draw import Order
 from lake_schema.arrays import Float
+from lake_schema.columns import Column, Table
+from lake_schema.fits.tables import table_to_fits
 
+SENSITIVITY = Table(
+    "sensitivity",
+    1,
+    (
+        Column("WAVELENGTH", "float64", "Angstrom", "em.wl", "vacuum wavelength"),
+        Column("SENSITIVITY", "float64", "electron cm2 erg-1", "instr.sensitivity", "in a bin of 1 A"),
+        Column("ERROR", "float64", "electron cm2 erg-1", "stat.error", "of the sensitivity: there is none"),
+    ),
+    "Electrons a second for each erg s-1 cm-2 A-1, of an order of a grism.",
+    key=("WAVELENGTH",),
+)
 # Of 1, x, y, x^2, x y, y^2: grismconf has no polynomial of four powers of t without the squares.
 _TERMS = 6
 
@@ -45,20 +58,16 @@ def _terms(row: Float) -> str:
     return " ".join(repr(float(value)) for value in np.pad(row, (0, _TERMS - len(row))))
 
 
-def sensitivity(order: Order, seconds: float) -> fits.BinTableHDU:
-    """Electrons a second for each erg s-1 cm-2 A-1, in bins of 1 A.
+def sensitivity(order: Order, seconds: float) -> pa.Table:
+    """Rows of SENSITIVITY.
 
     order : whose response is of an exposure of so many seconds
     The first and the last two values are 0: extraction software sets them so.
     """
     response = np.pad(order.response / seconds, 2)
     wavelength = order.first - 2 + np.arange(float(len(response)))
-    columns = [
-        fits.Column("WAVELENGTH", "D", "Angstrom", array=wavelength),
-        fits.Column("SENSITIVITY", "D", "electron cm2 erg-1", array=response),
-        fits.Column("ERROR", "D", "electron cm2 erg-1", array=np.zeros(len(response))),
-    ]
-    return fits.BinTableHDU.from_columns(columns, name="SENSITIVITY")
+    none = np.zeros(len(response))
+    return SENSITIVITY.build({"WAVELENGTH": wavelength, "SENSITIVITY": response, "ERROR": none})
 
 
 def write(folder: Path, grism: str, orders: Sequence[Order], shape: tuple[int, int], seconds: float) -> Path:
@@ -69,8 +78,7 @@ def write(folder: Path, grism: str, orders: Sequence[Order], shape: tuple[int, i
     """
     files = [f"{grism}_{order.trace.order:+d}.fits" for order in orders]
     for order, file in zip(orders, files, strict=True):
-        table = fits.HDUList([fits.PrimaryHDU(), sensitivity(order, seconds)])
-        table.writeto(folder / file, overwrite=True, checksum=True)
+        table_to_fits(folder / file, sensitivity(order, seconds), SENSITIVITY)
     path = folder / f"{grism}.conf"
     path.write_text(configuration(grism, [order.trace for order in orders], shape, files), encoding="utf-8")
     return path

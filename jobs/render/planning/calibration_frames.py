@@ -16,8 +16,8 @@ from jobs.render.camera import pointing
 from jobs.render.camera.lamps import LAMPS
 from jobs.render.effects.light import calibration_lamp
 from jobs.render.planning import unrendered
-from jobs.render.planning.observing_sequence import FILTERS, RED, offsets
-from jobs.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time
+from jobs.render.planning.observing_sequence import FILTERS, RED, SETTINGS, offsets
+from jobs.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time, through_grism
 from jobs.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
 from jobs.request.observations import Observation
 from lake_schema.arrays import Float
@@ -27,7 +27,6 @@ from lake_schema.mission.configuration import MissionConfiguration
 _DAY_S = 86400.0
 # The two standard stars (Serrano et al. 2024).
 _STARS = ("Vega", "white dwarf DA")
-_GRISMS = ("RGS000", "RGS180", "RGS000", "RGS180")
 # From the end of a frame to the start of the next, s: the slowest of the read-outs.
 _PAUSE = 90.0
 # Of a lamp's light, over what the camera's bands see where they see best: with less a flat is not taken.
@@ -96,7 +95,9 @@ def _lit(in_bands: Sequence[Exposure], block: Observation, mission: MissionConfi
     curves = {frame.band: passbands.load(frame.band) for frame in in_bands}
     for lamp in block.lamps or range(1, LAMPS[camera][0] + 1):
         sees = {band: calibration_lamp.seen_in(curve, lamp, camera, mission) for band, curve in curves.items()}
-        own = [replace(frame, lamp=lamp) for frame in in_bands if sees[frame.band] > _SEES]
+        lit = [replace(frame, lamp=lamp) for frame in in_bands if sees[frame.band] > _SEES]
+        # Flats of spectra are taken with the grism in.
+        own = [through_grism(frame, None, mission) for frame in lit]
         if block.lamps and not own:
             raise BadInput(f"lamps: {lamp} does not shine in {', '.join(curves)}")
         if own:
@@ -140,18 +141,19 @@ def _targets(
     dithers = block.exposures or int(mission.value(f"survey.{kind}.dithers"))
     steps = offsets("S", mission, seed, kind, channel)
     # A nebula is seen in every setting, a star in one a dither.
-    settings = len(_GRISMS) if kind == "planetary_nebula" else 1
+    settings = SETTINGS if kind == "planetary_nebula" else 1
     for target in _STARS if kind == "standard_star" else ("planetary nebula",):
         for setting in range(settings):
             for i in range(dithers):
                 for frame in in_bands:
                     moved = replace(_moved(frame, *steps[i % len(steps)]), dither=i + 1, target=target)
-                    number = setting if settings > 1 else i % len(_GRISMS)
+                    number = setting if settings > 1 else i % SETTINGS
                     yield _through_grism(moved, number, mission) if channel == "NISP-S" else moved
 
 
 def _through_grism(frame: Exposure, number: int, mission: MissionConfiguration) -> Exposure:
-    return replace(frame, grism=_GRISMS[number], grism_angle=mission.value(f"survey.grism_angle_{number + 1}", "deg"))
+    key = f"survey.grism_angle_{number + 1}"
+    return through_grism(frame, mission.value(key, "deg"), mission, key)
 
 
 def _scattered(camera: str, dithers: int, mission: MissionConfiguration, seed: int) -> Float:

@@ -17,7 +17,7 @@ from jobs import rng
 from jobs.render.camera import detectors as camera_detectors
 from jobs.render.camera import pointing
 from jobs.render.camera.detectors import Detector
-from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time
+from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time, through_grism
 from jobs.render.sky.solar_aspect import next_allowed, position_angle
 from jobs.request import pointing_tables
 from jobs.request.area import Area
@@ -190,7 +190,7 @@ def _of_row(row: Row, number: int, block: Observation, mission: MissionConfigura
     if angle is None:
         angle = position_angle(row.ra, row.dec, mjd) if euclid else 0.0
     seconds = block.exposure_time_s if row.exposure_time_s is None else row.exposure_time_s
-    return Exposure(
+    found = Exposure(
         channel=row.channel,
         camera=camera,
         band=row.band,
@@ -208,3 +208,4 @@ def _of_row(row: Row, number: int, block: Observation, mission: MissionConfigura
         psf=row.psf,
         detectors=row.detectors or block.detectors,
     )
+    return through_grism(found, row.grism_angle, mission, f"{row.where}: grism_angle")

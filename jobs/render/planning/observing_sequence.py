@@ -17,7 +17,7 @@ from jobs import rng
 from jobs.render.camera import pointing
 from jobs.render.camera.lamps import LEDS
 from jobs.render.effects.charge import ramp
-from jobs.render.planning.planned_exposures import Exposure, exposure_time
+from jobs.render.planning.planned_exposures import Exposure, exposure_time, through_grism
 from jobs.render.planning.reference_survey import Field
 from jobs.request.observations import Observation
 from lake_schema.arrays import Float
@@ -27,8 +27,8 @@ _DAY_S = 86400.0
 # The filters in the order they come after the grism, and the passband of each grism.
 FILTERS = ("euclid_j", "euclid_h", "euclid_y")
 RED, BLUE = "nisp_red", "nisp_blue"
-# Grisms at 0 and -4 deg are one, at 180 and 184 deg the other.
-_GRISMS = {0.0: "RGS000", 184.0: "RGS180", -4.0: "RGS000", 180.0: "RGS180"}
+# Angles at which spectra run in turn: survey.grism_angle_1 and so on.
+SETTINGS = 4
 
 
 def offsets(pattern: str, mission: MissionConfiguration, seed: int, *key: int | str) -> Float:
@@ -133,11 +133,10 @@ class _At:
 
     def _spectrum(self, after: float) -> Exposure:
         if self.block.blue and self.field.visit % 2 == 0:
-            return replace(self._one("NISP-S", BLUE, after), grism="BGS000", grism_angle=0.0)
-        number = (self.dither - 1) % len(_GRISMS) + 1
+            return through_grism(self._one("NISP-S", BLUE, after), None, self.mission)
+        number = (self.dither - 1) % SETTINGS + 1
         angle = self.mission.value(f"survey.grism_angle_{number}", "deg")
-        grism = "RGS000" if np.cos(np.radians(angle)) > 0 else "RGS180"
-        return replace(self._one("NISP-S", RED, after), grism=grism, grism_angle=angle)
+        return through_grism(self._one("NISP-S", RED, after), angle, self.mission, f"survey.grism_angle_{number}")
 
     def _one(self, channel: str, band: str, after: float, seconds: float | None = None) -> Exposure:
         """One that begins `after` seconds of the dither's start;  seconds : it takes, None = the mission's."""

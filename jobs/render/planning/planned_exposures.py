@@ -1,6 +1,7 @@
 """One exposure as the planner lays it out, before it is a row of the table `exposures`.
 
 Exposure       what, where and when
+through_grism  with the grism whose spectra run at an angle
 table          exposures -> rows, with the sky, zero point and seeing of each
 """
 
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import pyarrow as pa
 
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
-from jobs.render.camera import detectors
+from jobs.render.camera import detectors, grism_wheel
 from jobs.render.channels import image_types
 from jobs.render.effects.charge import ramp
 from jobs.render.planning import unrendered
@@ -30,6 +31,8 @@ from lake_schema.tables.exposures import EXPOSURES
 
 # What two exposures have in common whose random numbers would be the same, of one request of an exploration.
 _ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd")
+# Grisms by the passband that they are used in.
+GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}
 _DARK_TYPES = ("bias", "dark", "charge_injection")
 # Columns that are counted here.
 _NUMBERS = ("exposure_id", "realisation")
@@ -75,6 +78,27 @@ def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[
     if not found:
         raise BadInput(f"channel {channel} has no camera {camera!r}")
     return found
+
+
+def through_grism(exposure: Exposure, angle: float | None, mission: MissionConfiguration, where: str = "") -> Exposure:
+    """An exposure with the grism of its band whose spectra run nearest to an angle; as it is without a grism.
+
+    angle : in the focal plane, deg, None = as the grism's own;  mission : the mission database
+    where : named in the refusal
+    Errors : BadInput for an angle without a grism, or one that no grism of the band is turned to
+    """
+    grisms = GRISMS.get(exposure.band, ())
+    if not grisms:
+        if angle is not None:
+            raise BadInput(f"{where}: no grism of {exposure.camera} is in the beam in {exposure.band}")
+        return exposure
+    angle, section = angle or 0.0, image_types.section(exposure.camera)
+    tilts = [abs(grism_wheel.tilt(grism, angle, section, mission)) for grism in grisms]
+    nearest = int(np.argmin(tilts))
+    if tilts[nearest] > grism_wheel.MOST_TURNED:
+        many = ", ".join(grisms)
+        raise BadInput(f"{where} = {angle:g} deg turns {many} by more than {grism_wheel.MOST_TURNED:g} deg")
+    return replace(exposure, grism=grisms[nearest], grism_angle=angle)
 
 
 def exposure_time(channel: str, camera: str, band: str, mission: MissionConfiguration) -> float:

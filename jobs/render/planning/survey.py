@@ -26,6 +26,7 @@ from jobs.render.planning.planned_exposures import (
     check_ramp,
     elapsed_time,
     exposure_time,
+    through_grism,
 )
 from jobs.render.sky.solar_aspect import check_aspect
 from jobs.request.area import Area
@@ -111,12 +112,11 @@ def _pointing(pointing: Pointing, where: str, request: Request, mission: Mission
     if seconds is None:
         seconds = exposure_time(pointing.channel, pointing.camera, pointing.band, mission)
     check_ramp(pointing.channel, pointing.camera, seconds, mission, where)
-    return Exposure(
+    found = Exposure(
         pointing.channel, pointing.camera, pointing.band, "science", ra, dec, angle, pointing.mjd, seconds,
         request.name, detectors=pointing.detectors,
-        grism="RGS000" if pointing.band == "nisp_red" else "BGS000" if pointing.band == "nisp_blue" else None,
-        grism_angle=0.0 if pointing.channel == "NISP-S" else None,
     )  # fmt: skip
+    return through_grism(found, pointing.grism_angle, mission, f"{where}.grism_angle")
 
 
 def known_detectors(camera: str, names: tuple[str, ...], mission: MissionConfiguration, where: str) -> None:

@@ -1,0 +1,193 @@
+"""Every kind of image that NISP-S takes, by the jobs: four settings of the red grisms, the blue one, calibrations."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from jobs import shell
+from jobs.catalogue import build_galaxies, build_stars
+from jobs.fluxes import compute_fluxes
+from jobs.render import masters, plan_exposures, render_exposures
+from jobs.render.products import read_back
+from jobs.request.from_toml import parse
+from lake_schema.errors import BadInput
+from lake_schema.store import layout, publish, read
+from tests import requests
+
+MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures)
+MJD, NX, NY = 60905.0, 640, 96
+POINTING = """
+[[pointing]]
+channel = "NISP-S"
+camera = "nisp"
+band = "{}"
+ra = 53.117
+dec = -27.808
+centre_on = "DET22"
+detectors = ["DET22"]
+mjd = {}
+{}
+"""
+BLOCK = """
+[[observation]]
+channels = ["NISP-S"]
+detectors = ["DET22"]
+exposures = 1
+mjd = {}
+image_type = {}
+"""
+ANGLES = (0.0, 184.0, -4.0, 180.0)
+REQUEST = f"""
+accuracy = "draft"
+[mission]
+overrides = {{"nisp.fpa.nx" = {{value = {NX}, unit = "pix"}}, "nisp.fpa.ny" = {{value = {NY}, unit = "pix"}}}}
+[sources]
+only = "table"
+band = "euclid_h"
+stars = "stars.csv"
+[products]
+truth = ["noise_free", "order_1", "order_0", "order_2", "order_m1", "saturation", "persistence", "cosmic_rays"]
+{"".join(POINTING.format("nisp_red", MJD + i, f"grism_angle = {angle}") for i, angle in enumerate(ANGLES))}
+{POINTING.format("nisp_blue", MJD + 4, "")}
+{BLOCK.format(MJD + 5, '"dark"')}
+{BLOCK.format(MJD + 6, '"flat"')}
+lamps = [4]
+{BLOCK.format(MJD + 7, '"standard_star"')}
+{BLOCK.format(MJD + 8, '"planetary_nebula"')}
+"""
+RED = [("science", "nisp_red", grism, angle) for grism, angle in zip(("RGS000", "RGS180") * 2, ANGLES, strict=True)]
+KINDS = [
+    *RED,
+    ("science", "nisp_blue", "BGS000", 0.0),
+    ("dark", "nisp_red", None, None),
+    ("flat", "nisp_red", "RGS000", 0.0),
+    *[("standard_star", "nisp_red", "RGS000", 0.0)] * 2,
+    *[("planetary_nebula", *row[1:]) for row in RED],
+]
+
+BLUE = '"NISP-S"\ncamera = "nisp"\nband = "nisp_blue"'
+PHOTOMETRIC = '"NISP-P"\ncamera = "nisp"\nband = "euclid_h"\ngrism_angle = 0.0'
+
+
+def wanted(folder, more="", replaced=("", "")):
+    (folder / "stars.csv").write_text("ra,dec,mag\n53.117,-27.808,15.0\n53.119,-27.807,18.0\n")
+    return parse(requests.written(folder, REQUEST.replace(*replaced) + more, requests.FIELD.format(0.7), seed=3))
+
+
+def made(root, request, modules=MODULES):
+    for module in modules:
+        for step in module.steps(root, request):
+            publish.make(root, step.plan, step.work)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("spectra")
+
+
+@pytest.fixture(scope="module")
+def rendered(folder):
+    root = layout.lake(folder / "lake")
+    made(root, wanted(folder))
+    return root
+
+
+def opened(root, content):
+    """Exposure -> the file's path, of a content."""
+    version = read.version(root, "products")
+    return {
+        row["exposure_id"]: version.file(row["path"]) for row in version.rows().to_pylist() if row["content"] == content
+    }
+
+
+def check(root):
+    files, light = opened(root, "science"), opened(root, "noise_free")
+    assert sorted(files) == list(range(1, len(KINDS) + 1))
+    for number, (kind, band, grism, angle) in enumerate(KINDS, start=1):
+        with fits.open(files[number]) as units:
+            header = units[0].header
+            assert (header["IMAGETYP"], header["FILTER"]) == (kind, band)
+            assert (header.get("GRISM"), header.get("GRISMPA")) == (grism, angle)
+            assert (header["READMODE"], header["NG"], header["NR"], header["ND"]) == ("MACC", 15, 16, 11)
+            assert [unit.name for unit in units[1:]] == ["DET22.SCI", "DET22.CHI2"]
+        median, stars = np.median(read_back.electrons(files[number]).data), fits.getdata(light[number])
+        least, most = {"dark": (-2, 30), "flat": (1e4, 6e4)}.get(kind, (200, 2000))
+        assert least < median < most
+        assert (stars.sum() > 1e4) == (kind not in ("dark", "flat"))
+    # No order of the star has light in the dark, nor of what shines on a screen.
+    assert set(opened(root, "order_1")) == set(files) - {6, 7}
+    spectra = read.version(root, "rendered_spectra").rows().to_pylist()
+    assert {row["exposure_id"] for row in spectra} == set(files) - {6, 7}
+
+
+def test_each_kind_is_planned_rendered_and_published(rendered):
+    check(rendered)
+
+
+def test_grisms_at_opposite_angles_disperse_to_opposite_sides_and_tilts_along_rows(rendered):
+    """The trace's direction on the detector is the angle that was asked for, less the wheel's 0.1 deg."""
+    rows = read.version(rendered, "rendered_spectra").rows().to_pylist()
+    brightest = {}
+    for row in rows:
+        if row["order"] == 1 and row["exposure_id"] <= len(ANGLES):
+            other = brightest.get(row["exposure_id"], row)
+            brightest[row["exposure_id"]] = max(row, other, key=lambda one: one["expected"])
+    found = {}
+    for number, row in brightest.items():
+        along, across = row["x_last"] - row["x_first"], row["y_last"] - row["y_first"]
+        found[number] = np.degrees(np.arctan2(across, along))
+        assert np.hypot(along, across) == pytest.approx(500.0, abs=40.0)
+    # A row of detectors may be upside down: angles are told from that of the first.
+    for number, angle in enumerate(ANGLES, start=1):
+        apart = (found[number] - found[1] - angle + 180.0) % 360.0 - 180.0
+        assert apart == pytest.approx(0.0, abs=0.7)
+
+
+@pytest.mark.nightly
+def test_by_spark_the_same_bytes(spark, rendered, tmp_path):
+    root = layout.lake(tmp_path / "lake")
+    for module in MODULES:
+        shell.run(module.JOB, root, wanted(tmp_path))
+    for name in ("products", "rendered_truth", "rendered_spectra"):
+        assert read.version(root, name).manifest == read.version(rendered, name).manifest
+        assert read.verify(read.version(root, name), deep=True) == []
+
+
+def test_no_masters_are_made_of_spectra(rendered, folder, capsys):
+    before = sorted(path for path in rendered.rglob("*") if path.is_file())
+    arguments = ["--lake", str(rendered), "--out", str(folder / "masters")]
+    assert masters.main(arguments) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "no frames of the image type bias" in line
+    assert sorted(path for path in rendered.rglob("*") if path.is_file()) == before
+
+
+def test_the_fluxes_that_sources_are_chosen_by_are_computed(rendered, folder):
+    """In H, though no exposure is taken in it."""
+    assert wanted(folder).bands == ("nisp_red", "nisp_blue", "euclid_h")
+    assert "f_nu_euclid_h" in read.version(rendered, "star_fluxes").schema.names
+
+
+@pytest.mark.parametrize(
+    ("replaced", "message"),
+    [
+        (("grism_angle = 184.0", "grism_angle = 90.0"), r"pointing\[1\]\.grism_angle = 90 deg turns RGS000, RGS180"),
+        (("grism_angle = -4.0", "grism_angle = nan"), r"pointing\[2\]\.grism_angle"),
+        ((BLUE, PHOTOMETRIC), r"pointing\[4\]\.grism_angle: no grism of nisp is in the beam in euclid_h"),
+    ],
+)
+def test_angles_that_no_grism_has_are_one_line_and_nothing_is_written(tmp_path, lake, replaced, message):
+    with pytest.raises(BadInput, match=message) as caught:
+        made(lake, wanted(tmp_path, replaced=replaced), (plan_exposures,))
+    assert "\n" not in str(caught.value)
+    assert list(lake.rglob("*.parquet")) == []
+
+
+def test_a_table_of_pointings_names_the_grism_by_its_angle(tmp_path):
+    (tmp_path / "some.csv").write_text("ra,dec,mjd,band,grism_angle\n53.117,-27.808,60905.0,nisp_red,184\n")
+    block = '[[observation]]\nchannels = ["NISP-S"]\npointings = "some.csv"\n'
+    request = parse(requests.written(tmp_path, block, requests.FIELD.format(1.0)))
+    _, exposures, _ = plan_exposures.plan(None, request)
+    (row,) = exposures.to_pylist()
+    assert (row["grism"], row["grism_angle"]) == ("RGS180", 184.0)
+    assert request.bands == ("nisp_red", "euclid_h")
