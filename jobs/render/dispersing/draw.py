@@ -158,9 +158,12 @@ def draw(
 
 
 def _slope(trace: Trace) -> float:
-    """Rows a column along the first order, at the middle of the detector: of all orders, but for their curvature."""
-    along, across = trace.polynomials(0.0, 0.0)
-    return float(across[1:].sum() / along[1:].sum())
+    """Rows a column along the first order, at the middle of the detector: of all orders, but for their curvature.
+
+    0 where light is not spread along the columns.
+    """
+    along, across = (float(part[1:].sum()) for part in trace.polynomials(0.0, 0.0))
+    return across / along if abs(along) > abs(across) else 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -19,6 +20,7 @@ FIRST, LAST = 12060, 18920
 NODES = images.nodes(FIRST, LAST, 3)
 
 
+@cache
 def psf(count=3):
     """NISP's, of a few wavelengths of the red grism."""
     return euclid.nisp_psf_at(DETECTOR, images.nodes(FIRST, LAST, count), MISSION, 4)

@@ -5,58 +5,11 @@ import pytest
 
 from benchmarks import _scenes as scenes
 from jobs.render.dispersing import draw, images, kernels
-from jobs.render.drawing import transfer
-from jobs.render.drawing.kernels import fourier
-from jobs.render.sources import galaxy_shapes, sersic
+from tests.jobs.render.dispersing import fine
 from tests.jobs.render.dispersing.made import FIRST, LAST, drawn, one, order, psf, trace
 
 WAVES = np.arange(float(FIRST), LAST + 1.0)
 FINE = draw.Settings(edge=1e-9, faint=0.0, along=3)
-
-
-def series(sources, spectrum, orders, through, shape):
-    """The frame of the only source by the Fourier series of its light, wavelength by wavelength: periodic, [ny, nx]."""
-    (ny, nx), fine = shape, 3
-    fy, fx = np.fft.fftfreq(ny * fine, 1.0 / (ny * fine)) / ny, np.arange(nx * fine // 2 + 1) / nx
-    planes, samples = through.planes, through.planes.samples
-    spectra = []
-    for image in (*planes.images, *planes.drift):
-        at = (np.arange(len(image)) - len(image) // 2) / samples
-        left, right = np.exp(-2j * np.pi * np.outer(fy, at)), np.exp(-2j * np.pi * np.outer(at, fx))
-        spectra.append(left @ image.astype(float) @ right)
-    nodes = planes.wavelength
-    own = [
-        np.tensordot(transfer.basis_weights(through, part[None], sources.column, sources.row)[0], spectra, 1)
-        for part in np.eye(len(nodes))
-    ]
-    total = np.zeros((len(fy), len(fx)), complex)
-    column, row = float(sources.column[0]), float(sources.row[0])
-    for part in orders:
-        x, y = part.trace.offsets(column, row, part.wavelength)
-        electrons, share = spectrum * part.response, images.shares(part.wavelength, nodes)
-        for i in np.flatnonzero(electrons):
-            turned = np.exp(-2j * np.pi * fy * (row + y[i]))[:, None] * np.exp(-2j * np.pi * fx * (column + x[i]))
-            total += electrons[i] * np.tensordot(share[i], own, 1) * turned
-    total *= np.sinc(fx) * np.sinc(fy)[:, None]
-    if sources.shape[0] >= 0:
-        total *= profile(sources, fx, fy)
-    return fine**2 * np.fft.irfft2(total, s=(ny * fine, nx * fine))[::fine, ::fine]
-
-
-def profile(sources, fx, fy):
-    shapes = sources.shapes.take(sources.shape)
-    form = galaxy_shapes.forms(shapes, sources.jacobian)
-    row, weights = sersic.row_of(shapes.sersic_index)
-    table = np.empty(sersic.table().shape[1], np.float32)
-    fourier.interpolate(sersic.table(), int(row[0]), weights[0], 0.0, 1e9, table)
-    out, square = np.ones((len(fy), len(fx)), np.float32), np.empty(len(fx), np.float32)
-    for line, f in zip(out, fy, strict=True):
-        fourier.profile_at(
-            float(shapes.bulge_fraction[0]), form.bulge[0], form.disk[0], form.thick[0], table,
-            (2 * np.pi * fx).astype(np.float32), np.full(len(fx), 2 * np.pi * f, np.float32), square,
-            square.view(np.int32), line,
-        )  # fmt: skip
-    return out
 
 
 def placed(seed, i, column, row, galaxies=4, stars=1):
@@ -80,12 +33,12 @@ def test_spectra_are_the_series_of_every_wavelength(i, slope):
     source, through, short = placed(8, i, 47.3, 33.6), psf(), trace((-10.0, 64.0), slope)
     spectrum = continuum_and_line(3000.0)
     shape = (72, 160)
-    wanted = series(source, spectrum, [order(short)], through, shape)
+    wanted = fine.series(source, spectrum, [order(short)], fine.Seen.of(through, shape))
     settings = draw.Settings(edge=1e-9, faint=0.0, least=64)
     found = drawn(source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, settings)
     assert np.abs(found - wanted).max() < 5e-3 * wanted.max()
-    fine = drawn(source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, FINE)
-    assert np.abs(fine - wanted).max() < 1.5e-3 * wanted.max()
+    finely = drawn(source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, FINE)
+    assert np.abs(finely - wanted).max() < 1.5e-3 * wanted.max()
 
 
 def test_laying_keeps_the_total_and_the_mean_of_a_line():

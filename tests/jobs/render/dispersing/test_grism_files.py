@@ -1,7 +1,7 @@
 """Files of a grism, as grismconf reads them."""
 
+import grismconf
 import numpy as np
-import pytest
 
 from jobs.render.camera import traces
 from jobs.render.camera.detectors import detector, detectors
@@ -14,7 +14,6 @@ DETECTOR = detector("nisp", "DET23", MISSION)
 
 
 def test_grismconf_reads_the_same_places(tmp_path):
-    grismconf = pytest.importorskip("grismconf")
     for grism, tilt, one in (("RGS000", 0.0, DETECTOR), ("RGS180", 4.0, detectors("nisp", MISSION)[-1])):
         found = traces.traces(grism, tilt, one, MISSION)
         orders = [Order(trace, 12060, np.full(6861, 3.0)) for trace in found]

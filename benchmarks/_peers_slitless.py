@@ -1,0 +1,164 @@
+"""What slitlessutils makes of the same sources and the same grism: light along the traces, and the time of each."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import _scenes as scenes
+from jobs.accuracy import SURVEY
+from jobs.fluxes import passbands
+from jobs.render.camera import traces
+from jobs.render.camera.detectors import detector
+from jobs.render.dispersing import draw, grism_files, images
+from jobs.render.dispersing.draw import Dispersed, Order
+from jobs.render.psf import euclid
+from jobs.render.psf.model import Psf
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Float
+from lake_schema.mission.configuration import resolve
+
+# Names the Python of an environment with slitlessutils, which wants an older numpy than this one's.
+VARIABLE = "TRUESKY_SLITLESSUTILS"
+_HOW = "python3.11 -m venv PEERS; PEERS/bin/pip install slitlessutils==1.0.0 'numpy<2.4'"
+_CHILD = Path(__file__).with_name("_slitlessutils.py")
+# Wavelengths a pixel, as its modules take by default; pixels of a stretch that fluxes are compared in; noise, e-.
+_SUBSAMPLES, _STRETCH, _NOISE = 5, 64, 28.0
+_SHAPE, _SIDE = (2040, 2040), 40
+
+
+def slitlessutils_figures(count: int = 4, seed: int = 7) -> dict[str, float]:
+    """CPU s a spectrum of ours and of slitlessutils', and by how much light differs in stretches of a first order.
+
+    count, seed : stars and galaxies, half of each, on DET23 in the red grism
+    Errors      : SystemExit where there is no slitlessutils
+    """
+    python = _python()
+    order, through = _grism()
+    some = _sources(count, seed)
+    spectrum = _spectrum(order)
+    ours, seconds = _timed(some, order, through, spectrum)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        configuration = grism_files.write(folder, "RGS000", [order], _SHAPE, 1.0)
+        theirs, their_seconds = _child(python, folder, configuration, *_given(some, order, through, spectrum))
+    differ = _differences(some, order, ours, theirs)
+    return {
+        "spectrum_s": seconds / count,
+        "slitlessutils_spectrum_s": their_seconds / count,
+        "against_slitlessutils": their_seconds / seconds,
+        "slitlessutils_flux": float(np.abs(differ).max()),
+    }
+
+
+def _python() -> str:
+    python = os.environ.get(VARIABLE, "")
+    if not python or subprocess.run([python, "-c", "import pypolyclip"], check=False, capture_output=True).returncode:
+        raise SystemExit(f"no slitlessutils: {VARIABLE} must name a Python that has it ({_HOW})")
+    return python
+
+
+def _grism() -> tuple[Order, Psf]:
+    """The red grism's first order, and the PSF through it."""
+    mission, band = resolve(), passbands.load("nisp_red")
+    seen = detector("nisp", "DET23", mission)
+    trace = next(one for one in traces.traces("RGS000", 0.0, seen, mission) if one.order == 1)
+    part = (band.wavelength >= trace.first) & (band.wavelength <= trace.last)
+    # Electrons for each erg s-1 cm-2 A-1: of a scale that its limit of sensitivity, 1e10, is small beside.
+    response = (band.response * band.wavelength)[part] * 1e12
+    nodes = images.nodes(trace.first, trace.last, 3)
+    return Order(trace, int(band.wavelength[part][0]), response), euclid.nisp_psf_at(seen, nodes, mission, 4)
+
+
+def _sources(count: int, seed: int) -> Sources:
+    """Apart from each other, with their first orders on the detector."""
+    some = scenes.sources(scenes.NISP, seed, galaxies=40, stars=count - count // 2)
+    small = np.flatnonzero(scenes.magnitudes(some, scenes.NISP)[:40] > 21.0)[: count // 2]
+    some = some.take(np.concatenate([small, 40 + np.arange(count - count // 2)]))
+    rng = np.random.default_rng(seed)
+    column, row = 900.0 + rng.uniform(0.0, 1.0, count), 200.0 + 100.0 * np.arange(count) + rng.uniform(0.0, 1.0, count)
+    return replace(some, column=column, row=row, electrons=np.ones(count))
+
+
+def _spectrum(order: Order) -> Float:
+    """float64[w] f_lambda with two lines, of a million electrons of the order."""
+    waves = order.wavelength
+    flux = (waves / 15000.0) ** -1.5
+    for centre in (13500.0, 16600.0):
+        flux += 5.0 * np.exp(-0.5 * ((waves - centre) / 8.0) ** 2)
+    return np.asarray(flux * 1e6 / float((flux * order.response).sum()))
+
+
+def _timed(some: Sources, order: Order, through: Psf, spectrum: Float) -> tuple[Float, float]:
+    """(frame, the best CPU s of three)."""
+    of, best = spectrum.astype(np.float32), np.inf
+    dispersed = Dispersed(lambda which: np.tile(of, (len(which), 1)), (order,), draw.settings_for(SURVEY))
+    for _ in range(4):
+        start = time.process_time()
+        frame = draw.draw(some, dispersed, through, _SHAPE, _NOISE)
+        best = min(best, time.process_time() - start)
+    return frame, best
+
+
+def _given(some: Sources, order: Order, through: Psf, spectrum: Float) -> tuple[Float, Float, Float, Float]:
+    """(images through the PSF [n, side, side], their corners, wavelengths, f_lambda [n, v]) for the others."""
+    still = replace(order.trace, x=np.zeros((2, 3)), y=np.zeros((2, 3)))
+    whole = Order(still, order.first, order.response / float((spectrum * order.response).sum()))
+    of, found, corners = spectrum.astype(np.float32), [], []
+    for i in range(len(some)):
+        one = some.take(np.array([i]))
+        # The frame is no larger: its PSF is that of where the source lies, to a part in a thousand.
+        corner = np.floor([one.column[0], one.row[0]]).astype(int) - _SIDE // 2
+        moved = replace(one, column=one.column - corner[0], row=one.row - corner[1])
+        settings = replace(draw.settings_for(SURVEY), least=_SIDE, edge=1e-9, faint=0.0)
+        seen = Dispersed(lambda which: np.tile(of, (len(which), 1)), (whole,), settings)
+        found.append(draw.draw(moved, seen, through, (_SIDE, _SIDE), 1.0))
+        corners.append(corner)
+    step = (order.trace.last - order.trace.first) / 512.0 / _SUBSAMPLES
+    waves = np.arange(order.trace.first + 0.5 * step, order.trace.last, step)
+    # The mean of each step: lines are as bright.
+    edges = np.concatenate([[0.0], np.cumsum(spectrum)])
+    at = [np.interp(waves + side * step - order.first + 0.5, np.arange(len(edges)), edges) for side in (-0.5, 0.5)]
+    flux = (at[1] - at[0]) / step
+    return np.array(found), np.array(corners), waves, np.tile(flux, (len(some), 1))
+
+
+def _child(
+    python: str, folder: Path, configuration: Path, stamps: Float, corners: Float, waves: Float, spectra: Float
+) -> tuple[Float, float]:
+    given, out = folder / "given.npz", folder / "out.npz"
+    np.savez(given, images=stamps, corners=corners, waves=waves, spectra=spectra, shape=np.array(_SHAPE))
+    environment = {**os.environ, "HOME": str(folder), "OMP_NUM_THREADS": "1"}
+    subprocess.run(
+        [python, str(_CHILD), str(configuration), str(given), str(out)],
+        check=True,
+        env=environment,
+        capture_output=True,
+    )
+    with np.load(out) as read:
+        return np.asarray(read["frame"]), float(read["seconds"])
+
+
+def _differences(some: Sources, order: Order, ours: Float, theirs: Float) -> Float:
+    """[n, stretches] of light within half a stamp of each trace, of ours."""
+    found = []
+    for column, row in zip(some.column.tolist(), some.row.tolist(), strict=True):
+        x, y = order.trace.offsets(column, row, np.array([order.trace.first, order.trace.last]))
+        low = round(row + float(y.mean())) - _SIDE // 2
+        left = int(column + x[0])
+        edges = np.arange(left, int(column + x[1]), _STRETCH)
+        sums = [
+            np.add.reduceat(frame[low : low + _SIDE].sum(axis=0), edges)[:-1] for frame in (ours, theirs)
+        ]  # fmt: skip
+        found.append(sums[1] / sums[0] - 1.0)
+    return np.array(found)
+
+
+if __name__ == "__main__":
+    print(slitlessutils_figures())
