@@ -56,8 +56,9 @@ def notebooks(into: Path, run: bool) -> list[str]:
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
         if run:
-            # Those that look at a field look at that of `make demo`, which it has rendered.
-            demo = {} if "shear" in path.stem else {"TRUESKY_REQUEST": str(_DEMO), "TRUESKY_LAKE": str(_DEMO_LAKE)}
+            # Those that look at a field look at that of `make demo`, which it has rendered; others make their own.
+            own = path.stem.endswith(("shear", "slitless"))
+            demo = {} if own else {"TRUESKY_REQUEST": str(_DEMO), "TRUESKY_LAKE": str(_DEMO_LAKE)}
             client = NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}})
             client.execute(env={**os.environ, **demo})
         text, resources = MarkdownExporter().from_notebook_node(notebook)

@@ -1,5 +1,6 @@
-"""Notebooks that render: a field of small detectors, and the shear of known galaxies; they show what they say."""
+"""Notebooks that render: a field of small detectors, the shear of known galaxies, spectra; they show what they say."""
 
+import re
 from pathlib import Path
 
 import nbformat
@@ -54,6 +55,23 @@ detectors = ["DET22"]
 """
 )  # fmt: skip
 
+# The shipped field of spectra, its detector cut to a strip; without VIS, faint stars and some of the faint galaxies.
+SPECTRA = (NOTEBOOKS.parent / "requests" / "slitless.toml").read_text()
+STRIP = re.sub(r"# Twice.*?\n\n", "", SPECTRA, flags=re.DOTALL)
+for usual, small in (
+    ("galaxy_limit = 25.5", "galaxy_limit = 24.0"), ("star_limit = 25.0", "star_limit = 16.0"),
+    ("lensing_nside = 256", "lensing_nside = 64"),
+    ("[products]", '[mission.overrides]\n"nisp.fpa.nx" = { value = 760, unit = "pix" }\n'
+     '"nisp.fpa.ny" = { value = 160, unit = "pix" }\n[products]'),
+):  # fmt: skip
+    assert STRIP.count(usual) == 1
+    STRIP = STRIP.replace(usual, small)
+
+
+def printed(outputs):
+    """What cells print."""
+    return "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
+
 
 def run(monkeypatch, name, **environment):
     """The outputs of a notebook's cells."""
@@ -72,7 +90,7 @@ def test_the_shear_of_known_galaxies_is_measured_as_in_galsim_s_images(tmp_path,
     """The renderer's own m and c, less GalSim's, are within what each accuracy allows."""
     outputs = run(monkeypatch, "04_measure_shear", TRUESKY_LAKE=tmp_path / "shear")
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 1
-    text = "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
+    text = printed(outputs)
     rows = [line.split() for line in text.partition("less GalSim, without noise")[2].splitlines() if line]
     found = {name: [float(value) for value in values[::3]] for name, *values in rows}
     assert list(found) == ["quicklook", "survey"]
@@ -100,3 +118,37 @@ def test_every_cell_runs(tmp_path, monkeypatch, request_text):
     ]
     assert any("'tasks': 2, 'products': 2" in text for text in texts)
     assert 10_000 < (tmp_path / "field.jpg").stat().st_size < 500_000
+
+
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.nightly)], ids=["strip", "detector"])
+def test_redshifts_and_fluxes_of_lines_are_those_of_the_catalogue(tmp_path, monkeypatch, whole):
+    """Of the shipped field those that are claimed; in a strip of it every cell runs."""
+    (tmp_path / "spectra.toml").write_text(SPECTRA if whole else STRIP)
+    outputs = run(
+        monkeypatch,
+        "05_slitless",
+        TRUESKY_REQUEST=tmp_path / "spectra.toml",
+        TRUESKY_LAKE=tmp_path / "lake",
+        TRUESKY_PICTURE=tmp_path / "spectra.jpg",
+    )
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
+    assert 10_000 < (tmp_path / "spectra.jpg").stat().st_size < 150_000
+    text = printed(outputs)
+    emitters = int(re.search(r"(\d+) galaxies with H alpha", text)[1])
+    seen, claimed, right = map(
+        int, re.search(r"(\d+) galaxies in all 4 .* (\d+) claimed, (\d+) of them right", text).groups()
+    )
+    assert 0 <= right <= claimed <= seen <= emitters
+    if not whole:
+        assert emitters >= 3
+        return
+    assert claimed >= 50
+    assert right >= 0.93 * claimed
+    offset, scatter, flux, snr = (
+        float(re.search(rf"{name} ([-+.\de]+)", text)[1])
+        for name in ("median", "scatter", "measured / true", "exposures:")
+    )
+    assert abs(offset) < 2e-4
+    assert scatter < 4e-4
+    assert flux == pytest.approx(1.0, abs=0.06)
+    assert snr == pytest.approx(1.0, abs=0.2)
