@@ -2,6 +2,7 @@
 
 Chart       what is counted of which columns
 counted     all charts in one pass over kept columns
+points      some of the rows that count in a chart
 span        a range that holds nearly all of a column
 
 A row counts in a chart if it lies within the limits of every column that is not the chart's own, and within the
@@ -29,6 +30,8 @@ _MOST_AXES = 3
 _SPARSE = 4
 # Rows that tell a span, and the part of them that may lie outside on each side.
 _LOOKED_AT, _OUTSIDE = 200_000, 2e-3
+# Rows that are looked at for a point, at first.
+_LOOKED_AT_A_POINT = 8
 
 Limits = Mapping[int, tuple[float, float]]
 
@@ -162,6 +165,35 @@ def _count(
                 found[cell[i]] += 1
             for m in range(cells):
                 counts[starts[k] + m] += found[m]
+
+
+def points(columns: Sequence[Float32], chart: Chart, limits: Limits, most: int) -> tuple[Float32, int]:
+    """(float32[n, axes] places of rows that count in a chart, n <= most; one row in how many was looked at).
+
+    columns, limits : as of `counted`;  chart : which;  most : how many points at most, > 0
+    All rows that count where they are no more; else rows at equal steps, the step a power of two.
+    """
+    own = frozenset(chart.columns) if chart.own is None else chart.own
+    bounds = [(column, limit) for column, limit in limits.items() if column not in own]
+    bounds += zip(chart.columns, chart.spans, strict=True)
+    step = 1
+    # Of many rows few are looked at, and more only where these are not enough.
+    while len(columns[0]) > step * most * _LOOKED_AT_A_POINT:
+        step *= 2
+    while True:
+        some = [column[::step] for column in columns]
+        inside = np.ones(len(some[0]), bool)
+        for column, (low, high) in bounds:
+            inside &= (some[column] >= _single(low, up=True)) & (some[column] <= _single(high, up=False))
+        found = np.flatnonzero(inside)
+        if step == 1 or 2 * len(found) > most:
+            break
+        step //= 2
+    while len(found) > most:
+        step *= 2
+        found = found[found % 2 == 0] // 2
+        some = [column[::2] for column in some]
+    return np.stack([some[column][found] for column in chart.columns], axis=1), step
 
 
 def span(column: Float32) -> tuple[float, float]:

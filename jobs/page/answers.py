@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import struct
 import time
 from typing import Any
 
@@ -13,6 +14,7 @@ from aiohttp import web
 
 from jobs.page.opened import Lake
 from lake_schema import __version__
+from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
 from lake_schema.store import read
 
@@ -103,3 +105,11 @@ def plain(value: object) -> Any:
 def answer(found: object) -> web.Response:
     """JSON."""
     return web.Response(text=json.dumps(found, allow_nan=False), content_type="application/json")
+
+
+def packed(head: Json, *arrays: Array) -> bytes:
+    """4 bytes: length of the head, which is JSON; the head; the arrays as they are, little-endian."""
+    text = json.dumps(head).encode()
+    # What follows begins at a multiple of four bytes.
+    text += b" " * (-len(text) % 4)
+    return b"".join([struct.pack("<I", len(text)), text, *(array.tobytes() for array in arrays)])

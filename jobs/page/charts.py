@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
-import struct
 from typing import Any
 
 import numpy as np
@@ -12,6 +10,7 @@ import numpy as np
 from jobs.explore import columns, counting
 from jobs.explore.columns import Selection
 from jobs.explore.counting import Chart
+from jobs.page.answers import packed
 from jobs.page.opened import Lake
 from lake_schema import tables as declarations
 from lake_schema.arrays import Float32
@@ -20,16 +19,17 @@ from lake_schema.errors import BadInput
 # Rows a core that are counted at every move; of more a part is counted first.
 ROWS_A_CORE = 25_000_000
 PART = 64
-_MOST_AXES, _MOST_CHARTS = 16, 16
+_MOST_AXES, _MOST_CHARTS, MOST_POINTS = 16, 16, 20_000
 Json = dict[str, Any]
 
 
 async def counts(lake: Lake, question: Json) -> bytes:
-    """4 bytes: length of the head; the head, JSON; then the counts of every chart, uint32, first axis slowest.
+    """4 bytes: length of the head; the head, JSON; then the counts of every chart, uint32, first axis slowest; then of
+    every chart that wants them points, float32 [n, axes].
 
     question : source, where; axes, each an expression; charts, each with axes (numbers), bins, spans (or null) and,
-               if need be, own (numbers of axes whose limits do not hold in it); limits, [axis, lowest, highest] each;
-               part, one row in so many, or null
+               if need be, own (numbers of axes whose limits do not hold in it) and points (how many at most); limits,
+               [axis, lowest, highest] each; part, one row in so many, or null
     """
     source, where = str(question.get("source", "")), str(question.get("where") or "true")
     axes = [str(axis) for axis in question.get("axes", ())]
@@ -73,6 +73,7 @@ def _counted(lake: Lake, held: list[Float32], question: Json, part: int) -> byte
     try:
         spans = [counting.span(column) for column in held]
         charts = [_chart(chart, spans) for chart in question["charts"]]
+        most = [min(max(int(chart.get("points") or 0), 0), MOST_POINTS) for chart in question["charts"]]
         limits = {int(axis): (float(lo), float(hi)) for axis, lo, hi in question.get("limits") or ()}
         if any(not 0 <= axis < len(held) for axis in [*limits, *(axis for chart in charts for axis in chart.columns)]):
             raise BadInput("charts: an axis has no expression")
@@ -81,19 +82,19 @@ def _counted(lake: Lake, held: list[Float32], question: Json, part: int) -> byte
     rows = len(held[0])
     threads = lake.threads if rows > 1_000_000 else 1
     found = counting.counted(held, charts, limits, threads) if rows else [np.zeros(c.bins, np.int64) for c in charts]
+    sampled = [counting.points(held, chart, limits, n) if n else None for chart, n in zip(charts, most, strict=True)]
+    scattered = [one[0] for one in sampled if one is not None]
     head = {
         "rows": rows,
         "part": part,
         "missing": [int(rows - np.count_nonzero(np.isfinite(column))) for column in held],
         "charts": [
             {"axes": chart.columns, "bins": chart.bins, "spans": chart.spans, "total": int(counts.sum())}
-            for chart, counts in zip(charts, found, strict=True)
+            | ({} if one is None else {"points": len(one[0]), "points_part": one[1]})
+            for chart, counts, one in zip(charts, found, sampled, strict=True)
         ],
     }
-    text = json.dumps(head).encode()
-    # What follows begins at a multiple of four bytes.
-    text += b" " * (-len(text) % 4)
-    return b"".join([struct.pack("<I", len(text)), text, *(counts.astype("<u4").tobytes() for counts in found)])
+    return packed(head, *(counts.astype("<u4") for counts in found), *(points.astype("<f4") for points in scattered))
 
 
 def _chart(asked: Json, spans: list[tuple[float, float]]) -> Chart:

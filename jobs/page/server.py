@@ -183,6 +183,12 @@ async def _cutout(lake: Lake, request: web.Request) -> web.StreamResponse:
     return _bytes(await asyncio.to_thread(sources.cutout, lake, _whole(request, "number"), float(x), float(y)))
 
 
+async def _strip(lake: Lake, request: web.Request) -> web.StreamResponse:
+    order = _numbers(request, "order")
+    number, source = _whole(request, "number"), request.match_info["id"]
+    return _bytes(await asyncio.to_thread(sources.strip, lake, number, source, int(order[0])))
+
+
 async def _nearest(lake: Lake, request: web.Request) -> web.StreamResponse:
     ra, dec, radius = _view(request)
     return answers.answer(await asyncio.to_thread(sources.nearest, lake, float(ra), float(dec), min(radius, 1.0)))
@@ -213,6 +219,7 @@ _ROUTES: tuple[tuple[str, str, Answer], ...] = (
     ("GET", "tile/{number}/{level}/{row}/{column}", _tile),
     ("GET", "truth/{number}", _told(pictures.truth, "number")),
     ("GET", "cutout/{number}", _cutout),
+    ("GET", "trace/{number}/{id}", _strip),
     ("GET", "nearest", _nearest),
     ("GET", "source/{id}", _told(sources.source, "id")),
     ("GET", "spectrum/{id}", _told(sources.spectrum, "id")),

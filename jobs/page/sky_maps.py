@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
-import struct
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from jobs.page.answers import is_catalogue
+from jobs.page.answers import is_catalogue, packed
 from jobs.page.opened import Lake
 from jobs.render import archive
 from jobs.render import coverage as coverage_maps
@@ -162,10 +160,7 @@ def _ranges(cells: Int, order: int, most: int = 24) -> list[tuple[int, int]]:
 
 
 def _packed(corners: Float, density: Float, head: Json) -> bytes:
-    text = json.dumps({**head, "cells": len(density)}).encode()
-    text += b" " * (-len(text) % 4)
-    arrays = (np.asarray(corners, "<f4"), np.asarray(density, "<f4"))
-    return b"".join([struct.pack("<I", len(text)), text, *(array.tobytes() for array in arrays)])
+    return packed({**head, "cells": len(density)}, np.asarray(corners, "<f4"), np.asarray(density, "<f4"))
 
 
 # ------------------------------------------------------------------------------------------------ footprints

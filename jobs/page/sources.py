@@ -1,4 +1,4 @@
-"""One source: its rows, its spectrum as it is observed, where it was drawn, and small pictures of it."""
+"""One source: its rows, its spectrum as it is observed, where it was drawn and dispersed, and small pictures of it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.polynomial import polynomial
 
 from jobs.fluxes import band_fluxes, inputs, passbands
 from jobs.fluxes.spectra import lines
 from jobs.page import pictures
-from jobs.page.answers import plain
+from jobs.page.answers import packed, plain
 from jobs.page.opened import Lake
 from lake_schema import ids, sky
 from lake_schema.errors import BadInput, LakeError
@@ -20,6 +22,8 @@ _TABLES = {**{kind: ("galaxies", "galaxy_fluxes") for kind in range(5)}, 5: ("st
 # A spectrum is shown at so many wavelengths.
 _SAMPLES = 2400
 _CUTOUT = 64
+# Rows on each side of a trace that are shown of it, pixels; places along it at most.
+_BESIDE, _LONGEST = 12, 4096
 Json = dict[str, Any]
 
 
@@ -30,7 +34,7 @@ def source(lake: Lake, text: str) -> Json:
     """
     identifier = _identifier(text)
     kind = int(ids.kind_of(np.array([identifier]))[0])
-    found: Json = {"id": text, "kind": pictures.KINDS.get(kind, str(kind)), "tables": {}, "drawn": []}
+    found: Json = {"id": text, "kind": pictures.KINDS.get(kind, str(kind)), "tables": {}, "drawn": [], "spectra": []}
     for table in _TABLES.get(kind, ()):
         for version in lake.named(table):
             if (rows := _rows(version, identifier)).num_rows:
@@ -45,11 +49,40 @@ def source(lake: Lake, text: str) -> Json:
             for number, x, y in pictures.covering(lake, ra, dec)
         ]
     for version in lake.named("rendered_truth"):
-        drawn = version.rows(where=pa.compute.field("id") == identifier)
+        drawn = version.rows(where=pc.field("id") == identifier)
         found["drawn"] += [{key: plain(value) for key, value in row.items()} for row in drawn.to_pylist()]
+    for version in lake.named("rendered_spectra"):
+        traces = version.rows(where=pc.field("id") == identifier).to_pylist()
+        found["spectra"] += [_trace(lake, row, found["tables"].get("galaxies", [])) for row in traces]
     if not found["tables"] and not found["drawn"]:
         raise BadInput(f"the lake has no source {text}")
     return found
+
+
+def _trace(lake: Lake, row: Json, galaxy: list[Json]) -> Json:
+    """A row of `rendered_spectra`: the images that hold it, and its lines by name.
+
+    galaxy : facts of its row in the catalogue, none of other sources
+    """
+    place = row["exposure_id"], row["detector"]
+    known = pictures.pictures(lake)
+    numbers = [k for k, one in enumerate(known) if (one.row["exposure_id"], one.row["detector"]) == place]
+    z = next((float(fact["value"]) for fact in galaxy if fact["name"] == "z_obs"), 0.0)
+    about = known[numbers[0]].row if numbers else {"channel": "", "band": ""}
+    columns = [row.pop(f"line_{name}") for name in ("wavelength", "expected", "snr")]
+    return {key: plain(value) for key, value in row.items()} | {
+        "channel": about["channel"],
+        "band": about["band"],
+        "images": {known[k].row["content"]: k for k in numbers},
+        "lines": [
+            {"name": _line_at(wavelength / (1.0 + z)), "wavelength": wavelength, "expected": light, "snr": plain(snr)}
+            for wavelength, light, snr in zip(*columns, strict=True)
+        ],
+    }
+
+
+def _line_at(wavelength: float) -> str:
+    return min(lines.line_list(), key=lambda line: abs(line.vacuum - wavelength)).name
 
 
 def _identifier(text: str) -> int:
@@ -62,9 +95,9 @@ def _rows(version: read.Version, identifier: int) -> pa.Table:
     """The row of a source: of the files only that of its cell is read."""
     cell = identifier >> ids.BLOCK_BITS & ((1 << 2 * ids.GENERATION_ORDER + 4) - 1)
     rows = version.in_cells([int(sky.parent(cell, ids.GENERATION_ORDER, ids.FILE_ORDER))], ids.FILE_ORDER)
-    rows = rows.filter(pa.compute.equal(rows["id"], identifier))
+    rows = rows.filter(pc.equal(rows["id"], identifier))
     # A lensed source, or one at a cell's edge, may lie in a neighbour's file.
-    return rows if rows.num_rows else version.rows(where=pa.compute.field("id") == identifier)
+    return rows if rows.num_rows else version.rows(where=pc.field("id") == identifier)
 
 
 def _facts(rows: pa.Table) -> list[Json]:
@@ -151,6 +184,37 @@ def cutout(lake: Lake, number: int, x: float, y: float) -> bytes:
     piece = image[top : max(row + _CUTOUT, 0), left : max(column + _CUTOUT, 0)]
     out[top - row : top - row + piece.shape[0], left - column : left - column + piece.shape[1]] = piece
     return out.tobytes()
+
+
+def strip(lake: Lake, number: int, text: str, order: int) -> bytes:
+    """Pixels along the trace of a source's order: 4 bytes, the length of the head; the head, JSON; float32 [rows, n].
+
+    number : of the image;  text : identifier of the source, decimal;  order : of the grism
+    The head has rows and columns, and the wavelengths of the first and the last column, angstrom. Each value is that
+    of the pixel nearest to the place, NaN beyond the image; rows go across the trace, its own in the middle.
+    """
+    one = pictures.picture(lake, number)
+    place = {"exposure_id": one.row["exposure_id"], "detector": one.row["detector"], "order": order}
+    wanted = pc.field("id") == _identifier(text)
+    for name, value in place.items():
+        wanted = wanted & (pc.field(name) == value)
+    found = [row for version in lake.named("rendered_spectra") for row in version.rows(where=wanted).to_pylist()]
+    if not found:
+        raise BadInput(f"image {number} has no order {order} of source {text}")
+    x, y = (np.array(found[0][f"trace_{axis}"]) for axis in "xy")
+    image = one.levels(mended=True)[0]
+    t = np.linspace(0.0, 1.0, int(np.clip(np.hypot(x[1:].sum(), y[1:].sum()) + 1.0, 2, _LONGEST)))
+    along = np.stack([polynomial.polyval(t, polynomial.polyder(part)) for part in (x, y)])
+    along /= np.maximum(np.hypot(*along), 1e-12)
+    away = np.arange(-_BESIDE, _BESIDE + 1)[:, None]
+    column = np.rint(polynomial.polyval(t, x) - away * along[1]).astype(int)
+    row = np.rint(polynomial.polyval(t, y) + away * along[0]).astype(int)
+    inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
+    out = np.full(column.shape, np.nan, "<f4")
+    out[inside] = image[row[inside], column[inside]]
+    ends = {"first": found[0]["wavelength_first"], "last": found[0]["wavelength_last"]}
+    head = {"rows": out.shape[0], "columns": out.shape[1], **ends}
+    return packed(head, out)
 
 
 def nearest(lake: Lake, ra: float, dec: float, radius: float) -> Json:

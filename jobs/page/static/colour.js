@@ -43,6 +43,21 @@ export function bar(name, low, high, title) {
   return [words, canvas, ends];
 }
 
+/** Pixels [height][width], the first row at the bottom, from their sky to their brightest: asinh, gray. */
+export function stretched(pixels, width, height) {
+  const sorted = pixels.filter(Number.isFinite).sort(), at = (share) => sorted[Math.floor(share * (sorted.length - 1))] ?? 0;
+  const sky = at(0.5), noise = Math.max(sky - at(0.16), 1e-6 * Math.abs(at(1)), 1e-9), top = Math.max(at(0.9995), sky + 8 * noise);
+  const colours = lut("gray"), image = new ImageData(width, height);
+  for (let row = 0; row < height; row++) {
+    for (let column = 0; column < width; column++) {
+      const value = pixels[row * width + column], share = Math.asinh((value - sky + 1.5 * noise) / (3 * noise)) / Math.asinh((top - sky + 1.5 * noise) / (3 * noise));
+      const k = Number.isFinite(value) ? 4 * Math.round(255 * Math.min(1, Math.max(0, share))) : 0;
+      image.data.set(colours.subarray(k, k + 4), 4 * ((height - 1 - row) * width + column));
+    }
+  }
+  return image;
+}
+
 /** A shader program. */
 export function program(gl, vertex, fragment) {
   const made = gl.createProgram();

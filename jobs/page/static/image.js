@@ -6,6 +6,7 @@ import { pin, pinned, onPin } from "/static/pin.js";
 import { colourOf, compass, radiusOf, scaleOf } from "/static/marks.js";
 import { Plate } from "/static/sphere.js";
 import { Tiles } from "/static/tiles.js";
+import { drawTraces, use } from "/static/trace.js";
 
 const $ = (id) => document.getElementById(id);
 const VERTEX = `in vec2 corner; uniform mat3 toScreen; uniform vec4 box; out vec2 at;
@@ -68,6 +69,11 @@ export function start(given) {
   canvas.addEventListener("pointerdown", (event) => (from = [event.clientX, event.clientY]));
   canvas.addEventListener("click", (event) => Math.hypot(event.clientX - from[0], event.clientY - from[1]) < 4 && pinAt(...pixelAt(event)));
   onPin(redraw);
+  use({ show: async (number, x, y) => {
+    await choose(number).catch((error) => api.say(error.message, true));
+    Object.assign(view, { x, y, zoom: Math.max(1, view.zoom) });
+    redraw();
+  } });
 }
 
 /** Show an image at a place of the sky, deg. */
@@ -236,6 +242,7 @@ function marks() {
     }
     c.stroke();
   }
+  if (pinned()) drawTraces(c, pinned(), image, at);
   compass(c, image, view, at, [width, height]);
 }
 

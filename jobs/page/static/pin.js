@@ -1,7 +1,8 @@
 // One source: its rows, its spectrum with lines and passbands, its pictures, and where it was drawn.
 
 import * as api from "/static/api.js";
-import { ink, lut } from "/static/colour.js";
+import { ink, stretched } from "/static/colour.js";
+import { dispersed, use } from "/static/trace.js";
 
 const $ = (id) => document.getElementById(id);
 const SIDE = 64, SHOWN = ["ra", "dec", "ra_lensed", "dec_lensed", "z_obs", "z_true", "mag_r01", "abs_mag_r01", "color_gr_01", "log_stellar_mass", "log_sfr",
@@ -10,6 +11,7 @@ let source = null;
 const listeners = [];
 
 export const pinned = () => source;
+use({ line: named });
 export const onPin = (listener) => listeners.push(listener);
 
 export async function pin(id) {
@@ -20,8 +22,9 @@ export async function pin(id) {
   panel.append(api.h("div", { class: "bar" },
     api.h("button", { onclick: () => api.copy(source.id, "Identifier") }, "Copy id"),
     api.h("button", { onclick: () => api.copy(`SELECT * FROM ${Object.keys(source.tables)[0] ?? "rendered_truth"} WHERE id = ${source.id}`, "SQL") }, "Copy as SQL")));
-  const spectrum = api.h("div", {}), pictures = api.h("div", { class: "cutouts" });
+  const spectrum = api.h("div", {}), pictures = api.h("div", { class: "cutouts" }), grism = api.h("div", {});
   panel.append(spectrum, api.h("h3", {}, "Pictures, north up"), pictures);
+  if (api.lake.tables.some((table) => table.name.endsWith("rendered_spectra"))) panel.append(api.h("h3", {}, "Through the grism"), grism);
   for (const [name, rows] of Object.entries(source.tables)) {
     const first = rows.filter((row) => SHOWN.includes(row.name) || row.name.startsWith("f_nu_"));
     panel.append(api.h("h3", {}, name), facts(first.length ? first : rows.slice(0, 12)));
@@ -35,8 +38,11 @@ export async function pin(id) {
   const own = source;
   api.get(`spectrum/${id}`).then((found) => own === source && (found.said ? spectrum.append(api.h("p", { class: "quiet" }, `No spectrum: ${found.said}`)) : drawSpectrum(spectrum, found)),
     (error) => spectrum.append(api.h("p", { class: "quiet" }, error.message)));
-  cutouts(pictures, own);
+  cutouts(pictures, own).catch(failed);
+  dispersed(grism, own, () => own === source).catch(failed);
 }
+
+const failed = (error) => api.say(error.message, true);
 
 function facts(rows) {
   return api.table([{ name: "column", text: 1 }, { name: "value" }, { name: "unit", text: 1 }], rows.map((row) =>
@@ -47,34 +53,21 @@ async function cutouts(panel, own) {
   const list = await api.get("images");
   for (const { number, x, y, is_north_up: up } of own.images ?? []) {
     const about = list[number];
-    if (!["science", "noise_free"].includes(about.content)) continue;
+    // Through a grism nothing lies where it is.
+    if (!["science", "noise_free"].includes(about.content) || about.channel === "NISP-S") continue;
     const pixels = new Float32Array(await api.bytes(`cutout/${number}?${new URLSearchParams({ x, y })}`));
     if (own !== source) return;
     const canvas = api.h("canvas", { width: SIDE, height: SIDE, role: "img", "aria-label": `${about.band}, ${about.content}` });
-    canvas.getContext("2d").putImageData(stretched(up ? pixels : pixels.reverse()), 0, 0);
+    canvas.getContext("2d").putImageData(stretched(up ? pixels : pixels.reverse(), SIDE, SIDE), 0, 0);
     panel.append(api.h("figure", {}, canvas, api.h("figcaption", { class: "quiet" }, `${about.band} ${about.content.replace("_", " ")}`)));
   }
   if (!panel.childElementCount) panel.append(api.h("p", { class: "quiet" }, "No image holds its place."));
 }
 
-function stretched(pixels) {
-  const sorted = pixels.filter(Number.isFinite).sort(), at = (share) => sorted[Math.floor(share * (sorted.length - 1))] ?? 0;
-  const sky = at(0.5), noise = Math.max((sky - at(0.16)), 1e-6 * Math.abs(at(1)), 1e-9), top = Math.max(at(0.9995), sky + 8 * noise);
-  const colours = lut("gray"), image = new ImageData(SIDE, SIDE);
-  for (let row = 0; row < SIDE; row++) {
-    for (let column = 0; column < SIDE; column++) {
-      const value = pixels[row * SIDE + column], share = Math.asinh((value - sky + 1.5 * noise) / (3 * noise)) / Math.asinh((top - sky + 1.5 * noise) / (3 * noise));
-      const k = Number.isFinite(value) ? 4 * Math.round(255 * Math.min(1, Math.max(0, share))) : 0;
-      image.data.set(colours.subarray(k, k + 4), 4 * ((SIDE - 1 - row) * SIDE + column));
-    }
-  }
-  return image;
-}
-
 /** A line as it is written: halpha, nii_2 -> Hα, [N II]. */
 function named(name) {
-  const stem = name.split("_")[0];
-  return { halpha: "Hα", hbeta: "Hβ", oii: "[O II]", oiii: "[O III]", nii: "[N II]", sii: "[S II]" }[stem] ?? name;
+  return { halpha: "Hα", hbeta: "Hβ", hgamma: "Hγ", hdelta: "Hδ", paalpha: "Paα", pabeta: "Paβ", pagamma: "Paγ", padelta: "Paδ", oii: "[O II]", oiii: "[O III]",
+    nii: "[N II]", sii: "[S II]", siii: "[S III]", hei: "He I" }[name.split("_")[0]] ?? name;
 }
 
 /** f_lambda against wavelength, the passbands below it, its lines above. */

@@ -2,13 +2,13 @@
 // brush is held, the others are counted once for each of its pixels, and a move only adds up.
 
 import * as api from "/static/api.js";
-import { ink, lut } from "/static/colour.js";
+import { BOTTOM, LEFT, RIGHT, TOP, draw as drawChart } from "/static/chart.js";
 import { columnsOf, sources, suggested } from "/static/suggestions.js";
 
 const $ = (id) => document.getElementById(id);
 const BINS = 120, MAP_BINS = 96, CUBE_BINS = 256, CUBE_MAP_BINS = 32;
-const LEFT = 52, BOTTOM = 36, TOP = 8, RIGHT = 10;
-// charts: {axes: [{expression, log}], spans, brush: [[lo, hi], ...] | null, counts, whole, element ...}
+const MOST_POINTS = 20000;
+// charts: {axes: [{expression, log}], spans, brush: [[lo, hi], ...] | null, points, counts, whole, places, element ...}
 let page, source = "", where = "", charts = [], part = null, head = null, cube = null, drag = null;
 
 export function start(given) {
@@ -106,7 +106,7 @@ const ask = api.newest(async () => {
   const started = performance.now(), shown = charts, names = axes();
   const buffer = await api.post("charts", {
     source, where: where || "true", axes: names, part, limits: limits(),
-    charts: shown.map((chart) => ({ axes: chart.axes.map((axis) => names.indexOf(sqlOf(axis))), bins: bins(chart), spans: chart.spans, own: own(chart) })),
+    charts: shown.map((chart) => ({ axes: chart.axes.map((axis) => names.indexOf(sqlOf(axis))), bins: bins(chart), spans: chart.spans, own: own(chart), points: chart.points ? MOST_POINTS : 0 })),
   });
   if (shown !== charts) return;
   let at;
@@ -119,6 +119,12 @@ const ask = api.newest(async () => {
     chart.missing = names.map((name, n) => head.missing[n])[names.indexOf(sqlOf(chart.axes[0]))];
     if (!charts.some((other) => other.brush)) chart.whole = chart.counts;
     at += 4 * size;
+  });
+  shown.forEach((chart, k) => {
+    const { points = 0, points_part: step = 1 } = head.charts[k];
+    chart.places = points || chart.points ? new Float32Array(buffer, at, 2 * points) : null;
+    chart.placesPart = step;
+    at += 8 * points;
   });
   drawAll();
   tell(performance.now() - started);
@@ -169,6 +175,7 @@ function moveHeld() {
     const out = new Uint32Array(inner);
     for (let i = 0; i < inner; i++) out[i] = sums[b * inner + i] - sums[a * inner + i];
     one.counts = out;
+    one.places = null;
   }
   drawAll();
 }
@@ -196,6 +203,11 @@ function figure(chart) {
     built = false;
     show();
   } }, chart.axes.length > 1 ? `log ${"xy"[k]}` : "log"));
+  const points = chart.axes.length > 1 ? api.h("button", { "aria-pressed": String(Boolean(chart.points)), title: "The rows themselves, as points", onclick: (event) => {
+    chart.points = !chart.points;
+    event.target.setAttribute("aria-pressed", String(chart.points));
+    ask();
+  } }, "points") : null;
   const toTable = api.h("button", { onclick: () => {
     data.hidden = !data.hidden;
     if (!data.hidden) data.replaceChildren(asTable(chart));
@@ -206,7 +218,7 @@ function figure(chart) {
     show();
   } }, "×");
   const caption = api.h("figcaption", {}, api.h("strong", { title: names.map((n) => n.meaning).filter(Boolean).join("; ") || null },
-    names.map((n) => n.name).reverse().join(" against ")), api.h("span", { class: "quiet grow" }, names.length > 1 ? "" : names[0].meaning), ...logs, toTable, gone);
+    names.map((n) => n.name).reverse().join(" against ")), api.h("span", { class: "quiet grow" }, names.length > 1 ? "" : names[0].meaning), ...logs, points, toTable, gone);
   Object.assign(chart, { canvas, range, data });
   canvas.addEventListener("pointerdown", (event) => grab(chart, event));
   canvas.addEventListener("pointermove", (event) => drag?.chart === chart && pull(event));
@@ -232,92 +244,15 @@ function drawAll() {
   for (const chart of charts) if (chart.canvas && chart.counts) draw(chart);
 }
 
-function frame(chart) {
-  const [width, height, ratio] = api.fit(chart.canvas), context = chart.canvas.getContext("2d");
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.clearRect(0, 0, width, height);
-  context.font = "11px DejaVu Sans, sans-serif";
-  return { context, x0: LEFT, x1: width - RIGHT, y0: height - BOTTOM, y1: TOP, width, height };
-}
-
 function draw(chart) {
-  const f = frame(chart), [span] = chart.spans;
-  const text = chart.axes.length > 1 ? drawMap(chart, f) : drawBars(chart, f);
-  drawAxes(chart, f, span, text);
-  if (chart.brush) drawBrush(chart, f);
+  drawChart(chart, label, head.part);
   const shown = chart.brush ? chart.brush.map(([lo, hi], k) => `${label(chart.axes[k])} ${api.number(lo, 4)} to ${api.number(hi, 4)}`).join(", ") : "";
   const sum = chart.counts.reduce((a, b) => a + b, 0), scale = head.part;
   const error = scale > 1 ? ` ± ${api.number(Math.round(Math.sqrt(sum) * scale))}` : "";
-  chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, chart.missing ? `${api.number(chart.missing)} missing` : "", shown].filter(Boolean).join("; ");
+  const points = chart.points && chart.places ? `${api.number(chart.places.length / 2)} points${chart.placesPart * scale > 1 ? `, a sample: 1 row in ${chart.placesPart * scale}` : ""}` : "";
+  const most = chart.axes.length > 1 && !points ? `colours from none to ${api.number(chart.counts.reduce((a, b) => Math.max(a, b), 0) * scale)} a bin, logarithmic` : "";
+  chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, chart.missing ? `${api.number(chart.missing)} missing` : "", most, points, shown].filter(Boolean).join("; ");
   chart.canvas.setAttribute("aria-label", `${label(chart.axes[0])}${chart.axes[1] ? ` and ${label(chart.axes[1])}` : ""}: ${chart.range.textContent}`);
-}
-
-function drawBars(chart, f) {
-  const scale = head.part, behind = chart.whole ?? chart.counts, most = Math.max(...behind, 1);
-  const step = (f.x1 - f.x0) / chart.counts.length, y = (n) => f.y0 - ((f.y0 - f.y1) * n) / most;
-  for (const [counts, colour] of [[behind, ink("bar-off")], [chart.counts, ink("bar")]]) {
-    f.context.fillStyle = colour;
-    counts.forEach((n, k) => n && f.context.fillRect(f.x0 + k * step, y(n), Math.max(step - 0.5, 0.5), f.y0 - y(n)));
-  }
-  return [[0, most * scale], "number"];
-}
-
-function drawMap(chart, f) {
-  const size = Math.round(Math.sqrt(chart.counts.length)), image = new ImageData(size, size), colours = lut("cividis");
-  const most = Math.max(...chart.counts, 1), top = Math.log1p(most);
-  for (let i = 0; i < size; i++) {
-    for (let j = 0; j < size; j++) {
-      const n = chart.counts[i * size + j];
-      if (!n) continue;
-      const c = 4 * Math.round(40 + (215 * Math.log1p(n)) / top), at = 4 * ((size - 1 - j) * size + i);
-      image.data.set(colours.subarray(c, c + 4), at);
-    }
-  }
-  const small = new OffscreenCanvas(size, size);
-  small.getContext("2d").putImageData(image, 0, 0);
-  f.context.imageSmoothingEnabled = false;
-  f.context.drawImage(small, f.x0, f.y1, f.x1 - f.x0, f.y0 - f.y1);
-  return [chart.spans[1], label(chart.axes[1])];
-}
-
-function drawAxes(chart, f, span, [ySpan, yLabel]) {
-  const c = f.context;
-  c.strokeStyle = ink("line");
-  c.fillStyle = ink("quiet");
-  c.lineWidth = 1;
-  c.stroke(new Path2D(`M${f.x0} ${f.y1}V${f.y0}H${f.x1}`));
-  c.textAlign = "center";
-  for (const tick of api.ticks(...span, (f.x1 - f.x0) / 70)) {
-    const x = f.x0 + ((tick - span[0]) / (span[1] - span[0])) * (f.x1 - f.x0);
-    c.fillText(api.number(tick), x, f.y0 + 13);
-    c.fillRect(x, f.y0, 1, 3);
-  }
-  c.textAlign = "right";
-  for (const tick of api.ticks(...ySpan, (f.y0 - f.y1) / 40)) {
-    const y = f.y0 - ((tick - ySpan[0]) / (ySpan[1] - ySpan[0])) * (f.y0 - f.y1);
-    c.fillText(tick >= 1e5 ? tick.toExponential(0) : api.number(tick), f.x0 - 5, y + 4);
-    c.fillRect(f.x0 - 3, y, 3, 1);
-  }
-  c.fillStyle = ink("ink");
-  c.textAlign = "center";
-  c.fillText(label(chart.axes[0]), (f.x0 + f.x1) / 2, f.y0 + 29);
-  c.save();
-  c.translate(11, (f.y0 + f.y1) / 2);
-  c.rotate(-Math.PI / 2);
-  c.fillText(yLabel, 0, 0);
-  c.restore();
-}
-
-function drawBrush(chart, f) {
-  const place = (value, k) => {
-    const [lo, hi] = chart.spans[k], share = (value - lo) / (hi - lo);
-    return k ? f.y0 - share * (f.y0 - f.y1) : f.x0 + share * (f.x1 - f.x0);
-  };
-  const [a, b] = chart.brush[0].map((value) => place(value, 0));
-  const [bottom, top] = chart.brush[1] ? chart.brush[1].map((value) => place(value, 1)) : [f.y0, f.y1];
-  f.context.strokeStyle = ink("accent");
-  f.context.lineWidth = 1.5;
-  f.context.strokeRect(a, top, b - a, bottom - top);
 }
 
 // ---------------------------------------------------------------------------------------------- brushes
@@ -391,7 +326,7 @@ function python() {
 }
 
 export const redraw = () => head && drawAll();
-export const state = () => ({ source, where, charts: charts.map(({ axes: own, spans, brush }) => ({ axes: own, spans, brush })) });
+export const state = () => ({ source, where, charts: charts.map(({ axes: own, spans, brush, points }) => ({ axes: own, spans, brush, points })) });
 export function restore(was) {
   if (typeof was.source !== "string" || !Array.isArray(was.charts)) return;
   ({ source, where } = was);
