@@ -2,6 +2,7 @@
 
 import * as api from "/static/api.js";
 import * as image from "/static/image.js";
+import { redraw as redrawPin } from "/static/pin.js";
 import * as plots from "/static/plots.js";
 import * as runs from "/static/runs.js";
 import * as sky from "/static/sky.js";
@@ -59,6 +60,7 @@ function theme(name) {
   document.documentElement.dataset.theme = name;
   $("theme").textContent = name === "dark" ? "Light" : "Dark";
   for (const view of Object.values(VIEWS)) view.redraw?.();
+  redrawPin();
 }
 
 function keys(event) {
@@ -104,6 +106,9 @@ $("reopen").addEventListener("click", async () => {
 });
 document.addEventListener("keydown", keys);
 addEventListener("hashchange", () => document.body.dataset.ready && location.hash !== last && restore());
-addEventListener("resize", () => VIEWS[shown]?.redraw?.());
+addEventListener("resize", () => {
+  VIEWS[shown]?.redraw?.();
+  redrawPin();
+});
 setInterval(() => document.hidden || api.open().catch(() => {}), 30000);
 start().catch((error) => api.say(error.message, true));

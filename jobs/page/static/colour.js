@@ -34,6 +34,7 @@ export function bar(name, low, high, title) {
   const canvas = document.createElement("canvas");
   canvas.width = 256;
   canvas.height = 1;
+  canvas.setAttribute("aria-hidden", "true");
   const image = new ImageData(new Uint8ClampedArray(lut(name)), 256, 1);
   canvas.getContext("2d").putImageData(image, 0, 0);
   const ends = document.createElement("div"), words = document.createElement("div");

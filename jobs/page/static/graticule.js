@@ -31,11 +31,11 @@ export function graticule(c, view, at, [width, height]) {
   for (const dec of decs) {
     line(c, Array.from({ length: steps + 1 }, (_, k) => at(view.ra - wide + (2 * wide * k) / steps, dec)));
     const label = at(view.ra, dec);
-    if (label) c.fillText(`${dec < -1e-9 ? "−" : "+"}${Math.abs(dec).toFixed(digits)}°`, 4, label[1] - 3);
+    if (label) c.fillText(`Dec ${dec < -1e-9 ? "−" : "+"}${Math.abs(dec).toFixed(digits)}°`, 4, label[1] - 3);
   }
   for (const ra of ras) {
     line(c, Array.from({ length: steps + 1 }, (_, k) => at(ra, Math.max(-89.99, Math.min(89.99, view.dec - view.height + (2 * view.height * k) / steps)))));
     const label = at(ra, view.dec);
-    if (label && label[0] > 45 && label[0] < width - 45) c.fillText(`${(((ra % 360) + 360) % 360).toFixed(digits)}°`, label[0] + 3, 13);
+    if (label && label[0] > 45 && label[0] < width - 45) c.fillText(`RA ${(((ra % 360) + 360) % 360).toFixed(digits)}°`, label[0] + 3, 13);
   }
 }

@@ -1,8 +1,8 @@
 // Images: tiles of every product, stretched and coloured by the graphics processor; the truth on them.
 
 import * as api from "/static/api.js";
-import { NAMES, lutTexture, program } from "/static/colour.js";
-import { pin, pinned, onPin } from "/static/pin.js";
+import { NAMES, bar, lutTexture, program } from "/static/colour.js";
+import { pin, pinned, onPin, redraw as redrawPin } from "/static/pin.js";
 import { colourOf, compass, radiusOf, scaleOf } from "/static/marks.js";
 import { Plate } from "/static/sphere.js";
 import { Tiles } from "/static/tiles.js";
@@ -95,6 +95,7 @@ export async function show() {
     await choose(number, place);
   } else if (view.one < 0 || view.one >= list.length) await choose(list.findIndex((one) => one.content === "science"));
   else await choose(view.one, null, true);
+  redrawPin();
 }
 
 async function open(number) {
@@ -174,6 +175,7 @@ function paint() {
   gl.uniformMatrix3fv(uniform("toScreen"), true, matrix);
   const black = image.sky + Number($("image-black").value) * image.noise, white = image.sky + image.noise * 10 ** Number($("image-white").value);
   gl.uniform3f(uniform("levels"), black, Math.max(white, black + 1e-6 * image.noise), KNEE * image.noise);
+  $("image-legend").replaceChildren(...bar($("image-map").value, api.number(black, 4), api.number(white, 4), [image.unit, $("image-stretch").value].filter(Boolean).join(", ")));
   gl.uniform1i(uniform("stretch"), STRETCHES.indexOf($("image-stretch").value));
   gl.uniform1i(uniform("pixels"), 0);
   gl.uniform1i(uniform("colours"), 1);

@@ -7,7 +7,7 @@ import { dispersed, use } from "/static/trace.js";
 const $ = (id) => document.getElementById(id);
 const SIDE = 64, SHOWN = ["ra", "dec", "ra_lensed", "dec_lensed", "z_obs", "z_true", "mag_r01", "abs_mag_r01", "color_gr_01", "log_stellar_mass", "log_sfr",
   "bulge_fraction", "bulge_half_light_radius", "disk_half_light_radius", "inclination", "position_angle", "kappa", "gamma1", "gamma2", "a_v", "mag_h", "distance"];
-let source = null;
+let source = null, drawings = [];
 const listeners = [];
 
 export const pinned = () => source;
@@ -17,6 +17,7 @@ export const onPin = (listener) => listeners.push(listener);
 export async function pin(id) {
   source = await api.get(`source/${id}`);
   const panel = $("pin");
+  drawings = [];
   panel.replaceChildren(api.h("h2", {}, `${source.kind} ${source.id}`));
   if (source.place) panel.append(api.h("p", { class: "quiet" }, api.place(...source.place)));
   panel.append(api.h("div", { class: "bar" },
@@ -39,8 +40,11 @@ export async function pin(id) {
   api.get(`spectrum/${id}`).then((found) => own === source && (found.said ? spectrum.append(api.h("p", { class: "quiet" }, `No spectrum: ${found.said}`)) : drawSpectrum(spectrum, found)),
     (error) => spectrum.append(api.h("p", { class: "quiet" }, error.message)));
   cutouts(pictures, own).catch(failed);
-  dispersed(grism, own, () => own === source).catch(failed);
+  dispersed(grism, own, () => own === source, drawings).catch(failed);
 }
+
+/** Draw again what has the colours of the theme, or the size of the page; what is not seen has no size. */
+export const redraw = () => $("pin").checkVisibility() && drawings.forEach((draw) => draw());
 
 const failed = (error) => api.say(error.message, true);
 
@@ -74,11 +78,19 @@ function named(name) {
 function drawSpectrum(panel, found) {
   const canvas = api.h("canvas", { class: "spectrum", role: "img", tabindex: 0 });
   const data = api.h("div", { class: "data", hidden: true });
-  panel.replaceChildren(api.h("h3", {}, "Spectrum as it arrives"), canvas, api.h("button", { onclick: () => (data.hidden = !data.hidden) }, "Table of bands"), data);
-  data.append(api.table([{ name: "band", text: 1 }, { name: "pivot", unit: "nm" }, { name: "f_nu", unit: "uJy" }, { name: "AB", unit: "mag" }], found.bands.map((b) =>
+  panel.replaceChildren(api.h("h3", {}, "Spectrum as it arrives"), canvas, api.h("button", { onclick: () => (data.hidden = !data.hidden) }, "Bands and lines as a table"), data);
+  data.append(api.table([{ name: "band", text: 1 }, { name: "pivot", unit: "nm" }, { name: "f_nu", unit: "µJy" }, { name: "AB", unit: "mag" }], found.bands.map((b) =>
     [b.name, b.wavelength / 10, b.f_nu, b.f_nu > 0 ? +(23.9 - 2.5 * Math.log10(b.f_nu)).toFixed(3) : null])));
+  if (found.lines.length) data.append(api.table([{ name: "line", text: 1 }, { name: "wavelength", unit: "nm" }], found.lines.map((l) => [named(l.name), (l.wavelength / 10).toFixed(1)])));
+  canvas.setAttribute("aria-label", `Spectrum${found.z === undefined ? "" : ` at redshift ${found.z.toFixed(3)}`}; lines ${found.lines.map((l) => `${named(l.name)} at ${(l.wavelength / 10).toFixed(0)} nm`).join(", ")}`);
+  drawings.push(() => drawCurve(canvas, found));
+  drawCurve(canvas, found);
+}
+
+function drawCurve(canvas, found) {
   const [width, height, ratio] = api.fit(canvas), c = canvas.getContext("2d"), x0 = 44, x1 = width - 6, y0 = height - 32, y1 = 14;
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
+  c.clearRect(0, 0, width, height);
   c.font = "11px DejaVu Sans, sans-serif";
   const bright = found.f_lambda.reduce((a, b) => Math.max(a, b), 0), begin = Math.max(0, found.f_lambda.findIndex((f) => f > 1e-3 * bright));
   const low = Math.log(found.wavelength[begin]), high = Math.log(found.wavelength.at(-1)), x = (l) => x0 + ((Math.log(l) - low) / (high - low)) * (x1 - x0);
@@ -123,6 +135,7 @@ function drawSpectrum(panel, found) {
   c.fillText("wavelength / nm", (x0 + x1) / 2, y0 + 27);
   c.textAlign = "left";
   c.fillText(top.toExponential(1), 0, y1 + 8);
+  c.fillText("0", x0 - 11, y0 + 2);
   c.save();
   c.translate(11, (y0 + y1) / 2 + 50);
   c.rotate(-Math.PI / 2);
@@ -130,5 +143,4 @@ function drawSpectrum(panel, found) {
   c.restore();
   c.strokeStyle = ink("line");
   c.strokeRect(x0, y1, x1 - x0, y0 - y1);
-  canvas.setAttribute("aria-label", `Spectrum${found.z === undefined ? "" : ` at redshift ${found.z.toFixed(3)}`}; lines ${found.lines.map((l) => `${named(l.name)} at ${(l.wavelength / 10).toFixed(0)} nm`).join(", ")}`);
 }

@@ -11,6 +11,8 @@ export async function show() {
     parts.push(api.h("h2", {}, "Images"), api.h("p", {}, api.h("progress", { max: task.all, value: task.done, "aria-label": "detectors done" }),
       ` ${task.done} of ${task.all} detectors done`, task.done < task.all ? `, ${api.number(task.seconds_left, 3)} s of one core to come` : ""));
   }
+  const lost = Object.entries(api.lake.damaged);
+  if (lost.length) parts.push(api.h("h2", {}, "Tables that cannot be read"), api.table([{ name: "table", text: 1 }, { name: "why", text: 1 }], lost));
   parts.push(api.h("h2", {}, "Failures"), found.failures.length ? api.table(
     [{ name: "part", text: 1 }, { name: "error", text: 1 }, { name: "attempt" }, { name: "run", text: 1 }],
     found.failures.map((f) => [f.part, f.error, f.attempt, f.run])) : api.h("p", { class: "quiet" }, "None."));

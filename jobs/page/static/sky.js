@@ -221,11 +221,15 @@ function drawOver(turn) {
   graticule(c, view, at, [width, height]);
   if (dots) drawDots(c, at);
   if ($("sky-regions").checked) {
-    c.lineWidth = 1.6;
     for (const region of regions) {
-      c.strokeStyle = ink(STATES[region.state]);
-      c.setLineDash(region.state === "planned" ? [5, 4] : []);
-      line(c, [...region.polygon, region.polygon[0]].map(([ra, dec]) => at(ra, dec)));
+      const points = [...region.polygon, region.polygon[0]].map(([ra, dec]) => at(ra, dec));
+      // On a ground of the page's colour: cells may have any.
+      for (const [colour, wide] of [["paper", 4], [STATES[region.state], 1.6]]) {
+        c.strokeStyle = ink(colour);
+        c.lineWidth = wide;
+        c.setLineDash(region.state === "planned" && wide < 4 ? [5, 4] : []);
+        line(c, points);
+      }
       const top = at(...region.polygon[0]);
       if (top && view.height < 3) {
         const text = `${region.band ?? region.channel} ${region.detector}, ${region.state}`;
@@ -236,7 +240,6 @@ function drawOver(turn) {
         c.strokeText(text, top[0] + 4, top[1] - 5);
         c.fillStyle = ink(STATES[region.state]);
         c.fillText(text, top[0] + 4, top[1] - 5);
-        c.lineWidth = 1.6;
       }
     }
     c.setLineDash([]);

@@ -10,7 +10,7 @@ const said = { line: (name) => name, show: null };
 export const use = (given) => Object.assign(said, given);
 
 const poly = (c, t) => c.reduceRight((sum, a) => sum * t + a, 0);
-const nm = (angstrom) => api.number(angstrom / 10, 4);
+const nm = (angstrom) => String(+(angstrom / 10).toFixed(1));
 /** t of a wavelength, which is linear in it. */
 const at = (trace, wavelength) => (wavelength - trace.wavelength_first) / (trace.wavelength_last - trace.wavelength_first);
 
@@ -46,7 +46,7 @@ export function drawTraces(c, source, image, place) {
 }
 
 /** In the panel of a source: each first order as pixels, and a table of all orders and of their lines. */
-export async function dispersed(panel, source, isStill) {
+export async function dispersed(panel, source, isStill, drawings) {
   if (!source.spectra.length) return panel.append(api.h("p", { class: "quiet" }, "No image through a grism holds it."));
   for (const trace of source.spectra.filter((one) => one.order === 1 && one.images.science !== undefined)) {
     const number = trace.images.science, middle = [poly(trace.trace_x, 0.5), poly(trace.trace_y, 0.5)];
@@ -58,9 +58,10 @@ export async function dispersed(panel, source, isStill) {
       api.h("div", { class: "range" }, `${api.number(trace.expected, 4)} electrons expected, ${api.number(trace.drawn, 4)} on the detector${overlap}`)));
     const buffer = await api.bytes(`trace/${number}/${source.id}?order=1`), [head, from] = api.headed(buffer);
     if (!isStill()) return;
-    // Blue at the left, whichever way the grism stands.
+    // Short wavelengths at the left, whichever way the grism stands.
     Object.assign(canvas, { width: head.columns, height: head.rows });
     canvas.getContext("2d").putImageData(stretched(new Float32Array(buffer, from), head.columns, head.rows), 0, 0);
+    drawings.push(() => drawScale(scale, trace));
     drawScale(scale, trace);
     canvas.setAttribute("aria-label", `Pixels along order 1, ${nm(trace.wavelength_first)} to ${nm(trace.wavelength_last)} nm`);
   }

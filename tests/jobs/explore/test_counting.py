@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs.explore.counting import Chart, counted, span
+from jobs.explore.counting import Chart, counted, points, span
 from lake_schema.errors import BadInput
 
 SPECIAL = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, 0.1, np.float32(0.3), -1.0, 3.4e38]
@@ -94,3 +94,22 @@ def test_span():
     lo, hi = span(rows(2)[0])
     assert -6.0 < lo < -2.0
     assert 2.0 < hi < 6.0
+
+
+@pytest.mark.parametrize("limits", [{}, {2: (-0.5, 0.3), 0: (0.0, 3.0)}, {3: (9.0, 9.1)}])
+@pytest.mark.parametrize("most", [1, 100, 5_000, 10**6])
+def test_points_are_of_the_rows_that_count(limits, most):
+    columns = rows(4, 100_000)
+    chart = Chart((0, 1), ((-1.0, 1.0), (0.0, 0.3)), (1, 1))
+    places, step = points(columns, chart, limits, most)
+    (((total,),),) = counted(columns, [chart], limits)
+    assert places.shape[1] == 2
+    assert len(places) <= most
+    found = {tuple(place) for place in places.tolist()}
+    assert found <= {*zip(columns[0].tolist(), columns[1].tolist(), strict=True)}
+    if total <= most:
+        # Where there is room for all, all are there.
+        assert (len(places), step) == (total, 1)
+    else:
+        # Their number tells that of the rows, as a sample does.
+        assert len(places) * step == pytest.approx(total, abs=6 * np.sqrt(total * step))

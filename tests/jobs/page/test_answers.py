@@ -3,7 +3,10 @@
 import csv
 import io
 import json
+import os
+import signal
 import struct
+import threading
 import time
 from urllib.parse import quote
 
@@ -93,6 +96,53 @@ def test_a_join_is_counted(page):
                             charts=[{"axes": [0], "bins": [3], "spans": [[-1, 1]]}])  # fmt: skip
     # The flux was made of that very column: row by row the difference is nothing.
     assert counts.tolist() == [0, GALAXIES_N, 0]
+
+
+def test_counts_of_identifiers_and_missing_values_are_duckdbs(page):
+    """64-bit identifiers, NULL, values on the edges of bins, infinite ones: every row is where DuckDB has it."""
+    odd = "CASE kind WHEN 0 THEN 'inf'::FLOAT WHEN 1 THEN 'nan'::FLOAT WHEN 2 THEN NULL ELSE z_obs END AS odd"
+    source = f"(SELECT id, flux_halpha, round(z_obs, 1)::FLOAT AS z, {odd} FROM galaxies) AS rows"
+    axes = ["id", "flux_halpha", "z", "odd"]
+    low, high = page.json("sql", method="POST", body=b'{"sql": "SELECT min(id), max(id) FROM galaxies"}')["rows"][0]
+    spans = [[float(low), float(high)], [0.0, 1e-15], [0.0, 2.0], [0.0, 6.0]]
+    charts_ = [{"axes": [k], "bins": [20], "spans": [span]} for k, span in enumerate(spans)]
+    head, found = asked(page, source=source, axes=axes, charts=charts_)
+    for axis, (lo, hi), counts in zip(axes, spans, found, strict=True):
+        value, width = f"({axis})::FLOAT::DOUBLE", f"({hi!r}::DOUBLE - {lo!r}::DOUBLE)"
+        text = f"""SELECT least(floor(({value} - {lo!r}::DOUBLE) / {width} * 20), 19)::INT AS bin, count(*) AS n
+                   FROM {source} WHERE {value} BETWEEN {lo!r}::DOUBLE AND {hi!r}::DOUBLE GROUP BY bin"""
+        rows = page.json("sql", method="POST", body=json.dumps({"sql": text}).encode())["rows"]
+        expected = np.zeros(20, int)
+        for place, n in rows:
+            expected[place] = n
+        np.testing.assert_array_equal(counts, expected)
+    nothing = "SELECT " + ", ".join(f"count(*) - count(*) FILTER (isfinite(({axis})::FLOAT))" for axis in axes)
+    text = json.dumps({"sql": f"{nothing} FROM {source}"}).encode()
+    assert head["missing"] == page.json("sql", method="POST", body=text)["rows"][0]
+    # Of one identifier one row, though its neighbours are the same number of float32.
+    one = json.dumps({"sql": "SELECT id FROM galaxies ORDER BY id LIMIT 1 OFFSET 7"}).encode()
+    ((own,),) = page.json("sql", method="POST", body=one)["rows"]
+    assert (
+        asked(page, source="galaxies", where=f"id = {own}", axes=["ra"], charts=[{"axes": [0], "bins": [3]}])[0]["rows"]
+        == 1
+    )
+
+
+def test_points_are_rows_that_count(page, shown):
+    rows = read.version(shown, "galaxies").rows(["z_obs", "mag_r01"])
+    z, mag = (rows[name].to_numpy().astype(np.float32) for name in ("z_obs", "mag_r01"))
+    span = [[0.0, 5.0], [0.0, 40.0]]
+    chart = {"axes": [0, 1], "bins": [4, 4], "spans": span, "points": 20_000}
+    question = {"source": "galaxies", "axes": ["z_obs", "mag_r01"], "limits": [[0, 1.0, 3.0]]}
+    inside = (z >= 1.0) & (z <= 3.0) & (mag >= 0.0) & (mag <= 40.0)
+    for limited, kept in (({"own": []}, inside), ({}, (z >= 0) & (z <= 5) & (mag >= 0) & (mag <= 40))):
+        status, _, body = page.of_lake(
+            "charts", method="POST", body=json.dumps({**question, "charts": [{**chart, **limited}]}).encode()
+        )
+        head, rest = unpacked(body)
+        places = np.frombuffer(rest, "<f4", offset=64).reshape(-1, 2)
+        assert (status, head["charts"][0]["points"], head["charts"][0]["points_part"]) == (200, kept.sum(), 1)
+        np.testing.assert_array_equal(np.sort(places, axis=0), np.sort(np.stack([z[kept], mag[kept]], axis=1), axis=0))
 
 
 def test_many_rows_are_sampled_first(page, monkeypatch):
@@ -285,12 +335,40 @@ def test_footprints_and_runs(page):
 # ------------------------------------------------------------------------------------------------ processes
 
 
+def killed(lane):
+    """Kill the processes of a lane, as the system does where memory is short."""
+    found = [process._worker for process in lane._all if process._worker is not None]
+    for worker in found:
+        os.kill(worker.pid, signal.SIGKILL)
+        worker.wait(30.0)
+    return len(found)
+
+
 def test_a_killed_process_is_replaced(page):
-    for process in page.server.lake.questions._all:
-        process.stop()
+    lake, question = page.server.lake, {"method": "POST", "body": b'{"sql": "SELECT 7 AS a"}'}
+    for _ in range(2):
+        page.json("sql", **question)
+    chart = {"source": "galaxies", "axes": ["dec + 1"], "charts": [{"axes": [0], "bins": [5]}]}
+    assert killed(lake.questions)
+    assert killed(lake.own)
     for _ in range(3):
-        page.of_lake("sql", method="POST", body=b'{"sql": "SELECT 1"}')
-    assert page.json("sql", method="POST", body=b'{"sql": "SELECT 7 AS a"}')["rows"] == [[7]]
+        assert page.json("sql", **question)["rows"] == [[7]]
+    assert asked(page, **chart)[0]["rows"] == GALAXIES_N
+
+
+def test_who_asked_a_killed_process_is_told(page):
+    """In the midst of a question: one line, and the next question is answered."""
+    body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
+    told = []
+    asking = threading.Thread(target=lambda: told.append(page.of_lake("sql", method="POST", body=body)))
+    asking.start()
+    time.sleep(1.0)
+    assert killed(page.server.lake.questions)
+    asking.join(30.0)
+    ((status, _, answer),) = told
+    assert status == 400
+    assert "brought its process down" in json.loads(answer)["error"]
+    assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
 
 
 def test_who_goes_away_stops_the_query(page):

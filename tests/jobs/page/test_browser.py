@@ -8,8 +8,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from lake_schema.store import read
-from tests.jobs.page.conftest import GALAXIES_N
+from lake_schema.store import publish, read
+from tests.jobs.page import test_traces
+from tests.jobs.page.conftest import GALAXIES_N, published, serving
+from tests.universe import plain_plan, plain_work
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra browser)")
 CHROMIUM = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
@@ -150,6 +152,123 @@ def test_a_held_brush_asks_nothing(tab):
     mouse.up()
 
 
+def test_a_map_as_points(tab, shown):
+    tab.keyboard.press("2")
+    ranges = "[...document.querySelectorAll('#plot-grid figure.map .range')].map((one) => one.textContent)"
+    until(tab, f"{ranges}[0].includes('a bin')")
+    before = tab.locator("#plot-grid figure.map canvas").first.screenshot()
+    tab.locator("#plot-grid figure.map button", has_text="points").first.click()
+    text = until(tab, f"{ranges}[0].includes('points') && {ranges}[0]").replace("\N{NARROW NO-BREAK SPACE}", "")
+    rows, points = (int(text.split(f" {word}")[0].split()[-1]) for word in ("rows", "points"))
+    assert 0 < points == rows <= GALAXIES_N
+    assert tab.locator("#plot-grid figure.map canvas").first.screenshot() != before
+    until(tab, "JSON.parse(decodeURIComponent(location.hash.slice(1))).plots.charts[4].points === true")
+
+
+def test_charts_are_tables_too(tab):
+    """The same numbers: of the sky, of a histogram, of a map, of a spectrum's bands."""
+    tab.keyboard.press("1")
+    until(tab, "document.getElementById('sky-legend').textContent.includes('deg')")
+    tab.click("#sky-to-table")
+    assert tab.locator("#sky-data tbody tr").count() > 0
+    assert "deg" in tab.inner_text("#sky-data thead")
+    tab.keyboard.press("2")
+    until(tab, "[...document.querySelectorAll('#plot-grid .range')].every((one) => one.textContent.includes('rows'))")
+    for place in (0, 4):
+        figure = tab.locator("#plot-grid figure").nth(place)
+        figure.locator("button", has_text="Table").click()
+        numbers = [int(text.replace("\N{NARROW NO-BREAK SPACE}", "")) for text in
+                   figure.locator("tbody td:last-child").all_inner_texts()]  # fmt: skip
+        total = figure.locator(".range").inner_text().replace("\N{NARROW NO-BREAK SPACE}", "").split(" rows")[0]
+        # Of a map the fullest bins.
+        assert sum(numbers) == int(total) if place == 0 else 0 < sum(numbers) <= int(total)
+
+
+def test_a_source_through_the_grism(browser, tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    own, wavelength = test_traces.published(root)
+    with serving(root) as page, tab_of(browser, page) as tab:
+        tab.keyboard.press("4")
+        until(tab, "document.getElementById('image-one').childElementCount === 1")
+        time.sleep(1.0)
+        without = canvas_colours(tab, "#image-marks")
+        box, truth = tab.locator("#image-canvas").bounding_box(), page.json("truth/0")
+        zoom = 0.98 * min(box["width"] / 700, box["height"] / 600)
+        tab.mouse.click(box["x"] + box["width"] / 2 - (truth["x"][0] - 349.5) * zoom,
+                        box["y"] + box["height"] / 2 + (truth["y"][0] - 299.5) * zoom)  # fmt: skip
+        until(tab, f"document.getElementById('pin').textContent.includes('{own}')")
+        until(
+            tab, "document.querySelector('#pin canvas.strip')?.getAttribute('aria-label')?.includes('1206 to 1892 nm')"
+        )
+        assert canvas_colours(tab, "#pin canvas.strip") > 2
+        time.sleep(0.3)
+        assert canvas_colours(tab, "#image-marks") > without
+        tab.locator("#pin summary", has_text="orders as a table").click()
+        words = tab.locator("#pin details[open]").inner_text()
+        assert f"{wavelength / 10:.1f}".removesuffix(".0") in words
+        assert "Hα" in words
+        # Nothing is cut out of where the source is not.
+        assert tab.locator("#pin .cutouts canvas").count() == 0
+        tab.locator("#pin button", has_text="Show in the image").click()
+        time.sleep(0.6)
+        state = tab.evaluate("JSON.parse(decodeURIComponent(location.hash.slice(1))).images")
+        assert (state["x"], state["y"]) == (330.0, 283.0)
+
+
+def test_a_lake_that_is_published_anew_is_announced(browser, tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    published(root)
+    with serving(root) as page, tab_of(browser, page) as tab:
+        assert tab.locator("#changed").is_hidden()
+        old = page.server.lake.key
+        publish.make(root, plain_plan(2), plain_work)
+        # The page looks by itself every half a minute, and whenever it is loaded.
+        tab.reload()
+        until(tab, "!document.getElementById('changed').hidden")
+        assert page.server.lake.key == old
+        tab.click("#reopen")
+        until(tab, "document.body.dataset.ready === '1' && document.getElementById('changed').hidden")
+        assert page.server.lake.key != old
+        assert page.server.lake.key in tab.inner_text("#version")
+
+
+def peaks(tab, page, number, most):
+    """How many of the brightest stars that stand alone have the largest value of 3 x 3 pixels under the cursor."""
+    tab.keyboard.press("4")
+    until(tab, "document.getElementById('image-one').childElementCount === 3")
+    tab.select_option("#image-one", str(number))
+    time.sleep(1.5)
+    truth, box = page.json(f"truth/{number}"), tab.locator("#image-canvas").bounding_box()
+    place = np.array([truth["x"], truth["y"]]).T
+    zoom = 0.98 * min(box["width"] / 700, box["height"] / 600)
+
+    def value(column, row):
+        tab.mouse.move(box["x"] + box["width"] / 2 - (column - 349.5) * zoom,
+                       box["y"] + box["height"] / 2 + (row - 299.5) * zoom)  # fmt: skip
+        text = tab.inner_text("#image-place").split("pixel ")[1]
+        assert text.startswith(f"{column}, {row} ")
+        return float(text.split("   ")[1].split(" electron")[0].replace("\N{NARROW NO-BREAK SPACE}", ""))
+
+    alone = [at for k, at in enumerate(place) if (np.hypot(*(np.delete(place, k, 0) - at).T) > 14.0).all()]
+    inside = [at for at in alone if 8 < at[0] < 690 and 8 < at[1] < 590][:most]
+    for x, y in inside:
+        column, row = round(x), round(y)
+        near = {(i, j): value(column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+        assert max(near, key=near.get) == (0, 0), (x, y, near)
+    return len(inside)
+
+
+def test_the_truth_is_where_pixels_peak_on_the_screen(tab, page):
+    assert peaks(tab, page, 1, 8) == 8
+
+
+@pytest.mark.nightly
+def test_the_truth_of_all_is_where_pixels_peak_on_the_screen(tab, page):
+    assert peaks(tab, page, 1, 200) > 80
+
+
 def test_a_query_and_its_refusal(browser, page):
     with tab_of(browser, page) as tab:
         tab.keyboard.press("3")
@@ -233,6 +352,52 @@ def test_contrast(tab, theme):
     if tab.evaluate("document.documentElement.dataset.theme") != theme:
         tab.click("#theme")
     assert [found for found in tab.evaluate(CONTRAST) if found[2] < 4.5] == []
+
+
+NAMELESS = """() => [...document.querySelectorAll('button, input, select, textarea, canvas:not([aria-hidden])')]
+  .filter((one) => one.checkVisibility() && !(one.labels?.length || one.textContent.trim() || one.title
+    || one.getAttribute('aria-label') || one.closest('label'))).map((one) => one.outerHTML)"""
+
+
+def test_every_control_has_a_name(tab):
+    for number, view in enumerate(VIEWS, start=1):
+        tab.keyboard.press(str(number))
+        until(tab, f"!document.getElementById('{view}').hidden")
+        time.sleep(0.5)
+        assert tab.evaluate(NAMELESS) == []
+
+
+# Text of each visible element against what lies behind it; a picture behind text has its own ground.
+SEEN = """() => {
+  const part = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+  const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
+  const luminance = (c) => c.slice(0, 3).map((v) => part(v / 255))
+    .reduce((s, v, k) => s + v * [0.2126, 0.7152, 0.0722][k], 0);
+  const behind = (one) => {
+    for (let at = one; at; at = at.parentElement) {
+      const c = rgb(getComputedStyle(at).backgroundColor);
+      if (c.length < 4 || c[3] === 1) return c;
+    }
+    return [255, 255, 255];
+  };
+  return [...document.querySelectorAll('body *')].filter((one) => one.checkVisibility() && !one.disabled
+      && [...one.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim()))
+    .map((one) => {
+      const a = luminance(rgb(getComputedStyle(one).color)), b = luminance(behind(one));
+      return [one.tagName, one.textContent.slice(0, 40), (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05)];
+    }).filter((one) => one[2] < 4.5);
+}"""
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_text_can_be_read_where_it_stands(tab, theme):
+    if tab.evaluate("document.documentElement.dataset.theme") != theme:
+        tab.click("#theme")
+    for number, view in enumerate(VIEWS, start=1):
+        tab.keyboard.press(str(number))
+        until(tab, f"!document.getElementById('{view}').hidden")
+        time.sleep(0.4)
+        assert tab.evaluate(SEEN) == []
 
 
 @pytest.mark.nightly

@@ -1,9 +1,13 @@
 """Every rule of who may ask, by requests that break it."""
 
+import base64
 import json
+import re
+from pathlib import Path
 
 import pytest
 
+from jobs.page import gate, server
 from jobs.page.opened import MOST_WAITING
 
 
@@ -52,6 +56,28 @@ def test_the_token_becomes_a_cookie_that_no_script_reads(page):
     assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= set(headers["Set-Cookie"].split("; "))
     assert page.ask("/?token=wrong", cookie="")[0] == 401
     assert page.ask(f"/?token={page.gate.tap_token}", cookie="")[0] == 401
+
+
+def test_tokens_are_192_random_bits():
+    tokens = {gate.new_token() for _ in range(50)}
+    assert len(tokens) == 50
+    assert {len(base64.urlsafe_b64decode(token)) for token in tokens} == {24}
+
+
+STATIC = sorted((Path(server.__file__).parent / "static").iterdir())
+MARKUP = (
+    r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|setTimeout\(['\"]|\.style\.cssText"
+)
+
+
+@pytest.mark.parametrize("file", STATIC, ids=lambda file: file.name)
+def test_text_never_becomes_markup_and_nothing_is_loaded_from_elsewhere(file):
+    """Of the page's own files: no way to make markup or code of a text, no address of another host, no inline code."""
+    text = file.read_text(encoding="utf-8")
+    assert re.findall(MARKUP, text) == []
+    assert re.findall(r"(?:https?:)?//[\w.-]+\.\w{2,}", text.replace("// ", "")) == []
+    if file.suffix == ".html":
+        assert re.findall(r"<script(?![^>]*src=)|\son\w+=|\sstyle=", text) == []
 
 
 def test_tap_has_another_token(page):

@@ -7,8 +7,9 @@ import pytest
 
 from jobs.fluxes.spectra import lines
 from jobs.render.camera import astrometry
+from jobs.render.products.keys import truth_file
 from lake_schema.fits import images
-from lake_schema.store import layout, publish
+from lake_schema.store import layout, parquet, publish
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
@@ -70,7 +71,10 @@ def published(root, trace_x=TRACE_X):
         "line_wavelength": [[], [wavelength]], "line_expected": [[], [850.0]], "line_snr": [[], [7.5]],
     })  # fmt: skip
     pixels = spectrum_image(wavelength)
-    files = {path: lambda to: images.write_images(to, [images.Image(pixels, cards)])}
+    files = {
+        path: lambda to: images.write_images(to, [images.Image(pixels, cards)]),
+        truth_file(7, "DET22"): lambda to: parquet.write(to, truth, RENDERED_TRUTH),
+    }
     part = Part("000007-det22.parquet", {"exposure_id": 7, "detector": "DET22"})
     cell = Part(layout.cell_file(5, 1607), {})
     publish.make(root, Plan(GALAXIES, {}, (cell,)), lambda lake, facts: Output(rows))
