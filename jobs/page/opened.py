@@ -140,8 +140,9 @@ class Lake:
             return await asyncio.to_thread(process.ask, text, dict(parameters or {}), self.timeout)
 
     async def warm(self) -> None:
-        """Start the processes: the first question of each would wait for it."""
-        await asyncio.gather(*(lane.warm() for lane in (self.own, self.questions)))
+        """Start the processes, those first that the page itself asks: the first question of each would wait for it."""
+        for lane in (self.own, self.questions):
+            await lane.warm()
 
     def close(self) -> None:
         """End its processes."""

@@ -17,7 +17,7 @@ from jobs.page.opened import Lake
 from jobs.render import archive
 from jobs.render.camera import astrometry
 from jobs.render.products import pyramids, read_back
-from jobs.render.products.keys import truth_file
+from jobs.render.products.beside import truth_file
 from jobs.render.products.pyramids import TILE
 from lake_schema import ids
 from lake_schema.arrays import Array, Float

@@ -27,7 +27,8 @@ from jobs.render.planning import tasks as planned
 from jobs.render.planning.mission import mission_of
 from jobs.render.planning.preconditions import INPUTS
 from jobs.render.products import exposure_files, fits_files, truth_table
-from jobs.render.products.keys import ephemeris_files, product_keys, psf_files, spectra_file, truth_file
+from jobs.render.products.beside import spectra_file, truth_file
+from jobs.render.products.keys import ephemeris_files, product_keys, psf_files
 from jobs.render.psf import from_file
 from jobs.render.sources import catalogue_rows, ephemerides, selection, solar_system
 from jobs.render.sources.catalogue_rows import LENSES

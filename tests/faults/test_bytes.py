@@ -17,7 +17,7 @@ import pytest
 from jobs.catalogue.build_galaxies import quarantine_file, quarantine_work
 from jobs.explore.guard import checked
 from jobs.explore.session import Session
-from jobs.render.products.keys import truth_file
+from jobs.render.products.beside import truth_file
 from jobs.render.render_exposures import truth_work
 from lake_schema.errors import Damaged
 from lake_schema.fits import images

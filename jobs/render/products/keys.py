@@ -117,13 +117,3 @@ def _files_of_cells(*tables: read.Version) -> Mapping[int, list[tuple[str, ...]]
         for cell in part["facts"][CELLS]:
             found[cell].append(sums)
     return found
-
-
-def spectra_file(exposure_id: int, detector: str) -> str:
-    """Where a version of `products` keeps where spectra lie on a detector."""
-    return f"spectra/{exposure_id:06d}/{detector}.parquet"
-
-
-def truth_file(exposure_id: int, detector: str) -> str:
-    """Where a version of `products` keeps what was drawn on a detector."""
-    return f"truth/{exposure_id:06d}/{detector}.parquet"

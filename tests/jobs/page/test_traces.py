@@ -7,7 +7,7 @@ import pytest
 
 from jobs.fluxes.spectra import lines
 from jobs.render.camera import astrometry
-from jobs.render.products.keys import truth_file
+from jobs.render.products.beside import truth_file
 from lake_schema.fits import images
 from lake_schema.store import layout, parquet, publish
 from lake_schema.store.plan import Output, Part, Plan
