@@ -189,7 +189,7 @@ def cutout(lake: Lake, number: int, x: float, y: float) -> bytes:
 def strip(lake: Lake, number: int, text: str, order: int) -> bytes:
     """Pixels along the trace of a source's order: 4 bytes, the length of the head; the head, JSON; float32 [rows, n].
 
-    number : of the image;  text : identifier of the source, decimal;  order : of the grism
+    lake, number : of the image;  text : identifier of the source, decimal;  order : of the grism
     The head has rows and columns, and the wavelengths of the first and the last column, angstrom. Each value is that
     of the pixel nearest to the place, NaN beyond the image; rows go across the trace, its own in the middle.
     """

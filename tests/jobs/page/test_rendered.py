@@ -85,12 +85,16 @@ def test_the_brightest_stars_are_where_the_truth_says(rendered):
         lake.close()
     place = np.array([truth["x"], truth["y"]]).T
     inside = ((place > 6) & (place < SIDE - 7)).all(axis=1)
+    # Rows of charge injection hold no light.
+    dark = np.flatnonzero((image == 0.0).all(axis=1))
+    inside &= (np.abs(place[:, 1, None] - dark) > 3.0).all(axis=1)
     # Whoever lies in the light of a brighter one has no peak of its own.
     apart = np.array([all(np.hypot(*(place[:k] - at).T) > 12.0) for k, at in enumerate(place)])
     brightest = place[inside & apart][:STARS]
     assert len(brightest) == STARS
     away = np.array([peak(image, *at) - at for at in brightest])
-    assert np.abs(away).max() <= 0.15
+    # Ten times closer than the half pixel by which the brightest pixel alone may miss it.
+    assert np.abs(away).max() <= 0.05
 
 
 @pytest.mark.nightly
@@ -98,15 +102,10 @@ def test_the_trace_lies_on_the_spectrum(rendered):
     with serving(rendered) as page:
         listed = page.json("images")
         number = next(one["number"] for one in listed if (one["channel"], one["content"]) == ("NISP-S", "noise_free"))
-        truth = page.json(f"truth/{number}")
-        own = next(
-            found for found in map(lambda one: page.json(f"source/{one}"), truth["id"])
-            if any(one["order"] == 1 and one["overlapped"] == 0.0 and one["drawn"] > 0.99 * one["expected"]
-                   for one in found["spectra"])
-        )  # fmt: skip
-        head, rest = unpacked(page.of_lake(f"trace/{number}/{own['id']}?order=1")[2])
-    pixels = np.frombuffer(rest, "<f4").reshape(head["rows"], head["columns"])
-    light = pixels - np.median(pixels, axis=0)
-    weight = light[:, 50:-50].sum(axis=1)[7:18]
-    assert np.sum(np.arange(-5, 6) * weight) / weight.sum() == pytest.approx(0.0, abs=0.3)
-    assert weight.argmax() == 5
+        brightest = page.json(f"truth/{number}")["id"][:12]
+        strips = [unpacked(page.of_lake(f"trace/{number}/{one}?order=1")[2]) for one in brightest]
+    for head, rest in strips:
+        pixels = np.frombuffer(rest, "<f4").reshape(head["rows"], head["columns"])
+        middle = head["rows"] // 2
+        # Of the rows next to it the trace's own has the most light; beyond may lie others.
+        assert np.nanmedian(pixels, axis=1)[middle - 3 : middle + 4].argmax() == 3
