@@ -23,7 +23,7 @@ from nbconvert import MarkdownExporter
 from sphinx.application import Sphinx
 
 from lake_schema.mission.configuration import resolve
-from scripts import docs_references, page_pictures
+from scripts import docs_references, page_pictures, structure_picture
 
 ROOT = Path(__file__).resolve().parents[1]
 # Chapters of the site: title, pages.  Those of docs/ that none names tell how to do something.
@@ -105,7 +105,8 @@ def pages(into: Path, run: bool) -> None:
 
 
 def _with_pictures(into: Path) -> None:
-    """The page over a lake as a browser shows it, where there is one."""
+    """Spiral galaxies; the page over a lake as a browser shows it, where there is one."""
+    structure_picture.write(into / "structure.jpg")
     if why := page_pictures.missing():
         print(f"docs: no pictures of the page: {why}")
         return

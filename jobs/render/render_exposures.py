@@ -8,6 +8,7 @@ if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
 from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import replace
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -32,8 +33,11 @@ from jobs.render.products.keys import ephemeris_files, product_keys, psf_files
 from jobs.render.psf import from_file
 from jobs.render.sources import catalogue_rows, ephemerides, selection, solar_system
 from jobs.render.sources.catalogue_rows import LENSES
+from jobs.render.sources.disc_structure import DiscStructure
 from jobs.render.sources.solar_system import Population
+from jobs.request import structure
 from jobs.request.schema import Request
+from jobs.request.structure import Arms
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -113,6 +117,7 @@ def products(
     if request.sources is not None:
         # Those of the tables are the only ones: no bodies move.
         facts["request"]["bodies"] = "none"
+    facts["request"].update(structure.facts(request.structure))
     if request.bodies is not None:
         facts["bodies"] = ephemeris_files(request.bodies, exposures)
     held = reuse.held(lake, PRODUCTS.name, request.name)
@@ -217,6 +222,8 @@ def work(lake: Path, facts: Json) -> Output:
             bodies = ephemerides.read(Path(file), sha256).of_day
     with heap.kept():
         rows_ = _rows(lake, inputs, exposed, task, detector, own, bodies, earlier)
+        if "structure" in request:
+            rows_ = replace(rows_, discs=DiscStructure(Arms(**request["structure"]["arms"]), request["seed"]))
         band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
         aim, noise = Aim.of(exposed, detector, band, request["seed"]), request.get("noise_seed")
         rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)

@@ -19,6 +19,8 @@
     [ingest.dust]      file, column, quantity = "ebv" | "a_v"   a HEALPix map of the Milky Way's dust instead of ours
     [sources]      only = "table" | "grid"   galaxies = "file.csv"  stars = "file.csv"   these and no others
                    band   of their magnitudes (AB), default: "euclid_vis"   spacing   arcsec, of a grid
+    [structure]    arms = true | {contrast, knots, number, least_radius}   spiral arms and knots of large discs
+                   (jobs/request/structure.py), default: discs are smooth
     [strong_lenses]  boost   how many times denser than in nature they are drawn
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
                    of one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
@@ -69,7 +71,7 @@ from pathlib import Path
 from jobs.accuracy import SURVEY, Accuracy, preset, row_for
 from jobs.request import area as areas
 from jobs.request import bands as passbands
-from jobs.request import checks, files, observations
+from jobs.request import checks, files, observations, structure
 from jobs.request.area import Area
 from jobs.request.files import GivenSources
 from jobs.request.schema import (
@@ -150,6 +152,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         "ingest",
         "sources",
         "strong_lenses",
+        "structure",
         "mission",
         "fluxes",
         "psf",
@@ -189,6 +192,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         ingest=files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
         bodies=bodies,
         sources=files.sources(_section(table, "sources", {"only", *GivenSources.__slots__}), folder),
+        structure=structure.parse(_section(table, "structure", {"arms"})),
         noise_seed=_integer(table, "noise_seed", 0, _LARGEST_SEED) if "noise_seed" in table else None,
         psfs=files.psfs(_section(table, "psf", None), folder),
         strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),

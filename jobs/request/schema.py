@@ -13,6 +13,7 @@ from jobs.accuracy import Accuracy
 from jobs.request.area import Area
 from jobs.request.files import GivenSources, Ingest, UserCurves
 from jobs.request.observations import Observation, Pointing
+from jobs.request.structure import Structure
 from lake_schema.tables import mission as database
 from lake_schema.tables import products
 
@@ -43,6 +44,7 @@ EFFECTS = (
 ALWAYS = ("adc", "macc", "quadrants", "ramp", "signal_adc")
 _NO_FILES = UserCurves()
 _NOTHING_TAKEN = Ingest()
+_SMOOTH = Structure()
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +136,7 @@ class Request:
     wcs     : how headers tell the distortion of the optics, one of CONVENTIONS
     bodies  : file of moving bodies in place of ours
     sources : the only sources that there are, in place of the universe
+    structure : what galaxies have beside their profiles
     noise_seed : of all that differs between exposures of the same sky with the same detectors; None = the seed
     detectors, limit : of a plan, the detectors that are to be rendered now, () = all; and how many at most.  A
               command line gives them, and the plan is the same without
@@ -162,6 +165,7 @@ class Request:
     bodies: Path | None = None
     noise_seed: int | None = None
     sources: GivenSources | None = None
+    structure: Structure = _SMOOTH
     detectors: tuple[str, ...] = ()
     limit: int | None = None
 

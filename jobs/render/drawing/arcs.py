@@ -1,4 +1,4 @@
-"""Sources that are a picture: the arcs of strong lenses.
+"""Sources that are a picture: the arcs of strong lenses, the structure of discs.
 
 transform       its Fourier transform where the kernel takes its samples
 through         a PSF's planes with the picture behind them
@@ -24,6 +24,8 @@ from lake_schema.arrays import Array, Float
 # Ref : Barnett, Magland & af Klinteberg 2019, SIAM J. Sci. Comput. 41, C479
 _WIDTH = 8
 _SLOPE = 2.30 * _WIDTH
+# Where q / sinh q is 1.
+_THIN = 1e-9
 # Nodes of the integral that is the window's transform.
 _NODES = 64
 
@@ -41,15 +43,20 @@ def transform(picture: Picture, jacobian: Float, kx: Array, ky: Array) -> Array:
     jacobian : [2, 2] d(u, v) / d(column, row), arcsec, u to the west
     Error    : 1e-6 of the flux (tests/jobs/render/drawing/test_arcs.py)
     """
-    west, north = sums.product(sums.inverse(jacobian).T, np.stack([kx, ky]).astype(float)) * picture.scale
-    across, up = -west, north
+    on_sky = sums.product(sums.inverse(jacobian).T, np.stack([kx, ky]).astype(float))
+    across, up = sums.product(picture.matrix.T, on_sky)
     rows, columns = picture.image.shape
     found = np.empty(len(kx), complex)
     fourier.between(_spectrum(picture.image), across, up, _WIDTH, _SLOPE, found)
     if rows % 2 == 0 or columns % 2 == 0:
         # The middle lies between pixels.
         found *= np.exp(-0.5j * (across * (columns % 2 == 0) + up * (rows % 2 == 0)))
-    return np.asarray(found * quintic(across) * quintic(up))
+    found = found * quintic(across) * quintic(up)
+    if picture.thick is not None:
+        # q / sinh q, as of the disc's smooth light.
+        q = np.maximum(np.abs(sums.product(picture.thick, on_sky)), _THIN)
+        found = found * (2.0 * q * np.exp(-q) / -np.expm1(-2.0 * q))
+    return np.asarray(found)
 
 
 def through(passed: Transfer, picture: Picture, jacobian: Float) -> Transfer:

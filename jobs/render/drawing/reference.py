@@ -13,7 +13,7 @@ from jobs.render.psf.model import Psf
 from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.lensed_arcs import Picture
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Float32
 
 # What galsim takes for a point in the reference, arcsec.
 _POINT = 1e-6
@@ -35,7 +35,7 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e
     parts = [transfer.profile_of(psf, weights).dilate(1.0 / psf.pixel_scale), *pixel]
     picture = sources.picture_of(i)
     if sources.shape[i] >= 0 or picture is not None:
-        profile = _of(picture) if picture else galaxy_shapes.profile(sources.shapes, int(sources.shape[i]), _POINT)
+        profile = _profile(sources, i)
         # World frame, arcsec -> pixels, the flux kept.
         parts.append(galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(profile))
     whole = galsim.Convolve(parts, gsparams=settings) * float(sources.electrons[i])
@@ -46,8 +46,23 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e
     return np.asarray(image.array)
 
 
-def _of(picture: Picture) -> galsim.GSObject:
-    """A picture as galsim interpolates it, world frame (u to the west), flux 1."""
-    image = galsim.Image(np.ascontiguousarray(picture.image[:, ::-1], float), scale=picture.scale)
+def _profile(sources: Sources, i: int) -> galsim.GSObject:
+    """Of flux 1, world frame, arcsec; the structure of a disc as if it were thin."""
+    picture = sources.picture_of(i)
+    if sources.shape[i] < 0 and picture is not None:
+        return _of(picture, picture.image)
+    shape, which = sources.shapes, int(sources.shape[i])
+    smooth = galaxy_shapes.profile(shape, which, _POINT)
+    if picture is None:
+        return smooth
+    # galsim has no image of flux 0: what is added, and what is taken.
+    more, less = (_of(picture, np.maximum(sign * picture.image, 0.0)) for sign in (1.0, -1.0))
+    return smooth + (more - less) * (1.0 - float(shape.bulge_fraction[which]))
+
+
+def _of(picture: Picture, pixels: Float32) -> galsim.GSObject:
+    """Some pixels of a picture as galsim interpolates them, world frame (u to the west), of the flux that they have."""
+    image = galsim.Image(np.ascontiguousarray(pixels, float), scale=1.0)
     # Padded more than by default: the transform is as good as the reference should be.
-    return galsim.InterpolatedImage(image, x_interpolant="quintic", pad_factor=8.0)
+    plain = galsim.InterpolatedImage(image, x_interpolant="quintic", pad_factor=8.0)
+    return plain.transform(*picture.matrix.ravel()).withFlux(float(pixels.sum(dtype=float)))

@@ -120,6 +120,11 @@ def stamp_sizes(
     return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, found + wider), len(SIZES) - 1)])
 
 
+def holding(sizes: Int, wanted: Float) -> Int:
+    """Sides [n], one of SIZES, that are no smaller; wanted : [n] pixels that they hold besides, as far as any does."""
+    return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, np.maximum(sizes, wanted)), len(SIZES) - 1)])
+
+
 def reach(pixel_scale: float) -> float:
     """How far from a source it may shine, arcsec: beyond the corners of the largest stamp. So far sources are read."""
     return _FARTHEST * pixel_scale

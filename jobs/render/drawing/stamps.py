@@ -77,7 +77,7 @@ def draw(
     _draw_beyond(one, here, frame, fallen, unread)
     if tally is not None:
         tally.electrons[:] = np.bincount(whole, fallen, len(sources))
-    layer = wings.wings(pieces.column, pieces.row, pieces.electrons, one.sizes, psf, nx, ny, one.unit)
+    layer = wings.wings(pieces.column, pieces.row, _shining(pieces), one.sizes, psf, nx, ny, one.unit)
     layer += wings.galaxies(pieces.column, pieces.row, one.outside, one.sizes, nx, ny, one.unit)
     return np.asarray(electrons_of(frame, one.unit, layer, wings.BLOCK, wings.MARGIN))
 
@@ -95,7 +95,13 @@ class Tally:
 
 
 def in_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
-    """(what is drawn: each piece of a trail as a source [p], its own trail [p, 2] pixels, whose piece it is [p])."""
+    """(what is drawn: each piece of a trail as a source [p], its own trail [p, 2] pixels, whose piece it is [p]).
+
+    The structure of a disc is a piece besides.
+    """
+    structured = np.flatnonzero(sources.structured)
+    if len(structured):
+        return _with_structure(sources, structured)
     if sources.trail is None:
         return sources, np.zeros((len(sources), 2)), np.arange(len(sources))
     count = stamp_sizes.piece_count(sources.length)
@@ -112,6 +118,27 @@ def in_pieces(sources: Sources) -> tuple[Sources, Float, Int]:
         trail=None,
     )
     return pieces, trail / count[whole, None], whole
+
+
+def _shining(pieces: Sources) -> Float:
+    """[p] electrons that each brings: a disc's structure none, in the sum."""
+    if pieces.picture is None or not any(picture.is_structure for picture in pieces.pictures):
+        return pieces.electrons
+    nothing = np.array([*(picture.is_structure for picture in pieces.pictures), False])
+    return np.asarray(np.where(nothing[pieces.picture], 0.0, pieces.electrons))
+
+
+def _with_structure(sources: Sources, structured: Int) -> tuple[Sources, Float, Int]:
+    """`in_pieces` where some discs [m] have a structure: the sources without, then it, of the light of the discs."""
+    assert sources.picture is not None
+    bare = sources.picture.copy()
+    bare[structured] = -1
+    smooth, trail, whole = in_pieces(replace(sources, picture=bare))
+    some, at_rest = sources.take(structured), np.zeros((len(structured), 2))
+    light = some.electrons * (1.0 - sources.shapes.bulge_fraction[some.shape])
+    discs = replace(some, electrons=light, shape=np.full(len(some), -1), trail=at_rest)
+    pieces = replace(smooth.with_moving(discs), picture=np.append(bare[whole], sources.picture[structured]), trail=None)
+    return pieces, np.concatenate([trail, at_rest]), np.append(whole, structured)
 
 
 @dataclass(frozen=True, slots=True)

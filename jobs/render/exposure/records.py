@@ -10,6 +10,7 @@ import pyarrow as pa
 from jobs.accuracy import Accuracy
 from jobs.fluxes.libraries.templates import Library
 from jobs.render.channels.aim import Aim
+from jobs.render.sources.disc_structure import DiscStructure
 from jobs.render.sources.solar_system import Population
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
@@ -26,6 +27,7 @@ class Rows:
     library    : what the galaxies' sed_1 and sed_2 count;  stellar : what the stars' sed does; None = the embedded ones
     complete   : how far beyond the detector the rows have every source, arcsec
     earlier    : exposures that left something in the detector
+    discs      : what structure large discs have; None = they are smooth
     """
 
     galaxies: pa.Table
@@ -38,6 +40,7 @@ class Rows:
     stellar: Library | None = None
     complete: float = 0.0
     earlier: tuple[Earlier | EarlierSky, ...] = ()
+    discs: DiscStructure | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,15 @@ from jobs.render.exposure import bright_lights, scene_of, standard_stars
 from jobs.render.exposure.records import Rows
 from jobs.render.psf import from_file, spikes, sub_bands
 from jobs.render.psf.model import Psf, of_colours
-from jobs.render.sources import catalogue_rows, colours, galaxy_shapes, lensed_arcs, selection, solar_system
+from jobs.render.sources import (
+    catalogue_rows,
+    colours,
+    disc_structure,
+    galaxy_shapes,
+    lensed_arcs,
+    selection,
+    solar_system,
+)
 from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.errors import BadInput
@@ -255,6 +263,8 @@ def sources_of(
     column, row = astrometry.pixel_of_sky(system, every.ra[kept], every.dec[kept])
     wide = np.array([0.0, *(found.diagonal for found in every.pictures)])[picture[kept] + 1] / detector.pixel_scale
     sizes = stamp_sizes.stamp_sizes(light[kept], shape[kept], form, psf, noise, settings, wide)
+    structure = np.append(disc_structure.sides(form, rows.discs), 0.0)[shape[kept]] / detector.pixel_scale
+    sizes = stamp_sizes.holding(sizes, structure)
     found = Sources(
         every.ids[kept], column, row, np.zeros((len(kept), 2, 2)), light[kept], shape[kept], form, None,
         picture[kept], every.pictures,
@@ -264,7 +274,8 @@ def sources_of(
     colourful = psf.planes is not None and len(psf.planes.wavelength) > 1
     photons = _colours(every.of[kept], rows, aim.band) if colourful else None
     jacobian = astrometry.jacobian(system, found.column, found.row)
-    return replace(found, jacobian=jacobian, photons=photons), sizes[here]
+    found = disc_structure.added(replace(found, jacobian=jacobian, photons=photons), rows.discs)
+    return found, sizes[here]
 
 
 def _spikes(electrons: Float, detector: Detector, psf: Psf, noise: float) -> Float:

@@ -55,5 +55,5 @@ def spectra(rendered: Rendered) -> pa.Table | None:
 
 def _methods(sources: Sources) -> Int:
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
-    method = np.where(pictured, PICTURE, np.where(sources.shape < 0, POINT, PROFILE))
+    method = np.where(sources.shape >= 0, PROFILE, np.where(pictured, PICTURE, POINT))
     return np.where(sources.length > 0, TRAIL, method)

@@ -1,6 +1,6 @@
-"""Lensed images of a galaxy behind a strong lens, as pictures.
+"""Sources that are pictures; the lensed images of a galaxy behind a strong lens, as such.
 
-Picture         surface brightness on a grid of its own, north up, east to the right
+Picture         surface brightness on a grid of its own
 arcs            rows of strong lenses -> pictures, places and electrons
 """
 
@@ -21,15 +21,33 @@ ARC_SCALE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """image : float32[ny, nx] of sum 1, south to north and west to east, its place in the middle;  scale : arcsec"""
+    """What is drawn as it is, or on top of a disc.
+
+    image  : float32[ny, nx] of sum 1, its place in the middle; of sum 0 where it is a disc's structure
+    matrix : float64[2, 2] arcsec to the west and to the north (rows) of a step along its rows and columns (columns)
+    thick  : float64[2] of a disc's structure: galaxy_shapes.Forms' for arcsec, by which it is as thick as its disc
+    """
 
     image: Float32
-    scale: float
+    matrix: Float
+    thick: Float | None = None
+
+    @classmethod
+    def of_sky(cls, image: Float32, scale: float) -> Picture:
+        """An image of sum 1, south to north and west to east; scale : arcsec."""
+        return cls(image, np.array([[-scale, 0.0], [0.0, scale]]))
 
     @property
     def diagonal(self) -> float:
-        """Corner to corner, arcsec."""
-        return float(np.hypot(*self.image.shape)) * self.scale
+        """Corner to corner, arcsec; no less of an image that is drawn on a slant."""
+        west, north = np.abs(self.matrix)
+        rows, columns = self.image.shape
+        return float(np.hypot(west[0] * columns + west[1] * rows, north[0] * columns + north[1] * rows))
+
+    @property
+    def is_structure(self) -> bool:
+        """Light that is moved about on a disc, none by itself."""
+        return self.thick is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,4 +93,4 @@ def _picture(lens: int, side: int, pixels: Array) -> tuple[Picture, float]:
     total = float(pixels.sum(dtype=float))
     if len(pixels) != side**2 or not total > 0.0 or not np.isfinite(total):
         raise BadInput(f"strong lens {lens}: its stamp of side {side} has {len(pixels)} pixels of sum {total:g}")
-    return Picture((pixels / total).reshape(side, side).astype(np.float32), ARC_SCALE), total
+    return Picture.of_sky((pixels / total).reshape(side, side).astype(np.float32), ARC_SCALE), total

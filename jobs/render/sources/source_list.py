@@ -22,9 +22,10 @@ class Sources:
     column, row : float64[n] 0-based pixel position
     jacobian    : float64[n, 2, 2] d(u, v) / d(column, row), arcsec
     electrons   : float64[n] expected
-    shape       : row of `shapes`, -1 = a point or a picture
+    shape       : row of `shapes`, -1 = a point or a picture alone
     photons     : float64[n, w] fraction of its photons in each sub-band of the PSF; None: flat f_nu
-    picture     : row of `pictures`, -1 = no picture; None: there is none
+    picture     : row of `pictures`, -1 = no picture; None: there is none. Of a source with a shape it is the structure
+                  of its disc, drawn on top of it
     trail       : float64[n, 2] pixels that a point moves by in the exposure, in the middle of which it is at its
                   position; None: nothing moves
     """
@@ -74,6 +75,11 @@ class Sources:
         return Sources(
             **both, shapes=self.shapes, photons=photons, picture=picture, pictures=self.pictures, trail=trail
         )
+
+    @property
+    def structured(self) -> Bool:
+        """[n] True of galaxies whose disc has a structure of its own."""
+        return np.zeros(len(self), bool) if self.picture is None else (self.shape >= 0) & (self.picture >= 0)
 
     @property
     def length(self) -> Float:

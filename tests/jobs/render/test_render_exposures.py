@@ -495,6 +495,21 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
         render_exposures.steps(lake, crowded)
 
 
+def test_discs_have_arms_where_they_are_asked_for(rendered, lake):
+    """Images are another version then, and any process makes the same; where they are not, nothing is made anew."""
+    before, plain = keys(rendered, wanted()), images(rendered)
+    assert keys(rendered, wanted(structure={"arms": False})) == before
+    asked = wanted(structure={"arms": {"least_radius": 0.3}})
+    assert all(keys(rendered, asked)[part] != key for part, key in before.items())
+    assert render(rendered, asked) == BOTH
+    found, truth = images(rendered), read.version(rendered, "rendered_truth").rows()
+    assert all(found[path] != data for path, data in plain.items())
+    assert truth_table.PICTURE not in truth["method"].to_pylist()
+    alone = {**REQUEST["pointing"][0], "detectors": ["R22_S12"]}
+    render(lake, wanted(pointing=[alone], structure={"arms": {"least_radius": 0.3}}))
+    assert all(found[path] == data for path, data in images(lake).items())
+
+
 def test_a_product_is_rebuilt_from_its_own_manifest(rendered, tmp_path):
     version = read.version(rendered, "products")
     rebuilt = 0

@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from jobs import accuracy
+from jobs.request import structure
 from jobs.request.files import UserCurves
 from jobs.request.from_toml import from_table, parse
+from jobs.request.structure import Arms
 from lake_schema.errors import BadInput
 
 DEMO = Path(__file__).parents[3] / "requests" / "demo.toml"
@@ -55,6 +57,14 @@ BAD = [
     ("area", {"polygon": [[0, 0], [2, 0], [1, 0.5], [2, 2]]}, "area.polygon"),
     ("area", {"polygon": [[0, 0], 1, [1, 1]]}, r"area.polygon\[1\]"),
     ("area", "all", "area"),
+    ("structure", {"bars": True}, "structure.bars"),
+    ("structure", {"arms": "many"}, "structure.arms wants a table"),
+    ("structure", {"arms": {"pitch": 20.0}}, "structure.arms.pitch"),
+    ("structure", {"arms": {"contrast": -0.1}}, "structure.arms.contrast"),
+    ("structure", {"arms": {"knots": 0.6}}, "structure.arms.knots"),
+    ("structure", {"arms": {"number": 10**6}}, "structure.arms.number"),
+    ("structure", {"arms": {"least_radius": float("nan")}}, "structure.arms.least_radius"),
+    ("structure", {"arms": {"contrast": 0, "knots": 0}}, "structure.arms: neither contrast nor knots"),
     ("universe", {"galaxy_limit": 99}, "universe.galaxy_limit"),
     ("universe", {"galaxy_limit": "26"}, "universe.galaxy_limit"),
     ("universe", {"galaxy_band": 3}, "universe.galaxy_band"),
@@ -174,6 +184,16 @@ def test_the_demo():
     assert demo.pointings[0].detectors == ("3-4",)
     assert demo.accuracy == accuracy.SURVEY
     assert set(demo.facts("seed", "universe")) == {"seed", "universe"}
+
+
+def test_discs_have_structure_where_it_is_asked_for():
+    """And what shapes an image says nothing of it where it is not."""
+    assert structure.facts(from_table(GOOD).structure) == structure.facts(from_table(with_("structure", {})).structure)
+    assert structure.facts(from_table(with_("structure", {"arms": False})).structure) == {}
+    assert from_table(with_("structure", {"arms": True})).structure.arms == Arms()
+    some = from_table(with_("structure", {"arms": {"contrast": 0.5, "number": 40}})).structure
+    assert some.arms == Arms(contrast=0.5, number=40)
+    assert structure.facts(some)["structure"]["arms"]["number"] == 40
 
 
 def test_areas_are_the_same_sky_in_any_form():

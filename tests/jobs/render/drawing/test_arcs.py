@@ -30,7 +30,7 @@ def ring(side=40, seed=3):
     y, x = (np.mgrid[:side, :side] - 0.5 * (side - 1)) / side
     light = np.exp(-0.5 * ((np.hypot(x, y) - 0.2) / 0.06) ** 2) * (1.2 + np.cos(np.arctan2(y, x) - 0.7))
     light *= 1 + 0.3 * np.random.default_rng(seed).random(light.shape)
-    return Picture((light / light.sum()).astype(np.float32), 0.05)
+    return Picture.of_sky((light / light.sum()).astype(np.float32), 0.05)
 
 
 def pictured(camera, name, picture, electrons, column=80.3, row=77.6):
@@ -51,7 +51,7 @@ def drawn(source, psf, accuracy=SURVEY):
 def test_the_transform_is_that_of_the_pixels_under_the_interpolant(rows, columns, seed):
     rng = np.random.default_rng(seed)
     image = rng.random((rows, columns)).astype(np.float32)
-    picture = Picture(image / image.sum(), 0.05)
+    picture = Picture.of_sky(image / image.sum(), 0.05)
     jacobian, k = 0.1 * (np.eye(2) + 0.3 * rng.random((2, 2))), rng.uniform(-8, 8, (2, 40))
     west, north = 0.05 * np.linalg.inv(jacobian).T @ k
     y, x = np.mgrid[:rows, :columns] - 0.5 * np.array([rows - 1, columns - 1])[:, None, None]

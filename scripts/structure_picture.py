@@ -1,0 +1,65 @@
+"""A picture of spiral discs, smooth and with arms and knots: python -m scripts.structure_picture [FILE].
+
+They are drawn through VIS's PSF on a corner of a detector, without noise.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from matplotlib import image
+
+from jobs.accuracy import SURVEY
+from jobs.fluxes import passbands
+from jobs.render.camera import astrometry, detectors
+from jobs.render.camera.pointing import boresight_for
+from jobs.render.drawing import stamp_sizes, stamps
+from jobs.render.drawing.settings import settings_for
+from jobs.render.psf import euclid
+from jobs.render.sources import disc_structure, galaxy_shapes
+from jobs.render.sources.disc_structure import DiscStructure
+from jobs.render.sources.source_list import Sources
+from jobs.request.structure import Arms
+from lake_schema.arrays import Float
+from lake_schema.mission.configuration import resolve
+
+ROOT = Path(__file__).resolve().parents[1]
+# Side of a panel, pixels; electrons of a galaxy, of a pixel's noise, and of the softest and the brightest grey.
+_SIDE, _LIGHT, _NOISE, _SOFT, _WHITE = 160, 2e5, 12.0, 8.0, 1000.0
+_GALAXIES = {
+    "bulge_half_light_radius": [0.5, 0.6, 0.3, 0.4], "disk_half_light_radius": [2.2, 2.4, 1.5, 2.6],
+    "bulge_fraction": [0.1, 0.3, 0.05, 0.15], "bulge_sersic_index": [2.0, 3.0, 1.5, 2.0],
+    "bulge_axis_ratio": [0.9, 0.8, 0.9, 0.8], "inclination": [20.0, 48.0, 60.0, 74.0],
+    "position_angle": [10.0, 60.0, 95.0, 130.0], "kappa": [0.0] * 4, "gamma1": [0.0] * 4, "gamma2": [0.0] * 4,
+}  # fmt: skip
+
+
+def draw(discs: DiscStructure | None) -> Float:
+    """Electrons of the four galaxies side by side."""
+    mission = resolve()
+    detector = replace(detectors.detector("vis", "3-4", mission), nx=4 * _SIDE, ny=_SIDE)
+    system = astrometry.wcs(detector, *boresight_for(detector, 53.1, -27.8, 0.0))
+    column, row = _SIDE * (np.arange(4) + 0.5), np.full(4, _SIDE / 2)
+    shape = galaxy_shapes.shapes(pa.table(_GALAXIES))
+    jacobian = astrometry.jacobian(system, column, row)
+    sources = Sources(np.arange(4), column, row, jacobian, np.full(4, _LIGHT), np.arange(4), shape)
+    psf, settings = euclid.vis_psf(detector, passbands.load("euclid_vis"), mission), settings_for(SURVEY)
+    sizes = stamp_sizes.stamp_sizes(sources.electrons, sources.shape, shape, psf, _NOISE, settings)
+    sizes = stamp_sizes.holding(sizes, disc_structure.sides(shape, discs) / psf.pixel_scale)
+    return stamps.draw(disc_structure.added(sources, discs), sizes, psf, detector.nx, detector.ny)
+
+
+def write(path: Path) -> None:
+    """The picture, a JPEG."""
+    both = np.concatenate([draw(None)[::-1], draw(DiscStructure(Arms(), 1))[::-1]])
+    grey = np.arcsinh(np.maximum(both, 0.0) / _SOFT) / np.arcsinh(_WHITE / _SOFT)
+    twice = np.minimum(grey, 1.0).repeat(2, axis=0).repeat(2, axis=1)
+    image.imsave(path, twice, cmap="gray", vmin=0.0, vmax=1.0, pil_kwargs={"quality": 85})
+
+
+if __name__ == "__main__":
+    write(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "structure.jpg")
