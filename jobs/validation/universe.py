@@ -27,7 +27,7 @@ from jobs.catalogue.stars import stars as milky_way_stars
 from jobs.fluxes import cosmology
 from jobs.fluxes.libraries import rest_grid, templates
 from jobs.request.schema import Universe
-from jobs.validation import census, clustering, observed, pictures, shear, star_counts
+from jobs.validation import census, clustering, observed, pictures, shear, small_scales, star_counts
 from lake_schema import sky
 from lake_schema.arrays import Float
 
@@ -56,7 +56,7 @@ class Size:
 
     settings : of the universe;  blocks : of 4^side_order generation cells;  deep : blocks of one cell to I_E < 28
     wide : blocks of 54 deg2 a box whose clustering is measured;  near : of 215 deg2, for satellites at z = 0.1
-    pixels : order-5 cells whose halos are counted
+    pixels : order-5 cells whose halos are counted; four times as many for clustering at the size of halos
     boxes : seeds of further boxes whose power, clustering and lensing are measured;  stars : cells a latitude
     """
 
@@ -294,6 +294,8 @@ def run(size: Size, folder: Path | None = None) -> dict[str, float]:
         figures |= nearby(size)
     if size.pixels:
         figures |= abundances(size)
+        bright = small_scales.universe_of(SEED, size.settings.box_cells)
+        figures |= small_scales.figures(bright, 4 * size.pixels)
     if size.stars:
         figures |= milky_way(size)
     if folder is not None:

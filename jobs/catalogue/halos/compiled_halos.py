@@ -117,8 +117,8 @@ def satellites(keys: Any, log_mass: Any, limit: Any, least: Any, ratio: Any, sca
     """Number of satellites that reach the limit of their host; where out is long enough they are filled in.
 
     Sub-masses m fall: M / m is a Poisson process of rate 1 / ratio that begins at `least`.
-    keys : uint64[h];  log_mass, limit : float64[h] of hosts, and of the scattered sub-mass
-    least, ratio, scatter, depth : as in halos.toml
+    keys : uint64[h];  log_mass, limit, ratio : float64[h] of hosts, of the scattered sub-mass, and the host's
+    least, scatter, depth : as in halos.toml
     out  : host, member int64[n];  proxy float64[n];  float64[n, 4] uniform in enclosed mass, height, angle; normal
     """
     host, member, proxy, drawn = out
@@ -128,7 +128,7 @@ def satellites(keys: Any, log_mass: Any, limit: Any, least: Any, ratio: Any, sca
         over, number = least, 0
         while True:
             own = following(keys[h], number)
-            over -= ratio * np.log(uniform(following(own, STEP)))
+            over -= ratio[h] * np.log(uniform(following(own, STEP)))
             if over > most:
                 break
             number += 1

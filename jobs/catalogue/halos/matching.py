@@ -34,9 +34,20 @@ class Occupation:
 
     least: float
     ratio: float
+    ratio_z: float
+    z_pivot: float
+    z_last: float
     scatter: float
     depth: float
     concentration: float
+
+    def ratio_at(self, z: Float) -> Float:
+        """Of the halo's mass to a sub-mass, by which the mean number of satellites above that rises by one, [n].
+
+        z : float[n] of the halo
+        """
+        stretch = (1.0 + self.z_pivot) / (1.0 + np.minimum(z, self.z_last))
+        return np.asarray(self.ratio * stretch**self.ratio_z)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +161,7 @@ def proxies(halos: Masses, occupation: Occupation) -> Float:
     step = halos.log_mass[1] - halos.log_mass[0]
     number = np.exp(halos.ln_density) * step
     satellites = sums.product(number, satellites_above(halos.log_mass, occupation).T)
+    satellites *= satellites_at(halos.z, occupation)[:, None]
     # Of the cumulative count of satellites, what lies in each interval.
     inside = number + np.concatenate([satellites[:, :-1] - satellites[:, 1:], satellites[:, -1:]], axis=1)
     smooth = scattered(inside, step, occupation)
@@ -171,12 +183,20 @@ def scattered(number: Float, step: float, occupation: Occupation) -> Float:
 
 
 def satellites_above(log_mass: Float, occupation: Occupation) -> Float:
-    """Mean number of satellites above m[i] in a halo of mass M[j], [i, j].
+    """Mean number of satellites above m[i] in a halo of mass M[j] at z = z_pivot, [i, j].
 
     log_mass : float[m] log10 Msun/h, of halos and of sub-masses
     """
     over = 10.0 ** (log_mass[None, :] - log_mass[:, None])
     return np.asarray(np.maximum(over - occupation.least, 0.0) / occupation.ratio)
+
+
+def satellites_at(z: Float, occupation: Occupation) -> Float:
+    """How many times more satellites a halo has than one at z = z_pivot, [n].
+
+    z : float[n]
+    """
+    return np.asarray(occupation.ratio / occupation.ratio_at(z))
 
 
 def _place(z: Float, nodes: int) -> tuple[Int, Float]:

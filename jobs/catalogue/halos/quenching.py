@@ -79,11 +79,12 @@ def shares(law: Quenching, masses: Masses, occupation: Occupation) -> Shares:
     radius = _mean_radius(occupation.concentration * masses.at(masses.concentration, z, mass))
     red = quenched_central(law, z, mass), quenched_satellite(law, z, mass, radius)
     of_central, of_satellite = (share.reshape(centrals.shape) for share in red)
+    more = matching.satellites_at(masses.z, occupation)[:, None]
     numbers = (
         centrals,
-        sums.product(centrals, inside.T),
+        more * sums.product(centrals, inside.T),
         centrals * of_central,
-        sums.product(centrals * of_satellite, inside.T),
+        more * sums.product(centrals * of_satellite, inside.T),
     )
     central, satellite, red_central, red_satellite = (matching.scattered(n, step, occupation) for n in numbers)
     # Beyond the mass function's end there is nothing to average.

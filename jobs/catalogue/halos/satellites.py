@@ -56,24 +56,24 @@ def draw(halos: HaloModel, masses: Masses, hosts: Halos, seed: int) -> Satellite
     A host's satellites are drawn by falling sub-mass, each with numbers of its own: a deeper request goes on with them.
     halos, masses : tables of halos, and by mass;  hosts : n halos;  seed : of the request
     """
-    own, limit = halos.matching.occupation, halos.mass_limit(hosts.chi)
+    own, limit, z = halos.matching.occupation, halos.mass_limit(hosts.chi), halos.distances.redshift(hosts.chi)
+    ratio = own.ratio_at(z)
     about = (
         keyed.keys(hosts.id, seed, "satellites"),
         hosts.log_mass,
         limit,
         own.least,
-        own.ratio,
+        ratio,
         own.scatter,
         own.depth,
     )
     over = 10.0 ** np.maximum(hosts.log_mass - limit + own.depth, np.log10(own.least))
-    out = _room(int(np.sum(over - own.least) / own.ratio))
+    out = _room(int(np.sum((over - own.least) / ratio)))
     count = compiled_halos.satellites(*about, out)
     if count > out[0].size:
         out = _room(count)
         compiled_halos.satellites(*about, out)
     host, member, proxy, numbers = out[0][:count], out[1][:count], out[2][:count], out[3][:count]
-    z = halos.distances.redshift(hosts.chi)
     offset = _offsets(masses, own.concentration, hosts.log_mass, z, host, numbers)
     kick = masses.dispersion(hosts.log_mass, z)[host] * numbers[:, 3]
     ra, dec, chi = _moved(hosts, host, offset)

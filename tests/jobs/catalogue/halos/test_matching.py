@@ -59,7 +59,7 @@ def test_the_luminosity_function_comes_out(z, rng):
     density[HALOS.log_mass < 10.5] = 0.0
     mass = np.repeat(HALOS.log_mass, rng.poisson(volume * density)) + 0.02 * (rng.random() - 0.5)
     over = 10 ** (mass - 10.5)
-    count = rng.poisson(np.maximum(over - occupation.least, 0) / occupation.ratio)
+    count = rng.poisson(np.maximum(over - occupation.least, 0) / occupation.ratio_at(z))
     host = np.repeat(np.arange(mass.size), count)
     sub = mass[host] - np.log10(occupation.least + (over[host] - occupation.least) * rng.random(host.size))
     proxy = np.concatenate([mass, sub]) + occupation.scatter * rng.standard_normal(mass.size + sub.size)
@@ -87,6 +87,15 @@ def test_satellite_fraction_nearby(m_r, fraction):
     centrals = np.sum(number * ndtr((HALOS.log_mass - least) / occupation.scatter))
     satellites = np.sum(sub * ndtr((HALOS.log_mass[:-1] + 0.01 - least) / occupation.scatter))
     assert satellites / (centrals + satellites) == pytest.approx(fraction, abs=0.03)
+
+
+def test_halos_have_more_satellites_at_high_redshift_up_to_an_end():
+    own = MATCHED.occupation
+    assert own.ratio_at(np.array([own.z_pivot]))[0] == pytest.approx(own.ratio)
+    more = matching.satellites_at(np.array([0.1, 0.5, 1.0, 3.0]), own)
+    assert more[1] == pytest.approx((1.5 / 1.1) ** own.ratio_z)
+    assert (np.diff(more[:3]) > 0).all()
+    assert more[2] == more[3]
 
 
 def test_sizes_and_velocities():

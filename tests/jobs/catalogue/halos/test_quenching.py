@@ -60,7 +60,7 @@ def test_the_mean_over_halos_is_the_share_of_the_sequence(rng, z, proxy):
     """Centrals and satellites drawn by mass function, occupation and scatter, of one proxy mass."""
     occupation, step = MATCHED.occupation, 0.02
     density = np.exp(MASSES.interpolate(MASSES.ln_density, np.array([z]), MASSES.log_mass))[0] * step
-    above = matching.satellites_above(MASSES.log_mass, occupation)
+    above = matching.satellites_above(MASSES.log_mass, occupation) * matching.satellites_at(np.array(z), occupation)
     inside = np.concatenate([above[:-1] - above[1:], above[-1:]])
     scatter = np.exp(-0.5 * ((MASSES.log_mass - proxy) / occupation.scatter) ** 2)
     weight = np.concatenate([density * scatter, (inside * density * scatter[:, None]).ravel()])
