@@ -19,7 +19,7 @@ from tests.jobs.catalogue.conftest import made
 
 LIST = Path(observed.__file__).with_suffix(".csv")
 # Cells without structure: a few degrees of a survey would be needed to tell as much.
-MANY, FEW = 20, 4
+MANY, FEW = 32, 4
 
 
 def seen(universe, cells):
@@ -56,7 +56,7 @@ def test_every_row_is_measured(whole):
 
 
 def test_the_mean_sky_is_as_observed(whole):
-    """A degree2: within two Poisson errors more than the list says."""
+    """1.7 deg2: within two Poisson errors more than the list says."""
     results = checks.checks(whole, 2.0)
     assert [(check.name, check.found) for check in results if check.unexpected] == []
     # Numbers from memory gate nothing one by one; were many of them off, so would be the sky.
