@@ -36,6 +36,7 @@ LARGEST = {
     "library of spectra": 64 * _MB,
     "PSF": 512 * _MB,
     "map of dust": 8 * _GB,
+    "library of galaxies": 128 * _MB,
     "catalogue of stars": 2 * _GB,
     "table of bodies": 4 * _GB,
     "table of sources": 64 * _MB,

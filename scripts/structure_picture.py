@@ -43,14 +43,15 @@ def draw(discs: DiscStructure | None) -> Float:
     mission = resolve()
     detector = replace(detectors.detector("vis", "3-4", mission), nx=4 * _SIDE, ny=_SIDE)
     system = astrometry.wcs(detector, *boresight_for(detector, 53.1, -27.8, 0.0))
-    column, row = _SIDE * (np.arange(4) + 0.5), np.full(4, _SIDE / 2)
+    column: Float = _SIDE * (np.arange(4.0) + 0.5)
+    row = np.full(4, _SIDE / 2)
     shape = galaxy_shapes.shapes(pa.table(_GALAXIES))
     jacobian = astrometry.jacobian(system, column, row)
     sources = Sources(np.arange(4), column, row, jacobian, np.full(4, _LIGHT), np.arange(4), shape)
     psf, settings = euclid.vis_psf(detector, passbands.load("euclid_vis"), mission), settings_for(SURVEY)
     sizes = stamp_sizes.stamp_sizes(sources.electrons, sources.shape, shape, psf, _NOISE, settings)
     sizes = stamp_sizes.holding(sizes, disc_structure.sides(shape, discs) / psf.pixel_scale)
-    return stamps.draw(disc_structure.added(sources, discs), sizes, psf, detector.nx, detector.ny)
+    return stamps.draw(disc_structure.added(sources, shape, discs), sizes, psf, detector.nx, detector.ny)
 
 
 def write(path: Path) -> None:

@@ -43,9 +43,12 @@ GALAXIES: Mapping[str, float | None] = {
     "mag": None, "z_true": 0.2, "sed": 15.0, "ext_law": 0.0, "ebv": 0.0, "bulge_fraction": 0.0,
     "bulge_half_light_radius": 0.3, "disk_half_light_radius": 0.3, "bulge_sersic_index": 4.0, "bulge_axis_ratio": 1.0,
     "disk_axis_ratio": 1.0, "position_angle": 0.0, "kappa": 0.0, "gamma1": 0.0, "gamma2": 0.0, "a_v": 0.0,
+    "stamp": -1.0,
 }  # fmt: skip
 STARS: Mapping[str, float | None] = {"mag": None, "teff": 5800.0, "a_v": 0.0}
-_GALAXY_BOUNDS = {**GALAXY_BOUNDS, "sed": (0.0, 30.0)}
+_GALAXY_BOUNDS = {**GALAXY_BOUNDS, "sed": (0.0, 30.0), "stamp": (-1.0, GALAXY_BOUNDS["stamp"][1])}
+# Columns of whole numbers.
+_WHOLE = ("ext_law", "stamp")
 _STAR_BOUNDS = {**KEYS, "mag": GALAXY_BOUNDS["mag"]}
 # Of a grid, on the square about the area.
 _MOST_PLACES = 4_000_000
@@ -139,11 +142,11 @@ def _read(
         raise BadInput(f"{user_files.shown(file)}: holds no source")
     for title, values in found.items():
         external_rows.within(file, title, values, bounds[title])
-    if (half := found.get("ext_law", np.zeros(n)) % 1.0 != 0.0).any():
-        raise BadInput(f"{user_files.shown(file)}: ext_law of row {half.argmax() + 1} is not a whole number")
+    for title in _WHOLE:
+        if (half := found.get(title, np.zeros(n)) % 1.0 != 0.0).any():
+            raise BadInput(f"{user_files.shown(file)}: {title} of row {half.argmax() + 1} is not a whole number")
     found |= {name: np.full(n, value) for name, value in known.items() if name not in found}
-    if "ext_law" in found:
-        found["ext_law"] = found["ext_law"].astype(np.int64)
+    found |= {name: found[name].astype(np.int64) for name in _WHOLE if name in found}
     return found | {"origin_id": np.arange(1, n + 1)}
 
 

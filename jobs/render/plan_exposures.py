@@ -24,7 +24,7 @@ from jobs.render.planning import (
     variants,
 )
 from jobs.render.planning.mission import PARTS, mission_of, user_filters
-from jobs.render.products.keys import ephemeris_files
+from jobs.render.products.keys import ephemeris_files, stamp_files
 from jobs.request import universe
 from jobs.request.checks import check_rendered
 from jobs.request.schema import Request
@@ -114,6 +114,8 @@ def check(request: Request, lake: Path | None = None) -> tuple[pa.Table, pa.Tabl
     check_catalogues(request)
     if request.bodies is not None:
         ephemeris_files(request.bodies, exposures)
+    if request.structure.stamps is not None:
+        stamp_files(request.structure.stamps.file)
     seen = preconditions.rendered(exposures, rows)
     if request.detectors or request.limit is not None:
         seen = pa.Table.from_pylist(tasks.part(seen, request), seen.schema)

@@ -29,15 +29,15 @@ from jobs.render.planning.mission import mission_of
 from jobs.render.planning.preconditions import INPUTS
 from jobs.render.products import exposure_files, fits_files, truth_table
 from jobs.render.products.beside import spectra_file, truth_file
-from jobs.render.products.keys import ephemeris_files, product_keys, psf_files
+from jobs.render.products.keys import ephemeris_files, product_keys, psf_files, stamp_files
 from jobs.render.psf import from_file
-from jobs.render.sources import catalogue_rows, ephemerides, selection, solar_system
+from jobs.render.sources import catalogue_rows, ephemerides, galaxy_stamps, selection, solar_system
 from jobs.render.sources.catalogue_rows import LENSES
 from jobs.render.sources.disc_structure import DiscStructure
 from jobs.render.sources.solar_system import Population
 from jobs.request import structure
 from jobs.request.schema import Request
-from jobs.request.structure import Arms
+from jobs.request.structure import Arms, Stamps
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -120,6 +120,8 @@ def products(
     facts["request"].update(structure.facts(request.structure))
     if request.bodies is not None:
         facts["bodies"] = ephemeris_files(request.bodies, exposures)
+    if request.structure.stamps is not None:
+        facts["stamps"] = stamp_files(request.structure.stamps.file)
     held = reuse.held(lake, PRODUCTS.name, request.name)
     wanted = {_part_name(task) for task in asked}
     earlier = _earlier_tasks(inputs, exposures, request)
@@ -222,8 +224,7 @@ def work(lake: Path, facts: Json) -> Output:
             bodies = ephemerides.read(Path(file), sha256).of_day
     with heap.kept():
         rows_ = _rows(lake, inputs, exposed, task, detector, own, bodies, earlier)
-        if "structure" in request:
-            rows_ = replace(rows_, discs=DiscStructure(Arms(**request["structure"]["arms"]), request["seed"]))
+        rows_ = _with_structure(rows_, request, facts.get("stamps", {}))
         band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
         aim, noise = Aim.of(exposed, detector, band, request["seed"]), request.get("noise_seed")
         rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
@@ -236,6 +237,16 @@ def work(lake: Path, facts: Json) -> Output:
     if spectra is not None:
         files[spectra_file(*place)] = lambda path: parquet.write(path, spectra, RENDERED_SPECTRA)
     return Output(rows, files)
+
+
+def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows:
+    """The rows, and what galaxies have beside their profiles; files : sha256 of a library, by file."""
+    wanted, seed = request.get("structure", {}), request["seed"]
+    if "arms" in wanted:
+        rows = replace(rows, discs=DiscStructure(Arms(**wanted["arms"]), seed))
+    for file, sha256 in files.items():
+        rows = replace(rows, stamps=galaxy_stamps.of_file(Stamps(Path(file), **wanted["stamps"]), seed, sha256))
+    return rows
 
 
 def _rows(

@@ -21,6 +21,7 @@
                    band   of their magnitudes (AB), default: "euclid_vis"   spacing   arcsec, of a grid
     [structure]    arms = true | {contrast, knots, number, least_radius}   spiral arms and knots of large discs
                    (jobs/request/structure.py), default: discs are smooth
+                   stamps = {file, nearest, least_radius}   your own galaxies (jobs/render/sources/galaxy_stamps.py)
     [strong_lenses]  boost   how many times denser than in nature they are drawn
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
                    of one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
@@ -192,7 +193,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         ingest=files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
         bodies=bodies,
         sources=files.sources(_section(table, "sources", {"only", *GivenSources.__slots__}), folder),
-        structure=structure.parse(_section(table, "structure", {"arms"})),
+        structure=structure.parse(_section(table, "structure", set(structure.Structure.__slots__)), folder),
         noise_seed=_integer(table, "noise_seed", 0, _LARGEST_SEED) if "noise_seed" in table else None,
         psfs=files.psfs(_section(table, "psf", None), folder),
         strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),

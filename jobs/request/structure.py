@@ -1,6 +1,6 @@
 """Galaxies that are no smooth profiles: the section `structure`.
 
-Arms, Structure   what is asked for
+Arms, Stamps, Structure   what is asked for
 parse             the section
 facts             what shapes an image, for its key
 """
@@ -8,9 +8,11 @@ facts             what shapes an image, for its key
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-from jobs.request.toml_values import Toml, integer, number, table_of
+from jobs.request.toml_values import Toml, boolean, integer, number, string, table_of
+from lake_schema import user_files
 from lake_schema.errors import BadInput
 
 # Fewer knots would be no disc, and each is drawn.
@@ -34,18 +36,49 @@ class Arms:
 
 
 @dataclass(frozen=True, slots=True)
+class Stamps:
+    """A library of galaxies, drawn in place of profiles (jobs/render/sources/galaxy_stamps.py).
+
+    nearest : galaxies that name no stamp have one, too, drawn among those nearest in shape
+    least_radius : arcsec, half-light radius of the smallest of them
+    """
+
+    file: Path
+    nearest: bool = False
+    least_radius: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
 class Structure:
-    """What galaxies have beside their profiles; arms : None = discs are smooth."""
+    """What galaxies have beside their profiles; arms : None = discs are smooth;  stamps : None = there are none."""
 
     arms: Arms | None = None
+    stamps: Stamps | None = None
 
 
-def parse(table: Toml) -> Structure:
-    """The section `structure`; BadInput names the key."""
-    path, default, found = "structure.arms", Arms(), table.get("arms", False)
-    if isinstance(found, bool):
-        return Structure(default if found else None)
-    given = table_of(found, path, set(Arms.__slots__))
+def parse(table: Toml, folder: Path) -> Structure:
+    """The section `structure`; files are found from `folder`.  BadInput names the key."""
+    return Structure(_arms(table.get("arms", False)), _stamps(table["stamps"], folder) if "stamps" in table else None)
+
+
+def _stamps(value: object, folder: Path) -> Stamps:
+    path = "structure.stamps"
+    given = table_of(value, path, set(Stamps.__slots__))
+    nearest = boolean(given, f"{path}.nearest", False)
+    if "least_radius" in given and not nearest:
+        raise BadInput(f"{path}.least_radius wants nearest = true: a stamp that is named is drawn at any size")
+    return Stamps(
+        user_files.expanded(string(given, f"{path}.file"), folder),
+        nearest,
+        number(given, f"{path}.least_radius", 0.05, 60.0, 0.5),
+    )
+
+
+def _arms(value: object) -> Arms | None:
+    path, default = "structure.arms", Arms()
+    if isinstance(value, bool):
+        return default if value else None
+    given = table_of(value, path, set(Arms.__slots__))
     arms = Arms(
         number(given, f"{path}.contrast", 0.0, 2.0, default.contrast),
         number(given, f"{path}.knots", 0.0, 0.5, default.knots),
@@ -54,9 +87,14 @@ def parse(table: Toml) -> Structure:
     )
     if not arms.contrast and not arms.knots:
         raise BadInput(f"{path}: neither contrast nor knots: false leaves discs smooth")
-    return Structure(arms)
+    return arms
 
 
 def facts(structure: Structure) -> dict[str, Any]:
-    """Of a request that asks for some structure; nothing where galaxies are smooth."""
-    return {} if structure.arms is None else {"structure": {"arms": asdict(structure.arms)}}
+    """Of a request that asks for some structure; nothing where galaxies are smooth.  A file's name is no part of it."""
+    found: dict[str, Any] = {}
+    if structure.arms is not None:
+        found["arms"] = asdict(structure.arms)
+    if structure.stamps is not None:
+        found["stamps"] = {name: getattr(structure.stamps, name) for name in ("nearest", "least_radius")}
+    return {"structure": found} if found else {}

@@ -53,7 +53,7 @@ def _component(k: int) -> tuple[Column, ...]:
 
 GALAXIES = Table(
     "galaxies",
-    3,
+    4,
     (
         # 1 identity
         id_of_kinds(0, 4),
@@ -258,6 +258,16 @@ GALAXIES = Table(
             doc="identifier in the catalogue that the galaxy was taken from; missing where it was drawn here",
             nullable=True,
             since=2,
+        ),
+        Column(
+            "stamp",
+            "int32",
+            ucd="meta.number",
+            doc="picture of a library of yours that is drawn in place of the profile, counted from 0; missing: none",
+            lo=0,
+            hi=1e6,
+            nullable=True,
+            since=4,
         ),
     ),
     "Galaxies of the True Universe: central, satellite, QSO, high-redshift and strongly lensed.",

@@ -11,7 +11,7 @@ from lake_schema.columns import Column, Table
 METHODS = (
     (0, "a point, through the PSF at its place"),
     (1, "a profile, convolved with the PSF at its place"),
-    (2, "a strong lens' picture, convolved with the PSF at its place"),
+    (2, "a picture, of a strong lens' arcs or of a galaxy of a library, convolved with the PSF at its place"),
     (3, "a trail of a moving point, in pieces, each through the PSF at its place"),
 )
 

@@ -22,7 +22,7 @@ from jobs.render import archive
 from jobs.render.camera import detectors
 from jobs.render.planning import ground_surveys
 from jobs.render.psf import from_file
-from jobs.render.sources import ephemerides
+from jobs.render.sources import ephemerides, galaxy_stamps
 from jobs.request import area, files
 from jobs.request.from_toml import parse
 from jobs.request.observations import Observation
@@ -347,6 +347,10 @@ TARGETS = {
         lambda: [as_image(PLANES, SCALE), as_image(PLANES[0], SCALE), packed(as_image(PLANES, SCALE))], of_psf, ".fits",
     ),
     "PSF, PSFEx": (lambda: [psfex()], of_psf, ".psf"),
+    "library of galaxies": (
+        lambda: [as_image(PLANES[:2]), packed(as_image(PLANES[:2]))],
+        lambda path: galaxy_stamps.read.__wrapped__(path, ""), ".fits",
+    ),
     **table_targets("bodies", {**BODIES, "name": MANY["name"]}, lambda path: ephemerides.read.__wrapped__(path, "")),
     **table_targets("catalogue", MANY, rows_of(mapping.halos(HALOS)), units={"ra": "deg"}),
     "catalogue, Parquet": (

@@ -248,6 +248,9 @@ OWN = {
     "solar_system.bodies": (
         POINT + "[solar_system]\nbodies = {}\n", lambda r: keys.ephemeris_files(r.bodies, SKY)
     ),
+    "structure.stamps": (
+        POINT + "[structure]\nstamps = {{ file = {} }}\n", lambda r: keys.stamp_files(r.structure.stamps.file)
+    ),
     "observation.pointings": ('[[observation]]\nchannels = ["VIS"]\npointings = {}\n', lambda r: None),
 }  # fmt: skip
 

@@ -49,6 +49,7 @@ GALAXY_BOUNDS: Bounds = {
     "mag": (-5.0, 60.0),
     "origin_id": (-(2.0**63), 2.0**63),
     "halo": (-(2.0**63), 2.0**63),
+    "stamp": (-1, 1e6),
 }
 MAY_MISS = tuple(c.name for c in GALAXIES.columns if c.nullable)
 HALO_BOUNDS: Bounds = {
@@ -68,7 +69,7 @@ TRAINING_BOUNDS: Bounds = {
     "ext_law": (0, 4),
     "ebv": (0.0, 3.0),
 }
-_INTEGERS = ("kind", "ext_law", "ext_law_1", "ext_law_2", "sed_1", "sed_2")
+_INTEGERS = ("kind", "ext_law", "ext_law_1", "ext_law_2", "sed_1", "sed_2", "stamp")
 
 
 @dataclass(frozen=True, slots=True)

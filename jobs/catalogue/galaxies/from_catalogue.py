@@ -146,6 +146,8 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Ta
     }
     if "origin_id" in given:
         columns["origin_id"] = given["origin_id"]
+    if "stamp" in given:
+        columns["stamp"] = np.ma.masked_less(given["stamp"], 0)
     rows = GALAXIES.build({name: _masked(name, values) for name, values in columns.items()})
     return cells.in_order(lensing.turned(rows, universe.rotation))
 

@@ -11,7 +11,9 @@ from jobs.accuracy import Accuracy
 from jobs.fluxes.libraries.templates import Library
 from jobs.render.channels.aim import Aim
 from jobs.render.sources.disc_structure import DiscStructure
+from jobs.render.sources.galaxy_stamps import GalaxyStamps
 from jobs.render.sources.solar_system import Population
+from lake_schema.arrays import Float
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 
@@ -28,6 +30,8 @@ class Rows:
     complete   : how far beyond the detector the rows have every source, arcsec
     earlier    : exposures that left something in the detector
     discs      : what structure large discs have; None = they are smooth
+    stamps     : what galaxies are drawn as in place of their profiles; None = there are none
+    bulges     : [n] part of the galaxies' light that is in the bulge, the same in all bands; None = as the rows say
     """
 
     galaxies: pa.Table
@@ -41,6 +45,8 @@ class Rows:
     complete: float = 0.0
     earlier: tuple[Earlier | EarlierSky, ...] = ()
     discs: DiscStructure | None = None
+    stamps: GalaxyStamps | None = None
+    bulges: Float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,7 @@ from jobs.render.sources import (
     colours,
     disc_structure,
     galaxy_shapes,
+    galaxy_stamps,
     lensed_arcs,
     selection,
     solar_system,
@@ -48,7 +49,7 @@ from lake_schema.tables.strong_lenses import STRONG_LENSES
 
 # What is read of the catalogues; fluxes are read besides.
 SHAPE_COLUMNS = ("id", "kind", "ra_lensed", "dec_lensed", *galaxy_shapes.COLUMNS)
-GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, *colours.GALAXY_COLUMNS, *bulges.COLUMNS)))
+GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, galaxy_stamps.COLUMN, *colours.GALAXY_COLUMNS, *bulges.COLUMNS)))
 STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
 # Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
 _MOST_ELECTRONS = 1e17
@@ -83,7 +84,7 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """Galaxies, stars and arcs, [n] each.
+    """Galaxies, stars and arcs, [n] each; form : of all galaxies, those that are drawn as pictures among them.
 
     electrons : expected;  shape, picture : as of Sources
     of        : whose spectrum each has, counted from the galaxies on to the stars
@@ -108,6 +109,7 @@ def listed(rows: Rows, electrons: tuple[Float, Float]) -> Listed:
     catalogue, points = rows.galaxies, rows.stars
     form, n, stars = galaxy_shapes.shapes(catalogue), len(catalogue), len(points)
     arcs = _arcs(rows.lenses, catalogue, electrons[0], form)
+    stamp, stamps = galaxy_stamps.of_rows(catalogue, _of_all_bands(form, rows), rows.stamps)
     ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy(), arcs.ids]).astype(np.int64)
     light = np.concatenate([*electrons, arcs.electrons])
     _check(ids, light)
@@ -116,12 +118,12 @@ def listed(rows: Rows, electrons: tuple[Float, Float]) -> Listed:
         np.concatenate([catalogue["ra_lensed"].to_numpy(), points["ra"].to_numpy(), arcs.ra]),
         np.concatenate([catalogue["dec_lensed"].to_numpy(), points["dec"].to_numpy(), arcs.dec]),
         light,
-        np.concatenate([np.arange(n), np.full(stars + len(arcs.ids), -1)]).astype(np.int64),
-        np.concatenate([np.full(n + stars, -1), np.arange(len(arcs.ids))]).astype(np.int64),
+        np.concatenate([np.where(stamp < 0, np.arange(n), -1), np.full(stars + len(arcs.ids), -1)]).astype(np.int64),
+        np.concatenate([stamp, np.full(stars, -1), len(stamps) + np.arange(len(arcs.ids))]).astype(np.int64),
         # Arcs have the colour of what they are an image of.
         np.concatenate([np.arange(n + stars), arcs.source]).astype(np.int64),
         form,
-        arcs.pictures,
+        (*stamps, *arcs.pictures),
     )
 
 
@@ -161,7 +163,8 @@ def rows_of(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
     """
     middle = aim.exposure.mjd + 0.5 * aim.exposure.exposure_time_s / 86400.0
     galaxies = bulges.in_band(rows.galaxies, aim.band, rows.library or templates.galaxy_library())
-    rows = replace(rows, galaxies=galaxies, stars=catalogue_rows.at_time(rows.stars, middle))
+    shares = np.asarray(rows.galaxies["bulge_fraction"].to_numpy(), float)
+    rows = replace(rows, galaxies=galaxies, stars=catalogue_rows.at_time(rows.stars, middle), bulges=shares)
     return standard_stars.with_standards(rows, aim, mission)
 
 
@@ -263,8 +266,8 @@ def sources_of(
     column, row = astrometry.pixel_of_sky(system, every.ra[kept], every.dec[kept])
     wide = np.array([0.0, *(found.diagonal for found in every.pictures)])[picture[kept] + 1] / detector.pixel_scale
     sizes = stamp_sizes.stamp_sizes(light[kept], shape[kept], form, psf, noise, settings, wide)
-    structure = np.append(disc_structure.sides(form, rows.discs), 0.0)[shape[kept]] / detector.pixel_scale
-    sizes = stamp_sizes.holding(sizes, structure)
+    structure = np.append(disc_structure.sides(_of_all_bands(form, rows), rows.discs), 0.0)[shape[kept]]
+    sizes = stamp_sizes.holding(sizes, structure / detector.pixel_scale)
     found = Sources(
         every.ids[kept], column, row, np.zeros((len(kept), 2, 2)), light[kept], shape[kept], form, None,
         picture[kept], every.pictures,
@@ -274,8 +277,13 @@ def sources_of(
     colourful = psf.planes is not None and len(psf.planes.wavelength) > 1
     photons = _colours(every.of[kept], rows, aim.band) if colourful else None
     jacobian = astrometry.jacobian(system, found.column, found.row)
-    found = disc_structure.added(replace(found, jacobian=jacobian, photons=photons), rows.discs)
-    return found, sizes[here]
+    found = replace(found, jacobian=jacobian, photons=photons)
+    return disc_structure.added(found, _of_all_bands(form, rows), rows.discs), sizes[here]
+
+
+def _of_all_bands(form: galaxy_shapes.Shapes, rows: Rows) -> galaxy_shapes.Shapes:
+    """Galaxies with what they have of bulges in the catalogue: what they look like is not another thing in a band."""
+    return form if rows.bulges is None else replace(form, bulge_fraction=rows.bulges)
 
 
 def _spikes(electrons: Float, detector: Detector, psf: Psf, noise: float) -> Float:

@@ -13,7 +13,7 @@ from jobs.render.channels import registry
 from jobs.render.drawing import stamp_sizes
 from jobs.render.exposure import persistence
 from jobs.render.psf import from_file
-from jobs.render.sources import catalogue_rows, ephemerides, selection
+from jobs.render.sources import catalogue_rows, ephemerides, galaxy_stamps, selection
 from jobs.render.sources.catalogue_rows import CATALOGUES, CELLS, FARTHEST, LENSES
 from lake_schema import user_files
 from lake_schema.mission.configuration import MissionConfiguration
@@ -89,6 +89,8 @@ def _own_files(facts: Json, exposure: ExposureRow, detector: str) -> Json:
         files["psf"] = facts["psf"][str(from_file.file_of(psf, detector))]
     if "bodies" in facts and registry.CHANNELS[exposure.channel].sees_bodies(exposure.image_type):
         (files["bodies"],) = facts["bodies"].values()
+    if "stamps" in facts:
+        (files["stamps"],) = facts["stamps"].values()
     return files
 
 
@@ -106,6 +108,13 @@ def ephemeris_files(file: Path, exposures: pa.Table) -> dict[str, str]:
     rows = map(ExposureRow.of, exposures.to_pylist())
     seen = [row.mjd for row in rows if registry.CHANNELS[row.channel].sees_bodies(row.image_type)]
     ephemerides.check(ephemerides.read(file, sha256), file, seen)
+    return {str(file): sha256}
+
+
+def stamp_files(file: Path) -> dict[str, str]:
+    """sha256 of the user's library of galaxies, by file; refused before anything is rendered where it is none."""
+    sha256 = file_sha256(user_files.checked(file, galaxy_stamps.KIND, "structure.stamps.file"))
+    galaxy_stamps.read(file, sha256)
     return {str(file): sha256}
 
 

@@ -73,13 +73,11 @@ def sides(shape: Shapes, discs: DiscStructure | None) -> Float:
     return np.where(some, wide, 0.0)
 
 
-def added(sources: Sources, discs: DiscStructure | None) -> Sources:
-    """The sources, with pictures of the structure of those discs that have one."""
+def added(sources: Sources, shape: Shapes, discs: DiscStructure | None) -> Sources:
+    """The sources, with pictures of the structure of those discs that have one; shape : of all galaxies."""
     if discs is None:
         return sources
-    shape, body = sources.shapes, sources.shape >= 0
-    body[body] = sides(shape.take(sources.shape[body]), discs) > 0.0
-    which = np.flatnonzero(body)
+    which = np.flatnonzero(np.append(sides(shape, discs) > 0.0, False)[sources.shape])
     found = _pictures(sources.ids[which], shape.take(sources.shape[which]), discs)
     picture = np.full(len(sources), -1) if sources.picture is None else sources.picture.copy()
     picture[which] = len(sources.pictures) + np.arange(len(which))

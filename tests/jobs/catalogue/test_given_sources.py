@@ -15,7 +15,7 @@ from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 from tests import requests
 
-TWO = "ra,dec,mag,position_angle,gamma1\n53.10,-27.80,20.0,30.0,0.05\n53.11,-27.81,24.5,140.0,-0.02\n"
+TWO = "ra,dec,mag,position_angle,gamma1,stamp\n53.10,-27.80,20.0,30.0,0.05,3\n53.11,-27.81,24.5,140.0,-0.02,-1\n"
 STAR = "ra,dec,mag,teff\n53.12,-27.80,18.0,4000\n"
 
 
@@ -54,6 +54,7 @@ def test_the_tables_are_the_catalogue(tmp_path):
     assert rows["origin_id"].to_pylist() == [1, 2]
     assert rows["ra"].to_pylist() == rows["ra_lensed"].to_pylist() == [53.10, 53.11]
     assert rows["position_angle"].to_pylist() == [30.0, 140.0]
+    assert rows["stamp"].to_pylist() == [3, None]
     assert rows["gamma1"].to_numpy() == pytest.approx([0.05, -0.02], abs=1e-8)
     for name in ("bulge_fraction", "bulge_sersic_index", "disk_half_light_radius", "a_v"):
         assert np.all(rows[name].to_numpy() == np.float32(given_sources.GALAXIES[name]))

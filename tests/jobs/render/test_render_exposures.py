@@ -510,6 +510,26 @@ def test_discs_have_arms_where_they_are_asked_for(rendered, lake):
     assert all(found[path] == data for path, data in images(lake).items())
 
 
+def test_galaxies_of_a_library_are_drawn(rendered, tmp_path):
+    """The sha256 of its file is in the key of an image, and stands for it while it is rendered."""
+    before, path = keys(rendered, wanted()), tmp_path / "library.fits"
+    y, x = np.mgrid[:32, :32] - 15.5
+    fits.writeto(path, np.array([np.exp(-np.hypot(x, q * y) / 3.0) for q in (1.0, 2.0)], np.float32))
+    asked = wanted(structure={"stamps": {"file": str(path), "nearest": True, "least_radius": 0.2}})
+    found = keys(rendered, asked)
+    assert all(found[part] != key for part, key in before.items())
+    assert render(rendered, asked) == BOTH
+    truth = read.version(rendered, "rendered_truth").rows()
+    drawn = truth.filter(pc.equal(truth["method"], truth_table.PICTURE))
+    assert set(drawn["id"].to_pylist()) <= set(read.version(rendered, "galaxies").rows(["id"])["id"].to_pylist())
+    assert drawn.num_rows > 5
+    step = render_exposures.steps(rendered, asked)[0]
+    fits.writeto(path, np.exp(-np.hypot(x, y) / 3.0)[None].astype(np.float32), overwrite=True)
+    assert all(keys(rendered, asked)[part] != key for part, key in found.items())
+    with pytest.raises(BadInput, match=r"library.fits: has changed since the rendering began"):
+        render_exposures.work(rendered, {**step.plan.facts, **step.plan.parts[0].facts})
+
+
 def test_a_product_is_rebuilt_from_its_own_manifest(rendered, tmp_path):
     version = read.version(rendered, "products")
     rebuilt = 0

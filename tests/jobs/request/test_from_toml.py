@@ -10,7 +10,7 @@ from jobs import accuracy
 from jobs.request import structure
 from jobs.request.files import UserCurves
 from jobs.request.from_toml import from_table, parse
-from jobs.request.structure import Arms
+from jobs.request.structure import Arms, Stamps
 from lake_schema.errors import BadInput
 
 DEMO = Path(__file__).parents[3] / "requests" / "demo.toml"
@@ -65,6 +65,11 @@ BAD = [
     ("structure", {"arms": {"number": 10**6}}, "structure.arms.number"),
     ("structure", {"arms": {"least_radius": float("nan")}}, "structure.arms.least_radius"),
     ("structure", {"arms": {"contrast": 0, "knots": 0}}, "structure.arms: neither contrast nor knots"),
+    ("structure", {"stamps": "a.fits"}, "structure.stamps wants a table"),
+    ("structure", {"stamps": {}}, "structure.stamps.file is missing"),
+    ("structure", {"stamps": {"file": "a.fits", "sky": 1}}, "structure.stamps.sky"),
+    ("structure", {"stamps": {"file": "a.fits", "nearest": 1}}, "structure.stamps.nearest"),
+    ("structure", {"stamps": {"file": "a.fits", "least_radius": 1.0}}, "structure.stamps.least_radius wants nearest"),
     ("universe", {"galaxy_limit": 99}, "universe.galaxy_limit"),
     ("universe", {"galaxy_limit": "26"}, "universe.galaxy_limit"),
     ("universe", {"galaxy_band": 3}, "universe.galaxy_band"),
@@ -194,6 +199,10 @@ def test_discs_have_structure_where_it_is_asked_for():
     some = from_table(with_("structure", {"arms": {"contrast": 0.5, "number": 40}})).structure
     assert some.arms == Arms(contrast=0.5, number=40)
     assert structure.facts(some)["structure"]["arms"]["number"] == 40
+    own = from_table(with_("structure", {"stamps": {"file": "a.fits", "nearest": True}}), Path("there")).structure
+    assert own.stamps == Stamps(Path("there/a.fits"), True, 0.5)
+    # A library by another name is the same; its sha256 tells.
+    assert structure.facts(own) == {"structure": {"stamps": {"nearest": True, "least_radius": 0.5}}}
 
 
 def test_areas_are_the_same_sky_in_any_form():

@@ -4,18 +4,22 @@ from dataclasses import replace
 
 import galsim
 import numpy as np
+import pyarrow as pa
 import pytest
+from astropy.io import fits
 
 from jobs.accuracy import REFERENCE, SURVEY
+from jobs.fluxes import bulges
 from jobs.render.camera.astrometry import sky_of_pixel, wcs
 from jobs.render.camera.pointing import boresight_for
 from jobs.render.drawing import arcs, cost, reference, stamp_sizes, stamps
 from jobs.render.drawing.settings import settings_for
 from jobs.render.products import truth_table
 from jobs.render.psf import euclid
-from jobs.render.sources import disc_structure
+from jobs.render.sources import disc_structure, galaxy_stamps
 from jobs.render.sources.disc_structure import DiscStructure
-from jobs.request.structure import Arms
+from jobs.request.structure import Arms, Stamps
+from lake_schema.store.provenance import file_sha256
 from tests.jobs.render import fields, infrared
 from tests.jobs.render.exposure.test_render import SIDE, field, render
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, moments, one_source, psf_of, small, stars
@@ -34,7 +38,8 @@ def test_a_sheared_spiral_is_what_galsim_draws(camera, name, electrons):
     detector, psf = small(camera, name, 256), psf_of(camera)
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     shape = {**SPIRAL, "position_angle": 25.0, "kappa": 0.1, "gamma1": 0.15, "gamma2": -0.1}
-    source = disc_structure.added(one_source(detector, system, electrons, 128.3, 126.8, **shape), DISCS)
+    source = one_source(detector, system, electrons, 128.3, 126.8, **shape)
+    source = disc_structure.added(source, source.shapes, DISCS)
     settings = settings_for(REFERENCE)
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
     sizes = stamp_sizes.holding(sizes, disc_structure.sides(source.shapes, DISCS) / psf.pixel_scale)
@@ -54,7 +59,7 @@ def test_structure_is_as_thick_as_its_disc(inclination):
     detector = small("vis", "2-3")
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     source = one_source(detector, system, inclination=inclination, position_angle=90.0, disk_half_light_radius=1.2)
-    (picture,) = disc_structure.added(source, DISCS).pictures
+    (picture,) = disc_structure.added(source, source.shapes, DISCS).pictures
     k = np.random.default_rng(1).uniform(-8, 8, (2, 50))
     thick, thin = arcs.transform(picture, np.eye(2), *k), arcs.transform(replace(picture, thick=None), np.eye(2), *k)
     # A position angle of 90 deg: the major axis lies east-west.
@@ -114,6 +119,32 @@ def test_a_knot_is_at_the_same_place_in_every_band_and_dither():
     infra = [in_h(discs, place) for discs in (KNOT, None)]
     # NISP's headers have the windowed centroid of a star.
     np.testing.assert_allclose(offset(*infra, place), at, atol=0.06)
+
+
+@pytest.mark.parametrize("kind", ["arms", "stamps"])
+def test_a_bulge_that_is_brighter_in_a_band_is_another_bulge_in_the_same_picture(kind, monkeypatch, tmp_path):
+    """What a galaxy looks like goes by the catalogue; how much of its light is the disc's goes by the band."""
+    asked = {"discs": DISCS}
+    if kind == "stamps":
+        fits.writeto(tmp_path / "two.fits", np.array([blob(q) for q in (1.0, 0.9, 0.5)], np.float32))
+        sha256 = file_sha256(tmp_path / "two.fits")
+        asked = {"discs": None, "stamps": galaxy_stamps.of_file(Stamps(tmp_path / "two.fits", True), 1, sha256)}
+    plain = with_structure("VIS", **asked)[0].sources
+
+    def in_band(rows, *_):
+        return rows.set_column(rows.schema.get_field_index("bulge_fraction"), "bulge_fraction", pa.array([0.6]))
+
+    monkeypatch.setattr(bulges, "in_band", in_band)
+    red = with_structure("VIS", **asked)[0].sources
+    assert red.shapes.bulge_fraction.tolist() == [0.6]
+    (one,), (other,) = plain.pictures, red.pictures
+    np.testing.assert_array_equal(one.image, other.image)
+    np.testing.assert_array_equal(one.matrix, other.matrix)
+
+
+def blob(ratio):
+    y, x = np.mgrid[:48, :48] - 23.5
+    return np.exp(-np.hypot(x, y / ratio) / 4.0)
 
 
 def test_shear_moves_a_knot_as_it_moves_the_sky():
