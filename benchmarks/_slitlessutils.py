@@ -48,7 +48,7 @@ def main(configuration: Path, given: Path, out: Path) -> None:
     frame, start = np.zeros(shape), time.process_time()
     for image, (left, low), spectrum in zip(images, corners, spectra, strict=True):
         detected = order.sensitivity(waves) * spectrum * step
-        for row, column in np.argwhere(image > 1e-5 * image.sum()).tolist():
+        for row, column in np.argwhere(image > 1e-6 * image.sum()).tolist():
             # Corners of a pixel, whose places count from 1.
             x = left + column + 1 + np.array([-0.5, -0.5, 0.5, 0.5])
             y = low + row + 1 + np.array([-0.5, 0.5, 0.5, -0.5])
