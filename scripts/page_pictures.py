@@ -124,6 +124,11 @@ def pictures(into: Path) -> list[tuple[str, str]]:
             show(tab)
             tab.screenshot(path=into / f"page_{name}.png")
             taken.append((f"page_{name}.png", caption))
+        tab.click("#theme")
+        tab.click("#tab-plots")
+        time.sleep(1.5)
+        tab.screenshot(path=into / "page_light.png")
+        taken.append(("page_light.png", "The same histograms in the light theme"))
         browser.close()
     if faults:
         raise RuntimeError(f"the page has errors: {faults}")

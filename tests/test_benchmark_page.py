@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from benchmarks import _browser
 from benchmarks import page as benchmark
 
 
@@ -12,8 +13,9 @@ def test_the_figures(tmp_path):
     file = tmp_path / "page.json"
     assert benchmark.main(["--quick", "--json", str(file)]) == 0
     figures = json.loads(file.read_text())
-    assert set(benchmark.NOTES) <= set(figures)
-    assert all(figures[key] >= 0 for key in benchmark.NOTES)
+    browsers = {"cube_ms", "brush_1m_ms", "brush_1m_95_ms", "first_sky_browser_s"} if _browser.missing() else set()
+    assert set(benchmark.NOTES) - browsers <= set(figures)
+    assert all(figures[key] >= 0 for key in set(benchmark.NOTES) - browsers)
     # What no load spoils: memory.
     assert figures["server_gb"] < 0.5
     assert figures["download_mb"] < 300

@@ -52,7 +52,7 @@ export async function dispersed(panel, source, isStill, drawings) {
     const number = trace.images.science, middle = [poly(trace.trace_x, 0.5), poly(trace.trace_y, 0.5)];
     const canvas = api.h("canvas", { class: "strip", role: "img" }), scale = api.h("canvas", { class: "scale", "aria-hidden": "true" });
     const name = `${trace.channel} ${trace.band}, exposure ${trace.exposure_id}, ${trace.detector}`;
-    const overlap = trace.overlapped === null ? "" : `, ${api.number(100 * trace.overlapped, 3)} % of it beside ${trace.contaminants.length} other sources`;
+    const overlap = trace.contaminants.length ? `, ${api.number(100 * trace.overlapped, 3)} % of it beside ${trace.contaminants.length} other sources` : ", beside no other source";
     panel.append(api.h("figure", {}, api.h("figcaption", {}, api.h("span", { class: "grow" }, name),
       api.h("button", { onclick: () => said.show?.(number, ...middle) }, "Show in the image")), canvas, scale,
       api.h("div", { class: "range" }, `${api.number(trace.expected, 4)} electrons expected, ${api.number(trace.drawn, 4)} on the detector${overlap}`)));
