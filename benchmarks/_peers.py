@@ -1,4 +1,4 @@
-"""What others take for the same galaxies: galsim, object by object, and UFig's photons."""
+"""What others take for the same galaxies: galsim, object by object, UFig's photons; SkyPy's catalogues."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import numpy as np
 
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import BINS, Scene
+from jobs.catalogue.halos import luminosity_function
+from jobs.fluxes import cosmology
 from jobs.render.drawing import transfer
 from jobs.render.psf import model
 from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
 
 # Side of a PSF's image for galsim, samples: 10".
 _SIDE = 301
@@ -116,3 +119,41 @@ def ufig_seconds(scene: Scene) -> float:
         integrate_image(rendering_util.rng_buffer(), *arguments)
         best = best if few else min(best, time.process_time() - start)
     return best
+
+
+# Of blue galaxies (Herbel et al. 2017): what k-correct's five templates are mixed by at z = 0 and 1, and their weights.
+_MIX = (
+    [2.079, 3.524, 1.917, 1.992, 2.536], [2.265, 3.862, 1.921, 1.685, 2.480], [3.47e9, 3.31e6, 2.13e9, 1.64e10, 1.01e9],
+)  # fmt: skip
+# Beyond, the templates end before I_E does.
+_FARTHEST = 3.9
+
+
+def skypy_photometry(area: float, seed: int) -> float:
+    """SkyPy: galaxies a CPU second with positions and magnitudes in I_E, Y and H, to 26 in the reference band; z < 3.9.
+
+    area : deg2;  seed : of numpy's old generator, which it draws from
+    Errors : BadInput where it is not installed
+    """
+    try:
+        from astropy.cosmology import FlatLambdaCDM
+        from astropy.units import Quantity
+        from skypy.galaxies import schechter_lf
+        from skypy.galaxies.spectrum import dirichlet_coefficients, kcorrect
+    except ImportError as error:
+        raise BadInput(f"the peer is missing: {error} (pip install skypy)") from None
+    np.random.seed(seed)  # noqa: NPY002
+    ours, z = FlatLambdaCDM(67.0, 0.319), np.linspace(0.002, _FARTHEST, 400)
+    m_star, phi_star, alpha = luminosity_function.schechter().at(z)
+    scale = 5.0 * np.log10(cosmology.HUBBLE)
+    start = time.process_time()
+    redshift, m_r = schechter_lf(
+        z, m_star + scale, phi_star * cosmology.HUBBLE**3, float(alpha.mean()), 26.0, Quantity(area, "deg2"), ours
+    )
+    mix = dirichlet_coefficients(redshift, *_MIX[:2], weight=_MIX[2])
+    mass = kcorrect.stellar_mass(mix, m_r, "sdss2010-r")
+    bands = ["Euclid-VIS", "Euclid-Y", "Euclid-H"]
+    magnitudes = kcorrect.apparent_magnitudes(mix, redshift, bands, ours, stellar_mass=mass)
+    side = np.sqrt(area)
+    place = np.random.uniform(0.0, side, (2, redshift.size))  # noqa: NPY002
+    return float(np.concatenate([place, magnitudes.T]).shape[1] / (time.process_time() - start))

@@ -14,7 +14,7 @@ def test_the_benchmark(tmp_path):
     run("catalogue", "--quick", "--json", file)
     figures = json.loads(file.read_text())
     keys = (
-        "cell_rows", "cell_s", "cell_peak_gb", "speedup_2_cores", "galaxies_per_s_core", "schechter_per_s_core",
+        "cell_rows", "cell_s", "cell_peak_gb", "speedup_2_cores", "galaxies_per_s_core", "photometry_vs_skypy",
         "projected_core_hours_922m",
     )  # fmt: skip
     assert {"name", "commit", "machine", "repeats", *keys} <= set(figures)
