@@ -89,12 +89,12 @@ def _sources(count: int, seed: int) -> Sources:
 
 
 def _spectrum(order: Order) -> Float:
-    """float64[w] f_lambda with two lines, of a million electrons of the order."""
+    """float64[w] f_lambda with two lines, of 20,000 electrons of the order."""
     waves = order.wavelength
     flux = (waves / 15000.0) ** -1.5
     for centre in (13500.0, 16600.0):
         flux += 5.0 * np.exp(-0.5 * ((waves - centre) / 8.0) ** 2)
-    return np.asarray(flux * 1e6 / float((flux * order.response).sum()))
+    return np.asarray(flux * 2e4 / float((flux * order.response).sum()))
 
 
 def _timed(some: Sources, order: Order, through: Psf, spectrum: Float) -> tuple[Float, float]:
