@@ -174,7 +174,8 @@ def serving(lake: Path, rows: int, downloaded: int, side: int, repeats: int) -> 
         try:
             assert server.stdout is not None
             address = server.stdout.readline().split()[-1]
-            asker = Asker(int(address.rpartition("/?")[0].rpartition(":")[2]))
+            port = int(address.rpartition("/?")[0].rpartition(":")[2])
+            asker = Asker(port)
             key = json.loads(asker.ask("GET", "/api/lake").read())["key"]
             asker.ask("GET", f"/api/{key}/sky/trial/parts").read()
             figures = {"first_sky_s": time.perf_counter() - started}
@@ -184,7 +185,8 @@ def serving(lake: Path, rows: int, downloaded: int, side: int, repeats: int) -> 
                 print(f"page: no figures of the browser: {why}")
             else:
                 figures |= _browser.brushes(address, 20 * repeats)
-            figures |= downloads(asker, f"/api/{key}", server.pid, downloaded)
+            # A connection that was idle meanwhile has been closed.
+            figures |= downloads(Asker(port), f"/api/{key}", server.pid, downloaded)
         finally:
             server.terminate()
     if not _browser.missing():
