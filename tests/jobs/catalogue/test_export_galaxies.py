@@ -22,7 +22,7 @@ def lake(tmp_path):
     rng = np.random.default_rng(4)
     index, ra, dec = sky.random_in_cell(5, CELL, 50, rng)
     values = {c.name: rng.uniform(max(c.lo or 0.0, -20.0), min(c.hi or 1.0, 5.0), 50) for c in GALAXIES.columns}
-    values |= {name: np.zeros(50, int) for name in ("kind", "sed_1", "sed_2", "ext_law_1", "ext_law_2")}
+    values |= {name: np.zeros(50, int) for name in ("kind", "sed_1", "sed_2", "ext_law_1", "ext_law_2", "stamp")}
     values |= {"id": np.arange(50), "halo_id": np.arange(50), "origin_id": np.arange(50)}
     values |= {"ra": ra, "dec": dec, "ra_lensed": ra, "dec_lensed": dec, "_healpix_29": index}
     values |= {name: rng.uniform(-0.1, 0.1, 50) for name in ("kappa", "gamma1", "gamma2")}
