@@ -67,7 +67,7 @@ def quick():
     yield "integrated", integration.galaxies(random_galaxies(20), [vis], library)
     yield "distances", cosmology.comoving_separation(0.0, np.linspace(0.0, 6.0, 50))
     yield "galactic", np.stack(sky.galactic(*rng.uniform(-80.0, 80.0, (2, 1000))))
-    planes = euclid._planes(euclid.VIS, fields.small("vis", "3-4"), vis, fields.MISSION, 4)
+    planes = euclid.vis_psf(fields.small("vis", "3-4"), vis, fields.MISSION, 4).planes
     yield "psf", planes.images
     yield "psf_drift", planes.drift
     yield "sersic", sersic.table()

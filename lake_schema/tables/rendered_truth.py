@@ -77,7 +77,7 @@ RENDERED_SPECTRA = Table(
             "overlapped",
             "float64",
             "",
-            "arith.ratio",
+            "phys.size;arith.ratio",
             "part of a first order's length on the detector beside which a trace of another source lies, noticed and "
             "nearer than both are wide; of other orders null",
             0.0,

@@ -23,7 +23,7 @@ def _mixed(k: int) -> tuple[Column, ...]:
     return (
         Column(f"sed_{k}", "int16", "", "meta.code", f"template {k} that the spectrum is mixed of", 0, nullable=True,
                since=3),
-        Column(f"frac_{k}", "float32", "", "arith.ratio",
+        Column(f"frac_{k}", "float32", "", "phot.flux.density;arith.ratio",
                f"share of template {k} in f_lambda at 5500 A; sed has what is left by all", 0.0, 1.0, True,
                mantissa_bits=12, since=3),
     )  # fmt: skip

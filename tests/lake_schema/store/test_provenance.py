@@ -16,7 +16,7 @@ from tests.universe import plain_plan, plain_work
 
 PROJECT = Path(__file__).resolve().parents[3] / "pyproject.toml"
 # They carry rows, look at them or draw them, and make none; what drizzle makes, stacks, is in no table of a lake.
-HARMLESS = {"PyYAML", "drizzle", "duckdb", "h5py", "matplotlib", "pandas", "pyspark", "tqdm"}
+HARMLESS = {"PyYAML", "aiohttp", "drizzle", "duckdb", "h5py", "matplotlib", "pandas", "pyspark", "tqdm"}
 
 
 def test_every_library_that_shapes_a_byte_is_in_the_fingerprint():

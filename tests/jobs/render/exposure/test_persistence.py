@@ -168,7 +168,7 @@ def test_which_exposures_count():
         return replace(nominal, exposure_id=number, mjd=infrared.MJD + hours / 24.0, **more)
 
     rows = [
-        row(1, -3.0), row(2, -1.0), row(3, -1.0, realisation=2), row(4, -0.5, channel="NISP-S"),
+        row(1, -3.0), row(2, -1.0), row(3, -1.0, realisation=2), row(4, -0.5, channel="NISP-S", exposure_time_s=549.6),
         row(5, -0.4, settings="{}"), row(6, 0.0), row(7, 0.0, realisation=2), row(8, 0.1), row(9, -0.3),
     ]  # fmt: skip
     tasks = [{"exposure_id": one.exposure_id, "detector": "DET22"} for one in rows[:8]]
