@@ -202,6 +202,28 @@ def _lenses(lake: Path, request: Request, galaxies: read.Version) -> read.Versio
 def work(lake: Path, facts: Json) -> Output:
     """One detector: its sources from its own cells, its image, its files."""
     request = facts["request"]
+    with heap.kept():
+        aim, rows_, own = prepared(lake, facts)
+        noise = request.get("noise_seed")
+        rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
+    rice = request["compression"] == "rice"
+    rows, files = fits_files.products(rendered, request["truth"], rice, request.get("wcs", "sip"))
+    drawn = truth_table.truth(rendered)
+    place = facts["exposure_id"], facts["detector"]
+    files = {**files, truth_file(*place): lambda path: parquet.write(path, drawn, RENDERED_TRUTH)}
+    spectra = truth_table.spectra(rendered)
+    if spectra is not None:
+        files[spectra_file(*place)] = lambda path: parquet.write(path, spectra, RENDERED_SPECTRA)
+    return Output(rows, files)
+
+
+def prepared(lake: Path, facts: Json) -> tuple[Aim, Rows, Variant]:
+    """What a detector is rendered from.
+
+    facts  : of the plan and of its part: exposure_id, detector
+    Errors : BadInput where a file of the user's has changed since the plan was made
+    """
+    request = facts["request"]
     forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
     inputs = {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
     here = pc.field("exposure_id") == facts["exposure_id"]
@@ -222,21 +244,10 @@ def work(lake: Path, facts: Json) -> Output:
             if file_sha256(Path(file)) != sha256:
                 raise BadInput(f"{file}: has changed since the rendering began")
             bodies = ephemerides.read(Path(file), sha256).of_day
-    with heap.kept():
-        rows_ = _rows(lake, inputs, exposed, task, detector, own, bodies, earlier)
-        rows_ = _with_structure(rows_, request, facts.get("stamps", {}))
-        band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
-        aim, noise = Aim.of(exposed, detector, band, request["seed"]), request.get("noise_seed")
-        rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
-    rice = request["compression"] == "rice"
-    rows, files = fits_files.products(rendered, request["truth"], rice, request.get("wcs", "sip"))
-    drawn = truth_table.truth(rendered)
-    place = facts["exposure_id"], facts["detector"]
-    files = {**files, truth_file(*place): lambda path: parquet.write(path, drawn, RENDERED_TRUTH)}
-    spectra = truth_table.spectra(rendered)
-    if spectra is not None:
-        files[spectra_file(*place)] = lambda path: parquet.write(path, spectra, RENDERED_SPECTRA)
-    return Output(rows, files)
+    rows = _rows(lake, inputs, exposed, task, detector, own, bodies, earlier)
+    rows = _with_structure(rows, request, facts.get("stamps", {}))
+    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
+    return Aim.of(exposed, detector, band, request["seed"]), rows, own
 
 
 def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows:

@@ -7,10 +7,11 @@ from astropy.io import fits
 from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import masters, plan_exposures, render_exposures
+from jobs.render import masters, models, plan_exposures, render_exposures
 from jobs.render.products import read_back
 from jobs.request.from_toml import parse
 from lake_schema.errors import BadInput
+from lake_schema.fits import images
 from lake_schema.store import layout, publish, read
 from tests import requests
 
@@ -67,10 +68,12 @@ KINDS = [
 
 BLUE = '"NISP-S"\ncamera = "nisp"\nband = "nisp_blue"'
 PHOTOMETRIC = '"NISP-P"\ncamera = "nisp"\nband = "euclid_h"\ngrism_angle = 0.0'
+# 280 pixels beside the detector, on either side.
+BESIDE = "53.1735,-27.808,16.0\n53.0605,-27.808,16.5\n"
 
 
 def wanted(folder, more="", replaced=("", "")):
-    (folder / "stars.csv").write_text("ra,dec,mag\n53.117,-27.808,15.0\n53.119,-27.807,18.0\n")
+    (folder / "stars.csv").write_text("ra,dec,mag\n53.117,-27.808,15.0\n53.119,-27.807,18.0\n" + BESIDE)
     return parse(requests.written(folder, REQUEST.replace(*replaced) + more, requests.FIELD.format(0.7), seed=3))
 
 
@@ -151,6 +154,56 @@ def test_by_spark_the_same_bytes(spark, rendered, tmp_path):
     for name in ("products", "rendered_truth", "rendered_spectra"):
         assert read.version(root, name).manifest == read.version(rendered, name).manifest
         assert read.verify(read.version(root, name), deep=True) == []
+
+
+def test_sources_farther_away_than_images_are_read_have_a_first_order_on_the_detector(rendered):
+    """Of two that lie 280 px beside it, the one from which the grism disperses towards it."""
+    fluxes = read.version(rendered, "star_fluxes").rows(["id", "f_nu_euclid_h"]).to_pylist()
+    mags = {row["id"]: round(23.9 - 2.5 * np.log10(row["f_nu_euclid_h"]), 1) for row in fluxes}
+    rows = read.version(rendered, "rendered_spectra").rows().to_pylist()
+    seen = {
+        number: {mags[row["id"]] for row in rows if row["exposure_id"] == number and row["order"] == 1}
+        for number in range(1, len(ANGLES) + 1)
+    }
+    beside = [seen[number] - {15.0, 18.0} for number in seen]
+    assert beside[0] in ({16.0}, {16.5})
+    assert beside == [beside[0], {16.0, 16.5} - beside[0]] * 2
+
+
+def test_models_of_single_sources_add_up_to_the_published_image(rendered, folder, capsys):
+    light = opened(rendered, "noise_free")
+    found = list(models.models(rendered, 3, "DET22"))
+    np.testing.assert_array_equal(sum(one.frame for one in found).astype(np.float32), fits.getdata(light[3]))
+    bright = max(found, key=lambda one: one.frame.sum())
+    file = folder / "models.fits"
+    arguments = ["--lake", str(rendered), "--exposure", "3", "--detector", "DET22", "--sources", str(bright.id)]
+    for more, count in (([], 1), (["--orders"], 4)):
+        assert models.main([*arguments, "--out", str(file), *more]) == 0
+        assert capsys.readouterr().out.startswith(f"{bright.id}: ")
+        head, *units = images.read_images(file)
+        assert (head.data, len(units)) == (None, count)
+        # As 32-bit numbers.
+        np.testing.assert_allclose(sum(models.frame(unit, (NY, NX)) for unit in units), bright.frame, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("replaced", "message"),
+    [
+        ({"--sources": "12"}, "exposure 3, detector DET22: no light of source 12 is drawn there"),
+        ({"--exposure": "99"}, "table products has no detector DET22 of exposure 99"),
+        ({"--exposure": "6"}, "exposure 6: NISP-S dark is no image of spectra"),
+        ({"--out": "models.txt"}, "the ending is not one of .fits"),
+    ],
+)
+def test_models_that_there_are_not_are_one_line_and_no_file(rendered, tmp_path, capsys, replaced, message):
+    options = {"--lake": rendered, "--exposure": 3, "--detector": "DET22", "--sources": 1, "--out": "models.fits"}
+    options |= replaced
+    options["--out"] = tmp_path / options["--out"]
+    assert models.main([str(text) for pair in options.items() for text in pair]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("models: ")
+    assert message in line
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_no_masters_are_made_of_spectra(rendered, folder, capsys):
