@@ -21,7 +21,7 @@ from jobs.render.channels.image_types import SKY_TYPES
 from jobs.render.effects.charge import persistence, pixel_response
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import background, calibration_lamp, chromatic_response, dispersed_sky, pixel_area
-from jobs.render.psf import euclid
+from jobs.render.psf import double_gaussian, euclid
 from jobs.render.psf.model import Psf
 from jobs.render.sky import diffuse_light
 from lake_schema.arrays import Float
@@ -115,7 +115,14 @@ def _psf(
 ) -> Psf:
     """Of the middle of a band."""
     middle = np.array([np.average(band.wavelength, weights=band.response)])
-    return euclid.nisp_psf_at(detector, middle, mission, positions)
+    return _psf_at(detector, middle, mission, positions)
+
+
+def _psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, positions: int) -> Psf:
+    """Diffraction at the pupil, or the two Gaussians of Serrano et al. 2024, as the mission says."""
+    if mission.value(f"{detector.section}.spectra.psf", "") < 0.5:
+        return euclid.nisp_psf_at(detector, waves, mission, positions)
+    return double_gaussian.psf_at(detector, waves, mission)
 
 
 # Of a made field of 2,110 sources of 17 to 25 mag: 7.6 s of CPU, 2.5 ms a spectrum, and 1.1 GB on a busy AMD EPYC,
@@ -136,5 +143,5 @@ CHANNEL = Channel(
     own_light=(calibration_lamp.EFFECT,),
     ramp="spectroscopic",
     remembers=persistence.EFFECT,
-    disperses=Dispersion(_traces, _throughput, _vignetted, euclid.nisp_psf_at, _reach, CHOSEN_BY["NISP-S"]),
+    disperses=Dispersion(_traces, _throughput, _vignetted, _psf_at, _reach, CHOSEN_BY["NISP-S"]),
 )

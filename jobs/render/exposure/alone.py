@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from jobs.render.channels.aim import Aim
 from jobs.render.dispersing import draw
+from jobs.render.dispersing.draw import Spectra
 from jobs.render.exposure import scene_of
 from jobs.render.exposure.records import Rows, Variant
 from jobs.render.exposure.visible_spectra import visible_spectra
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import BadInput
 
 
@@ -53,7 +55,11 @@ def spectra(aim: Aim, rows: Rows, variant: Variant, seed: int, ids: Sequence[int
     shape, of = (aim.detector.ny, aim.detector.nx), dispersed.spectra
     for number in chosen:
         at = np.array([place[number]])
-        one = replace(dispersed, spectra=lambda some, at=at: of(at[some]))
+        one = replace(dispersed, spectra=partial(_of_some, of, at))
         layers: dict[int, Float] = {}
         frame = draw.draw(sources.take(at), one, psf, shape, light.scene.pixel_noise, None, layers)
         yield Alone(number, frame, layers)
+
+
+def _of_some(spectra: Spectra, which: Int, some: Int) -> Float32:
+    return spectra(which[some])
