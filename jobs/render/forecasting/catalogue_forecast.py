@@ -55,8 +55,8 @@ def of_request(request: Request, factor: float = 1.0) -> list[Line]:
     """The jobs that draw; what an external catalogue holds is not known, and left out; of given sources their number.
 
     factor : CPU s of the machine that is asked about over those of the channels' costs
-    Error  : over an area that no number was chosen on, of rows 3 %, of bytes 1 %, of seconds 7 % (galaxies) to 24 %
-             (stars), where the cache holds what is computed once a machine
+    Error  : over an area that no number was chosen on, of rows 3 %, of bytes 2 %, of seconds 5 % (galaxies) to 30 %
+             (fluxes), where the cache holds what is computed once a machine
     """
     cells = request.area.cells()
     rows = _drawn(request, cells) if request.sources is None else _given(request.sources, request.area)

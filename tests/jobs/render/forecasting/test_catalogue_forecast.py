@@ -29,16 +29,16 @@ AREAS = {
 }
 MEASURED = {
     "one": {
-        "build_galaxies": (462_604, None, 0.03357), "build_stars": (26_141, None, 0.00183),
-        "compute_fluxes": (225_522, None, 0.03839),
+        "build_galaxies": (466_693, None, 0.03994), "build_stars": (26_141, None, 0.00183),
+        "compute_fluxes": (202_170, None, 0.06333),
     },
     "two": {
-        "build_galaxies": (154_034, 5.98, 0.00956), "build_stars": (1_440_796, None, 0.09632),
-        "compute_fluxes": (1_486_079, None, 0.05903),
+        "build_galaxies": (167_074, 9.67, 0.01199), "build_stars": (1_440_796, None, 0.09632),
+        "compute_fluxes": (1_482_374, None, 0.08612),
     },
     "three": {
-        "build_galaxies": (935_904, 9.01, 0.06027), "build_stars": (37_822, None, 0.00263),
-        "compute_fluxes": (376_930, 6.30, 0.04334),
+        "build_galaxies": (963_441, 13.82, 0.07282), "build_stars": (37_822, None, 0.00264),
+        "compute_fluxes": (343_242, 3.83, 0.06829),
     },
 }  # fmt: skip
 FACTOR, ROWS_ERROR, SECONDS_ERROR, BYTES_ERROR = 0.45, 0.05, 0.3, 0.1
