@@ -81,7 +81,9 @@ def brushes(address: str, times: int) -> dict[str, float]:
         tab.press("#plot-source", "Enter")
         tab.evaluate("() => document.getElementById('plot-source').dispatchEvent(new Event('change'))")
         _until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
-        anew = [tab.evaluate(_MOVE, ["key", {"key": "ArrowRight"}]) for _ in range(times)][1:]
+        # To and fro: beyond the end of an axis nothing changes.
+        keys = ["ArrowRight" if k % 16 < 8 else "ArrowLeft" for k in range(times)]
+        anew = [tab.evaluate(_MOVE, ["key", {"key": key}]) for key in keys][1:]
         box = tab.locator("#plot-grid canvas").first.bounding_box()
         tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
         tab.mouse.down()

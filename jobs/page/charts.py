@@ -20,6 +20,8 @@ from lake_schema.errors import BadInput
 ROWS_A_CORE = 25_000_000
 PART = 64
 _MOST_AXES, _MOST_CHARTS, MOST_POINTS = 16, 16, 20_000
+# Selections whose columns stay mapped.
+_MOST_HELD = 4
 Json = dict[str, Any]
 
 
@@ -37,17 +39,23 @@ async def counts(lake: Lake, question: Json) -> bytes:
         raise BadInput(f"charts: wanted 1 to {_MOST_AXES} axes and 1 to {_MOST_CHARTS} charts")
     keys = _keys(lake, source)
     part = _part(lake, source, keys, question.get("part"))
-    async with lake.own.process() as process:
+    selection = Selection(lake.key, source, where, keys, part)
+    held = lake.held.get((selection, *axes))
+    if held is None:
+        async with lake.own.process() as process:
 
-        def kept() -> list[Float32]:
-            selection = Selection(lake.key, source, where, keys, part)
-            found = columns.kept(
-                selection, axes, lambda text, own: process.batches(text, {}, lake.timeout, expressions=own)
-            )
-            columns.trim()
-            return found
+            def kept() -> list[Float32]:
+                found = columns.kept(
+                    selection, axes, lambda text, own: process.batches(text, {}, lake.timeout, expressions=own)
+                )
+                columns.trim()
+                return found
 
-        held = await asyncio.to_thread(kept)
+            held = await asyncio.to_thread(kept)
+        # Compared with their checksums once, not at every move of a brush.
+        while len(lake.held) >= _MOST_HELD:
+            lake.held.pop(next(iter(lake.held)))
+        lake.held[(selection, *axes)] = held
     return await asyncio.to_thread(_counted, lake, held, question, part)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Hashable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from jobs.explore.explorer import Explorer
 from jobs.explore.process import MEMORY, TIMEOUT, Process
+from lake_schema.arrays import Float32
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.store import read
 from lake_schema.store.provenance import digest
@@ -101,6 +102,8 @@ class Lake:
         self.questions = Lane(self.explorer.process, 2)
         self.own = Lane(self.explorer.process, 1)
         self.threads = min(os.cpu_count() or 1, 8)
+        # Kept columns that are mapped, by selection and expressions.
+        self.held: dict[tuple[Hashable, ...], list[Float32]] = {}
 
     @property
     def versions(self) -> Mapping[str, read.Version]:

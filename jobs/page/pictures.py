@@ -50,7 +50,18 @@ class Picture:
 
     def levels(self, mended: bool = False) -> list[Array]:
         """Its pixels, and each time the means of 2 x 2 of them, until one tile holds all: float32 [ny, nx], mapped."""
-        hits = str(self.hits) if mended and self.is_mendable else ""
+        return self._mended if mended and self.is_mendable else self._as_it_is
+
+    @cached_property
+    def _as_it_is(self) -> list[Array]:
+        return self._levels("")
+
+    @cached_property
+    def _mended(self) -> list[Array]:
+        return self._levels(str(self.hits))
+
+    def _levels(self, hits: str) -> list[Array]:
+        """Compared with their checksums, which takes as long as reading all of them: once for all tiles."""
         contents = self.version.sha256(self.row["path"]), self.version.sha256(hits) if hits else ""
         path, has_unit = self.version.file(self.row["path"]), self.row["content"] != "saturation"
         return pyramids.levels(path, has_unit, self.version.file(hits) if hits else None, contents)

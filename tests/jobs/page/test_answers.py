@@ -268,6 +268,20 @@ def test_tiles_are_the_pixels(page):
     assert truth["kind"][0] == "star"
 
 
+def test_what_is_kept_is_compared_with_its_checksums_once(page, monkeypatch):
+    """Not at every tile, nor at every move of a brush: that takes as long as reading all of it."""
+    charts_ = {"axes": [0], "bins": [5], "spans": [[0.0, 5.0]]}
+    question = {"source": "galaxies", "axes": ["z_obs * 1.5"], "charts": [charts_]}
+    first = asked(page, **question)[1][0].tolist(), page.of_lake("tile/0/0/0/0")[2]
+    compared = []
+    monkeypatch.setattr("jobs.cache.is_whole", lambda *given: compared.append(given) or True)
+    for _ in range(3):
+        assert asked(page, **question)[1][0].tolist() == first[0]
+        assert page.of_lake("tile/0/0/0/0")[2] == first[1]
+        assert page.of_lake("tile/0/0/1/0")[0] == 200
+    assert compared == []
+
+
 def test_cosmic_rays_on_and_off(page):
     with_, without = (
         np.frombuffer(page.of_lake(f"tile/0/0/0/0{words}")[2], "<f4").reshape(512, 512) for words in ("", "?mended=1")
