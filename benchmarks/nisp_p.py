@@ -7,26 +7,23 @@ One process, one thread, the demo's field in H. Each time is of a process that h
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
 import sys
 import tempfile
-import time
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks import report, vis
-from jobs import cache
+from benchmarks import _detectors as one_detector
+from benchmarks import report
+from benchmarks._detectors import FIELD, ROOT, prepared, rendered
 from jobs.accuracy import preset
 from jobs.render.channels import nisp_p
 from jobs.request.from_toml import parse
 from jobs.request.schema import Effects, Request
 
-RESULTS = vis.ROOT / "benchmarks" / "results" / "nisp_p.json"
-# As far from the exposure's centre as sources of a detector may lie, deg.
-_FIELD = 0.62
+RESULTS = ROOT / "benchmarks" / "results" / "nisp_p.json"
+# Folders of the PSF's planes in the cache.
+_PLANES = "nisp*_psf-*"
 _RAMP = nisp_p.SKY[nisp_p.SKY.index(nisp_p.persistence.EFFECT) + 1 :]
 _NOTES = {
     "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed (target 5)",
@@ -41,12 +38,7 @@ _NOTES = {
 
 def request(quick: bool, detectors: str = 'detectors = ["DET22"]', exposures: int = 1) -> str:
     """The demo's field with one of NISP's detectors, in H; or the third of three exposures 134 s apart."""
-    text = (vis.ROOT / "requests" / "demo.toml").read_text(encoding="utf-8").split("[[pointing]]")[0]
-    text = text.split("[products]")[0]
-    if quick:
-        text = text.replace("galaxy_limit = 26.0", "galaxy_limit = 19.0").replace(
-            "star_limit = 26.0", "star_limit = 14.0"
-        )
+    text = one_detector.head(quick).split("[products]")[0]
     for number, band in enumerate(("h", "j", "y")[:exposures][::-1]):
         text += f"""
 [[pointing]]
@@ -68,70 +60,32 @@ def full(wanted: Request) -> Request:
     return replace(wanted, effects=Effects(on=tuple(names)))
 
 
-def without_planes() -> None:
-    """Empties the cache of PSF planes."""
-    for folder in cache.cache_dir().glob("nisp*_psf-*"):
-        for file in folder.iterdir():
-            file.unlink()
-        folder.rmdir()
-
-
-def effect_seconds(render: Callable[[], object]) -> dict[str, float]:
-    """CPU s of each effect in one rendering, and of those from cosmic rays on together."""
-    seconds: dict[str, float] = defaultdict(float)
-    kept = nisp_p.EFFECTS["science"]
-    # By which the channel is known for what it is: they stay what they are.
-    own = nisp_p.CHANNEL.remembers, nisp_p.CHANNEL.coloured
-    measured = tuple(
-        e if e in own else replace(e, apply=vis.timed(e.apply, f"effect_{e.name}_s", seconds)) for e in kept
-    )
-    nisp_p.EFFECTS["science"] = measured  # type: ignore[index]
-    try:
-        render()
-    finally:
-        nisp_p.EFFECTS["science"] = kept  # type: ignore[index]
-    return {"ramp_s": sum(seconds[f"effect_{effect.name}_s"] for effect in _RAMP), **seconds}
-
-
 def detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
     """All of a detector's figures."""
     file = folder / "three.toml"
     file.write_text(request(quick, exposures=3), encoding="utf-8")
     three = parse(file)
     one = replace(three, pointings=three.pointings[-1:])
-    root, out = vis.lake(folder, three), {}
-    everything = vis.prepared(root, full(one))
-    vis.rendered(root, everything, folder)  # Compiles, and fills the other caches.
-    for state in ("cold", "warm"):
-        seconds, peaks = [], []
-        for _ in range(repeats):
-            if state == "cold":
-                without_planes()
-            used, peak = vis.rendered(root, everything, folder)
-            seconds.append(used)
-            peaks.append(peak)
-        out |= {f"survey_{state}_s": min(seconds), "peak_gb": max([*peaks, out.get("peak_gb", 0.0)])}
-    out |= effect_seconds(lambda: vis.rendered(root, everything, folder))
-    draft = vis.prepared(root, replace(one, accuracy=preset("draft")))
-    out["draft_s"] = min(vis.rendered(root, draft, folder)[0] for _ in range(repeats + 1))
-    last = vis.prepared(root, full(three), -1)
-    out["third_s"] = min(vis.rendered(root, last, folder)[0] for _ in range(repeats + 1))
+    root = one_detector.lake(folder, three)
+    everything = prepared(root, full(one))
+    rendered(root, everything, folder)  # Compiles, and fills the other caches.
+    out = one_detector.cold_and_warm(root, everything, folder, _PLANES, repeats)
+    out |= {f"survey_{state}_s": out.pop(f"{state}_s") for state in ("cold", "warm")}
+    # By which the channel is known for what it is.
+    own = nisp_p.CHANNEL.remembers, nisp_p.CHANNEL.coloured
+    effects = one_detector.effect_seconds(nisp_p.EFFECTS, own, lambda: rendered(root, everything, folder))
+    out |= {"ramp_s": sum(effects[f"effect_{effect.name}_s"] for effect in _RAMP), **effects}
+    draft = prepared(root, replace(one, accuracy=preset("draft")))
+    out["draft_s"] = min(rendered(root, draft, folder)[0] for _ in range(repeats + 1))
+    last = prepared(root, full(three), -1)
+    out["third_s"] = min(rendered(root, last, folder)[0] for _ in range(repeats + 1))
     return out
 
 
 def whole_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
     """Wall s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
     text = request(quick, 'detectors = ["DET22", "DET23"]' if quick else "")
-    file = folder / "exposure.toml"
-    file.write_text(text.replace("radius = 0.2", f"radius = {_FIELD}"), encoding="utf-8")
-    wanted = parse(file)
-    root = vis.lake(folder / "exposure", wanted)
-    vis.prepared(root, wanted)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = ["spark-submit", "--master", "local[2]", str(vis.ROOT / "jobs" / "render" / "render_exposures.py")]
-    started = time.perf_counter()
-    subprocess.run([*command, "--lake", str(root), "--request", str(file)], check=True, env=environment)
-    return {"exposure_s": time.perf_counter() - started}
+    return {"exposure_s": one_detector.by_job(folder, text.replace("radius = 0.2", f"radius = {FIELD}"))}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -7,43 +7,34 @@ is without the PSF's planes in the cache, "warm" with them. Everything: every ef
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
 import sys
 import tempfile
-import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks import _detectors as one_detector
 from benchmarks import report
-from jobs import cache
+from benchmarks._detectors import FIELD, ROOT, lake, prepared, rendered, timed
 from jobs.accuracy import preset
-from jobs.catalogue import build_galaxies, build_stars
-from jobs.fluxes import compute_fluxes
-from jobs.measured import forget_peak, peak_gb
-from jobs.render import plan_exposures, render_exposures
 from jobs.render.channels import vis
 from jobs.render.drawing import stamps
 from jobs.render.exposure import visible_sources
 from jobs.render.sources import catalogue_rows
 from jobs.request.from_toml import parse
 from jobs.request.schema import Effects, Request
-from lake_schema.store import layout, publish
-from lake_schema.store.plan import Json
 
-ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "vis.json"
 _PRESETS = ("draft", "survey", "quicklook", "reference")
+# Folders of the PSF's planes in the cache.
+_PLANES = "vis_psf-*"
 # Which take what effects they ask for themselves, and all of them besides.
 _FAST = ("quicklook", "draft")
 # Takes as long as all others together, and no other time depends on it.
 _ONCE = "reference"
-# Where a detector's sources may lie, deg from the exposure's centre.
-_FIELD = 0.62
 _NOTES = {
     "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed (target 15)",
     "survey_warm_s": "the same, PSF planes from the cache",
@@ -56,15 +47,6 @@ _NOTES = {
     "survey_cold_peak_gb": "largest memory of the process (target 2)",
     "exposure_s": "wall, 36 detectors by the Spark job on 2 cores (target 360)",
 }
-
-
-def lake(folder: Path, wanted: Request) -> Path:
-    """Catalogues and fluxes of a request."""
-    root = layout.lake(folder / "lake")
-    for module in (build_galaxies, build_stars, compute_fluxes):
-        for step in module.steps(root, wanted):
-            publish.make(root, step.plan, step.work)
-    return root
 
 
 def request(quick: bool) -> Request:
@@ -81,34 +63,6 @@ def full(wanted: Request) -> Request:
     """With every effect of a science image forced on."""
     names = [effect.name for effect in (vis.DRAWN, *vis.SKY) if effect.optional]
     return replace(wanted, effects=Effects(on=tuple(names)))
-
-
-def prepared(root: Path, wanted: Request, number: int = 0) -> Json:
-    """Plans the request; facts of a detector's task, by its number among those of the plan."""
-    for step in plan_exposures.steps(root, wanted):
-        publish.make(root, step.plan, step.work)
-    step = render_exposures.steps(root, wanted)[0]
-    return {**step.plan.facts, **step.plan.parts[number].facts}
-
-
-def rendered(root: Path, facts: Json, folder: Path) -> tuple[float, float]:
-    """CPU s and largest memory, GB, from reading the sources to the last byte written."""
-    forget_peak()
-    started = time.process_time()
-    output = render_exposures.work(root, facts)
-    for path, write in output.files.items():
-        file = folder / path
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write(file)
-    return time.process_time() - started, peak_gb()
-
-
-def without_planes() -> None:
-    """Empties the cache of PSF planes."""
-    for folder in cache.cache_dir().glob("vis_psf-*"):
-        for file in folder.iterdir():
-            file.unlink()
-        folder.rmdir()
 
 
 @contextmanager
@@ -134,19 +88,6 @@ def stages(seconds: dict[str, float]) -> Iterator[None]:
             setattr(module, name, function)
 
 
-def timed(function: Callable[..., Any], name: str, seconds: dict[str, float]) -> Callable[..., Any]:
-    """The function, which adds its CPU seconds to those of a name."""
-
-    def measured(*arguments: Any, **options: Any) -> Any:
-        started = time.process_time()
-        try:
-            return function(*arguments, **options)
-        finally:
-            seconds[name] += time.process_time() - started
-
-    return measured
-
-
 def detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
     """All of a detector's figures."""
     plain = request(quick)
@@ -160,7 +101,7 @@ def detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
             seconds, peaks = [], []
             for _ in range(1 if name == _ONCE else repeats):
                 if state == "cold":
-                    without_planes()
+                    one_detector.without_planes(_PLANES)
                 used, peak = rendered(root, facts, folder)
                 seconds.append(used)
                 peaks.append(peak)
@@ -179,25 +120,12 @@ def detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
 
 def whole_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
     """Wall s of the Spark job that renders all 36 detectors of an exposure; quick: two of a bright universe."""
-    text = (ROOT / "requests" / "demo.toml").read_text(encoding="utf-8")
-    head, *blocks = text.split("[[pointing]]")
-    pointing = "\n".join(line for line in blocks[0].splitlines() if not line.startswith(("centre_on", "detectors")))
-    head = head.replace("radius = 0.2", f"radius = {_FIELD}")
+    block = (ROOT / "requests" / "demo.toml").read_text(encoding="utf-8").split("[[pointing]]")[1]
+    pointing = "\n".join(line for line in block.splitlines() if not line.startswith(("centre_on", "detectors")))
     if quick:
-        head = head.replace("galaxy_limit = 26.0", "galaxy_limit = 19.0").replace(
-            "star_limit = 26.0", "star_limit = 14.0"
-        )
         pointing += '\ndetectors = ["3-3", "3-4"]'
-    file = folder / "exposure.toml"
-    file.write_text(f"{head}[[pointing]]{pointing}\n", encoding="utf-8")
-    wanted = parse(file)
-    root = lake(folder / "exposure", wanted)
-    prepared(root, wanted)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = ["spark-submit", "--master", "local[2]", str(ROOT / "jobs" / "render" / "render_exposures.py")]
-    started = time.perf_counter()
-    subprocess.run([*command, "--lake", str(root), "--request", str(file)], check=True, env=environment)
-    return {"exposure_s": time.perf_counter() - started}
+    head = one_detector.head(quick).replace("radius = 0.2", f"radius = {FIELD}")
+    return {"exposure_s": one_detector.by_job(folder, f"{head}[[pointing]]{pointing}\n")}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

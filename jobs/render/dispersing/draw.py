@@ -17,21 +17,27 @@ from typing import Any
 
 import numpy as np
 
+from jobs import sums
 from jobs.accuracy import Accuracy
 from jobs.render.camera.traces import Trace
 from jobs.render.dispersing import images, kernels
 from jobs.render.dispersing.images import Planes, Sampling
-from jobs.render.drawing import arcs, transfer
+from jobs.render.drawing import transfer
 from jobs.render.drawing.kernels.frame import FIXED_POINT
 from jobs.render.psf.model import Psf
 from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Array, Float, Float32, Int
+from lake_schema.arrays import Bool, Float, Float32, Int
 
 # Sides of stamps whose transforms are fast.
 SIZES = np.array([16, 20, 24, 28, 32, 36, 40, 48, 56, 64, 80, 96, 128, 160, 192, 256, 320, 384, 512])
-# Sources whose spectra are held at a time.
-_TOGETHER = 64
+# Sources whose spectra are held at a time, and samples of their images.
+_TOGETHER, _HELD = 256, 1 << 17
+# Places at which it is seen where a trace goes, and whether it is straight: its slope, rows a column, is nowhere
+# farther from that of all.
+_PLACES, _STRAIGHT = 33, 0.03
+# Of the largest stamp, that an order must want to be drawn on it, too.
+_SHARED = 0.6
 # Of a galaxy's half-light radius, that its stamp is wider than a point's.
 _EXTENT = 6.0
 
@@ -61,7 +67,7 @@ class Settings:
     faint  : an order whose brightest column has less of a pixel's noise is not drawn; the first, if less than `edge`
     least  : smallest side of a stamp, pixels
     along, across : samples a pixel of a stamp
-    block  : A of a spectrum that share one PSF
+    block  : A of a spectrum that share one PSF; 0: each has its own, and its own rows, which is slow
     nodes  : wavelengths that the PSF is computed at;  positions : places of it on a detector, one of euclid.DEGREES
     """
 
@@ -138,19 +144,21 @@ def draw(
     """
     frames = [np.zeros(shape, np.int64)]
     orders, settings = dispersed.orders, dispersed.settings
-    slope = _slope(orders[0].trace)
-    seen = _Seen(sources, psf, Sizes.of(psf, noise, settings), settings, slope, shape)
-    plans = [_Plan.of(order, psf, settings, slope) for order in orders]
     if layers is not None:
         frames += [np.zeros(shape, np.int64) for _ in orders[1:]]
     onto = frames if layers is not None else frames * len(orders)
+    slope = _slope(orders[0].trace)
+    seen = _Seen(sources, psf, Sizes.of(psf, noise, settings), settings, slope, shape)
+    plans = [_Plan.of(order, psf, settings, slope) for order in orders]
+    tally = tally or Tally.of(len(sources), len(orders))
     for start in range(0, len(sources), _TOGETHER):
         some = np.arange(start, min(start + _TOGETHER, len(sources)))
-        for i, spectrum in zip(some.tolist(), dispersed.spectra(some), strict=True):
-            brought = [_add(seen, i, spectrum, plan, frame) for plan, frame in zip(plans, onto, strict=True)]
-            if tally is not None:
-                fallen, expected, sizes = zip(*brought, strict=True)
-                tally.electrons[i], tally.expected[i], tally.sizes[i] = fallen, expected, max(sizes)
+        spectra = dispersed.spectra(some)
+        parts = [_Part.of(seen, some, spectra, plan, shape) for plan in plans]
+        for column, part in enumerate(parts):
+            tally.expected[some, column] = part.expected
+        for straight in (True, False):
+            _add(seen, straight, some, spectra, list(zip(plans, parts, strict=True)), onto, tally)
     if layers is not None:
         layers.update({order.trace.order: frame / FIXED_POINT for order, frame in zip(orders, frames, strict=True)})
     # Of whole numbers: the same whether orders are told apart or not.
@@ -170,14 +178,14 @@ def _slope(trace: Trace) -> float:
 class _Plan:
     """What of an order is the same for all sources.
 
-    angstrom : of a pixel along the trace;  block : samples that share a PSF
+    angstrom : of a pixel along the trace;  tile : pixels that share a PSF, where it is straight; 0 = it never is
     share    : float64[w, b] of the PSF's wavelengths
     t        : of the first wavelength, and from one to the next
     """
 
     order: Order
     angstrom: float
-    block: int
+    tile: int
     share: Float
     t: tuple[float, float]
 
@@ -187,10 +195,12 @@ class _Plan:
         along, _ = order.trace.polynomials(0.0, 0.0)
         length = max(abs(float(along[1:].sum())), 1e-6) * float(np.hypot(1.0, slope))
         angstrom = (order.trace.last - order.trace.first) / length
-        block = max(round(settings.along * settings.block / angstrom), 1)
+        tile = 0
+        if settings.block >= 0.5 * kernels.STEP * angstrom:
+            tile = kernels.STEP * max(round(settings.block / angstrom / kernels.STEP), 1)
         step = 1.0 / (order.trace.last - order.trace.first)
         t = (order.first - order.trace.first) * step, step
-        return cls(order, angstrom, block, images.shares(order.wavelength, psf.planes.wavelength), t)
+        return cls(order, angstrom, tile, images.shares(order.wavelength, psf.planes.wavelength), t)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,97 +222,115 @@ class Sizes:
         row = [psf.surface[np.rint(np.hypot(x, size / 2)).astype(int).clip(0, reach)].sum() for size in SIZES]
         return cls(np.array(row), settings.edge * noise, settings.least)
 
-    def size(self, peak: float, wider: float) -> int:
-        """For a spectrum of so many electrons a column at most; wider : pixels, of a galaxy."""
-        dark = np.flatnonzero(self.row * peak < self.limit)
-        own = SIZES[dark[0]] if len(dark) else SIZES[-1]
-        wanted = max(float(own), float(self.least)) + wider
-        return int(SIZES[min(int(np.searchsorted(SIZES, wanted)), len(SIZES) - 1)])
+    def size(self, peak: Float, wider: Float) -> Int:
+        """[k] For spectra of so many electrons a column at most; wider : pixels, of galaxies."""
+        dark = self.row * peak[:, None] < self.limit
+        own = SIZES[np.where(dark.any(axis=1), dark.argmax(axis=1), len(SIZES) - 1)]
+        wanted = np.maximum(own, self.least) + wider
+        return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, wanted), len(SIZES) - 1)])
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One order of some of the sources, [k] each.
+
+    along, across : float64[k, i] polynomials of their traces
+    sizes    : of their stamps, 0 = nothing of it is drawn;  straight : whether the trace is
+    expected : electrons, on the frame and beside it
+    """
+
+    along: Float
+    across: Float
+    sizes: Int
+    straight: Bool
+    expected: Float
+
+    @classmethod
+    def of(cls, seen: _Seen, some: Int, spectra: Float32, plan: _Plan, shape: tuple[int, int]) -> _Part:
+        order, (ny, nx), count = plan.order, shape, len(some)
+        column, row = seen.sources.column[some], seen.sources.row[some]
+        peak, expected = np.empty(count), np.empty(count)
+        window = max(round(plan.angstrom), 1)
+        kernels.brightest(spectra, seen.sources.electrons[some], order.response, window, peak, expected)
+        place = np.stack([np.ones(count), column, row])
+        along, across = (sums.product(part, place).T for part in (order.trace.x, order.trace.y))
+        t = plan.t[0] + plan.t[1] * np.linspace(0.0, len(order.response) - 1.0, _PLACES)
+        x, y = (np.polynomial.polynomial.polyval(t, part.T) for part in (along, across))
+        limit = seen.sizes.limit * (1.0 if order.trace.order == 1 else seen.settings.faint / seen.settings.edge)
+        sizes = seen.sizes.size(peak, seen.wider[some])
+        left, right = column + x.min(axis=1), column + x.max(axis=1)
+        low, high = row + y.min(axis=1), row + y.max(axis=1)
+        beside = (right + sizes < 0) | (left - sizes > nx) | (high + sizes < 0) | (low - sizes > ny)
+        across_step, along_step = np.diff(y, axis=1), np.diff(x, axis=1)
+        straight = (np.abs(across_step - seen.slope * along_step) <= _STRAIGHT * np.abs(along_step)).all(axis=1)
+        straight &= (along_step > 0.0).all(axis=1) | (along_step < 0.0).all(axis=1)
+        nothing = beside | (peak < limit) | (peak <= 0.0)
+        return cls(
+            np.ascontiguousarray(along), np.ascontiguousarray(across), np.where(nothing, 0, sizes),
+            straight & (plan.tile > 0), expected,
+        )  # fmt: skip
 
 
 class _Seen:
-    """Sources through the PSF: images of one are kept until the next is drawn."""
+    """Sources through the PSF."""
 
     def __init__(
         self, sources: Sources, psf: Psf, sizes: Sizes, settings: Settings, slope: float, shape: tuple[int, int]
     ) -> None:
-        body = sources.shape >= 0
         self.sources, self.psf, self.sizes, self.settings, self.slope = sources, psf, sizes, settings, slope
-        self.shapes = sources.shapes.take(sources.shape[body])
-        self.form = galaxy_shapes.forms(self.shapes, sources.jacobian[body])
-        self.row = np.where(body, np.cumsum(body) - 1, -1)
+        body = sources.shape >= 0
+        self.places = list(zip(sources.column.tolist(), sources.row.tolist(), strict=True))
         self.wider = np.zeros(len(sources))
-        self.wider[body] = _EXTENT * galaxy_shapes.half_light(self.shapes) / psf.pixel_scale
+        shapes = sources.shapes.take(sources.shape[body])
+        self.wider[body] = _EXTENT * galaxy_shapes.half_light(shapes) / psf.pixel_scale
         pictured = (sources.picture_of(i) for i in range(len(sources)))
         self.wider += [0.0 if picture is None else picture.diagonal / psf.pixel_scale for picture in pictured]
         self.wider += sources.length
+        self.bodies = {straight: images.bodies(sources, slope if straight else 0.0) for straight in (True, False)}
         assert psf.planes is not None
         count = len(psf.planes.wavelength)
         # How the PSF changes is known on the detector alone.
         column, row = np.clip(sources.column, 0.0, shape[1] - 1.0), np.clip(sources.row, 0.0, shape[0] - 1.0)
         one = [transfer.basis_weights(psf, np.tile(part, (len(sources), 1)), column, row) for part in np.eye(count)]
         self.weights = np.stack(one, axis=1)
-        self._planes: dict[int, Planes] = {}
-        self._last: tuple[int, int, Float32] | None = None
+        self._planes: dict[tuple[int, bool], Planes] = {}
 
-    def images(self, i: int, size: int) -> tuple[int, Float32]:
-        """(side, coefficients) of a stamp of at least `size` pixels."""
-        if self._last is not None and self._last[0] == i and self._last[1] >= size:
-            return self._last[1:]
-        if size not in self._planes:
-            sampling = Sampling(size, self.settings.along, self.settings.across, self.slope)
-            self._planes[size] = images.planes(self.psf, sampling)
-        some = self._planes[size]
-        found = images.coefficients(
-            some, self.weights[i], self.shapes, self.form, int(self.row[i]), self._spread(i, some)
-        )
-        self._last = i, size, found
-        return size, found
+    def images(self, some: Int, size: int, straight: bool) -> Float32:
+        """Coefficients [m, b, n along, n across] of sources on stamps of `size` pixels."""
+        key = size, straight
+        if key not in self._planes:
+            sampling = Sampling(size, self.settings.along, self.settings.across, self.slope, straight)
+            self._planes[key] = images.planes(self.psf, sampling)
+        own = self._planes[key]
+        over = [images.spread_over(own, self.sources, i) for i in some.tolist()]
+        return images.coefficients(own, self.weights[some], self.bodies[straight].take(some), over)
 
-    def _spread(self, i: int, some: Planes) -> Array | None:
-        """[rows, columns] transform of a picture, or of a trail, over which a source's light is spread."""
-        picture, trail = self.sources.picture_of(i), self.sources.trail
-        kx, ky = np.meshgrid(some.kx, some.ky)
-        if picture is not None:
-            found = arcs.transform(picture, self.sources.jacobian[i], kx.ravel(), ky.ravel())
-            return np.asarray(found.reshape(kx.shape).astype(np.complex64))
-        if trail is not None and trail[i].any():
-            return np.asarray(np.sinc((kx * trail[i, 0] + ky * trail[i, 1]) / (2 * np.pi)).astype(np.float32))
-        return None
+    def together(self, size: int) -> int:
+        """How many stamps of `size` pixels are held at a time."""
+        samples = self.weights.shape[1] * size**2 * self.settings.along * self.settings.across
+        return max(_HELD // samples, 1)
 
 
-def _add(seen: _Seen, i: int, spectrum: Float32, plan: _Plan, frame: Int) -> tuple[float, float, int]:
-    """One order of source i onto the frame: (electrons that fell there, all of them, side of its stamp or 0)."""
-    order, settings, (ny, nx) = plan.order, seen.settings, frame.shape
-    column, row = float(seen.sources.column[i]), float(seen.sources.row[i])
-    electrons = np.empty(len(order.response))
-    peak = kernels.electrons_of(
-        spectrum, order.response, float(seen.sources.electrons[i]), max(round(plan.angstrom), 1), electrons
-    )
-    nothing = 0.0, float(electrons.sum()), 0
-    if peak < seen.sizes.limit * (1.0 if order.trace.order == 1 else settings.faint / settings.edge):
-        return nothing
-    along, across = order.trace.polynomials(column, row)
-    t = plan.t[0] + plan.t[1] * np.linspace(0.0, len(electrons) - 1.0, 33)
-    x, y = (np.polynomial.polynomial.polyval(t, part) for part in (along, across))
-    size = seen.sizes.size(peak, seen.wider[i])
-    left, right, low, high = column + x.min(), column + x.max(), row + y.min(), row + y.max()
-    if right + size < 0 or left - size > nx or high + size < 0 or low - size > ny:
-        return nothing
-    size, coefficients = seen.images(i, size)
-    samples = settings.along
-    first = int(np.floor(samples * left)) - 3
-    laid = np.zeros((coefficients.shape[0], int(np.ceil(samples * right)) + 4 - first))
-    kernels.lay(electrons, along, plan.t, column, samples, plan.share, first, laid)
-    at = (first + np.arange(laid.shape[1])) / samples
-    order_x = np.argsort(x)
-    bent = np.interp(at - column, x[order_x], (y - seen.slope * x)[order_x])
-    rows = row + seen.slope * (at - column) + bent
-    corner = max(int(np.floor(left)) - size // 2 - 2, 0), max(int(np.floor(rows.min())) - size // 2 - 1, 0)
-    width = min(int(np.ceil(right)) + size // 2 + 3, nx) - corner[0]
-    height = min(int(np.ceil(rows.max())) + size // 2 + 2, ny) - corner[1]
-    if width <= 0 or height <= 0:
-        return nothing
-    out = np.zeros((height, width), np.float32)
-    kernels.disperse(coefficients, laid, first, rows, (size, samples, settings.across), plan.block, corner, out)
-    return float(kernels.add(out, corner, FIXED_POINT, frame)), nothing[1], size
+def _add(
+    seen: _Seen, straight: bool, some: Int, spectra: Float32, orders: list[tuple[_Plan, _Part]], onto: list[Int],
+    tally: Tally,
+) -> None:  # fmt: skip
+    """Orders of some of the sources onto their frames: those that are straight, or the others."""
+    sizes = np.stack([np.where(part.straight == straight, part.sizes, 0) for _, part in orders])
+    # Orders that want stamps of nearly one size share the largest.
+    largest = sizes.max(axis=0)
+    sizes = np.where((sizes > 0) & (sizes >= _SHARED * largest), largest, sizes)
+    tally.sizes[some] = np.maximum(tally.sizes[some], largest)
+    shape = seen.settings.along, seen.settings.across
+    for size in np.unique(sizes[sizes > 0]).tolist():
+        which, count = np.flatnonzero((sizes == size).any(axis=0)), seen.together(size)
+        for own in np.split(which, range(count, len(which), count)):
+            for k, image in zip(own.tolist(), seen.images(some[own], size, straight), strict=True):
+                i = int(some[k])
+                factor, place = float(seen.sources.electrons[i]), seen.places[i]
+                for m in np.flatnonzero(sizes[:, k] == size).tolist():
+                    plan, part = orders[m]
+                    tally.electrons[i, m] = kernels.spread(
+                        image, spectra[k], factor, plan.order.response, plan.share, part.along[k], part.across[k],
+                        plan.t, place, seen.slope, (size, *shape), plan.tile if straight else 0, FIXED_POINT, onto[m],
+                    )  # fmt: skip

@@ -5,30 +5,35 @@ pixels, periodic, the image through each PSF_b,
 
     I_b(x, y) = 1 / N^2 sum_k profile(k) PSF_b(k) pixel(k) exp(i k r),
 
-is wanted at any place, not at the pixels alone.  It is held by ox samples a pixel along the rows and oy across,
+is wanted at any place, not at the pixels alone.  It is held by ox samples a pixel along the columns and oy across,
 unfolded (all |kx| <= pi ox, |ky| <= pi oy), as coefficients of splines: I = sum_j C_j B5(ox x - j) B3(oy y - j), so
 that C(k) = ox oy I(k) / (sinc(f / ox)^6 sinc(fy / oy)^4), f = k / 2 pi, and no resolution is lost to the splines.
 The quintic spline lies along the trace, of slope s: f = fx + s fy.
 
+Of a straight trace the image is held in coordinates in which the trace is a row, u = x and v = y - s x: then
+kx = ku - s kv, ky = kv, and f = fu.  What is summed along u is put in its place across at once, column by column.
+
 Nodes, nodes       wavelengths of the PSFs, and the share of each at any wavelength
 Planes, planes     PSF times pixel over splines, for stamps of a size
+Bodies, bodies     profiles of sources, in such coordinates
 coefficients       of sources
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
 import scipy.fft
 
+from jobs import sums
 from jobs.render.dispersing import kernels
-from jobs.render.drawing import transfer
+from jobs.render.drawing import arcs, transfer
 from jobs.render.psf.model import Psf
-from jobs.render.sources import sersic
-from jobs.render.sources.galaxy_shapes import Forms, Shapes
-from lake_schema.arrays import Array, Float, Float32
+from jobs.render.sources import galaxy_shapes, sersic
+from jobs.render.sources.source_list import Sources
+from lake_schema.arrays import Array, Bool, Float, Float32, Int
 
 # Degrees of the splines along and across.
 ALONG, ACROSS = 5, 3
@@ -54,45 +59,108 @@ def shares(wavelength: Float, at: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """n pixels of a stamp's side, even; samples a pixel along and across; slope of the trace, rows a column."""
+    """n pixels of a stamp's side, even; samples a pixel along and across; slope of the trace, rows a column.
+
+    straight : in coordinates in which the trace is a row
+    """
 
     n: int
     along: int
     across: int
     slope: float = 0.0
+    straight: bool = False
+
+    @property
+    def shear(self) -> float:
+        """Rows by which a row of the image rises in a column of the detector."""
+        return self.slope if self.straight else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Planes:
     """PSF times pixel over splines on a stamp's Fourier grid.
 
-    kx, ky : float32[columns], float32[rows] radian / pixel
+    ku, kv : float32[rows], float32[columns] radian / pixel
     planes : complex64[p, rows, columns], of all planes of the PSF
     """
 
     sampling: Sampling
-    kx: Float32
-    ky: Float32
+    ku: Float32
+    kv: Float32
     planes: Array
 
 
 def planes(psf: Psf, sampling: Sampling) -> Planes:
     """Of a PSF with planes, whose wavelengths are the nodes."""
     assert psf.planes is not None
-    n, columns = sampling.n, sampling.n * sampling.along // 2 + 1
-    iy = scipy.fft.fftfreq(n * sampling.across, 1.0 / (n * sampling.across)).astype(int)
-    fx, fy = np.arange(columns) / n, iy / n
-    on_trace = np.clip(fx + sampling.slope * fy[:, None], -_FARTHEST * sampling.along, _FARTHEST * sampling.along)
-    spline = np.sinc(on_trace / sampling.along) ** (ALONG + 1) * np.sinc(fy / sampling.across)[:, None] ** (ACROSS + 1)
+    n, count = sampling.n, sampling.n * sampling.along
+    iu, iv = scipy.fft.fftfreq(count, 1.0 / count).astype(int), np.arange(n * sampling.across // 2 + 1)
+    fu, fy = iu[:, None] / n, iv / n
+    fx = fu - sampling.shear * fy
+    on_trace = np.clip(fx + sampling.slope * fy, -_FARTHEST * sampling.along, _FARTHEST * sampling.along)
+    spline = np.sinc(on_trace / sampling.along) ** (ALONG + 1) * np.sinc(fy / sampling.across) ** (ACROSS + 1)
     # The stamp's middle is at sample n / 2 of each axis.
-    sign = (-1.0) ** np.arange(columns) * ((-1.0) ** iy)[:, None]
-    factor = sampling.along * sampling.across * np.sinc(fx) * np.sinc(fy)[:, None] * sign / spline
+    sign = (-1.0) ** iu[:, None] * (-1.0) ** iv
+    factor = sampling.along * sampling.across * np.sinc(fx) * np.sinc(fy) * sign / spline
     images = [*psf.planes.images, *psf.planes.drift]
-    found = np.empty((len(images), len(fy), columns), np.complex64)
+    found = np.empty((len(images), count, len(iv)), np.complex64)
     for image, out in zip(images, found, strict=True):
-        spectrum = transfer.spectrum(image, psf.planes.samples * n, columns)
-        out[:] = spectrum[iy] * factor
-    return Planes(sampling, (2 * np.pi * fx).astype(np.float32), (2 * np.pi * fy).astype(np.float32), found)
+        passed = transfer.sheared_spectrum(image, psf.planes.samples * n, len(iv), sampling.shear)
+        out[:] = passed[iu] * factor
+    return Planes(sampling, (2 * np.pi * fu[:, 0]).astype(np.float32), (2 * np.pi * fy).astype(np.float32), found)
+
+
+@dataclass(frozen=True, slots=True)
+class Bodies:
+    """Profiles of n sources, as kernels.zones takes them.
+
+    body     : bool[n] False for a point;  fraction : float64[n] of the light in the bulge
+    bulge, disk, thick : [n, 2, 2], [n, 2, 2], [n, 2] of galaxy_shapes.Forms
+    row, row_weights   : int64[n], float64[n, 4] of sersic.row_of
+    """
+
+    body: Bool
+    fraction: Float
+    bulge: Float
+    disk: Float
+    thick: Float
+    row: Int
+    row_weights: Float
+
+    def take(self, some: Int) -> Bodies:
+        """Some of them."""
+        return Bodies(*(getattr(self, field.name)[some] for field in fields(self)))
+
+
+def bodies(sources: Sources, shear: float) -> Bodies:
+    """Of sources, in coordinates whose rows rise by `shear` rows a column."""
+    n, body = len(sources), sources.shape >= 0
+    shapes = sources.shapes.take(sources.shape[body])
+    form = galaxy_shapes.forms(shapes, sheared(sources.jacobian[body], shear))
+    fraction, row, weights = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 4))
+    bulge, disk, thick = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2))
+    fraction[body], bulge[body], disk[body], thick[body] = shapes.bulge_fraction, form.bulge, form.disk, form.thick
+    row[body], weights[body] = sersic.row_of(shapes.sersic_index)
+    return Bodies(body, fraction, bulge, disk, thick, row, weights)
+
+
+def sheared(jacobian: Float, shear: float) -> Float:
+    """[.., 2, 2] arcsec by (u, v) of arcsec by pixels."""
+    return np.asarray(sums.product(jacobian, np.array([[1.0, 0.0], [shear, 1.0]])), float)
+
+
+def spread_over(some: Planes, sources: Sources, i: int) -> Array | None:
+    """[rows, columns] transform of a picture, or of a trail, over which source i's light is spread; None: nothing."""
+    picture, trail, shear = sources.picture_of(i), sources.trail, some.sampling.shear
+    if picture is None and (trail is None or not trail[i].any()):
+        return None
+    ku, kv = np.broadcast_arrays(some.ku[:, None], some.kv)
+    if picture is not None:
+        found = arcs.transform(picture, sheared(sources.jacobian[i], shear), ku.ravel(), kv.ravel())
+        return np.asarray(found.reshape(ku.shape).astype(np.complex64))
+    assert trail is not None
+    across, up = float(trail[i, 0]), float(trail[i, 1] - shear * trail[i, 0])
+    return np.asarray(np.sinc((ku * across + kv * up) / (2 * np.pi)).astype(np.float32))
 
 
 @lru_cache(maxsize=1)
@@ -100,28 +168,19 @@ def _sersic() -> Float32:
     return sersic.table()
 
 
-def coefficients(
-    some: Planes, weights: Float, shapes: Shapes, form: Forms, i: int, spread: Array | None = None
-) -> Float32:
-    """float32[b, along, n across, n] of kernels.disperse: of one source of one electron.
+def coefficients(some: Planes, weights: Float, of: Bodies, over: list[Array | None]) -> Float32:
+    """float32[m, b, n along, n across] of kernels.spread: of m sources of one electron.
 
-    weights : [b, p] of the planes, for each node;  shapes, form, i : of galaxies, and which it is, -1 = a point
-    some    : the planes;  spread : [rows, columns] the transform of what a point is spread over; None: nothing
+    some : the planes;  weights : [m, b, p] of them, for each node;  of : the sources
+    over : what each is spread over, of `spread_over`
     """
-    body = i >= 0
-    row, row_weights = sersic.row_of(shapes.sersic_index[i : i + 1]) if body else (np.zeros(1, int), np.zeros((1, 4)))
-    fraction, bulge, disk, thick = (
-        (float(shapes.bulge_fraction[i]), form.bulge[i], form.disk[i], form.thick[i])
-        if body
-        else (0.0, np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2))
-    )
-    zones = np.empty((len(weights), *some.planes.shape[1:]), np.complex64)
+    zones = np.empty((*weights.shape[:2], *some.planes.shape[1:]), np.complex64)
     kernels.zones(
-        some.planes, weights.astype(np.float32), some.kx, some.ky, body, fraction, bulge, disk, thick, _sersic(),
-        int(row[0]), row_weights[0], zones,
+        some.planes, weights.astype(np.float32), some.ku, some.kv, of.body, of.fraction, of.bulge, of.disk, of.thick,
+        _sersic(), of.row, of.row_weights, zones,
     )  # fmt: skip
-    if spread is not None:
-        zones *= spread
+    for part, transform in zip(zones, over, strict=True):
+        if transform is not None:
+            part *= transform
     n, along, across = some.sampling.n, some.sampling.along, some.sampling.across
-    images = scipy.fft.irfft2(zones, s=(n * across, n * along), overwrite_x=True)
-    return np.ascontiguousarray(images.reshape(len(weights), n * across, n, along).transpose(0, 3, 1, 2))
+    return np.asarray(scipy.fft.irfft2(zones, s=(n * along, n * across), overwrite_x=True))

@@ -1,9 +1,11 @@
 """The inner loops of dispersing, compiled.
 
-zones      profile x PSF of a source on a stamp's Fourier grid
-electrons_of  what is detected of a spectrum
-lay        it onto the samples of its trace, by quintic splines
-disperse   a source's image at every sample of its trace, by cubic splines across
+zones      profile x PSF of sources on a stamp's Fourier grid
+brightest  how bright spectra are in a column
+lay        what is detected of a spectrum onto the samples of its trace, by quintic splines
+follow     a source's image at every sample of its trace, each in its own rows
+convolve   a source's image, along a straight trace, by a few samples at a time;  settle : into rows
+spread     a source's order onto the frame, in one of the two ways
 add        a piece of the image onto the frame, in fixed point
 """
 
@@ -16,55 +18,70 @@ import numpy as np
 from jobs.compiling import jit
 from jobs.render.drawing.kernels import fourier
 from jobs.render.drawing.kernels.frame import smaller
-from lake_schema.arrays import Float, Float32, Int
+from lake_schema.arrays import Bool, Float, Float32, Int
+
+# Places along a trace between which it is taken as straight.
+_NODES = 129
+# Pixels of a trace that are taken together, and wavelengths.
+STEP, _WAVES = 4, 64
 
 
 @jit
 def zones(
-    planes: Any, weights: Float32, kx: Float32, ky: Float32, body: bool, fraction: float, bulge: Float, disk: Float,
-    thick: Float, sersic: Float32, row: int, row_weights: Float, out: Any,
+    planes: Any, weights: Float32, ku: Float32, kv: Float32, body: Bool, fraction: Float, bulge: Float, disk: Float,
+    thick: Float, sersic: Float32, row: Int, row_weights: Float, out: Any,
 ) -> None:  # fmt: skip
-    """Fills out [b, rows, columns] with profile x sum of planes [p, rows, columns] by weights [b, p].
+    """Fills out [m, b, rows, columns] with profile x sum of planes [p, rows, columns] by weights [m, b, p].
 
-    kx, ky : [columns], [rows] radian / pixel
-    body, fraction, bulge, disk, thick, sersic, row, row_weights : of fourier.nyquist_zones, of one source
+    ku, kv : [rows], [columns] radian / pixel
+    body .. row_weights : [m] of fourier.nyquist_zones
     """
-    rows, columns = len(ky), len(kx)
-    profile, square = np.ones(columns, np.float32), np.empty(columns, np.float32)
-    bits, high = square.view(np.int32), np.empty(columns, np.float32)
-    table = np.empty(sersic.shape[1], np.float32)
-    if body and fraction > 0.0:
-        step = kx[1]
-        most = 1.01 * (kx[columns - 1] ** 2 + np.max(ky) ** 2 + step**2) * 4.0 * np.sum(bulge**2)
-        fourier.interpolate(sersic, row, row_weights, 0.99 * step**2 * smaller(bulge), most, table)
-    for r in range(rows):
-        if body:
-            high[:] = ky[r]
-            fourier.profile_at(fraction, bulge, disk, thick, table, kx, high, square, bits, profile)
-        for b in range(len(weights)):
-            line = out[b, r]
-            line[:] = np.complex64(0.0)
-            for p in range(len(planes)):
-                w = weights[b, p]
-                if w != 0.0:
-                    plane = planes[p, r]
-                    for c in range(columns):
-                        line[c] += w * plane[c]
-            for c in range(columns):
-                line[c] *= profile[c]
+    rows, columns = len(ku), len(kv)
+    square, high = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    bits, table = square.view(np.int32), np.empty(sersic.shape[1], np.float32)
+    profile = np.empty(columns, np.float32)
+    step, reach = kv[1], 1.01 * (np.max(np.abs(ku)) ** 2 + kv[columns - 1] ** 2 + kv[1] ** 2) * 4.0
+    for m in range(len(weights)):
+        profile[:] = np.float32(1.0)
+        if body[m] and fraction[m] > 0.0:
+            fourier.interpolate(
+                sersic, row[m], row_weights[m], 0.99 * step**2 * smaller(bulge[m]), reach * np.sum(bulge[m] ** 2), table
+            )
+        for r in range(rows):
+            if body[m]:
+                high[:] = ku[r]
+                fourier.profile_at(fraction[m], bulge[m], disk[m], thick[m], table, high, kv, square, bits, profile)
+            for b in range(weights.shape[1]):
+                line = out[m, b, r]
+                line[:] = np.complex64(0.0)
+                for p in range(len(planes)):
+                    w = weights[m, b, p]
+                    if w != 0.0:
+                        plane = planes[p, r]
+                        for c in range(columns):
+                            line[c] += w * plane[c]
+                for c in range(columns):
+                    line[c] *= profile[c]
 
 
 @jit
-def electrons_of(spectrum: Float32, response: Float, factor: float, wavelengths: int, out: Float) -> float:
-    """Fills out [w] with factor x spectrum x response; returns the largest sum of `wavelengths` neighbours."""
-    most, running = 0.0, 0.0
-    for i in range(len(out)):
-        out[i] = factor * np.float64(spectrum[i]) * response[i]
-        running += out[i]
-        if i >= wavelengths:
-            running -= out[i - wavelengths]
-        most = max(most, running)
-    return most
+def brightest(spectra: Float32, factor: Float, response: Float, window: int, peak: Float, total: Float) -> None:
+    """Fills [k] with the electrons of spectra [k, w], and with the most among `window` neighbours, by half windows.
+
+    factor : [k] of each spectrum;  response : [w] electrons for each of its units
+    """
+    half = max(window // 2, 1)
+    for k in range(len(spectra)):
+        most, everything, before, start = 0.0, 0.0, 0.0, 0
+        while start < len(response):
+            some, through = spectra[k, start : start + half], response[start : start + half]
+            own = 0.0
+            for i in range(len(some)):
+                own += some[i] * through[i]
+            most = max(most, before + own)
+            everything += own
+            before, start = own, start + half
+        peak[k], total[k] = factor[k] * most, factor[k] * everything
 
 
 @jit
@@ -78,111 +95,243 @@ def lay(
     samples : a pixel;  first : place of out's first sample, in samples;  share : of each PSF, by wavelength
     A quintic spline keeps the total, the mean and the higher moments.
     """
-    count, last = out.shape[1], len(along) - 1
-    for i in range(len(electrons)):
-        if electrons[i] == 0.0:
+    count, places, low = out.shape[1], np.empty(_WAVES), np.empty(_WAVES, np.int64)
+    weights = np.empty((6, _WAVES))
+    w0, w1, w2, w3, w4, w5 = weights
+    for begin in range(0, len(electrons), _WAVES):
+        some = electrons[begin : begin + _WAVES]
+        if np.max(some) == 0.0:
             continue
-        place, power = along[last], times[0] + times[1] * i
-        for j in range(last - 1, -1, -1):
-            place = place * power + along[j]
-        place = samples * (start + place)
-        whole = int(np.floor(place))
-        t = place - whole
-        s = 1.0 - t
-        t2, s2 = t * t, s * s
-        w0, w5 = s2 * s2 * s, t2 * t2 * t
-        w1 = 26.0 + t * (-50.0 + t * (20.0 + t * (20.0 + t * (-20.0 + 5.0 * t))))
-        w4 = 26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s))))
-        w2 = 66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t))
-        w3 = 66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s))
-        low, scaled = whole - 2 - first, electrons[i] / 120.0
-        if low < 0 or low + 6 > count:
-            continue
+        # By whole vectors; then each to its samples.
+        places[:] = along[len(along) - 1]
+        for j in range(len(along) - 2, -1, -1):
+            for i in range(_WAVES):
+                places[i] = places[i] * (times[0] + times[1] * (begin + i)) + along[j]
+        for i in range(len(some)):
+            place = samples * (start + places[i])
+            whole = np.floor(place)
+            low[i] = np.int64(whole) - 2 - first
+            t = place - whole
+            s, e = 1.0 - t, some[i] / 120.0
+            t2, s2 = t * t, s * s
+            w0[i], w5[i] = e * s2 * s2 * s, e * t2 * t2 * t
+            w1[i] = e * (26.0 + t * (-50.0 + t * (20.0 + t * (20.0 + t * (-20.0 + 5.0 * t)))))
+            w4[i] = e * (26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s)))))
+            w2[i] = e * (66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t)))
+            w3[i] = e * (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s)))
         for b in range(out.shape[0]):
-            e = scaled * share[i, b]
-            line = out[b]
-            line[low] += e * w0
-            line[low + 1] += e * w1
-            line[low + 2] += e * w2
-            line[low + 3] += e * w3
-            line[low + 4] += e * w4
-            line[low + 5] += e * w5
+            line, part = out[b], share[begin : begin + _WAVES, b]
+            for i in range(len(some)):
+                at, own = low[i], part[i]
+                if some[i] == 0.0 or at < 0 or at + 6 > count:
+                    continue
+                line[at] += own * w0[i]
+                line[at + 1] += own * w1[i]
+                line[at + 2] += own * w2[i]
+                line[at + 3] += own * w3[i]
+                line[at + 4] += own * w4[i]
+                line[at + 5] += own * w5[i]
 
 
 @jit
-def disperse(
-    images: Float32, spectrum: Float, first: int, across: Float, shape: tuple[int, int, int], block: int,
+def _path(along: Float, across: Float, times: tuple[float, float], count: int, start: tuple[float, float]) -> Float:
+    """[3, nodes] columns, ascending, rows and numbers of wavelengths at places of a trace."""
+    out = np.empty((3, _NODES))
+    for i in range(_NODES):
+        number = (count - 1.0) * i / (_NODES - 1.0)
+        t = times[0] + times[1] * number
+        x, y = along[len(along) - 1], across[len(across) - 1]
+        for j in range(len(along) - 2, -1, -1):
+            x = x * t + along[j]
+        for j in range(len(across) - 2, -1, -1):
+            y = y * t + across[j]
+        out[0, i], out[1, i], out[2, i] = start[0] + x, start[1] + y, number
+    if out[0, _NODES - 1] < out[0, 0]:
+        return np.ascontiguousarray(out[:, ::-1])
+    return out
+
+
+@jit
+def _between(path: Float, x: float, ends: tuple[float, float]) -> tuple[float, float, float]:
+    """(row, number of the wavelength, rows a column) of a path at column x; ends : rows a column before and behind."""
+    columns = path[0]
+    last = len(columns) - 1
+    if x <= columns[0]:
+        return path[1, 0] + ends[0] * (x - columns[0]), path[2, 0], ends[0]
+    if x >= columns[last]:
+        return path[1, last] + ends[1] * (x - columns[last]), path[2, last], ends[1]
+    low, high = 0, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        if columns[middle] <= x:
+            low = middle
+        else:
+            high = middle
+    width = columns[high] - columns[low]
+    part = (x - columns[low]) / width
+    rise = path[1, high] - path[1, low]
+    return path[1, low] + part * rise, path[2, low] + part * (path[2, high] - path[2, low]), rise / width
+
+
+@jit
+def _slope(path: Float, i: int) -> float:
+    """Rows a column from place i of a path to the next."""
+    return (path[1, i + 1] - path[1, i]) / max(path[0, i + 1] - path[0, i], 1e-12)
+
+
+@jit
+def follow(
+    images: Float32, laid: Float, first: int, path: Float, slope: float, shape: tuple[int, int, int],
     corner: tuple[int, int], out: Float32,
 ) -> None:  # fmt: skip
-    """Adds a source's image at every sample of its trace to out [h, w].
+    """Adds a source's image at every sample of its trace to out [h, w], with a PSF and rows of its own.
 
-    images   : [b, phases along, samples across, N] spline coefficients of the source seen through PSF b, of a stamp of
-               N pixels; the stamp's middle is sample N / 2 of each axis
-    spectrum : [b, m] electrons;  first : place of its first sample, in samples along
-    across   : [m] row of each sample, pixels
-    shape    : N, samples a pixel along, across;  block : samples that share one PSF
-    corner   : column and row of out's first pixel
+    images : [b, n along, n across] spline coefficients of the source seen through PSF b, of a stamp of n pixels; the
+             stamp's middle is sample n / 2 of each axis
+    laid   : [b, m] electrons;  first : place of its first sample, in samples along
+    path   : of `_path`;  slope : rows a column before and behind it
+    shape  : n, samples a pixel along, across;  corner : column and row of out's first pixel
     """
     n, ox, oy = shape
-    tall = n * oy
-    mixed = np.zeros((ox, tall, n), np.float32)
-    columns = out.shape[1]
-    for start in range(0, spectrum.shape[1], block):
-        stop = min(start + block, spectrum.shape[1])
-        total = 0.0
-        for b in range(spectrum.shape[0]):
-            for m in range(start, stop):
-                total += spectrum[b, m]
-        if total == 0.0:
+    line = np.empty(n * oy, np.float32)
+    wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
+    for m in range(laid.shape[1]):
+        electrons = 0.0
+        for b in range(len(laid)):
+            electrons += laid[b, m]
+        place = first + m - (n // 2) * ox
+        phase = (-place) % ox
+        left = (place + phase) // ox - corner[0]
+        if electrons == 0.0 or left >= out.shape[1] or left + n <= 0:
             continue
-        mixed[:] = np.float32(0.0)
-        for b in range(spectrum.shape[0]):
-            own = 0.0
-            for m in range(start, stop):
-                own += spectrum[b, m]
-            weight = np.float32(own / total)
-            flat, image = mixed.reshape(-1), images[b].reshape(-1)
-            for i in range(len(flat)):
-                flat[i] += weight * image[i]
-        for m in range(start, stop):
-            electrons = 0.0
-            for b in range(spectrum.shape[0]):
-                electrons += spectrum[b, m]
-            if electrons == 0.0:
-                continue
-            place = first + m - (n // 2) * ox
-            phase = (-place) % ox
-            left = (place + phase) // ox - corner[0]
-            if left >= columns or left + n <= 0:
-                continue
-            row = int(np.ceil(across[m] - n // 2))
-            v = oy * (row - across[m] + n // 2)
-            whole = int(np.floor(v))
-            t = v - whole
-            s = 1.0 - t
-            e = electrons / 6.0
-            w0, w3 = np.float32(e * s * s * s), np.float32(e * t * t * t)
-            w1 = np.float32(e * (4.0 + t * t * (3.0 * t - 6.0)))
-            w2 = np.float32(e * (4.0 + s * s * (3.0 * s - 6.0)))
-            _add_rows(mixed[phase], whole, oy, (w0, w1, w2, w3), out, left, row - corner[1])
+        row, _, _ = _between(path, (first + m) / ox, (slope, slope))
+        for i in range(max(0, -left), min(n, out.shape[1] - left)):
+            line[:] = np.float32(0.0)
+            for b in range(len(laid)):
+                weight, some = np.float32(laid[b, m]), images[b, i * ox + phase]
+                for v in range(len(line)):
+                    line[v] += weight * some[v]
+            _add_line(line, row, n, oy, corner[1], wrapped, fine, out[:, left + i])
 
 
 @jit
-def _add_rows(image: Any, whole: int, step: int, weights: Any, out: Any, left: int, low: int) -> None:
-    """Rows whole + i step of an image, between its samples, onto rows low + i of out."""
-    tall, n = image.shape
-    height, width = out.shape
-    w0, w1, w2, w3 = weights
-    begin, end = max(0, -left), min(n, width - left)
-    # Flat, and counted without a sign: so the compiler uses whole vectors of as few as 16 pixels.
-    flat, line = image.reshape(-1), out.reshape(-1)
-    for i in range(max(0, -low), min(n, height - low)):
-        j = whole + i * step
-        a0, a1 = np.uint64((j - 1) % tall * n + begin), np.uint64(j % tall * n + begin)
-        a2, a3 = np.uint64((j + 1) % tall * n + begin), np.uint64((j + 2) % tall * n + begin)
-        to = np.uint64((low + i) * width + left + begin)
-        for c in range(np.uint64(end - begin)):
-            line[to + c] += w0 * flat[a0 + c] + w1 * flat[a1 + c] + w2 * flat[a2 + c] + w3 * flat[a3 + c]
+def _add_line(
+    line: Float32, row: float, n: int, oy: int, low: int, wrapped: Float32, fine: Float32, out: Float32
+) -> None:
+    """Adds a column of an image, oy samples a row, its middle at `row`, to out [h] from row `low` on."""
+    tall, begin = len(line), int(np.ceil(row - n // 2))
+    v = oy * (begin - row + n // 2)
+    whole = int(np.floor(v))
+    t = v - whole
+    s = 1.0 - t
+    w0, w3 = np.float32(s * s * s / 6.0), np.float32(t * t * t / 6.0)
+    w1 = np.float32((4.0 + t * t * (3.0 * t - 6.0)) / 6.0)
+    w2 = np.float32((4.0 + s * s * (3.0 * s - 6.0)) / 6.0)
+    # Periodic.
+    wrapped[0] = line[tall - 1]
+    wrapped[1 : tall + 1] = line
+    wrapped[tall + 1 :] = line[: len(wrapped) - tall - 1]
+    a0, a1, a2, a3 = wrapped[whole:], wrapped[whole + 1 :], wrapped[whole + 2 :], wrapped[whole + 3 :]
+    # Of every sample, in whole vectors, which is faster than of every row.
+    for i in range(len(fine) - oy + 1):
+        fine[i] = w0 * a0[i] + w1 * a1[i] + w2 * a2[i] + w3 * a3[i]
+    for r in range(max(0, low - begin), min(n, low + len(out) - begin)):
+        out[begin + r - low] += fine[r * oy]
+
+
+@jit
+def convolve(
+    images: Float32, laid: Float, first: int, path: Float, slope: float, share: Float, shape: tuple[int, int, int],
+    tile: int, low: int, out: Float32,
+) -> None:  # fmt: skip
+    """Adds a source's image at every sample of its trace to out [w, n across]: columns from `low` on, about the trace.
+
+    images : of `follow`, in coordinates that rise by `slope` rows a column;  laid : [m] electrons
+    share  : [wavelengths, b] of each PSF;  tile : pixels that share one, a multiple of STEP
+    """
+    n, ox, oy = shape
+    tall, pad = n * oy, STEP - 1
+    mixed, steep = np.zeros((ox, (n + 2 * pad) * tall), np.float32), np.empty((n * ox, tall), np.float32)
+    _steep(images[len(images) // 2], ox, oy, steep)
+    flat, weights, all_of_them = out.reshape(-1), np.empty(tile, np.float32), len(laid)
+    ends = _slope(path, 0), _slope(path, _NODES - 2)
+    for q in range(first // ox, (first + all_of_them - 1) // ox + 2, tile):
+        left = q - n // 2 - low
+        if left < 0 or (left + n + tile + pad) * tall > len(flat):
+            continue
+        total, mean = 0.0, 0.0
+        for m in range(max(ox * (q - 1) + 1 - first, 0), min(ox * (q + tile - 1) + 1 - first, all_of_them)):
+            total += laid[m]
+            mean += m * laid[m]
+        if total == 0.0:
+            continue
+        _, number, rise = _between(path, (first + mean / total) / ox, ends)
+        _mix(images, steep, share[int(number)], rise - slope, shape, mixed)
+        for phase in range(ox):
+            for k in range(tile):
+                m = ox * (q + k) - phase - first
+                weights[k] = np.float32(laid[m]) if 0 <= m < all_of_them else np.float32(0.0)
+            for k in range(0, tile, STEP):
+                w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
+                if w0 + w1 + w2 + w3 == 0.0:
+                    continue
+                length = (n + pad) * tall
+                some, source = flat[(left + k) * tall : (left + k) * tall + length], mixed[phase]
+                a0, a1 = source[3 * tall : 3 * tall + length], source[2 * tall : 2 * tall + length]
+                a2, a3 = source[tall : tall + length], source[:length]
+                for e in range(np.uint64(length)):
+                    some[e] += w0 * a0[e] + w1 * a1[e] + w2 * a2[e] + w3 * a3[e]
+
+
+@jit
+def _steep(image: Float32, ox: int, oy: int, out: Float32) -> None:
+    """Fills out [n along, n across] with u dI / dv of an image I: what it gains where its trace is steeper."""
+    tall = image.shape[1]
+    out[:] = np.float32(0.0)
+    for j in range(len(image)):
+        one, moved = image[j], np.float32((j - len(image) // 2) / ox * oy / 12.0)
+        inner, up, down = out[j, 2 : tall - 2], one[3 : tall - 1], one[1 : tall - 3]
+        for v in range(len(inner)):
+            inner[v] = up[v] - down[v]
+        higher, lower = one[4:tall], one[: tall - 4]
+        for v in range(len(inner)):
+            inner[v] = moved * (np.float32(8.0) * inner[v] - (higher[v] - lower[v]))
+
+
+@jit
+def _mix(
+    images: Float32, steep: Float32, share: Float, steeper: float, shape: tuple[int, int, int], out: Float32
+) -> None:
+    """Fills out [along, (padded) columns x samples across] with images [b, ..] by shares [b], of a steeper trace.
+
+    A trace that is steeper by d than the image's rows has I(u, v + d u) for its image: I + d u dI / dv.
+    """
+    n, ox, oy = shape
+    tall, pad = n * oy, STEP - 1
+    moved = np.float32(steeper)
+    for phase in range(ox):
+        for i in range(n):
+            line, j = out[phase, (pad + i) * tall : (pad + i + 1) * tall], i * ox + phase
+            weight, some, other = np.float32(share[0]), images[0, j], steep[j]
+            for v in range(len(line)):
+                line[v] = weight * some[v] + moved * other[v]
+            for b in range(1, len(images)):
+                weight, some = np.float32(share[b]), images[b, j]
+                for v in range(len(line)):
+                    line[v] += weight * some[v]
+
+
+@jit
+def settle(
+    lines: Float32, low: int, path: Float, shape: tuple[int, int, int], corner: tuple[int, int], out: Float32
+) -> None:
+    """Adds columns [w, n across] of `convolve`, the first column `low`, to out [h, w], where the trace has them."""
+    n, _, oy = shape
+    wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
+    ends = _slope(path, 0), _slope(path, _NODES - 2)
+    for c in range(out.shape[1]):
+        row, _, _ = _between(path, float(corner[0] + c), ends)
+        _add_line(lines[corner[0] + c - low], row, n, oy, corner[1], wrapped, fine, out[:, c])
 
 
 @jit
@@ -202,3 +351,46 @@ def add(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) -> flo
                 out[c] += units
                 total += units
     return total / unit
+
+
+@jit
+def spread(
+    images: Float32, spectrum: Float32, factor: float, response: Float, share: Float, along: Float, across: Float,
+    times: tuple[float, float], start: tuple[float, float], slope: float, shape: tuple[int, int, int], tile: int,
+    unit: float, frame: Int,
+) -> float:  # fmt: skip
+    """An order of a source onto the frame, `unit` to an electron; returns the electrons that fell there.
+
+    images   : of `follow`, or of `convolve` for tile > 0: the pixels that share a PSF
+    spectrum : [w], `factor` x `response` [w] electrons for each unit;  share : [w, b] of each PSF
+    along, across, times : of `lay`, and the same of rows;  start : column and row of the undispersed image
+    slope    : of a row of the images
+    shape    : n, samples a pixel along, across
+    """
+    n, ox, oy = shape
+    ny, nx = frame.shape
+    electrons = np.empty(len(response))
+    for i in range(len(response)):
+        electrons[i] = factor * np.float64(spectrum[i]) * response[i]
+    path = _path(along, across, times, len(response), start)
+    left, right = path[0, 0], path[0, _NODES - 1]
+    bottom, top = np.min(path[1]), np.max(path[1])
+    first = int(np.floor(ox * left)) - 3
+    laid = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * right)) + 4 - first))
+    lay(electrons, along, times, start[0], ox, np.ones((len(response), 1)) if tile > 0 else share, first, laid)
+    steepest = max(np.abs(_slope(path, 0)), np.abs(_slope(path, _NODES - 2)))
+    wing = steepest * (n // 2 + 2.0) if tile > 0 else 0.0
+    begin = max(int(np.floor(left)) - n // 2 - 2, 0), max(int(np.floor(bottom - wing)) - n // 2 - 1, 0)
+    width = min(int(np.ceil(right)) + n // 2 + 3, nx) - begin[0]
+    height = min(int(np.ceil(top + wing)) + n // 2 + 2, ny) - begin[1]
+    if width <= 0 or height <= 0:
+        return 0.0
+    piece = np.zeros((height, width), np.float32)
+    if tile == 0:
+        follow(images, laid, first, path, slope, shape, begin, piece)
+    else:
+        low = begin[0] - n - 2 * tile
+        lines = np.zeros((width + 2 * n + 4 * tile + 2 * STEP, n * oy), np.float32)
+        convolve(images, laid[0], first, path, slope, share, shape, tile, low, lines)
+        settle(lines, low, path, shape, begin, piece)
+    return add(piece, begin, unit, frame)

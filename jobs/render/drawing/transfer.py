@@ -8,6 +8,7 @@ grid          the samples of a stamp's half plane inside a disc, in the order in
 transfer      all planes of a PSF on such a grid
 collapsed     the one of a single source
 image_of      its image
+sheared_spectrum  of a plane, in coordinates that a row rises in
 profile_of    the same as a galsim object, for the reference
 """
 
@@ -278,6 +279,17 @@ def spectrum(image: Array, period: int, columns: int) -> Array:
     image = _middle(image[None], period)[0]
     lines = scipy.fft.rfft(_from_middle(image, period, 1), axis=1)[:, :columns]
     return np.asarray(scipy.fft.fft(_from_middle(lines, period, 0), axis=0, overwrite_x=True))
+
+
+def sheared_spectrum(image: Array, period: int, columns: int, shear: float) -> Array:
+    """The same in coordinates u = x, v = y - shear x, transposed: complex[period, columns], the first of v."""
+    image = _middle(image[None], period)[0]
+    middle = np.arange(image.shape[1]) - image.shape[1] // 2
+    lines = scipy.fft.rfft(_from_middle(image, period, 0), axis=0)[:columns]
+    if shear != 0.0:
+        turn = (2 * np.pi * shear / period) * np.arange(len(lines))[:, None] * middle
+        lines = lines * np.exp(1j * turn).astype(lines.dtype)
+    return np.asarray(scipy.fft.fft(_from_middle(lines, period, 1), axis=1, overwrite_x=True).T)
 
 
 def _from_middle(image: Array, period: int, axis: int) -> Array:

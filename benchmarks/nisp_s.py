@@ -1,0 +1,189 @@
+"""A NISP-S detector with everything: CPU seconds from the catalogue to the file, and memory; four dithers of 16.
+
+One process, one thread, the demo's field through RGS000: every source down to H_E = 23 or with H alpha of 1e-16, in all
+orders. Each time is of a process that has rendered before, as a worker has; "cold" is without the PSF's planes in the
+cache, "warm" with them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import galsim
+import numpy as np
+
+from benchmarks import _detectors as one_detector
+from benchmarks import report
+from benchmarks._detectors import FIELD, ROOT, prepared, rendered
+from jobs.accuracy import preset
+from jobs.render.channels import nisp_s
+from jobs.render.dispersing import draw
+from jobs.render.drawing import transfer
+from jobs.render.sources import galaxy_shapes, spectra
+from jobs.request.from_toml import parse
+from jobs.request.schema import Effects, Request
+from lake_schema.store.plan import Json
+
+RESULTS = ROOT / "benchmarks" / "results" / "nisp_s.json"
+# Folders of the PSF's planes in the cache.
+_PLANES = "nisp*_psf-*"
+# Where the exposure points for DET22 to lie in the middle of the demo's area, deg.
+_RA, _DEC = 53.0135, -27.907
+_RAMP = nisp_s.SKY[nisp_s.SKY.index(nisp_s.persistence.EFFECT) + 1 :]
+# Sources that galsim draws, and pixels of its stamps.
+_FEW, _STAMP = 8, 32
+_NOTES = {
+    "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed",
+    "survey_warm_s": "the same, PSF planes from the cache (target 12 on a Xeon of 2.5 GHz)",
+    "draft_s": "the same at draft accuracy, its own choice of effects (target 5)",
+    "reference_s": "the same at reference accuracy, everything on (target 40)",
+    "draw_s": "CPU, of survey_warm_s, of drawing spectra, with",
+    "spectra_s": "the spectra themselves (target 1.5)",
+    "sources": "whose spectra are drawn",
+    "ramp_s": "CPU, of survey_warm_s, of the effects from cosmic rays to the converter",
+    "peak_gb": "largest memory of the process, survey (target 2)",
+    "exposure_s": "wall, an exposure of 16 detectors by the Spark job on 2 cores (target of four 480)",
+    "against_galsim": "times that galsim takes, a first order pixel by pixel, of ours with all orders",
+}
+
+
+def request(quick: bool, detectors: str = 'detectors = ["DET22"]', place: tuple[float, float] = (_RA, _DEC)) -> str:
+    """The demo's field through the red grism, chosen as in Serrano et al. 2024."""
+    return f"""{one_detector.head(quick)}
+[mission.overrides]
+"nisp.spectra.selection" = {{ value = 1.0, unit = "" }}
+
+[fluxes]
+bands = ["euclid_h", "nisp_red"]
+
+[[observation]]
+channels = ["NISP-S"]
+ra = {place[0]}
+dec = {place[1]}
+position_angle = 0.0
+dither = "none"
+{detectors}
+mjd = 60905.0
+"""
+
+
+def full(wanted: Request) -> Request:
+    """With every effect of a science image forced on, but the non-linearity of the signal: that of the ramp is."""
+    names = [effect.name for effect in nisp_s.SKY if effect.optional and effect.name != "signal_nonlinearity"]
+    return replace(wanted, effects=Effects(on=tuple(names)))
+
+
+@contextmanager
+def watched(seconds: dict[str, float], drawn: list[tuple[Any, ...]]) -> Iterator[None]:
+    """Adds up the CPU seconds of drawing and of spectra, and keeps what is drawn, while it is open."""
+    kept_draw, kept_rows = draw.draw, spectra.of_rows
+
+    def kept(*arguments: Any, **options: Any) -> Any:
+        drawn.append(arguments)
+        return one_detector.timed(kept_draw, "draw_s", seconds)(*arguments, **options)
+
+    def of_rows(*arguments: Any, **options: Any) -> Any:
+        return one_detector.timed(kept_rows(*arguments, **options), "spectra_s", seconds)
+
+    draw.draw, spectra.of_rows = kept, of_rows
+    try:
+        yield
+    finally:
+        draw.draw, spectra.of_rows = kept_draw, kept_rows
+
+
+def galsim_seconds(drawn: tuple[Any, ...]) -> float:
+    """CPU s of a first order of one source by galsim: a stamp a pixel of the trace, one PSF for all of it; a mean."""
+    sources, dispersed, psf = drawn[:3]
+    (first,) = (order.trace for order in dispersed.orders if order.trace.order == 1)
+    some = np.linspace(0, len(sources) - 1, _FEW).astype(int)
+    weights = transfer.basis_weights(psf, None, sources.column, sources.row)
+    seconds = 0.0
+    for i in some.tolist():
+        through = galsim.InterpolatedImage(
+            galsim.Image(transfer.image_of(psf.planes, weights[i]), scale=1.0 / psf.planes.samples)
+        )
+        along, across = first.polynomials(float(sources.column[i]), float(sources.row[i]))
+        frame = galsim.ImageF(galsim.BoundsI(-1024, 1024, -256, 256), init_value=0.0)
+        started = time.process_time()
+        whole = through
+        if sources.shape[i] >= 0:
+            body = galaxy_shapes.profile(sources.shapes, int(sources.shape[i]), 1e-6)
+            whole = galsim.Convolve([galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(body), through])
+        for t in np.linspace(0.0, 1.0, max(int(abs(along[1:].sum())), 1)):
+            x, y = (float(np.polynomial.polynomial.polyval(t, part)) for part in (along, across))
+            stamp = whole.drawImage(nx=_STAMP, ny=_STAMP, scale=1.0, center=galsim.PositionD(x, y))
+            shared = frame.bounds & stamp.bounds
+            frame[shared] += stamp[shared]
+        seconds += time.process_time() - started
+    return seconds / len(some)
+
+
+def measured(root: Path, everything: Json, folder: Path) -> dict[str, float]:
+    """Of one rendering: what drawing, spectra and effects take, and galsim for as many sources."""
+    seconds: dict[str, float] = defaultdict(float)
+    drawn: list[tuple[Any, ...]] = []
+    with watched(seconds, drawn):
+        effects = one_detector.effect_seconds(
+            nisp_s.EFFECTS, (nisp_s.CHANNEL.remembers,), lambda: rendered(root, everything, folder)
+        )
+    sources = len(drawn[0][0])
+    return {
+        **seconds,
+        "sources": sources,
+        "ramp_s": sum(effects[f"effect_{effect.name}_s"] for effect in _RAMP),
+        "against_galsim": galsim_seconds(drawn[0]) * sources / seconds["draw_s"],
+        **effects,
+    }
+
+
+def detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
+    """All of a detector's figures."""
+    file = folder / "one.toml"
+    file.write_text(request(quick), encoding="utf-8")
+    wanted = parse(file)
+    root = one_detector.lake(folder, wanted)
+    everything = prepared(root, full(wanted))
+    rendered(root, everything, folder)  # Compiles, and fills the other caches.
+    out = one_detector.cold_and_warm(root, everything, folder, _PLANES, repeats)
+    out |= {f"survey_{state}_s": out.pop(f"{state}_s") for state in ("cold", "warm")}
+    out |= measured(root, everything, folder)
+    for name, request_of in (("draft", wanted), ("reference", full(wanted))):
+        facts = prepared(root, replace(request_of, accuracy=preset(name)))
+        out[f"{name}_s"] = min(rendered(root, facts, folder)[0] for _ in range(repeats + 1))
+    return out
+
+
+def whole_exposure(folder: Path, quick: bool) -> dict[str, float]:
+    """Wall s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
+    text = request(quick, 'detectors = ["DET22", "DET23"]' if quick else "", (53.117, -27.808))
+    return {"exposure_s": one_detector.by_job(folder, text.replace("radius = 0.2", f"radius = {FIELD}"))}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measures and prints everything."""
+    own = argparse.ArgumentParser(add_help=False)
+    own.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
+    own.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
+    known, others = own.parse_known_args(argv)
+    options = report.options("nisp_s", __doc__ or "", others)
+    repeats = 1 if options.quick else known.repeats
+    with tempfile.TemporaryDirectory() as name:
+        figures = detector(Path(name), options.quick, repeats)
+        if known.exposure:
+            figures |= whole_exposure(Path(name), options.quick)
+    report.finish("nisp_s", repeats, figures, _NOTES, options.json or (None if options.quick else RESULTS))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
