@@ -22,7 +22,7 @@ import galsim
 import numpy as np
 
 from benchmarks import _detectors as one_detector
-from benchmarks import report
+from benchmarks import _dispersion, report
 from benchmarks._detectors import FIELD, ROOT, prepared, rendered
 from jobs.accuracy import preset
 from jobs.render.channels import nisp_s
@@ -173,10 +173,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measures and prints everything."""
     own = argparse.ArgumentParser(add_help=False)
     own.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
+    own.add_argument("--settings", action="store_true", help="the table of settings of drawing alone, measured anew")
     own.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
     known, others = own.parse_known_args(argv)
     options = report.options("nisp_s", __doc__ or "", others)
     repeats = 1 if options.quick else known.repeats
+    if known.settings:
+        draw.TABLE.write_text(_dispersion.table(repeats), encoding="utf-8")
+        return 0
     with tempfile.TemporaryDirectory() as name:
         figures = detector(Path(name), options.quick, repeats)
         if known.exposure:

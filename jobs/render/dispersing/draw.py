@@ -81,17 +81,28 @@ class Settings:
     positions: int = 9
 
 
-_TABLE = Path(__file__).with_name("settings.csv")
+# What it is for, of a pixel's noise, and as measured by benchmarks/_dispersion.py.
+TABLE = Path(__file__).with_name("settings.csv")
 
 
 @cache
 def settings_for(wanted: Accuracy) -> Settings:
     """The cheapest settings that are for an accuracy, else the best."""
-    with _TABLE.open(newline="", encoding="utf-8") as lines:
-        rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
-    rows.sort(key=lambda row: -float(row["background"]))
-    row = next((row for row in rows if float(row["background"]) <= wanted.background), rows[-1])
-    known: dict[str, Any] = {name: float(row[name]) for name in ("edge", "faint", "block")}
+    known = rows()
+    return of_row(next((row for row in known if row["allowed"] <= wanted.background), known[-1]))
+
+
+def rows() -> list[dict[str, float]]:
+    """The table of settings, the cheapest first."""
+    with TABLE.open(newline="", encoding="utf-8") as lines:
+        read = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    found = [{name: float(value) for name, value in row.items()} for row in read]
+    return sorted(found, key=lambda row: -row["allowed"])
+
+
+def of_row(row: dict[str, float]) -> Settings:
+    """Of a row of the table."""
+    known: dict[str, Any] = {name: row[name] for name in ("edge", "faint", "block")}
     known |= {name: int(row[name]) for name in ("least", "along", "across", "nodes", "positions")}
     return Settings(**known)
 
