@@ -44,8 +44,8 @@ _HEAD = """\
 # edge, faint: of a sky pixel's noise; least: pixels; along, across: samples a pixel; block: A that share a PSF;
 # nodes: wavelengths of the PSF; positions: of the PSF on a detector, one of euclid.DEGREES.
 # Then by python -m benchmarks.nisp_s --settings, the largest errors of {chosen} galaxies and stars of
-# H_E = {bright:g} to {faint:g} that the settings were chosen on, and (_held) of {held} others, each in a first order at a
-# tilt of 0, 4 or -4 deg: background: of a pixel, of its own noise; flux: of a line in {wide} x {high} pixels;
+# H_E = {bright:g} to {faint:g} that the settings were chosen on, and (_held) of {held} others, each in a first order
+# at a tilt of 0, 4 or -4 deg: background: of a pixel, of its own noise; flux: of a line in {wide} x {high} pixels;
 # position: of a line, pixels; against every sample of the trace with a PSF and rows of its own.
 # CPU seconds of 7,400 first orders, on {machine}.
 """

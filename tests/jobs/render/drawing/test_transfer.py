@@ -126,3 +126,17 @@ def test_wings_that_come_in_are_not_in_the_middle(size, beta):
     assert np.abs(image - whole)[np.hypot(x, y) <= size / 8].max() < 0.1 * came_in
     stamp = (np.abs(x + 0.5) < size / 2) & (np.abs(y + 0.5) < size / 2)
     assert (image / whole)[stamp].min() > 0.999
+
+
+@pytest.mark.parametrize("shear", [0.0, 0.07, -0.3])
+def test_a_sheared_spectrum_is_the_series_at_sheared_frequencies(shear):
+    """Of a plane that fills its period, and of one that does not."""
+    rng = np.random.default_rng(3)
+    for side, period in ((9, 16), (11, 11)):
+        image = rng.random((side, side))
+        found = transfer.sheared_spectrum(image, period, 5, shear)
+        at, ku = np.arange(side) - side // 2, 2 * np.pi * np.fft.fftfreq(period)[:, None]
+        kv = 2 * np.pi * np.arange(5) / period
+        kx, ky = np.broadcast_arrays(ku - shear * kv, kv)
+        wanted = np.einsum("uvy,yx,uvx->uv", np.exp(-1j * ky[..., None] * at), image, np.exp(-1j * kx[..., None] * at))
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
