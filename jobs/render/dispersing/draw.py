@@ -319,7 +319,7 @@ class _Seen:
     def together(self, size: int) -> int:
         """How many stamps of `size` pixels are held at a time."""
         samples = self.weights.shape[1] * size**2 * self.settings.along * self.settings.across
-        return max(_HELD // samples, 1)
+        return max(int(_HELD // samples), 1)
 
 
 def _add(

@@ -34,7 +34,7 @@ def zones(
     """Fills out [m, b, rows, columns] with profile x sum of planes [p, rows, columns] by weights [m, b, p].
 
     ku, kv : [rows], [columns] radian / pixel
-    body .. row_weights : [m] of fourier.nyquist_zones
+    body, fraction, bulge, disk, thick, sersic, row, row_weights : [m] of fourier.nyquist_zones
     """
     rows, columns = len(ku), len(kv)
     square, high = np.empty(columns, np.float32), np.empty(columns, np.float32)
@@ -68,7 +68,7 @@ def zones(
 def brightest(spectra: Float32, factor: Float, response: Float, window: int, peak: Float, total: Float) -> None:
     """Fills [k] with the electrons of spectra [k, w], and with the most among `window` neighbours, by half windows.
 
-    factor : [k] of each spectrum;  response : [w] electrons for each of its units
+    factor : [k] of each spectrum;  response : [w] electrons for each of its units;  peak, total : [k]
     """
     half = max(window // 2, 1)
     for k in range(len(spectra)):
@@ -176,7 +176,7 @@ def _between(path: Float, x: float, ends: tuple[float, float]) -> tuple[float, f
 @jit
 def _slope(path: Float, i: int) -> float:
     """Rows a column from place i of a path to the next."""
-    return (path[1, i + 1] - path[1, i]) / max(path[0, i + 1] - path[0, i], 1e-12)
+    return float((path[1, i + 1] - path[1, i]) / max(path[0, i + 1] - path[0, i], 1e-12))
 
 
 @jit
@@ -247,6 +247,7 @@ def convolve(
     """Adds a source's image at every sample of its trace to out [w, n across]: columns from `low` on, about the trace.
 
     images : of `follow`, in coordinates that rise by `slope` rows a column;  laid : [m] electrons
+    first, path, shape : of `follow`
     share  : [wavelengths, b] of each PSF;  tile : pixels that share one, a multiple of STEP
     """
     n, ox, oy = shape
@@ -325,7 +326,10 @@ def _mix(
 def settle(
     lines: Float32, low: int, path: Float, shape: tuple[int, int, int], corner: tuple[int, int], out: Float32
 ) -> None:
-    """Adds columns [w, n across] of `convolve`, the first column `low`, to out [h, w], where the trace has them."""
+    """Adds columns of `convolve`, the first column `low`, to out [h, w], where the trace has them.
+
+    lines : [w, n across];  path, shape, corner : of `follow`
+    """
     n, _, oy = shape
     wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
     ends = _slope(path, 0), _slope(path, _NODES - 2)

@@ -282,7 +282,7 @@ def spectrum(image: Array, period: int, columns: int) -> Array:
 
 
 def sheared_spectrum(image: Array, period: int, columns: int, shear: float) -> Array:
-    """The same in coordinates u = x, v = y - shear x, transposed: complex[period, columns], the first of v."""
+    """The same of an image in coordinates u = x, v = y - shear x, transposed: complex[period, columns], v's first."""
     image = _middle(image[None], period)[0]
     middle = np.arange(image.shape[1]) - image.shape[1] // 2
     lines = scipy.fft.rfft(_from_middle(image, period, 0), axis=0)[:columns]
