@@ -77,7 +77,7 @@ class Settings:
     along: int = 2
     across: int = 3
     block: float = 110.0
-    nodes: int = 3
+    nodes: int = 4
     positions: int = 9
 
 

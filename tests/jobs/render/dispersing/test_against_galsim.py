@@ -56,7 +56,7 @@ def spectrum(electrons, first, length):
     return light
 
 
-def compared(case, length, number=1, settings=SETTINGS, nodes=3):
+def compared(case, length, number=1, settings=SETTINGS, nodes=SETTINGS.nodes):
     """(largest error of a pixel, and the brightest pixel) of an order of a case; but for the first, of 2 % of it."""
     grism, tilt, which, electrons, first = case
     path, light, source = trace(grism, tilt, number), spectrum(electrons, first, length), one(sources(), which)

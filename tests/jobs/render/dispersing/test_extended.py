@@ -65,8 +65,8 @@ def test_an_arc_is_its_pixels():
     light = np.exp(-0.5 * ((np.hypot(x, y) - 4.0) / 1.0) ** 2) * (1.2 + np.cos(np.arctan2(y, x) - 0.7))
     light /= light.sum()
     body = source()
-    # Columns of a picture run to the west, as do those of the sky's jacobian to the east.
+    # Columns of a picture run to the east; the world frame's first axis points west.
     across, up = np.linalg.solve(body.jacobian[0], scale * np.stack([-x.ravel(), y.ravel()]))
     alike = points(body, body.column + across, body.row + up, 1e6 * light.ravel())
-    arc = replace(body, picture=np.array([0]), pictures=(Picture(light.astype(np.float32), scale),))
+    arc = replace(body, picture=np.array([0]), pictures=(Picture.of_sky(light.astype(np.float32), scale),))
     check(arc, alike, 1.0)

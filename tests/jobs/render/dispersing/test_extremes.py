@@ -87,12 +87,19 @@ def test_a_crowd_takes_the_memory_of_a_frame(count, settings):
     rng, shape = np.random.default_rng(1), (2040, 2040 * count // 50_000)
     crowd = scenes.sources(scenes.NISP, 5, galaxies=count * 9 // 10, stars=count // 10)
     crowd.column[:], crowd.row[:] = rng.uniform(0, shape[1], len(crowd)), rng.uniform(0, shape[0], len(crowd))
-    tally, spectrum = draw.Tally.of(len(crowd), 1), np.full((64, COUNT), 10.0 / COUNT, np.float32)
+    tally, spectrum = draw.Tally.of(len(crowd), 1), np.full(COUNT, 10.0 / COUNT, np.float32)
     orders = [order(trace((-219.0, 512.0), 0.05))]
     through = psf()
     tracemalloc.start()
     frame = drawn(
-        crowd, lambda which: spectrum[: len(which)], orders, through, shape, 28.0, draw.settings_for(settings), tally
+        crowd,
+        lambda which: np.tile(spectrum, (len(which), 1)),
+        orders,
+        through,
+        shape,
+        28.0,
+        draw.settings_for(settings),
+        tally,
     )
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
