@@ -17,7 +17,6 @@ from jobs import heap
 from jobs.accuracy import SURVEY, Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
 from jobs.render.camera import detectors
-from jobs.render.camera.detectors import Detector
 from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim
 from jobs.render.drawing import stamp_sizes
@@ -244,10 +243,10 @@ def prepared(lake: Path, facts: Json) -> tuple[Aim, Rows, Variant]:
             if file_sha256(Path(file)) != sha256:
                 raise BadInput(f"{file}: has changed since the rendering began")
             bodies = ephemerides.read(Path(file), sha256).of_day
-    rows = _rows(lake, inputs, exposed, task, detector, own, bodies, earlier)
-    rows = _with_structure(rows, request, facts.get("stamps", {}))
     band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
-    return Aim.of(exposed, detector, band, request["seed"]), rows, own
+    aim = Aim.of(exposed, detector, band, request["seed"])
+    rows = _rows(lake, inputs, aim, task, own, bodies, earlier, request["seed"])
+    return aim, _with_structure(rows, request, facts.get("stamps", {})), own
 
 
 def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows:
@@ -263,18 +262,18 @@ def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows
 def _rows(
     lake: Path,
     inputs: Mapping[str, read.Version],
-    exposed: ExposureRow,
+    aim: Aim,
     task: Json,
-    detector: Detector,
     own: Variant,
     bodies: Callable[[int], Population] | None,
     earlier: tuple[Earlier | EarlierSky, ...],
+    seed: int,
 ) -> Rows:
     """The sources of a detector, from its own cells and, where they shine so far, from those about."""
-    margin = registry.CHANNELS[exposed.channel].margin(detector.section, own.mission)
-    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
-    reach = max(stamp_sizes.reach(detector.pixel_scale), visible_spectra.beyond(exposed, detector, own.mission, band))
-    farther = max(reach - margin, 0.0)
+    exposed, detector, band = aim.exposure, aim.detector, aim.band
+    margin = aim.channel.margin(detector.section, own.mission)
+    spread = visible_spectra.beyond(exposed, detector, own.mission, band, seed)
+    farther = max(stamp_sizes.reach(detector.pixel_scale) - margin, spread - margin, 0.0)
     least = visible_sources.least_flux(exposed, detector, own.mission, own.accuracy)
     spikes = visible_sources.spike_flux(exposed, detector, own.mission, own.accuracy, band)
     outer = visible_sources.outer_flux(exposed, detector, own.mission, own.accuracy)

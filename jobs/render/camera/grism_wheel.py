@@ -28,14 +28,14 @@ def tilt(grism: str, angle: float, section: str, mission: MissionConfiguration) 
     return (angle - traces.direction(grism, section, mission) + 180.0) % 360.0 - 180.0
 
 
-def turned(asked: float, exposure: str, section: str, mission: MissionConfiguration) -> float:
+def turned(asked: float, exposure: str, section: str, mission: MissionConfiguration, seed: int) -> float:
     """The tilt that a grism has in an exposure, deg: as asked for, and the wheel's error.
 
-    asked            : deg;  exposure : what the error is keyed by
+    asked            : deg;  exposure : what the error is keyed by, with the seed of the request
     section, mission : of the camera in the mission database
     """
     error = mission.value(f"{section}.grism_wheel_error", "deg")
-    return asked + float(rng.stream("grism_wheel", exposure).normal(0.0, error))
+    return asked + float(rng.stream(seed, "grism_wheel", exposure).normal(0.0, error))
 
 
 def vignetted(x: Float, y: Float, along: float, asked: float, section: str, mission: MissionConfiguration) -> Float:

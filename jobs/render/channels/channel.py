@@ -25,7 +25,7 @@ from lake_schema.tables.exposures import ExposureRow
 class Dispersion:
     """How a channel spreads the light of sources out, without a slit.
 
-    traces     : (exposure, detector, mission) -> where each order puts it
+    traces     : (exposure, detector, mission, seed of the request) -> where each order puts it
     throughput : (exposure, order, wavelengths [n] A, detector, mission) -> [n] light of an order, of what the
                  passband detects
     vignetted  : (exposure, detector, columns [n], rows [n] of undispersed images, mission) -> [n] part of the sources'
@@ -36,7 +36,7 @@ class Dispersion:
     chosen_by  : band in which sources are bright enough, where the mission says how bright they are to be
     """
 
-    traces: Callable[[ExposureRow, Detector, MissionConfiguration], tuple[Trace, ...]]
+    traces: Callable[[ExposureRow, Detector, MissionConfiguration, int], tuple[Trace, ...]]
     throughput: Callable[[ExposureRow, int, Float, Detector, MissionConfiguration], Float]
     vignetted: Callable[[ExposureRow, Detector, Float, Float, MissionConfiguration], Float]
     psf: Callable[[Detector, Float, MissionConfiguration, int], Psf]

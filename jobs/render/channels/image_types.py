@@ -19,9 +19,12 @@ def section(camera: str) -> str:
 def identity(exposure: ExposureRow) -> str:
     """What an exposure's random numbers are keyed by: what was pointed where and when, not its place in a plan.
 
+    A grism and its angle are a part of it: the band alone does not tell how spectra run.
+
     Of several alike the first has the numbers that it has alone.
     """
     places = (exposure.ra, exposure.dec, exposure.position_angle, exposure.mjd)
+    turned = () if exposure.grism is None else (exposure.grism, (exposure.grism_angle or 0.0).hex())
     number = exposure.realisation or 1
     again = (str(number),) if number > 1 else ()
-    return ":".join((exposure.camera, exposure.band, *(place.hex() for place in places), *again))
+    return ":".join((exposure.camera, exposure.band, *(place.hex() for place in places), *turned, *again))

@@ -67,11 +67,11 @@ def _turned(exposure: ExposureRow, section: str, mission: MissionConfiguration) 
     return exposure.grism, asked
 
 
-def _traces(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration) -> tuple[Trace, ...]:
+def _traces(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int) -> tuple[Trace, ...]:
     grism, asked = _turned(exposure, detector.section, mission)
     # Exposures that differ in their noise alone see alike.
     identity = image_types.identity(replace(exposure, realisation=None))
-    return traces.traces(grism, grism_wheel.turned(asked, identity, detector.section, mission), detector, mission)
+    return traces.traces(grism, grism_wheel.turned(asked, identity, detector.section, mission, seed), detector, mission)
 
 
 def _throughput(

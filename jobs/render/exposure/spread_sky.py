@@ -25,11 +25,11 @@ from lake_schema.mission.configuration import MissionConfiguration
 _CELL, _STEP = 64, 100
 
 
-def spread_sky(scene: Scene, aim: Aim) -> Frame | None:
+def spread_sky(scene: Scene, aim: Aim, seed: int) -> Frame | None:
     """[gy, gx] e- that the orders change of an even sky, at places of a detector evenly from corner to corner.
 
     None where no grism is in the beam, or no sky is seen.
-    scene : before anything is drawn;  aim : the exposure and detector
+    scene : before anything is drawn;  aim : the exposure and detector;  seed : of the request
     Error : the field's gradients of the traces are taken at the light's place, not at the source's: 1 % of the trace's
             length, where it matters at the field stop alone
     """
@@ -44,7 +44,7 @@ def spread_sky(scene: Scene, aim: Aim) -> Frame | None:
     out = np.full(column.shape, -float(photons.sum()))
     parts = np.array_split(np.arange(len(photons)), max(len(photons) // _STEP, 1))
     middle = np.array([band.wavelength[part].mean() for part in parts])
-    for trace in dispersion.traces(aim.exposure, detector, mission):
+    for trace in dispersion.traces(aim.exposure, detector, mission, seed):
         passed = photons * dispersion.throughput(aim.exposure, trace.order, band.wavelength, detector, mission)
         for wavelength, part in zip(middle, parts, strict=True):
             x, y = _offset(trace, column, row, float(wavelength))

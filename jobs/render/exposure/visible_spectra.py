@@ -55,7 +55,7 @@ def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     if exposure.psf:
         raise BadInput(f"exposure {exposure.exposure_id}: psf: spectra are drawn through the camera's own PSF alone")
     rows, settings = visible_sources.rows_of(rows, aim, mission), draw.settings_for(scene.accuracy)
-    found = dispersion.traces(exposure, aim.detector, mission)
+    found = dispersion.traces(exposure, aim.detector, mission, seed)
     orders = tuple(
         Order(
             trace,
@@ -80,15 +80,18 @@ def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     )  # fmt: skip
 
 
-def beyond(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, band: Passband) -> float:
+def beyond(
+    exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, band: Passband, seed: int
+) -> float:
     """How far beyond a detector's circle sources lie whose light of some order is on it, arcsec; 0 without a grism.
 
     exposure, detector, mission, band : its row, the detector, the mission database and the passband
+    seed : of the request
     """
     channel = registry.CHANNELS[exposure.channel]
     if channel.disperses is None or not channel.sees_sky(exposure.image_type):
         return 0.0
-    boxes = _rectangles(channel.disperses.traces(exposure, detector, mission), detector, band)
+    boxes = _rectangles(channel.disperses.traces(exposure, detector, mission, seed), detector, band)
     return max(_radius(boxes, detector) - detector.half_diagonal, 0.0)
 
 

@@ -30,7 +30,7 @@ from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.exposures import EXPOSURES
 
 # What two exposures have in common whose random numbers would be the same, of one request of an exploration.
-_ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd")
+_ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd", "grism", "grism_angle")
 # Grisms by the passband that they are used in.
 GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}
 _DARK_TYPES = ("bias", "dark", "charge_injection")

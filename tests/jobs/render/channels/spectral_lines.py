@@ -38,7 +38,7 @@ class Lines:
 def trace(detector, grism, angle, number=1):
     """Of the first order."""
     row = fields.exposure(**spectroscopic.exposed(detector, grism, angle, number=number))
-    return next(one for one in CHANNEL.disperses.traces(row, detector, MISSION) if one.order == 1)
+    return next(one for one in CHANNEL.disperses.traces(row, detector, MISSION, infrared.SEED) if one.order == 1)
 
 
 def grid(detector, step):

@@ -18,6 +18,7 @@ from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render import fields, infrared, spectroscopic
+from tests.jobs.render.infrared import SEED
 from tests.jobs.render.spectroscopic import MISSION, QUIET, TIME, strip
 
 CHANNEL = registry.CHANNELS["NISP-S"]
@@ -61,7 +62,7 @@ def test_an_order_has_the_light_of_the_table_where_its_trace_runs():
     detector, row = strip(), fields.exposure(**spectroscopic.exposed(strip()))
     total = 10 ** (-0.4 * (18.0 - row.zero_point)) * TIME
     assert found.drawn[0] == pytest.approx(total, rel=0.03)
-    (first,) = (trace for trace in CHANNEL.disperses.traces(row, detector, MISSION) if trace.order == 1)
+    (first,) = (trace for trace in CHANNEL.disperses.traces(row, detector, MISSION, SEED) if trace.order == 1)
     x, y = first.offsets(290.2, 30.6, BAND.wavelength)
     photons = BAND.response / BAND.wavelength
     columns = np.arange(640)
@@ -89,21 +90,47 @@ def test_the_margin_holds_the_first_order_and_the_rest_is_looked_for_as_far_as_a
     exposure = fields.exposure(**spectroscopic.exposed(whole))
     assert CHANNEL.margin("nisp", MISSION) == pytest.approx(60.0 + 293 * 0.3, rel=0.02)
     assert registry.CHANNELS["NISP-P"].margin("nisp", MISSION) == 60.0
-    assert 2019 * 0.3 < visible_spectra.beyond(exposure, whole, MISSION, BAND) < 1200.0
-    assert visible_spectra.beyond(replace(exposure, image_type="dark"), whole, MISSION, BAND) == 0.0
+    assert 2019 * 0.3 < visible_spectra.beyond(exposure, whole, MISSION, BAND, SEED) < 1200.0
+    assert visible_spectra.beyond(replace(exposure, image_type="dark"), whole, MISSION, BAND, SEED) == 0.0
+
+
+def wheel_errors(rows, seed):
+    """[n] deg, by the direction of the first order of each exposure."""
+    found = []
+    for row in rows:
+        (first,) = (trace for trace in CHANNEL.disperses.traces(row, strip(), MISSION, seed) if trace.order == 1)
+        along, across = first.polynomials(0.0, 0.0)
+        found.append(np.degrees(np.arctan2(across[1:].sum(), along[1:].sum())) - row.grism_angle)
+    return np.array(found)
 
 
 def test_the_wheel_turns_each_exposure_a_little_and_its_realisations_alike():
     rows = [fields.exposure(**spectroscopic.exposed(strip(), mjd=infrared.MJD + i)) for i in range(200)]
-    tilts = []
-    for row in rows:
-        (first,) = (trace for trace in CHANNEL.disperses.traces(row, strip(), MISSION) if trace.order == 1)
-        along, across = first.polynomials(0.0, 0.0)
-        tilts.append(np.degrees(np.arctan2(across[1:].sum(), along[1:].sum())))
+    tilts = wheel_errors(rows, SEED)
     assert np.std(tilts) == pytest.approx(0.1, rel=0.2)
     again = replace(rows[0], realisation=3)
-    one, other = (CHANNEL.disperses.traces(row, strip(), MISSION)[0].y for row in (rows[0], again))
-    np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(wheel_errors([again], SEED), tilts[:1])
+
+
+def test_the_wheel_s_errors_are_of_the_request_s_seed_and_of_the_setting():
+    """200 pairs of independent errors: the standard error of a correlation is 0.07."""
+    rows = [fields.exposure(**spectroscopic.exposed(strip(), mjd=infrared.MJD + i)) for i in range(200)]
+    turned = [replace(row, grism_angle=-4.0) for row in rows]
+    one, seed, angle = wheel_errors(rows, SEED), wheel_errors(rows, SEED + 1), wheel_errors(turned, SEED)
+    assert np.std(seed) == pytest.approx(0.1, rel=0.2)
+    assert abs(np.corrcoef(one, seed)[0, 1]) < 0.25
+    assert abs(np.corrcoef(one, angle)[0, 1]) < 0.25
+
+
+def test_spectra_are_drawn_where_the_seed_s_wheel_puts_them():
+    row = spectroscopic.exposed(strip())
+    stars, seeds = infrared.tables(strip(), row, [16.0], [290.2], [48.0]), (SEED, SEED + 1)
+    drawn = [fields.rendered(row, strip(), stars, MISSION, DRAFT, seed).noise_free for seed in seeds]
+    # 250 pixels along the spectrum.
+    found = [np.average(np.arange(96), weights=light[:, 530:550].sum(axis=1)) for light in drawn]
+    turned = np.concatenate([wheel_errors([fields.exposure(**row)], seed) for seed in seeds])
+    assert abs(turned[1] - turned[0]) > 0.05
+    assert found[1] - found[0] == pytest.approx(250.0 * np.radians(turned[1] - turned[0]), abs=0.1)
 
 
 def test_turned_grisms_darken_the_side_that_they_are_turned_to():

@@ -13,6 +13,7 @@ from jobs.render.exposure import scene_of, spread_sky
 from jobs.render.exposure.records import Variant
 from jobs.render.sky import diffuse_light
 from tests.jobs.render import fields, spectroscopic
+from tests.jobs.render.infrared import SEED
 from tests.jobs.render.spectroscopic import MISSION
 
 
@@ -21,7 +22,7 @@ def seen(name, mission=MISSION, **columns):
     own = detector("nisp", name, mission)
     aim = Aim.of(fields.exposure(**spectroscopic.exposed(own, **columns)), own)
     scene = scene_of.of_aim(aim, Variant(mission, SURVEY, {}))
-    return scene, aim, spread_sky.spread_sky(scene, aim)
+    return scene, aim, spread_sky.spread_sky(scene, aim, SEED)
 
 
 def exact(scene, aim, column, row):
@@ -29,7 +30,7 @@ def exact(scene, aim, column, row):
     band, own = aim.band, aim.detector
     zodi = diffuse_light.photons("nisp", scene.sky_rate, band, MISSION) - diffuse_light.warm("nisp", band, MISSION)
     total = -zodi.sum()
-    for trace in aim.channel.disperses.traces(aim.exposure, own, MISSION):
+    for trace in aim.channel.disperses.traces(aim.exposure, own, MISSION, SEED):
         light = zodi * aim.channel.disperses.throughput(aim.exposure, trace.order, band.wavelength, own, MISSION)
         x, y = trace.offsets(column, row, band.wavelength)
         sign = -1.0 if own.upside_down else 1.0
@@ -61,7 +62,7 @@ def test_no_sky_and_no_grism_change_nothing():
     _, aim, _ = seen("DET22")
     image = replace(aim.exposure, channel="NISP-P", band="euclid_h")
     other = Aim.of(image, aim.detector)
-    assert spread_sky.spread_sky(scene_of.of_aim(other, Variant(MISSION, SURVEY, {})), other) is None
+    assert spread_sky.spread_sky(scene_of.of_aim(other, Variant(MISSION, SURVEY, {})), other, SEED) is None
 
 
 def test_it_is_in_the_image_and_in_the_truth_of_the_sky():
