@@ -1,12 +1,14 @@
 """Traces of NISP's grisms: the laws that they are made of, and where sources lie."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.render.camera import traces
-from jobs.render.camera.detectors import detector
+from jobs.render.camera.detectors import detector, detectors
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 
@@ -31,7 +33,41 @@ def test_the_first_order_has_the_missions_dispersion_and_the_zeroth_hardly_any(g
     second = np.hypot(*np.subtract(place(found[2], 1000, 1000, high), place(found[2], 1000, 1000, low)))
     assert second == pytest.approx(2.0 * length, rel=1e-3)
     zeroth = np.hypot(*np.subtract(place(found[0], 1000, 1000, high), place(found[0], 1000, 1000, low)))
-    assert zeroth == pytest.approx((high - low) / 700.0, rel=0.1)
+    assert zeroth == pytest.approx((high - low) / 700.0, rel=0.01)
+    # In the middle of the field, from end to end and at half of it.
+    own = [
+        row for row in MISSION.rows("nisp.traces") if (row["grism"], row["order"], row["axis"]) == (grism, "0", "along")
+    ]
+    middle = np.polynomial.Polynomial([float(row["constant"]) for row in own])
+    assert middle(1.0) - middle(0.0) == pytest.approx((high - low) / 700.0, rel=1e-6)
+    assert middle(0.5) == pytest.approx({"BGS000": -1120.0 / 1.24}.get(grism, -1500.0 / 1.34), rel=1e-6)
+
+
+@pytest.mark.parametrize("grism", ["RGS000", "RGS180", "BGS000"])
+@pytest.mark.parametrize("tilt", [0.0, -4.0])
+def test_traces_are_the_mission_s_table_on_every_detector(grism, tilt):
+    """At the corners, on detectors of either orientation; in the focal plane, by complex numbers."""
+    everything, waves = detectors("nisp", MISSION), np.linspace(9000.0, 19000.0, 5)
+    half = 0.5 * everything[0].pixel_scale * 2040
+    edge_x, edge_y = (max(abs(getattr(one, axis)) for one in everything) + half for axis in "xy")
+    assert {one.upside_down for one in everything} == {False, True}
+    rows = [row for row in MISSION.rows("nisp.traces") if row["grism"] == grism]
+    turn = np.exp(1j * np.radians(float(rows[0]["direction_deg"]) + tilt))
+    for one, trace in itertools.product(everything, (0, 1, 2, 3)):
+        found, own_turn = traces.traces(grism, tilt, one, MISSION)[trace], np.exp(1j * np.radians(one.rotation))
+        # Mounted to a tenth of a degree.
+        assert own_turn.real * (-1.0 if one.upside_down else 1.0) > 0.999
+        for column, row in itertools.product((0.0, 2039.0), repeat=2):
+            place = complex(one.x, one.y) + own_turn * one.pixel_scale * complex(column - 1019.5, row - 1019.5)
+            x, y = place.real / edge_x, place.imag / edge_y
+            light = np.zeros(len(waves), complex)
+            for law in (law for law in rows if int(law["order"]) == found.order):
+                t = (waves / 10.0 - float(law["first_nm"])) / (float(law["last_nm"]) - float(law["first_nm"]))
+                own = float(law["constant"]) + float(law["slope_x"]) * x + float(law["slope_y"]) * y
+                light += (1.0 if law["axis"] == "along" else 1j) * own * t ** int(law["power"])
+            light *= turn / own_turn
+            seen = found.offsets(column, row, waves)
+            np.testing.assert_allclose(seen, [light.real, light.imag], rtol=0.0, atol=1e-9)
 
 
 def test_grisms_half_a_turn_apart_disperse_to_opposite_sides():
