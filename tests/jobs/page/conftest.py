@@ -5,6 +5,7 @@ import contextlib
 import http.client
 import json
 import socket
+import struct
 import threading
 from dataclasses import dataclass
 
@@ -198,6 +199,24 @@ def serving(root):
         asyncio.run_coroutine_threadsafe(page.runner.cleanup(), loop).result(60)
         loop.call_soon_threadsafe(loop.stop)
         thread.join(60)
+
+
+def unpacked(body):
+    (length,) = struct.unpack("<I", body[:4])
+    return json.loads(body[4 : 4 + length]), body[4 + length :]
+
+
+def asked(page, **question):
+    status, _, body = page.of_lake("charts", method="POST", body=json.dumps(question).encode())
+    assert status == 200, body
+    head, rest = unpacked(body)
+    found, at = [], 0
+    for chart in head["charts"]:
+        size = int(np.prod(chart["bins"]))
+        found.append(np.frombuffer(rest, "<u4", size, at).reshape(chart["bins"]))
+        at += 4 * size
+    assert at == len(rest)
+    return head, found
 
 
 @pytest.fixture(scope="package")

@@ -1,44 +1,14 @@
 """What the page is told equals what the lake holds."""
 
-import csv
-import io
 import json
-import os
-import signal
-import struct
-import threading
-import time
-from urllib.parse import quote
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from jobs.page import charts
 from lake_schema.store import publish, read
-from tests.jobs.page.conftest import GALAXIES_N, NX, NY, published, serving, system
-from tests.universe import plain_plan, plain_work
-
-QUERY = "SELECT id, ra, z_obs, flux_halpha, kind, 'a,\"<&>' || kind AS name FROM galaxies ORDER BY id LIMIT 700"
-
-
-def unpacked(body):
-    (length,) = struct.unpack("<I", body[:4])
-    return json.loads(body[4 : 4 + length]), body[4 + length :]
-
-
-def asked(page, **question):
-    status, _, body = page.of_lake("charts", method="POST", body=json.dumps(question).encode())
-    assert status == 200, body
-    head, rest = unpacked(body)
-    found, at = [], 0
-    for chart in head["charts"]:
-        size = int(np.prod(chart["bins"]))
-        found.append(np.frombuffer(rest, "<u4", size, at).reshape(chart["bins"]))
-        at += 4 * size
-    assert at == len(rest)
-    return head, found
+from tests.jobs.page.conftest import GALAXIES_N, NX, NY, asked, serving, system, unpacked
 
 
 def test_tables_are_described(page):
@@ -179,64 +149,52 @@ def test_sources_of_a_field(page, shown):
     assert set(found["id"]) == {str(i) for i in rows.filter(pa.array(inside))["id"].to_pylist()}
 
 
-# ------------------------------------------------------------------------------------------------ downloads
+def test_the_mean_of_an_expression(page, shown):
+    _, _, body = page.of_lake("sky/galaxies/density?order=5&value=z_obs%20%2B%201%20--%20one")
+    head, rest = unpacked(body)
+    mean = np.frombuffer(rest, "<f4", head["cells"], 32 * head["cells"])
+    z = read.version(shown, "galaxies").rows(["z_obs"])["z_obs"].to_numpy().astype(float)
+    assert mean == pytest.approx([z.mean() + 1], rel=1e-5)
+    assert page.of_lake("sky/galaxies/density?order=5&value=1)%20FROM%20stars%20--")[0] == 400
 
 
-def test_the_same_rows_in_all_four(page, shown):
-    from astropy.io.votable import parse_single_table
-    from astropy.table import Table
+def test_coverage(page, shown, tmp_path):
+    """Two detectors side by side, one of them twice: how often each cell is seen."""
+    from lake_schema import sky
+    from lake_schema.store.plan import Output, Part, Plan
+    from lake_schema.tables.exposures import EXPOSURES
+    from lake_schema.tables.tasks import TASKS
+    from tests.universe import rows_of
 
-    files = {}
-    for form in ("csv", "parquet", "vot", "fits"):
-        status, _, files[form] = page.of_lake(f"export?format={form}&sql={quote(QUERY)}")
-        assert status == 200
-    stored = (
-        read.version(shown, "galaxies").rows(["id", "ra", "z_obs", "flux_halpha", "kind"]).sort_by("id").slice(0, 700)
-    )
-    parquet = pq.read_table(pa.BufferReader(files["parquet"]))
-    vot, fits = (
-        parse_single_table(io.BytesIO(files["vot"])).to_table(),
-        Table.read(io.BytesIO(files["fits"]), format="fits"),
-    )
-    text = list(csv.DictReader(io.StringIO(files["csv"].decode())))
-    for name in ("id", "ra", "z_obs", "kind"):
-        expected = stored[name].to_numpy()
-        np.testing.assert_array_equal(parquet[name].to_numpy(), expected)
-        np.testing.assert_array_equal(np.asarray(vot[name]), expected)
-        np.testing.assert_array_equal(np.asarray(fits[name]), expected)
-        np.testing.assert_array_equal(np.array([row[name] for row in text]).astype(expected.dtype), expected)
-    missing = stored["flux_halpha"].is_null().to_numpy()
-    assert missing.any() or stored["flux_halpha"].null_count == 0
-    names = [f'a,"<&>{kind}' for kind in stored["kind"].to_pylist()]
-    assert (
-        parquet["name"].to_pylist()
-        == list(vot["name"])
-        == [n.strip() for n in fits["name"]]
-        == [r["name"] for r in text]
-        == names
-    )
-    assert str(vot["ra"].unit) == str(fits["ra"].unit) == parquet.schema.field("ra").metadata[b"unit"].decode() == "deg"
+    def square(ra, dec):
+        return f"POLYGON ICRS {ra} {dec} {ra + 1} {dec} {ra + 1} {dec + 1} {ra} {dec + 1}"
 
-
-@pytest.mark.parametrize("form", ["csv", "parquet", "vot", "fits"])
-@pytest.mark.parametrize(
-    "sql", ["SELECT nothing FROM galaxies", "SELECT 1 AS a, 2 AS a", "SELECT * FROM '/etc/passwd'"]
-)
-def test_an_error_is_no_file(page, form, sql):
-    status, headers, body = page.of_lake(f"export?format={form}&sql={quote(sql)}")
-    assert status == 400
-    assert "Content-Disposition" not in headers
-    assert json.loads(body)["error"]
-
-
-def test_an_error_in_the_midst_is_no_whole_file(page):
-    """The first pieces have been sent when a late row fails: the connection ends without its end."""
-    import http.client
-
-    sql = "SELECT CASE WHEN range = 4900000 THEN error('no') ELSE range END AS a FROM range(5000000)"
-    with pytest.raises((http.client.IncompleteRead, ConnectionError)):
-        page.of_lake(f"export?format=csv&sql={quote(sql)}")
-    assert page.of_lake("export?format=csv&sql=SELECT+1+AS+a")[2] == b'"a"\n1\n'
+    corners = [(10, 0), (10, 0), (11, 0)]
+    columns = {name: rows_of(TASKS, 3)[name] for name in TASKS.names}
+    columns |= {"exposure_id": [1, 2, 2], "ra": [10.5, 10.5, 11.5], "dec": [0.5] * 3, "radius": [0.8] * 3}
+    columns |= {"detector": ["a", "a", "b"], "s_region": [square(*corner) for corner in corners]}
+    exposures = {name: rows_of(EXPOSURES, 2)[name] for name in EXPOSURES.names} | {
+        "exposure_id": [1, 2],
+        "band": ["r", "i"],
+    }
+    root = tmp_path / "lake"
+    root.mkdir()
+    for table, rows in ((TASKS, TASKS.build(columns)), (EXPOSURES, EXPOSURES.build(exposures))):
+        publish.make(root, Plan(table, {}, (Part("0.parquet", {}),)), lambda lake, facts, rows=rows: Output(rows))
+    with serving(root) as page:
+        assert page.json("bands") == ["i", "r"]
+        assert {region["state"] for region in page.json("regions")} == {"planned"}
+        area = {}
+        for words in ("", "&band=i", "&band=r", "&ra=10.5&dec=0.5&radius=0.2"):
+            _, _, body = page.of_lake(f"coverage?order=9{words}")
+            head, rest = unpacked(body)
+            seen = np.frombuffer(rest, "<f4", head["cells"], 32 * head["cells"])
+            area[words] = [float((seen == n).sum() * sky.cell_area(9)) for n in (1, 2, 3)]
+        # To the width of the cells along the edges.
+        assert area[""] == pytest.approx([1.0, 1.0, 0.0], abs=0.11)
+        assert area["&band=i"] == pytest.approx([2.0, 0.0, 0.0], abs=0.21)
+        assert area["&band=r"] == pytest.approx([1.0, 0.0, 0.0], abs=0.11)
+        assert area["&ra=10.5&dec=0.5&radius=0.2"][1] > 0.1
 
 
 # ------------------------------------------------------------------------------------------------ images
@@ -344,146 +302,3 @@ def test_footprints_and_runs(page):
     assert page.json("runs")["failures"] == []
     tree = page.json("provenance/0")
     assert tree["from"][0]["name"] == "products"
-
-
-# ------------------------------------------------------------------------------------------------ processes
-
-
-def killed(lane):
-    """Kill the processes of a lane, as the system does where memory is short."""
-    found = [process._worker for process in lane._all if process._worker is not None]
-    for worker in found:
-        os.kill(worker.pid, signal.SIGKILL)
-        worker.wait(30.0)
-    return len(found)
-
-
-def test_a_killed_process_is_replaced(page):
-    lake, question = page.server.lake, {"method": "POST", "body": b'{"sql": "SELECT 7 AS a"}'}
-    for _ in range(2):
-        page.json("sql", **question)
-    chart = {"source": "galaxies", "axes": ["dec + 1"], "charts": [{"axes": [0], "bins": [5]}]}
-    assert killed(lake.questions)
-    assert killed(lake.own)
-    for _ in range(3):
-        assert page.json("sql", **question)["rows"] == [[7]]
-    assert asked(page, **chart)[0]["rows"] == GALAXIES_N
-
-
-def test_who_asked_a_killed_process_is_told(page):
-    """In the midst of a question: one line, and the next question is answered."""
-    body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
-    told = []
-    asking = threading.Thread(target=lambda: told.append(page.of_lake("sql", method="POST", body=body)))
-    asking.start()
-    time.sleep(1.0)
-    assert killed(page.server.lake.questions)
-    asking.join(30.0)
-    ((status, _, answer),) = told
-    assert status == 400
-    assert "brought its process down" in json.loads(answer)["error"]
-    assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
-
-
-def test_who_goes_away_stops_the_query(page):
-    import socket
-
-    body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
-    with socket.create_connection(("127.0.0.1", page.gate.port)) as connection:
-        head = f"POST /api/{page.server.lake.key}/sql HTTP/1.1\r\nHost: 127.0.0.1:{page.gate.port}\r\n"
-        connection.sendall(f"{head}Cookie: {page.cookie}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body)
-        time.sleep(0.5)
-    for _ in range(3):
-        started = time.monotonic()
-        assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
-        assert time.monotonic() - started < 15.0
-
-
-def test_a_lake_that_is_published_anew_is_announced(tmp_path):
-    root = tmp_path / "lake"
-    root.mkdir()
-    published(root)
-    with serving(root) as page:
-        old = page.server.lake.key
-        assert json.loads(page.ask("/api/lake")[2])["is_changed"] is False
-        publish.make(root, plain_plan(2), plain_work)
-        told = json.loads(page.ask("/api/lake")[2])
-        assert (told["is_changed"], told["key"]) == (True, old)
-        sums = b'{"sql": "SELECT sum(value) AS s FROM plain"}'
-        assert page.json("sql", method="POST", body=sums)["rows"] == [[60.0]]
-        status, _, body = page.ask("/api/reopen", method="POST", body=b"")
-        told = json.loads(body)
-        assert (status, told["is_changed"]) == (200, False)
-        assert told["key"] != old
-        assert page.ask(f"/api/{old}/sql", method="POST", body=sums)[0] == 409
-        assert page.json("sql", method="POST", body=sums)["rows"] == [[120.0]]
-
-
-def test_the_mean_of_an_expression(page, shown):
-    _, _, body = page.of_lake("sky/galaxies/density?order=5&value=z_obs%20%2B%201%20--%20one")
-    head, rest = unpacked(body)
-    mean = np.frombuffer(rest, "<f4", head["cells"], 32 * head["cells"])
-    z = read.version(shown, "galaxies").rows(["z_obs"])["z_obs"].to_numpy().astype(float)
-    assert mean == pytest.approx([z.mean() + 1], rel=1e-5)
-    assert page.of_lake("sky/galaxies/density?order=5&value=1)%20FROM%20stars%20--")[0] == 400
-
-
-def test_coverage(page, shown, tmp_path):
-    """Two detectors side by side, one of them twice: how often each cell is seen."""
-    from lake_schema import sky
-    from lake_schema.store.plan import Output, Part, Plan
-    from lake_schema.tables.exposures import EXPOSURES
-    from lake_schema.tables.tasks import TASKS
-    from tests.universe import rows_of
-
-    def square(ra, dec):
-        return f"POLYGON ICRS {ra} {dec} {ra + 1} {dec} {ra + 1} {dec + 1} {ra} {dec + 1}"
-
-    corners = [(10, 0), (10, 0), (11, 0)]
-    columns = {name: rows_of(TASKS, 3)[name] for name in TASKS.names}
-    columns |= {"exposure_id": [1, 2, 2], "ra": [10.5, 10.5, 11.5], "dec": [0.5] * 3, "radius": [0.8] * 3}
-    columns |= {"detector": ["a", "a", "b"], "s_region": [square(*corner) for corner in corners]}
-    exposures = {name: rows_of(EXPOSURES, 2)[name] for name in EXPOSURES.names} | {
-        "exposure_id": [1, 2],
-        "band": ["r", "i"],
-    }
-    root = tmp_path / "lake"
-    root.mkdir()
-    for table, rows in ((TASKS, TASKS.build(columns)), (EXPOSURES, EXPOSURES.build(exposures))):
-        publish.make(root, Plan(table, {}, (Part("0.parquet", {}),)), lambda lake, facts, rows=rows: Output(rows))
-    with serving(root) as page:
-        assert page.json("bands") == ["i", "r"]
-        assert {region["state"] for region in page.json("regions")} == {"planned"}
-        area = {}
-        for words in ("", "&band=i", "&band=r", "&ra=10.5&dec=0.5&radius=0.2"):
-            _, _, body = page.of_lake(f"coverage?order=9{words}")
-            head, rest = unpacked(body)
-            seen = np.frombuffer(rest, "<f4", head["cells"], 32 * head["cells"])
-            area[words] = [float((seen == n).sum() * sky.cell_area(9)) for n in (1, 2, 3)]
-        # To the width of the cells along the edges.
-        assert area[""] == pytest.approx([1.0, 1.0, 0.0], abs=0.11)
-        assert area["&band=i"] == pytest.approx([2.0, 0.0, 0.0], abs=0.21)
-        assert area["&band=r"] == pytest.approx([1.0, 0.0, 0.0], abs=0.11)
-        assert area["&ra=10.5&dec=0.5&radius=0.2"][1] > 0.1
-
-
-def test_a_lake_of_two_requests(tmp_path):
-    """Tables that both have go by the names of both."""
-    root = tmp_path / "lake"
-    root.mkdir()
-    for name, seed in (("a", 1), ("my-b", 2)):
-        publish.make(root, plain_plan(seed), plain_work, name=name)
-    with serving(root) as page:
-        told = json.loads(page.ask("/api/lake")[2])
-        assert [table["name"] for table in told["tables"]] == ["a.plain", "my-b.plain"]
-        for source, value in (("a.plain", 1.0), ('"my-b".plain', 2.0)):
-            chart = {"axes": [0], "bins": [1], "spans": [[value - 0.1, value + 0.1]]}
-            head, (counts,) = asked(page, source=source, axes=["value"], charts=[chart])
-            assert (head["rows"], counts.tolist()) == (60, [60])
-        status, _, body = page.ask(
-            f"/tap/{page.gate.tap_token}/sync?LANG=ADQL&QUERY=" + quote('SELECT TOP 1 "value" FROM "my-b".plain'),
-            cookie="",
-        )
-        assert (status, b"<TD>2.0</TD>" in body) == (200, True)
-        status, _, body = page.ask(f"/tap/{page.gate.tap_token}/tables", cookie="")
-        assert b"<name>&quot;my-b&quot;.plain</name>" in body or b'<name>"my-b".plain</name>' in body

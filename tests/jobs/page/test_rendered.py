@@ -11,8 +11,7 @@ from jobs.render import plan_exposures, render_exposures
 from jobs.request.from_toml import parse
 from lake_schema.store import layout, publish
 from tests import requests
-from tests.jobs.page.conftest import serving
-from tests.jobs.page.test_answers import unpacked
+from tests.jobs.page.conftest import serving, unpacked
 
 SIDE, COUNT, STARS = 1024, 260, 200
 POINTING = """

@@ -14,8 +14,7 @@ from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
-from tests.jobs.page.conftest import CENTRE, NX, NY, serving, system
-from tests.jobs.page.test_answers import unpacked
+from tests.jobs.page.conftest import CENTRE, NX, NY, serving, system, unpacked
 from tests.universe import rows_of
 
 # A trace that falls and bends, from 1206 to 1892 nm; the line's wavelength.

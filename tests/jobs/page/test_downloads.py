@@ -1,0 +1,72 @@
+"""The same rows come back from every kind of file, or none do."""
+
+import csv
+import io
+import json
+from urllib.parse import quote
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from lake_schema.store import read
+
+QUERY = "SELECT id, ra, z_obs, flux_halpha, kind, 'a,\"<&>' || kind AS name FROM galaxies ORDER BY id LIMIT 700"
+
+
+def test_the_same_rows_in_all_four(page, shown):
+    from astropy.io.votable import parse_single_table
+    from astropy.table import Table
+
+    files = {}
+    for form in ("csv", "parquet", "vot", "fits"):
+        status, _, files[form] = page.of_lake(f"export?format={form}&sql={quote(QUERY)}")
+        assert status == 200
+    stored = (
+        read.version(shown, "galaxies").rows(["id", "ra", "z_obs", "flux_halpha", "kind"]).sort_by("id").slice(0, 700)
+    )
+    parquet = pq.read_table(pa.BufferReader(files["parquet"]))
+    vot, fits = (
+        parse_single_table(io.BytesIO(files["vot"])).to_table(),
+        Table.read(io.BytesIO(files["fits"]), format="fits"),
+    )
+    text = list(csv.DictReader(io.StringIO(files["csv"].decode())))
+    for name in ("id", "ra", "z_obs", "kind"):
+        expected = stored[name].to_numpy()
+        np.testing.assert_array_equal(parquet[name].to_numpy(), expected)
+        np.testing.assert_array_equal(np.asarray(vot[name]), expected)
+        np.testing.assert_array_equal(np.asarray(fits[name]), expected)
+        np.testing.assert_array_equal(np.array([row[name] for row in text]).astype(expected.dtype), expected)
+    missing = stored["flux_halpha"].is_null().to_numpy()
+    assert missing.any() or stored["flux_halpha"].null_count == 0
+    names = [f'a,"<&>{kind}' for kind in stored["kind"].to_pylist()]
+    assert (
+        parquet["name"].to_pylist()
+        == list(vot["name"])
+        == [n.strip() for n in fits["name"]]
+        == [r["name"] for r in text]
+        == names
+    )
+    assert str(vot["ra"].unit) == str(fits["ra"].unit) == parquet.schema.field("ra").metadata[b"unit"].decode() == "deg"
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "vot", "fits"])
+@pytest.mark.parametrize(
+    "sql", ["SELECT nothing FROM galaxies", "SELECT 1 AS a, 2 AS a", "SELECT * FROM '/etc/passwd'"]
+)
+def test_an_error_is_no_file(page, form, sql):
+    status, headers, body = page.of_lake(f"export?format={form}&sql={quote(sql)}")
+    assert status == 400
+    assert "Content-Disposition" not in headers
+    assert json.loads(body)["error"]
+
+
+def test_an_error_in_the_midst_is_no_whole_file(page):
+    """The first pieces have been sent when a late row fails: the connection ends without its end."""
+    import http.client
+
+    sql = "SELECT CASE WHEN range = 4900000 THEN error('no') ELSE range END AS a FROM range(5000000)"
+    with pytest.raises((http.client.IncompleteRead, ConnectionError)):
+        page.of_lake(f"export?format=csv&sql={quote(sql)}")
+    assert page.of_lake("export?format=csv&sql=SELECT+1+AS+a")[2] == b'"a"\n1\n'

@@ -1,0 +1,104 @@
+"""Processes that end, questions that are given up, and lakes that are published anew."""
+
+import json
+import os
+import signal
+import threading
+import time
+from urllib.parse import quote
+
+from lake_schema.store import publish
+from tests.jobs.page.conftest import GALAXIES_N, asked, published, serving
+from tests.universe import plain_plan, plain_work
+
+
+def killed(lane):
+    """Kill the processes of a lane, as the system does where memory is short."""
+    found = [process._worker for process in lane._all if process._worker is not None]
+    for worker in found:
+        os.kill(worker.pid, signal.SIGKILL)
+        worker.wait(30.0)
+    return len(found)
+
+
+def test_a_killed_process_is_replaced(page):
+    lake, question = page.server.lake, {"method": "POST", "body": b'{"sql": "SELECT 7 AS a"}'}
+    for _ in range(2):
+        page.json("sql", **question)
+    chart = {"source": "galaxies", "axes": ["dec + 1"], "charts": [{"axes": [0], "bins": [5]}]}
+    assert killed(lake.questions)
+    assert killed(lake.own)
+    for _ in range(3):
+        assert page.json("sql", **question)["rows"] == [[7]]
+    assert asked(page, **chart)[0]["rows"] == GALAXIES_N
+
+
+def test_who_asked_a_killed_process_is_told(page):
+    """In the midst of a question: one line, and the next question is answered."""
+    body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
+    told = []
+    asking = threading.Thread(target=lambda: told.append(page.of_lake("sql", method="POST", body=body)))
+    asking.start()
+    time.sleep(1.0)
+    assert killed(page.server.lake.questions)
+    asking.join(30.0)
+    ((status, _, answer),) = told
+    assert status == 400
+    assert "brought its process down" in json.loads(answer)["error"]
+    assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
+
+
+def test_who_goes_away_stops_the_query(page):
+    import socket
+
+    body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
+    with socket.create_connection(("127.0.0.1", page.gate.port)) as connection:
+        head = f"POST /api/{page.server.lake.key}/sql HTTP/1.1\r\nHost: 127.0.0.1:{page.gate.port}\r\n"
+        connection.sendall(f"{head}Cookie: {page.cookie}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body)
+        time.sleep(0.5)
+    for _ in range(3):
+        started = time.monotonic()
+        assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
+        assert time.monotonic() - started < 15.0
+
+
+def test_a_lake_that_is_published_anew_is_announced(tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    published(root)
+    with serving(root) as page:
+        old = page.server.lake.key
+        assert json.loads(page.ask("/api/lake")[2])["is_changed"] is False
+        publish.make(root, plain_plan(2), plain_work)
+        told = json.loads(page.ask("/api/lake")[2])
+        assert (told["is_changed"], told["key"]) == (True, old)
+        sums = b'{"sql": "SELECT sum(value) AS s FROM plain"}'
+        assert page.json("sql", method="POST", body=sums)["rows"] == [[60.0]]
+        status, _, body = page.ask("/api/reopen", method="POST", body=b"")
+        told = json.loads(body)
+        assert (status, told["is_changed"]) == (200, False)
+        assert told["key"] != old
+        assert page.ask(f"/api/{old}/sql", method="POST", body=sums)[0] == 409
+        assert page.json("sql", method="POST", body=sums)["rows"] == [[120.0]]
+
+
+def test_a_lake_of_two_requests(tmp_path):
+    """Tables that both have go by the names of both."""
+    root = tmp_path / "lake"
+    root.mkdir()
+    for name, seed in (("a", 1), ("my-b", 2)):
+        publish.make(root, plain_plan(seed), plain_work, name=name)
+    with serving(root) as page:
+        told = json.loads(page.ask("/api/lake")[2])
+        assert [table["name"] for table in told["tables"]] == ["a.plain", "my-b.plain"]
+        for source, value in (("a.plain", 1.0), ('"my-b".plain', 2.0)):
+            chart = {"axes": [0], "bins": [1], "spans": [[value - 0.1, value + 0.1]]}
+            head, (counts,) = asked(page, source=source, axes=["value"], charts=[chart])
+            assert (head["rows"], counts.tolist()) == (60, [60])
+        status, _, body = page.ask(
+            f"/tap/{page.gate.tap_token}/sync?LANG=ADQL&QUERY=" + quote('SELECT TOP 1 "value" FROM "my-b".plain'),
+            cookie="",
+        )
+        assert (status, b"<TD>2.0</TD>" in body) == (200, True)
+        status, _, body = page.ask(f"/tap/{page.gate.tap_token}/tables", cookie="")
+        assert b"<name>&quot;my-b&quot;.plain</name>" in body or b'<name>"my-b".plain</name>' in body
