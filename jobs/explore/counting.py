@@ -11,6 +11,7 @@ chart's spans. A missing value (NaN) is in no bin, and within no limits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from lake_schema.errors import BadInput
 _BLOCK = 32768
 _MOST_COLUMNS, MOST_CELLS = 30, 8_000_000
 _MOST_AXES = 3
+# Counts of all threads together: 128 MB.
+_MOST_COUNTS = 2 * MOST_CELLS
 # A grid of more cells than so many a row of a block is counted in directly.
 _SPARSE = 4
 # Rows that tell a span, and the part of them that may lie outside on each side.
@@ -59,7 +62,8 @@ class Chart:
 
     @property
     def cells(self) -> int:
-        return int(np.prod(self.bins))
+        # Whole numbers of any size: a product of 64 bits would wrap around, and pass for a small one.
+        return math.prod(int(bins) for bins in self.bins)
 
 
 def counted(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1) -> list[Int]:
@@ -67,12 +71,14 @@ def counted(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits,
 
     columns : float32[n] each;  charts : what to count
     limits  : number of a column -> lowest and highest value that count, both included
-    threads : that count side by side
+    threads : that count side by side, fewer where the counts of each would fill much memory
     """
     if not 1 <= len(columns) <= _MOST_COLUMNS or len({len(column) for column in columns}) != 1:
         raise BadInput(f"counting wants 1 to {_MOST_COLUMNS} columns of the same rows")
+    _check(len(columns), charts, limits)
     tables = _tables(len(columns), charts, limits)
     rows = len(columns[0])
+    threads = max(1, min(threads, _MOST_COUNTS // max(1, sum(chart.cells for chart in charts))))
     edges = np.linspace(0, rows, threads + 1).astype(np.int64)
 
     def part(number: int) -> Int:
@@ -89,6 +95,14 @@ def counted(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits,
             total = reduce(np.add, pool.map(part, range(threads)))
     ends = np.cumsum([chart.cells for chart in charts])
     return [piece.reshape(chart.bins) for piece, chart in zip(np.split(total, ends[:-1]), charts, strict=True)]
+
+
+def _check(number: int, charts: Sequence[Chart], limits: Limits) -> None:
+    """Refuse what the compiled loops, which look at no bounds, would read or write outside of their arrays."""
+    if any(not 0 <= column < number for column in [*limits, *(c for chart in charts for c in chart.columns)]):
+        raise BadInput(f"a chart or a limit is of a column that is none of the {number}")
+    if sum(chart.cells for chart in charts) > MOST_CELLS:
+        raise BadInput(f"the charts have more than {MOST_CELLS} bins together")
 
 
 def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float32, Bool, Int, Float, Int, Int, Int]:

@@ -8,6 +8,8 @@ import { columnsOf, sources, suggested } from "/static/suggestions.js";
 const $ = (id) => document.getElementById(id);
 const BINS = 120, MAP_BINS = 96, CUBE_BINS = 256, CUBE_MAP_BINS = 32;
 const MOST_POINTS = 20000;
+// Of all charts of a question together.
+const MOST_CELLS = 8e6;
 // charts: {axes: [{expression, log}], spans, brush: [[lo, hi], ...] | null, points, counts, whole, places, element ...}
 let page, source = "", where = "", charts = [], part = null, head = null, cube = null, drag = null;
 
@@ -152,7 +154,7 @@ async function hold(chart) {
     return { axes: [axis, ...places], own: own(one), spans: [chart.spans[0], ...one.spans],
       bins: [CUBE_BINS, ...(places.length > 1 ? [CUBE_MAP_BINS * 3, CUBE_MAP_BINS * 3] : [BINS])] };
   });
-  if (asked.some((one) => one.bins.reduce((a, b) => a * b) > 8e6)) return;
+  if (asked.reduce((sum, one) => sum + one.bins.reduce((a, b) => a * b), 0) > MOST_CELLS) return;
   const held = drag;
   const buffer = await api.post("charts", { source, where: where || "true", axes: names, part, limits: limits(chart), charts: asked });
   if (drag !== held) return;

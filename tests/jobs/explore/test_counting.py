@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs.explore.counting import Chart, counted, points, span
+from jobs.explore.counting import MOST_CELLS, Chart, counted, points, span
 from lake_schema.errors import BadInput
 
 SPECIAL = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, 0.1, np.float32(0.3), -1.0, 3.4e38]
@@ -81,11 +81,26 @@ def test_refusals():
         ((0,), ((0.0, 1.0),), (0,)),
         ((0, 1), ((0.0, 1.0),), (3, 3)),
         ((0, 1), ((0.0, 1.0),) * 2, (10_000, 10_000)),
+        # Their product is 0 in 64 bits, that of the last 1.
+        ((0, 1), ((0.0, 1.0),) * 2, (2**40, 2**24)),
+        ((0, 1), ((0.0, 1.0),) * 2, (np.int64(2**40), np.int64(2**24))),
+        ((0, 1), ((0.0, 1.0),) * 2, (2**64 - 1, 2**64 - 1)),
     ]:
         with pytest.raises(BadInput):
             Chart(axes, spans, bins)
     with pytest.raises(BadInput, match="of the same rows"):
         counted([np.zeros(2, np.float32), np.zeros(3, np.float32)], CHARTS[:1], {})
+    column = [np.zeros(2, np.float32)]
+    for charts, limits in ((CHARTS[1:2], {}), ([Chart((-1,), ((0.0, 1.0),), (3,))], {}), (CHARTS[:1], {1: (0.0, 1.0)})):
+        with pytest.raises(BadInput, match="none of the 1"):
+            counted(column, charts, limits)
+
+
+def test_all_charts_share_a_bound_of_bins():
+    column, wide = [np.full(3, 0.5, np.float32)], Chart((0,), ((0.0, 1.0),), (MOST_CELLS // 2,))
+    assert [counts.sum() for counts in counted(column, [wide] * 2, {}, threads=64)] == [3, 3]
+    with pytest.raises(BadInput, match="together"):
+        counted(column, [wide] * 3, {})
 
 
 def test_span():
