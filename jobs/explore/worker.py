@@ -23,6 +23,8 @@ from lake_schema.store import layout
 
 # What Python and the libraries take before any query.
 _BASE_BYTES = 1 << 30
+# Bytes that are sent at a time, and that a row may have.
+_PIECE_BYTES, _MOST_ROW_BYTES = 8 << 20, 64 << 20
 
 
 def main(argv: Sequence[str]) -> int:
@@ -69,13 +71,30 @@ def _batches(session: Session, question: dict[str, Any]) -> Iterator[pa.RecordBa
     for text in question.get("expressions", ()):
         session.check_expression(text)
     for batch in session.run(session.checked(question["sql"]), question["parameters"]):
-        piece = batch if most_rows is None else batch.slice(0, most_rows - rows)
-        rows, size = rows + piece.num_rows, size + piece.nbytes
+        whole = batch if most_rows is None else batch.slice(0, most_rows - rows)
+        rows, size = rows + whole.num_rows, size + whole.nbytes
         if most_bytes is not None and size > most_bytes:
             raise BadInput(TOO_LARGE)
-        yield piece
+        yield from _pieces(whole, _MOST_ROW_BYTES if most_bytes is None else most_bytes)
         if rows == most_rows:
             return
+
+
+def _pieces(batch: pa.RecordBatch, most: int) -> Iterator[pa.RecordBatch]:
+    """The batch in parts of few bytes each: whoever passes them on holds one at a time.
+
+    Errors : BadInput where a row has more bytes than `most`
+    """
+    if batch.nbytes <= _PIECE_BYTES:
+        yield batch
+    elif batch.num_rows > 1:
+        half = batch.num_rows // 2
+        yield from _pieces(batch.slice(0, half), most)
+        yield from _pieces(batch.slice(half), most)
+    elif batch.nbytes <= most:
+        yield batch
+    else:
+        raise BadInput(f"SQL: a row of the result has more than {most >> 20} MB")
 
 
 def _said(error: BaseException) -> dict[str, str]:

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute as pc
 from aiohttp import web
 
 from jobs.explore import results
@@ -22,7 +23,7 @@ TYPES = {
     "fits": "application/fits",
 }
 # FITS wants the number of rows first, and all of them in memory.
-MOST_FITS_ROWS = 2_000_000
+MOST_FITS_ROWS, MOST_FITS_BYTES = 2_000_000, 128 << 20
 _CHUNK = 1 << 20
 
 
@@ -41,11 +42,23 @@ async def export(lake: Lake, request: web.Request) -> web.StreamResponse:
 
 
 def _fits(lake: Lake, process: Process, text: str, folder: Path) -> Path:
-    rows = pa.Table.from_batches(list(process.batches(text, {}, lake.timeout, MOST_FITS_ROWS + 1)))
-    if rows.num_rows > MOST_FITS_ROWS:
-        raise BadInput(f"more than {MOST_FITS_ROWS:,} rows: ask for CSV, Parquet or a VOTable, which come in pieces")
+    found, size = [], 0
+    for batch in process.batches(text, {}, lake.timeout, MOST_FITS_ROWS + 1):
+        found.append(batch)
+        size += batch.nbytes
+        _refuse(size > MOST_FITS_BYTES, f"{MOST_FITS_BYTES >> 20} MB")
+    rows = pa.Table.from_batches(found)
+    _refuse(rows.num_rows > MOST_FITS_ROWS, f"{MOST_FITS_ROWS:,} rows")
+    # There every text of a column takes as many bytes as the longest.
+    longest = [pc.max(pc.binary_length(column)).as_py() for column in rows.columns if pa.types.is_string(column.type)]
+    _refuse(rows.num_rows * sum(length or 0 for length in longest) > MOST_FITS_BYTES, f"{MOST_FITS_BYTES >> 20} MB")
     results.write(rows, folder / "result.fits")
     return folder / "result.fits"
+
+
+def _refuse(is_too_much: bool, bound: str) -> None:
+    if is_too_much:
+        raise BadInput(f"more than {bound}: ask for CSV, Parquet or a VOTable, which come in pieces")
 
 
 def chunks(path: Path) -> Iterator[bytes]:

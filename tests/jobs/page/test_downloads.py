@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from lake_schema.errors import BadInput
 from lake_schema.store import read
 
 QUERY = "SELECT id, ra, z_obs, flux_halpha, kind, 'a,\"<&>' || kind AS name FROM galaxies ORDER BY id LIMIT 700"
@@ -70,3 +71,30 @@ def test_an_error_in_the_midst_is_no_whole_file(page):
     with pytest.raises((http.client.IncompleteRead, ConnectionError)):
         page.of_lake(f"export?format=csv&sql={quote(sql)}")
     assert page.of_lake("export?format=csv&sql=SELECT+1+AS+a")[2] == b'"a"\n1\n'
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT repeat('x', 1000000) AS a FROM range(1000)",
+        # In FITS the short ones take as much as the long one.
+        "SELECT CASE WHEN range = 7 THEN repeat('x', 1000000) ELSE 'y' END AS a FROM range(1000)",
+    ],
+)
+def test_a_file_that_is_made_in_memory_has_a_bound_of_bytes(page, sql):
+    status, _, body = page.of_lake(f"export?format=fits&sql={quote(sql)}")
+    assert status == 400
+    assert "MB: ask for" in json.loads(body)["error"]
+
+
+def test_pieces_of_wide_rows_are_small(page):
+    """However wide they are: a table of a thousand rows of a megabyte is never held as a whole."""
+    process = page.server.lake.explorer.process()
+    try:
+        sizes = [batch.nbytes for batch in process.batches("SELECT repeat('x', 1000000) AS a FROM range(200)")]
+        assert sum(sizes) >= 200e6
+        assert max(sizes) <= 8 << 20
+        with pytest.raises(BadInput, match="64 MB"):
+            list(process.batches("SELECT repeat('x', 70000000) AS a"))
+    finally:
+        process.close()
