@@ -34,9 +34,8 @@ async def counts(lake: Lake, question: Json) -> bytes:
                [axis, lowest, highest] each; part, one row in so many, or null
     """
     source, where = str(question.get("source", "")), str(question.get("where") or "true")
-    axes = [str(axis) for axis in question.get("axes", ())]
-    if not 0 < len(axes) <= _MOST_AXES or not 0 < len(question.get("charts", ())) <= _MOST_CHARTS:
-        raise BadInput(f"charts: wanted 1 to {_MOST_AXES} axes and 1 to {_MOST_CHARTS} charts")
+    axes = [str(axis) for axis in _list(question, "axes", _MOST_AXES)]
+    _list(question, "charts", _MOST_CHARTS)
     keys = _keys(lake, source)
     part = _part(lake, source, keys, question.get("part"))
     selection = Selection(lake.key, source, where, keys, part)
@@ -57,6 +56,13 @@ async def counts(lake: Lake, question: Json) -> bytes:
             lake.held.pop(next(iter(lake.held)))
         lake.held[(selection, *axes)] = held
     return await asyncio.to_thread(_counted, lake, held, question, part)
+
+
+def _list(question: Json, name: str, most: int) -> list[Any]:
+    found = question.get(name)
+    if not isinstance(found, list) or not 0 < len(found) <= most:
+        raise BadInput(f"charts: wanted a list of 1 to {most} {name}")
+    return found
 
 
 def _keys(lake: Lake, source: str) -> tuple[str, ...]:
@@ -85,7 +91,7 @@ def _counted(lake: Lake, held: list[Float32], question: Json, part: int) -> byte
         limits = {int(axis): (float(lo), float(hi)) for axis, lo, hi in question.get("limits") or ()}
         if any(not 0 <= axis < len(held) for axis in [*limits, *(axis for chart in charts for axis in chart.columns)]):
             raise BadInput("charts: an axis has no expression")
-    except (TypeError, ValueError, LookupError) as error:
+    except (TypeError, ValueError, LookupError, OverflowError, AttributeError) as error:
         raise BadInput(f"charts: {error}") from None
     rows = len(held[0])
     threads = lake.threads if rows > 1_000_000 else 1

@@ -2,10 +2,13 @@
 
 import json
 import os
+import re
 import signal
 import threading
 import time
 from urllib.parse import quote
+
+import pytest
 
 from lake_schema.store import publish
 from tests.jobs.page.conftest import GALAXIES_N, asked, published, serving
@@ -102,3 +105,29 @@ def test_a_lake_of_two_requests(tmp_path):
         assert (status, b"<TD>2.0</TD>" in body) == (200, True)
         status, _, body = page.ask(f"/tap/{page.gate.tap_token}/tables", cookie="")
         assert b"<name>&quot;my-b&quot;.plain</name>" in body or b'<name>"my-b".plain</name>' in body
+
+
+@pytest.mark.parametrize(
+    ("question", "words"),
+    [
+        ({"axes": "z"}, "axes"),
+        ({"axes": 7}, "axes"),
+        ({"charts": {"axes": [0]}}, "charts"),
+        ({"charts": 7}, "charts"),
+        ({"charts": [7]}, "charts"),
+        ({"charts": [{"axes": [0], "bins": [2**40]}]}, "bins"),
+        ({"charts": [{"axes": [0, 0], "bins": [2**40, 2**24]}]}, "bins"),
+        ({"charts": [{"axes": [0], "bins": [1e999]}]}, "infinity"),
+        ({"charts": [{"axes": [0], "bins": [3], "points": 1e999}]}, "infinity"),
+        ({"charts": [{"axes": [-1], "bins": [3]}]}, "no expression"),
+        ({"charts": [{"axes": [1], "bins": [3]}]}, "index"),
+        ({"charts": [{"axes": [0], "bins": [8_000_000]}] * 2}, "together"),
+        ({"limits": [[3, 0, 1]]}, "no expression"),
+        ({"limits": 7}, "limits|iterable"),
+    ],
+)
+def test_charts_that_are_none(page, question, words):
+    usual = {"source": "galaxies", "axes": ["z_obs"], "charts": [{"axes": [0], "bins": [3]}]}
+    status, _, body = page.of_lake("charts", method="POST", body=json.dumps({**usual, **question}).encode())
+    assert status == 400
+    assert re.search(words, json.loads(body)["error"])
