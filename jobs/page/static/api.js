@@ -70,6 +70,8 @@ export function number(value, digits = 5) {
   if (value === null || value === undefined) return "";
   if (typeof value !== "number") return String(value);
   if ((Number.isInteger(value) || Math.abs(value) >= 1e5) && Math.abs(value) < 1e12) return Math.round(+value.toPrecision(Math.max(digits, Number.isInteger(value) ? 15 : 3))).toLocaleString("en-US").replace(/,/g, "\u202f");
+  // An identifier is a whole number too: what JSON holds exactly is shown to its last digit.
+  if (Number.isSafeInteger(value)) return String(value);
   const size = Math.abs(value);
   return size !== 0 && (size >= 1e12 || size < 1e-3) ? (+value.toPrecision(digits)).toExponential() : String(+value.toPrecision(digits));
 }
@@ -99,7 +101,7 @@ export function table(columns, rows, caption) {
   const head = h("tr", {}, ...columns.map((c) => h("th", { scope: "col", title: c.meaning || null, class: c.text ? "text" : null },
     c.name, c.unit ? h("small", {}, ` ${c.unit}`) : null)));
   const body = rows.map((row) => h("tr", {}, ...row.map((value, k) =>
-    h("td", { class: columns[k].text ? "text" : null }, value instanceof Node ? value : number(value, 7)))));
+    h("td", { class: columns[k].text ? "text" : null }, value instanceof Node ? value : number(value, columns[k].type === "double" ? 12 : 7)))));
   return h("table", {}, caption ? h("caption", {}, caption) : null, h("thead", {}, head), h("tbody", {}, ...body));
 }
 

@@ -244,6 +244,20 @@ def test_a_lake_that_is_published_anew_is_announced(browser, tmp_path):
         assert page.server.lake.key in tab.inner_text("#version")
 
 
+def test_numbers_keep_their_digits(tab):
+    tab.keyboard.press("3")
+    whole = [999999999999, 1000000000001, 4503599627370497, 9007199254740991, 9007199254740993, -1234567890123]
+    query = f"SELECT unnest({whole}) AS id, 150.1234567891::DOUBLE AS ra, 0.1::FLOAT AS x"
+    tab.fill("#sql-text", query)
+    tab.click("#sql-run")
+    cells = "[...document.querySelectorAll('#sql-result tbody td')].map((one) => one.textContent.replaceAll('\u202f', ''))"
+    until(tab, f"{cells}.length === 18")
+    found = tab.evaluate(cells)
+    assert found[::3] == [str(number) for number in whole]
+    assert set(found[1::3]) == {"150.123456789"}
+    assert set(found[2::3]) == {"0.1"}
+
+
 def peaks(tab, page, number, most):
     """How many of the brightest stars that stand alone have the largest value of 3 x 3 pixels under the cursor."""
     tab.keyboard.press("4")
