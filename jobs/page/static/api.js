@@ -23,10 +23,15 @@ async function answered(address, options) {
 
 const address = (path) => `/api/${lake.key}/${path}`;
 
-/** Learn what the lake holds. */
+/** Learn what the lake holds. What is shown belongs to the key that was learnt first: of another only the news is told. */
 export async function open(again = false) {
   const answer = again ? await answered("/api/reopen", { method: "POST" }) : await answered("/api/lake");
-  Object.assign(lake, await answer.json());
+  const told = await answer.json();
+  if (lake.key && told.key !== lake.key) {
+    document.getElementById("changed").hidden = false;
+    return lake;
+  }
+  Object.assign(lake, told);
   document.getElementById("changed").hidden = !lake.is_changed;
   return lake;
 }

@@ -244,6 +244,24 @@ def test_a_lake_that_is_published_anew_is_announced(browser, tmp_path):
         assert page.server.lake.key in tab.inner_text("#version")
 
 
+def test_a_tab_is_told_of_what_another_has_opened(browser, tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    published(root)
+    with serving(root) as page, tab_of(browser, page) as tab, tab_of(browser, page) as other:
+        old = page.server.lake.key
+        publish.make(root, plain_plan(2), plain_work)
+        tab.reload()
+        until(tab, "!document.getElementById('changed').hidden")
+        tab.click("#reopen")
+        until(tab, "document.body.dataset.ready === '1' && document.getElementById('changed').hidden")
+        assert page.server.lake.key != old
+        # What the page does every half a minute: nothing of the new lake gets between what is shown of the old one.
+        learnt = "import('/static/api.js').then((api) => api.open()).then((lake) => lake.key)"
+        assert [other.evaluate(learnt) for _ in range(2)] == [old] * 2
+        assert other.is_visible("#changed")
+
+
 def test_numbers_keep_their_digits(tab):
     tab.keyboard.press("3")
     whole = [999999999999, 1000000000001, 4503599627370497, 9007199254740991, 9007199254740993, -1234567890123]
