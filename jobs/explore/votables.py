@@ -16,6 +16,8 @@ from xml.sax.saxutils import escape, quoteattr
 
 import pyarrow as pa
 
+from lake_schema.errors import BadInput
+
 _OPEN = (
     '<?xml version="1.0" encoding="UTF-8"?>\n<VOTABLE version="1.4" xmlns="http://www.ivoa.net/xml/VOTable/v1.3">\n'
     '<RESOURCE type="results">\n'
@@ -85,6 +87,18 @@ def facts_of(column: pa.Field) -> Facts:
     return Facts(*(known.get(key, "") for key in ("unit", "ucd", "description", "xtype", "utype")))
 
 
+def values(column: pa.Array, name: str = "") -> list[Any]:
+    """The values as Python has them.
+
+    Errors : BadInput where it has none for them, such as moments before the year 1 or after 9999
+    """
+    try:
+        found: list[Any] = column.to_pylist()
+    except (ValueError, OverflowError, pa.ArrowException) as error:
+        raise BadInput(f"column {name}: a value cannot be shown; CAST it AS VARCHAR: {error}") from None
+    return found
+
+
 def datatype(kind: pa.DataType) -> tuple[str, str]:
     """VOTable's datatype and arraysize ("" of a scalar) of an Arrow type."""
     if pa.types.is_list(kind):
@@ -114,14 +128,14 @@ _NULLS = {"short": -32768, "int": -2147483648, "long": -9223372036854775808}
 def _rows(batch: pa.RecordBatch) -> bytes:
     if not batch.num_rows:
         return b""
-    cells = [_cells(column) for column in batch.columns]
+    cells = [_cells(column, field.name) for column, field in zip(batch.columns, batch.schema, strict=True)]
     return "".join(f"<TR>{''.join(row)}</TR>\n" for row in zip(*cells, strict=True)).encode()
 
 
-def _cells(column: pa.Array) -> list[str]:
+def _cells(column: pa.Array, name: str) -> list[str]:
     shown = _shown(column.type)
     null = f"<TD>{_NULLS.get(datatype(column.type)[0], '')}</TD>" if not datatype(column.type)[1] else "<TD/>"
-    return [null if value is None else f"<TD>{shown(value)}</TD>" for value in column.to_pylist()]
+    return [null if value is None else f"<TD>{shown(value)}</TD>" for value in values(column, name)]
 
 
 def _shown(kind: pa.DataType) -> Callable[[Any], str]:

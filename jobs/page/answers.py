@@ -12,6 +12,7 @@ from typing import Any
 import pyarrow as pa
 from aiohttp import web
 
+from jobs.explore import votables
 from jobs.page.opened import Lake
 from lake_schema import __version__
 from lake_schema.arrays import Array
@@ -79,9 +80,10 @@ async def sql(lake: Lake, question: Json) -> Json:
 
         rows = await asyncio.to_thread(ask)
     shown = rows.slice(0, ROWS_SHOWN)
+    told = [votables.values(column, name) for name, column in zip(shown.column_names, shown.columns, strict=True)]
     return {
         "columns": [_column(field) for field in shown.schema],
-        "rows": [[plain(value) for value in row] for row in zip(*(c.to_pylist() for c in shown.columns), strict=True)],
+        "rows": [[plain(value) for value in row] for row in zip(*told, strict=True)],
         "more": rows.num_rows > ROWS_SHOWN,
         "seconds": time.monotonic() - started,
     }

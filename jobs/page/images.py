@@ -50,7 +50,9 @@ def _bands(lake: Lake) -> dict[str, tuple[float, float]]:
     for version in lake.named("passbands"):
         for row in version.rows(["name", "first_wavelength", "wavelength_step", "response"]).to_pylist():
             response = np.array(row["response"])
-            seen = np.flatnonzero(response >= _FAINTEST * response.max(initial=0.0))
+            seen = np.flatnonzero((response > 0.0) & (response >= _FAINTEST * response.max(initial=0.0)))
+            if not seen.size:
+                continue
             ends = row["first_wavelength"] + row["wavelength_step"] * seen[[0, -1]]
             found[str(row["name"])] = float(ends[0]), float(ends[1])
     return found

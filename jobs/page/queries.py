@@ -125,5 +125,8 @@ class Jobs:
                 job.kind = kind
         except (LakeError, OSError) as error:
             job.error = str(error) or type(error).__name__
+        except Exception as error:
+            # Whatever it is: a job that has ended must not be waited for.
+            job.error = f"{type(error).__name__}: {error}"
         job.ended = datetime.now(UTC)
         job.set_phase("ERROR" if job.error else "COMPLETED")

@@ -268,7 +268,9 @@ def test_numbers_keep_their_digits(tab):
     query = f"SELECT unnest({whole}) AS id, 150.1234567891::DOUBLE AS ra, 0.1::FLOAT AS x"
     tab.fill("#sql-text", query)
     tab.click("#sql-run")
-    cells = "[...document.querySelectorAll('#sql-result tbody td')].map((one) => one.textContent.replaceAll('\u202f', ''))"
+    cells = (
+        "[...document.querySelectorAll('#sql-result tbody td')].map((one) => one.textContent.replaceAll('\u202f', ''))"
+    )
     until(tab, f"{cells}.length === 18")
     found = tab.evaluate(cells)
     assert found[::3] == [str(number) for number in whole]

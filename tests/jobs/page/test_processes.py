@@ -1,15 +1,18 @@
 """Processes that end, questions that are given up, and lakes that are published anew."""
 
+import asyncio
 import json
 import os
 import re
 import signal
 import threading
 import time
+from contextlib import asynccontextmanager
 from urllib.parse import quote
 
 import pytest
 
+from jobs.page.queries import Jobs
 from lake_schema.store import publish
 from tests.jobs.page.conftest import GALAXIES_N, asked, published, serving
 from tests.universe import plain_plan, plain_work
@@ -131,3 +134,41 @@ def test_charts_that_are_none(page, question, words):
     status, _, body = page.of_lake("charts", method="POST", body=json.dumps({**usual, **question}).encode())
     assert status == 400
     assert re.search(words, json.loads(body)["error"])
+
+
+@pytest.mark.parametrize("value", ["TIMESTAMP '20000-01-01'", "'infinity'::TIMESTAMP", "'infinity'::DATE"])
+def test_moments_that_python_lacks(page, value):
+    question = json.dumps({"sql": f"SELECT {value} AS moment"}).encode()
+    status, _, body = page.of_lake("sql", method="POST", body=question)
+    assert status == 400
+    assert "column moment" in json.loads(body)["error"]
+    tap = f"/tap/{page.gate.tap_token}"
+    form = f"LANG=ADQL&PHASE=RUN&QUERY={quote(f'SELECT {value} AS moment')}".encode()
+    status, headers, _ = page.ask(
+        f"{tap}/async", method="POST", body=form, cookie="", Content_Type="application/x-www-form-urlencoded"
+    )
+    assert status == 303
+    job = headers["Location"].removeprefix(page.origin)
+    ended = time.monotonic() + 30.0
+    while (phase := page.ask(f"{job}/phase", cookie="")[2]) != b"ERROR":
+        assert time.monotonic() < ended, phase
+        time.sleep(0.05)
+    assert b"column moment" in page.ask(f"{job}/error", cookie="")[2]
+
+
+def test_a_job_ends_whatever_goes_wrong():
+    @asynccontextmanager
+    async def broken(parameters, seconds):
+        raise IndexError("of a fault of our own")
+        yield
+
+    async def run():
+        jobs = Jobs(broken)
+        job = jobs.add({}, 1.0)
+        jobs.start(job)
+        await asyncio.wait_for(asyncio.gather(job.task, return_exceptions=True), 10.0)
+        found = job.phase, job.error
+        await jobs.close()
+        return found
+
+    assert asyncio.run(run()) == ("ERROR", "IndexError: of a fault of our own")
