@@ -48,20 +48,30 @@ async def density(
     """4 bytes: length of the head; the head, JSON; float32 corners [n, 4, 2] deg; float32 number per deg2 [n].
 
     order : of the cells;  where : SQL condition of the rows that count;  view : ra, dec, radius deg; None: everything
-    table : of the rows;  value : SQL whose mean over the rows of a cell is told instead of their number
+    table : of the rows;  value : SQL whose mean over the rows of a cell is told instead of their number; rows that
+            have no finite one are `missing` of the head, not of the mean
     """
     if not 0 <= order <= _DEEPEST_SHOWN:
         raise BadInput(f"order = {order} is outside [0, {_DEEPEST_SHOWN}]")
     shift = 2 * (sky.DEEPEST - order)
-    told = "count(*)::DOUBLE" if value is None else f"avg(TRY_CAST(({value}\n) AS DOUBLE))"
-    text = f"""SELECT _healpix_29 >> {shift} AS cell, count(*) AS n, {told} AS told FROM {_table(lake, table)}
+    told = "count(*)::DOUBLE AS told, 0 AS lost"
+    if value is not None:
+        # One NaN would make a NaN of the mean of its cell.
+        number = f"TRY_CAST(({value}\n) AS DOUBLE)"
+        finite = f"FILTER (isfinite({number}))"
+        told = f"avg({number}) {finite} AS told, count(*) - count(*) {finite} AS lost"
+    text = f"""SELECT _healpix_29 >> {shift} AS cell, count(*) AS n, {told} FROM {_table(lake, table)}
                WHERE ({where}\n) AND {_within(view)} GROUP BY cell ORDER BY cell LIMIT {MOST_CELLS + 1}"""
     found = await _asked(lake, text, where, *([value] if value is not None else []))
     _refuse_many(found.num_rows)
-    head = {"order": order, "rows": int(found["n"].to_numpy().sum())}
+    head = {"order": order, "rows": _sum(found["n"]), "missing": _sum(found["lost"])}
     found = found.filter(pc.is_finite(found["told"]))
     area = sky.cell_area(order) if value is None else 1.0
     return _packed(_corners(order, found["cell"].to_numpy()), found["told"].to_numpy() / area, head)
+
+
+def _sum(column: pa.ChunkedArray) -> int:
+    return int(pc.sum(column).as_py() or 0)
 
 
 def coverage(lake: Lake, order: int, view: Float | None, band: str | None) -> bytes:

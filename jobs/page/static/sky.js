@@ -207,7 +207,8 @@ export function redraw() {
 
 function legend() {
   if (isCoverage()) return `${shownTable.slice(12) || "all bands"}: planned exposures`;
-  return value ? `${shownTable}: mean of ${value}` : `${shownTable}: number / deg²`;
+  const missing = cells?.head.missing ? `, ${api.number(cells.head.missing)} rows without one left out` : "";
+  return value ? `${shownTable}: mean of ${value}${missing}` : `${shownTable}: number / deg²`;
 }
 
 function drawOver(turn) {

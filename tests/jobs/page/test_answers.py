@@ -1,6 +1,7 @@
 """What the page is told equals what the lake holds."""
 
 import json
+from urllib.parse import quote
 
 import numpy as np
 import pyarrow as pa
@@ -156,6 +157,18 @@ def test_the_mean_of_an_expression(page, shown):
     z = read.version(shown, "galaxies").rows(["z_obs"])["z_obs"].to_numpy().astype(float)
     assert mean == pytest.approx([z.mean() + 1], rel=1e-5)
     assert page.of_lake("sky/galaxies/density?order=5&value=1)%20FROM%20stars%20--")[0] == 400
+
+
+def test_a_mean_is_of_the_rows_that_have_a_number(page, shown):
+    odd = "CASE id % 4 WHEN 0 THEN 'nan'::DOUBLE WHEN 1 THEN 'inf'::DOUBLE WHEN 2 THEN NULL ELSE z_obs END"
+    _, _, body = page.of_lake(f"sky/galaxies/density?order=5&value={quote(odd)}")
+    head, rest = unpacked(body)
+    rows = read.version(shown, "galaxies").rows(["id", "z_obs"])
+    own = rows["id"].to_numpy() % 4 == 3
+    assert 0 < own.sum() < GALAXIES_N
+    assert (head["rows"], head["missing"]) == (GALAXIES_N, (~own).sum())
+    mean = np.frombuffer(rest, "<f4", head["cells"], 32 * head["cells"])
+    assert mean == pytest.approx([rows["z_obs"].to_numpy().astype(float)[own].mean()], rel=1e-5)
 
 
 def test_coverage(page, shown, tmp_path):
