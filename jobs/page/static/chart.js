@@ -22,7 +22,8 @@ export function draw(chart, label, scale) {
 }
 
 function drawBars(chart, f, scale) {
-  const behind = chart.whole ?? chart.counts, most = Math.max(...behind, 1);
+  // Both may be samples, each of its own part of the rows.
+  const behind = chart.whole ? Float64Array.from(chart.whole, (count) => (count * chart.wholePart) / scale) : chart.counts, most = Math.max(...behind, 1);
   const step = (f.x1 - f.x0) / chart.counts.length, y = (n) => f.y0 - ((f.y0 - f.y1) * n) / most;
   for (const [counts, colour] of [[behind, ink("bar-off")], [chart.counts, ink("bar")]]) {
     f.context.fillStyle = colour;

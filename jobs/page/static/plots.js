@@ -10,8 +10,10 @@ const BINS = 120, MAP_BINS = 96, CUBE_BINS = 256, CUBE_MAP_BINS = 32;
 const MOST_POINTS = 20000;
 // Of all charts of a question together.
 const MOST_CELLS = 8e6;
+// The whole is counted when no brush has moved for so long, ms.
+const IDLE = 400;
 // charts: {axes: [{expression, log}], spans, brush: [[lo, hi], ...] | null, points, counts, whole, places, element ...}
-let page, source = "", where = "", charts = [], part = null, head = null, cube = null, drag = null;
+let page, source = "", where = "", charts = [], part = null, head = null, cube = null, drag = null, idle = 0;
 
 export function start(given) {
   page = given;
@@ -21,14 +23,13 @@ export function start(given) {
   $("plot-where").addEventListener("change", () => {
     where = $("plot-where").value;
     for (const chart of charts) chart.spans = null;
-    part = null;
-    ask();
+    sampled();
   });
   $("plot-add-button").addEventListener("click", add);
   $("plot-add").addEventListener("keydown", (event) => event.key === "Enter" && add());
   $("plot-clear").addEventListener("click", () => {
     for (const chart of charts) chart.brush = null;
-    ask();
+    sampled();
   });
   $("plot-python").addEventListener("click", () => api.copy(python(), "Python"));
   $("plot-sql").addEventListener("click", () => api.copy(query(), "SQL"));
@@ -119,7 +120,8 @@ const ask = api.newest(async () => {
     chart.spans = about.spans;
     chart.total = about.total;
     chart.missing = names.map((name, n) => head.missing[n])[names.indexOf(sqlOf(chart.axes[0]))];
-    if (!charts.some((other) => other.brush)) chart.whole = chart.counts;
+    chart.part = head.part;
+    if (!charts.some((other) => other.brush)) Object.assign(chart, { whole: chart.counts, wholePart: head.part });
     at += 4 * size;
   });
   shown.forEach((chart, k) => {
@@ -130,13 +132,22 @@ const ask = api.newest(async () => {
   });
   drawAll();
   tell(performance.now() - started);
-  if (head.part > 1 && !charts.some((chart) => chart.brush)) {
-    // The whole follows the sample.
+  clearTimeout(idle);
+  // The whole follows the sample.
+  if (head.part > 1) idle = setTimeout(() => {
+    if (drag) return;
     part = 1;
     ask();
-  }
+  }, IDLE);
   page.remember();
 });
+
+/** Count after a move: of many rows a sample, which the whole follows when nothing moves any more. */
+function sampled() {
+  clearTimeout(idle);
+  part = null;
+  ask();
+}
 
 function tell(ms) {
   const sample = head.part > 1 ? ` a sample, 1 row in ${head.part}: counts are scaled, with the Poisson error of the sample;` : "";
@@ -156,10 +167,12 @@ async function hold(chart) {
   });
   if (asked.reduce((sum, one) => sum + one.bins.reduce((a, b) => a * b), 0) > MOST_CELLS) return;
   const held = drag;
+  clearTimeout(idle);
+  part = null;
   const buffer = await api.post("charts", { source, where: where || "true", axes: names, part, limits: limits(chart), charts: asked });
   if (drag !== held) return;
   let [about, at] = api.headed(buffer);
-  cube = { chart, parts: others.map((one, k) => {
+  cube = { chart, part: about.part, parts: others.map((one, k) => {
     const size = about.charts[k].bins.reduce((a, b) => a * b), inner = size / CUBE_BINS, counts = new Uint32Array(buffer, at, size);
     at += 4 * size;
     const sums = new Float64Array(size + inner);
@@ -177,6 +190,7 @@ function moveHeld() {
     const out = new Uint32Array(inner);
     for (let i = 0; i < inner; i++) out[i] = sums[b * inner + i] - sums[a * inner + i];
     one.counts = out;
+    one.part = cube.part;
     one.places = null;
   }
   drawAll();
@@ -230,7 +244,7 @@ function figure(chart) {
 }
 
 function asTable(chart) {
-  const [span] = chart.spans, n = bins(chart)[0], scale = head.part;
+  const [span] = chart.spans, n = bins(chart)[0], scale = chart.part;
   const edge = (k) => span[0] + ((span[1] - span[0]) * k) / n;
   if (chart.axes.length === 1) {
     return api.table([{ name: "from" }, { name: "to", unit: facts(chart.axes[0].expression).unit }, { name: "number" }],
@@ -247,13 +261,13 @@ function drawAll() {
 }
 
 function draw(chart) {
-  drawChart(chart, label, head.part);
+  drawChart(chart, label, chart.part);
   const shown = chart.brush ? chart.brush.map(([lo, hi], k) => `${label(chart.axes[k])} ${api.number(lo, 4)} to ${api.number(hi, 4)}`).join(", ") : "";
-  const sum = chart.counts.reduce((a, b) => a + b, 0), scale = head.part;
+  const sum = chart.counts.reduce((a, b) => a + b, 0), scale = chart.part;
   const error = scale > 1 ? ` ± ${api.number(Math.round(Math.sqrt(sum) * scale))}` : "";
   const points = chart.points && chart.places ? `${api.number(chart.places.length / 2)} points${chart.placesPart * scale > 1 ? `, a sample: 1 row in ${chart.placesPart * scale}` : ""}` : "";
   const most = chart.axes.length > 1 && !points ? `colours from none to ${api.number(chart.counts.reduce((a, b) => Math.max(a, b), 0) * scale)} a bin, logarithmic` : "";
-  chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, chart.missing ? `${api.number(chart.missing)} missing` : "", most, points, shown].filter(Boolean).join("; ");
+  chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, chart.missing ? `${api.number(chart.missing * head.part)} missing` : "", most, points, shown].filter(Boolean).join("; ");
   chart.canvas.setAttribute("aria-label", `${label(chart.axes[0])}${chart.axes[1] ? ` and ${label(chart.axes[1])}` : ""}: ${chart.range.textContent}`);
 }
 
@@ -282,14 +296,14 @@ function pull(event) {
   if (cube?.chart === chart) moveHeld();
   else {
     draw(chart);
-    ask();
+    sampled();
   }
 }
 
 function release() {
   if (!drag.far) drag.chart.brush = null;
   drag = cube = null;
-  ask();
+  sampled();
 }
 
 /** A brush by keys: arrows move it by a fiftieth of the axis, with Shift they widen or narrow it. */
@@ -306,7 +320,7 @@ function nudge(chart, event) {
   event.preventDefault();
   event.stopPropagation();
   draw(chart);
-  ask();
+  sampled();
 }
 
 // ---------------------------------------------------------------------------------------------- as text

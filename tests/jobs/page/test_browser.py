@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 
+from jobs.page import charts
 from lake_schema.store import publish, read
 from tests.jobs.page import test_traces
 from tests.jobs.page.conftest import GALAXIES_N, published, serving
@@ -160,6 +161,23 @@ def test_a_held_brush_asks_nothing(tab):
     assert tab.evaluate(ranges) != before
     assert asked == []
     mouse.up()
+
+
+def test_of_many_rows_every_brush_counts_a_sample_first(browser, page, monkeypatch):
+    monkeypatch.setattr(charts, "ROWS_A_CORE", 10)
+    with tab_of(browser, page) as tab:
+        tab.keyboard.press("2")
+        asked = []
+        tab.on("request", lambda one: asked.append(one.post_data_json["part"]) if "charts" in one.url else None)
+        state = "document.getElementById('plot-state').textContent"
+        until(tab, f"{state}.includes('rows') && !{state}.includes('sample')")
+        for _ in range(2):
+            asked.clear()
+            tab.locator("#plot-grid canvas").first.focus()
+            tab.keyboard.press("Shift+ArrowRight")
+            until(tab, f"{state}.includes('sample')")
+            until(tab, f"!{state}.includes('sample')")
+            assert (asked[0], asked[-1]) == (None, 1)
 
 
 def test_a_map_as_points(tab, shown):
