@@ -9,6 +9,7 @@ Ref: IVOA Recommendation VOTable 1.4; DALI 1.1, section 4.4 (QUERY_STATUS)
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -116,7 +117,7 @@ def _field(column: pa.Field) -> str:
     given = {"name": column.name, "datatype": kind, "arraysize": size, "unit": about.unit, "ucd": about.ucd}
     given |= {"xtype": about.xtype, "utype": about.utype}
     words = " ".join(f"{key}={_quoted(value)}" for key, value in given.items() if value)
-    null = f'<VALUES null="{_NULLS[kind]}"/>' if kind in _NULLS and not size else ""
+    null = f'<VALUES null="{_NULLS[kind]}"/>' if kind in _NULLS else ""
     description = f"<DESCRIPTION>{_text(about.description)}</DESCRIPTION>" if about.description else ""
     return f"<FIELD {words}>{description}{null}</FIELD>\n"
 
@@ -140,8 +141,8 @@ def _cells(column: pa.Array, name: str) -> list[str]:
 
 def _shown(kind: pa.DataType) -> Callable[[Any], str]:
     if pa.types.is_list(kind) and not datatype(kind.value_type)[1]:
-        inner = _shown(kind.value_type)
-        return lambda values: " ".join("NaN" if value is None else inner(value) for value in values)
+        inner, nothing = _shown(kind.value_type), str(_NULLS.get(datatype(kind.value_type)[0], "NaN"))
+        return lambda values: " ".join(nothing if value is None else inner(value) for value in values)
     if pa.types.is_boolean(kind):
         return lambda value: "T" if value else "F"
     if pa.types.is_integer(kind):
@@ -159,9 +160,13 @@ def _number(value: float, form: str) -> str:
     return "NaN" if math.isnan(value) else ("+Inf" if value > 0 else "-Inf")
 
 
+# What XML 1.0 leaves out.
+_NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
 def _text(text: str) -> str:
-    """XML has no form for most control characters."""
-    return escape("".join(c if c >= " " or c in "\t\n\r" else "\N{REPLACEMENT CHARACTER}" for c in text))
+    """XML has no form for most control characters, nor for two that are no characters, nor for halves of pairs."""
+    return escape(_NO_XML.sub("\N{REPLACEMENT CHARACTER}", text))
 
 
 def _quoted(text: str) -> str:

@@ -61,3 +61,16 @@ def test_a_refusal():
     (info,) = read(votables.refusal("no <table> & \x01")).resources[0].infos
     assert (info.name, info.value) == ("QUERY_STATUS", "ERROR")
     assert info.content == "no <table> & \N{REPLACEMENT CHARACTER}"
+
+
+def test_what_is_missing_in_a_list_of_whole_numbers():
+    rows = pa.record_batch({"a": pa.array([[1, None, -3], []], pa.list_(pa.int64()))})
+    data = b"".join(votables.pieces([rows]))
+    assert b"NaN" not in data
+    assert list(read(data).get_first_table().array["a"][0]) == [1, -(2**63), -3]
+
+
+@pytest.mark.parametrize("character", ["\ufffe", "\uffff", "\x0b"])
+def test_characters_that_xml_lacks(character):
+    (text,) = read(b"".join(votables.pieces([pa.record_batch({"a": [f"x{character}y"]})]))).get_first_table().array["a"]
+    assert text == "x\N{REPLACEMENT CHARACTER}y"
