@@ -33,10 +33,8 @@ def runs(lake: Lake) -> Json:
     done = {(one.row["exposure_id"], one.row["detector"]) for one in pictures.pictures(lake)}
     for version in lake.named("tasks"):
         rows = version.rows(["exposure_id", "detector", "seconds", "bytes"]).to_pylist()
-        own = [row for row in rows if (row["exposure_id"], row["detector"]) in done]
-        found["tasks"].append(
-            {"done": len(own), "all": len(rows), "seconds_left": sum(r["seconds"] for r in rows if r not in own)}
-        )
+        left = [row["seconds"] for row in rows if (row["exposure_id"], row["detector"]) not in done]
+        found["tasks"].append({"done": len(rows) - len(left), "all": len(rows), "seconds_left": sum(left)})
     if done or found["tasks"]:
         found["failures"] = [{k: plain(v) for k, v in row.items()} for row in _failures(lake)]
     for version in lake.named("mission"):
