@@ -29,8 +29,30 @@ MACROS = (
     """CREATE MACRO adql_sides(ra, dec, v) AS
        [adql_side(v[i], v[i + 1], v[(i + 1) % len(v) + 1], v[(i + 2) % len(v) + 1], ra, dec)
         for i in range(1, len(v), 2)]""",
+    """CREATE MACRO adql_cosine(a1, d1, a2, d2) AS
+       sin(radians(d1)) * sin(radians(d2)) + cos(radians(d1)) * cos(radians(d2)) * cos(radians(a1 - a2))""",
+    # How often the sides go round a place, in radians: of a polygon with notches the sides themselves tell too little.
+    """CREATE MACRO adql_turn(a1, d1, a2, d2, a, d) AS
+       atan2(adql_side(a1, d1, a2, d2, a, d),
+             adql_cosine(a1, d1, a2, d2) - adql_cosine(a1, d1, a, d) * adql_cosine(a2, d2, a, d))""",
+    """CREATE MACRO adql_turns(ra, dec, v) AS
+       list_sum([adql_turn(v[i], v[i + 1], v[(i + 1) % len(v) + 1], v[(i + 2) % len(v) + 1], ra, dec)
+                 for i in range(1, len(v), 2)])""",
+    # Places on a side of one without notches are inside.
     """CREATE MACRO adql_in_polygon(ra, dec, v) AS (separation(ra, dec, v[1], v[2]) < 90
-       AND (list_min(adql_sides(ra, dec, v)) >= 0 OR list_max(adql_sides(ra, dec, v)) <= 0))""",
+       AND (list_min(adql_sides(ra, dec, v)) >= 0 OR list_max(adql_sides(ra, dec, v)) <= 0
+            OR abs(adql_turns(ra, dec, v)) > pi()))""",
+    # Degrees from a place to an arc: to its great circle, or where that is nearest beyond its ends, to an end.
+    """CREATE MACRO adql_from_arc(a1, d1, a2, d2, a, d) AS
+       CASE WHEN adql_cosine(a2, d2, a, d) > adql_cosine(a1, d1, a, d) * adql_cosine(a1, d1, a2, d2)
+             AND adql_cosine(a1, d1, a, d) > adql_cosine(a2, d2, a, d) * adql_cosine(a1, d1, a2, d2)
+             AND separation(a1, d1, a2, d2) > 0
+            THEN degrees(asin(least(1.0,
+                 abs(adql_side(a1, d1, a2, d2, a, d)) / sin(radians(separation(a1, d1, a2, d2))))))
+            ELSE least(separation(a1, d1, a, d), separation(a2, d2, a, d)) END""",
+    """CREATE MACRO adql_meets_circle(ra, dec, radius, v) AS (adql_in_polygon(ra, dec, v) OR
+       list_min([adql_from_arc(v[i], v[i + 1], v[(i + 1) % len(v) + 1], v[(i + 2) % len(v) + 1], ra, dec)
+                 for i in range(1, len(v), 2)]) <= radius)""",
     """CREATE MACRO adql_vertices(region) AS
        [try_cast(x AS DOUBLE)
         for x in string_split(regexp_replace(trim(region), '^POLYGON (ICRS )?', '', 'i'), ' ')]""",
@@ -154,6 +176,9 @@ def _geometry(word: str, arguments: list[list[str]]) -> str:
     if word == "INTERSECTS" and kinds == ("CIRCLE", "CIRCLE"):
         one, other = _circle(first_argument), _circle(second_argument)
         return f"CAST(separation({one[0]}, {one[1]}, {other[0]}, {other[1]}) <= {one[2]} + {other[2]} AS INTEGER)"
+    if word == "INTERSECTS" and "CIRCLE" in kinds and "POINT" not in kinds:
+        region, circle = (first_argument, second_argument)[:: 1 if kinds[1] == "CIRCLE" else -1]
+        return f"CAST(adql_meets_circle({', '.join(_circle(circle))}, {_vertices(region)}) AS INTEGER)"
     if word == "INTERSECTS" and kinds[1] == "POINT":
         first_argument, second_argument = second_argument, first_argument
     ra, dec = _point(word, first_argument)
@@ -166,14 +191,19 @@ def _inside(ra: str, dec: str, region: list[str]) -> str:
     if kind == "CIRCLE":
         ra0, dec0, radius = _circle(region)
         return f"separation({ra}, {dec}, {ra0}, {dec0}) <= {radius}"
-    if kind == "POLYGON":
-        corners = [part for argument in _numbers(region) for part in argument]
-        if len(corners) < 6 or len(corners) % 2:
-            raise BadInput("ADQL: a POLYGON has three corners or more")
-        return f"adql_in_polygon({ra}, {dec}, [{', '.join(corners)}])"
-    if kind:
-        raise BadInput(f"ADQL: a {kind} contains nothing")
-    return f"adql_in_polygon({ra}, {dec}, adql_vertices({_sql(region)}))"
+    if kind == "POINT":
+        raise BadInput("ADQL: a POINT contains nothing")
+    return f"adql_in_polygon({ra}, {dec}, {_vertices(region)})"
+
+
+def _vertices(region: list[str]) -> str:
+    """The corners of a polygon, or of a column of STC-S polygons."""
+    if _kind(region) != "POLYGON":
+        return f"adql_vertices({_sql(region)})"
+    corners = [part for argument in _numbers(region) for part in argument]
+    if len(corners) < 6 or len(corners) % 2:
+        raise BadInput("ADQL: a POLYGON has three corners or more")
+    return f"[{', '.join(corners)}]"
 
 
 def _kind(tokens: list[str]) -> str:

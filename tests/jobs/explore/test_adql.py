@@ -72,6 +72,27 @@ def test_polygons(database):
     assert value(database, "CONTAINS(POINT(0.5, 0), POLYGON('ICRS', 359, -1, 1, -1, 1, 1, 359, 1))") == 1
 
 
+def test_a_polygon_with_a_notch(database):
+    # An L: its corner at 15, 0 goes inwards.
+    corners = "10, -5, 20, -5, 20, 0, 15, 0, 15, 5, 10, 5"
+    back = "10, 5, 15, 5, 15, 0, 20, 0, 20, -5, 10, -5"
+    for ra, dec, inside in ((12, 3, 1), (18, -3, 1), (12, -3, 1), (18, 3, 0), (9, 0, 0), (21, -3, 0), (192, -3, 0)):
+        for polygon in (corners, back):
+            assert value(database, f"CONTAINS(POINT({ra}, {dec}), POLYGON({polygon}))") == inside
+
+
+def test_circles_that_meet_polygons(database):
+    square, text = "POLYGON(10, -5, 20, -5, 20, 5, 10, 5)", "('POLYGON ICRS 10 -5 20 -5 20 5 10 5')"
+    for ra, dec, radius, meets in (
+        (15, 0, 0.1, 1), (9, 0, 0.9, 0), (9, 0, 1.1, 1), (9, -6, 1.3, 0), (9, -6, 1.5, 1), (15, 7, 1.9, 0),
+        (15, 7, 2.1, 1), (195, 0, 3, 0), (40, 30, 60, 1), (22, 0, 1.99, 0), (22, 0, 2.01, 1),
+    ):  # fmt: skip
+        for region in (square, text):
+            circle = f"CIRCLE('ICRS', {ra}, {dec}, {radius})"
+            assert value(database, f"INTERSECTS({circle}, {region})") == meets
+            assert value(database, f"INTERSECTS({region}, {circle})") == meets
+
+
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=15)
 @given(
     st.floats(0, 360), st.floats(-89, 89), st.floats(0.01, 5), st.floats(0, 6.28), st.floats(0, 0.9) | st.floats(1.1, 2)

@@ -101,6 +101,9 @@ def test_images_are_found_by_place(service, shown):
     )
     assert len(service.search(here.format(place["ra"] + 0.02, place["dec"]))) == 0
     assert len(service.search(here.format(place["ra"] + 180.0, -place["dec"]))) == 0
+    cone = "SELECT * FROM ivoa.obscore WHERE INTERSECTS(CIRCLE('ICRS', {}, {}, {}), s_region) = 1"
+    assert len(service.search(cone.format(place["ra"], place["dec"] + 0.02, 0.001))) == 0
+    assert len(service.search(cone.format(place["ra"], place["dec"] + 0.02, 0.015))) == 3
     dataset = row.getdataset().read()
     path = read.version(shown, "products").file("images/000001/vis_science.fits")
     assert dataset == path.read_bytes()
