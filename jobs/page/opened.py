@@ -32,6 +32,10 @@ class Busy(LakeError):
     """Too many questions wait already."""
 
 
+class Closed(Busy):
+    """The lake has been opened anew while a question waited."""
+
+
 class Lane:
     """Processes that answer questions, each one at a time.
 
@@ -39,7 +43,7 @@ class Lane:
     """
 
     def __init__(self, make: Callable[[], Process], number: int) -> None:
-        self._make, self._waiting = make, 0
+        self._make, self._waiting, self._is_closed = make, 0, False
         self._all = {make() for _ in range(number)}
         self._free: asyncio.Queue[Process] = asyncio.Queue()
         for process in self._all:
@@ -49,8 +53,9 @@ class Lane:
     async def process(self) -> AsyncIterator[Process]:
         """A process that is free; where its user is cancelled another takes its place.
 
-        Errors : Busy where too many wait
+        Errors : Busy where too many wait; Closed
         """
+        self._refuse_closed()
         if self._free.empty() and self._waiting >= MOST_WAITING:
             raise Busy(f"{MOST_WAITING} questions are waiting: ask again later")
         self._waiting += 1
@@ -59,6 +64,7 @@ class Lane:
         finally:
             self._waiting -= 1
         try:
+            self._refuse_closed()
             yield process
         except LakeError:
             raise
@@ -70,7 +76,13 @@ class Lane:
             self._all.add(process)
             raise
         finally:
+            if self._is_closed:
+                process.stop()
             self._free.put_nowait(process)
+
+    def _refuse_closed(self) -> None:
+        if self._is_closed:
+            raise Closed("the lake has been opened anew")
 
     async def warm(self) -> None:
         """Start them all."""
@@ -79,9 +91,12 @@ class Lane:
             await asyncio.gather(*(asyncio.to_thread(process.ask, "SELECT 1", {}) for process in processes))
 
     def close(self) -> None:
-        """End them all."""
-        for process in self._all:
+        """End them, those that are in use when their users are done; nobody else is given one."""
+        self._is_closed = True
+        for _ in range(self._free.qsize()):
+            process = self._free.get_nowait()
             process.stop()
+            self._free.put_nowait(process)
 
 
 class Lake:
@@ -127,15 +142,11 @@ class Lake:
         return [version for name, version in sorted(self.versions.items()) if name.rpartition(".")[2] == table]
 
     def is_changed(self) -> bool:
-        """Whether a table has been published since it was opened."""
+        """Whether a table has been published since it was opened, or has come or gone."""
         try:
-            for name, version in self.versions.items():
-                own, _, table = name.rpartition(".")
-                if read.version(self.root, table, request=own or self.request).key != version.key:
-                    return True
+            return _facts(Explorer(self.root, request=self.request)) != _facts(self.explorer)
         except LakeError:
             return True
-        return False
 
     async def rows(self, text: str, parameters: Mapping[str, object] | None = None) -> pa.Table:
         """The answer to a question of the page's own."""
@@ -148,10 +159,15 @@ class Lake:
             await lane.warm()
 
     def close(self) -> None:
-        """End its processes."""
+        """End its processes; what is being answered is answered to its end, of the lake as it was."""
         self.questions.close()
         self.own.close()
         self.explorer.close()
+
+
+def _facts(explorer: Explorer) -> tuple[dict[str, str], set[str]]:
+    """The keys of its tables, and the names of those that cannot be opened."""
+    return {name: version.key for name, version in explorer.versions.items()}, {*explorer.damaged}
 
 
 async def pieces(batches: Iterator[Item]) -> AsyncIterator[Item]:

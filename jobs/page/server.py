@@ -13,7 +13,7 @@ from aiohttp import web
 
 from jobs.page import answers, charts, downloads, pictures, runs, sky_maps, sources, tap
 from jobs.page.gate import MOST_BODY, TAP, Gate, dress
-from jobs.page.opened import Busy, Lake
+from jobs.page.opened import Busy, Closed, Lake
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput, LakeError
 
@@ -31,6 +31,7 @@ class Server:
     def __init__(self, open_lake: Callable[[], Lake], gate: Gate) -> None:
         self._open, self.gate, self.lake = open_lake, gate, open_lake()
         self.tap = tap.Service(gate)
+        self._opening = asyncio.Lock()
 
     def application(self) -> web.Application:
         """What aiohttp runs."""
@@ -71,8 +72,11 @@ class Server:
 
     async def _reopen(self, request: web.Request) -> web.StreamResponse:
         """Show the lake as it is now; whatever was made of it as it was is refused from here on."""
-        before, self.lake = self.lake, await asyncio.to_thread(self._open)
-        before.close()
+        async with self._opening:
+            # Of two who ask at once the second finds it done.
+            if await asyncio.to_thread(self.lake.is_changed):
+                before, self.lake = self.lake, await asyncio.to_thread(self._open)
+                before.close()
         return await self._described(request)
 
     def _of_the_lake(self, answer: Answer) -> Callable[[web.Request], Awaitable[web.StreamResponse]]:
@@ -92,6 +96,8 @@ async def _refusals(
     """What is refused is said in one line, with a status that tells whose fault it is."""
     try:
         return await handler(request)
+    except Closed as error:
+        return web.json_response({"error": str(error)}, status=409)
     except Busy as error:
         return web.json_response({"error": str(error)}, status=429)
     except BadInput as error:

@@ -1,6 +1,7 @@
 """Processes that end, questions that are given up, and lakes that are published anew."""
 
 import asyncio
+import http.client
 import json
 import os
 import re
@@ -8,13 +9,18 @@ import signal
 import threading
 import time
 from contextlib import asynccontextmanager
+from pathlib import Path
 from urllib.parse import quote
 
 import pytest
 
+from jobs.explore.process import Process
+from jobs.page.opened import Closed, Lane
 from jobs.page.queries import Jobs
-from lake_schema.store import publish
-from tests.jobs.page.conftest import GALAXIES_N, asked, published, serving
+from lake_schema.store import layout, publish
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.stars import STARS
+from tests.jobs.page.conftest import GALAXIES_N, asked, published, serving, star_rows
 from tests.universe import plain_plan, plain_work
 
 
@@ -86,6 +92,65 @@ def test_a_lake_that_is_published_anew_is_announced(tmp_path):
         assert told["key"] != old
         assert page.ask(f"/api/{old}/sql", method="POST", body=sums)[0] == 409
         assert page.json("sql", method="POST", body=sums)["rows"] == [[120.0]]
+
+
+def test_a_table_that_is_new_is_announced(tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    publish.make(root, plain_plan(), plain_work)
+    with serving(root) as page:
+        assert json.loads(page.ask("/api/lake")[2])["is_changed"] is False
+        part = Part(layout.cell_file(5, 1607), {})
+        publish.make(root, Plan(STARS, {}, (part,)), lambda lake, facts: Output(star_rows()[0]))
+        assert json.loads(page.ask("/api/lake")[2])["is_changed"] is True
+
+
+def test_a_lake_is_opened_anew_beside_what_is_being_answered(tmp_path):
+    """A download ends with all of its rows, though two ask at once to open the lake anew; nothing is left open."""
+    root = tmp_path / "lake"
+    root.mkdir()
+    publish.make(root, plain_plan(), plain_work)
+    with serving(root) as page:
+        server, opened = page.server, []
+        before, open_ = server.lake, server._open
+        server._open = lambda: opened.append(open_()) or opened[-1]
+        connection = http.client.HTTPConnection("127.0.0.1", page.gate.port, timeout=60)
+        address = f"/api/{before.key}/export?format=csv&sql=" + quote("SELECT range AS a FROM range(3000000)")
+        connection.request("GET", address, headers={"Cookie": page.cookie})
+        answer = connection.getresponse()
+        first = answer.read(1000)
+        publish.make(root, plain_plan(2), plain_work)
+        both = [threading.Thread(target=page.ask, args=("/api/reopen", "POST", b"")) for _ in range(2)]
+        for one in both:
+            one.start()
+        for one in both:
+            one.join(30.0)
+        assert opened == [server.lake]
+        assert server.lake is not before
+        assert (first + answer.read()).count(b"\n") == 3_000_001
+        connection.close()
+        ended = time.monotonic() + 30.0
+        while any(one._worker is not None and one._worker.poll() is None for one in before.questions._all):
+            assert time.monotonic() < ended
+            time.sleep(0.05)
+
+
+def test_a_lane_that_is_closed_gives_no_process():
+    async def run():
+        lane = Lane(lambda: Process(Path(), []), 1)
+        async with lane.process():
+            waiting = asyncio.create_task(anext(aiter_of(lane)))
+            await asyncio.sleep(0)
+            lane.close()
+        for one in (waiting, anext(aiter_of(lane))):
+            with pytest.raises(Closed):
+                await one
+
+    async def aiter_of(lane):
+        async with lane.process() as process:
+            yield process
+
+    asyncio.run(run())
 
 
 def test_a_lake_of_two_requests(tmp_path):
