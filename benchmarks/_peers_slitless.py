@@ -48,7 +48,7 @@ def slitlessutils_figures(count: int = 2, seed: int = 7) -> dict[str, float]:
     ours, seconds = _timed(some, order, through, spectrum)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        configuration = grism_files.write(folder, "RGS000", [order], _SHAPE, 1.0)
+        configuration = grism_files.write(folder, "RGS000", [order], _SHAPE)
         theirs, their_seconds = _child(python, folder, configuration, *_given(some, order, through, spectrum))
     differ = _differences(some, order, ours, theirs)
     return {

@@ -216,21 +216,32 @@ def work(lake: Path, facts: Json) -> Output:
     return Output(rows, files)
 
 
+def aimed(lake: Path, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
+    """A detector as it looks at the sky, its exposure's variant, and the request's mission; facts : of `prepared`."""
+    request = facts["request"]
+    forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
+    inputs = {
+        name: read.version(lake, name, facts["inputs"][name]) for name in ("exposures", "galaxy_fluxes", "mission")
+    }
+    here = pc.field("exposure_id") == facts["exposure_id"]
+    (exposed,) = map(ExposureRow.of, inputs["exposures"].rows(where=here).to_pylist())
+    mission = read_back(inputs["mission"])
+    own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
+    detector = detectors.detector(exposed.camera, facts["detector"], own.mission)
+    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
+    return Aim.of(exposed, detector, band, request["seed"]), own, mission
+
+
 def prepared(lake: Path, facts: Json) -> tuple[Aim, Rows, Variant]:
     """What a detector is rendered from.
 
     facts  : of the plan and of its part: exposure_id, detector
     Errors : BadInput where a file of the user's has changed since the plan was made
     """
-    request = facts["request"]
-    forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
-    inputs = {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
+    request, (aim, own, mission) = facts["request"], aimed(lake, facts)
+    exposed, inputs = aim.exposure, {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
     here = pc.field("exposure_id") == facts["exposure_id"]
-    (exposed,) = map(ExposureRow.of, inputs["exposures"].rows(where=here).to_pylist())
     (task,) = inputs["tasks"].rows(where=here & (pc.field("detector") == facts["detector"])).to_pylist()
-    mission = read_back(inputs["mission"])
-    own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
-    detector = detectors.detector(exposed.camera, task["detector"], own.mission)
     earlier = _earlier(lake, inputs, exposed, task, mission, request["seed"])
     for one in (exposed, *(before.exposure for before in earlier if isinstance(before, Earlier))):
         if one.psf:
@@ -243,8 +254,6 @@ def prepared(lake: Path, facts: Json) -> tuple[Aim, Rows, Variant]:
             if file_sha256(Path(file)) != sha256:
                 raise BadInput(f"{file}: has changed since the rendering began")
             bodies = ephemerides.read(Path(file), sha256).of_day
-    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
-    aim = Aim.of(exposed, detector, band, request["seed"])
     rows = _rows(lake, inputs, aim, task, own, bodies, earlier, request["seed"])
     return aim, _with_structure(rows, request, facts.get("stamps", {})), own
 

@@ -15,6 +15,7 @@ import pyarrow as pa
 
 from jobs.render.camera.traces import Trace
 from jobs.render.dispersing.draw import Order
+from lake_schema import user_files
 from lake_schema.arrays import Float
 from lake_schema.columns import Column, Table
 from lake_schema.fits.tables import table_to_fits
@@ -34,14 +35,15 @@ SENSITIVITY = Table(
 _TERMS = 6
 
 
-def configuration(grism: str, traces: Sequence[Trace], shape: tuple[int, int], files: Sequence[str]) -> str:
+def configuration(name: str, traces: Sequence[Trace], shape: tuple[int, int], files: Sequence[str]) -> str:
     """Text of a configuration.
 
-    grism, traces : its name, and its orders;  shape : ny, nx;  files : of the sensitivity of each order
+    name, traces : of the grism and detector, and its orders;  shape : ny, nx
+    files        : of the sensitivity of each order
     Offsets are from the undispersed image's place, 0-based pixels; wavelengths in A.
     """
     ny, nx = shape
-    lines = [f"# {grism}, simulated", f"NAXIS {ny} {nx}"]
+    lines = [f"# {name}, simulated", f"NAXIS {ny} {nx}"]
     for trace, file in zip(traces, files, strict=True):
         name = f"{trace.order:+d}" if trace.order else "0"
         # A source may lie outside the detector and its light on it.
@@ -58,27 +60,28 @@ def _terms(row: Float) -> str:
     return " ".join(repr(float(value)) for value in np.pad(row, (0, _TERMS - len(row))))
 
 
-def sensitivity(order: Order, seconds: float) -> pa.Table:
+def sensitivity(order: Order) -> pa.Table:
     """Rows of SENSITIVITY.
 
-    order : whose response is of an exposure of so many seconds
+    order : whose response is electrons a second in 1 A for each erg s-1 cm-2 A-1
     The first and the last two values are 0: extraction software sets them so.
     """
-    response = np.pad(order.response / seconds, 2)
+    response = np.pad(order.response, 2)
     wavelength = order.first - 2 + np.arange(float(len(response)))
     none = np.zeros(len(response))
     return SENSITIVITY.build({"WAVELENGTH": wavelength, "SENSITIVITY": response, "ERROR": none})
 
 
-def write(folder: Path, grism: str, orders: Sequence[Order], shape: tuple[int, int], seconds: float) -> Path:
-    """Writes a configuration and its tables; returns the configuration.
+def write(folder: Path, name: str, orders: Sequence[Order], shape: tuple[int, int]) -> Path:
+    """Writes tables and, after them, their configuration, each replaced in one rename; returns the configuration.
 
-    folder : where to;  grism, orders : its name, and its orders
-    shape  : ny, nx;  seconds : of the exposure that the orders' responses are of
+    folder : where to;  name : of its files;  orders : as of `sensitivity`;  shape : ny, nx
     """
-    files = [f"{grism}_{order.trace.order:+d}.fits" for order in orders]
+    files = [f"{name}_{order.trace.order:+d}.fits" for order in orders]
     for order, file in zip(orders, files, strict=True):
-        table_to_fits(folder / file, sensitivity(order, seconds), SENSITIVITY)
-    path = folder / f"{grism}.conf"
-    path.write_text(configuration(grism, [order.trace for order in orders], shape, files), encoding="utf-8")
+        table_to_fits(folder / file, sensitivity(order), SENSITIVITY)
+    path = folder / f"{name}.conf"
+    with user_files.staged(path) as temporary:
+        text = configuration(name, [order.trace for order in orders], shape, files)
+        temporary.write_text(text, encoding="utf-8")
     return path

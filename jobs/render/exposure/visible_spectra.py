@@ -4,6 +4,7 @@ An order puts a source's light far from its undispersed image: what is read is t
 its light to be on the detector, a rectangle for each order.
 
 visible_spectra   all that shines onto a detector
+orders            by which a grism puts it there
 beyond            how far beyond a detector sources lie whose light is on it
 bands             whose fluxes tell which sources are drawn
 """
@@ -55,29 +56,33 @@ def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     if exposure.psf:
         raise BadInput(f"exposure {exposure.exposure_id}: psf: spectra are drawn through the camera's own PSF alone")
     rows, settings = visible_sources.rows_of(rows, aim, mission), draw.settings_for(scene.accuracy)
-    found = dispersion.traces(exposure, aim.detector, mission, seed)
-    orders = tuple(
-        Order(
-            trace,
-            int(band.wavelength[0]),
-            band.response
-            * band.wavelength
-            * dispersion.throughput(exposure, trace.order, band.wavelength, aim.detector, mission),
-        )
-        for trace in found
-    )
-    sources, which = _sources(aim, rows, scene, _rectangles(found, aim.detector, band), seed)
+    found = orders(aim, mission, seed)
+    traced = tuple(order.trace for order in found)
+    sources, which = _sources(aim, rows, scene, _rectangles(traced, aim.detector, band), seed)
     left = dispersion.vignetted(exposure, aim.detector, sources.column, sources.row, mission)
     sources = replace(sources, electrons=sources.electrons * left)
     sun = solar(band.wavelength / 10.0, mission)
     own = spectra.of_rows(which, rows.galaxies, rows.stars, band, sun, (rows.library, rows.stellar))
-    nodes = images.nodes(found[0].first, found[0].last, settings.nodes)
+    nodes = images.nodes(traced[0].first, traced[0].last, settings.nodes)
     psf = dispersion.psf(aim.detector, nodes, mission, settings.positions)
     none = np.zeros(len(sources))
-    dispersed = Dispersed(own, orders, settings)
+    dispersed = Dispersed(own, found, settings)
     return Light(
         sources, none.astype(np.int64), none, psf, scene, dispersed=dispersed, of=which, let_through=left
     )  # fmt: skip
+
+
+def orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, ...]:
+    """Of the grism: what each detects of f_lambda on the scale of `sources.spectra`, A.
+
+    aim : the exposure and detector;  mission : the exposure's;  seed : of the request
+    """
+    dispersion, band, exposure = _of(aim), aim.band, aim.exposure
+    found = []
+    for trace in dispersion.traces(exposure, aim.detector, mission, seed):
+        light = dispersion.throughput(exposure, trace.order, band.wavelength, aim.detector, mission)
+        found.append(Order(trace, int(band.wavelength[0]), band.response * band.wavelength * light))
+    return tuple(found)
 
 
 def beyond(
