@@ -156,9 +156,22 @@ def test_a_vis_quadrant_as_it_is_read():
 
 def test_a_first_order_spectrum_is_512_pixels_long():
     """At the dispersion of Serrano et al. 2024."""
-    simulated = resolve(ladder=("SIM", *LADDER[:-1]))
-    length = simulated.value("nisp.rgs000.high", "Angstrom") - simulated.value("nisp.rgs000.low", "Angstrom")
-    assert length / simulated.value("nisp.rgs000.dispersion", "Angstrom / pix") == pytest.approx(512, abs=0.5)
+    for grism in ("RGS000", "RGS180"):
+        rows = [
+            row
+            for row in MISSION.rows("nisp.traces")
+            if (row["grism"], row["order"], row["axis"]) == (grism, "1", "along")
+        ]
+        length = sum(float(row["constant"]) for row in rows if row["power"] != "0")
+        assert length == pytest.approx(512, abs=0.5)
+        assert (float(rows[0]["last_nm"]) - float(rows[0]["first_nm"])) / length == pytest.approx(1.34, rel=1e-6)
+
+
+def test_what_the_table_of_traces_says_is_no_value_beside_it():
+    """A grism's ends and dispersion are the polynomials': a value of their own would be read by nobody."""
+    grisms = {row["grism"].lower() for row in MISSION.rows("nisp.traces")}
+    beside = {record.key.split(".")[-1] for record in read_all() if record.key.split(".")[1] in {*grisms, "grism"}}
+    assert beside == {"resolving_power"}
 
 
 def test_the_telescope_s_pupil():

@@ -25,7 +25,7 @@ def place(trace, column, row, wavelength):
 def test_the_first_order_has_the_missions_dispersion_and_the_zeroth_hardly_any(grism):
     found = {trace.order: trace for trace in traces.traces(grism, 0.0, DETECTOR, MISSION)}
     assert sorted(found) == [-1, 0, 1, 2]
-    low, high = (MISSION.value(f"nisp.{grism.lower()}.{end}", "Angstrom") for end in ("low", "high"))
+    low, high = {"BGS000": (9260.0, 13660.0)}.get(grism, (12060.0, 18920.0))
     wanted = {"RGS000": 13.4, "RGS180": 13.4, "BGS000": 12.4}[grism]
     length = np.hypot(*np.subtract(place(found[1], 1000, 1000, high), place(found[1], 1000, 1000, low)))
     # Within the field's gradients of 1 %.
