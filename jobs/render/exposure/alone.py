@@ -34,7 +34,7 @@ class Alone:
 
 
 def spectra(aim: Aim, rows: Rows, variant: Variant, seed: int, ids: Sequence[int] | None = None) -> Iterator[Alone]:
-    """One source after the other.  The frames of all of them add up to the noise-free one, to the last bit.
+    """One source after the other.  The 64-bit frames of all of them add up to the noise-free one.
 
     aim, rows, variant, seed : as of `render`;  ids : of the sources, None = all that may have light on the detector
     Errors : BadInput where nothing is spread out, or for a source that is not among them
