@@ -1,13 +1,15 @@
 """Every kind of image that NISP-S takes, by the jobs: four settings of the red grisms, the blue one, calibrations."""
 
+import grismconf
 import numpy as np
+import pyarrow.compute as pc
 import pytest
 from astropy.io import fits
 
 from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
-from jobs.render import masters, models, plan_exposures, render_exposures
+from jobs.render import grisms, masters, models, plan_exposures, render_exposures
 from jobs.render.products import read_back
 from jobs.request.from_toml import parse
 from lake_schema.errors import BadInput
@@ -205,6 +207,26 @@ def test_models_that_there_are_not_are_one_line_and_no_file(rendered, tmp_path, 
     assert line.startswith("models: ")
     assert message in line
     assert list(tmp_path.iterdir()) == []
+
+
+def test_grisms_of_an_exposure_are_as_its_spectra_were_drawn(rendered, tmp_path, capsys):
+    """Traces and the wheel's error; what has no spectra is one line and no file."""
+    arguments = ["--lake", str(rendered), "--out", str(tmp_path / "new"), "--exposure"]
+    for number, message in ((99, "no exposure 99"), (6, "exposure 6: NISP-S dark is no image of spectra")):
+        assert grisms.main([*arguments, str(number)]) == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / "new").exists()
+    assert grisms.main([*arguments, "3"]) == 0
+    found = grismconf.Config(str(tmp_path / "new" / "RGS000_000003_DET22.conf"))
+    here = (pc.field("exposure_id") == 3) & (pc.field("detector") == "DET22")
+    places = {row["id"]: row for row in read.version(rendered, "rendered_truth").rows(where=here).to_pylist()}
+    rows = read.version(rendered, "rendered_spectra").rows(where=here).to_pylist()
+    assert 1 in {row["order"] for row in rows}
+    for row in rows:
+        name, place = f"{row['order']:+d}" if row["order"] else "0", (places[row["id"]]["x"], places[row["id"]]["y"])
+        for axis, displaced in (("x", found.DISPX), ("y", found.DISPY)):
+            ends = [place["xy".index(axis)] + float(displaced(name, *place, t)) for t in (0.0, 1.0)]
+            assert ends == pytest.approx([row[f"{axis}_first"], row[f"{axis}_last"]], abs=0.01)
 
 
 def test_no_masters_are_made_of_spectra(rendered, folder, capsys):
