@@ -237,7 +237,7 @@ def _spectral_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
     edge = 0.5 * mission.value("plm.unvignetted_x", "arcsec")
     detector = replace(scene.detector, x=np.copysign(edge, -moved) + moved, y=0.0, rotation=0.0)
     scene = replace(scene, exposure_time_s=549.6, sky_rate=1.09, detector=detector, ramp="spectroscopic")
-    return frame, replace(scene, spread_sky=spread_sky.spread_sky(scene, Aim.of(exposure, detector)))
+    return frame, replace(scene, spread_sky=spread_sky.spread_sky(scene, Aim.of(exposure, detector), 1))
 
 
 def _of_ramp(frame: Frame, name: str) -> Frame:

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from jobs.fluxes import passbands
 from jobs.render import render_exposures
-from jobs.render.camera import detectors, traces
+from jobs.render.camera import detectors
 from jobs.render.channels.aim import Aim, electron_rate
 from jobs.render.dispersing import grism_files
 from jobs.render.dispersing.draw import Order
@@ -31,10 +31,7 @@ from lake_schema import command, user_files
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration, resolve
 from lake_schema.store import layout, read
-from lake_schema.tables.exposures import ExposureRow
 from lake_schema.units import LIGHT_ANGSTROM_S, UJY_CGS
-
-_CAMERA = "nisp"
 
 
 def nominal(grism: str, detector: str, mission: MissionConfiguration) -> Aim:
@@ -42,13 +39,8 @@ def nominal(grism: str, detector: str, mission: MissionConfiguration) -> Aim:
 
     grism, detector : names;  mission : whose wheel's error is left to whoever asks for the orders
     """
-    band = next(band for band, names in planned_exposures.GRISMS.items() if grism in names)
-    zero_point = planned_exposures.zero_point_of(_CAMERA, band, mission)
-    row = ExposureRow(
-        0, "NISP-S", _CAMERA, band, "science", 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, zero_point, "",
-        grism=grism, grism_angle=traces.direction(grism, _CAMERA, mission),
-    )  # fmt: skip
-    return Aim.of(row, detectors.detector(_CAMERA, detector, mission))
+    row = planned_exposures.unturned(grism, mission)
+    return Aim.of(row, detectors.detector(row.camera, detector, mission))
 
 
 def orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, ...]:
@@ -90,10 +82,10 @@ def _asked(options: argparse.Namespace) -> Iterator[tuple[str, Aim, MissionConfi
             if not options.detectors or name in options.detectors:
                 yield f"{aim.exposure.grism}_{options.exposure:06d}_{name}", aim, mission, seed
         return
-    mission = resolve().overridden_with({f"{_CAMERA}.grism_wheel_error": (0.0, "deg")})
-    names = options.detectors or [one.name for one in detectors.detectors(_CAMERA, mission)]
-    for grism in sorted({grism for names_ in planned_exposures.GRISMS.values() for grism in names_}):
-        for name in names:
+    for grism in sorted(grism for names in planned_exposures.GRISMS.values() for grism in names):
+        camera = planned_exposures.unturned(grism, resolve()).camera
+        mission = resolve(overrides={f"{camera}.grism_wheel_error": (0.0, "deg")})
+        for name in options.detectors or [one.name for one in detectors.detectors(camera, mission)]:
             yield f"{grism}_{name}", nominal(grism, name, mission), mission, 0
 
 

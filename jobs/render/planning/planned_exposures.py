@@ -2,6 +2,7 @@
 
 Exposure       what, where and when
 through_grism  with the grism whose spectra run at an angle
+unturned       through a grism as it is without a tilt
 table          exposures -> rows, with the sky, zero point and seeing of each
 """
 
@@ -17,7 +18,7 @@ import pyarrow as pa
 
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
-from jobs.render.camera import detectors, grism_wheel
+from jobs.render.camera import detectors, grism_wheel, traces
 from jobs.render.channels import image_types
 from jobs.render.effects.charge import ramp
 from jobs.render.planning import unrendered
@@ -27,7 +28,7 @@ from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import CAMERAS
-from lake_schema.tables.exposures import EXPOSURES
+from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 
 # What two exposures have in common whose random numbers would be the same, of one request of an exploration.
 _ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd", "grism", "grism_angle")
@@ -213,6 +214,18 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration) -
         "seeing": band.seeing if e.seeing is None else e.seeing,
         "zero_point": band.zero_point if e.zero_point is None else e.zero_point,
     }
+
+
+def unturned(grism: str, mission: MissionConfiguration) -> ExposureRow:
+    """An exposure of a second through a grism that is not turned, at nothing in particular.
+
+    grism : one of GRISMS;  mission : the mission database
+    """
+    camera, band = "nisp", next(band for band, names in GRISMS.items() if grism in names)
+    return ExposureRow(
+        0, "NISP-S", camera, band, "science", 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0,
+        zero_point_of(camera, band, mission), "", grism=grism, grism_angle=traces.direction(grism, camera, mission),
+    )  # fmt: skip
 
 
 def zero_point_of(prefix: str, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> float:
