@@ -78,8 +78,8 @@ RENDERED_SPECTRA = Table(
             "float64",
             "",
             "phys.size;arith.ratio",
-            "part of a first order's length on the detector beside which a trace of another source lies, noticed and "
-            "nearer than both are wide; of other orders null",
+            "part of a first order's length on the detector beside which a trace of another source lies, nearer than both "
+            "are wide and with at least a pixel's noise in a column: one sigma of a resolution element; of others null",
             0.0,
             1.0,
             nullable=True,

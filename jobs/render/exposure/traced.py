@@ -18,7 +18,7 @@ from jobs.fluxes.sources import GALAXY_KINDS, galaxies_of
 from jobs.fluxes.spectra import extinction, lines
 from jobs.render.channels.aim import Aim
 from jobs.render.dispersing.draw import Tally
-from jobs.render.effects.scene import NOTICEABLE, Scene
+from jobs.render.effects.scene import Scene
 from jobs.render.exposure.records import Rows
 from jobs.render.exposure.visible_sources import Light
 from jobs.render.sources import colours, galaxy_shapes
@@ -28,6 +28,9 @@ from lake_schema.units import LIGHT_ANGSTROM_S, PLANCK_ERG_S
 # Pixels of a trace that are compared at a time; places along a trace between which it is taken as straight; the widest
 # a trace is taken to be, half, pixels.
 _BIN, _PLACES, _WIDEST = 8, 33, 20.0
+# Electrons a column of a trace that counts as a contaminant, of a pixel's noise.  In an extraction that is as long as
+# wide, such as of a resolution element, it then brings at least as much light as there is noise: a bias of one sigma.
+MATTERS = 1.0
 
 Columns = dict[str, Any]
 
@@ -64,7 +67,7 @@ def traced(light: Light, tally: Tally, aim: Aim, rows: Rows, scene: Scene) -> Co
     source, at = np.nonzero(tally.electrons[:, by_order] > 0.0)
     which = by_order[at]
     paths = _paths(light, tally, source, which, aim)
-    part, beside = overlaps(paths, aim.detector.nx, NOTICEABLE * scene.pixel_noise)
+    part, beside = overlaps(paths, aim.detector.nx, MATTERS * scene.pixel_noise)
     seen = lines_of(light, source, paths, aim, rows, scene)
     first = paths.order == 1
     return {
@@ -122,15 +125,21 @@ def overlaps(paths: Paths, nx: int, least: float) -> tuple[Float, list[Int]]:
     order = np.argsort(at, kind="stable")
     path, at, row = path[order], at[order], row[order]
     ends = np.searchsorted(at, np.arange(at.max(initial=-1) + 2))
-    covered, pairs = np.zeros(len(paths.order)), [np.zeros((0, 2), np.int64)]
+    covered, sources = np.zeros(len(paths.order)), int(paths.source.max(initial=0)) + 1
+    before, found = np.zeros(0, np.int64), [np.zeros(0, np.int64)]
     for start, stop in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
         target, other = _near(paths, path[start:stop], row[start:stop], least)
-        covered[np.unique(target)] += 1.0
-        pairs.append(np.stack([target, paths.source[other]], axis=1))
+        beside = np.zeros(len(covered), bool)
+        beside[target] = True
+        covered += beside
+        # Most pairs go on from bin to bin: a pair is held where it begins.
+        pairs = np.unique(target * sources + paths.source[other])
+        found.append(np.setdiff1d(pairs, before, assume_unique=True))
+        before = pairs
     length = np.bincount(path, minlength=len(covered))
-    found = np.unique(np.concatenate(pairs), axis=0)
-    split = np.searchsorted(found[:, 0], np.arange(1, len(covered)))
-    return covered / np.maximum(length, 1), np.split(found[:, 1], split) if len(covered) else []
+    first, source = np.divmod(np.unique(np.concatenate(found)), sources)
+    split = np.searchsorted(first, np.arange(1, len(covered)))
+    return covered / np.maximum(length, 1), np.split(source, split) if len(covered) else []
 
 
 def _near(paths: Paths, path: Int, row: Float, least: float) -> tuple[Int, Int]:

@@ -7,7 +7,7 @@ import pytest
 
 from jobs.accuracy import DRAFT
 from jobs.render.channels.aim import Aim
-from jobs.render.exposure import alone
+from jobs.render.exposure import alone, traced
 from jobs.render.exposure.records import Rows, Variant
 from jobs.render.products import truth_table
 from lake_schema.errors import BadInput
@@ -66,7 +66,7 @@ def rows_of(image, least):
 def test_what_overlaps_is_what_models_show():
     """Contaminants of first orders, and how much of them: by where the light of each order of each source is drawn."""
     _, _, found = crowd()
-    least, wide = 0.1 * found.scene.pixel_noise, found.psf.fwhm / found.psf.pixel_scale
+    least, wide = traced.MATTERS * found.scene.pixel_noise, found.psf.fwhm / found.psf.pixel_scale
     seen = {
         (number, order): rows_of(image, least)
         for number, one in models().items() for order, image in one.orders.items() if image.any()

@@ -1,5 +1,6 @@
 """Truth of spectra: traces, electrons, what overlaps, how well lines are seen."""
 
+import tracemalloc
 from functools import cache
 
 import numpy as np
@@ -98,6 +99,37 @@ def test_overlaps_are_those_of_every_pair_of_traces(seed):
         wanted = covered / len(bins) if paths.order[i] == 1 and len(bins) else 0.0
         assert part[i] == pytest.approx(wanted)
         assert set(beside[i].tolist()) == (others if paths.order[i] == 1 else set())
+
+
+@pytest.mark.parametrize("n", [8000, pytest.param(50_000, marks=pytest.mark.nightly)])
+def test_a_crowd_fits_into_memory(n):
+    """Every pair is held once, not once a bin: of 5e4 sources there are 7e7 in all bins, of 16 bytes."""
+    rng, flat = np.random.default_rng(1), np.zeros(2)
+    along = [flat + [start, 512.0] for start in rng.uniform(-512, 2040, n).tolist()]
+    across = [flat + [row, 5.0] for row in rng.uniform(0, 2040, n).tolist()]
+    paths = Paths(np.arange(n), np.ones(n, np.int64), along, across, np.full(n, 1.5), np.full(n, 10.0))
+    tracemalloc.start()
+    part, beside = traced.overlaps(paths, 2040, 1.0)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 6e8 * n / 50_000
+    # A trace meets those that lie nearer than two widths, for half of its length on the average.
+    wanted = n * 1024 / 2552 * 6.0 / 2040
+    assert np.mean([len(some) for some in beside]) == pytest.approx(wanted, rel=0.1)
+    assert (part > 0.0).sum() == sum(len(some) > 0 for some in beside)
+
+
+@pytest.mark.parametrize(("times", "counts"), [(0.5, False), (2.0, True)])
+def test_a_neighbour_counts_that_brings_as_much_to_a_column_as_a_pixel_s_noise(times, counts):
+    """To ten pixels of a square of ten as much as the noise of their sum."""
+    x, y = [290.0, 320.0], [48.0, 48.5]
+    (row,) = (row for row in rows(spectroscopic.rendered([18.0], x[:1], y[:1])) if row["order"] == 1)
+    seen = min(row["x_last"], 639.0) - max(row["x_first"], 0.0)
+    mag = 18.0 - 2.5 * np.log10(times * pair().scene.pixel_noise / (row["drawn"] / seen))
+    found = spectroscopic.rendered([18.0, mag], x, y)
+    one, other = found.sources.ids.tolist()
+    beside = {row["id"]: row["contaminants"] for row in rows(found) if row["order"] == 1}
+    assert beside[one] == ([other] if counts else [])
 
 
 def test_nothing_shines():
