@@ -85,7 +85,7 @@ RENDERED_SPECTRA = Table(
             nullable=True,
         ),
         Column("contaminants", "list<int64>", "", "meta.id;src", "sources of these traces, ascending"),
-        Column("line_wavelength", "list<float64>", "Angstrom", "em.wl", "a first order's emission lines, in vacuum"),
+        Column("line_wavelength", "list<float64>", "Angstrom", "em.wl", "a first order's lines on the detector, in vacuum"),
         Column("line_expected", "list<float64>", "electron", "phot.count;em.line", "of each of these lines"),
         Column(
             "line_snr",

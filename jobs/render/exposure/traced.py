@@ -16,6 +16,7 @@ from scipy.ndimage import uniform_filter
 from jobs.fluxes.libraries import templates
 from jobs.fluxes.sources import GALAXY_KINDS, galaxies_of
 from jobs.fluxes.spectra import extinction, lines
+from jobs.render.camera.traces import Trace
 from jobs.render.channels.aim import Aim
 from jobs.render.dispersing.draw import Tally
 from jobs.render.effects.scene import Scene
@@ -181,11 +182,12 @@ def _bins(paths: Paths, nx: int) -> tuple[Int, Int, Float]:
 
 
 def lines_of(light: Light, source: Int, paths: Paths, aim: Aim, rows: Rows, scene: Scene) -> Columns:
-    """Columns of emission lines, of first orders of galaxies whose lines are known.
+    """Columns of emission lines on the detector, of first orders of galaxies whose lines are known.
 
     light, source, paths : sources, and those of the traces;  aim, rows, scene : as of `traced`
     Error : of the signal-to-noise ratio 20 %: a galaxy is taken as a Gaussian
     """
+    assert light.dispersed is not None
     names = ("line_wavelength", "line_expected", "line_snr")
     found: Columns = {name: [np.zeros(0)] * len(source) for name in names}
     known = _with_lines(light, source, paths, rows)
@@ -201,14 +203,23 @@ def lines_of(light: Light, source: Int, paths: Paths, aim: Aim, rows: Rows, scen
     area = scene.mission.value("plm.collecting_area", "cm2") * scene.exposure_time_s
     electrons = own.lines * dimmed * response * area * wavelength / (PLANCK_ERG_S * LIGHT_ANGSTROM_S)
     electrons *= light.let_through[source[at]][:, None]
+    (first,) = (order.trace for order in light.dispersed.orders if order.trace.order == 1)
     continuum = paths.level[at] / np.maximum(2.0 * paths.half[at], 1.0)
     noise = _image_area(light, source[at]) * (scene.pixel_noise**2 + continuum)
     snr = electrons / np.sqrt(noise[:, None] + np.maximum(electrons, 1e-30))
     for i, own_wave, own_light, own_snr in zip(at.tolist(), wavelength, electrons, snr, strict=True):
-        some = own_light > 0.0
+        some = (own_light > 0.0) & _on_detector(first, (paths.along[i], paths.across[i]), own_wave, aim)
         for name, values in zip(names, (own_wave, own_light, own_snr), strict=True):
             found[name][i] = values[some]
     return found
+
+
+def _on_detector(trace: Trace, path: tuple[Float, Float], wavelength: Float, aim: Aim) -> Bool:
+    """[n] Whether the middle of a line falls onto a pixel; path : columns and rows, polynomials of t."""
+    t = (wavelength - trace.first) / (trace.last - trace.first)
+    column, row = (np.polynomial.polynomial.polyval(t, part) for part in path)
+    here = (column > -0.5) & (column < aim.detector.nx - 0.5)
+    return np.asarray(here & (row > -0.5) & (row < aim.detector.ny - 0.5))
 
 
 def _with_lines(light: Light, source: Int, paths: Paths, rows: Rows) -> Bool:

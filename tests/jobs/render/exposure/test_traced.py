@@ -138,7 +138,7 @@ def test_nothing_shines():
     assert truth_table.spectra(spectroscopic.rendered(kind="dark", sky=0.0)) is None
 
 
-def with_line(flux):
+def with_line(flux, x=300.0, **options):
     """A galaxy of half-light radius 0.25" with H alpha of a flux at 1.6 um, as bright as its spectrum is."""
     column = dict.fromkeys(colours.GALAXY_COLUMNS, 0.0)
     column |= {
@@ -150,7 +150,19 @@ def with_line(flux):
     found = galaxies_of(table, library)
     (spectrum,) = stretches.galaxies(found, int(BAND.wavelength[0]), len(BAND.wavelength), library)
     mag = units.AB_UJY - 2.5 * np.log10(units.ujy_of_cgs(passbands.ab_flux(BAND, BAND.wavelength, spectrum)))
-    return spectroscopic.rendered([mag], [300.0], [48.0], body=column)
+    return spectroscopic.rendered([mag], [x], [48.0], body=column, **options)
+
+
+@pytest.mark.parametrize(("x", "there"), [(300.0, True), (520.0, False)])
+def test_a_line_beyond_the_detector_is_not_seen(x, there):
+    """At 1.6 um, 280 columns from the bluest light; of the same order others are on the detector."""
+    (row,) = (row for row in rows(with_line(2e-16, x)) if row["order"] == 1)
+    t = (np.array(row["line_wavelength"]) - row["wavelength_first"]) / (row["wavelength_last"] - row["wavelength_first"])
+    assert row["x_last"] > 640.0 or there
+    column = np.polynomial.polynomial.polyval(t, row["trace_x"])
+    assert ((column > -0.5) & (column < 639.5)).all()
+    assert (16000.0 in np.rint(row["line_wavelength"])) == there
+    assert len(row["line_snr"]) == len(row["line_expected"]) == len(column)
 
 
 def test_a_line_has_its_electrons_and_is_seen_as_well_as_is_required():
