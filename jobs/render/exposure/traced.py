@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from jobs.fluxes import passbands
 from jobs.fluxes.libraries import templates
 from jobs.fluxes.sources import GALAXY_KINDS, galaxies_of
 from jobs.fluxes.spectra import extinction, lines
@@ -23,8 +24,8 @@ from jobs.render.effects.scene import Scene
 from jobs.render.exposure.records import Rows
 from jobs.render.exposure.visible_sources import Light
 from jobs.render.sources import colours, galaxy_shapes
+from lake_schema import units
 from lake_schema.arrays import Bool, Float, Int
-from lake_schema.units import LIGHT_ANGSTROM_S, PLANCK_ERG_S
 
 # Pixels of a trace that are compared at a time; places along a trace between which it is taken as straight; the widest
 # a trace is taken to be, half, pixels.
@@ -200,8 +201,9 @@ def lines_of(light: Light, source: Int, paths: Paths, aim: Aim, rows: Rows, scen
     curve = extinction.milky_way(wavelength.ravel()).reshape(wavelength.shape)
     dimmed = own.magnification[:, None] * extinction.transmitted(curve, own.a_v[:, None])
     response = np.interp(wavelength, aim.band.wavelength, aim.band.response, left=0.0, right=0.0)
-    area = scene.mission.value("plm.collecting_area", "cm2") * scene.exposure_time_s
-    electrons = own.lines * dimmed * response * area * wavelength / (PLANCK_ERG_S * LIGHT_ANGSTROM_S)
+    # Square centimetres times seconds, by the exposure's own zero point, as all that is drawn.
+    area = aim.electrons / units.electron_rate(1.0, 1.0, passbands.log_width(aim.band))
+    electrons = own.lines * dimmed * response * area * wavelength / (units.PLANCK_ERG_S * units.LIGHT_ANGSTROM_S)
     electrons *= light.let_through[source[at]][:, None]
     (first,) = (order.trace for order in light.dispersed.orders if order.trace.order == 1)
     continuum = paths.level[at] / np.maximum(2.0 * paths.half[at], 1.0)

@@ -15,7 +15,7 @@ from jobs.render.exposure.traced import Paths
 from jobs.render.products import truth_table
 from jobs.render.sources import colours
 from lake_schema import units
-from tests.jobs.render import spectroscopic
+from tests.jobs.render import infrared, spectroscopic
 from tests.jobs.render.spectroscopic import strip
 
 BAND = passbands.load("nisp_red")
@@ -163,6 +163,17 @@ def test_a_line_beyond_the_detector_is_not_seen(x, there):
     assert ((column > -0.5) & (column < 639.5)).all()
     assert (16000.0 in np.rint(row["line_wavelength"])) == there
     assert len(row["line_snr"]) == len(row["line_expected"]) == len(column)
+
+
+def test_lines_are_of_the_exposure_s_own_zero_point():
+    """Twice as many electrons of a source, and of its lines."""
+    nominal = infrared.exposed(strip(), band="nisp_red")["zero_point"]
+    one, two = (
+        next(row for row in rows(with_line(2e-16, zero_point=nominal + more)) if row["order"] == 1)
+        for more in (0.0, 2.5 * np.log10(2.0))
+    )
+    assert two["expected"] == pytest.approx(2.0 * one["expected"], rel=1e-6)
+    np.testing.assert_allclose(two["line_expected"], 2.0 * np.array(one["line_expected"]), rtol=1e-6)
 
 
 def test_a_line_has_its_electrons_and_is_seen_as_well_as_is_required():
