@@ -99,6 +99,9 @@ def _paths(light: Light, tally: Tally, source: Int, which: Int, aim: Aim) -> Pat
     body = sources.shape >= 0
     half = np.full(len(sources), 0.5 * light.psf.fwhm / scale)
     half[body] += galaxy_shapes.half_light(sources.shapes.take(sources.shape[body])) / scale
+    for i in np.unique(source).tolist():
+        picture = None if body[i] else sources.picture_of(i)
+        half[i] += 0.0 if picture is None else picture.half_light / scale
     half += 0.5 * sources.length
     along, across, columns = [], [], []
     for i, m in zip(source.tolist(), which.tolist(), strict=True):

@@ -45,6 +45,17 @@ class Picture:
         return float(np.hypot(west[0] * columns + west[1] * rows, north[0] * columns + north[1] * rows))
 
     @property
+    def half_light(self) -> float:
+        """Radius about its middle that holds half of its light, arcsec, to half a pixel; 0 of a disc's structure."""
+        if self.is_structure:
+            return 0.0
+        step = 0.5 * float(np.abs(np.linalg.det(self.matrix))) ** 0.5
+        up, across = (np.arange(n) - (n - 1) / 2 for n in self.image.shape)
+        west, north = (line[0] * up[:, None] + line[1] * across for line in self.matrix)
+        light = np.bincount((np.hypot(west, north) / step).astype(int).ravel(), self.image.ravel()).cumsum()
+        return float((np.searchsorted(light, 0.5 * light[-1]) + 0.5) * step)
+
+    @property
     def is_structure(self) -> bool:
         """Light that is moved about on a disc, none by itself."""
         return self.thick is not None

@@ -7,15 +7,19 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from jobs.accuracy import DRAFT
 from jobs.fluxes import passbands, stretches
 from jobs.fluxes.libraries import templates
 from jobs.fluxes.sources import galaxies_of
+from jobs.render.camera import astrometry
+from jobs.render.channels.aim import Aim
 from jobs.render.exposure import traced
 from jobs.render.exposure.traced import Paths
 from jobs.render.products import truth_table
-from jobs.render.sources import colours
+from jobs.render.sources import colours, lensed_arcs
 from lake_schema import units
-from tests.jobs.render import infrared, spectroscopic
+from tests.jobs.render import fields, infrared, spectroscopic
+from tests.jobs.render.drawing import test_arcs
 from tests.jobs.render.spectroscopic import strip
 
 BAND = passbands.load("nisp_red")
@@ -136,6 +140,22 @@ def test_nothing_shines():
     found = spectroscopic.rendered(detector=strip())
     assert truth_table.spectra(found).num_rows == 0
     assert truth_table.spectra(spectroscopic.rendered(kind="dark", sky=0.0)) is None
+
+
+def test_arcs_are_as_wide_as_their_pictures():
+    """A galaxy and, five rows beside it, its image by a lens: four arcs 1.5" from the lens."""
+    row, x, y = spectroscopic.exposed(strip()), np.array([300.0]), np.array([48.0])
+    found = infrared.tables(strip(), row, 19.0, x, y, {"disk_half_light_radius": 0.1})
+    seen = Aim.of(fields.exposure(**row), strip()).wcs
+    place = (float(part[0]) for part in astrometry.sky_of_pixel(seen, x, y + 5.0))
+    blobs = [(1.5, 0.0, 1.0), (-1.5, 0.0, 1.0), (0.0, 1.5, 1.0), (0.0, -1.5, 1.0)]
+    arcs = test_arcs.lens(int(found[0]["id"][0].as_py()), *place, blobs)
+    (picture,) = lensed_arcs.arcs(arcs, found[0]["id"].to_numpy(), np.ones(1)).pictures
+    assert picture.half_light == pytest.approx(1.5, abs=0.06)
+    both = fields.rendered(row, strip(), found, spectroscopic.MISSION, DRAFT, lenses=arcs)
+    beside = {one["id"]: one["contaminants"] for one in rows(both) if one["order"] == 1}
+    galaxy, lens = sorted(beside)
+    assert beside == {galaxy: [lens], lens: [galaxy]}
 
 
 def with_line(flux, x=300.0, **options):
