@@ -16,7 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from jobs.fluxes import sources as checked
 from jobs.fluxes.passbands import Passband
+from jobs.fluxes.spectra import extinction, lines
 from jobs.render.camera import astrometry, traces
 from jobs.render.camera.detectors import Detector
 from jobs.render.camera.traces import Trace
@@ -175,9 +177,21 @@ def _selected(every: Listed, rows: Rows, aim: Aim, scene: Scene) -> Bool:
     f_nu = np.where(np.isnan(f_nu), seen, f_nu)
     bright = f_nu >= 10.0 ** (0.4 * (units.AB_UJY - scene.value("spectra.faintest", "mag")))
     if _HALPHA in rows.galaxies.column_names:
-        flux = np.nan_to_num(rows.galaxies[_HALPHA].to_numpy(zero_copy_only=False).astype(float))
-        bright[: len(flux)] |= flux >= scene.value("spectra.faintest_line", "erg / (s cm2)")
+        bright[: len(rows.galaxies)] |= _line_seen(rows) >= scene.value("spectra.faintest_line", "erg / (s cm2)")
     return np.asarray(bright[every.of] & (every.electrons > 0.0))
+
+
+def _line_seen(rows: Rows) -> Float:
+    """[galaxies] erg s-1 cm-2 of H alpha as it is observed: magnified, behind the Milky Way's dust; 0 of no line."""
+    flux = np.nan_to_num(rows.galaxies[_HALPHA].to_numpy(zero_copy_only=False).astype(float))
+    (some,) = np.nonzero(flux > 0.0)
+    shining = rows.galaxies.take(some)
+    flux[some] *= checked.magnification_of(shining)
+    if {"z_obs", "a_v"} <= set(shining.column_names):
+        vacuum = next(line.vacuum for line in lines.line_list() if line.column == _HALPHA)
+        at = lines.observed_wavelength(np.full(len(some), vacuum), checked.column(shining, "z_obs"), "vacuum")
+        flux[some] *= extinction.transmitted(extinction.milky_way(at), checked.column(shining, "a_v"))
+    return flux
 
 
 def _inside(x: Float, y: Float, electrons: Float, length: Float, boxes: Float) -> Bool:
