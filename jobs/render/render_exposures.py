@@ -297,7 +297,10 @@ def _rows(
     lenses = None
     if LENSES in inputs:
         deflection = catalogue_rows.deflection_of(inputs["galaxies"])
-        lenses = catalogue_rows.lenses(inputs[LENSES], task, deflection, least)
+        lenses = catalogue_rows.lenses(inputs[LENSES], task, deflection, farther, least)
+        versions = inputs["galaxies"], inputs["galaxy_fluxes"]
+        behind = catalogue_rows.with_lensed(found[0][:2], lenses, *versions, task, farther)
+        found[0] = *behind, found[0][2]
     return Rows(
         *found[0][:2],
         *found[1][:2],

@@ -60,6 +60,8 @@ def product_keys(
         # Of the sources stars alone have spikes; a grism puts any source's light far from it.
         if channel.pupil is not None or channel.disperses is not None:
             reaches["stars"] = max(FARTHEST, reach)
+        if channel.disperses is not None:
+            reaches[LENSES] = max(FARTHEST, reach)
         return [
             sorted({sums for cell in selection.within(task, deflection, reaches[name]) for sums in found.get(cell, ())})
             for name, (deflection, found) in files.items()

@@ -118,16 +118,46 @@ def bright(
     return found, light
 
 
-def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, least: float) -> pa.Table:
-    """Strong lenses that are seen within a task's circle.
+def lenses(
+    table: read.Version, task: Mapping[str, Any], deflection: float, farther: float, least: float
+) -> pa.Table:
+    """Strong lenses that are seen within a task's circle, and beyond it as far as others are read.
 
     deflection : largest of the galaxies, deg;  least : infinite where no source shows, as in `sources`
+    farther    : arcsec, as of `sources`
     table      : version of `strong_lenses`;  task : its row
     """
-    cells = selection.needed(task, deflection) if np.isfinite(least) else []
+    cells = selection.within(task, deflection, farther) if np.isfinite(least) else []
     about = table.in_cells(cells, GENERATION_ORDER, ["id", "ra_lensed", "dec_lensed"])
     ra, dec = (about[name].to_numpy() for name in ("ra_lensed", "dec_lensed"))
-    seen = about["id"].filter(pa.array(selection.near(ra, dec, (task["ra"], task["dec"]), task["radius"])))
+    reach = task["radius"] + farther / 3600.0
+    seen = about["id"].filter(pa.array(selection.near(ra, dec, (task["ra"], task["dec"]), reach)))
     # Pictures are large: only those of lenses that are seen are read.
     parts = [part["name"] for part in table.manifest["parts"] if not set(cells).isdisjoint(part["facts"][CELLS])]
     return table.rows(lensed_arcs.ARC_COLUMNS, parts if len(seen) else [], pc.field("id").isin(seen))
+
+
+def with_lensed(
+    found: tuple[pa.Table, pa.Table],
+    lenses: pa.Table,
+    catalogue: read.Version,
+    fluxes: read.Version,
+    task: Mapping[str, Any],
+    farther: float,
+) -> tuple[pa.Table, pa.Table]:
+    """(galaxies, their fluxes) with those behind lenses, that alone would be too faint to be seen from so far away.
+
+    found  : rows of the two tables, whose columns are read;  lenses : of `strong_lenses`
+    catalogue, fluxes : versions of the two tables;  task, farther : as of `lenses`
+    """
+    rows, light = found
+    missing = pc.unique(lenses["source_id"]).to_numpy()
+    missing = missing[~np.isin(missing, rows["id"].to_numpy())]
+    if not len(missing):
+        return found
+    # A lens and what lies behind it are of one cell.
+    cells = set(selection.within(task, deflection_of(catalogue), farther))
+    parts = [part["name"] for part in catalogue.manifest["parts"] if not cells.isdisjoint(part["facts"][CELLS])]
+    wanted = pc.field("id").isin(pa.array(missing))
+    more, its = (v.rows(t.column_names, parts, wanted) for v, t in ((catalogue, rows), (fluxes, light)))
+    return pa.concat_tables([rows, more]), pa.concat_tables([light, its])

@@ -19,6 +19,7 @@ from jobs.render.products import keys
 from jobs.render.sources import catalogue_rows, galaxy_shapes, selection
 from lake_schema import sky
 from tests.jobs.render import fields
+from tests.jobs.render.drawing import test_arcs
 from tests.jobs.render.exposure.test_render import field as field_of
 from tests.jobs.render.fields import MISSION, exposure, fluxes, galaxies, psf_of, small, stars
 
@@ -42,7 +43,7 @@ class Catalogue:
 
     def __post_init__(self):
         self.schema = self.rows.schema
-        self.manifest = {"parts": [{"facts": {"generation_cells": sorted(self.drawn)}}]}
+        self.manifest = {"parts": [{"name": "all", "facts": {"generation_cells": sorted(self.drawn)}}]}
 
     def deflection(self):
         return self.bent
@@ -192,6 +193,45 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
 
 
 @dataclass
+class Whole:
+    """A catalogue's rows of one file."""
+
+    table: pa.Table
+    cells: list
+
+    def __post_init__(self):
+        self.schema = self.table.schema
+        self.manifest = {"parts": [{"name": "all", "facts": {"generation_cells": self.cells}}], "facts": {}}
+
+    def rows(self, columns, parts, where):
+        return self.table.filter(where).select(columns) if parts else self.table.slice(0, 0).select(columns)
+
+    def deflection(self):
+        return 0.0
+
+
+@pytest.mark.parametrize(("farther", "seen"), [(0.0, 0), (300.0, 1)])
+def test_arcs_are_read_from_as_far_away_as_other_sources(farther, seen):
+    """A lens 200" beyond the circle, and what lies behind it, however faint."""
+    task = place()
+    where = task["ra"], task["dec"] + task["radius"] + 200.0 / 3600
+    cells = sky.cell_of([where[0]], [where[1]], 8)
+    behind = galaxies(*where)
+    row = test_arcs.lens(int(behind["id"][0].as_py()), *where, [(0.0, 0.0, 1.0)])
+    table, light = Whole(row, cells.tolist()), fluxes(behind, BAND, 1e-6)
+    table.in_cells = lambda wanted, order, columns: row.filter(pa.array(np.isin(cells, wanted)))
+    found = catalogue_rows.lenses(table, task, 0.0, farther, 1.0)
+    assert found["id"].to_pylist() == row["id"].to_pylist()[:seen]
+    none = behind.slice(0, 0), light.slice(0, 0)
+    versions = Whole(behind, cells.tolist()), Whole(light, cells.tolist())
+    rows, its = catalogue_rows.with_lensed(none, found, *versions, task, farther)
+    assert rows["id"].to_pylist() == its["id"].to_pylist() == behind["id"].to_pylist()[:seen]
+    again, _ = catalogue_rows.with_lensed((rows, its), found, *versions, task, farther)
+    assert again.equals(rows)
+    assert len(catalogue_rows.lenses(table, task, 0.0, farther, np.inf)) == 0
+
+
+@dataclass
 class Files:
     """A catalogue's files, or its fluxes': each of some cells."""
 
@@ -250,19 +290,24 @@ def test_a_product_is_of_what_it_may_show_from_far_away():
     some = [
         asdict(exposure(exposure_id=1, camera="vis", channel="VIS", psf="")),
         asdict(exposure(exposure_id=2, camera="lsstcam", channel="EXT", psf="")),
+        asdict(exposure(exposure_id=3, camera="nisp", channel="NISP-S", psf="")),
     ]
     tasks = [
         {**task, "exposure_id": 1, "detector": "3-4", "cells": 1},
         {**task, "exposure_id": 2, "detector": "R22_S11", "cells": 1},
+        {**task, "exposure_id": 3, "detector": "DET22", "cells": 1},
     ]
     found = []
-    for changed in ("", "stars", "galaxies"):
+    for changed in ("", "stars", "galaxies", "strong_lenses"):
         inputs = {}
-        for name, columns in (("galaxies", ("ra_lensed",)), ("stars", ()), ("galaxy_fluxes", ()), ("star_fluxes", ())):
+        tables = "galaxies", "stars", "galaxy_fluxes", "star_fluxes", "strong_lenses"
+        for name, columns in zip(tables, (("ra_lensed",), (), (), (), ()), strict=True):
             inputs[name] = Files(columns, cells, {"near": "a", "far": "b" if name == changed else "a"})
         facts = {"request": {}, "mission": "m", "code": "c"}
         found.append(keys.product_keys(facts, pa.Table.from_pylist(some), tasks, inputs, MISSION))
-    (vis, ext), (vis_stars, ext_stars), (vis_galaxies, ext_galaxies) = found
+    (vis, ext, spectra), (vis_stars, ext_stars, _), (vis_galaxies, ext_galaxies, _), lenses = found
+    assert lenses[:2] == [vis, ext]
+    assert lenses[2] != spectra
     assert vis_stars != vis
     assert ext_stars == ext
     assert vis_galaxies != vis
