@@ -167,7 +167,9 @@ class Scene:
     @property
     def pixel_noise(self) -> float:
         """Electrons rms of a pixel without a source: sky, dark current, reading."""
-        return float(np.sqrt(self.sky_electrons + self.dark_electrons + self.reading_noise**2))
+        # In the mean over the detector.
+        orders = 0.0 if self.spread_sky is None else float(self.spread_sky.mean())
+        return float(np.sqrt(max(self.sky_electrons + orders, 0.0) + self.dark_electrons + self.reading_noise**2))
 
     @property
     def reading_noise(self) -> float:

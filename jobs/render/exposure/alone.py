@@ -14,7 +14,7 @@ import numpy as np
 from jobs.render.channels.aim import Aim
 from jobs.render.dispersing import draw
 from jobs.render.dispersing.draw import Spectra
-from jobs.render.exposure import scene_of
+from jobs.render.exposure import scene_of, spread_sky
 from jobs.render.exposure.records import Rows, Variant
 from jobs.render.exposure.visible_spectra import visible_spectra
 from lake_schema.arrays import Float, Float32, Int
@@ -43,7 +43,7 @@ def spectra(aim: Aim, rows: Rows, variant: Variant, seed: int, ids: Sequence[int
     if aim.channel.disperses is None or not aim.sees_sky:
         what = f"{exposure.channel} {exposure.image_type}"
         raise BadInput(f"exposure {exposure.exposure_id}: {what} is no image of spectra")
-    light = visible_spectra(aim, rows, scene_of.of_aim(aim, variant), seed)
+    light = visible_spectra(aim, rows, spread_sky.with_sky(scene_of.of_aim(aim, variant), aim, seed), seed)
     sources, dispersed, psf = light.sources, light.dispersed, light.psf
     assert dispersed is not None
     assert psf is not None

@@ -49,7 +49,7 @@ def render(
     variant  : mission, accuracy, and the effects that are forced on or off;  seed : of the request
     """
     scene = replace(scene_of.of_aim(aim, variant), remembered=persistence.remembered(aim, rows.earlier, variant))
-    scene = replace(scene, spread_sky=spread_sky.spread_sky(scene, aim, seed))
+    scene = spread_sky.with_sky(scene, aim, seed)
     spread = aim.channel.disperses is not None and aim.sees_sky
     light = (visible_spectra if spread else visible_light)(aim, rows, scene, seed)
     limits.refuse_too_large(aim, light)

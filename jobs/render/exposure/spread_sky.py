@@ -4,12 +4,16 @@ A pixel at (x, y) sees by order m light of wavelength lambda from the undisperse
 
     B(x, y) = sum_m int S(lambda) T_m(lambda) V(x - X_m, y - Y_m) dlambda + thermal light
 
-S zodiacal light through the passband, T_m the orders' throughputs, V = 1 within the field stop and 0 beyond it.
+S zodiacal light through the passband, T_m the orders' throughputs, V what a grism that is turned lets through within the
+field stop, and 0 beyond it.  Thermal light is of the instrument as much as of the telescope and has no other orders.
 
 spread_sky   what this changes of the background of the passband
+with_sky     a scene that knows it
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -48,8 +52,17 @@ def spread_sky(scene: Scene, aim: Aim, seed: int) -> Frame | None:
         passed = photons * dispersion.throughput(aim.exposure, trace.order, band.wavelength, detector, mission)
         for wavelength, part in zip(middle, parts, strict=True):
             x, y = _offset(trace, column, row, float(wavelength))
-            out += float(passed[part].sum()) * _within(column - x, row - y, detector, mission)
+            seen = dispersion.vignetted(aim.exposure, detector, column - x, row - y, mission)
+            out += float(passed[part].sum()) * seen * _within(column - x, row - y, detector, mission)
     return out
+
+
+def with_sky(scene: Scene, aim: Aim, seed: int) -> Scene:
+    """The scene, with what a grism in the beam changes of its sky.
+
+    scene, aim, seed : as of `spread_sky`
+    """
+    return replace(scene, spread_sky=spread_sky(scene, aim, seed))
 
 
 def _offset(trace: Trace, column: Float, row: Float, wavelength: float) -> tuple[Float, Float]:

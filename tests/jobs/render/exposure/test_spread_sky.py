@@ -36,14 +36,15 @@ def exact(scene, aim, column, row):
         sign = -1.0 if own.upside_down else 1.0
         across = own.x + sign * 0.3 * (column - x - 1019.5)
         up = own.y + sign * 0.3 * (row - y - 1019.5)
+        light *= aim.channel.disperses.vignetted(aim.exposure, own, column - x, row - y, MISSION)
         total += light[(np.abs(across) <= 0.395 * 3600) & (np.abs(up) <= 0.58 * 3600)].sum()
     return total * scene.exposure_time_s
 
 
-@pytest.mark.parametrize("name", ["DET22", "DET14", "DET41"])
-def test_it_is_the_sum_over_orders_of_what_the_field_stop_lets_through(name):
+@pytest.mark.parametrize(("name", "angle"), [("DET22", 0.0), ("DET14", 0.0), ("DET41", 0.0), ("DET14", -4.0)])
+def test_it_is_the_sum_over_orders_of_what_the_field_stop_lets_through(name, angle):
     """Wavelengths 100 A apart: 2 % of what the second order brings."""
-    scene, aim, found = seen(name)
+    scene, aim, found = seen(name, angle=angle)
     for i, j in ((0, 0), (0, -1), (16, 16), (-1, 0), (-1, -1)):
         column, row = (np.linspace(0.0, 2039.0, n)[k] for n, k in ((found.shape[1], j), (found.shape[0], i)))
         assert found[i, j] == pytest.approx(exact(scene, aim, column, row), abs=0.002 * scene.sky_electrons)
@@ -54,6 +55,27 @@ def test_in_the_middle_other_orders_add_a_few_percent_and_at_the_edge_they_are_g
     scene, _, edge = seen("DET14")
     assert 0.03 < middle.max() / scene.sky_electrons < 0.08
     assert edge.min() < middle.max() - 0.01 * scene.sky_electrons
+
+
+@pytest.mark.parametrize("name", ["DET14", "DET44", "DET11", "DET41"])
+def test_a_turned_grism_vignettes_the_sky_as_sources(name):
+    """Of the pixels of a corner detector: less sky there than with the grism straight, where sources are dimmed."""
+    (scene, aim, straight), (_, turned, tilted) = seen(name), seen(name, angle=-4.0)
+    x, y = np.meshgrid(*(np.linspace(0.0, 2039.0, n) for n in straight.shape[::-1]))
+    left = turned.channel.disperses.vignetted(turned.exposure, turned.detector, x.ravel(), y.ravel(), MISSION)
+    lost = (straight - tilted).mean() / scene.sky_electrons
+    assert lost == pytest.approx(1.0 - left.mean(), abs=0.02)
+
+
+def test_the_noise_of_a_pixel_is_of_all_orders():
+    scene, aim, added = seen("DET22")
+    more = spread_sky.with_sky(scene, aim, 1).pixel_noise ** 2 - scene.pixel_noise**2
+    assert more == pytest.approx(added.mean())
+    # Pixels differ in area, too.
+    found = spectroscopic.rendered(truth=("sky",), forced={"pixel_area": False})
+    assert found.scene.pixel_noise**2 == pytest.approx(
+        found.maps["sky"].mean() + found.scene.dark_electrons + found.scene.reading_noise**2, rel=2e-3
+    )
 
 
 def test_no_sky_and_no_grism_change_nothing():
