@@ -1,6 +1,5 @@
 """NISP-S: what a file holds, where light of a source lies, which sources count, and what cannot be asked for."""
 
-import itertools
 from dataclasses import replace
 from functools import cache
 
@@ -12,7 +11,9 @@ from jobs.accuracy import DRAFT
 from jobs.fluxes import passbands
 from jobs.render.camera import detectors
 from jobs.render.channels import registry
-from jobs.render.exposure import persistence, visible_spectra
+from jobs.render.channels.aim import Aim
+from jobs.render.exposure import alone, persistence, visible_spectra
+from jobs.render.exposure.records import Rows, Variant
 from jobs.render.products import fits_files, read_back, truth_table
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
@@ -188,10 +189,15 @@ def test_a_pixel_is_sky_dark_and_noise():
 
 def test_neighbours_and_their_order_change_no_bit_of_another_s_light():
     mags, x, y = [18.0, 19.0, 20.0], [250.0, 300.0, 350.0], [20.0, 48.0, 70.0]
-    alone = [spectroscopic.rendered([m], [a], [b], accuracy=DRAFT) for m, a, b in zip(mags, x, y, strict=True)]
+    row, variant = spectroscopic.exposed(strip()), Variant(MISSION, DRAFT, {})
+    aim = Aim.of(fields.exposure(**row), strip())
+    frames = [
+        next(alone.spectra(aim, Rows(*infrared.tables(strip(), row, *one)), variant, 1)).frame
+        for one in zip(mags, x, y, strict=True)
+    ]
     together = spectroscopic.rendered(mags, x, y, accuracy=DRAFT)
-    np.testing.assert_allclose(together.noise_free, sum(one.noise_free.astype(float) for one in alone), atol=1e-3)
-    assert together.drawn.sum() == pytest.approx(sum(float(one.drawn.sum()) for one in alone), rel=1e-9)
+    np.testing.assert_array_equal(together.noise_free, sum(frames).astype(np.float32))
+    assert together.drawn.sum() == pytest.approx(sum(float(frame.sum()) for frame in frames), rel=1e-6)
 
 
 def test_layers_of_orders_add_up_to_the_frame():
@@ -269,8 +275,21 @@ def test_what_cannot_be_drawn_is_refused(change, said):
         spectroscopic.rendered([18.0], [300.0], [48.0], **change)
 
 
-@pytest.mark.parametrize(("angle", "mag"), list(itertools.product((0.0, 30.0), (2.0,))))
-def test_extremes(angle, mag):
-    """A star of AB 2, whose zeroth order is on the strip, and a grism turned by 30 deg."""
-    found = spectroscopic.rendered([mag], [1400.0], [48.0], angle=angle)
-    assert np.isfinite(infrared.electrons(found)).all()
+def test_a_star_of_ab_2_in_order_0_fills_its_pixels():
+    """And no others: of the strip half is as dark as without it."""
+    found = spectroscopic.rendered([2.0], [1400.0], [48.0], truth=("saturation", "order_0"))
+    (row,) = (row for row in truth_table.spectra(found).to_pylist() if row["order"] == 0)
+    column, line = (round(row[f"{axis}_first"] / 2 + row[f"{axis}_last"] / 2) for axis in "xy")
+    assert found.maps["saturation"][line, column] == 1
+    assert found.maps["order_0"].sum() == pytest.approx(row["drawn"], rel=1e-5)
+    assert row["drawn"] > 1e8
+    signal, full = infrared.electrons(found), found.scene.value("full_well", "electron")
+    assert -100.0 < signal.min() < signal.max() < 1.5 * full
+    assert found.maps["saturation"].mean() < 0.5
+
+
+def test_a_grism_that_is_turned_by_30_deg_puts_order_0_elsewhere():
+    found = spectroscopic.rendered([2.0], [1400.0], [48.0], angle=30.0, truth=("order_0",))
+    assert found.maps["order_0"].sum() == 0.0
+    straight = spectroscopic.rendered([2.0], [1400.0], [48.0], truth=("order_0",))
+    assert straight.maps["order_0"].sum() > 1e8

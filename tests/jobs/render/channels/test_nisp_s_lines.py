@@ -41,7 +41,7 @@ def unbiased(found):
 
 
 def test_fluxes_of_lines_are_measured_without_a_bias():
-    unbiased(pulls(strip(nx=840, ny=600), SEED))
+    unbiased(pulls(strip(nx=840, ny=1500), SEED))
 
 
 @pytest.mark.nightly
