@@ -348,19 +348,23 @@ def _drawn_again(
     mission: MissionConfiguration,
     seed: int,
 ) -> Earlier:
-    least = persistence.least_flux(exposed, before)
+    detector = detectors.detector(before.camera, task["detector"], mission)
+    aim = Aim.of(before, detector, passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], before.band), seed)
+    least = persistence.least_flux(exposed, before, persistence.brightest_column(aim, mission))
+    beyond = visible_spectra.beyond(before, detector, mission, aim.band)
+    farther = max(beyond - aim.channel.margin(detector.section, mission), 0.0)
+    # In images their colours are taken as flat.
+    spread = aim.channel.disperses is not None
     found = [
-        catalogue_rows.bright(inputs[rows], inputs[fluxes], task, columns, before.band, least)
+        catalogue_rows.bright(inputs[rows], inputs[fluxes], task, columns, before.band, least, farther)
         for rows, fluxes, columns in (
-            # Their colours are taken as flat.
-            ("galaxies", "galaxy_fluxes", visible_sources.SHAPE_COLUMNS),
+            ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS if spread else visible_sources.SHAPE_COLUMNS),
             ("stars", "star_fluxes", visible_sources.STAR_COLUMNS),
         )
     ]
-    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], before.band)
-    detector = detectors.detector(before.camera, task["detector"], mission)
+    library = library_of(lake, inputs["galaxy_fluxes"].manifest["facts"])
     stellar = stars_of(lake, inputs["star_fluxes"].manifest["facts"])
-    return Earlier(Aim.of(before, detector, band, seed), Rows(*found[0], *found[1], stellar=stellar))
+    return Earlier(aim, Rows(*found[0], *found[1], library=library, stellar=stellar))
 
 
 def truth_work(lake: Path, facts: Json) -> Output:

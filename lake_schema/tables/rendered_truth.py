@@ -78,14 +78,15 @@ RENDERED_SPECTRA = Table(
             "float64",
             "",
             "phys.size;arith.ratio",
-            "part of a first order's length on the detector beside which a trace of another source lies, nearer than both "
-            "are wide and with at least a pixel's noise in a column: one sigma of a resolution element; of others null",
+            "part of a first order's length on the detector beside which a trace of another source lies, nearer than "
+            "both are wide and with at least a pixel's noise in a column: one sigma of a resolution element; of other "
+            "orders null",
             0.0,
             1.0,
             nullable=True,
         ),
         Column("contaminants", "list<int64>", "", "meta.id;src", "sources of these traces, ascending"),
-        Column("line_wavelength", "list<float64>", "Angstrom", "em.wl", "a first order's lines on the detector, in vacuum"),
+        Column("line_wavelength", "list<float64>", "Angstrom", "em.wl", "of a first order's lines that are on it"),
         Column("line_expected", "list<float64>", "electron", "phot.count;em.line", "of each of these lines"),
         Column(
             "line_snr",

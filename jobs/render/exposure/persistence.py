@@ -2,14 +2,15 @@
 
 No exposure needs the image of another, so that they are rendered in any order: what is left is a function of the
 planned exposures and the catalogue alone.  Of an earlier exposure are drawn the stars and galaxies that leave
-something, its sky and its lamp; of one that nothing renders, and of spectra, its mean sky alone counts.
+something, its sky and its lamp, through a grism as they were; of one that nothing renders its mean sky alone counts.
 Error : cosmic rays, moving bodies and lensed arcs of earlier exposures are not drawn again.  A pixel that a hit gave
-        2300 e- lacks 10 e- of what it leaves after 134 s
+        2300 e- lacks 10 e- of what it leaves after 134 s.  Of a spectrum a source that is too faint to be drawn again
+        counts as flat: a line that has more than `_LEAST` electrons of its own is missed with it
 
 earlier_of        the tasks before a task
 window            how long before, days
 is_drawn          whether an earlier exposure's sources count
-least_flux        f_nu of the faintest source of an earlier exposure that is drawn again
+brightest_column  of a source, part of its light;  least_flux   f_nu of the faintest source that is drawn again
 remembered        what they left
 """
 
@@ -25,14 +26,17 @@ import numpy as np
 
 from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim, electron_rate
+from jobs.render.dispersing import draw as dispersing
 from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.settings import settings_for
 from jobs.render.effects.charge import ramp
 from jobs.render.effects.charge.persistence import Traps
 from jobs.render.effects.scene import Frame, Scene
-from jobs.render.exposure import scene_of, visible_sources
+from jobs.render.exposure import scene_of, spread_sky, visible_sources
 from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
+from jobs.render.exposure.visible_spectra import visible_spectra
 from jobs.render.psf.model import Psf
+from jobs.render.sources import solar_system
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
@@ -46,6 +50,10 @@ _STARLESS = ("bias", "dark", "flat", "charge_injection")
 # out; more where more time has passed.  A star of so many leaves 0.8 e- in a pixel; of two exposures of the demo's sky
 # before one, 1.2 e- are missed in a pixel at the most.
 _LEAST, _LEFT_OUT, _SECONDS = 400.0, 300.0, 134.0
+# Of a point's light in an image, in its brightest column: a column of a spectrum that has as much leaves as much.
+_COLUMN = 0.5
+# Of the brightest column that counts, what stamps of spectra leave out in a row at their edge.
+_EDGE = 0.1
 # Electrons that light brings to some pixel at least, to be worth a look: ten leave 0.05.
 _WORTH = 10.0
 
@@ -114,14 +122,8 @@ def window(camera: str, mission: MissionConfiguration) -> float:
 
 
 def is_drawn(before: ExposureRow) -> bool:
-    """Whether an earlier exposure is drawn again; else its mean sky counts.
-
-    Error : of spectra that of the brightest sources, some 1e4 pixels of a few e-, is left out
-    """
-    if registry.effects_or_none(before.channel, before.image_type) is None:
-        return False
-    channel = registry.CHANNELS[before.channel]
-    return channel.disperses is None or not channel.sees_sky(before.image_type)
+    """Whether an earlier exposure is drawn again; else its mean sky counts."""
+    return registry.effects_or_none(before.channel, before.image_type) is not None
 
 
 def delay(exposure: ExposureRow, before: ExposureRow) -> float:
@@ -132,11 +134,34 @@ def delay(exposure: ExposureRow, before: ExposureRow) -> float:
     return seconds
 
 
-def least_flux(exposure: ExposureRow, before: ExposureRow) -> float:
-    """f_nu of the faintest source that is drawn again, microjansky; infinite where none shone."""
+def brightest_column(aim: Aim, mission: MissionConfiguration) -> float:
+    """Part of a point's light in its brightest column: of all orders' where a grism spreads it out, of flat f_nu.
+
+    aim : the exposure and detector;  mission : the mission database
+    """
+    dispersion, band = aim.channel.disperses, aim.band
+    if dispersion is None or not aim.sees_sky:
+        return _COLUMN
+    detected, found = band.response / band.wavelength, 0.0
+    for trace in dispersion.traces(aim.exposure, aim.detector, mission):
+        throughput = dispersion.throughput(aim.exposure, trace.order, band.wavelength, aim.detector, mission)
+        middle = trace.polynomials((aim.detector.nx - 1) / 2, (aim.detector.ny - 1) / 2)
+        pixels = float(np.hypot(*(part[1:].sum() for part in middle)))
+        wide = max(round((trace.last - trace.first) / max(pixels, 1e-6)), 1)
+        light = np.cumsum(np.pad(detected * throughput, (wide, wide)))
+        found = max(found, float((light[wide:] - light[:-wide]).max()) / float(detected.sum()))
+    return found
+
+
+def least_flux(exposure: ExposureRow, before: ExposureRow, column: float = _COLUMN) -> float:
+    """f_nu of the faintest source that is drawn again, microjansky; infinite where none shone.
+
+    exposure, before : the later and the earlier;  column : `brightest_column` of the earlier
+    """
     if not registry.CHANNELS[before.channel].sees_sky(before.image_type):
         return float("inf")
-    return _LEAST * _older(exposure, before) / (electron_rate(before) * before.exposure_time_s)
+    least = _LEAST * _COLUMN / column
+    return least * _older(exposure, before) / (electron_rate(before) * before.exposure_time_s)
 
 
 def _older(exposure: ExposureRow, before: ExposureRow) -> float:
@@ -168,8 +193,10 @@ def _charge(before: Earlier | EarlierSky, variant: Variant, older: float) -> Fra
     if isinstance(before, EarlierSky):
         shines = before.exposure.image_type not in _STARLESS
         return np.asarray(shines * before.exposure.sky * before.exposure.exposure_time_s)
-    aim, scene = before.aim, scene_of.of_aim(before.aim, variant)
-    frame = _sources(aim, before.rows, scene, older)
+    aim = before.aim
+    scene = spread_sky.with_sky(scene_of.of_aim(aim, variant), aim)
+    spread = aim.channel.disperses is not None and aim.sees_sky
+    frame = (_spectra if spread else _sources)(aim, before.rows, scene, older)
     for effect in aim.effects:
         if effect is aim.channel.remembers:
             break
@@ -177,6 +204,18 @@ def _charge(before: Earlier | EarlierSky, variant: Variant, older: float) -> Fra
         if not effect.fixed and effect.applied(scene) and effect.contribution(scene) > _WORTH:
             frame = effect.apply(frame, *effect.parameters(scene), rng=np.random.default_rng(0))
     return frame
+
+
+def _spectra(aim: Aim, rows: Rows, scene: Scene, older: float) -> Frame:
+    """Orders of the sources that leave something; with the colours and lines that they have."""
+    light = visible_spectra(aim, replace(rows, bodies=solar_system.nobody), scene, 0)
+    assert light.dispersed is not None
+    assert light.psf is not None
+    least = _LEAST * _COLUMN * older
+    # With a noise of one these are electrons.
+    settings = replace(light.dispersed.settings, faint=least, edge=_EDGE * least)
+    dispersed = replace(light.dispersed, settings=settings)
+    return dispersing.draw(light.sources, dispersed, light.psf, (aim.detector.ny, aim.detector.nx), 1.0)
 
 
 def _sources(aim: Aim, rows: Rows, scene: Scene, older: float) -> Frame:

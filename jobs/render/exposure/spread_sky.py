@@ -4,8 +4,8 @@ A pixel at (x, y) sees by order m light of wavelength lambda from the undisperse
 
     B(x, y) = sum_m int S(lambda) T_m(lambda) V(x - X_m, y - Y_m) dlambda + thermal light
 
-S zodiacal light through the passband, T_m the orders' throughputs, V what a grism that is turned lets through within the
-field stop, and 0 beyond it.  Thermal light is of the instrument as much as of the telescope and has no other orders.
+S zodiacal light through the passband, T_m the orders' throughputs, V what a grism that is turned lets through
+within the field stop, and 0 beyond it.  Thermal light is taken as even, and of no other orders.
 
 spread_sky   what this changes of the background of the passband
 with_sky     a scene that knows it

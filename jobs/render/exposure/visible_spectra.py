@@ -191,7 +191,7 @@ def _line_seen(rows: Rows) -> Float:
         vacuum = next(line.vacuum for line in lines.line_list() if line.column == _HALPHA)
         at = lines.observed_wavelength(np.full(len(some), vacuum), checked.column(shining, "z_obs"), "vacuum")
         flux[some] *= extinction.transmitted(extinction.milky_way(at), checked.column(shining, "a_v"))
-    return flux
+    return np.asarray(flux)
 
 
 def _inside(x: Float, y: Float, electrons: Float, length: Float, boxes: Float) -> Bool:

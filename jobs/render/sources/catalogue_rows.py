@@ -102,14 +102,15 @@ def bright(
     columns: Sequence[str],
     band: str,
     least: float,
+    farther: float = 0.0,
 ) -> tuple[pa.Table, pa.Table]:
     """(rows of a catalogue that are seen within a task's circle and shine brightly, their fluxes).
 
-    least : microjansky; infinite where no source shows
+    least : microjansky; infinite where no source shows;  farther : how far beyond the circle they are seen, arcsec
     catalogue, fluxes : versions of the two tables;  task : its row
     columns : that are wanted;  band : whose fluxes are
     """
-    cells = selection.needed(task, deflection_of(catalogue)) if np.isfinite(least) else []
+    cells = selection.within(task, deflection_of(catalogue), farther) if np.isfinite(least) else []
     light = fluxes.in_cells(cells, GENERATION_ORDER, ["id", f"f_nu_{band}"])
     light = light.filter(pc.greater_equal(light[f"f_nu_{band}"], least))
     # Fluxes are small: only the parts of the catalogue that have some of these are read.
@@ -118,9 +119,7 @@ def bright(
     return found, light
 
 
-def lenses(
-    table: read.Version, task: Mapping[str, Any], deflection: float, farther: float, least: float
-) -> pa.Table:
+def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, farther: float, least: float) -> pa.Table:
     """Strong lenses that are seen within a task's circle, and beyond it as far as others are read.
 
     deflection : largest of the galaxies, deg;  least : infinite where no source shows, as in `sources`

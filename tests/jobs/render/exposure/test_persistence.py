@@ -14,12 +14,14 @@ from jobs.render.exposure import persistence
 from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
 from jobs.render.psf import euclid
 from lake_schema.errors import BadInput, OutOfRange
-from tests.jobs.render import fields, infrared
+from tests.jobs.render import fields, infrared, spectroscopic
 from tests.jobs.render.fields import MISSION, small
 
 DETECTOR = small("nisp", "DET22", 96)
 TRAPS = Traps(120.0, 150.0, 2e4, -0.9, 100.0, 87.24, 1.3e5)
 SECOND = 1.0 / 86400.0
+# Without bodies that move.
+STRIP, QUIET = spectroscopic.strip(), spectroscopic.MISSION
 
 
 def earlier(before, mags, x, y, **columns):
@@ -94,11 +96,49 @@ def test_a_flat_leaves_its_light_a_dark_nothing():
     assert (left(earlier(134.0, [], [], [], kind="dark", sky=0.0)) == 0.0).all()
 
 
-def test_the_sky_of_a_spectrum_leaves_something():
+def spectrum_before(before, mags, x, y):
+    """Spectra so many seconds before an image of the same strip: (now, earlier, what they were as an image)."""
+    columns = {"mjd": infrared.MJD - before * SECOND, "number": 9, "sky": 1.09}
+    row = spectroscopic.exposed(STRIP, **columns)
+    now = Aim.of(fields.exposure(**infrared.exposed(STRIP)), STRIP)
+    aim = Aim.of(fields.exposure(**row), STRIP)
+    bright = persistence.least_flux(now.exposure, aim.exposure, persistence.brightest_column(aim, QUIET))
+    some = 10 ** (-0.4 * (mags - 23.9)) >= bright
+    assert 0 < some.sum() < len(mags)
+    earlier = Earlier(aim, Rows(*infrared.tables(STRIP, row, mags[some], x[some], y[some])))
+    return now, earlier, spectroscopic.rendered(mags, x, y, detector=STRIP, truth=("sky",), **columns)
+
+
+@pytest.mark.parametrize("before", [700.0, pytest.param(3000.0, marks=pytest.mark.nightly)])
+def test_traces_leave_what_whole_spectra_leave(before):
+    """All orders of all sources against those of the bright ones alone: 1.5 e- in any pixel, of 30 and more."""
+    rng = np.random.default_rng(2)
+    count = 250
+    x, y, mags = rng.uniform(-1200.0, 1800.0, count), rng.uniform(0, 96, count), rng.uniform(12.0, 23.0, count)
+    now, earlier, whole = spectrum_before(before, mags, x, y)
+    light = whole.noise_free.astype(float) + whole.maps["sky"]
+    expected = TRAPS.left(light, before, infrared.TIME)
+    found = persistence.remembered(now, (earlier,), Variant(QUIET, SURVEY, {}))
+    even = TRAPS.left(np.array([1.09 * spectroscopic.TIME]), before, infrared.TIME)[0]
+    print("left at most", expected.max() - even, "missed at most", np.abs(found - expected).max())
+    assert expected.max() > even + 5.0
+    assert np.abs(found - expected).max() < 1.5
+    np.testing.assert_array_equal(found, persistence.remembered(now, (earlier,), Variant(QUIET, SURVEY, {})))
+
+
+def test_the_brightest_column_of_a_point():
+    """Half of an image; of a grism that of order 0, in ten columns, or a five-hundredth part of the first."""
+    _, earlier, _ = spectrum_before(700.0, np.array([15.0, 23.0]), np.array([300.0, 300.0]), np.array([40.0, 60.0]))
+    assert 1.0 / 512 < persistence.brightest_column(earlier.aim, QUIET) < 0.02
+    image = Aim.of(fields.exposure(**infrared.exposed(DETECTOR)), DETECTOR)
+    assert persistence.brightest_column(image, MISSION) == 0.5
+
+
+def test_the_sky_of_what_nothing_renders_leaves_something():
     """1.1 e- of 600 e- 400 s before, all over; a dark's nothing."""
     row = infrared.exposed(DETECTOR, mjd=infrared.MJD - 400 * SECOND, number=9, seconds=550.0, sky=1.09)
     spectrum = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red"})
-    assert not persistence.is_drawn(spectrum)
+    assert persistence.is_drawn(spectrum)
     assert persistence.is_drawn(fields.exposure(**row))
     found = left(EarlierSky(spectrum))
     np.testing.assert_allclose(found, 1.1, atol=0.15)

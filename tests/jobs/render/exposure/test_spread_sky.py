@@ -60,7 +60,7 @@ def test_in_the_middle_other_orders_add_a_few_percent_and_at_the_edge_they_are_g
 @pytest.mark.parametrize("name", ["DET14", "DET44", "DET11", "DET41"])
 def test_a_turned_grism_vignettes_the_sky_as_sources(name):
     """Of the pixels of a corner detector: less sky there than with the grism straight, where sources are dimmed."""
-    (scene, aim, straight), (_, turned, tilted) = seen(name), seen(name, angle=-4.0)
+    (scene, _, straight), (_, turned, tilted) = seen(name), seen(name, angle=-4.0)
     x, y = np.meshgrid(*(np.linspace(0.0, 2039.0, n) for n in straight.shape[::-1]))
     left = turned.channel.disperses.vignetted(turned.exposure, turned.detector, x.ravel(), y.ravel(), MISSION)
     lost = (straight - tilted).mean() / scene.sky_electrons

@@ -108,9 +108,9 @@ def test_overlaps_are_those_of_every_pair_of_traces(seed):
 @pytest.mark.parametrize("n", [8000, pytest.param(50_000, marks=pytest.mark.nightly)])
 def test_a_crowd_fits_into_memory(n):
     """Every pair is held once, not once a bin: of 5e4 sources there are 7e7 in all bins, of 16 bytes."""
-    rng, flat = np.random.default_rng(1), np.zeros(2)
-    along = [flat + [start, 512.0] for start in rng.uniform(-512, 2040, n).tolist()]
-    across = [flat + [row, 5.0] for row in rng.uniform(0, 2040, n).tolist()]
+    rng = np.random.default_rng(1)
+    along = [np.array([start, 512.0]) for start in rng.uniform(-512, 2040, n)]
+    across = [np.array([row, 5.0]) for row in rng.uniform(0, 2040, n)]
     paths = Paths(np.arange(n), np.ones(n, np.int64), along, across, np.full(n, 1.5), np.full(n, 10.0))
     tracemalloc.start()
     part, beside = traced.overlaps(paths, 2040, 1.0)
@@ -177,7 +177,9 @@ def with_line(flux, x=300.0, **options):
 def test_a_line_beyond_the_detector_is_not_seen(x, there):
     """At 1.6 um, 40 columns from the undispersed place; half of the order is on the detector."""
     (row,) = (row for row in rows(with_line(2e-16, x)) if row["order"] == 1)
-    t = (np.array(row["line_wavelength"]) - row["wavelength_first"]) / (row["wavelength_last"] - row["wavelength_first"])
+    t = (np.array(row["line_wavelength"]) - row["wavelength_first"]) / (
+        row["wavelength_last"] - row["wavelength_first"]
+    )
     assert row["x_last"] > 640.0 or there
     column = np.polynomial.polynomial.polyval(t, row["trace_x"])
     assert ((column > -0.5) & (column < 639.5)).all()
