@@ -351,7 +351,7 @@ def _drawn_again(
     detector = detectors.detector(before.camera, task["detector"], mission)
     aim = Aim.of(before, detector, passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], before.band), seed)
     least = persistence.least_flux(exposed, before, persistence.brightest_column(aim, mission))
-    beyond = visible_spectra.beyond(before, detector, mission, aim.band)
+    beyond = visible_spectra.beyond(before, detector, mission, aim.band, seed)
     farther = max(beyond - aim.channel.margin(detector.section, mission), 0.0)
     # In images their colours are taken as flat.
     spread = aim.channel.disperses is not None

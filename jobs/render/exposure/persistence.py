@@ -143,7 +143,8 @@ def brightest_column(aim: Aim, mission: MissionConfiguration) -> float:
     if dispersion is None or not aim.sees_sky:
         return _COLUMN
     detected, found = band.response / band.wavelength, 0.0
-    for trace in dispersion.traces(aim.exposure, aim.detector, mission):
+    # An error of the wheel turns orders and leaves their length.
+    for trace in dispersion.traces(aim.exposure, aim.detector, mission, 0):
         throughput = dispersion.throughput(aim.exposure, trace.order, band.wavelength, aim.detector, mission)
         middle = trace.polynomials((aim.detector.nx - 1) / 2, (aim.detector.ny - 1) / 2)
         pixels = float(np.hypot(*(part[1:].sum() for part in middle)))
@@ -168,11 +169,11 @@ def _older(exposure: ExposureRow, before: ExposureRow) -> float:
     return delay(exposure, before) / _SECONDS
 
 
-def remembered(aim: Aim, earlier: Sequence[Earlier | EarlierSky], variant: Variant) -> Frame | None:
+def remembered(aim: Aim, earlier: Sequence[Earlier | EarlierSky], variant: Variant, seed: int) -> Frame | None:
     """[ny, nx] electrons that earlier exposures leave in one; None = nothing.
 
     aim     : the exposure and detector;  earlier : of the same detector
-    variant : mission, accuracy and the effects that are forced on or off
+    variant : mission, accuracy and the effects that are forced on or off;  seed : of the request
     """
     if aim.channel.remembers is None or not earlier:
         return None
@@ -180,11 +181,11 @@ def remembered(aim: Aim, earlier: Sequence[Earlier | EarlierSky], variant: Varia
     left = np.zeros((aim.detector.ny, aim.detector.nx))
     for before in earlier:
         seconds = delay(aim.exposure, before.exposure), aim.exposure.exposure_time_s
-        left += traps.left(_charge(before, variant, _older(aim.exposure, before.exposure)), *seconds)
+        left += traps.left(_charge(before, variant, _older(aim.exposure, before.exposure), seed), *seconds)
     return left
 
 
-def _charge(before: Earlier | EarlierSky, variant: Variant, older: float) -> Frame:
+def _charge(before: Earlier | EarlierSky, variant: Variant, older: float, seed: int) -> Frame:
     """Expected electrons of its light: sources that leave something, sky and lamp [ny, nx]; or of a mean pixel [].
 
     Counted over its exposure time, as its signal is, of which the traps' parameters are told: what comes before a
@@ -194,9 +195,11 @@ def _charge(before: Earlier | EarlierSky, variant: Variant, older: float) -> Fra
         shines = before.exposure.image_type not in _STARLESS
         return np.asarray(shines * before.exposure.sky * before.exposure.exposure_time_s)
     aim = before.aim
-    scene = spread_sky.with_sky(scene_of.of_aim(aim, variant), aim)
-    spread = aim.channel.disperses is not None and aim.sees_sky
-    frame = (_spectra if spread else _sources)(aim, before.rows, scene, older)
+    scene = spread_sky.with_sky(scene_of.of_aim(aim, variant), aim, seed)
+    if aim.channel.disperses is not None and aim.sees_sky:
+        frame = _spectra(aim, before.rows, scene, older, seed)
+    else:
+        frame = _sources(aim, before.rows, scene, older)
     for effect in aim.effects:
         if effect is aim.channel.remembers:
             break
@@ -206,9 +209,9 @@ def _charge(before: Earlier | EarlierSky, variant: Variant, older: float) -> Fra
     return frame
 
 
-def _spectra(aim: Aim, rows: Rows, scene: Scene, older: float) -> Frame:
+def _spectra(aim: Aim, rows: Rows, scene: Scene, older: float, seed: int) -> Frame:
     """Orders of the sources that leave something; with the colours and lines that they have."""
-    light = visible_spectra(aim, replace(rows, bodies=solar_system.nobody), scene, 0)
+    light = visible_spectra(aim, replace(rows, bodies=solar_system.nobody), scene, seed)
     assert light.dispersed is not None
     assert light.psf is not None
     least = _LEAST * _COLUMN * older

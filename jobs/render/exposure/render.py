@@ -48,7 +48,7 @@ def render(
     aim      : the exposure and detector;  rows : catalogue rows that it may see
     variant  : mission, accuracy, and the effects that are forced on or off;  seed : of the request
     """
-    scene = replace(scene_of.of_aim(aim, variant), remembered=persistence.remembered(aim, rows.earlier, variant))
+    scene = replace(scene_of.of_aim(aim, variant), remembered=persistence.remembered(aim, rows.earlier, variant, seed))
     scene = spread_sky.with_sky(scene, aim, seed)
     spread = aim.channel.disperses is not None and aim.sees_sky
     light = (visible_spectra if spread else visible_light)(aim, rows, scene, seed)

@@ -218,7 +218,7 @@ def test_what_is_left_is_what_whole_images_leave(whole, folder):
     assert not any(isinstance(before, EarlierSky) for before in earlier)
     aim = replace(earlier[-1].aim, exposure=now)
     variant = Variant(mission, wanted(folder).accuracy, {})
-    found = persistence.remembered(aim, earlier, variant)
+    found = persistence.remembered(aim, earlier, variant, 5)
     traps, expected = Traps.of(scene_of.of_aim(aim, variant)), np.zeros_like(found)
     for number in BEFORE[5]:
         row = exposures[number]

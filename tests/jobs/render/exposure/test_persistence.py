@@ -35,7 +35,7 @@ def left(*before, **columns):
     aim = Aim.of(fields.exposure(**infrared.exposed(DETECTOR, **columns)), DETECTOR)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(euclid, "nisp_psf", lambda d, band, *_: infrared.psf_of(d, "euclid_h"))
-        return persistence.remembered(aim, before, Variant(MISSION, SURVEY, {}))
+        return persistence.remembered(aim, before, Variant(MISSION, SURVEY, {}), infrared.SEED)
 
 
 def test_the_formula():
@@ -118,12 +118,14 @@ def test_traces_leave_what_whole_spectra_leave(before):
     now, earlier, whole = spectrum_before(before, mags, x, y)
     light = whole.noise_free.astype(float) + whole.maps["sky"]
     expected = TRAPS.left(light, before, infrared.TIME)
-    found = persistence.remembered(now, (earlier,), Variant(QUIET, SURVEY, {}))
+    found = persistence.remembered(now, (earlier,), Variant(QUIET, SURVEY, {}), infrared.SEED)
     even = TRAPS.left(np.array([1.09 * spectroscopic.TIME]), before, infrared.TIME)[0]
     print("left at most", expected.max() - even, "missed at most", np.abs(found - expected).max())
     assert expected.max() > even + 5.0
     assert np.abs(found - expected).max() < 1.5
-    np.testing.assert_array_equal(found, persistence.remembered(now, (earlier,), Variant(QUIET, SURVEY, {})))
+    np.testing.assert_array_equal(
+        found, persistence.remembered(now, (earlier,), Variant(QUIET, SURVEY, {}), infrared.SEED)
+    )
 
 
 def test_the_brightest_column_of_a_point():

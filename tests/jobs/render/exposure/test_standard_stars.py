@@ -99,7 +99,7 @@ def test_they_leave_persistence():
     now = Aim.of(fields.exposure(**infrared.exposed(DETECTOR)), DETECTOR)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(euclid, "nisp_psf", lambda d, found, *_: infrared.psf_of(d, "euclid_y"))
-        left = persistence.remembered(now, (before,), Variant(MISSION, SURVEY, {}))
+        left = persistence.remembered(now, (before,), Variant(MISSION, SURVEY, {}), infrared.SEED)
     x, y = np.rint(PLACES).astype(int).T
     assert (left[y, x] > 20.0).all()
     assert np.median(left) < 1.5
