@@ -49,7 +49,8 @@ class Picture:
         """Radius about its middle that holds half of its light, arcsec, to half a pixel; 0 of a disc's structure."""
         if self.is_structure:
             return 0.0
-        step = 0.5 * float(np.abs(np.linalg.det(self.matrix))) ** 0.5
+        (a, b), (c, d) = self.matrix
+        step = 0.5 * float(abs(a * d - b * c)) ** 0.5
         up, across = (np.arange(n) - (n - 1) / 2 for n in self.image.shape)
         west, north = (line[0] * up[:, None] + line[1] * across for line in self.matrix)
         light = np.bincount((np.hypot(west, north) / step).astype(int).ravel(), self.image.ravel()).cumsum()

@@ -21,12 +21,16 @@ BIN = 8
 
 @cache
 def crowd():
-    """(catalogue rows, columns of the exposure, rendered): stars whose first and other orders lie across a strip."""
+    """(catalogue rows, columns of the exposure, rendered): stars whose first and other orders lie across a strip.
+
+    The last lies a row beside another.
+    """
     rng = np.random.default_rng(8)
     x = np.concatenate(
         [rng.uniform(-280.0, 850.0, 14), rng.uniform(-1100.0, -900.0, 3), rng.uniform(1300.0, 1700.0, 2)]
     )
     y, mags = rng.uniform(10.0, 150.0, len(x)), np.append(rng.uniform(17.0, 19.0, 14), np.full(5, 15.0))
+    x, y, mags = np.append(x, x[0]), np.append(y, y[0] + 1.0), np.append(mags, mags[0])
     row = spectroscopic.exposed(STRIP)
     tables = infrared.tables(STRIP, row, mags, x, y)
     return tables, row, fields.rendered(row, STRIP, tables, MISSION, DRAFT, truth=LAYERS)
