@@ -476,7 +476,7 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
     # In an exposure of no time nothing shows: neither galaxies are read nor what lenses make of them.
     for least, shows in ((0.0, True), (np.inf, False)):
         tasks = read.version(lake, "tasks").rows().to_pylist()
-        found = sum(catalogue_rows.lenses(version, task, 0.1, least).num_rows for task in tasks)
+        found = sum(catalogue_rows.lenses(version, task, 0.1, 0.0, least).num_rows for task in tasks)
         assert (found > 0) == shows
     assert set(drawn["id"].to_pylist()) <= set(version.rows(["id"])["id"].to_pylist())
     changed = {path for path, data in images(lake).items() if data != plain[path]}
