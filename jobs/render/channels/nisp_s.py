@@ -33,7 +33,6 @@ SKY = (
     background.EFFECT,
     dispersed_sky.EFFECT,
     pixel_area.EFFECT,
-    # Of the sky: a pixel sees all of its colours, each from another place.
     chromatic_response.EFFECT,
     pixel_response.EFFECT,
     *nisp_p.CURRENT,
@@ -143,6 +142,7 @@ CHANNEL = Channel(
     moving=True,
     own_light=(calibration_lamp.EFFECT,),
     ramp="spectroscopic",
+    coloured=chromatic_response.EFFECT,
     remembers=persistence.EFFECT,
     disperses=Dispersion(_traces, _throughput, _vignetted, _psf_at, _reach, CHOSEN_BY["NISP-S"]),
 )

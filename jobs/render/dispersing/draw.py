@@ -130,18 +130,20 @@ class Tally:
     """What each source brought, filled by `draw`.
 
     electrons : float64[n, orders] that fell onto the frame;  expected : on it and beside it
+    peak      : float64[n, orders] e- of its brightest column, where some of it is drawn
     sizes     : int64[n] side of its largest stamp, pixels; 0 = none was drawn
     """
 
     electrons: Float
     expected: Float
+    peak: Float
     sizes: Int
 
     @classmethod
     def of(cls, sources: int, orders: int) -> Tally:
         """Of so many sources and orders, before anything is drawn."""
         shape = sources, orders
-        return cls(np.zeros(shape), np.zeros(shape), np.zeros(sources, np.int64))
+        return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(sources, np.int64))
 
 
 def draw(
@@ -170,6 +172,7 @@ def draw(
         parts = [_Part.of(seen, some, spectra, plan, shape) for plan in plans]
         for column, part in enumerate(parts):
             tally.expected[some, column] = part.expected
+            tally.peak[some, column] = np.where(part.sizes > 0, part.peak, 0.0)
         for straight in (True, False):
             _add(seen, straight, some, spectra, list(zip(plans, parts, strict=True)), onto, tally)
     if layers is not None:
@@ -249,7 +252,7 @@ class _Part:
 
     along, across : float64[k, i] polynomials of their traces
     sizes    : of their stamps, 0 = nothing of it is drawn;  straight : whether the trace is
-    expected : electrons, on the frame and beside it
+    expected : electrons, on the frame and beside it;  peak : in the brightest column
     """
 
     along: Float
@@ -257,6 +260,7 @@ class _Part:
     sizes: Int
     straight: Bool
     expected: Float
+    peak: Float
 
     @classmethod
     def of(cls, seen: _Seen, some: Int, spectra: Float32, plan: _Plan, shape: tuple[int, int]) -> _Part:
@@ -280,7 +284,7 @@ class _Part:
         nothing = beside | (peak < limit) | (peak <= 0.0)
         return cls(
             np.ascontiguousarray(along), np.ascontiguousarray(across), np.where(nothing, 0, sizes),
-            straight & (plan.tile > 0), expected,
+            straight & (plan.tile > 0), expected, peak,
         )  # fmt: skip
 
 

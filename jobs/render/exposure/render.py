@@ -119,6 +119,7 @@ def _spread(aim: Aim, rows: Rows, light: Light, truth: Sequence[str]) -> tuple[_
         maps["stars"] = dispersing.draw(sources.take(of_stars), some, psf, shape, noise).astype(np.float32)
     fallen, scene = tally.electrons.sum(axis=1), scene_of.with_peak(light.scene, frame)
     listed, expected = fallen > 0.0, replace(sources, electrons=tally.expected.sum(axis=1))
+    scene = tints.with_spread_tints(scene, aim, light, tally)
     spectra = traced(light, tally, aim, rows, scene)
     return _Drawn(expected.take(listed), tally.sizes[listed], fallen[listed], maps, scene, spectra), [frame]
 

@@ -1,6 +1,7 @@
 """The light of sources by colour, for pixels that do not see all colours alike.
 
-with_tints   a scene with it
+with_tints          a scene with it
+with_spread_tints   the same of light that a grism spreads out, of which each column has its own colour
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from jobs.render.channels.aim import Aim
+from jobs.render.dispersing import draw as dispersing
 from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.settings import settings_for
 from jobs.render.effects.light import chromatic_response
@@ -31,9 +33,8 @@ def with_tints(scene: Scene, aim: Aim, light: Light) -> Scene:
     Error : of what they change in a pixel, 3 %: the PSF is that of the detector's centre. Where an accuracy wants a PSF
             of one colour those of the sources are not known: they change nothing
     """
-    effect, sources, psf = aim.channel.coloured, light.sources, light.psf
-    unwanted = effect is None or effect not in aim.effects or not scene.forced.get(effect.name, True)
-    if unwanted or psf is None or sources.photons is None or not len(sources):
+    sources, psf = light.sources, light.psf
+    if _unwanted(scene, aim) or psf is None or sources.photons is None or not len(sources):
         return scene
     components = chromatic_response.table(scene.section, aim.band, scene.mission)
     own = chromatic_response.colours(sources.photons, components)
@@ -59,14 +60,55 @@ def with_tints(scene: Scene, aim: Aim, light: Light) -> Scene:
     return replace(scene, tints=drawn, tint_electrons=float(change.max()))
 
 
-def _middle(psf: Psf) -> float:
-    """The most of a point's light that is in a pixel, of any colour."""
+def with_spread_tints(scene: Scene, aim: Aim, light: Light, tally: dispersing.Tally) -> Scene:
+    """The scene with the spectra of those sources of which a column's colour changes a pixel by what is noticed.
+
+    scene : with what is drawn;  aim : the exposure and detector;  light : dispersed;  tally : of all that was drawn
+    Error : of each source, a tenth of a pixel's noise beyond the stamps
+    """
+    dispersed, psf = light.dispersed, light.psf
+    if _unwanted(scene, aim) or psf is None or dispersed is None or not len(light.sources):
+        return scene
+    f = chromatic_response.spectrum(scene.section, dispersed.orders[0].wavelength, aim.band, scene.mission)
+    largest = float(np.hypot(*(f * np.array(chromatic_response.strength(scene))).T).max())
+    change = tally.peak.max(axis=1) * _middle(psf, of_rows=True) * largest
+    (some,) = np.nonzero(change > NOTICEABLE * scene.pixel_noise)
+    if not len(some):
+        return scene
+    chosen, shape = light.sources.take(some), (aim.detector.ny, aim.detector.nx)
+    # What is left out is what changes by less than is noticed.
+    settings = replace(dispersed.settings, edge=0.5 * NOTICEABLE / largest, faint=0.5 * NOTICEABLE / largest)
+
+    def draw(weight: Float) -> Frame:
+        """The light, each photon times its weight [w], 0 or more."""
+        orders = tuple(replace(order, response=order.response * weight) for order in dispersed.orders)
+        own = dispersing.Dispersed(lambda rows: dispersed.spectra(some[rows]), orders, settings)
+        return dispersing.draw(chosen, own, psf, shape, scene.pixel_noise)
+
+    drawn = draw(np.ones(len(f)))
+    found = np.empty((2, *shape), np.float32)
+    for k, component in enumerate(f.T):
+        # No wavelength has less than no light.
+        least = float(component.min())
+        found[k] = draw(component - least) + least * drawn
+    return replace(scene, tints=found, tint_electrons=float(change.max()))
+
+
+def _unwanted(scene: Scene, aim: Aim) -> bool:
+    """Whether the effect is not of this channel or image, or switched off."""
+    effect = aim.channel.coloured
+    return effect is None or effect not in aim.effects or not scene.forced.get(effect.name, True)
+
+
+def _middle(psf: Psf, *, of_rows: bool = False) -> float:
+    """The most of a point's light that is in a pixel, or in a row, of any colour."""
     if psf.planes is None:
         return 1.0
     images, samples = psf.planes.images, psf.planes.samples
     first = images.shape[1] // 2 - samples // 2
     core = slice(first, first + samples)
-    return min(float(images[:, core, core].sum(axis=(1, 2)).max()), 1.0)
+    across = slice(None) if of_rows else core
+    return min(float(images[:, core, across].sum(axis=(1, 2)).max()), 1.0)
 
 
 def _central(psf: Psf) -> Psf:

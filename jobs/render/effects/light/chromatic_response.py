@@ -16,7 +16,7 @@ What F changes by less than is noticed in its source's brightest pixel is not dr
 EFFECT, LAMP   the light of the sky and its sources, and of a lamp, as the pixels see it
 maps       s and c of a detector
 means      f1 and f2 over a band
-table      f1 and f2 in the parts of a band
+table      f1 and f2 in the parts of a band;  spectrum : at every wavelength
 colours    F1 and F2 of lights;  of_lines : of light at given wavelengths
 tints      the light of sources, each photon times f1, and times f2
 changes    the most that the colour of each source changes
@@ -135,6 +135,16 @@ def table(section: str, band: Passband, mission: MissionConfiguration) -> Float:
     """
     found = _in_parts(section, band, mission)
     return np.asarray(found - np.mean(found, axis=0))
+
+
+def spectrum(section: str, wavelength: Float, band: Passband, mission: MissionConfiguration) -> Float:
+    """float64[w, 2]: f1 and f2 told from their means over a band.
+
+    wavelength : [w] A;  section, mission : of the camera in the mission database;  band : a passband
+    """
+    nodes, *components = np.array(mission.numbers(f"{section}.response.components")).T
+    found = np.stack([np.interp(1e-4 * wavelength, nodes, f) for f in components], axis=1)
+    return np.asarray(found - means(section, band, mission))
 
 
 def of_lines(section: str, band: Passband, wavelength: Float, photons: Float, mission: MissionConfiguration) -> Float:
