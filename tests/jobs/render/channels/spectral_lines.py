@@ -1,16 +1,20 @@
 """Emission lines on noisy frames of NISP-S: drawn by the channel, and measured by weighted sums of pixels."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
 import scipy.fft
 from scipy.ndimage import convolve
 
+from jobs import rng
 from jobs.fluxes import passbands, stretches
 from jobs.fluxes.libraries import templates
 from jobs.fluxes.sources import galaxies_of
 from jobs.render.channels import registry
+from jobs.render.effects.effect import apply_all
+from jobs.render.exposure.rendered import numbers_of
 from jobs.render.sources import colours
 from lake_schema import units
 from tests.jobs.render import fields, infrared, spectroscopic
@@ -86,10 +90,12 @@ def kernel():
     return out
 
 
-def ramp_variance(rates, rng, ramps=6000):
+def ramp_variance(rates, numbers, ramps=6000):
     """[n] e-^2 of the signals of ramps of charge of `rates` e- a second, every frame drawn and read.
 
-    Kubik et al. 2016: the most likely signal of n differences of groups whose noise they estimate.
+    Kubik et al. 2016: the most likely signal of n differences of groups whose noise they estimate.  It is told by how
+    much it is more or less than that of the difference of the last group and the first, which is known: of these few
+    ramps alone it would be uncertain by 2 %.
     """
     groups, reads, drops = (
         int(MISSION.value(f"nisp.macc.spectroscopic.{name}")) for name in ("groups", "reads", "drops")
@@ -97,24 +103,28 @@ def ramp_variance(rates, rng, ramps=6000):
     noise, n = MISSION.value("nisp.read_noise", "electron"), groups - 1
     a = 1.0 + (1.0 - reads**2) / (3.0 * reads * (reads + drops))
     beta = 2.0 * noise**2 / (reads * a)
+    first = (reads + drops) * np.arange(groups)[:, None] + np.arange(reads)
+    # What an electron adds to the difference of the last group and the first, by the frame in which it comes.
+    begin, *_, end = (np.arange(first[-1, -1] + 1)[:, None] <= group for group in first)
+    weight = end.mean(axis=1) - begin.mean(axis=1)
     found = []
-    for rate in rates:
-        arrived = rng.poisson(rate * MISSION.value("nisp.frame_time", "s"), (ramps, n * (reads + drops) + reads))
-        charge = arrived.cumsum(axis=1, dtype=np.int32)
-        first = (reads + drops) * np.arange(groups)[:, None] + np.arange(reads)
-        group = charge[:, first].mean(axis=2) + rng.normal(0.0, noise / reads**0.5, (ramps, groups))
+    for rate in rates * MISSION.value("nisp.frame_time", "s"):
+        charge = numbers.poisson(rate, (ramps, len(weight))).cumsum(axis=1, dtype=np.int32)
+        group = charge[:, first].mean(axis=2) + numbers.normal(0.0, noise / reads**0.5, (ramps, groups))
         square = ((np.diff(group, axis=1) + beta) ** 2).mean(axis=1)
-        found.append(np.var(n * (2.0 * square / (a + np.hypot(a, 2.0 * square**0.5)) - beta)))
+        signal = n * (2.0 * square / (a + np.hypot(a, 2.0 * square**0.5)) - beta)
+        known = rate * (weight**2).sum() + 2.0 * noise**2 / reads
+        found.append(np.var(signal) / np.var(group[:, -1] - group[:, 0]) * known)
     return np.array(found)
 
 
 class Noise:
     """Of the pixels of a frame: that of photons, shared among neighbours, of reads, and of drifts of the outputs."""
 
-    def __init__(self, background, shape, rng):
+    def __init__(self, background, shape, numbers):
         """background : e- a second of sky and dark current;  shape : of a frame"""
         rates = background * np.array([0.0, 1.0, 2.0, 4.0, 8.0])
-        reads, *photons = ramp_variance(rates, rng)
+        reads, *photons = ramp_variance(rates, numbers)
         self.reads, self.levels, self.photons = reads, rates * TIME, np.array([0.0, *(v - reads for v in photons)])
         self.background, self.shape, self.kernel = background * TIME, shape, kernel()
         self.drift = MISSION.value("nisp.drift_spectroscopic", "electron")
@@ -124,6 +134,15 @@ class Noise:
     def photons_of(self, light):
         """e-^2 of pixels with so many electrons of sources."""
         return np.interp(light + self.background, self.levels, self.photons)
+
+    def weights(self, template, light):
+        """Of the pixels [ny, nx] of a box, whose sum is the best measure of a template on an even background.
+
+        light : e- of sources;  drifts are taken as white
+        """
+        basis = np.stack([template.ravel(), np.ones(template.size)])
+        scaled = basis / (self.photons_of(light) + self.reads + self.drift**2).ravel()
+        return np.linalg.solve(scaled @ basis.T, scaled)[0].reshape(template.shape)
 
     def variance(self, weights, light, corner):
         """Of the sum of a box of pixels times weights; light : of sources there;  corner : row, column of its first."""
@@ -153,21 +172,31 @@ class Noise:
 # ---------------------------------------------------------------------------------------------- measuring
 
 
-def measured(noisy, without, at, noise):
-    """([n] flux of each line, of that which was put in; [n] its error): weighted sums, the background fitted with it.
+def measured(noisy, without, at, noise, images=1):
+    """([images, n] flux of each line, of that which was put in; [n] its error): sums of pixels, the background fitted.
 
     noisy, without : with all lines, and without;  at : [2, n] where the lines are
+    images : with noise of their own, of the same light
     """
-    image = infrared.electrons(noisy)
     shared = [convolve(one.noise_free.astype(float), noise.kernel) for one in (noisy, without)]
+    seen = [infrared.electrons(noisy) - shared[1], *(_again(noisy, seed) - shared[1] for seed in range(1, images))]
     template, found = shared[0] - shared[1], []
     for column, row in np.rint(at.T).astype(int).tolist():
-        box = np.s_[row - HALF : row + HALF + 1, column - HALF : column + HALF + 1]
+        corner = row - HALF, column - HALF
+        box = np.s_[corner[0] : row + HALF + 1, corner[1] : column + HALF + 1]
         light = noisy.noise_free[box].astype(float)
-        basis = np.stack([template[box].ravel(), np.ones((2 * HALF + 1) ** 2)])
-        scaled = basis / (noise.photons_of(light) + noise.reads + noise.drift**2).ravel()
-        weights = np.linalg.solve(scaled @ basis.T, scaled)[0]
-        flux = float(weights @ (image[box] - shared[1][box]).ravel())
-        shape = 2 * HALF + 1, 2 * HALF + 1
-        found.append((flux, noise.variance(weights.reshape(shape), light, (row - HALF, column - HALF)) ** 0.5))
-    return np.array(found).T
+        weights = noise.weights(template[box], light)
+        found.append([*((weights * one[box]).sum() for one in seen), noise.variance(weights, light, corner) ** 0.5])
+    found = np.array(found).T
+    return found[:-1], found[-1]
+
+
+def _again(one, noise_seed):
+    """float64[ny, nx] e- of the same light in a detector of the same pixels, with noise of another seed."""
+
+    def stream(effect):
+        return rng.stream(*numbers_of(effect, one.exposure, one.detector.name, one.seed, noise_seed))
+
+    found, _ = apply_all(one.noise_free.astype(float), CHANNEL.effects["science"], one.scene, stream)
+    readout = CHANNEL.readout.arrays(found, one.scene, one.detector.name, one.wcs)
+    return infrared.electrons(SimpleNamespace(science=readout.pixels, scene=one.scene))
