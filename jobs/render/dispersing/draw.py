@@ -4,13 +4,15 @@ Order             a trace, and what it detects of a photon
 Settings          what decides how much of a spectrum is drawn;  settings_for : an accuracy
 Dispersed         what a grism makes of sources
 draw              sources -> frame;  Tally : with what each brought, by order
+
+A galaxy that no stamp holds is drawn in two parts (giants.py), a trail in pieces, each on a stamp of its own.
 """
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,17 +22,15 @@ import numpy as np
 from jobs import sums
 from jobs.accuracy import Accuracy
 from jobs.render.camera.traces import Trace
-from jobs.render.dispersing import images, kernels
+from jobs.render.dispersing import giants, images, kernels, spreading
 from jobs.render.dispersing.images import Planes, Sampling
-from jobs.render.drawing import transfer
+from jobs.render.dispersing.stamp_sizes import GIANT, Sizes
+from jobs.render.drawing import stamps, transfer
 from jobs.render.drawing.kernels.frame import FIXED_POINT
 from jobs.render.psf.model import Psf
-from jobs.render.sources import galaxy_shapes
 from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Bool, Float, Float32, Int
 
-# Sides of stamps whose transforms are fast.
-SIZES = np.array([16, 20, 24, 28, 32, 36, 40, 48, 56, 64, 80, 96, 128, 160, 192, 256, 320, 384, 512])
 # Sources whose spectra are held at a time, and samples of their images.
 _TOGETHER, _HELD = 256, 1 << 17
 # Places at which it is seen where a trace goes, and whether it is straight: its slope, rows a column, is nowhere
@@ -40,8 +40,6 @@ _PLACES, _STRAIGHT = 33, 0.03
 _STEEPEST = 0.15
 # Of the largest stamp, that an order must want to be drawn on it, too.
 _SHARED = 0.6
-# Of a galaxy's half-light radius, that its stamp is wider than a point's.
-_EXTENT = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +108,8 @@ def of_row(row: dict[str, float]) -> Settings:
 
 
 Spectra = Callable[[Int], Float32]
+# Of a PSF, by how stamps are sampled.
+Known = dict[Sampling, Planes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,10 +145,17 @@ class Tally:
         shape = sources, orders
         return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(sources, np.int64))
 
+    def add(self, pieces: Tally, whole: Int) -> None:
+        """Of pieces [p] of sources `whole` [p]."""
+        np.add.at(self.electrons, whole, pieces.electrons)
+        np.add.at(self.expected, whole, pieces.expected)
+        np.add.at(self.peak, whole, pieces.peak)
+        np.maximum.at(self.sizes, whole, pieces.sizes)
+
 
 def draw(
     sources: Sources, dispersed: Dispersed, psf: Psf, shape: tuple[int, int], noise: float,
-    tally: Tally | None = None, layers: dict[int, Float] | None = None,
+    tally: Tally | None = None, layers: dict[int, Float] | None = None, known: Known | None = None,
 ) -> Float:  # fmt: skip
     """Expected electrons of the sources alone, float64[ny, nx].
 
@@ -156,25 +163,32 @@ def draw(
     dispersed : their spectra, and where they lie;  psf : its wavelengths are the nodes
     shape     : ny, nx;  noise : of a pixel, e-;  tally : to be filled
     layers    : to be filled with the frame of each order, whose sum the result is; None: they are not told apart
+    known     : what calls with the same PSF and orders share, filled on the way
     """
     frames = [np.zeros(shape, np.int64)]
     orders, settings = dispersed.orders, dispersed.settings
     if layers is not None:
         frames += [np.zeros(shape, np.int64) for _ in orders[1:]]
     onto = frames if layers is not None else frames * len(orders)
-    slope = _slope(orders[0].trace)
-    seen = _Seen(sources, psf, Sizes.of(psf, noise, settings), settings, slope, shape)
+    slope = _slope(next((order for order in orders if order.trace.order == 1), orders[0]).trace)
+    # What moves far is drawn in pieces, each with a part of the light.
+    pieces, trail, whole = stamps.in_pieces(sources)
+    pieces = pieces if sources.trail is None else replace(pieces, trail=trail)
+    sizes = Sizes.of(pieces, psf, settings.edge * noise, settings.least)
+    seen = _Seen(pieces, psf, sizes, settings, slope, shape, {} if known is None else known)
     plans = [_Plan.of(order, psf, settings, slope) for order in orders]
-    tally = tally or Tally.of(len(sources), len(orders))
-    for start in range(0, len(sources), _TOGETHER):
-        some = np.arange(start, min(start + _TOGETHER, len(sources)))
-        spectra = dispersed.spectra(some)
+    own = Tally.of(len(pieces), len(orders))
+    for start in range(0, len(pieces), _TOGETHER):
+        some = np.arange(start, min(start + _TOGETHER, len(pieces)))
+        spectra = dispersed.spectra(whole[some])
         parts = [_Part.of(seen, some, spectra, plan, shape) for plan in plans]
         for column, part in enumerate(parts):
-            tally.expected[some, column] = part.expected
-            tally.peak[some, column] = np.where(part.sizes > 0, part.peak, 0.0)
+            own.expected[some, column] = part.expected
+            own.peak[some, column] = np.where(part.sizes > 0, part.peak, 0.0)
         for straight in (True, False):
-            _add(seen, straight, some, spectra, list(zip(plans, parts, strict=True)), onto, tally)
+            _add(seen, straight, some, spectra, list(zip(plans, parts, strict=True)), onto, own)
+    if tally is not None:
+        tally.add(own, whole)
     if layers is not None:
         layers.update({order.trace.order: frame / FIXED_POINT for order, frame in zip(orders, frames, strict=True)})
     # Of whole numbers: the same whether orders are told apart or not.
@@ -212,38 +226,11 @@ class _Plan:
         length = max(abs(float(along[1:].sum())), 1e-6) * float(np.hypot(1.0, slope))
         angstrom = (order.trace.last - order.trace.first) / length
         tile = 0
-        if settings.block >= 0.5 * kernels.STEP * angstrom and abs(slope) <= _STEEPEST:
-            tile = kernels.STEP * max(round(settings.block / angstrom / kernels.STEP), 1)
+        if settings.block >= 0.5 * spreading.STEP * angstrom and abs(slope) <= _STEEPEST:
+            tile = spreading.STEP * max(round(settings.block / angstrom / spreading.STEP), 1)
         step = 1.0 / (order.trace.last - order.trace.first)
         t = (order.first - order.trace.first) * step, step
         return cls(order, angstrom, tile, images.shares(order.wavelength, psf.planes.wavelength), t)
-
-
-@dataclass(frozen=True, slots=True)
-class Sizes:
-    """How large stamps are.
-
-    row   : float64[s] fraction of a point's light in a row at the edge of each of SIZES
-    """
-
-    row: Float
-    limit: float
-    least: int
-
-    @classmethod
-    def of(cls, psf: Psf, noise: float, settings: Settings) -> Sizes:
-        """Of points; limit : electrons of a row that are not seen."""
-        reach = len(psf.surface) - 1
-        x = np.arange(-reach, reach + 1)
-        row = [psf.surface[np.rint(np.hypot(x, size / 2)).astype(int).clip(0, reach)].sum() for size in SIZES]
-        return cls(np.array(row), settings.edge * noise, settings.least)
-
-    def size(self, peak: Float, wider: Float) -> Int:
-        """[k] For spectra of so many electrons a column at most; wider : pixels, of galaxies."""
-        dark = self.row * peak[:, None] < self.limit
-        own = SIZES[np.where(dark.any(axis=1), dark.argmax(axis=1), len(SIZES) - 1)]
-        wanted = np.maximum(own, self.least) + wider
-        return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, wanted), len(SIZES) - 1)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +261,7 @@ class _Part:
         t = plan.t[0] + plan.t[1] * np.linspace(0.0, len(order.response) - 1.0, _PLACES)
         x, y = (np.polynomial.polynomial.polyval(t, part.T) for part in (along, across))
         limit = seen.sizes.limit * (1.0 if order.trace.order == 1 else seen.settings.faint / seen.settings.edge)
-        sizes = seen.sizes.size(peak, seen.wider[some])
+        sizes = seen.sizes.size(some, peak)
         left, right = column + x.min(axis=1), column + x.max(axis=1)
         low, high = row + y.min(axis=1), row + y.max(axis=1)
         beside = (right + sizes < 0) | (left - sizes > nx) | (high + sizes < 0) | (low - sizes > ny)
@@ -292,17 +279,11 @@ class _Seen:
     """Sources through the PSF."""
 
     def __init__(
-        self, sources: Sources, psf: Psf, sizes: Sizes, settings: Settings, slope: float, shape: tuple[int, int]
-    ) -> None:
+        self, sources: Sources, psf: Psf, sizes: Sizes, settings: Settings, slope: float, shape: tuple[int, int],
+        known: Known,
+    ) -> None:  # fmt: skip
         self.sources, self.psf, self.sizes, self.settings, self.slope = sources, psf, sizes, settings, slope
-        body = sources.shape >= 0
         self.places = list(zip(sources.column.tolist(), sources.row.tolist(), strict=True))
-        self.wider = np.zeros(len(sources))
-        shapes = sources.shapes.take(sources.shape[body])
-        self.wider[body] = _EXTENT * galaxy_shapes.half_light(shapes) / psf.pixel_scale
-        pictured = (sources.picture_of(i) for i in range(len(sources)))
-        self.wider += [0.0 if picture is None else picture.diagonal / psf.pixel_scale for picture in pictured]
-        self.wider += sources.length
         self.bodies = {straight: images.bodies(sources, slope if straight else 0.0) for straight in (True, False)}
         assert psf.planes is not None
         count = len(psf.planes.wavelength)
@@ -310,21 +291,24 @@ class _Seen:
         column, row = np.clip(sources.column, 0.0, shape[1] - 1.0), np.clip(sources.row, 0.0, shape[0] - 1.0)
         one = [transfer.basis_weights(psf, np.tile(part, (len(sources), 1)), column, row) for part in np.eye(count)]
         self.weights = np.stack(one, axis=1)
-        self._planes: dict[tuple[int, bool], Planes] = {}
+        self._planes = known
 
-    def images(self, some: Int, size: int, straight: bool) -> Float32:
-        """Coefficients [m, b, n along, n across] of sources on stamps of `size` pixels."""
-        key = size, straight
-        if key not in self._planes:
-            sampling = Sampling(size, self.settings.along, self.settings.across, self.slope, straight)
-            self._planes[key] = images.planes(self.psf, sampling)
-        own = self._planes[key]
+    def sampling(self, size: int, straight: bool, smooth: bool = False) -> Sampling:
+        """Of stamps of `size` pixels; smooth : of what giants.add draws."""
+        like = Sampling(size, self.settings.along, self.settings.across, self.slope, straight)
+        return giants.sampling(size, like, smooth)
+
+    def images(self, some: Int, sampling: Sampling) -> Float32:
+        """Coefficients [m, b, n along, n across] of sources on stamps."""
+        if sampling not in self._planes:
+            self._planes[sampling] = images.planes(self.psf, sampling)
+        own = self._planes[sampling]
         over = [images.spread_over(own, self.sources, i) for i in some.tolist()]
-        return images.coefficients(own, self.weights[some], self.bodies[straight].take(some), over)
+        return images.coefficients(own, self.weights[some], self.bodies[sampling.straight].take(some), over)
 
-    def together(self, size: int) -> int:
-        """How many stamps of `size` pixels are held at a time."""
-        samples = self.weights.shape[1] * size**2 * self.settings.along * self.settings.across
+    def together(self, sampling: Sampling) -> int:
+        """How many stamps are held at a time."""
+        samples = self.weights.shape[1] * sampling.n**2 * sampling.along * sampling.across
         return max(int(_HELD // samples), 1)
 
 
@@ -338,16 +322,22 @@ def _add(
     largest = sizes.max(axis=0)
     sizes = np.where((sizes > 0) & (sizes >= _SHARED * largest), largest, sizes)
     tally.sizes[some] = np.maximum(tally.sizes[some], largest)
-    shape = seen.settings.along, seen.settings.across
     for size in np.unique(sizes[sizes > 0]).tolist():
-        which, count = np.flatnonzero((sizes == size).any(axis=0)), seen.together(size)
+        sampling = seen.sampling(size, straight)
+        smooth = seen.sampling(size, straight, smooth=True) if size == GIANT else None
+        which, count = np.flatnonzero((sizes == size).any(axis=0)), seen.together(sampling)
         for own in np.split(which, range(count, len(which), count)):
-            for k, image in zip(own.tolist(), seen.images(some[own], size, straight), strict=True):
+            for k, image in zip(own.tolist(), seen.images(some[own], sampling), strict=True):
                 i = int(some[k])
-                factor, place = float(seen.sources.electrons[i]), seen.places[i]
+                rest = None if smooth is None else seen.images(some[k : k + 1], smooth)[0]
                 for m in np.flatnonzero(sizes[:, k] == size).tolist():
                     plan, part = orders[m]
-                    tally.electrons[i, m] = kernels.spread(
-                        image, spectra[k], factor, plan.order.response, plan.share, part.along[k], part.across[k],
-                        plan.t, place, seen.slope, (size, *shape), plan.tile if straight else 0, FIXED_POINT, onto[m],
-                    )  # fmt: skip
+                    light = spectra[k], float(seen.sources.electrons[i]), plan.order.response
+                    path, place = (part.along[k], part.across[k]), seen.places[i]
+                    tile, shape = plan.tile if straight else 0, (sampling.n, sampling.along, sampling.across)
+                    fallen = spreading.spread(
+                        image, *light, plan.share, *path, plan.t, place, seen.slope, shape, tile, FIXED_POINT, onto[m]
+                    )
+                    if smooth is not None and rest is not None:
+                        fallen += giants.add(rest, light, plan.share, path, plan.t, place, smooth, onto[m])
+                    tally.electrons[i, m] = fallen

@@ -62,6 +62,8 @@ class Sampling:
     """n pixels of a stamp's side, even; samples a pixel along and across; slope of the trace, rows a column.
 
     straight : in coordinates in which the trace is a row
+    step     : of the detector's pixels in a pixel of the stamp;  split : pixels; of the smooth part of an image and of
+               the rest, of which the smooth part is drawn with a step above 1; 0 = of the whole image
     """
 
     n: int
@@ -69,6 +71,8 @@ class Sampling:
     across: int
     slope: float = 0.0
     straight: bool = False
+    step: int = 1
+    split: float = 0.0
 
     @property
     def shear(self) -> float:
@@ -96,18 +100,32 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
     n, count = sampling.n, sampling.n * sampling.along
     iu, iv = scipy.fft.fftfreq(count, 1.0 / count).astype(int), np.arange(n * sampling.across // 2 + 1)
     fu, fy = iu[:, None] / n, iv / n
-    fx = fu - sampling.shear * fy
+    fx, step = fu - sampling.shear * fy, sampling.step
     on_trace = np.clip(fx + sampling.slope * fy, -_FARTHEST * sampling.along, _FARTHEST * sampling.along)
     spline = np.sinc(on_trace / sampling.along) ** (ALONG + 1) * np.sinc(fy / sampling.across) ** (ACROSS + 1)
     # The stamp's middle is at sample n / 2 of each axis.
     sign = (-1.0) ** iu[:, None] * (-1.0) ** iv
-    factor = sampling.along * sampling.across * np.sinc(fx) * np.sinc(fy) * sign / spline
+    factor = sampling.along * sampling.across * np.sinc(fx / step) * np.sinc(fy / step) * sign / spline
+    factor *= _split(sampling, fx / step, fy / step)
     images = [*psf.planes.images, *psf.planes.drift]
     found = np.empty((len(images), count, len(iv)), np.complex64)
     for image, out in zip(images, found, strict=True):
-        passed = transfer.sheared_spectrum(image, psf.planes.samples * n, len(iv), sampling.shear)
+        passed = transfer.sheared_spectrum(image, psf.planes.samples * n * step, len(iv), sampling.shear)
         out[:] = passed[iu] * factor
-    return Planes(sampling, (2 * np.pi * fu[:, 0]).astype(np.float32), (2 * np.pi * fy).astype(np.float32), found)
+    ku, kv = ((2 * np.pi * f / step).astype(np.float32) for f in (fu[:, 0], fy))
+    return Planes(sampling, ku, kv, found)
+
+
+def _split(sampling: Sampling, fx: Float, fy: Float) -> Float:
+    """The share of the smooth part, or of the rest, by cycles a pixel.
+
+    The smooth part is the image behind 2 g - g^2, g a Gaussian of `split` pixels. The rest, behind (1 - g)^2, is the
+    fourth derivative of the image where that is smooth on this scale: next to nothing far from the middle.
+    """
+    if sampling.split == 0.0:
+        return np.ones(())
+    rest = np.expm1(-2.0 * (np.pi * sampling.split) ** 2 * (fx**2 + fy**2)) ** 2
+    return np.asarray(rest if sampling.step == 1 else 1.0 - rest)
 
 
 @dataclass(frozen=True, slots=True)

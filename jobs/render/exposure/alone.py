@@ -53,11 +53,12 @@ def spectra(aim: Aim, rows: Rows, variant: Variant, seed: int, ids: Sequence[int
         where = f"exposure {exposure.exposure_id}, detector {aim.detector.name}"
         raise BadInput(f"{where}: no light of source {missing[0]} is drawn there")
     shape, of = (aim.detector.ny, aim.detector.nx), dispersed.spectra
+    known: draw.Known = {}
     for number in chosen:
         at = np.array([place[number]])
         one = replace(dispersed, spectra=partial(_of_some, of, at))
         layers: dict[int, Float] = {}
-        frame = draw.draw(sources.take(at), one, psf, shape, light.scene.pixel_noise, None, layers)
+        frame = draw.draw(sources.take(at), one, psf, shape, light.scene.pixel_noise, None, layers, known)
         yield Alone(number, frame, layers)
 
 

@@ -29,8 +29,8 @@ def spectra(some):
     return light
 
 
-def frame(sources):
-    return drawn(sources, spectra, ORDERS, psf(), SHAPE, NOISE, SETTINGS)
+def frame(sources, settings=SETTINGS):
+    return drawn(sources, spectra, ORDERS, psf(), SHAPE, NOISE, settings)
 
 
 def points(like, columns, rows, electrons):
@@ -42,12 +42,12 @@ def points(like, columns, rows, electrons):
     )
 
 
-def check(extended, alike, beyond):
+def check(extended, alike, beyond, settings=SETTINGS):
     """To 1 % of the peak, and of the light but for wings that faint points leave out; a point is something else."""
-    found, wanted = frame(extended), frame(alike)
+    found, wanted = frame(extended, settings), frame(alike, settings)
     assert abs(found.sum() / wanted.sum() - 1.0) < 0.01
     assert np.abs(found - wanted).max() < 0.01 * wanted.max()
-    point = frame(replace(extended, picture=None, pictures=(), trail=None))
+    point = frame(replace(extended, picture=None, pictures=(), trail=None), settings)
     assert np.abs(found - point).max() > beyond * wanted.max()
 
 
@@ -57,6 +57,14 @@ def test_a_trail_is_its_points():
     part = (np.arange(60) + 0.5) / 60 - 0.5
     alike = points(body, body.column + part * trail[0], body.row + part * trail[1], np.full(60, 1e6 / 60))
     check(replace(body, trail=trail[None]), alike, 1.0)
+
+
+def test_a_trail_of_a_thousand_pixels_is_its_points():
+    """Longer than the largest stamp: in pieces."""
+    body, trail = source(), np.array([998.0, 40.0])
+    part = (np.arange(1000) + 0.5) / 1000 - 0.5
+    alike = points(body, body.column + part * trail[0], body.row + part * trail[1], np.full(1000, 1e3))
+    check(replace(body, trail=trail[None]), alike, 1.0, replace(SETTINGS, edge=1e-5, least=64))
 
 
 def test_an_arc_is_its_pixels():

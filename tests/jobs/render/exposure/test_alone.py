@@ -7,6 +7,7 @@ import pytest
 
 from jobs.accuracy import DRAFT
 from jobs.render.channels.aim import Aim
+from jobs.render.dispersing import images
 from jobs.render.exposure import alone, traced
 from jobs.render.exposure.records import Rows, Variant
 from jobs.render.products import truth_table
@@ -53,6 +54,17 @@ def test_sources_alone_add_up_to_the_image_and_to_its_orders():
         np.testing.assert_array_equal(sum(one.orders[order] for one in some).astype(np.float32), found.maps[name])
     assert found.maps["order_1"].sum() > found.maps["order_0"].sum() > 0.0
     assert found.maps["order_2"].sum() > 0.0
+
+
+def test_sources_share_the_planes_of_the_psf(monkeypatch):
+    """Those that one source's stamps need are not made again for the next."""
+    tables, row, _ = crowd()
+    made, planes = [], images.planes
+    monkeypatch.setattr(images, "planes", lambda psf, sampling: made.append(sampling) or planes(psf, sampling))
+    aim = Aim.of(fields.exposure(**row), STRIP)
+    found = list(alone.spectra(aim, Rows(*tables), Variant(MISSION, DRAFT, {}), 1, list(models())[:4]))
+    assert len(found) == 4
+    assert len(made) == len(set(made)) > 0
 
 
 def test_what_a_source_brings_is_what_the_table_says():

@@ -157,6 +157,22 @@ def test_surface_brightness_along_the_major_axis(kind):
         assert ring.max() > 0.4 * most
 
 
+@pytest.mark.parametrize("index", [0.5, 1.0, 4.0, 6.0])
+@pytest.mark.parametrize("distance", [0.5, 2.0, 8.0])
+def test_light_of_a_line_is_the_sum_along_it(index, distance):
+    """By a sum over a fine grid in x = sinh t, of a round bulge and a disc seen face-on."""
+    t = np.linspace(-9.0, 9.0, 40_001)
+    for fraction in (0.0, 1.0):
+        one = shape(
+            bulge_fraction=fraction, bulge_half_light_radius=0.7, bulge_sersic_index=index, bulge_axis_ratio=1.0,
+            disk_half_light_radius=1.1, inclination=0.0,
+        )  # fmt: skip
+        along = galaxy_shapes.surface(one, np.hypot(distance, np.sinh(t)))[0]
+        wanted = np.trapezoid(along * np.cosh(t), t)
+        # The disc's surface counts its thickness in: 0.5 %.
+        assert galaxy_shapes.line(one, distance)[0] == pytest.approx(wanted, rel=0.015, abs=1e-12)
+
+
 def test_a_point_has_no_size():
     found = shape(bulge_fraction=1.0, bulge_half_light_radius=0.0)
     assert isinstance(galaxy_shapes.profile(found, 0, 1e-3).original, galsim.DeltaFunction)
