@@ -64,7 +64,7 @@ def test_a_trail_of_a_thousand_pixels_is_its_points():
     body, trail = source(), np.array([998.0, 40.0])
     part = (np.arange(1000) + 0.5) / 1000 - 0.5
     alike = points(body, body.column + part * trail[0], body.row + part * trail[1], np.full(1000, 1e3))
-    check(replace(body, trail=trail[None]), alike, 1.0, replace(SETTINGS, edge=1e-5, least=64))
+    check(replace(body, trail=trail[None]), alike, 1.0, replace(SETTINGS, least=64))
 
 
 def test_an_arc_is_its_pixels():
