@@ -52,6 +52,9 @@ class Sizes:
         reach = len(psf.surface) - 1
         x = np.arange(-reach, reach + 1)
         point = [psf.surface[np.rint(np.hypot(x, size / 2)).astype(int).clip(0, reach)].sum() for size in SIZES]
+        if psf.planes is not None:
+            # A point has no light beyond its planes.
+            point = [0.0 if size >= psf.side else light for size, light in zip(SIZES, point, strict=True)]
         galaxy = sources.shape >= 0
         body = np.zeros((len(sources), len(SIZES)), np.float32)
         body[galaxy] = _rows(sources.shapes.take(sources.shape[galaxy]), psf.pixel_scale)

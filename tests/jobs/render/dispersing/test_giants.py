@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from benchmarks import _scenes as scenes
+from jobs import sums
 from jobs.accuracy import SURVEY
 from jobs.render.dispersing import draw, images
+from jobs.render.dispersing.stamp_sizes import Sizes
 from jobs.render.drawing import settings as drawing
 from jobs.render.drawing import stamp_sizes, stamps
 from tests.jobs.render.dispersing import fine
@@ -52,11 +54,28 @@ def test_no_more_light_comes_in_at_the_edges_than_is_asked_for(electrons):
 
 
 def test_faint_galaxies_take_no_more_than_their_light():
-    spectrum, tally = np.full((1, COUNT), 2e3 / COUNT, np.float32), draw.Tally.of(1, 1)
-    source = galaxy(0.5, 1.0, 0.0, 60.0, 60.0)
-    frame = drawn(source, lambda _: spectrum, [order(trace((-32.0, 512.0)))], psf(), (128, 700), NOISE, SETTINGS, tally)
-    assert tally.sizes[0] == SETTINGS.least
-    assert frame.sum() == pytest.approx(2e3, rel=0.02)
+    """The least stamp: no pixel is wrong by more than a survey allows, and what it lacks the PSF has outside."""
+    spectrum, source = np.full((1, COUNT), 2e3 / COUNT, np.float32), galaxy(0.5, 1.0, 0.0, 60.0, 60.0)
+    orders, through, frames = [order(trace((-32.0, 512.0)))], psf(), []
+    for least in (SETTINGS.least, 128):
+        tally, settings = draw.Tally.of(1, 1), replace(SETTINGS, least=least)
+        frames.append(drawn(source, lambda _: spectrum, orders, through, (256, 700), NOISE, settings, tally))
+        assert tally.sizes[0] == least
+    assert np.abs(frames[0] - frames[1]).max() < 0.02 * NOISE
+    share = images.shares(np.arange(FIRST, LAST + 1.0), NODES).mean(axis=0)
+    for found, least in zip(frames, (SETTINGS.least, 128), strict=True):
+        middle, half = through.planes.images.shape[1] // 2, least * through.planes.samples // 2
+        held = through.planes.images[:, middle - half : middle + half, middle - half : middle + half].sum(axis=(1, 2))
+        assert found.sum() == pytest.approx(2e3 * sums.product(share, held), rel=1e-3)
+
+
+@pytest.mark.parametrize("peak", [1e5, 1e7])
+def test_points_and_small_galaxies_end_where_the_planes_of_the_psf_do(peak):
+    """However bright a column: no stamp is larger than the PSF, and a giant is what is one by its own light."""
+    point = one(scenes.sources(scenes.NISP, 8, galaxies=0, stars=1), 0)
+    for source in (fine.placed(point, 60.0, 60.0), galaxy(0.3, 1.0, 0.0, 60.0, 60.0)):
+        sizes = Sizes.of(source, psf(), SETTINGS.edge * NOISE, SETTINGS.least)
+        assert sizes.size(np.array([0]), np.array([peak])) == psf().side
 
 
 @pytest.mark.parametrize(("index", "fraction"), [(4.0, 1.0), (1.0, 0.0)])
