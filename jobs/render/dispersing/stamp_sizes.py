@@ -48,7 +48,7 @@ class Sizes:
 
     @classmethod
     def of(cls, sources: Sources, psf: Psf, limit: float, least: int) -> Sizes:
-        """Of sources through a PSF.  limit, least : electrons of a row, pixels"""
+        """Of sources.  psf : of the detector;  limit, least : electrons of a row, pixels"""
         reach = len(psf.surface) - 1
         x = np.arange(-reach, reach + 1)
         point = [psf.surface[np.rint(np.hypot(x, size / 2)).astype(int).clip(0, reach)].sum() for size in SIZES]
