@@ -26,6 +26,7 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.fft
+from scipy.ndimage import uniform_filter1d
 
 from jobs import sums
 from jobs.render.dispersing import kernels
@@ -107,13 +108,31 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
     sign = (-1.0) ** iu[:, None] * (-1.0) ** iv
     factor = sampling.along * sampling.across * np.sinc(fx / step) * np.sinc(fy / step) * sign / spline
     factor *= _split(sampling, fx / step, fy / step)
-    images = [*psf.planes.images, *psf.planes.drift]
+    # Of the lowest frequencies alone the PSF's pixels tell as much as its samples.
+    fold = psf.planes.samples if step > 1 and psf.planes.samples % 2 else 1
+    factor /= _triangle(fx / step, fold) * _triangle(fy / step, fold)
+    images = [_summed(image, fold) for image in (*psf.planes.images, *psf.planes.drift)]
     found = np.empty((len(images), count, len(iv)), np.complex64)
     for image, out in zip(images, found, strict=True):
-        passed = transfer.sheared_spectrum(image, psf.planes.samples * n * step, len(iv), sampling.shear)
+        passed = transfer.sheared_spectrum(image, psf.planes.samples // fold * n * step, len(iv), sampling.shear)
         out[:] = passed[iu] * factor
     ku, kv = ((2 * np.pi * f / step).astype(np.float32) for f in (fu[:, 0], fy))
     return Planes(sampling, ku, kv, found)
+
+
+def _summed(image: Float32, fold: int) -> Float32:
+    """An image [n, n], n odd, on pixels of fold x fold samples, odd, one of them about its middle: triangles' sums."""
+    middle = len(image) // 2
+    count = -(-middle // fold)
+    whole = np.pad(image, fold * count + fold // 2 - middle)
+    for axis in (0, 1):
+        whole = uniform_filter1d(whole, fold, axis, mode="constant")
+    return np.asarray(whole.reshape(2 * count + 1, fold, 2 * count + 1, fold).sum(axis=(1, 3)))
+
+
+def _triangle(f: Float, fold: int) -> Float:
+    """What such sums leave of f cycles a pixel: of what is beyond half a cycle little folds onto the lowest."""
+    return np.asarray((np.sinc(f) / np.sinc(f / fold)) ** 2)
 
 
 def _split(sampling: Sampling, fx: Float, fy: Float) -> Float:
