@@ -261,7 +261,7 @@ class _Part:
         t = plan.t[0] + plan.t[1] * np.linspace(0.0, len(order.response) - 1.0, _PLACES)
         x, y = (np.polynomial.polynomial.polyval(t, part.T) for part in (along, across))
         limit = seen.sizes.limit * (1.0 if order.trace.order == 1 else seen.settings.faint / seen.settings.edge)
-        sizes = seen.sizes.size(some, peak)
+        sizes = seen.sizes.size(some, peak, expected)
         left, right = column + x.min(axis=1), column + x.max(axis=1)
         low, high = row + y.min(axis=1), row + y.max(axis=1)
         beside = (right + sizes < 0) | (left - sizes > nx) | (high + sizes < 0) | (low - sizes > ny)

@@ -23,7 +23,8 @@ SIZES = np.array([16, 20, 24, 28, 32, 36, 40, 48, 56, 64, 80, 96, 128, 160, 192,
 # Pixels between those of the stamp that the smooth light of a galaxy is drawn on which no other stamp holds; its side.
 COARSE = 8
 GIANT = COARSE * int(SIZES[-1])
-# Of a galaxy's light, at most in a row at the stamp's edge, however faint it is: a sum over many columns would show it.
+# Of a galaxy's light, at most in a row at the stamp's edge: a sum over many columns would show it. But for a galaxy so
+# faint that such a sum is not seen in a single pixel.
 _PART = 5e-4
 # Of a galaxy's light in a row, what no brightness shows.
 _DARK = 1e-9
@@ -62,10 +63,14 @@ class Sizes:
         wider = np.array([0.0 if picture is None else picture.diagonal / psf.pixel_scale for picture in pictured])
         return cls(np.array(point), body, galaxy, wider + sources.length, limit, least)
 
-    def size(self, some: Int, peak: Float) -> Int:
-        """[k] For spectra of some sources, of so many electrons a column at most; GIANT where none of SIZES will do."""
+    def size(self, some: Int, peak: Float, total: Float) -> Int:
+        """[k] For spectra of some sources, of so many electrons a column at most, and in all columns.
+
+        GIANT where none of SIZES will do
+        """
         body = self.body[some]
-        dark = ((self.point + body) * peak[:, None] < self.limit) & (body < _PART)
+        dark = (self.point + body) * peak[:, None] < self.limit
+        dark &= (body < _PART) | (body * total[:, None] < self.limit)
         held = dark.any(axis=1)
         own = SIZES[np.where(held, dark.argmax(axis=1), len(SIZES) - 1)]
         wanted = np.maximum(own, self.least) + self.wider[some]

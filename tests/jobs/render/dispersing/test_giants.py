@@ -10,7 +10,7 @@ from benchmarks import _scenes as scenes
 from jobs import sums
 from jobs.accuracy import SURVEY
 from jobs.render.dispersing import draw, images
-from jobs.render.dispersing.stamp_sizes import Sizes
+from jobs.render.dispersing.stamp_sizes import GIANT, Sizes
 from jobs.render.drawing import settings as drawing
 from jobs.render.drawing import stamp_sizes, stamps
 from tests.jobs.render.dispersing import fine
@@ -75,7 +75,14 @@ def test_points_and_small_galaxies_end_where_the_planes_of_the_psf_do(peak):
     point = one(scenes.sources(scenes.NISP, 8, galaxies=0, stars=1), 0)
     for source in (fine.placed(point, 60.0, 60.0), galaxy(0.3, 1.0, 0.0, 60.0, 60.0)):
         sizes = Sizes.of(source, psf(), SETTINGS.edge * NOISE, SETTINGS.least)
-        assert sizes.size(np.array([0]), np.array([peak])) == psf().side
+        assert sizes.size(np.array([0]), np.array([peak]), np.array([512.0 * peak])) == psf().side
+
+
+def test_a_giant_that_nobody_sees_takes_the_least_stamp():
+    """All of its light in a row at the stamp's edge is less than may be left out of a pixel."""
+    faint = Sizes.of(galaxy(15.0, 1.0, 0.0, 60.0, 60.0), psf(), SETTINGS.edge * NOISE, SETTINGS.least)
+    for electrons, wanted in ((1.0, SETTINGS.least), (1e8, GIANT)):
+        assert faint.size(np.array([0]), np.array([electrons / 512]), np.array([electrons])) == wanted
 
 
 @pytest.mark.parametrize(("index", "fraction"), [(4.0, 1.0), (1.0, 0.0)])
