@@ -93,9 +93,41 @@ def cell_centres(order: int, cells: npt.ArrayLike) -> tuple[Float, Float]:
 
 
 def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
-    """Corners of cells, [n, 4, 2] ra, dec deg, in order around each."""
-    corners = np.moveaxis(_hp().boundaries(1 << order, np.atleast_1d(np.asarray(cells, np.int64)), nest=True), 1, 2)
-    return np.stack(_hp().vec2ang(corners.reshape(-1, 3), lonlat=True), -1).reshape(-1, 4, 2)
+    """Corners of cells, [n, 4, 2] ra, dec deg, in order around each: north, west, south, east.
+
+    Ref: Gorski et al. 2005, ApJ 622, 759, eqs. 4-9 and 17-22
+    """
+    nested = np.atleast_1d(np.asarray(cells, np.int64))
+    face, within = nested >> (2 * order), nested & ((1 << 2 * order) - 1)
+    # Of the two coordinates in a base cell, of 1 across, those of the corner: they grow to the north-east and -west.
+    x, y = ((_every_second(within >> bit)[:, None] + np.array(step)) / (1 << order)
+            for bit, step in ((0, (1, 0, 0, 1)), (1, (1, 1, 0, 0))))  # fmt: skip
+    # Rows of base cells from the north, from 2, and their middles in steps of 45 deg.
+    row, column = face // 4 + 2, 2 * (face % 4) + (face // 4 != 1)
+    height = row[:, None] - x - y
+    polar = (height < 1.0) | (height > 3.0)
+    # Near the poles, how far from one.
+    depth = np.where(height < 1.0, height, np.where(height > 3.0, 4.0 - height, 1.0))
+    z = np.where(polar, np.sign(2.0 - height) * (1.0 - depth**2 / 3.0), (2.0 - height) * 2.0 / 3.0)
+    dec = np.where(
+        polar & (depth < 0.5),
+        # Where the sine is nearly one it tells little of the angle.
+        np.sign(2.0 - height) * (90.0 - 2.0 * np.degrees(np.arcsin(depth / np.sqrt(6.0)))),
+        np.degrees(np.arcsin(z)),
+    )
+    ra = 45.0 * (column[:, None] + np.divide(x - y, depth, out=np.zeros_like(depth), where=depth > 0.0))
+    return np.stack([ra % 360.0, dec], -1)
+
+
+def _every_second(bits: Int) -> Int:
+    """The number that bits 0, 2, 4 ... of a number make."""
+    found = bits & 0x5555555555555555
+    for shift, mask in (
+        (1, 0x3333333333333333), (2, 0x0F0F0F0F0F0F0F0F), (4, 0x00FF00FF00FF00FF), (8, 0x0000FFFF0000FFFF),
+        (16, 0x00000000FFFFFFFF),
+    ):  # fmt: skip
+        found = (found | found >> shift) & mask
+    return np.asarray(found, np.int64)
 
 
 def cell_range(order: int, cell: int) -> tuple[int, int]:

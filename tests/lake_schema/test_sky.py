@@ -184,6 +184,23 @@ def test_a_box_takes_few_cells_too_many():
     assert 380 < area < 380 + 96 * np.sqrt(sky.cell_area(7)) * 1.1
 
 
+@pytest.mark.parametrize("order", [0, 1, 2, 4, 9, 17, 29])
+def test_corners_are_those_of_healpy(order):
+    """All cells of large ones; of small ones some, and those at the poles and along the edges of base cells."""
+    healpy, number = pytest.importorskip("healpy"), 12 * 4**order
+    some = np.random.default_rng(2).integers(number, size=3000)
+    edges = [k * number // 12 + shift for k in range(13) for shift in (-1, 0) if 0 <= k * number // 12 + shift < number]
+    cells = np.arange(number) if order < 5 else np.unique([*some, *edges])
+    expected = np.moveaxis(healpy.boundaries(1 << order, cells, nest=True), 1, 2)
+    places = np.stack(healpy.vec2ang(expected.reshape(-1, 3), lonlat=True), -1).reshape(-1, 4, 2)
+    found = sky.cell_corners(order, cells)
+    apart = sky.separation(found[..., 0].ravel(), found[..., 1].ravel(), *places.reshape(-1, 2).T)
+    # healpy's own corners at the poles are 0.6 mas away from them at most.
+    assert np.max(apart[np.abs(found[..., 1].ravel()) < 89.99]) < 1e-10
+    assert np.max(apart) < 2e-7
+    assert ((found[..., 0] >= 0.0) & (found[..., 0] < 360.0)).all()
+
+
 @pytest.mark.parametrize("order", [0, 5, 12])
 def test_corners_lie_about_the_centre(order):
     cells = np.arange(0, 12 * 4**order, max(1, 12 * 4**order // 20))
