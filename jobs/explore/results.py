@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import itertools
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pandas as pd
 import pyarrow as pa
@@ -17,8 +18,9 @@ from jobs.explore import votables
 from lake_schema import user_files
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
-from lake_schema.fits.tables import table_to_fits
 
+# That a FITS file is made of, and that it may have: of other files no more than a piece is kept.
+MOST_FITS_BYTES, _PIECE = 8 << 30, 1 << 20
 INTO = ("pandas", "astropy", "arrow")
 # Where some are missing: pandas' own way is to make floats of integers, which rounds an identifier.
 _NULLABLE: dict[pa.DataType, Any] = {pa.bool_(): pd.BooleanDtype()}
@@ -101,8 +103,15 @@ def _parquet(rows: pa.Table, path: Path) -> None:
 
 
 def _fits(rows: pa.Table, path: Path) -> None:
-    declared = Table("result", 1, tuple(_column(field) for field in rows.schema), "Result of a query.", key=())
+    # astropy's import takes longer than a page of the sky.
+    from lake_schema.fits.tables import table_to_fits
+
+    declared = _declared(rows.schema)
     table_to_fits(path, rows.cast(declared.arrow()), declared)
+
+
+def _declared(schema: pa.Schema) -> Table:
+    return Table("result", 1, tuple(_column(field) for field in schema), "Result of a query.", key=())
 
 
 def _column(field: pa.Field) -> Column:
@@ -137,9 +146,10 @@ ENDINGS = tuple(_WRITERS)
 
 
 def streamed(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[bytes]:
-    """The bytes of a .csv, .parquet or .vot file of any number of rows, piece by piece.
+    """The bytes of a .csv, .parquet, .vot or .fits file of any number of rows, piece by piece.
 
-    batches : at least one;  Errors: BadInput before the first piece where such a file cannot hold the columns
+    batches : at least one; for FITS all of them are read before the first piece
+    Errors  : BadInput before the first piece where such a file cannot hold the columns
     """
     first = next(batches)
     _refuse_same_names(pa.Table.from_batches([first]))
@@ -150,8 +160,46 @@ def streamed(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[bytes]:
         yield from _written(both, lambda sink: pa.csv.CSVWriter(sink, first.schema))
     elif ending == ".parquet":
         yield from _written(both, lambda sink: _groups(sink, first.schema))
+    elif ending == ".fits":
+        yield from _fits_pieces(both, first.schema)
     else:
         raise BadInput(f"a file of {ending} is not written piece by piece")
+
+
+def _fits_pieces(batches: Iterator[pa.RecordBatch], schema: pa.Schema) -> Iterator[bytes]:
+    """A file whose header tells the number of rows and the longest text: through files on disc, not in memory."""
+    from lake_schema.fits.tables import stream_to_fits
+
+    declared = _declared(schema)
+    with tempfile.TemporaryFile() as spool, tempfile.TemporaryFile() as file:
+        _spool(batches, spool, declared.arrow())
+
+        def again() -> Iterator[pa.RecordBatch]:
+            spool.seek(0)
+            yield from pa.ipc.open_stream(spool)
+
+        stream_to_fits(file, again, declared, MOST_FITS_BYTES)
+        file.seek(0)
+        while piece := file.read(_PIECE):
+            yield piece
+
+
+def _spool(batches: Iterator[pa.RecordBatch], spool: IO[bytes], schema: pa.Schema) -> None:
+    """Keep batches on disc, of other types.  Errors: BadInput where they are too many, or names a column"""
+    with pa.ipc.new_stream(spool, schema) as writer:
+        for batch in batches:
+            columns = []
+            for field, values in zip(schema, batch.columns, strict=True):
+                try:
+                    columns.append(values.cast(field.type))
+                except pa.ArrowException as error:
+                    said = " ".join(str(error).split())[:300]
+                    raise BadInput(f"column {field.name}: FITS cannot hold it: {said}") from None
+            writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
+            if spool.tell() > MOST_FITS_BYTES:
+                raise BadInput(
+                    f"the result has more than {MOST_FITS_BYTES / 1e9:.3g} GB: ask for less, or another kind"
+                )
 
 
 def _groups(sink: Any, schema: pa.Schema) -> pq.ParquetWriter:

@@ -1,16 +1,23 @@
 """A table with its units as a FITS binary table.
 
 table_to_fits   an Arrow table -> a binary table, units and UCDs from the table's declaration
+stream_to_fits  the same of any number of rows, a batch of them in memory at a time
 fits_unit       a unit as FITS spells it
 """
 
 from __future__ import annotations
 
 import contextlib
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from astropy import units
 from astropy.io import fits
 
@@ -41,8 +48,7 @@ def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
     """
     columns = [declared.column(name) for name in table.column_names]
     for column in columns:
-        if not (column.name.isascii() and column.name.isprintable() and 0 < len(column.name) <= _LONGEST_NAME):
-            raise BadInput(f"{path}: column {column.name!r} has a name that FITS cannot hold; give it another with AS")
+        _check_name(column.name, f"{path}: ")
     unit = fits.BinTableHDU.from_columns(
         [_fits_column(c, table.column(c.name)) for c in columns], name=declared.name.upper()
     )
@@ -55,6 +61,11 @@ def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
             unit.header[f"TUCD{number}"] = (column.ucd, "IVOA UCD")
     unit.header["TABLEVER"] = (declared.version, "version of the table's declaration")
     write.write_staged(path, fits.HDUList([fits.PrimaryHDU(), unit]))
+
+
+def _check_name(name: str, where: str = "") -> None:
+    if not (name.isascii() and name.isprintable() and 0 < len(name) <= _LONGEST_NAME):
+        raise BadInput(f"{where}column {name!r} has a name that FITS cannot hold; give it another with AS")
 
 
 def _fits_column(column: Column, values: pa.ChunkedArray) -> fits.Column:
@@ -101,3 +112,165 @@ def fits_unit(text: str) -> str:
         with contextlib.suppress(ValueError):
             return str(units.Unit(text).to_string("fits"))
     return text
+
+
+# ------------------------------------------------------------------------------------------------ any number of rows
+
+# Bytes of rows that are put together at a time, and of a block of a FITS file.
+_PIECE_BYTES, _BLOCK = 8 << 20, 2880
+# Of the lowest numbers of an integer type those among which one that does not occur is looked for.
+_LOOKED_THROUGH = 1 << 16
+
+
+@dataclass(slots=True)
+class _Looked:
+    """What must be known of all values of a column before the first is written.
+
+    widest : bytes of a text, or length of a list;  is_missing : whether one is null
+    lowest : which of the lowest numbers of its type occur
+    """
+
+    column: Column
+    widest: int = 0
+    is_missing: bool = False
+    lowest: Array = field(default_factory=lambda: np.zeros(_LOOKED_THROUGH, bool))
+
+    @property
+    def is_list(self) -> bool:
+        return self.column.type.startswith("list")
+
+    @property
+    def kind(self) -> np.dtype[Any]:
+        """Of a value in its row; of a list the length and the place of its values."""
+        if self.is_list:
+            return np.dtype((">i8", (2,)))
+        if self.column.type == "string":
+            return np.dtype(f"S{max(self.widest, 1)}")
+        return np.dtype("u1") if self.column.type == "bool" else np.dtype(_item(self.column.type))
+
+    @property
+    def form(self) -> str:
+        if self.is_list:
+            return f"Q{_TABLE_FORMATS[_inner(self.column.type)]}({self.widest})"
+        return f"{max(self.widest, 1)}A" if self.column.type == "string" else _TABLE_FORMATS[self.column.type]
+
+    @property
+    def null(self) -> int | None:
+        """What stands for a missing whole number, None where none is missing."""
+        if not (self.is_missing and self.kind.kind == "i" and not self.is_list):
+            return None
+        if self.lowest.all():
+            raise BadInput(f"column {self.column.name}: no number is left for what is missing; make it ::DOUBLE")
+        return int(np.iinfo(self.kind).min) + int(np.argmin(self.lowest))
+
+    def look(self, values: pa.Array) -> None:
+        """At some more values."""
+        self.is_missing |= values.null_count > 0
+        if self.is_list or self.column.type == "string":
+            lengths = pc.list_value_length(values) if self.is_list else pc.binary_length(values)
+            self.widest = max(self.widest, pc.max(lengths).as_py() or 0)
+        elif self.kind.kind == "i":
+            found = values.drop_null().to_numpy()
+            # Far from the lowest a difference would leave the type.
+            near = found[found < np.iinfo(self.kind).min + _LOOKED_THROUGH].astype(np.int64)
+            self.lowest[near - np.iinfo(self.kind).min] = True
+
+
+def stream_to_fits(
+    file: IO[bytes], batches: Callable[[], Iterable[pa.RecordBatch]], declared: Table, most: int | None = None
+) -> None:
+    """Write rows as `table_to_fits` does, without checksums; lists have addresses of 64 bits.
+
+    file : open for writing;  batches: gives all rows, of the declared types, each time it is called: this is twice
+    most : bytes that the rows may take, None = any number
+    Errors : BadInput names a column that FITS cannot hold, or where they take more
+    """
+    looked, rows = [_Looked(column) for column in declared.columns], 0
+    for column in declared.columns:
+        _check_name(column.name)
+    for batch in batches():
+        rows += batch.num_rows
+        for one, values in zip(looked, batch.columns, strict=True):
+            one.look(values)
+    record = np.dtype([(f"f{number}", one.kind) for number, one in enumerate(looked)])
+    if most is not None and rows * record.itemsize > most:
+        raise BadInput(f"a FITS file of the result has more than {most / 1e9:.3g} GB: ask for less, or another kind")
+    with tempfile.TemporaryFile() as lists:
+        # The header says how long the values of lists are, which lie behind the rows.
+        start = file.tell()
+        file.write(_header(declared, looked, record.itemsize, rows, 0))
+        for batch in batches():
+            step = max(_PIECE_BYTES // max(record.itemsize, 1), 1)
+            for first in range(0, batch.num_rows, step):
+                file.write(_records(batch.slice(first, step), looked, record, lists))
+        behind = lists.tell()
+        lists.seek(0)
+        shutil.copyfileobj(lists, file, _PIECE_BYTES)
+        file.write(bytes(-(rows * record.itemsize + behind) % _BLOCK))
+        file.seek(start)
+        file.write(_header(declared, looked, record.itemsize, rows, behind))
+
+
+def _header(declared: Table, looked: list[_Looked], width: int, rows: int, behind: int) -> bytes:
+    """A primary unit without pixels, and the header of the table, of a length that its numbers do not change."""
+    columns = []
+    for one in looked:
+        unit = {"unit": fits_unit(one.column.unit)} if one.column.unit else {}
+        columns.append(fits.Column(one.column.name, one.form, null=one.null, **unit))
+    header = fits.BinTableHDU.from_columns(columns, name=declared.name.upper()).header
+    header["NAXIS1"], header["NAXIS2"], header["PCOUNT"] = width, rows, behind
+    for number, one in enumerate(looked, start=1):
+        header[f"TFORM{number}"] = one.form
+        if one.column.ucd:
+            header[f"TUCD{number}"] = (one.column.ucd, "IVOA UCD")
+    header["TABLEVER"] = (declared.version, "version of the table's declaration")
+    text: str = fits.PrimaryHDU().header.tostring() + header.tostring()
+    return text.encode("ascii")
+
+
+def _records(batch: pa.RecordBatch, looked: list[_Looked], record: np.dtype[Any], lists: IO[bytes]) -> bytes:
+    """Some rows as they stand in the file; values of lists go to the end of `lists`."""
+    out = np.zeros(batch.num_rows, record)
+    _place_lists(out, [(f"f{k}", one, batch.column(k)) for k, one in enumerate(looked) if one.is_list], lists)
+    for name, one, values in zip(record.names or (), looked, batch.columns, strict=True):
+        if one.is_list:
+            continue
+        if one.column.type == "string":
+            try:
+                out[name] = [(value or "").encode("ascii") for value in values.to_pylist()]
+            except UnicodeEncodeError as error:
+                raise BadInput(f"column {one.column.name}: FITS has no letter {error.object[error.start]!r}") from None
+        elif one.column.type == "bool":
+            texts = pc.if_else(values, ord("T"), ord("F")).cast(pa.uint8())
+            out[name] = texts.fill_null(0).to_numpy(zero_copy_only=False)
+        else:
+            missing = one.null if one.kind.kind == "i" else float("nan")
+            whole = values if missing is None else values.cast(_wide(values.type)).fill_null(missing)
+            out[name] = whole.to_numpy(zero_copy_only=False)
+    return out.tobytes()
+
+
+def _place_lists(out: Array, columns: list[tuple[str, _Looked, pa.Array]], lists: IO[bytes]) -> None:
+    """Write the values of lists row by row, however many rows come at a time; their lengths and places into `out`."""
+    kinds = [np.dtype(_item(_inner(one.column.type))) for _, one, _ in columns]
+    for k, row in enumerate(zip(*(values.to_pylist() for *_, values in columns), strict=True)):
+        for (name, one, _), kind, value in zip(columns, kinds, row, strict=True):
+            if value:
+                out[name][k] = len(value), lists.tell()
+                try:
+                    lists.write(np.array(value, kind).tobytes())
+                except (TypeError, ValueError):
+                    raise BadInput(f"column {one.column.name}: FITS has no missing value in a list") from None
+
+
+def _inner(kind: str) -> str:
+    return kind.removeprefix("list<").removesuffix(">")
+
+
+def _item(kind: str) -> str:
+    """FITS has no signed bytes: they are written as 16 bits."""
+    return ">i2" if kind == "int8" else np.dtype(kind).newbyteorder(">").str
+
+
+def _wide(kind: pa.DataType) -> pa.DataType:
+    return pa.int16() if kind == pa.int8() else kind
