@@ -8,6 +8,7 @@ import os
 import selectors
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -40,9 +41,17 @@ class Process:
         self.most_bytes = int(memory * _RESULT)
         self.command = [sys.executable, "-m", "jobs.explore.worker", str(root), str(int(memory)), *tables]
         self._worker: subprocess.Popen[bytes] | None = None
+        # Of the question that is being answered, None between two.
+        self._answering: object | None = None
+        # A question that was given up may be ended by whichever thread collects its generator.
+        self._changing = threading.RLock()
 
     def close(self) -> None:
         """End the process; a later query starts another."""
+        with self._changing:
+            self._end()
+
+    def _end(self) -> None:
         if self._worker is not None:
             self._worker.kill()
             self._worker.communicate()
@@ -87,7 +96,7 @@ class Process:
         except (TypeError, ValueError) as error:
             raise BadInput(f"SQL: a parameter is not a number, text, boolean or list of them: {error}") from None
         stopped = BadInput(f"SQL: stopped after {timeout:g} s")
-        worker = self._running()
+        own, worker = self._begun()
         assert worker.stdin is not None
         assert worker.stdout is not None
         whole = False
@@ -108,10 +117,26 @@ class Process:
         except (pa.ArrowException, OSError, EOFError):
             raise BadInput("SQL: the query needs more memory than it may have, or brought its process down") from None
         finally:
-            if not whole:
-                self.close()
+            self._ended(own, whole)
         if answer:
             raise _ERRORS.get(answer["kind"], LakeError)(answer["error"])
+
+    def _begun(self) -> tuple[object, subprocess.Popen[bytes]]:
+        """A question that is now being answered, and who answers it."""
+        with self._changing:
+            if self._answering is not None:
+                # Whoever asked before reads no further, though that is found out only when the generator is collected.
+                self._end()
+            self._answering = object()
+            return self._answering, self._running()
+
+    def _ended(self, question: object, whole: bool) -> None:
+        """A question that has been answered, or is given up; that may be found out when another is being answered."""
+        with self._changing:
+            if self._answering is question:
+                self._answering = None
+                if not whole:
+                    self._end()
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._worker is None or self._worker.poll() is not None:

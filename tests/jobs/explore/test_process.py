@@ -56,6 +56,18 @@ def test_who_reads_no_further_meets_no_rest(process):
     assert numbers(process.batches("SELECT 7 AS a")) == [7]
 
 
+def test_what_is_read_no_further_ends_no_later_answer(process):
+    """However late it is found out: a generator that failed is kept alive by the traceback of its error."""
+    given_up = process.batches("SELECT range + 100 FROM range(100000000)")
+    assert next(given_up).num_rows >= 0
+    later = process.batches("SELECT range FROM range(3000000)")
+    first = next(later)
+    worker = process._worker
+    given_up.close()
+    assert process._worker is worker
+    assert numbers([first, *later]) == list(range(3_000_000))
+
+
 def test_it_is_stopped_while_it_sends(process):
     slow = "SELECT count(*) FROM range(100000) a, range(100000) b WHERE a.range * b.range % 7 = 3"
     with pytest.raises(BadInput, match=r"stopped after 0\.3 s"):
