@@ -1,10 +1,13 @@
 """ADQL, the query language of the Virtual Observatory, in DuckDB's SQL.
 
 in_sql      a query in ADQL -> the same in SQL, with the macros of `MACROS`
+in_cone     the condition that a row lies in HEALPix cells that a circle touches
 
 What differs is TOP, which becomes LIMIT at the end of its SELECT; names of functions; and geometry: POINT, CIRCLE,
 POLYGON, CONTAINS, INTERSECTS, DISTANCE, COORD1, COORD2, and columns of STC-S polygons. Other geometry is refused by
 name.
+Where a query wants the rows of a catalogue in a circle, it also wants their cells among those of the circle: files and
+row groups that hold none of these are not read.
 Whatever stands in quotes stays as it is; whether the result may run is the guard's to say.
 
 Ref: IVOA Recommendation ADQL 2.1
@@ -13,8 +16,11 @@ Ref: IVOA Recommendation ADQL 2.1
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
+import numpy as np
+
+from lake_schema import sky
 from lake_schema.errors import BadInput
 
 # Vertices are lists of ra, dec, ra, dec ... deg; a side is positive where the place lies to the left of it.
@@ -69,16 +75,79 @@ _GEOMETRY = {"CONTAINS", "INTERSECTS", "DISTANCE", "COORD1", "COORD2"}
 _REFUSED = {"AREA", "BOX", "CENTROID", "COORDSYS", "REGION"}
 _SET = {"UNION", "INTERSECT", "EXCEPT"}
 _LONGEST = 50_000
+_CLAUSES = {"SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "ON"}
+# Between which a comparison is a condition of its own.
+_BEFORE, _BEHIND = {"WHERE", "ON", "AND", "OR", "NOT", "("}, {"AND", "OR", ")", "GROUP", "ORDER", "LIMIT", "OFFSET", ""}
+# What follows a table's name and is not another name of it.
+_NO_NAMES = {*_CLAUSES, *_SET, "JOIN", "INNER", "LEFT", "RIGHT", "FULL", "CROSS", "NATURAL", "USING", "LIMIT", "OFFSET"}
+# Cells of a cover are about this part of its radius wide, and stand in so many ranges at most.
+_CELLS_A_RADIUS, _MOST_RANGES, _WIDEST_DEG, _ROUNDING_DEG = 4, 24, 60.0, 1e-7
 
 
-def in_sql(text: str) -> str:
-    """The query in DuckDB's SQL.  Errors: BadInput names what of ADQL is not understood."""
+def in_sql(text: str, catalogues: Collection[str] = ()) -> str:
+    """The query in DuckDB's SQL.
+
+    catalogues : tables, in lower case, whose `_healpix_29` is that of ra and dec
+    Errors     : BadInput names what of ADQL is not understood
+    """
     if len(text) > _LONGEST:
         raise BadInput(f"ADQL: a query has at most {_LONGEST} characters")
     tokens = [token for token in _TOKEN.findall(text) if not token.startswith(("--", "/*"))]
     while tokens and (tokens[-1].isspace() or tokens[-1] == ";"):
         tokens.pop()
-    return "".join(_limited(_functions(tokens)))
+    return "".join(_limited(_functions(tokens, _indices(tokens, catalogues))))
+
+
+def in_cone(column: str, ra: float, dec: float, radius: float) -> str:
+    """The condition that an index of order 29 lies in cells that a circle touches, as few ranges.
+
+    column : of the index;  ra, dec, radius : deg
+    """
+    order = int(np.clip(np.ceil(np.log2(np.sqrt(sky.cell_area(0)) * _CELLS_A_RADIUS / max(radius, 1e-6))), 0, 20))
+    cells = sky.cells_in_cone(ra, dec, min(radius + _ROUNDING_DEG, 180.0), order)
+    gaps = np.diff(cells)
+    cuts = np.flatnonzero(gaps > 1)
+    if len(cuts) >= _MOST_RANGES:
+        # The widest gaps are left out.
+        cuts = np.sort(cuts[np.argsort(gaps[cuts])[-_MOST_RANGES + 1 :]])
+    firsts, lasts = cells[np.append(0, cuts + 1)], cells[np.append(cuts, len(cells) - 1)]
+    ranges = [(sky.cell_range(order, a)[0], sky.cell_range(order, b)[1]) for a, b in zip(firsts, lasts, strict=True)]
+    return f"({' OR '.join(f'({column} >= {first} AND {column} < {last})' for first, last in ranges)})"
+
+
+# ------------------------------------------------------------------------------------------------ places
+
+
+def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str, str]:
+    """What may stand before `ra` and `dec`, with its full stop or "" -> the index of the same rows.
+
+    Where a name may be that of something else than a catalogue it is left out.
+    """
+    words = [token for token in tokens if not token.isspace()]
+    upper = [word.upper() for word in words]
+    if not catalogues or "WITH" in upper:
+        return {}
+    found: list[tuple[str, bool]] = []
+    for k, word in enumerate(upper):
+        # A comma joins, too: what follows one is no table of ours unless it stands alone.
+        if word in ("FROM", "JOIN"):
+            name, at = "", k + 1
+            while at < len(words) and not (upper[at] in _NO_NAMES or words[at] in ("(", ")", ",")):
+                if words[at] != "." and words[at - 1] != "." and at > k + 1:
+                    break
+                name += words[at].strip('"').lower()
+                at += 1
+            at += at < len(words) and upper[at] == "AS"
+            other = words[at] if at < len(words) and words[at].isidentifier() and upper[at] not in _NO_NAMES else ""
+            behind = words[at + bool(other)] if at + bool(other) < len(words) else ""
+            found.append((other.lower() or name.rpartition(".")[2], name in catalogues and behind not in ("(", ",")))
+    # Names of subqueries stand behind a bracket.
+    behind_brackets = " ".join(upper).replace(") AS ", ") ").split(") ")[1:]
+    hidden = {text.partition(" ")[0].lower() for text in behind_brackets}
+    names = [name for name, _ in found]
+    own = {name for name, is_known in found if is_known and names.count(name) == 1 and name not in hidden}
+    alone = {"": "_healpix_29"} if len(found) == 1 and own else {}
+    return alone | {f"{name}.": f"{name}._healpix_29" for name in own if name.isidentifier()}
 
 
 # ------------------------------------------------------------------------------------------------ TOP
@@ -126,24 +195,71 @@ def _top(tokens: Sequence[str], at: int, out: list[str]) -> tuple[int, str | Non
 # ------------------------------------------------------------------------------------------------ functions
 
 
-def _functions(tokens: Sequence[str]) -> list[str]:
-    """Calls of functions that have another name or form."""
+def _functions(tokens: Sequence[str], indices: Mapping[str, str]) -> list[str]:
+    """Calls of functions that have another name or form.
+
+    indices : as of `_indices`
+    """
     out: list[str] = []
-    at = 0
+    at, clauses = 0, [""]
     while at < len(tokens):
         word = tokens[at].upper()
+        if word in _CLAUSES:
+            clauses[-1] = word
+        clauses = [*clauses, clauses[-1]] if word == "(" else clauses[:-1] if word == ")" and clauses[1:] else clauses
         bracket = next((k for k in range(at + 1, len(tokens)) if not tokens[k].isspace()), len(tokens))
         is_call = bracket < len(tokens) and tokens[bracket] == "("
         if is_call and word in _REFUSED | _REGIONS | {"POINT"}:
             where = "alone" if word in _REGIONS | {"POINT"} else "here"
             raise BadInput(f"ADQL: {word} is not possible {where}")
         if is_call and word in _GEOMETRY:
-            arguments, at = _arguments(tokens, bracket)
-            out.append(_geometry(word, arguments))
+            arguments, behind = _arguments(tokens, bracket)
+            cells = _cells(word, arguments, indices) if clauses[-1] in ("WHERE", "ON") else ""
+            geometry, at = _geometry(word, arguments), behind
+            if cells and (end := _condition(tokens, behind, out)) is not None:
+                geometry, at = f"({cells} AND {geometry} = 1)", end
+            out.append(geometry)
         else:
             out.append(_RENAMED.get(word, tokens[at]) if is_call else tokens[at])
             at += 1
     return out
+
+
+def _cells(word: str, arguments: list[list[str]], indices: Mapping[str, str]) -> str:
+    """The condition that the rows' cells are those of a circle, where a call asks whether they lie in one; else "".
+
+    Only of places that are columns, and circles that are numbers.
+    """
+    if word not in ("CONTAINS", "INTERSECTS") or len(arguments) != 2:
+        return ""
+    if word == "INTERSECTS" and _kind(arguments[0]) == "CIRCLE":
+        arguments = arguments[::-1]
+    if (_kind(arguments[0]), _kind(arguments[1])) != ("POINT", "CIRCLE"):
+        return ""
+    ra, dec = (text.lower() for text in _point(word, arguments[0]))
+    try:
+        lon, lat, radius = (float("".join(text.split()).strip("()")) for text in _circle(arguments[1]))
+    except ValueError:
+        return ""
+    column = indices.get(ra.removesuffix("ra"), "") if ra.endswith("ra") and ra[:-2] == dec[:-3] else ""
+    is_circle = -1e6 < lon < 1e6 and -90.0 <= lat <= 90.0 and 0.0 <= radius <= _WIDEST_DEG
+    return in_cone(column, lon, lat, radius) if column and dec.endswith("dec") and is_circle else ""
+
+
+def _condition(tokens: Sequence[str], behind: int, out: list[str]) -> int | None:
+    """Where what compares a call with 1 ends, `behind` the call or further on; None where it is no condition alone.
+
+    out : before the call; a "1 =" is taken away from it
+    """
+    ahead = [k for k in range(behind, len(tokens)) if not tokens[k].isspace()][:3]
+    before = [k for k in range(len(out)) if not out[k].isspace()][-3:]
+    next_, last = [tokens[k].upper() for k in ahead] + [""] * 3, [""] * 3 + [out[k].upper() for k in before]
+    if next_[:2] == ["=", "1"] and next_[2] in _BEHIND and last[-1] in _BEFORE:
+        return ahead[1] + 1
+    if last[-2:] == ["1", "="] and next_[0] in _BEHIND and last[-3] in _BEFORE:
+        del out[before[-2] :]
+        return behind
+    return None
 
 
 def _arguments(tokens: Sequence[str], bracket: int) -> tuple[list[list[str]], int]:
@@ -249,7 +365,7 @@ def _so_many(word: str, arguments: list[list[str]], number: int) -> list[list[st
 
 
 def _sql(tokens: list[str]) -> str:
-    text = "".join(_functions(tokens)).strip()
+    text = "".join(_functions(tokens, {})).strip()
     if not text:
         raise BadInput("ADQL: an argument is missing")
     # A column, a number or a text needs no brackets.

@@ -4,11 +4,13 @@ import contextlib
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jobs.explore import adql, session
+from lake_schema import sky
 from lake_schema.errors import BadInput
 
 
@@ -36,6 +38,69 @@ def database():
 )
 def test_in_sql(query, sql):
     assert adql.in_sql(query).split() == sql.split()
+
+
+CONE = "CONTAINS(POINT('ICRS', {0}ra, {0}dec), CIRCLE('ICRS', 40, -30, 3)) = 1"
+
+
+@pytest.mark.parametrize(
+    ("query", "column"),
+    [
+        (f"SELECT x FROM t WHERE {CONE.format('')}", "_healpix_29"),
+        (f"SELECT x FROM t AS s WHERE x > 1 AND ({CONE.format('s.')} OR x < 0) ORDER BY x", "s._healpix_29"),
+        (f"SELECT x FROM demo.t WHERE NOT {CONE.format('')}", "_healpix_29"),
+        ("SELECT x FROM t WHERE 1 = CONTAINS(POINT(ra, dec), CIRCLE(POINT(40, -30), 3)) LIMIT 9", "_healpix_29"),
+        ("SELECT x FROM t WHERE INTERSECTS(CIRCLE(40, - 30, 3), POINT(RA, Dec)) = 1 AND true", "_healpix_29"),
+        (f"SELECT t.x FROM t JOIN u ON t.x = u.x AND {CONE.format('t.')}", "t._healpix_29"),
+        (f"SELECT t.x FROM t LEFT JOIN u USING (x) WHERE {CONE.format('t.')}", "t._healpix_29"),
+        (f"SELECT x FROM (SELECT * FROM t AS own WHERE {CONE.format('own.')}) AS s WHERE x > 2", "own._healpix_29"),
+    ],
+)
+def test_a_cone_has_ranges_of_cells(database, query, column):
+    """With them the rows are the same, and a scan that looks at the ranges alone reads fewer."""
+    rng = np.random.default_rng(4)
+    ra, dec = rng.uniform(30, 50, 4000), rng.uniform(-40, -20, 4000)
+    rows = pa.table({"x": np.arange(4000), "ra": ra, "dec": dec, "_healpix_29": sky.healpix_29(ra, dec)})
+    other = pa.table({"x": np.arange(0, 4000, 3)})
+    found, plain = adql.in_sql(query, {"t", "demo.t"}), adql.in_sql(query)
+    assert f"({column} >= " in found
+    assert "_healpix_29" not in plain
+    with database.cursor() as session_:
+        session_.register("t", rows)
+        session_.register("u", other)
+        answers = [sorted(session_.sql(text.replace("demo.t", "t")).fetchall()) for text in (found, plain)]
+    assert answers[0] == answers[1]
+    assert 8 < len(answers[0]) < 4000
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        # Of no catalogue, of which of several, of a name that hides one, of columns of another name.
+        f"SELECT x FROM u WHERE {CONE.format('')}",
+        f"SELECT x FROM t, u WHERE {CONE.format('')}",
+        f"SELECT x FROM t JOIN u USING (x) WHERE {CONE.format('')}",
+        f"SELECT x FROM t JOIN u AS s USING (x) WHERE {CONE.format('s.')}",
+        f"WITH t AS (SELECT 1 AS x, 2 AS ra, 3 AS dec) SELECT x FROM t WHERE {CONE.format('')}",
+        f"SELECT x FROM (SELECT 1 AS ra, 2 AS dec FROM t) AS t WHERE {CONE.format('t.')}",
+        f"SELECT x FROM t AS s(ra, dec) WHERE {CONE.format('s.')}",
+        "SELECT x FROM t WHERE CONTAINS(POINT(ra_lensed, dec), CIRCLE(40, -30, 3)) = 1",
+        "SELECT x FROM t WHERE CONTAINS(POINT(ra, dec_lensed), CIRCLE(40, -30, 3)) = 1",
+        "SELECT x FROM t WHERE CONTAINS(POINT(dec, ra), CIRCLE(40, -30, 3)) = 1",
+        "SELECT x FROM t WHERE CONTAINS(POINT(ra, dec), CIRCLE(40, -30, x)) = 1",
+        "SELECT x FROM t WHERE CONTAINS(POINT(ra, dec), CIRCLE(40, -30, 90)) = 1",
+        # Of no condition of its own.
+        f"SELECT {CONE.format('')} FROM t",
+        f"SELECT x FROM t WHERE {CONE.format('')} + 1",
+        f"SELECT x FROM t WHERE 1 + {CONE.format('')}",
+        f"SELECT x FROM t GROUP BY x, ra, dec HAVING {CONE.format('')}",
+        "SELECT x FROM t WHERE CONTAINS(POINT(ra, dec), CIRCLE(40, -30, 3)) = 0",
+        "SELECT x FROM t WHERE CONTAINS(POINT(ra, dec), CIRCLE(40, -30, 3)) < 1",
+        "SELECT x FROM t WHERE DISTANCE(POINT(ra, dec), POINT(40, -30)) = 1",
+    ],
+)
+def test_where_cells_are_not_known_none_are_asked_for(query):
+    assert adql.in_sql(query, {"t"}) == adql.in_sql(query)
 
 
 @pytest.mark.parametrize(
