@@ -2,6 +2,8 @@
 
 Chart       what is counted of which columns
 counted     all charts in one pass over kept columns
+tallied     the same with the rows that lie outside of each chart's spans
+held        columns, with what is told of each at every question
 points      some of the rows that count in a chart
 span        a range that holds nearly all of a column
 
@@ -35,6 +37,11 @@ _SPARSE = 4
 _LOOKED_AT, _OUTSIDE = 200_000, 2e-3
 # Rows that are looked at for a point, at first.
 _LOOKED_AT_A_POINT = 8
+
+# Values of which missing ones are counted at a time.
+_PIECE = 1 << 22
+# The bit of a row that has a value on every axis, one of them outside of the spans; those below are of the columns.
+_BEYOND = 1 << _MOST_COLUMNS
 
 Limits = Mapping[int, tuple[float, float]]
 
@@ -73,6 +80,17 @@ def counted(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits,
     limits  : number of a column -> lowest and highest value that count, both included
     threads : that count side by side, fewer where the counts of each would fill much memory
     """
+    return tallied(columns, charts, limits, threads)[0]
+
+
+def tallied(
+    columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1
+) -> tuple[list[Int], list[int]]:
+    """(Counts as of `counted`; of each chart the rows within the limits that have a value on each of its axes, one of
+    them outside of the spans).
+
+    columns, charts, limits, threads : as of `counted`
+    """
     if not 1 <= len(columns) <= _MOST_COLUMNS or len({len(column) for column in columns}) != 1:
         raise BadInput(f"counting wants 1 to {_MOST_COLUMNS} columns of the same rows")
     _check(len(columns), charts, limits)
@@ -81,11 +99,14 @@ def counted(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits,
     threads = max(1, min(threads, _MOST_COUNTS // max(1, sum(chart.cells for chart in charts))))
     edges = np.linspace(0, rows, threads + 1).astype(np.int64)
 
+    cells = sum(chart.cells for chart in charts)
+
     def part(number: int) -> Int:
-        counts = np.zeros(sum(chart.cells for chart in charts), np.int64)
+        # Behind the counts, of each chart the rows outside of its spans.
+        counts = np.zeros(cells + len(charts), np.int64)
         for first in range(int(edges[number]), int(edges[number + 1]), _BLOCK):
             last = min(first + _BLOCK, int(edges[number + 1]))
-            _count(np.stack([column[first:last] for column in columns]), *tables, counts)
+            _count(np.stack([column[first:last] for column in columns]), *tables, counts[:cells], counts[cells:])
         return counts
 
     if threads == 1:
@@ -93,8 +114,9 @@ def counted(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits,
     else:
         with ThreadPoolExecutor(threads) as pool:
             total = reduce(np.add, pool.map(part, range(threads)))
-    ends = np.cumsum([chart.cells for chart in charts])
-    return [piece.reshape(chart.bins) for piece, chart in zip(np.split(total, ends[:-1]), charts, strict=True)]
+    *pieces, beyond = np.split(total, np.cumsum([chart.cells for chart in charts]))
+    found = [piece.reshape(chart.bins) for piece, chart in zip(pieces, charts, strict=True)]
+    return found, [int(rows) for rows in beyond]
 
 
 def _check(number: int, charts: Sequence[Chart], limits: Limits) -> None:
@@ -133,9 +155,9 @@ def _single(limit: float, up: bool) -> np.float32:
 @exact_jit
 def _count(
     values: Float32, bounds: Float32, is_set: Bool, axes: Int, spans: Float, bins: Int, heeded: Int, starts: Int,
-    counts: Int,
+    counts: Int, beyond: Int,
 ) -> None:  # fmt: skip
-    """Add the rows of a block, float32[column, n], to the counts.
+    """Add the rows of a block, float32[column, n], to the counts, and those outside of a chart's spans to `beyond`.
 
     Loops over rows have no branches, so that several are done at a time: what does not count is counted in a cell that
     is thrown away.
@@ -165,20 +187,24 @@ def _count(
                 place = (x - low) / width * size
                 place = place if place < last else last
                 cell[i] = cell[i] * n + np.int32(place if inside else 0.0)
-                out[i] |= np.int32(0) if inside else np.int32(1)
+                # A missing value, and an infinite one, is nowhere.
+                out[i] |= np.int32(0) if inside else (np.int32(_BEYOND) if abs(x) < np.inf else np.int32(1))
             cells *= n
         if cells > _SPARSE * rows:
             for i in range(rows):
                 if out[i] == 0:
                     counts[starts[k] + cell[i]] += 1
+                elif out[i] == _BEYOND:
+                    beyond[k] += 1
         else:
             for i in range(rows):
-                cell[i] = cell[i] if out[i] == 0 else cells
-            found = np.zeros(cells + 1, np.int32)
+                cell[i] = cell[i] if out[i] == 0 else (cells + 1 if out[i] == _BEYOND else cells)
+            found = np.zeros(cells + 2, np.int32)
             for i in range(rows):
                 found[cell[i]] += 1
             for m in range(cells):
                 counts[starts[k] + m] += found[m]
+            beyond[k] += found[cells + 1]
 
 
 def points(columns: Sequence[Float32], chart: Chart, limits: Limits, most: int) -> tuple[Float32, int]:
@@ -223,3 +249,23 @@ def span(column: Float32) -> tuple[float, float]:
     margin = 0.02 * (hi - lo)
     lo, hi = max(lo - margin, some.min()), min(hi + margin, some.max())
     return (float(lo), float(hi)) if hi > lo else (float(lo) - 0.5, float(hi) + 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Kept columns of the same rows, float32[n] each; of each its span and how many rows have no value."""
+
+    columns: list[Float32]
+    spans: list[tuple[float, float]]
+    missing: list[int]
+
+
+def held(columns: Sequence[Float32]) -> Held:
+    """Columns, looked at once: at every move of a brush this would take as long as counting."""
+    return Held([*columns], [span(column) for column in columns], [_missing(column) for column in columns])
+
+
+def _missing(column: Float32) -> int:
+    """How many values are NaN or infinite."""
+    pieces = (column[first : first + _PIECE] for first in range(0, len(column), _PIECE))
+    return len(column) - sum(int(np.count_nonzero(np.isfinite(piece))) for piece in pieces)

@@ -5,15 +5,12 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-import numpy as np
-
 from jobs.explore import columns, counting
 from jobs.explore.columns import Selection
-from jobs.explore.counting import Chart
+from jobs.explore.counting import Chart, Held
 from jobs.page.answers import packed
 from jobs.page.opened import Lake
 from lake_schema import tables as declarations
-from lake_schema.arrays import Float32
 from lake_schema.errors import BadInput
 
 # Rows a core that are counted at every move; of more a part is counted first.
@@ -22,12 +19,17 @@ PART = 64
 _MOST_AXES, _MOST_CHARTS, MOST_POINTS = 16, 16, 20_000
 # Selections whose columns stay mapped.
 _MOST_HELD = 4
+# That one thread counts as soon as several would.
+_FEW_ROWS = 1_000_000
 Json = dict[str, Any]
 
 
 async def counts(lake: Lake, question: Json) -> bytes:
     """4 bytes: length of the head; the head, JSON; then the counts of every chart, uint32, first axis slowest; then of
     every chart that wants them points, float32 [n, axes].
+
+    Of the head: `spans` and `missing` are of each axis, the span that holds nearly all of its values and the rows that
+    have none; of each chart `total` rows lie within its spans and `outside` beyond them, both within the limits.
 
     question : source, where; axes, each an expression; charts, each with axes (numbers), bins, spans (or null) and,
                if need be, own (numbers of axes whose limits do not hold in it) and points (how many at most); limits,
@@ -43,19 +45,19 @@ async def counts(lake: Lake, question: Json) -> bytes:
     if held is None:
         async with lake.own.process() as process:
 
-            def kept() -> list[Float32]:
+            def kept() -> Held:
                 found = columns.kept(
                     selection, axes, lambda text, own: process.batches(text, {}, lake.timeout, expressions=own)
                 )
                 columns.trim()
-                return found
+                return counting.held(found)
 
             held = await asyncio.to_thread(kept)
         # Compared with their checksums once, not at every move of a brush.
         while len(lake.held) >= _MOST_HELD:
             lake.held.pop(next(iter(lake.held)))
         lake.held[(selection, *axes)] = held
-    return await asyncio.to_thread(_counted, lake, held, question, part)
+    return await asyncio.to_thread(answered, held, question, part, lake.threads)
 
 
 def _list(question: Json, name: str, most: int) -> list[Any]:
@@ -83,29 +85,35 @@ def _part(lake: Lake, source: str, keys: tuple[str, ...], asked: object) -> int:
     return PART if many and keys else 1
 
 
-def _counted(lake: Lake, held: list[Float32], question: Json, part: int) -> bytes:
+def answered(held: Held, question: Json, part: int, threads: int) -> bytes:
+    """The answer of `counts`, of columns that are kept.
+
+    question : as of `counts`, of which source and axes are in
+    held : of the axes, in their order;  part : one row in so many, of which they are;  threads : for many rows
+    """
+    columns = held.columns
     try:
-        spans = [counting.span(column) for column in held]
-        charts = [_chart(chart, spans) for chart in question["charts"]]
+        charts = [_chart(chart, held.spans) for chart in question["charts"]]
         most = [min(max(int(chart.get("points") or 0), 0), MOST_POINTS) for chart in question["charts"]]
         limits = {int(axis): (float(lo), float(hi)) for axis, lo, hi in question.get("limits") or ()}
-        if any(not 0 <= axis < len(held) for axis in [*limits, *(axis for chart in charts for axis in chart.columns)]):
+        if any(not 0 <= axis < len(columns) for axis in [*limits, *(a for chart in charts for a in chart.columns)]):
             raise BadInput("charts: an axis has no expression")
     except (TypeError, ValueError, LookupError, OverflowError, AttributeError) as error:
         raise BadInput(f"charts: {error}") from None
-    rows = len(held[0])
-    threads = lake.threads if rows > 1_000_000 else 1
-    found = counting.counted(held, charts, limits, threads) if rows else [np.zeros(c.bins, np.int64) for c in charts]
-    sampled = [counting.points(held, chart, limits, n) if n else None for chart, n in zip(charts, most, strict=True)]
+    rows = len(columns[0])
+    found, beyond = counting.tallied(columns, charts, limits, threads if rows > _FEW_ROWS else 1)
+    sampled = [counting.points(columns, chart, limits, n) if n else None for chart, n in zip(charts, most, strict=True)]
     scattered = [one[0] for one in sampled if one is not None]
     head = {
         "rows": rows,
         "part": part,
-        "missing": [int(rows - np.count_nonzero(np.isfinite(column))) for column in held],
+        "missing": held.missing,
+        "spans": held.spans,
         "charts": [
-            {"axes": chart.columns, "bins": chart.bins, "spans": chart.spans, "total": int(counts.sum())}
+            {"axes": chart.columns, "bins": chart.bins, "spans": chart.spans}
+            | {"total": int(counts.sum()), "outside": outside}
             | ({} if one is None else {"points": len(one[0]), "points_part": one[1]})
-            for chart, counts, one in zip(charts, found, sampled, strict=True)
+            for chart, counts, outside, one in zip(charts, found, beyond, sampled, strict=True)
         ],
     }
     return packed(head, *(counts.astype("<u4") for counts in found), *(points.astype("<f4") for points in scattered))

@@ -2,11 +2,12 @@
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs.explore.counting import MOST_CELLS, Chart, counted, points, span
+from jobs.explore.counting import MOST_CELLS, Chart, counted, held, points, span, tallied
 from lake_schema.errors import BadInput
 
 SPECIAL = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, 0.1, np.float32(0.3), -1.0, 3.4e38]
@@ -22,8 +23,6 @@ def rows(seed, number=20_000):
 
 def by_duckdb(columns, chart, limits):
     """The slow reference: one query a chart."""
-    import pyarrow as pa
-
     table = pa.table({f"c{k}": pa.array(column, from_pandas=True) for k, column in enumerate(columns)})
     own = set(chart.columns) if chart.own is None else chart.own
     where = [f"c{k} BETWEEN {lo!r}::DOUBLE AND {hi!r}::DOUBLE" for k, (lo, hi) in limits.items() if k not in own]
@@ -71,6 +70,27 @@ def test_every_value_counts_at_most_once(values, bins):
     (counts,) = counted([column], [Chart((0,), ((-1.0, 1.0),), (bins,))], {})
     with np.errstate(invalid="ignore"):
         assert counts.sum() == ((column >= -1.0) & (column <= 1.0)).sum()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("limits", [{}, {1: (0.0, 1.0)}, {0: (-1.0, 0.1), 3: (0.3, 2.0), 2: (-9, 9)}])
+def test_rows_beyond_the_spans(limits, threads):
+    """Those that would count if the spans held every number, and do not: of few bins, and of more than rows."""
+    columns, everything = rows(1), (-3.5e38, 3.5e38)
+    grids = [*CHARTS, Chart((0, 3), ((-2.0, 2.0), (-1.0, 1.0)), (600, 700))]
+    wide = [Chart(one.columns, (everything,) * len(one.columns), (1,) * len(one.columns), one.own) for one in grids]
+    counts, beyond = tallied(columns, grids, limits, threads)
+    all_ = [int(one.sum()) for one in counted(columns, wide, limits)]
+    assert beyond == [most - one.sum() for most, one in zip(all_, counts, strict=True)]
+    assert min(beyond) > 100
+
+
+def test_held():
+    columns = rows(3)
+    found = held(columns)
+    assert found.missing == [int((~np.isfinite(column)).sum()) for column in columns]
+    assert min(found.missing) > 0
+    assert found.spans == [span(column) for column in columns]
 
 
 def test_refusals():
