@@ -8,24 +8,33 @@ from __future__ import annotations
 
 import asyncio
 import os
+import threading
 from collections.abc import AsyncIterator, Callable, Hashable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import pyarrow as pa
 
 from jobs.explore.explorer import Explorer
 from jobs.explore.process import MEMORY, TIMEOUT, Process
-from lake_schema.arrays import Float32
 from lake_schema.errors import BadInput, LakeError
 from lake_schema.store import read
 from lake_schema.store.provenance import digest
 
+if TYPE_CHECKING:
+    # Compiled, and slow to load.
+    from jobs.explore.counting import Held
+
 # Questions that wait for a process; those beyond are refused.
 MOST_WAITING = 8
+# Threads that answer from files and tables: of tiles and sources, which are asked for by the dozen and come soon, and
+# of the rest, which may take s; and how many questions may wait for each.
+PIXEL_THREADS, TABLE_THREADS, MOST_IN_LINE = 4, 2, 64
 _KEY_LENGTH = 16
 Item = TypeVar("Item")
+Given = ParamSpec("Given")
 
 
 class Busy(LakeError):
@@ -50,19 +59,20 @@ class Lane:
             self._free.put_nowait(process)
 
     @asynccontextmanager
-    async def process(self) -> AsyncIterator[Process]:
+    async def process(self, is_patient: bool = False) -> AsyncIterator[Process]:
         """A process that is free; where its user is cancelled another takes its place.
 
-        Errors : Busy where too many wait; Closed
+        is_patient : waits however many wait, and is none of those who wait
+        Errors     : Busy where too many wait; Closed
         """
         self._refuse_closed()
-        if self._free.empty() and self._waiting >= MOST_WAITING:
+        if self._free.empty() and self._waiting >= MOST_WAITING and not is_patient:
             raise Busy(f"{MOST_WAITING} questions are waiting: ask again later")
-        self._waiting += 1
+        self._waiting += not is_patient
         try:
             process = await self._free.get()
         finally:
-            self._waiting -= 1
+            self._waiting -= not is_patient
         try:
             self._refuse_closed()
             yield process
@@ -99,6 +109,37 @@ class Lane:
             self._free.put_nowait(process)
 
 
+class Pool:
+    """Threads that answer questions, and a bound of how many wait for one.
+
+    threads : that answer at a time;  most : questions that may wait beside
+    """
+
+    def __init__(self, threads: int, most: int = MOST_IN_LINE) -> None:
+        self._threads, self._most = ThreadPoolExecutor(threads), most
+        self._places = threading.BoundedSemaphore(threads + most)
+
+    async def run(self, function: Callable[Given, Item], *given: Given.args, **named: Given.kwargs) -> Item:
+        """What a function returns, without holding up anything else; one who goes away leaves the line.
+
+        Errors : Busy where too many wait; Closed; those of the function
+        """
+        if not self._places.acquire(blocking=False):
+            raise Busy(f"{self._most} questions are waiting: ask again later")
+        try:
+            asked = self._threads.submit(function, *given, **named)
+        except RuntimeError:
+            self._places.release()
+            raise Closed("the lake has been opened anew") from None
+        # Also where nobody waits any more: the thread is in use until it is done.
+        asked.add_done_callback(lambda _: self._places.release())
+        return await asyncio.wrap_future(asked)
+
+    def close(self) -> None:
+        """Take no other question; those that wait are answered."""
+        self._threads.shutdown(wait=False)
+
+
 class Lake:
     """One opened lake.
 
@@ -116,9 +157,10 @@ class Lake:
         # What a user asks may take minutes: it holds up neither the other nor what the page itself asks.
         self.questions = Lane(self.explorer.process, 2)
         self.own = Lane(self.explorer.process, 1)
+        self.pixels, self.tables = Pool(PIXEL_THREADS), Pool(TABLE_THREADS)
         self.threads = min(os.cpu_count() or 1, 8)
         # Kept columns that are mapped, by selection and expressions.
-        self.held: dict[tuple[Hashable, ...], list[Float32]] = {}
+        self.held: dict[tuple[Hashable, ...], Held] = {}
 
     @property
     def versions(self) -> Mapping[str, read.Version]:
@@ -162,6 +204,8 @@ class Lake:
         """End its processes; what is being answered is answered to its end, of the lake as it was."""
         self.questions.close()
         self.own.close()
+        self.pixels.close()
+        self.tables.close()
         self.explorer.close()
 
 

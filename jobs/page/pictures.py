@@ -37,11 +37,13 @@ class Picture:
 
     version : of the table;  row : of the file
     hits    : the file of its cosmic rays' truth, where there is one
+    request : that has them, where several have products of their own
     """
 
     version: read.Version
     row: Mapping[str, Any]
     hits: str | None
+    request: str | None = None
 
     @cached_property
     def is_mendable(self) -> bool:
@@ -94,10 +96,11 @@ class Picture:
 def pictures(lake: Lake) -> list[Picture]:
     """Every file of the products, in the order of their table: a file goes by its number here, never by its path."""
     found = []
+    names = {version.key: name.rpartition(".")[0] or None for name, version in lake.listed.items()}
     for version in lake.named("products"):
         rows = version.rows().to_pylist()
         hits = {_frame(row): row["path"] for row in rows if row["content"] == "cosmic_rays"}
-        found += [Picture(version, row, hits.get(_frame(row))) for row in rows]
+        found += [Picture(version, row, hits.get(_frame(row)), names.get(version.key)) for row in rows]
     return found
 
 
@@ -119,6 +122,7 @@ def listed(lake: Lake) -> list[Json]:
         {
             "number": number,
             "is_mendable": one.is_mendable,
+            "request": one.request,
             **{k: plain(v) for k, v in one.row.items() if k != "mission"},
         }
         for number, one in enumerate(pictures(lake))
@@ -158,12 +162,16 @@ def _grid(system: WCS, nx: int, ny: int) -> Json:
     (ra0,), (dec0,) = astrometry.sky_of_pixel(system, [(nx - 1) / 2], [(ny - 1) / 2])
     column, row = np.meshgrid(x, y)
     ra, dec = astrometry.sky_of_pixel(system, column.ravel(), row.ravel())
-    xi, eta = _tangent(ra, dec, float(ra0), float(dec0))
+    xi, eta = tangent(ra, dec, float(ra0), float(dec0))
     plane = {name: np.round(values, 12).tolist() for name, values in (("xi", xi), ("eta", eta))}
     return {"ra": float(ra0), "dec": float(dec0), "x": x.tolist(), "y": y.tolist(), **plane}
 
 
-def _tangent(ra: Float, dec: Float, ra0: float, dec0: float) -> tuple[Float, Float]:
+def tangent(ra: Float, dec: Float, ra0: float, dec0: float) -> tuple[Float, Float]:
+    """Places on a tangent plane: east and north of where it touches, deg.
+
+    ra, dec : [n] deg;  ra0, dec0 : where it touches the sphere, deg
+    """
     a, d, d0 = np.radians(ra - ra0), np.radians(dec), np.radians(dec0)
     depth = np.sin(d0) * np.sin(d) + np.cos(d0) * np.cos(d) * np.cos(a)
     east, north = np.cos(d) * np.sin(a), np.cos(d0) * np.sin(d) - np.sin(d0) * np.cos(d) * np.cos(a)

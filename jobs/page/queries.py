@@ -16,7 +16,9 @@ from pathlib import Path
 
 from lake_schema.errors import BadInput, LakeError
 
-MOST_JOBS = 64
+MOST_JOBS, AT_ONCE = 64, 2
+# Of the result of a job, and of those of all jobs together.
+MOST_BYTES, MOST_BYTES_IN_ALL = 4 << 30, 16 << 30
 KEPT = timedelta(days=1)
 _ENDED = ("COMPLETED", "ERROR", "ABORTED")
 # (parameters, s that it may take) -> content type and pieces of the answer
@@ -25,7 +27,7 @@ Run = Callable[[dict[str, str], float], AbstractAsyncContextManager[tuple[str, A
 
 @dataclass(slots=True)
 class Job:
-    """A question, and what becomes of it."""
+    """A question, and what becomes of it; `size` are the bytes of its result."""
 
     parameters: dict[str, str]
     most_seconds: float
@@ -37,6 +39,7 @@ class Job:
     destroyed: datetime = field(default_factory=lambda: datetime.now(UTC) + KEPT)
     error: str = ""
     kind: str = ""
+    size: int = 0
     task: asyncio.Task[None] | None = None
     changed: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -61,6 +64,7 @@ class Jobs:
         self._run = run
         self._folder = tempfile.TemporaryDirectory(prefix="truesky-")
         self._jobs: dict[str, Job] = {}
+        self._places = asyncio.Semaphore(AT_ONCE)
 
     def all(self) -> list[Job]:
         """Those that are not past their day, oldest first."""
@@ -115,18 +119,31 @@ class Jobs:
         self._folder.cleanup()
 
     async def _work(self, job: Job) -> None:
-        job.started = datetime.now(UTC)
-        job.set_phase("EXECUTING")
         try:
-            async with self._run(job.parameters, job.most_seconds) as (kind, pieces):
-                with self.file(job).open("wb") as file:
-                    async for piece in pieces:
-                        file.write(piece)
+            # Queued until there is a place, and a process that answers.
+            async with self._places, self._run(job.parameters, job.most_seconds) as (kind, pieces):
+                job.started = datetime.now(UTC)
+                job.set_phase("EXECUTING")
+                await self._keep(job, pieces)
                 job.kind = kind
         except (LakeError, OSError) as error:
             job.error = str(error) or type(error).__name__
         except Exception as error:
             # Whatever it is: a job that has ended must not be waited for.
             job.error = f"{type(error).__name__}: {error}"
+        if job.error:
+            self.file(job).unlink(missing_ok=True)
+            job.size = 0
         job.ended = datetime.now(UTC)
         job.set_phase("ERROR" if job.error else "COMPLETED")
+
+    async def _keep(self, job: Job, pieces: AsyncIterator[bytes]) -> None:
+        """Write the result of a job into its file.  Errors: BadInput where it is too large"""
+        with self.file(job).open("wb") as file:
+            async for piece in pieces:
+                file.write(piece)
+                job.size += len(piece)
+                if job.size > MOST_BYTES:
+                    raise BadInput(f"the result has more than {MOST_BYTES / 1e9:.3g} GB: ask for less")
+                if sum(one.size for one in self._jobs.values()) > MOST_BYTES_IN_ALL:
+                    raise BadInput(f"results of jobs have more than {MOST_BYTES_IN_ALL / 1e9:.3g} GB: delete some")

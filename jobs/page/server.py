@@ -1,8 +1,12 @@
-"""Which address is answered by what."""
+"""Which address is answered by what.
+
+What answers is imported when first asked, or when the first sky has been shown: it takes longer to load than that.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -11,7 +15,7 @@ from typing import Any
 import numpy as np
 from aiohttp import web
 
-from jobs.page import answers, charts, downloads, pictures, runs, sky_maps, sources, tap
+from jobs.page import answers, downloads, sky_maps, tap
 from jobs.page.gate import MOST_BODY, TAP, Gate, dress
 from jobs.page.opened import Busy, Closed, Lake
 from lake_schema.arrays import Float
@@ -19,6 +23,8 @@ from lake_schema.errors import BadInput, LakeError
 
 _STATIC = Path(__file__).with_name("static")
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+# s that the first sky may take: then the processes are started all the same.
+_FIRST_SKY = 3.0
 Answer = Callable[[Lake, web.Request], Awaitable[web.StreamResponse]]
 
 
@@ -31,7 +37,7 @@ class Server:
     def __init__(self, open_lake: Callable[[], Lake], gate: Gate) -> None:
         self._open, self.gate, self.lake = open_lake, gate, open_lake()
         self.tap = tap.Service(gate)
-        self._opening = asyncio.Lock()
+        self._opening, self._shown = asyncio.Lock(), asyncio.Event()
 
     def application(self) -> web.Application:
         """What aiohttp runs."""
@@ -49,7 +55,14 @@ class Server:
         return app
 
     async def _warm(self, app: web.Application) -> None:
-        self._warming = asyncio.create_task(self.lake.warm())
+        self._warming = asyncio.create_task(self._warmed())
+
+    async def _warmed(self) -> None:
+        """Start the processes when the first sky has been told: beside it they would make it late."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._shown.wait(), _FIRST_SKY)
+        await asyncio.to_thread(_load)
+        await self.lake.warm()
 
     async def _close(self, app: web.Application) -> None:
         self._warming.cancel()
@@ -67,15 +80,16 @@ class Server:
 
     async def _described(self, request: web.Request) -> web.StreamResponse:
         tap_address = f"http://{request.headers['Host']}{TAP}{self.gate.tap_token}"
-        is_changed = await asyncio.to_thread(self.lake.is_changed)
-        return answers.answer({**answers.described(self.lake), "is_changed": is_changed, "tap": tap_address})
+        lake = self.lake
+        is_changed = await lake.tables.run(lake.is_changed)
+        return answers.answer({**answers.described(lake), "is_changed": is_changed, "tap": tap_address})
 
     async def _reopen(self, request: web.Request) -> web.StreamResponse:
         """Show the lake as it is now; whatever was made of it as it was is refused from here on."""
         async with self._opening:
             # Of two who ask at once the second finds it done.
-            if await asyncio.to_thread(self.lake.is_changed):
-                before, self.lake = self.lake, await asyncio.to_thread(self._open)
+            if await self.lake.tables.run(self.lake.is_changed):
+                before, self.lake = self.lake, await self.lake.tables.run(self._open)
                 before.close()
         return await self._described(request)
 
@@ -84,9 +98,17 @@ class Server:
             lake = self.lake
             if request.match_info["key"] != lake.key:
                 return web.json_response({"error": "the lake has been opened anew", "key": lake.key}, status=409)
-            return await answer(lake, request)
+            found = await answer(lake, request)
+            if answer is _parts:
+                self._shown.set()
+            return found
 
         return answered
+
+
+def _load() -> None:
+    """What answers, before it is asked."""
+    from jobs.page import charts, images, pictures, runs, sources  # noqa: F401
 
 
 @web.middleware
@@ -152,11 +174,13 @@ async def _sql(lake: Lake, request: web.Request) -> web.StreamResponse:
 
 
 async def _charts(lake: Lake, request: web.Request) -> web.StreamResponse:
+    from jobs.page import charts
+
     return _bytes(await charts.counts(lake, await _question(request)))
 
 
 async def _parts(lake: Lake, request: web.Request) -> web.StreamResponse:
-    return _bytes(await asyncio.to_thread(sky_maps.parts, lake, request.match_info["table"]))
+    return _bytes(await lake.tables.run(sky_maps.parts, lake, request.match_info["table"]))
 
 
 async def _density(lake: Lake, request: web.Request) -> web.StreamResponse:
@@ -169,7 +193,12 @@ async def _density(lake: Lake, request: web.Request) -> web.StreamResponse:
 
 async def _coverage(lake: Lake, request: web.Request) -> web.StreamResponse:
     view, band = _view(request) if "ra" in request.query else None, request.query.get("band") or None
-    return _bytes(await asyncio.to_thread(sky_maps.coverage, lake, _whole(request, "order"), view, band))
+    return _bytes(await lake.tables.run(sky_maps.coverage, lake, _whole(request, "order"), view, band))
+
+
+async def _exposures(lake: Lake, request: web.Request) -> web.StreamResponse:
+    view = _view(request) if "ra" in request.query else None
+    return answers.answer(await lake.tables.run(sky_maps.exposures, lake, view))
 
 
 async def _sources(lake: Lake, request: web.Request) -> web.StreamResponse:
@@ -178,36 +207,89 @@ async def _sources(lake: Lake, request: web.Request) -> web.StreamResponse:
 
 
 async def _tile(lake: Lake, request: web.Request) -> web.StreamResponse:
+    from jobs.page import pictures
+
     number, level, row, column = (_whole(request, name) for name in ("number", "level", "row", "column"))
     mended = request.query.get("mended") == "1"
-    found = await asyncio.to_thread(lambda: pictures.picture(lake, number).tile(level, row, column, mended))
+    found = await lake.pixels.run(lambda: pictures.picture(lake, number).tile(level, row, column, mended))
     return _bytes(found.astype("<f4").tobytes())
 
 
 async def _cutout(lake: Lake, request: web.Request) -> web.StreamResponse:
+    from jobs.page import sources
+
     x, y = _numbers(request, "x", "y")
-    return _bytes(await asyncio.to_thread(sources.cutout, lake, _whole(request, "number"), float(x), float(y)))
+    return _bytes(await lake.pixels.run(sources.cutout, lake, _whole(request, "number"), float(x), float(y)))
 
 
 async def _strip(lake: Lake, request: web.Request) -> web.StreamResponse:
+    from jobs.page import sources
+
     order = _numbers(request, "order")
     number, source = _whole(request, "number"), request.match_info["id"]
-    return _bytes(await asyncio.to_thread(sources.strip, lake, number, source, int(order[0])))
+    return _bytes(await lake.pixels.run(sources.strip, lake, number, source, int(order[0])))
 
 
 async def _nearest(lake: Lake, request: web.Request) -> web.StreamResponse:
+    from jobs.page import sources
+
     ra, dec, radius = _view(request)
-    return answers.answer(await asyncio.to_thread(sources.nearest, lake, float(ra), float(dec), min(radius, 1.0)))
+    return answers.answer(await lake.pixels.run(sources.nearest, lake, float(ra), float(dec), min(radius, 1.0)))
 
 
-def _told(function: Callable[..., Any], *names: str) -> Answer:
-    """An answer of JSON: the function of the lake and of parts of the address, made beside everything else."""
+def _told(function: Callable[..., Any], *names: str, is_small: bool = False) -> Answer:
+    """An answer of JSON: the function of the lake and of parts of the address, made beside everything else.
+
+    is_small : asked for by the dozen, as tiles are
+    """
 
     async def answered(lake: Lake, request: web.Request) -> web.StreamResponse:
         given = [_whole(request, name) if name == "number" else request.match_info[name] for name in names]
-        return answers.answer(await asyncio.to_thread(function, lake, *given))
+        return answers.answer(await (lake.pixels if is_small else lake.tables).run(function, lake, *given))
 
     return answered
+
+
+def _listed(lake: Lake) -> Any:
+    from jobs.page import pictures
+
+    return pictures.listed(lake)
+
+
+def _described(lake: Lake, number: int) -> Any:
+    from jobs.page import pictures
+
+    return pictures.described(lake, number)
+
+
+def _truth(lake: Lake, number: int) -> Any:
+    from jobs.page import pictures
+
+    return pictures.truth(lake, number)
+
+
+def _source(lake: Lake, text: str) -> Any:
+    from jobs.page import sources
+
+    return sources.source(lake, text)
+
+
+def _spectrum(lake: Lake, text: str) -> Any:
+    from jobs.page import sources
+
+    return sources.spectrum(lake, text)
+
+
+def _runs(lake: Lake) -> Any:
+    from jobs.page import runs
+
+    return runs.runs(lake)
+
+
+def _provenance(lake: Lake, number: int) -> Any:
+    from jobs.page import runs
+
+    return runs.provenance(lake, number)
 
 
 _ROUTES: tuple[tuple[str, str, Answer], ...] = (
@@ -219,16 +301,17 @@ _ROUTES: tuple[tuple[str, str, Answer], ...] = (
     ("GET", "sky/{table}/sources", _sources),
     ("GET", "coverage", _coverage),
     ("GET", "bands", _told(sky_maps.bands)),
+    ("GET", "exposures", _exposures),
     ("GET", "regions", _told(sky_maps.regions)),
-    ("GET", "images", _told(pictures.listed)),
-    ("GET", "image/{number}", _told(pictures.described, "number")),
+    ("GET", "images", _told(_listed)),
+    ("GET", "image/{number}", _told(_described, "number", is_small=True)),
     ("GET", "tile/{number}/{level}/{row}/{column}", _tile),
-    ("GET", "truth/{number}", _told(pictures.truth, "number")),
+    ("GET", "truth/{number}", _told(_truth, "number", is_small=True)),
     ("GET", "cutout/{number}", _cutout),
     ("GET", "trace/{number}/{id}", _strip),
     ("GET", "nearest", _nearest),
-    ("GET", "source/{id}", _told(sources.source, "id")),
-    ("GET", "spectrum/{id}", _told(sources.spectrum, "id")),
-    ("GET", "runs", _told(runs.runs)),
-    ("GET", "provenance/{number}", _told(runs.provenance, "number")),
+    ("GET", "source/{id}", _told(_source, "id", is_small=True)),
+    ("GET", "spectrum/{id}", _told(_spectrum, "id")),
+    ("GET", "runs", _told(_runs)),
+    ("GET", "provenance/{number}", _told(_provenance, "number")),
 )

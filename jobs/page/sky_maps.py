@@ -1,4 +1,7 @@
-"""The sky of a lake: densities in HEALPix cells, sources of a small field, footprints of what is planned or done."""
+"""The sky of a lake: densities in HEALPix cells, sources of a small field, footprints of what is planned or done.
+
+What is of the renderer is imported where it is used: the first sky is shown before that is loaded.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from jobs.page.answers import is_catalogue, packed
+from jobs.explore import adql
+from jobs.page.answers import is_catalogue, packed, plain
 from jobs.page.opened import Lake
-from jobs.render import archive
-from jobs.render import coverage as coverage_maps
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, LakeError
@@ -22,8 +24,7 @@ from lake_schema.store import layout
 _TASK = ("exposure_id", "ra", "dec", "radius", "s_region")
 MOST_CELLS, MOST_SOURCES = 200_000, 20_000
 _DEEPEST_SHOWN = 16
-# Cells of a cover of the part in view are about this part of its radius wide.
-_CELLS_A_RADIUS = 4
+MOST_EXPOSURES = 20_000
 Json = dict[str, Any]
 # Of the sources of a field: what is shown beside the place, where a table has it.
 _MAGNITUDES = ("mag_r01", "mag_h", "phot_g_mean_mag", "log_mass")
@@ -80,6 +81,8 @@ def coverage(lake: Lake, order: int, view: Float | None, band: str | None) -> by
     lake : whose plan;  order : of the cells
     view : ra, dec, radius deg; None: everything;  band : of the exposures, None = all
     """
+    from jobs.render import coverage as coverage_maps
+
     if not 0 <= order <= _DEEPEST_SHOWN:
         raise BadInput(f"order = {order} is outside [0, {_DEEPEST_SHOWN}]")
     tasks = pa.concat_tables([version.rows(_TASK) for version in lake.named("tasks")] or [pa.table({})])
@@ -115,7 +118,7 @@ def _corners(order: int, cells: Int) -> Float:
 
 
 async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
-    """Rows of a catalogue in a field: places, identifiers, a magnitude, a kind; the brightest where they are many.
+    """Rows of a catalogue in a field: places, identifiers, a magnitude, a kind; the brightest `most` of `total`.
 
     view : ra, dec, radius deg;  where : SQL condition
     """
@@ -125,13 +128,15 @@ async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
     key = "id" if "id" in names else names[0]
     ra, dec = ("ra_lensed", "dec_lensed") if "ra_lensed" in names else ("ra", "dec")
     chosen = [f'"{key}" AS id', f"{ra} AS ra", f"{dec} AS dec", f"{mag or 'NULL'} AS mag"]
-    chosen += ["kind" if "kind" in names else "NULL AS kind"]
+    chosen += ["kind" if "kind" in names else "NULL AS kind", "count(*) OVER () AS total"]
     text = f"""SELECT {", ".join(chosen)} FROM {_table(lake, table)} WHERE ({where}\n) AND {_within(view)}
                AND separation(ra, dec, {lon!r}, {lat!r}) <= {radius!r}
                ORDER BY {"mag" if mag else "1"} LIMIT {MOST_SOURCES}"""
     found = await _asked(lake, text, where)
     columns = {name: found[name].to_pylist() for name in ("ra", "dec", "mag", "kind")}
-    return {**columns, "id": [str(value) for value in found["id"].to_pylist()], "by": mag}
+    return {**columns, "id": [str(value) for value in found["id"].to_pylist()], "by": mag} | {
+        "total": found["total"][0].as_py() if found.num_rows else 0, "most": MOST_SOURCES,
+    }  # fmt: skip
 
 
 async def _asked(lake: Lake, text: str, *expressions: str) -> pa.Table:
@@ -153,20 +158,7 @@ def _within(view: Float | None) -> str:
     """The condition that a row lies in cells that the view touches: files and row groups outside are not read."""
     if view is None:
         return "true"
-    ra, dec, radius = view
-    order = int(np.clip(np.ceil(np.log2(np.sqrt(sky.cell_area(0)) * _CELLS_A_RADIUS / max(radius, 1e-6))), 0, 20))
-    ranges = _ranges(sky.cells_in_cone(ra, dec, min(radius, 180.0), order), order)
-    return f"({' OR '.join(f'(_healpix_29 >= {first} AND _healpix_29 < {last})' for first, last in ranges)})"
-
-
-def _ranges(cells: Int, order: int, most: int = 24) -> list[tuple[int, int]]:
-    """Half-open stretches of order-29 indices that cover sorted cells, the widest gaps left out."""
-    gaps = np.diff(cells)
-    cuts = np.flatnonzero(gaps > 1)
-    if len(cuts) >= most:
-        cuts = np.sort(cuts[np.argsort(gaps[cuts])[-most + 1 :]])
-    firsts, lasts = cells[np.append(0, cuts + 1)], cells[np.append(cuts, len(cells) - 1)]
-    return [(sky.cell_range(order, a)[0], sky.cell_range(order, b)[1]) for a, b in zip(firsts, lasts, strict=True)]
+    return adql.in_cone("_healpix_29", *(float(number) for number in view))
 
 
 def _packed(corners: Float, density: Float, head: Json) -> bytes:
@@ -177,16 +169,20 @@ def _packed(corners: Float, density: Float, head: Json) -> bytes:
 
 
 def regions(lake: Lake) -> list[Json]:
-    """Footprints of detectors: what was planned, what is done, what failed."""
+    """Footprints of detectors: what was planned, what is done, what failed; images by number, each with its content."""
+    from jobs.render import archive
+
     found: dict[tuple[int, str], Json] = {}
+    bands_ = {row["exposure_id"]: row["band"] for row in _rows(lake, "exposures", ("exposure_id", "band"))}
     for row in _rows(lake, "tasks", ("exposure_id", "detector", "channel", "s_region")):
-        found[row["exposure_id"], row["detector"]] = {**_polygon(row), "state": "planned", "images": []}
+        about: Json = {"state": "planned", "images": [], "contents": [], "band": bands_.get(row["exposure_id"])}
+        found[row["exposure_id"], row["detector"]] = {**_polygon(row), **about}
     for number, row in enumerate(_rows(lake, "products", _PRODUCT)):
         place = row["exposure_id"], row["detector"]
-        region = found.setdefault(place, {**_polygon(row), "images": []})
-        region["state"] = "observed"
+        region = found.setdefault(place, {**_polygon(row), "images": [], "contents": []})
+        region |= {"state": "observed", "band": row["band"]}
         region["images"].append(number)
-        region["band"] = row["band"]
+        region["contents"].append(row["content"])
     try:
         failed = archive.failures(lake.root, lake.request).to_pylist() if found else []
     except LakeError:
@@ -209,3 +205,80 @@ def _polygon(row: Json) -> Json:
     numbers = [float(text) for text in row["s_region"].split()[2:]]
     polygon = [numbers[k : k + 2] for k in range(0, len(numbers), 2)]
     return {key: row[key] for key in ("exposure_id", "detector", "channel")} | {"polygon": polygon}
+
+
+def exposures(lake: Lake, view: Float | None = None) -> list[Json]:
+    """Footprints of exposures, each the convex hull of its detectors: how many of these are done, and how many failed.
+
+    view   : ra, dec, radius deg, None = all;  returns: of each exposure its state, what it is, and `outline`, polygons
+    Errors : BadInput where they are more than are shown
+    """
+    about = {row.pop("exposure_id"): row for row in _rows(lake, "exposures", _EXPOSURE)}
+    detectors: dict[int, list[Json]] = {}
+    for region in regions(lake):
+        detectors.setdefault(region["exposure_id"], []).append(region)
+    found: list[Json] = []
+    for number, own in sorted(detectors.items()):
+        corners = np.array([corner for region in own for corner in region["polygon"]])
+        if view is not None and not _is_near(corners, view):
+            continue
+        if len(found) == MOST_EXPOSURES:
+            raise BadInput(f"more than {MOST_EXPOSURES:,} exposures are here: look at a part")
+        states = [region["state"] for region in own]
+        done, failed = states.count("observed"), states.count("failed")
+        first = {"channel": own[0]["channel"], "camera": None, "band": own[0]["band"], "image_type": None, "mjd": None}
+        found.append(
+            {"exposure_id": number, **first, **{k: plain(v) for k, v in about.get(number, {}).items()}}
+            | {"state": _state(done, failed, len(own)), "done": done, "failed": failed, "all": len(own)}
+            | {"outline": [_hull(corners).tolist()]}
+        )
+    return found
+
+
+_EXPOSURE = ("exposure_id", "channel", "camera", "band", "image_type", "mjd")
+
+
+def _state(done: int, failed: int, number: int) -> str:
+    if done:
+        return "observed" if done == number else "partly"
+    return "failed" if failed else "planned"
+
+
+def _is_near(corners: Float, view: Float) -> bool:
+    """Whether a circle about all corners meets one about the place in view."""
+    ra, dec = _middle(corners)
+    extent = sky.separation(corners[:, 0], corners[:, 1], ra, dec).max()
+    return bool(sky.separation(np.array([ra]), np.array([dec]), view[0], view[1])[0] <= extent + view[2])
+
+
+def _middle(corners: Float) -> tuple[float, float]:
+    """ra, dec of the mean of unit vectors, deg."""
+    lon, lat = np.radians(corners).T
+    x, y, z = (np.cos(lat) * np.cos(lon)).mean(), (np.cos(lat) * np.sin(lon)).mean(), np.sin(lat).mean()
+    return float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+
+
+def _hull(corners: Float) -> Float:
+    """Those of the places [n, 2] deg that no great circle cuts off, counter-clockwise with north up and east left.
+
+    In the tangent plane of their middle great circles are straight lines.
+    """
+    from jobs.page import pictures
+
+    plane = np.stack(pictures.tangent(corners[:, 0], corners[:, 1], *_middle(corners)), axis=1)
+    order = np.lexsort((plane[:, 1], plane[:, 0]))
+    chains: list[int] = []
+    for direction in (order, order[::-1]):
+        chain: list[int] = []
+        for k in direction:
+            while len(chain) > 1 and _turn(plane[chain[-2]], plane[chain[-1]], plane[k]) <= 0.0:
+                chain.pop()
+            chain.append(int(k))
+        chains += chain[:-1]
+    # East is to the left of north.
+    return corners[chains[::-1]]
+
+
+def _turn(a: Float, b: Float, c: Float) -> float:
+    """Twice the area of a triangle, positive where it is passed counter-clockwise."""
+    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))

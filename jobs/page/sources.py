@@ -15,7 +15,7 @@ from jobs.page import pictures
 from jobs.page.answers import packed, plain
 from jobs.page.opened import Lake
 from lake_schema import ids, sky
-from lake_schema.errors import BadInput, LakeError
+from lake_schema.errors import BadInput
 from lake_schema.store import read
 
 _TABLES = {**{kind: ("galaxies", "galaxy_fluxes") for kind in range(5)}, 5: ("stars", "star_fluxes")}
@@ -100,6 +100,17 @@ def _rows(version: read.Version, identifier: int) -> pa.Table:
     return rows if rows.num_rows else version.rows(where=pc.field("id") == identifier)
 
 
+def _found(lake: Lake, table: str, identifier: int) -> tuple[pa.Table, read.Version]:
+    """The row of a source in a table, or in that of one of the requests, and the version that has it.
+
+    Errors : BadInput where none has it
+    """
+    for version in lake.named(table):
+        if (rows := _rows(version, identifier)).num_rows:
+            return rows, version
+    raise BadInput(f"the lake has no source {identifier} in a table {table}")
+
+
 def _facts(rows: pa.Table) -> list[Json]:
     about = [{key.decode(): value.decode() for key, value in (field.metadata or {}).items()} for field in rows.schema]
     return [
@@ -127,11 +138,9 @@ def _spectrum(lake: Lake, text: str) -> Json:
     if kind not in (0, 1, 4, 5):
         raise BadInput(f"no spectrum is made of a {pictures.KINDS.get(kind, kind)}")
     table, flux_table = _TABLES[kind]
-    fluxes = lake.version(flux_table)
+    row, _ = _found(lake, table, identifier)
+    flux, fluxes = _found(lake, flux_table, identifier)
     made_of = fluxes.manifest["facts"]
-    row = _rows(lake.version(table), identifier)
-    if not row.num_rows:
-        raise BadInput(f"the lake has no source {text}")
     if kind == 5:
         library = inputs.stars_of(lake.root, made_of)
         whole, grid = band_fluxes.star_spectra(row, library)[0], np.asarray(library.wavelength, float)
@@ -143,7 +152,7 @@ def _spectrum(lake: Lake, text: str) -> Json:
     found: Json = {
         "wavelength": np.round(grid[:size].reshape(-1, step).mean(axis=1), 2).tolist(),
         "f_lambda": [float(f"{value:.5g}") for value in whole[:size].reshape(-1, step).mean(axis=1)],
-        "lines": [], "bands": _bands(lake, _rows(fluxes, identifier)),
+        "lines": [], "bands": _bands(lake, flux),
     }  # fmt: skip
     if kind != 5:
         z = float(row["z_obs"][0].as_py())
@@ -157,15 +166,16 @@ def _spectrum(lake: Lake, text: str) -> Json:
 
 
 def _bands(lake: Lake, row: pa.Table) -> list[Json]:
-    named = {name: row[name][0].as_py() for name in row.column_names if name.startswith("f_nu_")} if len(row) else {}
-    try:
-        curves = lake.version("passbands").rows(["name", "pivot_wavelength", "log_width"]).to_pylist()
-    except LakeError:
-        return []
+    named = {name: row[name][0].as_py() for name in row.column_names if name.startswith("f_nu_")}
+    # Requests that have passbands of their own may have one of the same name: the first is shown.
+    curves: dict[str, Json] = {}
+    for version in lake.named("passbands"):
+        for one in version.rows(["name", "pivot_wavelength", "log_width"]).to_pylist():
+            curves.setdefault(one["name"], one)
     return [
         {"name": one["name"], "wavelength": one["pivot_wavelength"], "f_nu": named[f"f_nu_{one['name']}"],
          "width": one["pivot_wavelength"] * one["log_width"]}
-        for one in curves
+        for one in curves.values()
         if f"f_nu_{one['name']}" in named
     ]  # fmt: skip
 

@@ -19,10 +19,11 @@ import pyarrow as pa
 from aiohttp import web
 
 from jobs.explore import adql, results, votables
-from jobs.page import descriptions, downloads, images, tap_jobs
+from jobs.page import descriptions, downloads, tap_jobs
+from jobs.page.answers import is_catalogue
 from jobs.page.gate import Gate
 from jobs.page.opened import Busy, Lake, Lane, pieces
-from jobs.page.queries import Jobs
+from jobs.page.queries import AT_ONCE, Jobs
 from jobs.page.tap_tables import listed, written
 from lake_schema.errors import BadInput, LakeError
 
@@ -39,11 +40,14 @@ _FORMATS = {
 
 @dataclass(slots=True)
 class _Served:
-    """The processes that answer for one opened lake, and the folder of the tables that they have beside its own."""
+    """The processes that answer for one opened lake, the folder of the tables that they have beside its own, and those
+    of its tables that have positions.
+    """
 
     lake: Lake
     lane: Lane
     folder: tempfile.TemporaryDirectory[str]
+    catalogues: set[str]
 
     def close(self) -> None:
         self.lane.close()
@@ -88,15 +92,19 @@ class Service:
 
     @asynccontextmanager
     async def answered(
-        self, parameters: dict[str, str], seconds: float
+        self, parameters: dict[str, str], seconds: float, is_patient: bool = True
     ) -> AsyncIterator[tuple[str, AsyncIterator[bytes]]]:
-        """Content type and pieces of the answer to a question.  Errors: BadInput, Damaged"""
+        """Content type and pieces of the answer to a question.
+
+        parameters : of TAP;  seconds : that it may take;  is_patient : as of `Lane.process`
+        Errors     : BadInput, Damaged, Busy
+        """
         self.check(parameters)
         kind, ending = _format(parameters)
         most = _most_rows(parameters)
-        text = adql.in_sql(parameters["QUERY"])
         served = await self._opened()
-        async with served.lane.process() as process:
+        text = adql.in_sql(parameters["QUERY"], served.catalogues)
+        async with served.lane.process(is_patient) as process:
             batches = process.batches(text, {}, min(seconds, served.lake.timeout), most + 1)
             if ending == ".vot":
                 data = votables.pieces(batches, votables.Cut(most))
@@ -124,11 +132,16 @@ class Service:
             if self._served is None or self._served.lake is not lake:
                 if self._served is not None:
                     self._served.close()
+                from jobs.page import images
+
                 folder = tempfile.TemporaryDirectory(prefix="truesky-")
                 address = f"http://{self._gate.hosts[0]}:{self._gate.port}/tap/{self._gate.tap_token}"
                 rows = await asyncio.to_thread(images.obscore, lake, address)
                 extra = await asyncio.to_thread(written, lake.listed, rows, Path(folder.name))
-                self._served = _Served(lake, Lane(lambda: lake.explorer.process(extra), 2), folder)
+                # One more than jobs take: they never hold up who waits for an answer.
+                lane = Lane(lambda: lake.explorer.process(extra), AT_ONCE + 1)
+                catalogues = {name.lower() for name, version in lake.versions.items() if is_catalogue(version)}
+                self._served = _Served(lake, lane, folder, catalogues)
             return self._served
 
     # -------------------------------------------------------------------------------------------- addresses
@@ -149,7 +162,7 @@ class Service:
 
     async def _sync(self, request: web.Request) -> web.StreamResponse:
         parameters = await tap_jobs.parameters(request)
-        async with self.answered(parameters, self._lake().timeout) as (kind, data):
+        async with self.answered(parameters, self._lake().timeout, is_patient=False) as (kind, data):
             return await downloads.sent(request, data, kind, None)
 
     async def _availability(self, request: web.Request) -> web.StreamResponse:
@@ -164,10 +177,14 @@ class Service:
 
     async def _image(self, request: web.Request) -> web.StreamResponse:
         """A FITS file of the products, by its number in the lake of a key."""
+        from jobs.page import images, pictures
+
         lake, number = self._lake(), request.match_info["number"]
         if request.match_info["key"] != lake.key or not (number.isascii() and number.isdigit() and len(number) < 10):
             raise web.HTTPNotFound
-        path = await asyncio.to_thread(images.file, lake, int(number))
+        if int(number) >= len(await lake.tables.run(pictures.pictures, lake)):
+            raise web.HTTPNotFound
+        path = await lake.tables.run(images.file, lake, int(number))
         return await downloads.sent(request, pieces(downloads.chunks(path)), "application/fits", path.name)
 
 

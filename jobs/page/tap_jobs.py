@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 
 from aiohttp import web
 
+from jobs.explore import votables
 from jobs.page import descriptions, downloads
 from jobs.page.opened import pieces
 from jobs.page.queries import KEPT, Job, Jobs
@@ -130,9 +131,7 @@ class Routes:
     async def _part(self, request: web.Request) -> web.StreamResponse:
         job, part = self._known(request), request.match_info["part"]
         if part == "error" and job.phase == "ERROR":
-            from jobs.explore.votables import refusal
-
-            return web.Response(body=refusal(job.error), content_type="application/x-votable+xml")
+            return web.Response(body=votables.refusal(job.error), content_type="application/x-votable+xml")
         if part == "parameters":
             return web.Response(text=descriptions.parameters_of(job.parameters), content_type=_XML)
         if part == "results":

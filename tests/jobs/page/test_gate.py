@@ -1,9 +1,11 @@
 """Every rule of who may ask, by requests that break it."""
 
+import asyncio
 import base64
 import json
 import re
 from pathlib import Path
+from urllib.parse import quote
 
 import pytest
 
@@ -153,8 +155,6 @@ def test_another_key_is_refused(page):
 
 def test_a_queue_has_an_end(page):
     """Two questions at work, so many that wait, and the next is refused at once."""
-    import asyncio
-
     lane = page.server.lake.questions
 
     async def fill():
@@ -224,7 +224,5 @@ def test_expressions_of_charts_pass_the_guard(page, change):
     "where", ["true) OR (SELECT count(*) FROM read_text('/etc/passwd')) > (0", "1; SELECT 1", "getenv('X')"]
 )
 def test_conditions_of_the_sky_pass_the_guard(page, where):
-    from urllib.parse import quote
-
     assert page.of_lake(f"sky/galaxies/density?order=8&where={quote(where)}")[0] == 400
     assert page.of_lake(f"sky/galaxies/sources?ra=1&dec=1&radius=1&where={quote(where)}")[0] == 400
