@@ -59,6 +59,18 @@ export function downloadAddress(format, sql) {
   return `${address("export")}?${new URLSearchParams({ format, sql })}`;
 }
 
+/** The pieces of an answer of at most so many bytes; null of a larger one, which is given up.  Errors: a refusal, in words */
+export async function begun(address, most, signal) {
+  const reader = (await answered(address, { signal })).body.getReader(), pieces = [];
+  for (let size = 0; ; ) {
+    const { done, value } = await reader.read();
+    if (done) return pieces;
+    pieces.push(value);
+    size += value.length;
+    if (size > most) return null;
+  }
+}
+
 /** An element: h("td", {class: "text"}, "x", child). Texts become text, never markup. */
 export function h(tag, facts = {}, ...children) {
   const made = document.createElement(tag);
@@ -81,17 +93,33 @@ export function number(value, digits = 5) {
   return size !== 0 && (size >= 1e12 || size < 1e-3) ? (+value.toPrecision(digits)).toExponential() : String(+value.toPrecision(digits));
 }
 
-/** Right ascension and declination, sexagesimal beside degrees. */
+/** An angle of a place on the sky, deg, to better than 0.001 arcsec. */
+export const degrees = (value) => value.toFixed(7);
+
+/** Right ascension and declination, sexagesimal beside degrees, to better than 0.01 arcsec. */
 export function place(ra, dec) {
   const two = (x) => String(Math.floor(x)).padStart(2, "0");
-  const split = (value, last) => {
-    const unit = 10 ** last, all = Math.round(value * 3600 * unit);
+  const split = (value, last, most) => {
+    const unit = 10 ** last, all = Math.round(value * 3600 * unit) % (most * 3600 * unit);
     const seconds = ((all % (60 * unit)) / unit).toFixed(last).padStart(3 + last, "0");
     return [two(all / (3600 * unit)), two((all / (60 * unit)) % 60), seconds];
   };
-  const hours = split((((ra % 360) + 360) % 360) / 15, 2), degrees = split(Math.abs(dec), 1);
-  return `${hours.join(":")} ${dec < 0 ? "\u2212" : "+"}${degrees.join(":")}   ${ra.toFixed(5)} ${dec.toFixed(5)} deg`;
+  const turned = (((ra % 360) + 360) % 360), hours = split(turned / 15, 3, 24), angles = split(Math.abs(dec), 2, 180);
+  return `${hours.join(":")} ${dec < 0 ? "\u2212" : "+"}${angles.join(":")}   ${(+turned.toFixed(6) % 360).toFixed(6)} ${dec.toFixed(6)} deg`;
 }
+
+/** Tell those who do not see it what has come of their keys, when nothing has changed for a moment; `text` may be a function. */
+export function tell(text) {
+  clearTimeout(telling);
+  telling = setTimeout(() => (document.getElementById("told").textContent = typeof text === "string" ? text : text()), 700);
+}
+let telling = 0;
+
+/** What a table leaves out: "the first 500 of 12 288 cells"; nothing where it has all. */
+export const cut = (shown, all, what) => (shown < all ? `${number(shown)} of ${number(all)} ${what}` : null);
+
+/** A query as Python. */
+export const python = (sql) => `from jobs.explore.explorer import Explorer\n\nwith Explorer(${JSON.stringify(lake.lake)}) as lake:\n    rows = lake.sql(${JSON.stringify(sql)}, into="astropy")\n`;
 
 export async function copy(text, what) {
   try {
@@ -104,7 +132,7 @@ export async function copy(text, what) {
 
 export function table(columns, rows, caption) {
   const head = h("tr", {}, ...columns.map((c) => h("th", { scope: "col", title: c.meaning || null, class: c.text ? "text" : null },
-    c.name, c.unit ? h("small", {}, ` ${c.unit}`) : null)));
+    c.name, c.unit ? h("small", {}, ` ${c.unit}`) : null, c.ucd ? h("small", { class: "ucd" }, c.ucd) : null)));
   const body = rows.map((row) => h("tr", {}, ...row.map((value, k) =>
     h("td", { class: columns[k].text ? "text" : null }, value instanceof Node ? value : number(value, columns[k].type === "double" ? 12 : 7)))));
   return h("table", {}, caption ? h("caption", {}, caption) : null, h("thead", {}, head), h("tbody", {}, ...body));

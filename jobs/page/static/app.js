@@ -77,7 +77,7 @@ async function start() {
   $("tap-address").textContent = "";
   $("tap-address").append(api.h("button", { onclick: () => api.copy(api.lake.tap, "Address of the TAP service") }, "Copy TAP address"));
   for (const [name, why] of Object.entries(api.lake.damaged)) api.say(`${name}: ${why}`, true);
-  for (const [name, view] of Object.entries(VIEWS)) view.start?.({ show, remember, name });
+  for (const [name, view] of Object.entries(VIEWS)) view.start?.({ show, remember, name, toSky: sky.goToPlace });
   await restore();
   document.body.dataset.ready = "1";
 }

@@ -34,12 +34,13 @@ function drawBars(chart, f, scale) {
 
 function drawMap(chart, f) {
   const size = Math.round(Math.sqrt(chart.counts.length)), image = new ImageData(size, size), colours = lut("cividis");
-  const most = Math.max(...chart.counts, 1), top = Math.log1p(most);
+  const most = Math.max(...chart.counts, 1), top = Math.log1p(most), isLight = document.documentElement.dataset.theme === "light";
   for (let i = 0; i < size; i++) {
     for (let j = 0; j < size; j++) {
       const n = chart.counts[i * size + j];
       if (!n) continue;
-      const c = 4 * Math.round(40 + (215 * Math.log1p(n)) / top), at = 4 * ((size - 1 - j) * size + i);
+      // On a light ground the fullest bins are the darkest.
+      const share = Math.log1p(n) / top, c = 4 * Math.round(isLight ? 215 * (1 - share) : 40 + 215 * share), at = 4 * ((size - 1 - j) * size + i);
       image.data.set(colours.subarray(c, c + 4), at);
     }
   }

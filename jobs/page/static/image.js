@@ -3,10 +3,12 @@
 import * as api from "/static/api.js";
 import { NAMES, bar, lutTexture, program } from "/static/colour.js";
 import { pin, pinned, onPin, redraw as redrawPin } from "/static/pin.js";
-import { colourOf, compass, radiusOf, scaleOf } from "/static/marks.js";
+import { compass, cross, radiusOf, scaleOf } from "/static/marks.js";
+import { copyImageRequest } from "/static/request.js";
 import { Plate } from "/static/sphere.js";
 import { Tiles } from "/static/tiles.js";
 import { drawTraces, use } from "/static/trace.js";
+import { asked as truthOf, caption, drawSources, sourcesOf, tip } from "/static/truth.js";
 
 const $ = (id) => document.getElementById(id);
 const VERTEX = `in vec2 corner; uniform mat3 toScreen; uniform vec4 box; out vec2 at;
@@ -28,25 +30,16 @@ void main() {
 const STRETCHES = ["asinh", "linear", "log", "sqrt"];
 // Sigmas at which asinh turns from linear to logarithmic; milliseconds of a blink.
 const KNEE = 4, BLINK_MS = 750;
-const view = { one: -1, two: -1, x: 0, y: 0, zoom: 0 };
-const opened = new Map(), truths = new Map();
-let page, list = null, gl, drawing, quad, colours, other = false, blinking = null, wanted = null, asked = false, hovered = null, tiles;
+const view = { one: -1, two: -1, x: 0, y: 0, zoom: 0 }, opened = new Map();
+let page, list = null, gl, drawing, quad, colours, other = false, blinking = null, wanted = null, asked = false, isByKeys = false, cursor = null, tiles;
 
 export function start(given) {
   page = given;
   const canvas = $("image-canvas");
-  gl = canvas.getContext("webgl2");
-  if (!gl) return;
-  drawing = program(gl, VERTEX, FRAGMENT);
-  tiles = new Tiles(gl, redraw);
-  quad = gl.createBuffer();
-  gl.bindBuffer(gl.ARRAY_BUFFER, quad);
-  gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([0, 0, 1, 0, 0, 1, 1, 1]), gl.STATIC_DRAW);
   $("image-map").append(...NAMES.map((name) => api.h("option", {}, name)));
   $("image-map").value = "gray";
-  colours = lutTexture(gl, "gray");
   $("image-map").addEventListener("change", () => {
-    colours = lutTexture(gl, $("image-map").value, colours);
+    if (gl) lutTexture(gl, $("image-map").value, colours);
     redraw();
   });
   for (const name of ["image-stretch", "image-black", "image-white", "image-mended", "image-truth"]) $(name).addEventListener("input", redraw);
@@ -58,15 +51,22 @@ export function start(given) {
   });
   $("image-blink").addEventListener("click", blink);
   $("image-all").addEventListener("click", () => whole());
+  $("image-sky").addEventListener("click", toSky);
+  $("image-request").addEventListener("click", () => copyImageRequest(opened.get(view.one)));
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
     zoom(Math.exp(-Math.sign(event.deltaY) * Math.min(Math.abs(event.deltaY), 120) * 0.002), event);
   }, { passive: false });
-  canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
   canvas.addEventListener("pointermove", moved);
-  canvas.addEventListener("pointerleave", () => ($("image-tip").hidden = true));
+  canvas.addEventListener("pointerleave", () => {
+    cursor = null;
+    $("image-tip").hidden = true;
+  });
   let from = [0, 0];
-  canvas.addEventListener("pointerdown", (event) => (from = [event.clientX, event.clientY]));
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    from = [event.clientX, event.clientY];
+  });
   canvas.addEventListener("click", (event) => Math.hypot(event.clientX - from[0], event.clientY - from[1]) < 4 && pinAt(...pixelAt(event)));
   onPin(redraw);
   use({ show: async (number, x, y) => {
@@ -76,23 +76,43 @@ export function start(given) {
   } });
 }
 
-/** Show an image at a place of the sky, deg. */
-export function goTo(number, place) {
-  wanted = { number, place };
+/** The graphics processor's part, made when the first image is shown; false where there is none. */
+function prepare() {
+  if (gl !== undefined) return Boolean(gl);
+  gl = $("image-canvas").getContext("webgl2");
+  if (!gl) return false;
+  drawing = program(gl, VERTEX, FRAGMENT);
+  tiles = new Tiles(gl, redraw);
+  quad = gl.createBuffer();
+  gl.bindBuffer(gl.ARRAY_BUFFER, quad);
+  gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([0, 0, 1, 0, 0, 1, 1, 1]), gl.STATIC_DRAW);
+  colours = lutTexture(gl, $("image-map").value);
+  return true;
+}
+
+/** Show an image at a place of the sky, deg; `unit`: pixels of the screen a degree. */
+export function goTo(number, place, unit = null) {
+  wanted = { number, place, unit };
+}
+
+/** The sky at the centre of the view, as large as it is here. */
+function toSky() {
+  if (opened.has(view.one)) page.toSky(opened.get(view.one).plate.sky(view.x, view.y), view.zoom / scaleOf(opened.get(view.one)));
 }
 
 export async function show() {
+  if (!prepare()) return;
   list ??= await api.get("images");
   if (!list.length) return api.say("The lake holds no images.");
   if (!$("image-one").childElementCount) {
-    const name = (one) => `${one.exposure_id} ${one.channel} ${one.band} ${one.detector}: ${one.content.replace("_", " ")}`;
+    const name = (one) => `${one.request ? `${one.request}: ` : ""}${one.exposure_id} ${one.channel} ${one.band} ${one.detector}: ${one.content.replace("_", " ")}`;
     $("image-one").append(...list.map((one) => api.h("option", { value: one.number }, name(one))));
     $("image-two").append(api.h("option", { value: -1 }, "nothing"), ...list.map((one) => api.h("option", { value: one.number }, name(one))));
   }
   if (wanted) {
-    const { number, place } = wanted;
+    const { number, place, unit } = wanted;
     wanted = null;
-    await choose(number, place);
+    await choose(number, place, false, unit);
   } else if (view.one < 0 || view.one >= list.length) await choose(list.findIndex((one) => one.content === "science"));
   else await choose(view.one, null, true);
   redrawPin();
@@ -101,15 +121,14 @@ export async function show() {
 async function open(number) {
   if (!opened.has(number)) {
     $("image-place").textContent = "The tiles of this image are being made, once.";
-    const about = await api.get(`image/${number}`);
-    $("image-place").textContent = "";
+    const about = await api.get(`image/${number}`).finally(() => ($("image-place").textContent = ""));
     opened.set(number, { ...about, plate: new Plate(about.grid) });
   }
   return opened.get(number);
 }
 
 /** Show another image; the place on the sky stays where both have it. */
-async function choose(number, place = null, same = false) {
+async function choose(number, place = null, same = false, unit = null) {
   const before = opened.get(view.one), sky = place ?? (before && !same ? before.plate.sky(view.x, view.y) : null);
   const now = await open(Math.max(0, number));
   if (view.two >= 0) await open(view.two).catch(() => (view.two = -1));
@@ -119,12 +138,14 @@ async function choose(number, place = null, same = false) {
   const at = sky && now.plate.pixel(...sky);
   if (at && at[0] > 0 && at[1] > 0 && at[0] < now.nx && at[1] < now.ny) {
     [view.x, view.y] = at;
-    if (place) view.zoom = 4;
+    if (place) view.zoom = unit ? bounded(unit * scaleOf(now)) : 4;
     else if (before) view.zoom *= scaleOf(now) / scaleOf(before);
   } else if (!same || !view.zoom) whole(now);
   $("image-mended").disabled = !now.is_mendable;
   redraw();
 }
+
+const bounded = (zoom) => Math.min(64, Math.max(0.02, zoom));
 
 function whole(image = opened.get(view.one)) {
   const canvas = $("image-canvas");
@@ -159,6 +180,9 @@ export function redraw() {
     asked = false;
     paint();
     marks();
+    // Tiles that have come, another image: what lies under the cursor may be another value.
+    if (isByKeys) told(atCentre(), middle());
+    else if (cursor) told(pixelOn(...cursor, $("image-canvas").getBoundingClientRect()), cursor);
     page.remember();
   });
 }
@@ -175,7 +199,7 @@ function paint() {
   gl.uniformMatrix3fv(uniform("toScreen"), true, matrix);
   const black = image.sky + Number($("image-black").value) * image.noise, white = image.sky + image.noise * 10 ** Number($("image-white").value);
   gl.uniform3f(uniform("levels"), black, Math.max(white, black + 1e-6 * image.noise), KNEE * image.noise);
-  $("image-legend").replaceChildren(...bar($("image-map").value, api.number(black, 4), api.number(white, 4), [image.unit, $("image-stretch").value].filter(Boolean).join(", ")));
+  $("image-legend").replaceChildren(...bar($("image-map").value, api.number(black, 4), api.number(white, 4), [image.unit, $("image-stretch").value].filter(Boolean).join(", ")), api.h("div", { class: "caption" }));
   gl.uniform1i(uniform("stretch"), STRETCHES.indexOf($("image-stretch").value));
   gl.uniform1i(uniform("pixels"), 0);
   gl.uniform1i(uniform("colours"), 1);
@@ -218,20 +242,9 @@ function marks() {
   c.clearRect(0, 0, width, height);
   const [a, b, e0, d, e, f] = toFirst(image);
   const scale = view.zoom * turn(), at = (x, y) => [width / 2 + (a * x + b * y + e0 - view.x) * scale, height / 2 - (d * x + e * y + f - view.y) * scale];
-  if ($("image-truth").checked) {
-    const truth = sourcesOf(image);
-    if (truth) {
-      c.lineWidth = 1.3;
-      truth.x.forEach((x, k) => {
-        const p = at(x, truth.y[k]);
-        if (p[0] < -20 || p[1] < -20 || p[0] > width + 20 || p[1] > height + 20) return;
-        c.strokeStyle = colourOf(truth.kind[k]);
-        c.beginPath();
-        c.arc(...p, radiusOf(truth.expected[k]), 0, 7);
-        c.stroke();
-      });
-    }
-  }
+  const truth = $("image-truth").checked && sourcesOf(image, redraw);
+  if (truth) drawSources(c, truth, at, [width, height]);
+  $("image-legend").querySelector(".caption")?.replaceChildren(truth ? caption(truth) : "");
   const own = pinned()?.place && image.plate.pixel(...pinned().place);
   if (own) {
     const p = at(...own);
@@ -246,26 +259,22 @@ function marks() {
   }
   if (pinned()) drawTraces(c, pinned(), image, at);
   compass(c, image, view, at, [width, height]);
-}
-
-function sourcesOf(image) {
-  if (!truths.has(image.number)) {
-    truths.set(image.number, null);
-    api.get(`truth/${image.number}`).then((found) => {
-      truths.set(image.number, found);
-      redraw();
-    }, (error) => api.say(error.message, true));
-  }
-  return truths.get(image.number);
+  if (isByKeys) cross(c, [width / 2, height / 2], "#ffffff");
 }
 
 // ---------------------------------------------------------------------------------------------- moves
 
 /** Column and row, of the image that is seen, under the cursor. */
 function pixelAt(event) {
-  const box = $("image-canvas").getBoundingClientRect(), image = current(), [a, b, c, d, e, f] = toFirst(image), det = a * e - b * d;
+  const box = $("image-canvas").getBoundingClientRect();
+  return pixelOn(event.clientX - box.left, event.clientY - box.top, box);
+}
+
+/** The same at a place of the canvas. */
+function pixelOn(left, top, box) {
+  const image = current(), [a, b, c, d, e, f] = toFirst(image), det = a * e - b * d;
   const scale = view.zoom * turn();
-  const x = view.x + (event.clientX - box.left - box.width / 2) / scale - c, y = view.y - (event.clientY - box.top - box.height / 2) / scale - f;
+  const x = view.x + (left - box.width / 2) / scale - c, y = view.y - (top - box.height / 2) / scale - f;
   return [(e * x - b * y) / det, (a * y - d * x) / det];
 }
 
@@ -276,10 +285,29 @@ function moved(event) {
     view.y += (event.movementY / view.zoom) * turn();
     return redraw();
   }
-  const image = current(), [x, y] = pixelAt(event);
+  isByKeys = false;
+  const box = $("image-canvas").getBoundingClientRect();
+  cursor = [event.clientX - box.left, event.clientY - box.top];
+  told(pixelAt(event), cursor);
+}
+
+/** What is at a pixel, told at a place of the screen: where it is, its value, its source. */
+function told([x, y], at) {
+  const image = current();
   $("image-place").textContent = x > -0.5 && y > -0.5 && x < image.nx - 0.5 && y < image.ny - 0.5
     ? `${api.place(...image.plate.sky(x, y))}\npixel ${Math.round(x)}, ${Math.round(y)}   ${valueAt(image, Math.round(x), Math.round(y))}` : "";
-  tip(event, image, x, y);
+  tip(image, [x, y], 10 / view.zoom, at);
+}
+
+/** The pixel, of the image that is seen, at the centre. */
+const atCentre = () => pixelOn(...middle(), $("image-canvas").getBoundingClientRect());
+
+const middle = () => [$("image-canvas").clientWidth / 2, $("image-canvas").clientHeight / 2];
+
+/** The same of the centre, for those who move by keys. */
+function toldAtCentre() {
+  told(atCentre(), middle());
+  api.tell([$("image-place").textContent, $("image-tip").hidden ? "" : $("image-tip").textContent].join("\n"));
 }
 
 function valueAt(image, x, y) {
@@ -287,35 +315,10 @@ function valueAt(image, x, y) {
   return found ? `${api.number(found.value, 5)} ${image.unit}${found.level ? `, mean of ${4 ** found.level} pixels` : ""}` : "";
 }
 
-function tip(event, image, x, y) {
-  const box = $("image-canvas").getBoundingClientRect(), near = $("image-truth").checked && truths.get(image.number);
-  let best = -1, least = 10 / view.zoom;
-  if (near) near.x.forEach((sx, k) => {
-    const away = Math.hypot(sx - x, near.y[k] - y);
-    if (away < least) [best, least] = [k, away];
-  });
-  $("image-tip").hidden = best < 0;
-  if (best < 0) return (hovered = null);
-  $("image-tip").style.left = `${Math.min(event.clientX - box.left + 14, box.width - 240)}px`;
-  $("image-tip").style.top = `${event.clientY - box.top + 14}px`;
-  const text = `${near.kind[best]} ${near.id[best]}\n${api.number(near.expected[best])} electrons expected, ${api.number(near.drawn[best])} drawn`;
-  if (hovered?.id !== near.id[best]) {
-    hovered = { id: near.id[best] };
-    const mine = hovered;
-    api.get(`source/${mine.id}`).then((found) => {
-      if (hovered !== mine) return;
-      const values = Object.fromEntries(Object.values(found.tables).flat().map((row) => [row.name, row]));
-      const known = ["z_obs", "mag_r01", "log_stellar_mass", "disk_half_light_radius", "mag_h", "teff"].filter((name) => values[name]);
-      $("image-tip").textContent = [text, ...known.map((name) => `${name} ${api.number(values[name].value, 4)} ${values[name].unit}`)].join("\n");
-    }, () => {});
-  }
-  $("image-tip").textContent = text;
-}
-
 function zoom(by, event) {
   if (!opened.has(view.one)) return;
   const box = $("image-canvas").getBoundingClientRect(), was = view.zoom;
-  view.zoom = Math.min(64, Math.max(0.02, view.zoom * by));
+  view.zoom = bounded(view.zoom * by);
   if (event) {
     const dx = event.clientX - box.left - box.width / 2, dy = event.clientY - box.top - box.height / 2;
     view.x += (dx / was - dx / view.zoom) * turn();
@@ -328,8 +331,7 @@ async function pinAt(x, y) {
   const image = current();
   let id = null, least = 1;
   try {
-    if (!truths.get(image.number)) truths.set(image.number, await api.get(`truth/${image.number}`));
-    const near = truths.get(image.number);
+    const near = await truthOf(image);
     // Of sources side by side the brighter one is meant: the distance counts in radii of its mark.
     near.x.forEach((sx, k) => {
       const away = (Math.hypot(sx - x, near.y[k] - y) * view.zoom) / (6 + 2 * radiusOf(near.expected[k]));
@@ -364,22 +366,24 @@ function blink() {
 
 export function key(event) {
   if (!opened.has(view.one)) return;
-  const step = (80 / view.zoom) * turn(), move = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] }[event.key];
-  if (move) {
-    view.x += move[0];
-    view.y += move[1];
-    redraw();
-  } else if (event.key === "+" || event.key === "=") zoom(1.4);
+  // With Shift pixel by pixel.
+  const step = (event.shiftKey ? 1 : 80 / view.zoom) * turn(), move = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] }[event.key];
+  const isHere = event.target === $("image-canvas") || event.target === document.body;
+  if (move) [view.x, view.y] = [view.x + move[0], view.y + move[1]];
+  else if (event.key === "+" || event.key === "=") zoom(1.4);
   else if (event.key === "-") zoom(1 / 1.4);
   else if (event.key === "0") whole();
   else if (event.key === "b" || event.key === "B") blink();
-  else if (event.key === "Enter" && event.target === $("image-canvas")) pinAt(view.x, view.y);
+  else if (event.key === "o" || event.key === "O") return toSky();
+  else if (event.key === "Enter" && isHere) pinAt(...atCentre());
   else if ("cCtT".includes(event.key)) {
     const box = $("cC".includes(event.key) ? "image-mended" : "image-truth");
     box.checked = !box.checked;
-    redraw();
   } else return;
   event.preventDefault();
+  isByKeys = true;
+  redraw();
+  toldAtCentre();
 }
 
 export const state = () => ({ ...view, zoom: +view.zoom.toPrecision(4), x: +view.x.toFixed(2), y: +view.y.toFixed(2), map: $("image-map").value, stretch: $("image-stretch").value,
@@ -388,7 +392,7 @@ export function restore(was) {
   for (const name of ["one", "two", "x", "y", "zoom"]) if (Number.isFinite(was[name])) view[name] = was[name];
   if (NAMES.includes(was.map)) {
     $("image-map").value = was.map;
-    if (gl) colours = lutTexture(gl, was.map, colours);
+    if (gl) lutTexture(gl, was.map, colours);
   }
   for (const name of ["stretch", "black", "white"]) if (was[name] !== undefined) $(`image-${name}`).value = was[name];
   for (const name of ["mended", "truth"]) if (typeof was[name] === "boolean") $(`image-${name}`).checked = was[name];

@@ -5,6 +5,18 @@ export const radiusOf = (electrons) => Math.min(28, 3 + 1.6 * Math.log10(1 + Mat
 
 export const colourOf = (kind) => ({ star: "#9fd3ff", QSO: "#d9a7ff", "strong lens": "#9be0a8", "moving body": "#ff9a8d" })[kind] ?? "#ffd27d";
 
+/** The place that keys speak of: the centre. */
+export function cross(c, [x, y], colour) {
+  c.strokeStyle = colour;
+  c.lineWidth = 1;
+  c.beginPath();
+  for (const [u, v] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
+    c.moveTo(x + 4 * u, y + 4 * v);
+    c.lineTo(x + 12 * u, y + 12 * v);
+  }
+  c.stroke();
+}
+
 /** Size of a pixel of an image, deg. */
 export function scaleOf(image) {
   const a = image.plate.plane(image.nx / 2, image.ny / 2), b = image.plate.plane(image.nx / 2 + 1, image.ny / 2);

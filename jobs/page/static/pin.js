@@ -29,7 +29,7 @@ export async function pin(id) {
   for (const [name, rows] of Object.entries(source.tables)) {
     const first = rows.filter((row) => SHOWN.includes(row.name) || row.name.startsWith("f_nu_"));
     panel.append(api.h("h3", {}, name), facts(first.length ? first : rows.slice(0, 12)));
-    panel.append(api.h("details", {}, api.h("summary", {}, `all ${rows.length} columns`), facts(rows)));
+    panel.append(api.h("details", {}, api.h("summary", {}, `all ${rows.length} columns`), facts(rows, true)));
   }
   panel.append(api.h("h3", {}, "Drawn in"), source.drawn.length ? api.table(
     [{ name: "exposure" }, { name: "detector", text: 1 }, { name: "x", unit: "pix" }, { name: "y", unit: "pix" }, { name: "expected", unit: "electron" }, { name: "drawn", unit: "electron" }],
@@ -48,9 +48,13 @@ export const redraw = () => $("pin").checkVisibility() && drawings.forEach((draw
 
 const failed = (error) => api.say(error.message, true);
 
-function facts(rows) {
-  return api.table([{ name: "column", text: 1 }, { name: "value" }, { name: "unit", text: 1 }], rows.map((row) =>
-    [api.h("span", { title: row.meaning || null }, row.name), Array.isArray(row.value) ? `[${row.value.length}]` : row.value, row.unit]));
+function facts(rows, isWhole = false) {
+  const value = (row) => {
+    if (Array.isArray(row.value)) return `[${row.value.length}]`;
+    return typeof row.value === "number" && row.unit === "deg" && /^(ra|dec)(_|$)/.test(row.name) ? api.degrees(row.value) : row.value;
+  };
+  const columns = [{ name: "column", text: 1 }, { name: "value" }, { name: "unit", text: 1 }, ...(isWhole ? [{ name: "meaning", text: 1 }] : [])];
+  return api.table(columns, rows.map((row) => [row.name, value(row), row.unit, ...(isWhole ? [row.meaning] : [])]));
 }
 
 async function cutouts(panel, own) {
@@ -83,8 +87,16 @@ function drawSpectrum(panel, found) {
     [b.name, b.wavelength / 10, b.f_nu, b.f_nu > 0 ? +(23.9 - 2.5 * Math.log10(b.f_nu)).toFixed(3) : null])));
   if (found.lines.length) data.append(api.table([{ name: "line", text: 1 }, { name: "wavelength", unit: "nm" }], found.lines.map((l) => [named(l.name), (l.wavelength / 10).toFixed(1)])));
   canvas.setAttribute("aria-label", `Spectrum${found.z === undefined ? "" : ` at redshift ${found.z.toFixed(3)}`}; lines ${found.lines.map((l) => `${named(l.name)} at ${(l.wavelength / 10).toFixed(0)} nm`).join(", ")}`);
+  const ends = ceiling(found);
+  if (ends.most > ends.top) canvas.after(api.h("div", { class: "range" }, `cut at ${ends.top.toExponential(1)}; the highest line reaches ${ends.most.toExponential(1)} erg s⁻¹ cm⁻² Å⁻¹`));
   drawings.push(() => drawCurve(canvas, found));
   drawCurve(canvas, found);
+}
+
+/** Where the axis of a spectrum ends, so that one line does not flatten the rest, and how high it reaches. */
+function ceiling(found) {
+  const sorted = [...found.f_lambda].sort((a, b) => a - b), most = sorted.at(-1);
+  return { top: Math.min(most, 3 * sorted[Math.floor(0.99 * sorted.length)]) * 1.05 || 1, most };
 }
 
 function drawCurve(canvas, found) {
@@ -94,7 +106,7 @@ function drawCurve(canvas, found) {
   c.font = "11px DejaVu Sans, sans-serif";
   const bright = found.f_lambda.reduce((a, b) => Math.max(a, b), 0), begin = Math.max(0, found.f_lambda.findIndex((f) => f > 1e-3 * bright));
   const low = Math.log(found.wavelength[begin]), high = Math.log(found.wavelength.at(-1)), x = (l) => x0 + ((Math.log(l) - low) / (high - low)) * (x1 - x0);
-  const sorted = [...found.f_lambda].sort((a, b) => a - b), top = Math.min(sorted.at(-1), 3 * sorted[Math.floor(0.99 * sorted.length)]) * 1.05 || 1;
+  const { top } = ceiling(found);
   const y = (f) => y0 - Math.min(1, f / top) * (y0 - y1);
   for (const band of found.bands) {
     c.fillStyle = `color-mix(in srgb, ${ink("second")} 14%, transparent)`;

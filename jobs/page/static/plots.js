@@ -12,6 +12,8 @@ const MOST_POINTS = 20000;
 const MOST_CELLS = 8e6;
 // The whole is counted when no brush has moved for so long, ms.
 const IDLE = 400;
+// A table of a map has so many rows; it is filled anew when its chart has been still for so long, ms.
+const MOST_ROWS = 500, STILL = 120;
 // charts: {axes: [{expression, log}], spans, brush: [[lo, hi], ...] | null, points, counts, whole, places, element ...}
 let page, source = "", where = "", charts = [], part = null, head = null, cube = null, drag = null, idle = 0;
 
@@ -119,7 +121,9 @@ const ask = api.newest(async () => {
     chart.counts = new Uint32Array(buffer, at, size);
     chart.spans = about.spans;
     chart.total = about.total;
-    chart.missing = names.map((name, n) => head.missing[n])[names.indexOf(sqlOf(chart.axes[0]))];
+    // Of each axis: a row may lack one of them only.
+    chart.missing = chart.axes.map((axis) => head.missing[names.indexOf(sqlOf(axis))]);
+    chart.outside = about.outside;
     chart.part = head.part;
     if (!charts.some((other) => other.brush)) Object.assign(chart, { whole: chart.counts, wholePart: head.part });
     at += 4 * size;
@@ -191,6 +195,8 @@ function moveHeld() {
     for (let i = 0; i < inner; i++) out[i] = sums[b * inner + i] - sums[a * inner + i];
     one.counts = out;
     one.part = cube.part;
+    // The cube does not hold these: they follow with the next count.
+    one.outside = 0;
     one.places = null;
   }
   drawAll();
@@ -211,7 +217,7 @@ export function show() {
 
 function figure(chart) {
   const canvas = api.h("canvas", { tabindex: 0, role: "img" });
-  const range = api.h("div", { class: "range", "aria-live": "polite" }), data = api.h("div", { class: "data", hidden: true });
+  const range = api.h("div", { class: "range" }), data = api.h("div", { class: "data", tabindex: 0, role: "region", "aria-label": "The chart as a table", hidden: true });
   const names = chart.axes.map((axis) => facts(axis.expression));
   const logs = chart.axes.map((axis, k) => api.h("button", { "aria-pressed": String(axis.log), onclick: () => {
     axis.log = !axis.log;
@@ -243,6 +249,19 @@ function figure(chart) {
   return api.h("figure", { class: chart.axes.length > 1 ? "map" : null }, caption, canvas, range, data);
 }
 
+/** What no bin holds: rows beyond the ends of the axes, which leave out the ends of a distribution, and rows without a value. */
+function leftOut(chart) {
+  const ends = chart.outside ? `${api.number(chart.outside * chart.part)} beyond the ends of the ${chart.axes.length > 1 ? "axes" : "axis"}` : "";
+  return [ends, ...chart.axes.map((axis, k) => (chart.missing[k] ? `${api.number(chart.missing[k] * head.part)} of all rows without ${facts(axis.expression).name}` : ""))];
+}
+
+/** A table that is open says what its chart does; while a brush moves it waits until that is still. */
+function tabulate(chart) {
+  if (chart.data.hidden) return;
+  clearTimeout(chart.waiting);
+  chart.waiting = setTimeout(() => chart.data.hidden || chart.data.replaceChildren(asTable(chart)), STILL);
+}
+
 function asTable(chart) {
   const [span] = chart.spans, n = bins(chart)[0], scale = chart.part;
   const edge = (k) => span[0] + ((span[1] - span[0]) * k) / n;
@@ -253,7 +272,8 @@ function asTable(chart) {
   const size = Math.round(Math.sqrt(chart.counts.length)), [x, y] = chart.spans, at = (s, k) => s[0] + ((s[1] - s[0]) * (k + 0.5)) / size;
   const rows = [];
   chart.counts.forEach((count, k) => count && rows.push([at(x, Math.floor(k / size)), at(y, k % size), count * scale]));
-  return api.table([{ name: label(chart.axes[0]) }, { name: label(chart.axes[1]) }, { name: "number" }], rows.sort((a, b) => b[2] - a[2]).slice(0, 500));
+  return api.table([{ name: label(chart.axes[0]) }, { name: label(chart.axes[1]) }, { name: "number" }], rows.sort((a, b) => b[2] - a[2]).slice(0, MOST_ROWS),
+    api.cut(Math.min(rows.length, MOST_ROWS), rows.length, "bins that hold rows, the fullest first"));
 }
 
 function drawAll() {
@@ -267,7 +287,8 @@ function draw(chart) {
   const error = scale > 1 ? ` ± ${api.number(Math.round(Math.sqrt(sum) * scale))}` : "";
   const points = chart.points && chart.places ? `${api.number(chart.places.length / 2)} points${chart.placesPart * scale > 1 ? `, a sample: 1 row in ${chart.placesPart * scale}` : ""}` : "";
   const most = chart.axes.length > 1 && !points ? `colours from none to ${api.number(chart.counts.reduce((a, b) => Math.max(a, b), 0) * scale)} a bin, logarithmic` : "";
-  chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, chart.missing ? `${api.number(chart.missing * head.part)} missing` : "", most, points, shown].filter(Boolean).join("; ");
+  chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, ...leftOut(chart), most, points, shown].filter(Boolean).join("; ");
+  tabulate(chart);
   chart.canvas.setAttribute("aria-label", `${label(chart.axes[0])}${chart.axes[1] ? ` and ${label(chart.axes[1])}` : ""}: ${chart.range.textContent}`);
 }
 
@@ -321,6 +342,7 @@ function nudge(chart, event) {
   event.stopPropagation();
   draw(chart);
   sampled();
+  api.tell(() => chart.canvas.getAttribute("aria-label"));
 }
 
 // ---------------------------------------------------------------------------------------------- as text

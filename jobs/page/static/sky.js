@@ -1,27 +1,23 @@
 // The sky: densities in HEALPix cells, sources of small fields, footprints of what is planned and observed.
 
 import * as api from "/static/api.js";
-import { NAMES, bar, ink, lutTexture, program } from "/static/colour.js";
-import { graticule, line } from "/static/graticule.js";
+import { Cells } from "/static/cells.js";
+import { NAMES, bar, ink } from "/static/colour.js";
+import { KINDS, drawFootprints, imagesAt, legend as footprintLegend, load as loadFootprints } from "/static/footprints.js";
+import { graticule } from "/static/graticule.js";
 import { goTo } from "/static/image.js";
+import { cross } from "/static/marks.js";
 import { pin, pinned } from "/static/pin.js";
-import { frame, project, unproject, vector } from "/static/sphere.js";
+import { copyFieldRequest } from "/static/request.js";
+import { circleAround, frame, placeOf, project, unproject } from "/static/sphere.js";
 
 const $ = (id) => document.getElementById(id);
-const VERTEX = `in vec3 place; in float value; uniform mat3 turn; uniform vec2 scale; uniform vec2 range; uniform bool linear; out float level;
-void main() {
-  vec3 v = turn * place;
-  float k = sqrt(2.0 / max(1.0 + v.z, 1e-6)) * 57.29577951308232;
-  gl_Position = v.z < -0.9 ? vec4(9.0, 9.0, 9.0, 1.0) : vec4(-v.x * k * scale.x, v.y * k * scale.y, 0.0, 1.0);
-  level = clamp(((linear ? value : log(value)) - range.x) / max(range.y - range.x, 1e-6), 0.0, 1.0);
-}`;
-const FRAGMENT = `in float level; uniform sampler2D colours; uniform float alpha; out vec4 colour;
-void main() { colour = vec4(texture(colours, vec2(level, 0.5)).rgb, 1.0) * alpha; }`;
-const STATES = { planned: "quiet", observed: "second", failed: "bad" };
 // Below this height of the view, deg, sources are shown one by one.
-const SINGLE = 0.35, ROWS_A_CELL = 50;
+const SINGLE = 0.35, ROWS_A_CELL = 50, MOST_ROWS = 500;
+// Who comes nearer than this, deg, sees the pixels of an image where there is one.
+const PIXELS = 0.01;
 const view = { ra: 0, dec: 0, height: 180 };
-let page, gl, parts, overlay, cells = null, dots = null, regions = [], shownTable = "", where = "", value = "", held = "", colours;
+let page, density, overlay, cells = null, dots = null, isByKeys = false, isMoved = false, shownTable = "", where = "", value = "", held = "";
 
 export function start(given) {
   page = given;
@@ -29,55 +25,100 @@ export function start(given) {
   overlay = canvas.parentElement.insertBefore(document.createElement("canvas"), canvas.nextSibling);
   overlay.setAttribute("aria-hidden", "true");
   overlay.style.pointerEvents = "none";
-  gl = canvas.getContext("webgl2", { antialias: true });
-  if (!gl) return api.say("This browser has no WebGL 2: the sky and the images cannot be drawn.", true);
-  parts = program(gl, VERTEX, FRAGMENT);
   $("sky-map").append(...NAMES.map((name) => api.h("option", {}, name)));
+  $("sky-footprints").append(...KINDS.map((name) => api.h("option", {}, name)));
+  $("sky-footprints").value = "tasks";
   const tables = api.lake.tables.filter((table) => table.is_catalogue);
   $("sky-table").append(...tables.map((table) => api.h("option", { title: table.meaning }, table.name)));
   if (!shownTable) shownTable = (tables.find((t) => t.name === "galaxies") ?? tables[0])?.name ?? "";
   $("sky-table").value = shownTable;
   $("sky-table").addEventListener("change", () => again($("sky-table").value, where));
   $("sky-where").addEventListener("change", () => again(shownTable, $("sky-where").value.trim()));
-  api.get("bands").then((bands) => bands.length && $("sky-table").append(api.h("optgroup", { label: "planned exposures" },
-    api.h("option", { value: "coverage of" }, "all bands"), ...bands.map((band) => api.h("option", { value: `coverage of ${band}` }, band)))),
-    (error) => api.say(error.message, true)).then(() => ($("sky-table").value = shownTable));
   $("sky-value").addEventListener("change", () => {
     value = $("sky-value").value.trim();
     again(shownTable, where);
   });
   $("sky-map").addEventListener("change", () => {
-    colours = lutTexture(gl, $("sky-map").value, colours);
+    density?.recolour($("sky-map").value);
     redraw();
-    page.remember();
   });
-  $("sky-regions").addEventListener("change", redraw);
+  $("sky-footprints").addEventListener("change", () => footprints());
   $("sky-all").addEventListener("click", () => whole(true));
-  $("sky-to-table").addEventListener("click", asTable);
+  $("sky-to-table").addEventListener("click", () => {
+    $("sky-data").hidden = !$("sky-data").hidden;
+    asTable();
+    redraw();
+  });
   $("sky-go").addEventListener("change", go);
+  $("sky-image").addEventListener("click", () => openAt([view.ra, view.dec], true));
+  $("sky-python").addEventListener("click", () => api.copy(api.python(query()), "Python"));
+  $("sky-sql").addEventListener("click", () => api.copy(query(), "SQL"));
+  $("sky-request").addEventListener("click", () => copyFieldRequest([view.ra, view.dec], view.height / 2));
   canvas.addEventListener("wheel", zoomed, { passive: false });
   canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
   canvas.addEventListener("pointermove", moved);
-  canvas.addEventListener("click", clicked);
-  canvas.addEventListener("dblclick", opened);
-  colours = lutTexture(gl, $("sky-map").value);
+  canvas.addEventListener("click", (event) => event.detail < 2 && pinAt(placeAt(event)));
+  canvas.addEventListener("dblclick", (event) => openAt(placeAt(event)));
 }
 
+/** The graphics processor's part, made while the first answers are under way; false where there is none. */
+function prepare() {
+  if (density !== undefined) return Boolean(density);
+  const gl = $("sky-canvas").getContext("webgl2", { antialias: true });
+  density = gl ? new Cells(gl, $("sky-map").value) : null;
+  if (!gl) api.say("This browser has no WebGL 2: the sky and the images cannot be drawn.", true);
+  return Boolean(gl);
+}
+
+async function footprints() {
+  redraw();
+  try {
+    await loadFootprints($("sky-footprints").value);
+  } catch (error) {
+    api.say(error.message, true);
+  }
+  redraw();
+}
+
+/** Bands of planned exposures, whose depth can be shown. */
+async function depths() {
+  if ($("sky-table").querySelector("optgroup")) return;
+  const group = $("sky-table").appendChild(api.h("optgroup", { label: "planned exposures", hidden: true }));
+  const bands = await api.get("bands").catch((error) => api.say(error.message, true)) ?? [];
+  if (!bands.length) return;
+  group.hidden = false;
+  group.append(api.h("option", { value: "coverage of" }, "depth in all bands"), ...bands.map((band) => api.h("option", { value: `coverage of ${band}` }, `depth in ${band}`)));
+  $("sky-table").value = shownTable;
+}
+
+/** Other rows: of another table all are shown, under another condition the view stays. */
 function again(table, condition) {
+  const isOther = table !== shownTable;
   shownTable = table;
   where = condition;
   cells = dots = null;
   held = "";
-  load(true);
+  load(isOther);
 }
 
-// ---------------------------------------------------------------------------------------------- data
-
 export async function show() {
-  if (!gl) return;
-  if (!regions.length) regions = await api.get("regions");
-  if (!cells) await load(view.height >= 180);
-  else redraw();
+  if (density === null) return;
+  // The first question is under way while the shaders are compiled.
+  const loading = cells ? null : load(view.height >= 180);
+  if (!prepare()) return;
+  if (cells) {
+    redraw();
+    beside();
+  }
+  await loading;
+}
+
+/** What lies on the sky is asked for when there is a sky: the first picture waits for nothing else. */
+function beside() {
+  // Images lie on the tasks' footprints, whichever are shown.
+  loadFootprints("tasks").catch(() => {});
+  footprints();
+  depths();
 }
 
 const isCoverage = () => shownTable.startsWith("coverage of");
@@ -87,25 +128,32 @@ function addressOf(words) {
   return `sky/${shownTable}/density?${new URLSearchParams({ where: where || "true", ...(value ? { value } : {}), ...words })}`;
 }
 
+const use = (buffer) => (cells = density.filled(buffer, isCoverage() ? "depth" : value ? "mean" : "number"));
+
 /** First the files' own cells, which cost nothing; then what suits the view. */
 async function load(all) {
   if (!shownTable) return;
+  isMoved = false;
   try {
     if (!where && !value && !cells && !isCoverage()) {
-      use(await api.bytes(`sky/${shownTable}/parts`));
-      if (all) whole(false);
+      const buffer = await api.bytes(`sky/${shownTable}/parts`);
+      if (!density) return;
+      use(buffer);
+      if (all && !isMoved) whole(false);
       redraw();
     }
     if (!cells) {
       use(await api.bytes(addressOf({ order: isCoverage() ? 9 : 6 })));
-      if (all) whole(false);
+      if (all && !isMoved) whole(false);
     }
   } catch (error) {
     return api.say(error.message, true);
+  } finally {
+    beside();
   }
   await finer();
   // The cells of files are wider than what is in them.
-  if (all) whole(true);
+  if (all && !isMoved) whole(true);
 }
 
 function order() {
@@ -127,47 +175,18 @@ const finer = api.newest(async () => {
     dots = null;
     use(await api.bytes(addressOf({ order: wanted, ...(radius < 60 ? near : {}) })));
   }
+  asTable();
   redraw();
 });
-
-function use(buffer) {
-  const [head, at] = api.headed(buffer), corners = new Float32Array(buffer, at, head.cells * 8), density = new Float32Array(buffer, at + head.cells * 32, head.cells);
-  const data = new Float32Array(head.cells * 24);
-  for (let k = 0; k < head.cells; k++) {
-    const own = [0, 1, 2, 3].map((c) => vector(corners[8 * k + 2 * c], corners[8 * k + 2 * c + 1]));
-    [0, 1, 2, 0, 2, 3].forEach((c, n) => data.set([...own[c], density[k]], 24 * k + 4 * n));
-  }
-  const linear = isCoverage() || Boolean(value), filled = [...density].filter((d) => linear || d > 0).sort((a, b) => a - b), at5 = (share) => filled[Math.floor(share * (filled.length - 1))] ?? 1;
-  cells = { head, density, corners, count: head.cells * 6, buffer: cells?.buffer ?? gl.createBuffer(), linear,
-    range: isCoverage() ? [0, filled.at(-1) ?? 1] : [at5(0.01), at5(0.995)], rows: rowsOf(head, density) };
-  if (cells.range[0] >= cells.range[1]) cells.range = linear ? [cells.range[0] - 0.5, cells.range[1] + 0.5] : [cells.range[0] / 2, cells.range[1] * 1.01];
-  gl.bindBuffer(gl.ARRAY_BUFFER, cells.buffer);
-  gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
-}
-
-/** Rows a square degree, of the cells that have any. */
-const rowsOf = (head, density) => (head.rows * 12 * 4 ** (head.order ?? 5)) / (41253 * Math.max(1, density.length));
 
 /** Show everything that the table has. */
 function whole(load_) {
   if (!cells?.head.cells) return;
-  let sum = [0, 0, 0];
-  const places = [];
-  for (let k = 0; k < cells.corners.length; k += 2) {
-    const v = vector(cells.corners[k], cells.corners[k + 1]);
-    places.push(v);
-    sum = sum.map((s, i) => s + v[i]);
-  }
-  const size = Math.hypot(...sum) || 1, mean = sum.map((s) => s / size);
-  view.ra = ((Math.atan2(mean[1], mean[0]) * 180) / Math.PI + 360) % 360;
-  view.dec = (Math.asin(mean[2]) * 180) / Math.PI;
-  const far = Math.acos(Math.min(1, Math.max(-1, Math.min(...places.map((v) => v[0] * mean[0] + v[1] * mean[1] + v[2] * mean[2])))));
-  view.height = Math.min(180, Math.max(0.2, ((far * 180) / Math.PI) * 2.1));
+  const { ra, dec, radius: far } = circleAround(cells.corners);
+  Object.assign(view, { ra, dec, height: Math.min(180, Math.max(0.2, 2.1 * far)) });
   if (load_) finer();
   page.remember();
 }
-
-// ---------------------------------------------------------------------------------------------- drawing
 
 function scale() {
   const canvas = $("sky-canvas"), half = view.height / 2;
@@ -175,32 +194,10 @@ function scale() {
 }
 
 export function redraw() {
-  if (!gl || $("sky").hidden) return;
-  const canvas = $("sky-canvas");
-  api.fit(canvas);
-  gl.viewport(0, 0, canvas.width, canvas.height);
-  gl.clearColor(0, 0, 0, 0);
-  gl.clear(gl.COLOR_BUFFER_BIT);
+  if (!density || $("sky").hidden) return;
   const turn = frame(view.ra, view.dec);
-  if (cells?.count) {
-    gl.useProgram(parts);
-    gl.bindBuffer(gl.ARRAY_BUFFER, cells.buffer);
-    for (const [name, size, from] of [["place", 3, 0], ["value", 1, 12]]) {
-      const at = gl.getAttribLocation(parts, name);
-      gl.enableVertexAttribArray(at);
-      gl.vertexAttribPointer(at, size, gl.FLOAT, false, 16, from);
-    }
-    const uniform = (name) => gl.getUniformLocation(parts, name);
-    gl.uniformMatrix3fv(uniform("turn"), true, turn);
-    gl.uniform2fv(uniform("scale"), scale());
-    gl.uniform2fv(uniform("range"), cells.linear ? cells.range : cells.range.map(Math.log));
-    gl.uniform1i(uniform("linear"), cells.linear ? 1 : 0);
-    gl.uniform1f(uniform("alpha"), dots ? 0.25 : 1);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, colours);
-    gl.drawArrays(gl.TRIANGLES, 0, cells.count);
-    $("sky-legend").replaceChildren(...bar($("sky-map").value, api.number(cells.range[0], 3), api.number(cells.range[1], 3), legend()));
-  }
+  density.paint($("sky-canvas"), cells, turn, scale(), dots ? 0.25 : 1);
+  if (cells?.count) $("sky-legend").replaceChildren(...bar($("sky-map").value, api.number(cells.range[0], 3), api.number(cells.range[1], 3), legend()), api.h("div", {}, caption()));
   drawOver(turn);
   page.remember();
 }
@@ -209,6 +206,17 @@ function legend() {
   if (isCoverage()) return `${shownTable.slice(12) || "all bands"}: planned exposures`;
   const missing = cells?.head.missing ? `, ${api.number(cells.head.missing)} rows without one left out` : "";
   return value ? `${shownTable}: mean of ${value}${missing}` : `${shownTable}: number / deg²`;
+}
+
+/** What is left out: colours end at the 1 % of cells that are emptiest, the 0.5 % that are fullest; of very many sources the brightest are shown. */
+function caption() {
+  if (dots) {
+    const here = dots.ra.length, most = dots.most ?? 20000, all = dots.total ?? (here < most ? here : null);
+    if (all === here) return `${api.number(here)} sources one by one`;
+    return `${dots.by ? `the brightest ${api.number(here)} by ${dots.by}` : `the first ${api.number(here)}`} of ${all === null ? "more" : api.number(all)} sources`;
+  }
+  const outside = isCoverage() ? 0 : cells.beyond;
+  return outside ? `beyond the ends of the colours: ${api.number(outside)} of ${api.number(cells.density.length)} cells` : "";
 }
 
 function drawOver(turn) {
@@ -221,30 +229,8 @@ function drawOver(turn) {
   };
   graticule(c, view, at, [width, height]);
   if (dots) drawDots(c, at);
-  if ($("sky-regions").checked) {
-    for (const region of regions) {
-      const points = [...region.polygon, region.polygon[0]].map(([ra, dec]) => at(ra, dec));
-      // On a ground of the page's colour: cells may have any.
-      for (const [colour, wide] of [["paper", 4], [STATES[region.state], 1.6]]) {
-        c.strokeStyle = ink(colour);
-        c.lineWidth = wide;
-        c.setLineDash(region.state === "planned" && wide < 4 ? [5, 4] : []);
-        line(c, points);
-      }
-      const top = at(...region.polygon[0]);
-      if (top && view.height < 3) {
-        const text = `${region.band ?? region.channel} ${region.detector}, ${region.state}`;
-        c.font = "12px DejaVu Sans, sans-serif";
-        c.lineWidth = 4;
-        c.setLineDash([]);
-        c.strokeStyle = ink("paper");
-        c.strokeText(text, top[0] + 4, top[1] - 5);
-        c.fillStyle = ink(STATES[region.state]);
-        c.fillText(text, top[0] + 4, top[1] - 5);
-      }
-    }
-    c.setLineDash([]);
-  }
+  drawFootprints(c, $("sky-footprints").value, view, at, [width, height]);
+  footprintLegend($("sky-footprints").value);
   const own = pinned()?.place && at(...pinned().place);
   if (own) {
     c.strokeStyle = ink("accent");
@@ -253,6 +239,7 @@ function drawOver(turn) {
     c.arc(...own, 9, 0, 7);
     c.stroke();
   }
+  if (isByKeys) cross(c, [width / 2, height / 2], ink("ink"));
 }
 
 function drawDots(c, at) {
@@ -271,8 +258,6 @@ function drawDots(c, at) {
   c.globalAlpha = 1;
 }
 
-// ---------------------------------------------------------------------------------------------- moves
-
 function placeAt(event) {
   const box = $("sky-canvas").getBoundingClientRect(), unit = view.height / box.height;
   return unproject(frame(view.ra, view.dec), (event.clientX - box.left - box.width / 2) * unit, (box.height / 2 - event.clientY + box.top) * unit);
@@ -280,21 +265,29 @@ function placeAt(event) {
 
 function moved(event) {
   const place = placeAt(event);
+  isByKeys = false;
   $("sky-place").textContent = place ? api.place(...place) : "";
   if (!(event.buttons & 1)) return;
   pan((event.movementX / $("sky-canvas").clientHeight) * view.height, (event.movementY / $("sky-canvas").clientHeight) * view.height);
 }
 
+/** Who has moved while a table was on its way is not brought back to the whole of it. */
+function went() {
+  isMoved = true;
+  redraw();
+  finer();
+}
+
 function pan(dx, dy) {
   const place = unproject(frame(view.ra, view.dec), -dx, dy);
   if (place) [view.ra, view.dec] = [place[0], Math.max(-89.9, Math.min(89.9, place[1]))];
-  redraw();
-  finer();
+  went();
 }
 
 function zoomed(event) {
   event.preventDefault();
   const before = placeAt(event);
+  isByKeys = false;
   zoom(Math.exp(Math.sign(event.deltaY) * Math.min(Math.abs(event.deltaY), 120) * 0.002), before, event);
 }
 
@@ -308,79 +301,99 @@ function zoom(by, about, event) {
       view.dec = Math.max(-89.9, Math.min(89.9, view.dec + about[1] - now[1]));
     }
   }
-  redraw();
-  finer();
+  const unit = $("sky-canvas").clientHeight / view.height;
+  if (by < 1 && view.height < PIXELS && openAt(about ?? [view.ra, view.dec], false, unit)) {
+    view.height = 2 * PIXELS;
+    return;
+  }
+  went();
 }
 
-async function clicked(event) {
-  const place = placeAt(event);
-  if (!place || event.detail > 1 || view.height >= SINGLE) return;
+async function pinAt(place) {
+  if (!place || view.height >= SINGLE) return;
   const found = await api.get(`nearest?${new URLSearchParams({ ra: place[0], dec: place[1], radius: view.height / 40 })}`).catch(() => ({}));
   if (found.id) {
     await pin(found.id);
     redraw();
     api.say(`Source ${found.id} is pinned: Images shows it.`);
-  }
+  } else if (isByKeys) api.say("No source is near the centre.");
 }
 
-/** The image of a footprint, at that place. */
-function opened(event) {
-  const place = placeAt(event);
-  const inside = place && regions.filter((r) => r.images.length && contains(r.polygon, place));
-  if (inside?.length) {
-    goTo(inside[0].images[0], place);
-    page.show("images");
+/** The image of a footprint, at that place; true where there is one. */
+function openAt(place, isSaid = false, unit = null) {
+  const inside = place ? imagesAt(place) : [];
+  if (!inside.length) {
+    if (isSaid) api.say("No image holds the centre of the view.");
+    return false;
   }
+  goTo(inside[0].images[0], place, unit);
+  page.show("images");
+  return true;
 }
 
-function contains(polygon, [ra, dec]) {
-  const turn = frame(ra, dec), points = polygon.map((corner) => project(turn, ...corner));
-  const sides = points.map((p, k) => {
-    const q = points[(k + 1) % points.length];
-    return p && q ? p[0] * q[1] - p[1] * q[0] : NaN;
-  });
-  return sides.every((s) => s >= 0) || sides.every((s) => s <= 0);
+/** The place of an image, as large as it is there; `unit`: pixels of the screen a degree. */
+export function goToPlace([ra, dec], unit) {
+  Object.assign(view, { ra, dec, height: Math.min(180, Math.max(2 * PIXELS, $("image-canvas").clientHeight / unit)) });
+  page.show("sky").then(finer);
+}
+
+const radius = () => 0.5 * Math.hypot(view.height, (view.height * $("sky-canvas").clientWidth) / Math.max(1, $("sky-canvas").clientHeight));
+
+/** Rows of what is seen. */
+function query() {
+  const near = `separation(ra, dec, ${view.ra.toFixed(7)}, ${view.dec.toFixed(7)}) <= ${Math.min(180, radius()).toPrecision(6)}`;
+  const table = isCoverage() ? "tasks" : shownTable;
+  return `SELECT *\nFROM ${table}\nWHERE ${where && !isCoverage() ? `(${where})\n  AND ` : ""}${near}\n`;
 }
 
 function go() {
-  const text = $("sky-go").value.trim(), numbers = text.match(/[-+−]?\d+(\.\d+)?/g)?.map((t) => Number(t.replace("−", "-"))) ?? [];
-  if (numbers.length === 6 && /:/.test(text)) {
-    const [h, m, s, d, n, t] = numbers, sign = /[-−]\s*\d/.test(text) ? -1 : 1;
-    numbers.splice(0, 6, 15 * (h + m / 60 + s / 3600), sign * (Math.abs(d) + n / 60 + t / 3600));
-  }
-  if (numbers.length !== 2 || Math.abs(numbers[1]) > 90) return api.say("Go to: wanted RA and Dec, in degrees or as 03:32:28.1 -27:48:29", true);
-  Object.assign(view, { ra: ((numbers[0] % 360) + 360) % 360, dec: numbers[1], height: Math.min(view.height, 0.3) });
-  finer();
+  const place = placeOf($("sky-go").value);
+  if (!place) return api.say("Go to: wanted RA and Dec, in degrees or as 03:32:28.1 -27:48:29", true);
+  Object.assign(view, { ra: place[0], dec: place[1], height: Math.min(view.height, 0.3) });
+  went();
 }
 
+/** The same numbers, as long as the table is open. */
 function asTable() {
   const data = $("sky-data");
-  data.hidden = !data.hidden;
-  if (data.hidden || !cells) return redraw();
-  const rows = [...cells.density].map((d, k) => [cells.corners[8 * k], cells.corners[8 * k + 1], d]).sort((a, b) => b[2] - a[2]).slice(0, 500);
-  data.replaceChildren(api.table([{ name: "RA of a corner", unit: "deg" }, { name: "Dec of a corner", unit: "deg" }, { name: legend() }], rows));
-  redraw();
+  if (data.hidden || !cells) return;
+  if (dots) {
+    const rows = dots.ra.slice(0, MOST_ROWS).map((ra, k) => [dots.id[k], api.degrees(ra), api.degrees(dots.dec[k]), dots.mag[k]]);
+    return data.replaceChildren(api.table([{ name: "id" }, { name: "RA", unit: "deg" }, { name: "Dec", unit: "deg" }, { name: dots.by ?? "magnitude" }], rows,
+      api.cut(rows.length, dots.ra.length, "sources, the brightest first")));
+  }
+  const all = [...cells.density].map((d, k) => [api.degrees(cells.corners[8 * k]), api.degrees(cells.corners[8 * k + 1]), d]);
+  const rows = all.sort((a, b) => b[2] - a[2]).slice(0, MOST_ROWS);
+  data.replaceChildren(api.table([{ name: "RA of a corner", unit: "deg" }, { name: "Dec of a corner", unit: "deg" }, { name: legend() }], rows,
+    api.cut(rows.length, all.length, "cells, the largest values first")));
 }
 
 export function key(event) {
   const step = view.height / 8, move = { ArrowLeft: [step, 0], ArrowRight: [-step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] }[event.key];
+  const isHere = event.target === $("sky-canvas") || event.target === document.body;
+  isByKeys = true;
   if (move) pan(...move);
   else if (event.key === "+" || event.key === "=") zoom(0.7);
   else if (event.key === "-") zoom(1 / 0.7);
   else if (event.key === "0") whole(true);
+  else if (event.key === "o" || event.key === "O") openAt([view.ra, view.dec], true);
+  else if (event.key === "Enter" && isHere) view.height < SINGLE ? pinAt([view.ra, view.dec]) : api.say(`Sources can be pinned where the view is below ${SINGLE} deg.`);
   else return;
   event.preventDefault();
+  $("sky-place").textContent = api.place(view.ra, view.dec);
+  api.tell($("sky-place").textContent);
 }
-export const state = () => ({ ...view, table: shownTable, where, value, map: $("sky-map").value });
+export const state = () => ({ ...view, table: shownTable, where, value, map: $("sky-map").value, footprints: $("sky-footprints").value });
 export function restore(was) {
   for (const name of ["ra", "dec", "height"]) if (Number.isFinite(was[name])) view[name] = was[name];
   if (api.lake.tables.some((table) => table.name === was.table)) $("sky-table").value = shownTable = was.table;
   if (typeof was.table === "string" && was.table.startsWith("coverage of")) shownTable = was.table;
   if (typeof was.value === "string") $("sky-value").value = value = was.value;
   if (typeof was.where === "string") $("sky-where").value = where = was.where;
+  if (KINDS.includes(was.footprints)) $("sky-footprints").value = was.footprints;
   if (NAMES.includes(was.map)) {
     $("sky-map").value = was.map;
-    if (gl) colours = lutTexture(gl, was.map, colours);
+    density?.recolour(was.map);
   }
   cells = dots = null;
   held = "";

@@ -32,6 +32,25 @@ export function unproject(turn, mapX, mapY) {
   return [((Math.atan2(v[1], v[0]) / RAD) + 360) % 360, Math.asin(Math.max(-1, Math.min(1, v[2]))) / RAD];
 }
 
+/** RA, Dec deg of a text, in degrees or sexagesimal; null of any other. */
+export function placeOf(text) {
+  const numbers = text.match(/[-+−]?\d+(\.\d+)?/g)?.map((t) => Number(t.replace("−", "-"))) ?? [];
+  if (numbers.length === 6 && /:/.test(text)) {
+    const [h, m, s, d, n, t] = numbers, sign = /[-−]\s*\d/.test(text) ? -1 : 1;
+    numbers.splice(0, 6, 15 * (h + m / 60 + s / 3600), sign * (Math.abs(d) + n / 60 + t / 3600));
+  }
+  return numbers.length === 2 && Math.abs(numbers[1]) <= 90 ? [((numbers[0] % 360) + 360) % 360, numbers[1]] : null;
+}
+
+/** The circle, deg, about the middle of places [ra, dec, ra, dec ...] that holds them all. */
+export function circleAround(corners) {
+  const places = [];
+  for (let k = 0; k < corners.length; k += 2) places.push(vector(corners[k], corners[k + 1]));
+  const sum = [0, 1, 2].map((i) => places.reduce((all, v) => all + v[i], 0)), size = Math.hypot(...sum) || 1, mean = sum.map((s) => s / size);
+  const least = places.reduce((low, v) => Math.min(low, v[0] * mean[0] + v[1] * mean[1] + v[2] * mean[2]), 1);
+  return { ra: (Math.atan2(mean[1], mean[0]) / RAD + 360) % 360, dec: Math.asin(mean[2]) / RAD, radius: Math.acos(Math.max(-1, least)) / RAD };
+}
+
 /** Pixel <-> sky of an image, from the nodes of its grid. */
 export class Plate {
   constructor(grid) {

@@ -4,14 +4,16 @@ import * as api from "/static/api.js";
 import { usePlot } from "/static/plots.js";
 
 const $ = (id) => document.getElementById(id);
-let page, ran = null;
+// Bytes of a download that are kept here before it is known to be large.
+const MOST_HELD = 32e6;
+let page, ran = null, runs = 0;
 
 export function start(given) {
   page = given;
   $("sql-text").value = first();
   for (const table of api.lake.tables) {
-    const columns = table.columns.map((column) => api.h("button", { title: column.ucd || null, onclick: () => insert(column.name) },
-      column.name, api.h("small", {}, ` ${[column.unit, column.type].filter(Boolean).join(", ")}${column.meaning ? `: ${column.meaning}` : ""}`)));
+    const columns = table.columns.map((column) => api.h("button", { onclick: () => insert(column.name) },
+      column.name, api.h("small", {}, ` ${[column.unit, column.type].filter(Boolean).join(", ")}${column.meaning ? `: ${column.meaning}` : ""}`), column.ucd ? api.h("small", { class: "ucd" }, ` ${column.ucd}`) : null));
     $("sql-schema").append(api.h("details", {}, api.h("summary", {}, api.h("strong", {}, table.name), ` ${api.number(table.rows)} rows`),
       api.h("p", { class: "quiet" }, table.meaning), ...columns));
   }
@@ -22,8 +24,8 @@ export function start(given) {
   $("sql-text").addEventListener("input", page.remember);
   $("sql-plot").addEventListener("click", plot);
   for (const button of document.querySelectorAll("#sql [data-format]")) button.addEventListener("click", () => download(button.dataset.format));
-  $("sql-python").addEventListener("click", () => api.copy(python(), "Python"));
-  $("sql-request").addEventListener("click", () => api.copy(
+  $("sql-python").addEventListener("click", () => api.copy(api.python($("sql-text").value), "Python"));
+  $("sql-command").addEventListener("click", () => api.copy(
     `truesky sql ${quoted($("sql-text").value)} --lake ${quoted(api.lake.lake)}`, "Command"));
   $("sql-tap").addEventListener("click", () => api.copy(
     `import pyvo\npyvo.dal.TAPService(${JSON.stringify(api.lake.tap)}).search(${JSON.stringify($("sql-text").value)}).to_table()\n`, "Python"));
@@ -44,15 +46,16 @@ function insert(name) {
   page.remember();
 }
 
-function python() {
-  return `from jobs.explore.explorer import Explorer\n\nwith Explorer(${JSON.stringify(api.lake.lake)}) as lake:\n    rows = lake.sql(${JSON.stringify($("sql-text").value)}, into="astropy")\n`;
-}
-
 async function run() {
+  // Of queries that overlap the last one is shown, whichever is answered first.
+  const mine = ++runs;
   $("sql-state").textContent = "…";
   try {
-    ran = await api.post("sql", { sql: $("sql-text").value });
+    const found = await api.post("sql", { sql: $("sql-text").value });
+    if (mine !== runs) return;
+    ran = found;
   } catch (error) {
+    if (mine !== runs) return;
     $("sql-state").textContent = error.message;
     $("sql-state").className = "bad-text";
     return;
@@ -75,12 +78,29 @@ async function plot() {
   page.show("plots");
 }
 
-function download(format) {
-  // A refusal is said here instead of becoming a file.
-  const link = api.h("a", { href: api.downloadAddress(format, $("sql-text").value), download: `result.${format}` });
+/** A refusal is said here; a small answer becomes a file as it is, of a large one the browser takes what comes. */
+async function download(format) {
+  const address = api.downloadAddress(format, $("sql-text").value), stop = new AbortController();
+  $("sql-state").className = "quiet";
+  $("sql-state").textContent = `${format} …`;
+  try {
+    const pieces = await api.begun(address, MOST_HELD, stop.signal);
+    save(pieces ? URL.createObjectURL(new Blob(pieces)) : address, format);
+    $("sql-state").textContent = `${format}: the download has begun`;
+  } catch (error) {
+    $("sql-state").className = "bad-text";
+    $("sql-state").textContent = error.message;
+  } finally {
+    stop.abort();
+  }
+}
+
+function save(address, format) {
+  const link = api.h("a", { href: address, download: `result.${format}` });
   document.body.append(link);
   link.click();
   link.remove();
+  if (address.startsWith("blob:")) setTimeout(() => URL.revokeObjectURL(address), 60000);
 }
 
 export function show() {

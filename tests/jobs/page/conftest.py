@@ -4,6 +4,8 @@ import asyncio
 import contextlib
 import http.client
 import json
+import os
+import shutil
 import socket
 import struct
 import threading
@@ -26,6 +28,7 @@ from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 from lake_schema.tables.stars import STARS
+from tests.jobs.page.browsing import tab_of
 from tests.universe import plain_plan, plain_work, rows_of
 
 GALAXIES_N, STARS_N = 3000, 250
@@ -232,3 +235,22 @@ def shown(tmp_path_factory):
 def page(shown):
     with serving(shown) as found:
         yield found
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A chromium of the system's."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra browser)")
+    chromium = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium (Debian: apt install chromium)")
+    with playwright.sync_playwright() as started:
+        running = started.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def tab(browser, page):
+    with tab_of(browser, page, permissions=["clipboard-read", "clipboard-write"]) as opened:
+        yield opened

@@ -1,0 +1,113 @@
+// Footprints on the sky by their state: of exposures, of tasks (a detector of an exposure each), of products.
+
+import * as api from "/static/api.js";
+import { ink } from "/static/colour.js";
+import { line } from "/static/graticule.js";
+import { frame, project } from "/static/sphere.js";
+
+const $ = (id) => document.getElementById(id);
+export const KINDS = ["exposures", "tasks", "products", "nothing"];
+// Colour and dashes: no state is told by its colour alone.
+const STATES = { planned: ["quiet", [5, 4]], partly: ["accent", [10, 3, 2, 3]], observed: ["second", []], failed: ["bad", [2, 3]] };
+// Names are written below this height of the view, deg, where no more footprints than this are seen.
+const NAMED = 3, MOST_NAMED = 80;
+const known = {};
+
+/** Ask for what a kind needs, once; a promise. */
+export function load(kind) {
+  if (kind === "nothing") return Promise.resolve();
+  const path = kind === "exposures" ? "exposures" : "regions";
+  known[path] ??= api.get(path).then((found) => (known[path].rows = found), (error) => {
+    delete known[path];
+    throw error;
+  });
+  return known[path];
+}
+
+/** [{state, polygons, name}] of a kind, as far as they are here. */
+function shown(kind) {
+  if (kind === "exposures") return (known.exposures?.rows ?? []).map((one) => ({ ...one, polygons: one.outline,
+    name: `${one.band ?? one.channel} exposure ${one.exposure_id}, ${one.done} of ${one.all} detectors${one.failed ? `, ${one.failed} failed` : ""}` }));
+  const rows = known.regions?.rows ?? [];
+  if (kind === "tasks") return rows.map((one) => ({ ...one, polygons: [one.polygon], name: `${one.band ?? one.channel} ${one.detector}, ${one.state}` }));
+  return kind === "products" ? rows.filter((one) => one.images.length).map((one) => ({ ...one, polygons: [one.polygon],
+    name: `${one.band ?? one.channel} ${one.detector}: ${one.contents?.map((content) => content.replace("_", " ")).join(", ") ?? one.images.length}` })) : [];
+}
+
+/** Those with images that hold a place, of the finest kind. */
+export function imagesAt(place) {
+  return (known.regions?.rows ?? []).filter((one) => one.images.length && contains(one.polygon, place));
+}
+
+/** Detectors and exposures whose footprints have a corner in a circle, or hold its centre. */
+export function within(place, radius) {
+  const turn = frame(...place);
+  const near = (corner) => {
+    const p = project(turn, ...corner);
+    return p && Math.hypot(...p) < radius;
+  };
+  return (known.regions?.rows ?? []).filter((one) => one.polygon.some(near) || contains(one.polygon, place));
+}
+
+function contains(polygon, [ra, dec]) {
+  const turn = frame(ra, dec), points = polygon.map((corner) => project(turn, ...corner));
+  const sides = points.map((p, k) => {
+    const q = points[(k + 1) % points.length];
+    return p && q ? p[0] * q[1] - p[1] * q[0] : NaN;
+  });
+  return sides.every((s) => s >= 0) || sides.every((s) => s <= 0);
+}
+
+/** Draw those of a kind; `at`: RA, Dec -> screen. */
+export function drawFootprints(c, kind, view, at, [width, height]) {
+  const seen = [];
+  for (const one of shown(kind)) {
+    for (const polygon of one.polygons) {
+      const points = [...polygon, polygon[0]].map((corner) => at(...corner));
+      const [xs, ys] = [0, 1].map((k) => points.filter(Boolean).map((p) => p[k]));
+      if (xs.length && Math.max(...xs) > 0 && Math.min(...xs) < width && Math.max(...ys) > 0 && Math.min(...ys) < height) seen.push([one, points]);
+    }
+  }
+  for (const [one, points] of seen) {
+    const [ink_, dashes] = STATES[one.state];
+    // On a ground of the page's colour: cells may have any.
+    for (const [colour, wide] of [["paper", 4], [ink_, 1.6]]) {
+      c.strokeStyle = ink(colour);
+      c.lineWidth = wide;
+      c.setLineDash(wide < 4 ? dashes : []);
+      line(c, points);
+    }
+  }
+  c.setLineDash([]);
+  if (view.height < NAMED && seen.length <= MOST_NAMED) for (const [one, points] of seen) write(c, one, points.find(Boolean));
+}
+
+function write(c, one, [x, y]) {
+  c.font = "12px DejaVu Sans, sans-serif";
+  c.textAlign = "left";
+  c.lineWidth = 4;
+  c.strokeStyle = ink("paper");
+  c.strokeText(one.name, x + 4, y - 5);
+  c.fillStyle = ink(STATES[one.state][0]);
+  c.fillText(one.name, x + 4, y - 5);
+}
+
+/** What the lines mean, with how many there are of each state. */
+export function legend(kind) {
+  const all = shown(kind), rows = [];
+  for (const state of Object.keys(STATES)) {
+    const some = all.filter((one) => one.state === state).length;
+    if (some) rows.push(api.h("div", {}, swatch(...STATES[state]), ` ${state}: ${api.number(some)}`));
+  }
+  $("sky-states").replaceChildren(...(rows.length ? [api.h("div", {}, kind), ...rows] : []));
+}
+
+function swatch(colour, dashes) {
+  const made = api.h("canvas", { class: "swatch", width: 72, height: 16, "aria-hidden": "true" }), c = made.getContext("2d");
+  c.scale(2, 2);
+  c.strokeStyle = ink(colour);
+  c.lineWidth = 1.6;
+  c.setLineDash(dashes);
+  line(c, [[0, 4], [36, 4]]);
+  return made;
+}

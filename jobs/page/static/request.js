@@ -1,0 +1,67 @@
+// A request file for what is looked at: its field, and the exposures that see it.
+
+import * as api from "/static/api.js";
+import { imagesAt, load, within } from "/static/footprints.js";
+import { scaleOf } from "/static/marks.js";
+
+const MOST = 40;
+const FACTS = ["exposure_id", "channel", "camera", "band", "image_type", "ra", "dec", "position_angle", "mjd", "exposure_time_s", "grism_angle"];
+
+/**
+ * The text of a request.  place: [ra, dec] deg;  radius: deg, of the field;
+ * regions: of detectors that see it, each with exposure_id and detector
+ */
+async function requestOf(place, radius, regions) {
+  const detectors = new Map();
+  for (const one of regions) detectors.set(one.exposure_id, (detectors.get(one.exposure_id) ?? new Set()).add(one.detector));
+  const asked = [...detectors.keys()].sort((a, b) => a - b), rows = await exposures(asked.slice(0, MOST));
+  const science = rows.filter((row) => row.image_type === "science");
+  const lines = [`# The field at RA ${place[0].toFixed(6)}, Dec ${place[1].toFixed(6)} deg, as it is seen on the page of ${api.lake.lake.replace(/[^\x20-\x7e]/g, "?")}.`,
+    'name = "field"', "seed = 1   # of the universe: that of the lake's own request draws the same sources", "",
+    "[area]", `cone = { ra = ${place[0].toFixed(7)}, dec = ${place[1].toFixed(7)}, radius = ${decimal(Math.min(180, Math.max(1e-3, radius)))} }`];
+  if (asked.length > MOST) lines.push("", `# Of ${asked.length} exposures that see it the first ${MOST}.`);
+  if (science.length < rows.length) lines.push("", `# ${rows.length - science.length} of its exposures are of calibrations: an [[observation]] asks for these.`);
+  for (const row of science) lines.push("", ...pointing(row, [...detectors.get(row.exposure_id)].sort()));
+  return `${lines.join("\n")}\n`;
+}
+
+async function copied(make) {
+  try {
+    await load("tasks");
+    await api.copy(await make(), "Request");
+  } catch (error) {
+    api.say(error.message, true);
+  }
+}
+
+/** For a field of a radius, deg, about a place. */
+export const copyFieldRequest = (place, radius) => copied(() => requestOf(place, radius, within(place, radius)));
+
+/** For the exposure of an image, of its detector and the field that this sees. */
+export const copyImageRequest = (image) => copied(() => {
+  const { nx, ny, plate, row } = image, place = plate.sky((nx - 1) / 2, (ny - 1) / 2);
+  const own = imagesAt(place).filter((one) => one.exposure_id === row.exposure_id && one.detector === row.detector);
+  return requestOf(place, 0.5 * Math.hypot(nx, ny) * scaleOf(image), own);
+});
+
+/** Rows of the table of exposures as objects; none where the lake has no such table. */
+async function exposures(numbers) {
+  const tables = api.lake.tables.filter((table) => table.name.split(".").pop() === "exposures"), found = [];
+  for (const table of numbers.length ? tables : []) {
+    const has = table.columns.map((column) => column.name), names = FACTS.filter((name) => has.includes(name));
+    const from = table.name.split(".").map((part) => `"${part}"`).join(".");
+    const answer = await api.post("sql", { sql: `SELECT ${names.join(", ")} FROM ${from} WHERE exposure_id IN (${numbers.join(", ")}) ORDER BY exposure_id` });
+    found.push(...answer.rows.map((row) => Object.fromEntries(names.map((name, k) => [name, row[k]]))));
+  }
+  return found;
+}
+
+function pointing(row, detectors) {
+  const lines = ["[[pointing]]", ...["channel", "camera", "band"].map((name) => `${name} = ${JSON.stringify(row[name])}`)];
+  for (const name of ["ra", "dec", "position_angle", "mjd", "exposure_time_s"]) if (typeof row[name] === "number") lines.push(`${name} = ${decimal(row[name])}`);
+  if (row.channel === "NISP-S" && typeof row.grism_angle === "number") lines.push(`grism_angle = ${decimal(row.grism_angle)}`);
+  return [...lines, `detectors = [${detectors.map((name) => JSON.stringify(name)).join(", ")}]`];
+}
+
+/** A number as TOML writes one that is not whole. */
+const decimal = (value) => (Number.isInteger(value) ? value.toFixed(1) : String(value));

@@ -1,0 +1,85 @@
+"""What tests of the page do in a browser."""
+
+import io
+import time
+from contextlib import contextmanager, suppress
+
+import numpy as np
+from matplotlib.image import imread
+
+VIEWS = ("sky", "plots", "sql", "images", "runs")
+# What the address holds.
+HELD = "JSON.parse(decodeURIComponent(location.hash.slice(1)))"
+
+
+def until(tab, expression, seconds=30.0):
+    """Wait without eval, which the page's policy refuses."""
+    end = time.monotonic() + seconds
+    while True:
+        # A page that is being loaded says nothing, but an error of the browser's.
+        with suppress(Exception):
+            if value := tab.evaluate(expression):
+                return value
+        assert time.monotonic() < end, expression
+        time.sleep(0.03)
+
+
+@contextmanager
+def tab_of(browser, page, address="/", refused=None, **context):
+    """The page in a tab that has its cookie; at its end nothing may have gone wrong but what a test wants refused.
+
+    refused : part of an address
+    """
+    faults = []
+    opened = browser.new_context(viewport={"width": 1280, "height": 800}, **context)
+    tab = opened.new_page()
+    tab.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: faults.append(str(error)))
+
+    def lost(request):
+        # What is under way when an address is left is given up.
+        if request.failure != "net::ERR_ABORTED":
+            faults.append(f"{request.url} {request.failure}")
+
+    tab.on("requestfailed", lost)
+    tab.on("response", lambda answer: faults.append(f"{answer.url} {answer.status}") if answer.status >= 400 else None)
+    own = (page.origin + "/", "data:", "blob:")
+    tab.on("request", lambda request: None if request.url.startswith(own) else faults.append(request.url))
+    tab.goto(f"{page.origin}/?token={page.gate.token}")
+    if address != "/":
+        tab.goto(page.origin + address)
+        tab.reload()
+    until(tab, "document.body.dataset.ready === '1'")
+    yield tab
+    opened.close()
+    wrong = [one for one in faults if refused is None or not ("status of 400" in one or refused in one)]
+    assert wrong == []
+
+
+def canvas_colours(tab, selector):
+    """How many colours a picture of an element has."""
+    pixels = imread(io.BytesIO(tab.locator(selector).first.screenshot()), format="png")[..., :3]
+    return len(np.unique(pixels.reshape(-1, 3), axis=0))
+
+
+def drag(tab, selector, first, last):
+    """Drag over a canvas, from and to parts of its width."""
+    box = tab.locator(selector).first.bounding_box()
+    y = box["y"] + 0.4 * box["height"]
+    tab.mouse.move(box["x"] + first * box["width"], y)
+    tab.mouse.down()
+    for part in np.linspace(first, last, 12):
+        tab.mouse.move(box["x"] + part * box["width"], y)
+    return tab.mouse
+
+
+def plain(text):
+    """A text whose numbers have no gaps between thousands."""
+    return text.replace("\N{NARROW NO-BREAK SPACE}", "")
+
+
+def copied(tab, selector):
+    """What a button puts into the clipboard."""
+    tab.evaluate("navigator.clipboard.writeText('')")
+    tab.click(selector)
+    return until(tab, "navigator.clipboard.readText()")
