@@ -8,6 +8,7 @@ cache, "warm" with them.
 from __future__ import annotations
 
 import argparse
+import resource
 import sys
 import tempfile
 import time
@@ -22,7 +23,7 @@ import galsim
 import numpy as np
 
 from benchmarks import _detectors as one_detector
-from benchmarks import _dispersion, report
+from benchmarks import _dispersion, _peers_slitless, report
 from benchmarks._detectors import FIELD, ROOT, prepared, rendered
 from jobs.accuracy import preset
 from jobs.render.channels import nisp_s
@@ -52,6 +53,11 @@ _NOTES = {
     "ramp_s": "CPU, of survey_warm_s, of the effects from cosmic rays to the converter",
     "peak_gb": "largest memory of the process, survey (target 2)",
     "exposure_s": "wall, an exposure of 16 detectors by the Spark job on 2 cores (target of four 480)",
+    "exposure_cpu_s": "CPU of the same, of all its processes",
+    "spectrum_s": "CPU, a first order of a star or a small galaxy, as slitlessutils is given them",
+    "slitlessutils_spectrum_s": "CPU, the same by slitlessutils",
+    "against_slitlessutils": "times that it takes of ours",
+    "slitlessutils_flux": "largest difference of light in stretches of 64 pixels, relative (target 0.01)",
     "against_galsim": "times that galsim takes, a first order pixel by pixel, of ours with all orders",
 }
 
@@ -92,7 +98,8 @@ def watched(seconds: dict[str, float], drawn: list[tuple[Any, ...]]) -> Iterator
         return one_detector.timed(kept_draw, "draw_s", seconds)(*arguments, **options)
 
     def of_rows(*arguments: Any, **options: Any) -> Any:
-        return one_detector.timed(kept_rows(*arguments, **options), "spectra_s", seconds)
+        prepared_of = one_detector.timed(kept_rows, "spectra_s", seconds)
+        return one_detector.timed(prepared_of(*arguments, **options), "spectra_s", seconds)
 
     draw.draw, spectra.of_rows = kept, of_rows
     try:
@@ -164,15 +171,24 @@ def detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
 
 
 def whole_exposure(folder: Path, quick: bool) -> dict[str, float]:
-    """Wall s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
+    """Wall and CPU s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
     text = request(quick, 'detectors = ["DET22", "DET23"]' if quick else "", (53.117, -27.808))
-    return {"exposure_s": one_detector.by_job(folder, text.replace("radius = 0.2", f"radius = {FIELD}"))}
+    before = _children()
+    wall = one_detector.by_job(folder, text.replace("radius = 0.2", f"radius = {FIELD}"))
+    return {"exposure_s": wall, "exposure_cpu_s": _children() - before}
+
+
+def _children() -> float:
+    """CPU s of all processes that were started from here and have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures and prints everything."""
     own = argparse.ArgumentParser(add_help=False)
     own.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
+    own.add_argument("--peer", action="store_true", help="also slitlessutils, of the Python that its variable names")
     own.add_argument("--settings", action="store_true", help="the table of settings of drawing alone, measured anew")
     own.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
     known, others = own.parse_known_args(argv)
@@ -185,6 +201,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         figures = detector(Path(name), options.quick, repeats)
         if known.exposure:
             figures |= whole_exposure(Path(name), options.quick)
+        if known.peer:
+            figures |= _peers_slitless.slitlessutils_figures()
     report.finish("nisp_s", repeats, figures, _NOTES, options.json or (None if options.quick else RESULTS))
     return 0
 
