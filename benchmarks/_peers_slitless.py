@@ -145,6 +145,8 @@ def _child(
         [python, str(_CHILD), str(configuration), str(given), str(out)],
         check=True,
         env=environment,
+        # It writes a log where it is started.
+        cwd=folder,
         capture_output=True,
     )
     with np.load(out) as read:

@@ -47,8 +47,9 @@ _NOTES = {
     "survey_warm_s": "the same, PSF planes from the cache (target 12 on a Xeon of 2.5 GHz)",
     "draft_s": "the same at draft accuracy, its own choice of effects (target 5)",
     "reference_s": "the same at reference accuracy, everything on (target 40)",
-    "draw_s": "CPU, of survey_warm_s, of drawing spectra, with",
+    "draw_s": "CPU, of survey_warm_s, of drawing all spectra once, with",
     "spectra_s": "the spectra themselves (target 1.5)",
+    "colours_s": "CPU, of survey_warm_s, of drawing the bright ones again by what pixels see of their colours",
     "sources": "whose spectra are drawn",
     "ramp_s": "CPU, of survey_warm_s, of the effects from cosmic rays to the converter",
     "peak_gb": "largest memory of the process, survey (target 2)",
@@ -90,12 +91,16 @@ def full(wanted: Request) -> Request:
 
 @contextmanager
 def watched(seconds: dict[str, float], drawn: list[tuple[Any, ...]]) -> Iterator[None]:
-    """Adds up the CPU seconds of drawing and of spectra, and keeps what is drawn, while it is open."""
+    """Adds up the CPU seconds of drawing and of spectra, and keeps what is drawn, while it is open.
+
+    Of one rendering: all sources are drawn first, and then some of them by their colours.
+    """
     kept_draw, kept_rows = draw.draw, spectra.of_rows
 
     def kept(*arguments: Any, **options: Any) -> Any:
+        name = "colours_s" if drawn else "draw_s"
         drawn.append(arguments)
-        return one_detector.timed(kept_draw, "draw_s", seconds)(*arguments, **options)
+        return one_detector.timed(kept_draw, name, seconds)(*arguments, **options)
 
     def of_rows(*arguments: Any, **options: Any) -> Any:
         prepared_of = one_detector.timed(kept_rows, "spectra_s", seconds)
@@ -141,7 +146,9 @@ def measured(root: Path, everything: Json, folder: Path) -> dict[str, float]:
     drawn: list[tuple[Any, ...]] = []
     with watched(seconds, drawn):
         effects = one_detector.effect_seconds(
-            nisp_s.EFFECTS, (nisp_s.CHANNEL.remembers,), lambda: rendered(root, everything, folder)
+            nisp_s.EFFECTS,
+            (nisp_s.CHANNEL.remembers, nisp_s.CHANNEL.coloured),
+            lambda: rendered(root, everything, folder),
         )
     sources = len(drawn[0][0])
     return {
