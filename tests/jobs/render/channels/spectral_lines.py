@@ -179,7 +179,10 @@ def measured(noisy, without, at, noise, images=1):
     images : with noise of their own, of the same light
     """
     shared = [convolve(one.noise_free.astype(float), noise.kernel) for one in (noisy, without)]
-    seen = [infrared.electrons(noisy) - shared[1], *(_again(noisy, seed) - shared[1] for seed in range(1, images))]
+    seen = [
+        infrared.electrons(noisy) - shared[1],
+        *(_again(noisy, noisy.seed + k) - shared[1] for k in range(1, images)),
+    ]
     template, found = shared[0] - shared[1], []
     for column, row in np.rint(at.T).astype(int).tolist():
         corner = row - HALF, column - HALF
