@@ -153,7 +153,7 @@ def job(n: int) -> float:
     index, ra, dec = sky.random_in_cell(5, 1607, n, np.random.default_rng(_SEED_SPEED))
     columns: dict[str, Any] = {c.name: np.full(n, c.lo or 0.0) for c in GALAXIES.columns if not c.nullable}
     columns |= {name: drawn[name].to_numpy() for name in drawn.column_names}
-    columns |= {"ra": ra, "dec": dec, "ra_lensed": ra, "dec_lensed": dec, "_healpix_29": index}
+    columns |= {"ra": ra, "dec": dec, "ra_true": ra, "dec_true": dec, "_healpix_29": index}
     columns |= {"id": ids.source_id(0, 1607 << 6, np.arange(n)), "density_boost": np.ones(n)}
     fitting = {c.name: np.asarray(columns[c.name]).astype(c.type) for c in GALAXIES.columns if c.name in columns}
     rows = GALAXIES.build(fitting)

@@ -47,10 +47,7 @@ TRIAL = Table(
         DEC,
         HEALPIX_29,
         Column("halo_id", "int64", doc="identifier", lo=0),
-        *(
-            Column(f"{name}_lensed", "float64", "deg", doc="a place nearby", lo=-90.0, hi=360.0)
-            for name in ("ra", "dec")
-        ),
+        *(Column(f"{name}_true", "float64", "deg", doc="a place nearby", lo=-90.0, hi=360.0) for name in ("ra", "dec")),
         *(Column(f"kind_{i}", "int32", codes=KINDS, doc="random code", lo=0, hi=4) for i in range(3)),
         *(Column(f"x_{i}", "float32", doc="random number", lo=0.0, hi=1.0) for i in range(40)),
     ),
@@ -85,7 +82,7 @@ def rows_of(cell: int, n: int) -> pa.Table:
     index, ra, dec = sky.random_in_cell(5, cell, n, rng)
     ids = np.int64(cell) << 46 | np.arange(n)
     columns = {"id": ids, "ra": ra, "dec": dec, "_healpix_29": index, "halo_id": ids & ~np.int64(1023)}
-    columns |= {"ra_lensed": ra + rng.normal(0, 1e-3, n), "dec_lensed": dec + rng.normal(0, 1e-3, n)}
+    columns |= {"ra_true": ra + rng.normal(0, 1e-3, n), "dec_true": dec + rng.normal(0, 1e-3, n)}
     for column in TRIAL.columns[7:]:
         columns[column.name] = rng.integers(0, 5, n) if column.codes else rng.random(n)
     return TRIAL.build(columns)

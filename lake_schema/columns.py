@@ -97,6 +97,8 @@ class Table:
     order : HEALPix order of its files (nested), None for a table that is not on the sky
     finest : the highest order of its files, where they differ in order so as to hold about as many rows
     former : columns of earlier versions, which are passed over where a lake has them
+    aliases : earlier names of columns, and what they are called now: both are understood for a version
+    earlier : the declaration that lakes up to its version are read with, where a name has changed its meaning since
     """
 
     name: str
@@ -107,6 +109,8 @@ class Table:
     order: int | None = None
     finest: int | None = None
     former: tuple[str, ...] = ()
+    aliases: tuple[tuple[str, str], ...] = ()
+    earlier: Table | None = None
 
     def __post_init__(self) -> None:
         names = [column.name for column in self.columns]

@@ -157,15 +157,12 @@ def sources(field, header):
         warnings.simplefilter("ignore", FITSFixedWarning)  # astropy adds DATE-OBS to its own copy
         system = WCS(header)
     found = []
-    for catalogue, fluxes, ra, dec in (
-        ("galaxies", "galaxy_fluxes", "ra_lensed", "dec_lensed"),
-        ("stars", "star_fluxes", "ra", "dec"),
-    ):
+    for catalogue, fluxes in (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes")):
         motion = ["pm_ra", "pm_dec"] if catalogue == "stars" else []
         middle = header["MJD-OBS"] + 0.5 * header["EXPTIME"] / 86400.0
-        where = catalogue_rows.at_time(read.version(field, catalogue).rows([ra, dec, *motion]), middle)
+        where = catalogue_rows.at_time(read.version(field, catalogue).rows(["ra", "dec", *motion]), middle)
         flux = read.version(field, fluxes).rows([f"f_nu_{header['FILTER']}"])
-        x, y = system.all_world2pix(where[ra].to_numpy(), where[dec].to_numpy(), 0)
+        x, y = system.all_world2pix(where["ra"].to_numpy(), where["dec"].to_numpy(), 0)
         microjansky = flux.column(0).to_numpy().astype(float)
         electrons = microjansky / 3631e6 * 10 ** (0.4 * header["ZEROPNT"]) * header["EXPTIME"]
         nx, ny = (4096, 4136) if header["CHANNEL"] == "VIS" else (header["NAXIS1"], header["NAXIS2"])

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from jobs.catalogue import cells, dust_map, given_sources
 from jobs.catalogue.external import ingest, mapping
-from jobs.catalogue.galaxies import from_catalogue, galaxies, lensing, nearest_sed
+from jobs.catalogue.galaxies import from_catalogue, galaxies, lensing, nearest_sed, observed_cells
 from jobs.catalogue.galaxies.galaxies import GalaxyModel
 from jobs.catalogue.galaxies.lensing import Shear
 from jobs.catalogue.galaxies.nearest_sed import Training
@@ -103,11 +103,11 @@ def limit_work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
 
 
 def work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
-    """The galaxies of one order-5 cell."""
+    """The galaxies that are seen in one order-5 cell."""
     universe = _universe(facts, own)
     dust = dust_map.chosen(facts["seed"], own.dust if own else None)
     drawn = population.Cells(universe.population)
-    return _parted(facts, cells.rows(facts, GALAXIES, lambda cell: galaxies.draw(cell, universe, drawn, dust)))
+    return _parted(facts, observed_cells.draw(facts["generation_cells"], universe, drawn, dust))
 
 
 def quarantine_work(lake: Path, facts: Json) -> Output:
@@ -163,7 +163,7 @@ def _about(given: Catalogue, columns: mapping.Columns) -> Json:
 
 
 def _ingested(lake: Path, request: Request, given: Catalogue) -> Step:
-    columns = mapping.galaxies(given.format, dict(given.columns))
+    columns = _columns(given, request.universe.lensing is not None)
     found, sha256 = ingest.files(given.files, columns)
     about = {"sha256": sha256, "format": given.format, "columns": dict(given.columns)}
     dust = request.ingest.dust
@@ -174,6 +174,12 @@ def _ingested(lake: Path, request: Request, given: Catalogue) -> Step:
     if not layout.version(lake, GALAXIES.name, plan.key).exists():
         ingest.split(found, sha256, columns)
     return Step(plan, partial(ingested_work, given=given, dust=dust))
+
+
+def _columns(given: Catalogue, is_lensed_anew: bool) -> mapping.Columns:
+    """The mapping of a catalogue, which is seen where it says; where it is, if a request lenses it in another way."""
+    columns = mapping.galaxies(given.format, dict(given.columns))
+    return mapping.unlensed(columns) if is_lensed_anew else columns
 
 
 def _given(request: Request, own: GivenSources) -> Step:
@@ -210,7 +216,7 @@ def ingested_work(lake: Path, facts: Json, given: Catalogue, dust: DustMap | Non
     lake  : folder of the lake;  facts : of the plan and of the part, which has its cell
     given : the catalogue's files and columns;  dust : an external map of dust, None = the embedded one
     """
-    columns = mapping.galaxies(given.format, dict(given.columns))
+    columns = _columns(given, facts["lensing"] is not None)
     found, _ = ingest.listed(given.files, columns)
     laid_out = ingest.split(found, facts["ingest"]["sha256"], columns)
     model = from_catalogue.model(facts["seed"], columns, laid_out, _shear(facts), facts["rotation"])

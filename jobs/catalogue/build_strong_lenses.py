@@ -18,7 +18,7 @@ from jobs.catalogue.galaxies import strong_lenses
 from jobs.request import universe
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
-from lake_schema import sky
+from lake_schema import places, sky
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, read
 from lake_schema.store.plan import Json, Output, Part, Plan
@@ -30,6 +30,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """One part a file of the galaxies."""
     galaxies = read.for_request(lake, "galaxies", request.name)
     universe.refuse_other([galaxies], request)
+    places.refuse_earlier(galaxies)
     facts = {"seed": request.seed, "galaxies": galaxies.key, "boost": request.strong_lens_boost, "code": code_version()}
     named = {part["name"]: part["facts"].get("generation_cells") for part in galaxies.manifest["parts"]}
     parts = tuple(Part(name, {"part": name, "generation_cells": own or _all(name)}) for name, own in named.items())
@@ -37,7 +38,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def work(lake: Path, facts: Json) -> Output:
-    """The strong lenses of one file: sources are galaxies of the lens' own generation cell."""
+    """The strong lenses of one file: sources are galaxies that are seen in the lens' own generation cell."""
     rows = read.version(lake, "galaxies", facts["galaxies"]).rows(strong_lenses.COLUMNS, [facts["part"]])
     index = rows["_healpix_29"].to_numpy()
 

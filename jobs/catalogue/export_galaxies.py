@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jobs.catalogue.exports import skycatalogs
-from lake_schema import __version__, command, user_files
+from lake_schema import __version__, command, places, user_files
 from lake_schema.fits.tables import table_to_fits
 from lake_schema.store import layout, read
 from lake_schema.tables.galaxies import GALAXIES
@@ -53,11 +53,12 @@ def export(lake: Path, folder: Path, form: str, request: str | None = None) -> l
     if form == "skycatalogs":
         return skycatalogs.write(lake, folder, request)
     version = read.version(lake, GALAXIES.name, request=request)
+    declared = GALAXIES.earlier if GALAXIES.earlier and places.goes_by_true(version) else GALAXIES
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for part in version.parts:
         path = folder / f"galaxies_nside32_nest_{layout.cell_of_file(part)[1]}.fits"
-        table_to_fits(path, version.rows(parts=[part]), GALAXIES)
+        table_to_fits(path, version.rows(parts=[part]), declared)
         written.append(path)
     return written
 

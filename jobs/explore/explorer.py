@@ -141,11 +141,11 @@ class Explorer:
 
     def cone(
         self, table: str, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None,
-        on: str = "true", into: str = "pandas",
+        on: str = "observed", into: str = "pandas",
     ) -> Any:  # fmt: skip
         """Rows of a catalogue within a circle.
 
-        ra, dec, radius : deg;  on : "true" or "lensed" positions
+        ra, dec, radius : deg;  on : "observed" or "true" positions
         table, columns  : names; columns None: all of them;  into : kind of the result, as of `sql`
         """
         return results.converted(self._version(table).cone(ra, dec, radius, columns, on), into)

@@ -13,6 +13,7 @@ import pyarrow.dataset as ds
 
 from jobs.explore import adql
 from jobs.explore.guard import Query, check_expression, checked, one_line, parser
+from lake_schema import places
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import read
 
@@ -52,6 +53,8 @@ class Session:
         self.most = int(memory * _SHARE)
         self.opened: dict[str, Opened] = {}
         self._rows: dict[str, ds.Dataset] = {}
+        # Tables that queries can name, with the earlier names of columns that they have there.
+        self._shown: dict[str, tuple[tuple[str, str], ...]] = {}
         self._database: duckdb.DuckDBPyConnection | None = None
         self._parser = parser()
 
@@ -67,6 +70,7 @@ class Session:
         """Forget every table; the next query opens those that it names."""
         self.opened.clear()
         self._rows.clear()
+        self._shown.clear()
         if self._database is not None:
             self._database.close()
             self._database = None
@@ -80,9 +84,10 @@ class Session:
         whole = False
         try:
             for name in query.tables:
-                self._open(name)
+                self._open(name, query.text)
                 for file in getattr(self._rows[name], "read_from", ()):
                     file.forget()
+            places.refuse_mixed(one for name in query.tables if isinstance(one := self.opened[name], read.Version))
             relation = self._connected().sql(query.text, params=dict(parameters) or None)
             if relation is None:
                 raise BadInput("SQL: gives no rows")
@@ -115,19 +120,35 @@ class Session:
                 self._database.execute(command)
         return self._database
 
-    def _open(self, name: str) -> None:
-        """A table by its name, one of a request in a schema of the request's name."""
-        if name in self._rows:
+    def _open(self, name: str, text: str) -> None:
+        """A table by its name, one of a request in a schema of the request's name.
+
+        Columns are there by earlier names as well for a query that has one: none sees them that does not ask.
+        """
+        if name not in self._rows:
+            opened = _table(self.root, name, self.known[name])
+            self.opened[name], self._rows[name] = (
+                opened,
+                opened.dataset() if isinstance(opened, read.Version) else opened,
+            )
+        opened = self.opened[name]
+        aliases = places.aliases_in(opened.table, opened.schema.names, text) if isinstance(opened, read.Version) else ()
+        if self._shown.get(name) == aliases:
             return
-        opened = _table(self.root, name, self.known[name])
-        rows = opened.dataset() if isinstance(opened, read.Version) else opened
         database = self._connected()
-        database.register(name, rows)
+        stored = f"{name} as stored" if aliases else name
+        if name in self._shown:
+            database.unregister(name)
+            database.execute(f'DROP VIEW IF EXISTS "{name}"')
+        database.register(stored, self._rows[name])
+        chosen = ", ".join(["*", *(f'"{own}" AS "{earlier}"' for earlier, own in aliases)])
+        if aliases:
+            database.execute(f'CREATE OR REPLACE TEMP VIEW "{name}" AS SELECT {chosen} FROM "{stored}"')
         if "." in name:
             request, _, table = name.partition(".")
             database.execute(f'CREATE SCHEMA IF NOT EXISTS "{request}"')
             database.execute(f'CREATE OR REPLACE VIEW "{request}"."{table}" AS SELECT * FROM "{name}"')
-        self.opened[name], self._rows[name] = opened, rows
+        self._shown[name] = aliases
 
     def _with_units(self, schema: pa.Schema, query: Query) -> pa.Schema:
         """Give the columns that came unchanged from a table its unit and description."""

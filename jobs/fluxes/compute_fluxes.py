@@ -29,6 +29,7 @@ from jobs.fluxes.tables.settings import COVERED, Choice, of_stars
 from jobs.request import universe
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
+from lake_schema import places
 from lake_schema.columns import Table
 from lake_schema.store import layout, read
 from lake_schema.store.plan import Json, Output, Part, Plan
@@ -46,6 +47,8 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """What fluxes are made with; then one part a cell of each catalogue, row by row beside it."""
     catalogues = [(kind, read.for_request(lake, name, request.name)) for kind, name in CATALOGUES]
     universe.refuse_other([version for _, version in catalogues], request)
+    for _, version in catalogues:
+        places.refuse_earlier(version)
     own = inputs.read(request.curves)
     curves = inputs.curves(request.bands, own.passbands)
     sources = source_steps(own)

@@ -16,10 +16,10 @@ import pyarrow.compute as pc
 from jobs.explore import adql
 from jobs.page.answers import is_catalogue, packed, plain
 from jobs.page.opened import Lake
-from lake_schema import sky
+from lake_schema import places, sky
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, LakeError
-from lake_schema.store import layout
+from lake_schema.store import layout, read
 
 _TASK = ("exposure_id", "ra", "dec", "radius", "s_region")
 MOST_CELLS, MOST_SOURCES = 200_000, 20_000
@@ -122,21 +122,28 @@ async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
 
     view : ra, dec, radius deg;  where : SQL condition
     """
-    names = lake.version(table).schema.names
+    version = lake.version(table)
+    names = version.schema.names
     lon, lat, radius = (float(number) for number in view)
     mag = next((name for name in _MAGNITUDES if name in names), None)
     key = "id" if "id" in names else names[0]
-    ra, dec = ("ra_lensed", "dec_lensed") if "ra_lensed" in names else ("ra", "dec")
+    ra, dec = version.place(_shown(version))
     chosen = [f'"{key}" AS id', f"{ra} AS ra", f"{dec} AS dec", f"{mag or 'NULL'} AS mag"]
+    wider = np.array([lon, lat, radius + version.padding(_shown(version))])
     chosen += ["kind" if "kind" in names else "NULL AS kind", "count(*) OVER () AS total"]
-    text = f"""SELECT {", ".join(chosen)} FROM {_table(lake, table)} WHERE ({where}\n) AND {_within(view)}
-               AND separation(ra, dec, {lon!r}, {lat!r}) <= {radius!r}
+    text = f"""SELECT {", ".join(chosen)} FROM {_table(lake, table)} WHERE ({where}\n) AND {_within(wider)}
+               AND separation({ra}, {dec}, {lon!r}, {lat!r}) <= {radius!r}
                ORDER BY {"mag" if mag else "1"} LIMIT {MOST_SOURCES}"""
     found = await _asked(lake, text, where)
     columns = {name: found[name].to_pylist() for name in ("ra", "dec", "mag", "kind")}
     return {**columns, "id": [str(value) for value in found["id"].to_pylist()], "by": mag} | {
         "total": found["total"][0].as_py() if found.num_rows else 0, "most": MOST_SOURCES,
     }  # fmt: skip
+
+
+def _shown(version: read.Version) -> str:
+    """Which positions are shown: the observed ones, of a table that has them."""
+    return "true" if places.goes_by_true(version) and "ra_lensed" not in version.schema.names else "observed"
 
 
 async def _asked(lake: Lake, text: str, *expressions: str) -> pa.Table:

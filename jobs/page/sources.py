@@ -42,7 +42,7 @@ def source(lake: Lake, text: str) -> Json:
     rows = found["tables"].get(_TABLES.get(kind, ("",))[0])
     if rows:
         values = {row["name"]: row["value"] for row in rows}
-        ra, dec = (float(values.get(f"{name}_lensed", values.get(name, 0.0))) for name in ("ra", "dec"))
+        ra, dec = (float(values.get(name) or 0.0) for name in lake.named(_TABLES[kind][0])[0].place())
         found["place"] = [ra, dec]
         found["images"] = [
             {"number": number, "x": x, "y": y, "is_north_up": pictures.is_north_up(lake, number)}
@@ -92,12 +92,16 @@ def _identifier(text: str) -> int:
 
 
 def _rows(version: read.Version, identifier: int) -> pa.Table:
-    """The row of a source: of the files only that of its cell is read."""
+    """The row of a source: of the files only those about its cell are read, unless it lies far from its halo."""
     cell = identifier >> ids.BLOCK_BITS & ((1 << 2 * ids.GENERATION_ORDER + 4) - 1)
-    rows = version.in_cells([int(sky.parent(cell, ids.GENERATION_ORDER, ids.FILE_ORDER))], ids.FILE_ORDER)
-    rows = rows.filter(pc.equal(rows["id"], identifier))
-    # A lensed source, or one at a cell's edge, may lie in a neighbour's file.
-    return rows if rows.num_rows else version.rows(where=pc.field("id") == identifier)
+    for order in (ids.GENERATION_ORDER, ids.FILE_ORDER):
+        own = int(sky.parent(cell, ids.GENERATION_ORDER, order))
+        # What is lensed across a cell's edge lies in a neighbour.
+        rows = version.in_cells([own, *sky.margin_cells(order, own, order).tolist()], order)
+        rows = rows.filter(pc.equal(rows["id"], identifier))
+        if rows.num_rows:
+            return rows
+    return version.rows(where=pc.field("id") == identifier)
 
 
 def _found(lake: Lake, table: str, identifier: int) -> tuple[pa.Table, read.Version]:
@@ -235,9 +239,8 @@ def nearest(lake: Lake, ra: float, dec: float, radius: float) -> Json:
     best: Json = {}
     for table in ("galaxies", "stars"):
         for version in lake.named(table):
-            lensed = "ra_lensed" in version.schema.names
-            names = ("ra_lensed", "dec_lensed") if lensed else ("ra", "dec")
-            rows = version.cone(ra, dec, radius, ["id", *names], "lensed" if lensed else "true")
+            names = version.place()
+            rows = version.cone(ra, dec, radius, ["id", *names])
             if not rows.num_rows:
                 continue
             lon, lat = (rows[name].to_numpy() for name in names)

@@ -8,7 +8,7 @@ Version.beside          rows of a Parquet file that belongs to the version, thou
 Version.file            any other file, such as an image
 Version.margin          rows just outside a part's cell
 Version.in_cells        rows inside HEALPix cells
-Version.cone            rows inside a circle, by true or lensed position
+Version.cone            rows inside a circle, by observed or true position
 verify                  is a version what its manifest says?
 """
 
@@ -26,7 +26,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
-from lake_schema import sky
+from lake_schema import places, sky
 from lake_schema import tables as declarations
 from lake_schema.arrays import Int
 from lake_schema.columns import Table
@@ -40,8 +40,6 @@ _CELLS_A_RADIUS = 4
 _MOST_RANGES = 16
 # Added to a padded radius: more than the rounding of the largest deflection.
 _ROUNDING_DEG = 1e-9
-
-ON = {"true": ("ra", "dec"), "lensed": ("ra_lensed", "dec_lensed")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,18 +140,20 @@ class Version:
 
         columns : names, None = all;  parts : names of parts, None = all;  where : an Arrow filter
         """
-        names = list(columns) if columns is not None else None
-        self._refuse_unknown(names or [])
+        own = None if columns is None else self._own(columns)
         with self._refusing():
-            return self.dataset(parts).to_table(columns=names, filter=where)
+            found = self.dataset(parts).to_table(
+                columns=None if own is None else list(dict.fromkeys(own)), filter=where
+            )
+        return found if own is None or columns is None else _as_asked(found, own, columns)
 
     def margin(self, part: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows of a catalogue beside a part's cell, within 10" of it and a little farther."""
-        names = list(columns) if columns is not None else None
-        self._refuse_unknown(names or [])
+        own = self._own(self.schema.names if columns is None else columns)
         entry = self._file(f"{self.table}_margin/dataset/{part}")
         with self._refusing():
-            return self._opened([entry], self.schema).to_table(columns=names)
+            found = self._opened([entry], self.schema).to_table(columns=list(dict.fromkeys(own)))
+        return found if columns is None else _as_asked(found, own, columns)
 
     def beside(self, relative: str) -> pa.Table:
         """Rows of a Parquet file of the version that is no part of its table."""
@@ -162,10 +162,13 @@ class Version:
         with self._refusing():
             return parquet.read(self.folder, entry)
 
-    def _refuse_unknown(self, names: Sequence[str]) -> None:
-        for name in names:
+    def _own(self, asked: Sequence[str]) -> list[str]:
+        """What columns are called that may be asked for by an earlier name.  Errors: BadInput names an unknown one"""
+        own = places.named(self.table, asked, self.schema.names)
+        for name in own:
             if name not in self.schema.names:
                 raise BadInput(f"table {self.table} has no column {name}")
+        return own
 
     def in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows of a catalogue inside cells of an order (nested), reading only files and row groups that can hold some.
@@ -174,9 +177,9 @@ class Version:
         """
         wanted = np.unique(np.asarray(cells, np.int64))
         names = None if columns is None else list(dict.fromkeys([*columns, "_healpix_29"]))
-        self._refuse_unknown(names or [])
         empty = self.schema.empty_table()
-        pieces = [empty if names is None else empty.select(names)]
+        own = self._own(names or [])
+        pieces = [empty if names is None else _as_asked(empty.select(list(dict.fromkeys(own))), own, names)]
         for part in self.parts:
             here = _inside(part, wanted, order)
             if here.size:
@@ -187,24 +190,31 @@ class Version:
         return rows if columns is None else rows.select(list(columns))
 
     def cone(
-        self, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None, on: str = "true"
+        self, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None, on: str = "observed"
     ) -> pa.Table:
         """Rows of a catalogue within `radius` of a place, its edge included.
 
         ra, dec, radius : deg
-        on              : "true" or "lensed", which of a source's positions counts
+        on              : "observed" or "true", which of a source's positions counts
         columns         : that are wanted; None: all of them
         """
-        if on not in ON:
-            raise BadInput(f"on = {on!r} is not one of {', '.join(ON)}")
-        self._refuse_unknown([*ON[on], "_healpix_29"])
-        padded = radius + (self.deflection() + _ROUNDING_DEG if on == "lensed" else 0.0)
+        place = self.place(on)
+        self._own([*place, "_healpix_29"])
+        padded = radius + self.padding(on)
         order = cover_order(padded)
-        names = None if columns is None else list(dict.fromkeys([*columns, *ON[on]]))
+        names = None if columns is None else list(dict.fromkeys([*columns, *place]))
         rows = self.in_cells(sky.cells_in_cone(ra, dec, min(padded, 180.0), order).tolist(), order, names)
-        lon, lat = (rows[name].to_numpy() for name in ON[on])
+        lon, lat = (rows[name].to_numpy() for name in place)
         rows = rows.filter(pa.array(sky.separation(lon, lat, ra, dec) <= radius))
         return rows if columns is None else rows.select(list(columns))
+
+    def place(self, on: str = "observed") -> tuple[str, str]:
+        """Columns of ra and dec of a catalogue's observed or true positions.  Errors: as of places.columns"""
+        return places.columns(self, self.schema.names, on)
+
+    def padding(self, on: str = "observed") -> float:
+        """How far beyond the cells of a place its sources may lie, deg: files go by ra and dec."""
+        return 0.0 if self.place(on) == ("ra", "dec") else self.deflection() + _ROUNDING_DEG
 
     def deflection(self) -> float:
         """Largest distance of a lensed from its true position, deg, as it was when the version was published."""
@@ -218,6 +228,14 @@ def cover_order(radius: float) -> int:
     wanted = max(radius / _CELLS_A_RADIUS, 1e-7)
     order = int(np.ceil(np.log2(np.sqrt(sky.cell_area(0)) / wanted)))
     return min(max(order, 0), sky.DEEPEST - 3)
+
+
+def _as_asked(rows: pa.Table, own: Sequence[str], asked: Sequence[str]) -> pa.Table:
+    """Columns by the names that they were asked by."""
+    if list(own) == list(asked):
+        return rows.select(list(own))
+    fields = [rows.schema.field(name).with_name(other) for name, other in zip(own, asked, strict=True)]
+    return pa.Table.from_arrays([rows[name] for name in own], schema=pa.schema(fields, rows.schema.metadata))
 
 
 def _inside(part: str, cells: Int, order: int) -> Int:
@@ -316,9 +334,13 @@ def _open(root: Path, name: str, wanted: str, asked: bool, link: Path) -> Versio
 def as_declared(opened: Version, table: Table) -> Version:
     """The version as `table` declares it: nullable columns that came later are filled with nulls.
 
+    One of an earlier meaning of its columns stays as it was declared then.
+
     Errors : VersionMismatch, naming both versions and the first column that differs
     """
     was, now = int(opened.manifest["version"]), table.version
+    if table.earlier is not None and was <= table.earlier.version:
+        table = table.earlier
     if fault := _difference(opened.schema, table, was):
         raise VersionMismatch(
             f"table {table.name}: version {was} of its declaration is in the lake, this is version {now}: {fault}"

@@ -27,6 +27,8 @@ from lake_schema.store.validate import check
 
 # A part whose identifiers spread over more blocks than this has none worth noting (order 3 has 1024 of a kind).
 _MOST_BLOCKS = 4096
+# Positions of a source besides those that files go by.
+_OTHER_PLACES = (("ra_true", "dec_true"), ("ra_lensed", "dec_lensed"))
 
 
 def attempt(root: Path, key: str, table: Table, facts: Json, work: Work, part: Part) -> Json:
@@ -106,8 +108,9 @@ def _row_facts(rows: pa.Table, table: Table) -> dict[str, Any]:
     if is_numbered(table):
         blocks = np.unique(rows[table.key[0]].to_numpy() >> BLOCK_BITS)
         facts["blocks"] = blocks.tolist() if blocks.size <= _MOST_BLOCKS else None
-    if "ra_lensed" in table.names:
-        places = (rows[name].to_numpy() for name in ("ra", "dec", "ra_lensed", "dec_lensed"))
+    other = next((names for names in _OTHER_PLACES if names[0] in table.names), None)
+    if other is not None:
+        places = (rows[name].to_numpy() for name in ("ra", "dec", *other))
         facts["deflection_deg"] = float(sky.separation(*places).max(initial=0.0))
     return facts
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from lake_schema.columns import Column, Table
-from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
+from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA, SEEN_DEC, SEEN_RA
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 
@@ -39,7 +40,7 @@ def fluxes(kind: str, bands: Sequence[str]) -> Table:
         for band in bands
     ]
     catalogue = GALAXIES if kind == "galaxy" else STARS
-    return Table(
+    by_true = Table(
         f"{kind}_fluxes",
         1,
         (ID, RA, DEC, HEALPIX_29, *columns, INTEGRATED),
@@ -47,3 +48,7 @@ def fluxes(kind: str, bands: Sequence[str]) -> Table:
         order=catalogue.order,
         finest=catalogue.finest,
     )
+    if kind == "star":
+        return by_true
+    seen = (ID, SEEN_RA, SEEN_DEC, HEALPIX_29, *columns, INTEGRATED)
+    return replace(by_true, version=2, columns=seen, earlier=by_true)

@@ -3,9 +3,52 @@
 from __future__ import annotations
 
 from lake_schema.columns import Column, Table
-from lake_schema.tables.common import DEC, HEALPIX_29, RA, id_of_kinds
+from lake_schema.tables.common import DEC, HEALPIX_29, LENSED, RA, SEEN_DEC, SEEN_RA, TRUE_DEC, TRUE_RA, id_of_kinds
 
-STRONG_LENSES = Table(
+_REST = (
+    Column("kind", "int8", ucd="src.class", doc="kind of source", codes=((4, "strong lens"),), lo=4, hi=4),
+    Column("lens_id", "int64", ucd="meta.id.assoc", doc="the lens: a central or satellite of table galaxies", lo=0),
+    Column(
+        "source_id",
+        "int64",
+        ucd="meta.id.assoc",
+        doc="the galaxy of table galaxies whose spectrum, brightness and shape the lensed one has",
+        lo=0,
+    ),
+    Column(
+        "density_boost",
+        "float32",
+        ucd="stat.weight",
+        doc="how many times denser than in nature strong lenses were drawn; weight by its inverse",
+        lo=1e-3,
+        hi=1e6,
+    ),
+    Column("z_lens", "float32", "", "src.redshift", "redshift of the lens", 0.0, 15.0),
+    Column("z_source", "float32", "", "src.redshift", "redshift of the source", 0.0, 15.0),
+    Column("velocity_dispersion", "float32", "km/s", "phys.veloc.dispersion", "of the lens", 10.0, 1000.0),
+    Column("einstein_radius", "float32", "arcsec", "phys.angSize", "of the isothermal ellipsoid", 0.0, 30.0),
+    Column("axis_ratio", "float32", ucd="phys.size.axisRatio", doc="minor / major axis of the mass", lo=0.1, hi=1.0),
+    Column("position_angle", "float32", "deg", "pos.posAng", "of the mass, north through east", 0.0, 180.0),
+    Column("source_east", "float32", "arcsec", "pos", "true place of the source, east of the lens", -30.0, 30.0),
+    Column("source_north", "float32", "arcsec", "pos", "true place of the source, north of the lens", -30.0, 30.0),
+    Column("images", "int8", ucd="meta.number", doc="images of the source's centre", lo=1, hi=4),
+    Column("magnification", "float32", ucd="arith.factor", doc="flux of the arcs / that of the source", lo=0.0, hi=1e4),
+    Column("stamp_side", "int16", "pixel", "meta.number", "pixels of the stamp's side, of 0.05 arcsec", 1, 4096),
+    Column(
+        "stamp",
+        "list<float32>",
+        "",
+        "phot.flux;arith.ratio",
+        "arcs without the lens: flux in each pixel / flux of the source before magnification; row after row, "
+        "from south to north, each from west to east, the lens in the middle",
+        0.0,
+        1e6,
+    ),
+)
+_ABOUT = "Strong lenses: singular isothermal ellipsoids, and pictures of the galaxies behind them."
+
+# As lakes have it whose files go by true positions.
+_BY_TRUE = Table(
     "strong_lenses",
     1,
     (
@@ -15,49 +58,18 @@ STRONG_LENSES = Table(
         HEALPIX_29,
         Column("ra_lensed", "float64", "deg", "pos.eq.ra", "observed right ascension of the lens", 0.0, 360.0),
         Column("dec_lensed", "float64", "deg", "pos.eq.dec", "observed declination of the lens", -90.0, 90.0),
-        Column("kind", "int8", ucd="src.class", doc="kind of source", codes=((4, "strong lens"),), lo=4, hi=4),
-        Column("lens_id", "int64", ucd="meta.id.assoc", doc="the lens: a central or satellite of table galaxies", lo=0),
-        Column(
-            "source_id",
-            "int64",
-            ucd="meta.id.assoc",
-            doc="the galaxy of table galaxies whose spectrum, brightness and shape the lensed one has",
-            lo=0,
-        ),
-        Column(
-            "density_boost",
-            "float32",
-            ucd="stat.weight",
-            doc="how many times denser than in nature strong lenses were drawn; weight by its inverse",
-            lo=1e-3,
-            hi=1e6,
-        ),
-        Column("z_lens", "float32", "", "src.redshift", "redshift of the lens", 0.0, 15.0),
-        Column("z_source", "float32", "", "src.redshift", "redshift of the source", 0.0, 15.0),
-        Column("velocity_dispersion", "float32", "km/s", "phys.veloc.dispersion", "of the lens", 10.0, 1000.0),
-        Column("einstein_radius", "float32", "arcsec", "phys.angSize", "of the isothermal ellipsoid", 0.0, 30.0),
-        Column(
-            "axis_ratio", "float32", ucd="phys.size.axisRatio", doc="minor / major axis of the mass", lo=0.1, hi=1.0
-        ),
-        Column("position_angle", "float32", "deg", "pos.posAng", "of the mass, north through east", 0.0, 180.0),
-        Column("source_east", "float32", "arcsec", "pos", "true place of the source, east of the lens", -30.0, 30.0),
-        Column("source_north", "float32", "arcsec", "pos", "true place of the source, north of the lens", -30.0, 30.0),
-        Column("images", "int8", ucd="meta.number", doc="images of the source's centre", lo=1, hi=4),
-        Column(
-            "magnification", "float32", ucd="arith.factor", doc="flux of the arcs / that of the source", lo=0.0, hi=1e4
-        ),
-        Column("stamp_side", "int16", "pixel", "meta.number", "pixels of the stamp's side, of 0.05 arcsec", 1, 4096),
-        Column(
-            "stamp",
-            "list<float32>",
-            "",
-            "phot.flux;arith.ratio",
-            "arcs without the lens: flux in each pixel / flux of the source before magnification; row after row, "
-            "from south to north, each from west to east, the lens in the middle",
-            0.0,
-            1e6,
-        ),
+        *_REST,
     ),
-    "Strong lenses: singular isothermal ellipsoids, and pictures of the galaxies behind them.",
+    _ABOUT,
     order=5,
+)
+
+STRONG_LENSES = Table(
+    "strong_lenses",
+    2,
+    (id_of_kinds(4, 4), SEEN_RA, SEEN_DEC, HEALPIX_29, TRUE_RA, TRUE_DEC, *_REST),
+    _ABOUT,
+    order=5,
+    aliases=LENSED,
+    earlier=_BY_TRUE,
 )

@@ -70,8 +70,8 @@ def readers(version, table):
         ra, dec = (version.rows()[name].to_numpy()[0] for name in ("ra", "dec"))
         found["cone"] = lambda: version.cone(ra, dec, 0.5, ["id"])
         found["cells"] = lambda: version.in_cells([1607], 5, some)
-        if "ra_lensed" in names:
-            found["lensed cone"] = lambda: version.cone(ra, dec, 180.0, ["id"], on="lensed")
+        if "ra_true" in names:
+            found["cone by true positions"] = lambda: version.cone(ra, dec, 180.0, ["id"], on="true")
     return found
 
 

@@ -22,7 +22,7 @@ import yaml
 from jobs.catalogue.exports import stellar_spectra, tophat
 from jobs.fluxes import bulges, cosmology, inputs, passbands
 from jobs.fluxes.spectra.extinction import MILKY_WAY_R_V
-from lake_schema import __version__, sky, user_files
+from lake_schema import __version__, places, sky, user_files
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, names, read
@@ -112,7 +112,8 @@ def _catalogue(lake: Path, kind: str, request: str | None) -> _Catalogue:
     bands = [name.removeprefix("f_nu_") for name in fluxes.schema.names if name.startswith("f_nu_lsst_")]
     if not bands:
         raise BadInput(f"table {fluxes.table} has no LSST band: put lsst_r into fluxes.bands and run compute_fluxes")
-    return _Catalogue(rows, fluxes, ("ra_lensed", "dec_lensed") if kind == "galaxy" else ("ra", "dec"), bands)
+    places.refuse_mixed([rows, fluxes])
+    return _Catalogue(rows, fluxes, rows.place(), bands)
 
 
 def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
@@ -128,7 +129,7 @@ def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
 
 
 def _strays(catalogue: _Catalogue) -> dict[int, list[pa.Table]]:
-    """Rows by the pixel in which they are seen, of those that are kept elsewhere, where they would be unlensed."""
+    """Rows by the pixel in which they are seen, of those that an earlier lake keeps where they would be unlensed."""
     found: dict[int, list[pa.Table]] = {}
     if catalogue.place == ("ra", "dec"):
         return found
@@ -170,13 +171,13 @@ def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
         light = tophat.luminosities(given, library)
         share = bulges.in_bins(given, tophat.templates_in_bins(library), library)
         spectra = {"sed_val_bulge": _lists(light * share), "sed_val_disk": _lists(light * (1.0 - share))}
-        return pa.table({**_shapes(given), **spectra})
+        return pa.table({**_shapes(given, catalogue.place), **spectra})
 
     return rows, _fluxes("galaxy_id", catalogue.bands)
 
 
-def _shapes(given: pa.Table) -> dict[str, Any]:
-    """Columns of galaxies but for their spectra.
+def _shapes(given: pa.Table, place: tuple[str, str]) -> dict[str, Any]:
+    """Columns of galaxies but for their spectra; place : columns of the observed position.
 
     Sizes are half-light radii; shears are in GalSim's frame, whose x axis points west. Ellipticities are
     (a - b) / (a + b) along north and north-east: the reader turns them by 90 degrees.
@@ -185,8 +186,8 @@ def _shapes(given: pa.Table) -> dict[str, Any]:
     angle = c["position_angle"].astype(float)
     columns = {
         "galaxy_id": c["id"],
-        "ra": c["ra_lensed"],
-        "dec": c["dec_lensed"],
+        "ra": c[place[0]],
+        "dec": c[place[1]],
         "redshift": c["z_obs"].astype(np.float64),
         "redshift_hubble": np.maximum(c["z_true"].astype(np.float64), tophat.NEAREST),
         "peculiar_velocity": LIGHT_KM_S * ((1.0 + c["z_obs"].astype(float)) / (1.0 + c["z_true"]) - 1.0),

@@ -39,6 +39,8 @@ _MOST_HELD = 2_000_000
 _LOTS = 64
 _SEEN = np.dtype([("id", np.int64), ("file", np.int32), ("row", np.int64)])
 _ABOUT = "about.json"
+# Columns of positions, the observed ones last.
+_PLACES = (("ra", "dec"), ("ra_lensed", "dec_lensed"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,12 +179,15 @@ def _made(folder: Path, found: Sequence[Path], columns: Columns) -> dict[str, An
 
 
 def _write(folder: Path, held: Sequence[Rows], number: int) -> None:
-    """Rows of every cell -> a piece of its own, sorted by index."""
+    """Rows of every cell, that in which they are seen -> a piece of its own, sorted by index."""
     if not sum(len(piece.values["ra"]) for piece in held):
         return
     values = {name: np.concatenate([piece.values[name] for piece in held]) for name in held[0].values}
-    values["ra"], values["dec"] = sky.checked(values["ra"], values["dec"])
-    values["index"] = sky.healpix_29(values["ra"], values["dec"])
+    for ra, dec in _PLACES:
+        if ra in values:
+            values[ra], values[dec] = sky.checked(values[ra], values[dec])
+            # By where it is seen, where the catalogue says so.
+            values["index"] = sky.healpix_29(values[ra], values[dec])
     order = np.argsort(values["index"], kind="stable")
     cells = values["index"][order] >> 2 * (sky.DEEPEST - FILE_ORDER)
     for cell in np.unique(cells).tolist():

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,12 @@ _FIELD_KEYS = (
 _FORMAT_KEYS = ("source", "columns", "band", "beside", "seen_over_v", "lines_magnified")
 _SED = ("sed_1", "frac_1", "ext_law_1", "ebv_1", "sed_2", "frac_2", "ext_law_2", "ebv_2")
 # Computed by us, or another key's affair.
-_NOT_MAPPED = ("id", "halo_id", "_healpix_29")
+_NOT_MAPPED = ("id", "halo_id", "_healpix_29", "ra_true", "dec_true")
 GALAXY_BOUNDS: Bounds = {
     **{c.name: (c.lo, c.hi) for c in GALAXIES.columns if c.lo is not None and c.hi is not None},
     "ra": (-360.0, 360.0),
     "ra_lensed": (-360.0, 360.0),
+    "dec_lensed": (-90.0, 90.0),
     "position_angle": (-360.0, 360.0),
     "kind": (0, 1),
     "sed": (0.0, 1000.0),
@@ -149,6 +150,12 @@ def galaxies(name: str, own: Mapping[str, str]) -> Columns:
     beside, seen = tuple(about.get("beside", ())), about.get("seen_over_v")
     lines = bool(about.get("lines_magnified", False))
     return Columns(fields, GALAXY_BOUNDS, MAY_MISS, about.get("band", ""), beside, seen, lines)
+
+
+def unlensed(columns: Columns) -> Columns:
+    """The same mapping without the observed positions."""
+    fields = {key: field for key, field in columns.fields.items() if not key.endswith("_lensed")}
+    return replace(columns, fields=fields)
 
 
 def halos(own: Mapping[str, str]) -> Columns:

@@ -116,7 +116,7 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Ta
     if universe.columns.lines_magnified:
         given = {**given, **{name: given[name] * _shrinking(lens) for name in given if name.startswith("flux_")}}
     lens_seen = lens if universe.lens is None else lensing.columns(universe.lens, given["ra"] % 360.0, given["dec"], z)
-    a_v = given["a_v"] if "a_v" in given else dust_map.a_v(dust, given["ra"], given["dec"])
+    a_v = given["a_v"] if "a_v" in given else dust_map.a_v(dust, lens_seen["ra"], lens_seen["dec"])
     m_r, colour, sed, law_2, ebv_2 = _light(given, universe, z, kind, _seen(given, universe, lens, a_v), rng)
     seen = m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.reference, z, sed)
     log_mass = _known(given, "log_stellar_mass", stellar_mass.log_stellar_mass(universe.masses, m_r, colour.colour, z))
@@ -124,8 +124,6 @@ def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Ta
     drawn = emission_lines.fluxes(universe.lines, z, log_mass, log_sfr, colour.red, rng("lines"))
     columns: dict[str, Any] = {
         **_identity(given, cell, kind),
-        **{name: given[name] for name in ("ra", "dec")},
-        "_healpix_29": given["index"],
         **lens_seen,
         "kind": kind,
         "density_boost": np.ones(n),
@@ -199,9 +197,10 @@ def _identity(given: Given, cell: int, kind: Int) -> dict[str, Int]:
 
 def _lensing(given: Given, n: int) -> dict[str, Array]:
     zeros = np.zeros(n)
-    ra, dec = (given.get(f"{name}_lensed", given[name]) for name in ("ra", "dec"))
+    true = given["ra"], given["dec"]
+    seen = given.get("ra_lensed", true[0]), given.get("dec_lensed", true[1])
     shear = {name: given.get(name, zeros) for name in ("kappa", "gamma1", "gamma2")}
-    return {"ra_lensed": sky.wrapped(ra), "dec_lensed": dec, **shear}
+    return {**lensing.places(seen, true), **shear}
 
 
 def _seen(given: Given, universe: IngestModel, lens: Mapping[str, Array], a_v: Float) -> Float | None:

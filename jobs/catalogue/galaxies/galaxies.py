@@ -33,7 +33,7 @@ from jobs.catalogue.galaxies.alignments import Alignments
 from jobs.catalogue.galaxies.band_ratios import BandRatios, Sed
 from jobs.catalogue.galaxies.emission_lines import LineModel
 from jobs.catalogue.galaxies.halo_lensing import Neighbourhood
-from jobs.catalogue.galaxies.high_redshift import Kind
+from jobs.catalogue.galaxies.high_redshift import Kind, Near
 from jobs.catalogue.galaxies.lensing import Lens, Shear
 from jobs.catalogue.galaxies.morphology import Shapes
 from jobs.catalogue.galaxies.nearest_sed import Training
@@ -177,16 +177,32 @@ def _selection(wanted: Universe, training: Training | None) -> BandRatios:
 
 
 def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Table:
-    """Table `galaxies` of one order-8 cell, sorted by _healpix_29.
+    """Rows of table `galaxies` that are truly in one order-8 cell, sorted by _healpix_29 of where they are seen.
 
     cells : what has been drawn of the universe's population
     dust  : float32[pixel] mag, map of the Milky Way's A(V) (jobs.catalogue.dust_map)
     """
+    lens = halo_lensing.around(universe.lens, cells, cell)
+    return of_members(cell, universe, population.members(cells, cell), lens, dust)
+
+
+def of_members(
+    cell: int,
+    universe: GalaxyModel,
+    members: Members,
+    lens: Lens | Neighbourhood,
+    dust: Float32,
+    near: Near | None = None,
+) -> pa.Table:
+    """Those of them that are bright enough, and quasars and galaxies beyond the light-cone.
+
+    members : of the cell, or some of them;  lens : of the cell
+    near    : which true places the second are wanted at, None = all
+    cell, universe, dust : as of `draw`
+    """
     seed = universe.population.seed
-    members = population.members(cells, cell)
     drawn, physical = _bright(universe, members, select(universe, *_light(seed, universe, members), _LINES))
     distance_modulus = cosmology.distance_modulus(drawn.z)
-    lens = halo_lensing.around(universe.lens, cells, cell)
     columns = {
         **_places(lens, members, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
@@ -197,7 +213,7 @@ def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Ta
         **_shape_columns(universe, members, drawn, physical["log_stellar_mass"]),
     }
     rows = [GALAXIES.build(columns)]
-    rows += [high_redshift.draw(cell, seed, kind, lens, dust) for kind in universe.distant]
+    rows += [high_redshift.draw(cell, seed, kind, lens, dust, near) for kind in universe.distant]
     return in_order(lensing.turned(pa.concat_tables(rows), universe.rotation))
 
 
@@ -288,20 +304,17 @@ def _light(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, F
 def _places(
     lens: Lens | Neighbourhood, members: Members, row: Int, dust: Float32
 ) -> dict[str, npt.NDArray[np.generic]]:
-    ra, dec = members.ra[row], members.dec[row]
+    places = halo_lensing.columns(lens, members.ra[row], members.dec[row], members.chi[row])
     return {
         "id": members.id[row],
         "halo_id": members.halo_id[row],
-        "ra": ra,
-        "dec": dec,
-        "_healpix_29": members.index[row],
-        **halo_lensing.columns(lens, ra, dec, members.chi[row]),
+        **places,
         "kind": members.kind[row],
         "density_boost": np.ones(row.size),
         "z_true": members.z[row],
         "z_obs": members.z_obs[row],
         "log_halo_mass": members.host_mass[row],
-        "a_v": dust_map.a_v(dust, ra, dec),
+        "a_v": dust_map.a_v(dust, places["ra"], places["dec"]),
     }
 
 

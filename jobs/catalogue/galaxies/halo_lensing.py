@@ -14,9 +14,11 @@ Ref: Bartelmann & Schneider 2001, Phys. Rep. 340, 291, sections 3.1 and 4.3
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from jobs.catalogue.galaxies import lensing
 from jobs.catalogue.galaxies.lensing import Lens, Planes
@@ -27,6 +29,7 @@ from jobs.catalogue.halos.population import Cells
 from jobs.fluxes import cosmology, sources
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
+from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 
 # Sources of a cell of this order have the same halos to look through.
@@ -35,6 +38,8 @@ _PIECE = 11
 _CHI, _CIRCLE, _MASS = 3, 7, 9
 # Cells of halos that are kept: a cell's neighbourhood and that of the cells about it.
 _KEPT = 1024
+# How far all other halos but the strongest bend light together, rad.
+_OTHERS = np.radians(45.0 / 3600.0)
 # The grid goes this far beyond a cell, rad: no source is shown farther from where it is.
 _BEYOND = np.radians(7.0 / 60.0)
 
@@ -45,6 +50,7 @@ class Neighbourhood:
 
     frame  : [3, 3] east, north and direction of the centre;  halos : [8, h] as halo_lensing_sums wants them
     planes : [p] 1 / distance, h/Mpc;  smooth : [p, side, side, 5], what halos do to nodes of a grid in the plane
+    farthest : how far halos bend light at most, rad
     """
 
     box: Planes
@@ -53,14 +59,16 @@ class Neighbourhood:
     halos: Float
     planes: Float
     smooth: Float
+    farthest: float
 
 
-def around(lens: Lens, cells: Cells, cell: int) -> Lens | Neighbourhood:
+def around(lens: Lens, cells: Cells, cell: int, away: Callable[[int], float] | None = None) -> Lens | Neighbourhood:
     """The halos that reach into a generation cell, by distance, those of one distance by mass and identifier.
 
     lens  : the maps; where there is one shear for all, it stays so
     cells : what has been drawn of the universe's population: what halos do is kept there
     cell  : nested index at order 8
+    away  : how far the sources that matter are at least from a cell of order 8, rad; None: all of the cell's matter
     """
     if not isinstance(lens, Planes):
         return lens
@@ -68,7 +76,9 @@ def around(lens: Lens, cells: Cells, cell: int) -> Lens | Neighbourhood:
     centre = sky.cell_centre(GENERATION_ORDER, cell)
     frame = _frames(*np.atleast_2d(centre).T)[0]
     radius = sky.cell_radius(GENERATION_ORDER) + chosen.strip / 60.0
-    parts = [_lenses(chosen, lens, cells, *place) for place in _near(chosen, cell, centre, radius)]
+    every = _near(chosen, cell, centre, radius)
+    every = every if away is None else _reaching(chosen, every, away)
+    parts = [_lenses(chosen, lens, cells, *place) for place in every]
     halos, own = np.concatenate([part[0] for part in parts], 1), np.concatenate([part[1] for part in parts])
     # A chord is no longer than its arc.
     chord = np.sum((halos[:3] - frame[2][:, None]) ** 2, 0)
@@ -76,11 +86,11 @@ def around(lens: Lens, cells: Cells, cell: int) -> Lens | Neighbourhood:
     halos, own = halos[:, kept], own[kept]
     halos = halos[:, np.lexsort((own, halos[_MASS], halos[_CHI]))]
     table = np.concatenate([_stereographic(frame, halos[:3].T), halos[_CHI:_MASS]])
-    return Neighbourhood(lens, chosen, frame, table, *_grid(chosen, table))
+    return Neighbourhood(lens, chosen, frame, table, *_grid(chosen, table), _farthest(table))
 
 
-def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> dict[str, Float]:
-    """Observed positions and lensing of sources as columns of table `galaxies`.
+def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> dict[str, npt.NDArray[np.generic]]:
+    """Observed and true positions, and lensing, of sources as columns of table `galaxies`.
 
     ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
     lens    : halos and maps, maps alone, or one shear for all
@@ -90,9 +100,10 @@ def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> di
     box = lensing.at(lens.box, ra, dec, chi)
     seen = lensing.displaced(ra, dec, *box[3:])
     found = images(lens, *seen, chi)
-    ra_lensed, dec_lensed = lensing.displaced(*seen, *found[3:])
+    _refuse_beyond(lens, found[3:])
     kappa, gamma1, gamma2 = box[:3] + found[:3]
-    return {"ra_lensed": ra_lensed, "dec_lensed": dec_lensed, "kappa": kappa, "gamma1": gamma1, "gamma2": gamma2}
+    shear = {"kappa": kappa, "gamma1": gamma1, "gamma2": gamma2}
+    return {**lensing.places(lensing.displaced(*seen, *found[3:]), (ra, dec)), **shear}
 
 
 def images(lens: Neighbourhood, ra: Float, dec: Float, chi: Float) -> Float:
@@ -114,6 +125,14 @@ def images(lens: Neighbourhood, ra: Float, dec: Float, chi: Float) -> Float:
     return out
 
 
+def _refuse_beyond(lens: Neighbourhood, bent: Float) -> None:
+    """Refuse what would be seen in a cell that does not look for it."""
+    most = float(np.hypot(*bent).max(initial=0.0))
+    if most > lens.farthest:
+        found, expected = (np.degrees(angle) * 3600.0 for angle in (most, lens.farthest))
+        raise BadInput(f"table galaxies: halos bend light by {found:.0f} arcsec, more than the {expected:.0f} expected")
+
+
 # ------------------------------------------------------------------------------------------------ halos
 
 
@@ -125,6 +144,20 @@ def _near(chosen: Settings, cell: int, centre: tuple[float, float], radius: floa
     for order in LEVELS[1:]:
         own = cell >> 2 * (GENERATION_ORDER - order)
         found += [(order, place, chosen.lowest) for place in (own, *sky.margin_cells(order, own, order).tolist())]
+    return found
+
+
+def _reaching(
+    chosen: Settings, every: list[tuple[int, int, float]], away: Callable[[int], float]
+) -> list[tuple[int, int, float]]:
+    """Those of `_near` whose halos may reach nodes about the sources."""
+    wide, reach = (
+        np.radians((angle + chosen.strip + 2.0 * chosen.step) / 60.0) for angle in (chosen.wide, chosen.reach)
+    )
+    found = [place for place in every if place[0] != GENERATION_ORDER]
+    for order, cell, least in every:
+        if order == GENERATION_ORDER and (distance := away(cell)) <= reach:
+            found.append((order, cell, least if distance <= wide else chosen.heavy))
     return found
 
 
@@ -145,6 +178,24 @@ def _lenses(chosen: Settings, box: Planes, cells: Cells, order: int, cell: int, 
             kept.popitem(last=False)
     kept.move_to_end(which)
     return kept[which]
+
+
+def _farthest(halos: Float) -> float:
+    """The strongest of the halos bends light by its own, infinitely far behind it; all others together by less."""
+    # Its compiler takes a second to import.
+    from jobs.catalogue.halos import halo_lensing_sums as sums
+    from jobs.catalogue.halos import projected_nfw
+
+    amplitude, size = halos[sums.AMPLITUDE], halos[sums.SIZE]
+    if not amplitude.size:
+        return _OTHERS
+    nodes, shares = np.geomspace(1.0, 100.0, 25), np.linspace(0.02, 0.99, 98)
+    # What is enclosed, over the radius, both in units of the halo's own.
+    steepest = [
+        max(projected_nfw.profile(share * c, c)[1] / share for share in shares) / projected_nfw.total(c) for c in nodes
+    ]
+    own = amplitude / size * np.interp(halos[sums.CONCENTRATION], nodes, steepest)
+    return float(own.max()) + _OTHERS
 
 
 def _grid(chosen: Settings, halos: Float) -> tuple[Float, Float]:

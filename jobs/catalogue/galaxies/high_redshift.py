@@ -12,6 +12,7 @@ are in high_redshift.toml.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,12 +37,14 @@ from jobs.fluxes.high_redshift import (
 from jobs.keyed import Draws, Keyed
 from jobs.rng import stream
 from lake_schema import ids, sky
-from lake_schema.arrays import Float, Float32, Int
+from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.tables.galaxies import GALAXIES
 
 _FILE = "high_redshift.toml"
 _STREAM = {HIGH_REDSHIFT: "high_redshift", QUASAR: "quasars"}
+# ra, dec [n] deg -> which of them.
+Near = Callable[[Float, Float], Bool]
 _Z_STEP, _M_STEP, _M_BRIGHTEST = 0.02, 0.02, -32.0
 # Where the light-cone of galaxies ends and other populations begin, and the brightest magnitude that is drawn.
 _BEYOND, _FIRST_MAGNITUDE = 6.0, 10
@@ -92,12 +95,15 @@ def model(
     return tuple(_kind(*about, limit, z_end) for about in drawn)
 
 
-def draw(cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Float32) -> pa.Table:
-    """Rows of one kind in a generation cell, sorted by _healpix_29.
+def draw(
+    cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Float32, near: Near | None = None
+) -> pa.Table:
+    """Rows of one kind that are truly in a generation cell.
 
     dust : float32[pixel] map of A(V), mag (jobs.catalogue.dust_map)
     cell   : nested index at order 8;  seed : of the request;  kind : the objects' luminosity function and boost
     lens   : halos and maps, maps alone, or one shear for all
+    near   : which true places are wanted, None = all
     """
     found, number = [], 0
     for step in range(len(kind.cells)):
@@ -108,18 +114,18 @@ def draw(cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Flo
         kept = (ultraviolet_magnitude(drawn[1], drawn[0]) < kind.limit) & (
             (drawn[0] < kind.z_end) | (drawn[0] >= _BEYOND)
         )
+        if near is not None:
+            kept &= near(*drawn[3:])
         found.append([column[kept] for column in (own, *drawn)])
-    own, z, m, index, ra, dec = (np.concatenate(column) for column in zip(*found, strict=True))
+    own, z, m, _, ra, dec = (np.concatenate(column) for column in zip(*found, strict=True))
     source = ids.source_id(np.full(own.size, kind.code), cell, own)
     rng = Keyed(source, seed, _STREAM[kind.code])
     zeros = np.zeros(own.size)
+    places = halo_lensing.columns(lens, ra, dec, cosmology.comoving_distance(z))
     columns = {
         "id": source,
         "halo_id": ids.halo_of(source),
-        "ra": ra,
-        "dec": dec,
-        "_healpix_29": index,
-        **halo_lensing.columns(lens, ra, dec, cosmology.comoving_distance(z)),
+        **places,
         "kind": np.full(own.size, kind.code),
         "density_boost": np.full(own.size, kind.boost),
         "z_true": z,
@@ -133,7 +139,7 @@ def draw(cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Flo
         **{name: zeros.astype(int) for name in ("ext_law_1", "ext_law_2")},
         **{name: zeros for name in ("ebv_1", "ebv_2")},
         **_shapes(kind, z, m, rng),
-        "a_v": dust_map.a_v(dust, ra, dec),
+        "a_v": dust_map.a_v(dust, places["ra"], places["dec"]),
     }
     return GALAXIES.build(columns)
 

@@ -4,7 +4,8 @@ load        the planes of a box, from the cache or made now
 Shear       in their place one and the same shear of all sources, or none
 at          kappa, gamma1, gamma2, deflection of sources: bilinear on the sky, linear in distance between planes
 displaced   true positions -> observed ones
-columns     both, as table `galaxies` has them
+columns     both, as table `galaxies` has them;  places : the positions of these
+farthest    how far light is bent at most
 turned      galaxies with other position angles, before lensing
 
 gamma1, gamma2 are in the frame (x, y) = (east, north): east or west of a mass gamma1 < 0, north-east of it
@@ -122,19 +123,43 @@ def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     return found
 
 
-def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Float]:
-    """Observed positions and lensing of sources as columns of table `galaxies`.
+def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, npt.NDArray[np.generic]]:
+    """Observed and true positions, and lensing, of sources as columns of table `galaxies`.
 
     ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
     lens    : maps, or one shear for all
     """
     if isinstance(lens, Shear):
         gamma = {"gamma1": np.full(ra.size, lens.g1), "gamma2": np.full(ra.size, lens.g2)}
-        return {"ra_lensed": ra, "dec_lensed": dec, "kappa": np.zeros(ra.size), **gamma}
+        return {**places((ra, dec), (ra, dec)), "kappa": np.zeros(ra.size), **gamma}
     kappa, gamma1, gamma2, east, north = at(lens, ra, dec, chi)
-    ra_lensed, dec_lensed = displaced(ra, dec, east, north)
     shear = {"kappa": kappa, "gamma1": gamma1, "gamma2": gamma2}
-    return {"ra_lensed": ra_lensed, "dec_lensed": dec_lensed, **shear}
+    return {**places(displaced(ra, dec, east, north), (ra, dec)), **shear}
+
+
+def places(seen: tuple[Float, Float], true: tuple[Float, Float]) -> dict[str, npt.NDArray[np.generic]]:
+    """Columns of positions: seen, true : ra and dec [n], deg."""
+    return {
+        "ra": sky.wrapped(seen[0]),
+        "dec": seen[1],
+        "_healpix_29": sky.healpix_29(*seen),
+        "ra_true": sky.wrapped(true[0]),
+        "dec_true": true[1],
+    }
+
+
+def farthest(planes: Planes, order: int, cell: int) -> float:
+    """How far the light of any source in a cell is bent at most, rad.
+
+    Between nodes of a map, and between two planes, a deflection is a mean of theirs.
+    order, cell : nested;  planes : maps
+    """
+    own = int(np.log2(planes.nside))
+    coarse = min(order, own)
+    around = np.append(sky.margin_cells(coarse, cell >> 2 * (order - coarse), coarse), cell >> 2 * (order - coarse))
+    fine = 2 * (own - coarse)
+    pixels = (around[:, None] << fine) + np.arange(1 << fine)
+    return max(float(np.hypot(*field[pixels.ravel(), EAST:].T).max()) for field in planes.maps)
 
 
 # Where deflections lead.

@@ -38,7 +38,7 @@ from lake_schema.tables.strong_lenses import STRONG_LENSES
 from lake_schema.units import LIGHT_KM_S
 
 COLUMNS = (
-    "id", "kind", "ra", "dec", "_healpix_29", "ra_lensed", "dec_lensed", "z_true", "abs_mag_r01", "color_gr_01",
+    "id", "kind", "ra", "dec", "_healpix_29", "ra_true", "dec_true", "z_true", "abs_mag_r01", "color_gr_01",
     "disk_half_light_radius", "disk_axis_ratio", "position_angle",
 )  # fmt: skip
 STRONG_LENS = 4
@@ -302,7 +302,7 @@ def _table(cell: int, columns: dict[str, Array], rows: list[Any], boost: float) 
     order = np.lexsort((own, columns["_healpix_29"][lens]))
     own, lens, source, rows = own[order], lens[order], source[order], [rows[i] for i in order]
     n = len(rows)
-    placed = ("ra", "dec", "_healpix_29", "ra_lensed", "dec_lensed")
+    placed = ("ra", "dec", "_healpix_29", "ra_true", "dec_true")
 
     def each(value: Any) -> Array:
         return np.array([value(row) for row in rows], float)

@@ -12,7 +12,7 @@ seed and the cell only, never on which other cells are drawn; a nearer or shallo
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -67,6 +67,11 @@ class Members:
     host_mass: Float
     host_index: Int
     radius: Float
+
+    def part(self, keep: Bool) -> Members:
+        """The same halos, and the galaxies that are kept: keep : bool[n]."""
+        columns = (getattr(self, name)[keep] for name in self.__slots__ if name != "halos")
+        return Members(self.halos, *columns)
 
 
 @dataclass(slots=True, eq=False)
@@ -135,14 +140,24 @@ def halos_of(cells: Cells, cell: int) -> Halos:
     return together.part(np.lexsort((together.id, together.index)))
 
 
-def members(cells: Cells, cell: int) -> Members:
-    """Halos and candidate galaxies of one generation cell."""
+def members(cells: Cells, cell: int, about: Sequence[int] | None = None) -> Members:
+    """Halos and candidate galaxies of one generation cell.
+
+    cells : what has been drawn;  cell : nested index at order 8
+    about : of the cells that touch it those whose halos' satellites are wanted, None = all
+    """
     own = halos_of(cells, cell)
     lit = own.part(own.proxy >= cells.population.halos.mass_limit(own.chi))
-    landed = [_landed(cells, order, around, cell) for order in LEVELS for around in _around(order, cell)]
+    wanted = None if about is None else {cell, *about}
+    places = [(order, around) for order in LEVELS for around in _around(order, cell)]
+    landed = [
+        _landed(cells, order, around, cell)
+        for order, around in places
+        if order != GENERATION_ORDER or wanted is None or around in wanted
+    ]
     ra, dec = sky.positions(lit.index)
-    places = (lit.id, lit.id, lit.index, ra, dec, lit.chi, lit.velocity, lit.proxy, lit.log_mass, lit.index)
-    central = (*places, np.zeros(lit.chi.size))
+    own_columns = (lit.id, lit.id, lit.index, ra, dec, lit.chi, lit.velocity, lit.proxy, lit.log_mass, lit.index)
+    central = (*own_columns, np.zeros(lit.chi.size))
     columns = [np.concatenate(column) for column in zip(central, *landed, strict=True)]
     order = np.lexsort((columns[0], columns[2]))
     source, halo_id, index, ra, dec, chi, velocity, proxy, mass, home, radius = (column[order] for column in columns)

@@ -27,10 +27,10 @@ def bright_lights(
     detector        : that they are seen from;  system : its world coordinates
     """
     found = []
-    for (rows, electrons), (ra, dec) in ((galaxies, ("ra_lensed", "dec_lensed")), (stars, ("ra", "dec"))):
+    for rows, electrons in (galaxies, stars):
         bright = np.flatnonzero(electrons > _LIGHT)
-        chosen = rows.select(["id", ra, dec]).take(bright)
-        column, row = astrometry.pixel_of_sky(system, chosen[ra].to_numpy(), chosen[dec].to_numpy())
+        chosen = rows.select(["id", "ra", "dec"]).take(bright)
+        column, row = astrometry.pixel_of_sky(system, chosen["ra"].to_numpy(), chosen["dec"].to_numpy())
         found.append((chosen["id"].to_numpy(), column, row, electrons[bright]))
     ids, column, row, electrons = (np.concatenate(part) for part in zip(*found, strict=True))
     order = np.argsort(ids)

@@ -48,7 +48,7 @@ from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 
 # What is read of the catalogues; fluxes are read besides.
-SHAPE_COLUMNS = ("id", "kind", "ra_lensed", "dec_lensed", *galaxy_shapes.COLUMNS)
+SHAPE_COLUMNS = ("id", "kind", "ra", "dec", *galaxy_shapes.COLUMNS)
 GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, galaxy_stamps.COLUMN, *colours.GALAXY_COLUMNS, *bulges.COLUMNS)))
 STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
 # Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
@@ -115,8 +115,8 @@ def listed(rows: Rows, electrons: tuple[Float, Float]) -> Listed:
     _check(ids, light)
     return Listed(
         ids,
-        np.concatenate([catalogue["ra_lensed"].to_numpy(), points["ra"].to_numpy(), arcs.ra]),
-        np.concatenate([catalogue["dec_lensed"].to_numpy(), points["dec"].to_numpy(), arcs.dec]),
+        np.concatenate([catalogue["ra"].to_numpy(), points["ra"].to_numpy(), arcs.ra]),
+        np.concatenate([catalogue["dec"].to_numpy(), points["dec"].to_numpy(), arcs.dec]),
         light,
         np.concatenate([np.where(stamp < 0, np.arange(n), -1), np.full(stars + len(arcs.ids), -1)]).astype(np.int64),
         np.concatenate([stamp, np.full(stars, -1), len(stamps) + np.arange(len(arcs.ids))]).astype(np.int64),

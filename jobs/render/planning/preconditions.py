@@ -14,7 +14,7 @@ from jobs.render.sources.catalogue_rows import CATALOGUES, LENSES
 from jobs.request import universe
 from jobs.request.area import Area
 from jobs.request.schema import Request
-from lake_schema import sky
+from lake_schema import places, sky
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
@@ -32,6 +32,7 @@ INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars",
 def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> None:
     """What lies in the lake must have been made for this request, and the tables from one another."""
     universe.refuse_other([inputs[name] for name in universe.CATALOGUES], request)
+    places.refuse_mixed(inputs.values())
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
     filters = user_filters(request)[1]
     wanted = {"request": request.facts(*PARTS), "mission": mission_of(request.mission).fingerprint, **filters}

@@ -52,10 +52,11 @@ def labels(root: Path, product: dict[str, Any], image: images.Image, made_of: Ma
     radius = float(sky.separation(*centre, *corner)[0])
     cells = sky.cells_in_cone(*centre, radius, GENERATION_ORDER).tolist()
     found: list[Label] = []
-    for kind, position in (("galaxy", ("ra_lensed", "dec_lensed")), ("star", ("ra", "dec"))):
-        table = "galaxies" if kind == "galaxy" else "stars"
+    for kind, table in (("galaxy", "galaxies"), ("star", "stars")):
+        version = read.version(root, table, made_of[table])
+        position = version.place()
         columns = ["id", *position] + (["z_obs"] if kind == "galaxy" else [])
-        rows = read.version(root, table, made_of[table]).in_cells(cells, GENERATION_ORDER, columns)
+        rows = version.in_cells(cells, GENERATION_ORDER, columns)
         fluxes = read.version(root, f"{kind}_fluxes", made_of[f"{kind}_fluxes"])
         flux = fluxes.in_cells(cells, GENERATION_ORDER, ["id", column])
         near = sky.separation(*centre, *(rows[name].to_numpy() for name in position)) < radius

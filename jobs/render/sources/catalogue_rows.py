@@ -33,13 +33,23 @@ def drawn_cells(catalogue: read.Version) -> set[int]:
 
 
 def deflection_of(catalogue: read.Version) -> float:
-    """How far a source may be seen from where its cell says, deg: galaxies by lenses, stars as they move.
+    """How far a source may be seen from where its cell says, deg: stars as they move, galaxies of an earlier lake.
 
     Error: a star that has moved farther is missed where its cell is not read
     """
-    if "ra_lensed" in catalogue.schema.names:
-        return catalogue.deflection()
+    if farther := catalogue.padding():
+        return farther
     return _FARTHEST_MOVED if "pm_ra" in catalogue.schema.names else 0.0
+
+
+def as_seen(catalogue: read.Version, columns: Sequence[str]) -> list[str]:
+    """The columns, where `ra` and `dec` are those of observed positions, of a lake of this or of an earlier time."""
+    seen = dict(zip(("ra", "dec"), catalogue.place(), strict=True))
+    return [seen.get(name, name) for name in columns]
+
+
+def _as_asked(rows: pa.Table, own: Sequence[str], columns: Sequence[str]) -> pa.Table:
+    return rows if list(own) == list(columns) else rows.rename_columns(list(columns))
 
 
 def at_time(stars: pa.Table, mjd: float) -> pa.Table:
@@ -85,14 +95,15 @@ def sources(
     if np.isfinite(bright):
         around, _ = selection.beyond(task, deflection, max(FARTHEST, farther), drawn_cells(catalogue))
         farthest = sorted(set(around) - set(far))
-    rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
+    own = as_seen(catalogue, columns)
+    rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, own), (fluxes, flux)))
     for cells, limit in ((far, least), (farthest, bright)):
         if not cells:
             continue
-        more, fluxes_there = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
+        more, fluxes_there = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, own), (fluxes, flux)))
         shows = pc.greater_equal(fluxes_there[flux[1]], limit)
         rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, more), (light, fluxes_there)))
-    return rows, light, complete
+    return _as_asked(rows, own, columns), light, complete
 
 
 def bright(
@@ -115,8 +126,9 @@ def bright(
     light = light.filter(pc.greater_equal(light[f"f_nu_{band}"], least))
     # Fluxes are small: only the parts of the catalogue that have some of these are read.
     parts = [part["name"] for part in catalogue.manifest["parts"] if not set(cells).isdisjoint(part["facts"][CELLS])]
-    found = catalogue.rows(columns, parts if len(light) else [], pc.field("id").isin(light["id"]))
-    return found, light
+    own = as_seen(catalogue, columns)
+    found = catalogue.rows(own, parts if len(light) else [], pc.field("id").isin(light["id"]))
+    return _as_asked(found, own, columns), light
 
 
 def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, farther: float, least: float) -> pa.Table:
@@ -127,13 +139,15 @@ def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, fart
     table      : version of `strong_lenses`;  task : its row
     """
     cells = selection.within(task, deflection, farther) if np.isfinite(least) else []
-    about = table.in_cells(cells, GENERATION_ORDER, ["id", "ra_lensed", "dec_lensed"])
-    ra, dec = (about[name].to_numpy() for name in ("ra_lensed", "dec_lensed"))
+    about = table.in_cells(cells, GENERATION_ORDER, ["id", *table.place()])
+    ra, dec = (about[name].to_numpy() for name in table.place())
     reach = task["radius"] + farther / 3600.0
     seen = about["id"].filter(pa.array(selection.near(ra, dec, (task["ra"], task["dec"]), reach)))
     # Pictures are large: only those of lenses that are seen are read.
     parts = [part["name"] for part in table.manifest["parts"] if not set(cells).isdisjoint(part["facts"][CELLS])]
-    return table.rows(lensed_arcs.ARC_COLUMNS, parts if len(seen) else [], pc.field("id").isin(seen))
+    own = as_seen(table, lensed_arcs.ARC_COLUMNS)
+    found = table.rows(own, parts if len(seen) else [], pc.field("id").isin(seen))
+    return _as_asked(found, own, lensed_arcs.ARC_COLUMNS)
 
 
 def with_lensed(
@@ -158,5 +172,7 @@ def with_lensed(
     cells = set(selection.within(task, deflection_of(catalogue), farther))
     parts = [part["name"] for part in catalogue.manifest["parts"] if not cells.isdisjoint(part["facts"][CELLS])]
     wanted = pc.field("id").isin(pa.array(missing))
-    more, its = (v.rows(t.column_names, parts, wanted) for v, t in ((catalogue, rows), (fluxes, light)))
+    own = as_seen(catalogue, rows.column_names)
+    more = _as_asked(catalogue.rows(own, parts, wanted), own, rows.column_names)
+    its = fluxes.rows(light.column_names, parts, wanted)
     return pa.concat_tables([rows, more]), pa.concat_tables([light, its])

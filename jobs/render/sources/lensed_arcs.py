@@ -15,7 +15,7 @@ from lake_schema.arrays import Array, Float, Float32, Int
 from lake_schema.errors import BadInput
 
 # What is read of the table `strong_lenses`; arcsec of a pixel of its pictures, as the table declares.
-ARC_COLUMNS = ("id", "source_id", "ra_lensed", "dec_lensed", "stamp_side", "stamp")
+ARC_COLUMNS = ("id", "source_id", "ra", "dec", "stamp_side", "stamp")
 ARC_SCALE = 0.05
 
 
@@ -92,8 +92,8 @@ def arcs(rows: pa.Table, ids: Int, electrons: Float) -> Arcs:
     found = [_picture(*some) for some in zip(lenses, sides, stamps, strict=True)]
     return Arcs(
         rows["id"].to_numpy().astype(np.int64),
-        rows["ra_lensed"].to_numpy(),
-        rows["dec_lensed"].to_numpy(),
+        rows["ra"].to_numpy(),
+        rows["dec"].to_numpy(),
         electrons[source] * np.array([total for _, total in found]),
         source,
         tuple(picture for picture, _ in found),

@@ -6,8 +6,8 @@ beyond     cells that lie farther out, of which the bright sources count
 near       rows within a circle, before any projection
 touching   sources whose stamp overlaps the frame
 
-Cells hold sources by their true position, a circle tells where they are seen: it is widened by how far the catalogue's
-sources are deflected.
+Cells hold galaxies by where they are seen. Stars move, and a lake of an earlier time holds galaxies by their true
+position: circles are widened by how far a source may be seen from where its cell says.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ def lake(tmp_path):
     values = {c.name: rng.uniform(max(c.lo or 0.0, -20.0), min(c.hi or 1.0, 5.0), 50) for c in GALAXIES.columns}
     values |= {name: np.zeros(50, int) for name in ("kind", "sed_1", "sed_2", "ext_law_1", "ext_law_2", "stamp")}
     values |= {"id": np.arange(50), "halo_id": np.arange(50), "origin_id": np.arange(50)}
-    values |= {"ra": ra, "dec": dec, "ra_lensed": ra, "dec_lensed": dec, "_healpix_29": index}
+    values |= {"ra": ra, "dec": dec, "ra_true": ra, "dec_true": dec, "_healpix_29": index}
     values |= {name: rng.uniform(-0.1, 0.1, 50) for name in ("kappa", "gamma1", "gamma2")}
     values["position_angle"] = rng.uniform(0, 180, 50)
     part = Part(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})

@@ -52,7 +52,7 @@ def test_the_tables_are_the_catalogue(tmp_path):
     rows, points = made(tmp_path)
     rows = rows.sort_by("origin_id")
     assert rows["origin_id"].to_pylist() == [1, 2]
-    assert rows["ra"].to_pylist() == rows["ra_lensed"].to_pylist() == [53.10, 53.11]
+    assert rows["ra"].to_pylist() == rows["ra_true"].to_pylist() == [53.10, 53.11]
     assert rows["position_angle"].to_pylist() == [30.0, 140.0]
     assert rows["stamp"].to_pylist() == [3, None]
     assert rows["gamma1"].to_numpy() == pytest.approx([0.05, -0.02], abs=1e-8)

@@ -40,7 +40,7 @@ def catalogue(lake, declared, columns):
         rows = rows_of(declared, n, cell)
         given = {name: np.full(n, value).astype(declared.column(name).type) for name, value in columns.items()}
         if declared is GALAXIES:
-            place |= {"ra_lensed": ra, "dec_lensed": dec}
+            place |= {"ra_true": ra, "dec_true": dec}
         return plan.Output(declared.build({name: rows[name] for name in declared.names} | place | given))
 
     parts = tuple(plan.Part(layout.cell_file(5, cell), {"cell": cell}) for cell in CELLS)

@@ -55,7 +55,7 @@ def galaxies(ra, dec, **columns):
     """Rows of what the renderer reads; scalars are repeated."""
     ra, dec = np.atleast_1d(ra).astype(float), np.atleast_1d(dec).astype(float)
     n = len(ra)
-    table = {"id": source_id(0, 411_000, np.arange(n)), "ra_lensed": ra, "dec_lensed": dec}
+    table = {"id": source_id(0, 411_000, np.arange(n)), "ra": ra, "dec": dec}
     for name, value in {**DEFAULTS, **columns}.items():
         table[name] = np.broadcast_to(np.asarray(value, np.float32), n)
     return pa.table(table)

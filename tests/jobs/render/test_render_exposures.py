@@ -172,15 +172,32 @@ def test_every_planned_detector_has_its_products_and_every_source_its_row(render
         exposed = read.version(rendered, "exposures").rows(where=pc.field("exposure_id") == row["exposure_id"])
         (middle,) = (one["mjd"] + 0.5 * one["exposure_time_s"] / 86400.0 for one in exposed.to_pylist())
         moving = read.version(rendered, "stars").rows(["id", "ra", "dec", "pm_ra", "pm_dec"])
-        lensed = read.version(rendered, "galaxies").rows(["id", "ra_lensed", "dec_lensed"])
-        for rows_, ra, dec in (
-            (lensed, "ra_lensed", "dec_lensed"),
-            (catalogue_rows.at_time(moving, middle), "ra", "dec"),
-        ):
+        lensed = read.version(rendered, "galaxies").rows(["id", "ra", "dec"])
+        for rows_ in (lensed, catalogue_rows.at_time(moving, middle)):
             found = rows_.to_pydict()
-            sky |= dict(zip(found["id"], zip(found[ra], found[dec], strict=True), strict=True))
+            sky |= dict(zip(found["id"], zip(found["ra"], found["dec"], strict=True), strict=True))
         own = system.all_world2pix([sky[i] for i in ids.tolist()], 0)
         np.testing.assert_allclose(own, np.stack([x, y], 1), atol=1e-6)
+
+
+def test_a_cone_about_an_image_of_a_galaxy_finds_it_in_the_catalogue_and_among_its_fluxes(rendered):
+    """Through the header of the file alone: a cross-match of its sources has all of them in common."""
+    products, truth = (read.version(rendered, name) for name in ("products", "rendered_truth"))
+    catalogues = [read.version(rendered, name) for name in ("galaxies", "galaxy_fluxes")]
+    matched = 0
+    for row in products.rows(where=pc.field("content") == "noise_free").to_pylist():
+        drawn = truth.rows(where=pc.field("detector") == row["detector"])
+        drawn = drawn.filter(pa.array(ids.kind_of(drawn["id"].to_numpy()) < 4))
+        with fits.open(products.file(row["path"])) as file:
+            places = WCS(file[0].header).all_pix2world(drawn["x"].to_numpy(), drawn["y"].to_numpy(), 0)
+        for source, ra, dec in zip(drawn["id"].to_pylist(), *(axis.tolist() for axis in places), strict=True):
+            for catalogue in catalogues:
+                assert source in catalogue.cone(ra % 360.0, dec, 0.01 / 3600.0, ["id"])["id"].to_pylist()
+            matched += 1
+    assert matched > 10
+    rows = catalogues[0].rows()
+    moved = sky.separation(*(rows[name].to_numpy() for name in ("ra", "dec", "ra_true", "dec_true")))
+    assert 3600.0 * np.median(moved) > 10.0
 
 
 def test_a_detector_alone_is_what_it_is_among_others(lake, rendered):
@@ -450,10 +467,10 @@ def test_another_mission_makes_everything_again(rendered):
 
 def two_lenses(cell, galaxies, seed, boost):
     """Instead of shooting rays: the two of a cell's galaxies that are nearest to where the detectors look."""
-    away = sky.separation(*(galaxies[name].to_numpy() for name in ("ra_lensed", "dec_lensed")), 53.117, -27.808)
+    away = sky.separation(*(galaxies[name].to_numpy() for name in ("ra", "dec")), 53.117, -27.808)
     rows = galaxies.take(np.argsort(away)[:2])
     rest = {c.name: np.ones(2, int if c.type.startswith("int") else float) for c in STRONG_LENSES.columns}
-    placed = {name: rows[name].to_numpy() for name in ("ra", "dec", "_healpix_29", "ra_lensed", "dec_lensed")}
+    placed = {name: rows[name].to_numpy() for name in ("ra", "dec", "_healpix_29", "ra_true", "dec_true")}
     named = {"id": ids.source_id(np.full(2, 4), cell, 4_000_000 + np.arange(2)), "lens_id": rows["id"].to_numpy()}
     drawn = {"stamp_side": np.full(2, 20), "stamp": pa.array([[0.01] * 400] * 2, pa.list_(pa.float32()))}
     order = np.argsort(placed["_healpix_29"])

@@ -43,7 +43,7 @@ def galaxies(n=40, seed=4):
     far, mag = kind >= 2, rng.uniform(17.0, 26.0, n)
     continuum = units.cgs_of_ujy(units.f_nu_of_mag(mag)) * LIGHT_ANGSTROM_S / 7000.0**2
     z = np.where(far, rng.uniform(6.0, 6.5, n), rng.uniform(0.02, 2.3, n))
-    values = {c.name: np.full(n, max(c.lo or 0.0, 0.0)) for c in GALAXIES.columns if c.type.startswith("float")}
+    values = {c.name: np.full(n, max(c.lo or 0.0, 0.0)) for c in GALAXIES.earlier.columns if c.type.startswith("float")}
     values |= {
         "id": np.array([ids.source_id(int(k), CELL << 6, i) for i, k in enumerate(kind)]).ravel(),
         "halo_id": np.arange(n),
@@ -84,7 +84,7 @@ def galaxies(n=40, seed=4):
     neighbour = sky.cell_centre(5, CELL + 1)
     values["ra_lensed"][8 : 8 + STRAYS], values["dec_lensed"][8 : 8 + STRAYS] = neighbour
     _to_be_drawn(values, slice(*DRAWN))
-    return GALAXIES.build(values)
+    return GALAXIES.earlier.build(values)
 
 
 def _to_be_drawn(values, rows):
@@ -128,7 +128,9 @@ def lake(tmp_path_factory):
     root = tmp_path_factory.mktemp("lake")
     rows, points = galaxies(), stars()
     light = band_fluxes.galaxy_fluxes(rows, bands(), templates.galaxy_library())
-    published(root, fluxes("galaxy", BANDS), light, 5, {"input": published(root, GALAXIES, rows, 5, {})})
+    published(
+        root, fluxes("galaxy", BANDS).earlier, light, 5, {"input": published(root, GALAXIES.earlier, rows, 5, {})}
+    )
     light = band_fluxes.star_fluxes(points, bands(), templates.stellar_library())
     published(root, fluxes("star", BANDS), light, 3, {"input": published(root, STARS, points, 3, {})})
     assert read.version(root, "star_fluxes").num_rows == points.num_rows

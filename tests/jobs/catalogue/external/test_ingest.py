@@ -32,6 +32,10 @@ def own_cache(tmp_path, monkeypatch):
     monkeypatch.setattr(ingest, "cache_dir", lambda: tmp_path / "cache")
 
 
+# Where the table has positions of a catalogue that has both.
+PLACES = {"ra": "ra_true", "dec": "dec_true", "ra_lensed": "ra", "dec_lensed": "dec"}
+
+
 def asked(folder, file, more):
     """The path of a request for the galaxies of one file."""
     return requests.written(folder, f'[ingest.galaxies]\nfiles = ["{file}"]\n{more}\n', requests.FIELD.format(0.3))
@@ -57,10 +61,24 @@ def test_a_catalogue_comes_through(tmp_path, form):
     order = np.argsort(values["origin_id"])
     assert validate.violations(rows, GALAXIES) == []
     assert np.array_equal(by_origin(rows, "origin_id"), values["origin_id"][order])
-    kept = [key for key in mapping.formats()[form]["columns"] if key in GALAXIES.names and key != "origin_id"]
+    mapped = mapping.formats()[form]["columns"]
+    seen = PLACES if "ra_lensed" in mapped else {}
+    kept = [key for key in mapped if (key in GALAXIES.names or key in seen) and key != "origin_id"]
     assert len(kept) > 8
     for key in kept:
-        assert by_origin(rows, key) == pytest.approx(values[key][order], rel=2e-6, abs=2e-7), key
+        assert by_origin(rows, seen.get(key, key)) == pytest.approx(values[key][order], rel=2e-6, abs=2e-7), key
+
+
+def test_a_request_that_lenses_anew_has_galaxies_where_they_are(tmp_path):
+    """In the files, too; by the catalogue's own lensing they lie where they are seen."""
+    values = synthetic.columns()
+    file, order = synthetic.write(tmp_path, "flagship2", values), np.argsort(values["origin_id"])
+    own = build(tmp_path, file, 'format = "flagship2"')
+    still = build(tmp_path, file, 'format = "flagship2"\n[universe]\nlensing = { g1 = 0.02, g2 = -0.01 }')
+    for rows, key in ((own, "ra_lensed"), (still, "ra")):
+        assert by_origin(rows, "ra") == pytest.approx(values[key][order], rel=1e-12)
+        assert by_origin(rows, "ra_true") == pytest.approx(values["ra"][order], rel=1e-12)
+        assert np.array_equal(sky.healpix_29(*(rows[n].to_numpy() for n in ("ra", "dec"))), rows["_healpix_29"])
 
 
 def test_one_template_of_real_index_is_two_neighbours(tmp_path):
@@ -160,6 +178,7 @@ def test_a_folder_and_a_text_file_with_a_mapping_of_ones_own(tmp_path):
 def test_a_region_without_galaxies_is_an_empty_table(tmp_path):
     values = synthetic.columns()
     values["ra"] += 90.0
+    values["ra_lensed"] += 90.0
     rows = build(tmp_path, synthetic.write(tmp_path, "flagship2", values), 'format = "flagship2"')
     assert rows.num_rows == 0
     assert validate.violations(rows, GALAXIES) == []

@@ -99,8 +99,8 @@ def lens(source, ra, dec, blobs, side=80):
     columns = {
         "id": np.array([(4 << 60) + 7]),
         "source_id": np.array([source]),
-        "ra_lensed": np.array([ra]),
-        "dec_lensed": np.array([dec]),
+        "ra": np.array([ra]),
+        "dec": np.array([dec]),
         "stamp_side": np.array([side], np.int16),
         "stamp": pa.array([image.ravel().astype(np.float32)], STRONG_LENSES.column("stamp").arrow_type),
     }
