@@ -18,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.catalogue.galaxies import lensing
 from jobs.catalogue.galaxies.lensing import Lens, Planes
@@ -28,7 +27,7 @@ from jobs.catalogue.halos.lens_halos import Settings
 from jobs.catalogue.halos.population import Cells
 from jobs.fluxes import cosmology, sources
 from lake_schema import sky
-from lake_schema.arrays import Float, Int
+from lake_schema.arrays import Array, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 
@@ -39,7 +38,7 @@ _CHI, _CIRCLE, _MASS = 3, 7, 9
 # Cells of halos that are kept: a cell's neighbourhood and that of the cells about it.
 _KEPT = 1024
 # How far all other halos but the strongest bend light together, rad.
-_OTHERS = np.radians(45.0 / 3600.0)
+_OTHERS = float(np.radians(45.0 / 3600.0))
 # The grid goes this far beyond a cell, rad: no source is shown farther from where it is.
 _BEYOND = np.radians(7.0 / 60.0)
 
@@ -89,7 +88,7 @@ def around(lens: Lens, cells: Cells, cell: int, away: Callable[[int], float] | N
     return Neighbourhood(lens, chosen, frame, table, *_grid(chosen, table), _farthest(table))
 
 
-def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> dict[str, npt.NDArray[np.generic]]:
+def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
     """Observed and true positions, and lensing, of sources as columns of table `galaxies`.
 
     ra, dec : float[n] deg, true;  chi : float[n] Mpc/h

@@ -31,7 +31,7 @@ from jobs.catalogue.matter.density_box import Box
 from jobs.code_keys import code_key
 from jobs.fluxes import cosmology, sources
 from lake_schema import sky
-from lake_schema.arrays import Bool, Float, Float32
+from lake_schema.arrays import Array, Bool, Float, Float32
 from lake_schema.errors import BadInput
 
 KAPPA, GAMMA_1, GAMMA_2, EAST, NORTH = range(5)
@@ -123,7 +123,7 @@ def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     return found
 
 
-def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, npt.NDArray[np.generic]]:
+def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
     """Observed and true positions, and lensing, of sources as columns of table `galaxies`.
 
     ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
@@ -137,7 +137,7 @@ def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, npt.NDAr
     return {**places(displaced(ra, dec, east, north), (ra, dec)), **shear}
 
 
-def places(seen: tuple[Float, Float], true: tuple[Float, Float]) -> dict[str, npt.NDArray[np.generic]]:
+def places(seen: tuple[Float, Float], true: tuple[Float, Float]) -> dict[str, Array]:
     """Columns of positions: seen, true : ra and dec [n], deg."""
     return {
         "ra": sky.wrapped(seen[0]),

@@ -34,7 +34,7 @@ from lake_schema.tables.galaxies import GALAXIES
 # Distances are told of cells of this order, 26" wide: finer ones would cost more than they spare.
 _FINE = 13
 # How far halos may bend light, rad: one of 10^15.5 Msun/h does by half as much.
-_MOST = np.radians(2.5 / 60.0)
+_MOST = float(np.radians(2.5 / 60.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +126,8 @@ def draw(wanted: Sequence[int], universe: GalaxyModel, cells: Cells, dust: Float
 
 def _about(cell: int) -> list[int]:
     """The generation cells that touch one."""
-    return sky.margin_cells(GENERATION_ORDER, cell, GENERATION_ORDER).tolist()
+    found: list[int] = sky.margin_cells(GENERATION_ORDER, cell, GENERATION_ORDER).tolist()
+    return found
 
 
 def _kept(own: _Wanted, rows: pa.Table) -> pa.Table:
