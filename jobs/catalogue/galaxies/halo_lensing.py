@@ -22,9 +22,9 @@ import numpy as np
 from jobs.catalogue.galaxies import lensing
 from jobs.catalogue.galaxies.lensing import Lens, Planes
 from jobs.catalogue.halos import lens_halos
-from jobs.catalogue.halos.halos import LEVELS
+from jobs.catalogue.halos.halos import LEVELS, Halos
 from jobs.catalogue.halos.lens_halos import Settings
-from jobs.catalogue.halos.population import Cells
+from jobs.catalogue.halos.population import Cells, Population
 from jobs.fluxes import cosmology, sources
 from lake_schema import sky
 from lake_schema.arrays import Array, Float, Int
@@ -41,6 +41,8 @@ _KEPT = 1024
 _OTHERS = float(np.radians(45.0 / 3600.0))
 # The grid goes this far beyond a cell, rad: no source is shown farther from where it is.
 _BEYOND = np.radians(7.0 / 60.0)
+# (order, cell) -> rad.
+Away = Callable[[int, int], float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,13 +63,13 @@ class Neighbourhood:
     farthest: float
 
 
-def around(lens: Lens, cells: Cells, cell: int, away: Callable[[int], float] | None = None) -> Lens | Neighbourhood:
+def around(lens: Lens, cells: Cells, cell: int, away: Away | None = None) -> Lens | Neighbourhood:
     """The halos that reach into a generation cell, by distance, those of one distance by mass and identifier.
 
     lens  : the maps; where there is one shear for all, it stays so
     cells : what has been drawn of the universe's population: what halos do is kept there
     cell  : nested index at order 8
-    away  : how far the sources that matter are at least from a cell of order 8, rad; None: all of the cell's matter
+    away  : how far the sources that matter are at least from a cell of an order, rad; None: all of the cell's matter
     """
     if not isinstance(lens, Planes):
         return lens
@@ -146,37 +148,45 @@ def _near(chosen: Settings, cell: int, centre: tuple[float, float], radius: floa
     return found
 
 
-def _reaching(
-    chosen: Settings, every: list[tuple[int, int, float]], away: Callable[[int], float]
-) -> list[tuple[int, int, float]]:
+def _reaching(chosen: Settings, every: list[tuple[int, int, float]], away: Away) -> list[tuple[int, int, float]]:
     """Those of `_near` whose halos may reach nodes about the sources."""
-    wide, reach = (
-        np.radians((angle + chosen.strip + 2.0 * chosen.step) / 60.0) for angle in (chosen.wide, chosen.reach)
-    )
-    found = [place for place in every if place[0] != GENERATION_ORDER]
+    beyond = np.radians((chosen.strip + 2.0 * chosen.step) / 60.0)
+    wide, found = np.radians(chosen.wide / 60.0), []
     for order, cell, least in every:
-        if order == GENERATION_ORDER and (distance := away(cell)) <= reach:
-            found.append((order, cell, least if distance <= wide else chosen.heavy))
+        distance = away(order, cell) - beyond
+        if distance <= lens_halos.farthest(chosen, order):
+            light = least if order != GENERATION_ORDER or distance <= wide else chosen.heavy
+            found.append((order, cell, light))
     return found
 
 
 def _lenses(chosen: Settings, box: Planes, cells: Cells, order: int, cell: int, least: float) -> tuple[Float, Int]:
     """([10, h], identifiers[h]) of halos above a mass that a cell of a level draws, where the box shows them."""
-    kept, which = cells.lenses, (order, cell, least)
+    kept, which, every = cells.lenses, (order, cell, least), (order, cell, chosen.lowest)
+    far = chosen.far if least == chosen.lowest else min(chosen.far, chosen.far_of_wide)
     if which not in kept:
-        own = cells.population
-        far = chosen.far if least == chosen.lowest else min(chosen.far, chosen.far_of_wide)
-        hosts = lens_halos.draw(own, least, far, order, cell)
-        ra, dec = sky.positions(hosts.index)
-        bent = lensing.at(box, ra, dec, hosts.chi)[3:]
-        direction = _frames(*lensing.displaced(ra, dec, *bent))[:, 2]
-        z = own.halos.distances.redshift(hosts.chi)
-        size = lens_halos.sizes(own.masses, chosen, order, z, hosts.chi, hosts.log_mass)
-        kept[which] = np.concatenate([direction.T, hosts.chi[None], size, hosts.log_mass[None]]), hosts.id
+        if every in kept:
+            table, source = kept[every]
+            some = (table[_MASS] >= least) & (table[_CHI] < far)
+            kept[which] = table[:, some], source[some]
+        else:
+            kept[which] = _drawn(
+                chosen, box, cells.population, lens_halos.draw(cells.population, least, far, order, cell), order
+            )
         if len(kept) > _KEPT:
             kept.popitem(last=False)
     kept.move_to_end(which)
     return kept[which]
+
+
+def _drawn(chosen: Settings, box: Planes, own: Population, hosts: Halos, order: int) -> tuple[Float, Int]:
+    """What `_lenses` has of halos of a level."""
+    ra, dec = sky.positions(hosts.index)
+    bent = lensing.at(box, ra, dec, hosts.chi)[3:]
+    direction = _frames(*lensing.displaced(ra, dec, *bent))[:, 2]
+    z = own.halos.distances.redshift(hosts.chi)
+    size = lens_halos.sizes(own.masses, chosen, order, z, hosts.chi, hosts.log_mass)
+    return np.concatenate([direction.T, hosts.chi[None], size, hosts.log_mass[None]]), hosts.id
 
 
 def _farthest(halos: Float) -> float:

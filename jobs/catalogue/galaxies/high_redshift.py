@@ -105,19 +105,14 @@ def draw(
     lens   : halos and maps, maps alone, or one shear for all
     near   : which true places are wanted, None = all
     """
-    found, number = [], 0
-    for step in range(len(kind.cells)):
-        drawn = _of_magnitude(cell, seed, kind, step)
-        # Numbered before anything is left out.
-        own = ids.FIRST_NUMBER + number + np.arange(drawn[0].size)
-        number += own.size
-        kept = (ultraviolet_magnitude(drawn[1], drawn[0]) < kind.limit) & (
-            (drawn[0] < kind.z_end) | (drawn[0] >= _BEYOND)
-        )
-        if near is not None:
-            kept &= near(*drawn[3:])
-        found.append([column[kept] for column in (own, *drawn)])
-    own, z, m, _, ra, dec = (np.concatenate(column) for column in zip(*found, strict=True))
+    found = [_of_magnitude(cell, seed, kind, step) for step in range(len(kind.cells))]
+    z, m, _, ra, dec = (np.concatenate(column) for column in zip(*found, strict=True))
+    kept = (ultraviolet_magnitude(m, z) < kind.limit) & ((z < kind.z_end) | (z >= _BEYOND))
+    if near is not None:
+        kept &= near(ra, dec)
+    # Numbered with those that are left out.
+    own = ids.FIRST_NUMBER + np.flatnonzero(kept)
+    z, m, ra, dec = z[kept], m[kept], ra[kept], dec[kept]
     source = ids.source_id(np.full(own.size, kind.code), cell, own)
     rng = Keyed(source, seed, _STREAM[kind.code])
     zeros = np.zeros(own.size)

@@ -39,11 +39,14 @@ _MOST = float(np.radians(2.5 / 60.0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Wanted:
-    """Generation cells, ascending, and directions of small cells along their borders; known : distances told."""
+    """Generation cells, ascending, and directions of small cells along their borders.
+
+    known : distances told, by (order, cell)
+    """
 
     cells: Int
     border: cKDTree
-    known: dict[int, float] = field(default_factory=dict)
+    known: dict[tuple[int, int], float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, wanted: Sequence[int]) -> _Wanted:
@@ -68,17 +71,21 @@ class _Wanted:
         small, which = np.unique(sky.cell_of(ra, dec, _FINE), return_inverse=True)
         return np.asarray((self.away(small, angle) <= angle)[which])
 
-    def exactly_away(self, cell: int) -> float:
-        """No more than the distance, rad, of a generation cell from here, and hardly less."""
-        return float(self.away(sky.border_cells(GENERATION_ORDER, cell, _FINE)).min())
+    def away_of(self, order: int, cell: int) -> float:
+        """No more than the distance, rad, of a nested cell from here, and hardly less; order <= 8."""
+        if (order, cell) not in self.known:
+            fine = order + _FINE - GENERATION_ORDER
+            found, _ = self.border.query(_directions(sky.border_cells(order, cell, fine), fine))
+            slack = np.radians(sky.cell_radius(fine) + sky.cell_radius(_FINE))
+            holds = np.any(sky.parent(self.cells, GENERATION_ORDER, order) == cell)
+            self.known[order, cell] = 0.0 if holds else float(found.min()) - slack
+        return self.known[order, cell]
 
-    def away_of(self, cell: int) -> float:
-        """No more than the distance, rad, of a generation cell from here; soon told."""
-        if cell not in self.known:
-            found, _ = self.border.query(_directions(np.array([cell]), GENERATION_ORDER))
-            slack = np.radians(sky.cell_radius(GENERATION_ORDER) + sky.cell_radius(_FINE))
-            self.known[cell] = float(found[0]) - slack
-        return self.known[cell]
+    def nearest(self, cell: int) -> int:
+        """Of the cells, that whose centre is nearest to a cell that touches one of them."""
+        near = np.intersect1d(_about(cell), self.cells)
+        apart = sky.separation(*sky.cell_centre(GENERATION_ORDER, cell), *sky.cell_centres(GENERATION_ORDER, near))
+        return int(near[np.argmin(apart)])
 
 
 def _directions(cells: Int, order: int = _FINE) -> Float:
@@ -111,14 +118,14 @@ def draw(wanted: Sequence[int], universe: GalaxyModel, cells: Cells, dust: Float
         if isinstance(universe.lens, Planes):
             # While their neighbours are still kept.
             for other in _about(cell):
-                if other not in done:
+                if other not in done and own.nearest(other) == cell:
                     done.add(other)
                     found.append(_kept(own, _from_outside(other, own, own_sky)))
     beyond = {far for near in done for far in _about(near)} - done if isinstance(universe.lens, Planes) else set()
     while beyond:
         # Nothing comes from so far, but where cells are narrow or light is bent most.
         done |= beyond
-        near = [cell for cell in sorted(beyond) if _reach(own_sky, cell) > own.exactly_away(cell)]
+        near = [cell for cell in sorted(beyond) if _reach(own_sky, cell) > own.away_of(GENERATION_ORDER, cell)]
         found += [_kept(own, _from_outside(cell, own, own_sky)) for cell in near]
         beyond = {far for cell in near for far in _about(cell)} - done
     return in_order(pa.concat_tables(found))
@@ -145,14 +152,13 @@ def _from_outside(cell: int, own: _Wanted, sky_: _Sky) -> pa.Table:
     """Galaxies of a cell outside that may be seen inside."""
     universe, cells = sky_.universe, sky_.cells
     farthest = _reach(sky_, cell)
-    lens = halo_lensing.around(universe.lens, cells, cell, lambda place: own.away_of(place) - farthest)
+    lens = halo_lensing.around(universe.lens, cells, cell, lambda *place: own.away_of(*place) - farthest)
     assert isinstance(lens, Neighbourhood)
     if lens.farthest > _MOST:
         raise BadInput(f"table galaxies: halos may bend light by {3600 * np.degrees(lens.farthest):.0f} arcsec")
     farthest += lens.farthest - _MOST
     # Satellites of others land too far away.
-    hosts = [place for place in _about(cell) if own.away_of(place) <= farthest + halos.reach(GENERATION_ORDER)]
-    members = population.members(cells, cell, hosts)
+    members = population.members(cells, cell, lambda *place: own.away_of(*place) <= farthest + halos.reach(place[0]))
     members = members.part(own.near(members.ra, members.dec, farthest))
     bent = lensing.at(lens.box, members.ra, members.dec, members.chi)[3:]
     members = members.part(own.near(*lensing.displaced(members.ra, members.dec, *bent), lens.farthest))

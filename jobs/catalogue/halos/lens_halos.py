@@ -1,7 +1,8 @@
 """Halos that lens: all above one mass, whatever the limit of a request and its redshifts.
 
-draw    those of one cell of one level
-sizes   what they do to light: amplitude, radius, and the circles within which their mass is taken away again
+draw      those of one cell of one level
+sizes     what they do to light: amplitude, radius, and the circles within which their mass is taken away again
+farthest  how far they reach
 
 Error: spherical, cut at R_200m; halos below the threshold do not lens, and none does beyond its redshift
 """
@@ -91,12 +92,12 @@ def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, lo
     circle = np.where(
         log_mass >= chosen.heavy, np.maximum(chosen.span / chi, wide), np.minimum(chosen.radii * radius, wide)
     )
-    circle = np.minimum(circle, _farthest(chosen, order))
+    circle = np.minimum(circle, farthest(chosen, order))
     near = np.minimum(np.maximum(chosen.close_radii * radius, close), circle)
     return np.stack([amplitude, radius, near, circle, masses.at(masses.concentration, z, log_mass)])
 
 
-def _farthest(chosen: Settings, order: int) -> float:
+def farthest(chosen: Settings, order: int) -> float:
     """Largest theta_c, rad, of a level: what the cells about one hold."""
     if order == GENERATION_ORDER:
         return float(np.radians(chosen.reach / 60.0))

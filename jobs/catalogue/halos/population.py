@@ -12,7 +12,7 @@ seed and the cell only, never on which other cells are drawn; a nearer or shallo
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -140,21 +140,17 @@ def halos_of(cells: Cells, cell: int) -> Halos:
     return together.part(np.lexsort((together.id, together.index)))
 
 
-def members(cells: Cells, cell: int, about: Sequence[int] | None = None) -> Members:
+def members(cells: Cells, cell: int, wanted: Callable[[int, int], bool] | None = None) -> Members:
     """Halos and candidate galaxies of one generation cell.
 
-    cells : what has been drawn;  cell : nested index at order 8
-    about : of the cells that touch it those whose halos' satellites are wanted, None = all
+    cells  : what has been drawn;  cell : nested index at order 8
+    wanted : (order, cell) of what draws halos -> are their satellites wanted? None = all
     """
     own = halos_of(cells, cell)
     lit = own.part(own.proxy >= cells.population.halos.mass_limit(own.chi))
-    wanted = None if about is None else {cell, *about}
     places = [(order, around) for order in LEVELS for around in _around(order, cell)]
-    landed = [
-        _landed(cells, order, around, cell)
-        for order, around in places
-        if order != GENERATION_ORDER or wanted is None or around in wanted
-    ]
+    places = places if wanted is None else [place for place in places if wanted(*place)]
+    landed = [_landed(cells, *place, cell) for place in places]
     ra, dec = sky.positions(lit.index)
     own_columns = (lit.id, lit.id, lit.index, ra, dec, lit.chi, lit.velocity, lit.proxy, lit.log_mass, lit.index)
     central = (*own_columns, np.zeros(lit.chi.size))
