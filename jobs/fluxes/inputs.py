@@ -27,7 +27,7 @@ from jobs.code_keys import code_key
 from jobs.fluxes import high_redshift, passbands
 from jobs.fluxes.libraries import brown_dwarfs, from_files, model_stars, standards, stars_from_files, stellar, templates
 from jobs.fluxes.libraries.templates import Library
-from jobs.fluxes.libraries.vega import spectrum_file
+from jobs.fluxes.libraries.vega import spectrum_file, vega_magnitudes
 from jobs.fluxes.passbands import Passband
 from jobs.fluxes.spectra import extinction, lines
 from jobs.fluxes.spectra.continuum import dust_of
@@ -172,7 +172,7 @@ def passband_rows(own: Own) -> pa.Table:
     origins = [_passband_origin(name) for name in passbands.names()]
     origins += [own.origins[f"{FILTER}{name}"] for name in own.passbands]
     pivots, widths = [passbands.pivot_wavelength(b) for b in bands], [passbands.log_width(b) for b in bands]
-    return passband_table.rows(bands, pivots, widths, origins)
+    return passband_table.rows(bands, pivots, widths, origins, vega_magnitudes(bands))
 
 
 def library_of(lake: Path, facts: Mapping[str, Any]) -> Library:

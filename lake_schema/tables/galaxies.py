@@ -95,7 +95,7 @@ _REST = (
         "float32",
         "mag",
         "phot.mag;phys.magAbs;em.opt.R",
-        "absolute AB magnitude - 5 log10 h in SDSS r blue-shifted to z = 0.1, observed (after internal dust)",
+        "absolute AB magnitude - 5 log10 h of the continuum in SDSS r blue-shifted to z = 0.1, after internal dust",
         -30.0,
         5.0,
     ),
@@ -104,7 +104,8 @@ _REST = (
         "float32",
         "mag",
         "phot.mag;em.opt.R",
-        "apparent AB magnitude in the same reference passband (K-corrected), before magnification and Milky Way; "
+        "apparent AB magnitude of the continuum, without emission lines, in the same reference passband (K-corrected), "
+        "before magnification and Milky Way; "
         "for kinds 2 (QSO) and 3 (high redshift) at 1450 and 1500 Angstrom in the rest frame instead",
         -5.0,
         60.0,
@@ -237,7 +238,15 @@ _REST = (
         hi=1.0,
     ),
     # 10 Milky Way
-    Column("a_v", "float32", "mag", "phys.absorption.gal", "extinction A(V) of the Milky Way, R_V = 3.1", 0.0, 40.0),
+    Column(
+        "a_v",
+        "float32",
+        "mag",
+        "phys.absorption.gal",
+        "extinction A(V) of the Milky Way, by the curve of O'Donnell 1994 with R_V = 3.1",
+        0.0,
+        40.0,
+    ),
     # Of another catalogue
     Column(
         "origin_id",

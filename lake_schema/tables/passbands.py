@@ -17,7 +17,7 @@ MEDIA = (("air", "from the ground"), ("vacuum", "from space"))
 
 PASSBANDS = Table(
     "passbands",
-    1,
+    2,
     (
         Column("name", "string", ucd="meta.id;instr.bandpass", doc="name, the <band> of f_nu_<band>"),
         Column("medium", "string", ucd="meta.code", doc="in which the wavelengths are measured", codes=MEDIA),
@@ -28,6 +28,18 @@ PASSBANDS = Table(
         Column("response", "list<float64>", "", "phys.transmission", "detected per photon that arrives", 0.0, 1e9),
         Column("source", "string", ucd="meta.ref", doc="file that it was made from, and its reference"),
         Column("sha256", "string", ucd="meta.checksum", doc="of that file, hexadecimal"),
+        Column(
+            "ab_minus_vega",
+            "float64",
+            "mag",
+            "phot.mag;arith.diff",
+            "AB magnitude (0 at 3631 Jy in every band) of Vega through this response, m_AB - m_Vega of any source: the "
+            "spectrum has the shape of star Vega in table templates; missing where it ends",
+            -10.0,
+            20.0,
+            True,
+            since=2,
+        ),
     ),
     "Passbands.",
     key=("name",),
@@ -48,12 +60,16 @@ class Passband(Protocol):
 
 
 def rows(
-    bands: Sequence[Passband], pivot_wavelengths: npt.ArrayLike, log_widths: npt.ArrayLike, origins: Sequence[Origin]
+    bands: Sequence[Passband],
+    pivot_wavelengths: npt.ArrayLike,
+    log_widths: npt.ArrayLike,
+    origins: Sequence[Origin],
+    ab_minus_vega: Sequence[float | None],
 ) -> pa.Table:
     """Table `passbands`.
 
     pivot_wavelengths : [n] A;  log_widths : [n];  origins : where each is from
-    bands             : n passbands, a row each
+    bands             : n passbands, a row each;  ab_minus_vega : [n] mag, None where Vega's spectrum ends
     """
     return PASSBANDS.build(
         {
@@ -66,5 +82,6 @@ def rows(
             "response": [np.asarray(band.response) for band in bands],
             "source": [origin.source for origin in origins],
             "sha256": [origin.sha256 for origin in origins],
+            "ab_minus_vega": pa.array(ab_minus_vega, pa.float64()),
         }
     )

@@ -97,8 +97,9 @@ def test_templates_come_back_as_spectra():
 def test_passbands_come_back_as_responses():
     bands = [responses.load(name) for name in ("euclid_vis", "lsst_r")]
     pivots, widths = [responses.pivot_wavelength(b) for b in bands], [responses.log_width(b) for b in bands]
-    rows = passbands.rows(bands, pivots, widths, [Origin(b.name, "0" * 64) for b in bands])
+    rows = passbands.rows(bands, pivots, widths, [Origin(b.name, "0" * 64) for b in bands], [-0.1, None])
     check(rows, passbands.PASSBANDS)
+    assert rows["ab_minus_vega"].to_pylist() == [-0.1, None]
     assert rows["source"].to_pylist() == ["euclid_vis", "lsst_r"]
     for band, row in zip(bands, rows.to_pylist(), strict=True):
         assert row["name"] == band.name
@@ -107,7 +108,7 @@ def test_passbands_come_back_as_responses():
         assert row["first_wavelength"] + row["wavelength_step"] * (len(row["response"]) - 1) == band.wavelength[-1]
         assert 4000 < row["pivot_wavelength"] < 10_000
     with pytest.raises(BadInput, match="medium"):
-        check(passbands.rows([Other()], [5000.0], [0.1], [Origin("x", "")]), passbands.PASSBANDS)
+        check(passbands.rows([Other()], [5000.0], [0.1], [Origin("x", "")], [None]), passbands.PASSBANDS)
 
 
 class Other:

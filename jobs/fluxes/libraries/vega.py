@@ -1,12 +1,13 @@
 """Vega: its spectrum, and magnitudes relative to it.
 
-vega_magnitude    AB magnitude of Vega
-vega               the spectrum of Vega, for magnitudes that are not AB
+vega_magnitude   AB magnitude of Vega;  vega_magnitudes : in many bands, wherever its spectrum reaches
+vega             the spectrum of Vega, for magnitudes that are not AB
 """
 
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,23 @@ from lake_schema.errors import BadInput
 
 
 def vega_magnitude(band: Passband) -> float:
-    """AB magnitude of Vega: m_AB = m_Vega + this (J 0.90, H 1.37, Ks 1.85)."""
-    return float(units.mag_of_f_nu(units.ujy_of_cgs(passbands.ab_flux(band, *vega()))))
+    """AB magnitude of Vega: m_AB = m_Vega + this (2MASS J 0.90, H 1.365, Ks 1.85)."""
+    return _magnitude(band, *vega())
+
+
+def vega_magnitudes(bands: Sequence[Passband]) -> list[float | None]:
+    """The same of each band, None where Vega's spectrum does not reach over it."""
+    wavelength, flux = vega()
+    return [
+        _magnitude(band, wavelength, flux)
+        if wavelength[0] <= band.wavelength[0] and band.wavelength[-1] <= wavelength[-1]
+        else None
+        for band in bands
+    ]
+
+
+def _magnitude(band: Passband, wavelength: Float, flux: Float) -> float:
+    return float(units.mag_of_f_nu(units.ujy_of_cgs(passbands.ab_flux(band, wavelength, flux))))
 
 
 # Vega's Rayleigh-Jeans tail beyond the end of the CALSPEC extract, 22008 A.

@@ -10,7 +10,7 @@ from jobs.render.camera import pointing
 from jobs.render.channels import registry
 from jobs.render.planning.mission import PARTS, mission_of, user_filters
 from jobs.render.sources import catalogue_rows, selection
-from jobs.render.sources.catalogue_rows import CATALOGUES, LENSES
+from jobs.render.sources.catalogue_rows import CATALOGUES, FARTHEST_MOVED, LENSES
 from jobs.request import universe
 from jobs.request.area import Area
 from jobs.request.schema import Request
@@ -21,8 +21,6 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from lake_schema.store.provenance import canonical
 
-# How far a galaxy may be seen from where it is, before one is drawn: more than lensing moves any of ours, deg.
-DEFLECTION = 0.05
 # Detectors within so many deg of one another are named one circle; as many circles as a message has room for.
 _LINK, _MOST_PATCHES = 5.0, 12
 
@@ -100,10 +98,10 @@ def _covers(area: Area, ra: Float, dec: Float, radius: Float) -> Bool:
     """[n] Whether all order-8 cells in which sources of these circles may lie belong to the area."""
     drawn = set(area.cells())
     # Well inside there is nothing to count; of a box the distance to its edge is no lower bound.
-    found = area.depth(ra, dec) > radius + DEFLECTION if area.box is None else np.zeros(len(ra), bool)
+    found = area.depth(ra, dec) > radius + FARTHEST_MOVED if area.box is None else np.zeros(len(ra), bool)
     for i in np.flatnonzero(~found):
         place = {"ra": ra[i], "dec": dec[i], "radius": radius[i]}
-        found[i] = drawn.issuperset(selection.needed(place, DEFLECTION))
+        found[i] = drawn.issuperset(selection.needed(place, FARTHEST_MOVED))
     return np.asarray(found)
 
 
@@ -136,7 +134,7 @@ def _circle(ra: Float, dec: Float, radius: Float) -> tuple[float, float, float]:
     x, y, z = pointing.basis(ra, dec)[2].mean(axis=1)
     lon = round(float(np.degrees(np.arctan2(y, x))) % 360.0, 3) % 360.0
     lat = round(float(np.degrees(np.arctan2(z, np.hypot(x, y)))), 3)
-    reach = float((sky.separation(ra, dec, lon, lat) + radius).max()) + DEFLECTION
+    reach = float((sky.separation(ra, dec, lon, lat) + radius).max()) + FARTHEST_MOVED
     wanted = min(np.ceil(100.0 * reach) / 100.0, 180.0)
     # Covers hold cells that a circle only nearly touches.
     while wanted < 180.0 and not _covers(Area(ra=lon, dec=lat, radius=wanted), ra, dec, radius).all():

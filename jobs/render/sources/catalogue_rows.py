@@ -21,7 +21,7 @@ LENSES = "strong_lenses"
 # How far beyond a detector sources are looked for that shine so far, arcsec: spikes of stars, outskirts of galaxies.
 FARTHEST = max(spikes.FARTHEST, selection.FARTHEST)
 # How far a star has moved at most that is looked for, deg: 3"/yr over 12 years; Julian years and days, of J2000.
-_FARTHEST_MOVED = 0.01
+FARTHEST_MOVED = 0.01
 _JULIAN_2000, _MJD_2000, _DAYS_A_YEAR, _MAS_A_DEG = 2000.0, 51544.5, 365.25, 3.6e6
 # What the parts of catalogues say of themselves.
 CELLS = "generation_cells"
@@ -39,7 +39,7 @@ def deflection_of(catalogue: read.Version) -> float:
     """
     if farther := catalogue.padding():
         return farther
-    return _FARTHEST_MOVED if "pm_ra" in catalogue.schema.names else 0.0
+    return FARTHEST_MOVED if "pm_ra" in catalogue.schema.names else 0.0
 
 
 def as_seen(catalogue: read.Version, columns: Sequence[str]) -> list[str]:

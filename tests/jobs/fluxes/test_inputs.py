@@ -3,10 +3,11 @@
 import hashlib
 
 import numpy as np
+import pyarrow.compute as pc
 import pytest
 
 from jobs.fluxes import inputs, passbands, sources
-from jobs.fluxes.libraries.vega import spectrum_file
+from jobs.fluxes.libraries.vega import spectrum_file, vega_magnitudes
 from jobs.fluxes.spectra import continuum, lines
 from jobs.request.files import Curves, UserCurves
 from lake_schema.errors import BadInput
@@ -62,6 +63,30 @@ def test_embedded_passbands_and_laws_say_where_they_are_from(embedded):
     laws = inputs.law_rows(embedded)
     check(laws, EXTINCTION_LAWS)
     np.testing.assert_array_equal(np.stack(laws["k"].to_numpy()), continuum.dust_of(embedded.library))
+
+
+def test_vegas_level_is_that_of_the_published_spectrum_and_responses(embedded):
+    """By the definition of AB magnitudes, from two tables of a lake alone: one level of the spectrum for all bands."""
+    spectra = inputs.template_rows(embedded)
+    vega = spectra.filter(pc.equal(spectra["name"], "Vega")).to_pylist()[0]
+    at = vega["first_wavelength"] + vega["wavelength_step"] * np.arange(len(vega["flux"]))
+
+    def level(row):
+        wavelength = row["first_wavelength"] + row["wavelength_step"] * np.arange(len(row["response"]))
+        response = np.array(row["response"])
+        photons = np.sum(np.interp(wavelength, at, vega["flux"]) * response * wavelength)
+        return 10.0 ** (-0.4 * (row["ab_minus_vega"] + 48.6)) * 2.99792458e18 * np.sum(response / wavelength) / photons
+
+    rows = [row for row in inputs.passband_rows(embedded).to_pylist() if row["ab_minus_vega"] is not None]
+    assert len(rows) > 40
+    # CALSPEC: 3.44e-9 erg s-1 cm-2 A-1 at 5556 A.
+    levels = np.array([level(row) for row in rows])
+    np.testing.assert_allclose(levels, levels.mean(), rtol=5e-4)
+    assert levels.mean() == pytest.approx(3.5e-9, rel=0.03)
+    (own,) = (row["ab_minus_vega"] for row in rows if row["name"] == "twomass_h")
+    assert own == pytest.approx(1.3647, abs=1e-4)
+    beyond = passbands.Passband("beyond", np.array([2e4, 3e4]), np.ones(2), "vacuum")
+    assert vega_magnitudes([beyond]) == [None]
 
 
 def test_own_files_take_their_places(tmp_path, embedded):

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from jobs.fluxes import band_fluxes, passbands
@@ -121,6 +122,31 @@ def published(lake, table, rows, order, facts):
     plan = Plan(table, facts, (Part(layout.cell_file(order, CELL >> 2 * (5 - order)), {}),))
     publish.make(lake, plan, lambda root, facts: Output(rows))
     return plan.key
+
+
+def by_observed(rows, table):
+    """Rows of an earlier lake, in parts of CELL and the next as a lake of now has them: where they are seen."""
+    seen = {"ra": rows["ra_lensed"], "dec": rows["dec_lensed"], "ra_true": rows["ra"], "dec_true": rows["dec"]}
+    index = sky.healpix_29(rows["ra_lensed"].to_numpy(), rows["dec_lensed"].to_numpy())
+    values = seen | {"_healpix_29": index}
+    whole = table.build({name: values.get(name, rows[name]) for name in table.names}).sort_by("_healpix_29")
+    cells = sky.parent(whole["_healpix_29"].to_numpy(), sky.DEEPEST, 5)
+    return {layout.cell_file(5, cell): whole.filter(pa.array(cells == cell)) for cell in (CELL, CELL + 1)}
+
+
+def _published_parts(lake, table, parts, facts):
+    plan = Plan(table, facts, tuple(Part(name, {"name": name}) for name in parts))
+    publish.make(lake, plan, lambda root, facts: Output(parts[facts["name"]]))
+    return plan.key
+
+
+def lake_of_now(root):
+    """The same galaxies by observed positions, with their fluxes."""
+    rows = by_observed(galaxies(), GALAXIES)
+    light = {name: band_fluxes.galaxy_fluxes(some, bands(), templates.galaxy_library()) for name, some in rows.items()}
+    key = _published_parts(root, GALAXIES, rows, {})
+    _published_parts(root, fluxes("galaxy", BANDS), light, {"input": key})
+    return root
 
 
 @pytest.fixture(scope="module")

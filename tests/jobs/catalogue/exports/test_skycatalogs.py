@@ -17,7 +17,7 @@ from jobs.fluxes import cosmology, passbands
 from jobs.fluxes.libraries import templates
 from lake_schema import sky
 from lake_schema.store import read
-from tests.jobs.catalogue.exports.conftest import BANDS, CELL, DRAWN, STRAYS, bands
+from tests.jobs.catalogue.exports.conftest import BANDS, CELL, DRAWN, STRAYS, bands, lake_of_now
 
 PACKAGE = "skyCatalogs==2.5.0"
 # What of its dependencies the reading of galaxies and stars imports.
@@ -95,6 +95,22 @@ def test_columns_of_galaxies_and_of_their_components(lake, written):
         _shares(total, 5000, 6300)[far], truth["bulge_fraction"].to_numpy()[kept][far], rtol=1e-5
     )
     assert not any("knots" in name for name in rows.column_names)
+
+
+def test_a_lake_by_observed_positions_gives_the_same_set(written, tmp_path):
+    """What is seen across a border lies in another file of the lake, and in the same one of the set."""
+    lake = lake_of_now(tmp_path / "lake")
+    assert len(read.version(lake, "galaxies").parts) == 2
+    files = export_galaxies.export(lake, tmp_path / "set", "skycatalogs")
+    tables = [path.name for path in files if path.suffix == ".parquet"]
+    assert len(tables) == 4
+    for name in tables:
+        ours, theirs = (pq.read_table(folder / name) for folder in (tmp_path / "set", written[0]))
+        ours, theirs = (table.sort_by("galaxy_id") for table in (ours, theirs))
+        assert ours.column_names == theirs.column_names
+        plain = [field.name for field in ours.schema if not str(field.type).startswith("list")]
+        assert {"galaxy_id"} < set(plain)
+        assert ours.select(plain).equals(theirs.select(plain))
 
 
 def _shares(total, low, high):
