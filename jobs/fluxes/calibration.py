@@ -36,7 +36,7 @@ def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
 def star_scale(stars: Stars, library: Library) -> Float:
     """Factor for each star's mixture of templates, from its H magnitude before extinction.
 
-    The catalogue's H is Vega, 1.365 mag below AB; Serrano et al. 2024, appendix B, read it by the AB formula.
+    The catalogue's H is Vega, 1.375 mag below AB; Serrano et al. 2024, appendix B, read it by the AB formula.
     """
     band = passbands.load(STAR_BAND)
     seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)

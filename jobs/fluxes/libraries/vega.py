@@ -21,7 +21,7 @@ from lake_schema.errors import BadInput
 
 
 def vega_magnitude(band: Passband) -> float:
-    """AB magnitude of Vega: m_AB = m_Vega + this (2MASS J 0.90, H 1.365, Ks 1.85)."""
+    """AB magnitude of Vega: m_AB = m_Vega + this (2MASS J 0.90, H 1.375, Ks 1.85)."""
     return _magnitude(band, *vega())
 
 
