@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -163,16 +164,15 @@ def _reaching(chosen: Settings, every: list[tuple[int, int, float]], away: Away)
 def _lenses(chosen: Settings, box: Planes, cells: Cells, order: int, cell: int, least: float) -> tuple[Float, Int]:
     """([10, h], identifiers[h]) of halos above a mass that a cell of a level draws, where the box shows them."""
     kept, which, every = cells.lenses, (order, cell, least), (order, cell, chosen.lowest)
-    far = chosen.far if least == chosen.lowest else min(chosen.far, chosen.far_of_wide)
     if which not in kept:
+        far = chosen.far if least == chosen.lowest else min(chosen.far, chosen.far_of_wide)
         if every in kept:
             table, source = kept[every]
             some = (table[_MASS] >= least) & (table[_CHI] < far)
             kept[which] = table[:, some], source[some]
         else:
-            kept[which] = _drawn(
-                chosen, box, cells.population, lens_halos.draw(cells.population, least, far, order, cell), order
-            )
+            own = cells.population
+            kept[which] = _drawn(chosen, box, own, lens_halos.draw(own, least, far, order, cell), order)
         if len(kept) > _KEPT:
             kept.popitem(last=False)
     kept.move_to_end(which)
@@ -193,18 +193,24 @@ def _farthest(halos: Float) -> float:
     """The strongest of the halos bends light by its own, infinitely far behind it; all others together by less."""
     # Its compiler takes a second to import.
     from jobs.catalogue.halos import halo_lensing_sums as sums
-    from jobs.catalogue.halos import projected_nfw
 
     amplitude, size = halos[sums.AMPLITUDE], halos[sums.SIZE]
     if not amplitude.size:
         return _OTHERS
+    own = amplitude / size * np.interp(halos[sums.CONCENTRATION], *_steepest())
+    return float(own.max()) + _OTHERS
+
+
+@lru_cache
+def _steepest() -> tuple[Float, Float]:
+    """Concentrations, and the most that is enclosed, over the radius, both in units of the halo's own."""
+    from jobs.catalogue.halos import projected_nfw
+
     nodes, shares = np.geomspace(1.0, 100.0, 25), np.linspace(0.02, 0.99, 98)
-    # What is enclosed, over the radius, both in units of the halo's own.
-    steepest = [
+    enclosed = [
         max(projected_nfw.profile(share * c, c)[1] / share for share in shares) / projected_nfw.total(c) for c in nodes
     ]
-    own = amplitude / size * np.interp(halos[sums.CONCENTRATION], nodes, steepest)
-    return float(own.max()) + _OTHERS
+    return nodes, np.array(enclosed)
 
 
 def _grid(chosen: Settings, halos: Float) -> tuple[Float, Float]:
