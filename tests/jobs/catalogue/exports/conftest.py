@@ -129,7 +129,9 @@ def by_observed(rows, table):
     seen = {"ra": rows["ra_lensed"], "dec": rows["dec_lensed"], "ra_true": rows["ra"], "dec_true": rows["dec"]}
     index = sky.healpix_29(rows["ra_lensed"].to_numpy(), rows["dec_lensed"].to_numpy())
     values = seen | {"_healpix_29": index}
-    whole = table.build({name: values.get(name, rows[name]) for name in table.names}).sort_by("_healpix_29")
+    whole = table.build({name: values[name] if name in values else rows[name] for name in table.names}).sort_by(
+        "_healpix_29"
+    )
     cells = sky.parent(whole["_healpix_29"].to_numpy(), sky.DEEPEST, 5)
     return {layout.cell_file(5, cell): whole.filter(pa.array(cells == cell)) for cell in (CELL, CELL + 1)}
 
