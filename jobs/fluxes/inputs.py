@@ -271,7 +271,7 @@ def _star_origins(own: Sequence[Origin]) -> list[Origin]:
     models = (
         [own[k] for k in model_stars.nearest_dwarfs(stellar.types())] if own else [colours] * len(model_stars.names())
     )
-    vega = _origin("CALSPEC, as GalSim has it", spectrum_file("vega.txt"))
+    vega = _origin("CALSPEC alpha_lyr_mod_001, as GalSim has it; lambda^-3.95 beyond it", spectrum_file("vega.txt"))
     white_dwarf = _origin("Bohlin, Hubeny & Rauch 2020", Path(standards.__file__))
     nebula = _origin("the references in the file", standards.NEBULA)
     return [*first, *[dwarfs] * brown_dwarfs.COUNT, vega, white_dwarf, nebula, *models]

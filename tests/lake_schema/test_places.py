@@ -68,7 +68,7 @@ def test_what_is_rendered_is_where_it_is_seen(lake):
     assert (found["ra"][row].as_py(), found["dec"][row].as_py()) == (ra, dec)
     lens = read.version(root, "strong_lenses").rows()[3:4]
     at = {**task, **{k: lens[name][0].as_py() for k, name in zip(("ra", "dec"), version.place(), strict=True)}}
-    drawn = catalogue_rows.lenses(read.version(root, "strong_lenses"), at, version.padding(), 0.0)
+    drawn = catalogue_rows.lenses(read.version(root, "strong_lenses"), at, version.padding(), 0.0, 0.0)
     assert lens["id"][0].as_py() in drawn["id"].to_pylist()
     assert (catalogue_rows.deflection_of(version) > 0.0) is is_earlier
 

@@ -21,7 +21,10 @@ from lake_schema.errors import BadInput
 
 
 def vega_magnitude(band: Passband) -> float:
-    """AB magnitude of Vega: m_AB = m_Vega + this (2MASS J 0.90, H 1.375, Ks 1.85)."""
+    """AB magnitude of Vega: m_AB = m_Vega + this (2MASS J 0.9001, H 1.3753, Ks 1.8474).
+
+    Photons are counted, as for all fluxes: were it energy, H would be 1.3718.
+    """
     return _magnitude(band, *vega())
 
 

@@ -5,6 +5,8 @@ import pyarrow as pa
 import pytest
 
 from jobs.fluxes import band_fluxes, integration, passbands
+from jobs.fluxes.libraries import vega
+from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.store import validate
 from lake_schema.tables.fluxes import fluxes
@@ -76,6 +78,16 @@ def test_stars_are_their_spectra(stars, stars_library):
     got = band_fluxes.star_fluxes(table, BANDS, stars_library)
     np.testing.assert_allclose(columns(got), wanted, rtol=1e-6)
     assert got["id"].equals(table["id"])
+
+
+def test_stars_have_the_h_magnitude_that_the_published_level_of_vega_makes_of_it(stars, stars_library):
+    """Of every spectrum, before dust: m_AB of the flux in 2MASS H is mag_h + 1.3753."""
+    n = len(stars_library)
+    table = stars(n, sed=np.arange(n), a_v=0.0)
+    flux = band_fluxes.star_fluxes(table, ["twomass_h"], stars_library)["f_nu_twomass_h"].to_numpy()
+    (level,) = vega.vega_magnitudes([passbands.load("twomass_h")])
+    assert level == pytest.approx(1.3753, abs=1e-4)
+    np.testing.assert_allclose(units.mag_of_f_nu(flux) - table["mag_h"].to_numpy(), level, atol=1e-5)
 
 
 def test_the_tables_are_the_declared_ones(galaxies, stars, library, stars_library):

@@ -73,9 +73,21 @@ def test_displacements_are_great_circles(dec, rng):
     ra = 360.0 * rng.random(50)
     lon, lat = lensing.displaced(ra, np.full(50, dec), east, north)
     assert sky.separation(ra, np.full(50, dec), lon, lat) == pytest.approx(np.degrees(np.hypot(east, north)), rel=1e-6)
-    assert np.all((lon >= 0) & (lon <= 360))
+    assert np.all((lon >= 0) & (lon < 360))
     if abs(dec) < 80:
         assert (lat - dec) == pytest.approx(np.degrees(north), abs=3e-3)
+
+
+@pytest.mark.parametrize("dec", [-90.0, 0.0, 90.0])
+def test_right_ascensions_are_below_360(dec):
+    """True and observed ones, of what lies on the meridian of 0 and is moved over it, by as little as can be."""
+    ra = np.array([0.0, -0.0, -1e-300, -1e-16, 360.0, np.nextafter(360.0, 0.0), 720.0])
+    for east in (-1e-3, -1e-18, 0.0, 1e-18, 1e-3):
+        seen = lensing.displaced(ra, np.full(ra.size, dec), np.full(ra.size, east), np.zeros(ra.size))
+        columns = lensing.places(seen, (ra, np.full(ra.size, dec)))
+        for name in ("ra", "ra_true"):
+            assert np.all((columns[name] >= 0.0) & (columns[name] < 360.0))
+        assert np.array_equal(columns["_healpix_29"], sky.healpix_29(columns["ra"], columns["dec"]))
 
 
 def test_interpolation_in_distance(bump):
