@@ -1,5 +1,6 @@
 """Observed and true positions, in lakes of now and of an earlier time; which are not mixed."""
 
+import pyarrow as pa
 import pytest
 
 from jobs.catalogue import build_strong_lenses
@@ -71,6 +72,9 @@ def test_what_is_rendered_is_where_it_is_seen(lake):
     drawn = catalogue_rows.lenses(read.version(root, "strong_lenses"), at, version.padding(), 0.0, 0.0)
     assert lens["id"][0].as_py() in drawn["id"].to_pylist()
     assert (catalogue_rows.deflection_of(version) > 0.0) is is_earlier
+    none = found.slice(0, 0), light.rows(["id", "f_nu_euclid_vis"]).slice(0, 0)
+    behind, _ = catalogue_rows.with_lensed(none, pa.table({"source_id": rows["id"][7:8]}), version, light, task, 0.0)
+    assert behind.equals(found.slice(row, 1))
 
 
 def test_fluxes_of_before_have_no_observed_places(lake):
