@@ -108,8 +108,9 @@ def _spread(aim: Aim, rows: Rows, light: Light, truth: Sequence[str]) -> tuple[_
     sources, dispersed, psf, noise = light.sources, light.dispersed, light.psf, light.scene.pixel_noise
     shape, tally = (aim.detector.ny, aim.detector.nx), dispersing.Tally.of(len(sources), len(dispersed.orders))
     layers: dict[int, Float] = {}
+    known: dispersing.Known = {}
     asked = {order: name for order, name in truth_maps.ORDERS.items() if name in truth}
-    frame = dispersing.draw(sources, dispersed, psf, shape, noise, tally, layers if asked else None)
+    frame = dispersing.draw(sources, dispersed, psf, shape, noise, tally, layers if asked else None, known)
     maps: dict[str, Array] = {"noise_free": frame.astype(np.float32)}
     for order, name in asked.items():
         maps[name] = layers.get(order, np.zeros(shape)).astype(np.float32)
@@ -119,7 +120,7 @@ def _spread(aim: Aim, rows: Rows, light: Light, truth: Sequence[str]) -> tuple[_
         maps["stars"] = dispersing.draw(sources.take(of_stars), some, psf, shape, noise).astype(np.float32)
     fallen, scene = tally.electrons.sum(axis=1), scene_of.with_peak(light.scene, frame)
     listed, expected = fallen > 0.0, replace(sources, electrons=tally.expected.sum(axis=1))
-    scene = tints.with_spread_tints(scene, aim, light, tally)
+    scene = tints.with_spread_tints(scene, aim, light, tally, known)
     spectra = traced(light, tally, aim, rows, scene)
     return _Drawn(expected.take(listed), tally.sizes[listed], fallen[listed], maps, scene, spectra), [frame]
 

@@ -60,10 +60,11 @@ def with_tints(scene: Scene, aim: Aim, light: Light) -> Scene:
     return replace(scene, tints=drawn, tint_electrons=float(change.max()))
 
 
-def with_spread_tints(scene: Scene, aim: Aim, light: Light, tally: dispersing.Tally) -> Scene:
+def with_spread_tints(scene: Scene, aim: Aim, light: Light, tally: dispersing.Tally, known: dispersing.Known) -> Scene:
     """The scene with the spectra of those sources of which a column's colour changes a pixel by what is noticed.
 
     scene : with what is drawn;  aim : the exposure and detector;  light : dispersed;  tally : of all that was drawn
+    known : what drawings of them share
     Error : of each source, a tenth of a pixel's noise beyond the stamps
     """
     dispersed, psf = light.dispersed, light.psf
@@ -83,7 +84,7 @@ def with_spread_tints(scene: Scene, aim: Aim, light: Light, tally: dispersing.Ta
         """The light, each photon times its weight [w], 0 or more."""
         orders = tuple(replace(order, response=order.response * weight) for order in dispersed.orders)
         own = dispersing.Dispersed(lambda rows: dispersed.spectra(some[rows]), orders, settings)
-        return dispersing.draw(chosen, own, psf, shape, scene.pixel_noise)
+        return dispersing.draw(chosen, own, psf, shape, scene.pixel_noise, None, None, known)
 
     drawn = draw(np.ones(len(f)))
     found = np.empty((2, *shape), np.float32)

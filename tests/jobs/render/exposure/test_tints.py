@@ -62,7 +62,7 @@ def slowly(scene, aim, light, step=300.0):
 
 def test_pixels_see_the_colour_of_every_column():
     scene, aim, light, frame, tally = lit()
-    found = tints.with_spread_tints(scene, aim, light, tally)
+    found = tints.with_spread_tints(scene, aim, light, tally, {})
     exact = slowly(scene, aim, light)
     response = chromatic_response.maps(frame.shape, SLOPE, CURVATURE, np.random.default_rng(3))
     fast, slow = (response[0] * part[0] + response[1] * part[1] for part in (found.tints, exact))
@@ -78,7 +78,7 @@ def test_pixels_see_the_colour_of_every_column():
 def test_a_column_of_a_star_is_seen_as_its_wavelength_is():
     """By the trace alone: what a pixel of a straight red trace sees is f of the wavelength that lies there."""
     scene, aim, light, frame, tally = lit(MAGS[:1], 320.0, 48.0)
-    found = tints.with_spread_tints(scene, aim, light, tally)
+    found = tints.with_spread_tints(scene, aim, light, tally, {})
     first = next(order for order in light.dispersed.orders if order.trace.order == 1)
     wavelength = np.arange(13000.0, 18000.0, 250.0)
     x, _ = first.trace.offsets(float(light.sources.column[0]), float(light.sources.row[0]), wavelength)
@@ -97,11 +97,11 @@ def test_faint_spectra_are_not_drawn_again():
     mission = resolve(overrides={"env.solar_system.density": (0.0, "deg-2")})
     scene, aim, light, _, tally = lit(MAGS[-2:], X[-2:], Y[-2:], mission)
     assert tally.peak.max() > 0.0
-    assert tints.with_spread_tints(scene, aim, light, tally).tints is None
+    assert tints.with_spread_tints(scene, aim, light, tally, {}).tints is None
     bright = lit(MAGS[:1], X[:1], Y[:1], mission)
-    assert tints.with_spread_tints(*bright[:3], bright[4]).tints is not None
+    assert tints.with_spread_tints(*bright[:3], bright[4], {}).tints is not None
     off = replace(bright[0], forced={"chromatic_response": False})
-    assert tints.with_spread_tints(off, *bright[1:3], bright[4]).tints is None
+    assert tints.with_spread_tints(off, *bright[1:3], bright[4], {}).tints is None
 
 
 def test_an_exposure_sees_them():
