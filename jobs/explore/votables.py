@@ -23,6 +23,7 @@ _OPEN = (
     '<?xml version="1.0" encoding="UTF-8"?>\n<VOTABLE version="1.4" xmlns="http://www.ivoa.net/xml/VOTable/v1.3">\n'
     '<RESOURCE type="results">\n'
 )
+_ROWS_A_PIECE = 8192
 _CLOSE = "</RESOURCE>\n</VOTABLE>\n"
 _TYPES = {
     pa.bool_(): "boolean", pa.int8(): "short", pa.int16(): "short", pa.int32(): "int", pa.int64(): "long",
@@ -69,8 +70,10 @@ def pieces(batches: Iterable[pa.RecordBatch], cut: Cut | None = None, infos: Seq
     while batch is not None:
         left = batch.num_rows if cut.most is None else max(cut.most - sent, 0)
         cut.overflowed |= batch.num_rows > left
-        if rows := _rows(batch.slice(0, left)):
-            yield rows
+        kept = batch.slice(0, left)
+        # As texts of Python values take many times their size.
+        for first in range(0, kept.num_rows, _ROWS_A_PIECE):
+            yield _rows(kept.slice(first, _ROWS_A_PIECE))
         sent += min(left, batch.num_rows)
         batch = next(waiting, None)
     tail = '<INFO name="QUERY_STATUS" value="OVERFLOW"/>\n' if cut.overflowed else ""
@@ -127,8 +130,6 @@ _NULLS = {"short": -32768, "int": -2147483648, "long": -9223372036854775808}
 
 
 def _rows(batch: pa.RecordBatch) -> bytes:
-    if not batch.num_rows:
-        return b""
     cells = [_cells(column, field.name) for column, field in zip(batch.columns, batch.schema, strict=True)]
     return "".join(f"<TR>{''.join(row)}</TR>\n" for row in zip(*cells, strict=True)).encode()
 

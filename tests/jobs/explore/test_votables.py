@@ -75,3 +75,14 @@ def test_what_is_missing_in_a_list_of_whole_numbers():
 def test_characters_that_xml_lacks(character):
     (text,) = read(b"".join(votables.pieces([pa.record_batch({"a": [f"x{character}y"]})]))).get_first_table().array["a"]
     assert text == "x\N{REPLACEMENT CHARACTER}y"
+
+
+@pytest.mark.parametrize("most", [None, 50_000, 0])
+def test_pieces_of_many_rows_are_small(most):
+    """However many come at a time: as texts they take many times their size."""
+    batch = pa.RecordBatch.from_pydict({"a": np.arange(100_000), "b": np.arange(100_000) / 7})
+    cut = votables.Cut(most)
+    pieces = [*votables.pieces([batch], cut)]
+    assert max(map(len, pieces)) < 1 << 20
+    assert b"".join(pieces).count(b"<TR>") == (100_000 if most is None else most)
+    assert cut.overflowed == (most is not None)
