@@ -45,7 +45,7 @@ def lone(box, ra, dec, chi=800.0, amplitude=3e-9, size=2 * ARCMIN):
     halo = np.array([0, 0, chi, amplitude, size, max(size, 10 * ARCMIN), max(size, 25 * ARCMIN), 6.0])[:, None]
     empty = replace(box, maps=tuple(np.zeros_like(one) for one in box.maps))
     frame = halo_lensing._frames(np.array([ra]), np.array([dec]))[0]
-    return Neighbourhood(empty, chosen, frame, halo, *halo_lensing._grid(chosen, halo))
+    return Neighbourhood(empty, chosen, frame, halo, *halo_lensing._grid(chosen, halo), np.inf)
 
 
 @pytest.mark.parametrize(("ra", "dec"), [(40.0, 20.0), (0.0, -1.0), (359.9999, 60.0), (123.0, 89.5), (10.0, -89.9)])
