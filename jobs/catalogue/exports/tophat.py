@@ -37,9 +37,11 @@ from lake_schema.units import LIGHT_ANGSTROM_S
 FIRST, LAST = 450.5, 24499.5
 # Of a bin, in ln(wavelength); half a window about a line, a fraction of its wavelength: 4 sigma of 300 km/s.
 _STEP, _WINDOW = 0.02, 0.004
-# Where spectra break, A: the Lyman limit, Lyman alpha with the red half of its line, narrow or wide, the Balmer limit.
+# Where spectra break, A: the Lyman limit, the lines of the series, redward of which intergalactic hydrogen absorbs less,
+# Lyman alpha with the red half of its line, narrow or wide, the Balmer limit.
+_SERIES = (917.5, 919.5, 920.5, 923.5, 926.5, 930.5, 937.5, 949.5, 972.5, 1025.5)
 _RED_OF_ALPHA = (1216.5, 1217.5, 1219.5, 1222.5, 1226.5, 1231.5, 1236.5, 1241.5, 1246.5, 1251.5, 1260.5)
-_BREAKS = tuple((at, at) for at in (912.0, 1215.5, *_RED_OF_ALPHA, 3646.0))
+_BREAKS = tuple((at, at) for at in (912.0, *_SERIES, 1215.5, *_RED_OF_ALPHA, 3646.0))
 # L_nu is in units of this, W/Hz: GCR Catalogs, SCHEMA.md.
 TOPHAT_W_HZ = 4.4659e13
 _MPC_CM = 3.085677581491367e24
