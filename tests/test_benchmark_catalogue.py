@@ -10,6 +10,7 @@ from tests.benchmarks import run
 @pytest.mark.spark
 @pytest.mark.nightly
 def test_the_benchmark(tmp_path):
+    pytest.importorskip("skypy", reason="skypy is not installed (extra bench)")
     file = tmp_path / "catalogue.json"
     run("catalogue", "--quick", "--json", file)
     figures = json.loads(file.read_text())
