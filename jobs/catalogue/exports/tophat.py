@@ -37,7 +37,7 @@ from lake_schema.units import LIGHT_ANGSTROM_S
 FIRST, LAST = 450.5, 24499.5
 # Of a bin, in ln(wavelength); half a window about a line, a fraction of its wavelength: 4 sigma of 300 km/s.
 _STEP, _WINDOW = 0.02, 0.004
-# Where spectra break, A: the Lyman limit, the lines of the series, redward of which intergalactic hydrogen absorbs less,
+# Where spectra break, A: the Lyman limit, the lines of its series, redward of which hydrogen on the way absorbs less,
 # Lyman alpha with the red half of its line, narrow or wide, the Balmer limit.
 _SERIES = (917.5, 919.5, 920.5, 923.5, 926.5, 930.5, 937.5, 949.5, 972.5, 1025.5)
 _RED_OF_ALPHA = (1216.5, 1217.5, 1219.5, 1222.5, 1226.5, 1231.5, 1236.5, 1241.5, 1246.5, 1251.5, 1260.5)
