@@ -20,9 +20,13 @@ def _trail(axis: str, doc: str) -> Column:
     return Column(f"trail_{axis}", "float64", "pix", f"pos.cartesian.{axis};instr.det", doc, nullable=True, since=2)
 
 
+def _centroid(axis: str, doc: str) -> Column:
+    return Column(f"psf_{axis}", "float64", "pix", f"pos.cartesian.{axis};instr.det.psf", doc, nullable=True, since=3)
+
+
 RENDERED_TRUTH = Table(
     "rendered_truth",
-    2,
+    3,
     (
         Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure", lo=0),
         Column("detector", "string", ucd="meta.id;instr.det", doc="detector name"),
@@ -43,6 +47,17 @@ RENDERED_TRUTH = Table(
         Column("method", "int8", "", "meta.code", "how it was drawn", codes=METHODS),
         _trail("x", "it moves by, with (x, y) in the middle; of very long trails each row is of the part near"),
         _trail("y", "the same along the rows' axis"),
+        _centroid("x", "windowed centroid of a point of its colour there, minus x; null where light is spread out"),
+        _centroid("y", "the same along the rows' axis"),
+        Column(
+            "mag",
+            "float64",
+            "mag",
+            "phot.mag",
+            "AB, of `expected` by ZEROPNT and EXPTIME of the header",
+            nullable=True,
+            since=3,
+        ),
     ),
     "Sources of the rendered images: true places and electrons.",
     key=("exposure_id", "detector", "id"),

@@ -9,9 +9,11 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 
+from jobs.render.drawing import transfer
 from jobs.render.exposure.rendered import Rendered
+from jobs.render.psf import centroids
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Int
+from lake_schema.arrays import Float, Int
 from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
 
 # Codes of `method` in the table `rendered_truth`.
@@ -20,7 +22,7 @@ POINT, PROFILE, PICTURE, TRAIL = 0, 1, 2, 3
 
 def truth(rendered: Rendered) -> pa.Table:
     """One row a source that was drawn, ascending id."""
-    sources, n = rendered.sources, len(rendered.sources)
+    sources, n, (psf_x, psf_y) = rendered.sources, len(rendered.sources), _centroids(rendered)
     trail = np.zeros((n, 2)) if sources.trail is None else sources.trail
     return RENDERED_TRUTH.build(
         {
@@ -35,8 +37,27 @@ def truth(rendered: Rendered) -> pa.Table:
             "method": _methods(sources),
             "trail_x": trail[:, 0],
             "trail_y": trail[:, 1],
+            "psf_x": psf_x,
+            "psf_y": psf_y,
+            "mag": _magnitudes(rendered),
         }
     )
+
+
+def _centroids(rendered: Rendered) -> tuple[Float | None, Float | None]:
+    """Of a point of each source's colour, from its place, pixels; None where light is spread out."""
+    sources, psf = rendered.sources, rendered.psf
+    if psf is None or rendered.spectra is not None:
+        return None, None
+    return centroids.offsets(psf, transfer.basis_weights(psf, sources.photons, sources.column, sources.row))
+
+
+def _magnitudes(rendered: Rendered) -> Float:
+    """By the zero point and the exposure time of the header; null where nothing is expected."""
+    electrons = rendered.sources.electrons
+    shines = electrons > 0.0
+    rate = np.where(shines, electrons, 1.0) / rendered.scene.exposure_time_s
+    return np.ma.masked_array(rendered.zero_point - 2.5 * np.log10(rate), ~shines)
 
 
 def spectra(rendered: Rendered) -> pa.Table | None:
