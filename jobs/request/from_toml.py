@@ -53,7 +53,8 @@
     [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation", "persistence", "ramp",
                             "order_1", "order_0", "order_2", "order_m1"]
                    compression = "none" | "rice"   of images of whole numbers, without loss
-                   wcs = "sip" | "tpv"   how headers tell the distortion; SourceExtractor, SCAMP and SWarp read TPV
+                   wcs = "sip" | "tpv"   how headers tell the distortion, default: as the instrument's pipeline;
+                                         source-extractor, SCAMP and SWarp read TPV, or .head beside the image
                    files = "detector" | "exposure"   also one file of all of an exposure's science images
 
 Files are found from the folder of the request; their formats are in jobs/fluxes/libraries/spectrum_formats.toml.
@@ -184,7 +185,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         pointings=asked,
         truth=_truth(products_),
         compression=_string(products_, "products.compression", COMPRESSIONS, "none"),
-        wcs=_string(products_, "products.wcs", CONVENTIONS, "sip"),
+        wcs=_string(products_, "products.wcs", CONVENTIONS) if "wcs" in products_ else None,
         files=_string(products_, "products.files", FILES, "detector"),
         curves=curves,
         observations=blocks,

@@ -133,7 +133,7 @@ class Request:
     explore : parameter -> the values (JSON) that it takes in turn
     psfs    : (band, file) of PSFs in place of ours
     files   : what has a file of its own, one of FILES
-    wcs     : how headers tell the distortion of the optics, one of CONVENTIONS
+    wcs     : how headers tell the distortion of the optics, one of CONVENTIONS; None = as the instrument's pipeline
     bodies  : file of moving bodies in place of ours
     sources : the only sources that there are, in place of the universe
     structure : what galaxies have beside their profiles
@@ -159,7 +159,7 @@ class Request:
     ingest: Ingest = _NOTHING_TAKEN
     strong_lens_boost: float = 1.0
     compression: str = "none"
-    wcs: str = "sip"
+    wcs: str | None = None
     files: str = "detector"
     psfs: tuple[tuple[str, str], ...] = ()
     bodies: Path | None = None

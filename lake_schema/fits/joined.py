@@ -18,13 +18,22 @@ from lake_schema.fits.images import STRUCTURE, Card, Image
 # What astropy calls a packed image that has no name.
 _NAMELESS = ("", "COMPRESSED_IMAGE")
 
+_INHERIT: tuple[Card, ...] = (("INHERIT", True, "the first header of the file holds, too"),)
 
-def join(path: Path, files: Sequence[tuple[str, Path]], shared: Sequence[str], more: Sequence[Card]) -> None:
+
+def join(
+    path: Path,
+    files: Sequence[tuple[str, Path]],
+    shared: Sequence[str],
+    more: Sequence[Card],
+    in_each: Sequence[str] = (),
+) -> None:
     """Write a file of all the files' arrays, one file after the other; replaces `path` in one rename.
 
     path   : of the file, which begins with a header alone
     files  : each with a name, which its arrays get that have none;  shared : keywords that are of all files
     more   : cards of the first header, after the shared ones
+    in_each : keywords that arrays which have them keep, though they are shared
     Cards of a file that are not shared, or differ, go to each of its arrays, unless that has its own. Of the arrays
     one file's at a time are in memory.
     """
@@ -32,32 +41,33 @@ def join(path: Path, files: Sequence[tuple[str, Path]], shared: Sequence[str], m
         raise BadInput(f"{path}: there is nothing to join")
     every = [_first_cards(file) for _, file in files]
     common = [card for key, card in every[0].items() if key in shared and all(one.get(key) == card for one in every)]
-    write.write_one_by_one(path, _units(files, [*common, *more], {card[0] for card in common}))
+    write.write_one_by_one(path, _units(files, [*common, *more], {card[0] for card in common}, set(in_each)))
 
 
-def _units(files: Sequence[tuple[str, Path]], cards: Sequence[Card], common: set[str]) -> Iterator[Any]:
+def _units(files: Sequence[tuple[str, Path]], cards: Sequence[Card], common: set[str], kept: set[str]) -> Iterator[Any]:
     yield images.primary(Image(None, tuple(cards)))
     for name, file in files:
         with write.refusing(file), fits.open(file, memmap=False, disable_image_compression=True) as units:
             first = units[0]
             for unit in units:
                 if write.is_packed(unit):
-                    yield _packed(unit, name, common, first)
+                    yield _packed(unit, name, common, kept, first)
                 elif unit.header["NAXIS"]:
-                    yield _plain(unit, name, common, first)
+                    yield _plain(unit, name, common, kept, first)
 
 
-def _plain(unit: Any, name: str, common: set[str], first: Any) -> Any:
+def _plain(unit: Any, name: str, common: set[str], kept: set[str], first: Any) -> Any:
     image = images.image_of(unit)
-    own = tuple(card for card in image.cards if card[0] not in common)
-    return images.extension(Image(image.data, (*_cards_of(first, {*common, *unit.header}), *own), image.name or name))
+    own = tuple(card for card in image.cards if card[0] not in common - kept)
+    cards = (*_INHERIT * ("INHERIT" not in unit.header), *_cards_of(first, {*common, *unit.header}), *own)
+    return images.extension(Image(image.data, cards, image.name or name))
 
 
-def _packed(unit: Any, name: str, common: set[str], first: Any) -> Any:
+def _packed(unit: Any, name: str, common: set[str], kept: set[str], first: Any) -> Any:
     """The table that it is stored as: its rows are not touched."""
-    for key in common & set(unit.header):
+    for key in (common - kept) & set(unit.header):
         del unit.header[key]
-    for card in _cards_of(first, {*common, *unit.header}):
+    for card in (*_INHERIT * ("INHERIT" not in unit.header), *_cards_of(first, {*common, *unit.header})):
         unit.header.append(card, end=True)
     if unit.header.get("EXTNAME", "") in _NAMELESS:
         unit.header["EXTNAME"] = name

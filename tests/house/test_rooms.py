@@ -212,10 +212,9 @@ def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
     assert one.noise_free.max() > 100.0
     assert [decision.name for decision in one.decisions] == ["brighter"]
     np.testing.assert_allclose(one.science, 3.0 * one.noise_free, rtol=1e-5, atol=1.0)
-    _, writers = fits_files.products(one, ())
+    made, writers = fits_files.products(one, ())
     path = tmp_path / "science.fits"
-    (write,) = writers.values()
-    write(path)
+    writers[made["path"][0].as_py()](path)
     np.testing.assert_array_equal(read_back.frame(path).data, one.science)
 
 

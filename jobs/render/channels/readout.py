@@ -19,6 +19,7 @@ import scipy.special
 from astropy.wcs import WCS
 
 from jobs.render.camera import astrometry
+from jobs.render.camera.sections import Section, Sections
 from jobs.render.effects.charge import ramp
 from jobs.render.effects.readout import quadrants as layout
 from jobs.render.effects.scene import Frame, Scene
@@ -35,6 +36,7 @@ class Extension:
     unit      : as FITS writes it; "" = none, of a flag
     cards     : of it alone
     amplifier : the number of the one that it is read through; None = of several
+    sections  : which of its pixels are the detector's; None: it is not told
     """
 
     name: str
@@ -42,6 +44,7 @@ class Extension:
     unit: str
     cards: tuple[Card, ...] = ()
     amplifier: int | None = None
+    sections: Sections | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +91,7 @@ class ReadoutMode:
 def _frame(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
     """uint16[ny, nx] ADU."""
     raw = found.astype(np.uint16)
-    return Readout((Extension("", raw, "adu"),), raw, raw)
+    return Readout((Extension("", raw, "adu", sections=Sections.whole(*raw.shape[::-1])),), raw, raw)
 
 
 def _frame_electrons(read: Sequence[Image]) -> Float:
@@ -132,11 +135,15 @@ def _ramp(found: Frame, scene: Scene, detector: str, system: WCS, whole: bool) -
         ("REFPIX", border, "[pix] width of the border of reference pixels"),
     )
     place = astrometry.cards(astrometry.shifted(system, border, border))
-    planes = [Extension(f"{detector}.SCI", np.pad(signal, border, constant_values=level), "adu", place)]
+    ny, nx = signal.shape
+    own = Sections(Section(border, border, nx, ny), Section(0, 0, nx, ny))
+    padded = np.pad(signal, border, constant_values=level)
+    planes = [Extension(f"{detector}.SCI", padded, "adu", place, sections=own)]
     if mode.groups > 2:
         flag = np.rint(np.minimum(found[1], _MOST_CHI2)) if whole else found[1] > limit
         meaning = () if whole else (("QUALFLAG", 1, "value where chi^2 exceeds QUALLIM, else 0"),)
-        planes.append(Extension(f"{detector}.CHI2", np.pad(flag.astype(np.uint8), border), "", (*meaning, *place)))
+        quality = np.pad(flag.astype(np.uint8), border)
+        planes.append(Extension(f"{detector}.CHI2", quality, "", (*meaning, *place), sections=own))
         text = "chi^2 above which a ramp does not fit" if whole else "chi^2 above which a pixel's quality is 1"
         cards += (("QUALLIM", limit, text),)
     else:
@@ -183,7 +190,8 @@ def _quadrants(found: Frame, scene: Scene, detector: str, system: WCS) -> Readou
         across, up = layout.origin(number, raw[number].shape, *sizes)
         place = astrometry.cards(astrometry.shifted(system, across, up))
         cards: tuple[Card, ...] = (("QUADRANT", name, "quadrant"), *scans, *place)
-        extensions.append(Extension(f"{detector}.{name}", layout.placed(raw[number], number), "adu", cards, number))
+        own, plane = layout.sections(number, raw[number].shape, *sizes), layout.placed(raw[number], number)
+        extensions.append(Extension(f"{detector}.{name}", plane, "adu", cards, number, own))
     return Readout(tuple(extensions), raw, layout.assembled(raw, *sizes), scans)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import pyarrow.compute as pc
 
+from jobs.render.products import head_files, headers
 from lake_schema.errors import Damaged
 from lake_schema.fits import joined
 from lake_schema.fits.images import Card
@@ -24,10 +25,10 @@ from lake_schema.tables.products import EXPOSURE_FILES
 
 # Keywords of detectors' headers that are the exposure's.
 _OF_EXPOSURE = (
-    "INSTRUME", "CHANNEL", "FILTER", "IMAGETYP", "LAMP", "TARGET", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS",
-    "TIMESYS", "SEEING", "ZEROPNT", "SEED", "NOISSEED", "REALIS", "MISSION", "TRUESKY", "ACCFLUX", "ACCSHAPE", "ACCPOS",
-    "ACCBACK", "READMODE", "NG", "NR", "ND", "FRTIME", "ELAPTIME", "REFPIX", "QUALLIM", "PRESCAN", "OVERSCAN",
-    "OVERROWS", "INJROWS", "BUNIT",
+    "TELESCOP", "INSTRUME", "OBJECT", "RA", "DEC", "AIRMASS", "DETSIZE", "CHANNEL", "FILTER", "IMAGETYP", "LAMP",
+    "TARGET", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS", "TIMESYS", "SEEING", "ZEROPNT", "SEED", "NOISSEED",
+    "REALIS", "MISSION", "TRUESKY", "ACCFLUX", "ACCSHAPE", "ACCPOS", "ACCBACK", "READMODE", "NG", "NR", "ND", "FRTIME",
+    "ELAPTIME", "REFPIX", "QUALLIM", "PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS", "BUNIT",
 )  # fmt: skip
 
 
@@ -73,18 +74,22 @@ def work(lake: Path, facts: Json) -> Output:
         }
     )
     files = [(name, products.file(rows[name]["path"])) for name in facts["detectors"]]
-    return Output(table, {path: partial(_write, files, _cards(exposure, facts))})
+    heads = [products.file(head_files.beside(rows[name]["path"])) for name in facts["detectors"]]
+    writers = {path: partial(_write, files, _cards(exposure, facts)), head_files.beside(path): partial(_heads, heads)}
+    return Output(table, writers)
 
 
 def _cards(exposure: dict[str, Any], facts: Json) -> tuple[Card, ...]:
     return (
-        ("RA", exposure["ra"], "[deg] boresight"),
-        ("DEC", exposure["dec"], "[deg] boresight"),
         ("POSANGLE", exposure["position_angle"], "[deg] of the focal plane, north through east"),
         ("NDETECT", len(facts["detectors"]), "detectors in this file"),
         ("NPLANNED", facts["planned"], "detectors of the exposure that are planned"),
     )
 
 
+def _heads(files: Sequence[Path], path: Path) -> None:
+    head_files.write((file.read_text(encoding="ascii") for file in files), path)
+
+
 def _write(files: Sequence[tuple[str, Path]], cards: Sequence[Card], path: Path) -> None:
-    joined.join(path, files, _OF_EXPOSURE, cards)
+    joined.join(path, files, _OF_EXPOSURE, cards, headers.IN_EACH)

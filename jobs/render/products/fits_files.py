@@ -3,7 +3,7 @@
 A detector whose readout is one array is a file of one image; of several, each is an extension, behind a header that
 holds for all of them.
 
-products   rows, and a writer for each file
+products   rows, and a writer for each file; beside each image its place on the sky, for tools (head_files.py)
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from jobs.render.camera import astrometry, tpv
+from jobs.render.camera import astrometry, observatories, tpv
 from jobs.render.exposure.rendered import Rendered
-from jobs.render.products import headers
+from jobs.render.products import head_files, headers
 from lake_schema.fits.images import Image, write_images
 from lake_schema.tables.products import PRODUCTS
 
@@ -25,19 +25,20 @@ Writer = Callable[[Path], None]
 
 
 def products(
-    rendered: Rendered, truth: Sequence[str] = ("noise_free",), rice: bool = False, wcs: str = "sip"
+    rendered: Rendered, truth: Sequence[str] = ("noise_free",), rice: bool = False, wcs: str | None = None
 ) -> tuple[pa.Table, dict[str, Writer]]:
-    """Rows of `products` and, by path, what writes each file.
+    """Rows of `products` and, by path, what writes each file; beside each image its head file.
 
     rendered : a detector
     truth : truth maps that are wanted beside the science image;  rice : images of whole numbers are packed
-    wcs   : how headers tell the optics' distortion, one of tpv.CONVENTIONS
+    wcs   : how headers tell the optics' distortion, one of tpv.CONVENTIONS; None = as the instrument's pipeline
     """
     images = {"science": _science(rendered)}
     for content in truth:
         if content in rendered.maps:
             images[content] = [Image(rendered.maps[content], headers.truth_cards(rendered, content))]
-    if wcs == "tpv":
+    heads = {key: head_files.text(units) for key, units in images.items()}
+    if (wcs or observatories.of(rendered.exposure.camera).convention) == "tpv":
         images = {key: [replace(unit, cards=tpv.cards(unit.cards)) for unit in units] for key, units in images.items()}
     exposure, detector = rendered.exposure, rendered.detector
     stem = f"images/{exposure.exposure_id:06d}/{exposure.channel}_{exposure.band}_{detector.name}"
@@ -60,6 +61,9 @@ def products(
         }
     )
     writers: dict[str, Writer] = {paths[content]: partial(_write, units, rice) for content, units in images.items()}
+    for content, said in heads.items():
+        if said:
+            writers[head_files.beside(paths[content])] = partial(head_files.write, [said])
     return rows, writers
 
 
@@ -68,26 +72,14 @@ def _write(units: Sequence[Image], rice: bool, path: Path) -> None:
 
 
 def _science(rendered: Rendered) -> list[Image]:
-    """The image; or a header that holds for all, and an extension for each array of the readout.
-
-    The unit of the pixels stands in the header of all where they share it, else in each array's own.
-    """
+    """The image; or a header that holds for all, and an extension for each array of the readout."""
     readout = rendered.readout
     cards = (*headers.science_cards(rendered), *readout.cards)
     if [extension.name for extension in readout.extensions] == [""]:
         (only,) = readout.extensions
-        return [Image(only.data, (*cards, *only.cards))]
-    shared = readout.unit is not None
+        return [Image(only.data, (*cards, *only.cards, *headers.section_cards(rendered, only)))]
     arrays = [
-        Image(
-            extension.data,
-            (
-                *headers.unit_cards(None if shared else extension.unit),
-                *extension.cards,
-                *headers.amplifier_cards(rendered, extension.amplifier),
-            ),
-            extension.name,
-        )
+        Image(extension.data, headers.array_cards(rendered, extension, cards), extension.name)
         for extension in readout.extensions
     ]
     return [Image(None, cards), *arrays]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from datetime import datetime, timedelta
 
 import numpy as np
 
 from jobs import accuracy, rng
-from jobs.render.camera import astrometry
+from jobs.render.camera import astrometry, detectors, observatories, sections
+from jobs.render.channels.readout import Extension
 from jobs.render.channels.registry import effects_of
 from jobs.render.effects.charge import ramp, ramp_nonlinearity
 from jobs.render.effects.readout import bias_structure, charge_transfer, nonlinearity, ramp_noise, read_noise
@@ -18,11 +20,17 @@ from jobs.render.exposure.rendered import Rendered, numbers_of
 from lake_schema import __version__
 from lake_schema.arrays import Float
 from lake_schema.fits.images import Card
+from lake_schema.tables.exposures import ExposureRow
 
 # Of an amplifier's offset, a column's stripe and a reading: what next to no pixel is below.
 _SURE = 5.0
 # Effects that bring dark current.
 _DARK = {"dark_current", "dark_map"}
+# What tools look for in the header of each array: few follow INHERIT to the header that holds for all.
+_EVERYWHERE = ("EXPTIME", "FILTER", "DATE-OBS", "MJD-OBS", "TIMESYS")
+# Likewise of arrays of what amplifiers read.
+_OF_READING = ("GAIN", "RDNOISE", "RDNDRAWN", "SATURATE")
+IN_EACH = (*_EVERYWHERE, *_OF_READING, "BUNIT")
 # Of each number of an accuracy: the end of its keywords, and what it is of.
 _ERRORS = {
     "flux": ("FLUX", "fraction of a source's flux"),
@@ -49,6 +57,7 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     return (
         *_common(rendered),
+        ("DETSIZE", _mosaic(rendered), "of the mosaic of all detectors"),
         *unit_cards(rendered.readout.unit),
         *((key, float(value), comment) for key, value, comment in _of_amplifiers(rendered) if np.ndim(value) == 0),
         ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
@@ -66,8 +75,40 @@ def unit_cards(unit: str | None) -> tuple[Card, ...]:
     return (("BUNIT", unit, "unit of the pixels"),) if unit else ()
 
 
-def amplifier_cards(rendered: Rendered, number: int | None) -> tuple[Card, ...]:
-    """Header of an amplifier's array: what differs from one amplifier to the other, and is not in the common header.
+def array_cards(rendered: Rendered, extension: Extension, common: Sequence[Card]) -> tuple[Card, ...]:
+    """Header of one of several arrays.
+
+    common : cards of the header that holds for all of them
+    """
+    again = (*_EVERYWHERE, *(_OF_READING if extension.unit == "adu" else ()))
+    return (
+        ("INHERIT", True, "the first header of the file holds, too"),
+        *(card for card in common if card[0] in again),
+        *unit_cards(extension.unit),
+        *extension.cards,
+        *section_cards(rendered, extension),
+        *_amplifier_cards(rendered, extension.amplifier),
+    )
+
+
+def section_cards(rendered: Rendered, extension: Extension) -> tuple[Card, ...]:
+    """Which of an array's pixels are the detector's, and where these are on the detector and in the mosaic."""
+    own = extension.sections
+    if own is None:
+        return ()
+    every = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
+    where = sections.in_mosaic(rendered.detector, own.ccd, every)
+    return (
+        ("DATASEC", own.data.text, "pixels of the detector"),
+        ("TRIMSEC", own.data.text, "pixels to be kept"),
+        *((("BIASSEC", own.bias.text, "columns that tell the bias"),) if own.bias else ()),
+        ("CCDSEC", own.ccd.text, "DATASEC on the detector"),
+        *((("DETSEC", where, "DATASEC in the mosaic of the detectors"),) if where else ()),
+    )
+
+
+def _amplifier_cards(rendered: Rendered, number: int | None) -> tuple[Card, ...]:
+    """Of an amplifier's array: what differs from one amplifier to the other, and is not in the common header.
 
     number : of the amplifier; None = the array is of several
     """
@@ -75,6 +116,10 @@ def amplifier_cards(rendered: Rendered, number: int | None) -> tuple[Card, ...]:
         return ()
     found = ((key, np.atleast_1d(value), comment) for key, value, comment in _of_amplifiers(rendered))
     return tuple((key, float(values[number]), comment) for key, values, comment in found if len(values) > 1)
+
+
+def _mosaic(rendered: Rendered) -> str:
+    return sections.mosaic_size(detectors.detectors(rendered.exposure.camera, rendered.scene.mission))
 
 
 def _of_amplifiers(rendered: Rendered) -> tuple[tuple[str, float | Float, str], ...]:
@@ -92,18 +137,22 @@ def _of_amplifiers(rendered: Rendered) -> tuple[tuple[str, float | Float, str], 
 
 
 def _read_noise(rendered: Rendered) -> tuple[tuple[str, float | Float, str], ...]:
-    """Of the image; and of one read, where the image is the signal of a ramp."""
+    """Of the image; and of one read, where the image is the signal of a ramp: the detector's, and what was drawn of it.
+
+    An image whose other noise hides it is drawn without.
+    """
     scene = rendered.scene
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     of_read = scene.of_amplifiers("read_noise", "electron")
+    drawn = "[electron] the same, as it was drawn"
     if not scene.ramp:
         noise = (read_noise.EFFECT.name in applied) * of_read
-        return (("RDNOISE", noise, "[electron] rms read noise in the image"),)
-    parts = [effect for effect in (ramp_noise.EFFECT, ramp_noise.DRIFT) if effect.name in applied]
-    whole = math.hypot(*(effect.contribution(scene) for effect in parts))
+        return (("RDNOISE", of_read, "[electron] rms read noise"), ("RDNDRAWN", noise, drawn))
+    parts = {effect.name: effect.contribution(scene) for effect in (ramp_noise.EFFECT, ramp_noise.DRIFT)}
     return (
-        ("RDNOISE", whole, "[electron] rms of the signal that reading adds"),
-        ("FRNOISE", (ramp_noise.EFFECT in parts) * of_read, "[electron] rms noise of one read"),
+        ("RDNOISE", math.hypot(*parts.values()), "[electron] rms of the signal that reading adds"),
+        ("RDNDRAWN", math.hypot(*(part for name, part in parts.items() if name in applied)), drawn),
+        ("FRNOISE", of_read, "[electron] rms noise of one read"),
     )
 
 
@@ -141,8 +190,11 @@ def _group_cards(rendered: Rendered) -> tuple[Card, ...]:
 
 def _common(rendered: Rendered) -> tuple[Card, ...]:
     exposure, scene = rendered.exposure, rendered.scene
+    place = observatories.of(exposure.camera)
+    start, air = exposure.mjd + place.ahead / 86400.0, observatories.airmass(place, exposure.dec)
     return (
-        ("INSTRUME", exposure.camera, "camera"),
+        *((("TELESCOP", place.telescope, "telescope"),) if place.telescope else ()),
+        ("INSTRUME", place.instrument, "instrument"),
         ("CHANNEL", exposure.channel, "channel"),
         ("DETECTOR", rendered.detector.name, "detector"),
         ("FILTER", exposure.band, "passband"),
@@ -151,11 +203,15 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("IMAGETYP", exposure.image_type, "image type"),
         *((("LAMP", exposure.lamp, "LED of the calibration unit"),) if exposure.lamp else ()),
         *((("TARGET", exposure.target, "calibration source"),) if exposure.target else ()),
+        ("OBJECT", _object(exposure), "what is looked at"),
+        ("RA", exposure.ra, "[deg] boresight right ascension"),
+        ("DEC", exposure.dec, "[deg] boresight declination"),
+        *((("AIRMASS", air, "of the boresight as it culminates"),) if air is not None else ()),
         ("EXPOSURE", exposure.exposure_id, "identifier of the exposure"),
         ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
-        ("DATE-OBS", _date(exposure.mjd), "start of the exposure"),
-        ("MJD-OBS", exposure.mjd, "[d] start of the exposure"),
-        ("TIMESYS", "UTC", "time scale of DATE-OBS and MJD-OBS"),
+        ("DATE-OBS", _date(start), "start of the exposure"),
+        ("MJD-OBS", start, "[d] start of the exposure"),
+        ("TIMESYS", place.time_scale, "time scale of DATE-OBS and MJD-OBS"),
         *astrometry.cards(rendered.wcs),
         ("PIXSCALE", rendered.detector.pixel_scale, "[arcsec/pix] pixel scale at the boresight"),
         ("ZEROPNT", rendered.zero_point, "[mag] AB magnitude of 1 electron/s"),
@@ -187,6 +243,13 @@ def _accuracy_cards(rendered: Rendered) -> tuple[Card, ...]:
         *((f"ACC{short}", allowed[name], f"allowed error: {text}") for name, (short, text) in _ERRORS.items()),
         *((f"ERR{short}", made[name], f"largest error: {text}") for name, (short, text) in _ERRORS.items()),
     )
+
+
+def _object(exposure: ExposureRow) -> str:
+    """A calibration source, or the survey and its field."""
+    if exposure.target:
+        return exposure.target
+    return exposure.survey if exposure.field is None else f"{exposure.survey} {exposure.field}"
 
 
 def _date(mjd: float) -> str:

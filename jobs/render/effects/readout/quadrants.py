@@ -9,6 +9,7 @@ overscan.
 
 apply, EFFECT    detector -> quadrants in readout order, no charge outside the pixels
 placed           one quadrant in readout order -> as it lies on the detector, and back
+sections         which of its pixels are the detector's, which tell the bias
 assembled        quadrants -> detector, without pre- and overscan
 """
 
@@ -19,6 +20,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from jobs.render.camera.sections import Section, Sections
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import BadInput, OutOfRange
@@ -69,6 +71,22 @@ def origin(
     ny, nx = shape
     across = overscan - (nx - prescan - overscan) if _RIGHT[number] else prescan
     return across, rows - (ny - rows) - middle if _UPPER[number] else 0
+
+
+def sections(number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, middle: int = 0) -> Sections:
+    """Of a quadrant [ny, nx] as it is `placed`: the bias from the last half of its overscan.
+
+    Charge that traps gave back is in the first half.
+
+    number : of the quadrant;  shape : ny, nx of it
+    prescan, overscan, rows, middle : as of `apply`
+    """
+    (ny, nx), (across, up) = shape, origin(number, shape, prescan, overscan, rows, middle)
+    x, y = overscan if _RIGHT[number] else prescan, rows if _UPPER[number] else 0
+    data = Section(x, y, nx - prescan - overscan, ny - rows)
+    behind = max(overscan // 2, 1)
+    bias = Section(0 if _RIGHT[number] else nx - behind, 0, behind, ny) if overscan else None
+    return Sections(data, Section(x - across, y - up, data.nx, data.ny), bias)
 
 
 def assembled(

@@ -96,9 +96,9 @@ def residuals(detector, row, where, psf, folder):
     psfs = [scenes.own(psf, one.sources, i) for i in np.flatnonzero(seen)]
     found, out = fitted(one.noise_free, psfs, x, y), []
     for convention in ("sip", "tpv"):
-        _, writers = fits_files.products(one, ("noise_free",), wcs=convention)
-        for path, write in writers.items():
-            write(folder / "image.fits")
+        rows, writers = fits_files.products(one, ("noise_free",), wcs=convention)
+        for path in rows["path"].to_pylist():
+            writers[path](folder / "image.fits")
             with fits.open(folder / "image.fits") as units:
                 header = units[1].header if "science" in path else units[0].header
             assert header["CTYPE1"].endswith(convention.upper())

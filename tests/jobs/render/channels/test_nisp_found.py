@@ -25,8 +25,8 @@ def written(folder):
     found = infrared.rendered(
         rng.uniform(17.5, 20.5, len(x)), x, y, detector=small("nisp", "DET22", SIDE), mission=cold
     )
-    _, writers = fits_files.products(found, (), wcs="tpv")
-    (path,) = writers
+    rows, writers = fits_files.products(found, (), wcs="tpv")
+    (path,) = rows["path"].to_pylist()
     writers[path](folder / "science.fits")
     return found, fits.open(folder / "science.fits")
 

@@ -39,7 +39,7 @@ def test_the_file(tmp_path):
     """Signal and its quality, each in the border of reference pixels, which are 0; the sky is where it is drawn."""
     found = one()
     _, writers = fits_files.products(found, ("ramp", "sky"))
-    (science,) = (path for path in writers if "science" in path)
+    (science,) = (path for path in writers if path.endswith("science.fits"))
     writers[science](tmp_path / "science.fits")
     read = images.read_images(tmp_path / "science.fits")
     assert [(unit.name, unit.data.shape, unit.data.dtype) for unit in read[1:]] == [
@@ -52,6 +52,15 @@ def test_the_file(tmp_path):
     assert header["ELAPTIME"] == pytest.approx(76 * 1.454)
     # What reading adds to the signal, and the noise of one of its reads.
     assert (header["RDNOISE"], header["FRNOISE"]) == (pytest.approx(7.0, abs=0.2), 13.0)
+    assert header["RDNDRAWN"] == header["RDNOISE"]
+    # Of the signal; its quality has no noise.
+    signal, quality = ({key: value for key, value, _ in unit.cards} for unit in read[1:])
+    assert {key: signal[key] for key in ("GAIN", "RDNOISE", "SATURATE", "EXPTIME")} == {
+        key: header[key] for key in ("GAIN", "RDNOISE", "SATURATE", "EXPTIME")
+    }
+    assert (signal["BUNIT"], signal["DATASEC"], signal["CCDSEC"]) == ("adu", "[5:100,5:100]", "[1:96,1:96]")
+    assert quality["DATASEC"] == signal["DATASEC"]
+    assert not {"BIASSEC", "RDNOISE"} & set(quality)
     assert own["CRPIX1"] == pytest.approx(header["CRPIX1"] + 4)
     signal, flag = (unit.data for unit in read[1:])
     border = np.ones(signal.shape, bool)
@@ -67,7 +76,7 @@ def test_the_file(tmp_path):
         write(tmp_path / "map.fits") or images.read_images(tmp_path / "map.fits")[0]
         for content in ("ramp", "sky")
         for path, write in writers.items()
-        if content in path
+        if path.endswith(f"{content}.fits")
     )
     assert groups.data.shape == (4, 96, 96)
     # Read as the signal is, without its border; the third axis counts groups.

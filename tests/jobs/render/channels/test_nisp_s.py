@@ -35,7 +35,7 @@ def test_the_file(tmp_path):
     """Slope of 16 bits and chi^2 of 8, each in the border of reference pixels; the grism is named."""
     found = one()
     _, writers = fits_files.products(found, ())
-    (science,) = (path for path in writers if "science" in path)
+    (science,) = (path for path in writers if path.endswith("science.fits"))
     writers[science](tmp_path / "science.fits")
     read = images.read_images(tmp_path / "science.fits")
     assert [(unit.name, unit.data.shape, unit.data.dtype) for unit in read[1:]] == [

@@ -73,11 +73,11 @@ def test_every_array_has_its_own_type_unit_and_cards(monkeypatch, tmp_path, rice
 
 
 @pytest.mark.parametrize("channel", ["VIS", "EXT"])
-def test_arrays_of_one_unit_have_it_in_the_header_of_all(channel, tmp_path):
+def test_arrays_of_one_unit_have_it_each_and_in_the_header_of_all(channel, tmp_path):
     one = render(channel)
     assert one.readout.unit == "adu"
     with astropy_fits.open(put(one, tmp_path)["science"]) as units:
-        assert [unit.header.get("BUNIT") for unit in units] == ["adu", *[None] * (len(units) - 1)]
+        assert [unit.header.get("BUNIT") for unit in units] == ["adu"] * len(units)
 
 
 @pytest.mark.parametrize("channel", ["VIS", "EXT"])

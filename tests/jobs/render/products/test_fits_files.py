@@ -11,7 +11,7 @@ from jobs import accuracy
 from jobs.render.camera import astrometry, detectors
 from jobs.render.effects.readout import charge_transfer
 from jobs.render.effects.scene import Scene
-from jobs.render.products import fits_files, headers, read_back
+from jobs.render.products import fits_files, head_files, headers, read_back
 from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import validate
@@ -49,7 +49,8 @@ def test_rows_are_as_declared(rendered, written):
 def test_truth_is_written_where_it_is_wanted(rendered):
     rows, writers = fits_files.products(rendered, truth=())
     assert rows["content"].to_pylist() == ["science"]
-    assert list(writers) == rows["path"].to_pylist()
+    (path,) = rows["path"].to_pylist()
+    assert list(writers) == [path, path.replace(".fits", ".head")]
 
 
 @pytest.mark.parametrize("content", [name for name, _ in CONTENTS if name != "science"])
@@ -59,6 +60,39 @@ def test_the_unit_of_a_truth_map_fits_its_card(rendered, content):
     assert keyword == "BUNIT"
     assert unit in ("electron", "adu", "")
     assert len(f"{keyword:8}= {unit!r:20} / {comment}") <= 80
+
+
+def test_beside_an_image_lies_where_it_is_on_the_sky(rendered, written):
+    """Of each of its arrays, in their order, in the form that tools read: the same place as in the file."""
+    folder, rows = written
+    assert rows.num_rows == 2
+    for path in rows["path"].to_pylist():
+        with astropy_fits.open(folder / path) as units:
+            arrays = [unit.header for unit in units if unit.header["NAXIS"]]
+        *blocks, rest = (folder / path).with_suffix(".head").read_text().split("END\n")
+        assert (len(blocks), rest) == (len(arrays), "")
+        for block, header in zip(blocks, arrays, strict=True):
+            said = astropy_fits.Header.fromstring(block, sep="\n")
+            assert {"CTYPE1", "CRVAL1", "CRPIX1", "CD1_1", "PV1_4", "RADESYS", "EQUINOX"} <= set(said)
+            assert not any(key.startswith(("A_", "B_")) for key in said)
+            assert (header["CTYPE1"], said["CTYPE1"]) == ("RA---TAN-SIP", "RA---TPV")
+            x, y = [1.0, header["NAXIS1"] / 3], [header["NAXIS2"] / 2, 5.0]
+            ours, theirs = (WCS(one).all_pix2world(x, y, 0) for one in (header, said))
+            np.testing.assert_allclose(theirs, ours, atol=1e-10)
+
+
+def test_images_without_a_place_have_nothing_beside(rendered):
+    assert head_files.text([images.Image(np.zeros((4, 4), np.uint8), (("EXPTIME", 1.0, ""),))]) == ""
+    cube = images.Image(np.zeros((2, 4, 4), np.uint8), astrometry.cards(rendered.wcs))
+    assert head_files.text([images.Image(None, astrometry.cards(rendered.wcs)), cube]) == ""
+
+
+@pytest.mark.parametrize(("channel", "usual"), [("VIS", "RA---TAN-SIP"), ("EXT", "RA---TAN")])
+def test_usually_the_distortion_is_as_the_pipeline_reads_it(channel, usual, tmp_path):
+    rows, writers = fits_files.products(render(channel), ())
+    (path,) = rows["path"].to_pylist()
+    writers[path](tmp_path / "one.fits")
+    assert astropy_fits.getheader(tmp_path / "one.fits")["CTYPE1"] == usual
 
 
 def test_headers_may_tell_the_distortion_as_tpv(rendered, tmp_path):

@@ -1,0 +1,64 @@
+"""What an instrument's files say of where it is, and what its pipeline reads.
+
+of       camera -> Observatory
+airmass  where it looks -> through how much air
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+# Beyond it, deg from the zenith, nobody observes.
+_LOWEST = 80.0
+
+
+@dataclass(frozen=True, slots=True)
+class Observatory:
+    """Of a camera.
+
+    telescope, instrument : as its files name them; "" = it is not told
+    convention            : how its pipeline tells the distortion of the optics, one of tpv.CONVENTIONS
+    latitude              : deg; None: it is in space
+    time_scale            : of the times in its files;  ahead : s, of UTC
+    """
+
+    telescope: str
+    instrument: str
+    convention: str
+    latitude: float | None = None
+    time_scale: str = "UTC"
+    ahead: float = 0.0
+
+
+# TAI - UTC since 2017.
+_TAI = 37.0
+# VIS: its distortion model is fitted as SIP (Euclid Data Product Description Document, VIS, Distortion Model). LSST and
+# HSC share a pipeline, which writes SIP; those of the others are built about SCAMP and SWarp, which read TPV.
+_KNOWN = {
+    "vis": Observatory("Euclid", "VIS", "sip"),
+    "nisp": Observatory("Euclid", "NISP", "sip"),
+    "decam": Observatory("CTIO 4.0-m telescope", "DECam", "tpv", -30.1661),
+    "lsstcam": Observatory("Simonyi Survey Telescope", "LSSTCam", "sip", -30.2446, "TAI", _TAI),
+    "megacam": Observatory("CFHT 3.6m", "MegaPrime", "tpv", 19.8253),
+    "jpcam": Observatory("JST250", "JPCam", "tpv", 40.0419),
+    "gpc1": Observatory("PS1", "GPC1", "tpv", 20.7070),
+    "hsc": Observatory("Subaru", "Hyper Suprime-Cam", "sip", 19.8255),
+}
+
+
+def of(camera: str) -> Observatory:
+    """Of a camera; of one that nothing is known of, with its name, somewhere."""
+    return _KNOWN.get(camera, Observatory("", camera, "sip"))
+
+
+def airmass(observatory: Observatory, dec: float) -> float | None:
+    """Of a field as it culminates, of a plane atmosphere: exposures are planned by the day, not by the hour.
+
+    dec     : deg;  observatory : on the ground
+    returns : None in space, and where the field does not rise high enough to be observed
+    """
+    if observatory.latitude is None:
+        return None
+    distance = abs(observatory.latitude - dec)
+    return 1.0 / math.cos(math.radians(distance)) if distance <= _LOWEST else None
