@@ -87,7 +87,7 @@ def array_cards(rendered: Rendered, extension: Extension, common: Sequence[Card]
         *unit_cards(extension.unit),
         *extension.cards,
         *section_cards(rendered, extension),
-        *_amplifier_cards(rendered, extension.amplifier),
+        *amplifier_cards(rendered, extension.amplifier),
     )
 
 
@@ -107,7 +107,7 @@ def section_cards(rendered: Rendered, extension: Extension) -> tuple[Card, ...]:
     )
 
 
-def _amplifier_cards(rendered: Rendered, number: int | None) -> tuple[Card, ...]:
+def amplifier_cards(rendered: Rendered, number: int | None) -> tuple[Card, ...]:
     """Of an amplifier's array: what differs from one amplifier to the other, and is not in the common header.
 
     number : of the amplifier; None = the array is of several

@@ -13,6 +13,7 @@ from jobs.catalogue import build_galaxies, build_stars
 from jobs.commands import run, space
 from jobs.fluxes import compute_fluxes
 from jobs.render import archive, plan_exposures, render_exposures
+from jobs.render.products import head_files
 from jobs.request.from_toml import parse
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
@@ -111,6 +112,13 @@ def test_an_exposure_has_the_arrays_of_its_detectors(whole, channel, arrays):
         # Nothing that was said of it is lost, or said otherwise.
         said = {key: value for key, value, _ in (*files[name][0].cards, *before.cards)}
         assert {key: {**about, **own}[key] for key in said} == said
+        # What tools look for in each array stands there, though it is of all.
+        assert {"INHERIT", "EXPTIME", "FILTER", "MJD-OBS", "DATASEC", "CCDSEC", "DETSEC"} <= set(own)
+        assert ("GAIN" in {key for key, *_ in before.cards}) == (number != 1 or channel == "VIS")
+    heads = read.version(whole, "exposure_files").file(head_files.beside(row["path"])).read_text().split("END\n")
+    for head, unit in zip(heads[:-1], found, strict=True):
+        own = {key: value for key, value, _ in unit.cards}
+        assert fits.Header.fromstring(head, sep="\n")["CRPIX1"] == own["CRPIX1"]
     with fits.open(path, checksum=True) as units:
         units.verify("exception")
         assert len(units) == 1 + 2 * len(arrays)

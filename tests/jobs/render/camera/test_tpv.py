@@ -14,6 +14,7 @@ from jobs.render.camera.astrometry import sky_of_pixel, wcs
 from jobs.render.camera.detectors import detectors
 from jobs.render.camera.pointing import boresight_for
 from jobs.request import schema
+from jobs.request.from_toml import from_table
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 
@@ -85,3 +86,6 @@ def test_too_high_an_order_is_refused():
 
 def test_a_request_may_ask_for_it():
     assert schema.CONVENTIONS == tpv.CONVENTIONS
+    table = {"name": "x", "seed": 1, "area": {"cone": {"ra": 53.1, "dec": -27.8, "radius": 1.0}}}
+    asked = [from_table({**table, "products": products}).wcs for products in ({}, {"wcs": "sip"}, {"wcs": "tpv"})]
+    assert asked == [None, "sip", "tpv"]

@@ -8,7 +8,7 @@ from astropy.io import fits as astropy_fits
 from astropy.wcs import WCS
 
 from jobs import accuracy
-from jobs.render.camera import astrometry, detectors
+from jobs.render.camera import astrometry, detectors, observatories
 from jobs.render.effects.readout import charge_transfer
 from jobs.render.effects.scene import Scene
 from jobs.render.products import fits_files, head_files, headers, read_back
@@ -87,12 +87,15 @@ def test_images_without_a_place_have_nothing_beside(rendered):
     assert head_files.text([images.Image(None, astrometry.cards(rendered.wcs)), cube]) == ""
 
 
-@pytest.mark.parametrize(("channel", "usual"), [("VIS", "RA---TAN-SIP"), ("EXT", "RA---TAN")])
-def test_usually_the_distortion_is_as_the_pipeline_reads_it(channel, usual, tmp_path):
-    rows, writers = fits_files.products(render(channel), ())
-    (path,) = rows["path"].to_pylist()
-    writers[path](tmp_path / "one.fits")
-    assert astropy_fits.getheader(tmp_path / "one.fits")["CTYPE1"] == usual
+@pytest.mark.parametrize("convention", ["sip", "tpv"])
+def test_usually_the_distortion_is_as_the_pipeline_reads_it(rendered, monkeypatch, convention, tmp_path):
+    known = observatories.of("vis")
+    assert known.convention == "sip"
+    monkeypatch.setitem(observatories._KNOWN, "vis", replace(known, convention=convention))
+    rows, writers = fits_files.products(rendered, ())
+    writers[rows["path"][0].as_py()](tmp_path / "one.fits")
+    for number in range(5):
+        assert astropy_fits.getheader(tmp_path / "one.fits", number)["CTYPE1"].endswith(convention.upper())
 
 
 def test_headers_may_tell_the_distortion_as_tpv(rendered, tmp_path):
