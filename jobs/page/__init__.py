@@ -4,7 +4,7 @@ gate        who may ask
 opened      a lake as it is shown, and the processes that answer
 server      which address is answered by what
 answers, charts, sky_maps, pictures, sources, runs, downloads       what the page asks
-tap, queries, tap_tables, descriptions                              what other tools ask
+tap         what other tools ask
 
 The files of the page itself lie in static/: modules of JavaScript that the browser runs as they are.
 """

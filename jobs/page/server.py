@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from aiohttp import web
 
-from jobs.page import answers, downloads, sky_maps, tap
+from jobs.page import answers, downloads, sky_maps
 from jobs.page.gate import MOST_BODY, TAP, Gate, dress
 from jobs.page.opened import Busy, Closed, Lake
+from jobs.page.tap import service
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput, LakeError
 
@@ -36,7 +37,7 @@ class Server:
 
     def __init__(self, open_lake: Callable[[], Lake], gate: Gate) -> None:
         self._open, self.gate, self.lake = open_lake, gate, open_lake()
-        self.tap = tap.Service(gate)
+        self.tap = service.Service(gate)
         self._opening, self._shown = asyncio.Lock(), asyncio.Event()
 
     def application(self) -> web.Application:
@@ -108,7 +109,8 @@ class Server:
 
 def _load() -> None:
     """What answers, before it is asked."""
-    from jobs.page import charts, images, pictures, runs, sources  # noqa: F401
+    from jobs.page import charts, pictures, runs, sources  # noqa: F401
+    from jobs.page.tap import images  # noqa: F401
 
 
 @web.middleware

@@ -17,7 +17,7 @@ import pytest
 
 from jobs.explore.process import Process
 from jobs.page.opened import Closed, Lane
-from jobs.page.queries import Jobs
+from jobs.page.tap.queries import Jobs
 from lake_schema.store import layout, publish
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.stars import STARS

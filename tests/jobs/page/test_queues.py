@@ -12,9 +12,10 @@ from urllib.parse import quote
 import pytest
 
 from jobs.explore.process import Process
-from jobs.page import downloads, pictures, queries, sky_maps
+from jobs.page import downloads, pictures, sky_maps
 from jobs.page.opened import MOST_IN_LINE, MOST_WAITING, PIXEL_THREADS, Busy, Closed, Lane, Pool
-from jobs.page.queries import AT_ONCE, Jobs
+from jobs.page.tap import queries
+from jobs.page.tap.queries import AT_ONCE, Jobs
 
 
 def test_a_pool_refuses_beyond_its_bound_and_takes_others_when_done():

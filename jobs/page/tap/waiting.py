@@ -13,9 +13,10 @@ from datetime import UTC, datetime
 from aiohttp import web
 
 from jobs.explore import votables
-from jobs.page import descriptions, downloads
+from jobs.page import downloads
 from jobs.page.opened import pieces
-from jobs.page.queries import KEPT, Job, Jobs
+from jobs.page.tap import descriptions
+from jobs.page.tap.queries import KEPT, Job, Jobs
 from lake_schema.errors import BadInput
 
 _XML, _TEXT = "text/xml", "text/plain"

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime
 from xml.sax.saxutils import escape, quoteattr
 
-from jobs.page.tap_tables import KEYS, SCHEMAS, Listed, columns_of
+from jobs.page.tap.tables import KEYS, SCHEMAS, Listed, columns_of
 
 FORMATS = {
     "application/x-votable+xml": ("votable", "vot"),

@@ -19,12 +19,13 @@ import pyarrow as pa
 from aiohttp import web
 
 from jobs.explore import adql, results, votables
-from jobs.page import descriptions, downloads, tap_jobs
+from jobs.page import downloads
 from jobs.page.answers import is_catalogue
 from jobs.page.gate import Gate
 from jobs.page.opened import Busy, Lake, Lane, pieces
-from jobs.page.queries import AT_ONCE, Jobs
-from jobs.page.tap_tables import listed, written
+from jobs.page.tap import descriptions, waiting
+from jobs.page.tap.queries import AT_ONCE, Jobs
+from jobs.page.tap.tables import listed, written
 from lake_schema.errors import BadInput, LakeError
 
 MOST_ROWS, USUAL_ROWS = 20_000_000, 1_000_000
@@ -76,7 +77,7 @@ class Service:
         router.add_get(f"{path}/capabilities", self._told(self._capabilities))
         router.add_get(f"{path}/tables", self._told(self._tables))
         router.add_get(f"{path}/file/{{key}}/{{number}}", self._told(self._image))
-        tap_jobs.Routes(self.jobs, self.address, self.check, lambda: self._lake().timeout).add(router, path, self._told)
+        waiting.Routes(self.jobs, self.address, self.check, lambda: self._lake().timeout).add(router, path, self._told)
 
     async def close(self) -> None:
         """End jobs and processes."""
@@ -132,7 +133,7 @@ class Service:
             if self._served is None or self._served.lake is not lake:
                 if self._served is not None:
                     self._served.close()
-                from jobs.page import images
+                from jobs.page.tap import images
 
                 folder = tempfile.TemporaryDirectory(prefix="truesky-")
                 address = f"http://{self._gate.hosts[0]}:{self._gate.port}/tap/{self._gate.tap_token}"
@@ -161,7 +162,7 @@ class Service:
         return told
 
     async def _sync(self, request: web.Request) -> web.StreamResponse:
-        parameters = await tap_jobs.parameters(request)
+        parameters = await waiting.parameters(request)
         async with self.answered(parameters, self._lake().timeout, is_patient=False) as (kind, data):
             return await downloads.sent(request, data, kind, None)
 
@@ -177,7 +178,8 @@ class Service:
 
     async def _image(self, request: web.Request) -> web.StreamResponse:
         """A FITS file of the products, by its number in the lake of a key."""
-        from jobs.page import images, pictures
+        from jobs.page import pictures
+        from jobs.page.tap import images
 
         lake, number = self._lake(), request.match_info["number"]
         if request.match_info["key"] != lake.key or not (number.isascii() and number.isdigit() and len(number) < 10):

@@ -9,7 +9,7 @@ import numpy as np
 
 from jobs.page.opened import Lake
 from jobs.page.pictures import pictures
-from jobs.page.tap_tables import image_row
+from jobs.page.tap.tables import image_row
 from lake_schema import sky
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
