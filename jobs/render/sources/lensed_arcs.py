@@ -24,7 +24,8 @@ class Picture:
     """What is drawn as it is, or on top of a disc.
 
     image  : float32[ny, nx] of sum 1, its place in the middle; of sum 0 where it is a disc's structure
-    matrix : float64[2, 2] arcsec to the west and to the north (rows) of a step along its rows and columns (columns)
+    matrix : float64[2, 2] arcsec to the west and to the north (rows) of a step to its next column and to its next row
+             (columns)
     thick  : float64[2] of a disc's structure: galaxy_shapes.Forms' for arcsec, by which it is as thick as its disc
     """
 
@@ -46,13 +47,11 @@ class Picture:
 
     @property
     def half_light(self) -> float:
-        """Radius about its middle that holds half of its light, arcsec, to half a pixel; 0 of a disc's structure."""
-        if self.is_structure:
-            return 0.0
+        """Radius about its middle that holds half of its light, arcsec, to half a pixel."""
         (a, b), (c, d) = self.matrix
         step = 0.5 * float(abs(a * d - b * c)) ** 0.5
         up, across = (np.arange(n) - (n - 1) / 2 for n in self.image.shape)
-        west, north = (line[0] * up[:, None] + line[1] * across for line in self.matrix)
+        west, north = (line[0] * across + line[1] * up[:, None] for line in self.matrix)
         light = np.bincount((np.hypot(west, north) / step).astype(int).ravel(), self.image.ravel()).cumsum()
         return float((np.searchsorted(light, 0.5 * light[-1]) + 0.5) * step)
 
