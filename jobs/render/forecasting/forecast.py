@@ -12,8 +12,8 @@ from typing import Any
 
 import pyarrow as pa
 
+from jobs.render.channels import registry
 from jobs.render.forecasting.speed import Speed
-from jobs.render.planning import unrendered
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ def _line(row: dict[str, Any], factor: float) -> Line:
         row["seconds_sum"] * factor / 3600.0,
         row["bytes_sum"] / 1e9,
         row["memory_max"],
-        unrendered.of_channel(row["channel"]).cost.assumed,
+        registry.CHANNELS[row["channel"]].cost.assumed,
     )
 
 

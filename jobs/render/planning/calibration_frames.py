@@ -14,8 +14,8 @@ from jobs import rng
 from jobs.fluxes import passbands
 from jobs.render.camera import pointing
 from jobs.render.camera.lamps import LAMPS
+from jobs.render.channels import registry
 from jobs.render.effects.light import calibration_lamp
-from jobs.render.planning import unrendered
 from jobs.render.planning.observing_sequence import FILTERS, RED, SETTINGS, offsets
 from jobs.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time, through_grism
 from jobs.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
@@ -42,7 +42,7 @@ def exposures(
     centre : ra, dec deg of the block's own field or of the request's area
     block  : of the request;  mission : the mission database;  seed : of the request;  start : MJD
     """
-    own = [unrendered.of_channel(channel) for channel in block.channels]
+    own = [registry.CHANNELS[channel] for channel in block.channels]
     if any(not channel.on_ground and block.image_type in channel.sky_types for channel in own):
         if block.mjd is None:
             start = next_allowed(*centre, start, mission)

@@ -19,9 +19,8 @@ import pyarrow as pa
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import detectors, grism_wheel, traces
-from jobs.render.channels import image_types
+from jobs.render.channels import image_types, registry
 from jobs.render.effects.charge import ramp
-from jobs.render.planning import unrendered
 from jobs.render.sky.diffuse_light import SkyBand, sky_rate
 from jobs.request.observations import Observation
 from lake_schema import units
@@ -75,7 +74,7 @@ class Exposure:
 
 def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
     """Passbands that a camera has; BadInput where the channel has no such camera."""
-    found = unrendered.of_channel(channel).bands(camera, mission)
+    found = registry.CHANNELS[channel].bands(camera, mission)
     if not found:
         raise BadInput(f"channel {channel} has no camera {camera!r}")
     return found
@@ -189,7 +188,7 @@ class _Band:
         prefix = image_types.section(camera)
         seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec") if camera in CAMERAS else 0.0
         first = detectors.detectors(camera, mission)[0]
-        sky = unrendered.of_channel(exposure.channel).sky(first, band, mission, curve)
+        sky = registry.CHANNELS[exposure.channel].sky(first, band, mission, curve)
         return cls(zero_point_of(prefix, band, mission, curve), seeing, sky)
 
 

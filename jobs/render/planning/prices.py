@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jobs.accuracy import SURVEY, Accuracy
+from jobs.render.channels import registry
 from jobs.render.drawing import settings
 from jobs.render.effects.effect import Effect
 from jobs.render.exposure import truth_maps
-from jobs.render.planning import unrendered
 
 # A FITS header and its padding, one an image; s a byte of a truth map, to write and hash it.
 _HEADER_BYTES, _MAP_S = 8640, 2.5e-9
@@ -67,7 +67,7 @@ def price(
     channel : its name;  accuracy : of the request
     Error   : 30 % where the sources are as those that it was measured with
     """
-    own, applied = unrendered.of_channel(channel).cost, effects or ()
+    own, applied = registry.CHANNELS[channel].cost, effects or ()
     maps = truth_maps.made(truth, None if effects is None else [e.name for e in effects], looks)
     tier = settings.seconds_for(accuracy) / settings.seconds_for(SURVEY)
     mapped = sum(truth_maps.BYTES[name] for name in maps)

@@ -16,8 +16,9 @@ import numpy as np
 
 from jobs.render.camera import detectors
 from jobs.render.camera.pointing import boresight_for
+from jobs.render.channels import registry
 from jobs.render.channels.image_types import SKY_TYPES
-from jobs.render.planning import calibration_frames, ground_surveys, reference_survey, unrendered, variants
+from jobs.render.planning import calibration_frames, ground_surveys, reference_survey, variants
 from jobs.render.planning.observing_sequence import sequence
 from jobs.render.planning.planned_exposures import (
     Exposure,
@@ -106,7 +107,7 @@ def _pointing(pointing: Pointing, where: str, request: Request, mission: Mission
         known_detectors(pointing.camera, (pointing.centre_on,), mission, f"{where}.centre_on")
         target = detectors.detector(pointing.camera, pointing.centre_on, mission)
         ra, dec, angle = boresight_for(target, ra, dec, angle)
-    if not unrendered.of_channel(pointing.channel).on_ground:
+    if not registry.CHANNELS[pointing.channel].on_ground:
         check_aspect(ra, dec, pointing.mjd, mission, where)
     seconds = pointing.exposure_time_s
     if seconds is None:
@@ -155,7 +156,7 @@ def _block(
         for exposure in found:
             known_detectors(exposure.camera, exposure.detectors, mission, "detectors")
             check_ramp(exposure.channel, exposure.camera, exposure.exposure_time_s, mission)
-            own = unrendered.of_channel(exposure.channel)
+            own = registry.CHANNELS[exposure.channel]
             if not own.on_ground and block.pointings and exposure.image_type in SKY_TYPES:
                 check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
             yield exposure

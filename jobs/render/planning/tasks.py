@@ -20,7 +20,7 @@ from jobs.render.camera import pointing
 from jobs.render.channels import registry
 from jobs.render.exposure import scene_of
 from jobs.render.exposure.records import Variant
-from jobs.render.planning import unrendered, variants
+from jobs.render.planning import variants
 from jobs.render.planning.prices import Price, price
 from jobs.render.planning.source_counts import Densities
 from jobs.request.schema import Request
@@ -110,7 +110,7 @@ class _Camera:
         self.detectors = camera_detectors.detectors(camera, mission)
         self.index = {detector.name: i for i, detector in enumerate(self.detectors)}
         self.x, self.y = pointing.outline(self.detectors)
-        self.margin = unrendered.of_channel(channel).margin(self.detectors[0].section, mission)
+        self.margin = registry.CHANNELS[channel].margin(self.detectors[0].section, mission)
         # On the tangent plane, where a detector that the optics distort is larger than it is.
         corner = np.hypot(self.x[:, 1:] - self.x[:, :1], self.y[:, 1:] - self.y[:, :1]).max(axis=1)
         reach = np.array([max(d.half_diagonal, c) for d, c in zip(self.detectors, corner, strict=True)])
@@ -139,7 +139,7 @@ def _append(
     places: _Places,
     cost: Price,
 ) -> None:
-    looks = row.image_type in unrendered.of_channel(row.channel).sky_types
+    looks = row.image_type in registry.CHANNELS[row.channel].sky_types
     for i in [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors)):
         galaxies, stars = (places.density[:, i] * (camera.area[i] * looks)).tolist()
         pixels = int(camera.pixels[i])
@@ -163,7 +163,7 @@ def _price(row: ExposureRow, own: Variant, truth: Sequence[str], files: str) -> 
     Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
     """
     channel, kind = row.channel, row.image_type
-    looks, effects = kind in unrendered.of_channel(channel).sky_types, registry.effects_or_none(channel, kind)
+    looks, effects = kind in registry.CHANNELS[channel].sky_types, registry.effects_or_none(channel, kind)
     if effects is not None:
         first = camera_detectors.detectors(row.camera, own.mission)[0]
         scene = replace(scene_of.scene_of(row, first, own.mission, own.accuracy), forced=own.forced)

@@ -10,7 +10,7 @@ from jobs.render import plan_exposures
 from jobs.render.channels import image_types, registry
 from jobs.render.exposure import truth_maps
 from jobs.render.forecasting import forecast, speed
-from jobs.render.planning import prices, unrendered
+from jobs.render.planning import prices
 from lake_schema.tables.exposures import CHANNELS
 from tests.jobs.render.planning.test_survey import VIS, planned
 
@@ -117,14 +117,13 @@ def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
 
 @pytest.mark.parametrize("channel", registry.CHANNELS)
 def test_every_channel_has_measured_costs(channel):
-    cost = unrendered.of_channel(channel).cost
+    cost = registry.CHANNELS[channel].cost
     assert not cost.assumed
     assert min(getattr(cost, name) for name in cost.__slots__ if name != "assumed") > 0.0
 
 
 def test_every_channel_can_be_planned():
-    """By itself where it is rendered, else by what is assumed of it, and never by both."""
-    assert sorted([*registry.CHANNELS, *unrendered.UNRENDERED]) == sorted(dict(CHANNELS))
+    assert sorted(registry.CHANNELS) == sorted(dict(CHANNELS))
     for name in dict(CHANNELS):
-        assert set(image_types.SKY_TYPES) <= set(unrendered.of_channel(name).sky_types)
-    assert [name for name in dict(CHANNELS) if "flat" in unrendered.of_channel(name).sky_types] == ["VIS"]
+        assert set(image_types.SKY_TYPES) <= set(registry.CHANNELS[name].sky_types)
+    assert [name for name in dict(CHANNELS) if "flat" in registry.CHANNELS[name].sky_types] == ["VIS"]
