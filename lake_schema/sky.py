@@ -8,6 +8,7 @@ cells_in_polygon    cells that a spherical polygon touches
 cells_in_box        cells between two meridians and two parallels
 random_in_cell      uniform positions inside one cell, sorted
 displaced           moved along great circles
+unit_vectors        sky -> directions in space
 """
 
 from __future__ import annotations
@@ -94,6 +95,8 @@ def cell_centres(order: int, cells: npt.ArrayLike) -> tuple[Float, Float]:
 
 def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
     """Corners of cells, [n, 4, 2] ra, dec deg, in order around each: north, west, south, east.
+
+    Written out, so that a page of the sky does not wait for the import of healpy.
 
     Ref: Gorski et al. 2005, ApJ 622, 759, eqs. 4-9 and 17-22
     """
@@ -264,19 +267,27 @@ def positions(index: npt.ArrayLike) -> tuple[Float, Float]:
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
+def unit_vectors(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Float:
+    """[..., 3] unit vectors towards places; ra, dec [...] deg, of one shape."""
+    return np.moveaxis(_towards(np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))), 0, -1)
+
+
+def _towards(lon: Float, lat: Float) -> Float:
+    """[3, ...] of [...] rad."""
+    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+
+
 def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     """ICRS ra, dec [n] deg -> Galactic l, b [n] deg (matrix of the Hipparcos catalogue, ESA 1997, eq. 1.5.11)."""
     ra_rad, dec_rad = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
-    vector = np.stack([np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)])
-    x, y, z = _turned(TO_GALACTIC, vector)
+    x, y, z = _turned(TO_GALACTIC, _towards(ra_rad, dec_rad))
     return wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
 def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
     """Galactic l, b [n] deg -> ICRS ra, dec [n] deg; the inverse of `galactic`."""
     l_rad, b_rad = np.radians(np.asarray(lon, float)), np.radians(np.asarray(lat, float))
-    vector = np.stack([np.cos(b_rad) * np.cos(l_rad), np.cos(b_rad) * np.sin(l_rad), np.sin(b_rad)])
-    x, y, z = _turned(TO_GALACTIC.T, vector)
+    x, y, z = _turned(TO_GALACTIC.T, _towards(l_rad, b_rad))
     return wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
@@ -304,7 +315,8 @@ def border_cells(order: int, cell: int, fine: int) -> Int:
     side = 1 << (fine - order)
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     rim = (x == 0) | (y == 0) | (x == side - 1) | (y == side - 1)
-    return np.sort((np.int64(cell) << (2 * (fine - order))) + _interleave(x[rim]) + 2 * _interleave(y[rim]))
+    within = _hp().xyf2pix(side, x[rim], y[rim], 0, nest=True)
+    return np.sort((np.int64(cell) << (2 * (fine - order))) + within)
 
 
 def margin_cells(order: int, cell: int, fine: int) -> Int:
@@ -313,10 +325,3 @@ def margin_cells(order: int, cell: int, fine: int) -> Int:
     around = np.unique(around[around >= 0]).astype(np.int64)
     outside: Int = around[parent(around, fine, order) != cell]
     return outside
-
-
-def _interleave(values: Int) -> Int:
-    spread = np.zeros_like(values, np.int64)
-    for bit in range(DEEPEST):
-        spread |= ((values >> bit) & 1) << (2 * bit)
-    return spread

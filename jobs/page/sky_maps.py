@@ -143,7 +143,7 @@ async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
 
 def _shown(version: read.Version) -> str:
     """Which positions are shown: the observed ones, of a table that has them."""
-    return "true" if places.goes_by_true(version) and "ra_lensed" not in version.schema.names else "observed"
+    return "true" if places.is_indexed_by_true(version) and "ra_lensed" not in version.schema.names else "observed"
 
 
 async def _asked(lake: Lake, text: str, *expressions: str) -> pa.Table:
@@ -260,8 +260,7 @@ def _is_near(corners: Float, view: Float) -> bool:
 
 def _middle(corners: Float) -> tuple[float, float]:
     """ra, dec of the mean of unit vectors, deg."""
-    lon, lat = np.radians(corners).T
-    x, y, z = (np.cos(lat) * np.cos(lon)).mean(), (np.cos(lat) * np.sin(lon)).mean(), np.sin(lat).mean()
+    x, y, z = sky.unit_vectors(corners[:, 0], corners[:, 1]).mean(0)
     return float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 

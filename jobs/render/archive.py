@@ -29,7 +29,6 @@ from pyarrow import feather
 
 from jobs import sums
 from jobs.explore.process import Process
-from jobs.render.camera import pointing
 from jobs.render.products import run_log
 from lake_schema import command, sky, user_files
 from lake_schema.errors import BadInput
@@ -97,9 +96,8 @@ def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
     if not rows.num_rows:
         return rows
     corners = np.array([region.split()[2:] for region in rows["s_region"].to_pylist()], float).reshape(-1, 4, 2)
-    lon, lat = np.radians(corners[..., 0]), np.radians(corners[..., 1])
-    edges = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
-    place = pointing.basis(ra, dec)[2]
+    edges = sky.unit_vectors(corners[..., 0], corners[..., 1])
+    place = sky.unit_vectors(ra, dec)
     # A place is inside where it is on one side of the great circles through all edges, and not at the antipode.
     side = sums.product(np.cross(edges, np.roll(edges, -1, axis=1)), place)
     inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)

@@ -91,8 +91,7 @@ class Area:
         corners = np.array([patch[:2] for patch in self.patches] or self.vertices or _corners_of(self.box))
         if not corners.size:
             return self.ra, self.dec, self.radius
-        lon, lat = np.radians(corners[:, 0]), np.radians(corners[:, 1])
-        x, y, z = np.sum([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+        x, y, z = sky.unit_vectors(corners[:, 0], corners[:, 1]).sum(0)
         ra, dec = float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
         reach = sky.separation(corners[:, 0], corners[:, 1], ra, dec)
         return ra, dec, min(float((reach + np.array([p[2] for p in self.patches] or [0.0])).max()) * 1.05, 180.0)
@@ -107,8 +106,7 @@ def _corners_of(box: tuple[float, float, float, float] | None) -> list[tuple[flo
 
 
 def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Float) -> Float:
-    lon, lat = np.radians(np.array(vertices)).T
-    corners = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+    corners = sky.unit_vectors(*np.array(vertices).T)
     sides = np.cross(corners, np.roll(corners, -1, 0))
     sides /= np.sqrt(np.sum(sides**2, axis=1, keepdims=True))
     # Vertices may run either way round.

@@ -237,9 +237,7 @@ def _delta(one: Tracers | Float, order: int, cell: int) -> tuple[Float, float]:
 
 
 def _vectors(order: int, cell: int) -> Float:
-    ra, dec = sky.cell_centres(order + DEPTH, (cell << 2 * DEPTH) + np.arange(1 << 2 * DEPTH))
-    lon, lat = np.radians(ra), np.radians(dec)
-    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], 1)
+    return sky.unit_vectors(*sky.cell_centres(order + DEPTH, (cell << 2 * DEPTH) + np.arange(1 << 2 * DEPTH)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -70,8 +70,7 @@ def figures(universe: Population, count: int) -> dict[str, float]:
 
 def _pairs(ra: Float, dec: Float, theta: Float) -> Float:
     """Ordered pairs in each bin of separation, edges theta in rad."""
-    lon, lat = np.radians(ra), np.radians(dec)
-    tree = cKDTree(np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], 1))
+    tree = cKDTree(sky.unit_vectors(ra, dec))
     return np.asarray(np.diff(tree.count_neighbors(tree, 2.0 * np.sin(0.5 * theta))), float)
 
 

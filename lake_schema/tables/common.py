@@ -47,3 +47,9 @@ class Origin:
 def id_of_kinds(first: int, last: int) -> Column:
     """The column `id` of a table that holds these kinds only, so that no two tables can share an identifier."""
     return replace(ID, lo=first << 60, hi=(last + 1 << 60) - 1)
+
+
+def density_boost_of(what: str) -> Column:
+    """The column `density_boost` of a table; `what` was drawn."""
+    doc = f"how many times denser than in nature {what} drawn; weight by its inverse"
+    return Column("density_boost", "float32", ucd="stat.weight", doc=doc, lo=1e-3, hi=1e6)

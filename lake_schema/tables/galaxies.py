@@ -26,6 +26,7 @@ from lake_schema.tables.common import (
     TRUE_DEC,
     TRUE_RA,
     Origin,
+    density_boost_of,
     id_of_kinds,
 )
 
@@ -78,14 +79,7 @@ _IDENTITY = (
 _REST = (
     # 3 kind
     Column("kind", "int8", ucd="src.class", doc="kind of source", codes=KINDS[:5], lo=0, hi=4),
-    Column(
-        "density_boost",
-        "float32",
-        ucd="stat.weight",
-        doc="how many times denser than in nature this kind was drawn; weight by its inverse",
-        lo=1e-3,
-        hi=1e6,
-    ),
+    density_boost_of("this kind was"),
     # 4 redshift
     Column("z_true", "float32", "", "src.redshift", "cosmological redshift", 0.0, 15.0),
     Column("z_obs", "float32", "", "src.redshift", "observed redshift, with the peculiar velocity", -0.02, 15.0),

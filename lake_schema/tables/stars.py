@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lake_schema.columns import Column, Table
-from lake_schema.tables.common import DEC, HEALPIX_29, RA, id_of_kinds
+from lake_schema.tables.common import DEC, HEALPIX_29, RA, density_boost_of, id_of_kinds
 
 COMPONENTS = (
     (0, "thin disc"),
@@ -66,14 +66,7 @@ STARS = Table(
             0.0,
             40.0,
         ),
-        Column(
-            "density_boost",
-            "float32",
-            ucd="stat.weight",
-            doc="how many times denser than in nature this population was drawn; weight by its inverse",
-            lo=1e-3,
-            hi=1e6,
-        ),
+        density_boost_of("this population was"),
         Column("stage", "int8", "", "src.class", "stage of evolution", 0, 4, nullable=True, codes=STAGES, since=2),
         *(column for k in (2, 3, 4) for column in _mixed(k)),
         Column("mass", "float32", "solMass", "phys.mass", "mass at birth", 0.0, 200.0, True, since=3),

@@ -3,7 +3,18 @@
 from __future__ import annotations
 
 from lake_schema.columns import Column, Table
-from lake_schema.tables.common import DEC, HEALPIX_29, LENSED, RA, SEEN_DEC, SEEN_RA, TRUE_DEC, TRUE_RA, id_of_kinds
+from lake_schema.tables.common import (
+    DEC,
+    HEALPIX_29,
+    LENSED,
+    RA,
+    SEEN_DEC,
+    SEEN_RA,
+    TRUE_DEC,
+    TRUE_RA,
+    density_boost_of,
+    id_of_kinds,
+)
 
 _REST = (
     Column("kind", "int8", ucd="src.class", doc="kind of source", codes=((4, "strong lens"),), lo=4, hi=4),
@@ -15,14 +26,7 @@ _REST = (
         doc="the galaxy of table galaxies whose spectrum, brightness and shape the lensed one has",
         lo=0,
     ),
-    Column(
-        "density_boost",
-        "float32",
-        ucd="stat.weight",
-        doc="how many times denser than in nature strong lenses were drawn; weight by its inverse",
-        lo=1e-3,
-        hi=1e6,
-    ),
+    density_boost_of("strong lenses were"),
     Column("z_lens", "float32", "", "src.redshift", "redshift of the lens", 0.0, 15.0),
     Column("z_source", "float32", "", "src.redshift", "redshift of the source", 0.0, 15.0),
     Column("velocity_dispersion", "float32", "km/s", "phys.veloc.dispersion", "of the lens", 10.0, 1000.0),

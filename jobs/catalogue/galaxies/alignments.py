@@ -76,7 +76,7 @@ def tide(own: Alignments, ra: Float, dec: Float, chi: Float) -> Complex:
     """
     lon, lat = np.radians(ra), np.radians(dec)
     none = np.zeros_like(lon)
-    direction = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], 1)
+    direction = sky.unit_vectors(ra, dec)
     east = np.stack([-np.sin(lon), np.cos(lon), none], 1)
     north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], 1)
     cell, _ = lightcone.box_cells(own.box, own.turned, direction, chi)

@@ -117,8 +117,7 @@ def _offsets(masses: Masses, times: float, log_mass: Float, z: Float, host: Int,
 
 
 def _moved(hosts: Halos, host: Int, offset: Float) -> tuple[Float, Float, Float]:
-    ra, dec = (np.radians(angle) for angle in sky.positions(hosts.index))
-    unit = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], 1)
+    unit = sky.unit_vectors(*sky.positions(hosts.index))
     x, y, z = ((unit * hosts.chi[:, None])[host] + offset).T
     flat = np.hypot(x, y)
     return sky.wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, flat)), np.hypot(flat, z)

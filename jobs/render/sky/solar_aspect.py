@@ -14,11 +14,11 @@ from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs import sums
 from jobs.render.camera import pointing
 from jobs.render.sky.diffuse_light import sun_longitude
+from lake_schema import sky
 from lake_schema.arrays import Float
 from lake_schema.ecliptic import equatorial
 from lake_schema.errors import BadInput
@@ -35,17 +35,17 @@ _FIRST_DAY = np.datetime64("1858-11-17")
 
 def sun_vector(mjd: float) -> Float:
     """Unit vector [3], ICRS, from the Earth to the Sun.  Error: 0.02 deg"""
-    return _vector(*equatorial(sun_longitude(mjd), 0.0))
+    return sky.unit_vectors(*equatorial(sun_longitude(mjd), 0.0))
 
 
 def solar_aspect(ra: float, dec: float, mjd: float) -> float:
     """Angle between a pointing and the Sun, deg."""
-    return float(np.degrees(np.arccos(np.clip(sums.product(_vector(ra, dec), sun_vector(mjd)), -1.0, 1.0))))
+    return float(np.degrees(np.arccos(np.clip(sums.product(sky.unit_vectors(ra, dec), sun_vector(mjd)), -1.0, 1.0))))
 
 
 def position_angle(ra: float, dec: float, mjd: float) -> float:
     """Of the focal plane's y axis, deg, north through east: across the direction of the Sun, z x p."""
-    p, s = _vector(ra, dec), sun_vector(mjd)
+    p, s = sky.unit_vectors(ra, dec), sun_vector(mjd)
     towards = s - sums.product(s, p) * p
     if sums.product(towards, towards) < 1e-12:
         raise BadInput(f"a pointing at ra {ra:g}, dec {dec:g} on MJD {mjd:g} looks along the Sun's direction")
@@ -75,7 +75,7 @@ def allowed(ra: float, dec: float, start: float, mission: MissionConfiguration) 
     """
     lowest, highest = limits(mission)
     days, suns = _suns(start)
-    aspect = np.degrees(np.arccos(np.clip(sums.product(suns, _vector(ra, dec)), -1.0, 1.0)))
+    aspect = np.degrees(np.arccos(np.clip(sums.product(suns, sky.unit_vectors(ra, dec)), -1.0, 1.0)))
     free = ((lowest - _TOLERANCE <= aspect) & (aspect <= highest + _TOLERANCE)).tolist()
     first = start if free[0] else None
     for before, after, was, is_ in zip(days[:-1], days[1:], free[:-1], free[1:], strict=True):
@@ -137,8 +137,3 @@ def _date(mjd: float, towards: str) -> str:
     """A date that lies within the stretch: the first rounded up, the last rounded down."""
     tenth = (np.ceil if towards == "up" else np.floor)(mjd * 10.0) / 10.0
     return f"{tenth:.1f} ({_FIRST_DAY + int(tenth)})"
-
-
-def _vector(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Float:
-    lon, lat = np.radians(ra), np.radians(dec)
-    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
