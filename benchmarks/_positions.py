@@ -15,6 +15,7 @@ import numpy as np
 from benchmarks import _errors as errors
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import NISP, VIS, Scene
+from jobs import cache
 from jobs.render.camera import detectors
 from jobs.render.psf import euclid, model, sub_bands
 from lake_schema.arrays import Float
@@ -165,7 +166,7 @@ def _nearest(middles: Float, place: tuple[float, float]) -> tuple[float, float]:
 
 def _cold(positions: int, scene: Scene) -> tuple[float, model.Planes]:
     """CPU s to compute the planes, and they."""
-    with scenes.empty_cache():
+    with cache.temporary():
         start = time.process_time()
         planes = scenes.psf_of(scene, positions).planes
         seconds = time.process_time() - start

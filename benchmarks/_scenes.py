@@ -6,10 +6,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,20 +99,6 @@ def colours(n: int, rng: np.random.Generator) -> Float:
     """Photons in each of the PSF's wavelengths, [n, PARTS]: power laws."""
     waves = np.linspace(-0.25, 0.25, sub_bands.PARTS)
     return np.asarray(np.exp(np.outer(rng.normal(0.5, 1.5, n), waves)))
-
-
-@contextmanager
-def empty_cache() -> Iterator[None]:
-    """What is cached is made anew, meanwhile."""
-    before = os.environ.get("TRUESKY_CACHE")
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["TRUESKY_CACHE"] = folder
-        try:
-            yield
-        finally:
-            del os.environ["TRUESKY_CACHE"]
-            if before is not None:
-                os.environ["TRUESKY_CACHE"] = before
 
 
 def _magnitudes(rng: np.random.Generator, bright: float, faint: float, slope: float, n: int) -> Float:

@@ -3,6 +3,7 @@
 A process compares a file with its checksum before it first maps it; what differs is made again, and said so.
 
 cache_dir        where they lie
+temporary        an empty one
 machine_code_dir where compiled functions lie
 content_key      the key: sha256 of everything that goes into the making
 cached_arrays    load, or make and load
@@ -19,7 +20,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -44,6 +45,20 @@ def cache_dir() -> Path:
     if home := os.environ.get("XDG_CACHE_HOME"):
         return user_files.expanded(home) / "truesky"
     return Path.home() / ".cache" / "truesky"
+
+
+@contextlib.contextmanager
+def temporary() -> Iterator[None]:
+    """An empty cache meanwhile, which is removed afterwards."""
+    before = os.environ.get("TRUESKY_CACHE")
+    with tempfile.TemporaryDirectory(prefix="truesky-") as folder:
+        os.environ["TRUESKY_CACHE"] = folder
+        try:
+            yield
+        finally:
+            del os.environ["TRUESKY_CACHE"]
+            if before is not None:
+                os.environ["TRUESKY_CACHE"] = before
 
 
 def machine_code_dir() -> Path:

@@ -2,7 +2,7 @@
 
 named           columns by the names that they have, whichever they were asked by;  aliases_in : a text that asks
 columns         ra and dec of the one or the other place
-goes_by_true    does a table lie in files by true positions, as earlier ones do?
+is_indexed_by_true    does a table lie in files by true positions, as earlier ones do?
 refuse_earlier  such a table, where another is to be made of it
 refuse_mixed    a table by observed positions beside one by true ones
 """
@@ -20,7 +20,7 @@ from lake_schema.errors import BadInput
 # "lensed" is an earlier name of the first.
 ON = ("observed", "true", "lensed")
 _JOBS = {"galaxies": "build_galaxies", "quarantine": "build_galaxies", "strong_lenses": "build_strong_lenses"}
-_BY_TRUE = "goes by true positions, as an older truesky wrote it"
+_BY_TRUE = "is indexed by true positions, as earlier versions of truesky wrote it"
 
 
 class Published(Protocol):
@@ -63,12 +63,12 @@ def columns(version: Published, there: Sequence[str], on: str = "observed") -> t
         return ("ra_true", "dec_true") if "ra_true" in there else ("ra", "dec")
     if "ra_lensed" in there:
         return "ra_lensed", "dec_lensed"
-    if goes_by_true(version):
+    if is_indexed_by_true(version):
         raise BadInput(f"table {version.table} {_BY_TRUE}, and has no observed ones: take those of table galaxies")
     return "ra", "dec"
 
 
-def goes_by_true(version: Published) -> bool:
+def is_indexed_by_true(version: Published) -> bool:
     """Are a catalogue's files, and its ra and dec, of true positions, although its sources are seen elsewhere?"""
     known = _known(version)
     return known is not None and int(version.manifest["version"]) <= known.version
@@ -81,17 +81,17 @@ def _known(version: Published) -> Table | None:
 
 
 def refuse_earlier(version: Published) -> None:
-    """Raise BadInput where a table goes by true positions: what is made of it now would go by observed ones."""
-    if goes_by_true(version):
+    """Raise BadInput where a table is indexed by true positions: what is made of it now would be by observed ones."""
+    if is_indexed_by_true(version):
         raise BadInput(f"table {version.table} {_BY_TRUE}: run {_job(version)} first")
 
 
 def refuse_mixed(versions: Iterable[Published]) -> None:
-    """Raise BadInput, which names both, where some tables go by true positions and others by observed ones."""
+    """Raise BadInput, which names both, where some tables are indexed by true positions and others by observed ones."""
     every = [version for version in versions if _known(version) is not None]
-    earlier = [version for version in every if goes_by_true(version)]
+    earlier = [version for version in every if is_indexed_by_true(version)]
     if earlier and len(earlier) < len(every):
-        now = next(version for version in every if not goes_by_true(version))
+        now = next(version for version in every if not is_indexed_by_true(version))
         what = f"table {earlier[0].table} {_BY_TRUE}, table {now.table} by observed ones"
         raise BadInput(f"{what}: run {_job(earlier[0])} first")
 

@@ -53,7 +53,7 @@ def export(lake: Path, folder: Path, form: str, request: str | None = None) -> l
     if form == "skycatalogs":
         return skycatalogs.write(lake, folder, request)
     version = read.version(lake, GALAXIES.name, request=request)
-    declared = GALAXIES.earlier if GALAXIES.earlier and places.goes_by_true(version) else GALAXIES
+    declared = GALAXIES.earlier if GALAXIES.earlier and places.is_indexed_by_true(version) else GALAXIES
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for part in version.parts:

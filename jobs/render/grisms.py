@@ -76,7 +76,7 @@ def of_exposure(
 
 
 def _asked(options: argparse.Namespace) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
-    """(name of a configuration, what it is of)."""
+    """(name of a configuration, its aim, mission values and seed)."""
     if options.lake:
         for name, aim, mission, seed in of_exposure(layout.lake(options.lake), options.exposure, options.name):
             if not options.detectors or name in options.detectors:

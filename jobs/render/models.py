@@ -5,8 +5,8 @@
 
 Each source is drawn as it was in the image, by itself.  The file has an extension a source, SRC_ID, cut to the pixels
 that have light; its first pixel is at (X0, Y0) of the detector, 0-based.  With --orders it has one for each order.
-The sum of all sources is the image's truth map `noise_free`, to the rounding of the 32 bits that files have, 1e-7; what
-`models` gives adds up to it to the last bit.
+The sum of all sources is the image's truth map `noise_free` to the rounding of float32 in files, 1e-7; the float64
+frames of `models` add up exactly to the float64 noise-free frame.
 
 models    of an image of a lake
 frame     an extension as a whole frame

@@ -128,7 +128,7 @@ def skipping_rms(box: Box, redshift: float, step: float) -> float:
     return float(kappa.std())
 
 
-def map_rms(nside: int, chi: float, l_max: int) -> float:
+def map_rms(chi: float, l_max: int) -> float:
     """rms that linear theory gives a map to that multipole."""
     ell = np.arange(2, l_max + 1)
     nodes = np.unique(np.geomspace(2, l_max, 80).astype(int))
@@ -147,7 +147,7 @@ def maps(planes: Planes, number: int, name: str) -> dict[str, float]:
     return {
         f"kappa_mean_{name}_in_errors": float(patches.mean() / (patches.std(ddof=1) / np.sqrt(patches.size))),
         f"kappa_rms_{name}": float(kappa.std()),
-        f"kappa_rms_{name}_to_theory": float(kappa.std() / map_rms(planes.nside, chi, l_max)),
+        f"kappa_rms_{name}_to_theory": float(kappa.std() / map_rms(chi, l_max)),
         f"gamma_rms_{name}": float(np.std(gamma[0])),
         f"b_modes_{name}": float(np.sum(np.abs(b_mode) ** 2) / np.sum(np.abs(e_mode) ** 2)),
         f"deflection_rms_arcmin_{name}": float(60 * np.degrees(np.sqrt(np.mean(bend**2)))),

@@ -7,17 +7,16 @@ theory in several boxes, the stars with published counts.
 
 from __future__ import annotations
 
-import os
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jobs import cache
 from jobs.catalogue import dust_map
 from jobs.catalogue.galaxies import band_ratios, galaxies, lensing
 from jobs.catalogue.halos import luminosity_function, matching
@@ -157,23 +156,6 @@ def compared(
     return found.theta, found.w + expected - left, found.error, expected
 
 
-@contextmanager
-def own_cache(seed: int) -> Iterator[None]:
-    """The boxes of other seeds are not kept."""
-    if seed == SEED:
-        yield
-        return
-    before = os.environ.get("TRUESKY_CACHE")
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["TRUESKY_CACHE"] = folder
-        try:
-            yield
-        finally:
-            os.environ.pop("TRUESKY_CACHE")
-            if before is not None:
-                os.environ["TRUESKY_CACHE"] = before
-
-
 def clustered(size: Size) -> tuple[dict[str, float], dict[str, Any], clustering.Tracers]:
     """w(theta) of halos and of galaxies over Limber's, all boxes together; the curves; the halos of the first box."""
     many, seeds = 12 << 2 * clustering.BLOCK_ORDER, (SEED, *size.boxes)
@@ -181,7 +163,8 @@ def clustered(size: Size) -> tuple[dict[str, float], dict[str, Any], clustering.
     whole, pieces, curves = [], [], {}
     figures: dict[str, float] = {}
     for seed in seeds:
-        with own_cache(seed):
+        # The boxes of other seeds are not kept.
+        with nullcontext() if seed == SEED else cache.temporary():
             universe = clustering.population_above(seed, size.settings.box_cells, NEAR, FAR, LOG_MASS)
             for cell in cells:
                 one = clustering.tracers(universe, clustering.BLOCK_ORDER, cell)

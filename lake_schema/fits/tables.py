@@ -160,7 +160,7 @@ class _Looked:
         if not (self.is_missing and self.kind.kind == "i" and not self.is_list):
             return None
         if self.lowest.all():
-            raise BadInput(f"column {self.column.name}: no number is left for what is missing; make it ::DOUBLE")
+            raise BadInput(f"column {self.column.name}: no integer is left to stand for null; cast it to DOUBLE")
         return int(np.iinfo(self.kind).min) + int(np.argmin(self.lowest))
 
     def look(self, values: pa.Array) -> None:
@@ -239,7 +239,8 @@ def _records(batch: pa.RecordBatch, looked: list[_Looked], record: np.dtype[Any]
             try:
                 out[name] = [(value or "").encode("ascii") for value in values.to_pylist()]
             except UnicodeEncodeError as error:
-                raise BadInput(f"column {one.column.name}: FITS has no letter {error.object[error.start]!r}") from None
+                letter = error.object[error.start]
+                raise BadInput(f"column {one.column.name}: FITS cannot hold the character {letter!r}") from None
         elif one.column.type == "bool":
             texts = pc.if_else(values, ord("T"), ord("F")).cast(pa.uint8())
             out[name] = texts.fill_null(0).to_numpy(zero_copy_only=False)

@@ -33,8 +33,8 @@ PASSBANDS = Table(
             "float64",
             "mag",
             "phot.mag;arith.diff",
-            "AB magnitude of Vega through this response, m_AB - m_Vega of any source. AB is 0 at 3631 Jy in every "
-            "band, Vega's magnitude at 3631 Jy x 10^(-0.4 ab_minus_vega). Its spectrum is star Vega of table templates "
+            "AB magnitude of Vega in this band, m_AB - m_Vega of any source; the zero point of Vega magnitudes is "
+            "3631 Jy x 10^(-0.4 ab_minus_vega). Vega's spectrum is star Vega of table templates "
             "at the level of its source, f_lambda = 3.531e-9 erg s-1 cm-2 A-1 at 5500 A; photons are counted, as for "
             "all fluxes; missing where the spectrum ends",
             -10.0,

@@ -101,7 +101,13 @@ RENDERED_SPECTRA = Table(
             nullable=True,
         ),
         Column("contaminants", "list<int64>", "", "meta.id;src", "sources of these traces, ascending"),
-        Column("line_wavelength", "list<float64>", "Angstrom", "em.wl", "of a first order's lines that are on it"),
+        Column(
+            "line_wavelength",
+            "list<float64>",
+            "Angstrom",
+            "em.wl",
+            "observed wavelengths of the lines of a first order that fall on the detector",
+        ),
         Column("line_expected", "list<float64>", "electron", "phot.count;em.line", "of each of these lines"),
         Column(
             "line_snr",

@@ -200,7 +200,8 @@ def test_what_is_imported_is_named(folders, extras):
             r"^ *(?:import|from) (\w+)[\w.]*(?:$| import | as |,)", path.read_text(), re.MULTILINE
         ):
             sources = {canonicalize_name(name) for name in whose.get(module, ())} - {"truesky"}
-            if sources and not sources & named:
+            # Another package may bring a folder of the same name as one of ours.
+            if sources and not sources & named and not (ROOT / module).is_dir():
                 missing[module] = path.relative_to(ROOT).as_posix()
     assert missing == {}
 

@@ -38,7 +38,7 @@ def test_a_lake_of_before_is_read_as_it_was_written(lake):
     for name in TABLES:
         version = read.version(root, name)
         assert read.verify(version, deep=True) == []
-        assert places.goes_by_true(version) is is_earlier
+        assert places.is_indexed_by_true(version) is is_earlier
     assert read.version(root, "galaxies").rows().equals(rows)
     assert 0.3 * earlier.AWAY < read.version(root, "galaxies").deflection() < earlier.AWAY
 
@@ -82,7 +82,9 @@ def test_fluxes_of_before_have_no_observed_places(lake):
     fluxes, ra, dec = read.version(root, "galaxy_fluxes"), *(float(rows[name][0].as_py()) for name in ("ra", "dec"))
     assert rows["id"][0].as_py() in fluxes.cone(ra, dec, 1e-6, ["id"], "true")["id"].to_pylist()
     if is_earlier:
-        with pytest.raises(BadInput, match="table galaxy_fluxes goes by true positions, as an older truesky wrote it"):
+        with pytest.raises(
+            BadInput, match="table galaxy_fluxes is indexed by true positions, as earlier versions of truesky wrote it"
+        ):
             fluxes.cone(ra, dec, 1e-6)
     else:
         assert rows["id"][0].as_py() in fluxes.cone(ra, dec, 1e-6)["id"].to_pylist()
@@ -119,7 +121,10 @@ def test_an_earlier_name_leads_to_a_column_that_there_is():
 
 
 def test_tables_of_before_and_of_now_are_not_mixed(mixed):
-    line = "table galaxy_fluxes goes by true positions, as an older truesky wrote it, table galaxies by observed ones"
+    line = (
+        "table galaxy_fluxes is indexed by true positions, as earlier versions of truesky wrote it, "
+        "table galaxies by observed ones"
+    )
     with pytest.raises(BadInput, match=f"^{line}: run compute_fluxes first$"):
         places.refuse_mixed(read.version(mixed, name) for name in ("galaxies", "galaxy_fluxes"))
     places.refuse_mixed(read.version(mixed, name) for name in ("galaxy_fluxes", "strong_lenses"))
@@ -135,5 +140,5 @@ def test_nothing_new_is_made_of_galaxies_of_before(tmp_path, job, monkeypatch):
     earlier.published(tmp_path / "lake", STARS, rows_of(STARS, 20))
     monkeypatch.setattr("jobs.request.universe.refuse_other", lambda versions, request: list(versions))
     wanted = from_table({"name": "x", "seed": 3, "area": {"cone": {"ra": 10.0, "dec": 0.0, "radius": 0.1}}})
-    with pytest.raises(BadInput, match=r"table galaxies goes by true positions.*: run build_galaxies first"):
+    with pytest.raises(BadInput, match=r"table galaxies is indexed by true .*: run build_galaxies first"):
         job.steps(tmp_path / "lake", wanted)

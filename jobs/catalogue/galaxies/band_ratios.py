@@ -105,11 +105,11 @@ def _ln_ratios(library: Library, band: str, redshifts: Float, ebv: Float) -> Flo
     """[z, 4, template, e]"""
     dust = dusty(library, ebv)
     spectra = library.flux.astype(np.float64).T
-    reference = _band_flux(library, dust, spectra, band_weights(library, REFERENCE_BAND, 0.0))
+    reference = _band_flux(dust, spectra, band_weights(library, REFERENCE_BAND, 0.0))
     tiny = np.finfo(np.float32).tiny
     rows = []
     for z in redshifts:
-        flux = _band_flux(library, dust, spectra, band_weights(library, band, float(z)))
+        flux = _band_flux(dust, spectra, band_weights(library, band, float(z)))
         rows.append(np.log(np.maximum(flux / reference, tiny)))
     return np.stack(rows).transpose(0, 1, 3, 2)
 
@@ -157,7 +157,7 @@ def band_weights(library: Library, band: str, z: float) -> Float:
     return np.asarray(low + np.bincount(index + 1, np.where(inside, weights * part, 0.0), size))
 
 
-def _band_flux(library: Library, dust: Float, spectra: Float, weights: Float) -> Float:
+def _band_flux(dust: Float, spectra: Float, weights: Float) -> Float:
     """[4, e, template]"""
     used = np.flatnonzero(weights)
     cut = slice(used[0], used[-1] + 1)

@@ -132,7 +132,7 @@ def _refuse_beyond(lens: Neighbourhood, bent: Float) -> None:
     most = float(np.hypot(*bent).max(initial=0.0))
     if most > lens.farthest:
         found, expected = (np.degrees(angle) * 3600.0 for angle in (most, lens.farthest))
-        raise BadInput(f"table galaxies: halos bend light by {found:.0f} arcsec, more than the {expected:.0f} expected")
+        raise BadInput(f"table galaxies: halos deflect light by {found:.0f} arcsec, {expected:.0f} are allowed for")
 
 
 # ------------------------------------------------------------------------------------------------ halos

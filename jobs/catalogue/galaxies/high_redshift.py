@@ -106,7 +106,7 @@ def draw(
     near   : which true places are wanted, None = all
     """
     found = [_of_magnitude(cell, seed, kind, step) for step in range(len(kind.cells))]
-    z, m, _, ra, dec = (np.concatenate(column) for column in zip(*found, strict=True))
+    z, m, ra, dec = (np.concatenate(column) for column in zip(*found, strict=True))
     kept = (ultraviolet_magnitude(m, z) < kind.limit) & ((z < kind.z_end) | (z >= _BEYOND))
     if near is not None:
         kept &= near(ra, dec)
@@ -139,15 +139,16 @@ def draw(
     return GALAXIES.build(columns)
 
 
-def _of_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float, Float, Int, Float, Float]:
-    """Redshifts[n], M[n] and places (index, ra, dec) of one whole magnitude."""
+def _of_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float, Float, Float, Float]:
+    """Redshifts[n], M[n], ra[n] and dec[n], deg, of one whole magnitude."""
     rng, counts = stream(seed, _STREAM[kind.code], cell, kind.first + step), kind.counts[step]
     total = float(counts[-1]) if counts.size else 0.0
     n = int(rng.poisson(kind.boost * total * sky.cell_area(GENERATION_ORDER)))
     at = np.searchsorted(counts, rng.random(n) * total, side="right")
     row, column = np.divmod(kind.cells[step][np.minimum(at, counts.size - 1)], kind.m.size)
     z, m = kind.z[row] + _Z_STEP * rng.random(n), kind.m[column] + _M_STEP * rng.random(n)
-    return z, m, *sky.random_in_cell(GENERATION_ORDER, cell, n, rng)
+    _, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, n, rng)
+    return z, m, ra, dec
 
 
 def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:

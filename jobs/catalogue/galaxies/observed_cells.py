@@ -33,7 +33,7 @@ from lake_schema.tables.galaxies import GALAXIES
 
 # Distances are told of cells of this order, 26" wide: finer ones would cost more than they spare.
 _FINE = 13
-# How far halos may bend light, rad: one of 10^15.5 Msun/h does by half as much.
+# Largest deflection by halos that is allowed for, rad: twice that of a halo of 10^15.5 Msun/h.
 _MOST = float(np.radians(2.5 / 60.0))
 
 
@@ -89,8 +89,7 @@ class _Wanted:
 
 
 def _directions(cells: Int, order: int = _FINE) -> Float:
-    lon, lat = (np.radians(angle) for angle in sky.cell_centres(order, cells))
-    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], 1)
+    return sky.unit_vectors(*sky.cell_centres(order, cells))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +107,7 @@ def draw(wanted: Sequence[int], universe: GalaxyModel, cells: Cells, dust: Float
     wanted : nested indices at order 8
     cells  : what has been drawn of the universe's population
     dust   : float32[pixel] mag, map of the Milky Way's A(V) (jobs.catalogue.dust_map)
-    Errors : BadInput where light is bent farther than is looked for
+    Errors : BadInput where light is deflected farther than is allowed for
     """
     own = _Wanted.of(wanted)
     found = [GALAXIES.empty()]
@@ -155,7 +154,8 @@ def _from_outside(cell: int, own: _Wanted, sky_: _Sky) -> pa.Table:
     lens = halo_lensing.around(universe.lens, cells, cell, lambda *place: own.away_of(*place) - farthest)
     assert isinstance(lens, Neighbourhood)
     if lens.farthest > _MOST:
-        raise BadInput(f"table galaxies: halos may bend light by {3600 * np.degrees(lens.farthest):.0f} arcsec")
+        found, allowed = (np.degrees(angle) * 3600.0 for angle in (lens.farthest, _MOST))
+        raise BadInput(f"table galaxies: halos may deflect light by {found:.0f} arcsec, {allowed:.0f} are allowed for")
     farthest += lens.farthest - _MOST
     # Satellites of others land too far away.
     members = population.members(cells, cell, lambda *place: own.away_of(*place) <= farthest + halos.reach(place[0]))

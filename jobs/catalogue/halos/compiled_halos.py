@@ -10,8 +10,8 @@ from jobs.compiled_draws import following, normal, poisson, uniform
 from jobs.compiling import exact_jit
 
 # What a halo's and a satellite's numbers are for: the number of the key that follows theirs.
-HALO_NUMBERS = VOXEL, DISTANCE, MASS, PLACE, SCATTER = range(5)
-SATELLITE_NUMBERS = STEP, RADIUS, UP, AROUND, KICK, SUB_SCATTER = range(6)
+VOXEL, DISTANCE, MASS, PLACE, SCATTER = range(5)
+STEP, RADIUS, UP, AROUND, KICK, SUB_SCATTER = range(6)
 
 
 @exact_jit

@@ -82,10 +82,6 @@ class StellarTypes:
     def v_minus_h(self) -> Float:
         return -self.colors[:, 6]
 
-    @property
-    def color_vi(self) -> Float:
-        return -self.colors[:, 4]
-
 
 def types() -> StellarTypes:
     """The table of Pecaut & Mamajek 2013 (version 2022.04.16), O9V to M9V, as shipped by MeanStars."""

@@ -45,14 +45,14 @@ def configuration(name: str, traces: Sequence[Trace], shape: tuple[int, int], fi
     ny, nx = shape
     lines = [f"# {name}, simulated", f"NAXIS {ny} {nx}"]
     for trace, file in zip(traces, files, strict=True):
-        name = f"{trace.order:+d}" if trace.order else "0"
+        label = f"{trace.order:+d}" if trace.order else "0"
         # A source may lie outside the detector and its light on it.
         reach = float(np.abs(trace.polynomials(0.0, 0.0)[0]).sum())
-        lines += ["", f"BEAM_{name}", f"SENSITIVITY_{name} {file}"]
-        lines += [f"XRANGE_{name} {-reach:.1f} {reach:.1f}", f"YRANGE_{name} {-reach:.1f} {reach:.1f}"]
+        lines += ["", f"BEAM_{label}", f"SENSITIVITY_{label} {file}"]
+        lines += [f"XRANGE_{label} {-reach:.1f} {reach:.1f}", f"YRANGE_{label} {-reach:.1f} {reach:.1f}"]
         for axis, rows in (("X", trace.x), ("Y", trace.y)):
-            lines += [f"DISP{axis}_{name}_{i} {_terms(row)}" for i, row in enumerate(rows)]
-        lines += [f"DISPL_{name}_0 {trace.first!r}", f"DISPL_{name}_1 {trace.last - trace.first!r}"]
+            lines += [f"DISP{axis}_{label}_{i} {_terms(row)}" for i, row in enumerate(rows)]
+        lines += [f"DISPL_{label}_0 {trace.first!r}", f"DISPL_{label}_1 {trace.last - trace.first!r}"]
     return "\n".join(lines) + "\n"
 
 

@@ -34,7 +34,7 @@ class Alone:
 
 
 def spectra(aim: Aim, rows: Rows, variant: Variant, seed: int, ids: Sequence[int] | None = None) -> Iterator[Alone]:
-    """One source after the other.  The 64-bit frames of all of them add up to the noise-free one.
+    """One source after the other.  The float64 frames of all of them add up exactly to the noise-free one.
 
     aim, rows, variant, seed : as of `render`;  ids : of the sources, None = all that may have light on the detector
     Errors : BadInput where nothing is spread out, or for a source that is not among them
@@ -54,11 +54,12 @@ def spectra(aim: Aim, rows: Rows, variant: Variant, seed: int, ids: Sequence[int
         raise BadInput(f"{where}: no light of source {missing[0]} is drawn there")
     shape, of = (aim.detector.ny, aim.detector.nx), dispersed.spectra
     known: draw.Known = {}
+    noise = light.scene.pixel_noise
     for number in chosen:
         at = np.array([place[number]])
         one = replace(dispersed, spectra=partial(_of_some, of, at))
         layers: dict[int, Float] = {}
-        frame = draw.draw(sources.take(at), one, psf, shape, light.scene.pixel_noise, None, layers, known)
+        frame = draw.draw(sources.take(at), one, psf, shape, noise, None, layers, known)
         yield Alone(number, frame, layers)
 
 

@@ -7,7 +7,6 @@ import pyarrow as pa
 from astropy.wcs import WCS
 
 from jobs.render.camera import astrometry
-from jobs.render.camera.detectors import Detector
 from jobs.render.effects.scene import Lights
 from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float
@@ -18,13 +17,11 @@ _LIGHT = 1e6
 _PIECE = 32.0
 
 
-def bright_lights(
-    galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], detector: Detector, system: WCS
-) -> Lights:
+def bright_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], system: WCS) -> Lights:
     """Bright sources on the detector and around it, as far as rows were given.
 
     galaxies, stars : rows, and expected electrons of each
-    detector        : that they are seen from;  system : its world coordinates
+    system          : world coordinates of the detector
     """
     found = []
     for rows, electrons in (galaxies, stars):

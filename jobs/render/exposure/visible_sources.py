@@ -145,7 +145,7 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     if aim.channel.moving:
         sources, sizes, bright = _with_moving((sources, sizes), aim, rows, scene, psf, settings, seed)
     if aim.channel.scattered:
-        around = bright_lights.bright_lights((rows.galaxies, galaxies), (rows.stars, stars), aim.detector, aim.wcs)
+        around = bright_lights.bright_lights((rows.galaxies, galaxies), (rows.stars, stars), aim.wcs)
         scene = replace(scene, lights=around.joined(bright))
     psf, decisions = _with_pixels(aim, scene, psf, sources.electrons[touching(sources, sizes, aim.detector)])
     neglected = stamp_sizes.neglected_flux(sources.electrons, noise, settings)

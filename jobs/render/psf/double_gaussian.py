@@ -29,7 +29,7 @@ def widths(ee50: float, ee80: float, part: float) -> tuple[float, float]:
     """(s1, s2), in the unit of the radii; one Gaussian of half of the light where its EE80 is as wide or wider.
 
     ee50, ee80 : radii that hold 50 and 80 % of the light
-    part       : of the light in the core, c; with less than half or 0.8 there may be no such Gaussians
+    part       : of the light in the core, c; only between 0.5 and 0.8 do such Gaussians exist
     Errors : BadInput where the second radius is not the larger, or for another part
     """
     if not 0.5 < part < 0.8:

@@ -81,11 +81,11 @@ def test_no_rows():
 @pytest.mark.parametrize(
     ("column", "values", "words"),
     [
-        (Column("s", "string"), ["\u00e9"], "no letter"),
+        (Column("s", "string"), ["\u00e9"], "cannot hold the character"),
         (Column("s\u00e9", "int64"), [1], "cannot hold"),
         (Column("l", "list<int64>"), [[1, None]], "missing value in a list"),
         (Column("j", "int8", nullable=True), [*range(-128, 128), None], ""),
-        (Column("j", "int16", nullable=True), [*range(-(2**15), 2**15), None], "no number is left"),
+        (Column("j", "int16", nullable=True), [*range(-(2**15), 2**15), None], "no integer is left"),
     ],
 )
 def test_what_fits_cannot_hold(column, values, words):

@@ -106,7 +106,7 @@ def test_without_lensing_nothing_crosses_a_border(shallow, population, dust):
 
 def test_light_that_is_bent_too_far_is_refused(shallow, dust, monkeypatch):
     monkeypatch.setattr(observed_cells, "_MOST", np.radians(10.0 / 3600.0))
-    with pytest.raises(BadInput, match="halos may bend light by"):
+    with pytest.raises(BadInput, match="halos may deflect light by"):
         observed_cells.draw([cell_at(PLACES[0])], shallow, Cells(shallow.population), dust)
 
 

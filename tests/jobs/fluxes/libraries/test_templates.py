@@ -125,7 +125,6 @@ def test_stars_are_the_dwarf_sequence(stars_library):
     assert types.mass[g2] == 1.0
     assert types.log_g[g2] == pytest.approx(4.44, abs=0.02)
     assert types.color_bv[g2] == 0.650
-    assert types.color_vi[g2] == 0.713
     assert types.abs_mag_h[g2] == pytest.approx(3.309)
     assert types.abs_mag_v[g2] - types.abs_mag_ks[g2] == pytest.approx(1.564, abs=0.001)
 
