@@ -21,16 +21,19 @@ from jobs.accuracy import SURVEY
 from jobs.render.camera import astrometry, observatories
 from jobs.render.camera.detectors import detectors
 from jobs.render.camera.pointing import boresight_for
+from jobs.render.channels import registry
 from jobs.render.products import fits_files, truth_table
 from lake_schema.mission.parameter import CAMERAS
 from tests.jobs.render import fields, nominal
 from tests.jobs.render.fields import MISSION, small
 
 # Of quadrants each has four stars.
-SIDE, STARS = 400, 16
+SIDE, STARS = 512, 16
 BANDS = {
     "decam": "des_r", "lsstcam": "lsst_r", "megacam": "cfis_r", "jpcam": "jedis_g", "gpc1": "ps1_i", "hsc": "hsc_z",
 }  # fmt: skip
+# Of a ground camera's effects: what of light and noise moves no charge.
+SEEN = ("background", "poisson", "read_noise")
 COLUMNS = ("ALPHAWIN_J2000", "DELTAWIN_J2000", "XWIN_IMAGE", "YWIN_IMAGE", "FLUX_AUTO", "FLUXERR_AUTO", "FLAGS")
 COLUMNS += ("ERRAWIN_IMAGE", "ERRBWIN_IMAGE", "ERRTHETAWIN_IMAGE", "FLUX_RADIUS", "MAG_AUTO")
 
@@ -65,7 +68,8 @@ def farthest(camera):
 def stars_on(camera):
     """One detector with stars apart, of a signal-to-noise ratio of 600."""
     detector = farthest(camera)
-    x, y = nominal.lattice(SIDE, 100)
+    # In the middle of amplifiers, however many there are.
+    x, y = (axis + SIDE / 32 for axis in nominal.lattice(SIDE, SIDE / 4))
     if camera == "vis":
         quiet = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
         return nominal.rendered(detector, np.full(len(x), 19.0), x, y, forced=quiet)
@@ -79,7 +83,9 @@ def stars_on(camera):
         "sky": 5.0,
     }  # fmt: skip
     tables = none, fields.fluxes(none, band, 0.0), points, fields.fluxes(points, band, f_nu)
-    return fields.rendered(exposed, detector, tables, MISSION, SURVEY)
+    effects = registry.CHANNELS["EXT"].effects["science"]
+    quiet = nominal.off(*(effect.name for effect in effects if effect.optional and effect.name not in SEEN))
+    return fields.rendered(exposed, detector, tables, MISSION, SURVEY, forced=quiet)
 
 
 def written(camera, folder, wcs=None):
@@ -254,25 +260,26 @@ def test_fitsverify_says_nothing(field):
 
 
 def reduced(path):
-    """Images in e- of a raw file, each by its own header, as ccdproc makes them."""
+    """(where on the detector, image in e-) of each amplifier of a raw file, by its header, as ccdproc makes them."""
     ccdproc = pytest.importorskip("ccdproc", reason="ccdproc is not installed (extra test)")
     from astropy import units as u
 
-    found = []
-    with fits.open(path) as all_of_it:
-        extensions = [number for number, unit in enumerate(all_of_it) if unit.data is not None]
-    for number in extensions:
+    for number, (header, _) in enumerate(arrays(path), start=1):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            raw = ccdproc.CCDData.read(path, hdu=number)
-        header = raw.header
-        if "BIASSEC" in header:
-            level = ccdproc.subtract_overscan(raw, fits_section=header["BIASSEC"], overscan_axis=1, median=True)
-        else:
-            level = raw.subtract(header["BIAS"] * u.adu, handle_meta="first_found")
-        trimmed = ccdproc.trim_image(level, fits_section=header["TRIMSEC"])
-        found.append(ccdproc.gain_correct(trimmed, header["GAIN"] * u.electron / u.adu))
-    return found
+            raw = ccdproc.CCDData.read(path, hdu=number if "INHERIT" in header else 0)
+        if "NAMPS" not in header:
+            if "BIASSEC" in header:
+                level = ccdproc.subtract_overscan(raw, fits_section=header["BIASSEC"], overscan_axis=1, median=True)
+            else:
+                level = raw.subtract(header["BIAS"] * u.adu, handle_meta="first_found")
+            trimmed = ccdproc.trim_image(level, fits_section=header["TRIMSEC"])
+            yield header["CCDSEC"], ccdproc.gain_correct(trimmed, header["GAIN"] * u.electron / u.adu)
+        # Of a ground camera all amplifiers are in one array.
+        for n in range(1, header.get("NAMPS", 0) + 1):
+            pixels, bias = (ccdproc.trim_image(raw, fits_section=header[f"{key}{n}"]) for key in ("DSEC", "BSEC"))
+            level = ccdproc.subtract_overscan(pixels, overscan=bias, overscan_axis=1, median=True)
+            yield header[f"CSEC{n}"], ccdproc.gain_correct(level, header[f"GAIN{n}"] * u.electron / u.adu)
 
 
 @pytest.mark.parametrize("camera", ["vis", "decam"])
@@ -280,9 +287,9 @@ def test_ccdproc_reduces_a_raw_frame_by_its_header(camera, tmp_path):
     """To electrons, on the pixels of the detector; the WCS goes with them."""
     field = written(camera, tmp_path)
     found, one = np.zeros(field.one.science.shape), field.one
-    for image, (header, _) in zip(reduced(field.path), arrays(field.path), strict=True):
+    for text, image in reduced(field.path):
         assert image.unit == "electron"
-        place = window(header["CCDSEC"])
+        place = window(text)
         found[place] = image.data
         x, y = image.wcs.all_world2pix(*one.wcs.all_pix2world([place[1].start + 7.0], [place[0].start + 3.0], 0), 0)
         assert (x[0], y[0]) == pytest.approx((7.0, 3.0), abs=1e-4)
