@@ -4,7 +4,7 @@ import pytest
 
 from tests.faults import fuzz
 
-RUNS, MANY_RUNS = 30, 20_000
+RUNS, MANY_RUNS = 30, 6_000
 # Each mutation of a query asks DuckDB's parser, in a session of its own.
 SLOW = {"SQL": 10}
 
