@@ -65,8 +65,8 @@ def farthest(camera):
     return replace(detector, bending=detector.bending or radial)
 
 
-def stars_on(camera):
-    """One detector with stars apart, of a signal-to-noise ratio of 600."""
+def stars_on(camera, sky):
+    """One detector with stars apart, of a signal-to-noise ratio of 600; sky : of a ground camera, e-/s/pix."""
     detector = farthest(camera)
     # In the middle of amplifiers, however many there are.
     x, y = (axis + SIDE / 32 for axis in nominal.lattice(SIDE, SIDE / 4))
@@ -80,7 +80,7 @@ def stars_on(camera):
     f_nu = 10 ** (-0.4 * (25.93 - 2.5 * np.log10(4e5 / 100.0) - 23.9))
     exposed = {
         "channel": "EXT", "camera": camera, "band": band, "ra": ra, "dec": dec, "position_angle": angle, "seeing": 1.0,
-        "sky": 5.0,
+        "sky": sky,
     }  # fmt: skip
     tables = none, fields.fluxes(none, band, 0.0), points, fields.fluxes(points, band, f_nu)
     effects = registry.CHANNELS["EXT"].effects["science"]
@@ -88,9 +88,10 @@ def stars_on(camera):
     return fields.rendered(exposed, detector, tables, MISSION, SURVEY, forced=quiet)
 
 
-def written(camera, folder, wcs=None):
-    one = stars_on(camera)
-    rows, writers = fits_files.products(one, (), wcs=wcs)
+def written(camera, folder, sky=0.05):
+    """A dark sky: raw frames have no steps from it to the overscan."""
+    one = stars_on(camera, sky)
+    rows, writers = fits_files.products(one, ())
     path = folder / f"{camera}_science.fits"
     name = rows["path"][0].as_py()
     writers[name](path)
@@ -285,7 +286,7 @@ def reduced(path):
 @pytest.mark.parametrize("camera", ["vis", "decam"])
 def test_ccdproc_reduces_a_raw_frame_by_its_header(camera, tmp_path):
     """To electrons, on the pixels of the detector; the WCS goes with them."""
-    field = written(camera, tmp_path)
+    field = written(camera, tmp_path, sky=5.0)
     found, one = np.zeros(field.one.science.shape), field.one
     for text, image in reduced(field.path):
         assert image.unit == "electron"
