@@ -175,8 +175,8 @@ class Explorer:
         check("bins", bins, 1, _MOST_BINS)
         lo, hi = _ordered(span or self._span(table, x, where))
         text = f"""
-            SELECT {_bin("x", "x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x})::DOUBLE AS x, {_weight(weight)}
-            FROM {table} WHERE ({where})) WHERE x BETWEEN $x_lo AND $x_hi GROUP BY i"""
+            SELECT {_bin("x", "x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x}\n)::DOUBLE AS x, {_weight(weight)}
+            FROM {table}\nWHERE ({where}\n)) WHERE x BETWEEN $x_lo AND $x_hi GROUP BY i"""
         found = self.sql(text, into="arrow", x_lo=lo, x_hi=hi, x_bins=bins)
         counts = np.zeros(bins)
         counts[found["i"].to_numpy()] = found["n"].to_numpy()
@@ -198,7 +198,7 @@ class Explorer:
         (x_lo, x_hi), (y_lo, y_hi) = (_ordered(axis) for axis in spans)
         text = f"""
             SELECT {_bin("x", "x")} AS i, {_bin("y", "y")} AS j, {_counted(weight)} AS n
-            FROM (SELECT ({x})::DOUBLE AS x, ({y})::DOUBLE AS y, {_weight(weight)} FROM {table} WHERE ({where}))
+            FROM (SELECT ({x}\n)::DOUBLE AS x, ({y}\n)::DOUBLE AS y, {_weight(weight)} FROM {table}\nWHERE ({where}\n))
             WHERE x BETWEEN $x_lo AND $x_hi AND y BETWEEN $y_lo AND $y_hi GROUP BY i, j"""
         limits = {"x_lo": x_lo, "x_hi": x_hi, "x_bins": bins[0], "y_lo": y_lo, "y_hi": y_hi, "y_bins": bins[1]}
         found = self.sql(text, into="arrow", **limits)
@@ -216,14 +216,13 @@ class Explorer:
             raise BadInput(f"order = {order} is outside [0, {sky.DEEPEST}]")
         text = f"""
             SELECT cell, {_counted(weight)} AS n FROM (SELECT _healpix_29 >> $shift::INT AS cell, {_weight(weight)}
-            FROM {table} WHERE ({where})) GROUP BY cell ORDER BY cell"""
+            FROM {table}\nWHERE ({where}\n)) GROUP BY cell ORDER BY cell"""
         found = self.sql(text, into="arrow", shift=2 * (sky.DEEPEST - order))
         return found["cell"].to_numpy(), found["n"].to_numpy().astype(float)
 
     def _span(self, table: str, x: str, where: str) -> Range:
-        text = (
-            f"SELECT min(x)::DOUBLE AS lo, max(x)::DOUBLE AS hi FROM (SELECT ({x}) AS x FROM {table} WHERE ({where}))"
-        )
+        rows = f"SELECT ({x}\n) AS x FROM {table}\nWHERE ({where}\n)"
+        text = f"SELECT min(x)::DOUBLE AS lo, max(x)::DOUBLE AS hi FROM ({rows})"
         found = self.sql(text, into="arrow")
         lo, hi = found["lo"][0].as_py(), found["hi"][0].as_py()
         if lo is None or not np.isfinite([lo, hi]).all():
@@ -243,7 +242,7 @@ def _bin(x: str, axis: str) -> str:
 
 
 def _weight(weight: str | None) -> str:
-    return "1 AS w" if weight is None else f"({weight})::DOUBLE AS w"
+    return "1 AS w" if weight is None else f"({weight}\n)::DOUBLE AS w"
 
 
 def _counted(weight: str | None) -> str:

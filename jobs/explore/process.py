@@ -59,8 +59,9 @@ class Process:
 
     def stop(self) -> None:
         """End what it is doing, from another thread than the one that waits for it; a later query starts another."""
-        if self._worker is not None:
-            self._worker.kill()
+        # Looked up once: another thread may end it meanwhile.
+        if (worker := self._worker) is not None:
+            worker.kill()
 
     def ask(self, text: str, parameters: dict[str, object], timeout: float = TIMEOUT) -> pa.Table:
         """The result of a SELECT, which is stopped after `timeout` s.  Errors: BadInput, Damaged, as of Explorer.sql"""

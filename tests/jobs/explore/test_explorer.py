@@ -225,7 +225,8 @@ def test_skymap_counts_cells(explorer, galaxies):
         (lambda e: e.hist("galaxies", "speed"), "speed"),
         (lambda e: e.hist("stars", "ra"), "'stars' is not a table of the lake"),
         (lambda e: e.hist("galaxies", "1) FROM plain; DROP VIEW plain --"), "SQL"),
-        (lambda e: e.hist("galaxies", "ra) AS x FROM read_text('/etc/passwd') --"), "read_text"),
+        (lambda e: e.hist("galaxies", "ra) AS x FROM read_text('/etc/passwd') --"), "SQL"),
+        (lambda e: e.hist("galaxies", "(SELECT content FROM read_text('/etc/passwd'))"), "read_text"),
         (lambda e: e.hist("galaxies", "log_sfr", where="ra < 0"), "no finite"),
         (lambda e: e.hist("galaxies", "ra", 0), "bins = 0"),
         (lambda e: e.hist("galaxies", "ra", -1), "bins = -1"),
@@ -352,3 +353,17 @@ def test_questions_are_one_line_of_json(explorer):
     with pytest.raises(BadInput):
         explorer.sql(text, x=1)
     assert explorer.sql("SELECT $x AS a", x=json.dumps({"sql": "\n"}))["a"][0] == json.dumps({"sql": "\n"})
+
+
+def test_expressions_may_end_in_a_comment(explorer):
+    """Each of them stands alone, whatever follows it in the query."""
+    given = {"where": "z_obs > 1 -- far", "weight": "mag_r01 -- light"}
+    plain = {"where": "z_obs > 1", "weight": "mag_r01"}
+    for name, axes, noted in (
+        ("hist", ("z_obs",), ("z_obs -- x",)),
+        ("heatmap", ("z_obs", "mag_r01"), ("z_obs -- x", "mag_r01 -- y")),
+        ("skymap", (), ()),
+    ):
+        one, other = getattr(explorer, name), getattr(explorer, name)
+        for a, b in zip(one("galaxies", *axes, **plain), other("galaxies -- all", *noted, **given), strict=True):
+            np.testing.assert_array_equal(a, b)
