@@ -126,22 +126,31 @@ class Jobs:
                 job.set_phase("EXECUTING")
                 await self._keep(job, pieces)
                 job.kind = kind
+        except asyncio.CancelledError:
+            # What has been written of an answer that nobody will have counts against the others no more.
+            self._forget(job)
+            raise
         except (LakeError, OSError) as error:
             job.error = str(error) or type(error).__name__
         except Exception as error:
             # Whatever it is: a job that has ended must not be waited for.
             job.error = f"{type(error).__name__}: {error}"
         if job.error:
-            self.file(job).unlink(missing_ok=True)
-            job.size = 0
+            self._forget(job)
         job.ended = datetime.now(UTC)
         job.set_phase("ERROR" if job.error else "COMPLETED")
+
+    def _forget(self, job: Job) -> None:
+        """What has been written of its result."""
+        self.file(job).unlink(missing_ok=True)
+        job.size = 0
 
     async def _keep(self, job: Job, pieces: AsyncIterator[bytes]) -> None:
         """Write the result of a job into its file.  Errors: BadInput where it is too large"""
         with self.file(job).open("wb") as file:
             async for piece in pieces:
-                file.write(piece)
+                # A piece may be as large as the whole result: others are answered while it is written.
+                await asyncio.to_thread(file.write, piece)
                 job.size += len(piece)
                 if job.size > MOST_BYTES:
                     raise BadInput(f"the result has more than {MOST_BYTES / 1e9:.3g} GB: ask for less")

@@ -52,6 +52,30 @@ def test_a_killed_process_is_replaced(page):
     assert asked(page, **chart)[0]["rows"] == GALAXIES_N
 
 
+def test_a_process_is_stopped_while_it_ends():
+    """Another thread forgets the worker between two looks at it."""
+    killed = []
+
+    class Worker:
+        def kill(self):
+            killed.append(self)
+
+    class Ending(Process):
+        looks = 0
+
+        @property
+        def _worker(self):
+            self.looks += 1
+            return Worker() if self.looks == 1 else None
+
+        @_worker.setter
+        def _worker(self, worker):
+            """Of the constructor."""
+
+    Ending(Path(), []).stop()
+    assert len(killed) == 1
+
+
 def test_who_asked_a_killed_process_is_told(page):
     """In the midst of a question: one line, and the next question is answered."""
     until(page.server._warming.done)

@@ -1,6 +1,7 @@
 """Who waits for what, how many may, and what becomes of those beyond."""
 
 import asyncio
+import io
 import json
 import socket
 import threading
@@ -195,6 +196,65 @@ def test_results_have_a_bound(monkeypatch, bounds, words):
         jobs.start(again)
         await again.task
         assert again.phase == "COMPLETED"
+        await jobs.close()
+
+    asyncio.run(run())
+
+
+def test_of_a_job_that_is_aborted_nothing_stays():
+    """Neither its file nor its bytes among those of all jobs."""
+    waiting = asyncio.Event()
+
+    @asynccontextmanager
+    async def run_one(parameters, seconds):
+        async def pieces():
+            yield b"x" * 1000
+            waiting.set()
+            await asyncio.Event().wait()
+
+        yield "text/plain", pieces()
+
+    async def run():
+        jobs = Jobs(run_one)
+        job = jobs.add({}, 1.0)
+        jobs.start(job)
+        await waiting.wait()
+        assert (job.size, jobs.file(job).exists()) == (1000, True)
+        jobs.abort(job)
+        await asyncio.gather(job.task, return_exceptions=True)
+        assert (job.phase, job.size, jobs.file(job).exists()) == ("ABORTED", 0, False)
+        await jobs.close()
+
+    asyncio.run(run())
+
+
+def test_others_are_answered_while_a_result_is_written(monkeypatch):
+    go = threading.Event()
+
+    class Slow(io.BytesIO):
+        def write(self, piece):
+            assert go.wait(10.0)
+            return super().write(piece)
+
+    monkeypatch.setattr(Path, "open", lambda self, mode: Slow())
+
+    @asynccontextmanager
+    async def run_one(parameters, seconds):
+        async def pieces():
+            yield b"x"
+
+        yield "text/plain", pieces()
+
+    async def run():
+        jobs = Jobs(run_one)
+        job = jobs.add({}, 1.0)
+        jobs.start(job)
+        # The loop goes on: else nobody would ever let the file be written.
+        await asyncio.sleep(0.05)
+        assert job.phase == "EXECUTING"
+        go.set()
+        await job.task
+        assert (job.phase, job.size) == ("COMPLETED", 1)
         await jobs.close()
 
     asyncio.run(run())
