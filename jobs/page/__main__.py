@@ -71,7 +71,8 @@ def _names(options: argparse.Namespace) -> tuple[str, ...]:
     called = tuple(name.lower() for name in options.called)
     if options.host in _EVERYWHERE:
         if not called:
-            raise BadInput(f"--host {options.host}: others can reach it, so --called NAME is wanted, by which they do")
+            accepts = f"--host {options.host} accepts connections from other machines"
+            raise BadInput(f"{accepts}: give --called NAME, the name or address that they use")
         return (*called, *_HERE)
     return (*called, *_HERE) if options.host in _HERE else (options.host.lower(), *called)
 

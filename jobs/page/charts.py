@@ -29,7 +29,7 @@ async def counts(lake: Lake, question: Json) -> bytes:
     every chart that wants them points, float32 [n, axes].
 
     Of the head: `spans` and `missing` are of each axis, the span that holds nearly all of its values and the rows that
-    have none; of each chart `total` rows lie within its spans and `outside` beyond them, both within the limits.
+    have none; of each chart `outside` rows lie beyond its spans, within the limits.
 
     question : source, where; axes, each an expression; charts, each with axes (numbers), bins, spans (or null) and,
                if need be, own (numbers of axes whose limits do not hold in it) and points (how many at most); limits,
@@ -111,9 +111,9 @@ def answered(held: Held, question: Json, part: int, threads: int) -> bytes:
         "spans": held.spans,
         "charts": [
             {"axes": chart.columns, "bins": chart.bins, "spans": chart.spans}
-            | {"total": int(counts.sum()), "outside": outside}
+            | {"outside": outside}
             | ({} if one is None else {"points": len(one[0]), "points_part": one[1]})
-            for chart, counts, outside, one in zip(charts, found, beyond, sampled, strict=True)
+            for chart, outside, one in zip(charts, beyond, sampled, strict=True)
         ],
     }
     return packed(head, *(counts.astype("<u4") for counts in found), *(points.astype("<f4") for points in scattered))

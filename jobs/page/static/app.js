@@ -100,10 +100,7 @@ $("help-button").addEventListener("click", () => {
   $("help-button").setAttribute("aria-expanded", String(!$("help").hidden));
 });
 $("copy-address").addEventListener("click", () => api.copy(location.href, "Address"));
-$("reopen").addEventListener("click", async () => {
-  await api.open(true);
-  location.reload();
-});
+$("reopen").addEventListener("click", () => api.open(true).then(() => location.reload(), (error) => api.say(error.message, true)));
 document.addEventListener("keydown", keys);
 addEventListener("hashchange", () => document.body.dataset.ready && location.hash !== last && restore());
 addEventListener("resize", () => {

@@ -7,7 +7,7 @@ import { dispersed, use } from "/static/trace.js";
 const $ = (id) => document.getElementById(id);
 const SIDE = 64, SHOWN = ["ra", "dec", "ra_true", "dec_true", "ra_lensed", "dec_lensed", "z_obs", "z_true", "mag_r01", "abs_mag_r01", "color_gr_01", "log_stellar_mass", "log_sfr",
   "bulge_fraction", "bulge_half_light_radius", "disk_half_light_radius", "inclination", "position_angle", "kappa", "gamma1", "gamma2", "a_v", "mag_h", "distance"];
-let source = null, drawings = [];
+let source = null, drawings = [], pins = 0;
 const listeners = [];
 
 export const pinned = () => source;
@@ -15,10 +15,14 @@ use({ line: named });
 export const onPin = (listener) => listeners.push(listener);
 
 export async function pin(id) {
-  source = await api.get(`source/${id}`);
+  // Of two that are under way the later one is shown, whichever is answered first.
+  const mine = ++pins, found = await api.get(`source/${id}`);
+  if (mine !== pins) return;
+  source = found;
   const panel = $("pin");
   drawings = [];
   panel.replaceChildren(api.h("h2", {}, `${source.kind} ${source.id}`));
+  if (source.request) panel.append(api.h("p", { class: "quiet" }, `As request ${source.request} has it.`));
   if (source.place) panel.append(api.h("p", { class: "quiet" }, api.place(...source.place)));
   panel.append(api.h("div", { class: "bar" },
     api.h("button", { onclick: () => api.copy(source.id, "Identifier") }, "Copy id"),
@@ -31,22 +35,21 @@ export async function pin(id) {
     panel.append(api.h("h3", {}, name), facts(first.length ? first : rows.slice(0, 12)));
     panel.append(api.h("details", {}, api.h("summary", {}, `all ${rows.length} columns`), facts(rows, true)));
   }
-  panel.append(api.h("h3", {}, "Drawn in"), source.drawn.length ? api.table(
+  panel.append(api.h("h3", {}, "Drawn in"), source.drawn.length ? api.requested(source.drawn,
     [{ name: "exposure" }, { name: "detector", text: 1 }, { name: "x", unit: "pix" }, { name: "y", unit: "pix" }, { name: "expected", unit: "electron" }, { name: "drawn", unit: "electron" }],
-    source.drawn.map((d) => [d.exposure_id, d.detector, +d.x.toFixed(2), +d.y.toFixed(2), +d.expected.toPrecision(5), +d.drawn.toPrecision(5)]))
+    (d) => [d.exposure_id, d.detector, +d.x.toFixed(2), +d.y.toFixed(2), +d.expected.toPrecision(5), +d.drawn.toPrecision(5)])
     : api.h("p", { class: "quiet" }, "No image."));
   listeners.forEach((listener) => listener());
   const own = source;
   api.get(`spectrum/${id}`).then((found) => own === source && (found.said ? spectrum.append(api.h("p", { class: "quiet" }, `No spectrum: ${found.said}`)) : drawSpectrum(spectrum, found)),
-    (error) => spectrum.append(api.h("p", { class: "quiet" }, error.message)));
+    (error) => own === source && spectrum.append(api.h("p", { class: "quiet" }, error.message)));
+  const failed = (error) => own === source && api.say(error.message, true);
   cutouts(pictures, own).catch(failed);
   dispersed(grism, own, () => own === source, drawings).catch(failed);
 }
 
 /** Draw again what has the colours of the theme, or the size of the page; what is not seen has no size. */
 export const redraw = () => $("pin").checkVisibility() && drawings.forEach((draw) => draw());
-
-const failed = (error) => api.say(error.message, true);
 
 function facts(rows, isWhole = false) {
   const value = (row) => {
@@ -67,7 +70,7 @@ async function cutouts(panel, own) {
     if (own !== source) return;
     const canvas = api.h("canvas", { width: SIDE, height: SIDE, role: "img", "aria-label": `${about.band}, ${about.content}` });
     canvas.getContext("2d").putImageData(stretched(up ? pixels : pixels.reverse(), SIDE, SIDE), 0, 0);
-    panel.append(api.h("figure", {}, canvas, api.h("figcaption", { class: "quiet" }, `${about.band} ${about.content.replace("_", " ")}`)));
+    panel.append(api.h("figure", {}, canvas, api.h("figcaption", { class: "quiet" }, `${api.of(about)}${about.band} ${about.content.replace("_", " ")}`)));
   }
   if (!panel.childElementCount) panel.append(api.h("p", { class: "quiet" }, "No image holds its place."));
 }

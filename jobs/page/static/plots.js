@@ -33,7 +33,7 @@ export function start(given) {
     for (const chart of charts) chart.brush = null;
     sampled();
   });
-  $("plot-python").addEventListener("click", () => api.copy(python(), "Python"));
+  $("plot-python").addEventListener("click", () => charts.length ? api.copy(python(), "Python") : api.say("There is no chart.", true));
   $("plot-sql").addEventListener("click", () => api.copy(query(), "SQL"));
 }
 
@@ -120,7 +120,6 @@ const ask = api.newest(async () => {
     const about = head.charts[k], size = about.bins.reduce((a, b) => a * b);
     chart.counts = new Uint32Array(buffer, at, size);
     chart.spans = about.spans;
-    chart.total = about.total;
     // Of each axis: a row may lack one of them only.
     chart.missing = chart.axes.map((axis) => head.missing[names.indexOf(sqlOf(axis))]);
     chart.outside = about.outside;
@@ -244,7 +243,7 @@ function figure(chart) {
   Object.assign(chart, { canvas, range, data });
   canvas.addEventListener("pointerdown", (event) => grab(chart, event));
   canvas.addEventListener("pointermove", (event) => drag?.chart === chart && pull(event));
-  canvas.addEventListener("pointerup", (event) => drag?.chart === chart && release(event));
+  for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => drag?.chart === chart && release());
   canvas.addEventListener("keydown", (event) => nudge(chart, event));
   return api.h("figure", { class: chart.axes.length > 1 ? "map" : null }, caption, canvas, range, data);
 }
@@ -349,8 +348,8 @@ function nudge(chart, event) {
 
 function conditions() {
   const brushed = charts.filter((chart) => chart.brush).flatMap((chart) => chart.axes.map((axis, k) =>
-    `(${sqlOf(axis)})::FLOAT BETWEEN ${chart.brush[k][0]} AND ${chart.brush[k][1]}`));
-  return [...(where ? [`(${where})`] : []), ...brushed].join("\n  AND ") || "true";
+    `(${sqlOf(axis)}\n)::FLOAT BETWEEN ${chart.brush[k][0]} AND ${chart.brush[k][1]}`));
+  return [...(where ? [`(${where}\n)`] : []), ...brushed].join("\n  AND ") || "true";
 }
 
 function query() {

@@ -6,7 +6,7 @@ import { NAMES, bar, ink } from "/static/colour.js";
 import { KINDS, drawFootprints, imagesAt, legend as footprintLegend, load as loadFootprints } from "/static/footprints.js";
 import { graticule } from "/static/graticule.js";
 import { goTo } from "/static/image.js";
-import { cross } from "/static/marks.js";
+import { cross, drawDots, firstOf } from "/static/marks.js";
 import { pin, pinned } from "/static/pin.js";
 import { copyFieldRequest } from "/static/request.js";
 import { circleAround, frame, placeOf, project, unproject } from "/static/sphere.js";
@@ -73,7 +73,7 @@ function prepare() {
 async function footprints() {
   redraw();
   try {
-    await loadFootprints($("sky-footprints").value);
+    await loadFootprints($("sky-footprints").value, near());
   } catch (error) {
     api.say(error.message, true);
   }
@@ -164,17 +164,20 @@ function order() {
   return Math.max(3, Math.min(14, Math.round(Math.log2(58.6 / size)), Math.floor(filled)));
 }
 
+/** A circle about the view, with something beside it: 1.5 times as wide. */
+const near = () => ({ ra: view.ra, dec: view.dec, radius: Math.min(180, 1.5 * radius()) });
+
 const finer = api.newest(async () => {
-  const box = $("sky-canvas"), radius = Math.min(180, 0.75 * Math.hypot(view.height, (view.height * box.clientWidth) / Math.max(1, box.clientHeight)));
-  const wanted = order(), near = { ra: view.ra, dec: view.dec, radius };
+  const wanted = order(), here = near(), { radius } = here;
   const grid = Math.max(radius / 4, 1e-6), name = [shownTable, where, value, wanted, Math.round(view.ra / grid), Math.round(view.dec / grid), Math.round(Math.log2(radius) * 2)].join();
   if (name === held) return redraw();
   held = name;
-  if (view.height < SINGLE && !isCoverage()) dots = await api.get(`sky/${shownTable}/sources?${new URLSearchParams({ ...near, where: where || "true" })}`);
+  if (view.height < SINGLE && !isCoverage()) dots = await api.get(`sky/${shownTable}/sources?${new URLSearchParams({ ...here, where: where || "true" })}`);
   else {
     dots = null;
-    use(await api.bytes(addressOf({ order: wanted, ...(radius < 60 ? near : {}) })));
+    use(await api.bytes(addressOf({ order: wanted, ...(radius < 60 ? here : {}) })));
   }
+  if ($("sky-footprints").value === "exposures") footprints();
   asTable();
   redraw();
 });
@@ -213,7 +216,7 @@ function caption() {
   if (dots) {
     const here = dots.ra.length, most = dots.most ?? 20000, all = dots.total ?? (here < most ? here : null);
     if (all === here) return `${api.number(here)} sources one by one`;
-    return `${dots.by ? `the brightest ${api.number(here)} by ${dots.by}` : `the first ${api.number(here)}`} of ${all === null ? "more" : api.number(all)} sources`;
+    return `${dots.by ? `the ${firstOf(dots)} ${api.number(here)} by ${dots.by}` : `the first ${api.number(here)}`} of ${all === null ? "more" : api.number(all)} sources`;
   }
   const outside = isCoverage() ? 0 : cells.beyond;
   return outside ? `beyond the ends of the colours: ${api.number(outside)} of ${api.number(cells.density.length)} cells` : "";
@@ -228,7 +231,7 @@ function drawOver(turn) {
     return p && [width / 2 + p[0] * unit, height / 2 - p[1] * unit];
   };
   graticule(c, view, at, [width, height]);
-  if (dots) drawDots(c, at);
+  if (dots) drawDots(c, dots, at, ink(/star|gaia/.test(shownTable) ? "second" : "accent"));
   drawFootprints(c, $("sky-footprints").value, view, at, [width, height]);
   footprintLegend($("sky-footprints").value);
   const own = pinned()?.place && at(...pinned().place);
@@ -240,22 +243,6 @@ function drawOver(turn) {
     c.stroke();
   }
   if (isByKeys) cross(c, [width / 2, height / 2], ink("ink"));
-}
-
-function drawDots(c, at) {
-  const mags = dots.mag.filter((m) => m !== null), faint = Math.max(...mags, 0), bright = Math.min(...mags, faint - 1);
-  const star = shownTable.includes("star") || shownTable.includes("gaia");
-  c.fillStyle = star ? ink("second") : ink("accent");
-  dots.ra.forEach((ra, k) => {
-    const point = at(ra, dots.dec[k]);
-    if (!point) return;
-    const share = dots.mag[k] === null ? 0.3 : (faint - dots.mag[k]) / (faint - bright);
-    c.globalAlpha = 0.35 + 0.6 * share;
-    c.beginPath();
-    c.arc(...point, 0.9 + 4.5 * share ** 2, 0, 7);
-    c.fill();
-  });
-  c.globalAlpha = 1;
 }
 
 function placeAt(event) {
@@ -311,12 +298,15 @@ function zoom(by, about, event) {
 
 async function pinAt(place) {
   if (!place || view.height >= SINGLE) return;
-  const found = await api.get(`nearest?${new URLSearchParams({ ra: place[0], dec: place[1], radius: view.height / 40 })}`).catch(() => ({}));
-  if (found.id) {
-    await pin(found.id);
+  try {
+    const { id } = await api.get(`nearest?${new URLSearchParams({ ra: place[0], dec: place[1], radius: view.height / 40 })}`);
+    if (!id) return isByKeys && api.say("No source is near the centre.");
+    await pin(id);
     redraw();
-    api.say(`Source ${found.id} is pinned: Images shows it.`);
-  } else if (isByKeys) api.say("No source is near the centre.");
+    if (pinned().id === id) api.say(`Source ${id} is pinned: Images shows it.`);
+  } catch (error) {
+    api.say(error.message, true);
+  }
 }
 
 /** The image of a footprint, at that place; true where there is one. */
@@ -343,7 +333,7 @@ const radius = () => 0.5 * Math.hypot(view.height, (view.height * $("sky-canvas"
 function query() {
   const near = `separation(ra, dec, ${view.ra.toFixed(7)}, ${view.dec.toFixed(7)}) <= ${Math.min(180, radius()).toPrecision(6)}`;
   const table = isCoverage() ? "tasks" : shownTable;
-  return `SELECT *\nFROM ${table}\nWHERE ${where && !isCoverage() ? `(${where})\n  AND ` : ""}${near}\n`;
+  return `SELECT *\nFROM ${table}\nWHERE ${where && !isCoverage() ? `(${where}\n)\n  AND ` : ""}${near}\n`;
 }
 
 function go() {
@@ -360,7 +350,7 @@ function asTable() {
   if (dots) {
     const rows = dots.ra.slice(0, MOST_ROWS).map((ra, k) => [dots.id[k], api.degrees(ra), api.degrees(dots.dec[k]), dots.mag[k]]);
     return data.replaceChildren(api.table([{ name: "id" }, { name: "RA", unit: "deg" }, { name: "Dec", unit: "deg" }, { name: dots.by ?? "magnitude" }], rows,
-      api.cut(rows.length, dots.ra.length, "sources, the brightest first")));
+      api.cut(rows.length, dots.ra.length, `sources, the ${firstOf(dots)} first`)));
   }
   const all = [...cells.density].map((d, k) => [api.degrees(cells.corners[8 * k]), api.degrees(cells.corners[8 * k + 1]), d]);
   const rows = all.sort((a, b) => b[2] - a[2]).slice(0, MOST_ROWS);

@@ -23,8 +23,11 @@ export class Tiles {
     const height = Math.min(image.tile, image.levels[level][1] - row * image.tile);
     const made = { width, height, texture: null, data: null };
     this.kept.set(name, made);
-    api.bytes(`tile/${image.number}/${level}/${row}/${column}${mended ? "?mended=1" : ""}`).then((buffer) => this.fill(made, buffer), (error) => {
-      this.kept.delete(name);
+    api.bytes(`tile/${image.number}/${level}/${row}/${column}${mended ? "?mended=1" : ""}`).then((buffer) => {
+      // One that has been let go meanwhile would have a texture that nobody deletes.
+      if (this.kept.get(name) === made) this.fill(made, buffer);
+    }, (error) => {
+      if (this.kept.get(name) === made) this.kept.delete(name);
       api.say(error.message, true);
     });
     for (const [old, value] of this.kept) {

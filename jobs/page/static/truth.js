@@ -17,7 +17,11 @@ export function sourcesOf(image, come) {
     api.get(`truth/${image.number}`).then((found) => {
       truths.set(image.number, found);
       come();
-    }, (error) => api.say(error.message, true));
+    }, (error) => {
+      // Whoever asks again may be answered.
+      truths.delete(image.number);
+      api.say(error.message, true);
+    });
   }
   return truths.get(image.number);
 }
@@ -57,8 +61,8 @@ export function tip(image, pixel, reach, [left, top]) {
   $("image-tip").style.left = `${Math.min(left + 14, $("image-canvas").clientWidth - 240)}px`;
   $("image-tip").style.top = `${Math.max(0, Math.min(top + 14, $("image-canvas").clientHeight - TALLEST))}px`;
   // Of the same source what has come stays.
-  if (hovered?.id === near.id[best]) return;
-  const mine = (hovered = { id: near.id[best] });
+  if (hovered?.id === near.id[best] && hovered.number === image.number) return;
+  const mine = (hovered = { id: near.id[best], number: image.number });
   const text = `${near.kind[best]} ${mine.id}\n${api.number(near.expected[best])} electrons expected, ${api.number(near.drawn[best])} drawn`;
   $("image-tip").textContent = text;
   api.get(`source/${mine.id}`).then((found) => {

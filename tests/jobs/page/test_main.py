@@ -18,7 +18,10 @@ ROOT = Path(__file__).resolve().parents[3]
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--host", "0.0.0.0", "--token", "0123456789abcdef"], "--called NAME is wanted"),
+        (
+            ["--host", "0.0.0.0", "--token", "0123456789abcdef"],
+            "--host 0.0.0.0 accepts connections from other machines: give --called NAME, the name or address that they",
+        ),
         (["--host", "0.0.0.0", "--called", "here.example"], "a --token of your own is wanted"),
         (["--called", "here.example"], "a --token of your own is wanted"),
         (["--host", "0.0.0.0", "--called", "a b"], "'a b' is no name"),
