@@ -9,11 +9,13 @@ from __future__ import annotations
 import asyncio
 import os
 import threading
-from collections.abc import AsyncIterator, Callable, Hashable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import pyarrow as pa
 
@@ -33,6 +35,8 @@ MOST_WAITING = 8
 # of the rest, which may take s; and how many questions may wait for each.
 PIXEL_THREADS, TABLE_THREADS, MOST_IN_LINE = 4, 2, 64
 _KEY_LENGTH = 16
+# What is planned and rendered: rows of it go by the number of an exposure, which every request counts for itself.
+_OBSERVED = ("exposures", "tasks", "products")
 Item = TypeVar("Item")
 Given = ParamSpec("Given")
 
@@ -140,6 +144,24 @@ class Pool:
         self._threads.shutdown(wait=False)
 
 
+@dataclass(frozen=True, slots=True)
+class Requested:
+    """The tables of one request, and those that no request has to itself.
+
+    request  : its name, None where the lake has no other; of several that share these tables the first
+    names    : of all of them, none in a lake without names;  versions : by table
+    """
+
+    request: str | None
+    names: tuple[str, ...]
+    versions: Mapping[str, read.Version]
+
+    def rows(self, table: str, columns: Sequence[str] | None = None) -> list[dict[str, Any]]:
+        """Rows of a table, none where it is not there; columns None: all of them."""
+        version = self.versions.get(table)
+        return [] if version is None else version.rows(columns).to_pylist()
+
+
 class Lake:
     """One opened lake.
 
@@ -177,11 +199,35 @@ class Lake:
             raise BadInput(f"the lake has no table {table}")
         return self.versions[table]
 
-    def named(self, table: str) -> list[read.Version]:
-        """A table, or where requests have versions of their own, that of each of them."""
-        if table in self.versions:
-            return [self.versions[table]]
-        return [version for name, version in sorted(self.versions.items()) if name.rpartition(".")[2] == table]
+    def requested(self, *tables: str) -> list[Requested]:
+        """Each request that has one of these tables; those that have the same versions of all of them count once."""
+        own: dict[str, dict[str, read.Version]] = {}
+        for name, version in sorted(self.versions.items()):
+            request, _, table = name.rpartition(".")
+            own.setdefault(request, {})[table] = version
+        shared = own.pop("", {})
+        held = {table for versions in own.values() for table in versions}
+        free = {table: version for table, version in shared.items() if table not in held}
+        found: dict[tuple[str, ...], list[str]] = {}
+        for request, versions in (own or {"": shared}).items():
+            versions |= {table: version for table, version in free.items() if table not in versions}
+            if keys := tuple(versions[table].key for table in tables if table in versions):
+                found.setdefault(keys, []).append(request)
+        if not own:
+            return [Requested(None, (), shared) for _ in found]
+        return [
+            Requested(
+                names[0] if len(found) > 1 else None,
+                tuple(names),
+                {table: version for name in reversed(names) for table, version in own[name].items()},
+            )
+            for names in found.values()
+        ]
+
+    @cached_property
+    def observed(self) -> list[Requested]:
+        """Requests that have planned or rendered something; what goes by the number of an exposure is of one."""
+        return self.requested(*_OBSERVED)
 
     def is_changed(self) -> bool:
         """Whether a table has been published since it was opened, or has come or gone."""

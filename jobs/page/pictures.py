@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from astropy.wcs import WCS
 
 from jobs.page.answers import plain
-from jobs.page.opened import Lake
+from jobs.page.opened import Lake, Requested
 from jobs.render import archive
 from jobs.render.camera import astrometry
 from jobs.render.products import pyramids, read_back
@@ -21,7 +21,7 @@ from jobs.render.products.beside import truth_file
 from jobs.render.products.pyramids import TILE
 from lake_schema import ids
 from lake_schema.arrays import Array, Float
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, LakeError
 from lake_schema.store import read
 from lake_schema.tables.galaxies import GALAXIES
 
@@ -37,13 +37,18 @@ class Picture:
 
     version : of the table;  row : of the file
     hits    : the file of its cosmic rays' truth, where there is one
-    request : that has them, where several have products of their own
+    own     : the tables of the request that has it
     """
 
     version: read.Version
     row: Mapping[str, Any]
     hits: str | None
-    request: str | None = None
+    own: Requested
+
+    @property
+    def place(self) -> tuple[str | None, int, str]:
+        """Request, exposure and detector, which tell it from those of any other place and time."""
+        return self.own.request, self.row["exposure_id"], self.row["detector"]
 
     @cached_property
     def is_mendable(self) -> bool:
@@ -96,11 +101,10 @@ class Picture:
 def pictures(lake: Lake) -> list[Picture]:
     """Every file of the products, in the order of their table: a file goes by its number here, never by its path."""
     found = []
-    names = {version.key: name.rpartition(".")[0] or None for name, version in lake.listed.items()}
-    for version in lake.named("products"):
-        rows = version.rows().to_pylist()
+    for own in lake.observed:
+        rows = own.rows("products")
         hits = {_frame(row): row["path"] for row in rows if row["content"] == "cosmic_rays"}
-        found += [Picture(version, row, hits.get(_frame(row)), names.get(version.key)) for row in rows]
+        found += [Picture(own.versions["products"], row, hits.get(_frame(row)), own) for row in rows]
     return found
 
 
@@ -122,7 +126,7 @@ def listed(lake: Lake) -> list[Json]:
         {
             "number": number,
             "is_mendable": one.is_mendable,
-            "request": one.request,
+            "request": one.own.request,
             **{k: plain(v) for k, v in one.row.items() if k != "mission"},
         }
         for number, one in enumerate(pictures(lake))
@@ -143,7 +147,7 @@ def described(lake: Lake, number: int) -> Json:
     top = float(np.max(finite)) if finite.size else 1.0
     header = {key: plain(value) for key, value, _ in one.cards}
     return {
-        "number": number, "nx": nx, "ny": ny, "tile": TILE,
+        "number": number, "request": one.own.request, "nx": nx, "ny": ny, "tile": TILE,
         "levels": [[level.shape[1], level.shape[0]] for level in levels],
         "sky": sky_level, "noise": noise if noise > 0 else max(abs(top) * 1e-4, 1e-6), "top": top,
         "unit": "electron" if one.row["content"] != "saturation" else "",
@@ -202,6 +206,14 @@ KINDS = {int(code): name for code, name in GALAXIES.column("kind").codes} | {5: 
 
 def _kinds(rows: pa.Table) -> list[str]:
     return [KINDS.get(kind, str(kind)) for kind in ids.kind_of(rows["id"].to_numpy()).tolist()]
+
+
+def failures(lake: Lake, own: Requested) -> list[Json]:
+    """Detectors of a request whose last attempt failed, none where no run has left a log."""
+    try:
+        return [row for name in own.names or [None] for row in archive.failures(lake.root, name).to_pylist()]
+    except LakeError:
+        return []
 
 
 def is_north_up(lake: Lake, number: int) -> bool:

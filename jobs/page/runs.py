@@ -10,7 +10,6 @@ from jobs import report
 from jobs.page import pictures
 from jobs.page.answers import plain
 from jobs.page.opened import Lake
-from jobs.render import archive
 from lake_schema.errors import LakeError
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import names as named
@@ -30,24 +29,16 @@ def runs(lake: Lake) -> Json:
         ]
     except LakeError as error:
         found["said"] = str(error)
-    done = {(one.row["exposure_id"], one.row["detector"]) for one in pictures.pictures(lake)}
-    for version in lake.named("tasks"):
-        rows = version.rows(["exposure_id", "detector", "seconds", "bytes"]).to_pylist()
-        left = [row["seconds"] for row in rows if (row["exposure_id"], row["detector"]) not in done]
-        found["tasks"].append({"done": len(rows) - len(left), "all": len(rows), "seconds_left": sum(left)})
-    if done or found["tasks"]:
-        found["failures"] = [{k: plain(v) for k, v in row.items()} for row in _failures(lake)]
-    for version in lake.named("mission"):
-        found["mission"] += _changed(version)
+    done = {one.place for one in pictures.pictures(lake)}
+    for own in lake.observed:
+        about = {"request": own.request}
+        if rows := own.rows("tasks", ["exposure_id", "detector", "seconds"]):
+            left = [row["seconds"] for row in rows if (own.request, row["exposure_id"], row["detector"]) not in done]
+            found["tasks"].append(about | {"done": len(rows) - len(left), "all": len(rows), "seconds_left": sum(left)})
+        found["failures"] += [about | {k: plain(v) for k, v in row.items()} for row in pictures.failures(lake, own)]
+    for own in lake.requested("mission"):
+        found["mission"] += [{"request": own.request, **row} for row in _changed(own.versions["mission"])]
     return found
-
-
-def _failures(lake: Lake) -> list[Json]:
-    try:
-        rows: list[Json] = archive.failures(lake.root, lake.request).to_pylist()
-    except LakeError:
-        return []
-    return rows
 
 
 def _changed(version: read.Version) -> list[Json]:

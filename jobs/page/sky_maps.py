@@ -6,7 +6,8 @@ What is of the renderer is imported where it is used: the first sky is shown bef
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,10 @@ import pyarrow.compute as pc
 
 from jobs.explore import adql
 from jobs.page.answers import is_catalogue, packed, plain
-from jobs.page.opened import Lake
+from jobs.page.opened import Lake, Requested
 from lake_schema import places, sky
 from lake_schema.arrays import Float, Int
-from lake_schema.errors import BadInput, LakeError
+from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
 
 _TASK = ("exposure_id", "ra", "dec", "radius", "s_region")
@@ -26,8 +27,9 @@ MOST_CELLS, MOST_SOURCES = 200_000, 20_000
 _DEEPEST_SHOWN = 16
 MOST_EXPOSURES = 20_000
 Json = dict[str, Any]
-# Of the sources of a field: what is shown beside the place, where a table has it.
-_MAGNITUDES = ("mag_r01", "mag_h", "phot_g_mean_mag", "log_mass")
+# Of the sources of a field: what is shown beside the place, where a table has it, and which come first: the smallest
+# numbers of a magnitude, the largest of a mass.
+_SIZES = (("mag_r01", 1), ("mag_h", 1), ("phot_g_mean_mag", 1), ("log_mass", -1))
 
 
 def parts(lake: Lake, table: str) -> bytes:
@@ -85,11 +87,7 @@ def coverage(lake: Lake, order: int, view: Float | None, band: str | None) -> by
 
     if not 0 <= order <= _DEEPEST_SHOWN:
         raise BadInput(f"order = {order} is outside [0, {_DEEPEST_SHOWN}]")
-    tasks = pa.concat_tables([version.rows(_TASK) for version in lake.named("tasks")] or [pa.table({})])
-    if band is not None:
-        rows = _rows(lake, "exposures", ("exposure_id", "band"))
-        own = [row["exposure_id"] for row in rows if row["band"] == band]
-        tasks = tasks.filter(pc.is_in(tasks["exposure_id"], pa.array(own, pa.int64())))
+    tasks = _tasks(lake, band)
     cells = np.zeros(0, np.int64)
     if view is not None:
         cells = sky.cells_in_cone(float(view[0]), float(view[1]), min(float(view[2]), 180.0), order)
@@ -103,9 +101,23 @@ def coverage(lake: Lake, order: int, view: Float | None, band: str | None) -> by
     return _packed(_corners(order, cells), seen.astype(float), {"order": order, "rows": tasks.num_rows})
 
 
+def _tasks(lake: Lake, band: str | None) -> pa.Table:
+    """What is planned in a band, None = in all; what several requests have of one version counts once."""
+    found = {}
+    for own in lake.observed:
+        if version := own.versions.get("tasks"):
+            found[version.key] = version.rows(_TASK)
+            if band is not None:
+                exposures = own.rows("exposures", ("exposure_id", "band"))
+                numbers = [row["exposure_id"] for row in exposures if row["band"] == band]
+                is_own = pc.is_in(found[version.key]["exposure_id"], pa.array(numbers, pa.int64()))
+                found[version.key] = found[version.key].filter(is_own)
+    return pa.concat_tables([*found.values()] or [pa.table({})])
+
+
 def bands(lake: Lake) -> list[str]:
     """Passbands in which exposures are planned."""
-    return sorted({row["band"] for row in _rows(lake, "exposures", ("band",))})
+    return sorted({row["band"] for own in lake.observed for row in own.rows("exposures", ("band",))})
 
 
 def _refuse_many(cells: int) -> None:
@@ -118,14 +130,16 @@ def _corners(order: int, cells: Int) -> Float:
 
 
 async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
-    """Rows of a catalogue in a field: places, identifiers, a magnitude, a kind; the brightest `most` of `total`.
+    """Rows of a catalogue in a field: places, identifiers, a magnitude, a kind; of `total` the brightest `most`.
 
     view : ra, dec, radius deg;  where : SQL condition
+
+    `by` is the column of the magnitude, which a mass may stand for; `sense` 1 where small numbers come first, else -1.
     """
     version = lake.version(table)
     names = version.schema.names
     lon, lat, radius = (float(number) for number in view)
-    mag = next((name for name in _MAGNITUDES if name in names), None)
+    mag, sense = next((size for size in _SIZES if size[0] in names), (None, 1))
     key = "id" if "id" in names else names[0]
     ra, dec = version.place(_shown(version))
     chosen = [f'"{key}" AS id', f"{ra} AS ra", f"{dec} AS dec", f"{mag or 'NULL'} AS mag"]
@@ -133,10 +147,10 @@ async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
     chosen += ["kind" if "kind" in names else "NULL AS kind", "count(*) OVER () AS total"]
     text = f"""SELECT {", ".join(chosen)} FROM {_table(lake, table)} WHERE ({where}\n) AND {_within(wider)}
                AND separation({ra}, {dec}, {lon!r}, {lat!r}) <= {radius!r}
-               ORDER BY {"mag" if mag else "1"} LIMIT {MOST_SOURCES}"""
+               ORDER BY {("mag DESC" if sense < 0 else "mag") if mag else "1"} NULLS LAST LIMIT {MOST_SOURCES}"""
     found = await _asked(lake, text, where)
     columns = {name: found[name].to_pylist() for name in ("ra", "dec", "mag", "kind")}
-    return {**columns, "id": [str(value) for value in found["id"].to_pylist()], "by": mag} | {
+    return {**columns, "id": [str(value) for value in found["id"].to_pylist()], "by": mag, "sense": sense} | {
         "total": found["total"][0].as_py() if found.num_rows else 0, "most": MOST_SOURCES,
     }  # fmt: skip
 
@@ -176,42 +190,60 @@ def _packed(corners: Float, density: Float, head: Json) -> bytes:
 
 
 def regions(lake: Lake) -> list[Json]:
-    """Footprints of detectors: what was planned, what is done, what failed; images by number, each with its content."""
-    from jobs.render import archive
+    """Footprints of detectors: what was planned, what is done, what failed; images by number, each with its content.
 
-    found: dict[tuple[int, str], Json] = {}
-    bands_ = {row["exposure_id"]: row["band"] for row in _rows(lake, "exposures", ("exposure_id", "band"))}
-    for row in _rows(lake, "tasks", ("exposure_id", "detector", "channel", "s_region")):
-        about: Json = {"state": "planned", "images": [], "contents": [], "band": bands_.get(row["exposure_id"])}
-        found[row["exposure_id"], row["detector"]] = {**_polygon(row), **about}
-    for number, row in enumerate(_rows(lake, "products", _PRODUCT)):
-        place = row["exposure_id"], row["detector"]
-        region = found.setdefault(place, {**_polygon(row), "images": [], "contents": []})
-        region |= {"state": "observed", "band": row["band"]}
+    Each has the request whose exposure it is of, None where the lake has no other.
+    """
+    failed = _failed(lake)
+    return [_now(place, region, failed) for place, region in _regions(lake).items()]
+
+
+# A request, one of its exposures, and a detector: by these a footprint is found.
+_Place = tuple[str | None, int, str]
+
+
+@lru_cache(maxsize=4)
+def _regions(lake: Lake) -> Mapping[_Place, Json]:
+    """What was planned, and what is done; that does not change while the lake is open."""
+    from jobs.page import pictures
+
+    found: dict[_Place, Json] = {}
+    for own in lake.observed:
+        bands_ = {row["exposure_id"]: row["band"] for row in own.rows("exposures", ("exposure_id", "band"))}
+        for row in own.rows("tasks", ("exposure_id", "detector", "channel", "s_region")):
+            about: Json = {"state": "planned", "images": [], "contents": [], "band": bands_.get(row["exposure_id"])}
+            found[own.request, row["exposure_id"], row["detector"]] = {**_polygon(own, row), **about}
+    for number, one in enumerate(pictures.pictures(lake)):
+        empty = {**_polygon(one.own, one.row), "images": [], "contents": []}
+        region = found.setdefault(one.place, empty)
+        region |= {"state": "observed", "band": one.row["band"]}
         region["images"].append(number)
-        region["contents"].append(row["content"])
-    try:
-        failed = archive.failures(lake.root, lake.request).to_pylist() if found else []
-    except LakeError:
-        failed = []
-    lost = {str(row["part"]): str(row["error"]) for row in failed}
-    for (exposure, detector), region in found.items():
-        if region["state"] == "planned" and (error := lost.get(f"{exposure:06d}-{detector}.parquet".lower())):
-            region |= {"state": "failed", "error": error}
-    return list(found.values())
+        region["contents"].append(one.row["content"])
+    return found
 
 
-_PRODUCT = ("path", "content", "exposure_id", "detector", "channel", "band", "s_region")
+def _failed(lake: Lake) -> dict[tuple[str | None, str], str]:
+    """Why a part of a request's images could not be made: runs of other processes may say so at any time."""
+    from jobs.page import pictures
+
+    return {
+        (own.request, str(row["part"])): str(row["error"])
+        for own in lake.observed
+        for row in pictures.failures(lake, own)
+    }
 
 
-def _rows(lake: Lake, table: str, names: Sequence[str]) -> list[Json]:
-    return [row for version in lake.named(table) for row in version.rows(names).to_pylist()]
+def _now(place: _Place, region: Json, failed: Mapping[tuple[str | None, str], str]) -> Json:
+    request, exposure, detector = place
+    error = failed.get((request, f"{exposure:06d}-{detector}.parquet".lower())) if failed else None
+    return {**region, "state": "failed", "error": error} if error and region["state"] == "planned" else region
 
 
-def _polygon(row: Json) -> Json:
+def _polygon(own: Requested, row: Mapping[str, Any]) -> Json:
     numbers = [float(text) for text in row["s_region"].split()[2:]]
     polygon = [numbers[k : k + 2] for k in range(0, len(numbers), 2)]
-    return {key: row[key] for key in ("exposure_id", "detector", "channel")} | {"polygon": polygon}
+    about = {key: row[key] for key in ("exposure_id", "detector", "channel")}
+    return {"request": own.request, **about, "polygon": polygon}
 
 
 def exposures(lake: Lake, view: Float | None = None) -> list[Json]:
@@ -220,23 +252,21 @@ def exposures(lake: Lake, view: Float | None = None) -> list[Json]:
     view   : ra, dec, radius deg, None = all;  returns: of each exposure its state, what it is, and `outline`, polygons
     Errors : BadInput where they are more than are shown
     """
-    about = {row.pop("exposure_id"): row for row in _rows(lake, "exposures", _EXPOSURE)}
-    detectors: dict[int, list[Json]] = {}
-    for region in regions(lake):
-        detectors.setdefault(region["exposure_id"], []).append(region)
-    found: list[Json] = []
-    for number, own in sorted(detectors.items()):
-        corners = np.array([corner for region in own for corner in region["polygon"]])
-        if view is not None and not _is_near(corners, view):
-            continue
-        if len(found) == MOST_EXPOSURES:
-            raise BadInput(f"more than {MOST_EXPOSURES:,} exposures are here: look at a part")
+    about, places, circles = _exposures(lake)
+    # A circle about all corners meets the one in view.
+    near = np.full(len(about), True)
+    if view is not None:
+        near = sky.separation(circles[:, 0], circles[:, 1], view[0], view[1]) <= circles[:, 2] + view[2]
+    if np.count_nonzero(near) > MOST_EXPOSURES:
+        raise BadInput(f"more than {MOST_EXPOSURES:,} exposures are here: look at a part")
+    known, failures, found = _regions(lake), _failed(lake), []
+    for k in np.flatnonzero(near):
+        own = [_now(place, known[place], failures) for place in places[k]]
         states = [region["state"] for region in own]
         done, failed = states.count("observed"), states.count("failed")
-        first = {"channel": own[0]["channel"], "camera": None, "band": own[0]["band"], "image_type": None, "mjd": None}
+        corners = np.array([corner for region in own for corner in region["polygon"]])
         found.append(
-            {"exposure_id": number, **first, **{k: plain(v) for k, v in about.get(number, {}).items()}}
-            | {"state": _state(done, failed, len(own)), "done": done, "failed": failed, "all": len(own)}
+            {**about[k], "state": _state(done, failed, len(own)), "done": done, "failed": failed, "all": len(own)}
             | {"outline": [_hull(corners).tolist()]}
         )
     return found
@@ -245,17 +275,33 @@ def exposures(lake: Lake, view: Float | None = None) -> list[Json]:
 _EXPOSURE = ("exposure_id", "channel", "camera", "band", "image_type", "mjd")
 
 
+@lru_cache(maxsize=4)
+def _exposures(lake: Lake) -> tuple[list[Json], list[list[_Place]], Float]:
+    """Of every exposure what it is, its detectors, and a circle about their corners: ra, dec, radius deg [n, 3]."""
+    known, detectors = _regions(lake), dict[tuple[str | None, int], list[_Place]]()
+    for place in known:
+        detectors.setdefault(place[:2], []).append(place)
+    rows = {
+        (own.request, row["exposure_id"]): {name: plain(value) for name, value in row.items()}
+        for own in lake.observed
+        for row in own.rows("exposures", _EXPOSURE)
+    }
+    about, places, circles = [], [], []
+    for (request, number), own_places in sorted(detectors.items(), key=lambda item: (item[0][0] or "", item[0][1])):
+        own = [known[place] for place in own_places]
+        first = {"channel": own[0]["channel"], "camera": None, "band": own[0]["band"], "image_type": None, "mjd": None}
+        about.append({"request": request, "exposure_id": number, **first, **rows.get((request, number), {})})
+        places.append(own_places)
+        corners = np.array([corner for region in own for corner in region["polygon"]])
+        ra, dec = _middle(corners)
+        circles.append((ra, dec, sky.separation(corners[:, 0], corners[:, 1], ra, dec).max()))
+    return about, places, np.array(circles).reshape(-1, 3)
+
+
 def _state(done: int, failed: int, number: int) -> str:
     if done:
         return "observed" if done == number else "partly"
     return "failed" if failed else "planned"
-
-
-def _is_near(corners: Float, view: Float) -> bool:
-    """Whether a circle about all corners meets one about the place in view."""
-    ra, dec = _middle(corners)
-    extent = sky.separation(corners[:, 0], corners[:, 1], ra, dec).max()
-    return bool(sky.separation(np.array([ra]), np.array([dec]), view[0], view[1])[0] <= extent + view[2])
 
 
 def _middle(corners: Float) -> tuple[float, float]:
@@ -267,24 +313,16 @@ def _middle(corners: Float) -> tuple[float, float]:
 def _hull(corners: Float) -> Float:
     """Those of the places [n, 2] deg that no great circle cuts off, counter-clockwise with north up and east left.
 
-    In the tangent plane of their middle great circles are straight lines.
+    In the tangent plane of their middle great circles are straight lines. Of places on one line its ends are left.
     """
+    from scipy.spatial import ConvexHull, QhullError
+
     from jobs.page import pictures
 
     plane = np.stack(pictures.tangent(corners[:, 0], corners[:, 1], *_middle(corners)), axis=1)
-    order = np.lexsort((plane[:, 1], plane[:, 0]))
-    chains: list[int] = []
-    for direction in (order, order[::-1]):
-        chain: list[int] = []
-        for k in direction:
-            while len(chain) > 1 and _turn(plane[chain[-2]], plane[chain[-1]], plane[k]) <= 0.0:
-                chain.pop()
-            chain.append(int(k))
-        chains += chain[:-1]
-    # East is to the left of north.
-    return corners[chains[::-1]]
-
-
-def _turn(a: Float, b: Float, c: Float) -> float:
-    """Twice the area of a triangle, positive where it is passed counter-clockwise."""
-    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+    try:
+        # East is to the left of north.
+        hull: Float = corners[ConvexHull(plane).vertices[::-1]]
+    except QhullError:
+        hull = corners[np.lexsort((plane[:, 1], plane[:, 0]))[[-1, 0]]]
+    return hull

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.dataset as ds
 from numpy.polynomial import polynomial
 
 from jobs.fluxes import band_fluxes, inputs, passbands
 from jobs.fluxes.spectra import lines
 from jobs.page import pictures
 from jobs.page.answers import packed, plain
-from jobs.page.opened import Lake
+from jobs.page.opened import Lake, Requested
 from lake_schema import ids, sky
 from lake_schema.errors import BadInput
 from lake_schema.store import read
@@ -34,43 +36,57 @@ def source(lake: Lake, text: str) -> Json:
     """
     identifier = _identifier(text)
     kind = int(ids.kind_of(np.array([identifier]))[0])
-    found: Json = {"id": text, "kind": pictures.KINDS.get(kind, str(kind)), "tables": {}, "drawn": [], "spectra": []}
-    for table in _TABLES.get(kind, ()):
-        for version in lake.named(table):
-            if (rows := _rows(version, identifier)).num_rows:
-                found["tables"][table] = _facts(rows)
-    rows = found["tables"].get(_TABLES.get(kind, ("",))[0])
-    if rows:
-        values = {row["name"]: row["value"] for row in rows}
-        ra, dec = (float(values.get(name) or 0.0) for name in lake.named(_TABLES[kind][0])[0].place())
+    rows, own = _found(lake, identifier, kind)
+    found: Json = {
+        "id": text, "kind": pictures.KINDS.get(kind, str(kind)), "request": own and own.request,
+        "tables": {table: _facts(row) for table, row in rows.items()}, "drawn": [], "spectra": [],
+    }  # fmt: skip
+    if own is not None and (row := rows.get(_TABLES[kind][0])) is not None:
+        ra, dec = (float(row[name][0].as_py()) for name in own.versions[_TABLES[kind][0]].place())
         found["place"] = [ra, dec]
         found["images"] = [
             {"number": number, "x": x, "y": y, "is_north_up": pictures.is_north_up(lake, number)}
             for number, x, y in pictures.covering(lake, ra, dec)
         ]
-    for version in lake.named("rendered_truth"):
-        drawn = version.rows(where=pc.field("id") == identifier)
-        found["drawn"] += [{key: plain(value) for key, value in row.items()} for row in drawn.to_pylist()]
-    for version in lake.named("rendered_spectra"):
-        traces = version.rows(where=pc.field("id") == identifier).to_pylist()
-        found["spectra"] += [_trace(lake, row, found["tables"].get("galaxies", [])) for row in traces]
+    wanted = pc.field("id") == identifier
+    for observed in lake.observed:
+        for drawn in _where(observed, "rendered_truth", wanted):
+            found["drawn"].append({"request": observed.request, **{key: plain(value) for key, value in drawn.items()}})
+        traces = _where(observed, "rendered_spectra", wanted)
+        z = _redshift(observed, identifier, rows) if traces and "galaxies" in _TABLES.get(kind, ()) else 0.0
+        found["spectra"] += [_trace(lake, observed, trace, z) for trace in traces]
     if not found["tables"] and not found["drawn"]:
         raise BadInput(f"the lake has no source {text}")
     return found
 
 
-def _trace(lake: Lake, row: Json, galaxy: list[Json]) -> Json:
+def _where(own: Requested, table: str, wanted: ds.Expression) -> list[Json]:
+    """Those rows of a table of a request that a filter lets through."""
+    version = own.versions.get(table)
+    return [] if version is None else version.rows(where=wanted).to_pylist()
+
+
+def _redshift(own: Requested, identifier: int, rows: Mapping[str, pa.Table]) -> float:
+    """Of a galaxy as a request has it, whose universe may be another; 0 where none has its row.
+
+    rows : by table, of whichever request has the source
+    """
+    version = own.versions.get("galaxies")
+    row = rows.get("galaxies") if version is None else _rows(version, identifier)
+    return float(row["z_obs"][0].as_py()) if row is not None and row.num_rows else 0.0
+
+
+def _trace(lake: Lake, own: Requested, row: Json, z: float) -> Json:
     """A row of `rendered_spectra`: the images that hold it, and its lines by name.
 
-    galaxy : facts of its row in the catalogue, none of other sources
+    own : the tables of the request that has it;  z : redshift of the source
     """
-    place = row["exposure_id"], row["detector"]
+    place = own.request, row["exposure_id"], row["detector"]
     known = pictures.pictures(lake)
-    numbers = [k for k, one in enumerate(known) if (one.row["exposure_id"], one.row["detector"]) == place]
-    z = next((float(fact["value"]) for fact in galaxy if fact["name"] == "z_obs"), 0.0)
+    numbers = [k for k, one in enumerate(known) if one.place == place]
     about = known[numbers[0]].row if numbers else {"channel": "", "band": ""}
     columns = [row.pop(f"line_{name}") for name in ("wavelength", "expected", "snr")]
-    return {key: plain(value) for key, value in row.items()} | {
+    return {"request": own.request, **{key: plain(value) for key, value in row.items()}} | {
         "channel": about["channel"],
         "band": about["band"],
         "images": {known[k].row["content"]: k for k in numbers},
@@ -104,15 +120,21 @@ def _rows(version: read.Version, identifier: int) -> pa.Table:
     return version.rows(where=pc.field("id") == identifier)
 
 
-def _found(lake: Lake, table: str, identifier: int) -> tuple[pa.Table, read.Version]:
-    """The row of a source in a table, or in that of one of the requests, and the version that has it.
+def _found(lake: Lake, identifier: int, kind: int) -> tuple[dict[str, pa.Table], Requested | None]:
+    """The rows of a source by table, all of one request: of that which has most of them, of several the first.
 
-    Errors : BadInput where none has it
+    kind : of the source
     """
-    for version in lake.named(table):
-        if (rows := _rows(version, identifier)).num_rows:
-            return rows, version
-    raise BadInput(f"the lake has no source {identifier} in a table {table}")
+    best: tuple[dict[str, pa.Table], Requested | None] = {}, None
+    tables = _TABLES.get(kind, ())
+    for own in lake.requested(*tables):
+        rows = {table: _rows(own.versions[table], identifier) for table in tables if table in own.versions}
+        rows = {table: row for table, row in rows.items() if row.num_rows}
+        if len(rows) > len(best[0]):
+            best = rows, own
+        if len(rows) == len(tables):
+            break
+    return best
 
 
 def _facts(rows: pa.Table) -> list[Json]:
@@ -141,10 +163,13 @@ def _spectrum(lake: Lake, text: str) -> Json:
     kind = int(ids.kind_of(np.array([identifier]))[0])
     if kind not in (0, 1, 4, 5):
         raise BadInput(f"no spectrum is made of a {pictures.KINDS.get(kind, kind)}")
-    table, flux_table = _TABLES[kind]
-    row, _ = _found(lake, table, identifier)
-    flux, fluxes = _found(lake, flux_table, identifier)
-    made_of = fluxes.manifest["facts"]
+    rows, own = _found(lake, identifier, kind)
+    for name in _TABLES[kind]:
+        if own is None or name not in rows:
+            raise BadInput(f"the lake has no source {identifier} in a table {name}")
+    assert own is not None
+    row, flux = (rows[name] for name in _TABLES[kind])
+    made_of = own.versions[_TABLES[kind][1]].manifest["facts"]
     if kind == 5:
         library = inputs.stars_of(lake.root, made_of)
         whole, grid = band_fluxes.star_spectra(row, library)[0], np.asarray(library.wavelength, float)
@@ -156,7 +181,7 @@ def _spectrum(lake: Lake, text: str) -> Json:
     found: Json = {
         "wavelength": np.round(grid[:size].reshape(-1, step).mean(axis=1), 2).tolist(),
         "f_lambda": [float(f"{value:.5g}") for value in whole[:size].reshape(-1, step).mean(axis=1)],
-        "lines": [], "bands": _bands(lake, flux),
+        "lines": [], "bands": _bands(own, flux),
     }  # fmt: skip
     if kind != 5:
         z = float(row["z_obs"][0].as_py())
@@ -169,17 +194,13 @@ def _spectrum(lake: Lake, text: str) -> Json:
     return found
 
 
-def _bands(lake: Lake, row: pa.Table) -> list[Json]:
+def _bands(own: Requested, row: pa.Table) -> list[Json]:
+    """Passbands, of the request whose fluxes are shown, with the fluxes through them."""
     named = {name: row[name][0].as_py() for name in row.column_names if name.startswith("f_nu_")}
-    # Requests that have passbands of their own may have one of the same name: the first is shown.
-    curves: dict[str, Json] = {}
-    for version in lake.named("passbands"):
-        for one in version.rows(["name", "pivot_wavelength", "log_width"]).to_pylist():
-            curves.setdefault(one["name"], one)
     return [
         {"name": one["name"], "wavelength": one["pivot_wavelength"], "f_nu": named[f"f_nu_{one['name']}"],
          "width": one["pivot_wavelength"] * one["log_width"]}
-        for one in curves.values()
+        for one in own.rows("passbands", ["name", "pivot_wavelength", "log_width"])
         if f"f_nu_{one['name']}" in named
     ]  # fmt: skip
 
@@ -212,7 +233,7 @@ def strip(lake: Lake, number: int, text: str, order: int) -> bytes:
     wanted = pc.field("id") == _identifier(text)
     for name, value in place.items():
         wanted = wanted & (pc.field(name) == value)
-    found = [row for version in lake.named("rendered_spectra") for row in version.rows(where=wanted).to_pylist()]
+    found = _where(one.own, "rendered_spectra", wanted)
     if not found:
         raise BadInput(f"image {number} has no order {order} of source {text}")
     x, y = (np.array(found[0][f"trace_{axis}"]) for axis in "xy")
@@ -238,7 +259,8 @@ def nearest(lake: Lake, ra: float, dec: float, radius: float) -> Json:
     """
     best: Json = {}
     for table in ("galaxies", "stars"):
-        for version in lake.named(table):
+        for own in lake.requested(table):
+            version = own.versions[table]
             names = version.place()
             rows = version.cone(ra, dec, radius, ["id", *names])
             if not rows.num_rows:

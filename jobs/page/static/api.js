@@ -138,6 +138,15 @@ export function table(columns, rows, caption) {
   return h("table", {}, caption ? h("caption", {}, caption) : null, h("thead", {}, head), h("tbody", {}, ...body));
 }
 
+/** A table of what is of requests, which stand first where the lake has several; `row`: the cells of one. */
+export function requested(ones, columns, row) {
+  const several = ones.some((one) => one.request);
+  return several ? table([{ name: "request", text: 1 }, ...columns], ones.map((one) => [one.request, ...row(one)])) : table(columns, ones.map(row));
+}
+
+/** Before the name of what is of a request: its name, where the lake has several. */
+export const of = (one) => (one.request ? `${one.request}: ` : "");
+
 /** Run the newest question; while one is under way only the last of the others waits. */
 export function newest(ask) {
   let busy = false, waiting = null;

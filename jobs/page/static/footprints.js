@@ -3,7 +3,7 @@
 import * as api from "/static/api.js";
 import { ink } from "/static/colour.js";
 import { line } from "/static/graticule.js";
-import { frame, project } from "/static/sphere.js";
+import { frame, project, vector } from "/static/sphere.js";
 
 const $ = (id) => document.getElementById(id);
 export const KINDS = ["exposures", "tasks", "products", "nothing"];
@@ -13,25 +13,45 @@ const STATES = { planned: ["quiet", [5, 4]], partly: ["accent", [10, 3, 2, 3]], 
 const NAMED = 3, MOST_NAMED = 80;
 const known = {};
 
-/** Ask for what a kind needs, once; a promise. */
-export function load(kind) {
+/** Ask for what a kind needs, once; of exposures what is in view, a circle { ra, dec, radius } deg, where all are too many; a promise. */
+export function load(kind, near) {
   if (kind === "nothing") return Promise.resolve();
-  const path = kind === "exposures" ? "exposures" : "regions";
-  known[path] ??= api.get(path).then((found) => (known[path].rows = found), (error) => {
-    delete known[path];
+  if (kind === "exposures") return exposures(near);
+  known.regions ??= api.get("regions").then((found) => (known.regions.rows = found), (error) => {
+    delete known.regions;
     throw error;
   });
-  return known[path];
+  return known.regions;
+}
+
+/** All of them at first; where these are refused, those about the view: `of` is the circle that has been asked for. */
+async function exposures(near) {
+  const has = known.exposures, isFirst = !has;
+  if (has?.of && away(has.of, near) + near.radius <= has.of.radius) return has.under;
+  // Somewhat more than is seen: not every step asks anew.
+  const of = isFirst ? { ...near, radius: Infinity } : { ...near, radius: Math.min(180, 1.5 * near.radius) };
+  const mine = (known.exposures = { of, rows: has?.rows ?? [], said: has?.said });
+  mine.under = api.get(isFirst ? "exposures" : `exposures?${new URLSearchParams(of)}`).then((found) => Object.assign(mine, { rows: found, said: "" }), (error) => {
+    Object.assign(mine, { of: null, rows: [], said: error.message });
+    if (isFirst) return exposures(near);
+  });
+  return mine.under;
+}
+
+/** Distance of two places, deg. */
+function away(one, other) {
+  const a = vector(one.ra, one.dec), b = vector(other.ra, other.dec);
+  return (2 * Math.asin(Math.min(1, Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]) / 2)) * 180) / Math.PI;
 }
 
 /** [{state, polygons, name}] of a kind, as far as they are here. */
 function shown(kind) {
   if (kind === "exposures") return (known.exposures?.rows ?? []).map((one) => ({ ...one, polygons: one.outline,
-    name: `${one.band ?? one.channel} exposure ${one.exposure_id}, ${one.done} of ${one.all} detectors${one.failed ? `, ${one.failed} failed` : ""}` }));
+    name: `${api.of(one)}${one.band ?? one.channel} exposure ${one.exposure_id}, ${one.done} of ${one.all} detectors${one.failed ? `, ${one.failed} failed` : ""}` }));
   const rows = known.regions?.rows ?? [];
-  if (kind === "tasks") return rows.map((one) => ({ ...one, polygons: [one.polygon], name: `${one.band ?? one.channel} ${one.detector}, ${one.state}` }));
+  if (kind === "tasks") return rows.map((one) => ({ ...one, polygons: [one.polygon], name: `${api.of(one)}${one.band ?? one.channel} ${one.detector}, ${one.state}` }));
   return kind === "products" ? rows.filter((one) => one.images.length).map((one) => ({ ...one, polygons: [one.polygon],
-    name: `${one.band ?? one.channel} ${one.detector}: ${one.contents?.map((content) => content.replace("_", " ")).join(", ") ?? one.images.length}` })) : [];
+    name: `${api.of(one)}${one.band ?? one.channel} ${one.detector}: ${one.contents?.map((content) => content.replace("_", " ")).join(", ") ?? one.images.length}` })) : [];
 }
 
 /** Those with images that hold a place, of the finest kind. */
@@ -94,7 +114,7 @@ function write(c, one, [x, y]) {
 
 /** What the lines mean, with how many there are of each state. */
 export function legend(kind) {
-  const all = shown(kind), rows = [];
+  const all = shown(kind), said = kind === "exposures" && known.exposures?.said, rows = said ? [api.h("div", {}, said)] : [];
   for (const state of Object.keys(STATES)) {
     const some = all.filter((one) => one.state === state).length;
     if (some) rows.push(api.h("div", {}, swatch(...STATES[state]), ` ${state}: ${api.number(some)}`));

@@ -105,7 +105,7 @@ export async function show() {
   list ??= await api.get("images");
   if (!list.length) return api.say("The lake holds no images.");
   if (!$("image-one").childElementCount) {
-    const name = (one) => `${one.request ? `${one.request}: ` : ""}${one.exposure_id} ${one.channel} ${one.band} ${one.detector}: ${one.content.replace("_", " ")}`;
+    const name = (one) => `${api.of(one)}${one.exposure_id} ${one.channel} ${one.band} ${one.detector}: ${one.content.replace("_", " ")}`;
     $("image-one").append(...list.map((one) => api.h("option", { value: one.number }, name(one))));
     $("image-two").append(api.h("option", { value: -1 }, "nothing"), ...list.map((one) => api.h("option", { value: one.number }, name(one))));
   }

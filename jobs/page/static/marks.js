@@ -1,4 +1,4 @@
-// What is drawn over an image: marks of sources, a compass, a scale.
+// What is drawn over the sky and over an image: marks of sources, a compass, a scale.
 
 /** Of the mark of a source of so many electrons, pixels of the screen. */
 export const radiusOf = (electrons) => Math.min(28, 3 + 1.6 * Math.log10(1 + Math.max(0, electrons)));
@@ -43,4 +43,24 @@ export function compass(c, image, view, at, [width, height]) {
   const long = (nice / pixel) * view.zoom;
   c.fillRect(width - 110 - long, height - 22, long, 2);
   c.fillText(nice >= 60 ? `${nice / 60}′` : `${nice}″`, width - 110 - long / 2, height - 28);
+}
+
+/** Which sources of a field come first: of a magnitude those of small numbers, of a mass those of large ones. */
+export const firstOf = (dots) => (dots.sense < 0 ? "most massive" : "brightest");
+
+/** Sources of a field, the first ones large; `at`: RA, Dec -> screen. */
+export function drawDots(c, dots, at, colour) {
+  const mags = dots.mag.map((mag) => mag && mag * dots.sense), told = mags.filter((mag) => mag !== null);
+  const faint = told.reduce((a, b) => Math.max(a, b), -Infinity), bright = told.reduce((a, b) => Math.min(a, b), faint - 1);
+  c.fillStyle = colour;
+  dots.ra.forEach((ra, k) => {
+    const point = at(ra, dots.dec[k]);
+    if (!point) return;
+    const share = mags[k] === null ? 0.3 : (faint - mags[k]) / (faint - bright);
+    c.globalAlpha = 0.35 + 0.6 * share;
+    c.beginPath();
+    c.arc(...point, 0.9 + 4.5 * share ** 2, 0, 7);
+    c.fill();
+  });
+  c.globalAlpha = 1;
 }

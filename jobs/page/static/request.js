@@ -9,19 +9,22 @@ const FACTS = ["exposure_id", "channel", "camera", "band", "image_type", "ra", "
 
 /**
  * The text of a request.  place: [ra, dec] deg;  radius: deg, of the field;
- * regions: of detectors that see it, each with exposure_id and detector
+ * regions: of detectors that see it, each with request, exposure_id and detector
  */
 async function requestOf(place, radius, regions) {
-  const detectors = new Map();
-  for (const one of regions) detectors.set(one.exposure_id, (detectors.get(one.exposure_id) ?? new Set()).add(one.detector));
-  const asked = [...detectors.keys()].sort((a, b) => a - b), rows = await exposures(asked.slice(0, MOST));
-  const science = rows.filter((row) => row.image_type === "science");
+  // Every request counts its exposures for itself.
+  const detectors = new Map(), name = (one) => `${api.of(one)}${one.exposure_id}`;
+  for (const one of regions) detectors.set(name(one), [...(detectors.get(name(one)) ?? []), one]);
+  const asked = [...detectors.values()].map((own) => own[0]).sort((a, b) => api.of(a).localeCompare(api.of(b)) || a.exposure_id - b.exposure_id);
+  const rows = await exposures(asked.slice(0, MOST)), science = rows.filter((row) => row.image_type === "science");
   const lines = [`# The field at RA ${place[0].toFixed(6)}, Dec ${place[1].toFixed(6)} deg, as it is seen on the page of ${api.lake.lake.replace(/[^\x20-\x7e]/g, "?")}.`,
     'name = "field"', "seed = 1   # of the universe: that of the lake's own request draws the same sources", "",
     "[area]", `cone = { ra = ${place[0].toFixed(7)}, dec = ${place[1].toFixed(7)}, radius = ${decimal(Math.min(180, Math.max(1e-3, radius)))} }`];
   if (asked.length > MOST) lines.push("", `# Of ${asked.length} exposures that see it the first ${MOST}.`);
   if (science.length < rows.length) lines.push("", `# ${rows.length - science.length} of its exposures are of calibrations: an [[observation]] asks for these.`);
-  for (const row of science) lines.push("", ...pointing(row, [...detectors.get(row.exposure_id)].sort()));
+  // What several requests have planned alike is asked for once.
+  const pointings = science.map((row) => pointing(row, detectors.get(name(row)).map((one) => one.detector).sort()).join("\n"));
+  for (const text of new Set(pointings)) lines.push("", text);
   return `${lines.join("\n")}\n`;
 }
 
@@ -40,18 +43,20 @@ export const copyFieldRequest = (place, radius) => copied(() => requestOf(place,
 /** For the exposure of an image, of its detector and the field that this sees. */
 export const copyImageRequest = (image) => copied(() => {
   const { nx, ny, plate, row } = image, place = plate.sky((nx - 1) / 2, (ny - 1) / 2);
-  const own = imagesAt(place).filter((one) => one.exposure_id === row.exposure_id && one.detector === row.detector);
+  const own = imagesAt(place).filter((one) => one.request === image.request && one.exposure_id === row.exposure_id && one.detector === row.detector);
   return requestOf(place, 0.5 * Math.hypot(nx, ny) * scaleOf(image), own);
 });
 
-/** Rows of the table of exposures as objects; none where the lake has no such table. */
-async function exposures(numbers) {
+/** Rows of the table of exposures as objects, each with its request; none where the lake has no such table. */
+async function exposures(asked) {
   const tables = api.lake.tables.filter((table) => table.name.split(".").pop() === "exposures"), found = [];
-  for (const table of numbers.length ? tables : []) {
+  for (const request of new Set(asked.map((one) => one.request))) {
+    const table = tables.find((one) => one.name === `${request}.exposures`) ?? tables.find((one) => one.name === "exposures");
+    if (!table) continue;
     const has = table.columns.map((column) => column.name), names = FACTS.filter((name) => has.includes(name));
-    const from = table.name.split(".").map((part) => `"${part}"`).join(".");
+    const from = table.name.split(".").map((part) => `"${part}"`).join("."), numbers = asked.filter((one) => one.request === request).map((one) => one.exposure_id);
     const answer = await api.post("sql", { sql: `SELECT ${names.join(", ")} FROM ${from} WHERE exposure_id IN (${numbers.join(", ")}) ORDER BY exposure_id` });
-    found.push(...answer.rows.map((row) => Object.fromEntries(names.map((name, k) => [name, row[k]]))));
+    found.push(...answer.rows.map((row) => ({ request, ...Object.fromEntries(names.map((name, k) => [name, row[k]])) })));
   }
   return found;
 }

@@ -8,23 +8,22 @@ export async function show() {
   if (found.said) parts.push(api.h("p", { class: "quiet" }, found.said));
   else parts.push(jobs(found.jobs));
   for (const task of found.tasks) {
-    parts.push(api.h("h2", {}, "Images"), api.h("p", {}, api.h("progress", { max: task.all, value: task.done, "aria-label": "detectors done" }),
+    parts.push(api.h("h2", {}, `${api.of(task)}Images`), api.h("p", {}, api.h("progress", { max: task.all, value: task.done, "aria-label": "detectors done" }),
       ` ${task.done} of ${task.all} detectors done`, task.done < task.all ? `, ${api.number(task.seconds_left, 3)} s of one core to come` : ""));
   }
   const lost = Object.entries(api.lake.damaged);
   if (lost.length) parts.push(api.h("h2", {}, "Tables that cannot be read"), api.table([{ name: "table", text: 1 }, { name: "why", text: 1 }], lost));
-  parts.push(api.h("h2", {}, "Failures"), found.failures.length ? api.table(
+  parts.push(api.h("h2", {}, "Failures"), found.failures.length ? api.requested(found.failures,
     [{ name: "part", text: 1 }, { name: "error", text: 1 }, { name: "attempt" }, { name: "run", text: 1 }],
-    found.failures.map((f) => [f.part, f.error, f.attempt, f.run])) : api.h("p", { class: "quiet" }, "None."));
-  parts.push(api.h("h2", {}, "Mission values that differ from the default"), found.mission.length ? api.table(
+    (f) => [f.part, f.error, f.attempt, f.run]) : api.h("p", { class: "quiet" }, "None."));
+  parts.push(api.h("h2", {}, "Mission values that differ from the default"), found.mission.length ? api.requested(found.mission,
     [{ name: "name", text: 1 }, { name: "value" }, { name: "default" }, { name: "unit", text: 1 }],
-    found.mission.map((m) => [m.name, m.value, m.usual, m.unit])) : api.h("p", { class: "quiet" }, "None: all are as truesky has them."));
+    (m) => [m.name, m.value, m.usual, m.unit]) : api.h("p", { class: "quiet" }, "None: all are as truesky has them."));
   parts.push(api.h("h2", {}, "Where images are from"));
   for (const image of images) {
-    const details = api.h("details", { class: "tree" }, api.h("summary", {}, image.path.split("/").pop()));
-    details.addEventListener("toggle", async () => {
-      if (details.open && details.childElementCount === 1) details.append(tree(await api.get(`provenance/${image.number}`)));
-    });
+    const details = api.h("details", { class: "tree" }, api.h("summary", {}, `${api.of(image)}${image.path.split("/").pop()}`));
+    details.addEventListener("toggle", () => details.open && details.childElementCount === 1 && api.get(`provenance/${image.number}`).then(
+      (found) => details.childElementCount === 1 && details.append(tree(found)), (error) => api.say(error.message, true)));
     parts.push(details);
   }
   document.getElementById("runs-content").replaceChildren(...parts);

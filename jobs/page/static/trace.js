@@ -16,11 +16,11 @@ const at = (trace, wavelength) => (wavelength - trace.wavelength_first) / (trace
 
 /** The orders of a source on the image that is shown, its lines beside the first; `place`: pixels -> screen. */
 export function drawTraces(c, source, image, place) {
-  const { exposure_id: exposure, detector } = image.row;
+  const { request, row: { exposure_id: exposure, detector } } = image;
   c.font = "12px DejaVu Sans, sans-serif";
   c.textAlign = "left";
   c.strokeStyle = c.fillStyle = COLOUR;
-  for (const trace of source.spectra.filter((one) => one.exposure_id === exposure && one.detector === detector)) {
+  for (const trace of source.spectra.filter((one) => one.request === request && one.exposure_id === exposure && one.detector === detector)) {
     const on = (t) => place(poly(trace.trace_x, t), poly(trace.trace_y, t));
     c.lineWidth = trace.order === 1 ? 1.5 : 1;
     c.setLineDash(trace.order === 1 ? [] : [4, 4]);
@@ -51,7 +51,7 @@ export async function dispersed(panel, source, isStill, drawings) {
   for (const trace of source.spectra.filter((one) => one.order === 1 && one.images.science !== undefined)) {
     const number = trace.images.science, middle = [poly(trace.trace_x, 0.5), poly(trace.trace_y, 0.5)];
     const canvas = api.h("canvas", { class: "strip", role: "img" }), scale = api.h("canvas", { class: "scale", "aria-hidden": "true" });
-    const name = `${trace.channel} ${trace.band}, exposure ${trace.exposure_id}, ${trace.detector}`;
+    const name = `${api.of(trace)}${trace.channel} ${trace.band}, exposure ${trace.exposure_id}, ${trace.detector}`;
     const overlap = trace.contaminants.length ? `, ${api.number(100 * trace.overlapped, 3)} % of it beside ${trace.contaminants.length} other sources` : ", beside no other source";
     panel.append(api.h("figure", {}, api.h("figcaption", {}, api.h("span", { class: "grow" }, name),
       api.h("button", { onclick: () => said.show?.(number, ...middle) }, "Show in the image")), canvas, scale,
@@ -94,14 +94,15 @@ function drawScale(canvas, trace) {
 }
 
 function orders(traces) {
-  return api.table([{ name: "exposure" }, { name: "detector", text: 1 }, { name: "order" }, { name: "from", unit: "nm" }, { name: "to", unit: "nm" },
+  return api.requested(traces, [{ name: "exposure" }, { name: "detector", text: 1 }, { name: "order" }, { name: "from", unit: "nm" }, { name: "to", unit: "nm" },
     { name: "x", unit: "pix" }, { name: "y", unit: "pix" }, { name: "to x", unit: "pix" }, { name: "to y", unit: "pix" }, { name: "expected", unit: "electron" }, { name: "overlapped" }],
-  traces.map((one) => [one.exposure_id, one.detector, one.order, nm(one.wavelength_first), nm(one.wavelength_last),
-    ...[one.x_first, one.y_first, one.x_last, one.y_last].map((pixel) => pixel.toFixed(2)), +one.expected.toPrecision(4), one.overlapped === null ? "–" : +one.overlapped.toPrecision(3)]));
+  (one) => [one.exposure_id, one.detector, one.order, nm(one.wavelength_first), nm(one.wavelength_last),
+    ...[one.x_first, one.y_first, one.x_last, one.y_last].map((pixel) => pixel.toFixed(2)), +one.expected.toPrecision(4), one.overlapped === null ? "–" : +one.overlapped.toPrecision(3)]);
 }
 
 function lines(traces) {
-  const rows = traces.flatMap((one) => one.lines.map((line) => [one.exposure_id, said.line(line.name), nm(line.wavelength), +line.expected.toPrecision(4), +Number(line.snr).toPrecision(3)]));
-  return rows.length ? api.table([{ name: "exposure" }, { name: "line", text: 1 }, { name: "wavelength", unit: "nm" }, { name: "expected", unit: "electron" }, { name: "signal to noise" }], rows)
+  const rows = traces.flatMap((one) => one.lines.map((line) => ({ ...line, request: one.request, exposure: one.exposure_id })));
+  return rows.length ? api.requested(rows, [{ name: "exposure" }, { name: "line", text: 1 }, { name: "wavelength", unit: "nm" }, { name: "expected", unit: "electron" }, { name: "signal to noise" }],
+    (line) => [line.exposure, said.line(line.name), nm(line.wavelength), +line.expected.toPrecision(4), +Number(line.snr).toPrecision(3)])
     : api.h("p", { class: "quiet" }, "No emission lines in the first order.");
 }

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jobs.page.opened import Lake
+from jobs.page.opened import Lake, Requested
 from jobs.page.pictures import pictures
 from jobs.page.tap.tables import image_row
 from lake_schema import sky
@@ -24,8 +24,9 @@ def obscore(lake: Lake, address: str) -> list[dict[str, Any]]:
 
     address : of the service from which the files can be had
     """
-    exposures = {row["exposure_id"]: row for version in lake.named("exposures") for row in version.rows().to_pylist()}
-    bands = _bands(lake)
+    owns = {own.request: own for own in lake.observed}
+    exposures = {(name, row["exposure_id"]): row for name, own in owns.items() for row in own.rows("exposures")}
+    bands = {name: _bands(own) for name, own in owns.items()}
     found = []
     for number, one in enumerate(pictures(lake)):
         entry = next(entry for entry in one.version.manifest["files"] if entry["path"] == one.row["path"])
@@ -33,10 +34,12 @@ def obscore(lake: Lake, address: str) -> list[dict[str, Any]]:
         header = {key: value for key, value, _ in one.cards}
         about = {
             "url": f"{address}/file/{lake.key}/{number}", "kbyte": entry["bytes"] // 1024, "version": one.version.key,
-            "fov": _diameter(one.row["ra"], one.row["dec"], corners), "wavelengths": bands.get(one.row["band"]),
+            "fov": _diameter(one.row["ra"], one.row["dec"], corners),
+            "wavelengths": bands[one.own.request].get(one.row["band"]),
+            "exposure": "/".join(str(part) for part in one.place[:2] if part is not None),
             "nx": header.get("NAXIS1"), "ny": header.get("NAXIS2"),
         }  # fmt: skip
-        found.append(image_row(number, one.row, exposures.get(one.row["exposure_id"], {}), about))
+        found.append(image_row(number, one.row, exposures.get(one.place[:2], {}), about))
     return found
 
 
@@ -44,17 +47,16 @@ def _diameter(ra: float, dec: float, corners: Float) -> float:
     return 2.0 * float(np.max(sky.separation(corners[:, 0], corners[:, 1], ra, dec)))
 
 
-def _bands(lake: Lake) -> dict[str, tuple[float, float]]:
+def _bands(own: Requested) -> dict[str, tuple[float, float]]:
     """Passband -> shortest and longest wavelength, angstrom."""
     found = {}
-    for version in lake.named("passbands"):
-        for row in version.rows(["name", "first_wavelength", "wavelength_step", "response"]).to_pylist():
-            response = np.array(row["response"])
-            seen = np.flatnonzero((response > 0.0) & (response >= _FAINTEST * response.max(initial=0.0)))
-            if not seen.size:
-                continue
-            ends = row["first_wavelength"] + row["wavelength_step"] * seen[[0, -1]]
-            found[str(row["name"])] = float(ends[0]), float(ends[1])
+    for row in own.rows("passbands", ["name", "first_wavelength", "wavelength_step", "response"]):
+        response = np.array(row["response"])
+        seen = np.flatnonzero((response > 0.0) & (response >= _FAINTEST * response.max(initial=0.0)))
+        if not seen.size:
+            continue
+        ends = row["first_wavelength"] + row["wavelength_step"] * seen[[0, -1]]
+        found[str(row["name"])] = float(ends[0]), float(ends[1])
     return found
 
 

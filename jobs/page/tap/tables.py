@@ -188,13 +188,14 @@ def image_row(number: int, row: Mapping[str, Any], exposure: Mapping[str, Any], 
     """An image as a row of ivoa.obscore.
 
     number   : by which it can be had;  row : of `products`;  exposure : its row of `exposures`, {} where there is none
-    file     : url, kbyte, nx, ny, fov (deg), wavelengths (shortest and longest, angstrom, or None), version
+    file     : url, kbyte, nx, ny, fov (deg), wavelengths (shortest and longest, angstrom, or None), version; exposure,
+               by which it is told from all others
     """
     start, seconds = exposure.get("mjd"), exposure.get("exposure_time_s")
     wavelengths = file["wavelengths"] or (None, None)
     return {
         "dataproduct_type": "image", "dataproduct_subtype": row["content"], "calib_level": 1,
-        "obs_collection": exposure.get("survey") or "truesky", "obs_id": str(row["exposure_id"]),
+        "obs_collection": exposure.get("survey") or "truesky", "obs_id": file["exposure"],
         "obs_publisher_did": f"ivo://truesky.local/{file['version']}?{row['path']}", "access_url": file["url"],
         "access_format": "application/fits", "access_estsize": file["kbyte"], "target_name": None,
         "s_ra": row["ra"], "s_dec": row["dec"], "s_fov": file["fov"], "s_region": row["s_region"],

@@ -117,3 +117,22 @@ def test_coverage(planned):
     head, rest = unpacked(body)
     seen = np.frombuffer(rest, "<f4", head["cells"], 32 * head["cells"])
     assert set(seen) == {1.0, 2.0}
+
+
+@pytest.mark.parametrize(
+    ("corners", "wanted"),
+    [
+        ([(10, 0), (11, 0), (11, 1), (10, 1), (10.5, 0.5)], [(10, 0), (11, 0), (11, 1), (10, 1)]),
+        ([(10, 0), (12, 0), (11, 0)], [(10, 0), (12, 0)]),
+        ([(10, 5), (10, 7)], [(10, 5), (10, 7)]),
+        ([(10, 5)], [(10, 5)]),
+        ([(359, -80), (1, -80), (0, -79), (0, -80.005)], [(359, -80), (1, -80), (0, -79)]),
+    ],
+)
+def test_hulls(corners, wanted):
+    """Also of places on one line; the parallel at -80 deg is bent, so that what lies on it to the south is a corner."""
+    hull = sky_maps._hull(np.array(corners, float))
+    assert {tuple(corner) for corner in hull} >= set(wanted)
+    assert (10.5, 0.5) not in {tuple(corner) for corner in hull}
+    x, y = -((hull[:, 0] + 180) % 360 - 180), hull[:, 1]
+    assert np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) >= 0

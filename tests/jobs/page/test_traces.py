@@ -44,15 +44,18 @@ def spectrum_image(wavelength):
     return out.astype(np.float32)
 
 
-def published(root, trace_x=TRACE_X):
-    """A galaxy, an image through a grism, and the truth of it."""
+def published(root, trace_x=TRACE_X, name=None, band="nisp_red", seconds=0):
+    """A galaxy, an image through a grism, and the truth of it.
+
+    name : of the request that has them;  seconds : tells its versions from those of others
+    """
     rows, own, wavelength = galaxy()
     cards = (*astrometry.cards(system()), ("BUNIT", "electron", "unit"))
     corners = astrometry.sky_of_pixel(system(), [0, NX - 1, NX - 1, 0], [0, 0, NY - 1, NY - 1])
     path = "images/000007/nisp_science.fits"
     products = PRODUCTS.build({
         "path": [path], "content": ["science"], "exposure_id": [7], "detector": ["DET22"], "channel": ["NISP-S"],
-        "band": ["nisp_red"], "ra": [CENTRE[0]], "dec": [CENTRE[1]], "mission": ["m"], "sources": [1],
+        "band": [band], "ra": [CENTRE[0]], "dec": [CENTRE[1]], "mission": ["m"], "sources": [1],
         "s_region": ["POLYGON ICRS " + " ".join(f"{a:.7f} {d:.7f}" for a, d in zip(*corners, strict=True))],
     })  # fmt: skip
     place = {"exposure_id": [7], "detector": ["DET22"], "id": [own]}
@@ -76,10 +79,12 @@ def published(root, trace_x=TRACE_X):
     }
     part = Part("000007-det22.parquet", {"exposure_id": 7, "detector": "DET22"})
     cell = Part(layout.cell_file(5, 1607), {})
-    publish.make(root, Plan(GALAXIES, {}, (cell,)), lambda lake, facts: Output(rows))
-    publish.make(root, Plan(PRODUCTS, {}, (part,)), lambda lake, facts: Output(products, files))
-    publish.make(root, Plan(RENDERED_TRUTH, {}, (part,)), lambda lake, facts: Output(truth))
-    publish.make(root, Plan(RENDERED_SPECTRA, {}, (part,)), lambda lake, facts: Output(spectra))
+    publish.make(root, Plan(GALAXIES, {}, (cell,)), lambda lake, facts: Output(rows), name=name)
+    for table, made in (
+        (PRODUCTS, Output(products, files)), (RENDERED_TRUTH, Output(truth)), (RENDERED_SPECTRA, Output(spectra)),
+    ):  # fmt: skip
+        plan = Plan(table, {"seconds": seconds} if seconds else {}, (part,))
+        publish.make(root, plan, lambda lake, facts, made=made: made, name=name)
     return own, wavelength
 
 
