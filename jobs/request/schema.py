@@ -32,8 +32,8 @@ MOST_SHEAR = 0.9
 # Of all channels that are rendered. A copy, since requests are read below the renderer (test_effect.py holds it to the
 # registry of channels).
 EFFECTS = (
-    "adc", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp", "charge_injection",
-    "chromatic_response", "cosmic_rays", "crosstalk", "dark_current", "dark_map", "dispersed_sky", "drift",
+    "adc", "amplifiers", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp",
+    "charge_injection", "chromatic_response", "cosmic_rays", "crosstalk", "dark_current", "dark_map", "dispersed_sky", "drift",
     "filter_ghosts", "full_well", "ghosts", "group_noise", "hot_pixels", "illumination", "injection_noise",
     "intra_pixel", "ipc", "lamp_response", "macc", "nonlinearity", "output_gain", "parallel_cti",
     "persistence", "pixel_area", "pixel_response", "poisson", "quadrants", "ramp", "ramp_cosmic_rays",
@@ -41,7 +41,7 @@ EFFECTS = (
     "signal_adc", "signal_nonlinearity", "straylight",
 )  # fmt: skip
 # What no image is a product without.
-ALWAYS = ("adc", "macc", "quadrants", "ramp", "signal_adc")
+ALWAYS = ("adc", "amplifiers", "macc", "quadrants", "ramp", "signal_adc")
 _NO_FILES = UserCurves()
 _NOTHING_TAKEN = Ingest()
 _SMOOTH = Structure()

@@ -30,8 +30,6 @@ from lake_schema.errors import BadInput
 # Document, LE1 VIS and NISP).
 GRID_NAMES = {"vis": "{row}-{column}", "nisp": "DET{row}{column}"}
 CAMERA, DETECTOR, AMPLIFIER = "", "detector", "amplifier"
-# Cameras whose amplifiers are simulated one by one; of the others a detector is read as one frame.
-_READ_APART = ("vis",)
 
 
 class Known(Protocol):
@@ -128,6 +126,7 @@ def detectors(section: str, configuration: Known) -> tuple[str, ...]:
 def amplifiers(section: str, configuration: Known) -> tuple[str, ...]:
     """Names of a detector's amplifiers, in the order in which they are read; none where it is read as one frame."""
     key = f"{section}.amplifiers"
-    if section not in _READ_APART or key not in configuration:
+    if key not in configuration:
         return ()
-    return tuple(row["amplifier"] for row in configuration.rows(key))
+    # Makers' types may have the same names.
+    return tuple(dict.fromkeys(row["amplifier"] for row in configuration.rows(key)))

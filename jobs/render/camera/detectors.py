@@ -48,6 +48,7 @@ class Detector:
     pixel_scale : arcsec
     bending     : distortion of its camera's optics
     wheel       : of its camera's filters; None: they stand still
+    kind        : of a ground camera's, what its layout calls its type
     """
 
     name: str
@@ -61,6 +62,7 @@ class Detector:
     bending: distortion.Terms = ()
     middle: int = 0
     wheel: FilterWheel | None = None
+    kind: str = ""
 
     @property
     def upside_down(self) -> bool:
@@ -188,6 +190,7 @@ def _listed(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]
             y=float(row["y_mm"]) * plate_scale,
             rotation=float(row["rotation_deg"]),
             pixel_scale=scale,
+            kind=row["type"],
         )
         for row in mission.rows(f"{section}.layout")
     )

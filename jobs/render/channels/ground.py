@@ -13,7 +13,7 @@ from jobs.render.channels.cost import Cost
 from jobs.render.effects.charge import dark_current, full_well, poisson
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import background
-from jobs.render.effects.readout import adc, read_noise
+from jobs.render.effects.readout import adc, bias_structure, quadrants, read_noise
 from jobs.render.psf import seeing
 from jobs.render.psf.model import Psf
 from jobs.render.sky import diffuse_light
@@ -25,6 +25,8 @@ SKY = (
     poisson.EFFECT,
     dark_current.EFFECT,
     full_well.EFFECT,
+    quadrants.AMPLIFIERS,
+    bias_structure.EFFECT,
     read_noise.EFFECT,
     adc.EFFECT,
 )
@@ -45,7 +47,7 @@ COST = Cost(frame_s=0.1, sky_s=0.1, galaxy_s=1.0e-4, star_s=4.5e-5, base_gb=0.5,
 CHANNEL = Channel(
     effects=EFFECTS,
     psf=_psf,
-    readout=readout.FRAME,
+    readout=readout.AMPLIFIERS,
     bands=bands.of_ground,
     sky=diffuse_light.ground_sky,
     cost=COST,

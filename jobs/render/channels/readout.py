@@ -4,6 +4,7 @@ FRAME       one array of pixels
 RAMP        the signal of a ramp, and whether it fits, in the frame of pixels that see no light
 RAMP_AND_CHI2  the same, with chi^2 itself
 QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan; quadrant_map: where each lies
+AMPLIFIERS  one array: the pixels of all amplifiers as they lie on the detector, their pre- and overscans around them
 """
 
 from __future__ import annotations
@@ -236,3 +237,59 @@ def _header(image: Image) -> dict[str, Any]:
 
 
 QUADRANTS = ReadoutMode(arrays=_quadrants, assembled=_assembled, pixels=_quadrant_pixels, electrons=_quadrant_electrons)
+
+
+# ---------------------------------------------------------------------------------------------- amplifiers in one array
+
+
+def _amplifiers(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
+    """uint16[q, rows, columns] ADU; its file has one array, and for each amplifier, from 1, where its parts are."""
+    own, raw = scene.layout, found.astype(np.uint16)
+    assert own is not None
+    cards: list[Card] = [
+        *astrometry.cards(astrometry.shifted(system, own.data.x, own.data.y)),
+        ("DATASEC", own.data.text, "pixels of the detector"),
+        ("NAMPS", len(own.amplifiers), "amplifiers"),
+    ]
+    numbers = (
+        ("GAIN", scene.of_amplifiers("gain", "electron / adu"), "[electron/adu] conversion gain"),
+        ("RDN", scene.of_amplifiers("read_noise", "electron"), "[electron] rms read noise"),
+    )
+    for number, amplifier in enumerate(own.amplifiers):
+        n = number + 1
+        cards += [
+            (f"AMP{n}", amplifier.name, "amplifier"),
+            (f"DSEC{n}", own.pixels_of(number).text, "its pixels"),
+            (f"CSEC{n}", amplifier.pixels.text, "the same, on the detector"),
+            (f"BSEC{n}", own.bias_of(number).text, "columns of bias beside them"),
+            *((f"{key}{n}", float(np.broadcast_to(value, len(raw))[number]), text) for key, value, text in numbers),
+        ]
+    return Readout((Extension("", own.raw(raw), "adu", tuple(cards)),), raw, own.together(raw))
+
+
+def _apart_assembled(array: Array, scene: Scene) -> Array:
+    return array if array.ndim == 2 or scene.layout is None else scene.layout.together(array)
+
+
+def _data(read: Sequence[Image]) -> Array:
+    """The detector's pixels; all of a file that has nothing else."""
+    header, array = _header(read[0]), np.asarray(read[0].data)
+    return array[Section.of(header["DATASEC"]).slices] if "DATASEC" in header else array
+
+
+def _apart_electrons(read: Sequence[Image]) -> Float:
+    """Above the level of each amplifier's bias columns, where there are some."""
+    header, array = _header(read[0]), np.asarray(read[0].data)
+    if "NAMPS" not in header:
+        return _frame_electrons(read)
+    out = np.zeros(_data(read).shape)
+    for n in range(1, int(header["NAMPS"]) + 1):
+        pixels, place, bias = (Section.of(header[f"{key}{n}"]) for key in ("DSEC", "CSEC", "BSEC"))
+        level = float(array[bias.slices].mean()) if bias.nx and bias.ny else float(header["BIAS"])
+        out[place.slices] = (array[pixels.slices] - level) * float(header[f"GAIN{n}"])
+    return out
+
+
+AMPLIFIERS = ReadoutMode(
+    arrays=_amplifiers, assembled=_apart_assembled, pixels=_data, electrons=_apart_electrons
+)

@@ -9,6 +9,8 @@ import numpy as np
 
 from jobs.accuracy import SURVEY, Accuracy
 from jobs.fluxes.passbands import Passband
+from jobs.render.camera import amplifiers
+from jobs.render.camera.amplifiers import Layout
 from jobs.render.camera.detectors import Detector
 from lake_schema.arrays import Float, Float32
 from lake_schema.errors import OutOfRange
@@ -105,8 +107,23 @@ class Scene:
 
     def of_amplifiers(self, key: str, unit: str) -> float | Float:
         """A parameter of its amplifiers: float64[q] in the order in which they are read; one number where all agree."""
+        if self.detector is not None and self.layout is not None:
+            return amplifiers.values(key, unit, self.detector, self.mission, self.layout)
         values = self.mission.of_amplifiers(f"{self.section}.{key}", unit, self._name)
         return np.array(values) if len(values) > 1 else values[0]
+
+    @property
+    def layout(self) -> Layout | None:
+        """Its amplifiers, of a ground camera's detector; None: it is read in quadrants, or as one frame."""
+        return None if self.detector is None else amplifiers.layout(self.detector, self.mission)
+
+    @property
+    def runs(self) -> tuple[tuple[int, int, bool], ...]:
+        """Pieces of its columns: first row, the one past the last, whether their charge leaves upwards."""
+        if self.layout is not None:
+            return self.layout.runs
+        lower, upper = self.unread
+        return (0, lower, False), (upper, self.ny, True)
 
     @property
     def _name(self) -> str:

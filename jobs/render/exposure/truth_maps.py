@@ -110,3 +110,5 @@ def complete(
         maps["saturation"] |= mode.assembled(full, scene)
     for truth_map in maps.values():
         truth_map[slice(*scene.unread)] = 0
+        if scene.layout is not None:
+            truth_map[scene.layout.streets] = 0

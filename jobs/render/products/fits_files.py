@@ -77,7 +77,10 @@ def _science(rendered: Rendered) -> list[Image]:
     cards = (*headers.science_cards(rendered), *readout.cards)
     if [extension.name for extension in readout.extensions] == [""]:
         (only,) = readout.extensions
-        return [Image(only.data, (*cards, *only.cards, *headers.section_cards(rendered, only)))]
+        # Its own stand for the detector's: its WCS counts what lies around the pixels, too.
+        more = (*only.cards, *headers.section_cards(rendered, only))
+        own = {keyword for keyword, *_ in more}
+        return [Image(only.data, (*(card for card in cards if card[0] not in own), *more))]
     arrays = [
         Image(extension.data, headers.array_cards(rendered, extension, cards), extension.name)
         for extension in readout.extensions

@@ -59,7 +59,7 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
         *_common(rendered),
         ("DETSIZE", _mosaic(rendered), "of the mosaic of all detectors"),
         *unit_cards(rendered.readout.unit),
-        *((key, float(value), comment) for key, value, comment in _of_amplifiers(rendered) if np.ndim(value) == 0),
+        *_of_all(rendered),
         ("SKYRATE", ("background" in applied) * scene.sky_rate, "[electron/s/pix] mean sky in the image"),
         (
             "DARKRATE",
@@ -67,6 +67,16 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
             "[electron/s/pix] dark current of usual pixels",
         ),
         *_effect_cards(rendered),
+    )
+
+
+def _of_all(rendered: Rendered) -> tuple[Card, ...]:
+    """What amplifiers share; of those that are in one array, their mean, and the lowest of levels."""
+    together = len(rendered.readout.extensions) == 1
+    return tuple(
+        (key, float(np.min(value) if key == "SATURATE" else np.mean(value)), comment)
+        for key, value, comment in _of_amplifiers(rendered)
+        if together or np.ndim(value) == 0
     )
 
 

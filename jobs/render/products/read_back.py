@@ -12,18 +12,22 @@ from typing import Any
 
 import numpy as np
 
+from jobs.render.camera.amplifiers import Section
 from jobs.render.channels import registry
 from jobs.render.channels.readout import ReadoutMode
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 
+# Where in an array the detector's pixels are, if there is more in it.
+_DATA = "DATASEC"
+
 
 def frame(path: Path) -> images.Image:
     """A file's pixels [ny, nx], of a science file without pre- and overscan, with the header of the whole."""
     read = images.read_images(path)
-    if read[0].data is not None:
+    if read[0].data is not None and _DATA not in _header(read):
         return read[0]
-    return images.Image(_mode(path, read).pixels(read), read[0].cards)
+    return images.Image(_mode(path, read).pixels(read), _trimmed(read[0].cards))
 
 
 def electrons(path: Path) -> images.Image:
@@ -37,7 +41,21 @@ def electrons(path: Path) -> images.Image:
         return images.Image(np.asarray(read[0].data, float), read[0].cards)
     if unit == "":
         raise BadInput(f"{path}: its pixels have no unit: they are not electrons")
-    return images.Image(_mode(path, read).electrons(read), read[0].cards)
+    return images.Image(_mode(path, read).electrons(read), _trimmed(read[0].cards))
+
+
+def _trimmed(cards: Sequence[images.Card]) -> tuple[images.Card, ...]:
+    """Header of the pixels alone: their WCS counts from the first of them."""
+    where = next((str(value) for key, value, _ in cards if key == _DATA), None)
+    if where is None:
+        return tuple(cards)
+    data = Section.of(where)
+    moved = {"CRPIX1": data.x, "CRPIX2": data.y}
+    return tuple(
+        (key, value - moved[key], text) if key in moved else (key, value, text)
+        for key, value, text in cards
+        if key != _DATA
+    )
 
 
 def _mode(path: Path, read: Sequence[images.Image]) -> ReadoutMode:

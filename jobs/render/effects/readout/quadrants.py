@@ -8,6 +8,7 @@ H lower left (Euclid Data Product Description Document, LE1 VIS). Columns: presc
 overscan.
 
 apply, EFFECT    detector -> quadrants in readout order, no charge outside the pixels
+AMPLIFIERS       the same of a ground camera's detector, whose amplifiers its table lays out
 placed           one quadrant in readout order -> as it lies on the detector, and back
 sections         which of its pixels are the detector's, which tell the bias
 assembled        quadrants -> detector, without pre- and overscan
@@ -20,6 +21,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from jobs.render.camera.amplifiers import Layout
 from jobs.render.camera.sections import Section, Sections
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
@@ -111,4 +113,19 @@ def sizes(scene: Scene) -> tuple[int, int, int, int]:
     return prescan, overscan, rows, scene.middle
 
 
+def apply_amplifiers(frame: Frame, own: Layout, rng: np.random.Generator | None = None) -> Frame:
+    """frame [ny, nx] e- -> [q, rows, columns] e- in readout order, with pre- and overscan; what is not read is lost.
+
+    own : the detector's amplifiers;  rng : not used
+    """
+    return own.apart(frame)
+
+
+def _layout(scene: Scene) -> tuple[Layout]:
+    if scene.layout is None:
+        raise BadInput(f"{scene.section}: a detector without a table of its amplifiers is not read through them")
+    return (scene.layout,)
+
+
 EFFECT = Effect("quadrants", apply, sizes, lambda scene: 0.0, optional=False, cost=3e-3)
+AMPLIFIERS = Effect("amplifiers", apply_amplifiers, _layout, lambda scene: 0.0, optional=False, cost=3e-3)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jobs.render.camera.amplifiers import Amplifier, Layout, Section
 from jobs.render.channels import ground, nisp_p, nisp_s, vis
 from jobs.render.effects.charge.ramp import Mode
 from jobs.render.effects.light.ghosts import Pupil
@@ -77,6 +78,13 @@ def tinted(electrons, even=(0.0, 0.0)):
     return lambda shape: (np.full((2, *shape), electrons, np.float32), np.array(even), 0.1, 0.1)
 
 
+def halves(shape):
+    """Two amplifiers, of the left and the right half."""
+    ny, nx = shape
+    sections = [Section(x, 0, nx // 2, ny) for x in (0, nx // 2)]
+    return Layout(nx, ny, 2, 3, 1, tuple(Amplifier(str(s.x), s, s.x > 0, False) for s in sections))
+
+
 # `on` and `off` may depend on the frame's shape.
 _CASES = (
     Case("background", (120.0,), (0.0,), zero=False, whole=True),
@@ -126,6 +134,7 @@ _CASES = (
     Case("full_well", (2e5,), (1e300,), whole=True),
     Case("bleeding", (2e5, 2), (1e300, 2), whole=True),
     Case("quadrants", (2, 3, 1), None, linear=True, conserves=True, whole=True),
+    Case("amplifiers", lambda shape: (halves(shape),), None, linear=True, conserves=True, whole=True),
     Case("parallel_cti", (END_OF_LIFE, Sweeps(1, 2), 3), (EMPTY, Sweeps(1, 2), 3), planes=True),
     Case("serial_cti", (END_OF_LIFE, Sweeps(1, 2), 3), (EMPTY, Sweeps(1, 2), 3), planes=True),
     Case("nonlinearity", (0.05, 2.28e5, 0.01, 2e3), (0.0, 2.28e5, 0.0, 2e3)),
@@ -149,6 +158,8 @@ _CASES = (
     Case("signal_adc", (1.92, 1024.0, 65535.0), None, planes=True, zero=False, reshapes=True),
 )
 CASES = {case.name: case for case in _CASES}
+# What cuts frames into parts.
+CUT = ("quadrants", "amplifiers")
 # The sides of frames that a case can be asked for: quadrants want even ones.
 SHAPES = ((4, 6), (1, 1), (1, 9), (9, 1), (12, 10))
 
@@ -160,7 +171,7 @@ def call(case, frame, off=False, seed=7):
 
 
 def shapes_of(name):
-    return [s for s in SHAPES if name != "quadrants" or not (s[0] % 2 or s[1] % 2)]
+    return [s for s in SHAPES if name not in CUT or not (s[0] % 2 or s[1] % 2)]
 
 
 def frame_of(case, shape, values):
