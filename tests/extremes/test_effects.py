@@ -66,7 +66,7 @@ def test_bleeding_and_transfer_account_for_every_electron(shape):
     """Charge in = charge out + what is still trapped + what left through the registers."""
     for frame in scenes((max(shape), max(shape))).values():
         part = np.ascontiguousarray(frame[: shape[0], : shape[1]])
-        held, lost = bleeding.bleed(part, 2e5, 2)
+        held, lost = bleeding.bleed(part, 2e5, [(0, len(part), False)])
         assert held.sum() + lost == part.sum()
         out, below = traps.shifted(held, END_OF_LIFE, Sweeps(1, 2), -2)
         read, along = traps.shifted(out, END_OF_LIFE, Sweeps(1, 2), -1)

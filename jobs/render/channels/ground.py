@@ -10,7 +10,7 @@ from jobs.render.camera.detectors import Detector
 from jobs.render.channels import readout
 from jobs.render.channels.channel import Channel
 from jobs.render.channels.cost import Cost
-from jobs.render.effects.charge import dark_current, full_well, poisson
+from jobs.render.effects.charge import bleeding, dark_current, poisson
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import background
 from jobs.render.effects.readout import adc, bias_structure, quadrants, read_noise
@@ -24,7 +24,7 @@ SKY = (
     background.EFFECT,
     poisson.EFFECT,
     dark_current.EFFECT,
-    full_well.EFFECT,
+    bleeding.EFFECT,
     quadrants.AMPLIFIERS,
     bias_structure.EFFECT,
     read_noise.EFFECT,

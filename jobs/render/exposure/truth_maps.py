@@ -65,7 +65,7 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode) -> 
             maps["sky"] = (after - before).astype(np.float32) + maps.get("sky", np.float32(0.0))
         if name == "persistence" and "persistence" in truth:
             maps["persistence"] = (after - before).astype(np.float32)
-        if name in ("bleeding", "full_well") and "saturation" in truth:
+        if name == "bleeding" and "saturation" in truth:
             maps["saturation"] = bleeding.saturated(after, scene.value("full_well", "electron")).astype(np.uint8)
         if name == "ramp" and "saturation" in truth:
             full = ramp.full(before, ramp.mode_of(scene), scene.value("full_well", "electron"))

@@ -85,6 +85,12 @@ def halves(shape):
     return Layout(nx, ny, 2, 3, 1, tuple(Amplifier(str(s.x), s, s.x > 0, False) for s in sections))
 
 
+def columns(shape):
+    """Their pieces: registers at both ends."""
+    middle = shape[0] // 2
+    return (0, middle, False), (middle, shape[0], True)
+
+
 # `on` and `off` may depend on the frame's shape.
 _CASES = (
     Case("background", (120.0,), (0.0,), zero=False, whole=True),
@@ -131,8 +137,7 @@ _CASES = (
     ),
     Case("charge_injection", (1e4, 2, 2, 0.03), (0.0, 2, 2, 0.03), zero=False, whole=True),
     Case("injection_noise", (2, 2, 10.0), (2, 2, 0.0), zero=False, whole=True),
-    Case("full_well", (2e5,), (1e300,), whole=True),
-    Case("bleeding", (2e5, 2), (1e300, 2), whole=True),
+    Case("bleeding", lambda shape: (2e5, columns(shape)), lambda shape: (1e300, columns(shape)), whole=True),
     Case("quadrants", (2, 3, 1), None, linear=True, conserves=True, whole=True),
     Case("amplifiers", lambda shape: (halves(shape),), None, linear=True, conserves=True, whole=True),
     Case("parallel_cti", (END_OF_LIFE, Sweeps(1, 2), 3), (EMPTY, Sweeps(1, 2), 3), planes=True),

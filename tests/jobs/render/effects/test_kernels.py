@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from jobs.render.effects.charge import dark_current, full_well, poisson
+from jobs.render.effects.charge import dark_current, poisson
 from jobs.render.effects.light import background
 from jobs.render.effects.readout import adc, read_noise
 from lake_schema.errors import OutOfRange
@@ -27,7 +27,6 @@ def test_no_kernel_writes_its_argument_or_loses_a_number(frame):
         lambda: background.apply(frame, 120.0),
         lambda: poisson.apply(frame, rng=rng()),
         lambda: dark_current.apply(frame, 0.3, rng=rng()),
-        lambda: full_well.apply(frame, 2e5),
         lambda: read_noise.apply(frame, 4.4, rng=rng()),
         lambda: adc.apply(frame, 3.48, 1000.0, 65535.0),
     )
@@ -86,10 +85,6 @@ def test_read_noise_is_gaussian():
     assert (np.abs(noise) > 2 * 4.4).mean() == pytest.approx(0.0455, abs=0.003)
 
 
-def test_full_well():
-    np.testing.assert_array_equal(full_well.apply(np.array([[1.0, 2e5, 3e5]]), 2e5), [[1.0, 2e5, 2e5]])
-
-
 @given(st.floats(-1e4, 1e7), st.floats(0.1, 10), st.floats(0, 2000))
 def test_conversion(electrons, gain, bias):
     (adu,) = adc.apply(np.array([[electrons]]), gain, bias, 65535.0).ravel()
@@ -111,7 +106,6 @@ def test_conversion_rounds_halves_up_and_saturates():
         (lambda x: background.apply(x, -1.0), "sky"),
         (lambda x: background.apply(x, float("nan")), "sky"),
         (lambda x: dark_current.apply(x, -1.0, rng=rng()), "dark"),
-        (lambda x: full_well.apply(x, 0.0), "full well"),
         (lambda x: read_noise.apply(x, -1.0, rng=rng()), "read noise"),
         (lambda x: adc.apply(x, 0.0, 0.0, 1.0), "gain"),
         (lambda x: adc.apply(x, float("inf"), 0.0, 1.0), "gain"),

@@ -56,7 +56,6 @@ CASES = {
     "charge_injection": lambda x: scene(injection__level=x),
     "injection_noise": lambda x: scene(injection__level=1e4, injection__noise=x),
     "calibration_lamp": lambda x: scene(flat__signal=x),
-    "full_well": lambda x: scene(peak=2e5 - 141 + (x - 1)),
     "bleeding": lambda x: scene(peak=2e5 - 141 + (x - 1)),
     "parallel_cti": lambda x: scene(cti__age=1e-4 * x),
     "serial_cti": lambda x: scene(cti__age=3e-4 * x),

@@ -236,8 +236,8 @@ def test_an_exploration_is_the_product_of_requests(tmp_path):
     assert {v.accuracy.flux for v in own} == {5e-3, 1e-3}
     # Each variant has the same noise but for what it changes.
     assert len({image_types.identity(ExposureRow.of(row)) for row in exposures.to_pylist()}) == 1
-    forced = variants.variant('{"effects.full_well": false}', MISSION, accuracy.SURVEY, {"full_well": True}).forced
-    assert forced == {"full_well": False}
+    forced = variants.variant('{"effects.bleeding": false}', MISSION, accuracy.SURVEY, {"bleeding": True}).forced
+    assert forced == {"bleeding": False}
 
 
 def test_exposures_alike_are_numbered(tmp_path):
