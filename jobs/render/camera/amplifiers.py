@@ -6,7 +6,7 @@ files of DECam and MegaCam.
 
 Amplifier      a part of a detector, and its output
 Layout         all of a detector, with pre- and overscan; None of a camera that has no table of them
-layout         of a detector, from the mission database
+layout         of a detector, from the mission database;  full_size : of a whole one
 Section        a rectangle of a file or a detector, and how FITS writes it
 values         a parameter of each amplifier
 couplings      crosstalk of each pair
@@ -229,7 +229,7 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
     prescan, overscan, more = (int(first[key]) for key in ("prescan", "overscan", "overscan_rows"))
     across, up = (sorted({int(row[axis]) for row in rows}) for axis in "xy")
     width, height = int(first["nx"]), int(first["ny"])
-    if (detector.nx, detector.ny) != _size(detector, mission):
+    if (detector.nx, detector.ny) != full_size(detector, mission):
         width, height = detector.nx // len(across), detector.ny // len(up)
         across, up = [i * width for i in range(len(across))], [j * height for j in range(len(up))]
     if not (width and height):
@@ -256,10 +256,10 @@ def _table(section: str, mission: MissionConfiguration) -> tuple[dict[str, str],
     return rows if rows and "prescan" in rows[0] else ()
 
 
-def _size(detector: Detector, mission: MissionConfiguration) -> tuple[int, int]:
-    """nx, ny of a detector of its kind."""
+def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, int]:
+    """nx, ny of a ground camera's detectors of this kind, of which this one may be a part."""
     of_kind = (row for row in mission.rows(f"{detector.section}.layout") if row["type"] == detector.kind)
-    return next(((int(row["nx"]), int(row["ny"])) for row in of_kind), (0, 0))
+    return next(((int(row["nx"]), int(row["ny"])) for row in of_kind), (detector.nx, detector.ny))
 
 
 # Of these the table has how an amplifier compares with the first.

@@ -10,10 +10,26 @@ from jobs.render.camera.detectors import Detector
 from jobs.render.channels import readout
 from jobs.render.channels.channel import Channel
 from jobs.render.channels.cost import Cost
-from jobs.render.effects.charge import bleeding, dark_current, poisson
+from jobs.render.effects.charge import (
+    bleeding,
+    brighter_fatter,
+    cosmic_rays,
+    dark_current,
+    pixel_borders,
+    pixel_response,
+    poisson,
+)
 from jobs.render.effects.effect import Effect
-from jobs.render.effects.light import background
-from jobs.render.effects.readout import adc, bias_structure, quadrants, read_noise
+from jobs.render.effects.light import background, illumination
+from jobs.render.effects.readout import (
+    adc,
+    bias_structure,
+    charge_transfer,
+    crosstalk,
+    nonlinearity,
+    quadrants,
+    read_noise,
+)
 from jobs.render.psf import seeing
 from jobs.render.psf.model import Psf
 from jobs.render.sky import diffuse_light
@@ -22,10 +38,21 @@ from lake_schema.tables.exposures import ExposureRow
 
 SKY = (
     background.EFFECT,
+    illumination.EFFECT,
+    pixel_response.EFFECT,
+    pixel_borders.RINGS,
+    pixel_borders.EDGES,
     poisson.EFFECT,
+    brighter_fatter.EFFECT,
     dark_current.EFFECT,
+    dark_current.HOT,
+    cosmic_rays.EFFECT,
     bleeding.EFFECT,
     quadrants.AMPLIFIERS,
+    charge_transfer.PARALLEL_LOSS,
+    charge_transfer.SERIAL_LOSS,
+    nonlinearity.EFFECT,
+    crosstalk.EFFECT,
     bias_structure.EFFECT,
     read_noise.EFFECT,
     adc.EFFECT,
@@ -52,4 +79,5 @@ CHANNEL = Channel(
     sky=diffuse_light.ground_sky,
     cost=COST,
     on_ground=True,
+    tracks=(cosmic_rays.EFFECT,),
 )

@@ -273,7 +273,9 @@ def _saturation(rendered: Rendered) -> float | Float:
     scene = replace(rendered.scene, peak_electrons=full)
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     # The first of a column, or a row, finds all traps empty.
-    losses = (charge_transfer.PARALLEL, charge_transfer.SERIAL)
+    losses = (
+        charge_transfer.PARALLEL, charge_transfer.SERIAL, charge_transfer.PARALLEL_LOSS, charge_transfer.SERIAL_LOSS
+    )  # fmt: skip
     left = full - sum(effect.contribution(scene) for effect in losses if effect.name in applied)
     signal: float | Float = left
     if scene.ramp:

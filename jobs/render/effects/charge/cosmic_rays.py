@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
+from jobs.render.camera import amplifiers
 from jobs.render.effects.effect import Effect, nothing
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import OutOfRange
@@ -24,6 +25,8 @@ from lake_schema.errors import OutOfRange
 _SQUARE_CM = 1e-8
 # Quantiles of a track's length (pixels) and charge (electrons).
 _TRACKS = "env.cosmic_rays.vis_tracks"
+# Length of a vertical track, pixels.
+_SHORTEST = 1e-2
 # Expected tracks that nobody waits for.
 _FEW = 1e-3
 
@@ -127,13 +130,35 @@ def hits(events: tuple[Any, ...]) -> Any:
 
 
 def rate(scene: Scene, pixels: float) -> float:
-    """Tracks a second on so many pixels."""
+    """Tracks a second on so many pixels: of the site, where a camera has its own rate, else of space."""
+    if f"{scene.section}.cosmic_rays.rate" in scene.mission and scene.detector is not None:
+        nx, ny = amplifiers.full_size(scene.detector, scene.mission)
+        return scene.value("cosmic_rays.rate", "1 / s") * pixels / (nx * ny)
     area = pixels * scene.value("fpa.pixel_size", "um / pix") ** 2 * _SQUARE_CM
     return scene.mission.value("env.cosmic_rays.flux_stardust", "cm-2 s-1") * area
 
 
 def quantiles(scene: Scene) -> Frame:
+    """Of `tracks`; where a camera has the rate of its site: of muons in its silicon."""
+    if f"{scene.section}.cosmic_rays.rate" in scene.mission:
+        deposit = scene.mission.value("env.cosmic_rays.silicon_deposit", "electron / um")
+        return muons(
+            scene.value("cosmic_rays.thickness", "um"), scene.value("fpa.pixel_size", "um / pix"), deposit
+        )
     return np.array(scene.mission.numbers(_TRACKS))
+
+
+def muons(thickness: float, pixel: float, deposit: float) -> Frame:
+    """Quantiles of tracks straight through a horizontal detector: intensity cos^2, flux cos^3 of the zenith angle.
+
+    thickness, pixel : um;  deposit : e-/um along the track
+    Error            : no fluctuations of the energy loss, no electrons of natural radioactivity, whatever the pointing
+    """
+    below = np.append(np.linspace(0.0, 0.98, 50), [0.99, 0.999, 0.9999, 1.0 - 1e-6])
+    cosine = (1.0 - below) ** 0.25
+    length = np.maximum(thickness * np.sqrt(1.0 - cosine**2) / (cosine * pixel), _SHORTEST)
+    found = np.stack([below, length, deposit * thickness / cosine], axis=1)
+    return np.concatenate([found, [[1.0, 1.001 * found[-1, 1], 1.001 * found[-1, 2]]]])
 
 
 def _expected(scene: Scene) -> float:

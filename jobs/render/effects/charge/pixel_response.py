@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from jobs.render.effects import pixel_random
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import OutOfRange
+
+Runs = Sequence[tuple[int, int, bool]]
 
 # What a dead pixel still sees, at most.
 _DEAD = 0.5
@@ -24,13 +27,14 @@ def apply(
     dead: float,
     dark_columns: float,
     dust: tuple[float, float, float],
+    runs: Runs,
     rng: np.random.Generator,
 ) -> Frame:
     """frame [ny, nx] e- -> times `response`.
 
-    rms, dead, dark_columns, dust, rng : as of `response`
+    rms, dead, dark_columns, dust, runs, rng : as of `response`
     """
-    out = response(frame.shape, rms, dead, dark_columns, dust, rng)
+    out = response(frame.shape, rms, dead, dark_columns, dust, runs, rng)
     out *= frame
     return out
 
@@ -41,13 +45,15 @@ def response(
     dead: float,
     dark_columns: float,
     dust: tuple[float, float, float],
+    runs: Runs,
     rng: np.random.Generator,
 ) -> Frame:
     """Sensitivity of every pixel, mean 1 but for the defects, never below 0.
 
     rms : between pixels;  dead : fraction of pixels that see little
-    dark_columns : mean number of columns that see nothing from some row on, away from their register, to the middle
+    dark_columns : mean number of columns that see nothing from some row on, away from their register
     dust : grains a pixel; mean rms of their shadows, pixels, exponentially distributed; what a shadow's middle lacks
+    runs : pieces of a column: first row, the one past the last, whether the register lies above
     shape : ny, nx;  rng : random numbers of the detector's pixels
     """
     grains, radius, depth = dust
@@ -63,12 +69,12 @@ def response(
     count = int(rng.binomial(ny * nx, dead))
     rows, columns = rng.integers(0, max(ny, 1), count), rng.integers(0, max(nx, 1), count)
     out[..., rows, columns] = _DEAD * rng.random(count)
-    middle = (ny + 1) // 2
     for _ in range(int(rng.poisson(dark_columns)) if nx else 0):
         row, column = int(rng.integers(0, ny)), int(rng.integers(0, nx))
-        # Charge from beyond the defect does not come past it to its register, at either end of the columns.
-        blind = slice(row, middle) if row < middle else slice(middle, row + 1)
-        out[..., blind, column] = 0.0
+        # Charge from beyond the defect does not come past it to its register.
+        for first, past, upwards in runs:
+            if first <= row < past:
+                out[..., slice(first, row + 1) if upwards else slice(row, past), column] = 0.0
     count = int(rng.poisson(grains * ny * nx))
     places = rng.random((count, 2)) * (ny, nx), radius * rng.standard_exponential(count)
     for (y, x), size in zip(places[0].tolist(), places[1].tolist(), strict=True):
@@ -94,14 +100,15 @@ def _spread(out: Any, rms: float, key: Any) -> None:
         out[i] = max(1.0 + rms * pixel_random.normal(pixel_random.word(key, i)), 0.0)
 
 
-def parameters(scene: Scene) -> tuple[float, float, float, tuple[float, float, float]]:
+def parameters(scene: Scene) -> tuple[float, float, float, tuple[float, float, float], Runs]:
     """Of `response`."""
     dust = scene.value("dust", ""), scene.value("dust_radius", "pix"), scene.value("dust_depth", "")
-    return scene.value("prnu", ""), scene.value("dead_pixels", ""), scene.value("dark_columns", ""), dust
+    rms, dead, columns = (scene.value(key, "") for key in ("prnu", "dead_pixels", "dark_columns"))
+    return rms, dead, columns, dust, scene.runs
 
 
 def _contribution(scene: Scene) -> float:
-    rms, dead, columns, (grains, *_, depth) = parameters(scene)
+    rms, dead, columns, (grains, *_, depth), _ = parameters(scene)
     brightest = scene.peak_electrons + scene.sky_electrons
     shade = depth * (grains > 0)
     return max(rms * brightest, scene.sky_electrons * max(float(dead > 0 or columns > 0), shade))

@@ -56,7 +56,7 @@ def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, flo
 
 def _half_sides(scene: Scene) -> tuple[float, float]:
     """Half the focal plane's sides, arcsec."""
-    detectors = camera_detectors.detectors(scene.section, scene.mission)
+    detectors = camera_detectors.detectors(scene.section.rpartition(".")[2], scene.mission)
     scale, nx, ny = detectors[0].pixel_scale, detectors[0].nx, detectors[0].ny
     return (
         max(abs(d.x) for d in detectors) + scale * nx / 2,

@@ -2,20 +2,26 @@
 
 PARALLEL    down the columns, row by row, into the serial register
 SERIAL      along the register, pixel by pixel, into the amplifier
+PARALLEL_LOSS, SERIAL_LOSS   the same of cameras of which no more is known than the part that each transfer loses
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from jobs.accuracy import DRAFT, Accuracy
+from jobs.compiling import jit
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.readout import traps
 from jobs.render.effects.readout.traps import Sweeps, Traps
 from jobs.render.effects.scene import NOTICEABLE, Frame, Scene
+from lake_schema.errors import OutOfRange
 
+# Of a packet in a transfer, more than any detector that is in use.
+_MOST_LOSS = 1e-3
 # Species of the mission database.
 _SPECIES = 3
 # Traps passed that stand for the end of the mission: one in each of 2066 pixels.
@@ -100,6 +106,62 @@ def lattice(scene: Scene, direction: str) -> Traps:
     )
 
 
+def apply_parallel_loss(frame: Frame, loss: float, rng: np.random.Generator | None = None) -> Frame:
+    """Parts [.., ny, nx] e- in readout order, each transfer of which leaves the part `loss` to the next packet.
+
+    frame : e-, charge that is left in the last packets is not read;  rng : not used
+    Error : 2e-8 of a packet: what is left behind more than twice comes with the second one behind it
+    """
+    return _left_behind(frame, loss, along=False)
+
+
+def apply_serial_loss(frame: Frame, loss: float, rng: np.random.Generator | None = None) -> Frame:
+    """The same along the register; frame, loss, rng : as of `apply_parallel_loss`."""
+    return _left_behind(frame, loss, along=True)
+
+
+def _left_behind(frame: Frame, loss: float, along: bool) -> Frame:
+    if not 0.0 <= loss <= _MOST_LOSS:
+        raise OutOfRange("charge lost in a transfer", loss, 0.0, _MOST_LOSS)
+    transfers = np.arange(1.0, frame.shape[-1 if along else -2] + 1.0)
+    stays = (1.0 - loss) ** transfers
+    next_one = transfers * loss * stays
+    before = np.ascontiguousarray(frame, dtype=float)
+    out = np.empty(before.shape)
+    shape = -1, *before.shape[-2:]
+    _defer(before.reshape(shape), stays, next_one, 1.0 - stays - next_one, along, out.reshape(shape))
+    return out
+
+
+@jit
+def _defer(frame: Any, stays: Any, next_one: Any, second: Any, along: bool, out: Any) -> None:
+    """Of the packet at each place what stays in it, what comes with the next, and with the second behind it."""
+    for q in range(len(frame)):
+        for r in range(frame.shape[1]):
+            now, then = frame[q, r], out[q, r]
+            for c in range(len(now)):
+                i = c if along else r
+                then[c] = now[c] * stays[i]
+                if i > 0:
+                    then[c] += (now[c - 1] if along else frame[q, r - 1, c]) * next_one[i - 1]
+                if i > 1:
+                    then[c] += (now[c - 2] if along else frame[q, r - 2, c]) * second[i - 2]
+
+
+def _loss_of(scene: Scene, direction: str) -> float:
+    return scene.value(f"cti.{direction}", "")
+
+
+def _deferred(scene: Scene, direction: str) -> float:
+    """Electrons that the brightest packet leaves behind on the longest way."""
+    if scene.layout is None:
+        return 0.0
+    own = scene.layout
+    transfers = own.height if direction == "parallel" else own.prescan + own.width
+    held = min(scene.brightest_electrons, scene.value("full_well", "electron"))
+    return transfers * _loss_of(scene, direction) * held
+
+
 def _columns(scene: Scene) -> int:
     return scene.nx // 2 + int(scene.value("fpa.prescan", "pix"))
 
@@ -159,4 +221,18 @@ SERIAL = Effect(
     lambda scene: _loss(scene, "serial", _columns(scene)),
     cost=0.082,
     repeated=lambda scene: _repeated(scene, "serial", _columns(scene)),
+)
+PARALLEL_LOSS = Effect(
+    "parallel_loss",
+    apply_parallel_loss,
+    lambda scene: (_loss_of(scene, "parallel"),),
+    lambda scene: _deferred(scene, "parallel"),
+    cost=8e-3,
+)
+SERIAL_LOSS = Effect(
+    "serial_loss",
+    apply_serial_loss,
+    lambda scene: (_loss_of(scene, "serial"),),
+    lambda scene: _deferred(scene, "serial"),
+    cost=8e-3,
 )

@@ -1,4 +1,4 @@
-"""Crosstalk: the four amplifiers read at the same time, and each sees a little of the others."""
+"""Crosstalk: a detector's amplifiers read at the same time, and each sees a little of the others."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jobs.compiling import jit
+from jobs.render.camera import amplifiers
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import BadInput, OutOfRange
@@ -17,13 +18,13 @@ _RUN = 1024
 
 
 def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = None) -> Frame:
-    """quadrants [4, ny, nx] in readout order -> each plus its share of the others, all at once.
+    """Parts [q, ny, nx] in readout order -> each plus its share of the others, all at once.
 
-    coefficients : [4, 4] of signal from the second index into the first, 0 on the diagonal
+    coefficients : [q, q] of signal from the second index into the first, 0 on the diagonal
     """
     count = len(frame)
     if coefficients.shape != (count, count):
-        raise BadInput(f"crosstalk of {coefficients.shape} coefficients for {count} quadrants")
+        raise BadInput(f"crosstalk of {coefficients.shape} coefficients for {count} amplifiers")
     if not np.all(np.abs(coefficients) <= 1.0):
         raise OutOfRange("crosstalk", float(np.abs(coefficients).max()), 0.0, 1.0)
     flat = np.ascontiguousarray(frame, dtype=float).reshape(count, -1)
@@ -47,7 +48,10 @@ def _mix(frame: Any, coefficients: Any, out: Any) -> None:
 
 
 def coefficients(scene: Scene) -> Frame:
-    """The mission's for neighbours along a side, half of it across the diagonal."""
+    """Of quadrants: the mission's for neighbours along a side, half of it across the diagonal; else of each pair."""
+    if scene.layout is not None and scene.detector is not None:
+        largest = scene.value("crosstalk_max", "")
+        return amplifiers.couplings(scene.value("crosstalk", ""), largest, scene.detector, scene.layout)
     near = far = scene.value("crosstalk", "")
     diagonal = _DIAGONAL * near
     # E F G H: upper left, upper right, lower right, lower left.

@@ -16,6 +16,7 @@ TRUTH = ("noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation")
 
 def ramp(found, scene, detector, system):
     """A slope, a flag, the quality of the fit and the groups: what a detector read up the ramp delivers."""
+    found = scene.layout.together(found)
     slope = np.rint(np.clip(found, 0.0, 65535.0)).astype(np.uint16)
     flag = (slope > np.median(slope)).astype(np.uint8)
     groups = np.stack([np.rint(found * part).astype(np.int32) for part in (0.25, 0.5, 1.0)])

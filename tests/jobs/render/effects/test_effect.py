@@ -27,7 +27,8 @@ def run(effects, frame, scene=SCENE, forced=None, seed=1):
 # What each chain names comes in this order, where a channel has it.
 ORDER = (
     # Light falls on pixels, is counted once, and is charge from then on.
-    ("ghosts", "background", "illumination", "shutter", "pixel_response", "poisson", "brighter_fatter", "dark_current"),
+    ("ghosts", "background", "illumination", "shutter", "pixel_response", "tree_rings", "edge_displacement",
+     "poisson", "brighter_fatter", "dark_current"),
     ("straylight", "illumination"),
     ("ghosts", "filter_ghosts", "background"),
     ("background", "pixel_area", "pixel_response"),
@@ -37,7 +38,7 @@ ORDER = (
     ("dark_current", "hot_pixels", "bleeding"),
     ("poisson", "cosmic_rays", "bleeding", "quadrants", "parallel_cti", "readout_cosmic_rays", "serial_cti"),
     ("charge_injection", "injection_noise", "bleeding"),
-    ("dark_current", "bleeding", "amplifiers", "bias_structure", "read_noise"),
+    ("dark_current", "bleeding", "amplifiers", "parallel_loss", "serial_loss", "nonlinearity"),
     # Charge is read before it is amplified and converted.
     ("serial_cti", "nonlinearity", "crosstalk", "bias_structure", "read_noise", "adc"),
     # A ramp counts all that is expected, and what hits meanwhile; a pixel's capacity bends what it holds.

@@ -310,8 +310,25 @@ def test_a_map_of_other_size_is_refused():
         illumination.apply(EMPTY, np.full(300, -3.0), np.zeros(400))
 
 
+def halves(ny):
+    """Of columns with a register at both ends."""
+    return (0, ny // 2, False), (ny // 2, ny, True)
+
+
+def test_columns_of_one_register_are_blind_to_their_far_end():
+    pieces = [(0, 40, False)], [(0, 40, True)], [(0, 10, False), (12, 40, False)]
+    maps = [
+        pixel_response.response((40, 300), 0.0, 0.0, 90.0, CLEAN, runs, np.random.default_rng(3)) == 0 for runs in pieces
+    ]
+    assert (np.diff(maps[0].astype(int), axis=0) >= 0).all()
+    assert (np.diff(maps[1].astype(int), axis=0) <= 0).all()
+    assert maps[0].any(axis=0).sum() == maps[1].any(axis=0).sum() > 50
+    assert not maps[2][10:12].any()
+    assert (np.diff(maps[2][:10].astype(int), axis=0) >= 0).all()
+
+
 def test_the_response_of_pixels():
-    response = pixel_response.response((600, 500), 0.01, 1e-3, 3.0, CLEAN, np.random.default_rng(2))
+    response = pixel_response.response((600, 500), 0.01, 1e-3, 3.0, CLEAN, halves(600), np.random.default_rng(2))
     good = response > 0.6
     assert response[good].std() == pytest.approx(0.01, rel=0.02)
     assert response[good].mean() == pytest.approx(1.0, abs=1e-4)
@@ -320,7 +337,7 @@ def test_the_response_of_pixels():
     assert ((response > 0) & ~good).sum() == pytest.approx(300, abs=80)
     assert pixel_response.EFFECT.fixed
     # A defect hides what lies behind it, as seen from its own register: up to the middle, and no farther.
-    many = pixel_response.response((40, 500), 0.0, 0.0, 200.0, CLEAN, np.random.default_rng(3)) == 0
+    many = pixel_response.response((40, 500), 0.0, 0.0, 200.0, CLEAN, halves(40), np.random.default_rng(3)) == 0
     below, above = many[:20], many[20:][::-1]
     assert below.any()
     assert above.any()
@@ -332,7 +349,8 @@ def test_the_response_of_pixels():
 def test_dust_casts_shadows():
     """As many as stated, each as deep and, in the mean, as wide."""
     grains, radius, depth = 2e-4, 2.0, 0.3
-    dusty = pixel_response.response((1000, 900), 0.0, 0.0, 0.0, (grains, radius, depth), np.random.default_rng(4))
+    dust = (grains, radius, depth)
+    dusty = pixel_response.response((1000, 900), 0.0, 0.0, 0.0, dust, halves(1000), np.random.default_rng(4))
     # Two may lie on each other.
     assert (1 - depth) ** 2 * 0.99 < dusty.min() < 1 - 0.95 * depth
     # Light that is missing: of a Gaussian 2 pi size^2, whose mean is twice the square of the mean size.
@@ -341,7 +359,7 @@ def test_dust_casts_shadows():
     # The other defects are where they are without.
     defects = (0.01, 1e-3, 3.0)
     clean, same = (
-        pixel_response.response((300, 200), *defects, dust, np.random.default_rng(2))
+        pixel_response.response((300, 200), *defects, dust, halves(300), np.random.default_rng(2))
         for dust in (CLEAN, (1e-4, radius, depth))
     )
     assert 0 < (clean != same).sum() < 6000
@@ -359,7 +377,7 @@ def test_dust_casts_shadows():
 )  # fmt: skip
 def test_impossible_responses_are_refused(wrong):
     with pytest.raises(OutOfRange, match=r"pixel|dark|dust"):
-        pixel_response.response((3, 3), *wrong, np.random.default_rng(1))
+        pixel_response.response((3, 3), *wrong, halves(3), np.random.default_rng(1))
 
 
 # ------------------------------------------------------------------------------------------------ intra-pixel, trail

@@ -34,6 +34,13 @@ def scene(sky=0.25, peak=1e4, lights=None, **values):
     )  # fmt: skip
 
 
+def ground(sky=10.0, peak=1e4, **values):
+    """A detector of DECam, likewise."""
+    keys = {f"ext.decam.{key.replace('__', '.')}": value for key, value in values.items()}
+    mission = resolve(overrides={key: (value, MISSION.parameter(key).unit) for key, value in keys.items()})
+    return Scene(mission, "ext.decam", 90.0, sky, peak, detectors.detector("decam", "S29", MISSION))
+
+
 def star(electrons):
     return Lights(np.array([4.0]), np.array([1000.0]), np.array([electrons]))
 
@@ -59,6 +66,10 @@ CASES = {
     "bleeding": lambda x: scene(peak=2e5 - 141 + (x - 1)),
     "parallel_cti": lambda x: scene(cti__age=1e-4 * x),
     "serial_cti": lambda x: scene(cti__age=3e-4 * x),
+    "tree_rings": lambda x: ground(tree_rings__amplitude=min(1e-5 * x, 0.1)),
+    "edge_displacement": lambda x: ground(edge__shift=min(1e-5 * x, 0.5)),
+    "parallel_loss": lambda x: ground(cti__parallel=min(1e-8 * x, 1e-3)),
+    "serial_loss": lambda x: ground(cti__serial=min(1e-8 * x, 1e-3)),
     "nonlinearity": lambda x: scene(nonlinearity__low=min(1e-4 * x, 0.9), nonlinearity__high=1e-4 * x),
     "crosstalk": lambda x: scene(crosstalk=min(1e-4 * x, 0.1)),
     "bias_structure": lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x),
@@ -68,7 +79,7 @@ CASES = {
 }
 # What has another value in every frame; and dark current, which has a mean, too.
 RANDOM = ("poisson", "read_noise", "injection_noise", "dark_current")
-QUADRANTS = ("parallel_cti", "serial_cti", "crosstalk", "bias_structure", "readout_cosmic_rays")
+QUADRANTS = ("parallel_cti", "serial_cti", "parallel_loss", "serial_loss", "crosstalk", "bias_structure", "readout_cosmic_rays")
 
 
 def frame(name, one):
@@ -79,6 +90,8 @@ def frame(name, one):
         return np.stack([light, *(np.full(light.shape, one.sky_electrons) for _ in range(3))])
     if name == "serial_cti":
         return light[1990:2010].repeat(256, axis=1)[None, ::-1].copy()
+    if name == "serial_loss":
+        return light[1990:2010].repeat(128, axis=1)[None, ::-1].copy()
     return light[None] if name in QUADRANTS else light
 
 

@@ -135,3 +135,20 @@ def test_too_many_are_refused():
     for wrong in (-1.0, np.nan, 1e12):
         with pytest.raises(OutOfRange, match="cosmic"):
             cosmic_rays.tracks((3, 3), wrong, TRACKS, np.random.default_rng(1))
+
+
+def test_muons_come_at_the_site_s_rate_through_the_silicon_s_thickness():
+    """LSSTCam: 0.2 a second and detector; of cos^2 through a plane: 1 - cos^4 of the zenith angle is uniform."""
+    lsst = detectors.detector("lsstcam", "R22_S11", MISSION)
+    scene = Scene(MISSION, "ext.lsstcam", 30.0, 30.0, 1e4, lsst)
+    expected, quantiles = cosmic_rays.EFFECT.parameters(scene)
+    assert expected == pytest.approx(0.2 * 30.0)
+    quarter = replace(scene, detector=replace(lsst, nx=lsst.nx // 2, ny=lsst.ny // 2))
+    assert cosmic_rays.EFFECT.parameters(quarter)[0] == pytest.approx(0.25 * expected)
+    *_, length, electrons = cosmic_rays.events(100_000, 100, 100, quantiles, np.random.default_rng(1))
+    thickness, pixel = 100.0, 10.0
+    cosine = 80.0 * thickness / electrons
+    across = thickness / pixel * np.sqrt(1 / cosine**2 - 1)
+    np.testing.assert_allclose(length[length > 1.0], across[length > 1.0], rtol=0.05)
+    # The mean of cos over a flux of cos^3: 4 / 5.
+    assert cosine.mean() == pytest.approx(0.8, abs=0.01)
