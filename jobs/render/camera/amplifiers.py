@@ -193,7 +193,7 @@ class Layout:
 
     def _strips(self, number: int) -> tuple[int, int]:
         """First column and row in the raw file of what of an amplifier is no pixel."""
-        own, data, (across, up) = self.amplifiers[number].pixels, self.data, self._starts
+        own, (across, up) = self.amplifiers[number].pixels, self._starts
         i, j = across.index(own.x), up.index(own.y)
         x = i * self.scans + (self.nx if i >= len(across) // 2 else 0)
         y = j * self.rows + (self.ny if j >= len(up) // 2 else 0)

@@ -290,6 +290,4 @@ def _apart_electrons(read: Sequence[Image]) -> Float:
     return out
 
 
-AMPLIFIERS = ReadoutMode(
-    arrays=_amplifiers, assembled=_apart_assembled, pixels=_data, electrons=_apart_electrons
-)
+AMPLIFIERS = ReadoutMode(arrays=_amplifiers, assembled=_apart_assembled, pixels=_data, electrons=_apart_electrons)

@@ -52,7 +52,7 @@ def _trimmed(cards: Sequence[images.Card]) -> tuple[images.Card, ...]:
     data = Section.of(where)
     moved = {"CRPIX1": data.x, "CRPIX2": data.y}
     return tuple(
-        (key, value - moved[key], text) if key in moved else (key, value, text)
+        (key, float(value) - moved[key], text) if key in moved else (key, value, text)
         for key, value, text in cards
         if key != _DATA
     )

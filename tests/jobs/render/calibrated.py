@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jobs.render.effects.charge import pixel_response
+from jobs.render.effects.charge import pixel_borders, pixel_response
 from jobs.render.effects.light import illumination
 from jobs.render.effects.readout import bias_structure, crosstalk, nonlinearity, quadrants
 from jobs.rng import stream
@@ -13,22 +13,27 @@ def electrons(raw, scene, seed, applied):
 
     applied : names of the effects that are in the image
     """
-    found = (raw.astype(float) - scene.value("bias", "adu")) * scene.value("gain", "electron / adu")
-    if raw.ndim == 2:
-        return found
+    gain = np.reshape(scene.of_amplifiers("gain", "electron / adu"), (-1, 1, 1))
+    found = (raw.astype(float) - scene.value("bias", "adu")) * gain
 
     def fixed(effect):
-        return stream(seed, "vis", scene.detector.name, effect.name)
+        return stream(seed, camera_of(scene), scene.detector.name, effect.name)
 
     if "bias_structure" in applied:
         parameters = bias_structure.EFFECT.parameters(scene)
-        found -= bias_structure.structure(4, raw.shape[2], *parameters, fixed(bias_structure.EFFECT))[:, None]
+        found -= bias_structure.structure(len(raw), raw.shape[2], *parameters, fixed(bias_structure.EFFECT))[:, None]
     if "crosstalk" in applied:
         # To first order in the coefficients: 1e-8.
         found = 2.0 * found - crosstalk.apply(found, *crosstalk.EFFECT.parameters(scene))
     if "nonlinearity" in applied:
         found = nonlinearity.linearised(found, *nonlinearity.EFFECT.parameters(scene))
+    if scene.layout is not None:
+        return scene.layout.together(found) / flat(scene, seed, applied)
     return quadrants.assembled(found, *quadrants.sizes(scene)) / flat(scene, seed, applied)
+
+
+def camera_of(scene):
+    return scene.section.rpartition(".")[2]
 
 
 def flat(scene, seed, applied):
@@ -37,9 +42,10 @@ def flat(scene, seed, applied):
     for effect in (illumination.EFFECT, illumination.SHUTTER):
         if effect.name in applied:
             out = effect.apply(out, *effect.parameters(scene))
-    if "pixel_response" in applied:
-        own = stream(seed, "vis", scene.detector.name, "pixel_response")
-        out = pixel_response.apply(out, *pixel_response.EFFECT.parameters(scene), own)
+    for effect in (pixel_response.EFFECT, pixel_borders.RINGS, pixel_borders.EDGES):
+        if effect.name in applied:
+            own = stream(seed, camera_of(scene), scene.detector.name, effect.name)
+            out = effect.apply(out, *effect.parameters(scene), rng=own)
     return np.where(out > 0.7, out, np.nan)
 
 

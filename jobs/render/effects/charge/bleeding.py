@@ -22,7 +22,6 @@ from jobs.render.effects.scene import Frame, Scene
 from lake_schema.arrays import Bool
 from lake_schema.errors import OutOfRange
 
-
 Runs = Sequence[tuple[int, int, bool]]
 
 

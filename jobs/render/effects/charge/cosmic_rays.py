@@ -142,9 +142,7 @@ def quantiles(scene: Scene) -> Frame:
     """Of `tracks`; where a camera has the rate of its site: of muons in its silicon."""
     if f"{scene.section}.cosmic_rays.rate" in scene.mission:
         deposit = scene.mission.value("env.cosmic_rays.silicon_deposit", "electron / um")
-        return muons(
-            scene.value("cosmic_rays.thickness", "um"), scene.value("fpa.pixel_size", "um / pix"), deposit
-        )
+        return muons(scene.value("cosmic_rays.thickness", "um"), scene.value("fpa.pixel_size", "um / pix"), deposit)
     return np.array(scene.mission.numbers(_TRACKS))
 
 

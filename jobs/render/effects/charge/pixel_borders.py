@@ -58,16 +58,18 @@ def apply_rings(
 
 def distances(nx: int, ny: int, axis: tuple[float, float]) -> tuple[float, float]:
     """Of the nearest and of the farthest place of a detector from the wafer's axis, pixels."""
-    across, up = (np.maximum(np.maximum(-0.5 - at, at - n + 0.5), 0.0) for n, at in zip((nx, ny), axis, strict=True))
-    corner = [max(abs(at + 0.5), abs(n - 0.5 - at)) for n, at in zip((nx, ny), axis, strict=True)]
-    return float(np.hypot(across, up)), float(np.hypot(*corner))
+    sides = list(zip((nx, ny), axis, strict=True))
+    near = [max(-0.5 - at, at - n + 0.5, 0.0) for n, at in sides]
+    far = [max(abs(at + 0.5), abs(n - 0.5 - at)) for n, at in sides]
+    return math.hypot(*near), math.hypot(*far)
 
 
 def displacement(amplitude: float, periods: tuple[float, float], phase: float, near: float, far: float) -> Frame:
     """Pixels outwards that charge is carried at distances near, near + _STEP .. far from the axis.
 
     A flat changes by minus its divergence: amplitude times a wave whose period goes from the first to the second.
-    amplitude : of the flat;  phase : at `near`
+    amplitude : of the flat;  periods : pixels, at `near` and at `far`;  phase : at `near`
+    near, far : pixels
     """
     for period in periods:
         if not 2.0 <= period <= 1e5:
@@ -130,7 +132,7 @@ def _cross(frame: Any, table: Any, near: float, axis: Any, columns: Any, rows: A
 
 
 @jit
-def _away(table: Any, near: float, along: float, across: float) -> float:
+def _away(table: Any, near: float, along: float, across: float) -> Any:
     """Component along the first direction of the displacement away from the axis."""
     distance = math.sqrt(along * along + across * across)
     place = (distance - near) / _STEP

@@ -14,6 +14,8 @@ from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import OutOfRange
 
 Runs = Sequence[tuple[int, int, bool]]
+# Of `response`, without shape and random numbers.
+Parameters = tuple[float, float, float, tuple[float, float, float], Runs]
 
 # What a dead pixel still sees, at most.
 _DEAD = 0.5
@@ -100,7 +102,7 @@ def _spread(out: Any, rms: float, key: Any) -> None:
         out[i] = max(1.0 + rms * pixel_random.normal(pixel_random.word(key, i)), 0.0)
 
 
-def parameters(scene: Scene) -> tuple[float, float, float, tuple[float, float, float], Runs]:
+def parameters(scene: Scene) -> Parameters:
     """Of `response`."""
     dust = scene.value("dust", ""), scene.value("dust_radius", "pix"), scene.value("dust_depth", "")
     rms, dead, columns = (scene.value(key, "") for key in ("prnu", "dead_pixels", "dark_columns"))

@@ -22,7 +22,7 @@ def apply(
     frame: Frame,
     share: float,
     halves: int,
-    response: tuple[Any, ...] | None = None,
+    response: pixel_response.Parameters | None = None,
     rng: np.random.Generator | None = None,
 ) -> Frame:
     """frame [ny, nx] expected e- -> plus what is collected on the way to the register.
@@ -61,7 +61,7 @@ def _pass(light: Any, own: Any, share: float, out: Any) -> None:
                 before[c] += light[r, c] * own[r, c]
 
 
-def _parameters(scene: Scene) -> tuple[float, int, tuple[Any, ...] | None]:
+def _parameters(scene: Scene) -> tuple[float, int, pixel_response.Parameters | None]:
     # A row takes as long whatever part of a detector is looked at.
     rows = scene.value("fpa.ny", "pix") / 2 + scene.value("fpa.parallel_overscan", "pix")
     share = scene.value("readout_time", "s") / rows / max(scene.exposure_time_s, 1e-3)

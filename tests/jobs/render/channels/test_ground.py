@@ -1,5 +1,6 @@
 """Ground cameras from outside: from files alone, what a laboratory measures of a detector."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -7,16 +8,27 @@ import pytest
 from astropy.io import fits as astropy_fits
 
 from jobs.accuracy import SURVEY
-from jobs.render.camera.amplifiers import Section
 from jobs.render.camera import detectors
+from jobs.render.camera.amplifiers import Section
 from jobs.render.channels import ground
+from jobs.render.effects.effect import apply_all
+from jobs.render.effects.readout import crosstalk
+from jobs.render.effects.scene import Scene
+from jobs.rng import stream
 from lake_schema.mission.parameter import CAMERAS
 from tests.jobs.render import fields
 from tests.jobs.render.channels.test_readout import put
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, stars
 
 SECONDS = 100.0
-BANDS = {"decam": "des_r", "lsstcam": "lsst_r", "megacam": "cfis_r", "jpcam": "jedis_g", "gpc1": "ps1_i", "hsc": "hsc_z"}
+BANDS = {
+    "decam": "des_r",
+    "lsstcam": "lsst_r",
+    "megacam": "cfis_r",
+    "jpcam": "jedis_g",
+    "gpc1": "ps1_i",
+    "hsc": "hsc_z",
+}
 NOBODY = galaxies([], []), stars([], [])
 
 
@@ -84,8 +96,50 @@ def test_levels_of_amplifiers_differ_and_their_overscans_tell(tmp_path):
     pixels, bias, header = sections(put(one, tmp_path)["science"])
     levels = [columns.mean() for columns in bias]
     assert np.ptp(levels) > 5.0
-    light = [np.median(p - level) * header[f"GAIN{n}"] for n, (p, level) in enumerate(zip(pixels, levels, strict=True), 1)]
+    light = [
+        np.median(p - level) * header[f"GAIN{n}"] for n, (p, level) in enumerate(zip(pixels, levels, strict=True), 1)
+    ]
     np.testing.assert_allclose(light, np.mean(light), rtol=0.03)
+
+
+def check_crosstalk(camera, nx, ny):
+    """Each amplifier has light in rows that are read while the others are dark."""
+    one = replace(detectors.detectors(camera, MISSION)[0], nx=nx, ny=ny)
+    scene = Scene(MISSION, one.section, SECONDS, 0.0, 5e4, one, forced={"cosmic_rays": False, "hot_pixels": False})
+    own, count = scene.layout, len(scene.layout.amplifiers)
+    # Of a band; the last is dark in all of them.
+    rows = own.height // (count + 1)
+    planes = np.zeros((count, own.height + own.rows, own.scans + own.width))
+    bands = [slice(q * rows, (q + 1) * rows) for q in range(count)]
+    for q, band in enumerate(bands):
+        planes[q, band, own.prescan : own.prescan + own.width] = 5e4
+    found, decisions = apply_all(own.together(planes), ground.SKY, scene, lambda effect: stream(1, effect.name))
+    assert {d.name for d in decisions if d.applied} >= {"crosstalk", "parallel_loss", "serial_loss", "amplifiers"}
+    level = found[:, count * rows + 6 : own.height].mean(axis=1, keepdims=True)
+    light = (found - level) * scene.of_amplifiers("gain", "electron / adu")[:, None, None]
+    # Borders of pixels beside another amplifier's light are displaced.
+    pixels = slice(own.prescan + 4, own.prescan + own.width - 4)
+    # Charge that transfers have left behind is in the first rows of the next band.
+    seen = np.array([light[:, band, pixels][:, 6:-3].mean(axis=(1, 2)) for band in bands]).T
+    recovered = seen / np.diag(seen)
+    table = crosstalk.coefficients(scene)
+    # A hundred-thousandth of the light is half an electron: as much as the noise of these rows.
+    measured = table > 1e-4
+    assert measured.any()
+    np.testing.assert_allclose(recovered[measured], table[measured], rtol=0.1)
+    others = ~measured & ~np.eye(count, dtype=bool)
+    assert np.abs(recovered - table)[others].max(initial=0.0) < 2e-5
+
+
+@pytest.mark.parametrize(("camera", "nx", "ny"), [("decam", 256, 256), ("lsstcam", 1024, 1024)])
+def test_the_crosstalk_matrix_is_recovered(camera, nx, ny):
+    check_crosstalk(camera, nx, ny)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("camera", ["megacam", "jpcam", "hsc"])
+def test_the_crosstalk_matrix_of_every_camera(camera):
+    check_crosstalk(camera, 2048, 1024)
 
 
 def test_no_image_is_read_in_another_way():

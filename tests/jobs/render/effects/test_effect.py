@@ -27,8 +27,18 @@ def run(effects, frame, scene=SCENE, forced=None, seed=1):
 # What each chain names comes in this order, where a channel has it.
 ORDER = (
     # Light falls on pixels, is counted once, and is charge from then on.
-    ("ghosts", "background", "illumination", "shutter", "pixel_response", "tree_rings", "edge_displacement",
-     "poisson", "brighter_fatter", "dark_current"),
+    (
+        "ghosts",
+        "background",
+        "illumination",
+        "shutter",
+        "pixel_response",
+        "tree_rings",
+        "edge_displacement",
+        "poisson",
+        "brighter_fatter",
+        "dark_current",
+    ),
     ("straylight", "illumination"),
     ("ghosts", "filter_ghosts", "background"),
     ("background", "pixel_area", "pixel_response"),

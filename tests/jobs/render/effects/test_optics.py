@@ -318,7 +318,8 @@ def halves(ny):
 def test_columns_of_one_register_are_blind_to_their_far_end():
     pieces = [(0, 40, False)], [(0, 40, True)], [(0, 10, False), (12, 40, False)]
     maps = [
-        pixel_response.response((40, 300), 0.0, 0.0, 90.0, CLEAN, runs, np.random.default_rng(3)) == 0 for runs in pieces
+        pixel_response.response((40, 300), 0.0, 0.0, 90.0, CLEAN, runs, np.random.default_rng(3)) == 0
+        for runs in pieces
     ]
     assert (np.diff(maps[0].astype(int), axis=0) >= 0).all()
     assert (np.diff(maps[1].astype(int), axis=0) <= 0).all()

@@ -79,7 +79,15 @@ CASES = {
 }
 # What has another value in every frame; and dark current, which has a mean, too.
 RANDOM = ("poisson", "read_noise", "injection_noise", "dark_current")
-QUADRANTS = ("parallel_cti", "serial_cti", "parallel_loss", "serial_loss", "crosstalk", "bias_structure", "readout_cosmic_rays")
+QUADRANTS = (
+    "parallel_cti",
+    "serial_cti",
+    "parallel_loss",
+    "serial_loss",
+    "crosstalk",
+    "bias_structure",
+    "readout_cosmic_rays",
+)
 
 
 def frame(name, one):

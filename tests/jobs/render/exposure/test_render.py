@@ -170,21 +170,23 @@ def test_the_image_is_the_truth_with_the_predicted_noise(channel):
     scene = one.scene
     applied = {d.name for d in one.decisions if d.applied}
     assert one.raw.dtype == one.science.dtype == np.uint16
-    # In 100 s the ground's sky drowns the reading.
     assert applied == {
         "VIS": {
             "intra_pixel", "background", "pixel_area", "illumination", "shutter", "pixel_response", "poisson",
             "brighter_fatter", "dark_current", "hot_pixels", "cosmic_rays", "quadrants", "readout_cosmic_rays",
             "nonlinearity", "crosstalk", "bias_structure", "read_noise", "adc",
         },
-        "EXT": {"background", "poisson", "dark_current", "adc"},
+        "EXT": {
+            "background", "illumination", "pixel_response", "tree_rings", "edge_displacement", "poisson",
+            "brighter_fatter", "dark_current", "hot_pixels", "cosmic_rays", "amplifiers", "parallel_loss",
+            "serial_loss", "nonlinearity", "crosstalk", "bias_structure", "read_noise", "adc",
+        },
     }[channel]  # fmt: skip
     read_noise = scene.value("read_noise", "electron") * ("read_noise" in applied)
     expected = one.noise_free + scene.sky_electrons + scene.dark_electrons * ("dark_current" in applied)
     variance = expected + read_noise**2 + scene.value("gain", "electron / adu") ** 2 / 12
     found = calibrated.electrons(one.raw, scene, 1, applied)
-    if channel == "VIS":
-        found = np.where(one.maps["cosmic_rays"] > 0, np.nan, found)
+    found = np.where(one.maps["cosmic_rays"] > 0, np.nan, found)
     pull = (found - expected) / np.sqrt(variance)
     # Dark columns, cosmic rays.
     assert np.isfinite(pull).mean() > 0.95
@@ -325,10 +327,12 @@ def test_without_any_effect_the_image_is_the_truth_in_whole_numbers():
         asked = {"effects": {"on": list(keep), "off": ["all"]}}
         request = from_table({"name": "x", "seed": 1, "area": {"cone": {"ra": 0, "dec": 0, "radius": 1}}, **asked})
         one = render(channel, forced=variants.forced(request))
-        needed = {"adc", "quadrants"} & {decision.name for decision in one.decisions}
+        needed = {"adc", "quadrants", "amplifiers"} & {decision.name for decision in one.decisions}
         assert {decision.name for decision in one.decisions if decision.applied} == needed | set(keep)
         light = one.noise_free.astype(float) + bool(keep) * one.scene.sky_electrons
-        gain, bias = one.scene.value("gain", "electron / adu"), one.scene.value("bias", "adu")
+        gain, bias = one.scene.of_amplifiers("gain", "electron / adu"), one.scene.value("bias", "adu")
+        if one.scene.layout is not None:
+            gain = one.scene.layout.together(np.broadcast_to(np.reshape(gain, (-1, 1, 1)), one.raw.shape))
         assert np.abs(one.science - bias - light / gain).max() == pytest.approx(0.5, abs=1e-2)
 
 

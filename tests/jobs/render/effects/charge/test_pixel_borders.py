@@ -91,7 +91,11 @@ def test_sources_are_displaced_as_all_their_light_is(sigma, moved, widened):
 
 def test_charge_stays_and_nothing_is_negative():
     frame = 10.0 ** np.random.default_rng(1).uniform(0, 5, (60, 70))
-    for out in (rings(frame, 0.1), pixel_borders.apply_edges(frame, 0.5, 5.0), pixel_borders.apply_edges(frame, -0.5, 5.0)):
+    for out in (
+        rings(frame, 0.1),
+        pixel_borders.apply_edges(frame, 0.5, 5.0),
+        pixel_borders.apply_edges(frame, -0.5, 5.0),
+    ):
         assert out.sum() == pytest.approx(frame.sum(), rel=1e-12)
         assert out.min() >= 0.0
 

@@ -261,3 +261,35 @@ def test_other_mistakes_are_refused():
         traps.shifted(np.zeros((2, 2)), ISRAEL, SURVEY, 0)
     with pytest.raises(OutOfRange, match="pixels"):
         traps.shifted(np.zeros((2, 2)), ISRAEL, SURVEY, -1, 3)
+
+
+def clocked(column, loss, rows):
+    """Charge that leaves a column [n] at each of `rows` clocks; each site keeps `loss` for the packet behind."""
+    line, read = np.array(column, float), []
+    for _ in range(rows):
+        moved = (1.0 - loss) * line
+        read.append(moved[0])
+        line = np.append(moved[1:], 0.0) + loss * line
+    return np.array(read)
+
+
+@pytest.mark.parametrize("loss", [1e-6, 1e-4])
+def test_a_part_lost_in_every_transfer(loss):
+    """Against every transfer for itself, along columns and along rows: to the cube of what is lost."""
+    rng = np.random.default_rng(1)
+    columns = np.zeros((2, 60, 3))
+    columns[:, :50] = 10.0 ** rng.uniform(1, 5, (2, 50, 3))
+    out = charge_transfer.apply_parallel_loss(columns, loss)
+    expected = np.array([[clocked(q[:, c], loss, 60) for c in range(3)] for q in columns]).transpose(0, 2, 1)
+    np.testing.assert_allclose(out, expected, rtol=0, atol=(60 * loss) ** 3 * 1e5)
+    along = charge_transfer.apply_serial_loss(columns.transpose(0, 2, 1), loss)
+    np.testing.assert_array_equal(along, out.transpose(0, 2, 1))
+    # What is behind the last pixel is a part of it, and all is still there.
+    assert out[:, 50].sum() == pytest.approx(50 * loss * columns[:, 49].sum(), rel=60 * loss)
+    assert out.sum() == pytest.approx(columns.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("loss", [-1e-6, 0.01, np.nan])
+def test_impossible_losses_are_refused(loss):
+    with pytest.raises(OutOfRange, match="charge lost in a transfer"):
+        charge_transfer.apply_parallel_loss(np.ones((1, 4, 4)), loss)
