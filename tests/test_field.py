@@ -86,14 +86,15 @@ def product(field, channel, content):
 def image(request, field):
     channel = request.param
     path = product(field, channel, "science")
-    header = fits.getheader(path)
+    # Of the pixels, without what a raw file has around them.
+    header = fits.Header(card for card in read_back.frame(path).cards)
     noise_free = fits.getdata(product(field, channel, "noise_free")).astype(float)
     diffuse = diffuse_electrons(header)
     electrons = calibrated_electrons(path, header) - diffuse
-    hit, delayed = np.zeros(noise_free.shape, bool), 0.0
+    charge, delayed = fits.getdata(product(field, channel, "cosmic_rays")), 0.0
+    hit = charge > 0
     if channel == "VIS":
-        charge = fits.getdata(product(field, channel, "cosmic_rays"))
-        hit, held = charge > 0, np.minimum(noise_free + charge, 2e5) + diffuse
+        held = np.minimum(noise_free + charge, 2e5) + diffuse
         delayed = trailed(held, header) - held
         # No pixels lie between the halves.
         rows = int(header["INJROWS"])
@@ -112,8 +113,8 @@ def image(request, field):
 
 def scene_of(header):
     mission = resolve()
-    detector = detectors.detector("vis", header["DETECTOR"], mission)
-    return Scene(mission, "vis", header["EXPTIME"], header["SKYRATE"], 0.0, detector)
+    detector = detectors.detector(header["INSTRUME"], header["DETECTOR"], mission)
+    return Scene(mission, detector.section, header["EXPTIME"], header["SKYRATE"], 0.0, detector)
 
 
 def trailed(expected, header):
@@ -128,11 +129,12 @@ def trailed(expected, header):
 
 def calibrated_electrons(path, header):
     """Counted electrons, as a perfect calibration gives them back."""
-    with fits.open(path) as units:
-        if units[0].data is not None:
-            return (units[0].data.astype(float) - header["BIAS"]) * header["GAIN"]
-        raw = np.stack([quadrants.placed(unit.data.astype(np.uint16), i) for i, unit in enumerate(units[1:])])
     scene = scene_of(header)
+    with fits.open(path) as units:
+        if scene.layout is not None:
+            raw = scene.layout.apart(np.asarray(read_back.frame(path).data))
+        else:
+            raw = np.stack([quadrants.placed(unit.data.astype(np.uint16), i) for i, unit in enumerate(units[1:])])
     return calibrated.electrons(raw, scene, int(header["SEED"]), applied(header))
 
 
@@ -165,7 +167,7 @@ def sources(field, header):
         x, y = system.all_world2pix(where["ra"].to_numpy(), where["dec"].to_numpy(), 0)
         microjansky = flux.column(0).to_numpy().astype(float)
         electrons = microjansky / 3631e6 * 10 ** (0.4 * header["ZEROPNT"]) * header["EXPTIME"]
-        nx, ny = (4096, 4136) if header["CHANNEL"] == "VIS" else (header["NAXIS1"], header["NAXIS2"])
+        nx, ny = (4096, 4136) if header["CHANNEL"] == "VIS" else (4096, 4004)
         inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
         found.append((x[inside], y[inside], electrons[inside], np.full(inside.sum(), catalogue == "stars")))
     return (np.concatenate(column) for column in zip(*found, strict=True))

@@ -21,7 +21,7 @@ _FILLED_S = {
     "sky": {"background": 1e-8, "pixel_area": 4e-8, "straylight": 4e-8},
     "cosmic_rays": {"cosmic_rays": 4.5e-8, "readout_cosmic_rays": 3e-8},
     "ghosts": {"ghosts": 5e-8},
-    "saturation": {"bleeding": 2e-8},
+    "saturation": {"bleeding": 1e-8},
 }
 _STARS_S = 2e-8
 

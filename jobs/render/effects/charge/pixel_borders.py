@@ -174,11 +174,11 @@ def _edges(scene: Scene) -> tuple[float, float]:
     return shift, scene.value("edge.length", "pix") if shift else 1.0
 
 
-RINGS = Effect("tree_rings", apply_rings, _rings, _rings_contribution, fixed=True, cost=2e-2)
+RINGS = Effect("tree_rings", apply_rings, _rings, _rings_contribution, fixed=True, cost=1.5e-2)
 EDGES = Effect(
     "edge_displacement",
     apply_edges,
     _edges,
     lambda scene: abs(_edges(scene)[0]) * (scene.peak_electrons + scene.sky_electrons),
-    cost=2e-2,
+    cost=3e-3,
 )

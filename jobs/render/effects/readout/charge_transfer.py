@@ -227,12 +227,12 @@ PARALLEL_LOSS = Effect(
     apply_parallel_loss,
     lambda scene: (_loss_of(scene, "parallel"),),
     lambda scene: _deferred(scene, "parallel"),
-    cost=8e-3,
+    cost=2e-3,
 )
 SERIAL_LOSS = Effect(
     "serial_loss",
     apply_serial_loss,
     lambda scene: (_loss_of(scene, "serial"),),
     lambda scene: _deferred(scene, "serial"),
-    cost=8e-3,
+    cost=2e-3,
 )

@@ -1,0 +1,50 @@
+"""Every parameter of a ground camera is asked for by what plans or renders it."""
+
+from fnmatch import fnmatchcase
+from types import SimpleNamespace
+
+import pytest
+
+from jobs.fluxes import passbands
+from jobs.render.camera import bands, detectors
+from jobs.render.channels import ground
+from jobs.render.effects.scene import Scene
+from jobs.render.planning import planned_exposures
+from lake_schema.mission.configuration import MissionConfiguration, resolve
+from lake_schema.mission.parameter import CAMERAS
+from tests.jobs.render import fields
+
+# Declared, and asked for by nothing that renders: what zero points are checked with; optics that distort, and what a
+# raw header says wrong, which nothing simulates yet.
+WAITING = ("*.collecting_area", "*.throughput", "*.fpa.distortion*", "*.header.*")
+
+
+def asked(camera, mission, monkeypatch):
+    """Names that planning and rendering a camera in all its bands ask for."""
+    found = set()
+    for name in ("parameter", "model"):
+
+        def see(self, key, before=getattr(MissionConfiguration, name)):
+            found.add(key)
+            return before(self, key)
+
+        monkeypatch.setattr(MissionConfiguration, name, see)
+    for band in bands.of_ground(camera, mission):
+        exposed = {"channel": "EXT", "camera": camera, "band": band, "seeing": 0.8}
+        planned_exposures._Band.of(SimpleNamespace(**exposed), mission, None)
+        planned_exposures.exposure_time("EXT", camera, band, mission)
+        one = detectors.detectors(camera, mission)[0]
+        ground.CHANNEL.psf(fields.exposure(**exposed), one, passbands.load(band), mission, 1)
+    scene = Scene(mission, one.section, 90.0, 10.0, 1e6, one)
+    for effect in ground.SKY:
+        effect.parameters(scene)
+        effect.contribution(scene)
+    return found
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_every_parameter_is_asked_for(camera, monkeypatch):
+    mission = resolve()
+    keys = {record.key for record in (*mission.parameters, *mission.models) if record.key.startswith(f"ext.{camera}.")}
+    unasked = keys - asked(camera, mission, monkeypatch)
+    assert {key for key in unasked if not any(fnmatchcase(key, pattern) for pattern in WAITING)} == set()
