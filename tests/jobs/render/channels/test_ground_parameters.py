@@ -19,16 +19,21 @@ from tests.jobs.render import fields
 WAITING = ("*.collecting_area", "*.throughput", "*.fpa.distortion*", "*.header.*")
 
 
+def seen(method, found):
+    """The method, which adds the name that it is asked for."""
+
+    def see(self, key):
+        found.add(key)
+        return method(self, key)
+
+    return see
+
+
 def asked(camera, mission, monkeypatch):
     """Names that planning and rendering a camera in all its bands ask for."""
     found = set()
     for name in ("parameter", "model"):
-
-        def see(self, key, before=getattr(MissionConfiguration, name)):
-            found.add(key)
-            return before(self, key)
-
-        monkeypatch.setattr(MissionConfiguration, name, see)
+        monkeypatch.setattr(MissionConfiguration, name, seen(getattr(MissionConfiguration, name), found))
     for band in bands.of_ground(camera, mission):
         exposed = {"channel": "EXT", "camera": camera, "band": band, "seeing": 0.8}
         planned_exposures._Band.of(SimpleNamespace(**exposed), mission, None)
