@@ -113,7 +113,8 @@ def image(request, field):
 
 def scene_of(header):
     mission = resolve()
-    detector = detectors.detector(header["INSTRUME"], header["DETECTOR"], mission)
+    camera = "vis" if header["CHANNEL"] == "VIS" else "lsstcam"
+    detector = detectors.detector(camera, header["DETECTOR"], mission)
     return Scene(mission, detector.section, header["EXPTIME"], header["SKYRATE"], 0.0, detector)
 
 

@@ -7,7 +7,6 @@ files of DECam and MegaCam.
 Amplifier      a part of a detector, and its output
 Layout         all of a detector, with pre- and overscan; None of a camera that has no table of them
 layout         of a detector, from the mission database;  full_size : of a whole one
-Section        a rectangle of a file or a detector, and how FITS writes it
 values         a parameter of each amplifier
 couplings      crosstalk of each pair
 
@@ -25,6 +24,7 @@ import numpy.typing as npt
 
 from jobs import rng
 from jobs.render.camera.detectors import Detector
+from jobs.render.camera.sections import Section
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -37,32 +37,6 @@ _MOST_SPREAD = 3.0
 # Crosstalk falls off with the distance of two outputs, in amplifiers, as so high a power, up to so many; outputs at the
 # other end of the columns are as much farther away (as measured in LSSTCam: less than 5e-5 beyond the neighbours).
 _FALL, _FARTHEST, _OTHER_END = 2.0, 4.0, 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """Columns x to x + nx and rows y to y + ny of an array, from 0."""
-
-    x: int
-    y: int
-    nx: int
-    ny: int
-
-    @property
-    def text(self) -> str:
-        """As FITS headers have it: from 1, the last one included."""
-        return f"[{self.x + 1}:{self.x + self.nx},{self.y + 1}:{self.y + self.ny}]"
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        """Of an array [rows, columns]."""
-        return slice(self.y, self.y + self.ny), slice(self.x, self.x + self.nx)
-
-    @classmethod
-    def of(cls, text: str) -> Section:
-        """From a header's text."""
-        (x, past_x), (y, past_y) = (map(int, part.split(":")) for part in text.strip("[] ").split(","))
-        return cls(x - 1, y - 1, past_x - x + 1, past_y - y + 1)
 
 
 @dataclass(frozen=True, slots=True)

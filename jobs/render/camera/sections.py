@@ -32,6 +32,17 @@ class Section:
         """As FITS headers have it: from 1, the last one included."""
         return f"[{self.x + 1}:{self.x + self.nx},{self.y + 1}:{self.y + self.ny}]"
 
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Of an array [rows, columns]."""
+        return slice(self.y, self.y + self.ny), slice(self.x, self.x + self.nx)
+
+    @classmethod
+    def of(cls, text: str) -> Section:
+        """From a header's text."""
+        (x, past_x), (y, past_y) = (map(int, part.split(":")) for part in text.strip("[] ").split(","))
+        return cls(x - 1, y - 1, past_x - x + 1, past_y - y + 1)
+
 
 @dataclass(frozen=True, slots=True)
 class Sections:

@@ -248,7 +248,6 @@ def _amplifiers(found: Frame, scene: Scene, detector: str, system: WCS) -> Reado
     assert own is not None
     cards: list[Card] = [
         *astrometry.cards(astrometry.shifted(system, own.data.x, own.data.y)),
-        ("DATASEC", own.data.text, "pixels of the detector"),
         ("NAMPS", len(own.amplifiers), "amplifiers"),
     ]
     numbers = (
@@ -264,7 +263,15 @@ def _amplifiers(found: Frame, scene: Scene, detector: str, system: WCS) -> Reado
             (f"BSEC{n}", own.bias_of(number).text, "columns of bias beside them"),
             *((f"{key}{n}", float(np.broadcast_to(value, len(raw))[number]), text) for key, value, text in numbers),
         ]
-    return Readout((Extension("", own.raw(raw), "adu", tuple(cards)),), raw, own.together(raw))
+        # Letters, as DECam's and MegaCam's files have them.
+        if len(amplifier.name) == 1:
+            cards += [
+                (f"DATASEC{amplifier.name}", own.pixels_of(number).text, f"pixels of amplifier {amplifier.name}"),
+                (f"BIASSEC{amplifier.name}", own.bias_of(number).text, "columns of bias beside them"),
+                (f"CCDSEC{amplifier.name}", amplifier.pixels.text, "its pixels, on the detector"),
+            ]
+    parts = Sections(own.data, Section(0, 0, own.nx, own.ny))
+    return Readout((Extension("", own.raw(raw), "adu", tuple(cards), sections=parts),), raw, own.together(raw))
 
 
 def _apart_assembled(array: Array, scene: Scene) -> Array:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jobs.render.camera.amplifiers import Section
+from jobs.render.camera.sections import Section
 from jobs.render.channels import registry
 from jobs.render.channels.readout import ReadoutMode
 from lake_schema.errors import BadInput

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.render.camera import amplifiers, detectors
-from jobs.render.camera.amplifiers import Section
+from jobs.render.camera.sections import Section
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 from lake_schema.mission.parameter import CAMERAS

@@ -9,7 +9,7 @@ from astropy.io import fits as astropy_fits
 
 from jobs.accuracy import SURVEY
 from jobs.render.camera import detectors
-from jobs.render.camera.amplifiers import Section
+from jobs.render.camera.sections import Section
 from jobs.render.channels import ground
 from jobs.render.effects.effect import apply_all
 from jobs.render.effects.readout import crosstalk

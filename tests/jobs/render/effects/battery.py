@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jobs.render.camera.amplifiers import Amplifier, Layout, Section
+from jobs.render.camera.amplifiers import Amplifier, Layout
+from jobs.render.camera.sections import Section
 from jobs.render.channels import ground, nisp_p, nisp_s, vis
 from jobs.render.effects.charge.ramp import Mode
 from jobs.render.effects.light.ghosts import Pupil
