@@ -12,6 +12,7 @@ import pytest
 import sep
 from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from jobs import shell
@@ -42,7 +43,7 @@ JOBS = (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.
 class Image:
     """An image with its truth: e-, sky subtracted; sources with 0-based pixel positions and expected e-.
 
-    bad     : hit by a cosmic ray, or blind
+    bad     : hit by a cosmic ray, full or beside what is full, or blind
     delayed : e- that traps took from what lies there, or gave back from what passed, cosmic rays above all
     """
 
@@ -92,7 +93,8 @@ def image(request, field):
     diffuse = diffuse_electrons(header)
     electrons = calibrated_electrons(path, header) - diffuse
     charge, delayed = fits.getdata(product(field, channel, "cosmic_rays")), 0.0
-    hit = charge > 0
+    # What has bled lies where no source does.
+    hit = (charge > 0) | ndimage.binary_dilation(read_back.frame(path).data >= header["SATURATE"], iterations=3)
     if channel == "VIS":
         held = np.minimum(noise_free + charge, 2e5) + diffuse
         delayed = trailed(held, header) - held
