@@ -29,7 +29,7 @@ from jobs.render.drawing import stamps, transfer
 from jobs.render.drawing.kernels.frame import FIXED_POINT
 from jobs.render.psf.model import Psf
 from jobs.render.sources.source_list import Sources
-from lake_schema.arrays import Bool, Float, Float32, Int
+from lake_schema.arrays import Float, Float32, Int
 
 # Sources whose spectra are held at a time, and samples of their images.
 _TOGETHER, _HELD = 256, 1 << 17
@@ -175,8 +175,10 @@ def draw(
     pieces, trail, whole = stamps.in_pieces(sources)
     pieces = pieces if sources.trail is None else replace(pieces, trail=trail)
     sizes = Sizes.of(pieces, psf, settings.edge * noise, settings.least)
-    seen = _Seen(pieces, psf, sizes, settings, slope, shape, {} if known is None else known)
     plans = [_Plan.of(order, psf, settings, slope) for order in orders]
+    # Orders share images: where one of them is straight, in the coordinates in which it is a row.
+    straight = any(plan.tile > 0 for plan in plans)
+    seen = _Seen(pieces, psf, sizes, settings, (slope, straight), shape, {} if known is None else known)
     own = Tally.of(len(pieces), len(orders))
     for start in range(0, len(pieces), _TOGETHER):
         some = np.arange(start, min(start + _TOGETHER, len(pieces)))
@@ -185,8 +187,7 @@ def draw(
         for column, part in enumerate(parts):
             own.expected[some, column] = part.expected
             own.peak[some, column] = np.where(part.sizes > 0, part.peak, 0.0)
-        for straight in (True, False):
-            _add(seen, straight, some, spectra, list(zip(plans, parts, strict=True)), onto, own)
+        _add(seen, some, spectra, list(zip(plans, parts, strict=True)), onto, own)
     if tally is not None:
         tally.add(own, whole)
     if layers is not None:
@@ -238,14 +239,15 @@ class _Part:
     """One order of some of the sources, [k] each.
 
     along, across : float64[k, i] polynomials of their traces
-    sizes    : of their stamps, 0 = nothing of it is drawn;  straight : whether the trace is
+    sizes    : of their stamps, 0 = nothing of it is drawn
+    tiles    : pixels that share a PSF; 0 where the trace is not straight
     expected : electrons, on the frame and beside it;  peak : in the brightest column
     """
 
     along: Float
     across: Float
     sizes: Int
-    straight: Bool
+    tiles: Int
     expected: Float
     peak: Float
 
@@ -271,7 +273,7 @@ class _Part:
         nothing = beside | (peak < limit) | (peak <= 0.0)
         return cls(
             np.ascontiguousarray(along), np.ascontiguousarray(across), np.where(nothing, 0, sizes),
-            straight & (plan.tile > 0), expected, peak,
+            np.where(straight, plan.tile, 0), expected, peak,
         )  # fmt: skip
 
 
@@ -279,12 +281,13 @@ class _Seen:
     """Sources through the PSF."""
 
     def __init__(
-        self, sources: Sources, psf: Psf, sizes: Sizes, settings: Settings, slope: float, shape: tuple[int, int],
-        known: Known,
+        self, sources: Sources, psf: Psf, sizes: Sizes, settings: Settings, slope: tuple[float, bool],
+        shape: tuple[int, int], known: Known,
     ) -> None:  # fmt: skip
-        self.sources, self.psf, self.sizes, self.settings, self.slope = sources, psf, sizes, settings, slope
+        self.sources, self.psf, self.sizes, self.settings = sources, psf, sizes, settings
+        self.slope, self.straight = slope
         self.places = list(zip(sources.column.tolist(), sources.row.tolist(), strict=True))
-        self.bodies = {straight: images.bodies(sources, slope if straight else 0.0) for straight in (True, False)}
+        self.bodies = images.bodies(sources, self.slope if self.straight else 0.0)
         assert psf.planes is not None
         count = len(psf.planes.wavelength)
         # How the PSF changes is known on the detector alone.
@@ -293,9 +296,9 @@ class _Seen:
         self.weights = np.stack(one, axis=1)
         self._planes = known
 
-    def sampling(self, size: int, straight: bool, smooth: bool = False) -> Sampling:
+    def sampling(self, size: int, smooth: bool = False) -> Sampling:
         """Of stamps of `size` pixels; smooth : of what giants.add draws."""
-        like = Sampling(size, self.settings.along, self.settings.across, self.slope, straight)
+        like = Sampling(size, self.settings.along, self.settings.across, self.slope, self.straight)
         return giants.sampling(size, like, smooth)
 
     def images(self, some: Int, sampling: Sampling) -> Float32:
@@ -304,7 +307,7 @@ class _Seen:
             self._planes[sampling] = images.planes(self.psf, sampling)
         own = self._planes[sampling]
         over = [images.spread_over(own, self.sources, i) for i in some.tolist()]
-        return images.coefficients(own, self.weights[some], self.bodies[sampling.straight].take(some), over)
+        return images.coefficients(own, self.weights[some], self.bodies.take(some), over)
 
     def together(self, sampling: Sampling) -> int:
         """How many stamps are held at a time."""
@@ -313,18 +316,17 @@ class _Seen:
 
 
 def _add(
-    seen: _Seen, straight: bool, some: Int, spectra: Float32, orders: list[tuple[_Plan, _Part]], onto: list[Int],
-    tally: Tally,
-) -> None:  # fmt: skip
-    """Orders of some of the sources onto their frames: those that are straight, or the others."""
-    sizes = np.stack([np.where(part.straight == straight, part.sizes, 0) for _, part in orders])
+    seen: _Seen, some: Int, spectra: Float32, orders: list[tuple[_Plan, _Part]], onto: list[Int], tally: Tally
+) -> None:
+    """Orders of some of the sources onto their frames."""
+    sizes = np.stack([part.sizes for _, part in orders])
     # Orders that want stamps of nearly one size share the largest.
     largest = sizes.max(axis=0)
     sizes = np.where((sizes > 0) & (sizes >= _SHARED * largest), largest, sizes)
     tally.sizes[some] = np.maximum(tally.sizes[some], largest)
     for size in np.unique(sizes[sizes > 0]).tolist():
-        sampling = seen.sampling(size, straight)
-        smooth = seen.sampling(size, straight, smooth=True) if size == GIANT else None
+        sampling = seen.sampling(size)
+        smooth = seen.sampling(size, smooth=True) if size == GIANT else None
         which, count = np.flatnonzero((sizes == size).any(axis=0)), seen.together(sampling)
         for own in np.split(which, range(count, len(which), count)):
             for k, image in zip(own.tolist(), seen.images(some[own], sampling), strict=True):
@@ -334,10 +336,10 @@ def _add(
                     plan, part = orders[m]
                     light = spectra[k], float(seen.sources.electrons[i]), plan.order.response
                     path, place = (part.along[k], part.across[k]), seen.places[i]
-                    tile, shape = plan.tile if straight else 0, (sampling.n, sampling.along, sampling.across)
                     fallen = spreading.spread(
-                        image, *light, plan.share, *path, plan.t, place, seen.slope, shape, tile, FIXED_POINT, onto[m]
-                    )
+                        image, *light, plan.share, *path, plan.t, place, *sampling.rows, sampling.shape,
+                        int(part.tiles[k]), FIXED_POINT, onto[m],
+                    )  # fmt: skip
                     if smooth is not None and rest is not None:
                         fallen += giants.add(rest, light, plan.share, path, plan.t, place, smooth, onto[m])
                     tally.electrons[i, m] = fallen

@@ -34,7 +34,7 @@ def sampling(size: int, like: Sampling, smooth: bool = False) -> Sampling:
     if size < GIANT:
         return replace(like, n=size)
     whole = replace(like, n=int(SIZES[-1]), split=_SPLIT)
-    return replace(whole, step=COARSE, straight=False) if smooth else whole
+    return replace(whole, step=COARSE) if smooth else whole
 
 
 def add(
@@ -52,10 +52,10 @@ def add(
     along, across = (part / COARSE for part in polynomials)
     start = place[0] / COARSE + _BESIDE, place[1] / COARSE + _BESIDE
     spectrum, factor, response = electrons
-    shape = like.n, like.along, like.across
     spreading.spread(
-        image, spectrum, factor, response, share, along, across, times, start, like.slope, shape, 0, FIXED_POINT, coarse
-    )
+        image, spectrum, factor, response, share, along, across, times, start, *like.rows, like.shape, 0, FIXED_POINT,
+        coarse,
+    )  # fmt: skip
     y, x = (COARSE * (np.arange(float(n)) - _BESIDE) for n in coarse.shape)
     light = RectBivariateSpline(y, x, coarse / COARSE**2)(*(np.arange(float(n)) for n in frame.shape))
     units = np.rint(light).astype(np.int64)

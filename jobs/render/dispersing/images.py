@@ -10,7 +10,7 @@ unfolded (all |kx| <= pi ox, |ky| <= pi oy), as coefficients of splines: I = sum
 that C(k) = ox oy I(k) / (sinc(f / ox)^6 sinc(fy / oy)^4), f = k / 2 pi, and no resolution is lost to the splines.
 The quintic spline lies along the trace, of slope s: f = fx + s fy.
 
-Of a straight trace the image is held in coordinates in which the trace is a row, u = x and v = y - s x: then
+Where traces are straight the image is held in coordinates in which they are rows, u = x and v = y - s x: then
 kx = ku - s kv, ky = kv, and f = fu.  What is summed along u is put in its place across at once, column by column.
 
 Nodes, nodes       wavelengths of the PSFs, and the share of each at any wavelength
@@ -80,6 +80,16 @@ class Sampling:
         """Rows by which a row of the image rises in a column of the detector."""
         return self.slope if self.straight else 0.0
 
+    @property
+    def rows(self) -> tuple[float, float]:
+        """(slope, shear)."""
+        return self.slope, self.shear
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(n, along, across)."""
+        return self.n, self.along, self.across
+
 
 @dataclass(frozen=True, slots=True)
 class Planes:
@@ -111,7 +121,8 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
     # Of the lowest frequencies alone the PSF's pixels tell as much as its samples.
     fold = psf.planes.samples if step > 1 and psf.planes.samples % 2 else 1
     factor /= _triangle(fx / step, fold) * _triangle(fy / step, fold)
-    images = [_summed(image, fold) for image in (*psf.planes.images, *psf.planes.drift)]
+    images = [*psf.planes.images, *psf.planes.drift]
+    images = [_summed(image, fold) for image in images] if fold > 1 else images
     found = np.empty((len(images), count, len(iv)), np.complex64)
     for image, out in zip(images, found, strict=True):
         passed = transfer.sheared_spectrum(image, psf.planes.samples // fold * n * step, len(iv), sampling.shear)

@@ -68,7 +68,7 @@ def _slope(path: Float, i: int) -> float:
 
 @jit
 def follow(
-    images: Float32, laid: Float, first: int, path: Float, slope: float, shape: tuple[int, int, int],
+    images: Float32, laid: Float, first: int, path: Float, slope: float, shear: float, shape: tuple[int, int, int],
     corner: tuple[int, int], out: Float32,
 ) -> None:  # fmt: skip
     """Adds a source's image at every sample of its trace to out [h, w], with a PSF and rows of its own.
@@ -76,7 +76,7 @@ def follow(
     images : [b, n along, n across] spline coefficients of the source seen through PSF b, of a stamp of n pixels; the
              stamp's middle is sample n / 2 of each axis
     laid   : [b, m] electrons;  first : place of its first sample, in samples along
-    path   : of `_path`;  slope : rows a column before and behind it
+    path   : of `_path`;  slope : rows a column before and behind it;  shear : by which a row of the image rises
     shape  : n, samples a pixel along, across;  corner : column and row of out's first pixel
     """
     n, ox, oy = shape
@@ -98,7 +98,8 @@ def follow(
                 weight, some = np.float32(laid[b, m]), images[b, i * ox + phase]
                 for v in range(len(line)):
                     line[v] += weight * some[v]
-            _add_line(line, row, n, oy, corner[1], wrapped, fine, out[:, left + i])
+            aside = shear * (corner[0] + left + i - (first + m) / ox)
+            _add_line(line, row + aside, n, oy, corner[1], wrapped, fine, out[:, left + i])
 
 
 @jit
@@ -247,15 +248,15 @@ def add(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) -> flo
 @jit
 def spread(
     images: Float32, spectrum: Float32, factor: float, response: Float, share: Float, along: Float, across: Float,
-    times: tuple[float, float], start: tuple[float, float], slope: float, shape: tuple[int, int, int], tile: int,
-    unit: float, frame: Int,
+    times: tuple[float, float], start: tuple[float, float], slope: float, shear: float, shape: tuple[int, int, int],
+    tile: int, unit: float, frame: Int,
 ) -> float:  # fmt: skip
     """An order of a source onto the frame, `unit` to an electron; returns the electrons that fell there.
 
     images   : of `follow`, or of `convolve` for tile > 0: the pixels that share a PSF
     spectrum : [w], `factor` x `response` [w] electrons for each unit;  share : [w, b] of each PSF
     along, across, times : of kernels.lay, and the same of rows;  start : column and row of the undispersed image
-    slope    : of a row of the images
+    slope    : rows a column of the trace before and behind it;  shear : of a row of the images
     shape    : n, samples a pixel along, across
     """
     n, ox, oy = shape
@@ -270,7 +271,7 @@ def spread(
     laid = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * right)) + 4 - first))
     lay(electrons, along, times, start[0], ox, np.ones((len(response), 1)) if tile > 0 else share, first, laid)
     steepest = max(np.abs(_slope(path, 0)), np.abs(_slope(path, _NODES - 2)))
-    wing = steepest * (n // 2 + 2.0) if tile > 0 else 0.0
+    wing = (steepest if tile > 0 else abs(shear)) * (n // 2 + 2.0)
     begin = max(int(np.floor(left)) - n // 2 - 2, 0), max(int(np.floor(bottom - wing)) - n // 2 - 1, 0)
     width = min(int(np.ceil(right)) + n // 2 + 3, nx) - begin[0]
     height = min(int(np.ceil(top + wing)) + n // 2 + 2, ny) - begin[1]
@@ -278,10 +279,10 @@ def spread(
         return 0.0
     piece = np.zeros((height, width), np.float32)
     if tile == 0:
-        follow(images, laid, first, path, slope, shape, begin, piece)
+        follow(images, laid, first, path, slope, shear, shape, begin, piece)
     else:
         low = begin[0] - n - 2 * tile
         lines = np.zeros((width + 2 * n + 4 * tile + 2 * STEP, n * oy), np.float32)
-        convolve(images, laid[0], first, path, slope, share, shape, tile, low, lines)
+        convolve(images, laid[0], first, path, shear, share, shape, tile, low, lines)
         settle(lines, low, path, shape, begin, piece)
     return add(piece, begin, unit, frame)
