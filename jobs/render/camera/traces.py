@@ -53,9 +53,9 @@ class Trace:
         columns, rows = (np.asarray(np.polynomial.polynomial.polyval(t, part), float) for part in (along, across))
         return columns, rows
 
-    def polynomials(self, column: float, row: float) -> tuple[Float, Float]:
-        """Coefficients [i] of t^i of a source's own trace, columns and rows, pixels."""
-        place = np.array([1.0, column, row])
+    def polynomials(self, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
+        """Coefficients [i] of t^i of a source's own trace, columns and rows, pixels; [i, n] of n sources."""
+        place = np.array([np.ones_like(column, float), column, row])
         return np.asarray(sums.product(self.x, place)), np.asarray(sums.product(self.y, place))
 
 

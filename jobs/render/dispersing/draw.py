@@ -19,12 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from jobs import sums
 from jobs.accuracy import Accuracy
 from jobs.render.camera.traces import Trace
 from jobs.render.dispersing import giants, images, kernels, spreading
 from jobs.render.dispersing.images import Planes, Sampling
-from jobs.render.dispersing.stamp_sizes import GIANT, Sizes
+from jobs.render.dispersing.stamp_sizes import GIANTS, Sizes
 from jobs.render.drawing import stamps, transfer
 from jobs.render.drawing.kernels.frame import FIXED_POINT
 from jobs.render.psf.model import Psf
@@ -258,8 +257,7 @@ class _Part:
         peak, expected = np.empty(count), np.empty(count)
         window = max(round(plan.angstrom), 1)
         kernels.brightest(spectra, seen.sources.electrons[some], order.response, window, peak, expected)
-        place = np.stack([np.ones(count), column, row])
-        along, across = (sums.product(part, place).T for part in (order.trace.x, order.trace.y))
+        along, across = (part.T for part in order.trace.polynomials(column, row))
         t = plan.t[0] + plan.t[1] * np.linspace(0.0, len(order.response) - 1.0, _PLACES)
         x, y = (np.polynomial.polynomial.polyval(t, part.T) for part in (along, across))
         limit = seen.sizes.limit * (1.0 if order.trace.order == 1 else seen.settings.faint / seen.settings.edge)
@@ -326,7 +324,7 @@ def _add(
     tally.sizes[some] = np.maximum(tally.sizes[some], largest)
     for size in np.unique(sizes[sizes > 0]).tolist():
         sampling = seen.sampling(size)
-        smooth = seen.sampling(size, smooth=True) if size == GIANT else None
+        smooth = seen.sampling(size, smooth=True) if size >= GIANTS[0] else None
         which, count = np.flatnonzero((sizes == size).any(axis=0)), seen.together(sampling)
         for own in np.split(which, range(count, len(which), count)):
             for k, image in zip(own.tolist(), seen.images(some[own], sampling), strict=True):

@@ -63,8 +63,9 @@ class Sampling:
     """n pixels of a stamp's side, even; samples a pixel along and across; slope of the trace, rows a column.
 
     straight : in coordinates in which the trace is a row
-    step     : of the detector's pixels in a pixel of the stamp;  split : pixels; of the smooth part of an image and of
-               the rest, of which the smooth part is drawn with a step above 1; 0 = of the whole image
+    step     : of the detector's pixels in a pixel of the stamp, which then has a cubic spline's coefficient
+    split    : pixels; of the smooth part of an image and of the rest, of which the smooth part is drawn with a step
+               above 1; 0 = of the whole image
     """
 
     n: int
@@ -118,6 +119,8 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
     sign = (-1.0) ** iu[:, None] * (-1.0) ** iv
     factor = sampling.along * sampling.across * np.sinc(fx / step) * np.sinc(fy / step) * sign / spline
     factor *= _split(sampling, fx / step, fy / step)
+    if step > 1:
+        factor /= _cubic(fx) * _cubic(fy)
     # Of the lowest frequencies alone the PSF's pixels tell as much as its samples.
     fold = psf.planes.samples if step > 1 and psf.planes.samples % 2 else 1
     factor /= _triangle(fx / step, fold) * _triangle(fy / step, fold)
@@ -144,6 +147,11 @@ def _summed(image: Float32, fold: int) -> Float32:
 def _triangle(f: Float, fold: int) -> Float:
     """What such sums leave of f cycles a pixel: of what is beyond half a cycle little folds onto the lowest."""
     return np.asarray((np.sinc(f) / np.sinc(f / fold)) ** 2)
+
+
+def _cubic(f: Float) -> Float:
+    """Of f cycles a pixel: what a cubic spline is at the pixels, of its coefficients there."""
+    return np.asarray((2.0 + np.cos(2 * np.pi * f)) / 3.0)
 
 
 def _split(sampling: Sampling, fx: Float, fy: Float) -> Float:

@@ -4,6 +4,7 @@ follow     a source's image at every sample of its trace, each in its own rows
 convolve   a source's image, along a straight trace, by a few samples at a time;  settle : into rows
 spread     a source's order onto the frame, in one of the two ways
 add        a piece of the image onto the frame, in fixed point
+refine     a frame of wider pixels onto the frame
 """
 
 from __future__ import annotations
@@ -243,6 +244,35 @@ def add(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) -> flo
                 out[c] += units
                 total += units
     return total / unit
+
+
+@jit
+def refine(coarse: Int, step: int, frame: Int) -> int:
+    """Adds a cubic spline to the frame: coarse [h, w] its coefficients, of pixels as wide as `step` of the frame's.
+
+    The frame's first pixel is at (1, 1), and what is added to it is a share of a coarse one; returns the units added.
+    """
+    ny, nx = frame.shape
+    weights, wide, total = np.empty((step, 4)), np.empty(coarse.shape[1]), np.int64(0)
+    for k in range(step):
+        t = k / step
+        s = 1.0 - t
+        weights[k, 0], weights[k, 3] = s * s * s / 6.0, t * t * t / 6.0
+        weights[k, 1], weights[k, 2] = (4.0 + t * t * (3.0 * t - 6.0)) / 6.0, (4.0 + s * s * (3.0 * s - 6.0)) / 6.0
+    for y in range(ny):
+        own, some = weights[y % step] / step**2, coarse[y // step : y // step + 4]
+        for c in range(len(wide)):
+            wide[c] = own[0] * some[0, c] + own[1] * some[1, c] + own[2] * some[2, c] + own[3] * some[3, c]
+        if np.max(np.abs(wide)) == 0.0:
+            continue
+        for k in range(step):
+            w0, w1, w2, w3 = weights[k]
+            for q in range((nx - k + step - 1) // step):
+                light = w0 * wide[q] + w1 * wide[q + 1] + w2 * wide[q + 2] + w3 * wide[q + 3]
+                units = np.int64(np.rint(light))
+                frame[y, q * step + k] += units
+                total += units
+    return int(total)
 
 
 @jit

@@ -83,7 +83,7 @@ def traced(light: Light, tally: Tally, aim: Aim, rows: Rows, scene: Scene) -> Co
         "expected": tally.expected[source, which],
         "drawn": tally.electrons[source, which],
         "overlapped": np.ma.masked_array(part, ~first),
-        "contaminants": [np.unique(sources.ids[other]) for other in beside],
+        "contaminants": [np.unique(sources.ids[other]) if len(other) else sources.ids[:0] for other in beside],
         **seen,
     }
 
@@ -103,17 +103,20 @@ def _paths(light: Light, tally: Tally, source: Int, which: Int, aim: Aim) -> Pat
         picture = None if body[i] else sources.picture_of(i)
         half[i] += 0.0 if picture is None else picture.half_light / scale
     half += 0.5 * sources.length
-    along, across, columns = [], [], []
-    for i, m in zip(source.tolist(), which.tolist(), strict=True):
-        column, row = float(sources.column[i]), float(sources.row[i])
-        x, y = light.dispersed.orders[m].trace.polynomials(column, row)
-        x, y = x + column * (np.arange(len(x)) == 0), y + row * (np.arange(len(y)) == 0)
-        low, high = sorted((float(x[0]), float(x.sum())))
-        columns.append(max(min(high, aim.detector.nx - 1.0) - max(low, 0.0), 1.0))
-        along.append(x)
-        across.append(y)
-    order = np.array([light.dispersed.orders[m].trace.order for m in which], np.int64)
-    level = tally.electrons[source, which] / np.array(columns, float)
+    along, across = ([np.zeros(0)] * len(source) for _ in "xy")
+    order, columns = np.zeros(len(source), np.int64), np.ones(len(source))
+    for m, one in enumerate(light.dispersed.orders):
+        (own,) = np.nonzero(which == m)
+        order[own] = one.trace.order
+        column, row = sources.column[source[own]], sources.row[source[own]]
+        x, y = one.trace.polynomials(column, row)
+        x[0] += column
+        y[0] += row
+        low, high = np.sort([x[0], x.sum(axis=0)], axis=0)
+        columns[own] = np.maximum(np.minimum(high, aim.detector.nx - 1.0) - np.maximum(low, 0.0), 1.0)
+        for k, own_x, own_y in zip(own.tolist(), x.T.copy(), y.T.copy(), strict=True):
+            along[k], across[k] = own_x, own_y
+    level = tally.electrons[source, which] / columns
     return Paths(source, order, along, across, np.minimum(half, _WIDEST)[source], level)
 
 
@@ -167,19 +170,27 @@ def _near(paths: Paths, path: Int, row: Float, least: float) -> tuple[Int, Int]:
 
 def _bins(paths: Paths, nx: int) -> tuple[Int, Int, Float]:
     """(path, bin of 8 columns, row there) of all traces on the detector."""
-    t, found = np.linspace(0.0, 1.0, _PLACES), []
-    for i, (x, y) in enumerate(zip(paths.along, paths.across, strict=True)):
-        column, row = (np.polynomial.polynomial.polyval(t, part) for part in (x, y))
-        order = np.argsort(column)
-        low, high = max(column.min(), 0.0), min(column.max(), nx - 1.0)
-        bins = np.arange(int(low) // _BIN, int(high) // _BIN + 1) if high >= low else np.zeros(0, np.int64)
-        rows = np.interp((bins + 0.5) * _BIN, column[order], row[order])
-        found.append((np.full(len(bins), i), bins, rows))
-    if not found:
-        none = np.zeros(0, np.int64)
-        return none, none, np.zeros(0)
-    path, at, rows = (np.concatenate(part) for part in zip(*found, strict=True))
+    t = np.linspace(0.0, 1.0, _PLACES)
+    column, row = (np.polynomial.polynomial.polyval(t, _together(part).T) for part in (paths.along, paths.across))
+    order = np.argsort(column, axis=1)
+    column, row = (np.take_along_axis(part, order, axis=1) for part in (column, row))
+    low, high = np.maximum(column[:, 0], 0.0), np.minimum(column[:, -1], nx - 1.0)
+    first = low.astype(int) // _BIN
+    count = np.where(high >= low, high.astype(int) // _BIN - first + 1, 0)
+    path, ends = np.repeat(np.arange(len(count)), count), np.cumsum(count)
+    at = np.arange(len(path)) - np.repeat(ends - count - first, count)
+    rows, middle = np.empty(len(path)), (at + 0.5) * _BIN
+    for i, (start, stop) in enumerate(zip((ends - count).tolist(), ends.tolist(), strict=True)):
+        rows[start:stop] = np.interp(middle[start:stop], column[i], row[i])
     return path, at, rows
+
+
+def _together(polynomials: list[Float]) -> Float:
+    """[n, i] coefficients of polynomials, those that one does not have 0."""
+    out = np.zeros((len(polynomials), max((len(part) for part in polynomials), default=1)))
+    for own, part in zip(out, polynomials, strict=True):
+        own[: len(part)] = part
+    return out
 
 
 # ---------------------------------------------------------------------------------------------- lines

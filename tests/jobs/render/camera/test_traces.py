@@ -130,3 +130,12 @@ def test_orders_share_the_light_as_the_mission_has_it():
         found = traces.throughput("RGS000", number, waves, DETECTOR, MISSION)
         assert (low <= found).all()
         assert (found <= high).all()
+
+
+def test_paths_of_many_sources_are_those_of_each():
+    column, row = np.array([-300.0, 17.25, 2039.0]), np.array([5.5, 2040.0, 1000.0])
+    for trace in traces.traces("RGS000", 4.0, DETECTOR, MISSION):
+        many = trace.polynomials(column, row)
+        for i in range(len(column)):
+            for one, all_of_them in zip(trace.polynomials(column[i], row[i]), many, strict=True):
+                np.testing.assert_array_equal(one, all_of_them[:, i])

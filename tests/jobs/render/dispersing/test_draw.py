@@ -36,6 +36,29 @@ def test_straight_traces_are_drawn_as_sample_by_sample(slope, sag, along):
         assert np.abs(fast - slow).mean() < 3e-3 * slow.mean()
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.07])
+def test_orders_share_images_and_are_drawn_as_from_their_own(slope, monkeypatch):
+    """An order that is bent within a few pixels, beside a straight one: its stamps are sheared as those of the other."""
+    bent, straight = trace((-70.0, 5.0, 2.0, -1.0), -0.03, 0, 1.0), trace((-10.0, 512.0), slope)
+    orders, made, planes = [order(straight), order(bent, 0.2)], [], images.planes
+    monkeypatch.setattr(images, "planes", lambda *which: made.append(which[1]) or planes(*which))
+    spectrum = continuum_and_line(300.0).astype(np.float32)[None]
+    for i in (1, 4):
+        source, shape, found = placed(8, i, 150.3, 60.6), (128, 720), []
+        for block in (110.0, 0.0):
+            settings, layers = draw.Settings(edge=1e-6, least=64, block=block), {}
+            draw.draw(
+                source, draw.Dispersed(lambda some: spectrum, tuple(orders), settings), psf(), shape, 1.0, None, layers
+            )
+            found.append(layers[0])
+        assert [sampling.straight for sampling in made] == [True, False]
+        made.clear()
+        shared, own = found
+        assert own.sum() > 0.15 * spectrum.sum()
+        assert shared.sum() == pytest.approx(own.sum(), rel=1e-5)
+        assert np.abs(shared - own).max() < 1e-3 * own.max()
+
+
 def placed(seed, i, column, row, galaxies=4, stars=1):
     source = one(scenes.sources(scenes.NISP, seed, galaxies=galaxies, stars=stars), i)
     source.column[:], source.row[:] = column, row

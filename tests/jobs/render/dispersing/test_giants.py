@@ -5,12 +5,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from benchmarks import _scenes as scenes
 from jobs import sums
 from jobs.accuracy import SURVEY
-from jobs.render.dispersing import draw, images
-from jobs.render.dispersing.stamp_sizes import GIANT, Sizes
+from jobs.render.dispersing import draw, images, spreading
+from jobs.render.dispersing.stamp_sizes import GIANTS, Sizes
 from jobs.render.drawing import settings as drawing
 from jobs.render.drawing import stamp_sizes, stamps
 from tests.jobs.render.dispersing import fine
@@ -81,8 +82,19 @@ def test_points_and_small_galaxies_end_where_the_planes_of_the_psf_do(peak):
 def test_a_giant_that_nobody_sees_takes_the_least_stamp():
     """All of its light in a row at the stamp's edge is less than may be left out of a pixel."""
     faint = Sizes.of(galaxy(15.0, 1.0, 0.0, 60.0, 60.0), psf(), SETTINGS.edge * NOISE, SETTINGS.least)
-    for electrons, wanted in ((1.0, SETTINGS.least), (1e8, GIANT)):
+    for electrons, wanted in ((1.0, SETTINGS.least), (1e8, GIANTS[1])):
         assert faint.size(np.array([0]), np.array([electrons / 512]), np.array([electrons])) == wanted
+
+
+def test_a_coarse_frame_is_refined_as_its_spline():
+    """Against scipy's, to half a unit, in all pixels of a frame that is no whole number of coarse ones."""
+    rng, frame = np.random.default_rng(2), np.full((21, 35), 7, np.int64)
+    coarse = rng.integers(-(10**6), 10**6, (9, 12))
+    added = spreading.refine(coarse, 4, frame)
+    places = np.meshgrid(*(1.0 + np.arange(n) / 4 for n in frame.shape), indexing="ij")
+    wanted = map_coordinates(coarse / 16.0, places, order=3, prefilter=False)
+    assert np.abs(frame - 7 - wanted).max() < 0.5 + 1e-6
+    assert added == (frame - 7).sum()
 
 
 @pytest.mark.parametrize(("index", "fraction"), [(4.0, 1.0), (1.0, 0.0)])
