@@ -83,7 +83,7 @@ def lay(
     electrons: Float, along: Float, times: tuple[float, float], start: float, samples: int, share: Float, first: int,
     out: Float,
 ) -> None:  # fmt: skip
-    """Adds electrons [w] of each wavelength to the samples of a trace, out [b, m], by shares [w, b].
+    """Adds electrons [w] of each wavelength to the samples of a trace, out [b, m], by shares [b, w].
 
     along   : coefficients of t^i, pixels from `start`;  times : t of the first wavelength, and its step
     samples : a pixel;  first : place of out's first sample, in samples;  share : of each PSF, by wavelength
@@ -113,15 +113,34 @@ def lay(
             w4[i] = e * (26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s)))))
             w2[i] = e * (66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t)))
             w3[i] = e * (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s)))
-        for b in range(out.shape[0]):
-            line, part = out[b], share[begin : begin + _WAVES, b]
-            for i in range(len(some)):
-                at, own = low[i], part[i]
-                if some[i] == 0.0 or at < 0 or at + 6 > count:
-                    continue
-                line[at] += own * w0[i]
-                line[at + 1] += own * w1[i]
-                line[at + 2] += own * w2[i]
-                line[at + 3] += own * w3[i]
-                line[at + 4] += own * w4[i]
-                line[at + 5] += own * w5[i]
+        start_of, stop = 0, 0
+        while start_of < len(some):
+            # Those that lie between the same samples are added up first.
+            at, stop = low[start_of], start_of + 1
+            while stop < len(some) and low[stop] == at:
+                stop += 1
+            if 0 <= at <= count - 6:
+                for b in range(out.shape[0]):
+                    _add(weights[:, start_of:stop], share[b, begin + start_of : begin + stop], out[b, at : at + 6])
+            start_of = stop
+
+
+@jit
+def _add(weights: Float, share: Float, out: Float) -> None:
+    """Adds weights [6, k] by shares [k] to out [6]."""
+    w0, w1, w2, w3, w4, w5 = weights
+    s0 = s1 = s2 = s3 = s4 = s5 = 0.0
+    for i in range(len(share)):
+        own = share[i]
+        s0 += own * w0[i]
+        s1 += own * w1[i]
+        s2 += own * w2[i]
+        s3 += own * w3[i]
+        s4 += own * w4[i]
+        s5 += own * w5[i]
+    out[0] += s0
+    out[1] += s1
+    out[2] += s2
+    out[3] += s3
+    out[4] += s4
+    out[5] += s5

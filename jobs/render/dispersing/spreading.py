@@ -17,8 +17,8 @@ from lake_schema.arrays import Float, Float32, Int
 
 # Places along a trace between which it is taken as straight.
 _NODES = 129
-# Pixels of a trace that are taken together.
-STEP = 4
+# Pixels of a trace that are taken together; numbers of an image seen through one PSF that are held close at hand.
+STEP, _CLOSE = 4, 24_000
 
 
 @jit
@@ -140,9 +140,40 @@ def convolve(
     share  : [wavelengths, b] of each PSF;  tile : pixels that share one, a multiple of STEP
     """
     n, ox, oy = shape
-    tall, pad = n * oy, STEP - 1
-    mixed, steep = np.zeros((ox, (n + 2 * pad) * tall), np.float32), np.empty((n * ox, tall), np.float32)
+    tall = n * oy
+    steep = np.empty((n * ox, tall), np.float32)
     _steep(images[len(images) // 2], ox, oy, steep)
+    count = (n * ox * tall + _CLOSE - 1) // _CLOSE
+    for k in range(count):
+        # By some of the samples across, which then stay in the processor's cache.
+        begin, end = k * tall // count, (k + 1) * tall // count
+        parts = _by_phase(images, steep, ox, begin, end)
+        lines = np.zeros((len(out), end - begin), np.float32)
+        _convolve(parts, laid, first, path, slope, share, shape, tile, low, lines)
+        out[:, begin:end] += lines
+
+
+@jit
+def _by_phase(images: Float32, steep: Float32, ox: int, begin: int, end: int) -> Float32:
+    """[b + 1, ox, n x samples across] some samples across of images [b, n along, n across], and `steep`."""
+    n, wide = images.shape[1] // ox, end - begin
+    out = np.empty((len(images) + 1, ox, n * wide), np.float32)
+    for b in range(len(out)):
+        image = steep if b == len(images) else images[b]
+        for j in range(n * ox):
+            out[b, j % ox, j // ox * wide : (j // ox + 1) * wide] = image[j, begin:end]
+    return out
+
+
+@jit
+def _convolve(
+    parts: Float32, laid: Float, first: int, path: Float, slope: float, share: Float, shape: tuple[int, int, int],
+    tile: int, low: int, out: Float32,
+) -> None:  # fmt: skip
+    """Adds to out [w, wide] what `convolve` does, of parts [b + 1, ox, n x wide] of `_by_phase`."""
+    n, ox, _ = shape
+    tall, pad = out.shape[1], STEP - 1
+    mixed, amounts = np.zeros((ox, (n + 2 * pad) * tall), np.float32), np.empty(len(parts), np.float32)
     flat, weights, all_of_them = out.reshape(-1), np.empty(tile, np.float32), len(laid)
     ends = _slope(path, 0), _slope(path, _NODES - 2)
     for q in range(first // ox, (first + all_of_them - 1) // ox + 2, tile):
@@ -156,7 +187,10 @@ def convolve(
         if total == 0.0:
             continue
         _, number, rise = _between(path, (first + mean / total) / ox, ends)
-        _mix(images, steep, share[int(number)], rise - slope, shape, mixed)
+        # A trace that is steeper by d than the image's rows has I(u, v + d u) for its image: I + d u dI / dv.
+        amounts[:-1], amounts[-1] = share[int(number)], rise - slope
+        for phase in range(ox):
+            _mix(parts, phase, amounts, mixed[phase, pad * tall : (pad + n) * tall])
         for phase in range(ox):
             for k in range(tile):
                 m = ox * (q + k) - phase - first
@@ -189,26 +223,20 @@ def _steep(image: Float32, ox: int, oy: int, out: Float32) -> None:
 
 
 @jit
-def _mix(
-    images: Float32, steep: Float32, share: Float, steeper: float, shape: tuple[int, int, int], out: Float32
-) -> None:
-    """Fills out [along, (padded) columns x samples across] with images [b, ..] by shares [b], of a steeper trace.
-
-    A trace that is steeper by d than the image's rows has I(u, v + d u) for its image: I + d u dI / dv.
-    """
-    n, ox, oy = shape
-    tall, pad = n * oy, STEP - 1
-    moved = np.float32(steeper)
-    for phase in range(ox):
-        for i in range(n):
-            line, j = out[phase, (pad + i) * tall : (pad + i + 1) * tall], i * ox + phase
-            weight, some, other = np.float32(share[0]), images[0, j], steep[j]
-            for v in range(len(line)):
-                line[v] = weight * some[v] + moved * other[v]
-            for b in range(1, len(images)):
-                weight, some = np.float32(share[b]), images[b, j]
-                for v in range(len(line)):
-                    line[v] += weight * some[v]
+def _mix(parts: Float32, phase: int, amounts: Float32, out: Float32) -> None:
+    """Fills out [e] with the sum of parts [k, phase, e] by amounts [k]: of three at a time."""
+    last = len(parts) - 1
+    for k in range(0, len(parts), 3):
+        a0, a1, a2 = parts[k, phase], parts[min(k + 1, last), phase], parts[min(k + 2, last), phase]
+        w0 = amounts[k]
+        w1 = amounts[k + 1] if k + 1 <= last else np.float32(0.0)
+        w2 = amounts[k + 2] if k + 2 <= last else np.float32(0.0)
+        if k == 0:
+            for e in range(len(out)):
+                out[e] = w0 * a0[e] + w1 * a1[e] + w2 * a2[e]
+        else:
+            for e in range(len(out)):
+                out[e] += w0 * a0[e] + w1 * a1[e] + w2 * a2[e]
 
 
 @jit
@@ -299,7 +327,9 @@ def spread(
     bottom, top = np.min(path[1]), np.max(path[1])
     first = int(np.floor(ox * left)) - 3
     laid = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * right)) + 4 - first))
-    lay(electrons, along, times, start[0], ox, np.ones((len(response), 1)) if tile > 0 else share, first, laid)
+    # One that is straight has the shares of its tiles.
+    own = np.ones((1, len(response))) if tile > 0 else np.ascontiguousarray(share.T)
+    lay(electrons, along, times, start[0], ox, own, first, laid)
     steepest = max(np.abs(_slope(path, 0)), np.abs(_slope(path, _NODES - 2)))
     wing = (steepest if tile > 0 else abs(shear)) * (n // 2 + 2.0)
     begin = max(int(np.floor(left)) - n // 2 - 2, 0), max(int(np.floor(bottom - wing)) - n // 2 - 1, 0)
