@@ -45,7 +45,8 @@ _SHARED = 0.6
 class Order:
     """Where an order puts light, and how much of it is detected.
 
-    response : float64[w] electrons for each unit of the spectrum at whole angstroms from `first`
+    response : float64[w] electrons for each unit of the spectrum at whole angstroms from `first`; below 0 they are
+               taken off
     """
 
     trace: Trace

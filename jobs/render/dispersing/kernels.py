@@ -62,7 +62,8 @@ def zones(
 def brightest(spectra: Float32, factor: Float, response: Float, window: int, peak: Float, total: Float) -> None:
     """Fills [k] with the electrons of spectra [k, w], and with the most among `window` neighbours, by half windows.
 
-    factor : [k] of each spectrum;  response : [w] electrons for each of its units;  peak, total : [k]
+    factor : [k] of each spectrum;  response : [w] electrons for each of its units, or less than none
+    peak, total : [k], all of them counted as electrons
     """
     half = max(window // 2, 1)
     for k in range(len(spectra)):
@@ -71,7 +72,7 @@ def brightest(spectra: Float32, factor: Float, response: Float, window: int, pea
             some, through = spectra[k, start : start + half], response[start : start + half]
             own = 0.0
             for i in range(len(some)):
-                own += some[i] * through[i]
+                own += abs(some[i] * through[i])
             most = max(most, before + own)
             everything += own
             before, start = own, start + half
@@ -94,7 +95,7 @@ def lay(
     w0, w1, w2, w3, w4, w5 = weights
     for begin in range(0, len(electrons), _WAVES):
         some = electrons[begin : begin + _WAVES]
-        if np.max(some) == 0.0:
+        if np.max(np.abs(some)) == 0.0:
             continue
         # By whole vectors; then each to its samples.
         places[:] = along[len(along) - 1]

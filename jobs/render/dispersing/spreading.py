@@ -86,7 +86,7 @@ def follow(
     for m in range(laid.shape[1]):
         electrons = 0.0
         for b in range(len(laid)):
-            electrons += laid[b, m]
+            electrons += abs(laid[b, m])
         place = first + m - (n // 2) * ox
         phase = (-place) % ox
         left = (place + phase) // ox - corner[0]
@@ -182,8 +182,8 @@ def _convolve(
             continue
         total, mean = 0.0, 0.0
         for m in range(max(ox * (q - 1) + 1 - first, 0), min(ox * (q + tile - 1) + 1 - first, all_of_them)):
-            total += laid[m]
-            mean += m * laid[m]
+            total += abs(laid[m])
+            mean += m * abs(laid[m])
         if total == 0.0:
             continue
         _, number, rise = _between(path, (first + mean / total) / ox, ends)
@@ -197,7 +197,7 @@ def _convolve(
                 weights[k] = np.float32(laid[m]) if 0 <= m < all_of_them else np.float32(0.0)
             for k in range(0, tile, STEP):
                 w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
-                if w0 + w1 + w2 + w3 == 0.0:
+                if abs(w0) + abs(w1) + abs(w2) + abs(w3) == 0.0:
                     continue
                 length = (n + pad) * tall
                 some, source = flat[(left + k) * tall : (left + k) * tall + length], mixed[phase]

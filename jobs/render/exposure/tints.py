@@ -81,17 +81,12 @@ def with_spread_tints(scene: Scene, aim: Aim, light: Light, tally: dispersing.Ta
     settings = replace(dispersed.settings, edge=0.5 * NOTICEABLE / largest, faint=0.5 * NOTICEABLE / largest)
 
     def draw(weight: Float) -> Frame:
-        """The light, each photon times its weight [w], 0 or more."""
+        """The light, each photon times its weight [w]."""
         orders = tuple(replace(order, response=order.response * weight) for order in dispersed.orders)
         own = dispersing.Dispersed(lambda rows: dispersed.spectra(some[rows]), orders, settings)
         return dispersing.draw(chosen, own, psf, shape, scene.pixel_noise, None, None, known)
 
-    drawn = draw(np.ones(len(f)))
-    found = np.empty((2, *shape), np.float32)
-    for k, component in enumerate(f.T):
-        # No wavelength has less than no light.
-        least = float(component.min())
-        found[k] = draw(component - least) + least * drawn
+    found = np.stack([draw(component).astype(np.float32) for component in f.T])
     return replace(scene, tints=found, tint_electrons=float(change.max()))
 
 
