@@ -11,7 +11,7 @@ Ref : Bertin & Arnouts 1996, and the manual of SourceExtractor (XWIN_IMAGE: wind
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import correlate1d
 
 from jobs import sums
 from jobs.render.psf.model import SAMPLES, Psf
@@ -33,9 +33,9 @@ def offsets(psf: Psf, weights: Float) -> tuple[Float, Float]:
     planes, samples = _sampled(psf)
     if psf.intra_pixel is not None:
         # With the pixel, which all that is measured has in it.
-        planes = [uniform_filter(np.asarray(plane, float), samples) for plane in planes]
+        planes = [_averaged(plane, samples) for plane in planes]
     # Apertures take the light of a pixel as even in it.
-    smeared = uniform_filter(sum(planes[: _colours(psf)]), samples)
+    smeared = _averaged(np.sum(planes[: _colours(psf)], axis=0), samples)
     window = _half_light_diameter(smeared, samples) / _FWHM
     moments = np.stack([_moments(plane, samples, window) for plane in planes])
     zeroth, x, y, xx, xy, yy = sums.product(weights, moments).T
@@ -59,6 +59,15 @@ def _middle(plane: Array, reach: int) -> Array:
     middle = len(plane) // 2
     reach = min(reach, middle)
     return plane[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
+
+
+def _averaged(plane: Array, samples: int) -> Float:
+    """Over a pixel about each sample; of an even number of samples the outermost count half."""
+    weights = np.full(samples + 1 - samples % 2, 1.0 / samples)
+    weights[[0, -1]] *= 1.0 if samples % 2 else 0.5
+    for axis in (0, 1):
+        plane = correlate1d(np.asarray(plane, float), weights, axis)
+    return np.asarray(plane)
 
 
 def _colours(psf: Psf) -> int:

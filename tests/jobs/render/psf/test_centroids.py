@@ -21,14 +21,17 @@ def shifted(x, y, sigma=0.9, samples=3, side=24):
     return (one / one.sum()).astype(np.float32)
 
 
-def psf_of(*planes, drift=()):
+def psf_of(*planes, drift=(), samples=3):
     images, more = np.stack(planes), np.stack(drift) if drift else np.zeros((0, *planes[0].shape), np.float32)
     waves = 6000.0 + 1000.0 * np.arange(len(planes))
-    return model.sampled(model.Planes(waves, images, more, (50.0, 50.0), ((1, 0, 0),) * len(drift)), 0.1, False, 24)
+    return model.sampled(
+        model.Planes(waves, images, more, (50.0, 50.0), ((1, 0, 0),) * len(drift), samples), 0.1, False, 24
+    )
 
 
-def test_of_a_shifted_gaussian_it_is_the_shift():
-    found = np.stack(offsets(psf_of(shifted(0.1, -0.05)), np.ones((1, 1))))
+@pytest.mark.parametrize("samples", [1, 2, 3, 4])
+def test_of_a_shifted_gaussian_it_is_the_shift(samples):
+    found = np.stack(offsets(psf_of(shifted(0.1, -0.05, samples=samples), samples=samples), np.ones((1, 1))))
     assert found[:, 0] == pytest.approx((0.1, -0.05), rel=0.03)
 
 
