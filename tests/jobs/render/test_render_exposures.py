@@ -40,7 +40,8 @@ from tests import requests
 from tests.faults.victims import CONTEXT
 from tests.jobs.render.psf.test_from_file import cube, gaussian
 
-SIDE = 300
+# Eight amplifiers side by side.
+SIDE = 304
 SMALL = f"""
 accuracy = "draft"
 {requests.shallow(23.5, 20.0)}
