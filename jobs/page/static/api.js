@@ -118,6 +118,9 @@ let telling = 0;
 /** What a table leaves out: "the first 500 of 12 288 cells"; nothing where it has all. */
 export const cut = (shown, all, what) => (shown < all ? `${number(shown)} of ${number(all)} ${what}` : null);
 
+/** A table's name in a query: what is no plain word of SQL stands in quotes. */
+export const sqlName = (name) => name.split(".").map((part) => (/^[a-z_][a-z0-9_]*$/.test(part) ? part : `"${part}"`)).join(".");
+
 /** A query as Python. */
 export const python = (sql) => `from jobs.explore.explorer import Explorer\n\nwith Explorer(${JSON.stringify(lake.lake)}) as lake:\n    rows = lake.sql(${JSON.stringify(sql)}, into="astropy")\n`;
 

@@ -11,6 +11,8 @@ export const KINDS = ["exposures", "tasks", "products", "nothing"];
 const STATES = { planned: ["quiet", [5, 4]], partly: ["accent", [10, 3, 2, 3]], observed: ["second", []], failed: ["bad", [2, 3]] };
 // Names are written below this height of the view, deg, where no more footprints than this are seen.
 const NAMED = 3, MOST_NAMED = 80;
+// Of a name, pixels of the screen.
+const LINE = 14;
 const known = {};
 
 /** Ask for what a kind needs, once; of exposures what is in view, a circle { ra, dec, radius } deg, where all are too many; a promise. */
@@ -99,7 +101,16 @@ export function drawFootprints(c, kind, view, at, [width, height]) {
     }
   }
   c.setLineDash([]);
-  if (view.height < NAMED && seen.length <= MOST_NAMED) for (const [one, points] of seen) write(c, one, points.find(Boolean));
+  if (view.height >= NAMED || seen.length > MOST_NAMED) return;
+  const taken = [];
+  for (const [one, points] of seen) {
+    const [x, first] = points.find(Boolean);
+    let y = first;
+    // What several requests see at one place is named line by line.
+    while (taken.some(([u, v]) => Math.abs(u - x) < LINE && Math.abs(v - y) < LINE)) y += LINE;
+    taken.push([x, y]);
+    write(c, one, [x, y]);
+  }
 }
 
 function write(c, one, [x, y]) {

@@ -24,9 +24,12 @@ export async function pin(id) {
   panel.replaceChildren(api.h("h2", {}, `${source.kind} ${source.id}`));
   if (source.request) panel.append(api.h("p", { class: "quiet" }, `As request ${source.request} has it.`));
   if (source.place) panel.append(api.h("p", { class: "quiet" }, api.place(...source.place)));
+  // Of a table that several requests have to themselves that of the request is meant.
+  const table = Object.keys(source.tables)[0] ?? "rendered_truth", { request } = source.tables[table] ? source : source.drawn[0];
+  const from = api.sqlName(request ? `${request}.${table}` : table);
   panel.append(api.h("div", { class: "bar" },
     api.h("button", { onclick: () => api.copy(source.id, "Identifier") }, "Copy id"),
-    api.h("button", { onclick: () => api.copy(`SELECT * FROM ${Object.keys(source.tables)[0] ?? "rendered_truth"} WHERE id = ${source.id}`, "SQL") }, "Copy as SQL")));
+    api.h("button", { onclick: () => api.copy(`SELECT * FROM ${from} WHERE id = ${source.id}`, "SQL") }, "Copy as SQL")));
   const spectrum = api.h("div", {}), pictures = api.h("div", { class: "cutouts" }), grism = api.h("div", {});
   panel.append(spectrum, api.h("h3", {}, "Pictures, north up"), pictures);
   if (api.lake.tables.some((table) => table.name.endsWith("rendered_spectra"))) panel.append(api.h("h3", {}, "Through the grism"), grism);

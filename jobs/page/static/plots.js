@@ -51,7 +51,7 @@ let built = false;
 
 function usual() {
   const name = ["galaxies", "stars"].find((own) => api.lake.tables.some((table) => table.name === own)) ?? api.lake.tables[0]?.name;
-  if (name) usePlot(name, suggested(name));
+  if (name) usePlot(api.sqlName(name), suggested(name));
 }
 
 function facts(expression) {

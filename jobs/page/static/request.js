@@ -54,7 +54,7 @@ async function exposures(asked) {
     const table = tables.find((one) => one.name === `${request}.exposures`) ?? tables.find((one) => one.name === "exposures");
     if (!table) continue;
     const has = table.columns.map((column) => column.name), names = FACTS.filter((name) => has.includes(name));
-    const from = table.name.split(".").map((part) => `"${part}"`).join("."), numbers = asked.filter((one) => one.request === request).map((one) => one.exposure_id);
+    const from = api.sqlName(table.name), numbers = asked.filter((one) => one.request === request).map((one) => one.exposure_id);
     const answer = await api.post("sql", { sql: `SELECT ${names.join(", ")} FROM ${from} WHERE exposure_id IN (${numbers.join(", ")}) ORDER BY exposure_id` });
     found.push(...answer.rows.map((row) => ({ request, ...Object.fromEntries(names.map((name, k) => [name, row[k]])) })));
   }

@@ -332,7 +332,8 @@ const radius = () => 0.5 * Math.hypot(view.height, (view.height * $("sky-canvas"
 /** Rows of what is seen. */
 function query() {
   const near = `separation(ra, dec, ${view.ra.toFixed(7)}, ${view.dec.toFixed(7)}) <= ${Math.min(180, radius()).toPrecision(6)}`;
-  const table = isCoverage() ? "tasks" : shownTable;
+  const tasks = api.lake.tables.filter((table) => table.name.split(".").pop() === "tasks").map((table) => `SELECT * FROM ${api.sqlName(table.name)}`);
+  const table = isCoverage() ? `(${tasks.join(" UNION ALL ")})` : api.sqlName(shownTable);
   return `SELECT *\nFROM ${table}\nWHERE ${where && !isCoverage() ? `(${where}\n)\n  AND ` : ""}${near}\n`;
 }
 

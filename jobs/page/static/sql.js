@@ -36,7 +36,7 @@ const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
 function first() {
   const names = api.lake.tables.map((table) => table.name);
   if (names.includes("galaxies")) return "SELECT id, ra, dec, z_obs, mag_r01, log_stellar_mass\nFROM galaxies\nWHERE z_obs < 0.5\nORDER BY mag_r01\nLIMIT 100";
-  return names.length ? `SELECT * FROM ${names[0]} LIMIT 100` : "SELECT 1";
+  return names.length ? `SELECT * FROM ${api.sqlName(names[0])} LIMIT 100` : "SELECT 1";
 }
 
 function insert(name) {

@@ -6,9 +6,7 @@ import * as api from "/static/api.js";
 export function sources() {
   const names = api.lake.tables.map((table) => table.name);
   const joined = [["galaxies", "galaxy_fluxes"], ["stars", "star_fluxes"]].filter((pair) => pair.every((name) => names.includes(name)));
-  // A name that is no plain word of SQL stands in quotes.
-  const quoted = names.map((name) => name.split(".").map((part) => (/^[a-z_][a-z0-9_]*$/.test(part) ? part : `"${part}"`)).join("."));
-  return [...quoted, ...joined.map(([a, b]) => `${a} JOIN ${b} USING (id)`)];
+  return [...names.map(api.sqlName), ...joined.map(([a, b]) => `${a} JOIN ${b} USING (id)`)];
 }
 
 /** Expressions of the axes of each chart to begin with. */
@@ -24,5 +22,5 @@ export function suggested(rows) {
 
 /** Columns of all the tables that a source of rows names. */
 export function columnsOf(rows) {
-  return api.lake.tables.filter((table) => new RegExp(`(^|[^\\w.])${table.name}($|[^\\w])`).test(rows)).flatMap((table) => table.columns);
+  return api.lake.tables.filter((table) => new RegExp(`(^|[^\\w.])${table.name}($|[^\\w])`).test(rows.replaceAll('"', ""))).flatMap((table) => table.columns);
 }

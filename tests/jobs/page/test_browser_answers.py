@@ -226,6 +226,15 @@ def test_traces_and_requests_are_of_the_request_of_an_image(browser, two):  # no
             until(tab, f"{HELD}.images.one === {number}")
             request = from_table(tomllib.loads(copied(tab, "#image-request")))
             assert [(one.band, one.detectors) for one in request.pointings] == [(band, ("DET22",))]
+        # What is copied names the tables of the request.
+        tab.evaluate(f"import('/static/pin.js').then(({{ pin }}) => pin('{identifier}'))")
+        queries = [copied(tab, "#pin button:has-text('Copy as SQL')")]
+        tab.keyboard.press("1")
+        tab.select_option("#sky-table", "coverage of nisp_blue")
+        queries.append(copied(tab, "#sky-sql"))
+        for query, rows in zip(queries, (1, 2), strict=True):
+            found = page.json("sql", method="POST", body=json.dumps({"sql": query}).encode())
+            assert len(found["rows"]) >= rows
         # Of a field all that see it, each with its own place and band.
         far = REQUESTS["b"][1]
         tab.keyboard.press("1")
@@ -233,3 +242,18 @@ def test_traces_and_requests_are_of_the_request_of_an_image(browser, two):  # no
         tab.press("#sky-go", "Enter")
         request = from_table(tomllib.loads(copied(tab, "#sky-request")))
         assert [(one.band, one.ra, one.mjd) for one in request.pointings] == [("nisp_blue", far, 61001.0)]
+
+
+def test_names_of_footprints_at_one_place_stand_below_each_other(browser, two):  # noqa: F811
+    page, _ = two
+    with tab_of(browser, page) as tab:
+        until(tab, f"{STATES}.includes('observed')")
+        said = tab.evaluate("""async () => {
+          const { drawFootprints } = await import('/static/footprints.js'), said = [];
+          const get = (own, name) => (name === "fillText" ? (text, x, y) => said.push([text, x, y]) : () => 0);
+          const c = new Proxy({}, { get, set: () => true });
+          drawFootprints(c, "products", { height: 1 }, () => [50, 50], [100, 100]);
+          return said;
+        }""")
+        assert [text.partition(":")[0] for text, *_ in said] == ["a", "b"]
+        assert abs(said[0][2] - said[1][2]) >= 12
