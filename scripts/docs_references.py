@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks import effects as scene_of_effects
 from jobs import accuracy
 from jobs.render.camera import detectors, traces
-from jobs.render.channels import nisp_p, nisp_s, registry, vis
+from jobs.render.channels import ground, nisp_p, nisp_s, registry, vis
 from jobs.render.channels.aim import Aim
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.readout import quadrants
@@ -167,7 +167,7 @@ def _scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 def _asked(effects: list[Effect], mission: MissionConfiguration) -> dict[str, list[str]]:
     """The scalar parameters that each effect asks the mission for."""
     _, scene = _scene(mission)
-    ground_scene, (_, infrared) = Scene(mission, "ext.lsstcam", 30.0, 50.0, 1e5), _infrared_scene(mission)
+    (_, infrared), (_, ground_scene) = _infrared_scene(mission), _ground_scene(mission)
     found, value = {}, MissionConfiguration.value
     for effect in effects:
         keys: dict[str, None] = {}
@@ -208,7 +208,21 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
             if effect.name not in drawn and (before.shape != frame.shape or np.ptp(images[1] - images[0]) > 0.0):
                 _figure(folder / f"{effect.name}.png", *images, effect.name)
                 drawn.add(effect.name)
+    frame, scene = _ground_scene(mission)
+    for effect in ground.SKY:
+        before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(1, effect.name))
+        images = [image if image.ndim == 2 else scene.layout.together(image) for image in (before, frame)]
+        if effect.name not in drawn and np.ptp(images[1] - images[0]) > 0.0:
+            _figure(folder / f"{effect.name}.png", *images, effect.name)
+            drawn.add(effect.name)
     return drawn
+
+
+def _ground_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
+    """The corner of a detector of LSSTCam with points and squares of light."""
+    small = replace(detectors.detector("lsstcam", "R22_S11", mission), nx=_SIDE, ny=_SIDE)
+    frame = scene_of_effects.light(_SIDE, _SIDE)
+    return frame, Scene(mission, "ext.lsstcam", 30.0, 50.0, float(frame.max()), small)
 
 
 def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:

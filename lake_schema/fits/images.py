@@ -2,6 +2,7 @@
 
 Image           an image with its header cards
 write_images    images -> one file: checksums, the same bytes for the same input; whole numbers packed where wanted
+text_of         header cards as lines of text
 read_images     a file -> images; checksums are demanded and verified, sizes checked before data
 """
 
@@ -50,6 +51,11 @@ class Image:
     data: Array | None
     cards: tuple[Card, ...] = ()
     name: str = ""
+
+
+def text_of(cards: Sequence[Card]) -> str:
+    """Header cards as lines of text."""
+    return "".join(f"{str(fits.Card(*card)).rstrip()}\n" for card in cards)
 
 
 def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> None:

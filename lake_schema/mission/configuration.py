@@ -74,6 +74,10 @@ class MissionConfiguration:
     def __contains__(self, key: object) -> bool:
         return key in self._index or key in self._files
 
+    def is_own(self, key: str, place: Place) -> bool:
+        """Whether a detector or an amplifier has a value of its own, beside the camera's."""
+        return any(narrow in self for narrow in places.names(key, place)[:-1])
+
     def value(self, key: str, unit: str | None = None, place: Place | None = None) -> float:
         """The value of a name, in `unit` where one is given, else in its record's own; place : where."""
         record = self.parameter(key)

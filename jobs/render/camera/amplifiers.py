@@ -28,7 +28,7 @@ from jobs.render.camera.sections import Section
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.mission.places import Place, names
+from lake_schema.mission.places import Place
 
 Number = TypeVar("Number", bound=np.generic)
 
@@ -255,7 +255,7 @@ def values(key: str, unit: str, detector: Detector, mission: MissionConfiguratio
     for number, amplifier in enumerate(own.amplifiers):
         place = Place(detector.name, amplifier.name)
         found[number] = mission.value(name, unit, place)
-        if not exact and not any(narrow in mission for narrow in names(name, place)[:3]):
+        if not exact and not mission.is_own(name, place):
             deviation = float(rng.stream(0, name, detector.name, amplifier.name).standard_normal())
             relative = amplifier.relative[_RELATIVE[key]] if key in _RELATIVE else 1.0
             found[number] = relative * found[number] + rms * float(np.clip(deviation, -_MOST_SPREAD, _MOST_SPREAD))

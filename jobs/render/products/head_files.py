@@ -15,9 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
-from astropy.io import fits
-
 from jobs.render.camera import tpv
+from lake_schema.fits import images
 from lake_schema.fits.images import Image
 
 # Of a header, what stands in such a text: the WCS.
@@ -44,5 +43,4 @@ def _block(unit: Image) -> str:
     if not cards:
         return ""
     # J2000 is as near to ICRS as these tools tell.
-    lines = [str(fits.Card(*card)).rstrip() for card in (("EQUINOX", 2000.0, "mean equinox"), *cards)]
-    return "\n".join([*lines, "END", ""])
+    return f"{images.text_of([('EQUINOX', 2000.0, 'mean equinox'), *cards])}END\n"

@@ -27,10 +27,10 @@ def smooth(side=SIDE):
 
 
 def half_light(image, radius):
-    """Radius of the circle that holds half of an image's light."""
+    """Radius of the circle that holds half of the light of a disc of flux 1, some of which lies beyond the image."""
     order = np.argsort(radius, axis=None)
     grown = np.cumsum(image.ravel()[order], dtype=float)
-    return np.interp(0.5 * grown[-1], grown, radius.ravel()[order])
+    return np.interp(0.5, grown, radius.ravel()[order])
 
 
 def arms(seed, wanted, bulge=0.1, side=SIDE):
