@@ -60,6 +60,7 @@ def test_no_pixel_overflows(electrons, camera, accuracy, shape):
 @example(30.0 * 10 ** (0.4 * (28.17 + 1.0)), 0.73, SURVEY)
 @example(30.0 * 10 ** (0.4 * 28.17), 0.73, SURVEY)
 @example(10.0**10.5, 0.4375, DRAFT)
+@example(10.0**9.5, 0.4, DRAFT)
 def test_nothing_rings_about_a_bright_star(electrons, seeing, accuracy):
     """Behind any seeing, where a pixel samples it: no pixel of the frame is below none by a tenth of its noise."""
     image, *_ = drawn("lsstcam", electrons, seeing, accuracy=accuracy)

@@ -57,6 +57,8 @@ _THINNEST = 0.1
 # Above this many electrons the rounding of single precision would show; and where no pixel may miss more than this of a
 # source's flux.
 BRIGHT, ROUNDING = 1e7, 2.5e-8
+# Of a point behind good seeing, how much higher than the largest sample that is left out the rest may ring.
+_RINGING = 1.5
 # A trail is drawn in pieces no longer than this, pixels, each on a stamp of its own.
 _PIECE = 64.0
 # Of a galaxy's light, what may stay where it comes in at the stamp's edges: about what single precision sums to.
@@ -150,7 +152,7 @@ def _beyond_the_table(psf: Psf, light: Float, radius: Int) -> Float:
 
 def neglected_flux(electrons: Float, noise: float, settings: Settings) -> Float:
     """Per source, the Fourier samples that `draw` may leave out: of its flux, and in the noise."""
-    return np.minimum(settings.floor, settings.edge * noise / np.maximum(electrons, 1e-30))
+    return np.minimum(settings.floor, settings.edge * noise / np.maximum(_RINGING * electrons, 1e-30))
 
 
 def piece_length(length: Float) -> Float:

@@ -38,6 +38,7 @@ class Price:
     pixel_gb: float
     start_bytes: int
     pixel_bytes: float
+    read_bytes: float
 
     def seconds(self, pixels: int, galaxies: float, stars: float) -> float:
         """Of one core."""
@@ -47,9 +48,9 @@ class Price:
         """GB at the peak."""
         return self.start_gb + pixels * self.pixel_gb
 
-    def bytes(self, pixels: int) -> int:
-        """Of the image and its truth maps."""
-        return self.start_bytes + round(pixels * self.pixel_bytes)
+    def bytes(self, pixels: int, read: int) -> int:
+        """Of the image and its truth maps; read : pixels of the image, with those beside the detector's own."""
+        return self.start_bytes + round(pixels * self.pixel_bytes + read * self.read_bytes)
 
 
 def price(
@@ -84,5 +85,6 @@ def price(
         start_gb=own.base_gb,
         pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + mapped),
         start_bytes=_HEADER_BYTES * (images + len(maps)),
-        pixel_bytes=images * own.written + mapped,
+        pixel_bytes=mapped,
+        read_bytes=images * own.written,
     )

@@ -15,8 +15,8 @@ import numpy as np
 import pyarrow as pa
 
 from jobs.accuracy import SURVEY, Accuracy
+from jobs.render.camera import amplifiers, pointing
 from jobs.render.camera import detectors as camera_detectors
-from jobs.render.camera import pointing
 from jobs.render.channels import registry
 from jobs.render.exposure import scene_of
 from jobs.render.exposure.records import Variant
@@ -116,6 +116,9 @@ class _Camera:
         reach = np.array([max(d.half_diagonal, c) for d, c in zip(self.detectors, corner, strict=True)])
         self.radius = (reach + self.margin) / 3600.0
         self.pixels = np.array([detector.nx * detector.ny for detector in self.detectors])
+        layouts = [amplifiers.layout(detector, mission) for detector in self.detectors]
+        read = [layout and math.prod(layout.raw_shape) for layout in layouts]
+        self.read = np.array([n or pixels for n, pixels in zip(read, self.pixels, strict=True)])
         self.area = np.array([d.nx * d.ny * (d.pixel_scale / 3600.0) ** 2 for d in self.detectors])
 
     def places(self, ra: float, dec: float, angle: float, densities: Densities) -> _Places:
@@ -154,7 +157,7 @@ def _append(
         columns["sources"].append(math.ceil(galaxies + stars))
         columns["seconds"].append(cost.seconds(pixels, galaxies, stars))
         columns["memory"].append(cost.memory(pixels))
-        columns["bytes"].append(cost.bytes(pixels))
+        columns["bytes"].append(cost.bytes(pixels, int(camera.read[i])))
 
 
 def _price(row: ExposureRow, own: Variant, truth: Sequence[str], files: str) -> Price:

@@ -604,7 +604,7 @@ def test_truth_maps_are_those_that_were_asked_for_and_that_a_channel_has(lake):
     render(lake, request)
     version, tasks = read.version(lake, "products"), read.version(lake, "tasks").rows().to_pylist()
     assert Counter(version.rows()["content"].to_pylist()) == dict.fromkeys(
-        ("science", "noise_free", "stars", "sky", "saturation"), 2
+        ("science", "noise_free", "stars", "sky", "cosmic_rays", "saturation"), 2
     )
     assert set(everything) | {"persistence", "ramp", *truth_maps.ORDERS.values()} == set(truth_maps.BYTES)
     maps = {row["content"]: fits.getdata(version.file(row["path"])) for row in version.rows().to_pylist()}

@@ -40,7 +40,8 @@ def test_each_map_has_its_place_on_the_disc():
     for channel, kind, looks in (("VIS", "science", True), ("EXT", "science", True), ("VIS", "bias", False)):
         effects = registry.CHANNELS[channel].effects[kind]
         own = [
-            prices.price(channel, looks, effects, SURVEY, maps).bytes(PIXELS) for maps in ((), tuple(truth_maps.BYTES))
+            prices.price(channel, looks, effects, SURVEY, maps).bytes(PIXELS, PIXELS)
+            for maps in ((), tuple(truth_maps.BYTES))
         ]
         sizes[channel, kind] = round((own[1] - own[0]) / PIXELS, 2)
     # All of them; no ghosts; no light at all.
