@@ -77,7 +77,7 @@ class Channel:
     on_ground: bool = False
     sky_types: tuple[str, ...] = SKY_TYPES
     drawn: Effect | None = None
-    pupil: Callable[[Detector, Passband, MissionConfiguration], Edges] | None = None
+    pupil: Callable[[Detector, Passband, MissionConfiguration], Edges | None] | None = None
     moving: bool = False
     own_light: tuple[Effect, ...] = ()
     tracks: tuple[Effect, ...] = ()

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from jobs.fluxes.passbands import Passband
 from jobs.render.camera import bands
-from jobs.render.camera.detectors import Detector
 from jobs.render.channels import readout
 from jobs.render.channels.channel import Channel
 from jobs.render.channels.cost import Cost
@@ -31,10 +29,7 @@ from jobs.render.effects.readout import (
     read_noise,
 )
 from jobs.render.psf import seeing
-from jobs.render.psf.model import Psf
 from jobs.render.sky import diffuse_light
-from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.tables.exposures import ExposureRow
 
 SKY = (
     background.EFFECT,
@@ -61,23 +56,17 @@ SKY = (
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {"science": SKY, "deep": SKY}
 
 
-def _psf(
-    exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
-) -> Psf:
-    beta = mission.value(f"{detector.section}.psf.moffat_beta")
-    return seeing.ground_psf(exposure.seeing, beta, detector.pixel_scale)
-
-
 # As VIS, of LSSTCam's R22_S11 (2.1e4 predicted sources; others with 1e3 and 1e5).
 COST = Cost(frame_s=0.1, sky_s=0.1, galaxy_s=1.0e-4, star_s=4.5e-5, base_gb=0.5, held=33.0, held_sky=34.0, written=2.0)
 
 CHANNEL = Channel(
     effects=EFFECTS,
-    psf=_psf,
+    psf=seeing.of_exposure,
     readout=readout.AMPLIFIERS,
     bands=bands.of_ground,
     sky=diffuse_light.ground_sky,
     cost=COST,
     on_ground=True,
     tracks=(cosmic_rays.EFFECT,),
+    pupil=seeing.edges_of,
 )

@@ -6,9 +6,9 @@ remove_aliased   what of it the plane has inside, taken off
 left             how the plane fades there
 seconds, remove_aliased_seconds   what `add` and `remove_aliased` take
 
-Rings fall as r^-3, spikes are tabulated (psf/spikes.py).  The plane of side N fades over 24 pixels by the smooth step
-s(z) = z^2 (3 - 2 z) in columns and in rows; `add` draws 1 - s s of the light there and all of it farther out, so that
-the sum has no seam.
+Rings fall as r^-3, an aureole as r^-2, spikes are tabulated (psf/spikes.py).  The plane of side N fades over 24 pixels
+by the smooth step s(z) = z^2 (3 - 2 z) in columns and in rows; `add` draws 1 - s s of the light there and all of it
+farther out, so that the sum has no seam.
 
 A star that moves is drawn as points along its trail, closer than the finest fringe lambda / l of a bar.
 
@@ -79,17 +79,20 @@ def add(frame: Int, star: Star, unit: float = FIXED_POINT) -> None:
     level = star.electrons * spikes.ring(edges, photons)
     lines = star.electrons * spikes.spikes(edges, photons, max(farthest, edges.period))
     faintest = _FAINTEST * star.least
-    radius = min((level / faintest) ** (1.0 / 3.0), farthest) if faintest > 0.0 else farthest
+    halo, core = star.electrons * edges.aureole[0], edges.aureole[1]
+    # Where each of the two is as faint.
+    radius = max((level / faintest) ** (1.0 / 3.0), (halo / faintest) ** 0.5) if faintest > 0.0 else farthest
+    radius = min(radius, farthest)
     inner = star.size / 2 - SPARED
     # What a spike shows outside the plane: so far out, so wide.
     shown = lines[:, int(inner / LONG) :] > faintest
     out, across = (np.flatnonzero(shown.any(axis=axes)) for axes in ((0, 2), (0, 1)))
     far = min(inner + LONG * float(out[-1] + 1) if len(out) else 0.0, farthest)
     wide = STEP * float(across[-1] + 1) if len(across) else 0.0
-    level, lines = level * unit / len(x), lines * unit / len(x)
+    level, halo, lines = level * unit / len(x), halo * unit / len(x), lines * unit / len(x)
     for column, row in zip(x.tolist(), y.tolist(), strict=True):
-        far_light.outside(frame, column, row, inner, level, radius, turned, lines, far, wide)
-        far_light.inside(frame, column, row, inner, level, turned, lines)
+        far_light.outside(frame, column, row, inner, level, halo, core, radius, turned, lines, far, wide)
+        far_light.inside(frame, column, row, inner, level, halo, core, turned, lines)
 
 
 def _farthest_corner(frame: Int, x: Float, y: Float) -> float:
@@ -105,7 +108,7 @@ def remove_aliased(star: Star, stamp: Array, left: int, low: int, nx: int, ny: i
     Of each pixel it is the share that folded light has in all that should be there: the two run through each other, and
     where they cancel there is less than of either.
     """
-    if star.edges is None:
+    if star.edges is None or star.edges.period == 0.0:
         return
     edges = star.edges
     photons, turned = _seen(star.photons, edges)

@@ -231,6 +231,8 @@ def spike_flux(
         return float("inf")
     noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
     pupil = pupil_of(detector, band, mission)
+    if pupil is None:
+        return float("inf")
     (one,) = spikes.reach(pupil, np.ones(1), NOTICEABLE * noise)
     return float((stamp_sizes.reach(1.0) / one) ** 2 / (electron_rate(exposure) * time))
 

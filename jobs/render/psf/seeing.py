@@ -1,11 +1,53 @@
-"""The PSF of a ground telescope: the atmosphere's, with the pixel."""
+"""The PSF of a ground telescope: a Gaussian, a Moffat profile, or turbulent air and optics.
+
+of_exposure   that which the mission database chooses;  edges_of : what shines beyond it
+ground_psf    a Moffat profile
+"""
 
 from __future__ import annotations
 
 import galsim
 
-from jobs.render.psf import model
+from jobs.fluxes.passbands import Passband
+from jobs.render.camera.detectors import Detector
+from jobs.render.psf import ground, model
 from jobs.render.psf.model import Psf
+from jobs.render.psf.spikes import Edges
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
+
+# Values of <section>.psf.profile.
+_GAUSSIAN, _MOFFAT = 0.0, 1.0
+
+
+def of_exposure(
+    exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
+) -> Psf:
+    """The PSF of a detector of a ground camera, as wide as the exposure's seeing.
+
+    exposure  : its row;  detector : of its camera;  band : passband;  mission : the mission database
+    positions : where what changes across the detector is computed, one of euclid.DEGREES
+    """
+    section, scale = detector.section, detector.pixel_scale
+    profile = mission.value(f"{section}.psf.profile")
+    if profile == _GAUSSIAN:
+        return model.tabulated(galsim.Gaussian(fwhm=exposure.seeing), scale)
+    if profile == _MOFFAT:
+        return ground_psf(exposure.seeing, mission.value(f"{section}.psf.moffat_beta"), scale)
+    return ground.through_air(ground.air_of(exposure, detector, mission), detector, band, mission, positions)
+
+
+def edges_of(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges | None:
+    """What shines beyond the planes, in the seeing that is usual; None of a profile without planes.
+
+    detector : of a ground camera;  band : passband;  mission : the mission database
+    """
+    section = detector.section
+    if mission.value(f"{section}.psf.profile") in (_GAUSSIAN, _MOFFAT):
+        return None
+    key = f"{section}.{band.name}.seeing"
+    usual = mission.value(key, "arcsec") if key in mission else 1.0
+    return ground.edges(ground.Air(usual), detector, band, mission)
 
 
 def ground_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:

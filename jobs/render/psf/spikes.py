@@ -1,7 +1,7 @@
 """Diffraction spikes and rings of a pupil, far from a star.
 
 Edges     of a pupil;  of_pupil : the Euclid one's
-ring, spikes   light in a pixel;  reach : how far out a star's spikes are noticed
+ring, spikes   light in a pixel;  wavelengths : that they are made of;  reach : how far out a star's spikes are noticed
 
 A point's light is spread over angles theta as |A(theta)|^2 / (lambda^2 S), where A is the integral of
 exp(-2 pi i x theta / lambda) over the clear pupil and S the pupil's area.  Far out only edges count, and those of
@@ -58,7 +58,8 @@ class Edges:
     area       : mm2, clear;  round : mm, of all circles' perimeters
     bars       : float64[b, 3] angle (radian), width and visible length (mm)
     blur       : arcsec rms, of jitter and diffusion;  pixel_scale : arcsec
-    period     : pixels after which the plane's transform repeats itself
+    period     : pixels after which the plane's transform repeats itself; 0: what it folds is not noticed
+    halo       : aureole, A / (r^2 + c^2) of the light in an arcsec2 at r arcsec: (A, c)
     """
 
     wavelength: Float
@@ -68,6 +69,22 @@ class Edges:
     blur: float
     pixel_scale: float
     period: float
+    halo: tuple[float, float] = (0.0, 1.0)
+
+    @property
+    def aureole(self) -> tuple[float, float]:
+        """The same in a pixel at r pixels: (A, c^2)."""
+        return self.halo[0], (self.halo[1] / self.pixel_scale) ** 2
+
+
+def wavelengths(parts: tuple[Passband, ...]) -> Float:
+    """Edges.wavelength of sub-bands: the middles of parts of as many photons."""
+    places = (np.arange(_WAVES) + 0.5) / _WAVES
+    waves = []
+    for part in parts:
+        photons = np.cumsum(part.response / part.wavelength)
+        waves.append(part.wavelength[np.searchsorted(photons, places * photons[-1])])
+    return np.array(waves)
 
 
 def of_pupil(
@@ -78,12 +95,6 @@ def of_pupil(
     parts : sub-bands of the PSF;  blur, pixel_scale, period : of Edges
     mission : the mission database
     """
-    # The middles of parts of as many photons.
-    places = (np.arange(_WAVES) + 0.5) / _WAVES
-    waves = []
-    for part in parts:
-        photons = np.cumsum(part.response / part.wavelength)
-        waves.append(part.wavelength[np.searchsorted(photons, places * photons[-1])])
     radius = 0.5 * mission.value("plm.aperture_diameter", "mm")
     stop, stop_y = mission.value("plm.pupil.stop_radius", "mm"), mission.value("plm.pupil.stop_y", "mm")
     width, reach = (mission.value(f"plm.pupil.spider_{key}", "mm") for key in ("width", "half_length"))
@@ -98,7 +109,7 @@ def of_pupil(
     blocked = sum(width * length for _, width, length in bars)
     area = np.pi * (radius**2 - stop**2) - blocked
     circles = 2.0 * np.pi * (radius + stop)
-    return Edges(np.array(waves), area, circles, np.array(bars), blur, pixel_scale, period)
+    return Edges(wavelengths(parts), area, circles, np.array(bars), blur, pixel_scale, period)
 
 
 def ring(edges: Edges, photons: Float) -> float:
@@ -130,7 +141,9 @@ def spikes(edges: Edges, photons: Float, reach: float) -> Float:
 
 
 def reach(edges: Edges, electrons: Float, least: float) -> Float:
-    """float64[n] pixels as far as which a star's brightest spike has a pixel of `least` electrons, at most FARTHEST.
+    """float64[n] pixels as far as which a star's brightest spike, or its aureole, has a pixel of `least` electrons.
+
+    At most FARTHEST.
 
     Error : 15 %, of fringes along the spike, and of colours: sub-bands are taken as equal
     """
@@ -145,7 +158,7 @@ def reach(edges: Edges, electrons: Float, least: float) -> Float:
         for _, _, length in edges.bars
     ]
     farthest = FARTHEST / edges.pixel_scale
-    return np.asarray(np.minimum(np.sqrt(max(middle) * electrons / max(least, 1e-300)), farthest))
+    return np.asarray(np.minimum(np.sqrt(max(*middle, edges.halo[0]) * electrons / max(least, 1e-300)), farthest))
 
 
 def _blurred(lines: Float, blur: float, along: Float) -> Float:

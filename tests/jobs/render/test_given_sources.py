@@ -31,6 +31,8 @@ galaxies = "galaxies.csv"
 stars = "stars.csv"
 [effects]
 off = ["all"]
+[mission.overrides]
+"ext.lsstcam.psf.profile" = {{ value = 1, unit = "" }}
 [[pointing]]
 channel = "EXT"
 camera = "lsstcam"

@@ -31,13 +31,19 @@ def _on_spike(turned: Any, lines: Any, b: int, dx: float, dy: float) -> Any:
 
 
 @jit
-def outside(
-    frame: Any, x: float, y: float, inner: float, level: float, radius: float, turned: Any, lines: Any, far: float,
-    wide: float,
-) -> None:  # fmt: skip
-    """Adds what lies outside a square of half side `inner`: the ring up to `radius`, spikes up to `far`.
+def _round(square: float, level: float, halo: float, core: float) -> Any:
+    """Rings of the pupil's circles and the aureole, at a squared distance."""
+    return level / (square * np.sqrt(square)) + halo / (square + core)
 
-    level, lines : in the frame's units, as below
+
+@jit
+def outside(
+    frame: Any, x: float, y: float, inner: float, level: float, halo: float, core: float, radius: float, turned: Any,
+    lines: Any, far: float, wide: float,
+) -> None:  # fmt: skip
+    """Adds what lies outside a square of half side `inner`: ring and aureole up to `radius`, spikes up to `far`.
+
+    level, halo, core, lines : in the frame's units, as below
     frame : integers;  x, y : of the star, pixels
     turned : [b, 2] directions of the bars;  wide : half width of a spike's table, pixels, 0 = no spikes
     """
@@ -49,7 +55,7 @@ def outside(
         for c in range(max(0, int(np.ceil(x - chord))), min(nx, int(np.floor(x + chord)) + 1)):
             if not (own and abs(c - x) < inner):
                 square = (c - x) * (c - x) + dy * dy
-                frame[r, c] += np.int64(np.rint(level / (square * np.sqrt(square))))
+                frame[r, c] += np.int64(np.rint(_round(square, level, halo, core)))
         for b in range(len(turned) if wide > 0.0 else 0):
             left, right = 0, nx
             if abs(turned[b, 0]) > 1e-9:
@@ -61,10 +67,12 @@ def outside(
 
 
 @jit
-def inside(frame: Any, x: float, y: float, inner: float, level: float, turned: Any, lines: Any) -> None:
+def inside(
+    frame: Any, x: float, y: float, inner: float, level: float, halo: float, core: float, turned: Any, lines: Any
+) -> None:
     """Adds what has faded of the plane, inside the square.
 
-    frame, x, y, inner, level, turned, lines : as of `outside`
+    frame, x, y, inner, level, halo, core, turned, lines : as of `outside`
     """
     ny, nx = frame.shape
     for r in range(max(int(np.ceil(y - inner)), 0), min(int(np.ceil(y + inner)), ny)):
@@ -73,7 +81,7 @@ def inside(frame: Any, x: float, y: float, inner: float, level: float, turned: A
             if abs(dx) < inner and abs(dy) < inner:
                 left = left_compiled(abs(dx), inner) * left_compiled(abs(dy), inner)
                 if left < 1.0:
-                    frame[r, c] += np.int64(np.rint((1.0 - left) * _light(dx, dy, level, turned, lines)))
+                    frame[r, c] += np.int64(np.rint((1.0 - left) * _light(dx, dy, level, halo, core, turned, lines)))
 
 
 @jit
@@ -99,7 +107,7 @@ def remove_aliased_compiled(
                 for p in range(len(x)):
                     dx, dy = c - x[p], r - y[p]
                     left = left_compiled(abs(dx), inner) * left_compiled(abs(dy), inner)
-                    own += left * _light(dx, dy, level, turned, lines)
+                    own += left * _light(dx, dy, level, 0.0, 1.0, turned, lines)
                 stamp[r, c] *= own / (own + folded)
 
 
@@ -111,10 +119,9 @@ def left_compiled(distance: float, inner: float) -> Any:
 
 
 @jit
-def _light(dx: float, dy: float, level: float, turned: Any, lines: Any) -> Any:
+def _light(dx: float, dy: float, level: float, halo: float, core: float, turned: Any, lines: Any) -> Any:
     """What a star shines in a pixel at an offset."""
-    square = dx * dx + dy * dy
-    light = level / (square * np.sqrt(square))
+    light = _round(dx * dx + dy * dy, level, halo, core)
     for b in range(len(turned)):
         light += _on_spike(turned, lines, b, dx, dy)
     return light
@@ -131,7 +138,7 @@ def _folded(dx: float, dy: float, level: float, turned: Any, lines: Any, period:
             # From farther away than a period next to nothing has passed.
             if (up != 0 or right != 0) and square < period * period:
                 passed = _passed(np.sqrt(square) / period)
-                total += _light(ax, ay, level, turned, lines) * passed
+                total += _light(ax, ay, level, 0.0, 1.0, turned, lines) * passed
     return total / _passed(np.sqrt(dx * dx + dy * dy) / period)
 
 
