@@ -51,7 +51,8 @@ def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.
     checks.check(mission)
     found = survey.exposures(request, mission)
     filters, _ = user_filters(request)
-    exposures = planned_exposures.table([exposure for exposure, _ in found], [own for _, own in found], filters)
+    missions = [own for _, own in found]
+    exposures = planned_exposures.table([exposure for exposure, _ in found], missions, filters, request.seed)
     psf_files.check([(exposure, own) for exposure, own in found], filters)
     catalogues = [] if lake is None else _catalogues(lake, request)
     densities = source_counts.Densities(mission, request.universe, catalogues)

@@ -44,7 +44,7 @@ RENDERED: Mapping[str, tuple[str, ...]] = {
 
 EXPOSURES = Table(
     "exposures",
-    3,
+    4,
     (
         Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="identifier of the exposure", lo=0),
         Column("channel", "string", ucd="instr", doc="channel", codes=CHANNELS),
@@ -114,6 +114,18 @@ EXPOSURES = Table(
             nullable=True,
             since=3,
         ),
+        Column("airmass", "float64", "", "obs.airMass", "of the field, of ground cameras", 1.0, 10.0, True, since=4),
+        Column(
+            "zenith",
+            "float64",
+            "deg",
+            "pos.posAng",
+            "position angle of the zenith at the field, north through east",
+            -180.0,
+            180.0,
+            True,
+            since=4,
+        ),
     ),
     "Exposures, in the order they are taken.",
     key=("exposure_id",),
@@ -148,6 +160,8 @@ class ExposureRow:
     psf: str | None = None
     settings: str | None = None
     realisation: int | None = None
+    airmass: float | None = None
+    zenith: float | None = None
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> ExposureRow:

@@ -17,7 +17,9 @@ from jobs import rng
 from jobs.render.camera import detectors as camera_detectors
 from jobs.render.camera import pointing
 from jobs.render.camera.detectors import Detector
+from jobs.render.channels import image_types
 from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time, through_grism
+from jobs.render.sky.observatory import Site, next_dark
 from jobs.render.sky.solar_aspect import next_allowed, position_angle
 from jobs.request import pointing_tables
 from jobs.request.area import Area
@@ -27,7 +29,6 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
 _DAY_S, _OVERHEAD_S = 86400.0, 30.0
-# Mean midnight of the sites is not modelled: ground exposures follow one another from the earliest date on.
 
 
 def camera_of(survey: str, mission: MissionConfiguration) -> str:
@@ -40,7 +41,9 @@ def exposures(
 ) -> Iterator[Exposure]:
     """The exposures of a survey over an area: as many as are asked for, else one layer; or of a field of its own.
 
-    Bands that the survey takes together are taken at the same places.
+    Bands that the survey takes together are taken at the same places. They follow one another from the start on;
+    without a date of the block's, each when its field is next up at night. The telescope misses its place by the
+    survey's error.
     block   : of the request, with its survey and bands;  area : of the request
     mission : the mission database;  seed : of the request;  start : MJD
     """
@@ -52,6 +55,8 @@ def exposures(
     for rule, bands in zip(rules, groups, strict=True):
         if not bands:
             continue
+        section = image_types.section(rule["camera"])
+        site, error = Site.of(section, mission), mission.value(f"{section}.pointing_error", "arcsec")
         places = _places(rule, block, area, mission, seed) if block.place is None else _own(block)
         for i, (ra, dec) in enumerate(places):
             # Where the survey shares its exposures among bands, they take turns.
@@ -60,13 +65,15 @@ def exposures(
             for band in turn:
                 own = float(rule["exposure_time_s"])
                 seconds = own if block.exposure_time_s is None else block.exposure_time_s
+                now = next_dark(ra, dec, now, site) if block.mjd is None else now
+                there = _missed((ra, dec), error, rng.stream(seed, "pointing", block.survey, band, i))
                 yield Exposure(
                     channel="EXT",
                     camera=rule["camera"],
                     band=band,
                     image_type=block.image_type,
-                    ra=ra,
-                    dec=dec,
+                    ra=there[0],
+                    dec=there[1],
                     position_angle=block.position_angle or 0.0,
                     mjd=now,
                     exposure_time_s=seconds,
@@ -75,6 +82,15 @@ def exposures(
                     detectors=block.detectors,
                 )
                 now += (seconds + _OVERHEAD_S) / _DAY_S
+
+
+def _missed(place: tuple[float, float], error: float, rng: np.random.Generator) -> tuple[float, float]:
+    """Where a telescope points that misses a place by an error, arcsec rms of each coordinate; as it is without one."""
+    if error == 0.0:
+        return place
+    east, north = error * rng.standard_normal(2)
+    ra, dec = pointing.sky_of_plane(np.array([-east]), np.array([north]), *place, 0.0)
+    return float(ra[0]), float(dec[0])
 
 
 def _rules(survey: str, mission: MissionConfiguration) -> list[dict[str, str]]:

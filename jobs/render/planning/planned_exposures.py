@@ -16,12 +16,17 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from jobs import rng
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import detectors, grism_wheel, traces
+from jobs.render.camera.detectors import Detector
 from jobs.render.channels import image_types, registry
 from jobs.render.effects.charge import ramp
+from jobs.render.psf import seeing as ground_psf
+from jobs.render.sky import night_sky, observatory
 from jobs.render.sky.diffuse_light import SkyBand, sky_rate
+from jobs.render.sky.night_sky import Night
 from jobs.request.observations import Observation
 from lake_schema import units
 from lake_schema.errors import BadInput
@@ -35,7 +40,7 @@ _ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd", "g
 GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}
 _DARK_TYPES = ("bias", "dark", "charge_injection")
 # Columns that are counted here.
-_NUMBERS = ("exposure_id", "realisation")
+_NUMBERS = ("exposure_id", "realisation", "airmass", "zenith")
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,10 +159,12 @@ def table(
     exposures: Sequence[Exposure],
     missions: Sequence[MissionConfiguration],
     own: Mapping[str, Passband] | None = None,
+    seed: int = 0,
 ) -> pa.Table:
     """Rows of the table `exposures`, numbered from 1 in their order.
 
     missions : the configuration of each;  own : passbands by name besides the embedded ones
+    seed     : of the request: of ground cameras the seeing is drawn
     """
     if not exposures:
         return EXPOSURES.empty()
@@ -167,7 +174,7 @@ def table(
         key = (id(mission), exposure.channel, exposure.camera, exposure.band)
         if key not in bands:
             bands[key] = _Band.of(exposure, mission, (own or {}).get(exposure.band))
-        row = _row(number, exposure, bands[key], mission)
+        row = _row(number, exposure, bands[key], mission, seed)
         alike = tuple(row[name] for name in _ALIKE)
         taken[alike] += 1
         rows.append({**row, "realisation": taken[alike]})
@@ -179,17 +186,24 @@ class _Band:
     """What all exposures of a channel and camera in a band have in common."""
 
     zero_point: float
-    seeing: float
     sky: SkyBand
+    seeing: float = 0.0
+    scatter: float = 0.0
+    night: Night | None = None
+    detector: Detector | None = None
 
     @classmethod
     def of(cls, exposure: Exposure, mission: MissionConfiguration, curve: Passband | None) -> _Band:
         camera, band = exposure.camera, exposure.band
         prefix = image_types.section(camera)
-        seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec") if camera in CAMERAS else 0.0
         first = detectors.detectors(camera, mission)[0]
         sky = registry.CHANNELS[exposure.channel].sky(first, band, mission, curve)
-        return cls(zero_point_of(prefix, band, mission, curve), seeing, sky)
+        zero_point = zero_point_of(prefix, band, mission, curve)
+        if camera not in CAMERAS:
+            return cls(zero_point, sky)
+        seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec")
+        night = Night.of(first, band, zero_point, mission, curve)
+        return cls(zero_point, sky, seeing, mission.value(f"{prefix}.seeing_scatter", "dex"), night, first)
 
 
 def _column(name: str, values: list[Any]) -> Any:
@@ -198,10 +212,19 @@ def _column(name: str, values: list[Any]) -> Any:
     return np.ma.masked_array([0 if v is None else v for v in values], [v is None for v in values])
 
 
-def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration) -> dict[str, Any]:
-    sky = e.sky
+def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, seed: int) -> dict[str, Any]:
+    sky, night, fainter = e.sky, band.night, 0.0
+    airmass: float | None = None
+    zenith: float | None = None
+    seeing = _seeing(e, band, seed) if e.seeing is None else e.seeing
+    if night is not None and band.detector is not None:
+        ground_psf.check(seeing, band.detector, mission)
+        airmass, zenith = observatory.aloft(e.ra, e.dec, e.mjd, night.site)
+        fainter = night_sky.fainter(night, airmass)
     if e.image_type in _DARK_TYPES:
         sky = 0.0
+    elif sky is None and night is not None:
+        sky = night_sky.sky_rate(night, e.ra, e.dec, e.mjd, mission)
     elif sky is None:
         sky = sky_rate(band.sky, e.ra, e.dec, e.mjd, mission)
     return {
@@ -210,9 +233,20 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration) -
         "ra": e.ra % 360.0,
         "position_angle": (e.position_angle + 180.0) % 360.0 - 180.0,
         "sky": sky,
-        "seeing": band.seeing if e.seeing is None else e.seeing,
-        "zero_point": band.zero_point if e.zero_point is None else e.zero_point,
+        "seeing": seeing,
+        "zero_point": band.zero_point - fainter if e.zero_point is None else e.zero_point,
+        "airmass": airmass,
+        "zenith": zenith,
     }
+
+
+def _seeing(e: Exposure, band: _Band, seed: int) -> float:
+    """Drawn from the survey's log-normal distribution, between three standard deviations; 0 in space."""
+    if band.scatter == 0.0:
+        return band.seeing
+    where = (e.camera, e.band, *(value.hex() for value in (e.ra, e.dec, e.mjd)))
+    normal = float(np.clip(rng.stream(seed, "exposures.seeing", *where).standard_normal(), -3.0, 3.0))
+    return float(band.seeing * 10.0 ** (band.scatter * normal))
 
 
 def unturned(grism: str, mission: MissionConfiguration) -> ExposureRow:

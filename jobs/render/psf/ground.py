@@ -20,9 +20,7 @@ Ref : King 1971, PASP 83, 199, and Racine 1996, PASP 108, 699 (aureole)
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
-import galsim
 import numpy as np
 import scipy.fft
 from scipy.interpolate import make_interp_spline
@@ -32,6 +30,7 @@ from jobs import rng, sums
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector, detectors
 from jobs.render.psf import atmosphere, euclid, model, spikes
+from jobs.render.psf.aberrations import FARTHEST, Ratio, Telescope, clear
 from jobs.render.psf.model import Planes, Psf
 from jobs.render.psf.spikes import ARCSEC, LONG, STEP, Edges
 from jobs.render.psf.sub_bands import PARTS, sub_bands
@@ -44,14 +43,10 @@ from lake_schema.tables.exposures import ExposureRow
 SIDE, _DRIFT_SIDE = 256, 64
 # Samples of a FWHM, at least: beyond their Nyquist frequency the air passes less than 1e-7. Samples of a pixel.
 _SAMPLES_OF_FWHM, _LEAST_SAMPLES, _MOST_SAMPLES = 6.0, 2, 6
-# Where the air passes less than this nothing is looked at: Fried lengths.
-_FARTHEST = 3.0
-# Samples across the pupil, of the transform that its overlaps are made by; steps of the lattice out to _FARTHEST.
-_ACROSS, _TRANSFORM, _LATTICE = 120, 256, 10
-# Distance at which the phase tells where the light's centroid is, m.
-_NEAR = 0.06
 # Bands whose light is redder are drawn by half as many wavelengths: refraction changes less there; A.
 _REDDER = 5300.0
+# Of a seeing, arcsec: planes hold no more.
+_WORST = 10.0
 # Steps of the radial table.
 _TABLE = 4000
 # FWHM of a Gaussian in its standard deviations.
@@ -77,25 +72,6 @@ class Air:
     height: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Telescope:
-    """What is the same in all exposures: radii of the pupil's clear ring, and outer scale of the turbulence, m."""
-
-    radius: float
-    inner: float
-    outer: float
-
-    @classmethod
-    def of(cls, section: str, mission: MissionConfiguration) -> Telescope:
-        """Of a camera's section of the mission database; what is not clear of its aperture is in the middle."""
-        radius = 0.5 * mission.value(f"{section}.aperture_diameter", "m")
-        area = mission.value(f"{section}.collecting_area", "m2")
-        if not 0.0 < area <= np.pi * radius**2:
-            raise OutOfRange(f"mission parameter {section}.collecting_area, m2", area, 0.0, np.pi * radius**2)
-        inner = float(np.sqrt(max(radius**2 - area / np.pi, 0.0)))
-        return cls(radius, inner, mission.value(f"{section}.psf.outer_scale", "m"))
-
-
 def air_of(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration) -> Air:
     """The air of an exposure; its ellipticity is drawn, the same for all detectors.
 
@@ -108,11 +84,22 @@ def air_of(exposure: ExposureRow, detector: Detector, mission: MissionConfigurat
     # Two normal components have a size whose square is exponential.
     size = min(rms * float(np.sqrt(-2.0 * np.log1p(-size))), 0.5)
     angle = 2.0 * (np.pi * float(turn) - np.radians(detector.rotation))
-    return Air(
-        exposure.seeing,
-        (size * float(np.cos(angle)), size * float(np.sin(angle))),
-        mission.value(f"{section}.psf.seeing_slope", ""),
-    )
+    shear = size * float(np.cos(angle)), size * float(np.sin(angle))
+    slope = mission.value(f"{section}.psf.seeing_slope", "")
+    if exposure.airmass is None or exposure.zenith is None:
+        return Air(exposure.seeing, shear, slope)
+    # At position angle 0 the focal plane's x axis runs west.
+    zenith = float(np.radians(90.0 + exposure.zenith - exposure.position_angle - detector.rotation))
+    lift = float(np.sqrt(max(exposure.airmass**2 - 1.0, 0.0))) * mission.value(f"{section}.psf.refraction", "")
+    return Air(exposure.seeing, shear, slope, lift, zenith, mission.value(f"{section}.site.height", "m"))
+
+
+def check(seeing: float, detector: Detector, mission: MissionConfiguration) -> None:
+    """Refuse a seeing, arcsec, that is finer than a pixel, and a pupil that has no such area."""
+    Telescope.of(detector.section, mission)
+    if not detector.pixel_scale <= seeing <= _WORST:
+        name = f"seeing of {detector.section} through a turbulent atmosphere, arcsec"
+        raise OutOfRange(name, seeing, detector.pixel_scale, _WORST)
 
 
 def through_air(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
@@ -141,7 +128,7 @@ def through_air(air: Air, detector: Detector, band: Passband, mission: MissionCo
     middle, turn = _wavefront(detector, 0.0, 0.0, mission), float(np.radians(detector.rotation))
     images = []
     for wave, length, lift in zip(waves, fried, lifts - lifts.mean(), strict=True):
-        ratio = _Ratio.of(middle, telescope, float(wave), length, turn)
+        ratio = Ratio.of(middle, telescope, float(wave), length, turn)
         passed = whole.passed(float(wave), length, telescope, air) * whole.interpolated(ratio, float(wave))
         if lift != 0.0:
             passed *= whole.moved(lift * ARCSEC * np.cos(air.zenith), lift * ARCSEC * np.sin(air.zenith))
@@ -165,7 +152,9 @@ def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfigur
     section, telescope = detector.section, Telescope.of(detector.section, mission)
     vanes = int(mission.value(f"{section}.pupil.vanes"))
     width = mission.value(f"{section}.pupil.vane_width", "mm")
-    first = mission.value(f"{section}.pupil.vane_angle", "rad") - np.radians(detector.rotation)
+    # Of an altazimuth mount the spider keeps its place against the zenith.
+    turn = air.zenith if mission.value(f"{section}.pupil.altazimuth") == 1.0 else -np.radians(detector.rotation)
+    first = mission.value(f"{section}.pupil.vane_angle", "rad") + turn
     length = 1e3 * (telescope.radius - telescope.inner)
     bars = np.array([(first + 2.0 * np.pi * i / vanes, width, length) for i in range(vanes)]).reshape(vanes, 3)
     area = 1e6 * np.pi * (telescope.radius**2 - telescope.inner**2)
@@ -194,72 +183,6 @@ def _wavefront(detector: Detector, x: float, y: float, mission: MissionConfigura
     return euclid.wavefront(at[0] / reach, at[1] / reach, detector.section, mission)
 
 
-# ------------------------------------------------------------------------------------------------ optics
-
-
-@dataclass(frozen=True, slots=True)
-class _Ratio:
-    """The optics' transfer function over that without aberrations: complex[2 m + 1, 2 m + 1] at lags `step` m apart."""
-
-    values: Complex
-    step: float
-
-    @classmethod
-    def of(cls, nm: Float, telescope: Telescope, wave: float, fried: float, turn: float) -> _Ratio:
-        """Of a wavefront, nm by Noll number, in axes that are turned by `turn`, radian; wave : A;  fried : m."""
-        step = 2.0 * telescope.radius / _ACROSS
-        stride = max(int(np.ceil(_FARTHEST * fried / (_LATTICE * step))), 1)
-        lags = stride * (np.arange(2 * _LATTICE + 3) - _LATTICE - 1)
-        x, y, clear, plain = _pupil(telescope.radius, telescope.inner)
-        x, y = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
-        phase = galsim.zernike.Zernike(nm * (20.0 * np.pi / wave))(x, y)
-        field = scipy.fft.fft2(clear * np.exp(1j * phase), (_TRANSFORM, _TRANSFORM))
-        overlap = scipy.fft.ifft2(np.abs(field) ** 2)[np.ix_(lags, lags)]
-        values = overlap / plain[np.ix_(lags, lags)]
-        near = max(round(_NEAR / (stride * step)), 1)
-        middle, along = _LATTICE + 1, stride * step * (np.arange(len(lags)) - _LATTICE - 1)
-        tilts = [
-            float(np.angle(v)) / (near * stride * step)
-            for v in (values[middle, middle + near], values[middle + near, middle])
-        ]
-        values = values * np.exp(-1j * (tilts[0] * along + tilts[1] * along[:, None]))
-        return cls(values, stride * step)
-
-
-@lru_cache(maxsize=8)
-def _pupil(radius: float, inner: float) -> tuple[Float, Float, Float, Float]:
-    """(x, y in radii, what is clear [n, n], its overlap with itself by lags [_TRANSFORM, _TRANSFORM])."""
-    step = 2.0 / _ACROSS
-    axis = (np.arange(_ACROSS + 4) - (_ACROSS + 3) / 2) * step
-    x, y = np.meshgrid(axis, axis)
-    r = np.hypot(x, y)
-    clear = np.clip(0.5 + (1.0 - r) / step, 0.0, 1.0) * np.clip(0.5 + (r - inner / radius) / step, 0.0, 1.0)
-    overlap = scipy.fft.irfft2(np.abs(scipy.fft.rfft2(clear, (_TRANSFORM, _TRANSFORM))) ** 2)
-    return x, y, clear, np.asarray(overlap)
-
-
-def clear(distance: Float, radius: float, inner: float) -> Float:
-    """Overlap of a ring with itself, moved by a distance, of its area: the transfer function of perfect optics.
-
-    distance : [...] m;  radius, inner : of the ring, m
-    """
-    area = np.pi * (radius**2 - inner**2)
-    whole = _lens(distance, radius, radius) - 2.0 * _lens(distance, radius, inner) + _lens(distance, inner, inner)
-    return np.asarray(whole / area)
-
-
-def _lens(distance: Float, one: float, other: float) -> Float:
-    """Area that two circles have in common whose middles lie a distance apart."""
-    small = min(one, other)
-    if small == 0.0:
-        return np.zeros_like(distance)
-    d = np.clip(distance, max(abs(one - other), 1e-12), one + other)
-    a, b = (d * d + one**2 - other**2) / (2.0 * d * one), (d * d + other**2 - one**2) / (2.0 * d * other)
-    rim = np.maximum((one + other - d) * (d + one - other) * (d - one + other) * (d + one + other), 0.0)
-    area = one**2 * np.arccos(np.clip(a, -1.0, 1.0)) + other**2 * np.arccos(np.clip(b, -1.0, 1.0)) - 0.5 * np.sqrt(rim)
-    return np.asarray(np.where(distance <= abs(one - other), np.pi * small**2, area))
-
-
 # ------------------------------------------------------------------------------------------------ planes
 
 
@@ -279,7 +202,7 @@ class _Grid:
 
     def passed(self, wave: float, fried: float, telescope: Telescope, air: Air) -> Float:
         """Of air and of perfect optics: wave : A;  fried : m."""
-        farthest = _FARTHEST * fried
+        farthest = FARTHEST * fried
         rho = np.linspace(0.0, farthest, _TABLE)
         table = atmosphere.transfer(rho, fried, telescope.outer) * clear(rho, telescope.radius, telescope.inner)
         (e1, e2), metres = air.shear, wave * 1e-10
@@ -287,7 +210,7 @@ class _Grid:
         distance = np.sqrt((1.0 + e1) * x * x + (1.0 - e1) * y * y + 2.0 * e2 * x * y)
         return np.interp(distance, rho, table, right=0.0)
 
-    def interpolated(self, ratio: _Ratio, wave: float) -> Complex:
+    def interpolated(self, ratio: Ratio, wave: float) -> Complex:
         """Between the lags of a ratio; beyond them it is not wanted.  wave : A."""
         count = (len(ratio.values) - 1) // 2
         lags = ratio.step * (np.arange(len(ratio.values)) - count)
@@ -345,7 +268,7 @@ def _drift(
     fried = atmosphere.fried_length(air.seeing, wave, telescope.outer)
     turn = float(np.radians(detector.rotation))
     fronts = [_wavefront(detector, *at, mission) for at in ((0.0, 0.0), *nodes)]
-    ratios = [_Ratio.of(front, telescope, wave, fried, turn) for front in fronts]
+    ratios = [Ratio.of(front, telescope, wave, fried, turn) for front in fronts]
     x, y = np.array(nodes).T
     from_nodes = sums.least_squares(np.stack([x**i * y**j for i, j, _ in powers], axis=1), np.eye(len(nodes)))
     off = np.stack([r.values - ratios[0].values for r in ratios[1:]])

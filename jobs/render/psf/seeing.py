@@ -1,6 +1,6 @@
 """The PSF of a ground telescope: a Gaussian, a Moffat profile, or turbulent air and optics.
 
-of_exposure   that which the mission database chooses;  edges_of : what shines beyond it
+of_exposure   that which the mission database chooses;  edges_of : what shines beyond it;  check : is there one?
 ground_psf    a Moffat profile
 """
 
@@ -35,6 +35,12 @@ def of_exposure(
     if profile == _MOFFAT:
         return ground_psf(exposure.seeing, mission.value(f"{section}.psf.moffat_beta"), scale)
     return ground.through_air(ground.air_of(exposure, detector, mission), detector, band, mission, positions)
+
+
+def check(seeing: float, detector: Detector, mission: MissionConfiguration) -> None:
+    """Refuse a seeing, arcsec, or a pupil that there is no PSF of; detector : of a ground camera."""
+    if mission.value(f"{detector.section}.psf.profile") not in (_GAUSSIAN, _MOFFAT):
+        ground.check(seeing, detector, mission)
 
 
 def edges_of(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges | None:

@@ -1,8 +1,12 @@
-"""Tables of pointings as users write them: what stands in a line is taken, and what is wrong is refused by its line."""
+"""Ground surveys by their rules; tables of pointings: a line is taken as it stands, or refused by its number."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
-from jobs.render.planning import ground_surveys
+from jobs.render.planning import ground_surveys, planned_exposures
+from jobs.request.area import Area
 from jobs.request.observations import Observation
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
@@ -58,3 +62,44 @@ def test_what_is_wrong_is_refused_by_its_line(tmp_path, text, words):
         read(tmp_path, text)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def survey_of(name, number, seed=3, **changes):
+    block = Observation(("EXT",), survey=name, exposures=number, **changes)
+    area = Area(ra=60.0, dec=-35.0, radius=2.0) if name != "cfis" else Area(ra=200.0, dec=40.0, radius=2.0)
+    return [*ground_surveys.exposures(block, area, MISSION, seed, 60500.0)]
+
+
+@pytest.mark.parametrize(("name", "error"), [("des", 3.0), ("lsst", 0.0), ("cfis", 0.0)])
+def test_a_survey_observes_at_night_and_misses_by_its_error(name, error):
+    found = survey_of(name, 30)
+    table = planned_exposures.table(found, [MISSION] * len(found))
+    assert max(table["airmass"].to_pylist()) <= 2.0
+    assert (np.diff([one.mjd for one in found]) > 0).all()
+    # In bands that are taken together the places differ by the telescope's errors alone.
+    if name == "des":
+        first, second = (np.array([(e.ra, e.dec) for e in found if e.band == band]) for band in ("des_g", "des_r"))
+        apart = 3600.0 * (first - second) * np.stack([np.cos(np.radians(first[:, 1])), np.ones(len(first))], axis=1)
+        assert np.std(apart) == pytest.approx(error * np.sqrt(2.0), rel=0.35)
+    dated = survey_of(name, 30, mjd=60500.0)
+    assert dated[0].mjd == 60500.0
+    assert dated[1].mjd == pytest.approx(60500.0 + (dated[0].exposure_time_s + 30.0) / 86400.0)
+
+
+def test_seeing_is_drawn_for_each_exposure():
+    """Log-normal about the survey's median; the same for the same exposure in whatever order and company."""
+    found = survey_of("lsst", 300)
+    found = [one for one in found if one.band == "lsst_r"]
+    seeing = np.array(planned_exposures.table(found, [MISSION] * len(found), seed=5)["seeing"])
+    assert np.median(seeing) == pytest.approx(0.73, rel=0.05)
+    assert np.std(np.log10(seeing)) == pytest.approx(0.09, rel=0.2)
+    backwards = planned_exposures.table(found[::-1], [MISSION] * len(found), seed=5)["seeing"].to_pylist()
+    assert backwards[::-1] == seeing.tolist()
+    assert planned_exposures.table(found[:1], [MISSION], seed=6)["seeing"].to_pylist()[0] != seeing[0]
+    still = resolve(overrides={"ext.lsstcam.seeing_scatter": (0.0, "dex")})
+    assert set(planned_exposures.table(found, [still] * len(found))["seeing"].to_pylist()) == {0.73}
+    own = [replace(found[0], seeing=1.4, zero_point=28.0, sky=5.0)]
+    (row,) = planned_exposures.table(own, [MISSION]).to_pylist()
+    assert (row["seeing"], row["zero_point"], row["sky"]) == (1.4, 28.0, 5.0)
+    with pytest.raises(BadInput, match=r"seeing of ext\.lsstcam .*0.1 is outside"):
+        planned_exposures.table([replace(found[0], seeing=0.1)], [MISSION])

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jobs.fluxes import passbands
-from jobs.render.camera import detectors
+from jobs.render.camera import astrometry, detectors
 from jobs.render.camera.astrometry import wcs
 from jobs.render.drawing import stamps, transfer
-from jobs.render.psf import atmosphere, ground, seeing, spikes
+from jobs.render.psf import aberrations, atmosphere, ground, seeing, spikes
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
 from lake_schema.tables.exposures import ExposureRow
@@ -81,15 +81,17 @@ def test_air_refracts_as_published():
     assert blue - green == pytest.approx(1.10, abs=0.01)
 
 
-@pytest.mark.parametrize("camera", sorted(CASES))
+@pytest.mark.parametrize(
+    "camera", ["hsc", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("decam", "lsstcam", "megacam"))]
+)
 def test_the_whole_of_it_is_galsim_s(camera):
     """Atmosphere, obscured pupil and aberrations of one wavelength, but for where the centroid lies."""
-    detector, telescope = detector_of(camera), ground.Telescope.of(f"ext.{camera}", MISSION)
+    detector, telescope = detector_of(camera), aberrations.Telescope.of(f"ext.{camera}", MISSION)
     wave, nm = 6200.0, ground._wavefront(detector, 0.5, -0.8, MISSION)
     fried = atmosphere.fried_length(0.7, wave, telescope.outer)
     samples, step = 3, detector.pixel_scale / 3
     grid = ground._Grid.of(128, samples, detector.pixel_scale)
-    ratio = ground._Ratio.of(nm, telescope, wave, fried, 0.0)
+    ratio = aberrations.Ratio.of(nm, telescope, wave, fried, 0.0)
     ours = grid.image(grid.passed(wave, fried, telescope, AIR) * grid.interpolated(ratio, wave))
     middle, half = len(ours) // 2, 60
     ours = ours[middle - half : middle + half + 1, middle - half : middle + half + 1]
@@ -232,3 +234,29 @@ def test_the_brightest_star_has_no_seam_and_no_hole():
     assert (diagonal > 1.02 * law[350 + np.arange(60, 340), 350 + np.arange(60, 340)]).mean() > 0.9
     across = image[340:360, 350:].mean(axis=0)[100:200]
     assert np.abs(np.diff(np.log(across)) + 2.0 / (100 + np.arange(99))).max() < 0.02
+
+
+@pytest.mark.parametrize(("camera", "name"), [("decam", "N4"), ("lsstcam", "R22_S11"), ("megacam", "ccd04")])
+def test_refraction_lifts_towards_the_zenith_on_the_sky(camera, name):
+    """Whichever way the camera and its detector are turned; and an altazimuth's spider turns with it."""
+    detector = detectors.detector(camera, name, MISSION)
+    found = []
+    for zenith in (-40.0, 75.0):
+        row = ExposureRow(
+            1, "EXT", camera, "x", "science", 10.0, -20.0, 33.0, 6e4, 30.0, 1.0, 0.7, 28.0, "x",
+            airmass=1.4, zenith=zenith,
+        )  # fmt: skip
+        air = ground.air_of(row, detector, MISSION)
+        assert air.lift == pytest.approx(np.sqrt(1.4**2 - 1.0))
+        system = wcs(detector, 10.0, -20.0, 33.0)
+        middle = (detector.nx - 1) / 2, (detector.ny - 1) / 2
+        turns = np.cos(air.zenith), np.sin(air.zenith)
+        places = [np.array([at, at + 20.0 * turn]) for at, turn in zip(middle, turns, strict=True)]
+        ra, dec = astrometry.sky_of_pixel(system, *places)
+        east = (ra[1] - ra[0]) * np.cos(np.radians(dec[0]))
+        assert np.degrees(np.arctan2(east, dec[1] - dec[0])) == pytest.approx(zenith, abs=1.5)
+        band = passbands.load(CASES[camera][1])
+        found.append(ground.edges(air, detector, band, MISSION).bars[0, 0] - air.zenith)
+    assert (found[0] == pytest.approx(found[1])) == (camera == "lsstcam")
+    without = resolve(overrides={f"ext.{camera}.psf.refraction": (0.0, "")})
+    assert ground.air_of(row, detector, without).lift == 0.0

@@ -1,0 +1,107 @@
+"""Optics of a ground telescope as turbulent air lets them be seen: of its pupil, the overlap with itself.
+
+Telescope   its pupil;  clear : the transfer function of perfect optics
+Ratio       what aberrations make of it, at the small distances that the air leaves
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import galsim
+import numpy as np
+import scipy.fft
+
+from lake_schema.arrays import Complex, Float
+from lake_schema.errors import OutOfRange
+from lake_schema.mission.configuration import MissionConfiguration
+
+# Where the air passes less than this nothing is looked at: Fried lengths.
+FARTHEST = 3.0
+# Samples across the pupil, of the transform that its overlaps are made by; steps of the lattice out to FARTHEST.
+_ACROSS, _TRANSFORM, _LATTICE = 120, 256, 10
+# Distance at which the phase tells where the light's centroid is, m.
+_NEAR = 0.06
+
+
+@dataclass(frozen=True, slots=True)
+class Telescope:
+    """What is the same in all exposures: radii of the pupil's clear ring, and outer scale of the turbulence, m."""
+
+    radius: float
+    inner: float
+    outer: float
+
+    @classmethod
+    def of(cls, section: str, mission: MissionConfiguration) -> Telescope:
+        """Of a camera's section of the mission database; what is not clear of its aperture is in the middle."""
+        radius = 0.5 * mission.value(f"{section}.aperture_diameter", "m")
+        area = mission.value(f"{section}.collecting_area", "m2")
+        if not 0.0 < area <= np.pi * radius**2:
+            raise OutOfRange(f"mission parameter {section}.collecting_area, m2", area, 0.0, np.pi * radius**2)
+        inner = float(np.sqrt(max(radius**2 - area / np.pi, 0.0)))
+        return cls(radius, inner, mission.value(f"{section}.psf.outer_scale", "m"))
+
+
+@dataclass(frozen=True, slots=True)
+class Ratio:
+    """The optics' transfer function over that without aberrations: complex[2 m + 1, 2 m + 1] at lags `step` m apart."""
+
+    values: Complex
+    step: float
+
+    @classmethod
+    def of(cls, nm: Float, telescope: Telescope, wave: float, fried: float, turn: float) -> Ratio:
+        """Of a wavefront, nm by Noll number, in axes that are turned by `turn`, radian; wave : A;  fried : m."""
+        step = 2.0 * telescope.radius / _ACROSS
+        stride = max(int(np.ceil(FARTHEST * fried / (_LATTICE * step))), 1)
+        lags = stride * (np.arange(2 * _LATTICE + 3) - _LATTICE - 1)
+        x, y, clear, plain = _pupil(telescope.radius, telescope.inner)
+        x, y = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+        phase = galsim.zernike.Zernike(nm * (20.0 * np.pi / wave))(x, y)
+        field = scipy.fft.fft2(clear * np.exp(1j * phase), (_TRANSFORM, _TRANSFORM))
+        overlap = scipy.fft.ifft2(np.abs(field) ** 2)[np.ix_(lags, lags)]
+        values = overlap / plain[np.ix_(lags, lags)]
+        near = max(round(_NEAR / (stride * step)), 1)
+        middle, along = _LATTICE + 1, stride * step * (np.arange(len(lags)) - _LATTICE - 1)
+        tilts = [
+            float(np.angle(v)) / (near * stride * step)
+            for v in (values[middle, middle + near], values[middle + near, middle])
+        ]
+        values = values * np.exp(-1j * (tilts[0] * along + tilts[1] * along[:, None]))
+        return cls(values, stride * step)
+
+
+@lru_cache(maxsize=8)
+def _pupil(radius: float, inner: float) -> tuple[Float, Float, Float, Float]:
+    """(x, y in radii, what is clear [n, n], its overlap with itself by lags [_TRANSFORM, _TRANSFORM])."""
+    step = 2.0 / _ACROSS
+    axis = (np.arange(_ACROSS + 4) - (_ACROSS + 3) / 2) * step
+    x, y = np.meshgrid(axis, axis)
+    r = np.hypot(x, y)
+    clear = np.clip(0.5 + (1.0 - r) / step, 0.0, 1.0) * np.clip(0.5 + (r - inner / radius) / step, 0.0, 1.0)
+    overlap = scipy.fft.irfft2(np.abs(scipy.fft.rfft2(clear, (_TRANSFORM, _TRANSFORM))) ** 2)
+    return x, y, clear, np.asarray(overlap)
+
+
+def clear(distance: Float, radius: float, inner: float) -> Float:
+    """Overlap of a ring with itself, moved by a distance, of its area: the transfer function of perfect optics.
+
+    distance : [...] m;  radius, inner : of the ring, m
+    """
+    area = np.pi * (radius**2 - inner**2)
+    whole = _lens(distance, radius, radius) - 2.0 * _lens(distance, radius, inner) + _lens(distance, inner, inner)
+    return np.asarray(whole / area)
+
+
+def _lens(distance: Float, one: float, other: float) -> Float:
+    """Area that two circles have in common whose middles lie a distance apart."""
+    small = min(one, other)
+    if small == 0.0:
+        return np.zeros_like(distance)
+    d = np.clip(distance, max(abs(one - other), 1e-12), one + other)
+    a, b = (d * d + one**2 - other**2) / (2.0 * d * one), (d * d + other**2 - one**2) / (2.0 * d * other)
+    rim = np.maximum((one + other - d) * (d + one - other) * (d - one + other) * (d + one + other), 0.0)
+    area = one**2 * np.arccos(np.clip(a, -1.0, 1.0)) + other**2 * np.arccos(np.clip(b, -1.0, 1.0)) - 0.5 * np.sqrt(rim)
+    return np.asarray(np.where(distance <= abs(one - other), np.pi * small**2, area))
