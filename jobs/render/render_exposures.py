@@ -27,9 +27,9 @@ from jobs.render.planning import tasks as planned
 from jobs.render.planning.mission import mission_of
 from jobs.render.planning.preconditions import INPUTS
 from jobs.render.products import exposure_files, fits_files, truth_table
-from jobs.render.products.beside import spectra_file, truth_file
+from jobs.render.products.beside import psf_file, spectra_file, truth_file
 from jobs.render.products.keys import ephemeris_files, product_keys, psf_files, stamp_files
-from jobs.render.psf import from_file
+from jobs.render.psf import from_file, to_psfex
 from jobs.render.sources import catalogue_rows, ephemerides, galaxy_stamps, selection, solar_system
 from jobs.render.sources.catalogue_rows import LENSES
 from jobs.render.sources.disc_structure import DiscStructure
@@ -213,6 +213,10 @@ def work(lake: Path, facts: Json) -> Output:
     spectra = truth_table.spectra(rendered)
     if spectra is not None:
         files[spectra_file(*place)] = lambda path: parquet.write(path, spectra, RENDERED_SPECTRA)
+    if aim.channel.on_ground and rendered.psf is not None:
+        model, exposure = rendered.psf, aim.exposure
+        beside = psf_file(exposure.exposure_id, exposure.channel, exposure.band, aim.detector.name)
+        files[beside] = lambda path: to_psfex.written(model, aim.detector, path)
     return Output(rows, files)
 
 

@@ -168,8 +168,19 @@ def ingest(table: Toml, folder: Path) -> Ingest:
 
 
 def psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
-    """The section `psf`: (band, file), found from `folder`.  BadInput names the key."""
-    return tuple((layout.name(band), str(file_of(folder, string(table, f"psf.{band}")))) for band in sorted(table))
+    """The section `psf`: (band, file), found from `folder`; a band once for each file of a list.
+
+    Errors : BadInput names the key
+    """
+    found = []
+    for band in sorted(table):
+        path = f"psf.{band}"
+        several = isinstance(table[band], list)
+        names = strings(table, path) if several else (string(table, path),)
+        if not names:
+            raise BadInput(f"{path} names no file")
+        found += [(layout.name(band), str(file_of(folder, name))) for name in names]
+    return tuple(found)
 
 
 def sources(table: Toml, folder: Path) -> GivenSources | None:

@@ -31,7 +31,8 @@
     [fluxes.templates]             your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
     [fluxes.stars]                 your own dwarfs: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
     [fluxes.extinction.CODE]       your own law in place of law 1 .. 4: file, format
-    [psf]          BAND = "file.fits"   your own PSF in a band: a cube of planes or PSFEx's
+    [psf]          BAND = "file.fits"   your own PSF in a band: a cube of planes or PSFEx's; of a list of files each
+                   exposure has one, drawn at random
                    (jobs/render/psf/from_file.py); {detector} in the name stands for the detector's
     [solar_system] bodies = "file"      your own moving bodies in place of ours (jobs/render/sources/ephemerides.py)
     [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs

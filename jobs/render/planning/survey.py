@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jobs import rng
 from jobs.render.camera import detectors
 from jobs.render.camera.pointing import boresight_for
 from jobs.render.channels import registry
@@ -49,12 +50,21 @@ def exposures(request: Request, mission: MissionConfiguration) -> list[tuple[Exp
     for values in request.variants():
         shared = _Settled.of(values, request, mission)
         for exposure, own in _of_variant(request, values, shared):
-            psf = exposure.psf or dict(request.psfs).get(exposure.band)
+            psf = exposure.psf or _own_psf(exposure, request)
             found.append((replace(exposure, settings=own.settings, psf=psf), own.mission))
     for band, _ in request.psfs:
         if band not in {exposure.band for exposure, _ in found}:
             raise BadInput(f"psf.{band}: no exposure is taken in this band")
     return found
+
+
+def _own_psf(exposure: Exposure, request: Request) -> str | None:
+    """The request's file for the band; of several one is drawn for each exposure."""
+    files = [file for band, file in request.psfs if band == exposure.band]
+    if len(files) < 2:
+        return files[0] if files else None
+    where = (exposure.camera, exposure.band, *(value.hex() for value in (exposure.ra, exposure.dec, exposure.mjd)))
+    return files[int(rng.stream(request.seed, "exposures.psf", *where).integers(len(files)))]
 
 
 @dataclass(frozen=True, slots=True)

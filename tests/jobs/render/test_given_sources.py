@@ -1,6 +1,7 @@
 """A scene of given sources, from the table to the pixels, against GalSim's drawing of the same table."""
 
 import galsim
+import galsim.des
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -108,6 +109,16 @@ def test_a_source_is_what_galsim_draws_of_its_row(images, row, body):
     found = data[y - 1 : y + SIDE - 1, x - 1 : x + SIDE - 1]
     assert np.abs(found - image.array).max() < 2e-3 * image.array.max()
     assert found.sum() == pytest.approx(image.array.sum(), rel=2e-3)
+
+
+def test_the_psf_lies_beside_the_image(rendered):
+    version = read.version(rendered, "products")
+    (row,) = (row for row in version.rows().to_pylist() if row["content"] == "science")
+    image = version.file(row["path"])
+    model = galsim.des.DES_PSFEx(str(image.with_name(image.name.replace("_science.fits", ".psf"))))
+    found = model.getPSF(galsim.PositionD(2000.0, 2000.0)).drawImage(scale=0.25, method="no_pixel").calculateFWHM()
+    with fits.open(image) as units:
+        assert found * 0.2000587 == pytest.approx(units[-1].header["PSFFWHM"], rel=0.01)
 
 
 def test_nothing_else_is_in_the_image(rendered, images):

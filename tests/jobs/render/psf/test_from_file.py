@@ -15,9 +15,11 @@ from jobs.render import plan_exposures
 from jobs.render.camera.astrometry import wcs
 from jobs.render.camera.pointing import boresight_for
 from jobs.render.drawing import reference, stamps
+from jobs.render.planning import survey
 from jobs.render.psf import from_file
 from jobs.request.from_toml import from_table
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.mission.configuration import resolve
 from tests.jobs.render.exposure.test_render import field, render
 from tests.jobs.render.fields import moments, one_source, small
 
@@ -222,6 +224,29 @@ def test_a_request_names_it_by_band_and_detector(lake, tmp_path):
         plan_exposures.plan(lake, asked(tmp_path, lsst_i="R22_S11.psf"))
     with pytest.raises(BadInput, match=r"psf.lsst_r wants text, got 3"):
         asked(tmp_path, lsst_r=3)
+
+
+def test_of_a_set_each_exposure_has_one(tmp_path):
+    """At random, and the same whatever else is exposed."""
+    names = [f"{i}_{{detector}}.psf" for i in range(3)]
+    table = {"name": "x", "seed": 1, "area": {"cone": {"ra": 53.117, "dec": -27.808, "radius": 0.1}}}
+    pointings = [{**POINTING, "mjd": 60905.0 + 0.1 * i} for i in range(60)]
+    mission = resolve()
+
+    def drawn(some, seed=1):
+        request = from_table({**table, "seed": seed, "pointing": some, "psf": {"lsst_r": names}}, tmp_path)
+        return [exposure.psf for exposure, _ in survey.exposures(request, mission)]
+
+    found = drawn(pointings)
+    counts = [found.count(str(tmp_path / name)) for name in names]
+    assert sum(counts) == 60
+    assert min(counts) > 8
+    assert drawn(pointings[::-1]) == found[::-1]
+    assert drawn(pointings, 2) != found
+    with pytest.raises(BadInput, match=r"psf.lsst_r names no file"):
+        asked(tmp_path, lsst_r=[])
+    with pytest.raises(BadInput, match=r"psf.lsst_r wants a list of texts"):
+        asked(tmp_path, lsst_r=[3])
 
 
 @pytest.mark.parametrize("channel", ["VIS", "EXT"])

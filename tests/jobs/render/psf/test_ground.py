@@ -22,7 +22,7 @@ from tests.jobs.render.fields import one_source, small
 MISSION = resolve()
 AIR = ground.Air(0.7)
 CASES = {
-    "lsstcam": ("R44_S20", "lsst_r"),
+    "lsstcam": ("R43_S21", "lsst_r"),
     "decam": ("N4", "des_g"),
     "hsc": ("0_03", "hsc_z"),
     "megacam": ("ccd04", "cfis_r"),

@@ -1,0 +1,46 @@
+"""A PSF model in the form of PSFEx: planes that are multiplied with powers of the place on a detector.
+
+write   planes -> a file
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+from lake_schema.arrays import Float32
+from lake_schema.errors import BadInput
+from lake_schema.fits import write as whole
+
+
+def write(
+    path: Path, planes: Float32, step: float, fwhm: float, middle: tuple[float, float], unit: tuple[float, float]
+) -> None:
+    """Replaced in one rename.
+
+    planes : float32[n, s, s] for the powers 1, x, x^2 .. y, x y .. of a polynomial of some degree;  step : pixels
+             between their samples;  fwhm : of a star, pixels
+    middle, unit : (column, row) of x = y = 0, pixels, the first of which is 1, and what 1 is of
+    """
+    degree = round((np.sqrt(8 * len(planes) + 1) - 3) / 2)
+    if (degree + 1) * (degree + 2) // 2 != len(planes):
+        raise BadInput(f"{path}: {len(planes)} planes are not those of a polynomial of two coordinates")
+    side = planes.shape[1]
+    column = fits.Column("PSF_MASK", f"{planes.size}E", dim=f"({side}, {side}, {len(planes)})", array=planes[None])
+    table = fits.BinTableHDU.from_columns([column], name="PSF_DATA")
+    table.header.update({"LOADED": 0, "ACCEPTED": 0, "CHI2": 0.0, "POLNAXIS": 2})
+    for number, axis in enumerate("XY", start=1):
+        table.header[f"POLGRP{number}"] = (1, "polynomial group of this coordinate")
+        table.header[f"POLNAME{number}"] = (f"{axis}_IMAGE", "coordinate")
+        table.header[f"POLZERO{number}"] = (middle[number - 1], "[pix] its zero")
+        table.header[f"POLSCAL{number}"] = (unit[number - 1], "[pix] its unit")
+    table.header["POLNGRP"] = (1, "groups of coordinates")
+    table.header["POLDEG1"] = (degree, "degree of the polynomials")
+    table.header["PSF_FWHM"] = (fwhm, "[pix] of a star")
+    table.header["PSF_SAMP"] = (step, "[pix] between samples")
+    table.header["PSFNAXIS"] = (3, "axes of PSF_MASK")
+    for number, length in enumerate((side, side, len(planes)), start=1):
+        table.header[f"PSFAXIS{number}"] = length
+    whole.write_staged(path, fits.HDUList([fits.PrimaryHDU(), table]))
