@@ -37,7 +37,7 @@ COLUMNS = (
     ("image_type", "", "as in a request", "the observation's"),
     ("detectors", "", "names of detectors, separated by blanks", "the observation's, else all of the camera"),
     ("sky", "electron pix-1 s-1", "diffuse sky", "the mission's"),
-    ("seeing", "arcsec", "FWHM of the atmosphere, of ground cameras", "the mission's"),
+    ("seeing", "arcsec", "FWHM of the atmosphere, of ground cameras", "drawn about the mission's"),
     ("zero_point", "mag", "AB magnitude of 1 electron/s", "the mission's"),
     ("psf", "", "file of a PSF, found from the table's folder", "the request's `[psf]`, else the model's"),
     ("grism_angle", "deg", "at which the spectra of NISP-S run, in the focal plane: -4, 0, 180 or 184", "0"),

@@ -1,0 +1,44 @@
+"""Depth of one exposure, with the pixels' own PSF, sky and noise, against what surveys publish."""
+
+import numpy as np
+import pytest
+
+from jobs.fluxes import passbands
+from jobs.render.camera import detectors
+from jobs.render.planning import planned_exposures
+from jobs.render.psf import ground, to_psfex
+from jobs.render.sky import diffuse_light
+from lake_schema.mission.configuration import resolve
+
+MISSION = resolve()
+
+
+def depth(camera, band, ratio, seconds):
+    """AB magnitude of a star whose S/N is `ratio` in the least scatter that its pixels allow."""
+    section = f"ext.{camera}"
+    every = detectors.detectors(camera, MISSION)
+    detector = min(every, key=lambda one: np.hypot(one.x, one.y))
+    air = ground.Air(MISSION.value(f"{section}.{band}.seeing", "arcsec"))
+    psf = ground.through_air(air, detector, passbands.load(band), MISSION, 1)
+    (model, *_), _ = to_psfex.model_of(psf)
+    every_pixel = slice((len(model) // 2) % psf.planes.samples, None, psf.planes.samples)
+    share = psf.planes.samples**2 * model[every_pixel, every_pixel].astype(float)
+    assert share.sum() == pytest.approx(1.0, abs=2e-3)
+    sky = diffuse_light.ground_sky(detector, band, MISSION).constant
+    noise = sky * seconds + MISSION.value(f"{section}.read_noise", "electron") ** 2
+    light = np.geomspace(10.0, 1e6, 300)
+    found = np.sqrt(((light[:, None, None] * share) ** 2 / (noise + light[:, None, None] * share)).sum(axis=(1, 2)))
+    zero_point = planned_exposures.zero_point_of(section, band, MISSION)
+    return zero_point - 2.5 * np.log10(np.interp(ratio, found, light) / seconds)
+
+
+@pytest.mark.parametrize(("band", "published"), [("g", 23.57), ("r", 23.34), ("i", 22.78), ("z", 22.10)])
+def test_des_is_as_deep_as_published(band, published):
+    """Abbott et al. 2018: S/N 10 in a single exposure of 90 s."""
+    assert depth("decam", f"des_{band}", 10.0, 90.0) == pytest.approx(published, abs=0.11)
+
+
+@pytest.mark.parametrize(("band", "published"), [("u", 23.70), ("g", 24.97), ("r", 24.52), ("i", 24.13), ("z", 23.56)])
+def test_lsst_is_as_deep_as_foretold(band, published):
+    """S/N 5 in 30 s.  Theirs is of an effective area of 1.3 Gaussians; ours, with wings, of 1.5."""
+    assert depth("lsstcam", f"lsst_{band}", 5.0, 30.0) == pytest.approx(published, abs=0.18)
