@@ -165,9 +165,9 @@ def test_every_planned_detector_has_its_products_and_every_source_its_row(render
         assert (np.diff(ids) > 0).all()
         with fits.open(version.file(row["path"])) as file:
             electrons, system = file[0].data.astype(float), WCS(file[0].header)
-        # The image is the sum of the stamps and of wings that are fainter than the noise.
+        # The image is the sum of the stamps and of wings that are fainter than the noise: with the aureole, 4 %.
         assert onto.sum() <= electrons.sum() * (1 + 1e-5)
-        assert onto.sum() > 0.97 * electrons.sum()
+        assert onto.sum() > 0.94 * electrons.sum()
         assert (onto <= expected * 1.001).all()
         sky = {}
         exposed = read.version(rendered, "exposures").rows(where=pc.field("exposure_id") == row["exposure_id"])
