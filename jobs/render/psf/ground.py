@@ -78,6 +78,7 @@ def air_of(exposure: ExposureRow, detector: Detector, mission: MissionConfigurat
     exposure : its row;  detector : of its camera;  mission : the mission database
     """
     section = detector.section
+    # The seeing is drawn with the request's seed.
     identity = (exposure.camera, exposure.band, *(x.hex() for x in (exposure.ra, exposure.dec, exposure.mjd)))
     rms = mission.value(f"{section}.psf.air_ellipticity", "")
     size, turn = rng.stream("psf.air", exposure.seeing.hex(), *identity).random(2)
@@ -115,7 +116,7 @@ def through_air(air: Air, detector: Detector, band: Passband, mission: MissionCo
         raise OutOfRange(
             f"seeing of {detector.section} through a turbulent atmosphere, arcsec", air.seeing, scale, 10.0
         )
-    waves = _waves(band)
+    waves = _waves(band, air)
     widths = air.seeing * (waves / waves.mean()) ** air.slope
     telescope = Telescope.of(detector.section, mission)
     fried = [
@@ -166,11 +167,12 @@ def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfigur
     )  # fmt: skip
 
 
-def _waves(band: Passband) -> Float:
-    """[w] A: means of as many photons of flat f_nu."""
+def _waves(band: Passband, air: Air) -> Float:
+    """[w] A: means of as many photons of flat f_nu; one where the air does the same to all."""
     photons = band.response / band.wavelength
     mean = float((photons * band.wavelength).sum() / photons.sum())
-    parts = sub_bands(band, PARTS // 2 if mean > _REDDER else PARTS)
+    count = 1 if air.slope == 0.0 and air.lift == 0.0 else PARTS // 2 if mean > _REDDER else PARTS
+    parts = sub_bands(band, count)
     return np.array([np.average(p.wavelength, weights=p.response / p.wavelength) for p in parts])
 
 

@@ -18,6 +18,7 @@ from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
 from jobs.render.sky import diffuse_light, observatory
+from jobs.render.sky.diffuse_light import SkyBand
 from jobs.render.sky.observatory import Site
 from lake_schema import units
 from lake_schema.arrays import Float
@@ -40,22 +41,20 @@ class Night:
     level      : electrons a second in a pixel, as the mission database has it
     modelled   : whether it is of a dark zenith
     zodiacal   : of it, at the ecliptic pole;  moon : of a nanolambert of moonlight in V
-    scale      : electrons of the camera over those of its passband and area: of zodiacal light
+    sky, scale : zodiacal light of the passband and area, and the camera's electrons over theirs
     extinction : mag an airmass;  reference : airmass that the zero point is of
-    site, band, area, pixel_scale : of the camera: its observatory, passband, collecting area in m2, arcsec
+    site       : observatory
     """
 
     level: float
     modelled: bool
     zodiacal: float
     moon: float
+    sky: SkyBand
     scale: float
     extinction: float
     reference: float
     site: Site
-    band: Passband
-    area: float
-    pixel_scale: float
 
     @classmethod
     def of(
@@ -67,19 +66,18 @@ class Night:
         zero_point : AB magnitude of 1 e-/s;  mission : the mission database
         """
         section, curve = detector.section, curve or passbands.load(band)
-        area, scale = mission.value(f"{section}.collecting_area", "m2"), detector.pixel_scale
-        own = units.zero_point(1e4 * area, passbands.log_width(curve))
-        brighter = 10.0 ** (0.4 * (zero_point - own))
+        area, pixel = mission.value(f"{section}.collecting_area", "m2"), detector.pixel_scale
+        sky = diffuse_light.zodiacal_sky(curve, area, pixel, mission)
+        scale = 10.0 ** (0.4 * (zero_point - units.zero_point(1e4 * area, passbands.log_width(curve))))
         ra, dec = (float(x) for x in equatorial(0.0, _POLE))
-        zodiacal = brighter * diffuse_light.zodiacal_rate(ra, dec, 0.0, curve, area, scale, mission)
         level = diffuse_light.ground_sky(detector, band, mission, curve).constant
-        key, air = f"{section}.{band}.extinction", f"{section}.zero_point_airmass"
-        moon = 10.0 ** (0.4 * (zero_point - _sun_colour(curve, mission))) * scale**2
+        pole = scale * diffuse_light.sky_rate(sky, ra, dec, 0.0, mission)
+        moon = 10.0 ** (0.4 * (zero_point - _sun_colour(curve, mission))) * pixel**2 * np.exp(-_V_ZERO) / _NANOLAMBERTS
+        key = f"{section}.{band}.extinction"
+        extinction = mission.value(key, "mag") if key in mission else 0.0
         return cls(
-            level, mission.value(f"{section}.sky_model") == 1.0, min(zodiacal, (1.0 - _LEAST_AIRGLOW) * level),
-            moon * float(np.exp(-_V_ZERO)) / _NANOLAMBERTS, brighter,
-            mission.value(key, "mag") if key in mission else 0.0, mission.value(air) if air in mission else 1.0,
-            Site.of(section, mission), curve, area, scale,
+            level, mission.value(f"{section}.sky_model") == 1.0, min(pole, (1.0 - _LEAST_AIRGLOW) * level), float(moon),
+            sky, scale, extinction, mission.value(f"{section}.zero_point_airmass"), Site.of(section, mission),
         )  # fmt: skip
 
 
@@ -96,8 +94,7 @@ def sky_rate(night: Night, ra: float, dec: float, mjd: float, mission: MissionCo
     airmass, _ = observatory.aloft(ra, dec, mjd, night.site)
     dimmed = 10.0 ** (-0.4 * night.extinction * (airmass - 1.0))
     airglow = (night.level - night.zodiacal) * _path(float(np.arcsin(1.0 / airmass))) * dimmed
-    band, area, scale = night.band, night.area, night.pixel_scale
-    zodiacal = night.scale * diffuse_light.zodiacal_rate(ra, dec, mjd, band, area, scale, mission)
+    zodiacal = night.scale * diffuse_light.sky_rate(night.sky, ra, dec, mjd, mission)
     return float(airglow + zodiacal * dimmed + night.moon * moonlight(night, ra, dec, mjd, airmass))
 
 

@@ -105,7 +105,7 @@ def moon(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
     longitude = _MOON_MEAN[0] + _MOON_MEAN[1] * century + of(_MOON_LONGITUDE) - _PRECESSION * century
     latitude = of(_MOON_LATITUDE)
-    sun = np.vectorize(sun_longitude, otypes=[float])(mjd)
+    sun = _sun(np.asarray(mjd, float))
     elongation = np.degrees(np.arccos(np.cos(np.radians(latitude)) * np.cos(np.radians(longitude - sun))))
     ra, dec = equatorial(longitude % 360.0, latitude)
     return ra, dec, 180.0 - elongation
@@ -120,6 +120,9 @@ def moon_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
 
 def next_dark(ra: float, dec: float, start: float, site: Site) -> float:
     """MJD from `start` on when a field is up at night away from the Moon, to a quarter of an hour; `start` if never."""
+    # Most exposures follow one another in a night.
+    if _dark(ra, dec, np.array([start]), site)[0]:
+        return start
     for day in range(_DAYS):
         times: Float = start + day + _STEP * np.arange(float(round(1.0 / _STEP)))
         good = np.flatnonzero(_dark(ra, dec, times, site))
@@ -128,8 +131,13 @@ def next_dark(ra: float, dec: float, start: float, site: Site) -> float:
     return start
 
 
+def _sun(mjd: Float) -> Float:
+    """Ecliptic longitude, deg [...]."""
+    return np.array([sun_longitude(float(t)) for t in mjd.ravel()]).reshape(mjd.shape)
+
+
 def _dark(ra: float, dec: float, mjd: Float, site: Site) -> Bool:
-    sun = np.array([sun_longitude(float(t)) for t in mjd])
+    sun = _sun(mjd)
     night = site.altitude(*equatorial(sun, np.zeros_like(sun)), mjd) < _TWILIGHT
     up = airmass(site.altitude(ra, dec, mjd)) <= _MOST_AIRMASS
     if not (night & up).any():
