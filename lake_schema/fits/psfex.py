@@ -18,8 +18,9 @@ from lake_schema.fits import write as whole
 def write(
     path: Path, planes: Float32, step: float, fwhm: float, middle: tuple[float, float], unit: tuple[float, float]
 ) -> None:
-    """Replaced in one rename.
+    """Write a model; replaces `path` in one rename.
 
+    path   : of the file
     planes : float32[n, s, s] for the powers 1, x, x^2 .. y, x y .. of a polynomial of some degree;  step : pixels
              between their samples;  fwhm : of a star, pixels
     middle, unit : (column, row) of x = y = 0, pixels, the first of which is 1, and what 1 is of

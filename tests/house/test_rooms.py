@@ -200,7 +200,8 @@ def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
     ((wanted, _),) = survey.exposures(request, mission)
     exposures = planned_exposures.table([wanted], [mission])
     (row,) = exposures.to_pylist()
-    assert row["sky"] == mission.value("ext.dummycam.lsst_r.sky")
+    # Of a dark zenith, and here the Moon is up.
+    assert 1.0 < row["sky"] / mission.value("ext.dummycam.lsst_r.sky") < 5.0
     table = tasks.table(exposures, [wanted.detectors], mission, Densities(mission, Universe()))
     (task,) = table.to_pylist()
     # 4072 x 4000 pixels of an effect that takes a second a million, besides what the channel costs.

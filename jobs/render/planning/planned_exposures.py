@@ -202,7 +202,7 @@ class _Band:
         if camera not in CAMERAS:
             return cls(zero_point, sky)
         seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec")
-        night = Night.of(first, band, zero_point, mission, curve)
+        night = Night.of(first, band, (zero_point, sky.constant), mission, curve)
         return cls(zero_point, sky, seeing, mission.value(f"{prefix}.seeing_scatter", "dex"), night, first)
 
 

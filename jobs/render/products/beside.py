@@ -14,5 +14,8 @@ def truth_file(exposure_id: int, detector: str) -> str:
 
 
 def psf_file(exposure_id: int, channel: str, band: str, detector: str) -> str:
-    """Where a version of `products` keeps the PSF that a detector was drawn with, beside its images."""
+    """Where a version of `products` keeps the PSF that a detector was drawn with, beside its images.
+
+    exposure_id, channel, band, detector : of the image
+    """
     return f"images/{exposure_id:06d}/{channel}_{band}_{detector}.psf"

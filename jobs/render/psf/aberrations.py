@@ -53,7 +53,10 @@ class Ratio:
 
     @classmethod
     def of(cls, nm: Float, telescope: Telescope, wave: float, fried: float, turn: float) -> Ratio:
-        """Of a wavefront, nm by Noll number, in axes that are turned by `turn`, radian; wave : A;  fried : m."""
+        """Of a wavefront, nm by Noll number, in axes that are turned by `turn`, radian.
+
+        telescope : its pupil;  wave : A;  fried : m
+        """
         step = 2.0 * telescope.radius / _ACROSS
         stride = max(int(np.ceil(FARTHEST * fried / (_LATTICE * step))), 1)
         lags = stride * (np.arange(2 * _LATTICE + 3) - _LATTICE - 1)

@@ -58,19 +58,20 @@ class Night:
 
     @classmethod
     def of(
-        cls, detector: Detector, band: str, zero_point: float, mission: MissionConfiguration, curve: Passband | None
-    ) -> Night:
+        cls, detector: Detector, band: str, photometry: tuple[float, float], mission: MissionConfiguration,
+        curve: Passband | None,
+    ) -> Night:  # fmt: skip
         """Of a detector's camera.
 
         band       : name of the passband;  curve : the passband, None = the embedded one
-        zero_point : AB magnitude of 1 e-/s;  mission : the mission database
+        photometry : AB magnitude of 1 e-/s, and the sky's level in the mission database, e-/s in a pixel
+        mission    : the mission database
         """
-        section, curve = detector.section, curve or passbands.load(band)
+        (zero_point, level), section, curve = photometry, detector.section, curve or passbands.load(band)
         area, pixel = mission.value(f"{section}.collecting_area", "m2"), detector.pixel_scale
         sky = diffuse_light.zodiacal_sky(curve, area, pixel, mission)
         scale = 10.0 ** (0.4 * (zero_point - units.zero_point(1e4 * area, passbands.log_width(curve))))
         ra, dec = (float(x) for x in equatorial(0.0, _POLE))
-        level = diffuse_light.ground_sky(detector, band, mission, curve).constant
         pole = scale * diffuse_light.sky_rate(sky, ra, dec, 0.0, mission)
         moon = 10.0 ** (0.4 * (zero_point - _sun_colour(curve, mission))) * pixel**2 * np.exp(-_V_ZERO) / _NANOLAMBERTS
         key = f"{section}.{band}.extinction"

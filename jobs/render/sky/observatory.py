@@ -83,6 +83,7 @@ def airmass(altitude: npt.ArrayLike) -> Float:
 def aloft(ra: float, dec: float, mjd: float, site: Site) -> tuple[float, float]:
     """(airmass, position angle of the zenith in deg) of a field at a date.
 
+    ra, dec, mjd : deg, and date;  site : of the observatory
     A field that is too low then, or not up, is taken as where it is highest: the date says no more than the order of
     exposures.
     """
@@ -119,7 +120,10 @@ def moon_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
 
 
 def next_dark(ra: float, dec: float, start: float, site: Site) -> float:
-    """MJD from `start` on when a field is up at night away from the Moon, to a quarter of an hour; `start` if never."""
+    """MJD from `start` on when a field is up at night away from the Moon, to a quarter of an hour; `start` if never.
+
+    ra, dec : deg;  site : of the observatory
+    """
     # Most exposures follow one another in a night.
     if _dark(ra, dec, np.array([start]), site)[0]:
         return start

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jobs.render.camera import detectors
-from jobs.render.sky import night_sky, observatory
+from jobs.render.sky import diffuse_light, night_sky, observatory
 from jobs.render.sky.night_sky import Night
 from lake_schema.ecliptic import equatorial
 from lake_schema.mission.configuration import resolve
@@ -19,7 +19,9 @@ SCALES = {camera: detectors.detectors(camera, MISSION)[0].pixel_scale for camera
 
 def night(camera, band):
     zero_point = MISSION.value(f"ext.{camera}.{band}.zero_point", "mag")
-    return zero_point, Night.of(detectors.detectors(camera, MISSION)[0], band, zero_point, MISSION, None)
+    detector = detectors.detectors(camera, MISSION)[0]
+    level = diffuse_light.ground_sky(detector, band, MISSION).constant
+    return zero_point, Night.of(detector, band, (zero_point, level), MISSION, None)
 
 
 def brightness(camera, band, ra, dec, mjd):
