@@ -218,7 +218,8 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
     zenith: float | None = None
     seeing = _seeing(e, band, seed) if e.seeing is None else e.seeing
     if night is not None and band.detector is not None:
-        ground_psf.check(seeing, band.detector, mission)
+        if e.psf is None:
+            ground_psf.check(seeing, band.detector, mission)
         airmass, zenith = observatory.aloft(e.ra, e.dec, e.mjd, night.site)
         fainter = night_sky.fainter(night, airmass)
     if e.image_type in _DARK_TYPES:

@@ -103,3 +103,5 @@ def test_seeing_is_drawn_for_each_exposure():
     assert (row["seeing"], row["zero_point"], row["sky"]) == (1.4, 28.0, 5.0)
     with pytest.raises(BadInput, match=r"seeing of ext\.lsstcam .*0.1 is outside"):
         planned_exposures.table([replace(found[0], seeing=0.1)], [MISSION])
+    own = replace(found[0], seeing=0.1, psf="own.psf")
+    assert planned_exposures.table([own], [MISSION])["seeing"].to_pylist() == [0.1]
