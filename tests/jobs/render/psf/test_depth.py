@@ -32,13 +32,20 @@ def depth(camera, band, ratio, seconds):
     return zero_point - 2.5 * np.log10(np.interp(ratio, found, light) / seconds)
 
 
-@pytest.mark.parametrize(("band", "published"), [("g", 23.57), ("r", 23.34), ("i", 22.78), ("z", 22.10)])
+def bands(*published):
+    """The first in every run."""
+    return [pytest.param(*one, marks=[pytest.mark.nightly] if i else []) for i, one in enumerate(published)]
+
+
+@pytest.mark.parametrize(("band", "published"), bands(("r", 23.34), ("g", 23.57), ("i", 22.78), ("z", 22.10)))
 def test_des_is_as_deep_as_published(band, published):
     """Abbott et al. 2018: S/N 10 in a single exposure of 90 s."""
     assert depth("decam", f"des_{band}", 10.0, 90.0) == pytest.approx(published, abs=0.11)
 
 
-@pytest.mark.parametrize(("band", "published"), [("u", 23.70), ("g", 24.97), ("r", 24.52), ("i", 24.13), ("z", 23.56)])
+@pytest.mark.parametrize(
+    ("band", "published"), bands(("r", 24.52), ("u", 23.70), ("g", 24.97), ("i", 24.13), ("z", 23.56))
+)
 def test_lsst_is_as_deep_as_foretold(band, published):
     """S/N 5 in 30 s.  Theirs is of an effective area of 1.3 Gaussians; ours, with wings, of 1.5."""
     assert depth("lsstcam", f"lsst_{band}", 5.0, 30.0) == pytest.approx(published, abs=0.18)

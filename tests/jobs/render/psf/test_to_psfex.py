@@ -36,7 +36,11 @@ def cut(camera, name, n=300):
 
 @pytest.mark.parametrize(
     ("camera", "name", "band", "strength"),
-    [("lsstcam", "R43_S21", "lsst_r", 1.0), ("hsc", "0_03", "hsc_z", 2.0)],
+    [
+        ("lsstcam", "R43_S21", "lsst_r", 1.0),
+        pytest.param("hsc", "0_03", "hsc_z", 2.0, marks=pytest.mark.nightly),
+        pytest.param("decam", "N4", "des_g", 1.0, marks=pytest.mark.nightly),
+    ],
 )
 def test_galsim_opens_it_and_sees_the_same_stars(tmp_path, camera, name, band, strength):
     """Size within 1 %, ellipticity within 0.005, everywhere on the detector, whose PSF changes."""
