@@ -1,17 +1,11 @@
 """What an instrument's files say of where it is, and what its pipeline reads.
 
-of       camera -> Observatory
-airmass  where it looks -> through how much air
+of  camera -> Observatory
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-
-# Beyond it, deg from the zenith, nobody observes.
-_LOWEST = 80.0
-
 
 @dataclass(frozen=True, slots=True)
 class Observatory:
@@ -50,15 +44,3 @@ _KNOWN = {
 def of(camera: str) -> Observatory:
     """Of a camera; of one that nothing is known of, with its name, somewhere."""
     return _KNOWN.get(camera, Observatory("", camera, "sip"))
-
-
-def airmass(observatory: Observatory, dec: float) -> float | None:
-    """Of a field as it culminates, of a plane atmosphere: exposures are planned by the day, not by the hour.
-
-    dec     : deg;  observatory : on the ground
-    returns : None in space, and where the field does not rise high enough to be observed
-    """
-    if observatory.latitude is None:
-        return None
-    distance = abs(observatory.latitude - dec)
-    return 1.0 / math.cos(math.radians(distance)) if distance <= _LOWEST else None

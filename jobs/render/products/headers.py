@@ -201,7 +201,7 @@ def _group_cards(rendered: Rendered) -> tuple[Card, ...]:
 def _common(rendered: Rendered) -> tuple[Card, ...]:
     exposure, scene = rendered.exposure, rendered.scene
     place = observatories.of(exposure.camera)
-    start, air = exposure.mjd + place.ahead / 86400.0, observatories.airmass(place, exposure.dec)
+    start, air = exposure.mjd + place.ahead / 86400.0, exposure.airmass
     return (
         *((("TELESCOP", place.telescope, "telescope"),) if place.telescope else ()),
         ("INSTRUME", place.instrument, "instrument"),
@@ -216,7 +216,7 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("OBJECT", _object(exposure), "what is looked at"),
         ("RA", exposure.ra, "[deg] boresight right ascension"),
         ("DEC", exposure.dec, "[deg] boresight declination"),
-        *((("AIRMASS", air, "of the boresight as it culminates"),) if air is not None else ()),
+        *((("AIRMASS", air, "of the boresight"),) if air is not None else ()),
         ("EXPOSURE", exposure.exposure_id, "identifier of the exposure"),
         ("EXPTIME", scene.exposure_time_s, "[s] effective exposure time"),
         ("DATE-OBS", _date(start), "start of the exposure"),

@@ -35,6 +35,13 @@ def test_of_a_shifted_gaussian_it_is_the_shift(samples):
     assert found[:, 0] == pytest.approx((0.1, -0.05), rel=0.03)
 
 
+def test_of_an_even_number_of_samples_it_is_the_shift():
+    waves, none = np.array([6000.0]), np.zeros((0, 49, 49), np.float32)
+    planes = model.Planes(waves, shifted(0.1, -0.05, samples=2)[None], none, (50.0, 50.0), (), 2)
+    x, y = offsets(model.sampled(planes, 0.1, False, 24), np.ones((1, 1)))
+    assert (x[0], y[0]) == pytest.approx((0.1, -0.05), rel=0.05)
+
+
 def test_of_colours_and_places_it_is_between():
     """Two wavelengths that lie apart, and a change across the detector."""
     drift = shifted(0.05, 0.0) - shifted(0.0, 0.0)
