@@ -7,20 +7,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+
 @dataclass(frozen=True, slots=True)
 class Observatory:
     """Of a camera.
 
     telescope, instrument : as its files name them; "" = it is not told
     convention            : how its pipeline tells the distortion of the optics, one of tpv.CONVENTIONS
-    latitude              : deg; None: it is in space
     time_scale            : of the times in its files;  ahead : s, of UTC
     """
 
     telescope: str
     instrument: str
     convention: str
-    latitude: float | None = None
     time_scale: str = "UTC"
     ahead: float = 0.0
 
@@ -32,12 +31,12 @@ _TAI = 37.0
 _KNOWN = {
     "vis": Observatory("Euclid", "VIS", "sip"),
     "nisp": Observatory("Euclid", "NISP", "sip"),
-    "decam": Observatory("CTIO 4.0-m telescope", "DECam", "tpv", -30.1661),
-    "lsstcam": Observatory("Simonyi Survey Telescope", "LSSTCam", "sip", -30.2446, "TAI", _TAI),
-    "megacam": Observatory("CFHT 3.6m", "MegaPrime", "tpv", 19.8253),
-    "jpcam": Observatory("JST250", "JPCam", "tpv", 40.0419),
-    "gpc1": Observatory("PS1", "GPC1", "tpv", 20.7070),
-    "hsc": Observatory("Subaru", "Hyper Suprime-Cam", "sip", 19.8255),
+    "decam": Observatory("CTIO 4.0-m telescope", "DECam", "tpv"),
+    "lsstcam": Observatory("Simonyi Survey Telescope", "LSSTCam", "sip", "TAI", _TAI),
+    "megacam": Observatory("CFHT 3.6m", "MegaPrime", "tpv"),
+    "jpcam": Observatory("JST250", "JPCam", "tpv"),
+    "gpc1": Observatory("PS1", "GPC1", "tpv"),
+    "hsc": Observatory("Subaru", "Hyper Suprime-Cam", "sip"),
 }
 
 
