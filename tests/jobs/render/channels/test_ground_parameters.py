@@ -9,7 +9,9 @@ from jobs.fluxes import passbands
 from jobs.render.camera import bands, detectors
 from jobs.render.channels import ground
 from jobs.render.effects.scene import Scene
-from jobs.render.planning import planned_exposures
+from jobs.render.planning import ground_surveys, planned_exposures
+from jobs.request.area import Area
+from jobs.request.observations import Observation
 from lake_schema.mission.configuration import MissionConfiguration, resolve
 from lake_schema.mission.parameter import CAMERAS
 from tests.jobs.render import fields
@@ -39,7 +41,13 @@ def asked(camera, mission, monkeypatch):
         planned_exposures._Band.of(SimpleNamespace(**exposed), mission, None)
         planned_exposures.exposure_time("EXT", camera, band, mission)
         one = detectors.detectors(camera, mission)[0]
-        ground.CHANNEL.psf(fields.exposure(**exposed), one, passbands.load(band), mission, 1)
+        shown = fields.exposure(**exposed, airmass=1.3, zenith=20.0)
+        for profile in (1.0, 2.0):
+            own = mission.overridden_with({f"ext.{camera}.psf.profile": (profile, "")})
+            ground.CHANNEL.psf(shown, one, passbands.load(band), own, 1)
+    surveys = [row["survey"] for row in mission.rows("survey.external") if row["camera"] == camera]
+    block = Observation(("EXT",), survey=surveys[0], exposures=1)
+    assert [*ground_surveys.exposures(block, Area(ra=60.0, dec=0.0, radius=1.0), mission, 1, 60500.0)]
     scene = Scene(mission, one.section, 90.0, 10.0, 1e6, one)
     for effect in ground.SKY:
         effect.parameters(scene)
