@@ -1,0 +1,76 @@
+"""No row of the mission database that nothing asks for: who changed it would change nothing."""
+
+import ast
+import csv
+import re
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import pytest
+
+from lake_schema.mission.configuration import resolve
+
+ROOT = Path(__file__).parents[3]
+# Files that are read where they lie; their rows tell from which the catalogues were made.
+READ_IN_PLACE = {"env.calibration.planetary_nebula", "env.calibration.vega", "env.dust.map"}
+
+
+def keys():
+    mission = resolve()
+    return {record.key for record in (*mission.parameters, *mission.models)}
+
+
+def named(tree):
+    """Strings of a module that have names."""
+    return {
+        node.targets[0].id: node.value.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign)
+        and isinstance(node.targets[0], ast.Name)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    }
+
+
+def literal(part, names):
+    """What a part of a formatted string says; None of one that is computed."""
+    if isinstance(part, ast.Constant):
+        return part.value
+    return names.get(part.value.id) if isinstance(part.value, ast.Name) else None
+
+
+def names_in_code():
+    """(strings, pattern of formatted strings) of all modules, and of tests, which hold images to values."""
+    strings, formatted = set(), set()
+    paths = {path for room in ("jobs", "lake_schema", "tests") for path in (ROOT / room).rglob("*.py")}
+    for path in paths - {Path(__file__)}:
+        tree = ast.parse(path.read_text())
+        names = named(tree)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                strings.add(node.value)
+            elif isinstance(node, ast.JoinedStr):
+                parts = [literal(part, names) for part in node.values]
+                # One that says next to nothing fits every key.
+                if sum(len(re.sub(r"\W", "", part)) for part in parts if part) >= 3:
+                    formatted.add("".join("[^.]*" if part is None else re.escape(part) for part in parts))
+    return strings, re.compile("|".join(f"(?:{pattern})" for pattern in sorted(formatted)))
+
+
+def test_every_row_is_asked_for():
+    """Those of ground cameras are held by tests/jobs/render/channels/test_ground_parameters.py."""
+    strings, formatted = names_in_code()
+
+    def asked(key):
+        # By its whole name, or within a section.
+        return any(name in strings or formatted.fullmatch(name) for name in (key, key.split(".", 1)[1]))
+
+    own = {key for key in keys() if not key.startswith("ext.")}
+    assert sorted(key for key in own if not asked(key)) == sorted(READ_IN_PLACE)
+
+
+@pytest.mark.parametrize("table", ["bounds", "counts", "places"])
+def test_every_pattern_fits_a_row(table):
+    with (ROOT / "lake_schema" / "mission" / f"{table}.csv").open(encoding="utf-8") as stream:
+        patterns = {row["pattern"] for row in csv.DictReader(stream)}
+    assert {pattern for pattern in patterns if not any(fnmatchcase(key, pattern) for key in keys())} == set()
