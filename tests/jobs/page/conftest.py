@@ -23,11 +23,13 @@ from lake_schema import ids, sky
 from lake_schema.fits import images
 from lake_schema.store import layout, parquet, publish
 from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 from lake_schema.tables.stars import STARS
+from lake_schema.tables.tasks import TASKS
 from tests.jobs.page.browsing import tab_of
 from tests.universe import plain_plan, plain_work, rows_of
 
@@ -126,6 +128,34 @@ def published(root):
     publish.make(root, Plan(PRODUCTS, {}, (one,)), lambda lake, facts: Output(rows, files))
     publish.make(root, Plan(RENDERED_TRUTH, {}, (one,)), lambda lake, facts: Output(truth))
     publish.make(root, plain_plan(), plain_work)
+
+
+def square(ra, dec, half):
+    corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
+    numbers = [f"{ra + x / np.cos(np.radians(dec)):.7f} {dec + y:.7f}" for x, y in corners]
+    return "POLYGON ICRS " + " ".join(numbers)
+
+
+def planned(root):
+    """Two exposures: the first with the detector of the images and another, the second with one, not yet observed."""
+    published(root)
+    (ra, dec), rows = CENTRE, rows_of(EXPOSURES, 2)
+    own = {name: rows[name] for name in EXPOSURES.names} | {
+        "exposure_id": [1, 2], "channel": ["VIS", "VIS"], "camera": ["vis", "vis"], "band": ["euclid_vis"] * 2,
+        "image_type": ["science"] * 2, "ra": [ra, ra + 0.1], "dec": [dec, dec], "position_angle": [0.0, 12.5],
+        "mjd": [60905.0, 60906.5], "exposure_time_s": [566.0, 90.0], "grism_angle": [None, None],
+    }  # fmt: skip
+    exposures = EXPOSURES.build(own)
+    rows = rows_of(TASKS, 3)
+    places = [(ra, dec), (ra, dec + 0.05), (ra + 0.1, dec)]
+    own = {name: rows[name] for name in TASKS.names} | {
+        "exposure_id": [1, 1, 2], "detector": ["1-1", "1-2", "3-4"], "channel": ["VIS"] * 3,
+        "ra": [place[0] for place in places], "dec": [place[1] for place in places],
+        "s_region": [square(*place, 0.009) for place in places],
+    }  # fmt: skip
+    for table, found in ((EXPOSURES, exposures), (TASKS, TASKS.build(own))):
+        part = Part("all.parquet", {})
+        publish.make(root, Plan(table, {}, (part,)), lambda lake, facts, found=found: Output(found))
 
 
 @dataclass
@@ -234,6 +264,16 @@ def shown(tmp_path_factory):
 @pytest.fixture(scope="package")
 def page(shown):
     with serving(shown) as found:
+        yield found
+
+
+@pytest.fixture(scope="package", name="sky")
+def page_of_a_plan(tmp_path_factory):
+    """A page over a lake with a plan."""
+    root = tmp_path_factory.mktemp("sky") / "lake"
+    root.mkdir()
+    planned(root)
+    with serving(root) as found:
         yield found
 
 

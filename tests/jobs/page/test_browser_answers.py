@@ -6,13 +6,11 @@ Answers are held back or replaced in the page, so that no request fails.
 import json
 import tomllib
 
-import pytest
-
 from jobs.page import sky_maps
 from jobs.request.from_toml import from_table
 from tests.jobs.page.browsing import HELD, copied, tab_of, until
-from tests.jobs.page.conftest import CENTRE, serving
-from tests.jobs.page.test_browser_sky import CLIPBOARD, LEGEND, STATES, gone_to, planned
+from tests.jobs.page.conftest import CENTRE
+from tests.jobs.page.test_browser_sky import CLIPBOARD, LEGEND, STATES, gone_to
 from tests.jobs.page.test_requests import REQUESTS, two  # noqa: F401
 
 SAID = "document.getElementById('said').textContent"
@@ -30,15 +28,6 @@ REPLACED = """([part, delay, error, times]) => {
 
 def replaced(tab, part, delay=0, error=None, times=1):
     tab.evaluate(REPLACED, [part, delay, error, times])
-
-
-@pytest.fixture(scope="module")
-def sky(tmp_path_factory):
-    root = tmp_path_factory.mktemp("sky") / "lake"
-    root.mkdir()
-    planned(root)
-    with serving(root) as found:
-        yield found
 
 
 def test_of_two_pins_the_later_is_shown(tab, page):
