@@ -8,7 +8,7 @@ from jobs.render.exposure import visible_sources
 from jobs.render.exposure.visible_sources import Light
 from lake_schema.errors import BadInput
 
-# Memory of a task, bytes: what an executor's core may count on.
+# Memory of a task, bytes: what an executor's core may count on; where a forecast says more, as much.
 _MOST_BYTES = 2e9
 # And its drawing's time, CPU s: a scene that takes longer is a mistake.
 _MOST_SECONDS = 6 * 3600.0
@@ -23,12 +23,12 @@ def refuse_too_large(aim: Aim, light: Light) -> None:
     here = visible_sources.touching(sources, sizes, detector)
     where = f"exposure {exposure.exposure_id}, detector {detector.name}: {int(here.sum())} sources"
     base = aim.channel.cost.base_gb * 1e9
+    has = max(_MOST_BYTES, base + aim.channel.cost.held_sky * detector.nx * detector.ny)
     picture = None if sources.picture is None else sources.picture[here]
     wanted = base + cost.memory(sources.electrons[here], sizes[here], detector.nx, detector.ny, picture)
-    if wanted > _MOST_BYTES:
+    if wanted > has:
         raise BadInput(
-            f"{where} take {wanted / 1e9:.1f} GB, a task has {_MOST_BYTES / 1e9:g}: "
-            "ask for fainter sources to be left out"
+            f"{where} take {wanted / 1e9:.1f} GB, a task has {has / 1e9:.2g}: ask for fainter sources to be left out"
         )
     seconds = cost.seconds(sources, sizes, light.psf, detector.nx, detector.ny)
     if seconds > _MOST_SECONDS:
