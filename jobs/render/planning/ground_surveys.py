@@ -93,7 +93,7 @@ def _missed(place: tuple[float, float], error: float, rng: np.random.Generator) 
     return float(ra[0]), float(dec[0])
 
 
-def _rules(survey: str, mission: MissionConfiguration) -> list[dict[str, str]]:
+def _rules(survey: str, mission: MissionConfiguration) -> list[Mapping[str, str]]:
     return [row for row in mission.rows("survey.external") if row["survey"] == survey]
 
 
@@ -202,7 +202,10 @@ def _of_row(row: Row, number: int, block: Observation, mission: MissionConfigura
     euclid = row.channel != "EXT"
     if mjd is None:
         mjd = mission.value("svm.launch", "d")
-        mjd = next_allowed(row.ra, row.dec, mjd, mission) if euclid else mjd
+        if euclid:
+            mjd = next_allowed(row.ra, row.dec, mjd, mission)
+        else:
+            mjd = next_dark(row.ra, row.dec, mjd, Site.of(image_types.section(camera), mission))
     if angle is None:
         angle = position_angle(row.ra, row.dec, mjd) if euclid else 0.0
     seconds = block.exposure_time_s if row.exposure_time_s is None else row.exposure_time_s

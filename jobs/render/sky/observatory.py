@@ -124,6 +124,8 @@ def next_dark(ra: float, dec: float, start: float, site: Site) -> float:
 
     ra, dec : deg;  site : of the observatory
     """
+    if float(airmass(90.0 - abs(dec - site.latitude))) > _MOST_AIRMASS:
+        return start
     # Most exposures follow one another in a night.
     if _dark(ra, dec, np.array([start]), site)[0]:
         return start

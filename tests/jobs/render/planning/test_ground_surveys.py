@@ -105,3 +105,12 @@ def test_seeing_is_drawn_for_each_exposure():
         planned_exposures.table([replace(found[0], seeing=0.1)], [MISSION])
     own = replace(found[0], seeing=0.1, psf="own.psf")
     assert planned_exposures.table([own], [MISSION])["seeing"].to_pylist() == [0.1]
+
+
+def test_a_row_without_a_date_is_observed_at_night(tmp_path):
+    """A field beside the Sun at the date that counts begin with: zodiacal light would be 20 times a dark sky."""
+    (bare,) = read(tmp_path, "channel,camera,band,ra,dec\nEXT,lsstcam,lsst_r,100.0,20.0\n")
+    site = ground_surveys.Site.of("ext.lsstcam", MISSION)
+    assert site.altitude(bare.ra, bare.dec, bare.mjd) > 29.0
+    (row,) = planned_exposures.table([bare], [MISSION]).to_pylist()
+    assert 32.95 < row["sky"] < 150.0

@@ -66,3 +66,17 @@ def test_surveys_wait_for_the_night(start):
     assert observatory.moon_altitude(found, LSST) < 0.0 or separation(53.1, -27.8, ra, dec) > 30.0
     # The pole star is never seen from there.
     assert observatory.next_dark(30.0, 89.0, start, LSST) == start
+
+
+def test_a_field_that_never_rises_is_not_waited_for(monkeypatch):
+    """400 days of each of a survey's exposures would be looked through in vain."""
+    looked = []
+    monkeypatch.setattr(observatory, "_dark", lambda ra, dec, mjd, site: looked.append(mjd) or np.zeros(len(mjd), bool))
+    assert observatory.next_dark(30.0, 80.0, 60000.3, LSST) == 60000.3
+    assert observatory.next_dark(30.0, -60.0, 60000.3, CFHT) == 60000.3
+    assert looked == []
+    # One that does is, whether it is high or just high enough.
+    for dec in (-30.0, 29.0):
+        observatory.next_dark(30.0, dec, 60000.3, LSST)
+        assert looked
+        looked.clear()
