@@ -99,7 +99,7 @@ class MissionConfiguration:
         """A model that is a table of numbers: its rows."""
         return model.numbers(model.content(self.model(key), self.folder))
 
-    def rows(self, key: str) -> tuple[dict[str, str], ...]:
+    def rows(self, key: str) -> tuple[Mapping[str, str], ...]:
         """A model that is a table of texts: its rows by column name."""
         return model.rows(model.content(self.model(key), self.folder))
 

@@ -18,6 +18,7 @@ from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from types import MappingProxyType
 
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.mission.parameter import Identity, check_record, identity_of, read_rows
@@ -112,9 +113,10 @@ def numbers(data: bytes) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(entry) if entry else math.nan for entry in row) for row in table[1:])
 
 
-def rows(data: bytes) -> tuple[dict[str, str], ...]:
+@lru_cache(maxsize=256)
+def rows(data: bytes) -> tuple[Mapping[str, str], ...]:
     """A table of texts by column name; lines that begin with '#' are comments."""
-    return tuple(csv.DictReader(_lines(data)))
+    return tuple(MappingProxyType(row) for row in csv.DictReader(_lines(data)))
 
 
 def _lines(data: bytes) -> list[str]:

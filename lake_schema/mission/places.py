@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from fnmatch import translate
 from functools import cache
@@ -36,7 +36,7 @@ class Known(Protocol):
     """What is asked of a mission configuration."""
 
     def value(self, key: str) -> float: ...
-    def rows(self, key: str) -> tuple[dict[str, str], ...]: ...
+    def rows(self, key: str) -> tuple[Mapping[str, str], ...]: ...
     def __contains__(self, key: object) -> bool: ...
 
 

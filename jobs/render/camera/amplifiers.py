@@ -16,6 +16,7 @@ rows: pixels, overscan.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -36,7 +37,7 @@ Number = TypeVar("Number", bound=np.generic)
 _MOST_SPREAD = 3.0
 # Crosstalk falls off with the distance of two outputs, in amplifiers, as so high a power, up to so many; outputs at the
 # other end of the columns are as much farther away (as measured in LSSTCam: less than 5e-5 beyond the neighbours).
-_FALL, _FARTHEST, _OTHER_END = 2.0, 4.0, 2.0
+_FALL, _FARTHEST, _OTHER_END = 2.6, 4.0, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +224,7 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
     return Layout(detector.nx, detector.ny, prescan, overscan, more, found)
 
 
-def _table(section: str, mission: MissionConfiguration) -> tuple[dict[str, str], ...]:
+def _table(section: str, mission: MissionConfiguration) -> tuple[Mapping[str, str], ...]:
     """Rows of the amplifiers of a ground camera."""
     key = f"{section}.amplifiers"
     rows = mission.rows(key) if section.startswith("ext.") and key in mission else ()

@@ -19,6 +19,7 @@ Ref : Pirzkal & Ryan 2017, STScI WFC3 ISR 2017-01 (the form); laws of the orders
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,7 +87,7 @@ def direction(grism: str, section: str, mission: MissionConfiguration) -> float:
     return float(_rows(grism, section, mission)[0]["direction_deg"])
 
 
-def _rows(grism: str, section: str, mission: MissionConfiguration) -> list[dict[str, str]]:
+def _rows(grism: str, section: str, mission: MissionConfiguration) -> list[Mapping[str, str]]:
     """Of a grism's laws; BadInput where there is none of that name."""
     rows = mission.rows(f"{section}.traces")
     own = [row for row in rows if row["grism"] == grism]
@@ -95,7 +96,7 @@ def _rows(grism: str, section: str, mission: MissionConfiguration) -> list[dict[
     return own
 
 
-def _coefficients(rows: list[dict[str, str]], axis: str, highest: int, to_field: Float) -> Float:
+def _coefficients(rows: Sequence[Mapping[str, str]], axis: str, highest: int, to_field: Float) -> Float:
     """float64[highest + 1, 3] pixels of t^i, of (1, x0, y0)."""
     powers = {int(row["power"]): row for row in rows if row["axis"] == axis}
     out = np.zeros((highest + 1, 3))

@@ -112,3 +112,14 @@ def test_what_a_request_gives_is_taken_as_it_is():
 def test_a_detector_too_small_for_its_amplifiers_is_refused():
     with pytest.raises(BadInput, match=r"detector S29: 1 x 8 pixels for 2 amplifiers"):
         layout_of(replace(detectors.detector("decam", "S29", MISSION), nx=1, ny=8))
+
+
+def test_crosstalk_beyond_neighbours_is_as_little_as_measured():
+    """Rubin Observatory, LSSTCam: 1.5e-4 to 2.9e-4 between neighbours, less than 5e-5 between others."""
+    for one in detectors.detectors("lsstcam", MISSION)[:60]:
+        own = layout_of(one)
+        found = amplifiers.couplings(2.2e-4, 2.9e-4, one, own)
+        columns, top = np.array([(a.pixels.x // own.width, a.read_top) for a in own.amplifiers]).T
+        neighbours = (np.abs(columns[:, None] - columns) == 1) & (top[:, None] == top)
+        assert 1.4e-4 < found[neighbours].min() < found[neighbours].max() <= 2.9e-4
+        assert 0.0 < found[~neighbours].max() < 5e-5

@@ -12,6 +12,7 @@ from jobs.render.effects.readout.traps import Traps
 from jobs.render.effects.scene import Scene
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
+from lake_schema.mission.parameter import CAMERAS
 from tests.jobs.render.effects.readout.test_charge_transfer import every_transfer
 
 MISSION = resolve()
@@ -152,3 +153,12 @@ def test_muons_come_at_the_site_s_rate_through_the_silicon_s_thickness():
     np.testing.assert_allclose(length[length > 1.0], across[length > 1.0], rtol=0.05)
     # The mean of cos over a flux of cos^3: 4 / 5.
     assert cosine.mean() == pytest.approx(0.8, abs=0.01)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_muons_go_with_area_and_height(camera):
+    """LSSTCam's 0.2 a second on 16.4 cm2; above 3000 m half as many again."""
+    key, one = f"ext.{camera}", detectors.detectors(camera, MISSION)[0]
+    area = one.nx * one.ny * MISSION.value(f"{key}.fpa.pixel_size", "cm / pix") ** 2
+    high = 1.5 if MISSION.value(f"{key}.site.height", "m") > 3000.0 else 1.0
+    assert MISSION.value(f"{key}.cosmic_rays.rate", "1 / s") == pytest.approx(0.0122 * area * high, rel=0.06)
