@@ -191,6 +191,7 @@ class _Band:
     scatter: float = 0.0
     night: Night | None = None
     detector: Detector | None = None
+    curve: Passband | None = None
 
     @classmethod
     def of(cls, exposure: Exposure, mission: MissionConfiguration, curve: Passband | None) -> _Band:
@@ -202,8 +203,9 @@ class _Band:
         if camera not in CAMERAS:
             return cls(zero_point, sky)
         seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec")
+        curve = curve or passbands.load(band)
         night = Night.of(first, band, (zero_point, sky.constant), mission, curve)
-        return cls(zero_point, sky, seeing, mission.value(f"{prefix}.seeing_scatter", "dex"), night, first)
+        return cls(zero_point, sky, seeing, mission.value(f"{prefix}.seeing_scatter", "dex"), night, first, curve)
 
 
 def _column(name: str, values: list[Any]) -> Any:
@@ -217,9 +219,9 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
     airmass: float | None = None
     zenith: float | None = None
     seeing = _seeing(e, band, seed) if e.seeing is None else e.seeing
-    if night is not None and band.detector is not None:
+    if night is not None and band.detector is not None and band.curve is not None:
         if e.psf is None:
-            ground_psf.check(seeing, band.detector, mission)
+            ground_psf.check(seeing, band.detector, band.curve, mission)
         airmass, zenith = observatory.aloft(e.ra, e.dec, e.mjd, night.site)
         fainter = night_sky.fainter(night, airmass)
     if e.image_type in _DARK_TYPES:

@@ -1,7 +1,7 @@
 """Light through turbulent air: long-exposure transfer function of von Karman turbulence, and refraction.
 
 transfer      what passes, by the distance of two points of the pupil
-fried_length  that of a seeing;  fwhm : the seeing of it
+fried_length  that of a seeing;  fwhm : the seeing of it;  finest : the least that there is
 refraction    how far a wavelength is lifted towards the zenith
 """
 
@@ -51,6 +51,12 @@ def fwhm(wavelength: float, fried: float, outer: float) -> float:
 
 
 @lru_cache(maxsize=256)
+def finest(wavelength: float, outer: float) -> float:
+    """The least FWHM, arcsec, that is looked for; wavelength : A;  outer : outer scale, m."""
+    return fwhm(wavelength, _LONGEST * outer, outer)
+
+
+@lru_cache(maxsize=256)
 def fried_length(seeing: float, wavelength: float, outer: float) -> float:
     """Fried length, m, of air through which a point has a FWHM of `seeing`.
 
@@ -58,7 +64,7 @@ def fried_length(seeing: float, wavelength: float, outer: float) -> float:
     Errors : OutOfRange for a seeing that the turbulence does not make
     """
     ends = tuple(ratio * outer for ratio in (_SHORTEST, _LONGEST))
-    worst, best = (fwhm(wavelength, fried, outer) for fried in ends)
+    worst, best = fwhm(wavelength, ends[0], outer), finest(wavelength, outer)
     if not best <= seeing <= worst:
         raise OutOfRange("seeing, arcsec", seeing, best, worst)
     # Of an infinite outer scale the length would be this: it is between that and half of it but for the sharpest.

@@ -95,12 +95,17 @@ def air_of(exposure: ExposureRow, detector: Detector, mission: MissionConfigurat
     return Air(exposure.seeing, shear, slope, lift, zenith, mission.value(f"{section}.site.height", "m"))
 
 
-def check(seeing: float, detector: Detector, mission: MissionConfiguration) -> None:
-    """Refuse a seeing, arcsec, that is finer than a pixel, and a pupil that has no such area."""
-    Telescope.of(detector.section, mission)
-    if not detector.pixel_scale <= seeing <= _WORST:
+def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
+    """Refuse a seeing, arcsec, finer than a pixel or than turbulence makes, and a pupil that has no such area.
+
+    detector : of the camera;  band : passband;  mission : the mission database
+    """
+    outer, slope = Telescope.of(detector.section, mission).outer, mission.value(f"{detector.section}.psf.seeing_slope")
+    waves = _waves(band, Air(seeing, slope=slope, lift=1.0))
+    best = max(atmosphere.finest(wave, outer) * (wave / waves.mean()) ** -slope for wave in waves.tolist())
+    if not max(best, detector.pixel_scale) <= seeing <= _WORST:
         name = f"seeing of {detector.section} through a turbulent atmosphere, arcsec"
-        raise OutOfRange(name, seeing, detector.pixel_scale, _WORST)
+        raise OutOfRange(name, seeing, max(best, detector.pixel_scale), _WORST)
 
 
 def through_air(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
@@ -111,11 +116,8 @@ def through_air(air: Air, detector: Detector, band: Passband, mission: MissionCo
     Errors    : OutOfRange for a seeing of less than a pixel, or that its air does not make
     Error     : 1e-3 of the peak from the pupil's samples
     """
+    check(air.seeing, detector, band, mission)
     scale = detector.pixel_scale
-    if air.seeing < scale:
-        raise OutOfRange(
-            f"seeing of {detector.section} through a turbulent atmosphere, arcsec", air.seeing, scale, 10.0
-        )
     waves = _waves(band, air)
     widths = air.seeing * (waves / waves.mean()) ** air.slope
     telescope = Telescope.of(detector.section, mission)

@@ -21,8 +21,9 @@ SAMPLES, DETAIL = 3, 0.4
 # Largest side of a plane, pixels, and of the largest stamp of a point; what lies outside (VIS: 0.2 %) is drawn for
 # bright stars alone (drawing/far_light.py).
 SIDE = 512
-# Side and samples a pixel of the drawing that tells the width.
-_CORE, _FINE = 243, 9
+# Side of the drawing that tells the width, and its samples a pixel: as many as let it hold what is broad.
+_CORE, _FINE = 243, (9, 3, 1)
+_WITHIN = slice(_CORE // 6, -(_CORE // 6))
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,13 +151,25 @@ def tabulated(
     around = np.asarray(maximum(image, square, np.arange(side // 2)))
     rim = np.maximum(np.maximum.accumulate(around[::-1])[::-1], 0.0)
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
-    core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / _FINE, method="no_pixel", dtype=float)
-    with_pixel = core.array if has_pixel else uniform_filter(core.array, _FINE)
-    # About the middle of the core: a user's PSF may lie off the source's place.
-    bright = with_pixel > 0.5 * with_pixel.max()
-    y, x = (float(at[bright].mean()) + 1.0 for at in np.indices(with_pixel.shape))
-    fwhm = float(galsim.Image(with_pixel, scale=pixel_scale / _FINE).calculateFWHM(center=galsim.PositionD(x, y)))
+    fwhm = _width(profile, pixel_scale, has_pixel)
     return Psf(profile, pixel_scale, surface, rim, outside, fwhm, planes, None if has_pixel else 0.0)
+
+
+def _width(profile: galsim.GSObject, pixel_scale: float, has_pixel: bool) -> float:
+    """FWHM with the pixel, arcsec.
+
+    profile, pixel_scale, has_pixel : as of `tabulated`
+    """
+    for samples in _FINE:
+        core = profile.drawImage(nx=_CORE, ny=_CORE, scale=pixel_scale / samples, method="no_pixel", dtype=float)
+        with_pixel = core.array if has_pixel else uniform_filter(core.array, samples)
+        bright = with_pixel > 0.5 * with_pixel.max()
+        # What ends well within the drawing needs no coarser one.
+        if bright[_WITHIN, _WITHIN].sum() == bright.sum():
+            break
+    # About the middle of the core: a user's PSF may lie off the source's place.
+    y, x = (float(at[bright].mean()) + 1.0 for at in np.indices(with_pixel.shape))
+    return float(galsim.Image(with_pixel, scale=pixel_scale / samples).calculateFWHM(center=galsim.PositionD(x, y)))
 
 
 def spectrum_of(psf: Psf, size: int, reach: int) -> Array:

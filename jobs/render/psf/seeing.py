@@ -37,10 +37,13 @@ def of_exposure(
     return ground.through_air(ground.air_of(exposure, detector, mission), detector, band, mission, positions)
 
 
-def check(seeing: float, detector: Detector, mission: MissionConfiguration) -> None:
-    """Refuse a seeing, arcsec, or a pupil that there is no PSF of; detector : of a ground camera."""
+def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
+    """Refuse a seeing, arcsec, or a pupil that there is no PSF of.
+
+    detector : of a ground camera;  band : passband;  mission : the mission database
+    """
     if mission.value(f"{detector.section}.psf.profile") not in (_GAUSSIAN, _MOFFAT):
-        ground.check(seeing, detector, mission)
+        ground.check(seeing, detector, band, mission)
 
 
 def edges_of(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges | None:

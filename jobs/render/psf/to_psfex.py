@@ -21,7 +21,7 @@ _HALF, _MOST, _SAMPLES = 5.0, 63, 2
 
 
 def written(psf: Psf, detector: Detector, path: Path) -> None:
-    """Write the model of a detector; its flux is 1 within its side, 10 FWHM.
+    """Write the model of a detector; its flux is 1 within its side, 10 FWHM or as much as 127 samples hold.
 
     Error : what of the PSF goes with a source's colour is left out;  size 1e-3, ellipticity 1e-3
     """

@@ -13,7 +13,7 @@ from jobs.fluxes import passbands
 from jobs.render.camera import astrometry, detectors
 from jobs.render.camera.astrometry import wcs
 from jobs.render.drawing import stamps, transfer
-from jobs.render.psf import aberrations, atmosphere, ground, seeing, spikes
+from jobs.render.psf import aberrations, atmosphere, ground, seeing, spikes, to_psfex
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
 from lake_schema.tables.exposures import ExposureRow
@@ -208,6 +208,29 @@ def test_a_profile_is_chosen_by_a_number():
 def test_a_seeing_finer_than_a_pixel_is_refused():
     with pytest.raises(OutOfRange, match=r"seeing of ext\.lsstcam .*0.15 is outside"):
         psf_of(air=ground.Air(0.15))
+
+
+def test_a_seeing_that_turbulence_does_not_make_is_refused_before_it_is_rendered():
+    """Waves of two metres at most have no air of half an arcsec."""
+    calm = resolve(overrides={"ext.lsstcam.psf.outer_scale": (2.0, "m")})
+    detector, band = small("lsstcam", "R22_S11"), passbands.load("lsst_r")
+    for found in (seeing.check, lambda wide, *others: ground.through_air(ground.Air(wide), *others, 1)):
+        with pytest.raises(OutOfRange, match=r"seeing of ext\.lsstcam .*0.5 is outside"):
+            found(0.5, detector, band, calm)
+    seeing.check(1.1, detector, band, calm)
+    assert ground.through_air(ground.Air(1.1), detector, band, calm, 1).fwhm == pytest.approx(1.1, rel=0.05)
+
+
+@pytest.mark.parametrize("wide", [4.0, 9.5])
+def test_the_worst_seeing_has_its_width(wide):
+    """Of what is wider than the core in which a FWHM is looked for; its PSFEx model has more than a sample."""
+    detector, band = small("lsstcam", "R22_S11"), passbands.load("lsst_r")
+    psf = ground.through_air(ground.Air(wide), detector, band, MISSION, 1)
+    assert psf.fwhm == pytest.approx(psf.profile.calculateFWHM(), rel=5e-3)
+    # Spikes are as narrow as in any seeing.
+    assert psf.fwhm == pytest.approx(wide, rel=0.04)
+    planes, _ = to_psfex.model_of(psf)
+    assert planes.shape[-1] > 100
 
 
 def test_the_brightest_star_has_no_seam_and_no_hole():
