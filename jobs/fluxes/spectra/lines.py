@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,7 @@ class Profiles:
     f_lambda: Float
 
 
+@cache
 def line_list() -> tuple[Line, ...]:
     """All lines, primaries before their secondaries."""
     with TABLE.open(newline="", encoding="utf-8") as file:
