@@ -2,7 +2,7 @@
 
 Image           an image with its header cards
 write_images    images -> one file: checksums, the same bytes for the same input; whole numbers packed where wanted
-text_of         header cards as lines of text
+text_of         header cards as lines of text;  cards_of_text : and back
 read_images     a file -> images; checksums are demanded and verified, sizes checked before data
 """
 
@@ -56,6 +56,11 @@ class Image:
 def text_of(cards: Sequence[Card]) -> str:
     """Header cards as lines of text."""
     return "".join(f"{str(fits.Card(*card)).rstrip()}\n" for card in cards)
+
+
+def cards_of_text(lines: str) -> tuple[Card, ...]:
+    """What `text_of` wrote -> header cards."""
+    return tuple((card.keyword, card.value, card.comment) for card in map(fits.Card.fromstring, lines.splitlines()))
 
 
 def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> None:

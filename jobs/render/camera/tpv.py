@@ -48,7 +48,7 @@ def cards(header: Sequence[Card]) -> tuple[Card, ...]:
     for keyword, value, comment in header:
         if keyword in ("CTYPE1", "CTYPE2"):
             out.append((keyword, f"{str(value)[:5]}TPV", "gnomonic projection, distortion as PV"))
-        elif not _is_sip(keyword):
+        elif not is_sip(keyword):
             out.append((keyword, value, comment))
         elif keyword == "A_ORDER":
             out += [card for axis in (1, 2) for card in _pv_cards(axis, bent[axis - 1])]
@@ -83,7 +83,8 @@ def _sip(values: Mapping[str, Any], name: str) -> Float:
     return np.array([[float(values.get(f"{name}_{p}_{q}", 0.0)) for q in range(side)] for p in range(side)])
 
 
-def _is_sip(keyword: str) -> bool:
+def is_sip(keyword: str) -> bool:
+    """Whether a card is of a distortion as SIP."""
     name, *powers = keyword.split("_")
     return name in ("A", "B") and (powers == ["ORDER"] or (len(powers) == 2 and all(p.isdigit() for p in powers)))
 

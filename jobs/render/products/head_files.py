@@ -6,6 +6,7 @@ in place of those in the file.
 beside     path of an image -> path of its text
 text       images of a file -> cards, the distortion as TPV
 write      the same into a file
+first      such a file -> cards of its first image
 
 Ref : SCAMP and SWarp, "external headers"
 """
@@ -17,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 from jobs.render.camera import tpv
 from lake_schema.fits import images
-from lake_schema.fits.images import Image
+from lake_schema.fits.images import Card, Image
 
 # Of a header, what stands in such a text: the WCS.
 _KEPT = ("RADESYS", "CTYPE", "CUNIT", "CRVAL", "CRPIX", "CD", "PV")
@@ -38,8 +39,21 @@ def write(said: Iterable[str], path: Path) -> None:
     path.write_text("".join(said), encoding="ascii")
 
 
+def first(path: Path) -> tuple[Card, ...]:
+    """Of an image's file, what the text beside it says of its first image; nothing where there is none."""
+    said = path.with_suffix(".head")
+    if not said.is_file():
+        return ()
+    return tuple(card for card in images.cards_of_text(said.read_text("ascii").split("END\n")[0]) if is_place(card[0]))
+
+
+def is_place(keyword: str) -> bool:
+    """Whether a card is of the WCS."""
+    return keyword.rstrip("0123456789_") in _KEPT
+
+
 def _block(unit: Image) -> str:
-    cards = [card for card in tpv.cards(unit.cards) if card[0].rstrip("0123456789_") in _KEPT]
+    cards = [card for card in tpv.cards(unit.cards) if is_place(card[0])]
     if not cards:
         return ""
     # J2000 is as near to ICRS as these tools tell.

@@ -1,5 +1,6 @@
 """A file of a detector -> pixels.
 
+placed     cards of a file's first header, with its true place on the sky
 frame      a science file or a truth map -> the detector's pixels in one piece, as stored
 electrons  the same in electrons, the bias of a science file subtracted
 """
@@ -12,9 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from jobs.render.camera import tpv
 from jobs.render.camera.sections import Section
 from jobs.render.channels import registry
 from jobs.render.channels.readout import ReadoutMode
+from jobs.render.products import head_files, raw_pointing
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 
@@ -26,8 +29,8 @@ def frame(path: Path) -> images.Image:
     """A file's pixels [ny, nx], of a science file without pre- and overscan, with the header of the whole."""
     read = images.read_images(path)
     if read[0].data is not None and _DATA not in _header(read):
-        return read[0]
-    return images.Image(_mode(path, read).pixels(read), _trimmed(read[0].cards))
+        return images.Image(read[0].data, placed(path, read[0].cards))
+    return images.Image(_mode(path, read).pixels(read), _trimmed(placed(path, read[0].cards)))
 
 
 def electrons(path: Path) -> images.Image:
@@ -41,7 +44,23 @@ def electrons(path: Path) -> images.Image:
         return images.Image(np.asarray(read[0].data, float), read[0].cards)
     if unit == "":
         raise BadInput(f"{path}: its pixels have no unit: they are not electrons")
-    return images.Image(_mode(path, read).electrons(read), _trimmed(read[0].cards))
+    return images.Image(_mode(path, read).electrons(read), _trimmed(placed(path, read[0].cards)))
+
+
+def placed(path: Path, cards: Sequence[images.Card]) -> tuple[images.Card, ...]:
+    """Cards of a raw file's header; where that is not sure of its place, with the true one, from its head file."""
+    if all(key not in raw_pointing.ERRORS for key, *_ in cards):
+        return tuple(cards)
+    true = {card[0]: card for card in head_files.first(path) if not card[0].startswith("CRPIX")}
+    if not true:
+        return tuple(cards)
+    boresight = {"RA": true["CRVAL1"][1], "DEC": true["CRVAL2"][1]}
+    kept = [
+        (key, boresight.get(key, value), text)
+        for key, value, text in cards
+        if key.startswith("CRPIX") or not (head_files.is_place(key) or tpv.is_sip(key) or key in raw_pointing.ERRORS)
+    ]
+    return (*kept, *true.values())
 
 
 def _trimmed(cards: Sequence[images.Card]) -> tuple[images.Card, ...]:

@@ -123,8 +123,8 @@ def of_lake(
 
 
 def header_of(path: Path) -> tuple[Card, ...]:
-    """Cards of the common header."""
-    return images.read_images(path)[0].cards
+    """Cards of the common header, with the true place on the sky."""
+    return read_back.placed(path, images.read_images(path)[0].cards)
 
 
 def _applied(cards: Iterable[Card]) -> frozenset[str]:

@@ -46,6 +46,12 @@ def tool(name, where="Debian: apt install source-extractor scamp swarp"):
     return command
 
 
+# Raw headers that are sure of their place.
+SURE = MISSION.overridden_with(
+    {f"ext.{camera}.header.{error}": (0.0, "arcsec") for camera in CAMERAS for error in ("offset", "rotation")}
+)
+
+
 @dataclass(frozen=True)
 class Field:
     """A file of bright stars, its head beside it, and where their light is on the sky."""
@@ -65,16 +71,19 @@ def farthest(camera):
     return replace(detector, bending=detector.bending or radial)
 
 
-def stars_on(camera, sky):
-    """One detector with stars apart, of a signal-to-noise ratio of 600; sky : of a ground camera, e-/s/pix."""
-    detector = farthest(camera)
+def stars_on(camera, sky, detector=None, pointed=None, mission=SURE, at=None, way="raw"):
+    """One detector with stars of a signal-to-noise ratio of 600; sky : of a ground camera, e-/s/pix.
+
+    pointed : ra, dec, position angle of the boresight;  at : ra, dec of the stars, None = apart
+    """
+    detector = detector or farthest(camera)
     # In the middle of amplifiers, however many there are.
     x, y = (axis + SIDE / 32 for axis in nominal.lattice(SIDE, SIDE / 4))
     if camera == "vis":
         quiet = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
         return nominal.rendered(detector, np.full(len(x), 19.0), x, y, forced=quiet)
-    ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
-    where = astrometry.sky_of_pixel(astrometry.wcs(detector, ra, dec, angle), x, y)
+    ra, dec, angle = pointed or boresight_for(detector, 53.1, -27.8, 12.0)
+    where = at or astrometry.sky_of_pixel(astrometry.wcs(detector, ra, dec, angle), x, y)
     band, none, points = BANDS[camera], fields.galaxies([], []), fields.stars(*where)
     # Four hundred thousand electrons of each.
     f_nu = 10 ** (-0.4 * (25.93 - 2.5 * np.log10(4e5 / 100.0) - 23.9))
@@ -85,12 +94,17 @@ def stars_on(camera, sky):
     tables = none, fields.fluxes(none, band, 0.0), points, fields.fluxes(points, band, f_nu)
     effects = registry.CHANNELS["EXT"].effects["science"]
     quiet = nominal.off(*(effect.name for effect in effects if effect.optional and effect.name not in SEEN))
-    return fields.rendered(exposed, detector, tables, MISSION, SURVEY, forced=quiet)
+    return fields.rendered(exposed, detector, tables, mission, SURVEY, forced=quiet, way=way)
 
 
 def written(camera, folder, sky=0.05):
     """A dark sky: raw frames have no steps from it to the overscan."""
-    one = stars_on(camera, sky)
+    return put(stars_on(camera, sky), folder)
+
+
+def put(one, folder):
+    """Into a folder, with the text beside it."""
+    camera = one.exposure.camera
     rows, writers = fits_files.products(one, ())
     path = folder / f"{camera}_science.fits"
     name = rows["path"][0].as_py()
