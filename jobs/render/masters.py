@@ -28,23 +28,30 @@ from lake_schema.store import layout
 
 
 def made(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, Combined, list[Frame]]]:
-    """(kind, master, its frames) of what a detector's calibration frames allow: a bias, then a dark, then a flat.
+    """(kind, master, its frames) of what a detector's calibration frames allow: bias, dark, and a flat of each band.
 
     scratch : folder for the frames while they are combined: 4 bytes a pixel and frame
     """
     shape = frames[0].scene.ny, frames[0].scene.nx
     masters = {kind: calibration.nothing(shape, 0.0) for kind in ("bias", "dark")}
+    if not frames_of.of_types(frames, ("bias",)):
+        raise BadInput(f"detector {frames[0].detector}: the lake has no frame of it of the image type bias")
     for kind in files.KINDS:
-        own = frames_of.of_types(frames, (kind,))
-        if not own and kind == "bias":
-            raise BadInput(f"detector {frames[0].detector}: the lake has no frame of it of the image type bias")
-        if own:
+        for own in _alike(frames_of.of_types(frames, (kind,)), kind):
             frames_of.common(own, (*files.SAME, "MISSION"))
             stack = np.memmap(scratch / kind, np.float32, "w+", shape=(len(own), *shape))
             masters[kind] = _combined(kind, own, masters, stack)
             del stack
             (scratch / kind).unlink()
             yield kind, masters[kind], own
+
+
+def _alike(frames: Sequence[Frame], kind: str) -> list[list[Frame]]:
+    """Frames that one master is made of: flats of one band."""
+    found: dict[str, list[Frame]] = {}
+    for frame in frames:
+        found.setdefault(frame.exposure.band if kind == "flat" else "", []).append(frame)
+    return list(found.values())
 
 
 def _combined(kind: str, frames: Sequence[Frame], masters: Mapping[str, Combined], stack: Array) -> Combined:

@@ -39,7 +39,7 @@ RENDERED: Mapping[str, tuple[str, ...]] = {
     "VIS": ("science", "deep", "self_calibration", "flat", "dark", "charge_injection", "bias"),
     "NISP-P": ("science", "deep", "self_calibration", "standard_star", "flat", "dark"),
     "NISP-S": ("science", "deep", "standard_star", "planetary_nebula", "flat", "dark"),
-    "EXT": ("science", "deep"),
+    "EXT": ("science", "deep", "flat", "dark", "bias"),
 }
 
 EXPOSURES = Table(

@@ -108,7 +108,6 @@ MISTAKES = {
     "a field towards the Sun": (OWN + "mjd = 60950.0\n", "observation[0]: mjd: 126."),
     "no survey": (GROUND.replace('survey = "des"\n', ""), "observation[0].survey"),
     "Euclid and the ground together": (OWN.replace('"VIS"', '"VIS", "EXT"'), "EXT stands alone"),
-    "nothing that is rendered": (EXT + 'image_type = "flat"\n', "no simulator renders EXT flat yet"),
     "no number of frames": (OWN + 'image_type = "bias"\n', "wants exposures"),
     "a calibration of another channel": (OWN + 'image_type = "standard_star"\n', "observation[0].image_type"),
     "fields that see more than the area": (

@@ -1,4 +1,4 @@
-"""The calibration lamps of VIS and NISP."""
+"""The calibration lamps of VIS and NISP, and the dome's of ground cameras."""
 
 from __future__ import annotations
 
@@ -13,3 +13,8 @@ LAMPS: Mapping[str, tuple[int, tuple[str, ...]]] = {
     "vis": (LEDS, ("euclid_vis",)),
     "nisp": (NISP_LAMPS, ("euclid_y", "euclid_j", "euclid_h")),
 }
+
+
+def count(section: str) -> int:
+    """Of a camera, "vis", "nisp" or "ext.decam": of a ground camera's dome one, which shines alike in all bands."""
+    return LAMPS[section][0] if section in LAMPS else 1

@@ -14,7 +14,7 @@ from jobs import rng
 from jobs.fluxes import passbands
 from jobs.render.camera import pointing
 from jobs.render.camera.lamps import LAMPS
-from jobs.render.channels import registry
+from jobs.render.channels import image_types, registry
 from jobs.render.effects.light import calibration_lamp
 from jobs.render.planning.observing_sequence import FILTERS, RED, SETTINGS, offsets
 from jobs.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time, through_grism
@@ -117,8 +117,9 @@ def _seconds(first: Exposure, band: str, block: Observation, mission: MissionCon
         return 0.0
     if block.exposure_time_s is not None:
         return block.exposure_time_s
-    if first.camera == "vis" and first.image_type == "flat":
-        return mission.value("vis.exposure_time_flat", "s")
+    key = f"{image_types.section(first.camera)}.exposure_time_flat"
+    if first.image_type == "flat" and key in mission:
+        return mission.value(key, "s")
     return exposure_time(first.channel, first.camera, band, mission)
 
 

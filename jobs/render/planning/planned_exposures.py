@@ -224,7 +224,8 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
             ground_psf.check(seeing, band.detector, band.curve, mission)
         airmass, zenith = observatory.aloft(e.ra, e.dec, e.mjd, night.site)
         fainter = night_sky.fainter(night, airmass)
-    if e.image_type in _DARK_TYPES:
+    own = registry.CHANNELS[e.channel]
+    if e.image_type in _DARK_TYPES or (own.on_ground and not own.sees_sky(e.image_type)):
         sky = 0.0
     elif sky is None and night is not None:
         sky = night_sky.sky_rate(night, e.ra, e.dec, e.mjd, mission)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jobs.render.camera import astrometry
+from jobs.render.channels import registry
 from jobs.render.reduction import calibration
 from jobs.render.reduction.calibration import FLAGS, Reduced
 from jobs.render.reduction.combining import Combined
@@ -111,7 +112,8 @@ def masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibrat
         flags |= calibration.response_flags(found["flat"])
     if "dark" not in without:
         flags |= calibration.dark_flags(found["dark"])
-    return calibration.Masters(found["bias"], found["dark"], found["flat"], flags, dark_time)
+    through = registry.CHANNELS[frame.exposure.channel].on_ground and "flat" not in without
+    return calibration.Masters(found["bias"], found["dark"], found["flat"], flags, dark_time, through)
 
 
 def reduced_cards(frame: Frame, per_second: bool, without: Sequence[str]) -> tuple[Card, ...]:

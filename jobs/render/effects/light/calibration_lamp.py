@@ -1,6 +1,7 @@
 """Flats: the calibration unit shines with one of its LEDs; what it lights is far from even.
 
-Each has its own wavelengths: of as much light the band detects more or less.
+Each has its own wavelengths: of as much light the band detects more or less. A dome has one
+lamp, as bright in all bands.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import numpy as np
 
 from jobs.fluxes import passbands
 from jobs.fluxes.passbands import Passband
+from jobs.render.camera import lamps
 from jobs.render.camera.lamps import LAMPS
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.light import illumination
@@ -36,7 +38,7 @@ def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
 
     scene : with the parameters of the unit;  led : its number;  nx, ny : pixels of the detector
     """
-    leds, _ = LAMPS[scene.section]
+    leds = lamps.count(scene.section)
     if not 1 <= led <= leds:
         raise OutOfRange("LED", led, 1, leds)
     angle = 2.0 * np.pi * (led - 1) / leds
@@ -83,7 +85,9 @@ def _width(section: str, mission: MissionConfiguration) -> float:
 
 
 def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:
-    level = scene.value("flat.signal", "electron") * seen(scene, scene.lamp)
+    level = scene.value("flat.signal", "electron")
+    if scene.section in LAMPS:
+        level *= seen(scene, scene.lamp)
     return level, *pattern(scene, scene.lamp, scene.nx, scene.ny)
 
 

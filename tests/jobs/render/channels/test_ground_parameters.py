@@ -9,16 +9,17 @@ from jobs.fluxes import passbands
 from jobs.render.camera import bands, detectors
 from jobs.render.channels import ground
 from jobs.render.effects.scene import Scene
-from jobs.render.planning import ground_surveys, planned_exposures
+from jobs.render.planning import calibration_frames, ground_surveys, planned_exposures
+from jobs.render.products import raw_pointing
 from jobs.request.area import Area
 from jobs.request.observations import Observation
 from lake_schema.mission.configuration import MissionConfiguration, resolve
 from lake_schema.mission.parameter import CAMERAS
 from tests.jobs.render import fields
 
-# Declared, and asked for by nothing that renders: what zero points are checked with; optics that distort, and what a
-# raw header says wrong, which nothing simulates yet.
-WAITING = ("*.collecting_area", "*.throughput", "*.fpa.distortion*", "*.header.*")
+# Declared, and asked for by nothing that renders: what zero points are checked with; optics that distort, which nothing
+# simulates yet.
+WAITING = ("*.collecting_area", "*.throughput", "*.fpa.distortion*")
 
 
 def seen(method, found):
@@ -45,11 +46,14 @@ def asked(camera, mission, monkeypatch):
         for profile in (1.0, 2.0):
             own = mission.overridden_with({f"ext.{camera}.psf.profile": (profile, "")})
             ground.CHANNEL.psf(shown, one, passbands.load(band), own, 1)
+    raw_pointing.believed(shown, one, mission, 1)
     surveys = [row["survey"] for row in mission.rows("survey.external") if row["camera"] == camera]
     block = Observation(("EXT",), survey=surveys[0], exposures=1)
     assert [*ground_surveys.exposures(block, Area(ra=60.0, dec=0.0, radius=1.0), mission, 1, 60500.0)]
+    flat = Observation(("EXT",), "flat", surveys[0], exposures=1)
+    assert [*calibration_frames.exposures(flat, camera, (60.0, 0.0), mission, 1, 60500.0)]
     scene = Scene(mission, one.section, 90.0, 10.0, 1e6, one)
-    for effect in ground.SKY:
+    for effect in {effect.name: effect for effects in ground.EFFECTS.values() for effect in effects}.values():
         effect.parameters(scene)
         effect.contribution(scene)
     return found
