@@ -35,7 +35,7 @@ from jobs.render.sources.catalogue_rows import LENSES
 from jobs.render.sources.disc_structure import DiscStructure
 from jobs.render.sources.solar_system import Population
 from jobs.request import structure
-from jobs.request.schema import Request
+from jobs.request.schema import WRITTEN, Request
 from jobs.request.structure import Arms, Stamps
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema.errors import BadInput
@@ -109,7 +109,7 @@ def products(
     exposures     : rows of the table;  every, asked : rows of the table `tasks`, all and those to be rendered now
     """
     facts = {
-        **common_facts(request, "seed", "noise_seed", "accuracy", "mission", "effects", "truth", "compression", "wcs"),
+        **common_facts(request, "seed", "noise_seed", "accuracy", "mission", "effects", "truth", *WRITTEN),
         "mission": mission_of(request.mission).fingerprint,
         "inputs": {name: version.key for name, version in inputs.items()},
     }
@@ -205,8 +205,8 @@ def work(lake: Path, facts: Json) -> Output:
         aim, rows_, own = prepared(lake, facts)
         noise = request.get("noise_seed")
         rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
-    rice = request["compression"] == "rice"
-    rows, files = fits_files.products(rendered, request["truth"], rice, request.get("wcs", "sip"))
+    rice, form = request["compression"] == "rice", request.get("wcs", "sip")
+    rows, files = fits_files.products(rendered, request["truth"], rice, form)
     drawn = truth_table.truth(rendered)
     place = facts["exposure_id"], facts["detector"]
     files = {**files, truth_file(*place): lambda path: parquet.write(path, drawn, RENDERED_TRUTH)}
@@ -233,7 +233,7 @@ def aimed(lake: Path, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
     own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
     detector = detectors.detector(exposed.camera, facts["detector"], own.mission)
     band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
-    return Aim.of(exposed, detector, band, request["seed"]), own, mission
+    return Aim.of(exposed, detector, band, request["seed"], request.get("readout", "raw")), own, mission
 
 
 def prepared(lake: Path, facts: Json) -> tuple[Aim, Rows, Variant]:

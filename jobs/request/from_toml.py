@@ -57,6 +57,8 @@
                    wcs = "sip" | "tpv"   how headers tell the distortion, default: as the instrument's pipeline;
                                          source-extractor, SCAMP and SWarp read TPV, or .head beside the image
                    files = "detector" | "exposure"   also one file of all of an exposure's science images
+                   readout = "raw" | "amplifiers" | "electrons"   of ground cameras: one array, an extension each
+                                         amplifier, or electrons before they are read
 
 Files are found from the folder of the request; their formats are in jobs/fluxes/libraries/spectrum_formats.toml.
 A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
@@ -88,6 +90,7 @@ from jobs.request.schema import (
     LADDER,
     LENSING_NSIDES,
     MOST_SHEAR,
+    READOUTS,
     STATUSES,
     TRUTH,
     Effects,
@@ -170,7 +173,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
     curves = files.curves(fluxes, folder)
     bands = _strings(fluxes, "fluxes.bands")
     mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
-    products_ = _section(table, "products", {"truth", "compression", "wcs", "files"})
+    products_ = _section(table, "products", {"truth", "compression", "wcs", "files", "readout"})
     solar_system = _section(table, "solar_system", {"bodies"})
     bodies = files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
     universe = _universe(_section(table, "universe", set(Universe.__slots__)))
@@ -188,6 +191,7 @@ def from_table(table: Toml, folder: Path = Path()) -> Request:
         compression=_string(products_, "products.compression", COMPRESSIONS, "none"),
         wcs=_string(products_, "products.wcs", CONVENTIONS) if "wcs" in products_ else None,
         files=_string(products_, "products.files", FILES, "detector"),
+        readout=_string(products_, "products.readout", READOUTS, "raw"),
         curves=curves,
         observations=blocks,
         effects=_effects(_section(table, "effects", {"on", "off"})),

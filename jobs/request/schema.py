@@ -24,6 +24,10 @@ COMPRESSIONS = ("none", "rice")
 # As jobs/render/camera/tpv.py (a test compares them).
 CONVENTIONS = ("sip", "tpv")
 FILES = ("detector", "exposure")
+# Of ground cameras (jobs/render/channels/ground.py; test_readout.py compares them).
+READOUTS = ("raw", "amplifiers", "electrons")
+# Parts of a request that say how images are written.
+WRITTEN = ("compression", "wcs", "readout")
 DENSITIES = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
@@ -134,6 +138,7 @@ class Request:
     psfs    : (band, file) of PSFs in place of ours
     files   : what has a file of its own, one of FILES
     wcs     : how headers tell the distortion of the optics, one of CONVENTIONS; None = as the instrument's pipeline
+    readout : how files of ground cameras are wanted, one of READOUTS
     bodies  : file of moving bodies in place of ours
     sources : the only sources that there are, in place of the universe
     structure : what galaxies have beside their profiles
@@ -161,6 +166,7 @@ class Request:
     compression: str = "none"
     wcs: str | None = None
     files: str = "detector"
+    readout: str = "raw"
     psfs: tuple[tuple[str, str], ...] = ()
     bodies: Path | None = None
     noise_seed: int | None = None

@@ -31,7 +31,7 @@ def join(
     """Write a file of all the files' arrays, one file after the other; replaces `path` in one rename.
 
     path   : of the file, which begins with a header alone
-    files  : each with a name, which its arrays get that have none;  shared : keywords that are of all files
+    files  : each with a name, with which those of its arrays begin;  shared : keywords that are of all files
     more   : cards of the first header, after the shared ones
     in_each : keywords that arrays which have them keep, though they are shared
     Cards of a file that are not shared, or differ, go to each of its arrays, unless that has its own. Of the arrays
@@ -60,7 +60,7 @@ def _plain(unit: Any, name: str, common: set[str], kept: set[str], first: Any) -
     image = images.image_of(unit)
     own = tuple(card for card in image.cards if card[0] not in common - kept)
     cards = (*_INHERIT * ("INHERIT" not in unit.header), *_cards_of(first, {*common, *unit.header}), *own)
-    return images.extension(Image(image.data, cards, image.name or name))
+    return images.extension(Image(image.data, cards, _name(image.name, name)))
 
 
 def _packed(unit: Any, name: str, common: set[str], kept: set[str], first: Any) -> Any:
@@ -69,9 +69,13 @@ def _packed(unit: Any, name: str, common: set[str], kept: set[str], first: Any) 
         del unit.header[key]
     for card in (*_INHERIT * ("INHERIT" not in unit.header), *_cards_of(first, {*common, *unit.header})):
         unit.header.append(card, end=True)
-    if unit.header.get("EXTNAME", "") in _NAMELESS:
-        unit.header["EXTNAME"] = name
+    unit.header["EXTNAME"] = _name(unit.header.get("EXTNAME", ""), name)
     return unit
+
+
+def _name(own: str, file: str) -> str:
+    """Of an array: its file's, and its own where it has one."""
+    return file if own in _NAMELESS else own if own.startswith(file) else f"{file}.{own}"
 
 
 def _first_cards(file: Path) -> dict[str, Card]:

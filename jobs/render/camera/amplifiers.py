@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from jobs import rng
 from jobs.render.camera.detectors import Detector
-from jobs.render.camera.sections import Section
+from jobs.render.camera.sections import Section, Sections
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
@@ -139,11 +139,40 @@ class Layout:
 
     def bias_of(self, number: int) -> Section:
         """Its overscan columns beside its pixels in the raw file; its prescan where it has no others."""
-        amplifier, (strip, _) = self.amplifiers[number], self._strips(number)
         first, many = (self.prescan, self.overscan) if self.overscan else (0, self.prescan)
+        return self._columns_of(number, first, many)
+
+    def prescan_of(self, number: int) -> Section:
+        """Its columns that are read before its pixels, in the raw file."""
+        return self._columns_of(number, 0, self.prescan)
+
+    def overscan_rows_of(self, number: int) -> Section:
+        """The rows that are read after its pixels, in the columns of these, in the raw file."""
+        own, (_, band) = self.pixels_of(number), self._strips(number)
+        return Section(own.x, band, own.nx, self.rows)
+
+    def _columns_of(self, number: int, first: int, many: int) -> Section:
+        """So many of what of an amplifier is no pixel, from one on as they are read."""
+        amplifier, (strip, _) = self.amplifiers[number], self._strips(number)
         if amplifier.read_right:
             first = self.scans - first - many
         return Section(strip + first, self.pixels_of(number).y, many, self.height)
+
+    def placed(self, plane: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
+        """What an amplifier reads [rows, columns] in readout order -> as it lies on the detector."""
+        return _turned(plane, self.amplifiers[number])
+
+    def sections_of(self, number: int) -> Sections:
+        """Of an amplifier's pixels with their pre- and overscan, as `placed` has them."""
+        amplifier = self.amplifiers[number]
+        x = self.overscan if amplifier.read_right else self.prescan
+        data = Section(x, self.rows if amplifier.read_top else 0, self.width, self.height)
+        before, after = (0, self.prescan), (self.prescan + self.width, self.overscan)
+        first, many = after if self.overscan else before
+        if amplifier.read_right:
+            first = self.scans + self.width - first - many
+        bias = Section(first, 0, many, self.height + self.rows) if many else None
+        return Sections(data, amplifier.pixels, bias)
 
     def raw(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
         """[q, rows, columns] in readout order -> the raw file's image."""

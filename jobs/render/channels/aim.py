@@ -34,14 +34,17 @@ class Aim:
     effects: tuple[Effect, ...]
 
     @classmethod
-    def of(cls, exposure: ExposureRow, detector: Detector, band: Passband | None = None, seed: int = 0) -> Aim:
+    def of(
+        cls, exposure: ExposureRow, detector: Detector, band: Passband | None = None, seed: int = 0, way: str = "raw"
+    ) -> Aim:
         """Of a planned exposure; BadInput where nothing renders it.
 
         exposure : its row;  detector : of its camera
         band     : None = the embedded one of its name;  seed : of the request
+        way      : in which its files are wanted (Channel.read_as)
         """
         kind = exposure.image_type
-        channel = registry.channel_of(exposure.channel, kind, f"exposure {exposure.exposure_id}")
+        channel = registry.channel_of(exposure.channel, kind, f"exposure {exposure.exposure_id}").read_as(way)
         # Exposures that differ in their noise alone see alike; no filter is in front of a grism.
         identity = image_types.identity(replace(exposure, realisation=None))
         seen = filter_wheel.tilted(detector, identity, seed) if channel.disperses is None else detector

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
 
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
@@ -65,6 +66,7 @@ class Channel:
     ramp       : which of the mission's ramps its detectors are read up (Scene.ramp); "" = they are read once
     remembers  : effect that brings what earlier exposures left; None: they leave nothing
     coloured   : effect by which pixels see the colours of sources (Scene.tints); None: all see them alike
+    readouts   : other ways in which a request may have its detectors' files, by their names
     disperses  : how the light of sources is spread out; None: it is not
     """
 
@@ -86,6 +88,7 @@ class Channel:
     remembers: Effect | None = None
     coloured: Effect | None = None
     disperses: Dispersion | None = None
+    readouts: Mapping[str, ReadoutMode] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for effects in self.effects.values():
@@ -93,6 +96,14 @@ class Channel:
                 if not effect.cost > 0.0:
                     what = f"effect {effect.name} has the cost {effect.cost:g}: a forecast would take it as free"
                     raise BadInput(f"{what}; python -m benchmarks.effects measures it")
+
+    def read_as(self, way: str) -> Channel:
+        """With the files that a request asks for; as it is where it has no other way of that name."""
+        if way not in self.readouts:
+            return self
+        mode = self.readouts[way]
+        effects = {kind: tuple(takewhile(lambda e: e.name != mode.before, own)) for kind, own in self.effects.items()}
+        return replace(self, readout=mode, effects=effects)
 
     def sees_sky(self, image_type: str) -> bool:
         """Whether sources shine on the detectors."""

@@ -18,7 +18,7 @@ from jobs.render.effects.charge import (
     poisson,
 )
 from jobs.render.effects.effect import Effect
-from jobs.render.effects.light import background, illumination
+from jobs.render.effects.light import background, calibration_lamp, illumination
 from jobs.render.effects.readout import (
     adc,
     bias_structure,
@@ -53,7 +53,22 @@ SKY = (
     adc.EFFECT,
 )
 
-EFFECTS: Mapping[str, tuple[Effect, ...]] = {"science": SKY, "deep": SKY}
+
+def _from(first: Effect) -> tuple[Effect, ...]:
+    """Of the effects on the sky's light this one, and those after it."""
+    return SKY[SKY.index(first) :]
+
+
+# Of the dome, by day: no sky, and no stars. The lamp's light comes through the telescope, as theirs does.
+FLAT = (calibration_lamp.EFFECT, illumination.EFFECT, *_from(pixel_response.EFFECT))
+
+EFFECTS: Mapping[str, tuple[Effect, ...]] = {
+    "science": SKY,
+    "deep": SKY,
+    "flat": FLAT,
+    "dark": _from(dark_current.EFFECT),
+    "bias": _from(quadrants.AMPLIFIERS),
+}
 
 
 # As VIS, of LSSTCam's R22_S11 (2.1e4 predicted sources; others with 1e3 and 1e5); 0.15 s of sky_s are of its PSF.
@@ -67,6 +82,8 @@ CHANNEL = Channel(
     sky=diffuse_light.ground_sky,
     cost=COST,
     on_ground=True,
+    own_light=(calibration_lamp.EFFECT,),
     tracks=(cosmic_rays.EFFECT,),
     pupil=seeing.edges_of,
+    readouts={"amplifiers": readout.BY_AMPLIFIER, "electrons": readout.ELECTRONS},
 )

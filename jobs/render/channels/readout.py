@@ -4,11 +4,14 @@ FRAME       one array of pixels
 RAMP        the signal of a ramp, and whether it fits, in the frame of pixels that see no light
 RAMP_AND_CHI2  the same, with chi^2 itself
 QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan; quadrant_map: where each lies
+BY_AMPLIFIER  an array of each amplifier, in the detector's own axes with its pre- and overscan
+ELECTRONS   what lies in the pixels before they are read
 AMPLIFIERS  one array: the pixels of all amplifiers as they lie on the detector, their pre- and overscans around them
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -78,12 +81,14 @@ class ReadoutMode:
                 axes; the array itself where it is that already
     pixels    : images of a file -> [ny, nx] its pixels as stored
     electrons : images of a file -> float64[ny, nx] its pixels in e-, the bias subtracted
+    before    : the effect from which on nothing of a channel is applied; "" = all of it is
     """
 
     arrays: Callable[[Frame, Scene, str, WCS], Readout]
     assembled: Callable[[Array, Scene], Array]
     pixels: Callable[[Sequence[Image]], Array]
     electrons: Callable[[Sequence[Image]], Float]
+    before: str = ""
 
 
 # ---------------------------------------------------------------------------------------------- one frame
@@ -278,14 +283,56 @@ def _apart_assembled(array: Array, scene: Scene) -> Array:
     return array if array.ndim == 2 or scene.layout is None else scene.layout.together(array)
 
 
+def _by_amplifier(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
+    """uint16[q, rows, columns] ADU; extensions named as LSST's segments, or as the amplifiers."""
+    own, raw = scene.layout, found.astype(np.uint16)
+    assert own is not None
+    extensions = []
+    for number, amplifier in enumerate(own.amplifiers):
+        parts = own.sections_of(number)
+        across, up = (getattr(parts.data, axis) - getattr(parts.ccd, axis) for axis in "xy")
+        cards: tuple[Card, ...] = (
+            ("AMPNAME", amplifier.name, "amplifier"),
+            *astrometry.cards(astrometry.shifted(system, across, up)),
+        )
+        name = _SEGMENT.sub("Segment", amplifier.name)
+        extensions.append(Extension(name, own.placed(raw[number], number), "adu", cards, number, parts))
+    return Readout(tuple(extensions), raw, own.together(raw))
+
+
+def _assembled_of(read: Sequence[Image], level: Callable[[Array, dict[str, Any]], Array]) -> Array:
+    """Extensions of a file -> [ny, nx] the detector's pixels; level : (array, its cards) -> what is taken of them."""
+    parts = [(unit, {**_header(read[0]), **_header(unit)}) for unit in read[1:]]
+    places = [Section.of(header["CCDSEC"]) for _, header in parts]
+    found = [level(np.asarray(unit.data), header)[Section.of(header["DATASEC"]).slices] for unit, header in parts]
+    out = np.zeros((max(p.y + p.ny for p in places), max(p.x + p.nx for p in places)), found[0].dtype)
+    for place, pixels in zip(places, found, strict=True):
+        out[place.slices] = pixels
+    return out
+
+
+def _above_bias(array: Array, header: dict[str, Any]) -> Float:
+    bias = Section.of(header["BIASSEC"]) if "BIASSEC" in header else None
+    level = float(header["BIAS"]) if bias is None else float(array[bias.slices].mean())
+    return np.asarray((array - level) * float(header["GAIN"]))
+
+
+# An amplifier of LSSTCam is a segment of its sensor.
+_SEGMENT = re.compile(r"^C(?=[01][0-7]$)")
+
+
 def _data(read: Sequence[Image]) -> Array:
     """The detector's pixels; all of a file that has nothing else."""
+    if read[0].data is None:
+        return _assembled_of(read, lambda array, header: array)
     header, array = _header(read[0]), np.asarray(read[0].data)
     return array[Section.of(header["DATASEC"]).slices] if "DATASEC" in header else array
 
 
 def _apart_electrons(read: Sequence[Image]) -> Float:
     """Above the level of each amplifier's bias columns, where there are some."""
+    if read[0].data is None:
+        return _assembled_of(read, _above_bias)
     header, array = _header(read[0]), np.asarray(read[0].data)
     if "NAMPS" not in header:
         return _frame_electrons(read)
@@ -298,3 +345,17 @@ def _apart_electrons(read: Sequence[Image]) -> Float:
 
 
 AMPLIFIERS = ReadoutMode(arrays=_amplifiers, assembled=_apart_assembled, pixels=_data, electrons=_apart_electrons)
+BY_AMPLIFIER = replace(AMPLIFIERS, arrays=_by_amplifier)
+
+
+# ---------------------------------------------------------------------------------------------- electrons in the pixels
+
+
+def _electrons(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
+    """float32[ny, nx] e-, the sky and what else has come in them."""
+    pixels = found.astype(np.float32)
+    own = Extension("", pixels, "electron", sections=Sections.whole(*pixels.shape[::-1]))
+    return Readout((own,), pixels, pixels)
+
+
+ELECTRONS = replace(AMPLIFIERS, arrays=_electrons, before=layout.AMPLIFIERS.name)

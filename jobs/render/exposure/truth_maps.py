@@ -28,6 +28,8 @@ BYTES = {
     # Four groups of a photometric ramp.
     "ramp": 8, **dict.fromkeys(ORDERS.values(), 4),
 }  # fmt: skip
+# Beyond what they hold a pixel is not told.
+_CONVERTERS = ("adc", "signal_adc")
 # Of an image that a grism is in the beam of.
 _GRISM = "dispersed_sky"
 # What adds to a map of the same name as an effect, or of another.
@@ -104,7 +106,7 @@ def complete(
     ):
         if name in wanted and name not in maps:
             maps[name] = np.zeros(shape, dtype)
-    if "saturation" in truth:
+    if "saturation" in truth and any(effect.name in _CONVERTERS for effect in effects):
         largest = scene.of_amplifiers("adc_max", "adu")
         full = raw >= (np.reshape(largest, (-1, 1, 1)) if np.ndim(largest) else largest)
         maps["saturation"] |= mode.assembled(full, scene)

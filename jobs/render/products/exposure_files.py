@@ -14,10 +14,12 @@ from typing import Any
 
 import pyarrow.compute as pc
 
+from jobs.render.camera import detectors
 from jobs.render.products import head_files, headers
 from lake_schema.errors import Damaged
 from lake_schema.fits import joined
 from lake_schema.fits.images import Card
+from lake_schema.mission.published import read_back
 from lake_schema.store import read, reuse
 from lake_schema.store.plan import Json, Output, Part, Plan
 from lake_schema.store.provenance import digest
@@ -28,7 +30,9 @@ _OF_EXPOSURE = (
     "TELESCOP", "INSTRUME", "OBJECT", "RA", "DEC", "AIRMASS", "DETSIZE", "CHANNEL", "FILTER", "IMAGETYP", "LAMP",
     "TARGET", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS", "TIMESYS", "SEEING", "ZEROPNT", "SEED", "NOISSEED",
     "REALIS", "MISSION", "TRUESKY", "ACCFLUX", "ACCSHAPE", "ACCPOS", "ACCBACK", "READMODE", "NG", "NR", "ND", "FRTIME",
-    "ELAPTIME", "REFPIX", "QUALLIM", "PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS", "BUNIT",
+    "ELAPTIME", "REFPIX", "QUALLIM", "PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS", "BUNIT", "OBSTYPE",
+    "PROCTYPE", "PRODTYPE", "EXPNUM", "OBSID", "SEQNUM", "IMGTYPE", "CONTRLLR", "ROTPA", "ROTCOORD", "RASTART",
+    "DECSTART", "AMSTART", "SHUTTIME", "DARKTIME",
 )  # fmt: skip
 
 
@@ -45,9 +49,9 @@ def plan(products: Plan, every: Sequence[Json]) -> Plan:
         held[part.facts["exposure_id"]][part.facts["detector"]] = part.facts[reuse.PRODUCT]
     parts = []
     for number, keys in sorted(held.items()):
-        detectors = sorted(keys)
-        about = {"exposure_id": number, "detectors": detectors, "planned": planned[number]}
-        key = digest({**about, "products": [keys[name] for name in detectors]})
+        names = sorted(keys)
+        about = {"exposure_id": number, "detectors": names, "planned": planned[number]}
+        key = digest({**about, "products": [keys[name] for name in names]})
         parts.append(Part(f"{number:06d}.parquet", {**about, reuse.PRODUCT: key}))
     return Plan(EXPOSURE_FILES, {"products": products.key}, tuple(parts))
 
@@ -73,10 +77,17 @@ def work(lake: Path, facts: Json) -> Output:
             "sources": [sum(row["sources"] for row in rows.values())],
         }
     )
-    files = [(name, products.file(rows[name]["path"])) for name in facts["detectors"]]
-    heads = [products.file(head_files.beside(rows[name]["path"])) for name in facts["detectors"]]
+    order = _in_order(lake, products, exposure["camera"], facts["detectors"])
+    files = [(name, products.file(rows[name]["path"])) for name in order]
+    heads = [products.file(head_files.beside(rows[name]["path"])) for name in order]
     writers = {path: partial(_write, files, _cards(exposure, facts)), head_files.beside(path): partial(_heads, heads)}
     return Output(table, writers)
+
+
+def _in_order(lake: Path, products: read.Version, camera: str, names: Sequence[str]) -> list[str]:
+    """Detectors as the camera's layout numbers them."""
+    mission = read_back(read.version(lake, "mission", products.manifest["facts"]["inputs"]["mission"]))
+    return [one.name for one in detectors.detectors(camera, mission) if one.name in names]
 
 
 def _cards(exposure: dict[str, Any], facts: Json) -> tuple[Card, ...]:

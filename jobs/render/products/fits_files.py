@@ -17,8 +17,8 @@ import pyarrow as pa
 
 from jobs.render.camera import astrometry, observatories, tpv
 from jobs.render.exposure.rendered import Rendered
-from jobs.render.products import head_files, headers
-from lake_schema.fits.images import Image, write_images
+from jobs.render.products import camera_cards, head_files, headers, raw_pointing
+from lake_schema.fits.images import Card, Image, write_images
 from lake_schema.tables.products import PRODUCTS
 
 Writer = Callable[[Path], None]
@@ -38,6 +38,7 @@ def products(
         if content in rendered.maps:
             images[content] = [Image(rendered.maps[content], headers.truth_cards(rendered, content))]
     heads = {key: head_files.text(units) for key, units in images.items()}
+    images["science"] = [replace(unit, cards=_told(rendered, unit.cards)) for unit in images["science"]]
     if (wcs or observatories.of(rendered.exposure.camera).convention) == "tpv":
         images = {key: [replace(unit, cards=tpv.cards(unit.cards)) for unit in units] for key, units in images.items()}
     exposure, detector = rendered.exposure, rendered.detector
@@ -67,6 +68,10 @@ def products(
     return rows, writers
 
 
+def _told(rendered: Rendered, cards: tuple[Card, ...]) -> tuple[Card, ...]:
+    return raw_pointing.cards(cards, rendered.exposure, rendered.detector, rendered.scene.mission, rendered.seed)
+
+
 def _write(units: Sequence[Image], rice: bool, path: Path) -> None:
     write_images(path, units, rice)
 
@@ -74,7 +79,7 @@ def _write(units: Sequence[Image], rice: bool, path: Path) -> None:
 def _science(rendered: Rendered) -> list[Image]:
     """The image; or a header that holds for all, and an extension for each array of the readout."""
     readout = rendered.readout
-    cards = (*headers.science_cards(rendered), *readout.cards)
+    cards = (*headers.science_cards(rendered), *camera_cards.cards(rendered), *readout.cards)
     if [extension.name for extension in readout.extensions] == [""]:
         (only,) = readout.extensions
         # Its own stand for the detector's: its WCS counts what lies around the pixels, too.

@@ -31,6 +31,13 @@ _EVERYWHERE = ("EXPTIME", "FILTER", "DATE-OBS", "MJD-OBS", "TIMESYS")
 # Likewise of arrays of what amplifiers read.
 _OF_READING = ("GAIN", "RDNOISE", "RDNDRAWN", "SATURATE")
 IN_EACH = (*_EVERYWHERE, *_OF_READING, "BUNIT")
+# Of electrons that have not been read.
+_UNREAD: tuple[Card, ...] = (
+    ("GAIN", 1.0, "[electron/electron] of the pixels"),
+    ("RDNOISE", 0.0, "[electron] rms read noise"),
+    ("RDNDRAWN", 0.0, "[electron] the same, as it was drawn"),
+    ("BIAS", 0.0, "[electron] bias level"),
+)
 # Of each number of an accuracy: the end of its keywords, and what it is of.
 _ERRORS = {
     "flux": ("FLUX", "fraction of a source's flux"),
@@ -72,10 +79,12 @@ def science_cards(rendered: Rendered) -> tuple[Card, ...]:
 
 def _of_all(rendered: Rendered) -> tuple[Card, ...]:
     """What amplifiers share; of those that are in one array, their mean, and the lowest of levels."""
+    if rendered.readout.unit == "electron":
+        return (*_UNREAD, ("SATURATE", rendered.scene.value("full_well", "electron"), "[electron] of a full pixel"))
     together = len(rendered.readout.extensions) == 1
     return tuple(
         (key, float(np.min(value) if key == "SATURATE" else np.mean(value)), comment)
-        for key, value, comment in _of_amplifiers(rendered)
+        for key, value, comment in of_amplifiers(rendered)
         if together or np.ndim(value) == 0
     )
 
@@ -124,7 +133,7 @@ def amplifier_cards(rendered: Rendered, number: int | None) -> tuple[Card, ...]:
     """
     if number is None:
         return ()
-    found = ((key, np.atleast_1d(value), comment) for key, value, comment in _of_amplifiers(rendered))
+    found = ((key, np.atleast_1d(value), comment) for key, value, comment in of_amplifiers(rendered))
     return tuple((key, float(values[number]), comment) for key, values, comment in found if len(values) > 1)
 
 
@@ -132,8 +141,8 @@ def _mosaic(rendered: Rendered) -> str:
     return sections.mosaic_size(detectors.detectors(rendered.exposure.camera, rendered.scene.mission))
 
 
-def _of_amplifiers(rendered: Rendered) -> tuple[tuple[str, float | Float, str], ...]:
-    """Keyword, value or values [q], comment."""
+def of_amplifiers(rendered: Rendered) -> tuple[tuple[str, float | Float, str], ...]:
+    """What differs from one amplifier to the other: keyword, value or values [q], comment."""
     scene = rendered.scene
     saturated = "[adu] lowest level of a saturated pixel"
     if scene.ramp:
@@ -194,7 +203,7 @@ def _group_cards(rendered: Rendered) -> tuple[Card, ...]:
     for card in _common(rendered):
         out += _GROUP_AXIS if card[0] == "WCSAXES" else [card]
     out += [card for card in rendered.readout.cards if card[0] in _OF_RAMP]
-    found = ((key, value, text) for key, value, text in _of_amplifiers(rendered) if key in _OF_GROUPS)
+    found = ((key, value, text) for key, value, text in of_amplifiers(rendered) if key in _OF_GROUPS)
     return (*out, *((key, float(value), text) for key, value, text in found if np.ndim(value) == 0))
 
 

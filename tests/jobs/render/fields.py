@@ -103,12 +103,13 @@ def rendered(
     progress=None,
     passband=None,
     noise_seed=None,
+    way="raw",
     **rows,
 ):
     """One detector; exposed : columns of its exposure;  tables : galaxies, their fluxes, stars, theirs."""
     variant = Variant(mission, accuracy, forced or {})
     return render.render(
-        Aim.of(exposure(**exposed), detector, passband),
+        Aim.of(exposure(**exposed), detector, passband, way=way),
         Rows(*tables, **rows),
         variant,
         seed,

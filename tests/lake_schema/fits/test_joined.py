@@ -105,3 +105,12 @@ def test_one_file_at_a_time_is_in_memory(tmp_path):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 6 * big.nbytes
+
+
+@pytest.mark.parametrize("rice", [False, True])
+def test_arrays_named_alike_are_told_apart(tmp_path, rice):
+    """As amplifiers, of which each detector has the same."""
+    units = [Image(None, (("CAMERA", "x", ""),)), *(Image(array(i, np.uint16), (), f"C0{i}") for i in range(2))]
+    joined.join(tmp_path / "all.fits", written(tmp_path, [units, units], rice), SHARED, ())
+    names = [unit.name for unit in images.read_images(tmp_path / "all.fits")[1:]]
+    assert names == ["D0.C00", "D0.C01", "D1.C00", "D1.C01"]
