@@ -51,7 +51,6 @@ class Masters:
     """Of one detector; without one of them: zeros, or ones.
 
     bias : e-;  dark : e-/s;  flat : response, 1 where all light is counted
-    vignetted : whether the flat's light came through the telescope, as a dome's does: its vignetting is in the flat
     flags : uint8[ny, nx];  dark_time : s that the dark's frames have lasted: the noise of the bias is in them, too
     """
 
@@ -60,7 +59,6 @@ class Masters:
     flat: Combined
     flags: Array
     dark_time: float = np.inf
-    vignetted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +156,7 @@ def reduced(
     dark = masters.dark.mean * time
     flags = masters.flags | np.where(full, SATURATED, 0).astype(np.uint8)
     flags[slice(*scene.unread)] = NO_DATA
-    response = masters.flat.mean * (1.0 if masters.vignetted else illuminated(scene, applied))
+    response = masters.flat.mean * (1.0 if masters.flat.vignetted else illuminated(scene, applied))
     used = (flags == 0) & (response > 0.0) & np.isfinite(counted)
     image = np.where(used, counted - dark, 0.0) / np.where(used, response, 1.0)
     reading = reading_variance(scene, applied)

@@ -23,11 +23,13 @@ class Combined:
 
     mean, uncertainty : float32[ny, nx], the latter of the mean, infinite where no frame is left
     count             : int16[ny, nx] frames that are left
+    vignetted         : of a flat, whether its light came through the telescope, whose vignetting is in it
     """
 
     mean: Float32
     uncertainty: Float32
     count: Array
+    vignetted: bool = False
 
 
 def clipped_mean(frames: Array, variance: Callable[[Float, slice], Float], clip: float = 5.0) -> Combined:

@@ -18,6 +18,7 @@ import numpy as np
 
 from jobs.render.camera import astrometry
 from jobs.render.channels import registry
+from jobs.render.effects.light import illumination
 from jobs.render.reduction import calibration
 from jobs.render.reduction.calibration import FLAGS, Reduced
 from jobs.render.reduction.combining import Combined
@@ -71,12 +72,18 @@ def write_master(path: Path, combined: Combined, kind: str, frames: Sequence[Fra
         *(card for card in first.cards if card[0] in (*SAME, "CHANNEL", "MISSION", "TRUESKY")),
         ("IMAGETYP", f"master {kind}", "image type"),
         ("BUNIT", _UNITS[kind], "unit of the pixels"),
+        *((("VIGNETTE", _through_optics(first), "vignetting is in it"),) if kind == "flat" else ()),
         ("NCOMBINE", len(frames), "frames"),
         ("EXPTIME", float(np.mean([frame.exposure.exposure_time_s for frame in frames])), "[s] mean of the frames"),
         *((f"FRAME{i}", frame.exposure.exposure_id, "exposure") for i, frame in enumerate(frames, start=1)),
     )
     units = [Image(None, cards), Image(combined.mean, (), "VALUE"), Image(combined.uncertainty, (), "UNCERTAINTY")]
     write_images(path, [*units, Image(combined.count, (), "COUNT")])
+
+
+def _through_optics(flat: Frame) -> bool:
+    """Whether the lamp's light came through the telescope, as a dome's does."""
+    return illumination.EFFECT.name in flat.applied and registry.CHANNELS[flat.exposure.channel].on_ground
 
 
 def read_master(path: Path, kind: str, frame: Frame) -> tuple[Combined, float]:
@@ -94,7 +101,8 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[Combined, float]:
     shape = (frame.scene.ny, frame.scene.nx)
     if not mean.shape == uncertainty.shape == count.shape == shape:
         raise BadInput(f"{user_files.shown(path)}: {mean.shape} pixels, the frame has {shape}")
-    return Combined(mean, uncertainty, count), float(header["EXPTIME"])
+    vignetted = bool(header.get("VIGNETTE", False))
+    return Combined(mean, uncertainty, count, vignetted), float(header["EXPTIME"])
 
 
 def masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibration.Masters:
@@ -112,8 +120,7 @@ def masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibrat
         flags |= calibration.response_flags(found["flat"])
     if "dark" not in without:
         flags |= calibration.dark_flags(found["dark"])
-    through = registry.CHANNELS[frame.exposure.channel].on_ground and "flat" not in without
-    return calibration.Masters(found["bias"], found["dark"], found["flat"], flags, dark_time, through)
+    return calibration.Masters(found["bias"], found["dark"], found["flat"], flags, dark_time)
 
 
 def reduced_cards(frame: Frame, per_second: bool, without: Sequence[str]) -> tuple[Card, ...]:
