@@ -1,5 +1,6 @@
 """An exposure of DECam in one file, by the jobs: CCDs in the order of their numbers, with what DECam says of each."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -56,9 +57,13 @@ def lake(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(detectors, "_listed", smaller)
         for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
-            for step in module.steps(root, request):
-                publish.make(root, step.plan, step.work, name="x")
+            make(root, module.steps(root, request))
         yield root
+
+
+def make(root, steps):
+    for step in steps:
+        publish.make(root, step.plan, step.work, name="x")
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +126,22 @@ def test_ccdproc_reduces_it_by_its_header(whole):
     levels = [np.median(image.data) for _, image in found]
     assert min(levels) > 100.0
     assert np.ptp(levels) < 0.05 * np.mean(levels)
+
+
+def test_amplifiers_apart_are_extensions_of_their_ccds(lake, whole, tmp_path):
+    """Asked for by the request; the pixels are the same."""
+    root = layout.lake(shutil.copytree(lake, tmp_path / "lake", symlinks=True))
+    make(root, render_exposures.steps(root, replace(parse(lake.parent / "r.toml"), readout="amplifiers")))
+    version = read.version(root, "exposure_files")
+    (row,) = version.rows().to_pylist()
+    with fits.open(version.file(row["path"]), checksum=True) as units, fits.open(whole[1]) as together:
+        assert [unit.name for unit in units[1:]] == [f"{name}.{letter}" for name in NUMBERS for letter in "AB"]
+        for number, unit in enumerate(units[1:]):
+            ccd, letter = together[1 + number // 2], "AB"[number % 2]
+            own, there = tools.window(unit.header["DATASEC"]), tools.window(ccd.header[f"DATASEC{letter}"])
+            np.testing.assert_array_equal(unit.data[own], ccd.data[there])
+            assert unit.header["GAIN"] == pytest.approx(ccd.header[f"GAIN{letter}"])
+            assert unit.header["DETSEC"] == ccd.header[f"DETSEC{letter}"]
 
 
 def images_shape(text):

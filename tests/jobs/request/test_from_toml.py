@@ -122,6 +122,7 @@ BAD = [
     ("products", {"compression": "zip"}, "products.compression"),
     ("products", {"wcs": "zpn"}, "products.wcs"),
     ("products", {"files": "quadrant"}, "products.files = 'quadrant'"),
+    ("products", {"readout": "photons"}, "products.readout = 'photons'"),
     ("pointing", {}, "pointing wants a list"),
     ("pointing", [3], r"pointing\[0\]"),
     ("pointing.channel", "RADIO", r"pointing\[0\].channel"),

@@ -297,7 +297,7 @@ def reduced(path):
             yield header[f"CSEC{n}"], ccdproc.gain_correct(level, header[f"GAIN{n}"] * u.electron / u.adu)
 
 
-@pytest.mark.parametrize("camera", ["vis", "decam"])
+@pytest.mark.parametrize("camera", ["vis", "decam", "lsstcam"])
 def test_ccdproc_reduces_a_raw_frame_by_its_header(camera, tmp_path):
     """To electrons, on the pixels of the detector; the WCS goes with them."""
     field = written(camera, tmp_path, sky=5.0)
