@@ -53,11 +53,10 @@ def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float
 
 def _image(full: model.Psf, weights: Float) -> galsim.GSObject:
     """The PSF in pixels."""
-    if full.planes is None:
-        return galsim.Moffat(beta=scenes.BETA, fwhm=scenes.SEEING / full.pixel_scale)
+    assert full.planes is not None
     whole = transfer.image_of(full.planes, weights)
     middle = slice((len(whole) - _SIDE) // 2, (len(whole) + _SIDE) // 2)
-    return galsim.InterpolatedImage(galsim.Image(whole[middle, middle], scale=1.0 / model.SAMPLES))
+    return galsim.InterpolatedImage(galsim.Image(whole[middle, middle], scale=1.0 / full.planes.samples))
 
 
 def _draw(some: Sources, i: int, psf: galsim.GSObject, index: float) -> None:

@@ -14,7 +14,7 @@ from jobs.fluxes import passbands
 from jobs.render.camera import detectors
 from jobs.render.drawing import stamp_sizes, stamps, transfer
 from jobs.render.drawing.settings import Settings
-from jobs.render.psf import euclid, model, seeing, sub_bands
+from jobs.render.psf import euclid, ground, model, sub_bands
 from jobs.render.sources.galaxy_shapes import Shapes
 from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float, Int
@@ -24,8 +24,10 @@ from lake_schema.mission.configuration import resolve
 BINS = (17.0, 20.0, 22.0, 23.0, 24.0, 25.0, 26.0)
 # Edges of the layers of magnitude of a stratified sample.
 LAYERS = (14.5, 16.0, 18.0, 20.0, 22.0, 24.0, 26.0)
-# The seeing disc of the LSST scene: FWHM in arcsec, exponent.
+# Of the LSST scene: FWHM in arcsec; of peers that have nothing but a Moffat profile, its exponent.
 SEEING, BETA = 0.7, 3.0
+# Its air, at an airmass of 1.2.
+_AIR = ground.Air(SEEING, (0.01, 0.005), slope=-0.3, lift=0.66, zenith=0.5, height=2663.0)
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,13 @@ LSST = Scene("lsst", 4096, 4004, 0.2, 30.0, 28.17, 38.3, 18223, 1160)
 
 def psf_of(scene: Scene, positions: int = 9, colours: int = sub_bands.PARTS) -> model.Psf:
     """The scene's PSF."""
+    mission = resolve()
     if scene.name == "lsst":
-        return seeing.ground_psf(SEEING, BETA, scene.scale)
-    mission, (name, band, psf) = resolve(), SPACE[scene.name]
+        detector = detectors.detector("lsstcam", "R22_S11", mission)
+        return model.of_colours(
+            ground.through_air(_AIR, detector, passbands.load("lsst_i"), mission, positions), colours
+        )
+    name, band, psf = SPACE[scene.name]
     detector = detectors.detector(scene.name, name, mission)
     return model.of_colours(psf(detector, passbands.load(band), mission, positions), colours)
 

@@ -1,0 +1,40 @@
+"""The benchmark of the ground cameras in haste; and a whole exposure of LSSTCam."""
+
+import json
+
+import pytest
+
+from benchmarks import ext as benchmark
+from jobs.request.from_toml import parse
+
+
+def test_a_field_that_all_sites_see(tmp_path):
+    """Requests that are right; what is asked for of a detector is everything."""
+    file = tmp_path / "ext.toml"
+    file.write_text(benchmark.request(tuple(benchmark.CAMERAS.values()), 0.2))
+    wanted = parse(file)
+    assert [pointing.camera for pointing in wanted.pointings] == ["lsstcam", "decam", "jpcam"]
+    assert {"bleeding", "crosstalk", "tree_rings", "brighter_fatter"} < set(benchmark.full(wanted).effects.on)
+    file.write_text(benchmark.request([benchmark.LSST], 2.1, whole=True))
+    (pointing,) = parse(file).pointings
+    assert pointing.detectors == ()
+
+
+@pytest.mark.nightly
+def test_the_figures(tmp_path):
+    file = tmp_path / "ext.json"
+    assert benchmark.main(["--quick", "--json", str(file)]) == 0
+    figures = json.loads(file.read_text())
+    assert {"lsst_survey_s", "lsst_draft_s", "decam_survey_s", "lsst_peak_gb", "effect_bleeding_s"} <= set(figures)
+    # However few the sources: what its effects take is in it.
+    assert 0.2 < figures["lsst_survey_s"] < 15.0
+    assert 0.3 < figures["lsst_peak_gb"] < 2.0
+
+
+@pytest.mark.spark
+@pytest.mark.nightly
+def test_a_whole_exposure_of_lsstcam(tmp_path):
+    """189 sensors, planned and rendered at draft accuracy on 2 cores: 12 minutes are asked for."""
+    assert benchmark.whole_exposure(tmp_path, (24.0, 22.0))["lsst_exposure_s"] < 720.0
+    images = [*tmp_path.rglob("EXT_lsst_r_*_science.fits")]
+    assert len({image.name for image in images}) == 189
