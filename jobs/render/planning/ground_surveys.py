@@ -63,8 +63,7 @@ def exposures(
             whole = rule["shared"] == "0" or (block.place is not None and not block.exposures)
             turn = bands if whole else (bands[i % len(bands)],)
             for band in turn:
-                own = float(rule["exposure_time_s"])
-                seconds = own if block.exposure_time_s is None else block.exposure_time_s
+                seconds = _seconds(rule, band, mission) if block.exposure_time_s is None else block.exposure_time_s
                 now = next_dark(ra, dec, now, site) if block.mjd is None else now
                 there = _missed((ra, dec), error, rng.stream(seed, "pointing", block.survey, band, i))
                 yield Exposure(
@@ -82,6 +81,12 @@ def exposures(
                     detectors=block.detectors,
                 )
                 now += (seconds + _OVERHEAD_S) / _DAY_S
+
+
+def _seconds(rule: Mapping[str, str], band: str, mission: MissionConfiguration) -> float:
+    """Exposure time of a survey in a band: the band's own, where the camera has one."""
+    own = f"{image_types.section(rule['camera'])}.{band}.exposure_time"
+    return mission.value(own, "s") if own in mission else float(rule["exposure_time_s"])
 
 
 def _missed(place: tuple[float, float], error: float, rng: np.random.Generator) -> tuple[float, float]:

@@ -114,3 +114,14 @@ def test_a_row_without_a_date_is_observed_at_night(tmp_path):
     assert site.altitude(bare.ra, bare.dec, bare.mjd) > 29.0
     (row,) = planned_exposures.table([bare], [MISSION]).to_pylist()
     assert 32.95 < row["sky"] < 150.0
+
+
+def test_a_survey_exposes_each_band_as_long_as_it_does(tmp_path):
+    """CFIS: 80 s in u and 200 s in r, whether its pattern is laid out or a table of pointings is given."""
+    seconds = {one.band: one.exposure_time_s for one in survey_of("cfis", 4)}
+    assert seconds == {"cfis_u": 80.0, "cfis_r": 200.0}
+    assert {one.exposure_time_s for one in survey_of("cfis", 4, exposure_time_s=60.0)} == {60.0}
+    path = tmp_path / "cfis.csv"
+    path.write_text("ra,dec,band\n200.0,40.0,cfis_u\n200.0,40.0,cfis_r\n")
+    rows = ground_surveys.read(path, Observation(("EXT",), survey="cfis"), MISSION)
+    assert {row.band: row.exposure_time_s for row in rows} == seconds
