@@ -94,3 +94,11 @@ def test_the_fingerprint_follows_the_files():
     other = resolve(models=(*models, replace(ZODI, sha256="0" * 64)))
     assert other.fingerprint != base.fingerprint
     assert resolve(models=(*models, replace(ZODI, source="elsewhere"))).fingerprint == base.fingerprint
+
+
+def test_a_table_is_read_once_and_nobody_changes_it():
+    """A detector's effects ask for its amplifiers some hundred times."""
+    data = content(next(m for m in read_models() if m.key == "ext.gpc1.amplifiers"))
+    assert rows(data) is rows(data)
+    with pytest.raises(TypeError):
+        rows(data)[0]["gain"] = "2"
