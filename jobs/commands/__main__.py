@@ -7,6 +7,7 @@
     truesky page LAKE                       the lake in the browser, and a TAP service for other tools
     truesky sql QUERY --lake LAKE           a SELECT over the lake's tables
     truesky list | verify | gc | describe LAKE      what is there, whether it is whole, what no longer serves
+    truesky masters | reduce | stack        master frames, calibrated images and their sources, stacks of dithers
     truesky report LAKE                     what the runs took, beside the forecast
     truesky mission ...                     the mission database
     truesky examples FOLDER                 copies requests and notebooks
@@ -42,6 +43,9 @@ MODULES = {
     "gc": ("lake_schema.__main__", True),
     "describe": ("lake_schema.__main__", True),
     "mission": ("lake_schema.__main__", True),
+    "masters": ("jobs.render.masters", False),
+    "reduce": ("jobs.render.reduce", False),
+    "stack": ("jobs.render.stack", False),
     "report": ("jobs.report", False),
     "page": ("jobs.page.__main__", False),
     "examples": ("jobs.commands.examples", False),

@@ -74,9 +74,7 @@ def _combined(kind: str, frames: Sequence[Frame], masters: Mapping[str, Combined
 
 def _counted(frame: Frame, bias: Combined, dark: Combined) -> Float:
     """Electrons as they were counted, without bias and dark current."""
-    electrons = frame.electrons() - bias.mean
-    if "nonlinearity" in frame.applied:
-        electrons = calibration.linearised(electrons, frame.scene)
+    electrons = calibration.counted(frame.electrons() - bias.mean, frame.scene, frame.applied)
     return np.asarray(electrons - dark.mean * frame.scene.exposure_time_s)
 
 
@@ -104,10 +102,10 @@ def _written(options: argparse.Namespace) -> int:
     if not some:
         raise BadInput(f"lake {options.lake} has no frames of the image type bias")
     out.mkdir(parents=True, exist_ok=True)
-    for (_, detector), own in some.items():
+    for own in some.values():
         with tempfile.TemporaryDirectory(dir=out, prefix=".frames-") as scratch:
             for kind, master, frames in made(own, Path(scratch)):
-                path = files.master_name(out, own[0].exposure.channel, detector, kind)
+                path = files.master_name(out, frames[0], kind)
                 files.write_master(path, master, kind, frames)
                 noise = float(np.median(master.uncertainty))
                 print(

@@ -1,33 +1,60 @@
 """Calibrated images from the raw frames of a lake: bias, dark, response of the amplifiers, flat, vignetting.
 
     python -m jobs.render.reduce --lake LAKE [--name REQUEST] --masters FOLDER --out FOLDER [--detectors ..]
-                                 [--exposures ..] [--rate] [--without ..]
+                                 [--exposures ..] [--rate] [--without ..] [--cosmic-rays SIGMA]
+                                 [--level2 [--aperture ARCSEC] [--threshold SIGMA] [--least-pixels N]]
 
-A file a frame that sees the sky, with the extensions SCI (electrons, or e-/s), WHT (inverse variance) and FLG (bits).
+A file a frame that sees the sky, with the extensions SCI (electrons, e-/s or, of level 2, counts of the mean gain), WHT
+(inverse variance) and FLG (bits). Of level 2 a catalogue of its sources, its PSF and a .head lie beside it.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from jobs.render.channels.image_types import SKY_TYPES
-from jobs.render.reduction import calibration, files
+from jobs.render.reduction import calibration, cosmic_rays, files, level2
 from jobs.render.reduction import frames as frames_of
 from jobs.render.reduction.calibration import Masters, Reduced
+from jobs.render.reduction.catalogue import Limits
 from jobs.render.reduction.frames import Frame
 from lake_schema import command, user_files
 from lake_schema.errors import BadInput
+from lake_schema.fits.images import Card
 from lake_schema.store import layout
 
+# Of a level 2 where none is asked for: van Dokkum 2001.
+_LIMIT = 4.5
 
-def reduced(frame: Frame, masters: Masters, per_second: bool = False) -> Reduced:
-    """A frame with the masters of its detector."""
-    return calibration.reduced(frame.electrons(), frame.full(), masters, frame.scene, frame.applied, per_second)
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What is made of a frame.
+
+    unit        : of the pixels: electron, electron/s or adu
+    without     : of files.UNDONE what is left as it is
+    cosmic_rays : standard deviations above which they are found, 0 = they are not looked for
+    """
+
+    unit: str = "electron"
+    without: tuple[str, ...] = ()
+    cosmic_rays: float = 0.0
+
+
+def reduced(frame: Frame, masters: Masters, wish: Wish) -> tuple[Reduced, tuple[Card, ...]]:
+    """A frame with the masters of its detector: the image and its header."""
+    electrons = {"electron": 1.0, "electron/s": frame.scene.exposure_time_s}.get(wish.unit) or frame.mean_gain
+    undone = frame.applied - set(wish.without)
+    found = calibration.reduced(frame.electrons(), frame.full(), masters, frame.scene, undone, electrons)
+    if wish.cosmic_rays:
+        found = cosmic_rays.flagged(found, cosmic_rays.found(found, wish.cosmic_rays))
+    return found, files.reduced_cards(frame, wish.unit, electrons, wish.without)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,35 +62,73 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m jobs.render.reduce", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--lake", required=True, help="folder of the lake, with rendered frames")
     parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
-    parser.add_argument("--masters", type=Path, help="folder that jobs.render.masters has written")
+    parser.add_argument("--masters", type=Path, help="folder that jobs.render.masters has written, or of your own")
     parser.add_argument("--out", type=Path, required=True, help="folder of the calibrated images")
     parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all")
     parser.add_argument("--exposures", nargs="+", type=int, default=[], metavar="ID", help="default: all")
     parser.add_argument("--rate", action="store_true", help="electrons a second instead of those of the exposure")
-    parser.add_argument("--without", nargs="+", default=[], choices=files.KINDS, help="masters that are not applied")
+    parser.add_argument("--without", nargs="+", default=[], choices=files.UNDONE, help="what is left as it is")
+    parser.add_argument(
+        "--cosmic-rays", type=float, metavar="SIGMA", help=f"flag them; with --level2 {_LIMIT:g}, 0 = no"
+    )
+    parser.add_argument("--level2", action="store_true", help="in counts, with sources, PSF and .head beside")
+    parser.add_argument("--aperture", type=float, metavar="ARCSEC", help="diameter of MAG_APER (3 FWHM)")
+    parser.add_argument("--threshold", type=float, default=Limits().threshold, metavar="SIGMA", help="of sources (1.5)")
+    parser.add_argument("--least-pixels", type=int, default=Limits().pixels, metavar="N", help="of a source (5)")
     options = parser.parse_args(argv)
     return command.status("reduce", lambda: _written(options))
 
 
 def _written(options: argparse.Namespace) -> int:
     out = user_files.folder(options.out)
-    if options.masters is None and set(options.without) != set(files.KINDS):
-        raise BadInput(f"--masters: which folder? Or --without {' '.join(files.KINDS)}")
+    wish, settings = _wish(options), _settings(options)
     found = frames_of.of_lake(layout.lake(options.lake), options.detectors, options.exposures, options.name)
     science = [own for frames in found.values() if (own := frames_of.of_types(frames, SKY_TYPES))]
     if not science:
         raise BadInput(f"lake {options.lake} has no such frame that sees the sky")
     out.mkdir(parents=True, exist_ok=True)
     for frames in science:
-        masters = files.masters(options.masters or out, frames[0], options.without)
-        for frame in frames:
-            made = reduced(frame, masters, options.rate)
+        for frame, masters in _with_masters(frames, options.masters or out, wish.without):
+            made, cards = reduced(frame, masters, wish)
             path = out / f"{frame.stem}.fits"
-            files.write_image(path, made, files.reduced_cards(frame, options.rate, options.without))
-            good = made.flags == 0
+            more = ""
+            if settings is None:
+                files.write_image(path, made, cards)
+            else:
+                more = f", {level2.written(path, frame, made, cards, settings)} sources"
+            good = made.weight > 0.0
             shown = f"sky {np.median(made.image[good]):.5g}" if good.any() else "no pixel is good"
-            print(f"{path}: {shown}, {100.0 * good.mean():.2f} % of the pixels without flags")
+            print(f"{path}: {shown}, {100.0 * good.mean():.2f} % of the pixels are good{more}")
     return 0
+
+
+def _with_masters(frames: Sequence[Frame], folder: Path, without: Sequence[str]) -> Iterator[tuple[Frame, Masters]]:
+    """Frames of a detector with its masters, which are read once a band."""
+    for band in dict.fromkeys(frame.exposure.band for frame in frames):
+        own = [frame for frame in frames if frame.exposure.band == band]
+        masters = files.masters(folder, own[0], without)
+        yield from ((frame, masters) for frame in own)
+
+
+def _wish(options: argparse.Namespace) -> Wish:
+    if options.masters is None and not set(options.without) >= set(files.KINDS):
+        raise BadInput(f"--masters: which folder? Or --without {' '.join(files.KINDS)}")
+    if options.level2 and options.rate:
+        raise BadInput("--rate: images of level 2 are in counts")
+    limit = options.cosmic_rays
+    if limit is None:
+        limit = _LIMIT if options.level2 else 0.0
+    if limit:
+        cosmic_rays.check(limit)
+    unit = "adu" if options.level2 else "electron/s" if options.rate else "electron"
+    return Wish(unit, tuple(options.without), limit)
+
+
+def _settings(options: argparse.Namespace) -> level2.Settings | None:
+    limits = Limits(options.threshold, options.least_pixels)
+    if not options.level2 and (limits != Limits() or options.aperture is not None):
+        raise BadInput("--aperture, --threshold, --least-pixels: without --level2 there is no catalogue")
+    return level2.Settings(limits, options.aperture) if options.level2 else None
 
 
 if __name__ == "__main__":

@@ -19,9 +19,7 @@ from astropy.wcs import WCS
 from scipy import ndimage
 
 from jobs.render.camera import astrometry
-from jobs.render.channels import registry
-from jobs.render.psf import from_file
-from jobs.render.reduction import files, stacking
+from jobs.render.reduction import files, point_sources, stacking
 from jobs.render.reduction import frames as frames_of
 from jobs.render.reduction.calibration import COSMIC_RAY, Reduced
 from jobs.render.reduction.files import ImageFile
@@ -37,16 +35,15 @@ from lake_schema.store import layout
 # What all images of a stack share.
 _SAME = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
 # What each of them says besides; the second are numbers above 0.
-_SAID, _NUMBERS = ("IMAGETYP", "DETECTOR"), ("EXPOSURE", "EXPTIME", "PIXSCALE")
-# Places on a detector at which its PSF is known; the middle one is taken.
-_POSITIONS = 1
+_SAID, _NUMBERS = ("IMAGETYP", "DETECTOR"), ("EXPOSURE", "EXPTIME", "GAIN", "PIXSCALE")
 
 
 def rate(image: ImageFile) -> Reduced:
     """The image in e-/s."""
     if image.card("BUNIT") == "electron/s":
         return image.reduced
-    time = float(image.card("EXPTIME"))
+    # Seconds in which there is one unit for each e-/s.
+    time = float(image.card("EXPTIME")) / float(image.card("GAIN"))
     one = image.reduced
     return Reduced((one.image / time).astype(np.float32), (one.weight * time**2).astype(np.float32), one.flags)
 
@@ -88,7 +85,7 @@ def _written(options: argparse.Namespace) -> int:
     if options.lake:
         frames = _frames(layout.lake(options.lake), found, options.name)
         parts = [
-            Contribution(system, shape, _profile(frame), frame.scene.detector.pixel_scale, weight)
+            Contribution(system, shape, point_sources.profile(frame), frame.scene.detector.pixel_scale, weight)
             for system, shape, frame, weight in zip(systems, shapes, frames, weights, strict=True)
             if frame.scene.detector is not None
         ]
@@ -144,18 +141,6 @@ def _frames(root: Path, found: Sequence[ImageFile], request: str | None) -> list
         if (number, detector) not in known:
             raise BadInput(f"lake {root}: table products has no image of exposure {number}, detector {detector}")
     return [known[one] for one in asked]
-
-
-def _profile(frame: Frame) -> object:
-    """The PSF in the middle of a frame's detector."""
-    scene, exposure = frame.scene, frame.exposure
-    assert scene.detector is not None
-    assert scene.band is not None
-    if exposure.psf:
-        file = from_file.file_of(exposure.psf, frame.detector)
-        return from_file.read(file, scene.detector, scene.band).profile
-    channel = registry.channel_of(exposure.channel, exposure.image_type, f"exposure {exposure.exposure_id}")
-    return channel.psf(exposure, scene.detector, scene.band, scene.mission, _POSITIONS).profile
 
 
 def _psf_of(parts: Sequence[Contribution], grid: Grid, stack: Stack) -> Image:

@@ -139,11 +139,12 @@ def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
         return np.asarray(values, np.float64).ravel(), dict(unit.header.items())
 
 
-def read_planes(path: Path, column: str, kind: str = "PSF") -> tuple[Float, dict[str, Any]]:
+def read_planes(path: Path, column: str, kind: str = "PSF", most: int = _MOST_SAMPLES) -> tuple[Float, dict[str, Any]]:
     """An external file's planes, float64[ny, nx] or [n, ny, nx], with the cards of their header.
 
     The first image of two or three axes, or the array that the first row of a table has in `column`.
 
+    path   : the file;  kind : of user_files;  most : numbers that one holds
     Errors : BadInput for a file that is cut short or is none, and where it holds neither, or packed images
     """
     with _opened(path, kind) as units:
@@ -156,8 +157,8 @@ def read_planes(path: Path, column: str, kind: str = "PSF") -> tuple[Float, dict
             elif unit.is_image and unit.header["NAXIS"] in (2, 3):
                 found = unit.data
             if found is not None and np.ndim(found) in (2, 3) and found.size and found.dtype.kind in "fiu":
-                if found.size > _MOST_SAMPLES:
-                    raise BadInput(f"{path}: holds {found.size} samples, a {kind} has at most {_MOST_SAMPLES}")
+                if found.size > most:
+                    raise BadInput(f"{path}: holds {found.size} samples, a {kind} has at most {most}")
                 return np.array(found, np.float64), dict(unit.header.items())
     raise BadInput(f"{path}: holds no image of two or three axes and no table with a column {column}")
 

@@ -1,6 +1,6 @@
 """A table in the form FITS_LDAC, which SCAMP and SExtractor exchange.
 
-write   columns -> a file: an empty field's header, and the table LDAC_OBJECTS
+write   columns -> a file: the header of the field in LDAC_IMHEAD, and the table LDAC_OBJECTS
 """
 
 from __future__ import annotations
@@ -12,35 +12,43 @@ import numpy as np
 from astropy.io import fits
 
 from lake_schema.arrays import Array
+from lake_schema.fits import images
 from lake_schema.fits import write as whole
+from lake_schema.fits.images import Card
 
 # Name, code of the FITS type, unit ("" = none), values of a column.
 Values = tuple[str, str, str, Array]
-_CARD = 80
+_CARD, _BLOCK = 80, 2880
 
 
-def write(path: Path, columns: Sequence[Values]) -> None:
-    """Replaced in one rename."""
+def write(
+    path: Path, columns: Sequence[Values], cards: Sequence[Card] = (), shape: tuple[int, ...] | None = None
+) -> None:
+    """Replaced in one rename.
+
+    path  : of the file;  columns : of the table
+    cards : of the image that the rows were found in;  shape : ny, nx of it, None where there is none
+    """
     objects = fits.BinTableHDU.from_columns([_column(*column) for column in columns], name="LDAC_OBJECTS")
-    whole.write_staged(path, fits.HDUList([fits.PrimaryHDU(), _header(), objects]))
+    whole.write_staged(path, fits.HDUList([fits.PrimaryHDU(), _header(cards, shape or ()), objects]))
 
 
 def _column(name: str, code: str, unit: str, values: Array) -> fits.Column:
     return fits.Column(name, code, array=values, **({"unit": unit} if unit else {}))
 
 
-def _header() -> fits.BinTableHDU:
-    """The cards of a field's header as one text, as the form wants them: here none but the end."""
-    cards = b"".join(
-        text.ljust(_CARD)
-        for text in (
-            b"SIMPLE  =                    T",
-            b"BITPIX  =                    8",
-            b"NAXIS   =                    0",
-            b"END",
-        )
-    )
+def _header(of_image: Sequence[Card], shape: tuple[int, ...]) -> fits.BinTableHDU:
+    """The cards of a field's header as one text, as the form wants them."""
+    structure: tuple[Card, ...] = (
+        ("SIMPLE", True, ""), ("BITPIX", -32 if shape else 8, ""), ("NAXIS", len(shape), ""),
+        *((f"NAXIS{i}", n, "") for i, n in enumerate(reversed(shape), start=1)),
+    )  # fmt: skip
+    lines = [*images.text_of([*structure, *of_image]).splitlines(), "END"]
+    # A long text goes on in the next cards.
+    cards = b"".join(line.ljust(-(-len(line) // _CARD) * _CARD).encode("ascii") for line in lines)
     column = fits.Column("Field Header Card", f"{len(cards)}A", array=np.array([cards]))
     unit = fits.BinTableHDU.from_columns([column], name="LDAC_IMHEAD")
     unit.header["TDIM1"] = f"({_CARD}, {len(cards) // _CARD})"
-    return unit
+    # Taken as it is stored: astropy would make zeros of the spaces at the end of a text, after it has summed them up.
+    stored = unit.header.tostring().encode("ascii") + cards + bytes(-len(cards) % _BLOCK)
+    return fits.BinTableHDU.fromstring(stored)

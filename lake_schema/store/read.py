@@ -98,6 +98,10 @@ class Version:
         """Any other file of the version, such as an image; Damaged where its sha256 is not what the manifest says."""
         return manifest.whole(self.folder, self._file(relative))
 
+    def has(self, relative: str) -> bool:
+        """Whether there is such a file."""
+        return relative in self._files()
+
     def sha256(self, relative: str) -> str:
         """sha256 of such a file, as it was published."""
         return str(self._file(relative)["sha256"])

@@ -7,6 +7,7 @@ QUADRANTS   four of them, each in the detector's own axes with its pre- and over
 BY_AMPLIFIER  an array of each amplifier, in the detector's own axes with its pre- and overscan
 ELECTRONS   what lies in the pixels before they are read
 AMPLIFIERS  one array: the pixels of all amplifiers as they lie on the detector, their pre- and overscans around them
+planes, pixels  a frame by quadrants or amplifiers, in the order in which they are read, and back
 """
 
 from __future__ import annotations
@@ -359,3 +360,20 @@ def _electrons(found: Frame, scene: Scene, detector: str, system: WCS) -> Readou
 
 
 ELECTRONS = replace(AMPLIFIERS, arrays=_electrons, before=layout.AMPLIFIERS.name)
+
+
+# ---------------------------------------------------------------------------------------------- by amplifiers, and back
+
+
+def planes(frame: Float, scene: Scene) -> Float:
+    """[ny, nx] -> [q, rows, columns] in readout order; 0 in the pre- and overscan that a layout has."""
+    if scene.layout is not None:
+        return scene.layout.apart(frame)
+    return layout.apply(frame, 0, 0, 0, scene.middle)
+
+
+def pixels(of_amplifiers: Array, scene: Scene) -> Array:
+    """[q, rows, columns] as `planes` makes them -> [ny, nx], 0 where nothing is read."""
+    if scene.layout is not None:
+        return scene.layout.together(of_amplifiers)
+    return layout.assembled(of_amplifiers, 0, 0, 0, scene.middle)

@@ -3,6 +3,7 @@
 placed     cards of a file's first header, with its true place on the sky
 frame      a science file or a truth map -> the detector's pixels in one piece, as stored
 electrons  the same in electrons, the bias of a science file subtracted
+header     cards of the header that holds for the whole
 """
 
 from __future__ import annotations
@@ -31,6 +32,11 @@ def frame(path: Path) -> images.Image:
     if read[0].data is not None and _DATA not in _header(read):
         return images.Image(read[0].data, placed(path, read[0].cards))
     return images.Image(_mode(path, read).pixels(read), _trimmed(placed(path, read[0].cards)))
+
+
+def header(path: Path) -> tuple[images.Card, ...]:
+    """Cards of a file's first header, with the place on the sky of the detector's pixels."""
+    return _trimmed(placed(path, images.read_images(path)[0].cards))
 
 
 def electrons(path: Path) -> images.Image:

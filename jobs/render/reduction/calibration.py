@@ -1,14 +1,14 @@
 """Calibration of a frame: what its detector added is taken off, what it kept of the light is divided out.
 
-counted = linearised(electrons - bias) - dark time;  light = counted / (flat illumination)
+counted = linearised(without_crosstalk(electrons - bias)) - dark time;  light = counted / (flat illumination)
 
 Masters        bias, dark and flat of a detector, with their uncertainties and flags
 Reduced        a calibrated image, its weight, its flags
 reduced        a frame's electrons above the overscan -> Reduced
-linearised, of_pixels    by amplifier: the inverse of the amplifiers' response; their numbers as a map
+counted        electrons above the bias -> as they came to the amplifiers
 illuminated    what the optics and the shutter bring to each pixel, as the mission declares it
 
-What is not undone: charge transfer inefficiency, the brighter-fatter effect, crosstalk, ghosts.
+What is not undone: charge transfer inefficiency, the brighter-fatter effect, ghosts.
 """
 
 from __future__ import annotations
@@ -19,27 +19,33 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from jobs.render.channels import readout
+from jobs.render.effects.charge import pixel_borders
 from jobs.render.effects.light import illumination
-from jobs.render.effects.readout import nonlinearity
+from jobs.render.effects.readout import crosstalk, nonlinearity
 from jobs.render.effects.scene import Scene
+from jobs.render.reduction import amplifiers
 from jobs.render.reduction.combining import Combined
 from lake_schema.arrays import Array, Bool, Float
 
 # Bits of the flags, and their meaning.
-NO_DATA, RESPONSE, HOT, SATURATED, UNSURE, COSMIC_RAY = 1, 2, 4, 8, 16, 32
+NO_DATA, RESPONSE, HOT, SATURATED, UNSURE, COSMIC_RAY, EDGE = 1, 2, 4, 8, 16, 32, 64
 FLAGS = (
     (NO_DATA, "no data"),
     (RESPONSE, "response far from 1"),
     (HOT, "hot pixel"),
     (SATURATED, "saturated"),
     (UNSURE, "too few frames, or a star in the flat"),
-    (COSMIC_RAY, "cosmic ray: unlike other exposures"),
+    (COSMIC_RAY, "cosmic ray"),
+    (EDGE, "beside the edge of the detector, good"),
 )
+# What a pixel may have that is used all the same.
+_GOOD = EDGE
 # Response of a pixel that is used, and its largest difference from its neighbours', in units of their rms.
 _LEAST, _MOST, _SPREAD = 0.7, 1.3, 8.0
 # Standard deviations of a dark's pixel above the others.
 _HOT = 8.0
+# Pixels beside an edge at which charge is displaced.
+_BORDER = 10
 # Pixels of the mesh on which the level of the sky is taken, and of a side of the neighbours of a pixel of the flat.
 _MESH, _NEAR = 64, 9
 # Standard deviations above the sky, smoothed over a pixel, from which light counts as a source's.
@@ -65,7 +71,7 @@ class Masters:
 class Reduced:
     """A calibrated image [ny, nx].
 
-    image  : float32, electrons of the exposure (or e-/s), the sky in it
+    image  : float32, electrons of the exposure (or another unit), the sky in it; 0 where there is no value
     weight : float32, inverse variance, 0 where flags say not to use it
     flags  : uint8
     """
@@ -81,27 +87,6 @@ def nothing(shape: tuple[int, ...], value: float) -> Combined:
     return Combined(np.full(shape, value, np.float32), np.zeros(shape, np.float32), count)
 
 
-def of_pixels(numbers: float | Float, shape: tuple[int, ...], middle: int) -> float | Float:
-    """Numbers [4] of the amplifiers as a map [ny, nx] of their pixels; one number stays one."""
-    if np.ndim(numbers) == 0:
-        return numbers
-    return readout.quadrant_map(np.asarray(numbers), shape, middle)
-
-
-def linearised(frame: Float, scene: Scene) -> Float:
-    """Electrons [ny, nx] above the bias, as the amplifiers gave them -> as they came."""
-    curve = nonlinearity.parameters(scene)
-    if all(np.ndim(number) == 0 for number in curve):
-        return nonlinearity.linearised(frame, *curve)
-    # Amplifier by amplifier; between the halves nothing is read.
-    which = readout.quadrant_map(np.arange(1.0, 5.0), frame.shape, scene.middle)
-    out = np.zeros(frame.shape)
-    for number in range(4):
-        own = which == number + 1.0
-        out[own] = nonlinearity.linearised(frame[own], *(n[number] if isinstance(n, np.ndarray) else n for n in curve))
-    return out
-
-
 def illuminated(scene: Scene, applied: Container[str]) -> Float:
     """What of the light reaches each pixel [ny, nx], 1 in the middle of the focal plane: as the mission declares it."""
     out = np.ones((scene.ny, scene.nx))
@@ -113,10 +98,9 @@ def illuminated(scene: Scene, applied: Container[str]) -> Float:
 
 def reading_variance(scene: Scene, applied: Container[str]) -> Float:
     """Variance [ny, nx] of what is read where there is no light: reading, rounding to whole ADU; e-^2."""
-    shape = (scene.ny, scene.nx)
     noise = scene.of_amplifiers("read_noise", "electron") if "read_noise" in applied else 0.0
     gain = scene.of_amplifiers("gain", "electron / adu")
-    return np.broadcast_to(of_pixels(noise**2 + gain**2 / 12.0, shape, scene.middle), shape)
+    return np.broadcast_to(amplifiers.of_pixels(noise**2 + gain**2 / 12.0, scene), (scene.ny, scene.nx))
 
 
 def response_flags(flat: Combined) -> Array:
@@ -138,27 +122,36 @@ def dark_flags(dark: Combined) -> Array:
     return (np.where(hot, HOT, 0) | np.where(dark.count == 0, UNSURE, 0)).astype(np.uint8)
 
 
+def counted(above: Float, scene: Scene, applied: Container[str]) -> Float:
+    """Electrons [ny, nx] above the bias as they were read -> as they came to the amplifiers.
+
+    above   : of a frame;  scene : what effects may know of it
+    applied : names of the effects that are undone, where they are of the amplifiers
+    """
+    out = amplifiers.without_crosstalk(above, scene) if crosstalk.EFFECT.name in applied else above
+    return amplifiers.linearised(out, scene) if nonlinearity.EFFECT.name in applied else out
+
+
 def reduced(
-    electrons: Float, full: Bool, masters: Masters, scene: Scene, applied: Container[str], per_second: bool = False
+    electrons: Float, full: Bool, masters: Masters, scene: Scene, applied: Container[str], unit: float = 1.0
 ) -> Reduced:
     """Calibrate a frame.
 
     electrons : [ny, nx] above the level of the overscan;  full : pixels that read no less than a saturated one
     masters   : of its detector;  scene : what effects may know of it
-    applied   : names of the effects that are in the frame
-    per_second : e-/s instead of the electrons of the exposure
+    applied   : names of the effects that are in the frame, and are undone
+    unit      : electrons of the exposure that the image's unit is: 1; the exposure time for e-/s; the gain for ADU
     Error     : of the weight: shot noise of the light that is expected (the sky, and what is far above it), not counted
     """
     time = scene.exposure_time_s
-    counted = electrons - masters.bias.mean
-    if "nonlinearity" in applied:
-        counted = linearised(counted, scene)
+    came = counted(electrons - masters.bias.mean, scene, applied)
     dark = masters.dark.mean * time
-    flags = masters.flags | np.where(full, SATURATED, 0).astype(np.uint8)
-    flags[slice(*scene.unread)] = NO_DATA
+    flags = masters.flags | np.where(full, SATURATED, 0).astype(np.uint8) | _edges(scene, applied)
+    flags[amplifiers.unread(scene)] = NO_DATA
     response = masters.flat.mean * (1.0 if masters.flat.vignetted else illuminated(scene, applied))
-    used = (flags == 0) & (response > 0.0) & np.isfinite(counted)
-    image = np.where(used, counted - dark, 0.0) / np.where(used, response, 1.0)
+    known = (flags & NO_DATA == 0) & (response > 0.0) & np.isfinite(came)
+    used = known & (flags & ~np.uint8(_GOOD) == 0)
+    image = np.where(known, came - dark, 0.0) / np.where(known, response, 1.0)
     reading = reading_variance(scene, applied)
     light = expected(image, used, float(np.median(reading)))
     variance = np.maximum(light * response + dark, 0.0) + reading
@@ -166,11 +159,18 @@ def reduced(
     variance += (masters.dark.uncertainty * time) ** 2 + (light * response * masters.flat.uncertainty) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = np.where(used, response**2 / variance, 0.0)
-    scale = time if per_second else 1.0
     return Reduced(
-        (image / scale).astype(np.float32), np.where(np.isfinite(weight), weight * scale**2, 0.0).astype(np.float32),
+        (image / unit).astype(np.float32), np.where(np.isfinite(weight), weight * unit**2, 0.0).astype(np.float32),
         flags,
     )  # fmt: skip
+
+
+def _edges(scene: Scene, applied: Container[str]) -> Array:
+    """Bits [ny, nx] of the last pixels of a detector that the field at its edge displaces."""
+    flags = np.zeros((scene.ny, scene.nx), np.uint8)
+    if pixel_borders.EDGES.name in applied:
+        flags[:_BORDER] = flags[-_BORDER:] = flags[:, :_BORDER] = flags[:, -_BORDER:] = EDGE
+    return flags
 
 
 def expected(image: Float, used: Bool, floor: float) -> Float:

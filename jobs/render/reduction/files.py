@@ -9,6 +9,8 @@ write_image, read_image       image, weight, flags
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,15 +26,24 @@ from jobs.render.reduction.calibration import FLAGS, Reduced
 from jobs.render.reduction.combining import Combined
 from jobs.render.reduction.frames import Frame
 from lake_schema import __version__, user_files
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
+from lake_schema.fits import external
 from lake_schema.fits.images import Card, Image, read_images, write_images
+from lake_schema.mission.parameter import CAMERAS
 
 KINDS = ("bias", "dark", "flat")
+# What can be left as it is.
+UNDONE = (*KINDS, "crosstalk", "nonlinearity")
 _UNITS = {"bias": "electron", "dark": "electron/s", "flat": ""}
 # What a master must share with the frame that it is applied to: the detector's patterns are keyed by these.
 SAME = ("INSTRUME", "DETECTOR", "SEED")
-# Of a raw file's header what is not so any more.
-_RAW = ("BUNIT", "GAIN", "BIAS", "SATURATE", "PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS")
+# Of a raw file's header what is not so any more; of amplifiers, with their number or letter at the end.
+_RAW: tuple[str, ...] = ("BUNIT", "GAIN", "BIAS", "SATURATE", "PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS", "NAMPS")
+_RAW += ("DATASEC", "TRIMSEC", "BIASSEC", "CCDSEC")
+_OF_AMPLIFIER = re.compile(r"(AMP|DSEC|CSEC|BSEC|GAIN|RDN)[0-9]+|(DATASEC|BIASSEC|CCDSEC|GAIN|RDNOISE|SATURAT)[A-Z]")
+# Pixels of a master of the user's.
+_MOST_PIXELS = 1 << 28
 _STRUCTURE: tuple[str, ...] = (
     "SIMPLE",
     "BITPIX",
@@ -60,9 +71,16 @@ class ImageFile:
         return next((value for key, value, _ in self.cards if key == keyword), None)
 
 
-def master_name(folder: Path, channel: str, detector: str, kind: str) -> Path:
-    """The file of a master in a folder; kind : of KINDS, of a channel's detector."""
-    return folder / f"{channel}_{detector}_{kind}.fits"
+def master_name(folder: Path, frame: Frame, kind: str) -> Path:
+    """The file in a folder of the master for a frame; kind : of KINDS.
+
+    Of ground cameras, whose channel is one, it has the camera's name; and, a flat, that of the band.
+    """
+    exposure = frame.exposure
+    if exposure.camera not in CAMERAS:
+        return folder / f"{exposure.channel}_{frame.detector}_{kind}.fits"
+    band = f"_{exposure.band}" if kind == "flat" else ""
+    return folder / f"{exposure.camera}{band}_{frame.detector}_{kind}.fits"
 
 
 def write_master(path: Path, combined: Combined, kind: str, frames: Sequence[Frame]) -> None:
@@ -87,8 +105,18 @@ def _through_optics(flat: Frame) -> bool:
 
 
 def read_master(path: Path, kind: str, frame: Frame) -> tuple[Combined, float]:
-    """(a master for a frame, s that its frames lasted); BadInput: it is of another detector, or another seed's."""
-    units = read_images(user_files.checked(path, "master frame"))
+    """(a master for a frame, s that its frames lasted); BadInput: it is of another detector, or another seed's.
+
+    One of the user's is an image of the detector's pixels in the units of ours, NaN where it says nothing; whether
+    vignetting is in a flat its card VIGNETTE says, else it is in that of a ground camera.
+    """
+    shape = (frame.scene.ny, frame.scene.nx)
+    found, about = external.read_planes(user_files.checked(path, "master frame"), "", "master frame", _MOST_PIXELS)
+    if about.get("EXTNAME") != "VALUE":
+        _refuse_other_shape(path, found.shape, shape)
+        vignetted = bool(about.get("VIGNETTE", registry.CHANNELS[frame.exposure.channel].on_ground))
+        return _of_user(found, 1.0 if kind == "flat" else 0.0, vignetted), np.inf
+    units = read_images(path)
     header = {keyword: value for keyword, value, _ in units[0].cards}
     if header.get("IMAGETYP") != f"master {kind}" or len(units) != 4:
         raise BadInput(f"{user_files.shown(path)}: is no master {kind}")
@@ -98,11 +126,22 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[Combined, float]:
             what = f"{keyword} = {header.get(keyword)}, the frame's is {frame.card(keyword)}"
             raise BadInput(f"{user_files.shown(path)}: {what}: it cannot calibrate {frame.stem}")
     mean, uncertainty, count = (np.asarray(unit.data) for unit in units[1:])
-    shape = (frame.scene.ny, frame.scene.nx)
-    if not mean.shape == uncertainty.shape == count.shape == shape:
-        raise BadInput(f"{user_files.shown(path)}: {mean.shape} pixels, the frame has {shape}")
+    for part in (mean, uncertainty, count):
+        _refuse_other_shape(path, part.shape, shape)
     vignetted = bool(header.get("VIGNETTE", False))
     return Combined(mean, uncertainty, count, vignetted), float(header["EXPTIME"])
+
+
+def _refuse_other_shape(path: Path, found: tuple[int, ...], wanted: tuple[int, int]) -> None:
+    if found != wanted:
+        raise BadInput(f"{user_files.shown(path)}: {found} pixels, the frame has {wanted}")
+
+
+def _of_user(values: Float, neutral: float, vignetted: bool) -> Combined:
+    """A master without uncertainty; neutral : what stands where it says nothing;  vignetted : of a flat."""
+    said = np.isfinite(values)
+    mean = np.where(said, values, neutral).astype(np.float32)
+    return Combined(mean, np.zeros(values.shape, np.float32), said.astype(np.int16), vignetted)
 
 
 def masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibration.Masters:
@@ -112,7 +151,7 @@ def masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibrat
         if kind in without:
             found[kind] = calibration.nothing(shape, 1.0 if kind == "flat" else 0.0)
         else:
-            path = master_name(folder, frame.exposure.channel, frame.detector, kind)
+            path = master_name(folder, frame, kind)
             found[kind], time = read_master(path, kind, frame)
             dark_time = time if kind == "dark" else dark_time
     flags = np.zeros(shape, np.uint8)
@@ -123,14 +162,25 @@ def masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibrat
     return calibration.Masters(found["bias"], found["dark"], found["flat"], flags, dark_time)
 
 
-def reduced_cards(frame: Frame, per_second: bool, without: Sequence[str]) -> tuple[Card, ...]:
-    """Header of a calibrated image: the raw one's, and what was done."""
+def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[str]) -> tuple[Card, ...]:
+    """Header of a calibrated image: the raw one's, and what was done.
+
+    frame     : its raw one;  unit : of its pixels, as FITS writes it
+    electrons : of the exposure that one of them is;  without : of UNDONE what was left as it is
+    """
+    kept = (
+        card for card in frame.cards if card[0] not in (*_RAW, *_STRUCTURE) and not _OF_AMPLIFIER.fullmatch(card[0])
+    )
+    time = frame.scene.exposure_time_s
+    done = frame.applied - set(without)
     return (
-        *(card for card in frame.cards if card[0] not in (*_RAW, *_STRUCTURE)),
-        ("BUNIT", "electron/s" if per_second else "electron", "unit of SCI; of WHT its inverse square"),
-        ("GAIN", 1.0, "[electron/electron] of the pixels"),
+        *kept,
+        ("BUNIT", unit, "unit of SCI; of WHT its inverse square"),
+        ("GAIN", electrons, "[electron/BUNIT] of the pixels"),
+        ("MAGZERO", float(frame.card("ZEROPNT")) + 2.5 * math.log10(time / electrons), "[mag] AB magnitude of 1 BUNIT"),
         *((f"CAL{kind.upper()}", kind not in without, f"master {kind} applied?") for kind in KINDS),
-        ("CALLIN", "nonlinearity" in frame.applied, "response of the amplifiers undone?"),
+        ("CALXTALK", "crosstalk" in done, "crosstalk undone?"),
+        ("CALLIN", "nonlinearity" in done, "response of the amplifiers undone?"),
         ("CALILLUM", bool({"illumination", "shutter"} & frame.applied), "vignetting and shutter undone?"),
         *flag_cards(),
     )
@@ -146,7 +196,7 @@ def write_image(path: Path, reduced: Reduced, cards: tuple[Card, ...], more: Seq
 
     path : of its file;  reduced : its pixels;  cards : of its header;  more : extensions after it
     """
-    place = tuple(card for card in cards if card[0] in _PLACE or card[0].startswith(("A_", "B_")))
+    place = tuple(card for card in cards if card[0] in _PLACE or card[0].startswith(("A_", "B_", "PV1_", "PV2_")))
     pixels = zip(("SCI", "WHT", "FLG"), (reduced.image, reduced.weight, reduced.flags), strict=True)
     own = tuple(card for card in cards if card[0] != "TRUESKY")
     whole = Image(None, (*own, ("TRUESKY", __version__, "version of the simulator")))

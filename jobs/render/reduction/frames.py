@@ -19,8 +19,8 @@ from jobs.render.camera import detectors
 from jobs.render.effects.scene import Scene
 from jobs.render.exposure import scene_of
 from jobs.render.planning import variants
-from jobs.render.products import read_back
-from jobs.render.reduction.calibration import of_pixels
+from jobs.render.products import beside, read_back
+from jobs.render.reduction import amplifiers
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
@@ -36,6 +36,8 @@ class Frame:
 
     scene   : what effects may know of it, from the lake's plan and mission
     applied : names of the effects that are in it, from its header
+    cards   : of the header that holds for all arrays; the WCS is that of the detector's pixels
+    psf     : the file of its PSF beside it; None: the lake has none
     """
 
     path: Path
@@ -43,6 +45,7 @@ class Frame:
     scene: Scene
     applied: frozenset[str]
     cards: tuple[Card, ...]
+    psf: Path | None = None
 
     @property
     def detector(self) -> str:
@@ -54,6 +57,11 @@ class Frame:
     def stem(self) -> str:
         """Of files made from it."""
         return f"{self.exposure.exposure_id:06d}_{self.exposure.channel}_{self.exposure.band}_{self.detector}"
+
+    @property
+    def mean_gain(self) -> float:
+        """Of its amplifiers, electrons an ADU."""
+        return float(np.mean(self.scene.of_amplifiers("gain", "electron / adu")))
 
     def card(self, keyword: str) -> Any:
         """The value of a card of the common header."""
@@ -67,7 +75,7 @@ class Frame:
         """Pixels [ny, nx] that read no less than a saturated one."""
         levels = self._of_amplifiers("SATURATE")
         adu = np.asarray(read_back.frame(self.path).data)
-        return np.asarray(adu >= of_pixels(levels, adu.shape, self.scene.middle))
+        return np.asarray(adu >= amplifiers.of_pixels(levels, self.scene))
 
     def _of_amplifiers(self, keyword: str) -> float | Float:
         """A card of the common header, else of the arrays' own, [q]."""
@@ -110,9 +118,11 @@ def of_lake(
         scene = scene_of.scene_of(exposed, detector, own.mission, own.accuracy)
         scene = replace(scene, band=passband_of(root, fluxes, exposed.band), forced=own.forced)
         path = version.file(row["path"])
-        cards = header_of(path)
+        cards = read_back.header(path)
         key = (exposed.camera, row["detector"])
-        found.setdefault(key, []).append(Frame(path, exposed, scene, _applied(cards), cards))
+        model = beside.psf_file(exposed.exposure_id, exposed.channel, exposed.band, row["detector"])
+        psf = version.file(model) if version.has(model) else None
+        found.setdefault(key, []).append(Frame(path, exposed, scene, _applied(cards), cards, psf))
     for name in wanted:
         if not any(detector == name for _, detector in found):
             raise BadInput(f"table products: no image of detector {name!r}")
@@ -120,11 +130,6 @@ def of_lake(
         if not any(frame.exposure.exposure_id == number for frames in found.values() for frame in frames):
             raise BadInput(f"table products: no image of exposure {number}")
     return found
-
-
-def header_of(path: Path) -> tuple[Card, ...]:
-    """Cards of the common header, with the true place on the sky."""
-    return read_back.placed(path, images.read_images(path)[0].cards)
 
 
 def _applied(cards: Iterable[Card]) -> frozenset[str]:

@@ -10,6 +10,7 @@ from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
 from jobs.render.products import read_back
+from jobs.render.reduction import frames
 from jobs.request.from_toml import parse
 from lake_schema.errors import BadInput
 from lake_schema.store import publish, read
@@ -119,6 +120,15 @@ def test_the_psf_lies_beside_the_image(rendered):
     found = model.getPSF(galsim.PositionD(2000.0, 2000.0)).drawImage(scale=0.25, method="no_pixel").calculateFWHM()
     with fits.open(image) as units:
         assert found * 0.2000587 == pytest.approx(units[-1].header["PSFFWHM"], rel=0.01)
+
+
+def test_a_frame_has_its_psf_and_the_place_of_its_pixels(rendered, images):
+    """Of the detector's first pixel, not of the file's."""
+    ((frame,),) = frames.of_lake(rendered).values()
+    assert frame.psf is not None
+    assert frame.psf.name == frame.path.name.replace("_science.fits", ".psf")
+    header, _ = images["noise_free"]
+    assert [frame.card(key) for key in ("CRPIX1", "CRPIX2")] == pytest.approx([header["CRPIX1"], header["CRPIX2"]])
 
 
 def test_nothing_else_is_in_the_image(rendered, images):

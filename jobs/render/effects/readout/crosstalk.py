@@ -1,4 +1,8 @@
-"""Crosstalk: a detector's amplifiers read at the same time, and each sees a little of the others."""
+"""Crosstalk: a detector's amplifiers read at the same time, and each sees a little of the others.
+
+apply       parts of a detector -> each with its share of the others
+removed     its inverse: what a calibration does
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,8 @@ from lake_schema.errors import BadInput, OutOfRange
 # Of the coupling between neighbours (assumed).
 _DIAGONAL = 0.5
 _RUN = 1024
+# Each time what is left is smaller by the sum of an amplifier's coefficients: a hundredth at most.
+_ITERATIONS = 3
 
 
 def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = None) -> Frame:
@@ -31,6 +37,18 @@ def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = N
     out = np.empty_like(flat)
     _mix(flat, np.asarray(coefficients, float), out)
     return out.reshape(frame.shape)
+
+
+def removed(frame: Frame, coefficients: Frame) -> Frame:
+    """Parts [q, ny, nx] as `apply` left them -> as they were.
+
+    coefficients : of `apply`
+    Error        : the fourth power of the sum of an amplifier's coefficients: 1e-8 of the light of the others
+    """
+    out = apply(frame, -coefficients)
+    for _ in range(_ITERATIONS - 1):
+        out = frame - (apply(out, coefficients) - out)
+    return out
 
 
 @jit

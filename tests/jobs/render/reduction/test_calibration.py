@@ -70,10 +70,3 @@ def test_a_source_has_its_own_shot_noise():
     light = calibration.expected(image, np.ones(image.shape, bool), 20.0)
     assert light[65, 65] == pytest.approx(5100.0, rel=0.01)
     assert light[10, 10] == pytest.approx(100.0, rel=0.01)
-
-
-def test_numbers_of_amplifiers_lie_on_their_pixels():
-    found = calibration.of_pixels(np.array([1.0, 2.0, 3.0, 4.0]), (12, 6), 4)
-    assert [found[-1, 0], found[-1, -1], found[0, -1], found[0, 0]] == [1, 2, 3, 4]
-    assert not found[4:8].any()
-    assert calibration.of_pixels(3.0, (12, 6), 4) == 3.0

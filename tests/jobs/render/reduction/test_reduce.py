@@ -8,6 +8,7 @@ import pytest
 from scipy import ndimage
 
 from jobs.render import masters, reduce, stack
+from jobs.render.channels import readout
 from jobs.render.reduction import calibration, files
 from lake_schema.fits import images
 from lake_schema.store import layout, read
@@ -121,7 +122,7 @@ def test_masters_are_what_the_detector_has(made):
     pixels = np.ones(bias[1].data.shape, bool)
     pixels[128:132] = False
     # Noise of the mean of 8 frames: read noise and rounding, in each amplifier its own.
-    gain = calibration.of_pixels(np.array([3.0, 3.48, 3.48, 4.0]), pixels.shape, 4)
+    gain = readout.quadrant_map(np.array([3.0, 3.48, 3.48, 4.0]), pixels.shape, 4)
     expected = np.sqrt((4.4**2 + gain**2 / 12) / bias[3].data.clip(1))
     np.testing.assert_allclose(bias[2].data[pixels], expected[pixels], rtol=1e-5)
     # The pattern is the same in every row of a quadrant.

@@ -192,7 +192,7 @@ def test_what_makes_no_grid_is_refused():
 CARDS = (
     ("INSTRUME", "vis", ""), ("CHANNEL", "VIS", ""), ("FILTER", "euclid_vis", ""), ("ZEROPNT", 25.0, ""),
     ("IMAGETYP", "science", ""), ("EXPOSURE", 1, ""), ("DETECTOR", "3-4", ""), ("EXPTIME", 560.0, ""),
-    ("PIXSCALE", 0.1, ""),
+    ("GAIN", 1.0, ""), ("PIXSCALE", 0.1, ""),
 )  # fmt: skip
 
 

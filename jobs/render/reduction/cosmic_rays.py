@@ -1,0 +1,55 @@
+"""Cosmic rays in one calibrated image: what is sharper than a point source can be.
+
+found       their pixels
+flagged     an image with them
+
+Ref : van Dokkum 2001, PASP 113, 1420 (L.A.Cosmic), as astroscrappy does it
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from astroscrappy import detect_cosmics
+
+from jobs.render.reduction.calibration import COSMIC_RAY, SATURATED, Reduced
+from lake_schema.arrays import Bool
+from lake_schema.errors import OutOfRange
+
+# Of the limit, that of a hit's neighbours; contrast with the fine structure; rounds.
+_NEIGHBOURS, _CONTRAST, _ROUNDS = 0.3, 5.0, 4
+
+
+def check(limit: float) -> None:
+    """OutOfRange where a limit is none."""
+    if not 1.0 <= limit <= 1e3:
+        raise OutOfRange("--cosmic-rays", limit, 1.0, 1e3)
+
+
+def found(image: Reduced, limit: float) -> Bool:
+    """[ny, nx] pixels that a cosmic ray has hit.
+
+    image : with its weights
+    limit : standard deviations of the noise above which a pixel's Laplacian is no source's
+    Error : hits as faint as the noise are not found, nor those on saturated pixels; where a point source is narrower
+            than two pixels its middle may be taken for one
+    """
+    check(limit)
+    used = image.weight > 0.0
+    if not used.any():
+        return np.zeros(used.shape, bool)
+    typical = 1.0 / float(np.median(image.weight[used]))
+    variance = np.where(used, 1.0 / np.where(used, image.weight, 1.0), typical).astype(np.float32)
+    hit, _ = detect_cosmics(
+        np.ascontiguousarray(image.image, np.float32), inmask=~used, invar=variance, sigclip=limit,
+        sigfrac=_NEIGHBOURS, objlim=_CONTRAST, gain=1.0, satlevel=np.inf, niter=_ROUNDS, fsmode="median",
+    )  # fmt: skip
+    return np.asarray(hit & used)
+
+
+def flagged(image: Reduced, hit: Bool) -> Reduced:
+    """The image with these pixels flagged, and without weight; what is saturated is not one."""
+    hit = hit & (image.flags & SATURATED == 0)
+    flags = np.where(hit, image.flags | COSMIC_RAY, image.flags).astype(np.uint8)
+    return replace(image, weight=np.where(hit, np.float32(0.0), image.weight), flags=flags)
