@@ -1,7 +1,8 @@
 """Level 2 of ground cameras: what a survey's own pipeline gives, against the truth of what was rendered."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +11,18 @@ from astropy.wcs import WCS
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from jobs.render import reduce, stack
-from jobs.render.camera import astrometry
+from jobs.render import masters, reduce, stack
+from jobs.render.camera import astrometry, detectors
 from jobs.render.reduction import calibration, files
 from jobs.render.reduction import frames as frames_of
 from jobs.render.reduction.calibration import COSMIC_RAY, EDGE, NO_DATA, SATURATED
+from jobs.request.from_toml import parse
+from lake_schema.fits import images
+from lake_schema.ids import kind_of
+from lake_schema.store import layout, publish, read
+from tests import requests
 from tests.jobs.render.reduction import ground_frames
+from tests.jobs.render.test_render_exposures_calibration import MODULES
 
 BLOCK = 64
 # Standard deviations of a star's light that count, and above which its place is known to 5 mas.
@@ -251,10 +258,10 @@ def test_a_master_of_another_size_is_refused(jpcam, tmp_path, capsys):
 
 
 def test_where_a_flat_of_yours_says_nothing_a_pixel_is_not_used(jpcam):
-    masters = files.masters(jpcam.ground.masters, jpcam.ground.frame, ("dark",))
+    found = files.masters(jpcam.ground.masters, jpcam.ground.frame, ("dark",))
     blind = ~np.isfinite(fits.getdata(files.master_name(jpcam.ground.masters, jpcam.ground.frame, "flat")))
     assert blind.any()
-    assert np.all(masters.flags[blind] & calibration.UNSURE)
+    assert np.all(found.flags[blind] & calibration.UNSURE)
     assert np.all(jpcam.image.reduced.weight[blind] == 0.0)
 
 
@@ -265,3 +272,86 @@ def test_every_camera(tmp_path, camera):
     for check in (check_files, check_flags, check_sky):
         check(made)
     check_stars(made, 40)
+
+
+LAKE = """
+accuracy = "survey"
+[universe]
+galaxy_limit = 21.0
+star_limit = 22.5
+box_cells = 192
+lensing_nside = 64
+[fluxes]
+bands = ["jedis_g"]
+[[pointing]]
+channel = "EXT"
+camera = "jpcam"
+band = "jedis_g"
+ra = 53.117
+dec = -27.808
+centre_on = "ccd05"
+detectors = ["ccd05"]
+mjd = 60905.25
+[[observation]]
+channels = ["EXT"]
+survey = "jedis"
+image_type = "bias"
+exposures = 8
+detectors = ["ccd05"]
+[[observation]]
+channels = ["EXT"]
+survey = "jedis"
+image_type = "flat"
+exposures = 12
+detectors = ["ccd05"]
+[products]
+truth = ["noise_free", "sky", "cosmic_rays"]
+"""
+
+
+@pytest.mark.nightly
+def test_of_a_lake_with_masters_of_its_own_frames(tmp_path):
+    """From a request: biases and dome flats, a master flat that has its band's name, sources of the catalogues."""
+    root, listed = layout.lake(tmp_path / "lake"), detectors._listed
+    wanted = parse(requests.written(tmp_path, LAKE, requests.FIELD.format(0.2), seed=11))
+    with pytest.MonkeyPatch.context() as patch:
+        small = {"nx": 1024, "ny": 1024}
+        patch.setattr(detectors, "_listed", lambda *of: tuple(replace(d, **small) for d in listed(*of)))
+        for job in MODULES:
+            for step in job.steps(root, wanted):
+                publish.make(root, step.plan, step.work)
+        own, out = str(tmp_path / "masters"), tmp_path / "level2"
+        assert masters.main(["--lake", str(root), "--out", own]) == 0
+        call = ["--lake", str(root), "--masters", own, "--without", "dark", "--out", str(out), "--level2"]
+        assert reduce.main(call) == 0
+    assert sorted(path.name for path in Path(own).iterdir()) == [
+        "jpcam_ccd05_bias.fits", "jpcam_jedis_g_ccd05_flat.fits"
+    ]  # fmt: skip
+    (path,) = out.glob("*.fits")
+    found, version = files.read_image(path), read.version(root, "products")
+    image = next(row["path"] for row in version.rows().to_pylist() if row["path"].endswith("_sky.fits"))
+    sky, light, rays = (
+        images.read_images(version.file(image.replace("_sky", kind)))[0].data
+        for kind in ("_sky", "_noise_free", "_cosmic_rays")
+    )
+    # Outer light of galaxies is everywhere.
+    good = (found.reduced.weight > 0.0) & (light < 0.01 * np.median(sky)) & (rays == 0)
+    dark = found.card("DARKRATE") * found.card("EXPTIME")
+    left = np.where(good, found.reduced.image * found.card("GAIN") - light - sky - dark, np.nan)
+    each = left.reshape(16, BLOCK, 16, BLOCK)
+    count = np.isfinite(each).sum(axis=(1, 3))
+    means = (np.nansum(each, axis=(1, 3)) / np.maximum(count, 1))[count > 0.5 * BLOCK**2] / np.median(sky)
+    print(f"{len(means)} blocks: mean {means.mean():.5f}, rms {means.std():.5f}, largest {np.abs(means).max():.5f}")
+    assert len(means) > 100
+    assert np.mean(np.abs(means) <= 0.003) >= 0.98
+    truth = read.version(root, "rendered_truth").rows().to_pylist()
+    stars = [row for row in truth if row["expected"] and kind_of(row["id"]) == 5 and 17.0 < row["mag"] < 21.0]
+    rows = fits.getdata(path.with_suffix(".cat"), "LDAC_OBJECTS")
+    distance, which = cKDTree(np.transpose([rows["XWIN_IMAGE"], rows["YWIN_IMAGE"]]) - 1.0).query(
+        [(row["x"] + row["psf_x"], row["y"] + row["psf_y"]) for row in stars]
+    )
+    seen = (distance < 1.0) & (rows["FLAGS"][which] == 0) & (rows["IMAFLAGS_ISO"][which] == 0)
+    off = rows["MAG_APER"][which] + found.card("APERCOR") - [row["mag"] for row in stars]
+    print(f"{seen.sum()} of {len(stars)} stars: {np.median(off[seen]):.4f} mag")
+    assert seen.sum() >= 5
+    assert abs(np.median(off[seen])) < 0.02
