@@ -29,7 +29,12 @@ COLUMNS = (
     ("ra", "deg", "right ascension of the boresight, ICRS, -360 to 360", ""),
     ("dec", "deg", "declination of the boresight, ICRS", ""),
     ("position_angle", "deg", "of the focal plane's y axis, north through east", "Euclid: as the Sun asks; ground: 0"),
-    ("mjd", "d", "start of the exposure, MJD (UTC)", "the observation's `mjd`; Euclid: the first date the Sun allows"),
+    (
+        "mjd",
+        "d",
+        "start of the exposure, MJD (UTC)",
+        "the observation's `mjd`; Euclid: the first date the Sun allows; ground: when the field is next up at night",
+    ),
     ("channel", "", "VIS, NISP-P, NISP-S or EXT", "the observation's, where it has one"),
     ("camera", "", "of the mission database", "vis, nisp; EXT: the camera of the observation's `survey`"),
     ("band", "", "passband", "VIS: euclid_vis"),
