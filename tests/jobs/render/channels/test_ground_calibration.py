@@ -1,5 +1,6 @@
 """Biases, darks and dome flats of ground cameras: planned as DES asks for them, each with noise of its own."""
 
+import warnings
 from collections import Counter
 from dataclasses import replace
 from functools import cache
@@ -7,20 +8,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy import units as u
 
 from jobs.accuracy import SURVEY
+from jobs.fluxes import passbands
+from jobs.render import masters, reduce
 from jobs.render.camera import detectors
 from jobs.render.channels import image_types
 from jobs.render.effects.light import calibration_lamp, illumination
 from jobs.render.plan_exposures import plan
+from jobs.render.products import read_back
+from jobs.render.reduction import files
+from jobs.render.reduction import frames as frames_of
+from jobs.render.reduction.frames import Frame
 from jobs.request.from_toml import parse
 from lake_schema.tables.exposures import ExposureRow
 from tests.jobs.render import fields
 from tests.jobs.render.channels.test_ground import BANDS, NOBODY
+from tests.jobs.render.channels.test_readout import put
 from tests.jobs.render.fields import MISSION, fluxes
+from tests.jobs.render.products import test_tools as tools
 
 PILOT = Path(__file__).parents[4] / "requests" / "sc8_pilot.toml"
-SIDE = 256
+SIDE, BLOCK, FRAMES = 256, 64, 7
 
 
 @pytest.fixture(scope="module")
@@ -53,12 +63,13 @@ def test_no_two_of_them_have_the_same_noise(planned):
 
 
 @cache
-def frame(camera, kind, number=1, seconds=10.0, forced=()):
+def frame(camera, kind, number=1, seconds=10.0, forced=(), sky=0.0):
     """e- above zero [ny, nx] of the pixels, with the amplifiers' levels; and what was rendered."""
     one = fields.small(camera, detectors.detectors(camera, MISSION)[0].name, SIDE)
     exposed = {
         "exposure_id": number, "channel": "EXT", "camera": camera, "band": BANDS[camera], "image_type": kind,
         "exposure_time_s": 0.0 if kind == "bias" else seconds, "mjd": 60905.0 + 0.01 * number, "seeing": 0.8, "lamp": 1,
+        "sky": sky,
     }  # fmt: skip
     body, points = NOBODY
     tables = body, fluxes(body, BANDS[camera], []), points, fluxes(points, BANDS[camera], [])
@@ -111,3 +122,65 @@ def test_a_dark_has_dark_current_and_no_light():
     assert one.scene.dark_electrons > 50.0
     assert not one.noise_free.any()
     assert len(one.sources) == 0
+
+
+def stored(one, folder):
+    """The raw file, with what is known of it."""
+    path = put(one, folder)["science"]
+    cards, scene = read_back.header(path), replace(one.scene, band=passbands.load(one.exposure.band))
+    return Frame(path, one.exposure, scene, frames_of._applied(cards), cards)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A folder with masters of biases and flats of DECam; a frame of the sky alone."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    kinds = ((kind, number) for kind in ("bias", "flat") for number in range(1, FRAMES + 1))
+    raw = [stored(frame("decam", kind, number + 50 * (kind == "flat"))[1], folder) for kind, number in kinds]
+    made = [(kind, own) for kind, master, own in masters.made(raw, folder) if write(folder, master, kind, own)]
+    assert [(kind, len(own)) for kind, own in made] == [("bias", FRAMES), ("flat", FRAMES)]
+    return folder, stored(frame("decam", "science", 200, 90.0, QUIET[:1], 100.0)[1], folder)
+
+
+def write(folder, master, kind, own):
+    path = files.master_name(folder, own[0], kind)
+    files.write_master(path, master, kind, own)
+    return path.is_file()
+
+
+def check_flat(found, scene):
+    """Blocks of 64 pixels within 0.3 % of the sky."""
+    expected = scene.sky_electrons + scene.dark_electrons
+    blocks = np.nanmean(found.reshape(SIDE // BLOCK, BLOCK, SIDE // BLOCK, BLOCK), axis=(1, 3)) / expected - 1.0
+    print(f"blocks: mean {blocks.mean():.5f}, rms {blocks.std():.5f}, largest {np.abs(blocks).max():.5f}")
+    assert np.abs(blocks).max() < 0.003
+    return blocks
+
+
+def test_ccdproc_with_the_masters_leaves_a_flat_sky(calibrated):
+    """Each amplifier by the header, then master bias and master flat: the vignetting is in that."""
+    ccdproc = pytest.importorskip("ccdproc", reason="ccdproc is not installed (extra test)")
+    folder, science = calibrated
+    (bias, _), (flat, _) = (
+        files.read_master(files.master_name(folder, science, kind), kind, science) for kind in ("bias", "flat")
+    )
+    found = np.full((SIDE, SIDE), np.nan)
+    for text, image in tools.reduced(science.path):
+        place = tools.window(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            light = ccdproc.subtract_bias(image, ccdproc.CCDData(bias.mean[place], unit=u.electron))
+            even = ccdproc.flat_correct(light, ccdproc.CCDData(flat.mean[place], unit=""), norm_value=1.0)
+        found[place] = np.where(flat.mean[place] > 0.7, even.data, np.nan)
+    # Without the flat the vignetting stands out.
+    raw = read_back.electrons(science.path).data
+    assert abs(np.median(raw) / science.scene.sky_electrons - 1.0) > 0.02
+    check_flat(found, science.scene)
+
+
+def test_our_reduction_does_so_too(calibrated):
+    """Vignetting is undone once."""
+    folder, science = calibrated
+    image, _ = reduce.reduced(science, files.masters(folder, science, ("dark",)), reduce.Wish(without=("dark",)))
+    assert (image.weight > 0.0).mean() > 0.9
+    check_flat(np.where(image.weight > 0.0, image.image, np.nan), science.scene)
