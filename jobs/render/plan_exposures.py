@@ -24,6 +24,7 @@ from jobs.render.planning import (
     variants,
 )
 from jobs.render.planning.mission import PARTS, mission_of, user_filters
+from jobs.render.planning.prices import Files
 from jobs.render.products.keys import ephemeris_files, stamp_files
 from jobs.request import universe
 from jobs.request.checks import check_rendered
@@ -57,7 +58,7 @@ def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.
     catalogues = [] if lake is None else _catalogues(lake, request)
     densities = source_counts.Densities(mission, request.universe, catalogues)
     wanted = [exposure.detectors for exposure, _ in found]
-    forced, files = variants.forced(request), request.files
+    forced, files = variants.forced(request), Files(request.files == "exposure", request.readout)
     rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, forced, files)
     return mission, exposures, rows
 
@@ -76,7 +77,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **user_filters(request)[1]}
     # What they cost depends on more than which they are.
     counts = {v.table: v.key for v in _catalogues(lake, request)}
-    costs = {**facts, "counts": counts, "rendered": request.facts("accuracy", "effects", "files")}
+    costs = {**facts, "counts": counts, "rendered": request.facts("accuracy", "effects", "files", "readout")}
     about = {
         "mission": mission.fingerprint,
         "ladder": list(mission.ladder),

@@ -83,6 +83,7 @@ class ReadoutMode:
     pixels    : images of a file -> [ny, nx] its pixels as stored
     electrons : images of a file -> float64[ny, nx] its pixels in e-, the bias subtracted
     before    : the effect from which on nothing of a channel is applied; "" = all of it is
+    written   : bytes of a file for each of the detector's pixels; None = as measured (channels/cost.py)
     """
 
     arrays: Callable[[Frame, Scene, str, WCS], Readout]
@@ -90,6 +91,7 @@ class ReadoutMode:
     pixels: Callable[[Sequence[Image]], Array]
     electrons: Callable[[Sequence[Image]], Float]
     before: str = ""
+    written: int | None = None
 
 
 # ---------------------------------------------------------------------------------------------- one frame
@@ -359,7 +361,7 @@ def _electrons(found: Frame, scene: Scene, detector: str, system: WCS) -> Readou
     return Readout((own,), pixels, pixels)
 
 
-ELECTRONS = replace(AMPLIFIERS, arrays=_electrons, before=layout.AMPLIFIERS.name)
+ELECTRONS = replace(AMPLIFIERS, arrays=_electrons, before=layout.AMPLIFIERS.name, written=4)
 
 
 # ---------------------------------------------------------------------------------------------- by amplifiers, and back

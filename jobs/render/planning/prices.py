@@ -1,5 +1,6 @@
 """What a detector costs: seconds of a core, memory and bytes, from numbers that benchmarks/planner.py measures.
 
+Files        what is written of a detector
 price        what every detector of a kind of exposure costs
 """
 
@@ -24,6 +25,17 @@ _FILLED_S = {
     "saturation": {"bleeding": 1e-8},
 }
 _STARS_S = 2e-8
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """whole : whether its exposure has a file, too;  readout : how its own is wanted (jobs.request.schema.READOUTS)."""
+
+    whole: bool = False
+    readout: str = "raw"
+
+
+_ITS_OWN = Files()
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +71,12 @@ def price(
     effects: Sequence[Effect] | None,
     accuracy: Accuracy = SURVEY,
     truth: Sequence[str] = (),
-    files: str = "detector",
+    files: Files = _ITS_OWN,
 ) -> Price:
     """What detectors of one kind of exposure cost.
 
     looks   : whether the sky is drawn;  effects : that are applied; None = nothing renders the channel yet
-    truth   : maps that are wanted;  files : what has a file of its own (jobs.request.schema.FILES)
+    truth   : maps that are wanted;  files : what is written besides
     channel : its name;  accuracy : of the request
     Error   : 30 % where the sources are as those that it was measured with
     """
@@ -73,7 +85,8 @@ def price(
     tier = settings.seconds_for(accuracy) / settings.seconds_for(SURVEY)
     mapped = sum(truth_maps.BYTES[name] for name in maps)
     # An exposure's file has the science image a second time.
-    images = 2 if files == "exposure" else 1
+    images = 2 if files.whole else 1
+    own_pixels = registry.CHANNELS[channel].read_as(files.readout).readout.written
     names = [effect.name for effect in applied]
     filled = sum(cost for name in maps for by, cost in _FILLED_S.get(name, {}).items() if by in names)
     filled += _STARS_S * ("stars" in maps)
@@ -85,6 +98,6 @@ def price(
         start_gb=own.base_gb,
         pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + mapped),
         start_bytes=_HEADER_BYTES * (images + len(maps)),
-        pixel_bytes=mapped,
-        read_bytes=images * own.written,
+        pixel_bytes=mapped + images * (own_pixels or 0),
+        read_bytes=0.0 if own_pixels else images * own.written,
     )

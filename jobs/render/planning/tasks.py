@@ -21,7 +21,7 @@ from jobs.render.channels import registry
 from jobs.render.exposure import scene_of
 from jobs.render.exposure.records import Variant
 from jobs.render.planning import variants
-from jobs.render.planning.prices import Price, price
+from jobs.render.planning.prices import Files, Price, price
 from jobs.render.planning.source_counts import Densities
 from jobs.request.schema import Request
 from lake_schema import sky
@@ -31,6 +31,8 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.tasks import TASKS
+
+_ITS_OWN = Files()
 
 # ------------------------------------------------------------------------------------------------ tasks
 
@@ -43,12 +45,12 @@ def table(
     truth: Sequence[str] = (),
     accuracy: Accuracy = SURVEY,
     forced: Mapping[str, bool] | None = None,
-    files: str = "detector",
+    files: Files = _ITS_OWN,
 ) -> pa.Table:
     """Rows of the table `tasks`.
 
     exposures  : rows of the table `exposures`;  detectors : of each exposure, () = all of its camera
-    truth      : truth maps that are wanted;  files : what has a file of its own
+    truth      : truth maps that are wanted;  files : what is written besides
     forced     : effects that the request forces on or off
     mission    : the mission database;  densities : of galaxies and stars;  accuracy : of the request
     """
@@ -160,13 +162,14 @@ def _append(
         columns["bytes"].append(cost.bytes(pixels, int(camera.read[i])))
 
 
-def _price(row: ExposureRow, own: Variant, truth: Sequence[str], files: str) -> Price:
+def _price(row: ExposureRow, own: Variant, truth: Sequence[str], files: Files) -> Price:
     """Of the detectors of an exposure.
 
     Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
     """
     channel, kind = row.channel, row.image_type
-    looks, effects = kind in registry.CHANNELS[channel].sky_types, registry.effects_or_none(channel, kind)
+    looks = kind in registry.CHANNELS[channel].sky_types
+    effects = registry.CHANNELS[channel].read_as(files.readout).effects.get(kind)
     if effects is not None:
         first = camera_detectors.detectors(row.camera, own.mission)[0]
         scene = replace(scene_of.scene_of(row, first, own.mission, own.accuracy), forced=own.forced)

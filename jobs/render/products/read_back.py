@@ -47,7 +47,7 @@ def electrons(path: Path) -> images.Image:
     read = images.read_images(path)
     unit = _header(read).get("BUNIT")
     if unit == "electron":
-        return images.Image(np.asarray(read[0].data, float), read[0].cards)
+        return images.Image(np.asarray(read[0].data, float), placed(path, read[0].cards))
     if unit == "":
         raise BadInput(f"{path}: its pixels have no unit: they are not electrons")
     return images.Image(_mode(path, read).electrons(read), _trimmed(placed(path, read[0].cards)))

@@ -11,6 +11,7 @@ from jobs.render.channels import image_types, registry
 from jobs.render.exposure import truth_maps
 from jobs.render.forecasting import forecast, speed
 from jobs.render.planning import prices
+from jobs.request.schema import READOUTS
 from lake_schema.tables.exposures import CHANNELS
 from tests.jobs.render.planning.test_survey import VIS, planned
 
@@ -33,6 +34,19 @@ def test_more_is_dearer():
     # A bias frame has neither sky nor light.
     bias = prices.price("VIS", False, registry.CHANNELS["VIS"].effects["bias"])
     assert bias.seconds(PIXELS, 5000, 10) == bias.seconds(PIXELS, 0, 0) < 0.7 * base.seconds(PIXELS, 0, 0)
+
+
+def test_electrons_have_more_bytes_and_no_pixels_beside_the_detectors():
+    """As their files: of 2.3 million pixels 2.1 million are the detector's."""
+    raw, read = 2_100_000, 2_300_000
+    effects = registry.CHANNELS["EXT"].effects["science"]
+    for whole, times in ((False, 1), (True, 2)):
+        sizes = {
+            way: prices.price("EXT", True, effects, files=prices.Files(whole, way)).bytes(raw, read)
+            - prices.price("EXT", True, effects, files=prices.Files(whole, way)).bytes(0, 0)
+            for way in READOUTS
+        }
+        assert sizes == {"raw": 2 * times * read, "amplifiers": 2 * times * read, "electrons": 4 * times * raw}
 
 
 def test_each_map_has_its_place_on_the_disc():

@@ -41,9 +41,9 @@ def apart(one, other):
 
 
 def test_errors_are_of_the_missions_size():
-    found = np.array([apart((ra, -30.0, 5.0), believed((ra, -30.0, 5.0))) for ra in np.linspace(0.0, 90.0, 300)])
-    np.testing.assert_allclose(found.std(axis=0), (3.0, 3.0, 30.0), rtol=0.15)
-    assert (np.abs(found.mean(axis=0)) < 0.2 * found.std(axis=0)).all()
+    found = np.array([apart((ra, -30.0, 5.0), believed((ra, -30.0, 5.0))) for ra in np.linspace(0.0, 90.0, 150)])
+    np.testing.assert_allclose(found.std(axis=0), (3.0, 3.0, 30.0), rtol=0.2)
+    assert (np.abs(found.mean(axis=0)) < 0.3 * found.std(axis=0)).all()
 
 
 def test_they_are_of_the_pointing_and_of_the_seed():
@@ -139,6 +139,23 @@ def test_the_truth_is_beside_it_and_in_what_is_read_back(chips):
         cards = {key: value for key, value, _ in read_back.frame(field.path).cards}
         assert (cards["RA"], cards["DEC"]) == pytest.approx(POINTED[:2], abs=1e-9)
         assert "CSYER1" not in cards
+
+
+@pytest.mark.parametrize("way", ["amplifiers", "electrons"])
+def test_other_forms_of_a_frame_know_no_more(way, tmp_path):
+    """In each of their headers; what is read back has the truth."""
+    one = tools.stars_on("decam", 0.05, small("decam", "N31", tools.SIDE), POINTED, MISSION, way=way)
+    path = tools.put(one, tmp_path).path
+    with tools.fits.open(path) as units:
+        headers = [unit.header for unit in units]
+    assert len(headers) == (3 if way == "amplifiers" else 1)
+    for header in headers:
+        assert (header["CRVAL1"], header["CRVAL2"]) == pytest.approx(believed(POINTED)[:2], abs=1e-9)
+        assert header["CSYER1"] > 0.0
+    for cards in (read_back.frame(path).cards, read_back.electrons(path).cards):
+        found = {key: value for key, value, _ in cards}
+        assert (found["CRVAL1"], found["CRVAL2"]) == pytest.approx(POINTED[:2], abs=1e-9)
+        np.testing.assert_allclose(astrometry.from_cards(cards).wcs.crpix, one.wcs.wcs.crpix, rtol=1e-12)
 
 
 def test_scamp_recovers_the_place_of_four_dithered_frames(tmp_path):
