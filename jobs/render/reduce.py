@@ -86,6 +86,8 @@ def _written(options: argparse.Namespace) -> int:
     science = [own for frames in found.values() if (own := frames_of.of_types(frames, SKY_TYPES))]
     if not science:
         raise BadInput(f"lake {options.lake} has no such frame that sees the sky")
+    if settings is not None:
+        level2.refuse([frame for frames in science for frame in frames])
     out.mkdir(parents=True, exist_ok=True)
     for frames in science:
         for frame, masters in _with_masters(frames, options.masters or out, wish.without):

@@ -1,5 +1,6 @@
 """What a survey gives of a detector: the calibrated image, its sources, its PSF, and its place for other tools.
 
+refuse      frames that there is no level 2 of
 written     an image and all that lies beside it, the image last: where it is, all is
 
 NAME.fits   SCI, WHT, FLG;  NAME.cat: FITS_LDAC;  NAME.psf: PSFEx;  NAME.head: the WCS as TPV, of each array
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from jobs.render.camera import astrometry
+from jobs.render.channels import registry
 from jobs.render.products import head_files
 from jobs.render.reduction import catalogue, files, point_sources
 from jobs.render.reduction.calibration import Reduced
@@ -43,6 +45,20 @@ class Settings:
             raise OutOfRange("--aperture", self.diameter, 1e-2, 1e3)
 
 
+def refuse(frames: Sequence[Frame]) -> None:
+    """BadInput where the lake has not the PSF of every frame: before anything is written."""
+    for frame in frames:
+        _psf_of(frame)
+
+
+def _psf_of(frame: Frame) -> Path:
+    if frame.psf is None:
+        ground = registry.CHANNELS[frame.exposure.channel].on_ground
+        why = "an older version rendered it" if ground else "level 2 is of ground cameras"
+        raise BadInput(f"--level2: the lake has no PSF beside the image {frame.stem}: {why}")
+    return frame.psf
+
+
 def written(path: Path, frame: Frame, image: Reduced, cards: Sequence[Card], settings: Settings) -> int:
     """Number of sources of an image, of which all files are written.
 
@@ -50,8 +66,7 @@ def written(path: Path, frame: Frame, image: Reduced, cards: Sequence[Card], set
     image : calibrated;  cards : of its header, with MAGZERO and GAIN
     settings : of the catalogue
     """
-    if frame.psf is None:
-        raise BadInput(f"{frame.stem}: the lake has no PSF beside its image: it must be rendered again")
+    psf = _psf_of(frame)
     about = {keyword: value for keyword, value, _ in cards}
     scale, system = float(about["PIXSCALE"]), astrometry.from_cards(cards)
     diameter = _DIAMETER * float(about["PSFFWHM"]) if settings.diameter is None else settings.diameter
@@ -69,7 +84,7 @@ def written(path: Path, frame: Frame, image: Reduced, cards: Sequence[Card], set
     rows = catalogue.columns(found, system, float(about["MAGZERO"]))
     ldac.write(path.with_suffix(".cat"), rows, said, image.image.shape)
     with user_files.staged(path.with_suffix(".psf")) as temporary:
-        shutil.copyfile(frame.psf, temporary)
+        shutil.copyfile(psf, temporary)
     with user_files.staged(path.with_suffix(".head")) as temporary:
         units = [Image(data, tuple(cards)) for data in (image.image, image.weight, image.flags)]
         head_files.write([head_files.text(units)], temporary)

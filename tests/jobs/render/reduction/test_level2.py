@@ -1,11 +1,15 @@
 """Level 2 of ground cameras: what a survey's own pipeline gives, against the truth of what was rendered."""
 
+import re
+import shutil
+import subprocess
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.wcs import WCS
 from scipy import ndimage
@@ -21,6 +25,7 @@ from lake_schema.fits import images
 from lake_schema.ids import kind_of
 from lake_schema.store import layout, publish, read
 from tests import requests
+from tests.jobs.render.products import test_tools
 from tests.jobs.render.reduction import ground_frames
 from tests.jobs.render.test_render_exposures_calibration import MODULES
 
@@ -181,6 +186,29 @@ def test_files_lie_together(jpcam):
     check_files(jpcam)
 
 
+def test_scamp_reads_the_catalogue(jpcam, tmp_path):
+    """With the head file beside it: places of its rows are those that the catalogue says itself."""
+    command = test_tools.tool("scamp")
+    for end in (".cat", ".head"):
+        shutil.copy(jpcam.path.with_suffix(end), tmp_path / f"a{end}")
+    rows = jpcam.catalogue
+    clean = rows[(rows["FLAGS"] == 0) & (rows["FLUX_AUTO"] > 100.0 * rows["FLUXERR_AUTO"])]
+    stars = SkyCoord(clean["ALPHA_J2000"], clean["DELTA_J2000"], unit="deg")
+    test_tools.reference(tmp_path / "reference.cat", stars)
+    done = subprocess.run(
+        [command, "a.cat", "-c", "none", "-AHEADER_SUFFIX", ".head", "-HEADER_SUFFIX", ".out",
+         "-ASTREF_CATALOG", "FILE", "-ASTREFCAT_NAME", "reference.cat", "-MATCH", "N", "-SOLVE_ASTROM", "N",
+         "-SOLVE_PHOTOM", "N", "-CENTROID_KEYS", "X_IMAGE,Y_IMAGE", "-DISTORT_KEYS", "X_IMAGE,Y_IMAGE",
+         "-CENTROIDERR_KEYS", "ERRA_IMAGE,ERRB_IMAGE,ERRTHETA_IMAGE", "-CHECKPLOT_TYPE", "NONE",
+         "-CROSSID_RADIUS", "1", "-WRITE_XML", "N", "-VERBOSE_TYPE", "NORMAL"],
+        cwd=tmp_path, check=True, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    external = (done.stdout + done.stderr).split("(external)")[1]
+    across, up, _, many = re.search(r"Group +1: ([\d.e+-]+)\" ([\d.e+-]+)\" +([\d.e+-]+) +(\d+)", external).groups()
+    assert int(many) == len(clean) > 20
+    assert max(float(across), float(up)) < 1e-4
+
+
 def test_flags_are_those_of_the_truth(jpcam):
     check_flags(jpcam)
 
@@ -249,6 +277,16 @@ def test_what_makes_no_level2_is_refused_in_a_line(jpcam, tmp_path, capsys, more
     said = capsys.readouterr().err
     assert (words in said, said.count("\n")) == (True, 1), said
     assert not out.exists() or not list(out.iterdir())
+
+
+@pytest.mark.parametrize(("channel", "why"), [("EXT", "an older version rendered it"), ("VIS", "of ground cameras")])
+def test_without_a_psf_nothing_is_written(jpcam, tmp_path, capsys, channel, why):
+    exposure = replace(jpcam.ground.frame.exposure, channel=channel)
+    ground = replace(jpcam.ground, frame=replace(jpcam.ground.frame, psf=None, exposure=exposure))
+    reduced(ground, tmp_path / "out", "--level2", wanted=2)
+    said = capsys.readouterr().err
+    assert (why in said, said.count("\n")) == (True, 1), said
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_master_of_another_size_is_refused(jpcam, tmp_path, capsys):
