@@ -7,9 +7,11 @@ has. Everything: every effect of a science image is forced on.
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -97,24 +99,36 @@ def full(wanted: Request) -> Request:
 
 
 def detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
-    """All figures of single detectors."""
+    """All figures of single detectors, each camera's of a process of its own, which holds nothing of the others."""
     file, out = folder / "detectors.toml", dict[str, float]()
     cameras = {name: camera for name, camera in CAMERAS.items() if not (quick and name == "jpcam")}
     field, limits = (_SMALL, _BRIGHT) if quick else (_FIELD, _DEEP)
     file.write_text(request(tuple(cameras.values()), field, limits), encoding="utf-8")
     wanted = parse(file)
     root = one_detector.lake(folder, wanted)
+    alone = multiprocessing.get_context("spawn")
     for number, name in enumerate(cameras):
         one = replace(wanted, pointings=wanted.pointings[number : number + 1])
-        everything = prepared(root, full(one))
-        # Compiles, and fills the caches.
-        out[f"{name}_sources"] = float(render_exposures.work(root, everything).rows["sources"][0].as_py())
-        figures = [rendered(root, everything, folder) for _ in range(repeats)]
-        out |= {f"{name}_survey_s": min(s for s, _ in figures), f"{name}_peak_gb": max(gb for _, gb in figures)}
-        if name == "lsst":
-            parts = one_detector.effect_seconds(ground.EFFECTS, (), lambda f=everything: rendered(root, f, folder))
-            draft = prepared(root, replace(one, accuracy=preset("draft")))
-            out |= {**parts, "lsst_draft_s": min(rendered(root, draft, folder)[0] for _ in range(repeats))}
+        with ProcessPoolExecutor(1, mp_context=alone) as process:
+            out |= process.submit(_figures, name, root, one, repeats).result()
+    return out
+
+
+def _figures(name: str, root: Path, one: Request, repeats: int) -> dict[str, float]:
+    """Of a camera's detector; one : the request of it alone."""
+    folder, everything = root.parent, prepared(root, full(one))
+    # Compiles, and fills the caches.
+    sources = render_exposures.work(root, everything).rows["sources"][0].as_py()
+    took = [rendered(root, everything, folder) for _ in range(repeats)]
+    out = {
+        f"{name}_sources": float(sources),
+        f"{name}_survey_s": min(seconds for seconds, _ in took),
+        f"{name}_peak_gb": max(gb for _, gb in took),
+    }
+    if name == "lsst":
+        out |= one_detector.effect_seconds(ground.EFFECTS, (), lambda: rendered(root, everything, folder))
+        draft = prepared(root, replace(one, accuracy=preset("draft")))
+        out |= {"lsst_draft_s": min(rendered(root, draft, folder)[0] for _ in range(repeats))}
     return out
 
 
