@@ -121,7 +121,7 @@ def centre(detector: Detector, system: WCS) -> tuple[float, float]:
 
 
 def s_region(detector: Detector, system: WCS) -> str:
-    """The footprint as an STC-S polygon.  Error: its sides are straight; VIS's distortion bends them by 2 pixels."""
+    """The footprint as an STC-S polygon.  Error: its sides are straight; VIS's are bent by 2 pixels, HSC's by 7."""
     return "POLYGON ICRS " + " ".join(f"{value:.7f}" for value in corners(detector, system).ravel())
 
 

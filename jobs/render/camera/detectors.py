@@ -80,6 +80,14 @@ def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...
 
     Ref : VIS and NISP, Scaramella et al. 2022, Table 1 (gaps); ground cameras, the mission database's layouts
     """
+    found = _of_camera(camera, mission)
+    farthest = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in found)
+    scale = found[0].pixel_scale
+    distortion.refuse_folded(found[0].bending, farthest / scale, scale, camera)
+    return found
+
+
+def _of_camera(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
     if camera == "vis":
         _refuse_odd("vis", mission)
         return _of_grid("vis", lambda row, column: column >= _VIS_FIRST_ROTATED_COLUMN, mission)
@@ -178,6 +186,7 @@ def _mounted(planned: Iterable[Detector], section: str, mission: MissionConfigur
 
 def _listed(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
     """Detectors of a layout in millimetres."""
+    bending = distortion.terms(section, mission)
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")
     return tuple(
@@ -190,6 +199,7 @@ def _listed(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]
             y=float(row["y_mm"]) * plate_scale,
             rotation=float(row["rotation_deg"]),
             pixel_scale=scale,
+            bending=bending,
             kind=row["type"],
         )
         for row in mission.rows(f"{section}.layout")

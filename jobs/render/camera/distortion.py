@@ -3,17 +3,19 @@
 A focal-plane position P (arcsec) looks where a perfect camera has P + D(P); D is a polynomial without constant and
 linear terms, so that the boresight stays, and the scale there. In pixels it is the polynomial of the SIP convention.
 
-terms      a camera's polynomial, from the mission database
+terms      a camera's polynomial, from the mission database: any, or one of the distance from the axis
 joined     the sum of two
 bent       P -> P + D(P)
 sip        the same in a detector's pixels: coefficients of the header's cards
 stretch    what it does to a pixel's area
-straight   what SIP makes of pixels, undone
+straight   what SIP makes of pixels, undone, as far as `one_to_one`
 
 Ref : Shupe et al. 2005 (SIP)
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -31,13 +33,15 @@ _ARCSEC = 3600.0
 # The inverse: pixels that it is exact to, steps it may take (each doubles the digits), and from where on there is no
 # camera, pixels from the boresight: what lies there is left where a perfect camera has it.
 _EXACT, _MOST_STEPS, _FARTHEST = 1e-9, 30, 6e4
+# It is sought where a pixel keeps more than this part of its area; distances and directions that are tried.
+_LEAST_AREA, _RINGS, _RAYS = 0.1, 60, 24
 
 
 def terms(section: str, mission: MissionConfiguration) -> Terms:
     """A camera's distortion; none where the database has no polynomial, or its strength is 0."""
     key = f"{section}.fpa.distortion_polynomial"
     if key not in mission:
-        return ()
+        return _radial(section, mission)
     strength = mission.value(f"{section}.fpa.distortion", "")
     # The polynomial is in degrees.
     found = [
@@ -47,6 +51,42 @@ def terms(section: str, mission: MissionConfiguration) -> Terms:
     if any(i + j < 2 for i, j, _, _ in found):
         raise BadInput(f"mission model {key}: a term of less than second order moves the boresight or turns the camera")
     return tuple(term for term in found if term[2] or term[3])
+
+
+def _radial(section: str, mission: MissionConfiguration) -> Terms:
+    """P times k r^n for each even power n that the mission has; r : of P in the focal plane, mm."""
+    scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
+    plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")
+    found: Terms = ()
+    for power in (2, 4):
+        key = f"{section}.fpa.distortion_r{power}"
+        k = mission.value(key, f"1 / mm{power}") / plate_scale**power if key in mission else 0.0
+        if k:
+            found = joined(found, _RADIAL[power](k))
+    return found
+
+
+def refuse_folded(some: Terms, pixels: float, scale: float, camera: str) -> None:
+    """BadInput where detectors reach farther than the distortion can be undone.
+
+    some : of the camera;  pixels : from the boresight to the farthest corner;  scale : arcsec of a pixel
+    """
+    if some and pixels >= one_to_one(*sip(some, scale * np.eye(2))):
+        raise BadInput(
+            f"camera {camera}: its distortion is so strong that places of the sky are seen twice, or nowhere"
+        )
+
+
+def _of_square(k: float) -> Terms:
+    return (3, 0, k, 0.0), (1, 2, k, 0.0), (2, 1, 0.0, k), (0, 3, 0.0, k)
+
+
+def _of_fourth(k: float) -> Terms:
+    of_x, of_y = ((5, 0, k), (3, 2, 2.0 * k), (1, 4, k)), ((4, 1, k), (2, 3, 2.0 * k), (0, 5, k))
+    return (*((i, j, a, 0.0) for i, j, a in of_x), *((i, j, 0.0, a) for i, j, a in of_y))
+
+
+_RADIAL = {2: _of_square, 4: _of_fourth}
 
 
 def joined(some: Terms, more: Terms) -> Terms:
@@ -116,12 +156,12 @@ def _binomial(line: Float, n: int) -> Float:
 def straight(u: Float, v: Float, a: Float, b: Float) -> tuple[Float, Float]:
     """(u, v) [n] pixels from the boresight with u + a(u, v), v + b(u, v) as given, by Newton's rule.
 
-    Error : 1e-9 pixels; beyond any camera (see above) nothing is undone
+    Error : 1e-9 pixels; beyond any camera (see above), and where places are seen twice, nothing is undone
     """
     wanted = np.stack([np.asarray(u, float), np.asarray(v, float)])
     found = wanted.copy()
     with np.errstate(invalid="ignore"):
-        near = np.hypot(*wanted) < _FARTHEST
+        near = np.hypot(*wanted) < one_to_one(a, b)
     at, goal = found[:, near], wanted[:, near]
     slopes = [np.asarray(polynomial.polyder(c, axis=axis), float) for c in (a, b) for axis in (0, 1)]
     for _ in range(_MOST_STEPS):
@@ -136,6 +176,30 @@ def straight(u: Float, v: Float, a: Float, b: Float) -> tuple[Float, Float]:
         raise BadInput("the distortion is so strong that places of the sky are seen twice, or nowhere")
     found[:, near] = at
     return found[0], found[1]
+
+
+def one_to_one(a: Float, b: Float) -> float:
+    """Pixels from the boresight within which each place of the sky is seen once; at most those of any camera.
+
+    a, b : as of `straight`, coefficients [n, n]
+    """
+    return _one_to_one(a.tobytes(), b.tobytes(), a.shape, b.shape)
+
+
+@lru_cache(maxsize=512)
+def _one_to_one(a: bytes, b: bytes, of_a: tuple[int, int], of_b: tuple[int, int]) -> float:
+    some = np.frombuffer(a).reshape(of_a), np.frombuffer(b).reshape(of_b)
+    # As far on the detectors as the sky goes that may be asked for, even where they see less of it.
+    radius = np.linspace(0.0, 2.0 * _FARTHEST, _RINGS + 1)[:, None]
+    ray = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
+    places = np.stack([radius * np.cos(ray), radius * np.sin(ray)])
+    (au, av), (bu, bv) = ([np.asarray(polynomial.polyder(c, axis=axis), float) for axis in (0, 1)] for c in some)
+    area = (1.0 + _at(places, au)) * (1.0 + _at(places, bv)) - _at(places, av) * _at(places, bu)
+    turns = np.flatnonzero((area < _LEAST_AREA).any(axis=1))
+    if not len(turns):
+        return _FARTHEST
+    seen = np.hypot(*(places + np.stack([_at(places, c) for c in some])))[: turns[0]].min(axis=1)
+    return float(min(seen[-1], _FARTHEST))
 
 
 def _at(places: Float, coefficients: Float) -> Float:

@@ -18,7 +18,7 @@ from jobs.render.effects.charge import (
     poisson,
 )
 from jobs.render.effects.effect import Effect
-from jobs.render.effects.light import background, calibration_lamp, illumination
+from jobs.render.effects.light import background, calibration_lamp, illumination, pixel_area
 from jobs.render.effects.readout import (
     adc,
     bias_structure,
@@ -33,6 +33,7 @@ from jobs.render.sky import diffuse_light
 
 SKY = (
     background.EFFECT,
+    pixel_area.EFFECT,
     illumination.EFFECT,
     pixel_response.EFFECT,
     pixel_borders.RINGS,

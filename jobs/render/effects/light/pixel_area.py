@@ -1,6 +1,7 @@
 """Area of the sky that a pixel sees: where the optics distort, more of the diffuse sky, or less.
 
-Sources keep their light wherever they lie: theirs is drawn through the same distortion's Jacobian.
+And a tangent plane is larger than the sky. Sources keep their light wherever they lie: theirs is drawn through the same
+Jacobian.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from numpy.polynomial import polynomial
 
 from jobs import sums
 from jobs.render.camera import distortion
+from jobs.render.camera.pointing import ARCSEC
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.errors import OutOfRange
@@ -36,15 +38,15 @@ def apply(
 def change(u: Frame, v: Frame, stretch: Frame) -> Frame:
     """[ny, nx] a pixel's area over that at the boresight, less 1.
 
-    u [nx], v [ny] : pixels from the boresight;  stretch : coefficients of u^p v^q (distortion.stretch)
-    Error          : 2e-4, of the projection: a tangent plane is not the sky
+    u [nx], v [ny] : pixels from the boresight;  stretch : coefficients of u^p v^q
+    Error          : 1e-4, of what distortion and projection do to each other
     """
     across, along = (polynomial.polyvander(at, n - 1) for at, n in zip((u, v), stretch.shape, strict=True))
     return np.asarray(sums.product(along, sums.product(stretch.T, across.T)))
 
 
 def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
-    """Nothing changes without a detector, or where its camera's optics do not distort."""
+    """Nothing changes without a detector."""
     d = scene.detector
     if d is None:
         return scene.sky_electrons, np.zeros(scene.nx), np.zeros(scene.ny), np.zeros((1, 1))
@@ -52,7 +54,13 @@ def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
     u = np.arange(d.nx) - (d.nx - 1) / 2 + (cosine * d.x + sine * d.y) / d.pixel_scale
     v = np.arange(d.ny) - (d.ny - 1) / 2 + (cosine * d.y - sine * d.x) / d.pixel_scale
     matrix = d.pixel_scale * np.array([[cosine, -sine], [sine, cosine]])
-    stretch = distortion.stretch(d.bending, matrix) if d.bending else np.zeros((1, 1))
+    stretch = np.zeros((3, 3))
+    if d.bending:
+        stretch = distortion.stretch(d.bending, matrix)
+    # Of the sky a tangent plane has (1 + r^2)^(-3/2).
+    flat = -1.5 * (d.pixel_scale * ARCSEC) ** 2
+    stretch[2, 0] += flat
+    stretch[0, 2] += flat
     return scene.sky_electrons, u, v, stretch
 
 

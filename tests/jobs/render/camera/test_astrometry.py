@@ -24,13 +24,17 @@ MISSION = resolve(
         for camera in ("vis", "nisp")
         for key, unit in (("distortion", ""), ("metrology_shift", "pix"), ("metrology_rotation", "deg"))
     }
+    | {f"ext.lsstcam.fpa.distortion_r{power}": (0.0, f"1 / mm{power}") for power in (2, 4)}
 )
 VIS, LSST, NISP = (detectors(camera, MISSION) for camera in ("vis", "lsstcam", "nisp"))
 BENT = detectors("vis", resolve())
 BENT_NISP = detectors("nisp", resolve())
 SKY = st.tuples(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(-180, 180))
 STRAIGHT = st.sampled_from([VIS[0], VIS[15], VIS[35], LSST[0], LSST[94], LSST[188]])
-ANY_DETECTOR = st.one_of(STRAIGHT, st.sampled_from([BENT[0], BENT[15], BENT[35], BENT_NISP[0], BENT_NISP[10]]))
+BENT_GROUND = [detectors(camera, resolve())[0] for camera in ("lsstcam", "hsc", "decam")]
+ANY_DETECTOR = st.one_of(
+    STRAIGHT, st.sampled_from([BENT[0], BENT[15], BENT[35], BENT_NISP[0], BENT_NISP[10], *BENT_GROUND])
+)
 
 
 # ------------------------------------------------------------------------------------------------ layouts

@@ -19,7 +19,7 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 
 MISSION = resolve()
-BENT = [d for camera in ("vis", "nisp") for d in detectors(camera, MISSION)]
+BENT = [d for camera in ("vis", "nisp", "lsstcam", "hsc") for d in detectors(camera, MISSION)]
 SKY = st.tuples(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(-180, 180))
 PLACE = st.tuples(st.floats(0, 1), st.floats(0, 1))
 

@@ -17,9 +17,8 @@ from lake_schema.mission.configuration import MissionConfiguration, resolve
 from lake_schema.mission.parameter import CAMERAS
 from tests.jobs.render import fields
 
-# Declared, and asked for by nothing that renders: what zero points are checked with; optics that distort, which nothing
-# simulates yet.
-WAITING = ("*.collecting_area", "*.throughput", "*.fpa.distortion*")
+# Declared, and asked for by nothing that renders: what zero points are checked with.
+WAITING = ("*.collecting_area", "*.throughput")
 
 
 def seen(method, found):

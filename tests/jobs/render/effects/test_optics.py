@@ -19,6 +19,7 @@ from jobs.render.exposure import rendered
 from jobs.render.psf import diffraction
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
+from lake_schema.mission.parameter import CAMERAS
 from tests.jobs.render.fields import exposure
 
 MISSION = resolve()
@@ -215,7 +216,7 @@ def test_a_pixel_sees_of_the_sky_what_the_jacobian_says(name):
     system = astrometry.wcs(one.detector, 150.0, 2.0, 33.0)
     area = np.abs(np.linalg.det(astrometry.jacobian(system, column, row))) / 0.1**2
     # The tangent plane is 1.2e-4 larger than the sky at the corners of the field.
-    np.testing.assert_allclose(found, area - 1.0, atol=2e-4)
+    np.testing.assert_allclose(found, area - 1.0, atol=1e-5)
     assert np.abs(pixel_area.change(np.zeros(1), np.zeros(1), stretch)).max() == 0
     # In a mean of many pixels, everywhere in the field; in one pixel, in its corner.
     assert pixel_area.EFFECT.needed_if(one)
@@ -223,10 +224,26 @@ def test_a_pixel_sees_of_the_sky_what_the_jacobian_says(name):
     assert not pixel_area.EFFECT.needed_if(replace(one, sky_rate=1e-4))
 
 
-def test_without_distortion_all_pixels_see_the_same():
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_a_pixel_of_a_ground_camera_too(camera):
+    """On its outermost detector, against differences of the header's world coordinates."""
+    d = max(detectors.detectors(camera, resolve()), key=lambda d: np.hypot(d.x, d.y))
+    one = replace(scene(), section=d.section, detector=d, sky_rate=10.0)
+    _, u, v, stretch = pixel_area.parameters(one)
+    column, row = (np.array(at) for at in ((0, d.nx - 1, 0, d.nx - 1), (0, 0, d.ny - 1, d.ny - 1)))
+    system = astrometry.wcs(d, 150.0, 2.0, 33.0)
+    area = np.abs(np.linalg.det(astrometry.jacobian(system, column, row))) / d.pixel_scale**2
+    found = np.diag(pixel_area.change(u[column], v[row], stretch))
+    np.testing.assert_allclose(found, area - 1.0, atol=1e-4)
+    # It is what the sky lacks there.
+    assert found.max() < -2e-3
+    assert pixel_area.EFFECT.needed_if(one)
+
+
+def test_without_distortion_only_the_projection_is_left():
     straight = replace(scene(), detector=replace(scene().detector, bending=()))
-    for one in (straight, replace(straight, detector=None)):
-        assert pixel_area.EFFECT.contribution(one) == 0.0
+    assert 0.0 < pixel_area.EFFECT.contribution(straight) < 2e-4 * straight.sky_electrons
+    assert pixel_area.EFFECT.contribution(replace(straight, detector=None)) == 0.0
 
 
 # ------------------------------------------------------------------------------------------------ illumination
