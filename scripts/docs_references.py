@@ -16,12 +16,14 @@ import numpy as np
 
 from benchmarks import effects as scene_of_effects
 from jobs import accuracy
+from jobs.fluxes import passbands
 from jobs.render.camera import detectors, traces
 from jobs.render.channels import ground, nisp_p, nisp_s, registry, vis
 from jobs.render.channels.aim import Aim
+from jobs.render.effects.charge import bleeding
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.readout import quadrants
-from jobs.render.effects.scene import Frame, Lights, Scene
+from jobs.render.effects.scene import Elsewhere, Frame, Lights, Scene
 from jobs.render.exposure import spread_sky
 from jobs.request import from_toml, observations, schema, toml_values
 from jobs.rng import stream
@@ -219,10 +221,17 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
 
 
 def _ground_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """The corner of a detector of LSSTCam with points and squares of light."""
+    """The corner of a detector of LSSTCam with points and squares of light, satellites, and a star on another."""
     small = replace(detectors.detector("lsstcam", "R22_S11", mission), nx=_SIDE, ny=_SIDE)
     frame = scene_of_effects.light(_SIDE, _SIDE)
-    return frame, Scene(mission, "ext.lsstcam", 30.0, 50.0, float(frame.max()), small)
+    crossed = mission.overridden_with({"survey.satellites.rate": (3.0, "1 / (deg s)")})
+    brightest = float(frame.max())
+    scene = Scene(crossed, "ext.lsstcam", 30.0, 50.0, brightest, small, seeing=0.7, zero_point=26.82)
+    held = bleeding.apply(np.where(frame > 1e4, 10.0 * frame, 0.0)[::-1], 1e5, scene.runs)
+    assert scene.layout is not None
+    pixels = scene.layout.apart(held).reshape(-1)
+    some = np.flatnonzero(pixels)
+    return frame, replace(scene, band=passbands.load("lsst_y"), elsewhere=Elsewhere(some, pixels[some]))
 
 
 def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:

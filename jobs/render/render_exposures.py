@@ -20,7 +20,7 @@ from jobs.render.camera import detectors
 from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim
 from jobs.render.drawing import stamp_sizes
-from jobs.render.exposure import persistence, render, visible_sources, visible_spectra
+from jobs.render.exposure import elsewhere, persistence, render, visible_sources, visible_spectra
 from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
 from jobs.render.planning import preconditions, variants
 from jobs.render.planning import tasks as planned
@@ -314,6 +314,7 @@ def _rows(
         lenses=lenses,
         bodies=bodies,
         earlier=earlier,
+        beside=elsewhere.stars(inputs, aim, own),
     )
 
 

@@ -51,8 +51,8 @@
         dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
         detectors, mjd, exposure_time_s, realisations
         lamps = [..] of flats      macc = [groups, reads, drops] of NISP-P
-    [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation", "persistence", "ramp",
-                            "order_1", "order_0", "order_2", "order_m1"]
+    [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "satellites", "saturation",
+                            "persistence", "ramp", "order_1", "order_0", "order_2", "order_m1"]
                    compression = "none" | "rice"   of images of whole numbers, without loss
                    wcs = "sip" | "tpv"   how headers tell the distortion, default: as the instrument's pipeline;
                                          source-extractor, SCAMP and SWarp read TPV, or .head beside the image

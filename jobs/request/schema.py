@@ -37,12 +37,13 @@ MOST_SHEAR = 0.9
 # registry of channels).
 EFFECTS = (
     "adc", "amplifiers", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp",
-    "charge_injection", "chromatic_response", "cosmic_rays", "crosstalk", "dark_current", "dark_map", "dispersed_sky",
-    "drift", "edge_displacement", "filter_ghosts", "ghosts", "group_noise", "hot_pixels", "illumination",
-    "injection_noise", "intra_pixel", "ipc", "lamp_response", "macc", "nonlinearity", "output_gain", "parallel_cti",
-    "parallel_loss", "persistence", "pixel_area", "pixel_response", "poisson", "quadrants", "ramp", "ramp_cosmic_rays",
-    "ramp_nonlinearity", "read_noise", "readout_cosmic_rays", "readout_trail", "reset_level", "serial_cti",
-    "serial_loss", "shutter", "signal_adc", "signal_nonlinearity", "straylight", "tree_rings",
+    "charge_injection", "chromatic_response", "cosmic_rays", "crosstalk", "dark_current", "dark_map",
+    "detector_crosstalk", "dispersed_sky", "drift", "edge_displacement", "filter_ghosts", "fringes", "ghosts",
+    "group_noise", "hot_pixels", "illumination", "injection_noise", "intra_pixel", "ipc", "lamp_response", "macc",
+    "nonlinearity", "output_gain", "parallel_cti", "parallel_loss", "persistence", "pixel_area", "pixel_response",
+    "poisson", "quadrants", "ramp", "ramp_cosmic_rays", "ramp_nonlinearity", "read_noise", "readout_cosmic_rays",
+    "readout_trail", "reset_level", "satellite_trails", "serial_cti", "serial_loss", "shutter", "signal_adc",
+    "signal_nonlinearity", "straylight", "tree_rings",
 )  # fmt: skip
 # What no image is a product without.
 ALWAYS = ("adc", "amplifiers", "macc", "quadrants", "ramp", "signal_adc")

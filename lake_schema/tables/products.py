@@ -13,6 +13,7 @@ CONTENTS = (
     ("cosmic_rays", "electrons of cosmic rays, where they hit"),
     ("ghosts", "expected electrons of ghosts"),
     ("persistence", "expected electrons that earlier exposures left"),
+    ("satellites", "expected electrons of satellites' trails"),
     ("ramp", "groups of a ramp, as read"),
     ("saturation", "1 where a pixel or the converter is full"),
     ("order_1", "expected electrons of the sources' first order"),

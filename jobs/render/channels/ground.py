@@ -18,12 +18,20 @@ from jobs.render.effects.charge import (
     poisson,
 )
 from jobs.render.effects.effect import Effect
-from jobs.render.effects.light import background, calibration_lamp, illumination, pixel_area
+from jobs.render.effects.light import (
+    background,
+    calibration_lamp,
+    fringes,
+    illumination,
+    pixel_area,
+    satellite_trails,
+)
 from jobs.render.effects.readout import (
     adc,
     bias_structure,
     charge_transfer,
     crosstalk,
+    detector_crosstalk,
     nonlinearity,
     quadrants,
     read_noise,
@@ -32,8 +40,10 @@ from jobs.render.psf import seeing
 from jobs.render.sky import diffuse_light
 
 SKY = (
+    satellite_trails.EFFECT,
     background.EFFECT,
     pixel_area.EFFECT,
+    fringes.EFFECT,
     illumination.EFFECT,
     pixel_response.EFFECT,
     pixel_borders.RINGS,
@@ -49,6 +59,7 @@ SKY = (
     charge_transfer.SERIAL_LOSS,
     nonlinearity.EFFECT,
     crosstalk.EFFECT,
+    detector_crosstalk.EFFECT,
     bias_structure.EFFECT,
     read_noise.EFFECT,
     adc.EFFECT,
@@ -83,7 +94,7 @@ CHANNEL = Channel(
     sky=diffuse_light.ground_sky,
     cost=COST,
     on_ground=True,
-    own_light=(calibration_lamp.EFFECT,),
+    own_light=(calibration_lamp.EFFECT, satellite_trails.EFFECT),
     tracks=(cosmic_rays.EFFECT,),
     pupil=seeing.edges_of,
     readouts={"amplifiers": readout.BY_AMPLIFIER, "electrons": readout.ELECTRONS},

@@ -84,6 +84,7 @@ class ReadoutMode:
     electrons : images of a file -> float64[ny, nx] its pixels in e-, the bias subtracted
     before    : the effect from which on nothing of a channel is applied; "" = all of it is
     written   : bytes of a file for each of the detector's pixels; None = as measured (channels/cost.py)
+    apart     : ([ny, nx] of the detector, scene) -> what is read at a time side by side, in readout order
     """
 
     arrays: Callable[[Frame, Scene, str, WCS], Readout]
@@ -92,6 +93,7 @@ class ReadoutMode:
     electrons: Callable[[Sequence[Image]], Float]
     before: str = ""
     written: int | None = None
+    apart: Callable[[Array, Scene], Array] = lambda array, scene: array
 
 
 # ---------------------------------------------------------------------------------------------- one frame
@@ -244,7 +246,17 @@ def _header(image: Image) -> dict[str, Any]:
     return {keyword: value for keyword, value, _ in image.cards}
 
 
-QUADRANTS = ReadoutMode(arrays=_quadrants, assembled=_assembled, pixels=_quadrant_pixels, electrons=_quadrant_electrons)
+def _quadrants_apart(array: Array, scene: Scene) -> Array:
+    return layout.apply(array, *layout.sizes(scene))
+
+
+QUADRANTS = ReadoutMode(
+    arrays=_quadrants,
+    assembled=_assembled,
+    pixels=_quadrant_pixels,
+    electrons=_quadrant_electrons,
+    apart=_quadrants_apart,
+)
 
 
 # ---------------------------------------------------------------------------------------------- amplifiers in one array
@@ -347,7 +359,11 @@ def _apart_electrons(read: Sequence[Image]) -> Float:
     return out
 
 
-AMPLIFIERS = ReadoutMode(arrays=_amplifiers, assembled=_apart_assembled, pixels=_data, electrons=_apart_electrons)
+def _apart(array: Array, scene: Scene) -> Array:
+    return array if scene.layout is None else scene.layout.apart(array)
+
+
+AMPLIFIERS = ReadoutMode(_amplifiers, _apart_assembled, _data, _apart_electrons, apart=_apart)
 BY_AMPLIFIER = replace(AMPLIFIERS, arrays=_by_amplifier)
 
 

@@ -23,6 +23,7 @@ class Effect:
     repeated     : scene -> the part of it that a mean over frames or pixels keeps, electrons; None = all of it
     optional     : False where the frame is no product without it
     fixed        : a pattern of the detector itself: its random numbers are the same in every exposure
+    shared       : one thing for all detectors of an exposure: its random numbers are the same on each
     numbers      : the effect whose random numbers it takes, "" = its own
     cost         : seconds a million pixels take on one core (benchmarks/effects.py); a channel has none of 0
     """
@@ -33,6 +34,7 @@ class Effect:
     contribution: Callable[[Scene], float]
     optional: bool = True
     fixed: bool = False
+    shared: bool = False
     numbers: str = ""
     cost: float = 0.0
     repeated: Callable[[Scene], float] | None = None

@@ -12,7 +12,7 @@ from jobs.fluxes.passbands import Passband
 from jobs.render.camera import amplifiers
 from jobs.render.camera.amplifiers import Layout
 from jobs.render.camera.detectors import Detector
-from lake_schema.arrays import Float, Float32
+from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.places import Place
@@ -63,6 +63,18 @@ class Lights:
 
 
 @dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """What other detectors hold while one is read.
+
+    pixel     : int64[n] of the parts of the detector in readout order, counted on; each once
+    electrons : float64[n]
+    """
+
+    pixel: Int
+    electrons: Frame
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """What effects may know of an exposure of one detector.
 
@@ -81,6 +93,8 @@ class Scene:
     tints          : float32[2, ny, nx] of `chromatic_response`: sources of which pixels see the colour; None = of none
     spread_sky     : [gy, gx] e- that a grism changes of the sky, at places evenly over the detector; None = nothing
     tint_electrons : the most that this changes in a pixel, e- rms
+    seeing         : FWHM, arcsec, of a ground camera's exposure;  zero_point : AB magnitude of 1 e-/s
+    elsewhere      : charge of the detectors that are read with this one; None = none that is noticed
     """
 
     mission: MissionConfiguration
@@ -100,6 +114,9 @@ class Scene:
     tints: Float32 | None = None
     tint_electrons: float = 0.0
     spread_sky: Frame | None = None
+    elsewhere: Elsewhere | None = None
+    seeing: float = 0.0
+    zero_point: float = 0.0
 
     def value(self, key: str, unit: str) -> float:
         """A parameter of the detector."""

@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from jobs.accuracy import Accuracy
 from jobs.fluxes.libraries.templates import Library
+from jobs.render.camera.detectors import Detector
 from jobs.render.channels.aim import Aim
 from jobs.render.sources.disc_structure import DiscStructure
 from jobs.render.sources.galaxy_stamps import GalaxyStamps
@@ -32,6 +33,7 @@ class Rows:
     discs      : what structure large discs have; None = they are smooth
     stamps     : what galaxies are drawn as in place of their profiles; None = there are none
     bulges     : [n] part of the galaxies' light that is in the bulge, the same in all bands; None = as the rows say
+    beside     : bright stars of the detectors that are read with this one
     """
 
     galaxies: pa.Table
@@ -47,6 +49,16 @@ class Rows:
     discs: DiscStructure | None = None
     stamps: GalaxyStamps | None = None
     bulges: Float | None = None
+    beside: tuple[Beside, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """Another detector of the same exposure; stars : on it;  fluxes : row by row theirs."""
+
+    detector: Detector
+    stars: pa.Table
+    fluxes: pa.Table
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.stamps import Tally
 from jobs.render.effects.effect import Effect, apply_all
 from jobs.render.effects.scene import Frame, Scene
-from jobs.render.exposure import limits, persistence, rendered, scene_of, spread_sky, tints, truth_maps
+from jobs.render.exposure import elsewhere, limits, persistence, rendered, scene_of, spread_sky, tints, truth_maps
 from jobs.render.exposure.records import Rows, Variant
 from jobs.render.exposure.rendered import Rendered
 from jobs.render.exposure.traced import Columns, traced
@@ -53,6 +53,7 @@ def render(
     spread = aim.channel.disperses is not None and aim.sees_sky
     light = (visible_spectra if spread else visible_light)(aim, rows, scene, seed)
     limits.refuse_too_large(aim, light)
+    light = elsewhere.with_charge(light, aim, rows, variant, seed)
     drawn, frame = _drawn(aim, light, truth, progress) if light.dispersed is None else _spread(aim, rows, light, truth)
     return _detected(aim, rows, light, drawn, frame, (seed, noise_seed, truth))
 

@@ -83,4 +83,4 @@ def numbers_of(
     """
     what = exposure.camera if effect.fixed else image_types.identity(exposure)
     own = seed if effect.fixed or noise_seed is None else noise_seed
-    return own, what, detector, effect.numbers or effect.name
+    return own, what, "" if effect.shared else detector, effect.numbers or effect.name

@@ -40,6 +40,7 @@ def scene_of(exposure: ExposureRow, detector: Detector, mission: MissionConfigur
     scene = Scene(
         mission, detector.section, exposure.exposure_time_s, exposure.sky, 0.0, detector,
         lamp=exposure.lamp or 1, accuracy=accuracy, ramp=channel.ramp if channel else "",
+        seeing=exposure.seeing, zero_point=exposure.zero_point,
     )  # fmt: skip
     if scene.ramp:
         ramp.mode_of(scene)

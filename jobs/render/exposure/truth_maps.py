@@ -24,7 +24,8 @@ Maps = dict[str, Array]
 ORDERS = {1: "order_1", 0: "order_0", 2: "order_2", -1: "order_m1"}
 # Bytes a pixel of each map's file.
 BYTES = {
-    "noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "persistence": 4, "saturation": 1,
+    "noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "persistence": 4, "satellites": 4,
+    "saturation": 1,
     # Four groups of a photometric ramp.
     "ramp": 8, **dict.fromkeys(ORDERS.values(), 4),
 }  # fmt: skip
@@ -35,7 +36,7 @@ _GRISM = "dispersed_sky"
 # What adds to a map of the same name as an effect, or of another.
 _OF_EFFECT = {
     "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "dispersed_sky": "sky", "pixel_area": "sky",
-    "straylight": "sky",
+    "straylight": "sky", "fringes": "sky", "satellite_trails": "satellites",
     "cosmic_rays": "cosmic_rays", "readout_cosmic_rays": "cosmic_rays", "ramp_cosmic_rays": "cosmic_rays",
     "persistence": "persistence", "macc": "ramp",
 }  # fmt: skip
@@ -63,10 +64,10 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode) -> 
     def see(name: str, before: Frame, after: Frame) -> None:
         if name in ("ghosts", "filter_ghosts") and "ghosts" in truth:
             maps["ghosts"] = (after - before).astype(np.float32) + maps.get("ghosts", np.float32(0.0))
-        if name in ("background", "dispersed_sky", "pixel_area", "straylight") and "sky" in truth:
+        if _OF_EFFECT.get(name) == "sky" and "sky" in truth:
             maps["sky"] = (after - before).astype(np.float32) + maps.get("sky", np.float32(0.0))
-        if name == "persistence" and "persistence" in truth:
-            maps["persistence"] = (after - before).astype(np.float32)
+        if name in ("persistence", "satellite_trails") and _OF_EFFECT[name] in truth:
+            maps[_OF_EFFECT[name]] = (after - before).astype(np.float32)
         if name == "bleeding" and "saturation" in truth:
             maps["saturation"] = bleeding.saturated(after, scene.value("full_well", "electron")).astype(np.uint8)
         if name == "ramp" and "saturation" in truth:
@@ -102,6 +103,7 @@ def complete(
         ("sky", np.float32),
         ("cosmic_rays", np.int32),
         ("persistence", np.float32),
+        ("satellites", np.float32),
         ("saturation", np.uint8),
     ):
         if name in wanted and name not in maps:

@@ -19,7 +19,8 @@ from jobs.render.exposure import truth_maps
 _HEADER_BYTES, _MAP_S = 8640, 2.5e-9
 # s a pixel of a map, for each effect that fills it in; and of the stars' own frame, on which they are drawn again.
 _FILLED_S = {
-    "sky": {"background": 1e-8, "pixel_area": 4e-8, "straylight": 4e-8},
+    "sky": {"background": 1e-8, "pixel_area": 4e-8, "straylight": 4e-8, "fringes": 2.5e-8},
+    "satellites": {"satellite_trails": 2.5e-8},
     "cosmic_rays": {"cosmic_rays": 4.5e-8, "readout_cosmic_rays": 3e-8},
     "ghosts": {"ghosts": 5e-8},
     "saturation": {"bleeding": 1e-8},

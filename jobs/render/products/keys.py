@@ -1,17 +1,21 @@
 """The key of each product: a digest of everything that shapes it."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
 
 import pyarrow as pa
 
+from jobs.accuracy import SURVEY
 from jobs.render.camera import detectors
+from jobs.render.camera.detectors import Detector
 from jobs.render.channels import registry
 from jobs.render.drawing import stamp_sizes
-from jobs.render.exposure import persistence
+from jobs.render.effects.readout import detector_crosstalk
+from jobs.render.exposure import elsewhere, persistence
+from jobs.render.planning import variants
 from jobs.render.psf import from_file
 from jobs.render.sources import catalogue_rows, ephemerides, galaxy_stamps, selection
 from jobs.render.sources.catalogue_rows import CATALOGUES, CELLS, FARTHEST, LENSES
@@ -21,6 +25,8 @@ from lake_schema.store import read
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import digest, file_sha256
 from lake_schema.tables.exposures import ExposureRow
+
+Beside = Callable[[ExposureRow, str], Json]
 
 
 def product_keys(
@@ -39,10 +45,8 @@ def product_keys(
     earlier   : tasks that left something in a detector, by exposure and detector
     """
     flux_facts = inputs["galaxy_fluxes"].manifest["facts"]
-    shared = {
-        **{key: facts[key] for key in ("request", "mission", "code")},
-        "library": [flux_facts.get("files"), flux_facts.get("sources")],
-    }
+    shared = {key: facts[key] for key in ("request", "mission", "code")}
+    shared["library"] = [flux_facts.get("files"), flux_facts.get("sources")]
     rows = {row.exposure_id: row for row in map(ExposureRow.of, exposures.to_pylist())}
     files = {
         name: (catalogue_rows.deflection_of(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes]))
@@ -67,11 +71,14 @@ def product_keys(
             for name, (deflection, found) in files.items()
         ]
 
+    beside = _beside(files["stars"], mission)
+
     def drawn(task: Json) -> Json:
         return {
             "exposure": asdict(rows[task["exposure_id"]]),
             "task": {name: task[name] for name in ("detector", "cells", "radius")},
             "catalogues": catalogues(task) if task["cells"] else [],
+            **(beside(rows[task["exposure_id"]], task["detector"]) if task["cells"] else {}),
             **_own_files(facts, rows[task["exposure_id"]], task["detector"]),
         }
 
@@ -82,6 +89,28 @@ def product_keys(
     before = ([left(one) for one in earlier.get((task["exposure_id"], task["detector"]), ())] for task in tasks)
     also = ({"earlier": some} if some else {} for some in before)
     return [digest({**shared, **drawn(task), **more}) for task, more in zip(tasks, also, strict=True)]
+
+
+def _beside(stars: tuple[float, Mapping[int, list[tuple[str, ...]]]], mission: MissionConfiguration) -> Beside:
+    """What an image shows of the stars of detectors that are read with its own: the files that hold them.
+
+    stars : how far they move, deg, and their files by cell;  mission : the mission database
+    """
+    boards: dict[tuple[str, str, str | None], tuple[Detector, ...]] = {}
+
+    def of(exposure: ExposureRow, detector: str) -> Json:
+        if detector_crosstalk.EFFECT not in (registry.effects_or_none(exposure.channel, exposure.image_type) or ()):
+            return {}
+        which = exposure.camera, detector, exposure.settings
+        if which not in boards:
+            own = variants.variant(exposure.settings, mission, SURVEY, {}).mission
+            boards[which] = elsewhere.neighbours(exposure.camera, detector, own)
+        places = [elsewhere.circle(exposure, other) for other in boards[which]]
+        cells = {cell for place in places for cell in selection.within(place, stars[0], 0.0)}
+        sums = sorted({each for cell in cells for each in stars[1].get(cell, ())})
+        return {"beside": sums} if sums else {}
+
+    return of
 
 
 def _own_files(facts: Json, exposure: ExposureRow, detector: str) -> Json:

@@ -9,6 +9,7 @@ from jobs.fluxes import passbands
 from jobs.render.camera import bands, detectors
 from jobs.render.channels import ground
 from jobs.render.effects.scene import Scene
+from jobs.render.exposure import elsewhere
 from jobs.render.planning import calibration_frames, ground_surveys, planned_exposures
 from jobs.render.products import raw_pointing
 from jobs.request.area import Area
@@ -51,10 +52,14 @@ def asked(camera, mission, monkeypatch):
     assert [*ground_surveys.exposures(block, Area(ra=60.0, dec=0.0, radius=1.0), mission, 1, 60500.0)]
     flat = Observation(("EXT",), "flat", surveys[0], exposures=1)
     assert [*calibration_frames.exposures(flat, camera, (60.0, 0.0), mission, 1, 60500.0)]
-    scene = Scene(mission, one.section, 90.0, 10.0, 1e6, one)
-    for effect in {effect.name: effect for effects in ground.EFFECTS.values() for effect in effects}.values():
-        effect.parameters(scene)
-        effect.contribution(scene)
+    elsewhere.neighbours(camera, one.name, mission)
+    crossed = mission.overridden_with({"survey.satellites.rate": (0.1, "1 / (deg s)")})
+    every = {effect.name: effect for effects in ground.EFFECTS.values() for effect in effects}
+    for band in bands.of_ground(camera, mission):
+        scene = Scene(crossed, one.section, 90.0, 10.0, 1e6, one, band=passbands.load(band))
+        for effect in every.values():
+            effect.parameters(scene)
+            effect.contribution(scene)
     return found
 
 

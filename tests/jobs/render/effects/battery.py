@@ -9,8 +9,9 @@ from jobs.render.camera.sections import Section
 from jobs.render.channels import ground, nisp_p, nisp_s, vis
 from jobs.render.effects.charge.ramp import Mode
 from jobs.render.effects.light.ghosts import Pupil
+from jobs.render.effects.light.satellite_trails import Blur, Satellites
 from jobs.render.effects.readout.traps import Sweeps, Traps
-from jobs.render.effects.scene import Lights
+from jobs.render.effects.scene import Elsewhere, Lights
 from lake_schema.mission.configuration import resolve
 
 # Every effect of a channel, by its name.
@@ -79,6 +80,11 @@ def tinted(electrons, even=(0.0, 0.0)):
     return lambda shape: (np.full((2, *shape), electrons, np.float32), np.array(even), 0.1, 0.1)
 
 
+def beside(electrons):
+    """A star in the first pixel of another detector."""
+    return lambda shape: (Elsewhere(np.array([0]), np.array([electrons])), 1e-4)
+
+
 def halves(shape):
     """Two amplifiers, of the left and the right half."""
     ny, nx = shape
@@ -108,6 +114,13 @@ _CASES = (
         zero=False,
     ),
     Case("pixel_area", stretched(1e-2), stretched(0.0), zero=False),
+    Case("fringes", (120.0, 0.01, 20.0), (120.0, 0.0, 20.0), zero=False, positive=False),
+    Case(
+        "satellite_trails",
+        (Satellites(20.0, 500.0, 0.5), Blur(3.0, 2.0, 1.0), None, 10.0),
+        (Satellites(0.0, 500.0, 0.5), Blur(3.0, 2.0, 1.0), None, 10.0),
+        zero=False,
+    ),
     Case("dispersed_sky", (np.array([[0.0, 3.0, 2.0], [1.0, 20.0, 5.0]]),), (None,), zero=False),
     Case("straylight", (LIGHTS, 5e-4, 40.0), (LIGHTS, 0.0, 40.0), zero=False),
     Case("illumination", bowl, flat, linear=True),
@@ -159,6 +172,7 @@ _CASES = (
     Case("serial_loss", (1e-4,), (0.0,), planes=True, linear=True),
     Case("nonlinearity", (0.05, 2.28e5, 0.01, 2e3), (0.0, 2.28e5, 0.0, 2e3)),
     Case("crosstalk", (PAIRS,), (np.zeros((4, 4)),), planes=True, linear=True),
+    Case("detector_crosstalk", beside(1e5), (None, 1e-4), planes=True, zero=False),
     Case("bias_structure", (30.0, -9.0, 40.0, 1.0), (0.0, 0.0, 40.0, 0.0), planes=True, zero=False, positive=False),
     Case("read_noise", (4.4,), (0.0,), zero=False, positive=False),
     Case("adc", (3.48, 0.0, 65535.0), None, whole=True),

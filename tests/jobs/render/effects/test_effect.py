@@ -42,6 +42,8 @@ ORDER = (
     ("straylight", "illumination"),
     ("ghosts", "filter_ghosts", "background"),
     ("background", "pixel_area", "pixel_response"),
+    # A fixed part of the sky's light, which vignetting dims as it does satellites'.
+    ("satellite_trails", "background", "pixel_area", "fringes", "illumination", "poisson"),
     ("readout_trail", "poisson"),
     ("calibration_lamp", "pixel_response"),
     # All charge fills wells before it is read; what hits the register meanwhile misses the way down the columns.
@@ -50,7 +52,7 @@ ORDER = (
     ("charge_injection", "injection_noise", "bleeding"),
     ("dark_current", "bleeding", "amplifiers", "parallel_loss", "serial_loss", "nonlinearity"),
     # Charge is read before it is amplified and converted.
-    ("serial_cti", "nonlinearity", "crosstalk", "bias_structure", "read_noise", "adc"),
+    ("serial_cti", "nonlinearity", "crosstalk", "detector_crosstalk", "bias_structure", "read_noise", "adc"),
     # A ramp counts all that is expected, and what hits meanwhile; a pixel's capacity bends what it holds.
     (
         "background",

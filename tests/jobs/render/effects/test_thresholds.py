@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from jobs import rng
+from jobs.fluxes import passbands
 from jobs.render.camera import detectors
 from jobs.render.channels import vis
 from jobs.render.effects.charge import cosmic_rays
 from jobs.render.effects.effect import apply_all
-from jobs.render.effects.scene import NOTICEABLE, STACK, Lights, Scene
+from jobs.render.effects.scene import NOTICEABLE, STACK, Elsewhere, Lights, Scene
 from lake_schema.mission.configuration import resolve
 from tests.jobs.render import nominal
 from tests.jobs.render.effects import test_ramp_thresholds
@@ -41,6 +42,12 @@ def ground(sky=10.0, peak=1e4, **values):
     return Scene(mission, "ext.decam", 90.0, sky, peak, detectors.detector("decam", "S29", MISSION))
 
 
+def crossed():
+    """The same, of a field with ten trails."""
+    rate = {"survey.satellites.rate": (0.05, "1 / (deg s)")}
+    return replace(ground(), mission=MISSION.overridden_with(rate), seeing=0.9)
+
+
 def star(electrons):
     return Lights(np.array([4.0]), np.array([1000.0]), np.array([electrons]))
 
@@ -50,6 +57,8 @@ CASES = {
     "background": lambda x: scene(sky=0.01 * x),
     "pixel_area": lambda x: scene(sky=0.01 * x),
     "dispersed_sky": lambda x: replace(scene(), spread_sky=np.full((3, 3), 0.01 * x)),
+    "fringes": lambda x: replace(ground(des_z__fringes=min(1e-5 * x, 0.5)), band=passbands.load("des_z")),
+    "satellite_trails": lambda x: replace(crossed(), zero_point=10.0 + 2.5 * np.log10(x)),
     "illumination": lambda x: scene(illumination=min(1e-4 * x, 0.5)),
     "shutter": lambda x: scene(shutter_map=min(0.05 * x, 280.0)),
     "pixel_response": lambda x: scene(
@@ -72,6 +81,9 @@ CASES = {
     "serial_loss": lambda x: ground(cti__serial=min(1e-8 * x, 1e-3)),
     "nonlinearity": lambda x: scene(nonlinearity__low=min(1e-4 * x, 0.9), nonlinearity__high=1e-4 * x),
     "crosstalk": lambda x: scene(crosstalk=min(1e-4 * x, 0.1)),
+    "detector_crosstalk": lambda x: replace(
+        scene(crosstalk_detectors=1e-4), elsewhere=Elsewhere(np.array([0]), np.array([1e3 * x]))
+    ),
     "bias_structure": lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x),
     "read_noise": lambda x: scene(sky=10.0, read_noise=x),
     "ghosts": lambda x: scene(lights=star(1e8 * x)),
@@ -85,6 +97,7 @@ QUADRANTS = (
     "parallel_loss",
     "serial_loss",
     "crosstalk",
+    "detector_crosstalk",
     "bias_structure",
     "readout_cosmic_rays",
 )
