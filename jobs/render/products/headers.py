@@ -181,6 +181,7 @@ _TRUTH = {
     "sky": ("electron", "unit of the pixels: expected, sky alone"),
     "cosmic_rays": ("electron", "unit of the pixels: cosmic rays alone"),
     "ghosts": ("electron", "unit of the pixels: expected, ghosts alone"),
+    "satellites": ("electron", "unit of the pixels: expected, trails alone"),
     "persistence": ("electron", "unit of the pixels: expected, persistence"),
     **{
         content: ("electron", f"unit of the pixels: expected, order {order} alone")

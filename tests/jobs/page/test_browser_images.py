@@ -193,10 +193,13 @@ def test_blinking_shows_both_in_turn(tab):
     tab.select_option("#image-two", "1")
     time.sleep(1.0)
     tab.keyboard.press("b")
-    seen = set()
-    for _ in range(8):
-        seen.add(tab.locator("#image-canvas").screenshot())
+    # The last of so many shown: on a busy machine the first may be of tiles that are still on their way.
+    shown = []
+    for _ in range(24):
+        shown.append(tab.locator("#image-canvas").screenshot())
         time.sleep(0.25)
-    assert len(seen) == 2
+        if len(shown) > 8 and len(set(shown[-8:])) == 2:
+            break
+    assert len(set(shown[-8:])) == 2
     tab.click("#image-blink")
     assert tab.get_attribute("#image-blink", "aria-pressed") == "false"
