@@ -8,7 +8,6 @@ cache, "warm" with them.
 from __future__ import annotations
 
 import argparse
-import resource
 import sys
 import tempfile
 import time
@@ -54,7 +53,6 @@ _NOTES = {
     "ramp_s": "CPU, of survey_warm_s, of the effects from cosmic rays to the converter",
     "peak_gb": "largest memory of the process, survey (target 2)",
     "exposure_s": "wall, an exposure of 16 detectors by the Spark job on 2 cores (target of four 480)",
-    "exposure_cpu_s": "CPU of the same, of all its processes",
     "spectrum_s": "CPU, a first order of a star or a small galaxy, as slitlessutils is given them",
     "slitlessutils_spectrum_s": "CPU, the same by slitlessutils",
     "against_slitlessutils": "times that it takes of ours",
@@ -178,17 +176,9 @@ def detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
 
 
 def whole_exposure(folder: Path, quick: bool) -> dict[str, float]:
-    """Wall and CPU s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
+    """Wall s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
     text = request(quick, 'detectors = ["DET22", "DET23"]' if quick else "", (53.117, -27.808))
-    before = _children()
-    wall = one_detector.by_job(folder, text.replace("radius = 0.2", f"radius = {FIELD}"))
-    return {"exposure_s": wall, "exposure_cpu_s": _children() - before}
-
-
-def _children() -> float:
-    """CPU s of all processes that were started from here and have ended."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    return {"exposure_s": one_detector.by_job(folder, text.replace("radius = 0.2", f"radius = {FIELD}"))}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
