@@ -54,7 +54,7 @@ def refuse(frames: Sequence[Frame]) -> None:
 def _psf_of(frame: Frame) -> Path:
     if frame.psf is None:
         ground = registry.CHANNELS[frame.exposure.channel].on_ground
-        why = "an older version rendered it" if ground else "level 2 is of ground cameras"
+        why = "an older version rendered it" if ground else "choose those of ground cameras by --exposures"
         raise BadInput(f"--level2: the lake has no PSF beside the image {frame.stem}: {why}")
     return frame.psf
 
