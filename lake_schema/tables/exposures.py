@@ -24,6 +24,11 @@ IMAGE_TYPES = (
     ("self_calibration", "dense field, many dithers"),
     ("standard_star", "standard star"),
     ("planetary_nebula", "emission lines for the wavelength scale"),
+    ("trap_pumping", "charge shuffled to and fro over the traps, each of which makes a dipole"),
+    ("defocus", "sky exposure out of focus, for the wavefront"),
+    ("bleeding", "stars that fill their pixels, at known places of every detector"),
+    ("stray_light", "sky exposure with a bright star beside the field"),
+    ("white_dwarf", "white dwarfs at known places of every detector"),
 )
 # Passbands of Euclid's channels, which requests know by themselves (a test holds them to the planner's).
 EUCLID_BANDS: Mapping[str, tuple[str, ...]] = {
