@@ -211,7 +211,7 @@ PARALLEL = Effect(
     apply_parallel,
     lambda scene: _parameters(scene, "parallel", scene.half_rows),
     lambda scene: _loss(_before_readout(scene), "parallel", scene.half_rows),
-    cost=0.11,
+    cost=0.044,
     repeated=lambda scene: _repeated(_before_readout(scene), "parallel", scene.half_rows),
 )
 SERIAL = Effect(
@@ -219,7 +219,7 @@ SERIAL = Effect(
     apply_serial,
     lambda scene: _parameters(scene, "serial", _columns(scene)),
     lambda scene: _loss(scene, "serial", _columns(scene)),
-    cost=0.082,
+    cost=0.032,
     repeated=lambda scene: _repeated(scene, "serial", _columns(scene)),
 )
 PARALLEL_LOSS = Effect(

@@ -42,7 +42,9 @@ from lake_schema.errors import BadInput, OutOfRange
 # Lines that are copied together where a line's packets do not lie next to each other in memory.
 _BLOCK = 64
 # Species are followed together, in one register; those that are missing have no traps.
-_SPECIES = 4
+_SPECIES = 3
+# Of a packet, what it may be wrong by where the height of its cloud is told: 0.6 of it in V.
+_SMALL = 1e-4
 # V(n) is tabulated: 2^6 linear segments of an octave of n, and octaves below the full well.
 _SEGMENT_BITS, _OCTAVES = 6, 60
 
@@ -118,7 +120,7 @@ def shifted(frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int |
     """
     if axis not in (-1, -2):
         raise OutOfRange("axis of transfer", axis, -2, -1)
-    out = np.ascontiguousarray(frame, dtype=np.float64).copy()
+    out = np.array(frame, dtype=np.float64, order="C")
     n = out.shape[axis]
     physical = n if pixels is None else pixels
     if not 0 <= physical <= n:
@@ -127,7 +129,8 @@ def shifted(frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int |
         return out, 0.0
     missing = _SPECIES - len(traps.density)
     density, release = np.array(traps.density + (0.0,) * missing), np.array(traps.release + (1.0,) * missing)
-    left = np.exp(-np.arange(n + 1)[:, None] / release)
+    # What a species' traps in a pixel that were filled so many transfers ago still hold.
+    left = density * np.exp(-np.arange(n + 1)[:, None] / release)
     # 1 - exp(-1 / tau) without the difference of almost equal numbers.
     released = -np.expm1(-1.0 / release)
     edges = np.rint(np.linspace(physical, 0, min(sweeps.steps, max(physical, 1)) + 1)).astype(np.int64)
@@ -135,15 +138,18 @@ def shifted(frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int |
     ends = trap_levels.heights(out, traps.notch, sweeps.levels) if sweeps.levels else None
     trapped = 0.0
     for plane in out.reshape(-1, *out.shape[-2:]):
-        lines = plane if axis == -1 else plane.T
         if ends is not None:
             trapped += trap_levels.shift(plane, axis, physical, density, released, ends, traps.volume(ends))
-            continue
-        # Some lines at a time: those that are columns lie far apart in memory.
-        for start in range(0, len(lines), _BLOCK):
-            some = np.array(lines[start : start + _BLOCK], order="C")
-            trapped += _shift(some, density, left, released, *volumes, edges, sweeps.order)
-            lines[start : start + _BLOCK] = some
+        elif axis == -1:
+            trapped += _shift(plane, density, left, released, *volumes, edges, sweeps.order)
+        else:
+            # Some columns at a time: their packets lie far apart in memory.
+            lines = np.empty((_BLOCK, n))
+            for start in range(0, plane.shape[1], _BLOCK):
+                some = lines[: plane.shape[1] - start]
+                some[:] = plane[:, start : start + _BLOCK].T
+                trapped += _shift(some, density, left, released, *volumes, edges, sweeps.order)
+                plane[:, start : start + _BLOCK] = some.T
     return out, trapped
 
 
@@ -151,7 +157,8 @@ def _volumes(traps: Traps) -> tuple[Float, float, float]:
     """V at the ends of the segments of (n - notch) / (full_well - notch), from 2^-_OCTAVES to 1; notch; 1 / range."""
     octave = np.arange(_OCTAVES)[:, None] - _OCTAVES
     part = np.ldexp(1.0 + np.arange(1 << _SEGMENT_BITS) / (1 << _SEGMENT_BITS), octave).ravel()
-    return np.append(part, 1.0) ** traps.power, traps.notch, 1.0 / (traps.full_well - traps.notch)
+    # Twice the last: a full well is the start of a segment, too.
+    return np.concatenate([part, [1.0, 1.0]]) ** traps.power, traps.notch, 1.0 / (traps.full_well - traps.notch)
 
 
 @jit
@@ -162,28 +169,26 @@ def _shift(
     """Every line lines[k, :], in place; returns what is still trapped."""
     n = lines.shape[1]
     first, second = np.empty(n), np.empty(n)
-    height, full, since = np.empty(n + 1), np.empty(n + 1), np.empty(n + 1, np.int64)
-    part = np.empty(1)
-    bits = part.view(np.int64)
-    # What a pixel filled so many rows ago holds, of all species; 1 / n.
-    filled, inverse = np.zeros(n + 1), np.zeros(n + 1)
-    for i in range(n + 1):
-        for s in range(_SPECIES):
-            filled[i] += density[s] * left[i, s]
-        inverse[i] = 1.0 / max(i, 1)
+    seen, inverse, reached, part = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    height, full, since = np.empty(n + 2), np.empty(n + 2), np.empty(n + 2, np.int64)
     trapped = 0.0
     for line in lines:
         if line.max() <= notch:
             continue
         for e in range(len(edges) - 1):
             high, low = edges[e], edges[e + 1]
-            held_back = _sweep(line, first, low, high, edges[0], density, left, filled, inverse, released, volumes,
-                               notch, scale, height, full, since, part, bits)  # fmt: skip
+            for i in range(low, n):
+                seen[i] = min(min(i, edges[0] - 1) + 1, high) - low
+                inverse[i] = 1.0 / max(seen[i], 1.0)
+            _reach(line, volumes, notch, scale, part, part.view(np.int64), reached)
+            held_back = _sweep(line, first, low, seen, inverse, reached, density, left, released, volumes, notch, scale,
+                               height, full, since, part)  # fmt: skip
             for i in range(n):
                 first[i] += line[i]
             if order == 2:
-                again = _sweep(first, second, low, high, edges[0], density, left, filled, inverse, released, volumes,
-                               notch, scale, height, full, since, part, bits)  # fmt: skip
+                _reach(first, volumes, notch, scale, part, part.view(np.int64), reached)
+                again = _sweep(first, second, low, seen, inverse, reached, density, left, released, volumes, notch,
+                               scale, height, full, since, part)  # fmt: skip
                 held_back = 0.5 * (held_back + again)
                 for i in range(n):
                     line[i] = 0.5 * (line[i] + first[i] + second[i])
@@ -195,81 +200,127 @@ def _shift(
 
 @jit
 def _sweep(
-    line: Any, change: Any, low: int, high: int, pixels: int, density: Float, left: Float, filled: Float,
-    inverse: Float, released: Float, volumes: Float, notch: float, scale: float, height: Float, full: Float,
-    since: Any, part: Float, bits: Any,
+    line: Any, change: Any, low: int, seen: Float, inverse: Float, reached: Float, density: Float, left: Float,
+    released: Float, volumes: Float, notch: float, scale: float, height: Float, full: Float, since: Any, part: Float,
 ) -> float:  # fmt: skip
-    """Fills `change` with what the pixels low .. high - 1 do to the packets; returns what they hold at the end.
+    """Fills `change` with what pixels from `low` on do to the packets; returns what they hold at the end.
 
+    seen, inverse       : how many of them see each packet, and 1 over that
+    reached             : V of each packet as it comes
     height, full, since : the stack of watermarks, lowest last: up to which height, how many pixels, from which row
-    part, bits          : scratch of `_volume`
     """
-    # Species by species, in registers: an array of four would be read and written at every packet.
-    d0, d1, d2, d3 = density[0], density[1], density[2], density[3]
-    r0, r1, r2, r3 = released[0], released[1], released[2], released[3]
-    h0, h1, h2, h3 = 0.0, 0.0, 0.0, 0.0
-    depth, total = 0, d0 + d1 + d2 + d3
+    # Species by species, in registers: an array would be read and written at every packet.
+    d0, d1, d2 = density[0], density[1], density[2]
+    r0, r1, r2 = released[0], released[1], released[2]
+    h0, h1, h2 = 0.0, 0.0, 0.0
+    total, held = d0 + d1 + d2, 0.0
+    # The lowest watermark in registers, too. Below all no pixel is full: that of a cloud that nothing reaches.
+    th, tf, ti = np.inf, 0.0, 0
+    depth = -1
     for i in range(min(low, len(line))):
         change[i] = 0.0
     for i in range(low, len(line)):
-        count = min(min(i, pixels - 1) + 1, high) - low
-        reached = float(count)
-        g0, g1, g2, g3 = h0 * r0, h1 * r1, h2 * r2, h3 * r3
-        h0, h1, h2, h3 = h0 - g0, h1 - g1, h2 - g2, h3 - g3
-        gain = d0 * g0 + d1 * g1 + d2 * g2 + d3 * g3
-        # Never more than the packet has: the cloud then ends lower.
-        most = line[i] + gain
-        top = _volume(line[i] + gain * inverse[count], volumes, notch, scale, part, bits)
+        count, top = seen[i], reached[i]
+        h0, h1, h2 = h0 - h0 * r0, h1 - h1 * r1, h2 - h2 * r2
+        after = h0 + h1 + h2
+        gain = held - after
+        # What a pixel gives back makes a cloud hardly larger: where it does not, which watermarks a cloud reaches is
+        # known before what the traps hold, and the processor need not wait for that.
+        if gain * inverse[i] > _SMALL * line[i]:
+            top = _volume(line[i] + gain * inverse[i], volumes, notch, scale, part, part.view(np.int64))
         if top <= 0.0:
-            change[i] = gain
+            change[i], held = gain, after
             continue
-        taken, bottom, empty = 0.0, 0.0, reached * total
-        while depth > 0:
-            end, weight, age = height[depth - 1], full[depth - 1], i - since[depth - 1]
-            free = empty - weight * filled[age]
-            step = min(end, top) - bottom
-            short = taken + step * free > most
-            if short:
-                step = (most - taken) / free
-                top = bottom + step
-            emptied = step * weight
-            h0 -= emptied * left[age, 0]
-            h1 -= emptied * left[age, 1]
-            h2 -= emptied * left[age, 2]
-            h3 -= emptied * left[age, 3]
-            taken += step * free
-            bottom += step
-            if short or end > top:
-                break
-            depth -= 1
-            bottom = end
-        if depth == 0 and bottom < top:
-            step = min(top - bottom, (most - taken) / empty)
-            taken += step * empty
-            bottom += step
-        if bottom > 0.0:
-            height[depth], full[depth], since[depth] = bottom, reached, i
+        e0, e1, e2, bottom = 0.0, 0.0, 0.0, 0.0
+        most = line[i] + gain
+        if top * count * total <= most:
+            if th > top:
+                emptied, age = top * tf, i - ti
+                e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                depth += 1
+                height[depth], full[depth], since[depth] = th, tf, ti
+            else:
+                emptied, age = th * tf, i - ti
+                e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                bottom = th
+                while height[depth] <= top:
+                    emptied, age = (height[depth] - bottom) * full[depth], i - since[depth]
+                    e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                    bottom = height[depth]
+                    depth -= 1
+                emptied, age = (top - bottom) * full[depth], i - since[depth]
+                e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+        else:
+            # Never more than the packet has: the cloud then ends lower.
             depth += 1
-            more = bottom * reached
-            h0, h1, h2, h3 = h0 + more, h1 + more, h2 + more, h3 + more
-        change[i] = gain - taken
-    return float(d0 * h0 + d1 * h1 + d2 * h2 + d3 * h3)
+            height[depth], full[depth], since[depth] = th, tf, ti
+            top, depth, e0, e1, e2 = _short(most, top, count * total, i, depth, left, height, full, since)
+        if top <= 0.0:
+            th, tf, ti = height[depth], full[depth], since[depth]
+            depth -= 1
+        else:
+            th, tf, ti = top, count, i
+            filled = top * count
+            h0, h1, h2 = h0 + (filled * d0 - e0), h1 + (filled * d1 - e1), h2 + (filled * d2 - e2)
+        after = h0 + h1 + h2
+        change[i], held = held - after, after
+    return float(held)
+
+
+@jit
+def _more(e0: float, e1: float, e2: float, emptied: float, left: Float, age: int) -> tuple[float, float, float]:
+    """Of each species what pixels held that a cloud has filled again: plus so many, last filled so long ago."""
+    return e0 + emptied * left[age, 0], e1 + emptied * left[age, 1], e2 + emptied * left[age, 2]
+
+
+@jit
+def _short(
+    most: float, top: float, empty: float, i: int, depth: int, left: Float, height: Float, full: Float, since: Any
+) -> tuple[float, int, float, float, float]:
+    """What a packet takes that may have less than its cloud would reach: where it ends, the stack's depth, the rest.
+
+    empty : electrons that all traps hold;  most : electrons of the packet
+    """
+    e0, e1, e2, taken, bottom = 0.0, 0.0, 0.0, 0.0, 0.0
+    while bottom < top:
+        end, age = height[depth], i - since[depth]
+        still = left[age, 0] + left[age, 1] + left[age, 2]
+        free, step = empty - full[depth] * still, min(end, top) - bottom
+        if taken + step * free > most:
+            step = (most - taken) / free
+            top = bottom + step
+        taken += step * free
+        emptied = step * full[depth]
+        e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+        if end > top:
+            break
+        bottom = end
+        depth -= 1
+    return top, depth, e0, e1, e2
+
+
+@jit
+def _reach(line: Any, volumes: Float, notch: float, scale: float, part: Float, bits: Any, reached: Float) -> None:
+    """V of every packet of a line, as `_volume`;  part, bits : scratch, numbers and their binary form."""
+    for i in range(len(line)):
+        part[i] = min(max((line[i] - notch) * scale, 0.0), 1.0)
+    for i in range(len(line)):
+        at = (bits[i] >> (52 - _SEGMENT_BITS)) - ((1023 - _OCTAVES) << _SEGMENT_BITS)
+        beyond = (bits[i] & ((1 << (52 - _SEGMENT_BITS)) - 1)) * 2.0 ** (_SEGMENT_BITS - 52)
+        here = max(at, 0)
+        volume = volumes[here] + beyond * (volumes[here + 1] - volumes[here])
+        reached[i] = volume if at >= 0 else 0.0
 
 
 @jit
 def _volume(electrons: float, volumes: Float, notch: float, scale: float, part: Float, bits: Any) -> float:
-    """V from its table: linear between the segments' ends (1e-4 of V), and to zero below the last octave.
+    """V from its table: linear between the segments' ends (1e-4 of V), and none below the last octave.
 
     part, bits : scratch, one number and its binary form: exponent and first bits of the mantissa tell the segment
     """
-    x = (electrons - notch) * scale
-    if x >= 1.0:
-        return 1.0
-    if x <= 0.0:
-        return 0.0
-    part[0] = x
+    part[0] = min(max((electrons - notch) * scale, 0.0), 1.0)
     at = (bits[0] >> (52 - _SEGMENT_BITS)) - ((1023 - _OCTAVES) << _SEGMENT_BITS)
     if at < 0:
-        return float(x * volumes[0] * 2.0**_OCTAVES)
+        return 0.0
     beyond = (bits[0] & ((1 << (52 - _SEGMENT_BITS)) - 1)) * 2.0 ** (_SEGMENT_BITS - 52)
     return float(volumes[at] + beyond * (volumes[at + 1] - volumes[at]))
