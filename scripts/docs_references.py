@@ -179,7 +179,7 @@ def _asked(effects: list[Effect], mission: MissionConfiguration) -> dict[str, li
             return value(*arguments)
 
         with patch.object(MissionConfiguration, "value", noted):
-            if effect in vis.SKY + vis.FLAT + vis.INJECTION:
+            if effect in vis.SKY + vis.FLAT + vis.PUMPING:
                 effect.parameters(scene)
             else:
                 effect.parameters(infrared if effect in nisp_p.SKY + nisp_p.FLAT else ground_scene)
@@ -194,7 +194,7 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
     folder.mkdir()
     drawn = set()
     light = frame
-    for effect in dict.fromkeys((*vis.SKY, *vis.FLAT, *vis.INJECTION)):
+    for effect in dict.fromkeys((*vis.SKY, *vis.FLAT, *vis.PUMPING)):
         before = frame if effect in vis.SKY else light
         after = effect.apply(before, *effect.parameters(scene), rng=stream(1, effect.name))
         # Some need more than a small frame to show.

@@ -44,13 +44,16 @@
     [[observation]]
         channels = ["VIS", "NISP-P", "NISP-S"] | ["EXT"]
         image_type = "science" | "deep" | "bias" | "dark" | "flat" | "charge_injection" | "self_calibration"
-                     | "standard_star" | "planetary_nebula"
+                     | "standard_star" | "planetary_nebula" | "trap_pumping" | "defocus" | "bleeding"
+                     | "stray_light" | "white_dwarf"
         survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
         ra, dec, position_angle    a field of your own instead of the survey's (docs/own_field.md)
         pointings = "file.csv"     a table of pointings instead of either (jobs/request/pointing_tables.py)
         dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
         detectors, mjd, exposure_time_s, realisations
         lamps = [..] of flats      macc = [groups, reads, drops] of NISP-P
+        phase_times_s = [..] of trap_pumping     defocus_nm = [..] of defocus
+        magnitude of bleeding, white_dwarf, stray_light     distance_deg of stray_light
     [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "satellites", "saturation",
                             "persistence", "ramp", "order_1", "order_0", "order_2", "order_m1"]
                    compression = "none" | "rice"   of images of whole numbers, without loss

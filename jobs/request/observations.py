@@ -33,6 +33,8 @@ from lake_schema.errors import BadInput
 from lake_schema.store import layout
 
 _MOST_POINTINGS, _MOST_OBSERVATIONS, _MOST_REALISATIONS = 100_000, 1000, 10_000
+# Frames of a sequence whose parameter is listed.
+_MOST_VALUES = 1000
 # Dithers of an observation's own: how many, and how far from its place, arcsec.
 _MOST_DITHERS, _FARTHEST = 1000, 36_000.0
 DITHERS = ("S", "J", "none")
@@ -41,7 +43,18 @@ GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes")
 # What each channel can be asked for besides the sky. Not derived from what is rendered: more than that can be planned
 # (test_checks.py: all that is rendered is in it).
 _CALIBRATIONS = {
-    "VIS": ("bias", "dark", "flat", "charge_injection", "self_calibration"),
+    "VIS": (
+        "bias",
+        "dark",
+        "flat",
+        "charge_injection",
+        "trap_pumping",
+        "self_calibration",
+        "defocus",
+        "bleeding",
+        "stray_light",
+        "white_dwarf",
+    ),
     "NISP-P": ("dark", "flat", "self_calibration", "standard_star"),
     "NISP-S": ("dark", "flat", "standard_star", "planetary_nebula"),
     "EXT": ("bias", "dark", "flat"),
@@ -50,7 +63,7 @@ _SKY_TYPES = ("science", "deep")
 # Kinds of block, as messages call them.
 _SURVEY, _OWN = "fields of a Euclid survey", "a Euclid field at ra, dec"
 _GROUND, _GROUND_OWN = "a ground survey's pattern", "a ground camera's field at ra, dec"
-_TIMED, _UNTIMED = "dark and flat frames", "bias and charge_injection frames"
+_TIMED, _UNTIMED = "dark and flat frames", "bias, charge_injection and trap_pumping frames"
 _DITHERED, _TABLE = "calibrations on the sky", "a table of pointings"
 _CALIBRATION = (_TIMED, _UNTIMED, _DITHERED)
 # The kinds that use a key; a key that is not here is used by all. EXT always has a survey, for its camera.
@@ -66,11 +79,23 @@ _USERS = {
     "blue": (_SURVEY, _OWN),
     "bands": (_SURVEY, _OWN, _GROUND, _GROUND_OWN, *_CALIBRATION),
     "lamps": (_TIMED,),
+    "phase_times_s": (_UNTIMED,),
+    "defocus_nm": (_DITHERED,),
+    "magnitude": (_DITHERED,),
+    "distance_deg": (_DITHERED,),
     "macc": (_SURVEY, _OWN, _TIMED, _DITHERED, _TABLE),
     "exposure_time_s": (_GROUND, _GROUND_OWN, _TIMED, _DITHERED, _TABLE),
 }
 # Exposures that only one channel has.
 _CHANNEL_OF = {"short": "VIS", "flat": "VIS", "blue": "NISP-S", "macc": "NISP-P"}
+# Image types that a key of calibrations is for.
+_TYPES_OF = {
+    "lamps": ("flat",),
+    "phase_times_s": ("trap_pumping",),
+    "defocus_nm": ("defocus",),
+    "magnitude": ("bleeding", "white_dwarf", "stray_light"),
+    "distance_deg": ("stray_light",),
+}
 # LEDs of a calibration unit. A copy, since requests are read below the renderer (test_survey.py holds it to the lamps).
 LAMPS = {"VIS": 6, "NISP-P": 5, "NISP-S": 5}
 
@@ -120,6 +145,10 @@ class Observation:
     realisations : how many of each exposure, which differ in their noise alone
     lamps     : of flats, numbers of the LEDs in their turn, () = all;  each in bands that see it
     macc      : (groups, reads, drops) of NISP-P's ramps, () = the mission's
+    phase_times_s : of trap pumping, s that charge stays under an electrode, a frame each, () = the mission's
+    defocus_nm : of exposures out of focus, rms of the wavefront, one each, () = the mission's, on both sides
+    magnitude  : of calibration stars, AB in the exposure's band, None = the mission's
+    distance_deg : of a star beside the field from the boresight, None = the mission's
     """
 
     channels: tuple[str, ...]
@@ -145,6 +174,10 @@ class Observation:
     realisations: int = 1
     lamps: tuple[int, ...] = ()
     macc: tuple[int, ...] = ()
+    phase_times_s: tuple[float, ...] = ()
+    defocus_nm: tuple[float, ...] = ()
+    magnitude: float | None = None
+    distance_deg: float | None = None
 
     @property
     def place(self) -> tuple[float, float] | None:
@@ -225,6 +258,10 @@ def _observation(value: object, path: str, folder: Path) -> Observation:
         realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
         lamps=_lamps(table, f"{path}.lamps", channels),
         macc=_macc(table, f"{path}.macc"),
+        phase_times_s=_numbers(table, f"{path}.phase_times_s", 1e-6, 100.0),
+        defocus_nm=_numbers(table, f"{path}.defocus_nm", -2000.0, 2000.0),
+        magnitude=optional(table, f"{path}.magnitude", -10.0, 30.0),
+        distance_deg=optional(table, f"{path}.distance_deg", 0.0, 10.0),
     )
 
 
@@ -260,6 +297,19 @@ def _integers(table: Toml, path: str, names: tuple[str, ...], bounds: tuple[tupl
     return tuple(numbers)
 
 
+def _numbers(table: Toml, path: str, lo: float, hi: float) -> tuple[float, ...]:
+    """A list of different numbers; () where there is none."""
+    found = table.get(path.rpartition(".")[2])
+    if found is None:
+        return ()
+    if not isinstance(found, list) or not 1 <= len(found) <= _MOST_VALUES:
+        raise BadInput(f"{path} = {shown(found)} is not a list of 1 to {_MOST_VALUES} numbers")
+    numbers = tuple(checked_number(value, f"{path}[{i}]", lo, hi) for i, value in enumerate(found))
+    if len(set(numbers)) < len(numbers):
+        raise BadInput(f"{path} = {shown(found)} names a number twice")
+    return numbers
+
+
 def _turn(ra: float | None) -> float | None:
     return None if ra is None else ra % 360.0
 
@@ -284,8 +334,8 @@ def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path
         users = _USERS.get(key, (kind,))
         if kind not in users and not (ground and key == "survey"):
             raise BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(users)}")
-        if key == "lamps" and image_type != "flat":
-            raise BadInput(f"{path}.lamps is not for {image_type}: used by flat")
+        if key in _TYPES_OF and image_type not in _TYPES_OF[key]:
+            raise BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(_TYPES_OF[key])}")
         if (channel := _CHANNEL_OF.get(key)) is not None and channel not in channels:
             raise BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {channel}")
 
@@ -294,8 +344,8 @@ def _kind(table: Toml, ground: bool, image_type: str) -> str:
     if "pointings" in table:
         return _TABLE
     if image_type not in _SKY_TYPES:
-        kinds = {"dark": _TIMED, "flat": _TIMED, "bias": _UNTIMED, "charge_injection": _UNTIMED}
-        return kinds.get(image_type, _DITHERED)
+        untimed = dict.fromkeys(("bias", "charge_injection", "trap_pumping"), _UNTIMED)
+        return {"dark": _TIMED, "flat": _TIMED, **untimed}.get(image_type, _DITHERED)
     if ground:
         return _GROUND_OWN if "ra" in table else _GROUND
     return _OWN if "ra" in table else _SURVEY

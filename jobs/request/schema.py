@@ -43,7 +43,7 @@ EFFECTS = (
     "nonlinearity", "output_gain", "parallel_cti", "parallel_loss", "persistence", "pixel_area", "pixel_response",
     "poisson", "quadrants", "ramp", "ramp_cosmic_rays", "ramp_nonlinearity", "read_noise", "readout_cosmic_rays",
     "readout_trail", "reset_level", "satellite_trails", "serial_cti", "serial_loss", "shutter", "signal_adc",
-    "signal_nonlinearity", "straylight", "tree_rings",
+    "signal_nonlinearity", "straylight", "trap_pumping", "tree_rings",
 )  # fmt: skip
 # What no image is a product without.
 ALWAYS = ("adc", "amplifiers", "macc", "quadrants", "ramp", "signal_adc")

@@ -41,7 +41,20 @@ CHOSEN_BY: Mapping[str, str] = {"NISP-S": "euclid_h"}
 # What there is a simulator for: channel -> image types. All others can be planned and forecast. A copy, since
 # requests are refused below the renderer (test_checks.py holds it to the registry of channels).
 RENDERED: Mapping[str, tuple[str, ...]] = {
-    "VIS": ("science", "deep", "self_calibration", "flat", "dark", "charge_injection", "bias"),
+    "VIS": (
+        "science",
+        "deep",
+        "self_calibration",
+        "flat",
+        "dark",
+        "charge_injection",
+        "bias",
+        "trap_pumping",
+        "defocus",
+        "bleeding",
+        "stray_light",
+        "white_dwarf",
+    ),
     "NISP-P": ("science", "deep", "self_calibration", "standard_star", "flat", "dark"),
     "NISP-S": ("science", "deep", "standard_star", "planetary_nebula", "flat", "dark"),
     "EXT": ("science", "deep", "flat", "dark", "bias"),
@@ -105,7 +118,7 @@ EXPOSURES = Table(
             "string",
             "",
             "meta.note",
-            "JSON of what this exposure changes of the request: the variant of an exploration",
+            "JSON of what this exposure changes of the request: a variant's, a calibration's parameters",
             nullable=True,
             since=2,
         ),

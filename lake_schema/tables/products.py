@@ -16,6 +16,8 @@ CONTENTS = (
     ("satellites", "expected electrons of satellites' trails"),
     ("ramp", "groups of a ramp, as read"),
     ("saturation", "1 where a pixel or the converter is full"),
+    ("traps", "traps of the first species, plus 256 times those of the second, 65536 times those of the third"),
+    ("dipoles", "electrons that trap pumping brought"),
     ("order_1", "expected electrons of the sources' first order"),
     ("order_0", "the same of order 0"),
     ("order_2", "the same of order 2"),

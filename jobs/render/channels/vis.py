@@ -45,6 +45,7 @@ from jobs.render.effects.readout import (
     read_noise,
     readout_cosmic_rays,
     readout_trail,
+    trap_pumping,
 )
 from jobs.render.psf import euclid
 from jobs.render.psf.model import Psf
@@ -98,7 +99,12 @@ FLAT = (
     *_READOUT,
 )
 DARK = (*_CHARGE, *_READOUT)
-INJECTION = (charge_injection.EFFECT, charge_injection.NOISE, bleeding.EFFECT, *_READOUT)
+_INJECTED = (charge_injection.EFFECT, charge_injection.NOISE)
+INJECTION = (*_INJECTED, bleeding.EFFECT, *_READOUT)
+# It takes minutes, behind a closed shutter.
+PUMPING = (*_INJECTED, trap_pumping.EFFECT, *_CHARGE, *_READOUT)
+# Besides surveys and self-calibration, what the sky is looked at for.
+_CHECKS = ("defocus", "bleeding", "stray_light", "white_dwarf")
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "science": SKY,
@@ -107,6 +113,8 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "flat": FLAT,
     "dark": DARK,
     "charge_injection": INJECTION,
+    "trap_pumping": PUMPING,
+    **dict.fromkeys(_CHECKS, SKY),
     "bias": _READOUT,
 }
 
@@ -129,11 +137,11 @@ CHANNEL = Channel(
     sky=diffuse_light.starlit_sky,
     cost=COST,
     # A flat is taken with the shutter open.
-    sky_types=(*SKY_TYPES, "flat"),
+    sky_types=(*SKY_TYPES, *_CHECKS, "flat"),
     drawn=DRAWN,
     pupil=euclid.vis_edges,
     moving=True,
-    own_light=(calibration_lamp.EFFECT, charge_injection.EFFECT, charge_injection.NOISE),
+    own_light=(calibration_lamp.EFFECT, *_INJECTED, trap_pumping.EFFECT),
     tracks=(cosmic_rays.EFFECT, readout_cosmic_rays.READOUT),
     scattered=True,
 )

@@ -16,6 +16,7 @@ from jobs.render.dispersing import draw as dispersing
 from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.stamps import Tally
 from jobs.render.effects.effect import Effect, apply_all
+from jobs.render.effects.readout import trap_pumping
 from jobs.render.effects.scene import Frame, Scene
 from jobs.render.exposure import elsewhere, limits, persistence, rendered, scene_of, spread_sky, tints, truth_maps
 from jobs.render.exposure.records import Rows, Variant
@@ -139,6 +140,8 @@ def _detected(
     mode = aim.channel.readout
     watch = truth_maps.watch(drawn.maps, scene, truth, mode)
     found, decisions = apply_all(frame.pop(), aim.effects, scene, stream, watch)
+    if "traps" in truth and trap_pumping.EFFECT in aim.effects:
+        drawn.maps["traps"] = trap_pumping.trap_map(scene, stream(trap_pumping.EFFECT))
     readout = mode.arrays(found, scene, detector.name, aim.wcs)
     truth_maps.complete(drawn.maps, readout.raw, aim.effects, scene, truth, mode)
     return Rendered(

@@ -25,7 +25,7 @@ ORDERS = {1: "order_1", 0: "order_0", 2: "order_2", -1: "order_m1"}
 # Bytes a pixel of each map's file.
 BYTES = {
     "noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "persistence": 4, "satellites": 4,
-    "saturation": 1,
+    "saturation": 1, "traps": 4, "dipoles": 4,
     # Four groups of a photometric ramp.
     "ramp": 8, **dict.fromkeys(ORDERS.values(), 4),
 }  # fmt: skip
@@ -38,7 +38,7 @@ _OF_EFFECT = {
     "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "dispersed_sky": "sky", "pixel_area": "sky",
     "straylight": "sky", "fringes": "sky", "satellite_trails": "satellites",
     "cosmic_rays": "cosmic_rays", "readout_cosmic_rays": "cosmic_rays", "ramp_cosmic_rays": "cosmic_rays",
-    "persistence": "persistence", "macc": "ramp",
+    "persistence": "persistence", "macc": "ramp", "trap_pumping": "dipoles",
 }  # fmt: skip
 
 
@@ -49,6 +49,8 @@ def made(truth: Sequence[str], effects: Sequence[str] | None, looks: bool) -> li
     """
     found = {_OF_EFFECT[name] for name in effects or () if name in _OF_EFFECT}
     found |= {"noise_free", "saturation"} | ({"stars"} if looks else set())
+    if "trap_pumping" in (effects or ()):
+        found.add("traps")
     if looks and _GRISM in (effects or ()):
         found |= set(ORDERS.values())
     return [name for name in truth if effects is None or name in found]
@@ -68,6 +70,8 @@ def watch(maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode) -> 
             maps["sky"] = (after - before).astype(np.float32) + maps.get("sky", np.float32(0.0))
         if name in ("persistence", "satellite_trails") and _OF_EFFECT[name] in truth:
             maps[_OF_EFFECT[name]] = (after - before).astype(np.float32)
+        if name == "trap_pumping" and "dipoles" in truth:
+            maps["dipoles"] = np.rint(after - before).astype(np.int32)
         if name == "bleeding" and "saturation" in truth:
             maps["saturation"] = bleeding.saturated(after, scene.value("full_well", "electron")).astype(np.uint8)
         if name == "ramp" and "saturation" in truth:
@@ -103,6 +107,7 @@ def complete(
         ("sky", np.float32),
         ("cosmic_rays", np.int32),
         ("persistence", np.float32),
+        ("dipoles", np.int32),
         ("satellites", np.float32),
         ("saturation", np.uint8),
     ):

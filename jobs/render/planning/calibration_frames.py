@@ -1,6 +1,7 @@
-"""Calibration exposures: bias, dark, flat, self-calibration, standard stars, planetary nebula.
+"""Calibration exposures: bias, dark, flat, injected charge, and what the sky is looked at for besides surveys.
 
 exposures   what an observation block of one of these types asks for
+TARGETS     what an image type is of
 
 Ref : Serrano et al. 2024, section 5.1 and the table of the pilot phase's products
 """
@@ -16,6 +17,7 @@ from jobs.render.camera import pointing
 from jobs.render.camera.lamps import LAMPS
 from jobs.render.channels import image_types, registry
 from jobs.render.effects.light import calibration_lamp
+from jobs.render.effects.readout import trap_pumping
 from jobs.render.planning.observing_sequence import FILTERS, RED, SETTINGS, offsets
 from jobs.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time, through_grism
 from jobs.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
@@ -25,8 +27,18 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
 _DAY_S = 86400.0
-# The two standard stars (Serrano et al. 2024).
-_STARS = ("Vega", "white dwarf DA")
+# What an image type is of (two standard stars: Serrano et al. 2024).
+TARGETS = {
+    "standard_star": ("Vega", "white dwarf DA"),
+    "planetary_nebula": ("planetary nebula",),
+    "bleeding": ("Vega",),
+    "stray_light": ("Vega",),
+    "white_dwarf": ("white dwarf DA",),
+}
+# Of an image type what every one of its exposures may be asked for: key of the request, of the mission, and unit.
+_ASKED = (("magnitude", "magnitude", "mag"), ("distance_deg", "distance", "deg"))
+# Frames of trap pumping that the mission lists.
+_PHASE_TIMES = 4
 # From the end of a frame to the start of the next, s: the slowest of the read-outs.
 _PAUSE = 90.0
 # Of a lamp's light, over what the camera's bands see where they see best: with less a flat is not taken.
@@ -71,8 +83,12 @@ def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, 
         dithers = block.exposures or int(mission.value("survey.self_calibration.dithers"))
         for i, (x, y) in enumerate(_scattered(first.camera, dithers, mission, seed)):
             yield from (replace(_moved(frame, x, y), dither=i + 1) for frame in in_bands)
-    elif first.image_type in ("standard_star", "planetary_nebula"):
-        yield from _targets(in_bands, block, mission, seed)
+    elif first.image_type in TARGETS:
+        yield from _targets([_asked(frame, block) for frame in in_bands], block, mission, seed)
+    elif first.image_type == "defocus":
+        yield from _out_of_focus(in_bands, block, mission, seed)
+    elif first.image_type == "trap_pumping":
+        yield from _pumped(in_bands[0], block, mission)
     elif not block.exposures:
         raise BadInput(f"an observation of image_type {first.image_type} wants exposures = how many frames")
     elif first.image_type == "flat" and first.camera in LAMPS:
@@ -84,6 +100,35 @@ def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, 
         lamp = 1 if first.image_type == "flat" else None
         for i in range(block.exposures):
             yield replace(in_bands[i % len(in_bands)], lamp=lamp)
+
+
+def _pumped(frame: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
+    """Frames without rows between the injected ones; charge has time to gather while it is pumped."""
+    section = image_types.section(frame.camera)
+    listed = [mission.value(f"{section}.pumping.phase_time_{i + 1}", "s") for i in range(_PHASE_TIMES)]
+    for phase in block.phase_times_s or listed:
+        own = ((f"{section}.injection.off", 0.0, "pix"), (f"{section}.pumping.phase_time", phase, "s"))
+        seconds = trap_pumping.duration(phase, section, mission)
+        for _ in range(block.exposures or 1):
+            yield replace(frame, exposure_time_s=seconds, parameters=own)
+
+
+def _out_of_focus(
+    in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
+) -> Iterator[Exposure]:
+    """At each place all wavefronts, one after the other."""
+    nominal = mission.value("survey.defocus.wavefront", "nm")
+    for frame in _dithered(in_bands, block, mission, seed):
+        key = f"{image_types.section(frame.camera)}.psf.defocus"
+        for nm in block.defocus_nm or (-nominal, nominal):
+            yield replace(frame, parameters=((key, nm, "nm"),))
+
+
+def _asked(frame: Exposure, block: Observation) -> Exposure:
+    """With what the block asks of its target instead of what the mission says."""
+    values = ((getattr(block, asked), key, unit) for asked, key, unit in _ASKED)
+    own = tuple((f"survey.{block.image_type}.{key}", value, unit) for value, key, unit in values if value is not None)
+    return replace(frame, parameters=own)
 
 
 def _lit(in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration) -> list[list[Exposure]]:
@@ -113,7 +158,7 @@ def _chosen(wanted: Sequence[str], own: Sequence[str]) -> Sequence[str]:
 
 
 def _seconds(first: Exposure, band: str, block: Observation, mission: MissionConfiguration) -> float:
-    if first.image_type in ("bias", "charge_injection"):
+    if first.image_type in ("bias", "charge_injection", "trap_pumping"):
         return 0.0
     if block.exposure_time_s is not None:
         return block.exposure_time_s
@@ -130,7 +175,7 @@ def _bands(first: Exposure, mission: MissionConfiguration) -> tuple[str, ...]:
     if first.channel == "NISP-S":
         return (RED,)
     return bands_of(first.channel, first.camera, mission)[
-        : 1 if first.image_type in ("bias", "dark", "charge_injection") else None
+        : 1 if first.image_type in ("bias", "dark", "charge_injection", "trap_pumping") else None
     ]
 
 
@@ -139,17 +184,25 @@ def _targets(
 ) -> Iterator[Exposure]:
     """Each target in each band, or in each setting of the grisms, dithered."""
     kind, channel = in_bands[0].image_type, in_bands[0].channel
-    dithers = block.exposures or int(mission.value(f"survey.{kind}.dithers"))
-    steps = offsets("S", mission, seed, kind, channel)
     # A nebula is seen in every setting, a star in one a dither.
     settings = SETTINGS if kind == "planetary_nebula" else 1
-    for target in _STARS if kind == "standard_star" else ("planetary nebula",):
+    for target in TARGETS[kind]:
         for setting in range(settings):
-            for i in range(dithers):
-                for frame in in_bands:
-                    moved = replace(_moved(frame, *steps[i % len(steps)]), dither=i + 1, target=target)
-                    number = setting if settings > 1 else i % SETTINGS
-                    yield _through_grism(moved, number, mission) if channel == "NISP-S" else moved
+            for frame in _dithered(in_bands, block, mission, seed):
+                moved = replace(frame, target=target)
+                number = setting if settings > 1 else ((frame.dither or 1) - 1) % SETTINGS
+                yield _through_grism(moved, number, mission) if channel == "NISP-S" else moved
+
+
+def _dithered(
+    in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
+) -> Iterator[Exposure]:
+    """All bands at each place of the pattern."""
+    kind, channel = in_bands[0].image_type, in_bands[0].channel
+    steps = offsets("S", mission, seed, kind, channel)
+    for i in range(block.exposures or int(mission.value(f"survey.{kind}.dithers"))):
+        for frame in in_bands:
+            yield replace(_moved(frame, *steps[i % len(steps)]), dither=i + 1)
 
 
 def _through_grism(frame: Exposure, number: int, mission: MissionConfiguration) -> Exposure:

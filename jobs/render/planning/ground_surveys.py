@@ -18,6 +18,7 @@ from jobs.render.camera import detectors as camera_detectors
 from jobs.render.camera import pointing
 from jobs.render.camera.detectors import Detector
 from jobs.render.channels import image_types
+from jobs.render.planning import calibration_frames
 from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time, through_grism
 from jobs.render.sky.observatory import Site, next_dark
 from jobs.render.sky.solar_aspect import next_allowed, position_angle
@@ -226,6 +227,7 @@ def _of_row(row: Row, number: int, block: Observation, mission: MissionConfigura
         exposure_time_s=exposure_time(row.channel, camera, row.band, mission) if seconds is None else seconds,
         survey=block.survey,
         field=number,
+        target=calibration_frames.TARGETS.get(row.image_type, (None,))[0],
         sky=row.sky,
         seeing=row.seeing,
         zero_point=row.zero_point,

@@ -38,7 +38,7 @@ from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 _ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd", "grism", "grism_angle")
 # Grisms by the passband that they are used in.
 GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}
-_DARK_TYPES = ("bias", "dark", "charge_injection")
+_DARK_TYPES = ("bias", "dark", "charge_injection", "trap_pumping")
 # Columns that are counted here.
 _NUMBERS = ("exposure_id", "realisation", "airmass", "zenith")
 
@@ -50,6 +50,7 @@ class Exposure:
     ra, dec, position_angle : deg, boresight and the focal plane's y axis, north through east
     detectors               : names, () = all of the camera
     sky, seeing, zero_point : electrons a second and pixel, arcsec, mag; None = the mission's
+    parameters              : (key, value, unit) of the mission database that it is taken with instead of the request's
     """
 
     channel: str
@@ -75,6 +76,7 @@ class Exposure:
     seeing: float | None = None
     zero_point: float | None = None
     settings: str | None = None
+    parameters: tuple[tuple[str, float, str], ...] = ()
 
 
 def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ from jobs.render.planning.planned_exposures import (
     through_grism,
 )
 from jobs.render.sky.solar_aspect import check_aspect
+from jobs.request import pointing_tables
 from jobs.request.area import Area
 from jobs.request.observations import Observation, Pointing
 from jobs.request.schema import Request
@@ -39,9 +40,8 @@ from lake_schema.mission.configuration import MissionConfiguration
 
 _RAMP = ("groups", "reads", "drops")
 _DEEP = ("edf_north", "edf_south", "edf_fornax")
-_CALIBRATION = (
-    "bias", "dark", "flat", "charge_injection", "self_calibration", "standard_star", "planetary_nebula"
-)  # fmt: skip
+# Image types that are laid out as calibrations are.
+_CALIBRATION = tuple(code for code in pointing_tables.IMAGE_TYPES if code not in ("science", "deep"))
 
 
 def exposures(request: Request, mission: MissionConfiguration) -> list[tuple[Exposure, MissionConfiguration]]:
@@ -94,11 +94,18 @@ def _of_variant(request: Request, values: Mapping[str, Any], shared: _Settled) -
         where, found = f"observation[{i}]", 0
         ramp = {f"nisp.macc.photometric.{part}": (n, "") for part, n in zip(_RAMP, block.macc, strict=False)}
         own = _Settled.of({**values, **ramp}, request, shared.mission) if ramp else shared
+        kept: dict[tuple[bool, tuple[tuple[str, float, str], ...]], _Settled] = {(True, ()): own, (False, ()): shared}
         for exposure in _block(block, request, own.mission, where, free):
             found += 1
             if exposure.camera == "nisp" and (exposure.image_type in _CALIBRATION or _undated(block)):
                 free = max(free, _forgotten(exposure, own.mission))
-            yield from repeat((exposure, own if exposure.camera == "nisp" else shared), block.realisations)
+            of_nisp = exposure.camera == "nisp"
+            which = of_nisp, exposure.parameters
+            if which not in kept:
+                changed = {key: (value, unit) for key, value, unit in exposure.parameters}
+                more = {**ramp, **changed} if of_nisp else changed
+                kept[which] = _Settled.of({**values, **more}, request, shared.mission)
+            yield from repeat((exposure, kept[which]), block.realisations)
         if not found:
             raise BadInput(f"{where} asks for no exposure")
 

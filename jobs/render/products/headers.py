@@ -17,6 +17,7 @@ from jobs.render.effects.charge import ramp, ramp_nonlinearity
 from jobs.render.effects.readout import bias_structure, charge_transfer, nonlinearity, ramp_noise, read_noise
 from jobs.render.exposure import truth_maps
 from jobs.render.exposure.rendered import Rendered, numbers_of
+from jobs.render.products import calibration_cards
 from lake_schema import __version__
 from lake_schema.arrays import Float
 from lake_schema.fits.images import Card
@@ -189,6 +190,8 @@ _TRUTH = {
     },
     "ramp": ("adu", "unit of the pixels: groups as read"),
     "saturation": ("", "1 where a pixel or the converter is saturated"),
+    "traps": ("", "traps of species 1 + 256 of 2 + 65536 of 3"),
+    "dipoles": ("electron", "unit of the pixels: brought by pumping"),
 }
 
 
@@ -223,6 +226,7 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("IMAGETYP", exposure.image_type, "image type"),
         *((("LAMP", exposure.lamp, "LED of the calibration unit"),) if exposure.lamp else ()),
         *((("TARGET", exposure.target, "calibration source"),) if exposure.target else ()),
+        *calibration_cards.cards(exposure, scene),
         ("OBJECT", _object(exposure), "what is looked at"),
         ("RA", exposure.ra, "[deg] boresight right ascension"),
         ("DEC", exposure.dec, "[deg] boresight declination"),

@@ -57,6 +57,8 @@ VIS = Sampling(SAMPLES, SIDE, 2048, 768, 160)
 NISP = Sampling(5, 256, 2048, 768, 96, window=0.2)
 # Of the drift, by the number of positions: degree in place of the mean PSF, and of its slope with wavelength.
 DEGREES = {1: (0, 0), 4: (1, 0), 9: (2, 1), 25: (4, 2)}
+# Noll's number of defocus, which every wavefront has a coefficient of.
+_DEFOCUS = 4
 # Of its rms, as far as which a window is looked through.
 _WINDOWS = 5.0
 
@@ -129,7 +131,10 @@ def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -
     nm = np.zeros(1 + int(max(term[0] for term in terms)))
     for noll, x_power, y_power, coefficient in terms:
         nm[int(noll)] += coefficient * x**x_power * y**y_power
-    return nm * mission.value(f"{section}.psf.wavefront_scale")
+    nm *= mission.value(f"{section}.psf.wavefront_scale")
+    if (key := f"{section}.psf.defocus") in mission:
+        nm[_DEFOCUS] += mission.value(key, "nm")
+    return nm
 
 
 def _planes(

@@ -14,6 +14,7 @@ from jobs.render.effects.light import calibration_lamp
 from jobs.render.effects.scene import Scene
 from jobs.render.exposure import rendered, scene_of
 from jobs.render.plan_exposures import plan
+from jobs.render.planning import variants
 from jobs.render.products import fits_files, read_back
 from jobs.request.from_toml import parse
 from lake_schema.fits import images
@@ -31,7 +32,7 @@ def planned(tmp_path_factory):
     """Mission, one exposure of each kind (of a flat: each lamp), by (image type, seconds, lamp)."""
     request = parse(EXAMPLE)
     mission, exposures, tasks = plan(tmp_path_factory.mktemp("none"), request)
-    assert len(tasks) == len(exposures) == 3 + 20 + 3 + 24 + 3 + 4
+    assert len(tasks) == len(exposures) == 3 + 20 + 3 + 24 + 3 + 4 + 4 + 2 + 1 + 1 + 1
     rows = {}
     for row in exposures.to_pylist():
         rows.setdefault((row["image_type"], round(row["exposure_time_s"]), row["lamp"]), row)
@@ -41,6 +42,7 @@ def planned(tmp_path_factory):
 def written(planned, row, folder, forced=None, magnitude=20.0):
     """(what was rendered, what is read of its file): a galaxy and a star in the lower half of the detector."""
     request, mission, _ = planned
+    mission = variants.variant(row["settings"], mission, request.accuracy, {}).mission
     detector = replace(detectors.detector("vis", "3-4", mission), nx=SIDE, ny=SIDE, middle=0)
     system = astrometry.wcs(detector, row["ra"], row["dec"], row["position_angle"])
     where = [astrometry.sky_of_pixel(system, [x], [30.0]) for x in (30.0, 90.0)]
@@ -64,6 +66,9 @@ def test_the_example_asks_for_every_kind(planned):
     assert set(planned[2]) == {
         ("science", 561, None), ("science", 90, None), ("flat", 10, 1), ("bias", 0, None), ("dark", 1000, None),
         *(("flat", 10, lamp) for lamp in range(1, 7)), ("charge_injection", 0, None), ("self_calibration", 561, None),
+        # 2000 cycles of six phases.
+        *(("trap_pumping", seconds, None) for seconds in (60, 180, 600, 1800)), ("defocus", 561, None),
+        ("bleeding", 561, None), ("stray_light", 561, None), ("white_dwarf", 561, None),
     }  # fmt: skip
     assert set(vis.EFFECTS) == {kind for kind, *_ in planned[2]} | {"deep"}
 
@@ -79,17 +84,24 @@ def test_the_example_asks_for_every_kind(planned):
         (("dark", 1000, None), -4, 4),
         (("flat", 10, 3), 18_000, 21_000),
         (("charge_injection", 0, None), -4, 4),
+        (("trap_pumping", 600, None), 13_500, 16_500),
+        (("defocus", 561, None), 100, 200),
+        # Wings of five stars of 12 mag on so few pixels.
+        (("bleeding", 561, None), 200, 600),
+        (("white_dwarf", 561, None), 100, 200),
     ],
 )
 def test_each_is_rendered_and_read(planned, tmp_path, key, least, most):
     row = planned[2][key]
     one, header = written(planned, row, tmp_path)
     assert (header["IMAGETYP"], round(header["EXPTIME"]), header.get("LAMP")) == key
-    assert header["MISSION"] == planned[1].fingerprint
+    own = variants.variant(row["settings"], planned[1], planned[0].accuracy, {}).mission
+    assert header["MISSION"] == own.fingerprint
     level = (np.median(one.science) - header["BIAS"]) * header["GAIN"]
     assert least < level < most
     looks = vis.CHANNEL.sees_sky(key[0])
-    assert len(one.sources) == 2 * looks
+    # The catalogue's, and those of the calibration.
+    assert len(one.sources) == 2 * looks + 5 * (key[0] in ("bleeding", "white_dwarf"))
     names = {d.name for d in one.decisions if d.applied}
     assert ("readout_trail" in {d.name for d in one.decisions}) == (key[0] == "flat")
     assert ("cosmic_rays" in names) == (header["EXPTIME"] > 0)

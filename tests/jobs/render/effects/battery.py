@@ -10,6 +10,7 @@ from jobs.render.channels import ground, nisp_p, nisp_s, vis
 from jobs.render.effects.charge.ramp import Mode
 from jobs.render.effects.light.ghosts import Pupil
 from jobs.render.effects.light.satellite_trails import Blur, Satellites
+from jobs.render.effects.readout.trap_pumping import Pumping
 from jobs.render.effects.readout.traps import Sweeps, Traps
 from jobs.render.effects.scene import Elsewhere, Lights
 from lake_schema.mission.configuration import resolve
@@ -23,6 +24,7 @@ END_OF_LIFE = Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
 EMPTY = Traps((0.0,), (1.0,), 2e5, 0.0, 0.58)
 TRACKS = np.array(resolve().numbers("env.cosmic_rays.vis_tracks"))
 DUST = (1e-2, 3.0, 0.2)
+PUMPING = Pumping(2000, 0.5, 0.5, 1.0, 0.034)
 PHOTOMETRIC = Mode(4, 16, 4)
 PAIRS = np.full((4, 4), 1e-4) - 1e-4 * np.eye(4)
 
@@ -163,6 +165,13 @@ _CASES = (
     ),
     Case("charge_injection", (1e4, 2, 2, 0.03), (0.0, 2, 2, 0.03), zero=False, whole=True),
     Case("injection_noise", (2, 2, 10.0), (2, 2, 0.0), zero=False, whole=True),
+    Case(
+        "trap_pumping",
+        lambda shape: (END_OF_LIFE, PUMPING, columns(shape)),
+        lambda shape: (EMPTY, PUMPING, columns(shape)),
+        conserves=True,
+        whole=True,
+    ),
     Case("bleeding", lambda shape: (2e5, columns(shape)), lambda shape: (1e300, columns(shape)), whole=True),
     Case("quadrants", (2, 3, 1), None, linear=True, conserves=True, whole=True),
     Case("amplifiers", lambda shape: (halves(shape),), None, linear=True, conserves=True, whole=True),

@@ -49,7 +49,7 @@ ORDER = (
     # All charge fills wells before it is read; what hits the register meanwhile misses the way down the columns.
     ("dark_current", "hot_pixels", "bleeding"),
     ("poisson", "cosmic_rays", "bleeding", "quadrants", "parallel_cti", "readout_cosmic_rays", "serial_cti"),
-    ("charge_injection", "injection_noise", "bleeding"),
+    ("charge_injection", "injection_noise", "trap_pumping", "dark_current", "bleeding"),
     ("dark_current", "bleeding", "amplifiers", "parallel_loss", "serial_loss", "nonlinearity"),
     # Charge is read before it is amplified and converted.
     ("serial_cti", "nonlinearity", "crosstalk", "detector_crosstalk", "bias_structure", "read_noise", "adc"),

@@ -71,6 +71,7 @@ CASES = {
     "hot_pixels": lambda x: scene(hot_pixels=0.01, hot_current=2e-3 * x),
     "charge_injection": lambda x: scene(injection__level=x),
     "injection_noise": lambda x: scene(injection__level=1e4, injection__noise=x),
+    "trap_pumping": lambda x: scene(pumping__phase_time=1e-6 * x),
     "calibration_lamp": lambda x: scene(flat__signal=x),
     "bleeding": lambda x: scene(peak=2e5 - 141 + (x - 1)),
     "parallel_cti": lambda x: scene(cti__age=1e-4 * x),
