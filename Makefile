@@ -1,11 +1,11 @@
-# make demo | test | check | bench | docs | clean -- each installs what it is missing into .venv, and nothing a second time.
+# make demo | pilot | test | check | bench | docs | clean -- each installs what it is missing into .venv, and nothing a second time.
 
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help demo test check bench docs clean spark FORCE
+.PHONY: help demo pilot test check bench docs clean spark FORCE
 
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -23,6 +23,8 @@ KNOWN := $(INSTALL) --require-hashes --requirement
 
 help:
 	@echo 'make demo    simulate a field: five Spark jobs, a lake of tables and two images in out/demo'
+	@echo 'make pilot   one observation of Euclid in full, ground cameras, calibrations: says hours and disc first; goes on'
+	@echo '             where it was stopped'
 	@echo 'make test    all tests'
 	@echo 'make check   style, types, who may import whom'
 	@echo 'make bench   all benchmarks'
@@ -31,6 +33,9 @@ help:
 
 demo: spark
 	@$(RUN) python -m jobs.demo
+
+pilot: spark
+	@$(RUN) python -m jobs.demo --request requests/pilot_one_observation.toml --out out/pilot
 
 test: .venv/installed-test spark
 	@$(RUN) python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder

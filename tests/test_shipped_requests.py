@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,8 @@ from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
 from jobs.render.camera import detectors
-from jobs.render.planning import ground_surveys
-from jobs.request.from_toml import from_table
+from jobs.render.planning import ground_surveys, survey
+from jobs.request.from_toml import from_table, parse
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import layout, read
@@ -85,3 +86,18 @@ def test_a_shipped_request_goes_through_all_jobs(name, tmp_path, monkeypatch):
     assert rendered
     assert {number for number, _ in rendered} == is_rendered
     assert {(row["exposure_id"], row["detector"]) for row in products} == rendered
+
+
+def test_the_pilot_observation_has_every_kind_of_image():
+    """All that is rendered, deep fields apart, which are the wide survey's again; every band of every ground survey."""
+    request = parse(REQUESTS / "pilot_one_observation.toml")
+    found = [exposure for exposure, _ in survey.exposures(request, MISSION)]
+    rendered = {(channel, kind) for channel, kinds in RENDERED.items() for kind in kinds if kind != "deep"}
+    assert {(one.channel, one.image_type) for one in found} == rendered
+    euclid = [one for one in found if one.image_type == "science" and one.channel != "EXT"]
+    assert Counter(one.channel for one in euclid) == {"VIS": 4, "NISP-P": 12, "NISP-S": 4}
+    assert not any(one.detectors for one in euclid)
+    ground = {one.band for one in found if one.channel == "EXT" and one.image_type == "science"}
+    printed = {band for rule in MISSION.rows("survey.external") for band in rule["bands"].split()}
+    assert ground == printed | {"lsst_y", "hsc_g"}
+    assert len({one.camera for one in found if one.channel == "EXT"}) == 6

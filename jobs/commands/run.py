@@ -14,9 +14,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import pyarrow as pa
+
 from jobs.catalogue.stars import gaia
 from jobs.commands import space
 from jobs.render import plan_exposures
+from jobs.render.forecasting import catalogue_forecast, speed
+from jobs.render.planning import preconditions, tasks
 from jobs.request import universe
 from jobs.request.from_toml import parse
 from jobs.request.schema import Request
@@ -112,7 +116,8 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
         plan = plan_exposures.check(request, root)
     else:
         plan_exposures.check_catalogues(request)
-    space.check(root, request, plan)
+    wanted_gb, free_gb = space.check(root, request, plan)
+    _foretell(root, request, plan, wanted_gb, free_gb)
     rows, began = [], time.perf_counter()
     for stage in wanted:
         started = time.perf_counter()
@@ -124,6 +129,24 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
     if rendered:
         _show(root, out, request.name)
     return 0
+
+
+def _foretell(
+    root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None, wanted_gb: float, free_gb: float
+) -> None:
+    """Says what all of it will take; what the lake has already is taken off the room alone."""
+    machine = speed.of_machine(root)
+    seconds = sum(line.seconds for line in catalogue_forecast.of_request(request, machine.factor))
+    count = 0
+    if plan is not None:
+        asked = tasks.part(preconditions.rendered(*plan), request)
+        count, seconds = len(asked), seconds + machine.factor * sum(task["seconds"] for task in asked)
+    hours, cores = seconds / 3600.0, catalogue_forecast.WORKERS
+    print(
+        f"forecast: {count:,} detectors, {hours:.2f} core-hours of this machine ({machine.source}), "
+        f"{hours / cores:.2f} h on {cores} cores; {wanted_gb:.2f} GB to write, {free_gb:.2f} GB are free\n",
+        flush=True,
+    )
 
 
 def _table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], total: float) -> None:
@@ -140,7 +163,11 @@ def _table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], tota
 
 def _show(root: Path, out: Path, request: str) -> None:
     # All that renders: seconds that the first job need not wait for.
-    from jobs.render.products import preview
+    from jobs.render.forecasting import taken
+    from jobs.render.products import preview, same_sky
 
-    for picture in preview.previews(root, out, _PICTURES, request):
+    for line in taken.text(taken.rows(root, request, speed.of_machine(root).factor)):
+        print(line)
+    print()
+    for picture in (*preview.previews(root, out, _PICTURES, request), *same_sky.draw(root, out, request)):
         print(picture)

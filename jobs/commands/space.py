@@ -26,10 +26,11 @@ from lake_schema.store.provenance import code_version
 _GB = 1e9
 
 
-def check(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) -> None:
+def check(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) -> tuple[float, float]:
     """Refuses a run whose forecast is larger than what is free; what it will take from the lake is taken off.
 
-    plan : rows of the tables `exposures` and `tasks`, None = nothing is rendered
+    plan    : rows of the tables `exposures` and `tasks`, None = nothing is rendered
+    returns : GB that will be written, GB that are free
     """
     foreseen = {line.job: line.gb * _GB for line in catalogue_forecast.of_request(request)}
     if plan is not None:
@@ -43,6 +44,7 @@ def check(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) 
             f"lake {root}: {free / _GB:.2f} GB are free, the forecast is {total / _GB:.2f} GB ({parts}): make room, or "
             "ask for a part of it (--detectors, --limit)"
         )
+    return total / _GB, free / _GB
 
 
 def _there(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) -> float:

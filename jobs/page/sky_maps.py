@@ -83,7 +83,7 @@ def coverage(lake: Lake, order: int, view: Float | None, band: str | None) -> by
     lake : whose plan;  order : of the cells
     view : ra, dec, radius deg; None: everything;  band : of the exposures, None = all
     """
-    from jobs.render import coverage as coverage_maps
+    from jobs.render.camera import footprints
 
     if not 0 <= order <= _DEEPEST_SHOWN:
         raise BadInput(f"order = {order} is outside [0, {_DEEPEST_SHOWN}]")
@@ -95,7 +95,7 @@ def coverage(lake: Lake, order: int, view: Float | None, band: str | None) -> by
         for row in tasks.select(["ra", "dec", "radius"]).to_pylist() if tasks.num_rows else []:
             cells = np.union1d(cells, sky.cells_in_cone(row["ra"], row["dec"], row["radius"], order))
             _refuse_many(len(cells))
-    seen = coverage_maps.counts(tasks, *sky.cell_centres(order, cells)) if tasks.num_rows and len(cells) else cells * 0
+    seen = footprints.counts(tasks, *sky.cell_centres(order, cells)) if tasks.num_rows and len(cells) else cells * 0
     cells, seen = cells[seen > 0], seen[seen > 0]
     _refuse_many(len(cells))
     return _packed(_corners(order, cells), seen.astype(float), {"order": order, "rows": tasks.num_rows})

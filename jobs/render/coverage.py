@@ -2,7 +2,6 @@
 
     python -m jobs.render.coverage --lake LAKE [--name REQUEST] --out coverage.png
 
-counts     of places: how many of the planned detectors see each
 depths     of the lake's plan, each band over its area
 picture    the same as maps
 """
@@ -16,12 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from jobs import sums
-from jobs.render.camera import pointing
+from jobs.render.camera import footprints, pointing
 from jobs.render.channels.image_types import SKY_TYPES
 from jobs.request.area import Area
 from lake_schema import command, sky, user_files
@@ -57,24 +54,6 @@ class Depth:
         return float((self.seen[self.interior] >= least).mean()) if self.interior.any() else 0.0
 
 
-def counts(tasks: pa.Table, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
-    """[n] How many footprints of the tasks hold each place, gaps between detectors left out; ra, dec : [n] deg."""
-    from scipy.spatial import cKDTree
-
-    places = pointing.basis(np.asarray(ra, float), np.asarray(dec, float))[2].T
-    found = np.zeros(len(places), np.int64)
-    centres = pointing.basis(tasks["ra"].to_numpy(), tasks["dec"].to_numpy())[2].T
-    chords = 2.0 * np.sin(np.radians(tasks["radius"].to_numpy()) / 2.0)
-    nearby = cKDTree(places).query_ball_point(centres, chords) if len(tasks) else []
-    for near, region in zip(nearby, tasks["s_region"].to_pylist(), strict=True):
-        if near:
-            corners = np.array(region.split()[2:], float).reshape(-1, 2)
-            edges = pointing.basis(corners[:, 0], corners[:, 1])[2].T
-            side = sums.product(places[near], np.cross(edges, np.roll(edges, -1, axis=0)).T)
-            found[near] += (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
-    return found
-
-
 def depths(exposures: pa.Table, tasks: pa.Table, area: Area, side: int = _SIDE) -> list[Depth]:
     """Of every channel and band that looks at the sky, long exposures alone.
 
@@ -99,7 +78,7 @@ def depths(exposures: pa.Table, tasks: pa.Table, area: Area, side: int = _SIDE) 
     for channel, band in sorted({(row.channel, row.band) for row in map(ExposureRow.of, looks.to_pylist())}):
         own = looks.filter(pc.and_(pc.equal(looks["channel"], channel), pc.equal(looks["band"], band)))
         long = own.filter(pc.greater(own["exposure_time_s"], 0.5 * pc.max(own["exposure_time_s"]).as_py()))
-        seen = counts(tasks.filter(pc.is_in(tasks["exposure_id"], long["exposure_id"])), ra, dec)
+        seen = footprints.counts(tasks.filter(pc.is_in(tasks["exposure_id"], long["exposure_id"])), ra, dec)
         found.append(Depth(channel, band, len(long), seen.reshape(side, side), interior, extent))
     return found
 

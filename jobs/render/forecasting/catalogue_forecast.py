@@ -31,7 +31,7 @@ from lake_schema.store import names, read
 # Lowest order of a file of stars, as of jobs/catalogue/build_stars.py.
 _LARGEST = 3
 # Workers that begin a job: those of spark-defaults.conf.
-_WORKERS = 2
+WORKERS = 2
 _JOBS = {
     "build_galaxies": ("halos", "galaxies"),
     "build_stars": ("stars",),
@@ -185,7 +185,7 @@ def _lines(
                 continue
             cost, n, in_bands = _costs()[table], parts.get(table, parts[catalogue]), bands.get(table, 1)
             number += rows[catalogue]
-            seconds += cost["start_s"] + min(n, _WORKERS) * cost["worker_s"] + n * cost["part_s"]
+            seconds += cost["start_s"] + min(n, WORKERS) * cost["worker_s"] + n * cost["part_s"]
             seconds += rows[catalogue] * in_bands * cost["row_s"]
             size += cost["start_bytes"] + rows[catalogue] * (cost["row_bytes"] + in_bands * cost["band_bytes"])
         if number:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jobs.render import coverage, plan_exposures
-from jobs.render.camera import astrometry, detectors
+from jobs.render.camera import astrometry, detectors, footprints
 from jobs.render.plan_exposures import plan
 from jobs.render.planning import planned_exposures, source_counts, tasks
 from jobs.request import schema
@@ -37,7 +37,7 @@ def test_a_footprint_ends_where_the_detector_does(distortion):
         edges = np.abs([x + 0.5, x - detector.nx + 0.5, y + 0.5, y - detector.ny + 0.5])
         sharp = edges.min(axis=0) > 3.0
         assert 0.98 < sharp.mean() < 1.0
-    found = coverage.counts(rows, *astrometry.sky_of_pixel(system, x, y))
+    found = footprints.counts(rows, *astrometry.sky_of_pixel(system, x, y))
     np.testing.assert_array_equal(found[sharp], inside[sharp])
 
 
@@ -55,7 +55,7 @@ def dithers(tmp_path_factory):
     radius, angle = 0.7 * np.sqrt(rng.random(4000)), 2 * np.pi * rng.random(4000)
     ra, dec = 150.0 + radius * np.cos(angle) / np.cos(np.radians(20.0)), 20.0 + radius * np.sin(angle)
     assert sky.separation(ra, dec, 150.0, 20.0).max() < 0.72
-    return {c: coverage.counts(rows.filter([x == c for x in rows["channel"].to_pylist()]), ra, dec)
+    return {c: footprints.counts(rows.filter([x == c for x in rows["channel"].to_pylist()]), ra, dec)
             for c in ("VIS", "NISP-P")}  # fmt: skip
 
 
