@@ -1,0 +1,14 @@
+"""The forecast of a production: of a few exposures as of all of them."""
+
+import pytest
+
+from benchmarks import production as benchmark
+
+
+def test_a_few_exposures_stand_for_all():
+    """Each field of the deep one is like the others: to a few hundredths what all of them take."""
+    few, counts = benchmark.core_hours("sc8_deep", 2)
+    assert counts == {"VIS": 120, "NISP-P": 360, "NISP-S": 120}
+    some, _ = benchmark.core_hours("sc8_deep", 6)
+    assert few == pytest.approx(some, rel=0.03)
+    assert all(hours > 0.0 for hours in few.values())
