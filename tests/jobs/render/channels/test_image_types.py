@@ -66,7 +66,7 @@ def test_the_example_asks_for_every_kind(planned):
     assert set(planned[2]) == {
         ("science", 561, None), ("science", 90, None), ("flat", 10, 1), ("bias", 0, None), ("dark", 1000, None),
         *(("flat", 10, lamp) for lamp in range(1, 7)), ("charge_injection", 0, None), ("self_calibration", 561, None),
-        # 2000 cycles of six phases.
+        # 5000 cycles of six phases.
         *(("trap_pumping", seconds, None) for seconds in (60, 180, 600, 1800)), ("defocus", 561, None),
         ("bleeding", 561, None), ("stray_light", 561, None), ("white_dwarf", 561, None),
     }  # fmt: skip
