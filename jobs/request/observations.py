@@ -39,7 +39,7 @@ _MOST_VALUES = 1000
 _MOST_DITHERS, _FARTHEST = 1000, 36_000.0
 DITHERS = ("S", "J", "none")
 EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
-GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes")
+GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes", "whigs")
 # What each channel can be asked for besides the sky. Not derived from what is rendered: more than that can be planned
 # (test_checks.py: all that is rendered is in it).
 _CALIBRATIONS = {

@@ -19,13 +19,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.special
 from astropy.wcs import WCS
 
 from jobs.render.camera import astrometry
 from jobs.render.camera.sections import Section, Sections
 from jobs.render.effects.charge import ramp
+from jobs.render.effects.readout import adc
 from jobs.render.effects.readout import quadrants as layout
 from jobs.render.effects.scene import Frame, Scene
 from lake_schema.arrays import Array, Float
@@ -100,8 +100,8 @@ class ReadoutMode:
 
 
 def _frame(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """uint16[ny, nx] ADU."""
-    raw = found.astype(np.uint16)
+    """[ny, nx] ADU, in as many bits as the converter wants."""
+    raw = adc.as_stored(found, scene)
     return Readout((Extension("", raw, "adu", sections=Sections.whole(*raw.shape[::-1])),), raw, raw)
 
 
@@ -186,8 +186,8 @@ RAMP_AND_CHI2 = replace(RAMP, arrays=partial(_ramp, whole=True))
 
 
 def _quadrants(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """uint16[4, rows, columns] ADU, extensions named detector.quadrant."""
-    raw = found.astype(np.uint16)
+    """[4, rows, columns] ADU as stored, extensions named detector.quadrant."""
+    raw = adc.as_stored(found, scene)
     prescan, overscan, rows, middle = sizes = layout.sizes(scene)
     scans = (
         ("PRESCAN", prescan, "[pix] columns before the pixels"),
@@ -233,7 +233,7 @@ def _quadrant_electrons(read: Sequence[Image]) -> Float:
     return layout.assembled((raw - level) * gain, *sizes)
 
 
-def _raw(read: Sequence[Image]) -> tuple[npt.NDArray[np.uint16], tuple[int, int, int, int]]:
+def _raw(read: Sequence[Image]) -> tuple[Array, tuple[int, int, int, int]]:
     """Quadrants in readout order; prescan, overscan, overscan rows, rows between the halves."""
     header = _header(read[0])
     raw = np.stack([layout.placed(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
@@ -263,8 +263,8 @@ QUADRANTS = ReadoutMode(
 
 
 def _amplifiers(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """uint16[q, rows, columns] ADU; its file has one array, and for each amplifier, from 1, where its parts are."""
-    own, raw = scene.layout, found.astype(np.uint16)
+    """[q, rows, columns] ADU as stored; its file has one array, and for each amplifier, from 1, where its parts are."""
+    own, raw = scene.layout, adc.as_stored(found, scene)
     assert own is not None
     cards: list[Card] = [
         *astrometry.cards(astrometry.shifted(system, own.data.x, own.data.y)),
@@ -299,8 +299,8 @@ def _apart_assembled(array: Array, scene: Scene) -> Array:
 
 
 def _by_amplifier(found: Frame, scene: Scene, detector: str, system: WCS) -> Readout:
-    """uint16[q, rows, columns] ADU; extensions named as LSST's segments, or as the amplifiers."""
-    own, raw = scene.layout, found.astype(np.uint16)
+    """[q, rows, columns] ADU as stored; extensions named as LSST's segments, or as the amplifiers."""
+    own, raw = scene.layout, adc.as_stored(found, scene)
     assert own is not None
     extensions = []
     for number, amplifier in enumerate(own.amplifiers):

@@ -26,14 +26,22 @@ _FILLED_S = {
     "saturation": {"bleeding": 1e-8},
 }
 _STARS_S = 2e-8
+# Of a pixel that has 32 bits, more than of one that has 16.
+_WIDE_BYTES = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Files:
-    """whole : whether its exposure has a file, too;  readout : how its own is wanted (jobs.request.schema.READOUTS)."""
+    """What is written of it.
+
+    whole   : whether its exposure has a file, too
+    readout : how its own is wanted (jobs.request.schema.READOUTS)
+    wide    : whether its converters have more than 16 bits, of which a file has 32
+    """
 
     whole: bool = False
     readout: str = "raw"
+    wide: bool = False
 
 
 _ITS_OWN = Files()
@@ -100,5 +108,5 @@ def price(
         pixel_gb=1e-9 * ((own.held_sky if looks else own.held) + mapped),
         start_bytes=_HEADER_BYTES * (images + len(maps)),
         pixel_bytes=mapped + images * (own_pixels or 0),
-        read_bytes=0.0 if own_pixels else images * own.written,
+        read_bytes=0.0 if own_pixels else images * (own.written + _WIDE_BYTES * files.wide),
     )

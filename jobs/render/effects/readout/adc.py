@@ -1,16 +1,18 @@
-"""Analogue-to-digital conversion: gain, bias, rounding, the converter's range."""
+"""Analogue-to-digital conversion: gain, bias, rounding, the converter's range.
+
+as_stored   what the converter gives, in as many bits as a file has for it
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from jobs.compiling import jit
 from jobs.render.effects.effect import Effect, by_pixel
 from jobs.render.effects.scene import Frame, Scene
-from lake_schema.arrays import Float
+from lake_schema.arrays import Array, Float
 from lake_schema.errors import OutOfRange
 
 
@@ -52,10 +54,21 @@ def _parameters(scene: Scene) -> tuple[float | Float, float | Float, float | Flo
     return gain, bias, scene.of_amplifiers("adc_max", "adu")
 
 
-def converted(groups: Frame, scene: Scene) -> npt.NDArray[np.uint16]:
+def pixel_type(scene: Scene) -> type[np.uint16] | type[np.int32]:
+    """Of a file: 16 bits without a sign; 32 where a converter has more than 16."""
+    largest = float(np.max(scene.of_amplifiers("adc_max", "adu")))
+    return np.uint16 if largest <= np.iinfo(np.uint16).max else np.int32
+
+
+def as_stored(numbers: Frame, scene: Scene) -> Array:
+    """Whole ADU, as `apply` gives them -> the same in the type of a file."""
+    return numbers.astype(pixel_type(scene))
+
+
+def converted(groups: Frame, scene: Scene) -> Array:
     """Groups of a ramp [groups, ny, nx] e- -> ADU."""
     numbers = _parameters(scene)
-    return np.stack([apply(group, *numbers).astype(np.uint16) for group in groups])
+    return np.stack([as_stored(apply(group, *numbers), scene) for group in groups])
 
 
 def _contribution(scene: Scene) -> float:

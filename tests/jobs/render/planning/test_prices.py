@@ -47,6 +47,9 @@ def test_electrons_have_more_bytes_and_no_pixels_beside_the_detectors():
             for way in READOUTS
         }
         assert sizes == {"raw": 2 * times * read, "amplifiers": 2 * times * read, "electrons": 4 * times * raw}
+    # Of converters of more than 16 bits.
+    few, wide = (prices.price("EXT", True, effects, files=prices.Files(wide=wide)) for wide in (False, True))
+    assert wide.bytes(raw, read) - few.bytes(raw, read) == 2 * read
 
 
 def test_each_map_has_its_place_on_the_disc():

@@ -302,7 +302,7 @@ def layers(exposures, ra, dec):
 def test_ground_surveys_see_the_main_run_as_often_as_theirs_did():
     """Serrano et al. 2024, their table of exposures and layers."""
     wanted = parse(DEMO.with_name("sc8_main.toml"))
-    rules = list(MISSION.rows("survey.external"))
+    rules = [rule for rule in MISSION.rows("survey.external") if int(rule["exposures"])]
     assert len(wanted.observations) == 1 + len(rules)
     for block, rule in zip(wanted.observations[1:], rules, strict=True):
         assert (block.survey, block.exposures) == (rule["survey"], int(rule["exposures"]))
