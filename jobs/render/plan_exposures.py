@@ -15,6 +15,7 @@ from jobs.catalogue import request_checks
 from jobs.fluxes import inputs
 from jobs.render.forecasting import catalogue_forecast, forecast, speed
 from jobs.render.planning import (
+    ground_surveys,
     planned_exposures,
     preconditions,
     psf_files,
@@ -30,6 +31,7 @@ from jobs.request import universe
 from jobs.request.checks import check_rendered
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
+from lake_schema import command
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput
 from lake_schema.mission import checks, published
@@ -74,6 +76,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     universe.refuse_other(_catalogues(lake, request), request)
     mission, exposures, rows = plan(lake, request)
     _print_forecast(lake, exposures, rows)
+    _say_by_day(exposures, mission)
     facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **user_filters(request)[1]}
     # What they cost depends on more than which they are.
     counts = {v.table: v.key for v in _catalogues(lake, request)}
@@ -99,6 +102,7 @@ def dry_run(lake: Path, request: Request) -> Sequence[Step]:
     universe.refuse_other(_catalogues(lake, request), request)
     exposures, rows = check(request, lake)
     _print_forecast(lake, exposures, rows)
+    _say_by_day(exposures, mission_of(request.mission))
     print()
     for line in catalogue_forecast.text(catalogue_forecast.of_request(request, speed.of_machine(lake).factor)):
         print(line)
@@ -135,6 +139,11 @@ def _print_forecast(lake: Path, exposures: pa.Table, rows: pa.Table) -> None:
     machine = speed.of_machine(lake)
     for line in forecast.text(forecast.rows(exposures, rows, machine.factor), machine):
         print(line)
+
+
+def _say_by_day(exposures: pa.Table, mission: MissionConfiguration) -> None:
+    if line := ground_surveys.by_day(exposures, mission):
+        command.say("plan_exposures", line, 0)
 
 
 JOB = Job(

@@ -1,7 +1,7 @@
 """What is checked of a whole request: its bands, the mission's parameters, and whether any of it can be rendered.
 
 check_bands, check_mission   of names and values
-check_rendered               something of it can be rendered
+check_rendered               all of it can be rendered
 skipped                      what of it cannot, as one line
 """
 
@@ -67,11 +67,10 @@ def check_mission(request: Request) -> MissionConfiguration:
 
 
 def check_rendered(request: Request) -> None:
-    """There must be a simulator for some channel and image type of it, if it wants anything observed."""
-    kinds = [kind for _, kind in _kinds(request)]
-    if kinds and not any(map(_is_rendered, kinds)):
-        key, (channel, image_type) = next(_kinds(request))
-        raise BadInput(f"{key}: no simulator renders {channel} {image_type} yet: it can be planned alone")
+    """There must be a simulator for each channel and image type that it wants observed."""
+    for key, (channel, image_type) in _kinds(request):
+        if not _is_rendered((channel, image_type)):
+            raise BadInput(f"{key}: no simulator renders {channel} {image_type} yet: it can be planned alone")
 
 
 def skipped(request: Request) -> str:

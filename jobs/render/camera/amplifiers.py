@@ -8,6 +8,7 @@ Amplifier      a part of a detector, and its output
 Layout         all of a detector, with pre- and overscan; None of a camera that has no table of them
 layout         of a detector, from the mission database;  full_size : of a whole one
 values         a parameter of each amplifier
+refuse_spread  gains and noises of amplifiers that differ too much
 couplings      crosstalk of each pair
 
 Readout order, as everywhere: [amplifier, row, column], where [0, 0] is read first. Columns: prescan, pixels, overscan;
@@ -16,7 +17,7 @@ rows: pixels, overscan.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -290,6 +291,29 @@ def values(key: str, unit: str, detector: Detector, mission: MissionConfiguratio
             relative = amplifier.relative[_RELATIVE[key]] if key in _RELATIVE else 1.0
             found[number] = relative * found[number] + rms * float(np.clip(deviation, -_MOST_SPREAD, _MOST_SPREAD))
     return found if np.ptp(found) > 0.0 else float(found[0])
+
+
+# What an amplifier's own value may not be below: as bounds.csv has it of the mean.
+_LEAST = {"gain": ("electron / adu", 1e-3), "read_noise": ("electron", 0.0)}
+
+
+def refuse_spread(detectors: Sequence[Detector], mission: MissionConfiguration) -> None:
+    """BadInput names the first amplifier of a camera that would have no gain, or less than no noise."""
+    for detector in detectors:
+        own = layout(detector, mission)
+        for key, (unit, least) in _LEAST.items() if own else ():
+            assert own is not None
+            name = f"{detector.section}.{key}_spread"
+            rms = mission.value(name, unit) if name in mission else 0.0
+            mean = mission.value(f"{detector.section}.{key}", unit)
+            lowest = mean * min(amplifier.relative[_RELATIVE[key]] for amplifier in own.amplifiers)
+            if lowest - _MOST_SPREAD * rms >= least:
+                continue
+            found = np.broadcast_to(values(key, unit, detector, mission, own), len(own.amplifiers))
+            worst = int(np.argmin(found))
+            if found[worst] < least:
+                who = f"amplifier {own.amplifiers[worst].name} of detector {detector.name}"
+                raise BadInput(f"mission: {name} = {rms:g}: {who} would have {found[worst]:.3g} {unit}")
 
 
 def couplings(median: float, largest: float, detector: Detector, own: Layout) -> Float:

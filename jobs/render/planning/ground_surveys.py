@@ -2,6 +2,7 @@
 
 exposures    of one survey over an area
 read         a table of pointings, CSV
+by_day       what of a plan is dated when it is not night, as a line
 
 Ref : Serrano et al. 2024, appendix on the survey files of the eighth science challenge
 """
@@ -12,15 +13,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 from jobs import rng
 from jobs.render.camera import detectors as camera_detectors
 from jobs.render.camera import pointing
 from jobs.render.camera.detectors import Detector
-from jobs.render.channels import image_types
+from jobs.render.channels import image_types, registry
 from jobs.render.planning import calibration_frames
 from jobs.render.planning.planned_exposures import Exposure, bands_of, exposure_time, through_grism
-from jobs.render.sky.observatory import Site, next_dark
+from jobs.render.sky.observatory import Site, next_dark, sun_altitude
 from jobs.render.sky.solar_aspect import next_allowed, position_angle
 from jobs.request import pointing_tables
 from jobs.request.area import Area
@@ -28,8 +30,11 @@ from jobs.request.observations import Observation
 from jobs.request.pointing_tables import Row
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
 
 _DAY_S, _OVERHEAD_S = 86400.0, 30.0
+# Nautical twilight: the Sun brightens the sky while it is higher, deg.
+_NIGHT = -12.0
 
 
 def camera_of(survey: str, mission: MissionConfiguration) -> str:
@@ -182,6 +187,31 @@ def _by_chips(
         lon, lat = pointing.sky_of_plane(x, y, ra, dec, 0.0)
         places += list(zip(lon.tolist(), lat.tolist(), strict=True))
     return places[:count] if count else places
+
+
+def by_day(exposures: pa.Table, mission: MissionConfiguration) -> str:
+    """A line about ground exposures of the sky that a request dates by day or in twilight, empty where there are none.
+
+    exposures : rows of the table;  mission : the mission database
+    """
+    found, count = [], 0
+    sites: dict[str, Site] = {}
+    for row in map(ExposureRow.of, exposures.to_pylist()):
+        own = registry.CHANNELS[row.channel]
+        if not (own.on_ground and own.sees_sky(row.image_type)):
+            continue
+        count += 1
+        if row.camera not in sites:
+            sites[row.camera] = Site.of(image_types.section(row.camera), mission)
+        high = float(sun_altitude(np.array([row.mjd]), sites[row.camera])[0])
+        if high > _NIGHT:
+            found.append((high, row))
+    if not found:
+        return ""
+    high, row = max(found, key=lambda one: one[0])
+    what = f"{len(found)} of {count} exposures of the sky are dated when the Sun is above {_NIGHT:g} deg"
+    where = f"{row.camera} on MJD {row.mjd:.3f}, the Sun at {high:+.0f} deg"
+    return f"EXT: {what} ({where}): their sky has no light of the Sun; without a date a survey observes at night"
 
 
 # ------------------------------------------------------------------------------------------------ tables

@@ -18,6 +18,7 @@ from jobs.accuracy import SURVEY, Accuracy
 from jobs.render.camera import amplifiers, pointing
 from jobs.render.camera import detectors as camera_detectors
 from jobs.render.channels import registry
+from jobs.render.effects.readout import adc
 from jobs.render.exposure import scene_of
 from jobs.render.exposure.records import Variant
 from jobs.render.planning import variants
@@ -171,8 +172,10 @@ def _price(row: ExposureRow, own: Variant, truth: Sequence[str], files: Files) -
     looks = kind in registry.CHANNELS[channel].sky_types
     effects = registry.CHANNELS[channel].read_as(files.readout).effects.get(kind)
     if effects is not None:
-        first = camera_detectors.detectors(row.camera, own.mission)[0]
-        scene = replace(scene_of.scene_of(row, first, own.mission, own.accuracy), forced=own.forced)
+        every = camera_detectors.detectors(row.camera, own.mission)
+        amplifiers.refuse_spread(every, own.mission)
+        scene = replace(scene_of.scene_of(row, every[0], own.mission, own.accuracy), forced=own.forced)
         scene = scene_of.with_own_light(scene, registry.CHANNELS[channel], effects)
+        files = replace(files, wide=adc.pixel_type(scene) is np.int32)
         effects = tuple(e for e in effects if own.forced.get(e.name, looks or e.needed_if(scene)))
     return price(channel, looks, effects, own.accuracy, truth, files)

@@ -2,7 +2,7 @@
 
 Site           an observatory
 aloft          airmass of a field, and where the zenith lies from it;  airmass : of an altitude
-moon           place and phase of the Moon
+moon           place and phase of the Moon;  sun_altitude : of the Sun
 next_dark      when a field can be observed next
 """
 
@@ -74,6 +74,12 @@ class Site:
         return np.asarray(2.0 * np.pi * (turns % 1.0) + np.radians(self.longitude - np.asarray(ra, float)))
 
 
+def sun_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
+    """deg [...] above the horizon of a site."""
+    sun = _sun(np.asarray(mjd, float))
+    return site.altitude(*equatorial(sun, np.zeros_like(sun)), mjd)
+
+
 def airmass(altitude: npt.ArrayLike) -> Float:
     """Of an altitude of 0 deg or more.  Ref: Kasten & Young 1989, Appl. Opt. 28, 4735."""
     up = np.maximum(np.asarray(altitude, float), 0.0)
@@ -143,8 +149,7 @@ def _sun(mjd: Float) -> Float:
 
 
 def _dark(ra: float, dec: float, mjd: Float, site: Site) -> Bool:
-    sun = _sun(mjd)
-    night = site.altitude(*equatorial(sun, np.zeros_like(sun)), mjd) < _TWILIGHT
+    night = sun_altitude(mjd, site) < _TWILIGHT
     up = airmass(site.altitude(ra, dec, mjd)) <= _MOST_AIRMASS
     if not (night & up).any():
         return night & up

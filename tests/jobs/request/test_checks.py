@@ -86,9 +86,13 @@ def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_
     ("channels", "kind", "said"),
     [(("EXT",), "science", ""), (("VIS", "EXT"), "self_calibration", "EXT"), (("VIS",), "bias", ""), ((), "", "")],
 )
-def test_what_is_rendered_in_part_is_taken_and_the_rest_named(channels, kind, said):
+def test_what_is_rendered_in_part_is_refused_and_the_rest_named(channels, kind, said):
     request = only(channels, kind)
-    checks.check_rendered(request)
+    if said:
+        with pytest.raises(BadInput, match=f"no simulator renders {said} {kind}"):
+            checks.check_rendered(request)
+    else:
+        checks.check_rendered(request)
     assert checks.skipped(request).startswith(said)
     assert bool(checks.skipped(request)) == bool(said)
 
@@ -100,10 +104,11 @@ def stars_by_decam(folder):
 
 
 def test_the_command_refuses_in_one_line_and_plans_on_demand(tmp_path, capsys):
-    path = requests.written(tmp_path, stars_by_decam(tmp_path))
+    # Beside what can be rendered, too.
+    path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\nfields = 1\n' + stars_by_decam(tmp_path))
     assert __main__.main(["check", str(path)]) == 2
     said = capsys.readouterr().err
-    text = r"request: .*observation\[0\]\.pointings: no simulator renders EXT standard_star yet: .*\n"
+    text = r"request: .*observation\[1\]\.pointings: no simulator renders EXT standard_star yet: .*\n"
     assert re.fullmatch(text, said)
     assert __main__.main(["check", str(path), "--plan"]) == 0
     assert "EXT standard_star: planned and forecast, skipped by rendering" in capsys.readouterr().out

@@ -123,3 +123,20 @@ def test_crosstalk_beyond_neighbours_is_as_little_as_measured():
         neighbours = (np.abs(columns[:, None] - columns) == 1) & (top[:, None] == top)
         assert 1.4e-4 < found[neighbours].min() < found[neighbours].max() <= 2.9e-4
         assert 0.0 < found[~neighbours].max() < 5e-5
+
+
+def test_amplifiers_that_would_have_no_gain_are_refused():
+    """Exactly those: a spread that is wide, and a camera whose own amplifiers all lie on one side of it."""
+    every, key = detectors.detectors("decam", MISSION), "ext.decam.gain_spread"
+    amplifiers.refuse_spread(every, MISSION)
+    for rms in (0.5, 1.0, 1.35, 1.5, 2.0, 3.0):
+        mission = resolve(overrides={key: (rms, GAIN)})
+        lowest = min(np.min(amplifiers.values("gain", GAIN, d, mission, layout_of(d))) for d in every)
+        if lowest >= 1e-3:
+            amplifiers.refuse_spread(every, mission)
+            continue
+        with pytest.raises(BadInput, match=rf"^mission: {key} = {rms:g}: amplifier [AB] of detector \w+ would have -"):
+            amplifiers.refuse_spread(every, mission)
+    assert lowest < 0.0
+    with pytest.raises(BadInput, match="read_noise_spread = 9: amplifier"):
+        amplifiers.refuse_spread(every, resolve(overrides={"ext.decam.read_noise_spread": (9.0, "electron")}))

@@ -1,9 +1,12 @@
 """Ground surveys by their rules; tables of pointings: a line is taken as it stands, or refused by its number."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.coordinates import AltAz, EarthLocation, get_sun
+from astropy.time import Time
 
 from jobs.render.planning import ground_surveys, planned_exposures
 from jobs.request.area import Area
@@ -84,6 +87,32 @@ def test_a_survey_observes_at_night_and_misses_by_its_error(name, error):
     dated = survey_of(name, 30, mjd=60500.0)
     assert dated[0].mjd == 60500.0
     assert dated[1].mjd == pytest.approx(60500.0 + (dated[0].exposure_time_s + 30.0) / 86400.0)
+
+
+@pytest.mark.parametrize(("name", "camera", "band"), [("lsst", "lsstcam", "lsst_y"), ("whigs", "hsc", "hsc_g")])
+def test_bands_that_the_challenge_has_not_are_planned_as_the_others(name, camera, band):
+    found = survey_of(name, 5, bands=(band,))
+    assert {(one.camera, one.band) for one in found} == {(camera, band)}
+    assert len(found) == 5
+    table = planned_exposures.table(found, [MISSION] * len(found))
+    assert (np.diff(table["mjd"].to_numpy()) > 0).all()
+    assert min(table["sky"].to_pylist()) > 0.0
+
+
+def test_dates_by_day_are_named():
+    """The Sun's altitude as astropy has it."""
+    none = survey_of("lsst", 4, bands=("lsst_r",))
+    assert ground_surveys.by_day(planned_exposures.table(none, [MISSION] * 4), MISSION) == ""
+    # 11:30 of local time.
+    dated = [replace(one, mjd=60500.68 if i else one.mjd) for i, one in enumerate(none[:2])]
+    dated.append(replace(dated[1], image_type="flat"))
+    line = ground_surveys.by_day(planned_exposures.table(dated, [MISSION] * 3), MISSION)
+    where = EarthLocation.from_geodetic(-70.7494, -30.2446, 2663.0)
+    when = Time(60500.68, format="mjd")
+    high = get_sun(when).transform_to(AltAz(obstime=when, location=where)).alt.deg
+    assert line.startswith("EXT: 1 of 2 exposures of the sky are dated when the Sun is above -12 deg")
+    assert float(re.search(r"the Sun at ([+-]\d+) deg", line)[1]) == pytest.approx(high, abs=0.8)
+    assert "\n" not in line
 
 
 def test_seeing_is_drawn_for_each_exposure():
