@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from jobs.render.effects.light import calibration_lamp, illumination
-from jobs.render.reduction import calibration, files
+from jobs.render.reduction import amplifiers, calibration, files
 from jobs.render.reduction import frames as frames_of
 from jobs.render.reduction.combining import Combined, clipped_mean
 from jobs.render.reduction.frames import Frame
@@ -74,7 +74,7 @@ def _combined(kind: str, frames: Sequence[Frame], masters: Mapping[str, Combined
 
 def _counted(frame: Frame, bias: Combined, dark: Combined) -> Float:
     """Electrons as they were counted, without bias and dark current."""
-    electrons = calibration.counted(frame.electrons() - bias.mean, frame.scene, frame.applied)
+    electrons = amplifiers.undone(frame.electrons() - bias.mean, frame.scene, frame.applied)
     return np.asarray(electrons - dark.mean * frame.scene.exposure_time_s)
 
 

@@ -51,7 +51,8 @@ def reduced(frame: Frame, masters: Masters, wish: Wish) -> tuple[Reduced, tuple[
     """A frame with the masters of its detector: the image and its header."""
     electrons = {"electron": 1.0, "electron/s": frame.scene.exposure_time_s}.get(wish.unit) or frame.mean_gain
     undone = frame.applied - set(wish.without)
-    found = calibration.reduced(frame.electrons(), frame.full(), masters, frame.scene, undone, electrons)
+    fringes = frame.fringes() if "fringes" in undone else None
+    found = calibration.reduced(frame.electrons(), frame.full(), masters, frame.scene, undone, electrons, fringes)
     if wish.cosmic_rays:
         found = cosmic_rays.flagged(found, cosmic_rays.found(found, wish.cosmic_rays))
     return found, files.reduced_cards(frame, wish.unit, electrons, wish.without)

@@ -1,30 +1,54 @@
 """What the amplifiers of a detector do, as maps of its pixels and undone: of quadrants and of a ground camera's alike.
 
 of_pixels         their numbers as a map
+at_least          pixels that reach their amplifier's number
 unread            pixels that none of them reads
-linearised        the inverse of their response
-without_crosstalk what each sees of the others, taken off
+undone            what each sees of the others, taken off, and the inverse of their response
+
+A large detector of a ground camera is taken some rows at a time: memory.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Container
 
 import numpy as np
 
 from jobs.render.channels.readout import pixels, planes
 from jobs.render.effects.readout import crosstalk, nonlinearity
 from jobs.render.effects.scene import Scene
-from lake_schema.arrays import Bool, Float
+from lake_schema.arrays import Array, Bool, Float
+
+# Rows of each amplifier that are taken at a time.
+_ROWS = 64
 
 
-def of_pixels(numbers: float | Float, scene: Scene) -> float | Float:
-    """Numbers [q] of the amplifiers as a map [ny, nx] of their pixels, 0 between them; one number stays one."""
+def of_pixels(numbers: float | Float, scene: Scene, rows: slice = slice(None)) -> float | Float:
+    """Numbers [q] of the amplifiers as a map [ny, nx] of their pixels, 0 between them; one number stays one.
+
+    rows : of the detector, from the first to one past the last, all of them or some
+    """
     if np.ndim(numbers) == 0:
         return numbers
-    values = np.asarray(numbers, float).reshape(-1, 1, 1)
-    own = scene.layout
+    values, own = np.asarray(numbers, float), scene.layout
     if own is None:
-        return pixels(np.broadcast_to(values, (4, scene.half_rows, scene.nx // 2)), scene)
-    return pixels(np.broadcast_to(values, (len(values), own.height + own.rows, own.scans + own.width)), scene)
+        planes_of = np.broadcast_to(values.reshape(-1, 1, 1), (4, scene.half_rows, scene.nx // 2))
+        return np.asarray(pixels(planes_of, scene)[rows])
+    first, past, _ = rows.indices(own.ny)
+    out = np.zeros((past - first, own.nx))
+    for value, amplifier in zip(values, own.amplifiers, strict=True):
+        low, high = (min(max(y, first), past) for y in (amplifier.pixels.y, amplifier.pixels.y + own.height))
+        out[low - first : high - first, amplifier.pixels.x : amplifier.pixels.x + own.width] = value
+    return out
+
+
+def at_least(frame: Array, numbers: float | Float, scene: Scene) -> Bool:
+    """Pixels [ny, nx] that are no less than their amplifier's number; those between amplifiers, than 0."""
+    out = np.empty(frame.shape, bool)
+    for first in range(0, len(frame), _ROWS):
+        rows = slice(first, min(first + _ROWS, len(frame)))
+        out[rows] = frame[rows] >= of_pixels(numbers, scene, rows)
+    return out
 
 
 def unread(scene: Scene) -> Bool:
@@ -36,14 +60,30 @@ def unread(scene: Scene) -> Bool:
     return out
 
 
-def linearised(frame: Float, scene: Scene) -> Float:
-    """Electrons [ny, nx] above the bias, as the amplifiers gave them -> as they came."""
-    curve = nonlinearity.parameters(scene)
-    if all(np.ndim(number) == 0 for number in curve):
-        return nonlinearity.linearised(frame, *curve)
-    return np.asarray(pixels(nonlinearity.linearised(planes(frame, scene), *curve), scene))
+def undone(frame: Float, scene: Scene, effects: Container[str]) -> Float:
+    """Electrons [ny, nx] above the bias, as the amplifiers gave them -> as they came; 0 where none of them reads.
+
+    effects : names of what is undone: crosstalk, by the mission, and then the response
+    """
+    table = crosstalk.coefficients(scene) if crosstalk.EFFECT.name in effects else None
+    curve = nonlinearity.parameters(scene) if nonlinearity.EFFECT.name in effects else None
+
+    def change(parts: Float) -> Float:
+        found = parts if table is None else crosstalk.removed(parts, table)
+        return found if curve is None else nonlinearity.linearised(found, *curve)
+
+    return _by_rows(frame, scene, change)
 
 
-def without_crosstalk(frame: Float, scene: Scene) -> Float:
-    """Electrons [ny, nx] above the bias -> without what each amplifier saw of the others, by the mission."""
-    return np.asarray(pixels(crosstalk.removed(planes(frame, scene), crosstalk.coefficients(scene)), scene))
+def _by_rows(frame: Float, scene: Scene, change: Callable[[Float], Float]) -> Float:
+    """What `change` makes of [q, rows, columns] that the amplifiers read at the same time; 0 where none reads."""
+    own = scene.layout
+    if own is None:
+        return np.asarray(pixels(change(planes(frame, scene)), scene))
+    out = np.zeros(frame.shape)
+    for first in range(0, own.height, _ROWS):
+        some = slice(first, min(first + _ROWS, own.height))
+        found = change(np.stack([own.placed(frame[a.pixels.slices], q)[some] for q, a in enumerate(own.amplifiers)]))
+        for q, (amplifier, plane) in enumerate(zip(own.amplifiers, found, strict=True)):
+            own.placed(out[amplifier.pixels.slices], q)[some] = plane
+    return out

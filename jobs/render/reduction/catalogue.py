@@ -64,7 +64,7 @@ def detected(image: Reduced, gain: float, radius: float, limits: Limits) -> dict
     limits : what a source is
     """
     masked = (image.flags & ~np.uint8(SATURATED) != 0) & (image.weight <= 0.0)
-    above, noise, level = _above(image, masked, limits)
+    above, noise, sky = _above(image, masked, limits)
     found, own = sep.extract(
         above, limits.threshold, err=noise, mask=masked, minarea=limits.pixels, gain=gain, segmentation_map=True
     )
@@ -91,27 +91,35 @@ def detected(image: Reduced, gain: float, radius: float, limits: Limits) -> dict
         "fwhm": _width(above, own, found["peak"]),
         "flux_iso": found["flux"], "flux_max": found["peak"], "threshold": found["thresh"], "kron": kron,
         "flux_auto": flux, "fluxerr_auto": error, "flux_aper": aperture[0], "fluxerr_aper": aperture[1],
-        "flux_radius": half, "background": level[at], "flags": flags, "imaflags": bits,
+        "flux_radius": half, "background": sky.back()[at], "flags": flags, "imaflags": bits,
     }  # fmt: skip
 
 
-def _above(image: Reduced, masked: Bool, limits: Limits) -> tuple[Array, Array, Array]:
-    """float32[ny, nx]: the image without the sky, rms of the sky, its level; what sources cover is none of it.
+def _above(image: Reduced, masked: Bool, limits: Limits) -> tuple[Array, Array, sep.Background]:
+    """float32[ny, nx]: the image without the sky, rms of the sky; its level; what sources cover is none of it.
 
     image : with weights;  masked : pixels without value;  limits : what a source is
     """
+    # What is not needed any more is freed: of a large detector each array is a third of a gigabyte.
     pixels = np.ascontiguousarray(image.image, np.float32)
     sep.set_extract_pixstack(max(300_000, int(_STACK * pixels.size)))
     sep.set_sub_object_limit(_PARTS)
     mesh = {"bw": _MESH, "bh": _MESH, "fw": _SMOOTHED, "fh": _SMOOTHED}
     empty = image.weight > 0.0
     sky = sep.Background(pixels, mask=~empty, **mesh)
-    first = {"err": np.maximum(sky.rms(), _FLOOR), "mask": masked, "minarea": limits.pixels, "deblend_cont": 1.0}
-    _, own = sep.extract(pixels - sky.back(), limits.threshold, segmentation_map=True, **first)
-    empty &= ~ndimage.binary_dilation(own > 0, iterations=_MARGIN)
+    first = {"err": _noise(sky), "mask": masked, "minarea": limits.pixels, "deblend_cont": 1.0}
+    own = sep.extract(pixels - sky.back(), limits.threshold, segmentation_map=True, **first)[1] > 0
+    del first
+    empty &= ~ndimage.binary_dilation(own, iterations=_MARGIN)
+    del own
     if empty.any():
         sky = sep.Background(pixels, mask=~empty, **mesh)
-    return pixels - sky.back(), np.maximum(sky.rms(), _FLOOR), sky.back()
+    return pixels - sky.back(), _noise(sky), sky
+
+
+def _noise(sky: sep.Background) -> Array:
+    rms = sky.rms()
+    return np.asarray(np.maximum(rms, _FLOOR, out=rms))
 
 
 def _errors(found: Array, signal: Float) -> Float:

@@ -19,6 +19,8 @@ from lake_schema.errors import OutOfRange
 
 # Of the limit, that of a hit's neighbours; contrast with the fine structure; rounds.
 _NEIGHBOURS, _CONTRAST, _ROUNDS = 0.3, 5.0, 4
+# Rows that are searched at a time (memory), and those beyond that tell what a hit is.
+_ROWS, _BEYOND = 1024, 64
 
 
 def check(limit: float) -> None:
@@ -40,12 +42,18 @@ def found(image: Reduced, limit: float) -> Bool:
     if not used.any():
         return np.zeros(used.shape, bool)
     typical = 1.0 / float(np.median(image.weight[used]))
-    variance = np.where(used, 1.0 / np.where(used, image.weight, 1.0), typical).astype(np.float32)
-    hit, _ = detect_cosmics(
-        np.ascontiguousarray(image.image, np.float32), inmask=~used, invar=variance, sigclip=limit,
-        sigfrac=_NEIGHBOURS, objlim=_CONTRAST, gain=1.0, satlevel=np.inf, niter=_ROUNDS, fsmode="median",
-    )  # fmt: skip
-    return np.asarray(hit & used)
+    variance = np.full(used.shape, typical, np.float32)
+    np.divide(np.float32(1.0), image.weight, out=variance, where=used)
+    out = np.zeros(used.shape, bool)
+    for first in range(0, len(out), _ROWS):
+        wide = slice(max(first - _BEYOND, 0), first + _ROWS + _BEYOND)
+        hit, _ = detect_cosmics(
+            np.ascontiguousarray(image.image[wide], np.float32), inmask=~used[wide], invar=variance[wide],
+            sigclip=limit, sigfrac=_NEIGHBOURS, objlim=_CONTRAST, gain=1.0, satlevel=np.inf, niter=_ROUNDS,
+            fsmode="median",
+        )  # fmt: skip
+        out[first : first + _ROWS] = hit[first - wide.start :][:_ROWS]
+    return out & used
 
 
 def flagged(image: Reduced, hit: Bool) -> Reduced:

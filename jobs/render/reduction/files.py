@@ -34,7 +34,7 @@ from lake_schema.mission.parameter import CAMERAS
 
 KINDS = ("bias", "dark", "flat")
 # What can be left as it is.
-UNDONE = (*KINDS, "crosstalk", "nonlinearity")
+UNDONE = (*KINDS, "crosstalk", "nonlinearity", "fringes")
 _UNITS = {"bias": "electron", "dark": "electron/s", "flat": ""}
 # What a master must share with the frame that it is applied to: the detector's patterns are keyed by these.
 SAME = ("INSTRUME", "DETECTOR", "SEED")
@@ -181,6 +181,7 @@ def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[s
         *((f"CAL{kind.upper()}", kind not in without, f"master {kind} applied?") for kind in KINDS),
         ("CALXTALK", "crosstalk" in done, "crosstalk undone?"),
         ("CALLIN", "nonlinearity" in done, "response of the amplifiers undone?"),
+        ("CALFRING", "fringes" in done, "fringes of the sky taken off?"),
         ("CALILLUM", bool({"illumination", "shutter"} & frame.applied), "vignetting and shutter undone?"),
         *flag_cards(),
     )

@@ -13,15 +13,18 @@ from typing import Any
 
 import numpy as np
 
+from jobs import rng
 from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import passband_of
 from jobs.render.camera import detectors
+from jobs.render.effects.light import fringes, pixel_area
 from jobs.render.effects.scene import Scene
 from jobs.render.exposure import scene_of
+from jobs.render.exposure.rendered import numbers_of
 from jobs.render.planning import variants
 from jobs.render.products import beside, read_back
 from jobs.render.reduction import amplifiers
-from lake_schema.arrays import Bool, Float
+from lake_schema.arrays import Bool, Float, Float32
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.fits.images import Card
@@ -75,7 +78,20 @@ class Frame:
         """Pixels [ny, nx] that read no less than a saturated one."""
         levels = self._of_amplifiers("SATURATE")
         adu = np.asarray(read_back.frame(self.path).data)
-        return np.asarray(adu >= amplifiers.of_pixels(levels, self.scene))
+        return amplifiers.at_least(adu, levels, self.scene)
+
+    def fringes(self) -> Float32 | None:
+        """[ny, nx] over the sky that each pixel sees, as the mission declares them; None where there are none."""
+        effect = fringes.EFFECT
+        if effect.name not in self.applied:
+            return None
+        _, amplitude, period = effect.parameters(self.scene)
+        own = rng.stream(*numbers_of(effect, self.exposure, self.detector, int(self.card("SEED"))))
+        nothing = np.zeros((self.scene.ny, self.scene.nx))
+        found = effect.apply(nothing, 1.0, amplitude, period, rng=own)
+        if pixel_area.EFFECT.name in self.applied:
+            found /= pixel_area.apply(np.ones_like(found), 1.0, *pixel_area.parameters(self.scene)[1:])
+        return np.asarray(found, np.float32)
 
     def _of_amplifiers(self, keyword: str) -> float | Float:
         """A card of the common header, else of the arrays' own, [q]."""

@@ -38,13 +38,14 @@ class Ground:
     wcs: WCS
 
 
-def made(folder, camera, side, electrons, pitch, sky=8.0, rays=1.0):
+def made(folder, camera, side, electrons, pitch, sky=8.0, rays=1.0, forced=None, overrides=None):
     """Stars of so many electrons, (least, most) in a logarithmic scale, on a lattice.
 
-    pitch : pixels from star to star;  sky : e-/s in a pixel;  rays : of the camera's rate of cosmic rays
+    pitch  : pixels from star to star;  sky : e-/s in a pixel;  rays : of the camera's rate of cosmic rays
+    forced : effects on or off;  overrides : of the mission
     """
     usual = fields.MISSION.value(f"ext.{camera}.cosmic_rays.rate", "1 / s")
-    mission = resolve(overrides={f"ext.{camera}.cosmic_rays.rate": (rays * usual, "1 / s")})
+    mission = resolve(overrides={f"ext.{camera}.cosmic_rays.rate": (rays * usual, "1 / s"), **(overrides or {})})
     detector = replace(detectors.detectors(camera, mission)[4], nx=side, ny=side, middle=0)
     ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
     system = astrometry.wcs(detector, ra, dec, angle)
@@ -58,7 +59,8 @@ def made(folder, camera, side, electrons, pitch, sky=8.0, rays=1.0):
         "sky": sky, "zero_point": ZERO_POINT, "exposure_time_s": SECONDS,
     }  # fmt: skip
     tables = none, fields.fluxes(none, band, 0.0), points, fields.fluxes(points, band, f_nu)
-    one = fields.rendered(exposed, detector, tables, mission, SURVEY, SEED, truth=TRUTH)
+    own = passbands.load(band)
+    one = fields.rendered(exposed, detector, tables, mission, SURVEY, SEED, forced, truth=TRUTH, passband=own)
     return _written(folder, one)
 
 

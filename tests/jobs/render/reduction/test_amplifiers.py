@@ -42,13 +42,19 @@ def test_numbers_lie_on_their_pixels():
     found = amplifiers.of_pixels(np.arange(16.0), scene)
     for number, amplifier in enumerate(scene.layout.amplifiers):
         assert np.all(found[amplifier.pixels.slices] == number)
+    np.testing.assert_array_equal(amplifiers.of_pixels(np.arange(16.0), scene, slice(5, 11)), found[5:11])
+    frame = np.random.default_rng(3).integers(0, 16, found.shape)
+    np.testing.assert_array_equal(amplifiers.at_least(frame, np.arange(16.0), scene), frame >= found)
+    np.testing.assert_array_equal(amplifiers.at_least(frame, 7.0, scene), frame >= 7)
 
 
-@pytest.mark.parametrize("camera", ["vis", "decam", "lsstcam"])
+@pytest.mark.parametrize("camera", ["vis", "decam", "lsstcam", "gpc1"])
 def test_what_amplifiers_did_is_undone(camera):
     """Each its own gain, and so its own response; as large a crosstalk as there is."""
     vis = {"vis.gain.E": (3.0, "electron / adu"), "vis.crosstalk": (1e-3, "")}
-    scene = scene_of(camera, 32, 16, vis if camera == "vis" else None)
+    # So many rows of each amplifier that they are taken in more than one piece.
+    nx, ny = (64, 16) if camera == "gpc1" else (32, 4 * amplifiers._ROWS + 6)
+    scene = scene_of(camera, nx, ny, vis if camera == "vis" else None)
     came = np.random.default_rng(2).uniform(0.0, 8e4, (scene.ny, scene.nx))
     came[amplifiers.unread(scene)] = 0.0
     curve = nonlinearity.parameters(scene)
@@ -56,5 +62,8 @@ def test_what_amplifiers_did_is_undone(camera):
     given = nonlinearity.apply(readout.planes(came, scene), *curve)
     read = readout.pixels(crosstalk.apply(given, crosstalk.coefficients(scene)), scene)
     assert np.abs(read - came).max() > 10.0
-    found = amplifiers.linearised(amplifiers.without_crosstalk(read, scene), scene)
+    found = amplifiers.undone(read, scene, {"crosstalk", "nonlinearity"})
     np.testing.assert_allclose(found, came, atol=1e-3)
+    left = amplifiers.undone(read, scene, {"crosstalk"})
+    np.testing.assert_allclose(left, readout.pixels(given, scene), atol=1e-3)
+    np.testing.assert_array_equal(amplifiers.undone(read, scene, ()), read)

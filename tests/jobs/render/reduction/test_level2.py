@@ -249,6 +249,32 @@ def test_counts_are_electrons_over_the_mean_gain(jpcam, tmp_path):
     assert not any(key.startswith(("DSEC", "CSEC", "BSEC", "DATASEC")) for key, *_ in electrons.cards)
 
 
+def test_fringes_of_the_sky_are_taken_off(tmp_path):
+    """They are those that were drawn; what is left of them is lost in the noise."""
+    found = {}
+    for name, on in (("with", True), ("none", False)):
+        (tmp_path / name).mkdir()
+        field = {"electrons": (2e4, 1e5), "pitch": 128, "forced": {"fringes": on}}
+        found[name] = ground_frames.made(
+            tmp_path / name, "hsc", 256, overrides={"ext.hsc.hsc_z.fringes": (0.05, "")}, **field
+        )
+    own, none = found["with"], found["none"]
+    pattern = own.frame.fringes()
+    drawn = own.one.maps["sky"] / none.one.maps["sky"] - 1.0
+    np.testing.assert_allclose(pattern, drawn, atol=1e-5)
+    assert none.frame.fringes() is None
+    left = []
+    for more in (["--without", "bias", "dark", "fringes"], []):
+        image, other = (
+            files.read_image(reduced(one, tmp_path / f"{len(more)}{name}", *more)) for name, one in found.items()
+        )
+        good = (image.reduced.weight > 0.0) & (other.reduced.weight > 0.0) & (own.one.noise_free < 1.0)
+        more_light = (image.reduced.image - other.reduced.image)[good] / np.median(other.reduced.image[good])
+        left.append(float(np.polyfit(pattern[good], more_light, 1)[0]))
+        assert (image.card("CALFRING"), other.card("CALFRING")) == (not more, False)
+    assert left == pytest.approx([1.0, 0.0], abs=0.05)
+
+
 def test_what_is_left_as_it_is_is_said(jpcam, tmp_path):
     path = reduced(jpcam.ground, tmp_path / "out", "--without", "bias", "dark", "flat", "crosstalk", "nonlinearity")
     found = files.read_image(path)
@@ -320,38 +346,44 @@ star_limit = 22.5
 box_cells = 192
 lensing_nside = 64
 [fluxes]
-bands = ["jedis_g"]
+bands = ["{band}"]
 [[pointing]]
 channel = "EXT"
-camera = "jpcam"
-band = "jedis_g"
+camera = "{camera}"
+band = "{band}"
 ra = 53.117
 dec = -27.808
-centre_on = "ccd05"
-detectors = ["ccd05"]
-mjd = 60905.25
+centre_on = "{detector}"
+detectors = ["{detector}"]
+mjd = {mjd}
 [[observation]]
 channels = ["EXT"]
-survey = "jedis"
+survey = "{survey}"
 image_type = "bias"
 exposures = 8
-detectors = ["ccd05"]
+detectors = ["{detector}"]
 [[observation]]
 channels = ["EXT"]
-survey = "jedis"
+survey = "{survey}"
 image_type = "flat"
 exposures = 12
-detectors = ["ccd05"]
+bands = ["{band}"]
+detectors = ["{detector}"]
 [products]
 truth = ["noise_free", "sky", "cosmic_rays"]
 """
 
 
 @pytest.mark.nightly
-def test_of_a_lake_with_masters_of_its_own_frames(tmp_path):
+@pytest.mark.parametrize(
+    ("survey", "camera", "band", "detector", "mjd"),
+    [("jedis", "jpcam", "jedis_g", "ccd05", 60905.08), ("whigs", "hsc", "hsc_g", "1_00", 60905.6)],
+)
+def test_of_a_lake_with_masters_of_its_own_frames(tmp_path, survey, camera, band, detector, mjd):
     """From a request: biases and dome flats, a master flat that has its band's name, sources of the catalogues."""
     root, listed = layout.lake(tmp_path / "lake"), detectors._listed
-    wanted = parse(requests.written(tmp_path, LAKE, requests.FIELD.format(0.2), seed=11))
+    text = LAKE.format(survey=survey, camera=camera, band=band, detector=detector, mjd=mjd)
+    wanted = parse(requests.written(tmp_path, text, requests.FIELD.format(0.2), seed=11))
     with pytest.MonkeyPatch.context() as patch:
         small = {"nx": 1024, "ny": 1024}
         patch.setattr(detectors, "_listed", lambda *of: tuple(replace(d, **small) for d in listed(*of)))
@@ -363,7 +395,7 @@ def test_of_a_lake_with_masters_of_its_own_frames(tmp_path):
         call = ["--lake", str(root), "--masters", own, "--without", "dark", "--out", str(out), "--level2"]
         assert reduce.main(call) == 0
     assert sorted(path.name for path in Path(own).iterdir()) == [
-        "jpcam_ccd05_bias.fits", "jpcam_jedis_g_ccd05_flat.fits"
+        f"{camera}_{detector}_bias.fits", f"{camera}_{band}_{detector}_flat.fits"
     ]  # fmt: skip
     (path,) = out.glob("*.fits")
     found, version = files.read_image(path), read.version(root, "products")
