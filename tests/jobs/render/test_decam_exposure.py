@@ -1,6 +1,7 @@
 """An exposure of DECam in one file, by the jobs: CCDs in the order of their numbers, with what DECam says of each."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,15 +13,17 @@ from astropy.wcs import WCS
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
-from jobs.render.camera import detectors
+from jobs.render.camera import astrometry, detectors
+from jobs.render.camera.pointing import boresight_for
 from jobs.render.products import head_files, read_back
 from jobs.request.from_toml import parse
 from lake_schema.fits import images
 from lake_schema.store import layout, publish, read
 from tests import requests
+from tests.jobs.render.fields import MISSION
 from tests.jobs.render.products import test_tools as tools
 
-SIDE = 64
+SIDE, PLACE = 64, (53.117, -27.808)
 # Their names are in another order.
 NUMBERS = {"S29": 1, "S25": 4}
 TEXT = """
@@ -51,7 +54,12 @@ def lake(tmp_path_factory):
     def smaller(*args):
         return tuple(replace(d, nx=SIDE, ny=SIDE) for d in listed(*args))
 
-    (folder / "stars.csv").write_text("ra,dec,mag\n53.117,-27.808,18.0\n53.1172,-27.8082,20.0\n")
+    # The last is bright, and in the middle of a CCD that is read with the first.
+    other = detectors.detector("decam", "S30", MISSION)
+    ra, dec, angle = boresight_for(detectors.detector("decam", "S29", MISSION), *PLACE, 0.0)
+    ra, dec = astrometry.centre(other, astrometry.wcs(other, ra, dec, angle))
+    rows = f"53.117,-27.808,18.0\n53.1172,-27.8082,20.0\n{ra:.7f},{dec:.7f},12.0\n"
+    (folder / "stars.csv").write_text(f"ra,dec,mag\n{rows}")
     request = parse(requests.written(folder, TEXT, requests.FIELD.format(0.45), seed=5))
     root = layout.lake(folder / "lake")
     with pytest.MonkeyPatch.context() as patch:
@@ -61,9 +69,9 @@ def lake(tmp_path_factory):
         yield root
 
 
-def make(root, steps):
+def make(root, steps, mapper=map):
     for step in steps:
-        publish.make(root, step.plan, step.work, name="x")
+        publish.make(root, step.plan, step.work, mapper, name="x")
 
 
 @pytest.fixture(scope="module")
@@ -156,3 +164,28 @@ def test_what_is_read_back_has_the_true_place(lake):
         cards = {key: value for key, value, _ in read_back.frame(products.file(row["path"])).cards}
         assert (cards["CRVAL1"], cards["CRVAL2"]) == pytest.approx((exposure["ra"], exposure["dec"]), abs=1e-9)
         assert products.file(head_files.beside(row["path"])).is_file()
+
+
+def test_what_ccds_see_of_each_other_is_the_same_whoever_is_rendered_with_whom(lake, tmp_path):
+    """One after another, two at a time the other way about, and alone."""
+    wanted = parse(lake.parent / "r.toml")
+    (pointing,) = wanted.pointings
+    wanted = replace(wanted, files="detector", pointings=(replace(pointing, detectors=("S29", "S30")),))
+
+    def together(function, parts):
+        with ThreadPoolExecutor(2) as pool:
+            yield from pool.map(function, [*parts][::-1])
+
+    found = []
+    for name, mapper, some in (("one", map, ()), ("two", together, ()), ("alone", map, ("S29",))):
+        root = layout.lake(shutil.copytree(lake, tmp_path / name, symlinks=True))
+        shutil.rmtree(layout.table(root, "products"))
+        make(root, plan_exposures.steps(root, wanted))
+        make(root, render_exposures.steps(root, replace(wanted, detectors=some)), mapper)
+        version = read.version(root, "products")
+        found.append({row["detector"]: version.file(row["path"]) for row in version.rows().to_pylist()})
+    one, two, alone = ({key: path.read_bytes() for key, path in files.items()} for files in found)
+    assert one == two
+    assert (len(one), alone) == (2, {"S29": one["S29"]})
+    said = [value for key, value, _ in read_back.header(found[0]["S29"]) if key.startswith("EFFECT")]
+    assert any(str(value).startswith("detector_crosstalk: on") for value in said)
