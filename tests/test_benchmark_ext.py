@@ -14,7 +14,7 @@ def test_a_field_that_all_sites_see(tmp_path):
     file = tmp_path / "ext.toml"
     file.write_text(benchmark.request(tuple(benchmark.CAMERAS.values()), 0.2))
     wanted = parse(file)
-    assert [pointing.camera for pointing in wanted.pointings] == ["lsstcam", "decam", "jpcam"]
+    assert [pointing.camera for pointing in wanted.pointings] == ["lsstcam", "decam", "jpcam", "megacam", "hsc", "gpc1"]
     assert {"bleeding", "crosstalk", "tree_rings", "brighter_fatter"} < set(benchmark.full(wanted).effects.on)
     file.write_text(benchmark.request([benchmark.LSST], 2.1, whole=True))
     (pointing,) = parse(file).pointings
@@ -27,6 +27,7 @@ def test_the_figures(tmp_path):
     assert benchmark.main(["--quick", "--json", str(file)]) == 0
     figures = json.loads(file.read_text())
     assert {"lsst_survey_s", "lsst_draft_s", "decam_survey_s", "lsst_peak_gb", "effect_bleeding_s"} <= set(figures)
+    assert {"gpc1_s_error", "memory_error"} <= set(figures)
     # However few the sources: what its effects take is in it.
     assert 0.2 < figures["lsst_survey_s"] < 15.0
     assert 0.3 < figures["lsst_peak_gb"] < 2.0

@@ -83,8 +83,9 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
 }
 
 
-# As VIS, of LSSTCam's R22_S11 (2.1e4 predicted sources; others with 1e3 and 1e5); 0.15 s of sky_s are of its PSF.
-COST = Cost(frame_s=0.1, sky_s=0.25, galaxy_s=1.0e-4, star_s=4.5e-5, base_gb=0.5, held=33.0, held_sky=34.0, written=2.0)
+# As VIS, of a detector of each camera but HSC with every effect (benchmarks/ext.py; 1.1e4 to 1.4e5 sources): most of
+# sky_s is reading of catalogues, colours of galaxies, PSFs.
+COST = Cost(frame_s=0.2, sky_s=1.9, galaxy_s=2.5e-5, star_s=4.5e-5, base_gb=0.8, held=33.0, held_sky=34.0, written=2.0)
 
 CHANNEL = Channel(
     effects=EFFECTS,
