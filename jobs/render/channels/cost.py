@@ -14,7 +14,6 @@ class Cost:
     base_gb      : of a worker before it draws
     held, held_sky : bytes a pixel while a frame is made, without and with a sky
     written      : bytes a pixel of the image, pre- and overscan counted
-    assumed      : nothing renders the channel yet, and nothing was measured
     """
 
     frame_s: float
@@ -25,4 +24,3 @@ class Cost:
     held: float
     held_sky: float
     written: float
-    assumed: bool = False

@@ -12,13 +12,12 @@ from typing import Any
 
 import pyarrow as pa
 
-from jobs.render.channels import registry
 from jobs.render.forecasting.speed import Speed
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One kind of exposure; assumed : some of its costs were not measured."""
+    """One kind of exposure."""
 
     channel: str
     survey: str
@@ -29,7 +28,6 @@ class Line:
     core_hours: float
     gigabytes: float
     memory_gb: float
-    assumed: bool = False
 
 
 def rows(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line]:
@@ -67,7 +65,6 @@ def _sum(name: str, lines: list[Line]) -> Line:
         sum(line.core_hours for line in lines),
         sum(line.gigabytes for line in lines),
         max((line.memory_gb for line in lines), default=0.0),
-        any(line.assumed for line in lines),
     )
 
 
@@ -82,7 +79,6 @@ def _line(row: dict[str, Any], factor: float) -> Line:
         row["seconds_sum"] * factor / 3600.0,
         row["bytes_sum"] / 1e9,
         row["memory_max"],
-        registry.CHANNELS[row["channel"]].cost.assumed,
     )
 
 
@@ -96,6 +92,5 @@ def text(lines: list[Line], speed: Speed) -> Iterator[str]:
         yield (
             f"{line.channel:8} {line.survey:12} {line.image_type:17} {line.exposures:10,} {line.detectors:10,} "
             f"{line.sources:14,} {line.core_hours:11,.2f} {line.gigabytes:10,.2f} {line.memory_gb:8.2f}"
-            f"{' assumed' * line.assumed}"
         )
     yield f"core-hours are of this machine, {speed.source}: {speed.factor:.2f} of those of the channels' costs"
