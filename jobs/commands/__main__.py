@@ -9,6 +9,7 @@
     truesky list | verify | gc | describe LAKE      what is there, whether it is whole, what no longer serves
     truesky masters | reduce | stack        master frames, calibrated images and their sources, stacks of dithers
     truesky report LAKE                     what the runs took, beside the forecast
+    truesky validate --lake LAKE            what the lake holds against what it should, a table and a report
     truesky mission ...                     the mission database
     truesky examples FOLDER                 copies requests and notebooks
 
@@ -47,6 +48,7 @@ MODULES = {
     "reduce": ("jobs.render.reduce", False),
     "stack": ("jobs.render.stack", False),
     "report": ("jobs.report", False),
+    "validate": ("jobs.validation.__main__", False),
     "page": ("jobs.page.__main__", False),
     "examples": ("jobs.commands.examples", False),
 }

@@ -34,11 +34,10 @@ from lake_schema.columns import Table
 from lake_schema.store import layout, read
 from lake_schema.store.plan import Json, Output, Part, Plan
 from lake_schema.store.provenance import code_version
-from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import EMISSION_LINES
 from lake_schema.tables.passbands import PASSBANDS
-from lake_schema.tables.templates import TEMPLATES
+from lake_schema.tables.templates import EXTINCTION_LAWS, TEMPLATES
 
 CATALOGUES = (("galaxy", "galaxies"), ("star", "stars"))
 

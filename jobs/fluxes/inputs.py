@@ -36,7 +36,6 @@ from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
 from lake_schema.store import read as lake_read
 from lake_schema.store.provenance import file_sha256
-from lake_schema.tables import extinction_laws
 from lake_schema.tables import galaxies as line_table
 from lake_schema.tables import passbands as passband_table
 from lake_schema.tables import templates as template_table
@@ -157,7 +156,7 @@ def law_rows(own: Own) -> pa.Table:
         *(_origin("Calzetti et al. 2000 with the bump of Fitzpatrick & Massa 1986", code) for _ in range(2)),
     )
     origins = [own.origins.get(f"{_LAWS}{law}", origin) for law, origin in enumerate(embedded)]
-    return extinction_laws.rows(own.library.wavelength, dust_of(own.library), origins)
+    return template_table.law_rows(own.library.wavelength, dust_of(own.library), origins)
 
 
 def line_rows(own: Own) -> pa.Table:

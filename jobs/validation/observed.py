@@ -2,7 +2,7 @@
 
 sky_of      columns and magnitudes of rows of table `galaxies`
 figures     what is measured of them, by the names of the list; Poisson errors of densities under name + "_error"
-in_lake     the sky of a lake
+in_version  the sky of a lake
 
 Rows of confidence P are published numbers that were looked up; those of M are remembered or read off a figure: they are
 shown, and gate nothing. Magnitudes are before magnification and the Milky Way, as surveys correct theirs.
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from jobs.fluxes import cosmology, passbands
 from jobs.fluxes.high_redshift import QUASAR
 from jobs.fluxes.libraries import templates
 from lake_schema import sky, units
-from lake_schema.arrays import Array, Bool, Float
+from lake_schema.arrays import Array, Bool, Float, Int
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 
@@ -72,14 +71,16 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def in_lake(lake: Path, request: str | None = None) -> Sky:
-    """The galaxies of a lake: of the request of a name, or those published last.
+def in_version(galaxies: read.Version) -> tuple[Sky, Int]:
+    """(galaxies of a version of the table, the generation cell of each that is no quasar).
 
-    The area is that of the generation cells which hold any: for areas of whole cells.
+    The area is that of the cells which it was drawn in.
     """
-    table = read.version(lake, "galaxies", request=request).rows([*COLUMNS, "_healpix_29"])
-    cells = np.unique(table["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER))
-    return sky_of(table, cells.size * sky.cell_area(GENERATION_ORDER))
+    table = galaxies.rows([*COLUMNS, "_healpix_29"])
+    cell = table["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    drawn = [cell for part in galaxies.manifest["parts"] for cell in part["facts"].get("generation_cells", ())]
+    number = len(set(drawn)) or np.unique(cell).size
+    return sky_of(table, number * sky.cell_area(GENERATION_ORDER)), cell[table["kind"].to_numpy() < 2]
 
 
 def sky_of(table: pa.Table, area: float) -> Sky:

@@ -15,7 +15,6 @@ from lake_schema.columns import Table
 def declared(bands: Sequence[str]) -> list[Table]:
     """Every table of the lake, the flux tables with these bands."""
     from lake_schema.tables.exposures import EXPOSURES
-    from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
     from lake_schema.tables.fluxes import fluxes
     from lake_schema.tables.gaia import GAIA
     from lake_schema.tables.galaxies import EMISSION_LINES, GALAXIES
@@ -28,12 +27,13 @@ def declared(bands: Sequence[str]) -> list[Table]:
     from lake_schema.tables.stars import STARS
     from lake_schema.tables.strong_lenses import STRONG_LENSES
     from lake_schema.tables.tasks import TASKS
-    from lake_schema.tables.templates import TEMPLATES
+    from lake_schema.tables.templates import EXTINCTION_LAWS, TEMPLATES
+    from lake_schema.tables.validation import VALIDATION
 
     galaxies, stars = (fluxes(kind, bands) for kind in ("galaxy", "star"))
     skies = [HALOS, GALAXIES, QUARANTINE, STRONG_LENSES, STARS, galaxies, stars, GAIA]
     plans, images = [MISSION, EXPOSURES, TASKS], [PRODUCTS, RENDERED_TRUTH, RENDERED_SPECTRA, EXPOSURE_FILES]
-    return [*skies, HALO_LIMITS, TEMPLATES, EXTINCTION_LAWS, EMISSION_LINES, PASSBANDS, *plans, *images]
+    return [*skies, HALO_LIMITS, TEMPLATES, EXTINCTION_LAWS, EMISSION_LINES, PASSBANDS, *plans, *images, VALIDATION]
 
 
 def markdown() -> str:

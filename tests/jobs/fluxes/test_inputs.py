@@ -12,10 +12,9 @@ from jobs.fluxes.spectra import continuum, lines
 from jobs.request.files import Curves, UserCurves
 from lake_schema.errors import BadInput
 from lake_schema.store.validate import check
-from lake_schema.tables.extinction_laws import EXTINCTION_LAWS
 from lake_schema.tables.galaxies import EMISSION_LINES
 from lake_schema.tables.passbands import PASSBANDS
-from lake_schema.tables.templates import TEMPLATES
+from lake_schema.tables.templates import EXTINCTION_LAWS, TEMPLATES
 from tests.jobs.fluxes.libraries.test_from_files import BAND, FLUX, RESPONSE, WAVELENGTH, ascii_file, votable
 
 

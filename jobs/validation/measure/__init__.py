@@ -1,0 +1,1 @@
+"""What the checks share: rows with verdicts, frames by their headers alone, stars, blank sky."""

@@ -1,0 +1,137 @@
+"""Blank sky of a frame: tiles without sources, their level, their noise.
+
+tiles     a frame's tiles, sources, saturated pixels and outliers masked
+Tiles     pixels, which of them are blank, and where
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from jobs.validation.measure.frames import Amplifier, Frame
+from jobs.validation.measure.references import Reference
+from lake_schema.arrays import Array, Bool, Float, Int
+
+# Side of a tile, pixels, and every how many of them one is looked at, along rows and columns, of large detectors.
+SIDE, EVERY = 64, 2
+_LARGE = 2 << 20
+# Light of a point beyond r arcsec falls as this times its flux / r^3, per square arcsec (obscured aperture, 3 bars).
+_WING = 9.3e-3
+# Part of a pixel's noise that a source may bring to a blank pixel; of galaxies, how much wider; arcsec at least.
+_SHOWS, _WIDER, _LEAST = 0.1, 1.5, 1.0
+_MOST_RADIUS = 400
+# Standard deviations from a tile's median beyond which a pixel is an outlier, and tiles want so many pixels.
+_CLIP, _LEAST_PIXELS = 5.0, 400
+# Standard deviations above its tile from which a pixel is hit.
+_HIT = 8.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tiles:
+    """float32[t, SIDE, SIDE] e-, bool of blank pixels and of hits, and the tiles' first rows and columns [t].
+
+    hit : far above the level of its tile, though no source that is known shines there
+    """
+
+    pixels: Array
+    blank: Bool
+    hit: Bool
+    row: Int
+    column: Int
+
+    @property
+    def level(self) -> Float:
+        """e- a pixel [t], mean of the blank ones."""
+        return np.asarray((self.pixels * self.blank).sum(axis=(1, 2)) / self.blank.sum(axis=(1, 2)))
+
+    def of(self, amplifier: Amplifier) -> Tiles:
+        """Tiles that lie wholly in an amplifier."""
+        rows, columns = amplifier.pixels
+        return self.where((self.row >= rows.start) & (self.row + SIDE <= rows.stop)
+                          & (self.column >= columns.start) & (self.column + SIDE <= columns.stop))  # fmt: skip
+
+    def where(self, kept: Bool) -> Tiles:
+        return Tiles(self.pixels[kept], self.blank[kept], self.hit[kept], self.row[kept], self.column[kept])
+
+
+def rough_noise(frame: Frame) -> float:
+    """e- rms of a pixel of blank sky: from differences of neighbours, whose middle half tells it."""
+    some = frame.electrons[5::37, :].astype(float)
+    step = np.diff(some, axis=1).ravel()
+    low, high = np.percentile(step, [25.0, 75.0])
+    return float((high - low) / 1.349 / np.sqrt(2.0))
+
+
+def tiles(frame: Frame, known: Reference, noise: float) -> Tiles:
+    """Of a frame; noise : e- rms of a pixel of blank sky."""
+    ny, nx = frame.electrons.shape
+    every = EVERY if ny * nx > _LARGE else 1
+    down, across = (np.arange(0, n - SIDE + 1, SIDE * every) for n in (ny, nx))
+    row, column = (axis.ravel() for axis in np.meshgrid(down, across, indexing="ij"))
+    shows = _sources(frame, known, noise)
+    pixels: Array = np.stack([frame.electrons[r : r + SIDE, c : c + SIDE] for r, c in zip(row, column, strict=True)])
+    hidden = np.stack([shows[r : r + SIDE, c : c + SIDE] for r, c in zip(row, column, strict=True)])
+    blank = ~_grown(pixels, hidden, noise)
+    enough = blank.sum(axis=(1, 2)) >= _LEAST_PIXELS
+    pixels, hidden, blank = pixels[enough], hidden[enough], blank[enough]
+    found = Tiles(pixels, blank, np.zeros_like(blank), row[enough], column[enough])
+    if not len(pixels):
+        return found
+    spread = np.sqrt((blank * (pixels - found.level[:, None, None]) ** 2).sum(axis=(1, 2)) / blank.sum(axis=(1, 2)))
+    hit = ~hidden & (pixels > (found.level + _HIT * spread)[:, None, None])
+    return replace(found, hit=hit)
+
+
+def _grown(pixels: Array, hidden: Bool, noise: float) -> Bool:
+    """What is no blank sky: sources, outliers and what touches them, pixels that nobody reads."""
+    bad = hidden | (pixels == 0.0)
+    # Sources are a minor part of most tiles: their median is where the level is first looked for.
+    middle = np.median(np.where(bad, np.median(pixels), pixels), axis=(1, 2))
+    spread = np.full(len(pixels), noise)
+    for _ in range(3):
+        out = np.abs(pixels - middle[:, None, None]) > (_CLIP * spread)[:, None, None]
+        kept = ~(bad | out)
+        n = np.maximum(kept.sum(axis=(1, 2)), 1)
+        middle = (pixels * kept).sum(axis=(1, 2)) / n
+        spread = np.sqrt((kept * (pixels - middle[:, None, None]) ** 2).sum(axis=(1, 2)) / n)
+    touched = ndimage.binary_dilation(out & ~hidden, structure=np.ones((1, 3, 3), bool))
+    return np.asarray(bad | out | touched)
+
+
+def _sources(frame: Frame, known: Reference, noise: float) -> Bool:
+    """bool[ny, nx]: pixels that a known source may show in."""
+    ny, nx = frame.electrons.shape
+    out = np.zeros((ny, nx), bool)
+    width = float(frame.header["PSFFWHM"])
+    radius = np.cbrt(_WING * np.maximum(known.expected, 0.0) * frame.scale**2 / (_SHOWS * noise))
+    radius = np.maximum(radius * np.where(known.point, 1.0, _WIDER), max(2.0 * width, _LEAST))
+    # What nobody could see even where it is brightest stays: its light is part of the sky's noise.
+    radius[known.expected * frame.scale**2 < _SHOWS * noise * width**2] = 0.0
+    pixels = np.minimum(np.ceil(radius / frame.scale), _MOST_RADIUS).astype(int)
+    discs: dict[int, Bool] = {}
+    for x, y, r in zip(np.rint(known.x).astype(int), np.rint(known.y).astype(int), pixels, strict=True):
+        if r == 0 or not (-r <= x < nx + r and -r <= y < ny + r):
+            continue
+        axis = np.arange(-r, r + 1)
+        disc = discs.setdefault(int(r), np.hypot(axis, axis[:, None]) <= r)
+        top, left = max(y - r, 0), max(x - r, 0)
+        bottom, right = min(y + r + 1, ny), min(x + r + 1, nx)
+        if top < bottom and left < right:
+            out[top:bottom, left:right] |= disc[top - y + r : bottom - y + r, left - x + r : right - x + r]
+    return out
+
+
+def variance(found: Tiles) -> tuple[float, float, int]:
+    """(e-^2 of a blank pixel about the mean of its tile, its standard error, pixels)."""
+    blank = found.blank
+    n = blank.sum(axis=(1, 2))
+    off = np.where(blank, found.pixels - found.level[:, None, None], 0.0).astype(float)
+    own = (off**2).sum(axis=(1, 2)) / (n - 1)
+    weight = n / n.sum()
+    value = float((weight * own).sum())
+    # From the scatter of the tiles themselves.
+    error = float(np.sqrt((weight**2 * (own - value) ** 2).sum())) if len(n) > 1 else np.inf
+    return value, error, int(n.sum())

@@ -1,0 +1,233 @@
+"""A raw file of a detector as a pipeline opens it: by its header alone.
+
+Frame     electrons of the detector's pixels above each amplifier's level, and what its header says
+opened    a file -> Frame
+
+Ref : FITS standard 4.0; keywords of sections as NOAO and LSST use them (DATASEC, BIASSEC, CCDSEC)
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS, FITSFixedWarning
+
+from lake_schema.arrays import Array, Bool, Float, Float32
+from lake_schema.errors import BadInput
+
+_SECTION = re.compile(r"\[(\d+):(\d+),(\d+):(\d+)\]")
+# Of a header that is not sure of its place (FITS, paper I); the true one is then in the .head file beside it.
+_UNSURE = "CSYER1"
+# Overscan columns next to the pixels that are left out: charge that traps gave back is in them.
+_SKIPPED = 0.5
+# Differences of neighbours in the overscan that are no noise, in units of their spread.
+_FAR = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Amplifier:
+    """What one amplifier read.
+
+    pixels  : its part of the detector;  gain : e-/ADU;  level : ADU without light
+    noise   : e- rms of the overscan, NaN where there is none;  told : e- rms read noise, as the header has it drawn
+    samples : pixels of the overscan;  full : e- of the lowest saturated pixel
+    """
+
+    name: str
+    pixels: tuple[slice, slice]
+    gain: float
+    level: float
+    noise: float
+    told: float
+    samples: int
+    full: float
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """How an amplifier falls behind: s = n / (1 + high n / range), of which low * knee (1 - exp(-s / knee)) is missing.
+
+    high, low : parts of the signal, at the converter's range and of the first electrons;  knee : e-
+    """
+
+    high: float = 0.0
+    low: float = 0.0
+    knee: float = 2000.0
+
+    def light(self, read: Float, most: float) -> Float:
+        """Electrons [..] of what was read; most : e- of the converter's range."""
+        signal = np.asarray(read, float)
+        for _ in range(3):
+            signal = read - self.low * self.knee * np.expm1(-np.maximum(signal, 0.0) / self.knee)
+        return np.where(signal > 0.0, signal / np.maximum(1.0 - self.high * signal / most, 0.1), signal)
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A detector of an exposure.
+
+    electrons  : float32[ny, nx] above each amplifier's level
+    amplifiers : what read them
+    quality    : uint8[ny, nx] of a ramp, None = there is none
+    header     : of the whole file;  wcs : of the detector's pixels, the first is (0, 0)
+    curve      : of its amplifiers
+    """
+
+    electrons: Float32
+    amplifiers: tuple[Amplifier, ...]
+    quality: Array | None
+    header: Mapping[str, Any]
+    wcs: WCS
+    curve: Curve = Curve()
+
+    def light(self, read: Float) -> Float:
+        """e- [..] that were collected where so many were read."""
+        most = 65535.0 * float(np.mean([amplifier.gain for amplifier in self.amplifiers]))
+        return self.curve.light(read, most)
+
+    @property
+    def seconds(self) -> float:
+        return float(self.header["EXPTIME"])
+
+    @property
+    def scale(self) -> float:
+        """arcsec a pixel."""
+        return float(self.header["PIXSCALE"])
+
+    @property
+    def full(self) -> float:
+        """e- of the lowest saturated pixel of all amplifiers."""
+        return min(amplifier.full for amplifier in self.amplifiers)
+
+    def saturated(self) -> Bool:
+        """bool[ny, nx]"""
+        out = np.zeros(self.electrons.shape, bool)
+        for amplifier in self.amplifiers:
+            out[amplifier.pixels] = self.electrons[amplifier.pixels] >= amplifier.full
+        return out
+
+
+def opened(path: Path, curve: Curve | None = None) -> Frame:
+    """A science file.
+
+    path : of it;  curve : of the amplifiers, as the lake's mission database has it; None = they are linear
+
+    Errors : BadInput where its header lacks what a pipeline needs, naming the keyword
+    """
+    with fits.open(path, memmap=False) as units:
+        try:
+            return replace(_frame(units, path), curve=curve or Curve())
+        except KeyError as error:
+            raise BadInput(f"{path}: header without {error.args[0]}") from None
+
+
+def _frame(units: Any, path: Path) -> Frame:
+    first = dict(units[0].header)
+    images = [unit for unit in units if unit.data is not None and unit.data.ndim == 2]
+    if first.get("NAXIS") == 0 and len(images) and "CHANNEL" not in first:
+        first = dict(images[0].header)
+    planes = [unit for unit in images if not unit.name.endswith(".CHI2")]
+    parts = [part for unit in planes for part in _parts({**first, **dict(unit.header)}, unit.data)]
+    shape = tuple(max(part[0][axis].stop for part in parts) for axis in (0, 1))
+    electrons, amplifiers = np.zeros(shape, np.float32), []
+    for ccd, data, bias, cards, name in parts:
+        amplifier = _amplifier(name, ccd, bias, cards)
+        electrons[ccd] = (data - np.float32(amplifier.level)) * np.float32(amplifier.gain)
+        amplifiers.append(amplifier)
+    quality = next((unit for unit in images if unit.name.endswith(".CHI2")), None)
+    found = None if quality is None else np.asarray(quality.data)[section(quality.header["DATASEC"])]
+    return Frame(electrons, tuple(amplifiers), found, first, _wcs(planes[0].header, path, first))
+
+
+_Part = tuple[tuple[slice, slice], Array, Array | None, Mapping[str, Any], str]
+
+
+def _parts(header: dict[str, Any], array: Array) -> list[_Part]:
+    """Of an array: where its pixels are on the detector, the pixels, columns of bias, cards, the amplifier's name."""
+    if "NAMPS" in header:
+        return [_lettered(header, array, n) for n in range(1, int(header["NAMPS"]) + 1)]
+    ny, nx = array.shape
+    data = section(header["DATASEC"]) if "DATASEC" in header else (slice(0, ny), slice(0, nx))
+    size = [axis.stop - axis.start for axis in data]
+    ccd = section(header["CCDSEC"]) if "CCDSEC" in header else (slice(0, size[0]), slice(0, size[1]))
+    bias = array[section(header["BIASSEC"])] if "BIASSEC" in header else None
+    return [(ccd, array[data], bias, header, str(header.get("EXTNAME", "")))]
+
+
+def _lettered(header: dict[str, Any], array: Array, n: int) -> _Part:
+    """Amplifier n of several in one array."""
+    own = {**header, "GAIN": header[f"GAIN{n}"]}
+    if f"RDN{n}" in header and header.get("RDNDRAWN", 1.0) > 0.0:
+        own["RDNDRAWN"] = header[f"RDN{n}"]
+    bias = array[section(header[f"BSEC{n}"])]
+    place = section(header[f"CSEC{n}"])
+    return place, array[section(header[f"DSEC{n}"])], bias if bias.size else None, own, str(header[f"AMP{n}"])
+
+
+def _amplifier(name: str, ccd: tuple[slice, slice], bias: Array | None, cards: Mapping[str, Any]) -> Amplifier:
+    gain, told = float(cards["GAIN"]), float(cards["RDNDRAWN"])
+    level, noise, samples = float(cards.get("BIAS", 0.0)), np.nan, 0
+    if bias is not None:
+        # Of whichever side the pixels are on, the middle half is farthest from what follows them.
+        cut = int(0.5 * _SKIPPED * bias.shape[1])
+        kept = bias[:, cut : bias.shape[1] - cut].astype(float)
+        level = float(kept.mean())
+        # Rows have offsets of their own.
+        step = np.diff(kept, axis=1)
+        # But for what a cosmic ray left behind.
+        step = step[np.abs(step) < _FAR * 1.4826 * max(float(np.median(np.abs(step))), 1.0)]
+        noise = float(np.std(step) / np.sqrt(2.0)) * gain if step.size else np.nan
+        samples = kept.size
+    full = (float(cards["SATURATE"]) - (level if cards.get("BUNIT", "adu") != "electron" else 0.0)) * gain
+    return Amplifier(name, ccd, gain, level, noise, told, samples, full)
+
+
+def section(text: str) -> tuple[slice, slice]:
+    """[x1:x2,y1:y2] from 1, both ends in it -> slices of an array [ny, nx]."""
+    match = _SECTION.fullmatch(text.strip())
+    if match is None:
+        raise BadInput(f"section {text!r} is not of the form [x1:x2,y1:y2]")
+    x1, x2, y1, y2 = map(int, match.groups())
+    return slice(y1 - 1, y2), slice(x1 - 1, x2)
+
+
+def _wcs(header: Any, path: Path, first: Mapping[str, Any]) -> WCS:
+    """Of the detector's pixels: what stands before them in the array is taken off; true where the header is unsure."""
+    cards = header if "CTYPE1" in header else fits.Header(first)
+    beside = path.with_suffix(".head")
+    if (_UNSURE in header or _UNSURE in first) and beside.is_file():
+        cards = fits.Header.fromstring(beside.read_text("ascii").split("END\n")[0], sep="\n")
+    kept = fits.Header()
+    for card in cards.cards:
+        if re.match(
+            r"(CTYPE|CRVAL|CRPIX|CUNIT|CDELT)\d$|(CD|PC)\d_\d$|PV\d_\d+$|[AB]P?_(ORDER|\d_\d)$|LONPOLE|RADESYS",
+            card.keyword,
+        ):
+            kept[card.keyword] = card.value
+    data, ccd = header.get("DATASEC", first.get("DATASEC")), header.get("CCDSEC", first.get("CCDSEC"))
+    if "DSEC1" in header:
+        data, ccd = header["DSEC1"], header["CSEC1"]
+    if data and ccd:
+        (dy, dx), (cy, cx) = section(data), section(ccd)
+        kept["CRPIX1"] -= dx.start - cx.start
+        kept["CRPIX2"] -= dy.start - cy.start
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        return WCS(kept)
+
+
+def pixels_of(wcs: WCS, ra: Float, dec: Float) -> tuple[Float, Float]:
+    """Columns and rows [n] of places, from 0; deg."""
+    if not len(ra):
+        return np.zeros(0), np.zeros(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        x, y = wcs.all_world2pix(np.asarray(ra, float), np.asarray(dec, float), 0, quiet=True, tolerance=1e-6)
+    return np.asarray(x), np.asarray(y)

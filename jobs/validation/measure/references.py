@@ -1,0 +1,123 @@
+"""What is known of a frame's sources: the lake's tables, for one exposure and detector.
+
+Reference   rows of `rendered_truth`, with places and magnitudes of the catalogues
+Catalogue   stars and band fluxes of a lake, sorted by identifier
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from lake_schema.arrays import Array, Bool, Float, Int
+from lake_schema.store import read
+from lake_schema.tables.stars import EPOCH
+
+POINT = 0
+# Microjansky of AB magnitude 0, as a magnitude.
+ZERO = 23.9
+_JULIAN_2000, _MJD_2000, _YEAR, _MAS_A_DEG = 2000.0, 51544.5, 365.25, 3.6e6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Catalogue:
+    """Stars of a lake[n], ascending id: deg at EPOCH, mas/yr; microjansky by band, of stars and of galaxies."""
+
+    id: Int
+    ra: Float
+    dec: Float
+    pm_ra: Float
+    pm_dec: Float
+    flux_id: Int
+    fluxes: dict[str, Float]
+
+    def seen(self, ids: Int, mjd: float) -> tuple[Float, Float]:
+        """Where stars are at a time, deg [n]; NaN of what is not in the catalogue."""
+        at, known = _find(self.id, ids)
+        years = _JULIAN_2000 + (mjd - _MJD_2000) / _YEAR - EPOCH
+        dec = self.dec[at] + years * self.pm_dec[at] / _MAS_A_DEG
+        ra = self.ra[at] + years * self.pm_ra[at] / _MAS_A_DEG / np.cos(np.radians(self.dec[at]))
+        return np.where(known, ra, np.nan), np.where(known, dec, np.nan)
+
+    def magnitudes(self, ids: Int, band: str) -> Float:
+        """AB [n]; NaN of what is not there."""
+        if band not in self.fluxes or not self.flux_id.size:
+            return np.full(len(ids), np.nan)
+        at, known = _find(self.flux_id, ids)
+        flux = np.where(known, self.fluxes[band][at], np.nan)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(ZERO - 2.5 * np.log10(flux))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """Sources of a detector [n]: places in pixels from 0 and electrons as they were drawn, and the catalogue's own.
+
+    ra, dec : deg, of stars at the time of the exposure, else NaN;  mag : AB of the catalogue
+    psf_x, psf_y : windowed centroid of a point of its colour there, minus its place, pixels
+    """
+
+    id: Int
+    x: Float
+    y: Float
+    expected: Float
+    point: Bool
+    psf_x: Float
+    psf_y: Float
+    ra: Float
+    dec: Float
+    mag: Float
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+
+def catalogue(tables: Mapping[str, read.Version], ids: Int, bands: Sequence[str]) -> Catalogue:
+    """Of the stars that a lake's frames show; what the lake has no table of is left empty.
+
+    tables : of the lake, by name;  ids : that are wanted, ascending;  bands : whose fluxes are wanted
+    """
+    none = np.zeros(0)
+    columns = {name: none for name in ("id", "ra", "dec", "pm_ra", "pm_dec")}
+    if (stars := tables.get("stars")) is not None:
+        wanted = [name for name in columns if name in stars.schema.names]
+        rows = _sorted(stars.rows(wanted, where=pc.field("id").isin(pa.array(ids))))
+        columns = {name: np.zeros(len(rows)) for name in columns} | {
+            name: pc.fill_null(rows[name], 0).to_numpy() for name in wanted
+        }
+    fluxes = pa.table({"id": none})
+    if (table := tables.get("star_fluxes")) is not None:
+        kept = [f"f_nu_{band}" for band in bands if f"f_nu_{band}" in table.schema.names]
+        fluxes = _sorted(table.rows(["id", *kept], where=pc.field("id").isin(pa.array(ids))))
+    ra, dec, pm_ra, pm_dec = (np.asarray(columns[name], float) for name in ("ra", "dec", "pm_ra", "pm_dec"))
+    own = {band: f"f_nu_{band}" for band in bands if f"f_nu_{band}" in fluxes.schema.names}
+    return Catalogue(
+        np.asarray(columns["id"], np.int64), ra, dec, pm_ra, pm_dec, np.asarray(fluxes["id"].to_numpy(), np.int64),
+        {band: fluxes[name].to_numpy().astype(float) for band, name in own.items()},
+    )  # fmt: skip
+
+
+def reference(truth: pa.Table, known: Catalogue, band: str, mjd: float) -> Reference:
+    """Of one frame: truth : its rows of `rendered_truth`;  known : of the lake;  band, mjd : of the exposure."""
+    ids = truth["id"].to_numpy()
+    own = {name: pc.fill_null(truth[name], np.nan).to_numpy() for name in ("psf_x", "psf_y")}
+    ra, dec = known.seen(ids, mjd)
+    return Reference(
+        ids, truth["x"].to_numpy(), truth["y"].to_numpy(), truth["expected"].to_numpy(),
+        truth["method"].to_numpy() == POINT, own["psf_x"], own["psf_y"], ra, dec, known.magnitudes(ids, band),
+    )  # fmt: skip
+
+
+def _sorted(rows: pa.Table) -> pa.Table:
+    return rows.sort_by("id")
+
+
+def _find(own: Array, ids: Int) -> tuple[Int, Bool]:
+    if not len(own):
+        return np.zeros(0, np.int64), np.zeros(len(ids), bool)
+    at = np.minimum(np.searchsorted(own, ids), len(own) - 1)
+    return at, own[at] == ids

@@ -1,0 +1,46 @@
+"""Which checks there are; each is a file of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from jobs.validation.catalogues import duplicates, observed_sky, requirements
+from jobs.validation.images import between
+from jobs.validation.images.astrometry import ASTROMETRY
+from jobs.validation.images.background import BACKGROUND
+from jobs.validation.images.cosmic_rays import COSMIC_RAYS
+from jobs.validation.images.depth import DEPTH
+from jobs.validation.images.noise import NOISE
+from jobs.validation.images.photometry import PHOTOMETRY
+from jobs.validation.images.psf import PSF
+from jobs.validation.images.quality import QUALITY
+from jobs.validation.images.saturation import SATURATION
+from jobs.validation.measure.rows import Row
+from jobs.validation.measure.seen import Result
+
+
+@dataclass(frozen=True, slots=True)
+class Catalogued:
+    """A check of catalogues.
+
+    tables : that it wants, in the order in which `rows` takes their versions;  source : of its expectations
+    """
+
+    name: str
+    tables: tuple[str, ...]
+    rows: Callable[..., list[Row]]
+    source: str
+
+
+# Of one frame each.
+OF_FRAMES = (ASTROMETRY, PHOTOMETRY, BACKGROUND, NOISE, PSF, QUALITY, COSMIC_RAYS, SATURATION, DEPTH)
+# Of all frames together.
+OF_SEVERAL: tuple[Callable[[Sequence[Result]], list[Row]], ...] = (between.rows,)
+# Of the lake's tables.
+OF_CATALOGUES = (
+    Catalogued(observed_sky.NAME, ("galaxies",), observed_sky.rows, "observed.csv"),
+    Catalogued(duplicates.NAME, ("galaxies",), duplicates.rows, duplicates.SOURCE),
+    Catalogued(duplicates.NAME, ("stars",), duplicates.rows, duplicates.SOURCE),
+    Catalogued(requirements.NAME, ("galaxies", "galaxy_fluxes"), requirements.rows, requirements.SOURCE),
+)

@@ -1,0 +1,99 @@
+"""Pictures of the report, as base64 of PNG.
+
+drawn   (caption, picture) of whatever there is something of
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jobs.validation.measure.seen import Result
+from jobs.validation.suite.running import Found
+
+_WIDTH = 10.0
+
+
+def drawn(found: Found) -> Iterator[tuple[str, str]]:
+    """Of what was found."""
+    channels = dict.fromkeys(str(result.place.channel) for result in found.results)
+    for channel in channels:
+        own = [result for result in found.results if result.place.channel == channel]
+        for wants, text, draw in _FIGURES:
+            some = [result for result in own if wants in result.series]
+            if some:
+                figure = Figure(figsize=(_WIDTH, 4.0), layout="constrained")
+                draw(figure, some)
+                figure.suptitle(channel)
+                yield f"{channel}: {text}", _encoded(figure)
+
+
+def _encoded(figure: Figure) -> str:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=95, metadata={"Software": None})
+    return base64.b64encode(stream.getvalue()).decode("ascii")
+
+
+def _together(results: list[Result], name: str) -> Any:
+    return np.concatenate([np.asarray(result.series[name], float) for result in results])
+
+
+def _astrometry(figure: Figure, results: list[Result]) -> None:
+    """Residuals as vectors over the detector, and their scatter."""
+    u, v, x, y = (_together(results, name) for name in ("u", "v", "off_x", "off_y"))
+    left, right = figure.subplots(1, 2)
+    # Hit by a cosmic ray, or beside something that nobody knows: no residuals of the system.
+    usual = np.hypot(x - np.median(x), y - np.median(y)) < 6.0 * np.median(np.hypot(x, y))
+    u, v, x, y = u[usual], v[usual], x[usual], y[usual]
+    some = np.linspace(0, len(u) - 1, min(len(u), 500)).astype(int)
+    left.quiver(u[some], v[some], x[some], y[some], angles="xy", width=2e-3, color="#1f4e79")
+    left.set(xlabel="column / half a side", ylabel="row / half a side", title="residuals over the detector")
+    limit = float(np.abs(np.append(x, y)).max()) or 1.0
+    right.plot(x, y, ".", ms=2, alpha=0.5, color="#1f4e79")
+    right.axhline(0, lw=0.5, color="k")
+    right.axvline(0, lw=0.5, color="k")
+    right.set(xlim=(-limit, limit), ylim=(-limit, limit), xlabel="columns, mas", ylabel="rows, mas")
+    right.set_title(f"median {np.median(x):+.2f}, {np.median(y):+.2f} mas")
+    right.set_aspect("equal")
+
+
+def _photometry(figure: Figure, results: list[Result]) -> None:
+    axis = figure.subplots()
+    for band in dict.fromkeys(str(result.place.band) for result in results):
+        own = [result for result in results if result.place.band == band]
+        axis.plot(_together(own, "mag"), _together(own, "dm"), ".", ms=2, alpha=0.6, label=band)
+    axis.axhspan(-0.02, 0.02, color="k", alpha=0.08)
+    axis.set(xlabel="AB of the catalogue", ylabel="measured - catalogue", ylim=(-0.15, 0.15))
+    axis.legend(markerscale=4)
+
+
+def _noise(figure: Figure, results: list[Result]) -> None:
+    axis = figure.subplots()
+    told, found = _together(results, "noise").T
+    axis.loglog(told, found, ".", color="#1f4e79")
+    ends = np.array([told.min() * 0.95, told.max() * 1.05])
+    axis.plot(ends, ends, "k-", lw=0.7)
+    axis.set(xlabel="foreseen by the header, e- rms", ylabel="blank sky, e- rms")
+
+
+def _background(figure: Figure, results: list[Result]) -> None:
+    axis = figure.subplots()
+    column, row, level = _together(results, "background").T
+    points = axis.scatter(column, row, c=level, s=6, cmap="viridis")
+    figure.colorbar(points, label="blank sky / foreseen")
+    axis.set(xlabel="column", ylabel="row")
+    axis.set_aspect("equal")
+
+
+_Draw = Callable[[Figure, list[Result]], None]
+_FIGURES: tuple[tuple[str, str, _Draw], ...] = (
+    ("off_x", "positions of stars against the catalogue by the WCS of the frame", _astrometry),
+    ("dm", "magnitudes of stars against the catalogue", _photometry),
+    ("noise", "noise of blank sky, an amplifier a point", _noise),
+    ("background", "level of blank sky, tile by tile", _background),
+)

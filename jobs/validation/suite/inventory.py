@@ -1,0 +1,143 @@
+"""What a lake holds that can be checked.
+
+Held       its tables and its frames
+look       of a lake
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from jobs.validation.measure import references
+from jobs.validation.measure.frames import Curve
+from jobs.validation.measure.references import Catalogue
+from jobs.validation.measure.rows import Place
+from lake_schema.errors import BadInput
+from lake_schema.mission.parameter import CAMERAS
+from lake_schema.store import layout, read
+
+# What verdicts may come from; their versions name the version of `validation`.
+TABLES = (
+    "galaxies", "stars", "mission", "galaxy_fluxes", "star_fluxes", "exposures", "products", "rendered_truth",
+    "rendered_spectra",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A science file: its path in the version of `products`, where it was taken, the row of its exposure."""
+
+    path: str
+    place: Place
+    exposure: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """Tables by name, science files, and where files of a content are: (exposure, detector, content) -> path."""
+
+    root: Path
+    tables: Mapping[str, read.Version]
+    shots: tuple[Shot, ...]
+    paths: Mapping[tuple[int, str, str], str]
+
+    @property
+    def keys(self) -> dict[str, str]:
+        """Of the versions that were read."""
+        return {name: version.key for name, version in self.tables.items()}
+
+
+def look(root: Path, request: str | None = None, exposures: Sequence[int] = ()) -> Held:
+    """Of a lake.
+
+    root : of it;  request : whose tables, where it has those of several;  exposures : only these, () = all
+    Errors : BadInput where there is nothing to check, and for exposures that it has no images of
+    """
+    names = layout.tables(root)
+    found = {name: _own(root, name, request) for name in TABLES if name in names}
+    if not found:
+        raise BadInput(f"lake {root}: none of {', '.join(TABLES)} is there to be validated")
+    if "products" not in found:
+        return Held(root, found, (), {})
+    rows = found["products"].rows(["path", "content", "exposure_id", "detector", "channel", "band"]).to_pylist()
+    paths = {(row["exposure_id"], row["detector"], row["content"]): row["path"] for row in rows}
+    planned = _planned(root, found["products"])
+    shots = []
+    for row in sorted(rows, key=lambda row: (row["exposure_id"], row["detector"])):
+        if row["content"] == "science" and (not exposures or row["exposure_id"] in exposures):
+            place = Place(row["channel"], row["band"], row["exposure_id"], row["detector"])
+            shots.append(Shot(row["path"], place, planned[row["exposure_id"]]))
+    for number in exposures:
+        if not any(shot.place.exposure_id == number for shot in shots):
+            raise BadInput(f"table products: no image of exposure {number}")
+    return Held(root, found, tuple(shots), paths)
+
+
+def _own(root: Path, name: str, request: str | None) -> read.Version:
+    return read.version(root, name) if request is None else read.for_request(root, name, request)
+
+
+def _planned(root: Path, products: read.Version) -> dict[int, Mapping[str, Any]]:
+    """Rows of the exposures that the images were made of."""
+    rows = read.version(root, "exposures", products.manifest["facts"]["inputs"]["exposures"]).rows()
+    return {row["exposure_id"]: row for row in rows.to_pylist()}
+
+
+def curves(held: Held) -> dict[str, Curve]:
+    """Of the amplifiers of each camera that images are of, by the mission database; of all of them, their mean."""
+    if "mission" not in held.tables or "products" not in held.tables:
+        return {}
+    key = held.tables["products"].manifest["facts"]["inputs"]["mission"]
+    rows = read.version(held.root, "mission", key).rows(["name", "value", "chosen"])
+    value = {row["name"]: row["value"] for row in rows.to_pylist() if row["chosen"]}
+    found = {}
+    for camera in {str(shot.exposure["camera"]) for shot in held.shots}:
+        section = f"{f'ext.{camera}' if camera in CAMERAS else camera}.nonlinearity"
+        names = [f"{section}.{name}" for name in ("high", "low", "low_scale")]
+        if all(name in value for name in names):
+            found[camera] = Curve(*(float(value[name]) for name in names))
+    return found
+
+
+def truth(held: Held) -> dict[tuple[int, str], pa.Table]:
+    """Rows of `rendered_truth` by exposure and detector."""
+    return _by_frame(held, "rendered_truth")
+
+
+def spectra(held: Held) -> dict[tuple[int, str], pa.Table]:
+    """The same of `rendered_spectra`."""
+    return _by_frame(held, "rendered_spectra")
+
+
+def _by_frame(held: Held, name: str) -> dict[tuple[int, str], pa.Table]:
+    if name not in held.tables:
+        return {}
+    wanted = {(shot.place.exposure_id, shot.place.detector) for shot in held.shots}
+    rows = held.tables[name].rows(
+        where=pc.field("exposure_id").isin(sorted({number for number, _ in wanted if number}))
+    )
+    if not len(rows):
+        return {}
+    keys = rows.select(["exposure_id", "detector"]).to_pandas()
+    found = {}
+    for key, index in keys.groupby(["exposure_id", "detector"]).indices.items():
+        if key in wanted:
+            found[key] = rows.take(pa.array(np.asarray(index)))
+    return found
+
+
+def stars_of(held: Held, rows: Mapping[tuple[int, str], pa.Table]) -> Catalogue:
+    """Stars that the frames show, from the catalogue of the lake."""
+    points = [
+        part["id"].to_numpy()[part["method"].to_numpy() == references.POINT] for part in rows.values() if len(part)
+    ]
+    ids = np.unique(np.concatenate([np.zeros(0, np.int64), *points]))
+    bands = sorted({shot.exposure["band"] for shot in held.shots})
+    return references.catalogue(held.tables, ids, bands)

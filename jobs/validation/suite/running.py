@@ -1,0 +1,103 @@
+"""All checks of a lake: frames in several processes, then what needs them together, then its catalogues.
+
+validated   a lake -> rows and what figures are drawn of
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+from tqdm import tqdm
+
+from jobs.validation.measure import references, seen
+from jobs.validation.measure.frames import Curve
+from jobs.validation.measure.references import Reference
+from jobs.validation.measure.rows import Place, Row, not_applicable
+from jobs.validation.measure.seen import Result
+from jobs.validation.suite import checks, inventory
+from jobs.validation.suite.inventory import Held
+from lake_schema.store import read
+from lake_schema.tables.rendered_truth import RENDERED_TRUTH
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One frame: its file, what it is of, and what is known of its sources and of its amplifiers."""
+
+    products: read.Version
+    path: str
+    place: Place
+    known: Reference
+    spectra: pa.Table | None
+    curve: Curve | None
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """All rows of a lake, and the numbers of its frames."""
+
+    rows: list[Row]
+    results: list[Result]
+
+
+def validated(held: Held, processes: int = 2) -> Found:
+    """Run all checks that a lake has something for; processes : that look at frames at a time."""
+    results = list(_frames(held, processes))
+    rows = [row for result in results for row in result.rows]
+    together = [row for check in checks.OF_SEVERAL for row in check(results)]
+    return Found([*rows, *together, *_catalogued(held)], results)
+
+
+def _catalogued(held: Held) -> Iterator[Row]:
+    """Rows of the catalogues; one that says what is missing where a check has not its tables."""
+    for check in checks.OF_CATALOGUES:
+        missing = [name for name in check.tables if name not in held.tables]
+        if missing:
+            yield not_applicable(check.name, Place(), f"the lake has no table {' and '.join(missing)}", check.source)
+        else:
+            yield from check.rows(*(held.tables[name] for name in check.tables))
+
+
+def _frames(held: Held, processes: int) -> Iterator[Result]:
+    tasks = _tasks(held)
+    bar = tqdm(total=len(tasks), unit="detector", desc="validation", disable=None)
+    with bar:
+        if processes <= 1 or len(tasks) <= 1:
+            for task in tasks:
+                yield of_frame(task)
+                bar.update()
+            return
+        context = multiprocessing.get_context("forkserver")
+        with ProcessPoolExecutor(min(processes, len(tasks)), context) as pool:
+            for result in pool.map(of_frame, tasks):
+                yield result
+                bar.update()
+
+
+def _tasks(held: Held) -> Sequence[Task]:
+    if not held.shots:
+        return []
+    truth, spectra = inventory.truth(held), inventory.spectra(held)
+    stars, curves = inventory.stars_of(held, truth), inventory.curves(held)
+    out = []
+    for shot in held.shots:
+        key = (int(shot.place.exposure_id or 0), str(shot.place.detector))
+        known = references.reference(
+            truth.get(key, RENDERED_TRUTH.empty()), stars, str(shot.exposure["band"]), float(shot.exposure["mjd"])
+        )
+        curve = curves.get(str(shot.exposure["camera"]))
+        out.append(Task(held.tables["products"], shot.path, shot.place, known, spectra.get(key), curve))
+    return out
+
+
+def of_frame(task: Task) -> Result:
+    """Rows of one frame."""
+    path: Path = task.products.file(task.path)
+    found = seen.seen(path, task.place, task.known, task.spectra, task.curve)
+    rows = seen.all_rows(checks.OF_FRAMES, found)
+    return Result(task.place, rows, found.series)

@@ -1,0 +1,49 @@
+"""Table `validation`: what was measured of a lake, beside what it should be."""
+
+from __future__ import annotations
+
+from lake_schema.columns import Column, Table
+from lake_schema.tables.exposures import CHANNELS
+
+VERDICTS = (
+    ("pass", "within the tolerance, and measured well enough to tell"),
+    ("fail", "beyond the tolerance by more than three standard errors"),
+    ("undecided", "too little to tell"),
+    ("not_applicable", "the lake has nothing that it could be measured of"),
+)
+KINDS = (
+    ("around", "within the tolerance of what is expected"),
+    ("least", "no less than what is expected minus the tolerance"),
+    ("most", "no more than what is expected and the tolerance"),
+)
+
+
+def _number(name: str, ucd: str, doc: str) -> Column:
+    return Column(name, "float64", "", ucd, doc, nullable=True)
+
+
+VALIDATION = Table(
+    "validation",
+    1,
+    (
+        Column("check_name", "string", ucd="meta.id", doc="which check"),
+        Column("quantity", "string", ucd="meta.id", doc="what it measured"),
+        Column("place", "string", ucd="meta.id", doc="where: channel/band/exposure/detector, as far as it goes"),
+        Column("channel", "string", ucd="instr", doc="channel", nullable=True, codes=CHANNELS),
+        Column("band", "string", ucd="instr.bandpass", doc="passband name", nullable=True),
+        Column("exposure_id", "int64", "", "meta.id;obs.exposure", "exposure", 0, nullable=True),
+        Column("detector", "string", ucd="meta.id;instr.det", doc="detector name", nullable=True),
+        _number("value", "meta.number", "as measured, in the unit of `value_unit`"),
+        _number("error", "stat.error", "its standard error"),
+        _number("expected", "meta.number", "what it should be"),
+        _number("tolerance", "stat.max", "how far from that it may be"),
+        Column("kind", "string", ucd="meta.code", doc="how tolerance and expectation bound it", codes=KINDS),
+        Column("value_unit", "string", ucd="meta.unit", doc="unit of these numbers, empty for a ratio"),
+        Column("source", "string", ucd="meta.bib", doc="where the expectation and the tolerance are from"),
+        Column("note", "string", ucd="meta.note", doc="what was sampled; why a check does not apply"),
+        Column("known", "string", ucd="meta.note", doc="why it is known to fail; empty where it has to pass"),
+        Column("verdict", "string", ucd="meta.code.qual", doc="what follows", codes=VERDICTS),
+    ),
+    "Figures measured of what a lake holds, with what they should be.",
+    key=("check_name", "quantity", "place"),
+)

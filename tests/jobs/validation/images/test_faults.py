@@ -1,0 +1,156 @@
+"""Each check of images passes a frame as it should be, and turns by the fault that it is there for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from jobs.validation.images.astrometry import ASTROMETRY
+from jobs.validation.images.background import BACKGROUND
+from jobs.validation.images.cosmic_rays import COSMIC_RAYS
+from jobs.validation.images.depth import DEPTH
+from jobs.validation.images.noise import NOISE
+from jobs.validation.images.photometry import PHOTOMETRY
+from jobs.validation.images.psf import PSF
+from jobs.validation.images.quality import QUALITY
+from jobs.validation.images.saturation import SATURATION
+from jobs.validation.measure import seen
+from jobs.validation.measure.rows import FAIL, NOT_APPLICABLE, PASS, Place
+from tests.jobs.validation import made
+
+CHECKS = (ASTROMETRY, PHOTOMETRY, BACKGROUND, NOISE, PSF, COSMIC_RAYS, SATURATION)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("frames")
+
+
+@pytest.fixture(scope="module")
+def good(folder):
+    """A frame of VIS as it should be."""
+    return made.vis(folder)
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
+def test_a_good_frame_passes(good, check):
+    found = made.verdicts(check, good[0])
+    assert found
+    assert set(found.values()) == {PASS}
+
+
+def test_numbers_are_those_that_were_put_in(good):
+    """Of a frame whose arithmetic is known: half-light and width of the points, level and noise of its sky."""
+    of, _ = good
+    # A Gaussian that is averaged over pixels is not quite one.
+    assert of.measured.fwhm == pytest.approx(made.FWHM / made.SCALE, rel=0.05)
+    assert of.tiles.level.mean() == pytest.approx(made.SKY * made.SECONDS, rel=2e-3)
+    assert np.abs(np.median(of.measured.stars.dx)) < 0.01
+    rows = {row.quantity: row for row in ASTROMETRY.of(of)}
+    assert abs(rows["offset_x"].value) < 5.0 * rows["offset_x"].error
+
+
+def turned(check, of, quantity):
+    return made.verdicts(check, of)[quantity] == FAIL
+
+
+def test_a_wcs_off_by_a_tenth_of_a_pixel(folder, good):
+    of, _ = made.vis(folder, of=good[1], shift=(0.1, 0.0))
+    assert turned(ASTROMETRY, of, "offset_x")
+    assert made.verdicts(ASTROMETRY, of)["offset_y"] == PASS
+
+
+def test_a_scale_that_is_wrong(good):
+    """By 0.2 pixels at the edge."""
+    of, stars = good
+    frame = replace(of.frame, wcs=made.system(stretch=1.0 + 4e-4))
+    wrong = replace(of, frame=frame, measured=seen.stars.measured(frame, stars, of.noise), series={})
+    assert turned(ASTROMETRY, wrong, "stretch_x")
+
+
+def test_a_gain_that_is_three_percent_off(folder, good):
+    of, _ = made.vis(folder, of=good[1], told=1.03 * made.GAIN)
+    found = made.verdicts(NOISE, of)
+    assert found["ratio"] == FAIL
+    assert PASS not in {found[f"ratio_{quadrant}"] for quadrant in "EFGH"}
+
+
+def test_a_read_noise_that_is_a_fifth_off(folder, good):
+    of, _ = made.vis(folder, of=good[1], noise=1.2 * made.NOISE)
+    assert turned(NOISE, of, "overscan_E")
+
+
+def test_a_band_whose_flux_is_shifted(good):
+    of, stars = good
+    measured = seen.stars.measured(of.frame, replace(stars, mag=stars.mag + 0.05), of.noise)
+    assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), "offset")
+
+
+def test_magnitudes_that_are_not_linear(good):
+    of, stars = good
+    measured = seen.stars.measured(of.frame, replace(stars, mag=20.0 + 1.05 * (stars.mag - 20.0)), of.noise)
+    assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), "slope")
+
+
+def test_a_sky_that_is_too_bright(folder, good):
+    of, _ = made.vis(folder, of=good[1], sky=1.1 * made.SKY)
+    assert turned(BACKGROUND, of, "level")
+
+
+def test_points_that_are_no_points(folder, good):
+    of, _ = made.vis(folder, of=good[1], stretched=1.6)
+    found = made.verdicts(PSF, of)
+    assert found == {"fwhm": FAIL, "ellipticity": FAIL}
+
+
+@pytest.mark.parametrize("hits", [0.0, 2.5 * made.HITS])
+def test_cosmic_rays_that_are_off_or_too_many(folder, good, hits):
+    of, _ = made.vis(folder, of=good[1], hits=hits)
+    assert turned(COSMIC_RAYS, of, "cover")
+
+
+def test_stars_that_do_not_saturate(good):
+    """A header that promises a saturation which nothing reaches, and one that is below the sky."""
+    of, _ = good
+    for factor, quantity in ((1.5, "bright_full"), (0.2, "faint_full")):
+        amplifiers = tuple(replace(a, full=a.full * factor) for a in of.frame.amplifiers)
+        frame = replace(of.frame, amplifiers=amplifiers)
+        wrong = replace(of, frame=frame)
+        if factor < 1.0:
+            # The stars are judged by what they should be.
+            wrong.frame = replace(of.frame, electrons=of.frame.electrons * np.float32(8.0))
+        assert turned(SATURATION, wrong, quantity)
+
+
+def ramps(folder, chi2, channel="NISP-S"):
+    path = made.ramp_file(folder / "ramp.fits", np.clip(np.rint(chi2), 0, 255), channel)
+    nobody = made.known(np.zeros(0), np.zeros(0), np.zeros(0))
+    return seen.seen(path, Place(channel, "nisp_red", 1, "DET11"), nobody)
+
+
+def test_ramps_that_fit_and_others(folder):
+    chi2 = scipy.stats.chi2(13).rvs((400, 400), random_state=1)
+    assert set(made.verdicts(QUALITY, ramps(folder, chi2)).values()) == {PASS}
+    assert turned(QUALITY, ramps(folder, 1.15 * chi2), "median")
+    # Of noise that is not that of photons.
+    assert turned(QUALITY, ramps(folder, scipy.stats.chi2(15).rvs((400, 400), random_state=1)), "median")
+    chi2[:40] = 255
+    assert turned(QUALITY, ramps(folder, chi2), "not_fitting")
+
+
+def test_a_frame_without_stars_is_said_to_have_none(folder):
+    of, _ = made.vis(folder, of=made.known(np.zeros(0), np.zeros(0), np.zeros(0)))
+    for check in (ASTROMETRY, PHOTOMETRY, PSF, SATURATION, QUALITY):
+        (row,) = check.of(of)
+        assert row.verdict == NOT_APPLICABLE
+        assert row.note
+
+
+def test_a_stack_that_is_not_deep_enough(folder, good):
+    """Of a sky that hides a galaxy of 24.5; of a band whose zero point is off."""
+    assert made.verdicts(DEPTH, good[0]) == {"vis_snr_24.5": PASS}
+    of, _ = made.vis(folder, of=good[1], sky=10.0 * made.SKY)
+    assert turned(DEPTH, of, "vis_snr_24.5")
+    of, _ = made.vis(folder, of=good[1], zero_point=made.ZERO_POINT - 1.5)
+    assert turned(DEPTH, of, "vis_snr_24.5")

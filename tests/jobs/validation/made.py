@@ -1,0 +1,147 @@
+"""Frames that are made here, by a few lines of arithmetic, so that what a check finds in them is known beforehand."""
+
+from dataclasses import replace
+
+import numpy as np
+import scipy.stats
+from astropy.io import fits
+from astropy.wcs import WCS
+from scipy.special import erf
+
+from jobs.validation.measure import seen
+from jobs.validation.measure.references import Reference
+from jobs.validation.measure.rows import Place
+
+SIDE, PRESCAN, OVERSCAN = 512, 8, 24
+SCALE, FWHM, SECONDS, ZERO_POINT, SKY, DARK = 0.1, 0.17, 565.0, 25.9, 0.22, 0.0
+GAIN, NOISE, BIAS, FULL = 3.4, 4.4, 1000.0, 1.5e5
+HITS = 0.02
+
+
+def system(shift=(0.0, 0.0), ra=10.0, dec=-20.0, side=2 * SIDE, stretch=1.0):
+    """A plain projection; shift, stretch : pixels and a factor by which its header is wrong."""
+    out = WCS(naxis=2)
+    out.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    out.wcs.crval = [ra, dec]
+    out.wcs.crpix = [side / 2 + 0.5 + shift[0], side / 2 + 0.5 + shift[1]]
+    out.wcs.cd = stretch * SCALE / 3600.0 * np.array([[-1.0, 0.0], [0.0, 1.0]])
+    return out
+
+
+def scene(rng, n=160, faintest=21.0, side=2 * SIDE):
+    """Stars on a jittered lattice, none beside another."""
+    per = int(np.ceil(np.sqrt(n)))
+    step = (side - 80) / per
+    x, y = (axis.ravel()[:n] for axis in np.meshgrid(*[40 + step * (np.arange(per) + 0.5)] * 2))
+    x, y = (axis + 0.25 * step * (rng.random(n) - 0.5) for axis in (x, y))
+    mag = 18.0 + (faintest - 18.0) * rng.random(n)
+    # Six that must be full.
+    mag[:8] = 14.0
+    return known(x, y, mag)
+
+
+def known(x, y, mag, seconds=SECONDS):
+    """What the lake would say of these points."""
+    n = len(x)
+    ra, dec = system().all_pix2world(x, y, 0)
+    electrons = seconds * 10 ** (-0.4 * (mag - ZERO_POINT))
+    still, ids = np.zeros(n), (5 << 60) + np.arange(n)
+    return Reference(ids, x, y, electrons, np.ones(n, bool), still, still.copy(), ra, dec, mag)
+
+
+def light(of, side=2 * SIDE, fwhm=FWHM / SCALE, round_=1.0):
+    """Expected e- of the points, each a Gaussian averaged over pixels; round_ : how much taller than wide."""
+    out = np.zeros((side, side))
+    sigma = np.sqrt(max(fwhm**2 - 0.7, 0.2)) / 2.3548
+    edge = np.arange(-24, 26) - 0.5
+    for x, y, flux in zip(of.x, of.y, of.expected, strict=True):
+        i, j = round(x), round(y)
+        across, up = (
+            np.diff(0.5 * erf((edge - (place - middle)) / (np.sqrt(2) * sigma * factor)))
+            for place, middle, factor in ((x, i, 1.0), (y, j, round_))
+        )
+        out[j - 24 : j + 25, i - 24 : i + 25] += flux * np.outer(up, across)
+    return out
+
+
+def hit(rng, image, part=HITS):
+    """Tracks of eight pixels along rows, 1,500 e- each."""
+    out, n = image.copy(), int(part * image.size / 8)
+    for y, x in zip(rng.integers(0, image.shape[0], n), rng.integers(0, image.shape[1] - 8, n), strict=True):
+        out[y, x : x + 8] += 1500.0
+    return out
+
+
+def vis_file(path, electrons, rng, shift=(0.0, 0.0), told=GAIN, read=GAIN, noise=NOISE, zero_point=ZERO_POINT):
+    """A raw file of four quadrants with pre- and overscan.
+
+    electrons : counted in each pixel;  shift : of the header's WCS;  told, read : gain of the header, and the true one
+    """
+    primary = fits.PrimaryHDU()
+    cards = {
+        "CHANNEL": "VIS", "IMAGETYP": "science", "EXPTIME": SECONDS, "PIXSCALE": SCALE, "PSFFWHM": FWHM, "FILTER": "i",
+        "ZEROPNT": zero_point, "SKYRATE": SKY, "DARKRATE": DARK, "DETECTOR": "1-1",
+    }  # fmt: skip
+    primary.header.update(cards)
+    units, place = [primary], system(shift)
+    for name, (row, column) in {"E": (1, 0), "F": (1, 1), "G": (0, 1), "H": (0, 0)}.items():
+        part = electrons[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE]
+        whole = np.pad(part, ((0, 0), (PRESCAN, OVERSCAN)))
+        adu = np.floor(BIAS + np.minimum(whole + noise * rng.standard_normal(whole.shape), FULL) / read + 0.5)
+        unit = fits.ImageHDU(np.clip(adu, 0, 65535).astype(np.uint16), name=f"1-1.{name}")
+        unit.header.update(place.to_header())
+        x0, y0 = column * SIDE, row * SIDE
+        unit.header["CRPIX1"] = place.wcs.crpix[0] + PRESCAN - x0
+        unit.header["CRPIX2"] = place.wcs.crpix[1] - y0
+        unit.header.update(
+            GAIN=told, RDNDRAWN=NOISE, BIAS=BIAS, SATURATE=BIAS + 0.99 * FULL / told, BUNIT="adu",
+            DATASEC=f"[{PRESCAN + 1}:{PRESCAN + SIDE},1:{SIDE}]",
+            BIASSEC=f"[{PRESCAN + SIDE + 1}:{PRESCAN + SIDE + OVERSCAN},1:{SIDE}]",
+            CCDSEC=f"[{x0 + 1}:{x0 + SIDE},{y0 + 1}:{y0 + SIDE}]",
+        )  # fmt: skip
+        units.append(unit)
+    fits.HDUList(units).writeto(path, overwrite=True)
+    return path
+
+
+def vis(folder, rng=None, of=None, hits=HITS, sky=SKY, stretched=1.0, bright=1.0, **wrong):
+    """(what a check is given of a frame of VIS, its stars); wrong : of vis_file."""
+    rng = np.random.default_rng(3) if rng is None else rng
+    of = scene(rng) if of is None else of
+    expected = light(of, round_=stretched) * bright + sky * SECONDS
+    counted = hit(rng, rng.poisson(expected).astype(float), hits)
+    path = vis_file(folder / "vis.fits", counted, rng, **wrong)
+    return seen.seen(path, Place("VIS", "euclid_vis", 1, "1-1"), of), of
+
+
+def ramp_file(path, chi2, channel="NISP-S", border=4):
+    """A ramp's signal, level sky, and its chi^2."""
+    ny, nx = chi2.shape
+    primary = fits.PrimaryHDU()
+    cards = {
+        "CHANNEL": channel, "IMAGETYP": "science", "EXPTIME": 549.6, "ELAPTIME": 573.0, "PIXSCALE": 0.3, "NG": 15,
+        "PSFFWHM": 0.33, "NR": 16, "ND": 11, "ZEROPNT": 25.0, "SKYRATE": 1.0, "DARKRATE": 0.02,
+        "QUALLIM": float(scipy.stats.chi2.isf(1e-3, 13)), "BIAS": 1024.0,
+    }  # fmt: skip
+    primary.header.update(cards)
+    units = [primary]
+    for name, plane in (("SCI", np.full(chi2.shape, 1300, np.uint16)), ("CHI2", chi2.astype(np.uint8))):
+        unit = fits.ImageHDU(np.pad(plane, border), name=f"DET11.{name}")
+        unit.header.update(system().to_header())
+        unit.header["DATASEC"] = f"[{border + 1}:{border + nx},{border + 1}:{border + ny}]"
+        unit.header["CCDSEC"] = f"[1:{nx},1:{ny}]"
+        unit.header.update(GAIN=1.92, RDNDRAWN=8.0, SATURATE=60000.0, BUNIT="adu")
+        units.append(unit)
+    fits.HDUList(units).writeto(path, overwrite=True)
+    return path
+
+
+def verdicts(check, of):
+    """Quantity -> verdict."""
+    return {row.quantity: row.verdict for row in check.of(of)}
+
+
+def moved(of, dx):
+    """The catalogue with all of its stars dx pixels to the right."""
+    ra, dec = system().all_pix2world(of.x + dx, of.y, 0)
+    return replace(of, ra=ra, dec=dec)
