@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from jobs import sums
 from jobs.validation.measure.rows import MOST, Row
 from jobs.validation.measure.seen import Check, Seen, wants_stars
 from lake_schema.arrays import Float
@@ -37,7 +38,7 @@ def check(of: Seen) -> list[Row]:
     of.series |= {"u": u, "v": v, "id": stars.id}
     # On the sky, without what the place in the pixel does.
     cd = of.frame.wcs.pixel_scale_matrix * 3.6e6
-    of.series["east"], of.series["north"] = cd @ np.stack([left["x"], left["y"]])
+    of.series["east"], of.series["north"] = (row[0] * left["x"] + row[1] * left["y"] for row in cd)
     return rows
 
 
@@ -53,13 +54,14 @@ def fitted(off: Float, noise: Float, u: Float, v: Float, place: Float) -> tuple[
     kept = np.abs(off - np.median(off)) < _CLIP * _spread(off)
     for _ in range(4):
         root = 1.0 / np.hypot(noise, 0.5 * _spread((off - np.median(off))[kept]))
-        solution, *_ = np.linalg.lstsq(matrix[kept] * root[kept, None], off[kept] * root[kept], rcond=None)
-        left = off - matrix @ solution
+        inverse = sums.least_squares(matrix[kept] * root[kept, None], np.eye(int(kept.sum())))
+        solution = (inverse * (off[kept] * root[kept])).sum(axis=1)
+        left = off - (matrix * solution).sum(axis=1)
         kept = np.abs(left) < _CLIP * max(_spread(left[kept]), 1e-9)
-    covariance = np.linalg.pinv((matrix[kept] * root[kept, None]).T @ (matrix[kept] * root[kept, None]))
     freedom = max(int(kept.sum()) - matrix.shape[1], 1)
     scale = float(((left[kept] * root[kept]) ** 2).sum()) / freedom
-    return np.asarray(solution[:3], float), np.sqrt(np.diag(covariance)[:3] * scale), matrix[:, 3:] @ solution[3:]
+    error = np.sqrt((inverse[:3] ** 2).sum(axis=1) * scale)
+    return np.asarray(solution[:3], float), error, (matrix[:, 3:] * solution[3:]).sum(axis=1)
 
 
 def _spread(values: Float) -> float:

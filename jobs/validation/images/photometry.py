@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from jobs import sums
 from jobs.validation.measure.rows import Row, not_applicable
 from jobs.validation.measure.seen import Check, Seen, wants_stars
 from jobs.validation.measure.stars import Measured
@@ -41,10 +42,10 @@ def check(of: Seen) -> list[Row]:
         kept = known & (np.abs(left - np.median(left[known])) < 5.0 * spread)
         weight = 1.0 / (error[kept] ** 2 + spread**2)
         matrix = np.stack([np.ones(kept.sum()), faint[kept]], axis=1)
-        covariance = np.linalg.inv(matrix.T @ (matrix * weight[:, None]))
-        line = covariance @ (matrix.T @ (weight * off[kept]))
+        inverse = sums.least_squares(matrix * np.sqrt(weight)[:, None], np.eye(len(matrix)))
+        line = (inverse * (np.sqrt(weight) * off[kept])).sum(axis=1)
         spread = _spread((off - line[0] - line[1] * faint)[kept])
-    errors = np.sqrt(np.diag(covariance))
+    errors = np.sqrt((inverse**2).sum(axis=1))
     of.series |= {"mag": stars.mag, "dm": off, "measured": np.where(kept, magnitude, np.nan)}
     note = f"{int(kept.sum())} stars, I_AB {stars.mag[kept].min():.1f} to {stars.mag[kept].max():.1f}"
     place = of.place
@@ -77,7 +78,7 @@ def curve(found: Measured) -> tuple[Float, float]:
     held = np.median(own / own[:, -1:], axis=0)
     radius = found.radii[_WINGS]
     missing = 1.0 / radius + np.pi * radius**2 * found.sky_has
-    slope, total = np.polyfit(missing, held[_WINGS], 1)
+    total, slope = sums.least_squares(np.stack([np.ones(len(missing)), missing], axis=1), held[_WINGS])
     return held, float(total) if slope < 0.0 else float(held[-1])
 
 

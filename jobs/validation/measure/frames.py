@@ -10,19 +10,25 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 
 from lake_schema.arrays import Array, Bool, Float, Float32
 from lake_schema.errors import BadInput
+from lake_schema.fits import images
 
 _SECTION = re.compile(r"\[(\d+):(\d+),(\d+):(\d+)\]")
+# Of a system on the sky; distortions as SIP or TPV.
+_PLACE = re.compile(
+    r"(CTYPE|CRVAL|CRPIX|CUNIT|CDELT)[12]|(CD|PC)[12]_[12]|PV\d_\d+|[AB]P?_(ORDER|\d_\d)|LONPOLE|LATPOLE|RADESYS"
+)
+# How the plane of a ramp's chi^2 ends its name.
+_QUALITY = ".CHI2"
 # Of a header that is not sure of its place (FITS, paper I); the true one is then in the .head file beside it.
 _UNSURE = "CSYER1"
 # Overscan columns next to the pixels that are left out: charge that traps gave back is in them.
@@ -121,29 +127,31 @@ def opened(path: Path, curve: Curve | None = None) -> Frame:
 
     Errors : BadInput where its header lacks what a pipeline needs, naming the keyword
     """
-    with fits.open(path, memmap=False) as units:
-        try:
-            return replace(_frame(units, path), curve=curve or Curve())
-        except KeyError as error:
-            raise BadInput(f"{path}: header without {error.args[0]}") from None
+    units = images.read_images(path)
+    try:
+        return replace(_frame(units, path), curve=curve or Curve())
+    except KeyError as error:
+        raise BadInput(f"{path}: header without {error.args[0]}") from None
 
 
-def _frame(units: Any, path: Path) -> Frame:
-    first = dict(units[0].header)
-    images = [unit for unit in units if unit.data is not None and unit.data.ndim == 2]
-    if first.get("NAXIS") == 0 and len(images) and "CHANNEL" not in first:
-        first = dict(images[0].header)
-    planes = [unit for unit in images if not unit.name.endswith(".CHI2")]
-    parts = [part for unit in planes for part in _parts({**first, **dict(unit.header)}, unit.data)]
+def _frame(units: Sequence[images.Image], path: Path) -> Frame:
+    first = _header(units[0])
+    planes = [unit for unit in units if unit.data is not None and unit.data.ndim == 2]
+    signal = [unit for unit in planes if not unit.name.endswith(_QUALITY)]
+    parts = [part for unit in signal for part in _parts({**first, **_header(unit)}, np.asarray(unit.data))]
     shape = tuple(max(part[0][axis].stop for part in parts) for axis in (0, 1))
     electrons, amplifiers = np.zeros(shape, np.float32), []
     for ccd, data, bias, cards, name in parts:
         amplifier = _amplifier(name, ccd, bias, cards)
         electrons[ccd] = (data - np.float32(amplifier.level)) * np.float32(amplifier.gain)
         amplifiers.append(amplifier)
-    quality = next((unit for unit in images if unit.name.endswith(".CHI2")), None)
-    found = None if quality is None else np.asarray(quality.data)[section(quality.header["DATASEC"])]
-    return Frame(electrons, tuple(amplifiers), found, first, _wcs(planes[0].header, path, first))
+    quality = next((unit for unit in planes if unit.name.endswith(_QUALITY)), None)
+    found = None if quality is None else np.asarray(quality.data)[section(_header(quality)["DATASEC"])]
+    return Frame(electrons, tuple(amplifiers), found, first, _wcs(_header(signal[0]), path, first))
+
+
+def _header(unit: images.Image) -> dict[str, Any]:
+    return {key: value for key, value, _ in unit.cards} | ({"EXTNAME": unit.name} if unit.name else {})
 
 
 _Part = tuple[tuple[slice, slice], Array, Array | None, Mapping[str, Any], str]
@@ -198,24 +206,18 @@ def section(text: str) -> tuple[slice, slice]:
     return slice(y1 - 1, y2), slice(x1 - 1, x2)
 
 
-def _wcs(header: Any, path: Path, first: Mapping[str, Any]) -> WCS:
+def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
     """Of the detector's pixels: what stands before them in the array is taken off; true where the header is unsure."""
-    cards = header if "CTYPE1" in header else fits.Header(first)
+    cards = header if "CTYPE1" in header else first
     beside = path.with_suffix(".head")
     if (_UNSURE in header or _UNSURE in first) and beside.is_file():
-        cards = fits.Header.fromstring(beside.read_text("ascii").split("END\n")[0], sep="\n")
-    kept = fits.Header()
-    for card in cards.cards:
-        if re.match(
-            r"(CTYPE|CRVAL|CRPIX|CUNIT|CDELT)\d$|(CD|PC)\d_\d$|PV\d_\d+$|[AB]P?_(ORDER|\d_\d)$|LONPOLE|RADESYS",
-            card.keyword,
-        ):
-            kept[card.keyword] = card.value
-    data, ccd = header.get("DATASEC", first.get("DATASEC")), header.get("CCDSEC", first.get("CCDSEC"))
-    if "DSEC1" in header:
-        data, ccd = header["DSEC1"], header["CSEC1"]
-    if data and ccd:
-        (dy, dx), (cy, cx) = section(data), section(ccd)
+        lines = beside.read_text("ascii").split("END\n")[0]
+        cards = {key: value for key, value, _ in images.cards_of_text(lines)}
+    kept = {key: value for key, value in cards.items() if _PLACE.fullmatch(key)}
+    whole = {**first, **header}
+    names = ("DSEC1", "CSEC1") if "DSEC1" in whole else ("DATASEC", "CCDSEC")
+    if all(name in whole for name in names):
+        (dy, dx), (cy, cx) = (section(whole[name]) for name in names)
         kept["CRPIX1"] -= dx.start - cx.start
         kept["CRPIX2"] -= dy.start - cy.start
     with warnings.catch_warnings():

@@ -15,6 +15,7 @@ import numpy as np
 import sep
 from scipy.spatial import cKDTree
 
+from jobs import sums
 from jobs.validation.measure.frames import Frame, pixels_of
 from jobs.validation.measure.references import Reference
 from lake_schema.arrays import Bool, Float, Int
@@ -214,8 +215,9 @@ def _fwhm(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> float:
         return np.nan
     square, bend = radius[near] ** 2, np.log(np.maximum(light[near], 1e-9))
     for _ in range(4):
-        fourth, second, first = np.polyfit(square, bend, 2)
-        left = bend - np.polyval((fourth, second, first), square)
+        basis = np.stack([np.ones(len(square)), square, square**2], axis=1)
+        first, second, fourth = sums.least_squares(basis, bend)
+        left = bend - first - second * square - fourth * square**2
         kept = np.abs(left) < 4.0 * 1.4826 * np.median(np.abs(left)) + 1e-9
         square, bend = square[kept], bend[kept]
     # Where second u + fourth u^2 = -ln 2, u = r^2.

@@ -1,16 +1,14 @@
 """Frames that are made here, by a few lines of arithmetic, so that what a check finds in them is known beforehand."""
 
-from dataclasses import replace
-
 import numpy as np
 import scipy.stats
-from astropy.io import fits
 from astropy.wcs import WCS
 from scipy.special import erf
 
 from jobs.validation.measure import seen
 from jobs.validation.measure.references import Reference
 from jobs.validation.measure.rows import Place
+from lake_schema.fits import images
 
 SIDE, PRESCAN, OVERSCAN = 512, 8, 24
 SCALE, FWHM, SECONDS, ZERO_POINT, SKY, DARK = 0.1, 0.17, 565.0, 25.9, 0.22, 0.0
@@ -77,31 +75,40 @@ def vis_file(path, electrons, rng, shift=(0.0, 0.0), told=GAIN, read=GAIN, noise
 
     electrons : counted in each pixel;  shift : of the header's WCS;  told, read : gain of the header, and the true one
     """
-    primary = fits.PrimaryHDU()
     cards = {
         "CHANNEL": "VIS", "IMAGETYP": "science", "EXPTIME": SECONDS, "PIXSCALE": SCALE, "PSFFWHM": FWHM, "FILTER": "i",
         "ZEROPNT": zero_point, "SKYRATE": SKY, "DARKRATE": DARK, "DETECTOR": "1-1",
     }  # fmt: skip
-    primary.header.update(cards)
-    units, place = [primary], system(shift)
+    units, place = [image(None, cards)], system(shift)
     for name, (row, column) in {"E": (1, 0), "F": (1, 1), "G": (0, 1), "H": (0, 0)}.items():
         part = electrons[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE]
         whole = np.pad(part, ((0, 0), (PRESCAN, OVERSCAN)))
         adu = np.floor(BIAS + np.minimum(whole + noise * rng.standard_normal(whole.shape), FULL) / read + 0.5)
-        unit = fits.ImageHDU(np.clip(adu, 0, 65535).astype(np.uint16), name=f"1-1.{name}")
-        unit.header.update(place.to_header())
         x0, y0 = column * SIDE, row * SIDE
-        unit.header["CRPIX1"] = place.wcs.crpix[0] + PRESCAN - x0
-        unit.header["CRPIX2"] = place.wcs.crpix[1] - y0
-        unit.header.update(
-            GAIN=told, RDNDRAWN=NOISE, BIAS=BIAS, SATURATE=BIAS + 0.99 * FULL / told, BUNIT="adu",
-            DATASEC=f"[{PRESCAN + 1}:{PRESCAN + SIDE},1:{SIDE}]",
-            BIASSEC=f"[{PRESCAN + SIDE + 1}:{PRESCAN + SIDE + OVERSCAN},1:{SIDE}]",
-            CCDSEC=f"[{x0 + 1}:{x0 + SIDE},{y0 + 1}:{y0 + SIDE}]",
-        )  # fmt: skip
-        units.append(unit)
-    fits.HDUList(units).writeto(path, overwrite=True)
+        own = {
+            **placed(place, PRESCAN - x0, -y0),
+            "GAIN": told, "RDNDRAWN": NOISE, "BIAS": BIAS, "SATURATE": BIAS + 0.99 * FULL / told, "BUNIT": "adu",
+            "DATASEC": f"[{PRESCAN + 1}:{PRESCAN + SIDE},1:{SIDE}]",
+            "BIASSEC": f"[{PRESCAN + SIDE + 1}:{PRESCAN + SIDE + OVERSCAN},1:{SIDE}]",
+            "CCDSEC": f"[{x0 + 1}:{x0 + SIDE},{y0 + 1}:{y0 + SIDE}]",
+        }  # fmt: skip
+        units.append(image(np.clip(adu, 0, 65535).astype(np.uint16), own, f"1-1.{name}"))
+    images.write_images(path, units)
     return path
+
+
+def image(data, cards, name=""):
+    """A unit of a file."""
+    return images.Image(data, tuple((key, value, "") for key, value in cards.items()), name)
+
+
+def placed(place, x=0, y=0):
+    """Cards of a system whose pixels lie so far into an array."""
+    cards = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg"}
+    for i in (0, 1):
+        cards |= {f"CRVAL{i + 1}": float(place.wcs.crval[i]), f"CRPIX{i + 1}": float(place.wcs.crpix[i]) + (x, y)[i]}
+        cards |= {f"CD{i + 1}_{j + 1}": float(place.wcs.cd[i][j]) for j in (0, 1)}
+    return cards
 
 
 def vis(folder, rng=None, of=None, hits=HITS, sky=SKY, stretched=1.0, bright=1.0, **wrong):
@@ -117,31 +124,22 @@ def vis(folder, rng=None, of=None, hits=HITS, sky=SKY, stretched=1.0, bright=1.0
 def ramp_file(path, chi2, channel="NISP-S", border=4):
     """A ramp's signal, level sky, and its chi^2."""
     ny, nx = chi2.shape
-    primary = fits.PrimaryHDU()
     cards = {
         "CHANNEL": channel, "IMAGETYP": "science", "EXPTIME": 549.6, "ELAPTIME": 573.0, "PIXSCALE": 0.3, "NG": 15,
         "PSFFWHM": 0.33, "NR": 16, "ND": 11, "ZEROPNT": 25.0, "SKYRATE": 1.0, "DARKRATE": 0.02,
         "QUALLIM": float(scipy.stats.chi2.isf(1e-3, 13)), "BIAS": 1024.0,
     }  # fmt: skip
-    primary.header.update(cards)
-    units = [primary]
+    units = [image(None, cards)]
+    own = {
+        **placed(system()), "GAIN": 1.92, "RDNDRAWN": 8.0, "SATURATE": 60000.0, "BUNIT": "adu",
+        "DATASEC": f"[{border + 1}:{border + nx},{border + 1}:{border + ny}]", "CCDSEC": f"[1:{nx},1:{ny}]",
+    }  # fmt: skip
     for name, plane in (("SCI", np.full(chi2.shape, 1300, np.uint16)), ("CHI2", chi2.astype(np.uint8))):
-        unit = fits.ImageHDU(np.pad(plane, border), name=f"DET11.{name}")
-        unit.header.update(system().to_header())
-        unit.header["DATASEC"] = f"[{border + 1}:{border + nx},{border + 1}:{border + ny}]"
-        unit.header["CCDSEC"] = f"[1:{nx},1:{ny}]"
-        unit.header.update(GAIN=1.92, RDNDRAWN=8.0, SATURATE=60000.0, BUNIT="adu")
-        units.append(unit)
-    fits.HDUList(units).writeto(path, overwrite=True)
+        units.append(image(np.pad(plane, border), own, f"DET11.{name}"))
+    images.write_images(path, units)
     return path
 
 
 def verdicts(check, of):
     """Quantity -> verdict."""
     return {row.quantity: row.verdict for row in check.of(of)}
-
-
-def moved(of, dx):
-    """The catalogue with all of its stars dx pixels to the right."""
-    ra, dec = system().all_pix2world(of.x + dx, of.y, 0)
-    return replace(of, ra=ra, dec=dec)
