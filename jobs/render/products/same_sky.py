@@ -22,6 +22,7 @@ from jobs.render.camera import astrometry, footprints, pointing
 from jobs.render.products import read_back
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.store import read
+from lake_schema.tables.exposures import CHANNELS
 
 # Side of a patch, arcsec, and pixels of a picture of it; that of the colours is larger.
 SIDE, _PIXELS, _COLOUR_PIXELS = 100.0, 440, 1000
@@ -33,6 +34,8 @@ _TRIED = 9
 _COLOURS = (("euclid_h", "euclid_y", "euclid_vis"), ("lsst_i", "lsst_r", "lsst_g"), ("des_i", "des_r", "des_g"))
 # Shown from black to white: sigma below the sky, where logarithmic begins, sigma above.
 _BLACK, _KNEE, _WHITE = -1.5, 4.0, 150.0
+# From the median of a normal distribution to its quartile, in sigma.
+_QUARTILE = 0.6745
 # Of the colours: the softening of their stretch, and sigma of the reddest band that are half of white.
 _SOFTENING, _STRETCH = 8.0, 12.0
 _INK, _PAPER = "#e8e6df", "#0b0d12"
@@ -47,7 +50,8 @@ def draw(root: Path, out: Path, request: str | None = None) -> list[Path]:
     root : of the lake;  out : folder;  request : its name, where the lake has several
     """
     rows = _rows(root, request)
-    cameras = sorted({_camera(row) for row in rows})
+    order = [channel for channel, _ in CHANNELS]
+    cameras = sorted({_camera(row) for row in rows}, key=lambda camera: (order.index(camera[0]), camera))
     if len(cameras) < 3:
         return []
     place = _shared(rows, cameras)
@@ -162,11 +166,10 @@ def _footprint(row: Row) -> pa.Table:
 
 
 def _levels(image: Float) -> tuple[float, float]:
-    """Sky and noise, from the median and the pixels below it."""
+    """Sky and noise, from the median and the quartile below it: gaps between cells and cosmic rays are few."""
     some = image[np.isfinite(image)]
-    level = float(np.median(some))
-    below = some[some < level] - level
-    return level, float(np.sqrt(np.mean(below**2))) if below.size else 1.0
+    low, level = np.quantile(some, (0.25, 0.5))
+    return float(level), max(float(level - low) / _QUARTILE, 1e-12)
 
 
 def _panels(path: Path, panels: Sequence[tuple[Row, Float]], place: tuple[float, float]) -> Path:
@@ -182,7 +185,7 @@ def _panels(path: Path, panels: Sequence[tuple[Row, Float]], place: tuple[float,
         signal = np.clip((image - level) / noise, _BLACK, _WHITE)
         axes.imshow(np.arcsinh(signal / _KNEE), origin="lower", cmap="gray", interpolation="none")
         axes.set_axis_off()
-        title = f"{row['camera'].upper()}  {row['band']}  {row['exposure_time_s']:g} s"
+        title = f"{row['camera'].upper()}   {row['band']}   {row['exposure_time_s']:.0f} s"
         axes.set_title(title, color=_INK, fontsize=11, pad=4)
     text = f'RA {place[0]:.4f}  Dec {place[1]:+.4f}   {SIDE:g}" x {SIDE:g}"   north up, east left'
     figure.text(0.5, 0.012, text, color=_INK, fontsize=10, ha="center")
