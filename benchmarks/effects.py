@@ -78,9 +78,10 @@ def measured(side: int | None, repeats: int) -> dict[str, float]:
     for effect in vis.FLAT:
         if effect not in vis.SKY:
             _one(effect, light_alone, scene, repeats, out)
-    for effect in vis.INJECTION:
+    filled = np.zeros_like(light_alone)
+    for effect in vis.PUMPING:
         if effect not in vis.SKY:
-            _one(effect, np.zeros_like(light_alone), scene, repeats, out)
+            filled = _one(effect, filled, scene, repeats, out)
     return out
 
 

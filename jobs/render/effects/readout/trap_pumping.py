@@ -167,4 +167,4 @@ def _contribution(scene: Scene) -> float:
     return max(some, default=0.0) if pumping.efficiency > 0.0 else 0.0
 
 
-EFFECT = Effect("trap_pumping", apply, _parameters, _contribution, fixed=True, cost=7e-2)
+EFFECT = Effect("trap_pumping", apply, _parameters, _contribution, fixed=True, cost=1.5e-2)
