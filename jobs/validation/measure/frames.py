@@ -61,11 +61,13 @@ class Curve:
     """How an amplifier falls behind: s = n / (1 + high n / range), of which low * knee (1 - exp(-s / knee)) is missing.
 
     high, low : parts of the signal, at the converter's range and of the first electrons;  knee : e-
+    range     : of the converter, ADU
     """
 
     high: float = 0.0
     low: float = 0.0
     knee: float = 2000.0
+    range: float = 65535.0
 
     def light(self, read: Float, most: float) -> Float:
         """Electrons [..] of what was read; most : e- of the converter's range."""
@@ -95,7 +97,7 @@ class Frame:
 
     def light(self, read: Float) -> Float:
         """e- [..] that were collected where so many were read."""
-        most = 65535.0 * float(np.mean([amplifier.gain for amplifier in self.amplifiers]))
+        most = self.curve.range * float(np.mean([amplifier.gain for amplifier in self.amplifiers]))
         return self.curve.light(read, most)
 
     @property

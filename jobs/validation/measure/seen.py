@@ -82,11 +82,11 @@ def seen(path: Path, place: Place, known: Reference, spectra: Any = None, curve:
     """
     frame = frames.opened(path, curve)
     found = Seen(place, frame, known, spectra)
-    if found.sees_sky:
+    if found.sees_sky or spectra is not None:
         found.noise = blank.rough_noise(frame)
-        if found.channel != DISPERSED:
-            found.tiles = blank.tiles(frame, known, found.noise)
-            found.measured = stars.measured(frame, known, found.noise)
+    if found.sees_sky and found.channel != DISPERSED:
+        found.tiles = blank.tiles(frame, known, found.noise)
+        found.measured = stars.measured(frame, known, found.noise)
     return found
 
 

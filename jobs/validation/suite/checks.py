@@ -9,6 +9,7 @@ from jobs.validation.catalogues import duplicates, observed_sky, requirements
 from jobs.validation.images import between
 from jobs.validation.images.astrometry import ASTROMETRY
 from jobs.validation.images.background import BACKGROUND
+from jobs.validation.images.completeness import COMPLETENESS
 from jobs.validation.images.cosmic_rays import COSMIC_RAYS
 from jobs.validation.images.depth import DEPTH
 from jobs.validation.images.noise import NOISE
@@ -16,6 +17,7 @@ from jobs.validation.images.photometry import PHOTOMETRY
 from jobs.validation.images.psf import PSF
 from jobs.validation.images.quality import QUALITY
 from jobs.validation.images.saturation import SATURATION
+from jobs.validation.images.spectra import SPECTRA
 from jobs.validation.measure.rows import Row
 from jobs.validation.measure.seen import Result
 
@@ -34,7 +36,19 @@ class Catalogued:
 
 
 # Of one frame each.
-OF_FRAMES = (ASTROMETRY, PHOTOMETRY, BACKGROUND, NOISE, PSF, QUALITY, COSMIC_RAYS, SATURATION, DEPTH)
+OF_FRAMES = (
+    ASTROMETRY,
+    PHOTOMETRY,
+    BACKGROUND,
+    NOISE,
+    PSF,
+    QUALITY,
+    COSMIC_RAYS,
+    SATURATION,
+    DEPTH,
+    COMPLETENESS,
+    SPECTRA,
+)
 # Of all frames together.
 OF_SEVERAL: tuple[Callable[[Sequence[Result]], list[Row]], ...] = (between.rows,)
 # Of the lake's tables.

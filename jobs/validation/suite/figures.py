@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+import scipy.stats
 from matplotlib.figure import Figure
 
 from jobs.validation.measure.seen import Result
@@ -90,10 +91,51 @@ def _background(figure: Figure, results: list[Result]) -> None:
     axis.set_aspect("equal")
 
 
+def _completeness(figure: Figure, results: list[Result]) -> None:
+    axis = figure.subplots()
+    for band in dict.fromkeys(str(result.place.band) for result in results):
+        found = np.concatenate([result.series["completeness"] for result in results if result.place.band == band])
+        middle = np.unique(found[:, 0])
+        count = np.array([found[found[:, 0] == at, 2].sum() for at in middle])
+        part = np.array([(found[found[:, 0] == at, 1] * found[found[:, 0] == at, 2]).sum() for at in middle])
+        known = count >= 8
+        axis.plot(middle[known], part[known] / count[known], "o-", ms=3, label=band)
+    axis.axhline(0.5, lw=0.5, color="k")
+    axis.set(xlabel="AB", ylabel="found by sep", ylim=(0.0, 1.05))
+    axis.legend()
+
+
+def _quality(figure: Figure, results: list[Result]) -> None:
+    axis = figure.subplots()
+    mean = np.mean([result.series["chi2"] for result in results], axis=0)
+    axis.step(np.arange(len(mean)), mean, where="mid", label="ramps", color="#1f4e79")
+    x = np.linspace(0.5, 60.0, 300)
+    freedom = results[0].series["freedom"]
+    axis.plot(x, scipy.stats.chi2.pdf(x, freedom), "k-", lw=0.8, label=f"{freedom} degrees of freedom")
+    axis.set(xlabel="chi^2", ylabel="part of the pixels", xlim=(0, 60))
+    axis.legend()
+
+
+def _whiskers(figure: Figure, results: list[Result]) -> None:
+    """Ellipticities as whiskers along the long axis, over the detector."""
+    u, v, e1, e2 = (_together([r for r in results if "u" in r.series], name) for name in ("u", "v", "e1", "e2"))
+    angle, size = 0.5 * np.arctan2(e2, e1), np.hypot(e1, e2)
+    usual = size < 6.0 * np.median(size) + 1e-6
+    axis = figure.subplots()
+    drawn = axis.quiver(u[usual], v[usual], (size * np.cos(angle))[usual], (size * np.sin(angle))[usual], pivot="mid",
+                        headwidth=0, headlength=0, headaxislength=0, width=2e-3, color="#1f4e79")  # fmt: skip
+    axis.quiverkey(drawn, 0.9, 1.03, 0.05, "e = 0.05")
+    axis.set(xlabel="column / half a side", ylabel="row / half a side")
+    axis.set_aspect("equal")
+
+
 _Draw = Callable[[Figure, list[Result]], None]
 _FIGURES: tuple[tuple[str, str, _Draw], ...] = (
     ("off_x", "positions of stars against the catalogue by the WCS of the frame", _astrometry),
     ("dm", "magnitudes of stars against the catalogue", _photometry),
+    ("e1", "ellipticities of stars in a window of their half-light diameter", _whiskers),
+    ("completeness", "sources that are found, by magnitude", _completeness),
+    ("chi2", "how well ramps fit", _quality),
     ("noise", "noise of blank sky, an amplifier a point", _noise),
     ("background", "level of blank sky, tile by tile", _background),
 )

@@ -30,6 +30,9 @@ TABLES = (
 )  # fmt: skip
 
 
+_CURVE = ("nonlinearity.high", "nonlinearity.low", "nonlinearity.low_scale")
+
+
 @dataclass(frozen=True, slots=True)
 class Shot:
     """A science file: its path in the version of `products`, where it was taken, the row of its exposure."""
@@ -99,8 +102,8 @@ def curves(held: Held) -> dict[str, Curve]:
     value = {row["name"]: row["value"] for row in rows.to_pylist() if row["chosen"]}
     found = {}
     for camera in {str(shot.exposure["camera"]) for shot in held.shots}:
-        section = f"{f'ext.{camera}' if camera in CAMERAS else camera}.nonlinearity"
-        names = [f"{section}.{name}" for name in ("high", "low", "low_scale")]
+        section = f"ext.{camera}" if camera in CAMERAS else camera
+        names = [f"{section}.{name}" for name in (*_CURVE, "adc_max")]
         if all(name in value for name in names):
             found[camera] = Curve(*(float(value[name]) for name in names))
     return found

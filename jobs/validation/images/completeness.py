@@ -1,0 +1,91 @@
+"""Which of the known sources a program finds in the pixels: sep, in a part of each frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import sep
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from jobs.validation.measure.rows import LEAST, Row, not_applicable
+from jobs.validation.measure.seen import Check, Seen, wants_blank
+from lake_schema.arrays import Bool, Float
+
+SOURCE = "sep (Barbary 2016) as SourceExtractor: 5 pixels above 1.5 sigma after a filter of the PSF's width"
+# Side of the part that is searched, pixels; magnitudes of a bin.
+_SIDE, _BIN = 1024, 0.5
+_THRESHOLD, _PIXELS = 1.5, 5
+# Of sources one to four magnitudes above where half are found; of the magnitude of that, against the noise's.
+_BRIGHT, _LIMIT = 0.15, 0.75
+# Times the noise, and arcsec about a galaxy, of a source that is found as often as not; arcsec that it may be moved by.
+_SIGMA, _GALAXY, _MOVED = 10.0, 0.5, 0.5
+_LEAST = 20
+
+
+def check(of: Seen) -> list[Row]:
+    """Magnitude at which half of the sources are found, against the noise's; part of brighter ones that are."""
+    magnitude, found, note = searched(of)
+    edges = np.arange(np.floor(magnitude.min(initial=20.0)), 29.0, _BIN)
+    count = np.histogram(magnitude, edges)[0].astype(float)
+    part = np.histogram(magnitude[found], edges)[0] / np.maximum(count, 1.0)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    known = count >= 8
+    of.series["completeness"] = np.stack([middle, part, count], axis=1)
+    below = np.flatnonzero(known & (part < 0.5))
+    faintest = [i for i in below if i > 0 and known[i - 1] and part[i - 1] >= 0.5]
+    if not faintest or len(magnitude) < _LEAST:
+        return [not_applicable("completeness", of.place, "no magnitude at which half are found", SOURCE)]
+    i = faintest[0]
+    slope = max(part[i - 1] - part[i], 0.05)
+    limit = middle[i - 1] + _BIN * (part[i - 1] - 0.5) / slope
+    error = _BIN * np.sqrt(0.25 / count[i] + 0.25 / count[i - 1]) / slope
+    rows = [Row("completeness", "half", of.place, float(limit), float(error), _foreseen(of), _LIMIT, "mag", SOURCE,
+                note=note)]  # fmt: skip
+    bright = (magnitude < limit - 1.0) & (magnitude > limit - 4.0)
+    n = int(bright.sum())
+    if n >= _LEAST:
+        value = float(found[bright].mean())
+        near = (found[bright].sum() + 2.0) / (n + 4.0)
+        error = np.sqrt(near * (1.0 - near) / n)
+        rows.append(Row("completeness", "bright", of.place, value, float(error), 1.0, _BRIGHT, "", SOURCE, LEAST,
+                        f"{n} sources"))  # fmt: skip
+    return rows
+
+
+def searched(of: Seen) -> tuple[Float, Bool, str]:
+    """(magnitudes of the known sources of a part [n], which of them are found, what was searched)."""
+    assert of.tiles is not None
+    ny, nx = of.frame.electrons.shape
+    # Beside the middle, where detectors that are read in parts have no pixels.
+    top, left = (max(min(n // 2 + 8, n - _SIDE), 0) for n in (ny, nx))
+    part = np.ascontiguousarray(of.frame.electrons[top : top + _SIDE, left : left + _SIDE], np.float64)
+    level = float(np.median(of.tiles.level))
+    full = ndimage.binary_dilation(part >= of.frame.full, iterations=4)
+    width = float(of.frame.header["PSFFWHM"]) / of.frame.scale
+    axis = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
+    kernel = np.exp(-4.0 * np.log(2.0) * (axis[:, None] ** 2 + axis**2) / width**2)
+    objects = sep.extract(part - level, _THRESHOLD, err=of.noise, minarea=_PIXELS, filter_kernel=kernel, mask=full)
+    known = of.known
+    inside = (known.x > left + 8) & (known.x < left + part.shape[1] - 9)
+    inside &= (known.y > top + 8) & (known.y < top + part.shape[0] - 9) & (known.expected > 0.0)
+    x, y = known.x[inside] - left, known.y[inside] - top
+    good = ~full[np.rint(y).astype(int), np.rint(x).astype(int)]
+    light = known.expected[inside][good]
+    magnitude = float(of.frame.header["ZEROPNT"]) - 2.5 * np.log10(light / of.frame.seconds)
+    if not len(objects) or not len(light):
+        return magnitude, np.zeros(len(light), bool), "no source is found"
+    tree = cKDTree(np.stack([objects["x"], objects["y"]], axis=1))
+    distance, _ = tree.query(np.stack([x[good], y[good]], axis=1))
+    note = f"{len(light)} sources in {part.shape[1]} x {part.shape[0]} pixels, {len(objects)} objects"
+    return magnitude, distance < max(1.5 * width, _MOVED / of.frame.scale), note
+
+
+def _foreseen(of: Seen) -> float:
+    """AB of a source whose light is ten times the noise within the PSF's width and, of galaxies, 0.5"."""
+    extended = _GALAXY * float(np.mean(~of.known.point))
+    radius = np.hypot(float(of.frame.header["PSFFWHM"]), extended) / of.frame.scale
+    noise = of.noise * np.sqrt(np.pi) * radius
+    return float(float(of.frame.header["ZEROPNT"]) - 2.5 * np.log10(_SIGMA * noise / of.frame.seconds))
+
+
+COMPLETENESS = Check("completeness", SOURCE, wants_blank, check)

@@ -1,0 +1,35 @@
+"""What a program finds of the sources that are there, and of those that only the truth knows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jobs.validation.images.completeness import COMPLETENESS
+from jobs.validation.measure.rows import FAIL, PASS
+from tests.jobs.validation import made
+
+
+@pytest.fixture(scope="module")
+def faint(tmp_path_factory):
+    """Points down to what nobody finds."""
+    of = made.scene(np.random.default_rng(3), 900, faintest=28.5)
+    return made.vis(tmp_path_factory.mktemp("faint"), of=of)[0]
+
+
+def test_half_are_found_where_noise_says(faint):
+    assert made.verdicts(COMPLETENESS, faint) == {"half": PASS, "bright": PASS}
+
+
+def test_sources_that_were_not_drawn(faint):
+    """Every third is somewhere else."""
+    known = faint.known
+    off = np.where(np.arange(len(known)) % 3 == 0, 14.0, 0.0)
+    wrong = replace(faint, known=replace(known, x=known.x + off), series={})
+    assert made.verdicts(COMPLETENESS, wrong)["bright"] == FAIL
+
+
+def test_sources_that_are_fainter_than_they_should_be(faint):
+    known = faint.known
+    wrong = replace(faint, known=replace(known, expected=6.0 * known.expected), series={})
+    assert made.verdicts(COMPLETENESS, wrong)["half"] == FAIL
