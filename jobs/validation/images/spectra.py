@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyarrow.compute as pc
 
 from jobs.validation.measure.rows import Row, not_applicable
 from jobs.validation.measure.seen import DISPERSED, Check, Seen
@@ -39,9 +40,10 @@ class Extracted:
 
 def check(of: Seen) -> list[Row]:
     """Of a frame's first orders."""
-    table = of.spectra.to_pylist()
+    # Of other orders the overlap is null.
+    kept = (pc.field("order") == 1) & (pc.field("overlapped") < _OVERLAPPED)
+    first = of.spectra.filter(kept).to_pylist()
     points = set(of.known.id[of.known.point].tolist())
-    first = [row for row in table if row["order"] == 1 and (row["overlapped"] or 0.0) < _OVERLAPPED]
     alone = [row for row in first if row["id"] in points and row["drawn"] > 0.9 * row["expected"]]
     alone = sorted(alone, key=lambda row: -row["expected"])[:_MOST]
     ratios, offs = [], []
