@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs import heap
-from jobs.accuracy import SURVEY, Accuracy
+from jobs.accuracy import Accuracy
 from jobs.fluxes.inputs import library_of, passband_of, stars_of
 from jobs.render.camera import detectors
 from jobs.render.channels import registry
@@ -147,12 +147,9 @@ def _earlier_tasks(
     if all(name not in registry.CHANNELS or registry.CHANNELS[name].remembers is None for name in names):
         return {}
     rows = {row.exposure_id: row for row in map(ExposureRow.of, exposures.to_pylist())}
-    return persistence.earlier_of(inputs["tasks"].rows().to_pylist(), rows, _own(mission_of(request.mission)))
-
-
-def _own(mission: MissionConfiguration) -> Callable[[str | None], MissionConfiguration]:
-    """An exposure's settings -> its mission."""
-    return lambda settings: variants.variant(settings, mission, SURVEY, {}).mission
+    return persistence.earlier_of(
+        inputs["tasks"].rows().to_pylist(), rows, variants.missions(mission_of(request.mission))
+    )
 
 
 def _with_earlier(
@@ -329,18 +326,19 @@ def _earlier(
     """Exposures of the task's detector that left something in it, with their bright sources."""
     if registry.CHANNELS[exposed.channel].remembers is None:
         return ()
-    own = _own(mission)(exposed.settings)
-    since = exposed.mjd - persistence.window(exposed.camera, own)
+    own = variants.missions(mission)
+    since = exposed.mjd - persistence.window(exposed.camera, own(exposed.settings))
     near = (pc.field("mjd") >= since) & (pc.field("mjd") <= exposed.mjd)
     found = inputs["exposures"].rows(where=near & (pc.field("camera") == exposed.camera)).to_pylist()
     rows = {row.exposure_id: row for row in map(ExposureRow.of, found)}
     here = pc.field("exposure_id").isin(list(rows)) & (pc.field("detector") == task["detector"])
     tasks = inputs["tasks"].rows(where=here).to_pylist()
-    before = persistence.earlier_of(tasks, rows, _own(mission))[exposed.exposure_id, task["detector"]]
+    before = persistence.earlier_of(tasks, rows, own)[exposed.exposure_id, task["detector"]]
     pairs = ((rows[one["exposure_id"]], one) for one in before)
     return tuple(
-        _drawn_again(lake, inputs, exposed, row, one, own, seed) if persistence.is_drawn(row) else EarlierSky(row)
+        _drawn_again(lake, inputs, exposed, row, one, own(row.settings), seed) if drawn else EarlierSky(row)
         for row, one in pairs
+        for drawn in [persistence.is_drawn(row)]
     )
 
 
@@ -369,7 +367,7 @@ def _drawn_again(
     ]
     library = library_of(lake, inputs["galaxy_fluxes"].manifest["facts"])
     stellar = stars_of(lake, inputs["star_fluxes"].manifest["facts"])
-    return Earlier(aim, Rows(*found[0], *found[1], library=library, stellar=stellar))
+    return Earlier(aim, Rows(*found[0], *found[1], library=library, stellar=stellar), mission)
 
 
 def truth_work(lake: Path, facts: Json) -> Output:

@@ -45,13 +45,14 @@
         channels = ["VIS", "NISP-P", "NISP-S"] | ["EXT"]
         image_type = "science" | "deep" | "bias" | "dark" | "flat" | "charge_injection" | "self_calibration"
                      | "standard_star" | "planetary_nebula" | "trap_pumping" | "defocus" | "bleeding"
-                     | "stray_light" | "white_dwarf"
+                     | "stray_light" | "white_dwarf" | "persistence"
         survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
         ra, dec, position_angle    a field of your own instead of the survey's (docs/own_field.md)
         pointings = "file.csv"     a table of pointings instead of either (jobs/request/pointing_tables.py)
         dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
         detectors, mjd, exposure_time_s, realisations
-        lamps = [..] of flats      macc = [groups, reads, drops] of NISP-P
+        lamps = [..], intensities = [..] of flats      macc = [groups, reads, drops] of NISP-P, or of NISP-S alone
+        delays_s = [..], bright = "flat" | "sky" of persistence
         phase_times_s = [..] of trap_pumping     defocus_nm = [..] of defocus
         magnitude of bleeding, white_dwarf, stray_light     distance_deg of stray_light
     [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "satellites", "saturation",

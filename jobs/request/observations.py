@@ -55,8 +55,8 @@ _CALIBRATIONS = {
         "stray_light",
         "white_dwarf",
     ),
-    "NISP-P": ("dark", "flat", "self_calibration", "standard_star"),
-    "NISP-S": ("dark", "flat", "standard_star", "planetary_nebula"),
+    "NISP-P": ("dark", "flat", "persistence", "self_calibration", "standard_star"),
+    "NISP-S": ("dark", "flat", "persistence", "standard_star", "planetary_nebula"),
     "EXT": ("bias", "dark", "flat"),
 }
 _SKY_TYPES = ("science", "deep")
@@ -83,19 +83,27 @@ _USERS = {
     "defocus_nm": (_DITHERED,),
     "magnitude": (_DITHERED,),
     "distance_deg": (_DITHERED,),
+    "intensities": (_TIMED,),
+    "delays_s": (_TIMED,),
+    "bright": (_TIMED,),
     "macc": (_SURVEY, _OWN, _TIMED, _DITHERED, _TABLE),
     "exposure_time_s": (_GROUND, _GROUND_OWN, _TIMED, _DITHERED, _TABLE),
 }
 # Exposures that only one channel has.
-_CHANNEL_OF = {"short": "VIS", "flat": "VIS", "blue": "NISP-S", "macc": "NISP-P"}
+_CHANNELS_OF = {"short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S")}
 # Image types that a key of calibrations is for.
 _TYPES_OF = {
-    "lamps": ("flat",),
+    "lamps": ("flat", "persistence"),
+    "intensities": ("flat", "persistence"),
+    "delays_s": ("persistence",),
+    "bright": ("persistence",),
     "phase_times_s": ("trap_pumping",),
     "defocus_nm": ("defocus",),
     "magnitude": ("bleeding", "white_dwarf", "stray_light"),
     "distance_deg": ("stray_light",),
 }
+# What is bright before darks that show what it left.
+BRIGHT = ("flat", "sky")
 # LEDs of a calibration unit. A copy, since requests are read below the renderer (test_survey.py holds it to the lamps).
 LAMPS = {"VIS": 6, "NISP-P": 5, "NISP-S": 5}
 
@@ -144,7 +152,10 @@ class Observation:
     mjd       : the earliest date, None = the mission's launch
     realisations : how many of each exposure, which differ in their noise alone
     lamps     : of flats, numbers of the LEDs in their turn, () = all;  each in bands that see it
-    macc      : (groups, reads, drops) of NISP-P's ramps, () = the mission's
+    macc      : (groups, reads, drops) of NISP-P's ramps, of NISP-S's without NISP-P, () = the mission's
+    intensities : of flats, over the mission's level of the lamp, each for `exposures` frames; () = 1
+    delays_s  : of persistence, s from the end of the bright exposure to the start of each dark, () = the mission's
+    bright    : of persistence, what is bright: of BRIGHT
     phase_times_s : of trap pumping, s that charge stays under an electrode, a frame each, () = the mission's
     defocus_nm : of exposures out of focus, rms of the wavefront, one each, () = the mission's, on both sides
     magnitude  : of calibration stars, AB in the exposure's band, None = the mission's
@@ -178,6 +189,9 @@ class Observation:
     defocus_nm: tuple[float, ...] = ()
     magnitude: float | None = None
     distance_deg: float | None = None
+    intensities: tuple[float, ...] = ()
+    delays_s: tuple[float, ...] = ()
+    bright: str = BRIGHT[0]
 
     @property
     def place(self) -> tuple[float, float] | None:
@@ -262,6 +276,9 @@ def _observation(value: object, path: str, folder: Path) -> Observation:
         defocus_nm=_numbers(table, f"{path}.defocus_nm", -2000.0, 2000.0),
         magnitude=optional(table, f"{path}.magnitude", -10.0, 30.0),
         distance_deg=optional(table, f"{path}.distance_deg", 0.0, 10.0),
+        intensities=_numbers(table, f"{path}.intensities", 1e-4, 1e4),
+        delays_s=_numbers(table, f"{path}.delays_s", 1.0, 1e6),
+        bright=string(table, f"{path}.bright", BRIGHT, BRIGHT[0]),
     )
 
 
@@ -336,16 +353,17 @@ def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path
             raise BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(users)}")
         if key in _TYPES_OF and image_type not in _TYPES_OF[key]:
             raise BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(_TYPES_OF[key])}")
-        if (channel := _CHANNEL_OF.get(key)) is not None and channel not in channels:
-            raise BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {channel}")
+        if (some := _CHANNELS_OF.get(key)) is not None and not {*some} & {*channels}:
+            raise BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {', '.join(some)}")
 
 
 def _kind(table: Toml, ground: bool, image_type: str) -> str:
     if "pointings" in table:
         return _TABLE
     if image_type not in _SKY_TYPES:
+        timed = dict.fromkeys(("dark", "flat", "persistence"), _TIMED)
         untimed = dict.fromkeys(("bias", "charge_injection", "trap_pumping"), _UNTIMED)
-        return {"dark": _TIMED, "flat": _TIMED, **untimed}.get(image_type, _DITHERED)
+        return {**timed, **untimed}.get(image_type, _DITHERED)
     if ground:
         return _GROUND_OWN if "ra" in table else _GROUND
     return _OWN if "ra" in table else _SURVEY

@@ -23,6 +23,7 @@ IMAGE_TYPES = (
     ("charge_injection", "rows filled electronically, which traps delay"),
     ("self_calibration", "dense field, many dithers"),
     ("standard_star", "standard star"),
+    ("persistence", "dark after a bright exposure, which shows what that left in the detector"),
     ("planetary_nebula", "emission lines for the wavelength scale"),
     ("trap_pumping", "charge shuffled to and fro over the traps, each of which makes a dipole"),
     ("defocus", "sky exposure out of focus, for the wavefront"),
@@ -55,8 +56,8 @@ RENDERED: Mapping[str, tuple[str, ...]] = {
         "stray_light",
         "white_dwarf",
     ),
-    "NISP-P": ("science", "deep", "self_calibration", "standard_star", "flat", "dark"),
-    "NISP-S": ("science", "deep", "standard_star", "planetary_nebula", "flat", "dark"),
+    "NISP-P": ("science", "deep", "self_calibration", "standard_star", "flat", "dark", "persistence"),
+    "NISP-S": ("science", "deep", "standard_star", "planetary_nebula", "flat", "dark", "persistence"),
     "EXT": ("science", "deep", "flat", "dark", "bias"),
 }
 

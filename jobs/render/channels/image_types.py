@@ -1,14 +1,21 @@
 """Image types of the sky; whose random numbers an exposure has.
 
 identity       what tells an exposure's random numbers from those of all others
+family         what exposures of one sequence have in common of their settings
 """
 
 from __future__ import annotations
+
+import json
+from functools import lru_cache
 
 from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.exposures import ExposureRow
 
 SKY_TYPES = ("science", "deep", "self_calibration")
+
+# In settings before the name of a parameter that is an exposure's own, and no value that a request explores.
+OWN = "own:"
 
 
 def section(camera: str) -> str:
@@ -28,3 +35,11 @@ def identity(exposure: ExposureRow) -> str:
     number = exposure.realisation or 1
     again = (str(number),) if number > 1 else ()
     return ":".join((exposure.camera, exposure.band, *(place.hex() for place in places), *turned, *again))
+
+
+@lru_cache(maxsize=1024)
+def family(settings: str | None) -> str | None:
+    """Settings of an exposure without what is its own alone: those of the variant of an exploration."""
+    values = json.loads(settings) if settings else {}
+    shared = {key: value for key, value in values.items() if not key.startswith(OWN)}
+    return json.dumps(shared, sort_keys=True) if shared else None

@@ -78,6 +78,7 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "standard_star": SKY,
     "flat": FLAT,
     "dark": DARK,
+    "persistence": DARK,
 }
 
 

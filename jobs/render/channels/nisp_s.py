@@ -49,6 +49,7 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "planetary_nebula": SKY,
     "flat": FLAT,
     "dark": DARK,
+    "persistence": DARK,
 }
 
 

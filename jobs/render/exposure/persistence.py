@@ -26,17 +26,19 @@ import numpy as np
 
 from jobs.render.channels import registry
 from jobs.render.channels.aim import Aim, electron_rate
+from jobs.render.channels.image_types import family
 from jobs.render.dispersing import draw as dispersing
 from jobs.render.drawing import stamp_sizes, stamps
 from jobs.render.drawing.settings import settings_for
 from jobs.render.effects.charge import ramp
-from jobs.render.effects.charge.persistence import Traps
+from jobs.render.effects.charge.persistence import Traps, pixels_of
 from jobs.render.effects.scene import Frame, Scene
 from jobs.render.exposure import scene_of, spread_sky, visible_sources
 from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
 from jobs.render.exposure.visible_spectra import visible_spectra
 from jobs.render.psf.model import Psf
 from jobs.render.sources import solar_system
+from jobs.rng import stream
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
@@ -45,7 +47,7 @@ _DAY_S = 86400.0
 # Of a date, s: more than its rounding.
 _SAME_S = 1e-3
 # Images of which nothing of the sky is on a detector.
-_STARLESS = ("bias", "dark", "flat", "charge_injection")
+_STARLESS = ("bias", "dark", "flat", "charge_injection", "persistence")
 # Electrons of the faintest source that is drawn again so many seconds later, and of a pixel's light that stamps leave
 # out; more where more time has passed.  A star of so many leaves 0.8 e- in a pixel; of two exposures of the demo's sky
 # before one, 1.2 e- are missed in a pixel at the most.
@@ -56,6 +58,9 @@ _COLUMN = 0.5
 _EDGE = 0.1
 # Electrons that light brings to some pixel at least, to be worth a look: ten leave 0.05.
 _WORTH = 10.0
+
+# Name of the random numbers of what each pixel's traps have of their own.
+_PIXELS = "persistence_pixels"
 
 Task = Mapping[str, Any]
 
@@ -76,13 +81,12 @@ def earlier_of(
     for task in tasks:
         row = exposures[task["exposure_id"]]
         if row.camera in cameras:
-            by_detector[row.camera, row.settings, task["detector"]].append(task)
+            by_detector[row.camera, family(row.settings), task["detector"]].append(task)
     found = {}
     for (camera, settings, detector), some in by_detector.items():
-        mission = mission_of(settings)
-        days = window(camera, mission)
+        days = window(camera, mission_of(settings))
         some.sort(key=lambda task: (exposures[task["exposure_id"]].mjd, task["exposure_id"]))
-        _check_one_at_a_time([exposures[task["exposure_id"]] for task in some], detector, mission)
+        _check_one_at_a_time([exposures[task["exposure_id"]] for task in some], detector, mission_of)
         began = np.array([exposures[task["exposure_id"]].mjd for task in some])
         for task, now in zip(some, began.tolist(), strict=True):
             if not _remembers(exposures[task["exposure_id"]]):
@@ -94,7 +98,9 @@ def earlier_of(
     return found
 
 
-def _check_one_at_a_time(rows: Sequence[ExposureRow], detector: str, mission: MissionConfiguration) -> None:
+def _check_one_at_a_time(
+    rows: Sequence[ExposureRow], detector: str, mission_of: Callable[[str | None], MissionConfiguration]
+) -> None:
     """Refuse exposures of a detector, in order of time, of which one begins before another has ended.
 
     Such as begin at once are alternatives of one another.
@@ -103,7 +109,7 @@ def _check_one_at_a_time(rows: Sequence[ExposureRow], detector: str, mission: Mi
         channel, seconds = registry.CHANNELS.get(before.channel), before.exposure_time_s
         apart = (now.mjd - before.mjd) * _DAY_S
         if channel is not None and channel.ramp and apart > 0.0:
-            seconds = ramp.elapsed(channel.ramp, seconds, before.camera, mission)
+            seconds = ramp.elapsed(channel.ramp, seconds, before.camera, mission_of(before.settings))
         if 0.0 < apart < seconds - _SAME_S:
             raise BadInput(
                 f"exposures {before.exposure_id} and {now.exposure_id} of detector {detector}: the second begins "
@@ -177,11 +183,14 @@ def remembered(aim: Aim, earlier: Sequence[Earlier | EarlierSky], variant: Varia
     """
     if aim.channel.remembers is None or not earlier:
         return None
-    traps = Traps.of(scene_of.of_aim(aim, variant))
+    scene = scene_of.of_aim(aim, variant)
+    traps = Traps.of(scene)
+    own = pixels_of(scene, stream(seed, aim.exposure.camera, aim.detector.name, _PIXELS))
     left = np.zeros((aim.detector.ny, aim.detector.nx))
     for before in earlier:
-        seconds = delay(aim.exposure, before.exposure), aim.exposure.exposure_time_s
-        left += traps.left(_charge(before, variant, _older(aim.exposure, before.exposure), seed), *seconds)
+        charge = _charge(before, variant, _older(aim.exposure, before.exposure), seed)
+        times = delay(aim.exposure, before.exposure), aim.exposure.exposure_time_s, before.exposure.exposure_time_s
+        left += traps.left(charge, *times, own)
     return left
 
 
@@ -195,6 +204,7 @@ def _charge(before: Earlier | EarlierSky, variant: Variant, older: float, seed: 
         shines = before.exposure.image_type not in _STARLESS
         return np.asarray(shines * before.exposure.sky * before.exposure.exposure_time_s)
     aim = before.aim
+    variant = variant if before.mission is None else replace(variant, mission=before.mission)
     scene = spread_sky.with_sky(scene_of.of_aim(aim, variant), aim, seed)
     if aim.channel.disperses is not None and aim.sees_sky:
         frame = _spectra(aim, before.rows, scene, older, seed)

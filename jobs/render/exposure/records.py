@@ -63,10 +63,11 @@ class Beside:
 
 @dataclass(frozen=True, slots=True)
 class Earlier:
-    """An exposure of the same detector before; rows : of its bright sources."""
+    """An exposure of the same detector before; rows : of its bright sources;  mission : None = as the later one's."""
 
     aim: Aim
     rows: Rows
+    mission: MissionConfiguration | None = None
 
     @property
     def exposure(self) -> ExposureRow:

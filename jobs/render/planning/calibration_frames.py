@@ -12,12 +12,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from jobs import rng
-from jobs.fluxes import passbands
 from jobs.render.camera import pointing
 from jobs.render.camera.lamps import LAMPS
 from jobs.render.channels import image_types, registry
-from jobs.render.effects.light import calibration_lamp
 from jobs.render.effects.readout import trap_pumping
+from jobs.render.planning import after_bright, lit_flats
 from jobs.render.planning.observing_sequence import FILTERS, RED, SETTINGS, offsets
 from jobs.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time, through_grism
 from jobs.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
@@ -41,8 +40,6 @@ _ASKED = (("magnitude", "magnitude", "mag"), ("distance_deg", "distance", "deg")
 _PHASE_TIMES = 4
 # From the end of a frame to the start of the next, s: the slowest of the read-outs.
 _PAUSE = 90.0
-# Of a lamp's light, over what the camera's bands see where they see best: with less a flat is not taken.
-_SEES = 0.05
 
 
 def exposures(
@@ -55,7 +52,8 @@ def exposures(
     block  : of the request;  mission : the mission database;  seed : of the request;  start : MJD
     """
     own = [registry.CHANNELS[channel] for channel in block.channels]
-    if any(not channel.on_ground and block.image_type in channel.sky_types for channel in own):
+    of_sky = block.image_type == "persistence" and block.bright == "sky"
+    if of_sky or any(not channel.on_ground and block.image_type in channel.sky_types for channel in own):
         if block.mjd is None:
             start = next_allowed(*centre, start, mission)
         check_aspect(*centre, start, mission, "mjd")
@@ -68,6 +66,11 @@ def exposures(
         first = Exposure(
             channel, name, "", block.image_type, *centre, angle, start, 0.0, "calibration", detectors=block.detectors
         )
+        if block.image_type == "persistence":
+            for frame in after_bright.exposures(first, block, mission, now):
+                yield frame
+                now = after_bright.forgotten(frame, mission)
+            continue
         for frame in _frames(first, block, mission, seed):
             yield replace(frame, mjd=now)
             # A ramp is read out meanwhile, and longer where it has few groups.
@@ -77,7 +80,7 @@ def exposures(
 def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, seed: int) -> Iterator[Exposure]:
     in_bands = [
         replace(first, band=band, exposure_time_s=_seconds(first, band, block, mission))
-        for band in _chosen(block.bands, _bands(first, mission))
+        for band in lit_flats.chosen(block.bands, _bands(first, mission))
     ]
     if first.image_type == "self_calibration":
         dithers = block.exposures or int(mission.value("survey.self_calibration.dithers"))
@@ -92,14 +95,15 @@ def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, 
     elif not block.exposures:
         raise BadInput(f"an observation of image_type {first.image_type} wants exposures = how many frames")
     elif first.image_type == "flat" and first.camera in LAMPS:
-        lit = _lit(in_bands, block, mission)
+        lit = lit_flats.by_lamp(in_bands, block, mission)
         for i in range(block.exposures):
             turn, own = i // len(lit), lit[i % len(lit)]
-            yield own[turn % len(own)]
+            yield from lit_flats.at_levels(own[turn % len(own)], block, mission)
     else:
         lamp = 1 if first.image_type == "flat" else None
         for i in range(block.exposures):
-            yield replace(in_bands[i % len(in_bands)], lamp=lamp)
+            frame = replace(in_bands[i % len(in_bands)], lamp=lamp)
+            yield from lit_flats.at_levels(frame, block, mission) if lamp else [frame]
 
 
 def _pumped(frame: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
@@ -129,32 +133,6 @@ def _asked(frame: Exposure, block: Observation) -> Exposure:
     values = ((getattr(block, asked), key, unit) for asked, key, unit in _ASKED)
     own = tuple((f"survey.{block.image_type}.{key}", value, unit) for value, key, unit in values if value is not None)
     return replace(frame, parameters=own)
-
-
-def _lit(in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration) -> list[list[Exposure]]:
-    """Of each lamp a flat in every band that sees it; lamps that no band sees are not lit.
-
-    Errors : BadInput for a lamp of the block's that none of its bands sees, and where that are all of them
-    """
-    camera, found = in_bands[0].camera, []
-    curves = {frame.band: passbands.load(frame.band) for frame in in_bands}
-    for lamp in block.lamps or range(1, LAMPS[camera][0] + 1):
-        sees = {band: calibration_lamp.seen_in(curve, lamp, camera, mission) for band, curve in curves.items()}
-        lit = [replace(frame, lamp=lamp) for frame in in_bands if sees[frame.band] > _SEES]
-        # Flats of spectra are taken with the grism in.
-        own = [through_grism(frame, None, mission) for frame in lit]
-        if block.lamps and not own:
-            raise BadInput(f"lamps: {lamp} does not shine in {', '.join(curves)}")
-        if own:
-            found.append(own)
-    if not found:
-        raise BadInput(f"bands: no lamp shines in {', '.join(curves)}")
-    return found
-
-
-def _chosen(wanted: Sequence[str], own: Sequence[str]) -> Sequence[str]:
-    """Those of a channel's bands that a block names, all where it names none of them."""
-    return [band for band in own if band in wanted] or own
 
 
 def _seconds(first: Exposure, band: str, block: Observation, mission: MissionConfiguration) -> float:

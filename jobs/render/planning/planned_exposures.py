@@ -38,7 +38,7 @@ from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 _ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd", "grism", "grism_angle")
 # Grisms by the passband that they are used in.
 GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}
-_DARK_TYPES = ("bias", "dark", "charge_injection", "trap_pumping")
+_DARK_TYPES = ("bias", "dark", "charge_injection", "trap_pumping", "persistence")
 # Columns that are counted here.
 _NUMBERS = ("exposure_id", "realisation", "airmass", "zenith")
 
@@ -148,9 +148,20 @@ def check_macc(block: Observation, mission: MissionConfiguration) -> None:
     """
     if not block.macc or block.exposure_time_s is None:
         return
-    takes = exposure_time("NISP-P", "nisp", "", mission)
+    takes = exposure_time(channel_of_macc(block), "nisp", "", mission)
     if abs(block.exposure_time_s / takes - 1.0) > ramp.FRAME_TOLERANCE:
         raise BadInput(f"macc = {[*block.macc]} takes {takes:.4g} s, not exposure_time_s = {block.exposure_time_s:g}")
+
+
+def channel_of_macc(block: Observation) -> str:
+    """Of a block of both channels of NISP its ramp is the photometer's."""
+    return "NISP-P" if "NISP-P" in block.channels else "NISP-S"
+
+
+def ramp_of(block: Observation) -> dict[str, tuple[float, str]]:
+    """What a block's ramp changes of the mission: key -> (value, unit)."""
+    key = f"nisp.macc.{_ramp_of(channel_of_macc(block))}"
+    return {f"{key}.{part}": (n, "") for part, n in zip(("groups", "reads", "drops"), block.macc, strict=False)}
 
 
 def _ramp_of(channel: str) -> str:

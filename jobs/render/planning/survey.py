@@ -19,15 +19,15 @@ from jobs.render.camera import detectors
 from jobs.render.camera.pointing import boresight_for
 from jobs.render.channels import registry
 from jobs.render.channels.image_types import SKY_TYPES
-from jobs.render.planning import calibration_frames, ground_surveys, reference_survey, variants
+from jobs.render.planning import after_bright, calibration_frames, ground_surveys, reference_survey, variants
 from jobs.render.planning.observing_sequence import sequence
 from jobs.render.planning.planned_exposures import (
     Exposure,
     bands_of,
     check_macc,
     check_ramp,
-    elapsed_time,
     exposure_time,
+    ramp_of,
     through_grism,
 )
 from jobs.render.sky.solar_aspect import check_aspect
@@ -38,7 +38,6 @@ from jobs.request.schema import Request
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 
-_RAMP = ("groups", "reads", "drops")
 _DEEP = ("edf_north", "edf_south", "edf_fornax")
 # Image types that are laid out as calibrations are.
 _CALIBRATION = tuple(code for code in pointing_tables.IMAGE_TYPES if code not in ("science", "deep"))
@@ -83,7 +82,7 @@ class _Settled:
 def _of_variant(request: Request, values: Mapping[str, Any], shared: _Settled) -> Iterator[tuple[Exposure, _Settled]]:
     """Exposures, each with what it is planned with: of NISP, with its block's own ramp.
 
-    Of NISP-S, too, which has another ramp: what it leaves is in the exposures of its own block.
+    Of both channels of NISP, of which one has this ramp.
     """
     for i, pointing in enumerate(request.pointings):
         one = _pointing(pointing, f"pointing[{i}]", request, shared.mission)
@@ -92,19 +91,19 @@ def _of_variant(request: Request, values: Mapping[str, Any], shared: _Settled) -
     free = shared.mission.value("svm.launch", "d")
     for i, block in enumerate(request.observations):
         where, found = f"observation[{i}]", 0
-        ramp = {f"nisp.macc.photometric.{part}": (n, "") for part, n in zip(_RAMP, block.macc, strict=False)}
-        own = _Settled.of({**values, **ramp}, request, shared.mission) if ramp else shared
+        ramp = ramp_of(block)
+        own = _Settled.of({**values, **variants.own(ramp)}, request, shared.mission) if ramp else shared
         kept: dict[tuple[bool, tuple[tuple[str, float, str], ...]], _Settled] = {(True, ()): own, (False, ()): shared}
         for exposure in _block(block, request, own.mission, where, free):
             found += 1
             if exposure.camera == "nisp" and (exposure.image_type in _CALIBRATION or _undated(block)):
-                free = max(free, _forgotten(exposure, own.mission))
+                free = max(free, after_bright.forgotten(exposure, own.mission))
             of_nisp = exposure.camera == "nisp"
             which = of_nisp, exposure.parameters
             if which not in kept:
                 changed = {key: (value, unit) for key, value, unit in exposure.parameters}
                 more = {**ramp, **changed} if of_nisp else changed
-                kept[which] = _Settled.of({**values, **more}, request, shared.mission)
+                kept[which] = _Settled.of({**values, **variants.own(more)}, request, shared.mission)
             yield from repeat((exposure, kept[which]), block.realisations)
         if not found:
             raise BadInput(f"{where} asks for no exposure")
@@ -147,11 +146,6 @@ def known_detectors(camera: str, names: tuple[str, ...], mission: MissionConfigu
     unknown = [name for name in names if name not in there]
     if unknown:
         raise BadInput(f"{where}: camera {camera} has no detector {unknown[0]!r}")
-
-
-def _forgotten(exposure: Exposure, mission: MissionConfiguration) -> float:
-    """MJD from which nothing is seen of what an exposure leaves in NISP's detectors."""
-    return exposure.mjd + elapsed_time(exposure, mission) / 86400.0 + mission.value("nisp.persistence.window", "d")
 
 
 def _undated(block: Observation) -> bool:

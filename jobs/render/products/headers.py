@@ -224,7 +224,7 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         *((("GRISM", exposure.grism, "grism"),) if exposure.grism else ()),
         *((("GRISMPA", exposure.grism_angle, "[deg] of the dispersion, x to y"),) if exposure.grism else ()),
         ("IMAGETYP", exposure.image_type, "image type"),
-        *((("LAMP", exposure.lamp, "LED of the calibration unit"),) if exposure.lamp else ()),
+        *(_lamp_cards(exposure.lamp, rendered) if exposure.lamp else ()),
         *((("TARGET", exposure.target, "calibration source"),) if exposure.target else ()),
         *calibration_cards.cards(exposure, scene),
         ("OBJECT", _object(exposure), "what is looked at"),
@@ -250,6 +250,14 @@ def _common(rendered: Rendered) -> tuple[Card, ...]:
         ("MISSION", rendered.scene.mission.fingerprint, ""),
         ("TRUESKY", __version__, "version of the simulator"),
         *_accuracy_cards(rendered),
+    )
+
+
+def _lamp_cards(lamp: int, rendered: Rendered) -> tuple[Card, ...]:
+    level = rendered.scene.value("flat.signal", "electron")
+    return (
+        ("LAMP", lamp, "LED of the calibration unit"),
+        ("LAMPSIG", level, "[electron] its light in the band that sees it best"),
     )
 
 

@@ -12,11 +12,12 @@ from jobs import shell
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.render import plan_exposures, render_exposures
-from jobs.render.effects.charge.persistence import Traps
+from jobs.render.effects.charge.persistence import Traps, pixels_of
 from jobs.render.exposure import persistence, scene_of
 from jobs.render.exposure.records import EarlierSky, Variant
 from jobs.render.planning.mission import mission_of
 from jobs.request.from_toml import parse
+from jobs.rng import stream
 from lake_schema.fits import images
 from lake_schema.store import layout, publish, read
 from lake_schema.tables.exposures import ExposureRow
@@ -219,12 +220,15 @@ def test_what_is_left_is_what_whole_images_leave(whole, folder):
     aim = replace(earlier[-1].aim, exposure=now)
     variant = Variant(mission, wanted(folder).accuracy, {})
     found = persistence.remembered(aim, earlier, variant, 5)
-    traps, expected = Traps.of(scene_of.of_aim(aim, variant)), np.zeros_like(found)
+    scene = scene_of.of_aim(aim, variant)
+    traps, expected = Traps.of(scene), np.zeros_like(found)
+    own = pixels_of(scene, stream(5, "nisp", aim.detector.name, "persistence_pixels"))
     for number in BEFORE[5]:
         row = exposures[number]
         maps = [files.get((number, content)) for content in ("noise_free", "sky", "ghosts")]
         light = sum(images.read_images(file)[0].data.astype(float) for file in maps if file is not None)
-        expected += traps.left(light, (now.mjd - row.mjd) / SECOND, now.exposure_time_s)
+        times = (now.mjd - row.mjd) / SECOND, now.exposure_time_s, row.exposure_time_s
+        expected += traps.left(light, *times, own)
     assert expected.max() > 100.0
     assert np.abs(found - expected).max() < 1.5
     # Its own share of each pixel is in the image.

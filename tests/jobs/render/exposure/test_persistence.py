@@ -18,10 +18,14 @@ from tests.jobs.render import fields, infrared, spectroscopic
 from tests.jobs.render.fields import MISSION, small
 
 DETECTOR = small("nisp", "DET22", 96)
-TRAPS = Traps(120.0, 150.0, 2e4, -0.9, 100.0, 87.24, 1.3e5)
+TRAPS = Traps(120.0, 150.0, 2e4, -0.9, 100.0, 87.24, 1.3e5, 0.2)
 SECOND = 1.0 / 86400.0
+EXPLORED = '{"nisp.gain": [1.0, "electron / adu"]}'
 # Without bodies that move.
-STRIP, QUIET = spectroscopic.strip(), spectroscopic.MISSION
+STRIP = spectroscopic.strip()
+# In which all pixels are alike, but for the number of their traps.
+ALIKE = dict.fromkeys((f"nisp.persistence.{name}_spread" for name in ("p2", "time_power")), (0.0, ""))
+EVEN, QUIET = MISSION.overridden_with(ALIKE), spectroscopic.MISSION.overridden_with(ALIKE)
 
 
 def earlier(before, mags, x, y, **columns):
@@ -30,12 +34,12 @@ def earlier(before, mags, x, y, **columns):
     return Earlier(Aim.of(fields.exposure(**row), DETECTOR), Rows(*infrared.tables(DETECTOR, row, mags, x, y)))
 
 
-def left(*before, **columns):
+def left(*before, mission=EVEN, **columns):
     """[ny, nx] e- in an exposure now."""
     aim = Aim.of(fields.exposure(**infrared.exposed(DETECTOR, **columns)), DETECTOR)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(euclid, "nisp_psf", lambda d, band, *_: infrared.psf_of(d, "euclid_h"))
-        return persistence.remembered(aim, before, Variant(MISSION, SURVEY, {}), infrared.SEED)
+        return persistence.remembered(aim, before, Variant(mission, SURVEY, {}), infrared.SEED)
 
 
 def test_the_formula():
@@ -44,7 +48,12 @@ def test_the_formula():
     np.testing.assert_allclose(found, [236, 95, 33, 9, 0, 0], atol=0.8)
     assert TRAPS.left(np.array([8e4]), 1000.0, 87.24) == pytest.approx(236 * 10**-0.9, rel=0.01)
     assert TRAPS.left(np.array([1e9]), 100.0, 87.24) == TRAPS.left(np.array([1.3e5]), 100.0, 87.24)
-    assert TRAPS.left(np.array([8e4]), 100.0, 2 * 87.24) == pytest.approx(2 * 235.6, rel=0.01)
+    # Twice as long: not twice as much, since it fades meanwhile.
+    longer = (274.48**0.1 - 100**0.1) / (187.24**0.1 - 100**0.1)
+    assert 1.6 < longer < 1.7
+    assert TRAPS.left(np.array([8e4]), 100.0, 2 * 87.24) == pytest.approx(longer * 235.6, rel=0.01)
+    # What is held for longer fills more traps.
+    assert TRAPS.left(np.array([8e4]), 100.0, 87.24, 10 * 87.24) == pytest.approx(10**0.2 * 235.6, rel=0.01)
     with pytest.raises(OutOfRange, match="delay"):
         TRAPS.left(np.array([1.0]), 0.0, 87.24)
 
@@ -117,9 +126,9 @@ def test_traces_leave_what_whole_spectra_leave(before):
     x, y, mags = rng.uniform(-1200.0, 1800.0, count), rng.uniform(0, 96, count), rng.uniform(12.0, 23.0, count)
     now, earlier, whole = spectrum_before(before, mags, x, y)
     light = whole.noise_free.astype(float) + whole.maps["sky"]
-    expected = TRAPS.left(light, before, infrared.TIME)
+    expected = TRAPS.left(light, before, infrared.TIME, spectroscopic.TIME)
     found = persistence.remembered(now, (earlier,), Variant(QUIET, SURVEY, {}), infrared.SEED)
-    even = TRAPS.left(np.array([1.09 * spectroscopic.TIME]), before, infrared.TIME)[0]
+    even = TRAPS.left(np.array([1.09 * spectroscopic.TIME]), before, infrared.TIME, spectroscopic.TIME)[0]
     print("left at most", expected.max() - even, "missed at most", np.abs(found - expected).max())
     assert expected.max() > even + 5.0
     assert np.abs(found - expected).max() < 1.5
@@ -137,13 +146,13 @@ def test_the_brightest_column_of_a_point():
 
 
 def test_the_sky_of_what_nothing_renders_leaves_something():
-    """1.1 e- of 600 e- 400 s before, all over; a dark's nothing."""
+    """1.6 e- of 600 e- in 550 s 400 s before, all over; a dark's nothing."""
     row = infrared.exposed(DETECTOR, mjd=infrared.MJD - 400 * SECOND, number=9, seconds=550.0, sky=1.09)
     spectrum = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red"})
     assert persistence.is_drawn(spectrum)
     assert persistence.is_drawn(fields.exposure(**row))
     found = left(EarlierSky(spectrum))
-    np.testing.assert_allclose(found, 1.1, atol=0.15)
+    np.testing.assert_allclose(found, 1.1 * (550.0 / 87.24) ** 0.2, atol=0.2)
     np.testing.assert_array_equal(found, found[0, 0])
     for kind, seen in (
         ("dark", False), ("flat", False), ("standard_star", True), ("planetary_nebula", True), ("deep", True)
@@ -199,7 +208,7 @@ def test_a_detector_has_one_exposure_at_a_time():
         with pytest.raises(BadInput, match=rf"exposures 1 and 2 of detector DET22: .* begins {seconds} s .* 110\.5 s"):
             asked(seconds)
     asked(30.0, detector="DET23")
-    asked(30.0, settings="{}")
+    asked(30.0, settings=EXPLORED)
 
 
 def test_which_exposures_count():
@@ -211,7 +220,7 @@ def test_which_exposures_count():
 
     rows = [
         row(1, -3.0), row(2, -1.0), row(3, -1.0, realisation=2), row(4, -0.5, channel="NISP-S", exposure_time_s=549.6),
-        row(5, -0.4, settings="{}"), row(6, 0.0), row(7, 0.0, realisation=2), row(8, 0.1), row(9, -0.3),
+        row(5, -0.4, settings=EXPLORED), row(6, 0.0), row(7, 0.0, realisation=2), row(8, 0.1), row(9, -0.3),
     ]  # fmt: skip
     tasks = [{"exposure_id": one.exposure_id, "detector": "DET22"} for one in rows[:8]]
     tasks.append({"exposure_id": 9, "detector": "DET23"})
@@ -225,3 +234,75 @@ def test_which_exposures_count():
     assert numbers[9, "DET23"] == []
     shuffled = persistence.earlier_of(tasks[::-1], {one.exposure_id: one for one in rows}, lambda settings: MISSION)
     assert shuffled == found
+
+
+def test_pixels_have_their_own():
+    """p2 and the power of time scatter about the usual pixel's as the mission says; the same in every exposure."""
+    flat = {"kind": "flat", "lamp": 5}
+    usual, own = (
+        [left(earlier(before, [], [], [], **flat), mission=mission) for before in (134.0, 6700.0)]
+        for mission in (EVEN, MISSION)
+    )
+    ratio = [mine / all_alike for mine, all_alike in zip(own, usual, strict=True)]
+    assert np.median(ratio[0]) == pytest.approx(1.0, abs=0.01)
+    # What is left after fifty times the time: 50^(0.05 z).
+    fell = np.log(ratio[1] / ratio[0]) / np.log(50.0)
+    assert np.std(fell) == pytest.approx(0.05, rel=0.05)
+    # At the reference time, about, p2 alone: 20 % more of it bring 1 - exp(-I / p2) down by less.
+    spread = np.std(ratio[0] / (134.0 / 100.0) ** fell)
+    held = 3e4 * np.exp(-3e4 / 2e4) / 2e4 / -np.expm1(-3e4 / 2e4)
+    assert spread == pytest.approx(0.1 * held, rel=0.3)
+    np.testing.assert_array_equal(own[1], left(earlier(6700.0, [], [], [], **flat), mission=MISSION))
+
+
+def test_exposures_of_a_sequence_with_ramps_of_their_own_remember_one_another():
+    """What is explored tells variants of a sequence apart; what an exposure is taken with does not."""
+    nominal = fields.exposure(**infrared.exposed(DETECTOR))
+    flat, ramp = '{"own:nisp.flat.signal": [6e4, "electron"]}', '{"own:nisp.macc.photometric.groups": [8, ""]}'
+    explored = '{"nisp.flat.signal": [6e4, "electron"]}'
+    rows = [
+        replace(nominal, exposure_id=n, mjd=infrared.MJD + 300 * n * SECOND, settings=settings)
+        for n, settings in enumerate((flat, explored, ramp, None))
+    ]
+    tasks = [{"exposure_id": one.exposure_id, "detector": "DET22"} for one in rows]
+    found = persistence.earlier_of(tasks, {one.exposure_id: one for one in rows}, lambda settings: MISSION)
+    assert [[one["exposure_id"] for one in found[n, "DET22"]] for n in range(4)] == [[], [], [0], [0, 2]]
+
+
+def test_an_earlier_flat_had_its_own_lamp():
+    """Twice as bright: of the frame before its own settings hold, not those of the frame that it is seen in."""
+    flat = earlier(134.0, [], [], [], kind="flat", lamp=5)
+    bright = EVEN.overridden_with({"nisp.flat.signal": (6e4, "electron")})
+    found = [np.median(left(replace(flat, mission=mission))) for mission in (EVEN, bright)]
+    usual = np.median(TRAPS.left(np.array([2.5e4, 5e4]), 134.0, 87.24).reshape(2, 1), axis=1)
+    assert found[1] / found[0] == pytest.approx(usual[1] / usual[0], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("channel", "kind", "target"),
+    [
+        ("NISP-P", "standard_star", "Vega"), ("NISP-P", "standard_star", "white dwarf DA"),
+        ("NISP-S", "standard_star", "Vega"), ("NISP-S", "planetary_nebula", "planetary nebula"),
+    ],
+)  # fmt: skip
+def test_calibration_sources_leave_their_light(channel, kind, target):
+    """Before an image: at the five places of a star, or along its spectra, though no catalogue has them."""
+    strip = spectroscopic.strip(nx=900)
+    of_channel = spectroscopic if channel == "NISP-S" else infrared
+    row = of_channel.exposed(strip, kind=kind, target=target, mjd=infrared.MJD - 700 * SECOND, number=9)
+    aim = Aim.of(fields.exposure(**row), strip)
+    now = Aim.of(fields.exposure(**infrared.exposed(strip)), strip)
+    stars = fields.stars([], [])
+    for name in ("sed", "mag_h", "a_v"):
+        stars = stars.append_column(name, pa.array([], pa.int64() if name == "sed" else pa.float64()))
+    bodies = fields.galaxies([], [])
+    nothing = Rows(bodies, fields.fluxes(bodies, row["band"], 0.0), stars, fields.fluxes(stars, row["band"], 0.0))
+    with pytest.MonkeyPatch.context() as patch:
+        if channel == "NISP-P":
+            patch.setattr(euclid, "nisp_psf", lambda d, band, *_: infrared.psf_of(d, row["band"]))
+        found = persistence.remembered(now, (Earlier(aim, nothing),), Variant(QUIET, SURVEY, {}), infrared.SEED)
+    sky = np.median(found)
+    assert (found > sky + 1.0).sum() >= 5
+    if channel == "NISP-P":
+        middle = found[40:56, 440:460]
+        assert middle.max() > sky + 5.0

@@ -9,9 +9,11 @@ import pytest
 
 from jobs.fluxes import passbands
 from jobs.render.camera.lamps import LAMPS
+from jobs.render.channels import image_types
 from jobs.render.effects.light import calibration_lamp
 from jobs.render.plan_exposures import plan
 from jobs.render.planning import survey, variants
+from jobs.render.planning.planned_exposures import elapsed_time
 from jobs.request import observations
 from jobs.request.from_toml import from_table
 from lake_schema.errors import BadInput
@@ -197,9 +199,97 @@ def test_ramps_that_cannot_be_asked_for(macc, message):
         exposures({**FLAT, "exposures": 1, "macc": macc})
 
 
-def test_only_nisp_p_has_a_ramp_of_a_request():
-    with pytest.raises(BadInput, match="macc is not for VIS: used by NISP-P"):
+def test_only_nisp_has_a_ramp_of_a_request():
+    with pytest.raises(BadInput, match="macc is not for VIS: used by NISP-P, NISP-S"):
         exposures({"channels": ["VIS"], "image_type": "dark", "exposures": 1, "macc": [4, 16, 4]})
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        {"image_type": "dark", "exposures": 1}, {"image_type": "flat", "exposures": 1},
+        {"image_type": "standard_star", "exposures": 1}, {"image_type": "persistence"},
+        {"ra": 53.117, "dec": -27.808, "dither": "none"},
+    ],
+)  # fmt: skip
+def test_a_block_of_spectra_has_its_own_ramp(block):
+    """Of spectra alone: so long are they; NISP-P's ramp is the mission's."""
+    found = exposures({"channels": ["NISP-S"], "macc": [8, 16, 11], **block})
+    seconds = 7 * 27 * MISSION.value("nisp.frame_time", "s")
+    for exposure, mission in found:
+        assert exposure.exposure_time_s == pytest.approx(seconds)
+        assert mission.value("nisp.macc.spectroscopic.groups") == 8.0
+        assert mission.value("nisp.macc.photometric.groups") == 4.0
+        assert image_types.family(exposure.settings) is None
+
+
+def test_flats_at_intensities():
+    """As many frames of each; the lamp's level is the exposure's own."""
+    found = exposures({**FLAT, "exposures": 2, "lamps": [3, 5], "intensities": [0.1, 1.0, 2.5]})
+    level = MISSION.value("nisp.flat.signal")
+    assert [(e.lamp, mission.value("nisp.flat.signal") / level) for e, mission in found] == [
+        (lamp, pytest.approx(share)) for lamp in (3, 5) for share in (0.1, 1.0, 2.5)
+    ]
+    assert [e.settings is None for e, _ in found] == [False, True, False] * 2
+    of_vis = exposures({"channels": ["VIS"], "image_type": "flat", "exposures": 1, "intensities": [0.5]})
+    assert of_vis[0][1].value("vis.flat.signal") == 0.5 * MISSION.value("vis.flat.signal")
+    # What is explored is each variant's; a lamp's intensity is over that.
+    explored = {"nisp.flat.signal": {"values": [1e4, 2e4], "unit": "electron"}}
+    two = exposures({**FLAT, "exposures": 1, "lamps": [3], "intensities": [3.0]}, explore=explored)
+    assert [mission.value("nisp.flat.signal") for _, mission in two] == [3e4, 6e4]
+    assert len({image_types.family(e.settings) for e, _ in two}) == 2
+    for values, message in (([], "not a list"), ([0.0], r"intensities\[0\]"), ([1.0, 1.0], "twice")):
+        with pytest.raises(BadInput, match=rf"observation\[0\]\.intensities.*{message}|{message}"):
+            exposures({**FLAT, "exposures": 1, "intensities": values})
+    with pytest.raises(BadInput, match="intensities is not for dark: used by flat, persistence"):
+        exposures({"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "intensities": [1.0]})
+
+
+REMEMBERED = {"channels": ["NISP-P"], "image_type": "persistence"}
+
+
+def test_darks_after_a_bright_exposure():
+    """From 100 s to two hours after its end; the next bright one when it is forgotten, and so the next channel."""
+    found = [e for e, _ in exposures({**REMEMBERED, "channels": ["NISP-P", "NISP-S"], "exposures": 2, "lamps": [3]})]
+    window, at = MISSION.value("nisp.persistence.window", "d"), 0
+    for size in (8, 8, 5, 5):
+        bright, *darks = found[at : at + size]
+        at += size
+        ends = bright.mjd + elapsed_time(bright, MISSION) / 86400.0
+        after = [round((dark.mjd - ends) * 86400.0) for dark in darks]
+        listed = [100, 300, 600, 1200, 2400, 4800, 7000]
+        # Ramps of spectra take 573 s.
+        assert after == (listed if bright.channel == "NISP-P" else [100, 1200, 2400, 4800])
+        assert (bright.image_type, bright.lamp) == ("flat", 3)
+        assert {(dark.image_type, dark.lamp, dark.channel) for dark in darks} == {("persistence", None, bright.channel)}
+        if at < len(found):
+            assert found[at].mjd >= darks[-1].mjd + elapsed_time(darks[-1], MISSION) / 86400.0 + window - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"delays_s": [100.0, 150.0]}, r"delays_s: a dark at 150 s begins before that at 100 s, of 110\.5 s, ends"),
+        ({"delays_s": [7200.0]}, "delays_s: 7200 s is more than nisp.persistence.window looks back"),
+        ({"bright": "sky", "lamps": [3]}, "lamps: bright = 'sky' has no lamp"),
+        ({"bright": "moon"}, "bright"),
+        ({"image_type": "dark", "exposures": 1, "delays_s": [100.0]}, "delays_s is not for dark: used by persistence"),
+        ({"channels": ["VIS"]}, "image_type = 'persistence' is none of VIS's"),
+    ],
+)
+def test_darks_that_cannot_be_asked_for(more, message):
+    with pytest.raises(BadInput, match=message):
+        exposures({**REMEMBERED, **more})
+
+
+def test_a_field_of_stars_may_be_what_is_bright():
+    """In its image, or through the grism."""
+    sky = {**REMEMBERED, "bright": "sky", "delays_s": [300.0]}
+    photometry = [e for e, _ in exposures({**sky, "exposures": 2, "bands": ["euclid_h"]})]
+    assert [e.image_type for e in photometry] == ["self_calibration", "persistence"] * 2
+    assert {e.band for e in photometry[::2]} == {"euclid_h"}
+    spectra = [e for e, _ in exposures({**sky, "channels": ["NISP-S"]})]
+    assert [(e.image_type, e.grism) for e in spectra] == [("science", "RGS000"), ("persistence", None)]
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -4.0, 3.5])
