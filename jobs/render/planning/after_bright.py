@@ -37,7 +37,7 @@ def exposures(first: Exposure, block: Observation, mission: MissionConfiguration
         longest = mission.value(f"{first.camera}.persistence.window", "s") - (ends - now) * _DAY_S
         delays = _checked(block.delays_s, busy, longest) if block.delays_s else _listed(busy, longest, mission)
         yield replace(bright, mjd=now)
-        darks = [replace(dark, mjd=ends + seconds / _DAY_S) for seconds in delays]
+        darks = [replace(dark, band=bright.band, mjd=ends + seconds / _DAY_S) for seconds in delays]
         yield from darks
         now = forgotten(darks[-1], mission)
 

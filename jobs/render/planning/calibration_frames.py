@@ -80,7 +80,7 @@ def exposures(
 def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, seed: int) -> Iterator[Exposure]:
     in_bands = [
         replace(first, band=band, exposure_time_s=_seconds(first, band, block, mission))
-        for band in lit_flats.chosen(block.bands, _bands(first, mission))
+        for band in lit_flats.chosen(block.bands, _bands(first, block, mission))
     ]
     if first.image_type == "self_calibration":
         dithers = block.exposures or int(mission.value("survey.self_calibration.dithers"))
@@ -146,10 +146,10 @@ def _seconds(first: Exposure, band: str, block: Observation, mission: MissionCon
     return exposure_time(first.channel, first.camera, band, mission)
 
 
-def _bands(first: Exposure, mission: MissionConfiguration) -> tuple[str, ...]:
+def _bands(first: Exposure, block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:
     if first.channel == "NISP-P":
-        # A dark needs no filter; the closing position is that of the last.
-        return FILTERS[-1:] if first.image_type == "dark" else FILTERS
+        # A dark needs no filter; the closing position is that of the last, or of those that are named.
+        return FILTERS[-1:] if first.image_type == "dark" and not block.bands else FILTERS
     if first.channel == "NISP-S":
         return (RED,)
     return bands_of(first.channel, first.camera, mission)[

@@ -257,7 +257,7 @@ def _lamp_cards(lamp: int, rendered: Rendered) -> tuple[Card, ...]:
     level = rendered.scene.value("flat.signal", "electron")
     return (
         ("LAMP", lamp, "LED of the calibration unit"),
-        ("LAMPSIG", level, "[electron] its light in the band that sees it best"),
+        ("LAMPSIG", level, "[electron] of it where it is seen best"),
     )
 
 

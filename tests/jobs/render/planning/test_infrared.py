@@ -317,3 +317,11 @@ def test_an_exposure_time_that_no_ramp_has_is_refused_by_name(tmp_path, seconds,
         plan(tmp_path, one)
     with pytest.raises(BadInput, match=rf"observation\[0\]: exposure time .*{message}"):
         exposures({**FLAT, "exposures": 1, "exposure_time_s": seconds})
+
+
+def test_darks_are_in_bands_that_the_block_names():
+    """Fluxes are computed in no others."""
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2}
+    assert [e.band for e, _ in exposures(dark)] == ["euclid_y", "euclid_y"]
+    assert [e.band for e, _ in exposures({**dark, "bands": ["euclid_h"]})] == ["euclid_h", "euclid_h"]
+    assert {e.band for e, _ in exposures({**REMEMBERED, "bands": ["euclid_j"], "delays_s": [100.0]})} == {"euclid_j"}
