@@ -4,6 +4,8 @@
 
 FOLDER/VIS_3-4_bias.fits (e-), .._dark.fits (e-/s) and .._flat.fits (response; 1 = all light is counted), each with its
 uncertainty and the number of frames that a pixel is of. A flat is over its lamp's light as the mission declares it.
+Of NISP NISP-P_4-16-4_DET22_dark.fits (of each ramp), NISP_DET22_linearity.fits (b of N (1 - b N), 1/e-, of flats at
+three intensities and more) and NISP-P_euclid_y_DET22_flat.fits (of the lamps' mix that is like the sky).
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from jobs.render.effects.light import calibration_lamp, illumination
-from jobs.render.reduction import amplifiers, calibration, files
+from jobs.render.reduction import amplifiers, calibration, files, infrared
 from jobs.render.reduction import frames as frames_of
 from jobs.render.reduction.combining import Combined, clipped_mean
 from jobs.render.reduction.frames import Frame
@@ -90,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--lake", required=True, help="folder of the lake, with rendered calibration frames")
     parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
     parser.add_argument("--out", type=Path, required=True, help="folder of the masters")
-    parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all that have bias frames")
+    parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all that have any")
     options = parser.parse_args(argv)
     return command.status("masters", lambda: _written(options))
 
@@ -98,21 +100,32 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _written(options: argparse.Namespace) -> int:
     out = user_files.folder(options.out)
     found = frames_of.of_lake(layout.lake(options.lake), options.detectors, request=options.name)
-    some = {key: own for key, own in found.items() if options.detectors or frames_of.of_types(own, ("bias",))}
+    some = {key: own for key, own in found.items() if options.detectors or frames_of.of_types(own, _needed(own[0]))}
     if not some:
-        raise BadInput(f"lake {options.lake} has no frames of the image type bias")
+        raise BadInput(f"lake {options.lake} has no frames of the image type bias, and none of NISP's darks and flats")
     out.mkdir(parents=True, exist_ok=True)
     for own in some.values():
         with tempfile.TemporaryDirectory(dir=out, prefix=".frames-") as scratch:
-            for kind, master, frames in made(own, Path(scratch)):
-                path = files.master_name(out, frames[0], kind)
-                files.write_master(path, master, kind, frames)
-                noise = float(np.median(master.uncertainty))
+            for one in _of_detector(own, Path(scratch)):
+                path = files.master_name(out, one.frames[0], one.kind)
+                files.write_master(path, one.combined, one.kind, one.frames, one.cards)
+                noise = float(np.median(one.combined.uncertainty))
                 print(
-                    f"{path}: {len(frames)} frames, median {np.median(master.mean):.5g}, "
+                    f"{path}: {len(one.frames)} frames, median {np.median(one.combined.mean):.5g}, "
                     f"uncertainty of a pixel {noise:.3g}"
                 )
     return 0
+
+
+def _needed(frame: Frame) -> tuple[str, ...]:
+    """Image types of which a detector has one at least that masters are made of."""
+    return ("dark", "flat") if frame.scene.ramp else ("bias",)
+
+
+def _of_detector(frames: Sequence[Frame], scratch: Path) -> Iterator[infrared.Made]:
+    if frames[0].scene.ramp:
+        return infrared.masters(frames, scratch)
+    return (infrared.Made(*one) for one in made(frames, scratch))
 
 
 if __name__ == "__main__":

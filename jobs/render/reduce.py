@@ -18,11 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
+from jobs.render.channels import registry
 from jobs.render.channels.image_types import SKY_TYPES
-from jobs.render.reduction import calibration, cosmic_rays, files, level2
+from jobs.render.reduction import calibration, cosmic_rays, files, infrared, level2
 from jobs.render.reduction import frames as frames_of
 from jobs.render.reduction.calibration import Masters, Reduced
 from jobs.render.reduction.catalogue import Limits
+from jobs.render.reduction.foreseen import Foreseen
 from jobs.render.reduction.frames import Frame
 from lake_schema import command, user_files
 from lake_schema.errors import BadInput
@@ -47,12 +49,22 @@ class Wish:
     cosmic_rays: float = 0.0
 
 
-def reduced(frame: Frame, masters: Masters, wish: Wish) -> tuple[Reduced, tuple[Card, ...]]:
-    """A frame with the masters of its detector: the image and its header."""
+def reduced(
+    frame: Frame, masters: Masters, wish: Wish, foreseen: Foreseen | None = None
+) -> tuple[Reduced, tuple[Card, ...]]:
+    """A frame with the masters of its detector: the image and its header.
+
+    frame, masters, wish : what is made of it with what
+    foreseen : what earlier exposures leave in a detector of NISP; None: that is left as it is
+    """
     electrons = {"electron": 1.0, "electron/s": frame.scene.exposure_time_s}.get(wish.unit) or frame.mean_gain
     undone = frame.applied - set(wish.without)
-    fringes = frame.fringes() if "fringes" in undone else None
-    found = calibration.reduced(frame.electrons(), frame.full(), masters, frame.scene, undone, electrons, fringes)
+    if frame.scene.ramp:
+        bent = () if "nonlinearity" in wish.without else tuple(undone)
+        found = infrared.reduced(frame, masters, foreseen, bent, electrons)
+    else:
+        fringes = frame.fringes() if "fringes" in undone else None
+        found = calibration.reduced(frame.electrons(), frame.full(), masters, frame.scene, undone, electrons, fringes)
     if wish.cosmic_rays:
         found = cosmic_rays.flagged(found, cosmic_rays.found(found, wish.cosmic_rays))
     return found, files.reduced_cards(frame, wish.unit, electrons, wish.without)
@@ -83,16 +95,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _written(options: argparse.Namespace) -> int:
     out = user_files.folder(options.out)
     wish, settings = _wish(options), _settings(options)
-    found = frames_of.of_lake(layout.lake(options.lake), options.detectors, options.exposures, options.name)
-    science = [own for frames in found.values() if (own := frames_of.of_types(frames, SKY_TYPES))]
+    root = layout.lake(options.lake)
+    found = frames_of.of_lake(root, options.detectors, options.exposures, options.name)
+    science = [own for frames in found.values() if (own := [frame for frame in frames if _sees_sky(frame)])]
     if not science:
         raise BadInput(f"lake {options.lake} has no such frame that sees the sky")
     if settings is not None:
         level2.refuse([frame for frames in science for frame in frames])
     out.mkdir(parents=True, exist_ok=True)
+    every = frames_of.of_lake(root, options.detectors, (), options.name) if options.exposures else found
     for frames in science:
-        for frame, masters in _with_masters(frames, options.masters or out, wish.without):
-            made, cards = reduced(frame, masters, wish)
+        exposed, foreseen = frames[0].exposure, None
+        if frames[0].scene.ramp and "persistence" not in wish.without:
+            foreseen = Foreseen(every[exposed.camera, frames[0].detector])
+        for frame, masters in _with_masters(frames, options.masters, wish.without):
+            made, cards = reduced(frame, masters, wish, foreseen)
             path = out / f"{frame.stem}.fits"
             more = ""
             if settings is None:
@@ -105,17 +122,27 @@ def _written(options: argparse.Namespace) -> int:
     return 0
 
 
-def _with_masters(frames: Sequence[Frame], folder: Path, without: Sequence[str]) -> Iterator[tuple[Frame, Masters]]:
-    """Frames of a detector with its masters, which are read once a band."""
-    for band in dict.fromkeys(frame.exposure.band for frame in frames):
-        own = [frame for frame in frames if frame.exposure.band == band]
-        masters = files.masters(folder, own[0], without)
+def _with_masters(
+    frames: Sequence[Frame], folder: Path | None, without: Sequence[str]
+) -> Iterator[tuple[Frame, Masters]]:
+    """Frames of a detector with its masters, which are read once a band, and a ramp."""
+    alike = [(frame.exposure.band, frame.ramp if frame.scene.ramp else ()) for frame in frames]
+    for kind in dict.fromkeys(alike):
+        own = [frame for frame, its in zip(frames, alike, strict=True) if its == kind]
+        needed = files.kinds(own[0])
+        if folder is None and not {*without} >= {*needed}:
+            raise BadInput(f"--masters: which folder? Or --without {' '.join(needed)}")
+        masters = (infrared.of_frame if own[0].scene.ramp else files.masters)(folder or Path(), own[0], without)
         yield from ((frame, masters) for frame in own)
 
 
+def _sees_sky(frame: Frame) -> bool:
+    """Of NISP standard stars and nebulae, too."""
+    kind = frame.exposure.image_type
+    return kind in SKY_TYPES or (bool(frame.scene.ramp) and registry.CHANNELS[frame.exposure.channel].sees_sky(kind))
+
+
 def _wish(options: argparse.Namespace) -> Wish:
-    if options.masters is None and not set(options.without) >= set(files.KINDS):
-        raise BadInput(f"--masters: which folder? Or --without {' '.join(files.KINDS)}")
     if options.level2 and options.rate:
         raise BadInput("--rate: images of level 2 are in counts")
     limit = options.cosmic_rays

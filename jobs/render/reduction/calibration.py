@@ -29,7 +29,7 @@ from jobs.render.reduction.combining import Combined
 from lake_schema.arrays import Array, Bool, Float, Float32
 
 # Bits of the flags, and their meaning.
-NO_DATA, RESPONSE, HOT, SATURATED, UNSURE, COSMIC_RAY, EDGE = 1, 2, 4, 8, 16, 32, 64
+NO_DATA, RESPONSE, HOT, SATURATED, UNSURE, COSMIC_RAY, EDGE, PERSISTENCE = 1, 2, 4, 8, 16, 32, 64, 128
 FLAGS = (
     (NO_DATA, "no data"),
     (RESPONSE, "response far from 1"),
@@ -38,9 +38,10 @@ FLAGS = (
     (UNSURE, "too few frames, or a star in the flat"),
     (COSMIC_RAY, "cosmic ray"),
     (EDGE, "beside the edge of the detector, good"),
+    (PERSISTENCE, "earlier exposures left more than noise; off, good"),
 )
 # What a pixel may have that is used all the same.
-_GOOD = EDGE
+GOOD = EDGE | PERSISTENCE
 # Response of a pixel that is used, and its largest difference from its neighbours', in units of their rms.
 _LEAST, _MOST, _SPREAD = 0.7, 1.3, 8.0
 # Standard deviations of a dark's pixel above the others.
@@ -168,7 +169,7 @@ def reduced(
     flags = masters.flags | _edges(scene, applied)
     np.bitwise_or(flags, np.uint8(SATURATED), out=flags, where=full)
     flags[amplifiers.unread(scene)] = NO_DATA
-    used = flags & ~np.uint8(_GOOD) == 0
+    used = flags & ~np.uint8(GOOD) == 0
     for rows in _strips(scene.ny):
         response = _response(masters, scene, applied, rows)
         known = (flags[rows] & NO_DATA == 0) & (response > 0.0) & np.isfinite(image[rows])

@@ -33,9 +33,11 @@ from lake_schema.fits.images import Card, Image, read_images, write_images
 from lake_schema.mission.parameter import CAMERAS
 
 KINDS = ("bias", "dark", "flat")
+# Of an infrared detector, whose ramps have no bias.
+INFRARED = ("dark", "linearity", "flat")
 # What can be left as it is.
-UNDONE = (*KINDS, "crosstalk", "nonlinearity", "fringes")
-_UNITS = {"bias": "electron", "dark": "electron/s", "flat": ""}
+UNDONE = (*KINDS, "linearity", "crosstalk", "nonlinearity", "fringes", "persistence")
+_UNITS = {"bias": "electron", "dark": "electron/s", "flat": "", "linearity": "electron-1"}
 # What a master must share with the frame that it is applied to: the detector's patterns are keyed by these.
 SAME = ("INSTRUME", "DETECTOR", "SEED")
 # Of a raw file's header what is not so any more; of amplifiers, with their number or letter at the end.
@@ -44,6 +46,7 @@ _RAW += ("DATASEC", "TRIMSEC", "BIASSEC", "CCDSEC")
 _OF_AMPLIFIER = re.compile(r"(AMP|DSEC|CSEC|BSEC|GAIN|RDN)[0-9]+|(DATASEC|BIASSEC|CCDSEC|GAIN|RDNOISE|SATURAT)[A-Z]")
 # Pixels of a master of the user's.
 _MOST_PIXELS = 1 << 28
+_BENT = {"nonlinearity", "ramp_nonlinearity", "signal_nonlinearity"}
 _STRUCTURE: tuple[str, ...] = (
     "SIMPLE",
     "BITPIX",
@@ -71,20 +74,33 @@ class ImageFile:
         return next((value for key, value, _ in self.cards if key == keyword), None)
 
 
+def kinds(frame: Frame) -> tuple[str, ...]:
+    """Kinds of master that a frame is calibrated with."""
+    return INFRARED if frame.scene.ramp else KINDS
+
+
 def master_name(folder: Path, frame: Frame, kind: str) -> Path:
     """The file in a folder of the master for a frame; kind : of KINDS.
 
-    Of ground cameras, whose channel is one, it has the camera's name; and, a flat, that of the band.
+    Of ground cameras, whose channel is one, it has the camera's name; and, a flat, that of the band. Of NISP a dark has
+    its ramp's numbers, and both channels have one linearity.
     """
     exposure = frame.exposure
+    if frame.scene.ramp:
+        more = {"dark": "-".join(map(str, frame.ramp)) if kind == "dark" else "", "flat": exposure.band}.get(kind)
+        channel = "NISP" if kind == "linearity" else exposure.channel
+        return folder / "_".join(filter(None, (channel, more, frame.detector, f"{kind}.fits")))
     if exposure.camera not in CAMERAS:
         return folder / f"{exposure.channel}_{frame.detector}_{kind}.fits"
     band = f"_{exposure.band}" if kind == "flat" else ""
     return folder / f"{exposure.camera}{band}_{frame.detector}_{kind}.fits"
 
 
-def write_master(path: Path, combined: Combined, kind: str, frames: Sequence[Frame]) -> None:
-    """One master of these frames, in one rename; path : of its file, combined : what it holds, kind : of KINDS."""
+def write_master(path: Path, combined: Combined, kind: str, frames: Sequence[Frame], more: Sequence[Card] = ()) -> None:
+    """One master of these frames, in one rename.
+
+    path : of its file;  combined : what it holds;  kind : of `kinds`;  more : cards of its header
+    """
     first = frames[0]
     cards: tuple[Card, ...] = (
         *(card for card in first.cards if card[0] in (*SAME, "CHANNEL", "MISSION", "TRUESKY")),
@@ -93,6 +109,7 @@ def write_master(path: Path, combined: Combined, kind: str, frames: Sequence[Fra
         *((("VIGNETTE", _through_optics(first), "vignetting is in it"),) if kind == "flat" else ()),
         ("NCOMBINE", len(frames), "frames"),
         ("EXPTIME", float(np.mean([frame.exposure.exposure_time_s for frame in frames])), "[s] mean of the frames"),
+        *more,
         *((f"FRAME{i}", frame.exposure.exposure_id, "exposure") for i, frame in enumerate(frames, start=1)),
     )
     units = [Image(None, cards), Image(combined.mean, (), "VALUE"), Image(combined.uncertainty, (), "UNCERTAINTY")]
@@ -172,15 +189,16 @@ def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[s
         card for card in frame.cards if card[0] not in (*_RAW, *_STRUCTURE) and not _OF_AMPLIFIER.fullmatch(card[0])
     )
     time = frame.scene.exposure_time_s
-    done = frame.applied - set(without)
+    done = frame.applied - (set(without) | (_BENT if "nonlinearity" in without else set()))
     return (
         *kept,
         ("BUNIT", unit, "unit of SCI; of WHT its inverse square"),
         ("GAIN", electrons, "[electron/BUNIT] of the pixels"),
         ("MAGZERO", float(frame.card("ZEROPNT")) + 2.5 * math.log10(time / electrons), "[mag] AB magnitude of 1 BUNIT"),
-        *((f"CAL{kind.upper()}", kind not in without, f"master {kind} applied?") for kind in KINDS),
+        *((f"CAL{kind.upper()[:5]}", kind not in without, f"master {kind} applied?") for kind in kinds(frame)),
+        *((("CALPERS", "persistence" not in without, "foreseen persistence taken off?"),) if frame.scene.ramp else ()),
         ("CALXTALK", "crosstalk" in done, "crosstalk undone?"),
-        ("CALLIN", "nonlinearity" in done, "response of the amplifiers undone?"),
+        ("CALLIN", bool(_BENT & done), "response undone?"),
         ("CALFRING", "fringes" in done, "fringes of the sky taken off?"),
         ("CALILLUM", bool({"illumination", "shutter"} & frame.applied), "vignetting and shutter undone?"),
         *flag_cards(),

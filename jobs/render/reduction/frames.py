@@ -93,6 +93,23 @@ class Frame:
             found /= pixel_area.apply(np.ones_like(found), 1.0, *pixel_area.parameters(self.scene)[1:])
         return np.asarray(found, np.float32)
 
+    @property
+    def ramp(self) -> tuple[int, int, int]:
+        """Groups, reads and drops of its ramp."""
+        groups, reads, drops = (int(self.card(key)) for key in ("NG", "NR", "ND"))
+        return groups, reads, drops
+
+    def misfit(self) -> Bool:
+        """Pixels [ny, nx] whose ramp does not fit; of two groups nothing is known."""
+        units = images.read_images(self.path)
+        if len(units) < 3:
+            return np.zeros((self.scene.ny, self.scene.nx), bool)
+        border, quality = int(self.card("REFPIX")), np.asarray(units[2].data)
+        quality = quality[border : len(quality) - border, border : quality.shape[1] - border]
+        # One bit, or chi^2 itself.
+        flagged = any(key == "QUALFLAG" for key, _, _ in units[2].cards)
+        return np.asarray(quality > (0 if flagged else float(self.card("QUALLIM"))))
+
     def _of_amplifiers(self, keyword: str) -> float | Float:
         """A card of the common header, else of the arrays' own, [q]."""
         if (value := self.card(keyword)) is not None:
