@@ -44,21 +44,13 @@ GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes", "whigs")
 # (test_checks.py: all that is rendered is in it).
 _CALIBRATIONS = {
     "VIS": (
-        "bias",
-        "dark",
-        "flat",
-        "charge_injection",
-        "trap_pumping",
-        "self_calibration",
-        "defocus",
-        "bleeding",
-        "stray_light",
-        "white_dwarf",
+        "bias", "dark", "flat", "charge_injection", "trap_pumping", "self_calibration", "defocus", "bleeding",
+        "stray_light", "white_dwarf",
     ),
     "NISP-P": ("dark", "flat", "persistence", "self_calibration", "standard_star"),
     "NISP-S": ("dark", "flat", "persistence", "standard_star", "planetary_nebula"),
     "EXT": ("bias", "dark", "flat"),
-}
+}  # fmt: skip
 _SKY_TYPES = ("science", "deep")
 # Kinds of block, as messages call them.
 _SURVEY, _OWN = "fields of a Euclid survey", "a Euclid field at ra, dec"
