@@ -37,7 +37,7 @@ bands = ["euclid_j"]
 {OBSERVATION}
 image_type = "dark"
 bands = ["euclid_j"]
-exposures = 8
+exposures = 12
 {OBSERVATION}
 image_type = "flat"
 bands = ["euclid_j"]
@@ -72,7 +72,7 @@ def build(folder, side, flats, sources=STARS):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("infrared"), 192, 4)
+    return build(tmp_path_factory.mktemp("infrared"), 192, 6)
 
 
 def master(made, name):
@@ -130,7 +130,7 @@ def test_masters_are_what_the_detector_has(made):
     dark, error = master(made, "NISP-P_4-16-4_DET22_dark.fits")
     assert np.median(dark) == pytest.approx(0.02, abs=2e-3)
     # Single frames have 7 e- less the drift, in 87 s.
-    assert np.median(error) == pytest.approx(4.9 / np.sqrt(8) / 87.24, rel=0.1)
+    assert np.median(error) == pytest.approx(4.9 / np.sqrt(12) / 87.24, rel=0.1)
     flags = calibration.dark_flags(frames_of_master(dark, error))
     assert 0 < (flags == calibration.HOT).sum() < 0.01 * dark.size
     flat, _ = master(made, "NISP-P_euclid_j_DET22_flat.fits")
