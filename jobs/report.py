@@ -11,13 +11,13 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from jobs.render.forecasting import catalogue_forecast, speed
 from jobs.render.products import run_log
 from lake_schema import __version__, command
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.s3 import Folder
 from lake_schema.store import layout, names, read
 from lake_schema.store.provenance import canonical
 
@@ -54,7 +54,7 @@ class Line:
     peak_gb: float = 0.0
 
 
-def rows(root: Path) -> list[Line]:
+def rows(root: Folder) -> list[Line]:
     """By job, in the order of their first runs; the last line is of all.
 
     Errors : BadInput where nothing has run;  Damaged names a log's line that no run writes
@@ -81,7 +81,7 @@ def rows(root: Path) -> list[Line]:
     return [*made, _all(made)]
 
 
-def _forecast(root: Path, factor: float) -> dict[str, tuple[float, float]]:
+def _forecast(root: Folder, factor: float) -> dict[str, tuple[float, float]]:
     """CPU seconds and GB of what the lake holds, made once, by the job that makes it."""
     jobs = {line.job: (line.seconds, line.gb) for line in catalogue_forecast.of_lake(root, factor)}
     # By what shapes their bytes: what two requests share is rendered once.

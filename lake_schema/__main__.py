@@ -12,6 +12,7 @@ from pathlib import Path
 
 from lake_schema import __version__, command, listing, tables
 from lake_schema.errors import BadInput
+from lake_schema.s3 import Folder
 from lake_schema.store import garbage, layout, names, read
 
 
@@ -26,7 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True, metavar="list|verify|gc|describe|tables")
     one = {name: commands.add_parser(name) for name in ("list", "verify", "gc", "describe")}
     for name, its in one.items():
-        its.add_argument("lake", help="folder of the lake")
+        its.add_argument("lake", help="folder of the lake" + ("" if name == "gc" else ", or s3://BUCKET/PREFIX"))
+        if name != "gc":
+            its.add_argument(
+                "--endpoint-url", help="of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)"
+            )
         its.add_argument("table", nargs="?", help="one table (default: all of them)")
         if name in ("verify", "describe"):
             its.add_argument("--name", help="only what belongs to this request (default: all of them)")
@@ -42,11 +47,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _looked_after(options: argparse.Namespace) -> int:
-    root = layout.lake(options.lake)
+    if options.command == "gc":
+        return _gc(layout.lake(options.lake), options.table, options.delete)
+    root = layout.opened(options.lake, options.endpoint_url)
     if options.command == "list":
         return _list(root, options.table, options.json)
-    if options.command == "gc":
-        return _gc(root, options.table, options.delete)
     own = names.checked(root, options.name) if options.name else None
     there = names.tables(root, own) if own else read.tables(root)
     if not (chosen := [options.table] if options.table else there):
@@ -60,7 +65,7 @@ def _looked_after(options: argparse.Namespace) -> int:
     return max(command.status("lake_schema", lambda name=name: looked_at(name)) for name in chosen)  # type: ignore[misc]
 
 
-def _versions(root: Path, name: str, own: str | None) -> list[read.Version]:
+def _versions(root: Folder, name: str, own: str | None) -> list[read.Version]:
     """The current version of a table and those of its requests, or the one of a request."""
     if own:
         return [read.version(root, name, request=own)]
@@ -73,7 +78,7 @@ def _versions(root: Path, name: str, own: str | None) -> list[read.Version]:
     return list(found.values())
 
 
-def _list(root: Path, name: str | None, as_json: bool) -> int:
+def _list(root: Folder, name: str | None, as_json: bool) -> int:
     found = [row for row in listing.rows(root) if name in (None, row["table"])]
     if not found:
         raise BadInput(f"lake {root} has no table {name}")

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.s3 import MANIFEST, Folder
 from lake_schema.store import garbage, layout, manifest, names
 
 _HEADS = ("names", "table", "version", "current", "published", "rows", "bytes", "made of")
@@ -20,7 +20,7 @@ _RIGHT = {"rows", "bytes"}
 _SHORT = 8
 
 
-def rows(root: Path) -> list[dict[str, Any]]:
+def rows(root: Folder) -> list[dict[str, Any]]:
     """Versions by table, and in a table by date.
 
     names     : of the requests that it belongs to
@@ -34,7 +34,7 @@ def rows(root: Path) -> list[dict[str, Any]]:
     return [row for name in there for row in sorted(_of_table(root, name, there), key=lambda row: row["published"])]
 
 
-def _of_table(root: Path, name: str, there: Sequence[str]) -> list[dict[str, Any]]:
+def _of_table(root: Folder, name: str, there: Sequence[str]) -> list[dict[str, Any]]:
     current, held, found = layout.current_key(root, name), names.holders(root, name), []
     for folder in layout.table(root, name).glob("v-*"):
         key = folder.name.removeprefix("v-")
@@ -42,7 +42,7 @@ def _of_table(root: Path, name: str, there: Sequence[str]) -> list[dict[str, Any
         row: dict[str, Any] = {"table": name, "version": key, "names": own, "current": key == current}
         try:
             about = manifest.load(folder, name)
-            moment = datetime.fromtimestamp((folder / manifest.MANIFEST).stat().st_mtime, UTC)
+            moment = datetime.fromtimestamp((folder / MANIFEST).stat().st_mtime, UTC)
             row |= {
                 "published": f"{moment:%Y-%m-%dT%H:%M:%SZ}",
                 "rows": about["rows"],
@@ -55,7 +55,7 @@ def _of_table(root: Path, name: str, there: Sequence[str]) -> list[dict[str, Any
     return found
 
 
-def _made_of(root: Path, facts: Mapping[str, Any], there: Sequence[str]) -> dict[str, list[str]]:
+def _made_of(root: Folder, facts: Mapping[str, Any], there: Sequence[str]) -> dict[str, list[str]]:
     keys = sorted(set(names.keys_in(facts)))
     found = {name: [key for key in keys if layout.version(root, name, key).exists()] for name in there}
     return {name: own for name, own in found.items() if own}

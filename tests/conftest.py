@@ -77,3 +77,27 @@ def lake(tmp_path):
     root = tmp_path / "lake"
     root.mkdir()
     return root
+
+
+@pytest.fixture(scope="session")
+def object_storage():
+    """An S3 service on loopback, whose buckets are each test's own to name."""
+    from tests import object_storage as storage
+
+    with storage.service() as running:
+        yield running
+
+
+@pytest.fixture
+def bucket(object_storage, monkeypatch, request):
+    """The service with an empty bucket, its name, and an environment that leads there."""
+    from tests import object_storage as storage
+
+    for name, value in {**storage.CREDENTIALS, "AWS_ENDPOINT_URL": object_storage.url}.items():
+        monkeypatch.setenv(name, value)
+    name = f"sky-{abs(hash(request.node.nodeid)):x}"
+    object_storage.client.create_bucket(Bucket=name)
+    object_storage.recorder.asked.clear()
+    object_storage.recorder.answer = None
+    yield object_storage, name
+    object_storage.recorder.answer = None

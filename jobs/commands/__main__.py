@@ -7,6 +7,7 @@
     truesky page LAKE                       the lake in the browser, and a TAP service for other tools
     truesky sql QUERY --lake LAKE           a SELECT over the lake's tables
     truesky list | verify | gc | describe LAKE      what is there, whether it is whole, what no longer serves
+    truesky push LAKE s3://BUCKET/PREFIX    puts a lake on object storage, from where it can be read
     truesky masters | reduce | stack        master frames, calibrated images and their sources, stacks of dithers
     truesky report LAKE                     what the runs took, beside the forecast
     truesky validate --lake LAKE            what the lake holds against what it should, a table and a report
@@ -44,6 +45,7 @@ MODULES = {
     "gc": ("lake_schema.__main__", True),
     "describe": ("lake_schema.__main__", True),
     "mission": ("lake_schema.__main__", True),
+    "push": ("lake_schema.push", False),
     "masters": ("jobs.render.masters", False),
     "reduce": ("jobs.render.reduce", False),
     "stack": ("jobs.render.stack", False),

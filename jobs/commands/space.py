@@ -70,11 +70,11 @@ def _catalogues(root: Path, request: Request) -> Iterator[Path]:
         cells = {cell for part in version.manifest["parts"] for cell in part["facts"]["generation_cells"]}
         if version.manifest["facts"].get("code") != code_version() or cells != set(request.area.cells()):
             raise BadInput(f"table {table} is not that of the request")
-        yield version.folder
+        yield layout.version(root, table, version.key)
         plan = compute_fluxes.step_of(kind, root, request).plan
-        yield read.version(root, plan.table.name, plan.key).folder
+        yield layout.version(root, plan.table.name, read.version(root, plan.table.name, plan.key).key)
     with contextlib.suppress(LakeError):
-        yield read.for_request(root, "halos", request.name).folder
+        yield layout.version(root, "halos", read.for_request(root, "halos", request.name).key)
 
 
 def _images(root: Path, request: Request, exposures: pa.Table, tasks: pa.Table) -> float:

@@ -14,6 +14,7 @@ from jobs.explore import results
 from jobs.explore.explorer import Explorer
 from jobs.explore.process import MEMORY, TIMEOUT
 from lake_schema import __version__, command, user_files
+from lake_schema.store import layout
 
 _GIGABYTE = 1e9
 _MOST_ROWS_SHOWN = 40
@@ -28,7 +29,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _answer(options: argparse.Namespace) -> int:
     if options.out is not None:
         user_files.target(options.out, results.ENDINGS)
-    with Explorer(options.lake, options.memory * _GIGABYTE, options.timeout, options.name) as lake:
+    with Explorer(
+        layout.opened(options.lake, options.endpoint_url), options.memory * _GIGABYTE, options.timeout, options.name
+    ) as lake:
         if options.sql is None:
             print(lake.tables().to_string())
             return int(bool(lake.damaged))
@@ -49,7 +52,8 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
         epilog=f"truesky {__version__}",
     )
     parser.add_argument("sql", nargs="?", help="a SELECT, in DuckDB's SQL")
-    parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser.add_argument("--lake", required=True, help="folder of the lake, or s3://BUCKET/PREFIX")
+    parser.add_argument("--endpoint-url", help="of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)")
     parser.add_argument("--name", help="of the request whose tables are meant, where the lake has several")
     parser.add_argument("--out", type=Path, help="write to this .csv, .parquet, .fits or .vot file")
     limit = MEMORY / _GIGABYTE

@@ -14,6 +14,7 @@ from jobs.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process, check
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.s3 import Folder
 from lake_schema.store import layout, names, read
 
 Range = tuple[float, float]
@@ -32,9 +33,9 @@ class Explorer:
     """
 
     def __init__(
-        self, lake: str | Path, memory: float = MEMORY, timeout: float = TIMEOUT, request: str | None = None
+        self, lake: str | Folder, memory: float = MEMORY, timeout: float = TIMEOUT, request: str | None = None
     ) -> None:
-        self.root = layout.lake(lake)
+        self.root = layout.opened(lake)
         self.versions: dict[str, read.Version] = {}
         self.damaged: dict[str, LakeError] = {}
         self._unclear: dict[str, LakeError] = {}

@@ -17,6 +17,7 @@ from typing import IO, Any
 import pyarrow as pa
 
 from lake_schema.errors import BadInput, Damaged, LakeError, OutOfRange
+from lake_schema.s3 import Folder
 
 _ROOT = Path(__file__).resolve().parents[2]
 # Bytes that a query may take, and s, where nobody says otherwise; and between which bounds anybody may.
@@ -36,7 +37,7 @@ class Process:
     memory  : bytes that a query and its result may take together
     """
 
-    def __init__(self, root: Path, tables: Sequence[str], memory: float = MEMORY) -> None:
+    def __init__(self, root: Folder, tables: Sequence[str], memory: float = MEMORY) -> None:
         check("memory", memory, _MEMORY_LO, _MEMORY_HI)
         self.most_bytes = int(memory * _RESULT)
         self.command = [sys.executable, "-m", "jobs.explore.worker", str(root), str(int(memory)), *tables]

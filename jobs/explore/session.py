@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import TypeAlias
 
 import duckdb
@@ -15,6 +14,7 @@ from jobs.explore import adql
 from jobs.explore.guard import Query, check_expression, checked, one_line, parser
 from lake_schema import places
 from lake_schema.errors import BadInput, Damaged
+from lake_schema.s3 import Folder
 from lake_schema.store import read
 
 _MACROS = (
@@ -48,7 +48,7 @@ class Session:
     memory : bytes that a query and its result may take together
     """
 
-    def __init__(self, root: Path, tables: Mapping[str, str], memory: int) -> None:
+    def __init__(self, root: Folder, tables: Mapping[str, str], memory: int) -> None:
         self.root, self.known = root, tables
         self.most = int(memory * _SHARE)
         self.opened: dict[str, Opened] = {}
@@ -164,7 +164,7 @@ class Session:
         return pa.schema(fields)
 
 
-def _table(root: Path, name: str, what: str) -> Opened:
+def _table(root: Folder, name: str, what: str) -> Opened:
     if what.startswith("@"):
         return ds.dataset(what[1:], format="ipc")
     table = name.rpartition(".")[2]

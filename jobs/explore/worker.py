@@ -33,7 +33,7 @@ def main(argv: Sequence[str]) -> int:
     argv : lake, most bytes of memory, TABLE=KEY or REQUEST.TABLE=KEY of each table, =?REQUEST of one that could not be
            opened, TABLE=@FILE of rows in an Arrow file
     """
-    root, memory = layout.lake(argv[0]), int(argv[1])
+    root, memory = layout.opened(argv[0]), int(argv[1])
     resource.setrlimit(resource.RLIMIT_DATA, (memory + _BASE_BYTES, memory + _BASE_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     session = Session(root, dict(entry.split("=", 1) for entry in argv[2:]), memory)

@@ -34,6 +34,7 @@ from jobs.fluxes.spectra.continuum import dust_of
 from jobs.request.files import Curves, UserCurves
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
+from lake_schema.s3 import Folder
 from lake_schema.store import read as lake_read
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables import galaxies as line_table
@@ -174,7 +175,7 @@ def passband_rows(own: Own) -> pa.Table:
     return passband_table.rows(bands, pivots, widths, origins, vega_magnitudes(bands))
 
 
-def library_of(lake: Path, facts: Mapping[str, Any]) -> Library:
+def library_of(lake: Folder, facts: Mapping[str, Any]) -> Library:
     """The galaxies that a table of fluxes was, or is to be, made with; facts : of its plan."""
     library = templates.galaxy_library()
     if any(key.startswith((_TEMPLATES, _LAWS)) for key in facts.get("files", ())):
@@ -182,14 +183,14 @@ def library_of(lake: Path, facts: Mapping[str, Any]) -> Library:
     return replace(library, intergalactic=True) if facts.get("intergalactic") else library
 
 
-def stars_of(lake: Path, facts: Mapping[str, Any]) -> Library:
+def stars_of(lake: Folder, facts: Mapping[str, Any]) -> Library:
     """The same of stars."""
     if not any(key.startswith(_STARS) for key in facts.get("files", ())):
         return templates.stellar_library()
     return published_stars(lake, facts["sources"]["templates"])
 
 
-def passband_of(lake: Path, facts: Mapping[str, Any], name: str) -> Passband:
+def passband_of(lake: Folder, facts: Mapping[str, Any], name: str) -> Passband:
     """The same of a passband."""
     if f"{FILTER}{name}" not in facts.get("files", ()):
         return passbands.load(name)
@@ -197,7 +198,7 @@ def passband_of(lake: Path, facts: Mapping[str, Any], name: str) -> Passband:
 
 
 @lru_cache(maxsize=2)
-def published_library(lake: Path, templates_key: str, laws_key: str) -> Library:
+def published_library(lake: Folder, templates_key: str, laws_key: str) -> Library:
     """The galaxies of published versions of `templates` and `extinction_laws`, kept in the cache and mapped."""
 
     def read_rows() -> dict[str, Array]:
@@ -215,7 +216,7 @@ def published_library(lake: Path, templates_key: str, laws_key: str) -> Library:
 
 
 @lru_cache(maxsize=2)
-def published_stars(lake: Path, templates_key: str) -> Library:
+def published_stars(lake: Folder, templates_key: str) -> Library:
     """The stars of a published version of `templates`, kept in the cache and mapped."""
 
     def read_rows() -> dict[str, Array]:
@@ -228,7 +229,7 @@ def published_stars(lake: Path, templates_key: str) -> Library:
     )
 
 
-def published_passband(lake: Path, key: str, name: str) -> Passband:
+def published_passband(lake: Folder, key: str, name: str) -> Passband:
     """A passband of a published version of `passbands`."""
     row = lake_read.version(lake, "passbands", key).rows(where=pc.field("name") == name).to_pylist()[0]
     response = np.array(row["response"])

@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _served(options: argparse.Namespace) -> int:
-    root, names = layout.lake(_lake(options)), _names(options)
+    root, names = layout.opened(_lake(options), options.endpoint_url), _names(options)
     if options.token is None and names != _HERE:
         raise BadInput(f"--host {options.host}: others can reach it, so a --token of your own is wanted")
     if options.token is not None and not _TOKEN.fullmatch(options.token):
@@ -83,8 +83,9 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
         description="Show a lake in the browser, and serve its tables by TAP, until stopped with Ctrl-C.",
         epilog=f"truesky {__version__}",
     )
-    parser.add_argument("folder", nargs="?", metavar="LAKE", help="folder of the lake")
+    parser.add_argument("folder", nargs="?", metavar="LAKE", help="folder of the lake, or s3://BUCKET/PREFIX")
     parser.add_argument("--lake", help="the same")
+    parser.add_argument("--endpoint-url", help="of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)")
     parser.add_argument("--name", help="of the request whose tables are meant, where the lake has several")
     parser.add_argument("--port", type=int, default=0, help="port to listen on (default: any that is free)")
     parser.add_argument(

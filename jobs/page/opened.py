@@ -14,7 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import pyarrow as pa
@@ -22,6 +21,7 @@ import pyarrow as pa
 from jobs.explore.explorer import Explorer
 from jobs.explore.process import MEMORY, TIMEOUT, Process
 from lake_schema.errors import BadInput, LakeError
+from lake_schema.s3 import Folder
 from lake_schema.store import read
 from lake_schema.store.provenance import digest
 
@@ -171,7 +171,7 @@ class Lake:
     """
 
     def __init__(
-        self, root: Path, request: str | None = None, memory: float = MEMORY, timeout: float = TIMEOUT
+        self, root: Folder, request: str | None = None, memory: float = MEMORY, timeout: float = TIMEOUT
     ) -> None:
         self.explorer = Explorer(root, memory, timeout, request)
         self.root, self.request, self.timeout = self.explorer.root, request, timeout

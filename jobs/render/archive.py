@@ -32,6 +32,7 @@ from jobs.explore.process import Process
 from jobs.render.products import run_log
 from lake_schema import command, sky, user_files
 from lake_schema.errors import BadInput
+from lake_schema.s3 import Folder
 from lake_schema.store import layout, names, read
 from lake_schema.store.provenance import code_version, file_sha256
 
@@ -81,7 +82,7 @@ def exposures(root: Path, request: str | None = None) -> pa.Table:
     return rows.append_column("sha256", pa.array(found[0], pa.string())).append_column("bytes", pa.array(found[1]))
 
 
-def failures(root: Path, request: str | None = None) -> pa.Table:
+def failures(root: Folder, request: str | None = None) -> pa.Table:
     """Detectors whose last attempt failed: error, attempt, seconds, peak_gb (GB), and the run.
 
     request : whose detectors, None = of all requests
@@ -104,7 +105,7 @@ def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
     return rows.filter(pa.array(inside & (sums.product(edges.sum(axis=1), place) > 0)))
 
 
-def _parts(root: Path, request: str | None = None) -> Iterator[dict[str, Any]]:
+def _parts(root: Folder, request: str | None = None) -> Iterator[dict[str, Any]]:
     """What the runs' logs say of parts of `products`, oldest first, each with its run; of a request, or of all."""
     for path in run_log.of_products(root):
         lines = run_log.lines(path)

@@ -92,7 +92,7 @@ def read_back(version: Version) -> MissionConfiguration:
         tuple(facts["ladder"]),
         tuple(sorted(overridden)),
         tuple(sorted(models, key=lambda m: m.key)),
-        version.folder / _FOLDER,
+        version.below(_FOLDER),
     )
     if configuration.fingerprint != facts["mission"]:
         raise Damaged(f"table mission: version {version.key} is not the configuration {facts['mission']}")

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from lake_schema.errors import Damaged
+from lake_schema.s3 import Folder, Place
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import file_sha256
 
@@ -90,13 +91,15 @@ class Checked(io.RawIOBase):
 
     fault = ""
 
-    def __init__(self, path: Path, entry: Json) -> None:
+    def __init__(self, path: Folder, entry: Json) -> None:
         super().__init__()
         self.path, self._entry = path, entry
         blocks = listed(entry)
         self._ends, self._sums = [end for end, _ in blocks], [crc for _, crc in blocks]
         self._sound: set[int] = set()
         self._at = 0
+        # Of an object, which is no open file of this process.
+        self._object: Any = None
 
     def readable(self) -> bool:
         return True
@@ -132,6 +135,7 @@ class Checked(io.RawIOBase):
     def forget(self) -> None:
         """Compare every block again when it is next read: for who keeps a file from question to question."""
         self._sound.clear()
+        self._object = None
 
     def _start(self, number: int) -> int:
         return self._ends[number - 1] if number else 0
@@ -153,6 +157,8 @@ class Checked(io.RawIOBase):
 
     def _bytes(self, first: int, last: int) -> bytes:
         """Opened each time: a lake has more files than a process may hold open."""
+        if isinstance(self.path, Place):
+            return self._object_bytes(self.path, first, last)
         try:
             descriptor = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
@@ -170,3 +176,19 @@ class Checked(io.RawIOBase):
         if at < last:
             raise self._refusal(f"has {at} bytes, the manifest says {self._entry['bytes']}")
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+    def _object_bytes(self, place: Place, first: int, last: int) -> bytes:
+        """Asked for each time; of which size the object is, once, and again after `forget`."""
+        try:
+            if self._object is None:
+                self._object = place.open()
+            if (size := self._object.size()) != self._entry["bytes"]:
+                raise self._refusal(f"has {size} bytes, the manifest says {self._entry['bytes']}")
+            data: bytes = self._object.read_at(last - first, first)
+        except FileNotFoundError:
+            raise self._refusal("is missing") from None
+        except OSError as error:
+            raise self._refusal(f"cannot be read: {error}") from None
+        if len(data) < last - first:
+            raise self._refusal(f"has {first + len(data)} bytes, the manifest says {self._entry['bytes']}")
+        return data

@@ -18,6 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from lake_schema.errors import BadInput, Damaged, Superseded
+from lake_schema.s3 import Folder
 from lake_schema.store import layout, locks, manifest, names
 from lake_schema.store.stage import receipts
 
@@ -26,7 +27,7 @@ _KEYED = re.compile(r"(?:v|\.stage|\.receipts|\.lock)-([0-9a-f]{16})", re.ASCII)
 _GONE = ".gone*"
 
 
-def tables(root: Path) -> list[str]:
+def tables(root: Folder) -> list[str]:
     """Folders of the lake in which something was published or begun, sorted."""
     return sorted({path.parent.name for path in root.glob("*/.lock*")} | set(layout.tables(root)))
 

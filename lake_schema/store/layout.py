@@ -20,8 +20,9 @@ import re
 from pathlib import Path
 from urllib.parse import unquote
 
-from lake_schema import user_files
+from lake_schema import s3, user_files
 from lake_schema.errors import BadInput, Damaged
+from lake_schema.s3 import Below, Folder, Place
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
 _CELL = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet", re.ASCII)
@@ -55,6 +56,7 @@ def lake(text: str | Path) -> Path:
     if _REMOTE.match(str(text)):
         raise BadInput(
             f"lake {user_files.shown(text)}: only a POSIX file system can publish by rename; mount it and give the path"
+            + (", and truesky push puts the lake there when it is made" if s3.is_address(text) else "")
         )
     try:
         root = user_files.expanded(text).resolve()
@@ -70,7 +72,22 @@ def lake(text: str | Path) -> Path:
     return root
 
 
-def table(root: Path, table_name: str) -> Path:
+def opened(text: str | Folder, endpoint: str | None = None) -> Folder:
+    """The root of a lake that is only read: a folder, or a place on object storage that one was pushed to.
+
+    endpoint : URL of the object storage, None = what the address or $AWS_ENDPOINT_URL says
+    Errors   : BadInput; whether a lake is there is found out when it is read
+    """
+    if isinstance(text, Place):
+        return text.opened_anew()
+    if s3.is_address(text):
+        return Place(s3.Store(s3.address(str(text), endpoint)))
+    if endpoint is not None:
+        raise BadInput(f"lake {user_files.shown(text)} is no address s3://..: an endpoint does not go with it")
+    return lake(text)
+
+
+def table(root: Below, table_name: str) -> Below:
     """Folder of a table."""
     return within(root, root / name(table_name))
 
@@ -80,34 +97,36 @@ def stage(root: Path, table_name: str, key: str) -> Path:
     return table(root, table_name) / f".stage-{name(key)}"
 
 
-def version(root: Path, table_name: str, key: str) -> Path:
+def version(root: Below, table_name: str, key: str) -> Below:
     """Folder of a published version."""
     return table(root, table_name) / f"v-{name(key)}"
 
 
-def current(root: Path, table_name: str) -> Path:
+def current(root: Below, table_name: str) -> Below:
     """The link to the published version."""
     return table(root, table_name) / "current"
 
 
-def named(root: Path) -> Path:
+def named(root: Below) -> Below:
     """Folder of the requests, in each of which are links to its tables."""
     return within(root, root / _NAMES)
 
 
-def pin(root: Path, request: str, table_name: str) -> Path:
+def pin(root: Below, request: str, table_name: str) -> Below:
     """The link of a request to its version of a table."""
     return named(root) / name(request) / name(table_name)
 
 
-def tables(root: Path) -> list[str]:
+def tables(root: Folder) -> list[str]:
     """Names of the tables that have been published, sorted; also of one whose version has gone since."""
     others = {_NAMES, _RUNS}
     folders = [p for p in root.iterdir() if is_name(p.name) and p.name not in others] if root.is_dir() else []
-    return sorted(path.name for path in folders if path.is_dir() and "current" in os.listdir(path))
+    return sorted(
+        path.name for path in folders if path.is_dir() and any(own.name == "current" for own in path.iterdir())
+    )
 
 
-def current_key(root: Path, table_name: str) -> str | None:
+def current_key(root: Folder, table_name: str) -> str | None:
     """Key of the version that was published last, which may be missing; None where nothing has been published.
 
     Errors : Damaged where `current` is not a link to a version beside it
@@ -115,13 +134,13 @@ def current_key(root: Path, table_name: str) -> str | None:
     return linked_key(current(root, table_name), "")
 
 
-def linked_key(link: Path, table_name: str) -> str | None:
+def linked_key(link: Folder, table_name: str) -> str | None:
     """Key of the version that a link leads to, None where there is no link; Damaged where it leads elsewhere.
 
     table_name : where the version stands, as seen from the link; "" = beside it
     """
     try:
-        found = _VERSION.fullmatch(os.readlink(link))
+        found = _VERSION.fullmatch(link.readlink() if isinstance(link, Place) else os.readlink(link))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
@@ -131,7 +150,7 @@ def linked_key(link: Path, table_name: str) -> str | None:
     return found["key"]
 
 
-def runs(root: Path) -> Path:
+def runs(root: Below) -> Below:
     """Folder of the run logs."""
     return within(root, root / _RUNS)
 
@@ -149,8 +168,11 @@ def cell_of_file(part: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def within(root: Path, path: Path) -> Path:
+def within(root: Below, path: Below) -> Below:
     """`path` where, links followed, it lies in `root`; else BadInput."""
+    if isinstance(path, Place) or isinstance(root, Place):
+        # Made of names that were checked, in a storage without links.
+        return path
     try:
         inside = path.resolve().is_relative_to(root.resolve())
     except (OSError, RuntimeError, ValueError) as error:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -17,11 +18,11 @@ import pyarrow as pa
 
 from lake_schema import sky
 from lake_schema.errors import Damaged
+from lake_schema.s3 import MANIFEST, Folder, Place
 from lake_schema.store import blocks, layout, parquet
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical, digest, file_sha256
 
-MANIFEST = "manifest.json"
 # Types of what every manifest says, and of what it says of each file.
 _FACTS = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
 _FILE = {"path": str, "bytes": int, "sha256": str}
@@ -33,7 +34,7 @@ def write(folder: Path, facts: Json) -> None:
     write_json(folder / MANIFEST, {**plain, "digest": digest(plain)})
 
 
-def load(folder: Path, table: str) -> dict[str, Any]:
+def load(folder: Folder, table: str) -> dict[str, Any]:
     """The manifest of a version's folder.
 
     Errors : Damaged where it is missing, cut short, changed, or that of another version or table
@@ -88,22 +89,35 @@ def file_facts(path: Path, relative: str) -> dict[str, Any]:
     return {"path": relative, "bytes": path.stat().st_size, "sha256": file_sha256(path)}
 
 
-def checked(folder: Path, entry: Json) -> Path:
-    """A listed file that has the size that the manifest says; what is in it is not looked at.  Errors: Damaged"""
-    path: Path = folder / entry["path"]
+def checked(folder: Folder, entry: Json) -> Folder:
+    """A listed file that has the size that the manifest says; what is in it is not looked at.  Errors: Damaged
+
+    Of an object nothing is asked: whoever opens it compares its size.
+    """
+    path: Folder = folder / entry["path"]
+    if isinstance(path, Place):
+        return path
     if fault := _misfit(path, entry):
         raise Damaged(fault)
     return path
 
 
-def whole(folder: Path, entry: Json) -> Path:
-    """A listed file whose every byte is what was written, by its sha256.  Errors: Damaged"""
+def whole(folder: Folder, entry: Json) -> Path:
+    """A listed file whose every byte is what was written, by its sha256; of an object a copy.  Errors: Damaged"""
     path = checked(folder, entry)
+    if isinstance(path, Place):
+        return path.copy(entry["sha256"])
+    _compare(path, entry)
+    return path
+
+
+def _compare(path: Folder, entry: Json) -> None:
+    """Read all of a file.  Errors: Damaged"""
     try:
         if file_sha256(path) == entry["sha256"]:
-            return path
+            return
     except OSError as error:
-        raise Damaged(f"{path} cannot be read: {error.strerror}") from None
+        raise Damaged(f"{path} cannot be read: {error.strerror or error}") from None
     raise Damaged(f"{path} has other contents than the manifest says")
 
 
@@ -126,7 +140,7 @@ def _difference(path: Path, entry: Json) -> str:
     return ""
 
 
-def faults(folder: Path, facts: Json, deep: bool = False) -> list[str]:
+def faults(folder: Folder, facts: Json, deep: bool = False) -> list[str]:
     """What is wrong with a version: a list of sentences, empty where all is well.
 
     facts : its manifest
@@ -134,11 +148,14 @@ def faults(folder: Path, facts: Json, deep: bool = False) -> list[str]:
     """
     listed = facts["files"]
     names = {entry["path"] for entry in listed}
-    here = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()}
-    found = [f"{folder / extra} is not in the manifest" for extra in sorted(here - names - {MANIFEST})]
+    try:
+        here = _files(folder)
+    except OSError as error:
+        return [f"{folder} cannot be read: {error}"]
+    found = [f"{folder / extra} is not in the manifest" for extra in sorted(here.keys() - names - {MANIFEST})]
     # Hashing lets go of the interpreter: as many files at a time as there are cores.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for wrong in pool.map(lambda entry: _file_faults(folder, entry, deep), listed):
+        for wrong in pool.map(lambda entry: _file_faults(folder, entry, here.get(entry["path"], 0), deep), listed):
             found += wrong
     total = sum(entry.get("rows", 0) for entry in listed)
     if total != facts["rows"]:
@@ -146,10 +163,22 @@ def faults(folder: Path, facts: Json, deep: bool = False) -> list[str]:
     return found
 
 
-def _file_faults(folder: Path, entry: Json, deep: bool) -> list[str]:
+def _files(folder: Folder) -> Mapping[str, int]:
+    """Of every file below a folder its name and its bytes; of one that is none, 0."""
+    if isinstance(folder, Place):
+        return folder.sizes()
+    there = [path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()]
+    return {path.relative_to(folder).as_posix(): 0 if path.is_symlink() else path.stat().st_size for path in there}
+
+
+def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str]:
+    """What is wrong with a file, of which a listing says the size."""
+    path = folder / entry["path"]
+    if isinstance(path, Place) and size != entry["bytes"]:
+        return [f"{path} has {size} bytes, the manifest says {entry['bytes']}" if size else f"{path} is missing"]
     try:
         if deep:
-            whole(folder, entry)
+            _compare(checked(folder, entry), entry)
             return _row_faults(folder, entry) if "rows" in entry else []
         checked(folder, entry)
         if "blocks" in entry:
@@ -162,7 +191,7 @@ def _file_faults(folder: Path, entry: Json, deep: bool) -> list[str]:
     return []
 
 
-def _row_faults(folder: Path, entry: Json) -> list[str]:
+def _row_faults(folder: Folder, entry: Json) -> list[str]:
     path, schema = folder / entry["path"], parquet.schema(folder, entry)
     # Refuses another number of rows.
     rows = parquet.dataset(folder, [entry], schema)

@@ -19,32 +19,33 @@ from pathlib import Path
 from typing import Any
 
 from lake_schema.errors import BadInput
+from lake_schema.s3 import Folder
 from lake_schema.store import layout
 from lake_schema.store.manifest import sync
 
 _KEY = re.compile(r"[0-9a-f]{16}", re.ASCII)
 
 
-def names(root: Path) -> list[str]:
+def names(root: Folder) -> list[str]:
     """Names of the requests that have a table here, sorted."""
     folder = layout.named(root)
     return sorted(path.name for path in folder.iterdir() if layout.is_name(path.name)) if folder.is_dir() else []
 
 
-def checked(root: Path, name: str) -> str:
+def checked(root: Folder, name: str) -> str:
     """The name, if the lake has a request of it; else BadInput lists those that it has."""
     if layout.name(name) not in (known := names(root)):
         raise BadInput(f"lake {root} has no request {name}" + (f"; it has {', '.join(known)}" if known else ""))
     return name
 
 
-def tables(root: Path, name: str) -> list[str]:
+def tables(root: Folder, name: str) -> list[str]:
     """The tables that a request has a version of, sorted."""
     folder = layout.named(root) / layout.name(name)
     return sorted(path.name for path in folder.iterdir() if layout.is_name(path.name)) if folder.is_dir() else []
 
 
-def key_of(root: Path, name: str, table: str) -> str | None:
+def key_of(root: Folder, name: str, table: str) -> str | None:
     """Key of the version that a request has, which may be missing; None where it has none.
 
     Errors : Damaged where the link is none, or does not lead to a version of the table
@@ -52,7 +53,7 @@ def key_of(root: Path, name: str, table: str) -> str | None:
     return layout.linked_key(layout.pin(root, name, table), table)
 
 
-def holders(root: Path, table: str) -> dict[str, str]:
+def holders(root: Folder, table: str) -> dict[str, str]:
     """Name of every request that has a version of a table -> its key."""
     found = {name: key_of(root, name, table) for name in names(root)}
     return {name: key for name, key in found.items() if key is not None}

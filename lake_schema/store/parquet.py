@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from lake_schema import votable
 from lake_schema.columns import Table
 from lake_schema.errors import Damaged
+from lake_schema.s3 import Folder
 from lake_schema.store import blocks
 from lake_schema.store.plan import Json
 
@@ -62,7 +63,7 @@ class Dataset(ds.FileSystemDataset):  # type: ignore[misc]
         return next((file.fault for file in self.read_from if file.fault), "")
 
 
-def dataset(folder: Path, entries: Sequence[Json], schema: pa.Schema) -> Dataset:
+def dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> Dataset:
     """Files below a folder as one Arrow dataset, in the order given.
 
     entries : of the manifest
@@ -83,13 +84,13 @@ def dataset(folder: Path, entries: Sequence[Json], schema: pa.Schema) -> Dataset
     return found
 
 
-def read(folder: Path, entry: Json, columns: Sequence[str] | None = None) -> pa.Table:
+def read(folder: Folder, entry: Json, columns: Sequence[str] | None = None) -> pa.Table:
     """The rows of one file, in the types that it was written with.  Errors: Damaged names the file."""
     with blocks.Checked(folder / entry["path"], entry) as file:
         return pq.read_table(file, columns=None if columns is None else list(columns))
 
 
-def schema(folder: Path, entry: Json) -> pa.Schema:
+def schema(folder: Folder, entry: Json) -> pa.Schema:
     """What columns a file has.  Errors: Damaged names the file."""
     with blocks.Checked(folder / entry["path"], entry) as file:
         return pq.read_schema(file)

@@ -13,6 +13,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from lake_schema.s3 import Folder
+
 _ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("lake_schema", "jobs")
 _DATA = {".py", ".csv", ".toml"}
@@ -43,7 +45,7 @@ def digest(value: Any) -> str:
     return hashlib.sha256(canonical(value)).hexdigest()
 
 
-def file_sha256(path: Path) -> str:
+def file_sha256(path: Folder) -> str:
     """sha256 of a file's bytes, hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

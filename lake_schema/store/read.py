@@ -31,6 +31,7 @@ from lake_schema import tables as declarations
 from lake_schema.arrays import Int
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput, Damaged, VersionMismatch
+from lake_schema.s3 import Folder, Place
 from lake_schema.store import layout, manifest, names, parquet
 from lake_schema.store.provenance import digest
 
@@ -49,7 +50,7 @@ class Version:
     schema : of its rows, with units and descriptions in the fields' metadata; a column that the files lack is null
     """
 
-    folder: Path
+    folder: Folder
     manifest: dict[str, Any]
     schema: pa.Schema
 
@@ -76,8 +77,12 @@ class Version:
         return [str(part["name"]) for part in self.manifest["parts"]]
 
     def path(self, part: str) -> Path:
-        """A part's Parquet file, for a reader of somebody else's: nothing but its size is compared, see `verify`."""
-        return manifest.checked(self.folder, self._entry(part))
+        """A part's Parquet file, for a reader of somebody else's: nothing but its size is compared, see `verify`.
+
+        Of a lake on object storage it is a copy, as of `file`.
+        """
+        path = manifest.checked(self.folder, self._entry(part))
+        return path.copy(self.part_sha256(part)) if isinstance(path, Place) else path
 
     def part_sha256(self, part: str) -> str:
         """sha256 of a part's Parquet file, as it was published."""
@@ -95,8 +100,19 @@ class Version:
         raise BadInput(f"table {self.table}: version {self.key} has no part {part}")
 
     def file(self, relative: str) -> Path:
-        """Any other file of the version, such as an image; Damaged where its sha256 is not what the manifest says."""
+        """Any other file of the version, such as an image; Damaged where its sha256 is not what the manifest says.
+
+        Of a lake on object storage it is a copy, in a temporary folder that goes when the lake is no longer in use.
+        """
         return manifest.whole(self.folder, self._file(relative))
+
+    def below(self, relative: str) -> Path:
+        """A folder of files beside the table; of a lake on object storage one with copies of them.  Errors: Damaged"""
+        folder = self.folder / relative
+        if isinstance(folder, Path):
+            return folder
+        copies = [self.file(path) for path in self._files() if path.startswith(f"{relative}/")]
+        return folder.gathered(copies)
 
     def has(self, relative: str) -> bool:
         """Whether there is such a file."""
@@ -273,7 +289,7 @@ def _in_ranges(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
 # ------------------------------------------------------------------------------------------------ versions
 
 
-def version(root: Path, name: str, key: str | None = None, request: str | None = None) -> Version:
+def version(root: Folder, name: str, key: str | None = None, request: str | None = None) -> Version:
     """A published version of a table: the one of a key, or of a request; without these, the one published last.
 
     root : of the lake;  name : of the table
@@ -288,7 +304,7 @@ def version(root: Path, name: str, key: str | None = None, request: str | None =
     return _open(root, name, wanted, asked=key is not None, link=_link(root, name, request))
 
 
-def for_request(root: Path, name: str, request: str) -> Version:
+def for_request(root: Folder, name: str, request: str) -> Version:
     """What the next table of a request is made of: its own version of a table, else the one that was published last.
 
     The second is for lakes that an older truesky wrote, and for requests that share a catalogue.  Errors: as `version`
@@ -297,7 +313,7 @@ def for_request(root: Path, name: str, request: str) -> Version:
     return published_last(root, name) if own is None else version(root, name, request=request)
 
 
-def published_last(root: Path, name: str) -> Version:
+def published_last(root: Folder, name: str) -> Version:
     """The version that `current` leads to, whichever request it belongs to.  Errors: as `version`"""
     wanted = layout.current_key(root, name)
     if wanted is None:
@@ -305,7 +321,7 @@ def published_last(root: Path, name: str) -> Version:
     return _open(root, name, wanted, asked=False, link=layout.current(root, name))
 
 
-def _chosen(root: Path, name: str, request: str | None) -> str | None:
+def _chosen(root: Folder, name: str, request: str | None) -> str | None:
     if request is not None:
         return names.key_of(root, names.checked(root, request), name)
     if len(set((held := names.holders(root, name)).values())) > 1:
@@ -314,11 +330,11 @@ def _chosen(root: Path, name: str, request: str | None) -> str | None:
     return layout.current_key(root, name)
 
 
-def _link(root: Path, name: str, request: str | None) -> Path:
+def _link(root: Folder, name: str, request: str | None) -> Folder:
     return layout.current(root, name) if request is None else layout.pin(root, request, name)
 
 
-def _open(root: Path, name: str, wanted: str, asked: bool, link: Path) -> Version:
+def _open(root: Folder, name: str, wanted: str, asked: bool, link: Folder) -> Version:
     folder = layout.version(root, name, wanted)
     if not folder.exists():
         if asked:
@@ -374,7 +390,7 @@ def _difference(stored: pa.Schema, table: Table, was: int) -> str:
     return ""
 
 
-def tables(root: Path) -> list[str]:
+def tables(root: Folder) -> list[str]:
     """Names of the published tables, those that are damaged among them."""
     return layout.tables(root)
 

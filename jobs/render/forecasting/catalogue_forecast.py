@@ -26,6 +26,7 @@ from lake_schema import sky
 from lake_schema.errors import LakeError
 from lake_schema.external import rows as external_rows
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
+from lake_schema.s3 import Folder
 from lake_schema.store import names, read
 
 # Lowest order of a file of stars, as of jobs/catalogue/build_stars.py.
@@ -66,7 +67,7 @@ def of_request(request: Request, factor: float = 1.0) -> list[Line]:
     return _lines(rows, parts, dict.fromkeys(_CATALOGUE, len(request.bands)), factor)
 
 
-def of_lake(lake: Path, factor: float = 1.0) -> list[Line]:
+def of_lake(lake: Folder, factor: float = 1.0) -> list[Line]:
     """The jobs whose tables a lake holds, by what their manifests say of area and depth.
 
     Versions of several requests add up; one that requests share is made once.
@@ -115,7 +116,7 @@ def _files(cells: Sequence[int], order: int) -> int:
     return len({cell >> 2 * (GENERATION_ORDER - order) for cell in cells})
 
 
-def _held(lake: Path, table: str, request: str | None) -> read.Version | None:
+def _held(lake: Folder, table: str, request: str | None) -> read.Version | None:
     try:
         return read.published_last(lake, table) if request is None else read.for_request(lake, table, request)
     except LakeError:

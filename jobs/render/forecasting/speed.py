@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from jobs.code_keys import code_key
 from jobs.render.products import run_log
 from lake_schema.arrays import Float
 from lake_schema.errors import LakeError
+from lake_schema.s3 import Folder
 from lake_schema.store import read
 from lake_schema.store.provenance import machine
 
@@ -41,7 +41,7 @@ class Speed:
     source: str
 
 
-def of_machine(lake: Path) -> Speed:
+def of_machine(lake: Folder) -> Speed:
     """Of the machine that this process runs on.
 
     Error : of the calibration, 30 % of a detector's seconds
@@ -68,7 +68,7 @@ def calibration() -> Float:
     return seconds
 
 
-def _measured(lake: Path) -> Iterator[float]:
+def _measured(lake: Folder) -> Iterator[float]:
     """CPU s over the forecast's of every detector of the current products that a machine of this kind rendered."""
     try:
         version = read.published_last(lake, "products")
@@ -85,7 +85,7 @@ def _measured(lake: Path) -> Iterator[float]:
             yield took / foreseen[place]
 
 
-def _lines(lake: Path, key: str) -> Iterator[dict[str, Any]]:
+def _lines(lake: Folder, key: str) -> Iterator[dict[str, Any]]:
     """What was written of the parts of a version of `products`; a log that cannot be read teaches nothing."""
     for path in run_log.of_products(lake):
         with contextlib.suppress(LakeError, OSError):

@@ -8,11 +8,13 @@ lines           one of them: an object for its start, one a part, one for its en
 from __future__ import annotations
 
 import json
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 from lake_schema import user_files
 from lake_schema.errors import Damaged
+from lake_schema.s3 import Folder, Place
 from lake_schema.store import layout
 
 Json = dict[str, Any]
@@ -25,14 +27,14 @@ _SAID: dict[str, tuple[type, ...]] = {
 _MOST = 1e15
 
 
-def of_lake(root: Path) -> list[Path]:
-    """The files, in the order of their runs."""
-    return sorted(layout.runs(root).glob("*.jsonl"))
+def of_lake(root: Folder) -> list[Path]:
+    """The files, in the order of their runs; none of a lake on object storage: they stay where the jobs ran."""
+    return [] if isinstance(root, Place) else sorted(layout.runs(root).glob("*.jsonl"))
 
 
-def of_products(root: Path) -> list[Path]:
-    """The files, in the order of their runs."""
-    return sorted(layout.runs(root).glob("*-products-*.jsonl"))
+def of_products(root: Folder) -> list[Path]:
+    """The same of table `products`."""
+    return [path for path in of_lake(root) if fnmatch(path.name, "*-products-*.jsonl")]
 
 
 def lines(path: Path) -> list[dict[str, Any]]:
