@@ -1,9 +1,6 @@
 """Catalogues on object storage for programs that read by fsspec, such as lsdb: the objects come through pyarrow.
 
-import lsdb
-from jobs.explore.object_storage import catalogue
-
-lsdb.open_catalog(catalogue("s3://sky/lake", "galaxies")).cone_search(53.1, -27.8, 60.0).compute()
+    lsdb.open_catalog(catalogue("s3://sky/lake", "galaxies")).cone_search(53.1, -27.8, 60.0).compute()
 
 Nothing that is read so is compared with the manifest: `truesky verify --deep s3://sky/lake` is.
 """

@@ -183,11 +183,11 @@ def test_what_is_wanted_is_pinned_within_its_range():
         assert requirement.specifier.contains(pins()[canonicalize_name(requirement.name)]), line
 
 
-# Of numba and of pyspark, which want one version of them each and are nothing without.
-PARTS = {"llvmlite", "py4j"}
+# Of numba, pyspark and boto3, which want one version of them each and are nothing without.
+PARTS = {"llvmlite", "py4j", "botocore"}
 
 
-@pytest.mark.parametrize(("folders", "extras"), [(("lake_schema", "jobs"), ()), (("tests",), ("test",))])
+@pytest.mark.parametrize(("folders", "extras"), [(("lake_schema", "jobs"), ("s3",)), (("tests",), ("test", "s3"))])
 def test_what_is_imported_is_named(folders, extras):
     """Not only what comes with another package, which may do without it tomorrow; in programs kept as text, too."""
     project = PROJECT["project"]

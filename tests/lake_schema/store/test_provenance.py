@@ -19,6 +19,7 @@ PROJECT = Path(__file__).resolve().parents[3] / "pyproject.toml"
 # and stacks, is in no table of a lake.
 HARMLESS = {
     "PyYAML", "aiohttp", "duckdb", "h5py", "matplotlib", "pandas", "pyspark", "tqdm", "astroscrappy", "drizzle", "sep",
+    "fsspec", "universal-pathlib",
 }  # fmt: skip
 
 
