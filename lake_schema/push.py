@@ -205,6 +205,7 @@ def _sum_of_parts(one: _Object) -> str:
 def push(root: Path, place: Address, only: Sequence[str] = (), threads: int = THREADS) -> Iterator[Sent]:
     """Put the published versions of a lake there, each told when it is; then switch `current`.
 
+    root    : folder of the lake;  place : where it goes
     only    : tables, none = all of them: then the lake there is what this one is, else its other tables stay
     threads : objects at a time
     Errors  : BadInput for what cannot be pushed, or where the storage refuses; Damaged names what is not as it was
