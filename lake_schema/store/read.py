@@ -77,10 +77,7 @@ class Version:
         return [str(part["name"]) for part in self.manifest["parts"]]
 
     def path(self, part: str) -> Path:
-        """A part's Parquet file, for a reader of somebody else's: nothing but its size is compared, see `verify`.
-
-        Of a lake on object storage it is a copy, as of `file`.
-        """
+        """A part's Parquet file for a reader of somebody else's: only its size is compared; or a copy, as of `file`."""
         path = manifest.checked(self.folder, self._entry(part))
         return path.copy(self.part_sha256(part)) if isinstance(path, Place) else path
 
@@ -100,9 +97,9 @@ class Version:
         raise BadInput(f"table {self.table}: version {self.key} has no part {part}")
 
     def file(self, relative: str) -> Path:
-        """Any other file of the version, such as an image; Damaged where its sha256 is not what the manifest says.
+        """Any other file, such as an image; Damaged where its sha256 is not what the manifest says.
 
-        Of a lake on object storage it is a copy, in a temporary folder that goes when the lake is no longer in use.
+        Of a lake on object storage it is a copy, in a temporary folder that goes with the process.
         """
         return manifest.whole(self.folder, self._file(relative))
 
