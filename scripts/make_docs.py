@@ -46,7 +46,8 @@ CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Contributing", ("contributing.md",)),
 )
 _DEMO, _DEMO_LAKE = ROOT / "requests" / "demo.toml", ROOT / "out" / "demo" / "lake"
-_FILE = re.compile(r"\[([^\]]*)\]\((?:\.\./)*(?:(?:jobs|lake_schema|requests|benchmarks|tests|scripts)/|README)[^)]*\)")
+_FOLDERS = "deploy|jobs|lake_schema|requests|benchmarks|tests|scripts"
+_FILE = re.compile(rf"\[([^\]]*)\]\((?:\.\./)*(?:(?:{_FOLDERS})/|README)[^)]*\)")
 _NOTEBOOK = re.compile(r"\]\((?:\.\./)*notebooks/([^)]*)\.ipynb\)")
 
 
