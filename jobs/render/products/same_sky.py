@@ -36,7 +36,7 @@ _COLOURS = (("euclid_h", "euclid_y", "euclid_vis"), ("lsst_i", "lsst_r", "lsst_g
 _BLACK, _KNEE, _WHITE = -1.5, 4.0, 150.0
 # From the median of a normal distribution to its quartile, in sigma.
 _QUARTILE = 0.6745
-# Of the colours: the softening of their stretch, and sigma of the reddest band that are half of white.
+# Of the colours: the softening of their stretch, and sigma that are half of white.
 _SOFTENING, _STRETCH = 8.0, 12.0
 _INK, _PAPER = "#e8e6df", "#0b0d12"
 _COLUMNS, _INCHES, _DPI = 3, (13.2, 9.35), 100
@@ -90,7 +90,7 @@ def patch(file: Path, place: tuple[float, float], pixels: int, order: int) -> Fl
 
 
 def colours(red: Float, green: Float, blue: Float) -> Array:
-    """[ny, nx] fluxes above the sky, of one unit and in sigma of the red band -> uint8[ny, nx, 3]."""
+    """[ny, nx] fluxes above the sky, each in sigma of its own -> uint8[ny, nx, 3]."""
     from astropy.visualization import make_lupton_rgb
 
     layers = [np.nan_to_num(layer) for layer in (red, green, blue)]
@@ -204,9 +204,10 @@ def _coloured(path: Path, bands: Mapping[str, Sequence[Row]], place: tuple[float
         # To the flux of an AB magnitude, the same in all bands.
         scale = [10.0 ** (-0.4 * row["zero_point"]) / row["exposure_time_s"] for row in rows]
         some = [patch(row["file"], place, _COLOUR_PIXELS, order=1) for row in rows]
-        layers.append(np.median([s * (p - _levels(p)[0]) for s, p in zip(scale, some, strict=True)], axis=0))
-    noise = _levels(layers[0])[1]
-    made = colours(*(layer / noise for layer in layers))
+        above = np.sort([s * (p - _levels(p)[0]) for s, p in zip(scale, some, strict=True)], axis=0)
+        # Of two the lower.
+        layers.append(above[(len(above) - 1) // 2])
+    made = colours(*(layer / _levels(layer)[1] for layer in layers))
     path.parent.mkdir(parents=True, exist_ok=True)
     imsave(path, made, origin="lower")
     return path
