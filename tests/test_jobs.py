@@ -107,6 +107,7 @@ def test_what_must_be_built_first_is_named(job, tmp_path, capsys):
 
 
 @pytest.mark.spark
+@pytest.mark.nightly
 def test_the_same_request_gives_the_same_bytes_under_any_master(tmp_path):
     path = tmp_path / "r.toml"
     path.write_text(SMALL)

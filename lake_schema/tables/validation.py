@@ -36,7 +36,7 @@ VALIDATION = Table(
         _number("value", "meta.number", "as measured, in the unit of `value_unit`"),
         _number("error", "stat.error", "its standard error"),
         _number("expected", "meta.number", "what it should be"),
-        _number("tolerance", "stat.max", "how far from that it may be"),
+        _number("tolerance", "stat.error", "how far from that it may be"),
         Column("kind", "string", ucd="meta.code", doc="how tolerance and expectation bound it", codes=KINDS),
         Column("value_unit", "string", ucd="meta.unit", doc="unit of these numbers, empty for a ratio"),
         Column("source", "string", ucd="meta.bib", doc="where the expectation and the tolerance are from"),

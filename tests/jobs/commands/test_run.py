@@ -53,11 +53,11 @@ def test_what_cannot_be_done_is_refused_before_the_first_job(tmp_path, capsys, w
 
 def test_a_disc_without_room_is_refused_before_the_first_job(tmp_path, capsys, monkeypatch):
     asked = []
-    monkeypatch.setattr(space.shutil, "disk_usage", lambda path: asked.append(path) or Disc(1e12, 1e12 - 3e8, 3e8))
+    monkeypatch.setattr(space.shutil, "disk_usage", lambda path: asked.append(path) or Disc(1e12, 1e12 - 4e8, 4e8))
     lake, words = tmp_path / "not" / "there", ["--pictures", str(tmp_path / "pictures")]
     assert run.main([str(DEMO), "--lake", str(lake), *words], pytest.fail) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "0.30 GB are free, the forecast is 0." in line
+    assert "0.40 GB are free, the forecast is 0." in line
     assert asked == [tmp_path]
     # One detector of LSST's, and there is room.
     assert run.main([str(DEMO), "--lake", str(lake), "--detectors", "R22_S11"], lambda *job: 5) == 5

@@ -61,7 +61,9 @@ def test_a_command_that_is_stopped_stops_its_job(tmp_path, number, name, module,
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, cwd=tmp_path, env=environment, **pipes) as running:
-        assert running.stdout.readline() == "build_galaxies ...\n"
+        # After the forecast and an empty line.
+        assert running.stdout.readline().startswith("forecast: ")
+        assert [running.stdout.readline() for _ in range(2)] == ["\n", "build_galaxies ...\n"]
         pid = running.stdout.readline().strip()
         running.send_signal(number)
         assert running.wait(120) == 128 + number

@@ -606,7 +606,8 @@ def test_truth_maps_are_those_that_were_asked_for_and_that_a_channel_has(lake):
     assert Counter(version.rows()["content"].to_pylist()) == dict.fromkeys(
         ("science", "noise_free", "stars", "sky", "cosmic_rays", "saturation"), 2
     )
-    assert set(everything) | {"persistence", "ramp", "satellites", *truth_maps.ORDERS.values()} == set(truth_maps.BYTES)
+    others = {"persistence", "ramp", "satellites", "traps", "dipoles", *truth_maps.ORDERS.values()}
+    assert set(everything) | others == set(truth_maps.BYTES)
     maps = {row["content"]: fits.getdata(version.file(row["path"])) for row in version.rows().to_pylist()}
     exposed = read.version(lake, "exposures").rows().to_pylist()[0]
     np.testing.assert_allclose(maps["sky"], exposed["sky"] * exposed["exposure_time_s"], rtol=1e-6)

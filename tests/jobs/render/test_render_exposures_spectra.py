@@ -1,5 +1,8 @@
 """Every kind of image that NISP-S takes, by the jobs: four settings of the red grisms, the blue one, calibrations."""
 
+import re
+from pathlib import Path
+
 import grismconf
 import numpy as np
 import pyarrow.compute as pc
@@ -229,12 +232,15 @@ def test_grisms_of_an_exposure_are_as_its_spectra_were_drawn(rendered, tmp_path,
             assert ends == pytest.approx([row[f"{axis}_first"], row[f"{axis}_last"]], abs=0.01)
 
 
-def test_no_masters_are_made_of_spectra(rendered, folder, capsys):
+def test_masters_are_made_of_its_dark_and_flat(rendered, folder, capsys):
+    """Of the ramp that spectra are read with; the lake stays as it was."""
     before = sorted(path for path in rendered.rglob("*") if path.is_file())
-    arguments = ["--lake", str(rendered), "--out", str(folder / "masters")]
-    assert masters.main(arguments) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "no frames of the image type bias" in line
+    assert masters.main(["--lake", str(rendered), "--out", str(folder / "masters")]) == 0
+    dark, flat = (line.split(": ") for line in capsys.readouterr().out.strip().splitlines())
+    assert Path(dark[0]).name == "NISP-S_15-16-11_DET22_dark.fits"
+    assert Path(flat[0]).name == "NISP-S_nisp_red_DET22_flat.fits"
+    assert float(re.search(r"median (\S+),", dark[1])[1]) == pytest.approx(0.02, abs=0.005)
+    assert float(re.search(r"median (\S+),", flat[1])[1]) == pytest.approx(1.0, abs=0.005)
     assert sorted(path for path in rendered.rglob("*") if path.is_file()) == before
 
 

@@ -43,7 +43,10 @@ def widths(psf):
     return out
 
 
-@pytest.fixture(scope="module", params=WIDTHS)
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(band, marks=[] if band == "euclid_h" else [pytest.mark.nightly]) for band in WIDTHS],
+)
 def found(request):
     """Of a band, the widths on some detectors."""
     band = passbands.load(request.param)
