@@ -1,7 +1,8 @@
 """From a command line to published tables: the only file, with session.py, that knows Spark.
 
 A job is a function (lake, request) -> steps; a step is a plan (what to make of what) and the function that makes one
-part of it.  Spark carries the parts' numbers out and their receipts back; rows go straight from the kernel to a file.
+part of it.  Spark carries names and facts of the parts out, and what their receipts say back; rows go straight from the
+kernel to a file.
 """
 
 from __future__ import annotations
@@ -27,7 +28,6 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, TYPE_CHECKING, Any
 
-import pyarrow as pa
 from tqdm import tqdm
 
 from jobs.measured import Measured
@@ -50,12 +50,14 @@ class Step:
 
     on_driver : the work is too small to be worth a trip to the workers
     unit      : what a part is, for the progress bar
+    after     : told the version when it is published
     """
 
     plan: Plan
     work: Work
     on_driver: bool = False
     unit: str = "part"
+    after: Callable[[read.Version], None] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,20 +77,10 @@ class Job:
     dry_run: Callable[[Path, Request], Sequence[Step]] | None = None
 
 
-_RESULT = pa.schema(
-    [
-        pa.field("part", pa.string()),
-        pa.field("rows", pa.int64()),
-        pa.field("bytes", pa.int64()),
-        pa.field("seconds", pa.float64()),
-        pa.field("cpu_s", pa.float64()),
-        pa.field("peak_gb", pa.float64()),
-        pa.field("machine", pa.string()),
-        pa.field("attempt", pa.int64()),
-        pa.field("error", pa.string()),
-        pa.field("traceback", pa.string()),
-    ]
-)
+# What comes back of a part.
+_RESULT = (
+    "part", "rows", "bytes", "seconds", "cpu_s", "peak_gb", "machine", "attempt", "error", "traceback"
+)  # fmt: skip
 
 
 # What the C library calls an encoding of ASCII alone.
@@ -225,6 +217,8 @@ def _run(job: Job, step: Step, root: Path, request: Request, verbose: bool, took
     if len(machines) > 1:
         about = f"table {plan.table.name}: the machines that it was made on differ, and so may last bits"
         command.say(job.name, f"{about}: {'; '.join(machines)}", 0)
+    if step.after is not None:
+        step.after(version)
 
 
 def _summary(version: read.Version, made: int, seconds: float, before: bool) -> None:
@@ -282,9 +276,13 @@ def _bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
         done = threading.Event()
 
         def follow() -> None:
-            while not done.wait(0.25):
+            wait = 0.25
+            while not done.wait(wait):
+                started = time.perf_counter()
                 bar.update(count() - bar.n)
                 bar.refresh()
+                # Where there are 100,000 receipts a look takes long, and others work on the file system.
+                wait = max(0.25, 20.0 * (time.perf_counter() - started))
 
         thread = threading.Thread(target=follow, daemon=True)
         thread.start()
@@ -340,26 +338,22 @@ def _hushed() -> Iterator[None]:
 
 def _collect(spark: SparkSession, function: Callable[[Part], Json], parts: Sequence[Part]) -> list[Json]:
     tries = _tries(spark)
-    todo = list(parts)
 
-    def run(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+    def run(some: Iterable[Part]) -> Iterator[Json]:
         from pyspark import TaskContext
 
-        for batch in batches:
-            for index in batch["id"].to_pylist():
-                result = function(todo[index])
-                context = TaskContext.get()
-                last = context is None or context.attemptNumber() >= tries - 1
-                if "error" in result and not result.get("final") and not last:
-                    raise RuntimeError(result["error"])
-                attempt = 1 if context is None else context.attemptNumber() + 1
-                row = {field.name: [{**result, "attempt": attempt}.get(field.name)] for field in _RESULT}
-                yield pa.RecordBatch.from_pydict(row, _RESULT)
+        for part in some:
+            result = function(part)
+            context = TaskContext.get()
+            last = context is None or context.attemptNumber() >= tries - 1
+            if "error" in result and not result.get("final") and not last:
+                raise RuntimeError(result["error"])
+            attempt = 1 if context is None else context.attemptNumber() + 1
+            yield {name: value for name in _RESULT if (value := {**result, "attempt": attempt}.get(name)) is not None}
 
-    types = {pa.int64(): "long", pa.float64(): "double", pa.string(): "string"}
-    schema = ", ".join(f"{field.name} {types[field.type]}" for field in _RESULT)
-    frame = spark.range(0, len(todo), 1, numPartitions=len(todo)).mapInArrow(run, schema)
-    return [{k: v for k, v in row.asDict().items() if v is not None} for row in frame.collect()]
+    # A task is told its own part alone: what all of them are told is unpickled by each.
+    found: list[Json] = spark.sparkContext.parallelize(parts, len(parts)).mapPartitions(run).collect()
+    return found
 
 
 def _tries(spark: SparkSession) -> int:

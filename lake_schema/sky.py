@@ -4,6 +4,7 @@ healpix_29          sky -> order-29 index
 wrapped             angles in [0, 360)
 cell_of             sky -> cell of an order
 cells_in_cone       cells that a circle touches (never misses one)
+cells_in_cones      those of each of many circles that lie close together
 cells_in_polygon    cells that a spherical polygon touches
 cells_in_box        cells between two meridians and two parallels
 random_in_cell      uniform positions inside one cell, sorted
@@ -25,6 +26,8 @@ from lake_schema.errors import BadInput, OutOfRange
 DEEPEST = 29
 # Of three neighbouring vertices (unit vectors) the triple product at which healpy sees no corner any more.
 _FLATTEST = 1e-10
+# Added to a distance that decides: more than the rounding of any.
+_ROUNDING_DEG = 1e-9
 
 
 @cache
@@ -163,6 +166,42 @@ def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
     found = _hp().query_disc(1 << fine, centre, np.radians(min(radius + cell_radius(fine), 180.0)), nest=True)
     own = cell_of([ra], [dec], order)
     return np.unique(np.concatenate([parent(found, fine, order), own]))
+
+
+def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike, order: int) -> list[Int]:
+    """Cells of `order` that each of many circles touches, sorted: as `cells_in_cone`, of all circles at once.
+
+    ra, dec, radius : [n] deg; quick where the circles lie close together, such as those of the detectors of a camera
+    """
+    lon, lat = checked(ra, dec)
+    far, fine = np.asarray(radius, float), min(order + 3, DEEPEST)
+    if not lon.size:
+        return []
+    if not ((far >= 0.0) & (far <= 180.0)).all():
+        raise OutOfRange("radius", _first(far[~((far >= 0.0) & (far <= 180.0))]), 0.0, 180.0)
+    centres, own = unit_vectors(lon, lat), cell_of(lon, lat, order)
+    reach = np.minimum(far + cell_radius(fine), 180.0)
+    size = cell_radius(order) + _ROUNDING_DEG
+    widest = float((separation(lon, lat, lon[0], lat[0]) + far).max()) + size
+    about = cells_in_cone(float(lon[0]), float(lat[0]), min(widest, 180.0), order)
+    # Of most cells their middle tells; of the others, whether the middle of a finer cell within them is near enough.
+    middles = _hp().pix2vec(1 << order, about, nest=True)
+    nearness = sum(centres[:, i, None] * middles[i] for i in range(3))
+    sure = np.where(reach > size, np.cos(np.radians(np.maximum(reach - size, 0.0))), np.inf)
+    touched = nearness >= sure[:, None]
+    circle, unsure = np.nonzero(~touched & (nearness >= np.cos(np.radians(np.minimum(reach + size, 180.0)))[:, None]))
+    within = _middles(about, order, fine)[:, unsure]
+    nearness = sum(within[i] * centres[circle, i, None] for i in range(3))
+    touched[circle, unsure] = (nearness >= np.cos(np.radians(reach))[circle, None]).any(axis=1)
+    touched |= about == own[:, None]
+    return [about[row] for row in touched]
+
+
+def _middles(cells: Int, order: int, finer: int) -> Float:
+    """[3, n, m] directions of the middles of the finer cells within each cell."""
+    many = 1 << 2 * (finer - order)
+    inside = (np.asarray(cells)[:, None] << 2 * (finer - order)) + np.arange(many)
+    return np.array(_hp().pix2vec(1 << finer, inside, nest=True))
 
 
 def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:

@@ -1,5 +1,7 @@
 """Plan the exposures of a request: spark-submit jobs/render/plan_exposures.py --lake LAKE --request REQUEST."""
 
+from __future__ import annotations
+
 import sys
 from pathlib import Path
 
@@ -7,7 +9,10 @@ if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 
 import pyarrow as pa
 
@@ -16,15 +21,14 @@ from jobs.fluxes import inputs
 from jobs.render.forecasting import catalogue_forecast, forecast, speed
 from jobs.render.planning import (
     ground_surveys,
-    planned_exposures,
     preconditions,
     psf_files,
     source_counts,
-    survey,
     tasks,
     variants,
 )
 from jobs.render.planning.mission import PARTS, mission_of, user_filters
+from jobs.render.planning.parts import Layout, Piece
 from jobs.render.planning.prices import Files
 from jobs.render.products.keys import ephemeris_files, stamp_files
 from jobs.request import universe
@@ -32,7 +36,6 @@ from jobs.request.checks import check_rendered
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, common_facts, main
 from lake_schema import command
-from lake_schema.columns import Table
 from lake_schema.errors import BadInput
 from lake_schema.mission import checks, published
 from lake_schema.mission.configuration import MissionConfiguration
@@ -45,24 +48,76 @@ from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
 
+# Rows of `exposures` and of `tasks`.
+Plan_ = tuple[pa.Table, pa.Table]
+# Fact of the plan of `tasks`: keys of what they were made of.
+_MADE_OF = "made_of"
+
+
+@dataclass(frozen=True, slots=True)
+class Planner:
+    """What makes the parts of a request's plan, on the driver or on a worker.
+
+    lake : whose catalogues say how dense the sky is, if it has them
+    """
+
+    lake: Path | None
+    request: Request
+    mission: MissionConfiguration
+    layout: Layout
+
+    @classmethod
+    def of(cls, lake: Path | None, request: Request) -> Planner:
+        """Errors : BadInput for whatever is wrong with pointings, observations and PSFs."""
+        if not request.pointings and not request.observations:
+            raise BadInput(f"request {request.name}: pointing and observation are missing: there is nothing to plan")
+        mission = mission_of(request.mission)
+        checks.check(mission)
+        found = Layout.of(request, mission)
+        psf_files.check(found.standing(), user_filters(request)[0], request.psfs)
+        return cls(lake, request, mission, found)
+
+    def exposures(self, lake: Path, facts: Json) -> Output:
+        """A part of the table `exposures`; facts : its own."""
+        return Output(self.rows_of_exposures(self.layout.piece(facts)))
+
+    def tasks(self, lake: Path, facts: Json) -> Output:
+        """A part of the table `tasks`; facts : its own, and the key of `exposures`."""
+        exposures = read.version(lake, EXPOSURES.name, facts[_MADE_OF][EXPOSURES.name])
+        piece = self.layout.piece(facts)
+        return Output(self.rows_of_tasks(piece, exposures.rows(parts=[facts["part"]])))
+
+    def rows_of_exposures(self, piece: Piece) -> pa.Table:
+        """Rows of the table `exposures` of a part of the layout."""
+        return self.layout.exposures(piece, user_filters(self.request)[0], self.request.seed)
+
+    def rows_of_tasks(self, piece: Piece, exposures: pa.Table) -> pa.Table:
+        """Rows of the table `tasks` of a part of the layout; exposures : its rows."""
+        request = self.request
+        densities = source_counts.Densities(
+            self.mission, request.universe, [] if self.lake is None else _catalogues(self.lake, request)
+        )
+        files = Files(request.files == "exposure", request.readout)
+        wanted, forced = self.layout.wanted(piece), variants.forced(request)
+        return tasks.table(exposures, wanted, self.mission, densities, request.truth, request.accuracy, forced, files)
+
+    def tables(self) -> Iterator[Plan_]:
+        """Rows of `exposures` and `tasks`, a part after the other."""
+        for piece in self.layout.pieces:
+            exposures = self.rows_of_exposures(piece)
+            yield exposures, self.rows_of_tasks(piece, exposures)
+
 
 def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
     """The mission configuration, and rows of the tables `exposures` and `tasks`; lake : with catalogues, if any."""
-    if not request.pointings and not request.observations:
-        raise BadInput(f"request {request.name}: pointing and observation are missing: there is nothing to plan")
-    mission = mission_of(request.mission)
-    checks.check(mission)
-    found = survey.exposures(request, mission)
-    filters, _ = user_filters(request)
-    missions = [own for _, own in found]
-    exposures = planned_exposures.table([exposure for exposure, _ in found], missions, filters, request.seed)
-    psf_files.check([(exposure, own) for exposure, own in found], filters)
-    catalogues = [] if lake is None else _catalogues(lake, request)
-    densities = source_counts.Densities(mission, request.universe, catalogues)
-    wanted = [exposure.detectors for exposure, _ in found]
-    forced, files = variants.forced(request), Files(request.files == "exposure", request.readout)
-    rows = tasks.table(exposures, wanted, mission, densities, request.truth, request.accuracy, forced, files)
-    return mission, exposures, rows
+    planner = Planner.of(lake, request)
+    return planner.mission, *_together(planner.tables())
+
+
+def _together(parts: Iterable[Plan_]) -> Plan_:
+    """Rows of a whole plan, those of tasks longest first."""
+    exposures, rows = zip(*parts, strict=True)
+    return pa.concat_tables(exposures).combine_chunks(), tasks.in_order(pa.concat_tables(rows))
 
 
 def _catalogues(lake: Path, request: Request) -> list[read.Version]:
@@ -72,61 +127,84 @@ def _catalogues(lake: Path, request: Request) -> list[read.Version]:
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """The mission configuration, the exposures, and a task for each of their detectors; prints the forecast."""
+    """The mission configuration, the exposures, and a task for each of their detectors; prints the forecast.
+
+    A plan of one part is made on the driver, a larger one by the workers.
+    """
     universe.refuse_other(_catalogues(lake, request), request)
-    mission, exposures, rows = plan(lake, request)
-    _print_forecast(lake, exposures, rows)
-    _say_by_day(exposures, mission)
-    facts = {**common_facts(request, *PARTS), "mission": mission.fingerprint, **user_filters(request)[1]}
+    planner = Planner.of(lake, request)
+    _say_by_day(planner)
+    facts = {**common_facts(request, *PARTS), "mission": planner.mission.fingerprint, **user_filters(request)[1]}
+    about = {
+        "mission": planner.mission.fingerprint,
+        "ladder": list(planner.mission.ladder),
+        "records": digest([repr(r) for r in (*read_all(), *read_models())]),
+    }
+    parts = planner.layout.parts()
+    small = len(parts) == 1
+    exposures = Plan(EXPOSURES, facts, parts)
     # What they cost depends on more than which they are.
     counts = {v.table: v.key for v in _catalogues(lake, request)}
     costs = {**facts, "counts": counts, "rendered": request.facts("accuracy", "effects", "files", "readout")}
-    about = {
-        "mission": mission.fingerprint,
-        "ladder": list(mission.ladder),
-        "records": digest([repr(r) for r in (*read_all(), *read_models())]),
-    }
+    costs[_MADE_OF] = {EXPOSURES.name: exposures.key}
+    own = tuple(Part(part.name, {**part.facts, "part": part.name}) for part in parts)
+    whole = published.output(planner.mission)
     return [
-        _step(MISSION, published.output(mission), about),
-        _step(EXPOSURES, Output(exposures), facts),
-        _step(TASKS, Output(rows), costs),
+        Step(Plan(MISSION, about, (Part("all.parquet", {}),)), lambda lake, part: whole, on_driver=True),
+        Step(exposures, planner.exposures, on_driver=small),
+        Step(Plan(TASKS, costs, own), planner.tasks, on_driver=small, after=partial(_print_published, lake)),
     ]
 
 
-def _step(table: Table, output: Output, facts: Json) -> Step:
-    return Step(Plan(table, facts, (Part("all.parquet", {}),)), lambda lake, part: output, on_driver=True)
+def _print_published(lake: Path, version: read.Version) -> None:
+    """The forecast of published tasks."""
+    exposures = read.version(lake, EXPOSURES.name, version.manifest["facts"][_MADE_OF][EXPOSURES.name])
+    columns = ["exposure_id", "survey", "image_type"], ["exposure_id", "detector", "channel", *forecast.SUMMED]
+    _print_forecast(
+        lake, ((exposures.rows(columns[0], [part]), version.rows(columns[1], [part])) for part in version.parts)
+    )
 
 
 def dry_run(lake: Path, request: Request) -> Sequence[Step]:
     """The forecast alone, of the catalogues, too, of a request that no later job would refuse."""
     universe.refuse_other(_catalogues(lake, request), request)
-    exposures, rows = check(request, lake)
-    _print_forecast(lake, exposures, rows)
-    _say_by_day(exposures, mission_of(request.mission))
+    _print_forecast(lake, checked(request, lake))
+    _say_by_day(Planner.of(lake, request))
     print()
     for line in catalogue_forecast.text(catalogue_forecast.of_request(request, speed.of_machine(lake).factor)):
         print(line)
     return ()
 
 
-def check(request: Request, lake: Path | None = None) -> tuple[pa.Table, pa.Table]:
+def check(request: Request, lake: Path | None = None) -> Plan_:
     """Refuse whatever the jobs of this request would refuse, the catalogues' as well, before any of them runs.
 
     returns : rows of the tables `exposures` and `tasks`, as planned;  lake : whose catalogues say how dense the sky is
     """
+    return _together(checked(request, lake))
+
+
+def checked(request: Request, lake: Path | None = None) -> Iterator[Plan_]:
+    """As `check`, a part of the plan after the other; all is refused that is to be when the last has come."""
     check_rendered(request)
     # First what names the pointing or the observation that is wrong.
-    _, exposures, rows = plan(lake, request)
+    planner = Planner.of(lake, request)
+    parts = planner.tables()
+    first = next(parts)
     check_catalogues(request)
-    if request.bodies is not None:
-        ephemeris_files(request.bodies, exposures)
     if request.structure.stamps is not None:
         stamp_files(request.structure.stamps.file)
-    seen = preconditions.rendered(exposures, rows)
-    if request.detectors or request.limit is not None:
-        seen = pa.Table.from_pylist(tasks.part(seen, request), seen.schema)
-    preconditions.refuse_small_area(request.area, seen)
-    return exposures, rows
+    narrowed, some = tasks.Narrowed(request), False
+    for exposures, rows in chain([first], parts):
+        if request.bodies is not None:
+            ephemeris_files(request.bodies, exposures)
+        seen = preconditions.drawable(exposures, rows)
+        some = some or seen.num_rows > 0
+        preconditions.refuse_small_area(request.area, narrowed.of(seen))
+        yield exposures, rows
+    if not some:
+        preconditions.rendered(exposures, rows)
+    narrowed.refuse_unknown()
 
 
 def check_catalogues(request: Request) -> None:
@@ -135,14 +213,14 @@ def check_catalogues(request: Request) -> None:
     request_checks.refuse(request)
 
 
-def _print_forecast(lake: Path, exposures: pa.Table, rows: pa.Table) -> None:
+def _print_forecast(lake: Path, parts: Iterable[Plan_]) -> None:
     machine = speed.of_machine(lake)
-    for line in forecast.text(forecast.rows(exposures, rows, machine.factor), machine):
+    for line in forecast.text(forecast.of_parts(parts, machine.factor), machine):
         print(line)
 
 
-def _say_by_day(exposures: pa.Table, mission: MissionConfiguration) -> None:
-    if line := ground_surveys.by_day(exposures, mission):
+def _say_by_day(planner: Planner) -> None:
+    if line := ground_surveys.by_day((exposure for exposure, _ in planner.layout.standing()), planner.mission):
         command.say("plan_exposures", line, 0)
 
 

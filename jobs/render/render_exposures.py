@@ -22,13 +22,13 @@ from jobs.render.channels.aim import Aim
 from jobs.render.drawing import stamp_sizes
 from jobs.render.exposure import elsewhere, persistence, render, visible_sources, visible_spectra
 from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
-from jobs.render.planning import preconditions, variants
+from jobs.render.planning import parts, preconditions, variants
 from jobs.render.planning import tasks as planned
 from jobs.render.planning.mission import mission_of
 from jobs.render.planning.preconditions import INPUTS
 from jobs.render.products import exposure_files, fits_files, truth_table
 from jobs.render.products.beside import psf_file, spectra_file, truth_file
-from jobs.render.products.keys import ephemeris_files, product_keys, psf_files, stamp_files
+from jobs.render.products.keys import ephemeris_files, part_name, product_keys, psf_files, stamp_files
 from jobs.render.psf import from_file, to_psfex
 from jobs.render.sources import catalogue_rows, ephemerides, galaxy_stamps, selection, solar_system
 from jobs.render.sources.catalogue_rows import LENSES
@@ -58,7 +58,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     inputs = inputs_of(lake, request)
     preconditions.refuse_other_plan(inputs, request)
     exposures = inputs["exposures"].rows()
-    every = preconditions.rendered(exposures, inputs["tasks"].rows())
+    every = preconditions.rendered(exposures, planned.in_order(inputs["tasks"].rows()))
     asked = planned.part(every, request)
     earlier = _earlier_tasks(inputs, exposures, request)
     needed = _with_earlier(asked, earlier, exposures)
@@ -122,7 +122,7 @@ def products(
     if request.structure.stamps is not None:
         facts["stamps"] = stamp_files(request.structure.stamps.file)
     held = reuse.held(lake, PRODUCTS.name, request.name)
-    wanted = {_part_name(task) for task in asked}
+    wanted = {part_name(task) for task in asked}
     earlier = _earlier_tasks(inputs, exposures, request)
     tasks = _with_held(wanted, every, exposures, held, earlier)
     psfs = psf_files(exposures, _with_earlier(tasks, earlier, exposures))
@@ -130,11 +130,11 @@ def products(
     parts = tuple(
         Part(name, {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: key})
         for task, key in zip(tasks, keys, strict=True)
-        if (name := _part_name(task)) in wanted or held[name] == key
+        if (name := part_name(task)) in wanted or held[name] == key
     )
     if len(parts) < len(tasks):
         stay = {part.name for part in parts}
-        kept = [task for task in tasks if _part_name(task) in stay]
+        kept = [task for task in tasks if part_name(task) in stay]
         psfs = psf_files(exposures, _with_earlier(kept, earlier, exposures))
     return Plan(PRODUCTS, {**facts, "psf": psfs} if psfs else facts, parts)
 
@@ -164,10 +164,6 @@ def _with_earlier(
     return [*tasks, *(one for one in before if one["exposure_id"] in drawn)]
 
 
-def _part_name(task: Json) -> str:
-    return f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet"
-
-
 def _with_held(
     wanted: Set[str],
     every: Sequence[Json],
@@ -181,9 +177,9 @@ def _with_held(
     def stays(task: Json) -> bool:
         drawn = [task, *earlier.get((task["exposure_id"], task["detector"]), ())]
         read = [from_file.file_of(psf, one["detector"]) for one in drawn if (psf := psfs[one["exposure_id"]])]
-        return _part_name(task) in held and all(file.is_file() for file in read)
+        return part_name(task) in held and all(file.is_file() for file in read)
 
-    return [task for task in every if _part_name(task) in wanted or stays(task)]
+    return [task for task in every if part_name(task) in wanted or stays(task)]
 
 
 def _lenses(lake: Path, request: Request, galaxies: read.Version) -> read.Version | None:
@@ -224,8 +220,8 @@ def aimed(lake: Path, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
     inputs = {
         name: read.version(lake, name, facts["inputs"][name]) for name in ("exposures", "galaxy_fluxes", "mission")
     }
-    here = pc.field("exposure_id") == facts["exposure_id"]
-    (exposed,) = map(ExposureRow.of, inputs["exposures"].rows(where=here).to_pylist())
+    number, here = [facts["exposure_id"]], pc.field("exposure_id") == facts["exposure_id"]
+    (exposed,) = map(ExposureRow.of, parts.rows(inputs["exposures"], number, where=here).to_pylist())
     mission = read_back(inputs["mission"])
     own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
     detector = detectors.detector(exposed.camera, facts["detector"], own.mission)
@@ -241,8 +237,9 @@ def prepared(lake: Path, facts: Json) -> tuple[Aim, Rows, Variant]:
     """
     request, (aim, own, mission) = facts["request"], aimed(lake, facts)
     exposed, inputs = aim.exposure, {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
-    here = pc.field("exposure_id") == facts["exposure_id"]
-    (task,) = inputs["tasks"].rows(where=here & (pc.field("detector") == facts["detector"])).to_pylist()
+    number = facts["exposure_id"]
+    here = (pc.field("exposure_id") == number) & (pc.field("detector") == facts["detector"])
+    (task,) = parts.rows(inputs["tasks"], [number], where=here).to_pylist()
     earlier = _earlier(lake, inputs, exposed, task, mission, request["seed"])
     for one in (exposed, *(before.exposure for before in earlier if isinstance(before, Earlier))):
         if one.psf:
@@ -329,10 +326,11 @@ def _earlier(
     own = variants.missions(mission)
     since = exposed.mjd - persistence.window(exposed.camera, own(exposed.settings))
     near = (pc.field("mjd") >= since) & (pc.field("mjd") <= exposed.mjd)
-    found = inputs["exposures"].rows(where=near & (pc.field("camera") == exposed.camera)).to_pylist()
+    same = pc.field("camera") == exposed.camera
+    found = parts.rows(inputs["exposures"], dates=(since, exposed.mjd), where=near & same).to_pylist()
     rows = {row.exposure_id: row for row in map(ExposureRow.of, found)}
     here = pc.field("exposure_id").isin(list(rows)) & (pc.field("detector") == task["detector"])
-    tasks = inputs["tasks"].rows(where=here).to_pylist()
+    tasks = parts.rows(inputs["tasks"], rows, where=here).to_pylist()
     before = persistence.earlier_of(tasks, rows, own)[exposed.exposure_id, task["detector"]]
     pairs = ((rows[one["exposure_id"]], one) for one in before)
     return tuple(

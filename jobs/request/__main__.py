@@ -44,9 +44,11 @@ def _refuse(request: Request, alone: bool) -> None:
     if not request.pointings and not request.observations:
         plan_exposures.check_catalogues(request)
     elif alone:
-        plan_exposures.plan(None, request)
+        for _ in plan_exposures.Planner.of(None, request).tables():
+            pass
     else:
-        plan_exposures.check(request)
+        for _ in plan_exposures.checked(request):
+            pass
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from lake_schema.store import hats_files, layout, locks, manifest, names, reuse
 from lake_schema.store.layout import current_key
 from lake_schema.store.manifest import sync
 from lake_schema.store.plan import Json, Output, Part, Plan, Work, data_path
-from lake_schema.store.stage import attempt, forget_damaged, is_done, missing, receipt_of, receipts, write_part
+from lake_schema.store.stage import attempt, done, forget_damaged, is_done, missing, receipts, write_part
 from lake_schema.store.uniqueness import refuse_duplicates
 
 __all__ = [
@@ -73,8 +73,7 @@ def make(
         else:
             stage = layout.stage(root, table, key)
             stage.mkdir(exist_ok=True)
-            _make_parts(root, plan, work, mapper, name)
-            _finish(stage, plan)
+            _finish(stage, plan, _make_parts(root, plan, work, mapper, name))
         _publish(root, plan, base, name)
     return target
 
@@ -101,7 +100,8 @@ def _refuse_damaged(target: Path, name: str) -> None:
         raise Damaged(f"{found[0]}; remove {target} to have it made again")
 
 
-def _make_parts(root: Path, plan: Plan, work: Work, mapper: Mapper, name: str | None) -> None:
+def _make_parts(root: Path, plan: Plan, work: Work, mapper: Mapper, name: str | None) -> list[Json]:
+    """Receipts of all parts, in the plan's order."""
     table, stage = plan.table, layout.stage(root, plan.table.name, plan.key)
     forget_damaged(stage, plan)
     for version in _others(root, table.name, name):
@@ -112,10 +112,11 @@ def _make_parts(root: Path, plan: Plan, work: Work, mapper: Mapper, name: str | 
     for result in mapper(function, todo) if todo else ():
         if "error" in result:
             failures[result["part"]] = result["error"]
-    left = missing(stage, plan)
-    if left:
+    made = done(stage, plan)
+    if left := [part for part in plan.parts if part.name not in made]:
         lines = [f"{part.name}: {failures.get(part.name, 'ended without a receipt')}" for part in left]
         raise PartsFailed(f"table {table.name}: {len(left)} of {len(plan.parts)} parts failed: " + "; ".join(lines))
+    return [made[part.name] for part in plan.parts]
 
 
 def _others(root: Path, table: str, name: str | None) -> list[Path]:
@@ -125,9 +126,11 @@ def _others(root: Path, table: str, name: str | None) -> list[Path]:
     return [path for path in found if path.exists()]
 
 
-def _finish(stage: Path, plan: Plan) -> None:
-    """Metadata and manifest: after this the stage is the version, all but its name."""
-    made = [receipt for part in plan.parts if (receipt := receipt_of(stage, part.name)) is not None]
+def _finish(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
+    """Metadata and manifest: after this the stage is the version, all but its name.
+
+    made : receipts of the plan's parts
+    """
     refuse_duplicates(stage, plan, made)
     listed = {f["path"]: f for receipt in made for f in receipt["files"]}
     _sweep(stage, set(listed))
@@ -138,9 +141,14 @@ def _finish(stage: Path, plan: Plan) -> None:
     for path in sorted(stage.rglob("*")):
         relative = path.relative_to(stage).as_posix()
         if path.is_file():
-            entry = listed.pop(relative, None) or manifest.file_facts(path, relative)
+            entry = listed.pop(relative, None)
+            if entry is None:
+                # What a receipt names was synced before.
+                entry = manifest.file_facts(path, relative)
+                sync(path)
             files.append({**entry, **({"rows": rows[relative]} if relative in rows else {})})
-        sync(path)
+        else:
+            sync(path)
     if listed:
         raise Damaged(f"{stage / min(listed)} is missing")
     deflections = (

@@ -51,7 +51,7 @@ class Version:
     """
 
     folder: Folder
-    manifest: dict[str, Any]
+    manifest: manifest.Manifest
     schema: pa.Schema
 
     @property
@@ -126,7 +126,7 @@ class Version:
         return entry
 
     def _files(self) -> dict[str, dict[str, Any]]:
-        return {entry["path"]: entry for entry in self.manifest["files"]}
+        return self.manifest.by_path
 
     def dataset(self, parts: Iterable[str] | None = None) -> parquet.Dataset:
         """The version's files (or those parts') as an Arrow dataset that refuses what is not as it was written."""

@@ -24,7 +24,9 @@ def files_of(part: Part, receipt: Json) -> Json:
     """What the manifest says of a part that can be used again: its rows and files."""
     if PRODUCT not in part.facts:
         return {}
-    return {"rows": receipt["rows"], "files": [f["path"] for f in receipt["files"]], "machine": receipt.get("machine")}
+    known = {"span": receipt["span"]} if "span" in receipt else {}
+    files = [file["path"] for file in receipt["files"]]
+    return {"rows": receipt["rows"], "files": files, "machine": receipt.get("machine"), **known}
 
 
 def held(root: Path, table: str, request: str) -> Mapping[str, str]:
@@ -70,7 +72,7 @@ def take(stage: Path, version: Path, table: str, parts: Sequence[Part]) -> None:
             for entry in files:
                 _link(version / entry["path"], stage / entry["path"])
             receipt = {"part": part.name, "rows": found["rows"], "files": files, "machine": found.get("machine")}
-            write_receipt(stage, receipt)
+            write_receipt(stage, {**receipt, "span": found["span"]} if "span" in found else receipt)
 
 
 def _whole(folder: Path, entry: Json) -> Json | None:

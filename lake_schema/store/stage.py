@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from lake_schema import sky
 from lake_schema.columns import Table
@@ -27,6 +28,8 @@ from lake_schema.store.validate import check
 
 # A part whose identifiers spread over more blocks than this has none worth noting (order 3 has 1024 of a kind).
 _MOST_BLOCKS = 4096
+# Receipts that are looked at at once: what a file system on the network takes is waited for.
+_AT_ONCE = 16
 # Positions of a source besides those that files go by.
 _OTHER_PLACES = (("ra_true", "dec_true"), ("ra_lensed", "dec_lensed"))
 
@@ -103,16 +106,33 @@ def _check_sky(rows: pa.Table, table: Table, part: Part) -> None:
 
 
 def _row_facts(rows: pa.Table, table: Table) -> dict[str, Any]:
-    """What the driver must know of a part's rows: the blocks of its identifiers, the largest deflection."""
+    """What the driver must know of a part's rows: blocks of its identifiers or the span of its keys, the largest
+    deflection.
+    """
     facts: dict[str, Any] = {}
     if is_numbered(table):
         blocks = np.unique(rows[table.key[0]].to_numpy() >> BLOCK_BITS)
         facts["blocks"] = blocks.tolist() if blocks.size <= _MOST_BLOCKS else None
+    else:
+        facts["span"] = _span(rows, table)
     other = next((names for names in _OTHER_PLACES if names[0] in table.names), None)
     if other is not None:
         places = (rows[name].to_numpy() for name in ("ra", "dec", *other))
         facts["deflection_deg"] = float(sky.separation(*places).max(initial=0.0))
     return facts
+
+
+def _span(rows: pa.Table, table: Table) -> list[list[Any]]:
+    """Lowest and highest value of the key's first columns, as far as they are the same in all rows and one on."""
+    lowest: list[Any] = []
+    highest: list[Any] = []
+    for name in table.key if rows.num_rows else ():
+        bounds = pc.min_max(rows[name]).as_py()
+        lowest.append(bounds["min"])
+        highest.append(bounds["max"])
+        if lowest != highest:
+            break
+    return [lowest, highest] if lowest else []
 
 
 def is_numbered(table: Table) -> bool:
@@ -171,22 +191,33 @@ def is_done(stage: Path, part: Part) -> bool:
     return all(path.is_file() and path.stat().st_size == size for path, size in sizes)
 
 
+def done(stage: Path, plan: Plan) -> dict[str, Json]:
+    """Receipts of the parts that are done, by name."""
+    folder = receipts(stage)
+    there = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
+    some = [part for part in plan.parts if f"{_flat(part.name)}.json" in there]
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        found = pool.map(lambda part: receipt_of(stage, part.name) if is_done(stage, part) else None, some)
+        return {part.name: receipt for part, receipt in zip(some, found, strict=True) if receipt is not None}
+
+
 def missing(stage: Path, plan: Plan) -> list[Part]:
     """Parts of the plan that are not done."""
-    return [part for part in plan.parts if not is_done(stage, part)]
+    made = done(stage, plan)
+    return [part for part in plan.parts if part.name not in made]
 
 
 def forget_damaged(stage: Path, plan: Plan) -> None:
     """Remove the receipts of parts whose files do not have the sha256 that they say."""
-    done = [part for part in plan.parts if is_done(stage, part)]
+    made = done(stage, plan)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for part, whole in zip(done, pool.map(lambda part: _is_whole(stage, part), done), strict=True):
+        for name, whole in zip(made, pool.map(lambda name: _is_whole(stage, name), made), strict=True):
             if not whole:
-                _receipt_path(stage, part.name).unlink(missing_ok=True)
+                _receipt_path(stage, name).unlink(missing_ok=True)
 
 
-def _is_whole(stage: Path, part: Part) -> bool:
-    receipt = receipt_of(stage, part.name) or {"files": []}
+def _is_whole(stage: Path, part: str) -> bool:
+    receipt = receipt_of(stage, part) or {"files": []}
     files = [(stage / f["path"], f["sha256"]) for f in receipt["files"]]
     if "border" in receipt:
         files.append((receipts(stage) / receipt["border"]["path"], receipt["border"]["sha256"]))

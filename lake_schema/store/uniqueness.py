@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +22,15 @@ from lake_schema.store.stage import is_numbered
 def refuse_duplicates(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
     """Raise BadInput where a key stands in two parts; the rows of one part have been compared before they were written.
 
-    made : receipts.  Only parts that share a block of identifiers are read, so a catalogue costs little
+    made : receipts.  Only parts are read that share a block of identifiers, or whose keys' spans overlap
     """
     table = plan.table
     # A part's table is the first of its files.
     entries = {receipt["files"][0]["path"]: receipt["files"][0] for receipt in made}
     if not is_numbered(table):
-        return _refuse_any(stage, table, list(entries.values()))
+        for some in _overlapping(made):
+            _refuse_any(stage, table, [receipt["files"][0] for receipt in some])
+        return
 
     @lru_cache(maxsize=16)
     def ids(path: str) -> Int:
@@ -60,6 +63,33 @@ def _refuse_within(what: str, block: int | None, files: Sequence[str], ids: Call
         source = np.repeat(np.arange(len(files)), [piece.size for piece in pieces])
         first, second = (PurePosixPath(files[source[order[same[0] + i]]]).name for i in (0, 1))
         raise BadInput(f"{what} {together[order[same[0]]]} stands in {first} and in {second}")
+
+
+def _overlapping(made: Sequence[Json]) -> Iterator[list[Json]]:
+    """Receipts whose keys may be one another's, by their spans; of none that nobody shares a key with."""
+    if any("span" not in receipt for receipt in made):
+        # An older truesky wrote some.
+        yield list(made)
+        return
+    group: list[Json] = []
+    highest: list[Any] = []
+    for receipt in sorted((one for one in made if one["span"]), key=lambda receipt: receipt["span"][0]):
+        lowest, high = receipt["span"]
+        if group and _is_below(highest, lowest):
+            if len(group) > 1:
+                yield group
+            group = []
+        # Of bounds that are equal as far as both go, the shorter holds more.
+        if not group or _is_below(highest, high) or (not _is_below(high, highest) and len(high) < len(highest)):
+            highest = high
+        group.append(receipt)
+    if len(group) > 1:
+        yield group
+
+
+def _is_below(one: Sequence[Any], other: Sequence[Any]) -> bool:
+    many = min(len(one), len(other))
+    return list(one[:many]) < list(other[:many])
 
 
 def _refuse_any(stage: Path, table: Table, entries: Sequence[Json]) -> None:

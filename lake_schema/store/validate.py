@@ -112,6 +112,8 @@ def _duplicates(rows: pa.Table, table: Table) -> list[str]:
         value = int(keys[1:][same][0])
         places = np.flatnonzero(rows[table.key[0]].to_numpy() == value)
         return [f"table {table.name}: {table.key[0]} {value} stands in rows {places[0]} and {places[1]}"]
+    if rows.group_by(list(table.key), use_threads=False).aggregate([]).num_rows == rows.num_rows:
+        return []
     seen: dict[tuple[object, ...], int] = {}
     for row, key in enumerate(zip(*(rows[k].to_pylist() for k in table.key), strict=True)):
         if key in seen:

@@ -210,3 +210,26 @@ def test_corners_lie_about_the_centre(order):
         apart = sky.separation(*sky.cell_centre(order, int(cell)), around[:, 0], around[:, 1])
         assert (apart <= sky.cell_radius(order) * (1 + 1e-9)).all()
         assert (apart > 0.5 * np.sqrt(sky.cell_area(order) / 2)).all()
+
+
+@pytest.mark.parametrize("order", [3, 8])
+def test_cells_of_many_cones_are_those_of_each(order):
+    """As one after another: wherever they lie, small and large, also where they lie far from one another."""
+    rng = np.random.default_rng(5)
+    for ra, dec, spread in (
+        (0.0, 89.9, 0.5),
+        (359.9, 0.0, 0.5),
+        (45.0, 41.8, 0.5),
+        (12.0, -89.99, 0.1),
+        (0.0, 0.0, 90.0),
+    ):
+        lon = ra + rng.uniform(-spread, spread, 40) / max(np.cos(np.radians(dec)), 0.01)
+        lat = np.clip(dec + rng.uniform(-spread, spread, 40), -90.0, 90.0)
+        radius = np.concatenate([rng.uniform(0.0, 0.4, 38), [0.0, 3.0]])
+        found = sky.cells_in_cones(lon, lat, radius, order)
+        assert [cells.tolist() for cells in found] == [
+            sky.cells_in_cone(*place, order).tolist() for place in zip(lon, lat, radius, strict=True)
+        ]
+    assert sky.cells_in_cones([], [], [], order) == []
+    with pytest.raises(OutOfRange, match="radius"):
+        sky.cells_in_cones([0.0, 1.0], [0.0, 0.0], [0.1, -1.0], order)

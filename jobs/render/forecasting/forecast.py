@@ -1,18 +1,24 @@
 """What a plan will cost, before anything is rendered.
 
 rows     a line a channel, survey and image type, one a channel, one in all: exposures, detectors, core-hours, storage
+of_parts the same of a plan in parts
 text     the table that a person reads
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import pyarrow as pa
 
 from jobs.render.forecasting.speed import Speed
+
+# Columns of `tasks` that a forecast adds up; what stands for all surveys of a channel.
+SUMMED = ("sources", "seconds", "bytes", "memory")
+_ALL = "all"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +42,7 @@ def rows(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line
     factor : CPU s of the machine that is asked about over those of `tasks` (speed.of_machine)
     """
     about = exposures.select(["exposure_id", "survey", "image_type"])
-    joined = tasks.drop_columns(["cells", "s_region"]).join(about, "exposure_id")
+    joined = tasks.select(["exposure_id", "detector", "channel", *SUMMED]).join(about, "exposure_id")
     keys = ["channel", "survey", "image_type"]
     sums = joined.group_by(keys).aggregate(
         [
@@ -48,17 +54,29 @@ def rows(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line
             ("memory", "max"),
         ]
     )
-    kinds = [_line(row, factor) for row in sums.sort_by([(key, "ascending") for key in keys]).to_pylist()]
+    return _with_sums([_line(row, factor) for row in sums.to_pylist()])
+
+
+def of_parts(parts: Iterable[tuple[pa.Table, pa.Table]], factor: float = 1.0) -> list[Line]:
+    """As `rows`, of a plan of which a part comes after the other: exposures, and the tasks of these."""
+    return _with_sums([line for own in parts for line in rows(*own, factor) if line.survey != _ALL])
+
+
+def _with_sums(lines: list[Line]) -> list[Line]:
+    own: dict[tuple[str, str, str], list[Line]] = defaultdict(list)
+    for line in lines:
+        own[line.channel, line.survey, line.image_type].append(line)
+    kinds = [_sum(*key, some) for key, some in sorted(own.items())]
     channels = sorted({line.channel for line in kinds})
-    own = [[line for line in kinds if line.channel == channel] for channel in channels]
-    return [*kinds, *(_sum(channel, lines) for channel, lines in zip(channels, own, strict=True)), _sum("all", kinds)]
+    of_channels = [_sum(name, _ALL, "", [line for line in kinds if line.channel == name]) for name in channels]
+    return [*kinds, *of_channels, _sum("all", _ALL, "", kinds)]
 
 
-def _sum(name: str, lines: list[Line]) -> Line:
+def _sum(channel: str, survey: str, image_type: str, lines: list[Line]) -> Line:
     return Line(
-        name,
-        "all",
-        "",
+        channel,
+        survey,
+        image_type,
         sum(line.exposures for line in lines),
         sum(line.detectors for line in lines),
         sum(line.sources for line in lines),

@@ -9,11 +9,10 @@ Ref : Serrano et al. 2024, appendix on the survey files of the eighth science ch
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 
 from jobs import rng
 from jobs.render.camera import detectors as camera_detectors
@@ -30,7 +29,6 @@ from jobs.request.observations import Observation
 from jobs.request.pointing_tables import Row
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.tables.exposures import ExposureRow
 
 _DAY_S, _OVERHEAD_S = 86400.0, 30.0
 # Nautical twilight: the Sun brightens the sky while it is higher, deg.
@@ -189,14 +187,11 @@ def _by_chips(
     return places[:count] if count else places
 
 
-def by_day(exposures: pa.Table, mission: MissionConfiguration) -> str:
-    """A line about ground exposures of the sky that a request dates by day or in twilight, empty where there are none.
-
-    exposures : rows of the table;  mission : the mission database
-    """
+def by_day(exposures: Iterable[Exposure], mission: MissionConfiguration) -> str:
+    """A line about ground exposures of the sky that are dated by day or in twilight, empty where there are none."""
     found, count = [], 0
     sites: dict[str, Site] = {}
-    for row in map(ExposureRow.of, exposures.to_pylist()):
+    for row in exposures:
         own = registry.CHANNELS[row.channel]
         if not (own.on_ground and own.sees_sky(row.image_type)):
             continue

@@ -9,7 +9,7 @@ table          exposures -> rows, with the sky, zero point and seeing of each
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,8 +34,6 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 
-# What two exposures have in common whose random numbers would be the same, of one request of an exploration.
-_ALIKE = ("settings", "camera", "band", "ra", "dec", "position_angle", "mjd", "grism", "grism_angle")
 # Grisms by the passband that they are used in.
 GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}
 _DARK_TYPES = ("bias", "dark", "charge_injection", "trap_pumping", "persistence")
@@ -173,25 +171,39 @@ def table(
     missions: Sequence[MissionConfiguration],
     own: Mapping[str, Passband] | None = None,
     seed: int = 0,
+    first: int = 1,
+    before: Iterable[Exposure] = (),
 ) -> pa.Table:
-    """Rows of the table `exposures`, numbered from 1 in their order.
+    """Rows of the table `exposures`, numbered in their order.
 
     missions : the configuration of each;  own : passbands by name besides the embedded ones
     seed     : of the request: of ground cameras the seeing is drawn
+    first    : number of the first
+    before   : earlier exposures, of which some may differ from these in their noise alone
     """
     if not exposures:
         return EXPOSURES.empty()
     bands: dict[tuple[int, str, str, str], _Band] = {}
-    rows, taken = [], Counter[tuple[Any, ...]]()
-    for number, (exposure, mission) in enumerate(zip(exposures, missions, strict=True), start=1):
+    rows, taken = [], Counter(map(_alike, before))
+    for number, (exposure, mission) in enumerate(zip(exposures, missions, strict=True), start=first):
         key = (id(mission), exposure.channel, exposure.camera, exposure.band)
         if key not in bands:
             bands[key] = _Band.of(exposure, mission, (own or {}).get(exposure.band))
         row = _row(number, exposure, bands[key], mission, seed)
-        alike = tuple(row[name] for name in _ALIKE)
+        alike = _alike(exposure)
         taken[alike] += 1
         rows.append({**row, "realisation": taken[alike]})
     return EXPOSURES.build({name: _column(name, [row[name] for row in rows]) for name in EXPOSURES.names})
+
+
+def _alike(e: Exposure) -> tuple[Any, ...]:
+    """What two exposures have in common whose random numbers would be the same, of one request of an exploration."""
+    angle = _turned(e.position_angle)
+    return e.settings, e.camera, e.band, e.ra % 360.0, e.dec, angle, e.mjd, e.grism, e.grism_angle
+
+
+def _turned(angle: float) -> float:
+    return (angle + 180.0) % 360.0 - 180.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +260,7 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
         **{name: getattr(e, name) for name in EXPOSURES.names if name not in _NUMBERS},
         "exposure_id": number,
         "ra": e.ra % 360.0,
-        "position_angle": (e.position_angle + 180.0) % 360.0 - 180.0,
+        "position_angle": _turned(e.position_angle),
         "sky": sky,
         "seeing": seeing,
         "zero_point": band.zero_point - fainter if e.zero_point is None else e.zero_point,

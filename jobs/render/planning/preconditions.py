@@ -51,15 +51,27 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> N
 
 def rendered(exposures: pa.Table, tasks: pa.Table) -> pa.Table:
     """Those of the tasks whose exposures are of a kind that has a simulator; BadInput where none is."""
-    known = {
+    known = _known(exposures)
+    if not any(known.values()):
+        raise BadInput(f"no simulator renders {', '.join(map(' '.join, known))} yet: nothing to render is planned")
+    return drawable(exposures, tasks)
+
+
+def drawable(exposures: pa.Table, tasks: pa.Table) -> pa.Table:
+    """As `rendered`, none where none is."""
+    known = _known(exposures)
+    if all(known.values()):
+        return tasks
+    kinds = zip(exposures["channel"].to_pylist(), exposures["image_type"].to_pylist(), strict=True)
+    wanted = exposures["exposure_id"].filter(pa.array([known[kind] for kind in kinds], pa.bool_()))
+    return tasks.filter(pc.is_in(tasks["exposure_id"], wanted.combine_chunks()))
+
+
+def _known(exposures: pa.Table) -> dict[tuple[str, str], bool]:
+    return {
         (row["channel"], row["image_type"]): registry.effects_or_none(row["channel"], row["image_type"]) is not None
         for row in exposures.group_by(["channel", "image_type"]).aggregate([]).to_pylist()
     }
-    if not any(known.values()):
-        raise BadInput(f"no simulator renders {', '.join(map(' '.join, known))} yet: nothing to render is planned")
-    kinds = zip(exposures["channel"].to_pylist(), exposures["image_type"].to_pylist(), strict=True)
-    wanted = exposures["exposure_id"].filter(pa.array([known[kind] for kind in kinds]))
-    return tasks.filter(pc.is_in(tasks["exposure_id"], wanted.combine_chunks()))
 
 
 def refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
@@ -81,6 +93,8 @@ def refuse_small_area(area: Area, tasks: pa.Table) -> None:
     """
     looks = pc.greater(pc.list_value_length(tasks["cells"]), 0)
     seen = tasks.filter(looks)
+    if not seen.num_rows:
+        return
     ra, dec, radius = np.unique(np.stack([seen[name].to_numpy() for name in ("ra", "dec", "radius")], axis=1), axis=0).T
     inside = _covers(area, ra, dec, radius)
     if inside.all():

@@ -8,12 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from jobs.accuracy import SURVEY, Accuracy
 from jobs.render.channels import registry
 from jobs.render.drawing import settings
 from jobs.render.effects.effect import Effect
 from jobs.render.exposure import truth_maps
+from lake_schema.arrays import Float, Int
 
 # A FITS header and its padding, one an image; s a byte of a truth map, to write and hash it.
 _HEADER_BYTES, _MAP_S = 8640, 2.5e-9
@@ -49,7 +53,10 @@ _ITS_OWN = Files()
 
 @dataclass(frozen=True, slots=True)
 class Price:
-    """What a detector of so many pixels and sources takes: something to start with, and something for each of them."""
+    """What a detector of so many pixels and sources takes: something to start with, and something for each of them.
+
+    Of many detectors where pixels and sources are arrays [n].
+    """
 
     start_s: float
     pixel_s: float
@@ -61,17 +68,17 @@ class Price:
     pixel_bytes: float
     read_bytes: float
 
-    def seconds(self, pixels: int, galaxies: float, stars: float) -> float:
+    def seconds(self, pixels: Int | int, galaxies: Float | float, stars: Float | float) -> Any:
         """Of one core."""
         return self.start_s + pixels * self.pixel_s + galaxies * self.galaxy_s + stars * self.star_s
 
-    def memory(self, pixels: int) -> float:
+    def memory(self, pixels: Int | int) -> Any:
         """GB at the peak."""
         return self.start_gb + pixels * self.pixel_gb
 
-    def bytes(self, pixels: int, read: int) -> int:
+    def bytes(self, pixels: Int | int, read: Int | int) -> Any:
         """Of the image and its truth maps; read : pixels of the image, with those beside the detector's own."""
-        return self.start_bytes + round(pixels * self.pixel_bytes + read * self.read_bytes)
+        return self.start_bytes + np.rint(pixels * self.pixel_bytes + read * self.read_bytes).astype(np.int64)
 
 
 def price(

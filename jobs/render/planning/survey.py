@@ -1,14 +1,16 @@
 """From a request to its exposures, in the order they are taken.
 
-exposures    pointings and observation blocks -> exposures, once for each variant of an exploration
+stretches    pointings and observation blocks -> stretches of exposures, once for each variant of an exploration
+exposures    all of them
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
+from functools import partial
+from itertools import chain, islice, repeat
 from pathlib import Path
 from typing import Any
 
@@ -41,20 +43,103 @@ from lake_schema.mission.configuration import MissionConfiguration
 _DEEP = ("edf_north", "edf_south", "edf_fornax")
 # Image types that are laid out as calibrations are.
 _CALIBRATION = tuple(code for code in pointing_tables.IMAGE_TYPES if code not in ("science", "deep"))
+# Days: more than the rounding of a date, less than any exposure.
+_NO_TIME = 1e-7
 
 
-def exposures(request: Request, mission: MissionConfiguration) -> list[tuple[Exposure, MissionConfiguration]]:
-    """Every exposure of a request with the mission it is planned with; BadInput names the pointing or observation."""
-    found = []
+Taken = tuple[Exposure, MissionConfiguration]
+# Whether it is of NISP; parameters of an exposure's own.
+_Own = tuple[bool, tuple[tuple[str, float, str], ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Exposures that follow one another: laid out one by one, or fields whose exposures are laid out when wanted.
+
+    taken          : of pointings, calibrations, ground surveys; of fields those of the first, which stand for all
+    fields, lay    : of Euclid's surveys, in the order of time, and what lays the exposures of one out
+    times          : each is taken, one after another
+    settled        : what exposures are planned with: whether of NISP, and parameters of their own
+    """
+
+    request: Request
+    taken: tuple[Exposure, ...]
+    times: int
+    settled: Mapping[_Own, _Settled]
+    fields: tuple[reference_survey.Field, ...] = ()
+    lay: Callable[[reference_survey.Field], Iterable[Exposure]] | None = None
+
+    @property
+    def unit(self) -> int:
+        """Exposures that are laid out at once: of a field."""
+        return self.times * (len(self.taken) if self.lay is not None else 1)
+
+    def __len__(self) -> int:
+        return self.unit * (len(self.fields) if self.lay is not None else len(self.taken))
+
+    def exposures(self, first: int = 0, last: int | None = None) -> Iterator[Taken]:
+        """The exposures from the first to before the last, each with the mission that it is planned with."""
+        last = len(self) if last is None else last
+        start, end = first // self.unit, -(-last // self.unit)
+        laid = self.taken[start:end] if self.lay is None else chain.from_iterable(map(self.lay, self.fields[start:end]))
+        each = (self._planned(exposure) for exposure in laid)
+        repeated = chain.from_iterable(repeat(one, self.times) for one in each)
+        return islice(repeated, first - start * self.unit, last - start * self.unit)
+
+    def settled_of(self, exposure: Exposure) -> _Settled:
+        """What one of the exposures is planned with."""
+        return self.settled[exposure.camera == "nisp", exposure.parameters]
+
+    def _planned(self, exposure: Exposure) -> Taken:
+        own = self.settled_of(exposure)
+        psf = exposure.psf or _own_psf(exposure, self.request)
+        if own.settings is None and psf is None:
+            return exposure, own.mission
+        return replace(exposure, settings=own.settings, psf=psf), own.mission
+
+    def wanted(self, first: int, last: int) -> list[tuple[str, ...]]:
+        """The detectors that are wanted of each of these exposures, () = all."""
+        of = [exposure.detectors for exposure in self.taken]
+        return [of[i // self.times % len(of)] for i in range(first, last)]
+
+    def times_of(self, first: int, last: int) -> tuple[float, float]:
+        """MJD before which none of these exposures begins, and after which none does."""
+        start, end = first // self.unit, -(-last // self.unit)
+        if self.lay is None:
+            began = [exposure.mjd for exposure in self.taken[start:end]]
+            return min(began), max(began)
+        after = max(exposure.mjd for exposure in self.taken) - self.fields[0].mjd
+        # A little more than the rounding of a date.
+        return self.fields[start].mjd - _NO_TIME, self.fields[end - 1].mjd + after + _NO_TIME
+
+    def about(self, since: float, until: float, before: int) -> list[tuple[int, int]]:
+        """Runs of exposures, up to before a number, among which are all that begin between two dates."""
+        if self.lay is None:
+            here = [i for i, exposure in enumerate(self.taken) if since <= exposure.mjd <= until]
+            runs = [(i * self.unit, (i + 1) * self.unit) for i in here]
+        else:
+            began = np.array([field.mjd for field in self.fields])
+            low, high = self.times_of(0, self.unit)
+            near = np.searchsorted(began, (since - (high - low), until + _NO_TIME), "left")
+            runs = [(int(near[0]) * self.unit, int(near[1]) * self.unit)]
+        return [(first, min(last, before)) for first, last in runs if first < min(last, before)]
+
+
+def stretches(request: Request, mission: MissionConfiguration) -> list[Stretch]:
+    """The exposures of a request, in the order they are numbered; BadInput names the pointing or observation."""
+    found: list[Stretch] = []
     for values in request.variants():
-        shared = _Settled.of(values, request, mission)
-        for exposure, own in _of_variant(request, values, shared):
-            psf = exposure.psf or _own_psf(exposure, request)
-            found.append((replace(exposure, settings=own.settings, psf=psf), own.mission))
+        found += _of_variant(request, values, _Settled.of(values, request, mission))
+    taken = {exposure.band for stretch in found for exposure in stretch.taken}
     for band, _ in request.psfs:
-        if band not in {exposure.band for exposure, _ in found}:
+        if band not in taken:
             raise BadInput(f"psf.{band}: no exposure is taken in this band")
     return found
+
+
+def exposures(request: Request, mission: MissionConfiguration) -> list[Taken]:
+    """Every exposure of a request with the mission it is planned with; BadInput names the pointing or observation."""
+    return [one for stretch in stretches(request, mission) for one in stretch.exposures()]
 
 
 def _own_psf(exposure: Exposure, request: Request) -> str | None:
@@ -79,34 +164,36 @@ class _Settled:
         return cls(settings, variants.variant(settings, mission, request.accuracy, {}).mission)
 
 
-def _of_variant(request: Request, values: Mapping[str, Any], shared: _Settled) -> Iterator[tuple[Exposure, _Settled]]:
-    """Exposures, each with what it is planned with: of NISP, with its block's own ramp.
+def _of_variant(request: Request, values: Mapping[str, Any], shared: _Settled) -> Iterator[Stretch]:
+    """What is taken, with what it is planned with: of NISP, with its block's own ramp.
 
     Of both channels of NISP, of which one has this ramp.
     """
     for i, pointing in enumerate(request.pointings):
         one = _pointing(pointing, f"pointing[{i}]", request, shared.mission)
-        yield from repeat((one, shared), pointing.realisations)
+        yield Stretch(request, (one,), pointing.realisations, {(True, ()): shared, (False, ()): shared})
     # Of blocks that have no date NISP's begin when those before have ended, and what they left is gone.
     free = shared.mission.value("svm.launch", "d")
     for i, block in enumerate(request.observations):
-        where, found = f"observation[{i}]", 0
+        where = f"observation[{i}]"
         ramp = ramp_of(block)
         own = _Settled.of({**values, **variants.own(ramp)}, request, shared.mission) if ramp else shared
-        kept: dict[tuple[bool, tuple[tuple[str, float, str], ...]], _Settled] = {(True, ()): own, (False, ()): shared}
-        for exposure in _block(block, request, own.mission, where, free):
-            found += 1
-            if exposure.camera == "nisp" and (exposure.image_type in _CALIBRATION or _undated(block)):
-                free = max(free, after_bright.forgotten(exposure, own.mission))
+        laid = _block(block, request, own.mission, where, free)
+        if not laid.taken:
+            raise BadInput(f"{where} asks for no exposure")
+        kept: dict[_Own, _Settled] = {(True, ()): own, (False, ()): shared}
+        for exposure in laid.taken:
             of_nisp = exposure.camera == "nisp"
-            which = of_nisp, exposure.parameters
-            if which not in kept:
+            if (of_nisp, exposure.parameters) not in kept:
                 changed = {key: (value, unit) for key, value, unit in exposure.parameters}
                 more = {**ramp, **changed} if of_nisp else changed
-                kept[which] = _Settled.of({**values, **variants.own(more)}, request, shared.mission)
-            yield from repeat((exposure, kept[which]), block.realisations)
-        if not found:
-            raise BadInput(f"{where} asks for no exposure")
+                settled = _Settled.of({**values, **variants.own(more)}, request, shared.mission)
+                kept[of_nisp, exposure.parameters] = settled
+        stretch = Stretch(request, laid.taken, block.realisations, kept, laid.fields, laid.lay)
+        for exposure in laid.ends():
+            if exposure.camera == "nisp" and (exposure.image_type in _CALIBRATION or _undated(block)):
+                free = max(free, after_bright.forgotten(exposure, own.mission))
+        yield stretch
 
 
 def _pointing(pointing: Pointing, where: str, request: Request, mission: MissionConfiguration) -> Exposure:
@@ -153,9 +240,20 @@ def _undated(block: Observation) -> bool:
     return block.mjd is None and not block.pointings
 
 
-def _block(
-    block: Observation, request: Request, mission: MissionConfiguration, where: str, free: float
-) -> Iterator[Exposure]:
+@dataclass(frozen=True, slots=True)
+class _Laid:
+    """What a block asks for, as a Stretch has it."""
+
+    taken: tuple[Exposure, ...]
+    fields: tuple[reference_survey.Field, ...] = ()
+    lay: Callable[[reference_survey.Field], Iterable[Exposure]] | None = None
+
+    def ends(self) -> Iterable[Exposure]:
+        """Exposures among which is the last that each channel takes."""
+        return self.taken if self.lay is None else self.lay(self.fields[-1])
+
+
+def _block(block: Observation, request: Request, mission: MissionConfiguration, where: str, free: float) -> _Laid:
     """free : MJD from which NISP may observe."""
     area = block.area or request.area
     start = mission.value("svm.launch", "d") if block.mjd is None else block.mjd
@@ -163,31 +261,39 @@ def _block(
         start = free
     try:
         check_macc(block, mission)
-        found = _exposures(block, area, request.seed, start, mission)
-        for exposure in found:
+        laid = _exposures(block, area, request.seed, start, mission)
+        # Of fields the first of either grism stands for all.
+        seconds = () if laid.lay is None else (laid.lay(field) for field in _first_visits(laid.fields))
+        for exposure in (*laid.taken, *chain.from_iterable(seconds)):
             known_detectors(exposure.camera, exposure.detectors, mission, "detectors")
             check_ramp(exposure.channel, exposure.camera, exposure.exposure_time_s, mission)
             own = registry.CHANNELS[exposure.channel]
             if not own.on_ground and block.pointings and exposure.image_type in SKY_TYPES:
                 check_aspect(exposure.ra, exposure.dec, exposure.mjd, mission, "pointings")
-            yield exposure
+        return laid
     except BadInput as error:
         raise BadInput(f"{where}: {error}") from None
 
 
-def _exposures(
-    block: Observation, area: Area, seed: int, start: float, mission: MissionConfiguration
-) -> Iterator[Exposure]:
+def _first_visits(fields: Sequence[reference_survey.Field]) -> Iterator[reference_survey.Field]:
+    """The first visit of an odd and the first of an even number."""
+    for odd in (0, 1):
+        yield from islice((field for field in fields if field.visit % 2 == odd), 1)
+
+
+def _exposures(block: Observation, area: Area, seed: int, start: float, mission: MissionConfiguration) -> _Laid:
     if block.pointings:
-        yield from ground_surveys.read(Path(block.pointings), block, mission)
-    elif block.image_type in _CALIBRATION:
+        return _Laid(tuple(ground_surveys.read(Path(block.pointings), block, mission)))
+    if block.image_type in _CALIBRATION:
         camera = ground_surveys.camera_of(block.survey, mission) if "EXT" in block.channels else ""
-        yield from calibration_frames.exposures(block, camera, block.place or area.bounds()[:2], mission, seed, start)
-    elif "EXT" in block.channels:
-        yield from ground_surveys.exposures(block, area, mission, seed, start)
-    else:
-        for field in _fields(block, area, start, mission):
-            yield from sequence(field, block, "own" if block.place else block.survey, mission, seed)
+        place = block.place or area.bounds()[:2]
+        return _Laid(tuple(calibration_frames.exposures(block, camera, place, mission, seed, start)))
+    if "EXT" in block.channels:
+        return _Laid(tuple(ground_surveys.exposures(block, area, mission, seed, start)))
+    fields = tuple(_fields(block, area, start, mission))
+    name = "own" if block.place else block.survey
+    lay = partial(sequence, block=block, survey=name, mission=mission, seed=seed)
+    return _Laid(tuple(lay(fields[0])) if fields else (), fields, lay)
 
 
 def _fields(

@@ -1,18 +1,23 @@
 """From exposures to render tasks: one a detector, with its cells and what it will cost.
 
 table      rows of the table `tasks`, longest first
+in_order   those of several parts
 part       those of them that are to be rendered now
+Narrowed   the same of tasks that come a part after the other
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from jobs.accuracy import SURVEY, Accuracy
 from jobs.render.camera import amplifiers, pointing
@@ -26,7 +31,7 @@ from jobs.render.planning.prices import Files, Price, price
 from jobs.render.planning.source_counts import Densities
 from jobs.request.schema import Request
 from lake_schema import sky
-from lake_schema.arrays import Float
+from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.mission.configuration import MissionConfiguration
@@ -34,6 +39,9 @@ from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.tasks import TASKS
 
 _ITS_OWN = Files()
+# Pointings whose detectors' cells are found at once: within so many deg of the first, and as many.
+_TOGETHER, _MOST_TOGETHER = 0.5, 16
+_POLYGON = "POLYGON ICRS " + " ".join(["%.7f"] * 8)
 
 # ------------------------------------------------------------------------------------------------ tasks
 
@@ -57,23 +65,30 @@ def table(
     """
     pairs = set(zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True))
     cameras = {pair: _Camera(*pair, mission) for pair in pairs}
-    shared: dict[tuple[Any, ...], _Places] = {}
+    rows = [ExposureRow.of(row) for row in exposures.to_pylist()]
+    looking = {_where(row, cameras): cameras[row.camera, row.channel] for row in rows}
+    places = dict(zip(looking, _places(looking, densities), strict=True))
     prices: dict[tuple[Any, ...], Price] = {}
-    columns: dict[str, list[Any]] = {name: [] for name in TASKS.names}
-    for row, wanted in zip(map(ExposureRow.of, exposures.to_pylist()), detectors, strict=True):
-        camera = cameras[row.camera, row.channel]
-        where = (row.camera, camera.margin, row.ra, row.dec, row.position_angle)
-        if where not in shared:
-            shared[where] = camera.places(*where[2:], densities)
+    planned: list[_Planned] = []
+    for row, wanted in zip(rows, detectors, strict=True):
         kind = (row.camera, row.channel, row.image_type, row.exposure_time_s, row.lamp, row.settings)
         if kind not in prices:
             own = variants.variant(row.settings, mission, accuracy, forced or {})
             prices[kind] = _price(row, own, truth, files)
-        _append(columns, row, wanted, camera, shared[where], prices[kind])
-    seconds = np.array(columns["seconds"], float)
-    numbers = np.array(columns["exposure_id"], np.int64)
-    order = np.lexsort((np.array(columns["detector"]), numbers, -seconds)) if numbers.size else np.empty(0, np.int64)
-    return TASKS.build({name: [values[i] for i in order] for name, values in columns.items()})
+        camera = cameras[row.camera, row.channel]
+        planned.append(_Planned.of(row, wanted, camera, places[_where(row, cameras)], prices[kind]))
+    return _rows(planned, list(places.values()))
+
+
+def _where(row: ExposureRow, cameras: Mapping[tuple[str, str], _Camera]) -> tuple[Any, ...]:
+    """What exposures have in common whose detectors look at the same places."""
+    return row.camera, cameras[row.camera, row.channel].margin, row.ra, row.dec, row.position_angle
+
+
+def in_order(tasks: pa.Table) -> pa.Table:
+    """Rows of several parts, longest first; of one part they are already."""
+    keys = [("seconds", "descending"), ("exposure_id", "ascending"), ("detector", "ascending")]
+    return tasks.combine_chunks() if tasks["exposure_id"].num_chunks < 2 else tasks.sort_by(keys).combine_chunks()
 
 
 def part(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:
@@ -81,26 +96,131 @@ def part(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:
 
     Errors : BadInput where no exposure has a detector of that name, or the limit leaves none
     """
-    rows: list[dict[str, Any]] = tasks.to_pylist()
-    if unknown := sorted({*request.detectors} - {row["detector"] for row in rows}):
-        some = ", ".join(sorted({row["detector"] for row in rows})[:4])
-        raise BadInput(f"detectors: {unknown[0]} is not in the plan of request {request.name}, which has {some}, ...")
-    if request.limit is not None and request.limit < 1:
-        raise BadInput(f"limit = {request.limit} leaves no detector")
-    if request.detectors:
-        rows = [row for row in rows if row["detector"] in request.detectors]
-    first = sorted((row["exposure_id"], row["detector"]) for row in rows)[: request.limit]
-    chosen = {*first}
-    return [row for row in rows if (row["exposure_id"], row["detector"]) in chosen]
+    narrowed = Narrowed(request)
+    found: list[dict[str, Any]] = narrowed.of(tasks).to_pylist()
+    narrowed.refuse_unknown()
+    return found
+
+
+class Narrowed:
+    """What is wanted of tasks that come a part after the other, in the order of their exposures.
+
+    Errors : BadInput where the request's limit leaves none
+    """
+
+    def __init__(self, request: Request) -> None:
+        if request.limit is not None and request.limit < 1:
+            raise BadInput(f"limit = {request.limit} leaves no detector")
+        self.request, self._left = request, request.limit
+        self._known: set[str] = set()
+
+    def of(self, tasks: pa.Table) -> pa.Table:
+        """Rows of the request's detectors, as long as there are not too many."""
+        if self.request.detectors:
+            self._known |= {*tasks["detector"].unique().to_pylist()}
+            tasks = tasks.filter(pc.is_in(tasks["detector"], pa.array(self.request.detectors, pa.string())))
+        if self._left is not None:
+            order = pc.sort_indices(tasks, [("exposure_id", "ascending"), ("detector", "ascending")])
+            tasks = tasks.take(pa.array(np.sort(order.slice(0, self._left).to_numpy())))
+            self._left -= tasks.num_rows
+        return tasks
+
+    def refuse_unknown(self) -> None:
+        """BadInput where none of the tasks had a detector that the request names."""
+        if unknown := sorted({*self.request.detectors} - self._known):
+            plan = f"the plan of request {self.request.name}"
+            some = ", ".join(sorted(self._known)[:4])
+            raise BadInput(f"detectors: {unknown[0]} is not in {plan}, which has {some}, ...")
 
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    ra: list[float]
-    dec: list[float]
-    cells: list[list[int]]
+    """Where the detectors of a camera look that points somewhere; first : number of the first of them in a plan."""
+
+    first: int
+    names: list[str]
+    ra: Float
+    dec: Float
+    radius: Float
+    cells: list[Int]
     regions: list[str]
     density: Float
+
+
+@dataclass(frozen=True, slots=True)
+class _Planned:
+    """The detectors of an exposure that are wanted: where they look, by number, and what each will cost."""
+
+    exposure_id: int
+    channel: str
+    looks: bool
+    places: Int
+    sources: Int
+    seconds: Float
+    memory: Float
+    bytes: Int
+
+    @classmethod
+    def of(cls, row: ExposureRow, wanted: tuple[str, ...], camera: _Camera, places: _Places, cost: Price) -> _Planned:
+        looks = row.image_type in registry.CHANNELS[row.channel].sky_types
+        chosen = [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors))
+        which = np.array(chosen, np.int64)
+        galaxies, stars = places.density[:, which] * (camera.area[which] * looks)
+        pixels = camera.pixels[which]
+        return cls(
+            row.exposure_id,
+            row.channel,
+            looks,
+            places.first + which,
+            np.ceil(galaxies + stars).astype(np.int64),
+            cost.seconds(pixels, galaxies, stars),
+            cost.memory(pixels),
+            cost.bytes(pixels, camera.read[which]),
+        )
+
+
+def _rows(planned: Sequence[_Planned], places: Sequence[_Places]) -> pa.Table:
+    """The detectors of all exposures, longest first."""
+    if not planned:
+        return TASKS.empty()
+    numbers = np.array([one.exposure_id for one in planned], np.int64)
+    channels = np.array([one.channel for one in planned], object)
+    of = np.repeat(np.arange(len(planned)), [len(one.places) for one in planned])
+    where = np.concatenate([one.places for one in planned])
+    names = np.array([name for one in places for name in one.names], object)
+    seconds = np.concatenate([one.seconds for one in planned])
+    order = np.lexsort((_ranks(names)[where], numbers[of], -seconds))
+    of, where = of[order], where[order]
+    regions = np.array([region for one in places for region in one.regions], object)
+    looks = np.array([one.looks for one in planned])
+    lists, none = _lists([cells for one in places for cells in one.cells])
+    sky_of = {name: np.concatenate([getattr(one, name) for one in places])[where] for name in ("ra", "dec", "radius")}
+    costs = {
+        name: np.concatenate([getattr(one, name) for one in planned])[order]
+        for name in ("sources", "seconds", "memory", "bytes")
+    }
+    return TASKS.build(
+        {
+            "exposure_id": numbers[of],
+            "detector": names[where],
+            "channel": channels[of],
+            **sky_of,
+            "cells": lists.take(pa.array(np.where(looks[of], where, none))),
+            "s_region": regions[where],
+            **costs,
+        }
+    )
+
+
+def _ranks(names: npt.NDArray[np.object_]) -> Int:
+    """Of each name its place in the alphabet."""
+    return np.unique(names.astype(str), return_inverse=True)[1]
+
+
+def _lists(cells: Sequence[Int]) -> tuple[pa.ListArray, int]:
+    """Lists of cells, and the number of one more that is empty."""
+    ends = np.cumsum([0, *map(len, cells), 0], dtype=np.int32)
+    return pa.ListArray.from_arrays(ends, np.concatenate([*cells, np.empty(0, np.int64)])), len(cells)
 
 
 class _Camera:
@@ -111,7 +231,8 @@ class _Camera:
 
     def __init__(self, camera: str, channel: str, mission: MissionConfiguration) -> None:
         self.detectors = camera_detectors.detectors(camera, mission)
-        self.index = {detector.name: i for i, detector in enumerate(self.detectors)}
+        self.names = [detector.name for detector in self.detectors]
+        self.index = {name: i for i, name in enumerate(self.names)}
         self.x, self.y = pointing.outline(self.detectors)
         self.margin = registry.CHANNELS[channel].margin(self.detectors[0].section, mission)
         # On the tangent plane, where a detector that the optics distort is larger than it is.
@@ -124,43 +245,37 @@ class _Camera:
         self.read = np.array([n or pixels for n, pixels in zip(read, self.pixels, strict=True)])
         self.area = np.array([d.nx * d.ny * (d.pixel_scale / 3600.0) ** 2 for d in self.detectors])
 
-    def places(self, ra: float, dec: float, angle: float, densities: Densities) -> _Places:
-        lon, lat = pointing.sky_of_plane(self.x, self.y, ra, dec, angle)
-        cells = [
-            sky.cells_in_cone(x, y, radius, GENERATION_ORDER).tolist()
-            for x, y, radius in zip(lon[:, 0].tolist(), lat[:, 0].tolist(), self.radius.tolist(), strict=True)
-        ]
-        regions = [
-            "POLYGON ICRS " + " ".join(f"{value:.7f}" for value in corners)
-            for corners in np.stack([lon[:, 1:], lat[:, 1:]], axis=2).reshape(len(lon), -1).tolist()
-        ]
-        return _Places(lon[:, 0].tolist(), lat[:, 0].tolist(), cells, regions, densities.at(lon[:, 0], lat[:, 0]))
 
-
-def _append(
-    columns: dict[str, list[Any]],
-    row: ExposureRow,
-    wanted: tuple[str, ...],
-    camera: _Camera,
-    places: _Places,
-    cost: Price,
-) -> None:
-    looks = row.image_type in registry.CHANNELS[row.channel].sky_types
-    for i in [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors)):
-        galaxies, stars = (places.density[:, i] * (camera.area[i] * looks)).tolist()
-        pixels = int(camera.pixels[i])
-        columns["exposure_id"].append(row.exposure_id)
-        columns["detector"].append(camera.detectors[i].name)
-        columns["channel"].append(row.channel)
-        columns["ra"].append(places.ra[i])
-        columns["dec"].append(places.dec[i])
-        columns["radius"].append(float(camera.radius[i]))
-        columns["cells"].append(places.cells[i] if looks else [])
-        columns["s_region"].append(places.regions[i])
-        columns["sources"].append(math.ceil(galaxies + stars))
-        columns["seconds"].append(cost.seconds(pixels, galaxies, stars))
-        columns["memory"].append(cost.memory(pixels))
-        columns["bytes"].append(cost.bytes(pixels, int(camera.read[i])))
+def _places(looking: Mapping[tuple[Any, ...], _Camera], densities: Densities) -> Iterator[_Places]:
+    """Where the detectors look of each camera that points somewhere."""
+    first, waiting = 0, list(looking.items())
+    while waiting:
+        # The dithers of a field: their detectors share most of their cells.
+        _, _, ra, dec, _ = waiting[0][0]
+        near = (float(sky.separation(ra, dec, *place[2:4])) < _TOGETHER for place, _ in waiting[:_MOST_TOGETHER])
+        many = sum(1 for _ in takewhile(bool, near))
+        group, waiting = waiting[:many], waiting[many:]
+        outlines = [pointing.sky_of_plane(camera.x, camera.y, *place[2:]) for place, camera in group]
+        lon, lat = (np.concatenate([one[axis] for one in outlines]) for axis in (0, 1))
+        radius = np.concatenate([camera.radius for _, camera in group])
+        cells = sky.cells_in_cones(lon[:, 0], lat[:, 0], radius, GENERATION_ORDER)
+        corners = np.stack([lon[:, 1:], lat[:, 1:]], axis=2).reshape(len(lon), -1).tolist()
+        density = densities.at(lon[:, 0], lat[:, 0])
+        start = 0
+        for _, camera in group:
+            own = slice(start, start + len(camera.names))
+            start = own.stop
+            yield _Places(
+                first,
+                camera.names,
+                lon[own, 0],
+                lat[own, 0],
+                camera.radius,
+                cells[own],
+                [_POLYGON % tuple(some) for some in corners[own]],
+                density[:, own],
+            )
+            first += len(camera.names)
 
 
 def _price(row: ExposureRow, own: Variant, truth: Sequence[str], files: Files) -> Price:

@@ -1,4 +1,4 @@
-"""The key of each product: a digest of everything that shapes it."""
+"""The key of each product: a digest of everything that shapes it; and the name of its part."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -89,6 +89,11 @@ def product_keys(
     before = ([left(one) for one in earlier.get((task["exposure_id"], task["detector"]), ())] for task in tasks)
     also = ({"earlier": some} if some else {} for some in before)
     return [digest({**shared, **drawn(task), **more}) for task, more in zip(tasks, also, strict=True)]
+
+
+def part_name(task: Json) -> str:
+    """Name of the part of `products` that a task makes."""
+    return f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet"
 
 
 def _beside(stars: tuple[float, Mapping[int, list[tuple[str, ...]]]], mission: MissionConfiguration) -> Beside:

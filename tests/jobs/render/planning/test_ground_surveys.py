@@ -102,11 +102,11 @@ def test_bands_that_the_challenge_has_not_are_planned_as_the_others(name, camera
 def test_dates_by_day_are_named():
     """The Sun's altitude as astropy has it."""
     none = survey_of("lsst", 4, bands=("lsst_r",))
-    assert ground_surveys.by_day(planned_exposures.table(none, [MISSION] * 4), MISSION) == ""
+    assert ground_surveys.by_day(none, MISSION) == ""
     # 11:30 of local time.
     dated = [replace(one, mjd=60500.68 if i else one.mjd) for i, one in enumerate(none[:2])]
     dated.append(replace(dated[1], image_type="flat"))
-    line = ground_surveys.by_day(planned_exposures.table(dated, [MISSION] * 3), MISSION)
+    line = ground_surveys.by_day(dated, MISSION)
     where = EarthLocation.from_geodetic(-70.7494, -30.2446, 2663.0)
     when = Time(60500.68, format="mjd")
     high = get_sun(when).transform_to(AltAz(obstime=when, location=where)).alt.deg
