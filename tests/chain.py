@@ -1,7 +1,8 @@
 """What the chain makes, in this process, as digests: python -m tests.chain quick|whole FOLDER prints them as JSON.
 
-quick  tables of fluxes, of the PSF, of shapes; products and solutions as they occur; a small frame
-whole  besides, a small lake by the jobs' own plans: galaxies, stars, fluxes, two CCDs; every array in the cache
+quick  tables of galaxies' fluxes, of the PSF, of shapes; products and solutions as they occur
+whole  besides, those of stars; a small lake by the jobs' own plans: galaxies, stars, fluxes, two CCDs; every array in
+       the cache
 
 With --keep the arrays themselves are written beside the digests, to be compared number by number.
 """
@@ -60,9 +61,6 @@ def quick():
     setting = min((choice.setting for choice in settings.choose(["euclid_vis"], DRAFT)), key=lambda s: s.size)
     yield "templates", library.flux
     yield "galaxy_table", build_tables.galaxy_table(vis, library, setting, build_tables.library_key(library))
-    stellar = templates.stellar_library()
-    yield "stellar_templates", stellar.flux
-    yield "star_table", build_tables.star_table(vis, stellar, build_tables.library_key(stellar))
     yield "line_table", build_tables.line_table(vis)[1]
     yield "integrated", integration.galaxies(random_galaxies(20), [vis], library)
     yield "distances", cosmology.comoving_separation(0.0, np.linspace(0.0, 6.0, 50))
@@ -82,6 +80,10 @@ def quick():
 def whole(folder):
     """Of the lake, column by column and image by image; then all that lies in the cache."""
     yield from quick()
+    stellar = templates.stellar_library()
+    yield "stellar_templates", stellar.flux
+    table = build_tables.star_table(passbands.load("euclid_vis"), stellar, build_tables.library_key(stellar))
+    yield "star_table", table
     root = layout.lake(folder / "lake")
     root.mkdir(parents=True)
     wanted = from_table(REQUEST)

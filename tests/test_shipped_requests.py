@@ -1,4 +1,7 @@
-"""Every request that is shipped goes through all jobs, made small by its keys: area, depth, detectors, exposures."""
+"""Every request that is shipped goes through all jobs, made small by its keys: area, depth, detectors, exposures.
+
+That of the demo does so every day, as it is (test_field.py); and the check takes each (jobs/request/test_checks.py).
+"""
 
 import re
 import tomllib
@@ -22,8 +25,6 @@ from lake_schema.tables.exposures import RENDERED
 
 REQUESTS = Path(__file__).parents[1] / "requests"
 MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures)
-# The one with the fewest detectors that are rendered.
-SMALLEST = "sc8_deep"
 MISSION = resolve()
 
 
@@ -56,13 +57,8 @@ def small(name):
     return table
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(path.stem, marks=[] if path.stem == SMALLEST else [pytest.mark.nightly])
-        for path in sorted(REQUESTS.glob("*.toml"))
-    ],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", [path.stem for path in sorted(REQUESTS.glob("*.toml"))])
 def test_a_shipped_request_goes_through_all_jobs(name, tmp_path, monkeypatch):
     # The parts here, not in Spark's workers.
     monkeypatch.setattr(shell, "_spark_map", lambda function, parts, *rest: map(function, parts))

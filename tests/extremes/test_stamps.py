@@ -342,8 +342,16 @@ SLIM = {
 }
 
 
-@pytest.mark.parametrize("kind", SLIM)
-@pytest.mark.parametrize("accuracy", [DRAFT, SURVEY])
+# Of the large ones by day one is enough.
+LARGE = ("on edge", "turned a little")
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.nightly] if kind in LARGE else []) for kind in SLIM]
+)
+@pytest.mark.parametrize(
+    "accuracy", [pytest.param(DRAFT, id="draft", marks=pytest.mark.nightly), pytest.param(SURVEY, id="survey")]
+)
 def test_what_is_taken_off_slim_galaxies_is_theirs(kind, accuracy):
     """A frame of twice the stamp: nothing is doubled, and no pixel is darker than the noise allows."""
     shape = {"bulge_fraction": 1.0} | SLIM[kind]

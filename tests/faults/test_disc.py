@@ -10,8 +10,8 @@ from tests.faults.disc import Disc, Killed
 from tests.universe import plain_plan, plain_work
 
 # (kind of table, every how many calls one is tried)
-SHORT = [("plain", 1), ("toy", 9)]
-LONG = [pytest.param("toy", 1, marks=pytest.mark.nightly)]
+SHORT = [("plain", 3), ("toy", 9)]
+LONG = [pytest.param(kind, 1, marks=pytest.mark.nightly) for kind in ("plain", "toy")]
 
 
 @pytest.fixture(scope="module")

@@ -114,28 +114,27 @@ def past_first_receipt(lake, driver):
         time.sleep(0.1)
 
 
+@pytest.fixture
+def driver(lake, request_file):
+    """At work."""
+    promise.make(lake, "plain", 1)
+    running = started(lake, request_file)
+    yield running
+    if running.poll() is None:
+        os.killpg(running.pid, signal.SIGKILL)
+    running.stderr.close()
+
+
 # Ctrl-C reaches the whole group of a terminal, `kill` the process that was started, and kill -9 here everyone.
-ENDS = [(signal.SIGINT, "group", 130), (signal.SIGTERM, "driver", 143), (signal.SIGKILL, "group", -signal.SIGKILL)]
-
-
-@pytest.fixture(scope="module")
-def drivers(tmp_path_factory, request_file):
-    """One for each end, all started at once."""
-    lakes = [layout.lake(tmp_path_factory.mktemp("lake")) for _ in ENDS]
-    for lake in lakes:
-        promise.make(lake, "plain", 1)
-    running = [(lake, started(lake, request_file)) for lake in lakes]
-    yield dict(zip(ENDS, running, strict=True))
-    for _, driver in running:
-        if driver.poll() is None:
-            os.killpg(driver.pid, signal.SIGKILL)
-        driver.stderr.close()
-
-
-@pytest.mark.parametrize("end", ENDS, ids=lambda end: f"{end[0].name} to the {end[1]}")
-def test_a_driver_that_is_stopped(drivers, spark, request_file, end):
-    number, whom, status = end
-    lake, driver = drivers[end]
+@pytest.mark.parametrize(
+    ("number", "whom", "status"),
+    [
+        pytest.param(signal.SIGINT, "group", 130, id="SIGINT to the group"),
+        pytest.param(signal.SIGTERM, "driver", 143, id="SIGTERM to the driver", marks=pytest.mark.nightly),
+        pytest.param(signal.SIGKILL, "group", -signal.SIGKILL, id="SIGKILL to the group", marks=pytest.mark.nightly),
+    ],
+)
+def test_a_driver_that_is_stopped(driver, lake, spark, request_file, number, whom, status):
     past_first_receipt(lake, driver)
     below = children(driver.pid)
     assert len(below) >= 3

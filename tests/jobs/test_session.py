@@ -1,6 +1,7 @@
 """The Spark session: one, and it reads a lake's files as every other reader does."""
 
 import duckdb
+import psutil
 import pytest
 
 from jobs.session import session
@@ -20,6 +21,16 @@ def test_other_readers_find_the_same_rows(spark, lake):
     theirs = duckdb.sql("SELECT * FROM read_parquet($files) ORDER BY id", params={"files": files}).to_arrow_table()
     assert theirs.select(ours.column_names).cast(ours.schema).equals(ours)
     assert toy.count() == sum(n for _, n in CELLS)
+
+
+def test_nobody_else_can_reach_it(spark):
+    """All that its processes listen to is on this machine alone, and they ask each other for a secret."""
+    assert spark.range(0, 4, 1, numPartitions=2).mapInArrow(lambda batches: batches, "id long").count() == 4
+    processes = psutil.Process().children(recursive=True)
+    ends = {end.laddr.ip for p in processes for end in p.net_connections("inet") if end.status == psutil.CONN_LISTEN}
+    assert {end.removeprefix("::ffff:") for end in ends} == {"127.0.0.1"}
+    conf = spark.sparkContext.getConf()
+    assert (conf.get("spark.authenticate"), conf.get("spark.ui.enabled")) == ("true", "false")
 
 
 def test_there_is_one_session(spark):

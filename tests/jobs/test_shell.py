@@ -15,7 +15,7 @@ from py4j.protocol import Py4JNetworkError
 from jobs import shell
 from jobs.shell import Job, Step
 from lake_schema import __version__
-from lake_schema.store import layout, names, publish, read, stage
+from lake_schema.store import layout, locks, names, publish, read, stage
 from lake_schema.store.plan import Part, Plan
 from tests import requests
 from tests.universe import PLAIN, plain_plan, plain_work
@@ -131,7 +131,9 @@ def test_a_wrong_call_ends_with_2(lake, request_file, capsys, options, words):
     assert words in capsys.readouterr().err
 
 
-def test_another_run_of_the_same_plan_is_refused(run, lake, request_file, capsys):
+def test_another_run_of_the_same_plan_is_refused(run, lake, request_file, capsys, monkeypatch):
+    monkeypatch.setattr(locks, "MOMENT", 0.1)
+
     def work(root, facts):
         assert run(plain_work) == 1
         return plain_work(root, facts)

@@ -14,7 +14,7 @@ by it would leave stars wrong by as much. It is the WCS that tells it to who res
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -139,6 +139,16 @@ def dark_flags(dark: Combined) -> Array:
     above = dark.mean - float(np.median(dark.mean))
     hot = above > _HOT * np.where(np.isfinite(dark.uncertainty), dark.uncertainty, np.inf)
     return (np.where(hot, HOT, 0) | np.where(dark.count == 0, UNSURE, 0)).astype(np.uint8)
+
+
+def master_flags(shape: tuple[int, int], found: Mapping[str, Combined], without: Container[str]) -> Array:
+    """Flags [ny, nx] of a detector's pixels by its flat and its dark; without : masters that are not wanted."""
+    flags = np.zeros(shape, np.uint8)
+    if "flat" not in without:
+        flags |= response_flags(found["flat"])
+    if "dark" not in without:
+        flags |= dark_flags(found["dark"])
+    return flags
 
 
 def _strips(ny: int) -> Iterator[slice]:

@@ -171,11 +171,7 @@ def masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibrat
             path = master_name(folder, frame, kind)
             found[kind], time = read_master(path, kind, frame)
             dark_time = time if kind == "dark" else dark_time
-    flags = np.zeros(shape, np.uint8)
-    if "flat" not in without:
-        flags |= calibration.response_flags(found["flat"])
-    if "dark" not in without:
-        flags |= calibration.dark_flags(found["dark"])
+    flags = calibration.master_flags(shape, found, without)
     return calibration.Masters(found["bias"], found["dark"], found["flat"], flags, dark_time)
 
 

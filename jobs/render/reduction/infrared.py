@@ -200,10 +200,6 @@ def of_frame(folder: Path, frame: Frame, without: Sequence[str]) -> Masters:
         else:
             found[kind], time = files.read_master(files.master_name(folder, frame, kind), kind, frame)
             dark_time = time if kind == "dark" else dark_time
-    flags = np.zeros(shape, np.uint8)
-    if "flat" not in without:
-        flags |= calibration.response_flags(found["flat"])
-    if "dark" not in without:
-        flags |= calibration.dark_flags(found["dark"])
+    flags = calibration.master_flags(shape, found, without)
     flat = replace(found["flat"], vignetted=True)
     return Masters(found["linearity"], found["dark"], flat, flags, dark_time)

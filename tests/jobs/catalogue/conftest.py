@@ -14,6 +14,7 @@ from jobs.catalogue.matter import density_box
 from jobs.fluxes import cosmology, passbands
 from jobs.fluxes.libraries import templates
 from jobs.request.schema import Universe
+from jobs.validation import mean_sky
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 
@@ -54,6 +55,16 @@ def box():
 def cells(universe):
     """What has been drawn of the universe in this run of tests."""
     return population.Cells(universe.population)
+
+
+# Cells of a sky without structure, 1.7 deg2: a few degrees of a survey would be needed to tell as much.
+FLAT_CELLS = 32
+
+
+@cache
+def flat_sky():
+    """The galaxies of so many cells."""
+    return mean_sky.rows(mean_sky.flat(made()), 0, FLAT_CELLS)
 
 
 @pytest.fixture(scope="session")

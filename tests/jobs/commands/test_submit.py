@@ -48,7 +48,7 @@ except KeyboardInterrupt as stopped:
 @pytest.mark.parametrize(
     ("number", "name", "module", "words"),
     [
-        (signal.SIGINT, "demo", "jobs.demo", ["--out", "out"]),
+        pytest.param(signal.SIGINT, "demo", "jobs.demo", ["--out", "out"], marks=pytest.mark.nightly),
         (signal.SIGTERM, "truesky", "jobs.commands.__main__", ["run", "requests/demo.toml", "--lake", "out"]),
     ],
 )

@@ -1,4 +1,7 @@
-"""Notebooks that render: a field of small detectors, the shear of known galaxies, spectra; they show what they say."""
+"""Notebooks that render: a field of small detectors, the shear of known galaxies, spectra; they show what they say.
+
+What they ask of the packages is looked at every day, in tests/house/test_calls.py.
+"""
 
 import re
 from pathlib import Path
@@ -120,7 +123,8 @@ def test_every_cell_runs(tmp_path, monkeypatch, request_text):
     assert 10_000 < (tmp_path / "field.jpg").stat().st_size < 500_000
 
 
-@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.nightly)], ids=["strip", "detector"])
+@pytest.mark.nightly
+@pytest.mark.parametrize("whole", [False, True], ids=["strip", "detector"])
 def test_redshifts_and_fluxes_of_lines_are_those_of_the_catalogue(tmp_path, monkeypatch, whole):
     """Of the shipped field those that are claimed; in a strip of it every cell runs."""
     (tmp_path / "spectra.toml").write_text(SPECTRA if whole else STRIP)

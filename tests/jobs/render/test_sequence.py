@@ -129,6 +129,7 @@ def _killed(root, request):
 
 
 @pytest.mark.spark
+@pytest.mark.nightly
 def test_the_same_bytes_in_any_order_and_after_a_kill(spark, lake, whole, folder):
     request = wanted(folder)
     child = CONTEXT.Process(target=_killed, args=(lake, request))

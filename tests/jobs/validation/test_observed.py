@@ -15,15 +15,15 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, publish, read
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.galaxies import GALAXIES
-from tests.jobs.catalogue.conftest import made
+from tests.jobs.catalogue.conftest import FLAT_CELLS, flat_sky, made
 
 LIST = Path(observed.__file__).with_suffix(".csv")
-# Cells without structure: a few degrees of a survey would be needed to tell as much.
-MANY, FEW = 32, 4
+# Cells that tell a wrong recipe.
+FEW = 4
 
 
-def seen(universe, cells):
-    return observed.sky_of(mean_sky.rows(universe, 0, cells), cells * sky.cell_area(GENERATION_ORDER))
+def seen(rows, cells):
+    return observed.sky_of(rows, cells * sky.cell_area(GENERATION_ORDER))
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +32,8 @@ def flat():
 
 
 @pytest.fixture(scope="module")
-def whole(flat):
-    return observed.figures(seen(flat, MANY))
+def whole():
+    return observed.figures(seen(flat_sky(), FLAT_CELLS))
 
 
 def off(figures):
@@ -143,4 +143,4 @@ def far_quasars(flat):
 )
 def test_a_wrong_recipe_is_seen(flat, whole, mutant, name):
     assert name not in off(whole)
-    assert name in off(observed.figures(seen(mutant(flat), FEW)))
+    assert name in off(observed.figures(seen(mean_sky.rows(mutant(flat), 0, FEW), FEW)))

@@ -139,7 +139,9 @@ def test_a_version_that_was_overtaken_is_not_published(lake):
     assert read.version(lake, "toy").key == toy_plan(2).key
 
 
-def test_two_runs_of_one_plan_do_not_meet(lake):
+def test_two_runs_of_one_plan_do_not_meet(lake, monkeypatch):
+    monkeypatch.setattr(locks, "MOMENT", 0.1)
+
     def work(root, facts):
         with pytest.raises(Superseded, match="another run is making"):
             publish.make(lake, toy_plan(), toy_work)

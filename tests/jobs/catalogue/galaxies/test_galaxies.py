@@ -156,6 +156,7 @@ def test_galaxies_name_halos_of_the_table(drawn):
     assert [mass[i] for i in columns["halo_id"][rows].tolist()] == columns["log_halo_mass"][rows].tolist()
 
 
+@pytest.mark.nightly
 def test_satellite_fraction():
     """Zehavi et al. 2011: 0.21 with M_r < -20 nearby; in 10 deg2, for a cluster moves that of a few cells."""
     universe = galaxies.halos_and_galaxies(SEED, Universe(galaxy_limit=22.0, z_max=0.35, **SMALL))
@@ -182,8 +183,9 @@ def test_positions_are_lensed(drawn):
     assert shift[drawn.z < 0.1].max() < 0.2 * shift.max()
 
 
-def test_a_cell_is_the_same_alone_or_among_others(universe, dust, monkeypatch):
+def test_a_cell_is_the_same_alone_or_among_others(dust, monkeypatch):
     """In another process, in a file between other cells: every byte."""
+    universe = galaxies.model(SEED, Universe(galaxy_limit=22.5, **SMALL))
     other = pickle.loads(pickle.dumps(universe))
     monkeypatch.setattr(build_galaxies, "_universe", lambda facts, own: other)
     monkeypatch.setattr(dust_map, "chosen", lambda seed, own: dust)

@@ -18,6 +18,8 @@ from tests.jobs.catalogue.conftest import SEED, SMALL
 ORDER = ids.GENERATION_ORDER
 # Both poles, RA 0 on the equator, and a corner of three files.
 PLACES = [(10.0, 90.0), (200.0, -90.0), (0.0, 0.0), (45.0, 41.8)]
+# One pole, and the corner.
+SOME = PLACES[0], PLACES[3]
 
 
 def made(limit):
@@ -56,7 +58,9 @@ def crossing(rows):
 NAMES = ("ra", "dec"), ("ra_true", "dec_true")
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(
+    "place", [pytest.param(place, marks=[] if place in SOME else [pytest.mark.nightly]) for place in PLACES]
+)
 def test_a_cell_holds_what_is_seen_in_it_wherever_it_truly_is(place, shallow, population, dust):
     """Against the whole of the cell and of all about it, every one drawn where it truly is: the same bytes."""
     cell = cell_at(place)

@@ -16,13 +16,12 @@ from jobs.catalogue.galaxies.strong_lenses import Disc, Lens
 from jobs.catalogue.halos import luminosity_function
 from jobs.fluxes import cosmology
 from jobs.request.from_toml import parse
-from jobs.validation import mean_sky
 from lake_schema import sky
 from lake_schema.store import plan, publish, read, validate
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests import requests
-from tests.jobs.catalogue.conftest import SEED
+from tests.jobs.catalogue.conftest import FLAT_CELLS, SEED, flat_sky
 
 STAMPS = strong_lenses.stamps()
 SIDE = 200
@@ -118,20 +117,19 @@ def systems(drawn):
     return pa.concat_tables(found), 12 * sky.cell_area(8)
 
 
-def test_dispersions_are_those_of_nearby_galaxies(universe):
+def test_dispersions_are_those_of_nearby_galaxies():
     """sum of (sigma / 161 km/s)^4, (Mpc/h)^-3: Choi, Park & Vogeley 2007 have phi* Gamma((alpha + 4) / beta) / ...
 
     In a sky without structure: one cluster of a degree2 moves the sum by a tenth.
     """
-    law, cells = strong_lenses.laws(), 16
-    rows = mean_sky.rows(mean_sky.flat(universe), 0, cells)
+    law, rows = strong_lenses.laws(), flat_sky()
     z, m_r, colour = (rows[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01", "color_gr_01"))
     phi, alpha, beta = 8.0e-3, 2.32, 2.67
     expected = phi * gamma((alpha + 4.0) / beta) / gamma(alpha / beta)
     near = (z > 0.1) & (z < 0.7) & (colour > law.reddest_blue)
     m_star, _, _ = luminosity_function.schechter().at(z[near])
     fourth = 10.0 ** (0.4 * (m_star - m_r[near])) * np.exp(8.0 * (law.scatter * np.log(10.0)) ** 2)
-    volume = float(cosmology.comoving_volume(0.1, 0.7)) * np.radians(1.0) ** 2 * cells * sky.cell_area(8)
+    volume = float(cosmology.comoving_volume(0.1, 0.7)) * np.radians(1.0) ** 2 * FLAT_CELLS * sky.cell_area(8)
     assert law.sigma_star == 161.0
     assert fourth.sum() / volume == pytest.approx(expected, rel=0.15)
 

@@ -119,7 +119,7 @@ def test_a_detector_upside_down_sees_the_optics_turned():
     np.testing.assert_array_equal(one[:, ::-1, ::-1], other)
 
 
-@pytest.mark.parametrize("name", ["euclid_y", "euclid_h"])
+@pytest.mark.parametrize("name", [pytest.param("euclid_y", marks=pytest.mark.nightly), "euclid_h"])
 def test_eight_sub_bands_are_as_good_as_many(name):
     """R2 and ellipticity of blue and red stars, and the light in 1", against 32 sub-bands."""
     band, d, sampled = passbands.load(name), detector("nisp", "DET12", MISSION), euclid.NISP
@@ -145,7 +145,9 @@ def test_eight_sub_bands_are_as_good_as_many(name):
         np.testing.assert_allclose(few[4:], many[4:], atol=5e-5)
 
 
-@pytest.mark.parametrize("name", WIDTHS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(band, marks=[] if band == "euclid_h" else [pytest.mark.nightly]) for band in WIDTHS]
+)
 def test_stars_are_found_where_they_are(name):
     """sep's windowed positions over all places within a pixel, in the middle and in a corner of a detector."""
     d = detector("nisp", "DET11", MISSION)

@@ -86,6 +86,8 @@ def test_the_sky_comes_back_and_its_weight_is_its_inverse_variance(made):
     check(made)
 
 
+# That a reader wants a name: tests/lake_schema/store/test_names.py.
+@pytest.mark.nightly
 def test_of_two_requests_one_is_named(tmp_path, capsys):
     """Each has its own frames: two bias frames, or three."""
     root, side = layout.lake(tmp_path / "lake"), 64

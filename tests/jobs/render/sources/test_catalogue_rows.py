@@ -88,7 +88,7 @@ def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
 
 def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
     light = []
-    for distance in (60.0, 150.0, 215.0):
+    for distance in (60.0, 215.0):
         one, whole = rendered(distance), rendered(distance, found=False)
         np.testing.assert_array_equal(one.science, whole.science)
         assert len(one.sources) == 1
