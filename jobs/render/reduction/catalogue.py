@@ -12,6 +12,7 @@ Ref : Bertin & Arnouts 1996, A&AS 117, 393; Barbary 2016, JOSS 1, 58 (sep)
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import sep
@@ -32,8 +33,11 @@ _ISOPHOTES, _KRON, _LEAST_RADIUS = 6.0, 2.5, 1.75
 _EXACT = 0
 # Of a FWHM, the standard deviation of a window about a source's centre.
 _WINDOW = 2.0 / (2.0 * np.sqrt(2.0 * np.log(2.0)))
-# Pixels of sources that are held at a time, of a detector; parts that a source is divided into on the way.
+# Pixels of sources that are held at a time, of a tile; parts that a source is divided into on the way.
 _STACK, _PARTS = 0.5, 8192
+# Sources are found tile by tile, since sep compares each with every other and holds all their pixels: side of a tile,
+# and how far about it is looked at, pixels.
+_TILE, _BEYOND = 2048, 256
 # Pixels about a source that are no sky; what stands for no noise.
 _MARGIN, _FLOOR = 3, np.float32(1e-20)
 # What SourceExtractor writes where there is no magnitude; of a flux of 1, magnitudes.
@@ -58,16 +62,15 @@ class Limits:
 
 
 def detected(image: Reduced, gain: float, radius: float, limits: Limits) -> dict[str, Array]:
-    """Sources, brightest pixels first in rows from below: columns of SourceExtractor, x and y from 0.
+    """Sources, tile by tile from below: columns of SourceExtractor, x and y from 0.
 
     gain   : electrons of the exposure in a unit of the image;  radius : of the aperture of MAG_APER, pixels
     limits : what a source is
+    Error  : a source that reaches farther than 256 pixels from its brightest one may be cut there, and counted twice
     """
     masked = (image.flags & ~np.uint8(SATURATED) != 0) & (image.weight <= 0.0)
     above, noise, sky = _above(image, masked, limits)
-    found, own = sep.extract(
-        above, limits.threshold, err=noise, mask=masked, minarea=limits.pixels, gain=gain, segmentation_map=True
-    )
+    found, own = _extracted(above, noise, masked, limits, gain=gain)
     where = found["x"], found["y"]
     shape = found["a"], found["b"], np.clip(found["theta"], -np.pi / 2, np.pi / 2)
     common = {"err": noise, "mask": masked, "gain": gain, "subpix": _EXACT}
@@ -102,19 +105,47 @@ def _above(image: Reduced, masked: Bool, limits: Limits) -> tuple[Array, Array, 
     """
     # What is not needed any more is freed: of a large detector each array is a third of a gigabyte.
     pixels = np.ascontiguousarray(image.image, np.float32)
-    sep.set_extract_pixstack(max(300_000, int(_STACK * pixels.size)))
-    sep.set_sub_object_limit(_PARTS)
     mesh = {"bw": _MESH, "bh": _MESH, "fw": _SMOOTHED, "fh": _SMOOTHED}
     empty = image.weight > 0.0
     sky = sep.Background(pixels, mask=~empty, **mesh)
-    first = {"err": _noise(sky), "mask": masked, "minarea": limits.pixels, "deblend_cont": 1.0}
-    own = sep.extract(pixels - sky.back(), limits.threshold, segmentation_map=True, **first)[1] > 0
-    del first
+    own = _extracted(_without(pixels, sky), _noise(sky), masked, limits, deblend_cont=1.0)[1] > 0
     empty &= ~ndimage.binary_dilation(own, iterations=_MARGIN)
     del own
     if empty.any():
         sky = sep.Background(pixels, mask=~empty, **mesh)
-    return pixels - sky.back(), _noise(sky), sky
+    return _without(pixels, sky), _noise(sky), sky
+
+
+def _extracted(above: Array, noise: Array, masked: Bool, limits: Limits, **about: float) -> tuple[Array, Array]:
+    """Sources as sep describes them, and int32[ny, nx] the number of each pixel's one, from 1.
+
+    above : without the sky;  noise : its rms;  masked : pixels without value;  about : as sep.extract takes it
+    """
+    sep.set_sub_object_limit(_PARTS)
+    own, all_found, count = np.zeros(above.shape, np.int32), [], 0
+    for bottom, left in product(*(range(0, side, _TILE) for side in above.shape)):
+        wide = tuple(slice(max(first - _BEYOND, 0), first + _TILE + _BEYOND) for first in (bottom, left))
+        some, error, mask = (np.ascontiguousarray(array[wide]) for array in (above, noise, masked))
+        sep.set_extract_pixstack(max(300_000, int(_STACK * some.size)))
+        found, numbers = sep.extract(
+            some, limits.threshold, err=error, mask=mask, minarea=limits.pixels, segmentation_map=True, **about
+        )
+        for axis, part in zip("yx", wide, strict=True):
+            for name in (axis, f"{axis}min", f"{axis}max", f"{axis}peak", f"{axis}cpeak"):
+                found[name] += part.start
+        # Its brightest pixel is in one tile alone.
+        kept = (found["ypeak"] // _TILE == bottom // _TILE) & (found["xpeak"] // _TILE == left // _TILE)
+        number = np.zeros(len(found) + 1, np.int32)
+        number[1:][kept] = count + np.arange(1, kept.sum() + 1)
+        np.copyto(own[wide], number[numbers], where=number[numbers] > 0)
+        all_found.append(found[kept])
+        count += int(kept.sum())
+    return np.concatenate(all_found), own
+
+
+def _without(pixels: Array, sky: sep.Background) -> Array:
+    back = sky.back()
+    return np.asarray(np.subtract(pixels, back, out=back))
 
 
 def _noise(sky: sep.Background) -> Array:
