@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
+from uuid import uuid4
 
 import pyarrow as pa
 
@@ -27,6 +29,7 @@ from lake_schema.store.provenance import canonical, digest, file_sha256
 # Types of what every manifest says, and of what it says of each file.
 _FACTS = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
 _FILE = {"path": str, "bytes": int, "sha256": str}
+_TEMPORARY = re.compile(r"\.[0-9a-f]{12}\.tmp\.")
 
 
 def write(folder: Path, facts: Json) -> None:
@@ -191,7 +194,9 @@ def _files(folder: Folder) -> Mapping[str, int]:
     """Of every file below a folder its name and its bytes; of one that is none, 0."""
     if isinstance(folder, Place):
         return folder.sizes()
-    there = [path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()]
+    # What another copy of a task was writing when the version was renamed is in nobody's way.
+    some = (path for path in folder.rglob("*") if not is_temporary(path))
+    there = [path for path in some if path.is_symlink() or not path.is_dir()]
     return {path.relative_to(folder).as_posix(): 0 if path.is_symlink() else path.stat().st_size for path in there}
 
 
@@ -234,16 +239,26 @@ def _row_faults(folder: Folder, entry: Json) -> list[str]:
 def write_json(path: Path, value: Json) -> None:
     """Replace a JSON file in one rename, synced."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    own = temporary(path)
     try:
-        with temporary.open("w") as stream:
+        with own.open("w") as stream:
             stream.write(_text(value))
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, path)
+        os.replace(own, path)
         sync(path.parent)
     finally:
-        temporary.unlink(missing_ok=True)
+        own.unlink(missing_ok=True)
+
+
+def temporary(path: Path) -> Path:
+    """A name beside a file that nobody else gives to their own: processes of two machines may have one number."""
+    return path.with_name(f".{uuid4().hex[:12]}.tmp.{path.name}")
+
+
+def is_temporary(path: Path) -> bool:
+    """Is it a name that `temporary` gives?"""
+    return _TEMPORARY.match(path.name) is not None
 
 
 def _text(value: Json) -> str:

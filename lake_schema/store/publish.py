@@ -140,6 +140,9 @@ def _finish(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
     files = []
     for path in sorted(stage.rglob("*")):
         relative = path.relative_to(stage).as_posix()
+        if manifest.is_temporary(path):
+            # Of another copy of a task, which is still running.
+            continue
         if path.is_file():
             entry = listed.pop(relative, None)
             if entry is None:
@@ -179,7 +182,7 @@ def _sweep(stage: Path, wanted: set[str]) -> None:
     """Remove what no receipt names: temporary files of dead tasks, metadata of an interrupted finish."""
     for path in sorted(stage.rglob("*"), reverse=True):
         if path.is_file() and path.relative_to(stage).as_posix() not in wanted:
-            path.unlink()
+            path.unlink(missing_ok=True)
 
 
 def _publish(root: Path, plan: Plan, base: str | None, name: str | None) -> None:

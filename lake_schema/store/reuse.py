@@ -91,8 +91,7 @@ def _whole(folder: Path, entry: Json) -> Json | None:
 
 def _link(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{os.getpid()}.tmp.{target.name}")
-    temporary.unlink(missing_ok=True)
+    temporary = manifest.temporary(target)
     try:
         os.link(source, temporary)
     except OSError:

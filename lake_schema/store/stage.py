@@ -1,6 +1,7 @@
 """One part of a version: checked, written, hashed, its receipt last.  Everything here runs wherever the map runs it.
 
 A part is done when its receipt is there and its files have the sizes that it says; where a run begins, their sha256.
+Two copies of a task may run at a time, on machines of one kind, and one of them longer than the run.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import pyarrow.compute as pc
 
 from lake_schema import sky
 from lake_schema.columns import Table
-from lake_schema.errors import BadInput, LakeError
+from lake_schema.errors import BadInput, LakeError, Superseded
 from lake_schema.ids import BLOCK_BITS, kind_of
 from lake_schema.store import hats_files, layout, manifest, parquet
 from lake_schema.store.plan import Json, Output, Part, Plan, Work, data_path
@@ -45,7 +46,13 @@ def attempt(root: Path, key: str, table: Table, facts: Json, work: Work, part: P
     if is_done(stage, part):
         return receipt_of(stage, part.name) or {}
     try:
-        return write_part(stage, table, part, work(root, {**facts, **part.facts}))
+        output = work(root, {**facts, **part.facts})
+        if is_done(stage, part):
+            # Another copy of this task was faster.
+            return receipt_of(stage, part.name) or {}
+        if not stage.is_dir():
+            raise Superseded(f"table {table.name}: version {key} was published before {part.name} was made once more")
+        return write_part(stage, table, part, output)
     except Exception as error:
         refused = isinstance(error, LakeError)
         line = str(error) if refused else f"{type(error).__name__}: {error}"
@@ -143,7 +150,7 @@ def is_numbered(table: Table) -> bool:
 def _write_file(folder: Path, relative: str, writer: Callable[[Path], None]) -> Json:
     target = layout.within(folder, folder / relative)
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{os.getpid()}.tmp.{target.name}")
+    temporary = manifest.temporary(target)
     try:
         writer(temporary)
         manifest.sync(temporary)

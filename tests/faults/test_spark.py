@@ -15,6 +15,7 @@ from jobs import shell
 from jobs.shell import Job, Step
 from lake_schema.store import layout
 from tests import requests
+from tests.cluster import below
 from tests.faults import promise, slow_job
 from tests.universe import plain_plan, plain_work
 
@@ -89,15 +90,6 @@ def test_a_worker_that_dies_once_is_replaced(run, lake, wanted):
     assert promise.sums(lake, "plain") == wanted
 
 
-def children(pid):
-    """Process ids below `pid`."""
-    found = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout.split()
-    below, parents = {pid}, dict(zip(map(int, found[::2]), map(int, found[1::2]), strict=True))
-    for _ in range(5):
-        below |= {child for child, parent in parents.items() if parent in below}
-    return below - {pid}
-
-
 def started(lake, request_file):
     """A spark-submit of the slow job, in a process group of its own."""
     (lake / "slow").touch()
@@ -136,15 +128,15 @@ def driver(lake, request_file):
 )
 def test_a_driver_that_is_stopped(driver, lake, spark, request_file, number, whom, status):
     past_first_receipt(lake, driver)
-    below = children(driver.pid)
-    assert len(below) >= 3
+    left = below(driver.pid)
+    assert len(left) >= 3
     stopped = time.monotonic()
     os.killpg(driver.pid, number) if whom == "group" else driver.send_signal(number)
     assert driver.wait(120) == status
     lines = driver.stderr.read().strip().splitlines()
     assert len(lines) == (0 if number == signal.SIGKILL else 1), lines
     assert all("a second run continues where this one ended" in line for line in lines)
-    while any(Path(f"/proc/{pid}").exists() for pid in below):
+    while any(Path(f"/proc/{pid}").exists() for pid in left):
         assert time.monotonic() - stopped < 240, "a worker was left behind"
         time.sleep(0.1)
     assert promise.current(lake, "plain") == promise.key("plain", 1)

@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
-from lake_schema.store import garbage, layout, locks, manifest, parquet, publish, read
+from lake_schema.store import garbage, hats_files, layout, locks, manifest, parquet, publish, read
 from lake_schema.store.plan import Output, Part, Plan, data_path
 from lake_schema.store.stage import attempt, missing
 from tests.universe import CELLS, TOY, plain_plan, plain_work, toy_plan, toy_rows, toy_work
@@ -183,6 +183,37 @@ def test_a_receipt_without_its_file_does_not_count(lake):
     assert missing(stage, plan) == [plan.parts[0]]
     victim.unlink()
     assert missing(stage, plan) == [plan.parts[0]]
+
+
+def test_copies_of_a_task_that_are_late_change_nothing(lake, monkeypatch):
+    plan = toy_plan()
+    stage, part = layout.stage(lake, "toy", plan.key), plan.parts[0]
+    path, first = stage / data_path(TOY, part.name), []
+
+    def slow(root, facts):
+        # Another copy ends while this one renders.
+        attempt(root, plan.key, TOY, plan.facts, toy_work, part)
+        first.append(path.stat().st_ino)
+        return toy_work(root, facts)
+
+    def mapper(function, parts):
+        yield attempt(lake, plan.key, TOY, plan.facts, slow, part)
+        yield from map(function, parts)
+
+    write, writing = hats_files.write, manifest.temporary(path)
+
+    def while_another_writes(*given):
+        write(*given)
+        writing.write_bytes(b"half")
+
+    monkeypatch.setattr(hats_files, "write", while_another_writes)
+    folder = publish.make(lake, plan, toy_work, mapper)
+    assert (folder / data_path(TOY, part.name)).stat().st_ino == first[0]
+    assert (folder / writing.relative_to(stage)).exists()
+    assert read.verify(read.version(lake, "toy"), deep=True) == []
+    assert "was published before" in attempt(lake, plan.key, TOY, plan.facts, toy_work, part)["error"]
+    assert not stage.exists()
+    assert publish.make(lake, plan, toy_work) == folder
 
 
 def test_what_is_done_needs_no_lock(lake, monkeypatch):

@@ -1,0 +1,120 @@
+"""A cluster of processes on loopback: a standalone master of Spark and its workers, and jobs that are submitted to it.
+
+Everything goes through spark-submit, as it would from a login node; what a job was told, and who did its tasks, is in
+Spark's event log.
+"""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+from lake_schema.store import layout, read
+
+ROOT = Path(__file__).parents[1]
+
+
+def environment():
+    """The workers find the package where this test does."""
+    spark_home = str(Path(find_spec("pyspark").origin).parent)
+    return {**os.environ, "SPARK_HOME": spark_home, "PYTHONPATH": str(ROOT), "SPARK_DAEMON_MEMORY": "256m"}
+
+
+def command(script, lake, request_file, *options):
+    """The words of a spark-submit of one of our jobs."""
+    submit = shutil.which("spark-submit", path=str(Path(sys.executable).parent))
+    return [submit, *options, str(ROOT / script), "--lake", str(lake), "--request", str(request_file)]
+
+
+def submit(script, lake, request_file, *options):
+    done = subprocess.run(
+        command(script, lake, request_file, *options),
+        capture_output=True, text=True, cwd="/", env=environment(), timeout=3000,
+    )  # fmt: skip
+    assert done.returncode == 0, f"{script}: {done.stdout}{done.stderr}"
+
+
+@contextmanager
+def daemon(main_class, *arguments):
+    home = Path(environment()["SPARK_HOME"])
+    words = [home / "bin" / "spark-class", f"org.apache.spark.deploy.{main_class}", *arguments]
+    with subprocess.Popen(
+        list(map(str, words)), env=environment(), cwd="/", start_new_session=True, stdout=subprocess.DEVNULL
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+@contextmanager
+def running(folder, names):
+    """Address of a master, and a process a worker of one core and 1 GB; each has its name's folder below `folder`."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    master = f"spark://127.0.0.1:{port}"
+    with ExitStack() as stack:
+        stack.enter_context(daemon("master.Master", "--host", "127.0.0.1", "--port", port, "--webui-port", 0))
+        deadline = time.monotonic() + 60
+        while not _answers(port):
+            assert time.monotonic() < deadline, "no master"
+            time.sleep(0.5)
+        workers = {}
+        for name in names:
+            (folder / name).mkdir()
+            options = ("--cores", 1, "--memory", "1g", "--work-dir", folder / name, "--webui-port", 0)
+            workers[name] = stack.enter_context(daemon("worker.Worker", "--host", "127.0.0.1", *options, master))
+        yield master, workers
+
+
+def _answers(port):
+    try:
+        socket.create_connection(("127.0.0.1", port)).close()
+    except OSError:
+        return False
+    return True
+
+
+def told(folder, **more):
+    """Options of spark-submit: little memory, an event log in `folder`, and more settings."""
+    settings = {
+        "spark.executor.memory": "512m",
+        "spark.eventLog.enabled": "true",
+        "spark.eventLog.dir": folder.as_uri(),
+        "spark.eventLog.compress": "false",
+        "spark.eventLog.rolling.enabled": "false",
+        **more,
+    }
+    return [word for key, value in settings.items() for word in ("--conf", f"{key}={value}")]
+
+
+def events(path):
+    """Lines of an event log, or of the log of a run."""
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def below(pid):
+    """Process ids below `pid`."""
+    found = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout.split()
+    tree, parents = {pid}, dict(zip(map(int, found[::2]), map(int, found[1::2]), strict=True))
+    for _ in range(5):
+        tree |= {child for child, parent in parents.items() if parent in tree}
+    return tree - {pid}
+
+
+def different(one, other):
+    """Tables whose manifests, the sha256 of every file among them, differ; every byte of one is hashed."""
+    assert layout.tables(one) == layout.tables(other)
+    assert len(layout.tables(one)) > 10
+    versions = [{name: read.version(root, name) for name in layout.tables(root)} for root in (one, other)]
+    for version in versions[0].values():
+        assert read.verify(version, deep=True) == []
+    texts = [{name: (v.folder / "manifest.json").read_bytes() for name, v in found.items()} for found in versions]
+    return [name for name in texts[0] if texts[0][name] != texts[1][name]]
