@@ -1,6 +1,6 @@
 """Every request that is shipped goes through all jobs, made small by its keys: area, depth, detectors, exposures.
 
-That of the demo does so every day, as it is (test_field.py); and the check takes each (jobs/request/test_checks.py).
+That of the demo does so every day, as it is (test_field.py); and the check takes each (`test_checks.py` of requests).
 """
 
 import re
