@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from jobs.render.forecasting import catalogue_forecast, speed
+from jobs.render.planning.parts import of_exposures
 from jobs.render.products import run_log
 from lake_schema import __version__, command
 from lake_schema.errors import BadInput, LakeError
@@ -92,9 +93,12 @@ def _forecast(root: Folder, factor: float) -> dict[str, tuple[float, float]]:
             products = (
                 read.published_last(root, "products") if name is None else read.for_request(root, "products", name)
             )
-            tasks = read.version(root, "tasks", products.manifest["facts"]["inputs"]["tasks"]).rows().to_pylist()
-            planned = {(task["exposure_id"], task["detector"]): task for task in tasks}
-            for facts in (part["facts"] for part in products.manifest["parts"]):
+            made = [part["facts"] for part in products.manifest["parts"]]
+            tasks = read.version(root, "tasks", products.manifest["facts"]["inputs"]["tasks"])
+            columns, numbers = ("exposure_id", "detector", "seconds", "bytes"), {facts["exposure_id"] for facts in made}
+            some = of_exposures(tasks, numbers, columns).to_pylist()
+            planned = {(task["exposure_id"], task["detector"]): task for task in some}
+            for facts in made:
                 own.setdefault(canonical(facts), planned[facts["exposure_id"], facts["detector"]])
     except (LakeError, KeyError):
         return jobs

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -91,7 +92,8 @@ def _images(root: Path, request: Request, exposures: pa.Table, tasks: pa.Table) 
     own = [part for part in made.parts if (part.facts["exposure_id"], part.facts["detector"]) in wanted]
     size = _kept(root, request, made, own)
     if request.files == "exposure":
-        whole, numbers = exposure_files.plan(made, every.to_pylist()), {number for number, _ in wanted}
+        planned_of = Counter(every["exposure_id"].to_pylist())
+        whole, numbers = exposure_files.plan(made, planned_of), {number for number, _ in wanted}
         size += _kept(root, request, whole, [part for part in whole.parts if part.facts["exposure_id"] in numbers])
     return size
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import os
 import threading
-from collections.abc import AsyncIterator, Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from jobs.explore.explorer import Explorer
 from jobs.explore.process import MEMORY, TIMEOUT, Process
@@ -156,10 +157,22 @@ class Requested:
     names: tuple[str, ...]
     versions: Mapping[str, read.Version]
 
-    def rows(self, table: str, columns: Sequence[str] | None = None) -> list[dict[str, Any]]:
-        """Rows of a table, none where it is not there; columns None: all of them."""
+    def rows(
+        self, table: str, columns: Sequence[str] | None = None, exposures: Collection[int] | None = None
+    ) -> list[dict[str, Any]]:
+        """Rows of a table, none where it is not there.
+
+        columns : names, None = all;  exposures : only those of these, by number, None = all
+        """
         version = self.versions.get(table)
-        return [] if version is None else version.rows(columns).to_pylist()
+        numbers = None if exposures is None else pa.array([*exposures], pa.int64())
+        where = None if numbers is None else pc.field("exposure_id").isin(numbers)
+        return [] if version is None else version.rows(columns, where=where).to_pylist()
+
+    def pieces(self, table: str, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """The same, a part after the other: a plan may be larger than memory."""
+        version = self.versions.get(table)
+        return iter(()) if version is None else (version.rows(columns, [part]) for part in version.parts)
 
 
 class Lake:

@@ -6,10 +6,13 @@ import math
 from dataclasses import asdict
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from jobs import report
 from jobs.page import pictures
 from jobs.page.answers import plain
-from jobs.page.opened import Lake
+from jobs.page.opened import Lake, Requested
 from lake_schema.errors import LakeError
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import names as named
@@ -32,13 +35,27 @@ def runs(lake: Lake) -> Json:
     done = {one.place for one in pictures.pictures(lake)}
     for own in lake.observed:
         about = {"request": own.request}
-        if rows := own.rows("tasks", ["exposure_id", "detector", "seconds"]):
-            left = [row["seconds"] for row in rows if (own.request, row["exposure_id"], row["detector"]) not in done]
-            found["tasks"].append(about | {"done": len(rows) - len(left), "all": len(rows), "seconds_left": sum(left)})
+        if number := own.versions["tasks"].num_rows if "tasks" in own.versions else 0:
+            left, seconds = _left(own, {place[1:] for place in done if place[0] == own.request})
+            found["tasks"].append(about | {"done": number - left, "all": number, "seconds_left": seconds})
         found["failures"] += [about | {k: plain(v) for k, v in row.items()} for row in pictures.failures(lake, own)]
     for own in lake.requested("mission"):
         found["mission"] += [{"request": own.request, **row} for row in _changed(own.versions["mission"])]
     return found
+
+
+def _left(own: Requested, done: set[tuple[int, str]]) -> tuple[int, float]:
+    """Detectors that are planned and not done: how many, and their seconds."""
+    begun = pa.array([*{exposure for exposure, _ in done}], pa.int64())
+    number, seconds = 0, 0.0
+    for rows in own.pieces("tasks", ["exposure_id", "detector", "seconds"]):
+        is_begun = pc.is_in(rows["exposure_id"], begun)
+        some = rows.filter(is_begun).to_pylist()
+        left = [row["seconds"] for row in some if (row["exposure_id"], row["detector"]) not in done]
+        others = rows.filter(pc.invert(is_begun))
+        number += len(left) + others.num_rows
+        seconds += sum(left) + (pc.sum(others["seconds"]).as_py() or 0.0)
+    return number, seconds
 
 
 def _changed(version: read.Version) -> list[Json]:

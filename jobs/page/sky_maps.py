@@ -6,7 +6,7 @@ What is of the renderer is imported where it is used: the first sky is shown bef
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -22,10 +22,14 @@ from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
 
-_TASK = ("exposure_id", "ra", "dec", "radius", "s_region")
+_CIRCLE = ("exposure_id", "ra", "dec", "radius")
+_TASK = (*_CIRCLE, "s_region")
 MOST_CELLS, MOST_SOURCES = 200_000, 20_000
 _DEEPEST_SHOWN = 16
 MOST_EXPOSURES = 20_000
+# Of a plan of more detectors those are looked up that are shown: of so many exposures, whose boresights lie so many deg
+# at most from the edge of what is in view.
+MOST_PLANNED, MOST_LOOKED_UP, WIDEST_CAMERA = 200_000, 1_000, 2.0
 Json = dict[str, Any]
 # Of the sources of a field: what is shown beside the place, where a table has it, and which come first: the smallest
 # numbers of a magnitude, the largest of a mass.
@@ -87,37 +91,43 @@ def coverage(lake: Lake, order: int, view: Float | None, band: str | None) -> by
 
     if not 0 <= order <= _DEEPEST_SHOWN:
         raise BadInput(f"order = {order} is outside [0, {_DEEPEST_SHOWN}]")
-    tasks = _tasks(lake, band)
-    cells = np.zeros(0, np.int64)
+    cells, rows = np.zeros(0, np.int64), 0
     if view is not None:
         cells = sky.cells_in_cone(float(view[0]), float(view[1]), min(float(view[2]), 180.0), order)
     else:
-        for row in tasks.select(["ra", "dec", "radius"]).to_pylist() if tasks.num_rows else []:
-            cells = np.union1d(cells, sky.cells_in_cone(row["ra"], row["dec"], row["radius"], order))
-            _refuse_many(len(cells))
-    seen = footprints.counts(tasks, *sky.cell_centres(order, cells)) if tasks.num_rows and len(cells) else cells * 0
+        for tasks in _tasks(lake, band, _CIRCLE):
+            circles = np.unique(np.stack([tasks[name].to_numpy() for name in _CIRCLE[1:]], axis=1), axis=0)
+            for ra, dec, radius in circles:
+                cells = np.union1d(cells, sky.cells_in_cone(ra, dec, radius, order))
+                _refuse_many(len(cells))
+    seen, centres = np.zeros(len(cells), np.int64), sky.cell_centres(order, cells) if len(cells) else None
+    for tasks in _tasks(lake, band, _TASK):
+        rows += tasks.num_rows
+        if centres is not None:
+            seen += footprints.counts(tasks, *centres)
     cells, seen = cells[seen > 0], seen[seen > 0]
     _refuse_many(len(cells))
-    return _packed(_corners(order, cells), seen.astype(float), {"order": order, "rows": tasks.num_rows})
+    return _packed(_corners(order, cells), seen.astype(float), {"order": order, "rows": rows})
 
 
-def _tasks(lake: Lake, band: str | None) -> pa.Table:
-    """What is planned in a band, None = in all; what several requests have of one version counts once."""
-    found = {}
-    for own in lake.observed:
-        if version := own.versions.get("tasks"):
-            found[version.key] = version.rows(_TASK)
-            if band is not None:
-                exposures = own.rows("exposures", ("exposure_id", "band"))
-                numbers = [row["exposure_id"] for row in exposures if row["band"] == band]
-                is_own = pc.is_in(found[version.key]["exposure_id"], pa.array(numbers, pa.int64()))
-                found[version.key] = found[version.key].filter(is_own)
-    return pa.concat_tables([*found.values()] or [pa.table({})])
+def _tasks(lake: Lake, band: str | None, columns: Sequence[str]) -> Iterator[pa.Table]:
+    """What is planned in a band, None = in all, a part of a plan after the other.
+
+    What several requests have of one version counts once.
+    """
+    for own in {own.versions["tasks"].key: own for own in lake.observed if "tasks" in own.versions}.values():
+        numbers = None
+        if band is not None:
+            exposures = own.versions["exposures"].rows(("exposure_id", "band"))
+            numbers = exposures.filter(pc.equal(exposures["band"], band))["exposure_id"].combine_chunks()
+        for rows in own.pieces("tasks", columns):
+            yield rows if numbers is None else rows.filter(pc.is_in(rows["exposure_id"], numbers))
 
 
 def bands(lake: Lake) -> list[str]:
     """Passbands in which exposures are planned."""
-    return sorted({row["band"] for own in lake.observed for row in own.rows("exposures", ("band",))})
+    pieces = (rows for own in lake.observed for rows in own.pieces("exposures", ("band",)))
+    return sorted({band for rows in pieces for band in rows["band"].unique().to_pylist()})
 
 
 def _refuse_many(cells: int) -> None:
@@ -204,15 +214,16 @@ _Place = tuple[str | None, int, str]
 
 @lru_cache(maxsize=4)
 def _regions(lake: Lake) -> Mapping[_Place, Json]:
-    """What was planned, and what is done; that does not change while the lake is open."""
+    """What was planned, of a large plan with exposures of which something is done; and what is done.
+
+    That does not change while the lake is open.
+    """
     from jobs.page import pictures
 
     found: dict[_Place, Json] = {}
     for own in lake.observed:
-        bands_ = {row["exposure_id"]: row["band"] for row in own.rows("exposures", ("exposure_id", "band"))}
-        for row in own.rows("tasks", ("exposure_id", "detector", "channel", "s_region")):
-            about: Json = {"state": "planned", "images": [], "contents": [], "band": bands_.get(row["exposure_id"])}
-            found[own.request, row["exposure_id"], row["detector"]] = {**_polygon(own, row), **about}
+        begun = {one.row["exposure_id"] for one in pictures.pictures(lake) if one.own.request == own.request}
+        found |= _planned(own, begun if _is_large(own) else None)
     for number, one in enumerate(pictures.pictures(lake)):
         empty = {**_polygon(one.own, one.row), "images": [], "contents": []}
         region = found.setdefault(one.place, empty)
@@ -220,6 +231,40 @@ def _regions(lake: Lake) -> Mapping[_Place, Json]:
         region["images"].append(number)
         region["contents"].append(one.row["content"])
     return found
+
+
+def _is_large(own: Requested) -> bool:
+    return "tasks" in own.versions and own.versions["tasks"].num_rows > MOST_PLANNED
+
+
+def _planned(own: Requested, numbers: Collection[int] | None = None) -> dict[_Place, Json]:
+    """Detectors of a request's exposures, None = of all of them."""
+    bands_ = {row["exposure_id"]: row["band"] for row in own.rows("exposures", ("exposure_id", "band"), numbers)}
+    found = {}
+    for row in own.rows("tasks", ("exposure_id", "detector", "channel", "s_region"), numbers):
+        about: Json = {"state": "planned", "images": [], "contents": [], "band": bands_.get(row["exposure_id"])}
+        found[own.request, row["exposure_id"], row["detector"]] = {**_polygon(own, row), **about}
+    return found
+
+
+def _in_view(lake: Lake, view: Float | None) -> dict[_Place, Json]:
+    """Of large plans the detectors that may be in view.  Errors: BadInput where they are too many"""
+    found: dict[_Place, Json] = {}
+    for own in filter(_is_large, lake.observed):
+        exposures = own.versions["exposures"].rows(("exposure_id", "ra", "dec"))
+        exposures = exposures.filter(pc.is_valid(exposures["ra"]))
+        if view is not None:
+            ra, dec = (exposures[name].to_numpy() for name in ("ra", "dec"))
+            far = sky.separation(ra, dec, float(view[0]), float(view[1]))
+            exposures = exposures.filter(pa.array(far <= float(view[2]) + WIDEST_CAMERA))
+        _refuse_crowd(exposures.num_rows, MOST_LOOKED_UP)
+        found |= _planned(own, exposures["exposure_id"].to_pylist())
+    return found
+
+
+def _refuse_crowd(exposures: int, most: int) -> None:
+    if exposures > most:
+        raise BadInput(f"more than {most:,} exposures are here: look at a part")
 
 
 def _failed(lake: Lake) -> dict[tuple[str | None, str], str]:
@@ -252,14 +297,16 @@ def exposures(lake: Lake, view: Float | None = None) -> list[Json]:
     view   : ra, dec, radius deg, None = all;  returns: of each exposure its state, what it is, and `outline`, polygons
     Errors : BadInput where they are more than are shown
     """
-    about, places, circles = _exposures(lake)
+    known, (about, places, circles) = _regions(lake), _exposures(lake)
+    if more := _in_view(lake, view):
+        known = {**more, **known}
+        about, places, circles = _outlined(lake, known)
     # A circle about all corners meets the one in view.
     near = np.full(len(about), True)
     if view is not None:
         near = sky.separation(circles[:, 0], circles[:, 1], view[0], view[1]) <= circles[:, 2] + view[2]
-    if np.count_nonzero(near) > MOST_EXPOSURES:
-        raise BadInput(f"more than {MOST_EXPOSURES:,} exposures are here: look at a part")
-    known, failures, found = _regions(lake), _failed(lake), []
+    _refuse_crowd(int(np.count_nonzero(near)), MOST_EXPOSURES)
+    failures, found = _failed(lake), []
     for k in np.flatnonzero(near):
         own = [_now(place, known[place], failures) for place in places[k]]
         states = [region["state"] for region in own]
@@ -277,14 +324,18 @@ _EXPOSURE = ("exposure_id", "channel", "camera", "band", "image_type", "mjd")
 
 @lru_cache(maxsize=4)
 def _exposures(lake: Lake) -> tuple[list[Json], list[list[_Place]], Float]:
+    return _outlined(lake, _regions(lake))
+
+
+def _outlined(lake: Lake, known: Mapping[_Place, Json]) -> tuple[list[Json], list[list[_Place]], Float]:
     """Of every exposure what it is, its detectors, and a circle about their corners: ra, dec, radius deg [n, 3]."""
-    known, detectors = _regions(lake), dict[tuple[str | None, int], list[_Place]]()
+    detectors = dict[tuple[str | None, int], list[_Place]]()
     for place in known:
         detectors.setdefault(place[:2], []).append(place)
     rows = {
         (own.request, row["exposure_id"]): {name: plain(value) for name, value in row.items()}
         for own in lake.observed
-        for row in own.rows("exposures", _EXPOSURE)
+        for row in own.rows("exposures", _EXPOSURE, {number for request, number in detectors if request == own.request})
     }
     about, places, circles = [], [], []
     for (request, number), own_places in sorted(detectors.items(), key=lambda item: (item[0][0] or "", item[0][1])):

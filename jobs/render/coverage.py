@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +21,15 @@ import pyarrow.compute as pc
 
 from jobs.render.camera import footprints, pointing
 from jobs.render.channels.image_types import SKY_TYPES
+from jobs.render.planning import parts
 from jobs.request.area import Area
 from lake_schema import command, sky, user_files
 from lake_schema.arrays import Bool, Int
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
-from lake_schema.tables.exposures import ExposureRow
 
+_EXPOSURE = ("exposure_id", "channel", "band", "image_type", "exposure_time_s", "ra", "dec")
+_TASK = ("exposure_id", "ra", "dec", "radius", "s_region")
 # Places along a side of a map; the widest map, and how far inside an area its edge is no longer felt, deg.
 _SIDE, _WIDEST, _INSIDE = 500, 60.0, 0.5
 # Colours of a map, besides that of what nothing sees; more exposures than all but a few places have share the last.
@@ -54,33 +57,45 @@ class Depth:
         return float((self.seen[self.interior] >= least).mean()) if self.interior.any() else 0.0
 
 
-def depths(exposures: pa.Table, tasks: pa.Table, area: Area, side: int = _SIDE) -> list[Depth]:
+def depths(exposures: pa.Table, tasks: Callable[[], Iterable[pa.Table]], area: Area, side: int = _SIDE) -> list[Depth]:
     """Of every channel and band that looks at the sky, long exposures alone.
 
-    area : of the request, where its interior lies
-    exposures, tasks : rows of the tables;  side : pixels of the map
+    exposures : rows of the table;  tasks : rows of that table, a part after the other, whenever it is called
+    area : of the request, where its interior lies;  side : pixels of the map
     """
     looks = exposures.filter(pc.is_in(exposures["image_type"], pa.array(SKY_TYPES)))
     if not looks.num_rows:
         raise BadInput("table exposures has none of the sky")
     ra0, dec0 = _centre(looks)
     far = float(np.max(sky.separation(looks["ra"].to_numpy(), looks["dec"].to_numpy(), ra0, dec0)))
-    extent = far + float(pc.max(_reach(tasks, looks)).as_py())
-    if 2.0 * extent > _WIDEST:
-        raise BadInput(f"the exposures lie {2 * extent:.0f} deg apart: a map shows {_WIDEST:g} deg at most")
+    _refuse_wide(far)
+    extent = far + max(_reach(some, looks) for some in tasks())
+    _refuse_wide(extent)
     # Square on the tangent plane; x to the west.
     grid = np.tan(np.radians(extent)) * np.degrees(1.0) * 3600.0 * np.linspace(-1.0, 1.0, side)
     x, y = np.meshgrid(grid, grid)
     ra, dec = (a.ravel() for a in pointing.sky_of_plane(x, y, ra0, dec0, 0.0))
     inside = area.depth(ra, dec)
     interior = (inside > min(_INSIDE, 0.5 * float(inside.max()))).reshape(side, side)
-    found = []
-    for channel, band in sorted({(row.channel, row.band) for row in map(ExposureRow.of, looks.to_pylist())}):
-        own = looks.filter(pc.and_(pc.equal(looks["channel"], channel), pc.equal(looks["band"], band)))
-        long = own.filter(pc.greater(own["exposure_time_s"], 0.5 * pc.max(own["exposure_time_s"]).as_py()))
-        seen = footprints.counts(tasks.filter(pc.is_in(tasks["exposure_id"], long["exposure_id"])), ra, dec)
-        found.append(Depth(channel, band, len(long), seen.reshape(side, side), interior, extent))
-    return found
+    kinds = looks.group_by(["channel", "band"]).aggregate([]).to_pylist()
+    long = {kind: _long(looks, *kind) for kind in sorted((row["channel"], row["band"]) for row in kinds)}
+    seen = {kind: np.zeros(side * side, np.int64) for kind in long}
+    for some in tasks():
+        for kind, numbers in long.items():
+            seen[kind] += footprints.counts(some.filter(pc.is_in(some["exposure_id"], numbers)), ra, dec)
+    return [Depth(*kind, len(long[kind]), seen[kind].reshape(side, side), interior, extent) for kind in long]
+
+
+def _refuse_wide(extent: float) -> None:
+    if 2.0 * extent > _WIDEST:
+        raise BadInput(f"the exposures lie {2 * extent:.0f} deg apart: a map shows {_WIDEST:g} deg at most")
+
+
+def _long(exposures: pa.Table, channel: str, band: str) -> pa.Array:
+    """Numbers of a band's long exposures."""
+    own = exposures.filter(pc.and_(pc.equal(exposures["channel"], channel), pc.equal(exposures["band"], band)))
+    is_long = pc.greater(own["exposure_time_s"], 0.5 * pc.max(own["exposure_time_s"]).as_py())
+    return own.filter(is_long)["exposure_id"].combine_chunks()
 
 
 def _centre(exposures: pa.Table) -> tuple[float, float]:
@@ -88,12 +103,13 @@ def _centre(exposures: pa.Table) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
-def _reach(tasks: pa.Table, exposures: pa.Table) -> pa.Array:
-    """How far from its boresight each task of some exposures looks, deg."""
-    at = {row.exposure_id: (row.ra, row.dec) for row in map(ExposureRow.of, exposures.to_pylist())}
-    own = tasks.filter(pc.is_in(tasks["exposure_id"], exposures["exposure_id"]))
-    ra, dec = np.array([at[i] for i in own["exposure_id"].to_pylist()]).T
-    return pa.array(sky.separation(own["ra"].to_numpy(), own["dec"].to_numpy(), ra, dec) + own["radius"].to_numpy())
+def _reach(tasks: pa.Table, exposures: pa.Table) -> float:
+    """How far from their boresights the tasks of some exposures look, deg; 0 where there are none of them."""
+    where = pc.index_in(tasks["exposure_id"], exposures["exposure_id"].combine_chunks()).combine_chunks()
+    own, where = tasks.filter(pc.is_valid(where)), where.drop_null()
+    ra, dec = (exposures[name].take(where).to_numpy() for name in ("ra", "dec"))
+    far = sky.separation(own["ra"].to_numpy(), own["dec"].to_numpy(), ra, dec) + own["radius"].to_numpy()
+    return float(np.max(far, initial=0.0))
 
 
 def line(depth: Depth) -> str:
@@ -171,7 +187,7 @@ def _drawn(lake: str, name: str | None, out: Path | None) -> int:
         user_files.target(out, (".png",))
     root = layout.lake(lake)
     exposures, tasks = (read.version(root, table, request=name) for table in ("exposures", "tasks"))
-    found = depths(exposures.rows(), tasks.rows(), area_of(exposures))
+    found = depths(exposures.rows(_EXPOSURE), partial(parts.each, tasks, _TASK), area_of(exposures))
     for depth in found:
         print(line(depth))
     if out is not None:

@@ -23,12 +23,11 @@ from jobs.render.drawing import stamp_sizes
 from jobs.render.exposure import elsewhere, persistence, render, visible_sources, visible_spectra
 from jobs.render.exposure.records import Earlier, EarlierSky, Rows, Variant
 from jobs.render.planning import parts, preconditions, variants
-from jobs.render.planning import tasks as planned
 from jobs.render.planning.mission import mission_of
 from jobs.render.planning.preconditions import INPUTS
 from jobs.render.products import exposure_files, fits_files, truth_table
 from jobs.render.products.beside import psf_file, spectra_file, truth_file
-from jobs.render.products.keys import ephemeris_files, part_name, product_keys, psf_files, stamp_files
+from jobs.render.products.keys import ephemeris_files, exposures_of, part_name, product_keys, psf_files, stamp_files
 from jobs.render.psf import from_file, to_psfex
 from jobs.render.sources import catalogue_rows, ephemerides, galaxy_stamps, selection, solar_system
 from jobs.render.sources.catalogue_rows import LENSES
@@ -57,24 +56,24 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """
     inputs = inputs_of(lake, request)
     preconditions.refuse_other_plan(inputs, request)
-    exposures = inputs["exposures"].rows()
-    every = preconditions.rendered(exposures, planned.in_order(inputs["tasks"].rows()))
-    asked = planned.part(every, request)
-    earlier = _earlier_tasks(inputs, exposures, request)
-    needed = _with_earlier(asked, earlier, exposures)
+    held = exposures_of(reuse.held(lake, PRODUCTS.name, request.name))
+    chosen = parts.chosen(inputs["exposures"], inputs["tasks"], request, held)
+    own = variants.missions(mission_of(request.mission))
+    exposures, earlier = parts.before(inputs, chosen.exposures, chosen.asked, own)
+    needed = _with_earlier(chosen.asked, earlier, exposures)
     places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in needed if task["cells"]}
     for name in ("galaxies", "stars"):
         of_task = [selection.needed(task, catalogue_rows.deflection_of(inputs[name])) for task in places.values()]
         preconditions.refuse_uncovered(inputs[name], {cell for cells in of_task for cell in cells})
-    plan = products(lake, request, inputs, exposures, every.to_pylist(), asked)
+    plan = products(lake, request, inputs, chosen.exposures, chosen.tasks, chosen.asked)
     drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in plan.parts)
     steps = [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
-    spread = _dispersed(exposures)
+    spread = _dispersed(chosen.exposures)
     spectra = tuple(own for own, part in zip(drawn, plan.parts, strict=True) if part.facts["exposure_id"] in spread)
     if spectra:
         steps.append(Step(Plan(RENDERED_SPECTRA, {"products": plan.key}, spectra), spectra_work))
     if request.files == "exposure":
-        steps.append(Step(exposure_files.plan(plan, every.to_pylist()), exposure_files.work, unit="exposure"))
+        steps.append(Step(exposure_files.plan(plan, chosen.planned), exposure_files.work, unit="exposure"))
     return steps
 
 
@@ -106,7 +105,8 @@ def products(
     """The plan of the table `products`: what is asked for, and what the request has and keeps.
 
     lake, request : folder, and what is asked;  inputs : versions of the tables that are read
-    exposures     : rows of the table;  every, asked : rows of the table `tasks`, all and those to be rendered now
+    exposures     : rows of the table that hold the tasks
+    every, asked  : rows of the table `tasks`: those to be rendered now, and at least all that the request has already
     """
     facts = {
         **common_facts(request, "seed", "noise_seed", "accuracy", "mission", "effects", "truth", *WRITTEN),
@@ -123,33 +123,20 @@ def products(
         facts["stamps"] = stamp_files(request.structure.stamps.file)
     held = reuse.held(lake, PRODUCTS.name, request.name)
     wanted = {part_name(task) for task in asked}
-    earlier = _earlier_tasks(inputs, exposures, request)
+    exposures, earlier = parts.before(inputs, exposures, every, variants.missions(mission_of(request.mission)))
     tasks = _with_held(wanted, every, exposures, held, earlier)
     psfs = psf_files(exposures, _with_earlier(tasks, earlier, exposures))
     keys = product_keys({**facts, "psf": psfs}, exposures, tasks, inputs, mission_of(request.mission), earlier)
-    parts = tuple(
+    made = tuple(
         Part(name, {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: key})
         for task, key in zip(tasks, keys, strict=True)
         if (name := part_name(task)) in wanted or held[name] == key
     )
-    if len(parts) < len(tasks):
-        stay = {part.name for part in parts}
+    if len(made) < len(tasks):
+        stay = {part.name for part in made}
         kept = [task for task in tasks if part_name(task) in stay]
         psfs = psf_files(exposures, _with_earlier(kept, earlier, exposures))
-    return Plan(PRODUCTS, {**facts, "psf": psfs} if psfs else facts, parts)
-
-
-def _earlier_tasks(
-    inputs: Mapping[str, read.Version], exposures: pa.Table, request: Request
-) -> dict[tuple[int, str], list[Json]]:
-    """(exposure, detector) -> tasks that left something in the detector, also of exposures that nothing renders."""
-    names = exposures["channel"].unique().to_pylist()
-    if all(name not in registry.CHANNELS or registry.CHANNELS[name].remembers is None for name in names):
-        return {}
-    rows = {row.exposure_id: row for row in map(ExposureRow.of, exposures.to_pylist())}
-    return persistence.earlier_of(
-        inputs["tasks"].rows().to_pylist(), rows, variants.missions(mission_of(request.mission))
-    )
+    return Plan(PRODUCTS, {**facts, "psf": psfs} if psfs else facts, made)
 
 
 def _with_earlier(

@@ -25,11 +25,19 @@ def obscore(lake: Lake, address: str) -> list[dict[str, Any]]:
     address : of the service from which the files can be had
     """
     owns = {own.request: own for own in lake.observed}
-    exposures = {(name, row["exposure_id"]): row for name, own in owns.items() for row in own.rows("exposures")}
+    known = pictures(lake)
+    numbers: dict[str | None, set[int]] = {name: set() for name in owns}
+    for one in known:
+        numbers[one.own.request].add(one.row["exposure_id"])
+    exposures = {
+        (name, row["exposure_id"]): row
+        for name, own in owns.items()
+        for row in own.rows("exposures", None, numbers[name])
+    }
     bands = {name: _bands(own) for name, own in owns.items()}
     found = []
-    for number, one in enumerate(pictures(lake)):
-        entry = next(entry for entry in one.version.manifest["files"] if entry["path"] == one.row["path"])
+    for number, one in enumerate(known):
+        entry = one.version.manifest.by_path[one.row["path"]]
         corners = np.array([float(text) for text in one.row["s_region"].split()[2:]]).reshape(-1, 2)
         header = {key: value for key, value, _ in one.cards}
         about = {

@@ -7,7 +7,7 @@ Error : cosmic rays, moving bodies and lensed arcs of earlier exposures are not 
         2300 e- lacks 10 e- of what it leaves after 134 s.  Of a spectrum a source that is too faint to be drawn again
         counts as flat: a line that has more than `_LEAST` electrons of its own is missed with it
 
-earlier_of        the tasks before a task
+earlier_of        the tasks before a task;  remembers   whether there are any
 window            how long before, days
 is_drawn          whether an earlier exposure's sources count
 brightest_column  of a source, part of its light;  least_flux   f_nu of the faintest source that is drawn again
@@ -77,7 +77,7 @@ def earlier_of(
     Errors     : BadInput where a detector is exposed before an exposure of it has ended
     """
     by_detector: dict[tuple[Any, ...], list[Task]] = defaultdict(list)
-    cameras = {row.camera for row in exposures.values() if _remembers(row)}
+    cameras = {row.camera for row in exposures.values() if remembers(row)}
     for task in tasks:
         row = exposures[task["exposure_id"]]
         if row.camera in cameras:
@@ -89,7 +89,7 @@ def earlier_of(
         _check_one_at_a_time([exposures[task["exposure_id"]] for task in some], detector, mission_of)
         began = np.array([exposures[task["exposure_id"]].mjd for task in some])
         for task, now in zip(some, began.tolist(), strict=True):
-            if not _remembers(exposures[task["exposure_id"]]):
+            if not remembers(exposures[task["exposure_id"]]):
                 continue
             since = int(np.searchsorted(began, now - days))
             before = some[since : int(np.searchsorted(began, now))]
@@ -117,7 +117,8 @@ def _check_one_at_a_time(
             )
 
 
-def _remembers(exposure: ExposureRow) -> bool:
+def remembers(exposure: ExposureRow) -> bool:
+    """Whether a detector of the exposure has something left of those before."""
     channel = registry.CHANNELS.get(exposure.channel)
     return channel is not None and channel.remembers is not None
 

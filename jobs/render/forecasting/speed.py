@@ -18,6 +18,7 @@ import scipy.fft
 
 from jobs import cache
 from jobs.code_keys import code_key
+from jobs.render.planning.parts import of_exposures
 from jobs.render.products import run_log
 from lake_schema.arrays import Float
 from lake_schema.errors import LakeError
@@ -72,11 +73,13 @@ def _measured(lake: Folder) -> Iterator[float]:
     """CPU s over the forecast's of every detector of the current products that a machine of this kind rendered."""
     try:
         version = read.published_last(lake, "products")
-        tasks = read.version(lake, "tasks", version.manifest["facts"]["inputs"]["tasks"]).rows()
+        parts = {part["name"]: part["facts"] for part in version.manifest["parts"]}
+        numbers = {facts["exposure_id"] for facts in parts.values()}
+        planned = read.version(lake, "tasks", version.manifest["facts"]["inputs"]["tasks"])
+        tasks = of_exposures(planned, numbers, ("exposure_id", "detector", "seconds"))
     except (LakeError, KeyError):
         return
     foreseen = {(row["exposure_id"], row["detector"]): row["seconds"] for row in tasks.to_pylist()}
-    parts = {part["name"]: part["facts"] for part in version.manifest["parts"]}
     for line in _lines(lake, version.key):
         facts = parts.get(str(line.get("part", "")), {})
         place = facts.get("exposure_id"), facts.get("detector")

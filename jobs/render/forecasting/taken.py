@@ -7,6 +7,7 @@ text     the table that a person reads
 from __future__ import annotations
 
 import contextlib
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from jobs.render.camera import footprints
+from jobs.render.planning import parts
 from jobs.render.products import run_log
 from lake_schema import sky
 from lake_schema.errors import LakeError
@@ -26,6 +28,9 @@ _ORDER = 13
 _ALL = "all"
 # Image types that survey the sky: others are taken where it is bright or dense.
 _SURVEYED = ("science", "deep")
+_TASK = ("exposure_id", "detector", "channel", "seconds", "bytes", "ra", "dec", "radius", "s_region")
+# Channel, camera, image type.
+_Kind = tuple[str, str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,25 +67,27 @@ def rows(root: Path, request: str | None = None, factor: float = 1.0) -> list[Li
     """
     products = read.version(root, "products", request=request)
     made_of = products.manifest["facts"]["inputs"]
-    tasks = read.version(root, "tasks", made_of["tasks"]).rows().to_pylist()
-    exposures = {
-        row["exposure_id"]: row for row in read.version(root, "exposures", made_of["exposures"]).rows().to_pylist()
-    }
+    tasks, exposures = (read.version(root, name, made_of[name]) for name in ("tasks", "exposures"))
     sizes = {entry["path"]: entry["bytes"] for entry in products.manifest["files"]}
-    parts = {part["name"]: part for part in products.manifest["parts"]}
+    named = {part["name"]: part for part in products.manifest["parts"]}
     took = _took(root, products.key)
     made = {
         (part["facts"]["exposure_id"], part["facts"]["detector"]): (
             sum(sizes[path] for path in part.get("files", ())),
             took.get(name, {}),
         )
-        for name, part in parts.items()
+        for name, part in named.items()
     }
-    kinds: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
-    for task in tasks:
-        exposure = exposures[task["exposure_id"]]
-        kinds.setdefault((task["channel"], exposure["camera"], exposure["image_type"]), []).append(task)
-    own = [_line(kind, some, made, factor) for kind, some in sorted(kinds.items())]
+    about = exposures.rows(("exposure_id", "camera", "image_type"))
+    kinds: dict[_Kind, list[dict[str, Any]]] = defaultdict(list)
+    # Of a large plan a small part may be made: of the others it counts how many there are.
+    numbers = {number for number, _ in made}
+    exposed = {
+        row["exposure_id"]: row for row in parts.of_exposures(exposures, numbers, about.column_names).to_pylist()
+    }
+    for task in parts.of_exposures(tasks, numbers, _TASK).to_pylist():
+        kinds[_kind({**task, **exposed[task["exposure_id"]]})].append(task)
+    own = [_line(kind, number, kinds[kind], made, factor) for kind, number in sorted(_planned(tasks, about).items())]
     channels = sorted({line.channel for line in own})
     sums = [_sum(channel, [line for line in own if line.channel == channel]) for channel in channels]
     return [*own, *sums, _sum(_ALL, own)]
@@ -89,14 +96,28 @@ def rows(root: Path, request: str | None = None, factor: float = 1.0) -> list[Li
 Made = Mapping[tuple[int, str], tuple[int, Mapping[str, Any]]]
 
 
-def _line(kind: tuple[str, str, str], tasks: Sequence[dict[str, Any]], made: Made, factor: float) -> Line:
+def _kind(row: Mapping[str, Any]) -> _Kind:
+    return row["channel"], row["camera"], row["image_type"]
+
+
+def _planned(tasks: read.Version, exposures: pa.Table) -> dict[_Kind, int]:
+    """How many detectors of each kind are planned."""
+    found: Counter[_Kind] = Counter()
+    for some in parts.each(tasks, ("exposure_id", "channel")):
+        sums = some.join(exposures, "exposure_id").group_by(["channel", "camera", "image_type"])
+        for row in sums.aggregate([("exposure_id", "count")]).to_pylist():
+            found[_kind(row)] += row["exposure_id_count"]
+    return found
+
+
+def _line(kind: _Kind, planned: int, tasks: Sequence[dict[str, Any]], made: Made, factor: float) -> Line:
     own = [(task, *made[place]) for task in tasks if (place := (task["exposure_id"], task["detector"])) in made]
     known = [(task, took) for task, _, took in own if took]
     cpu = sum(took["cpu_s"] for _, took in known)
     deg2 = _seen([task for task, _ in known]) if kind[2] in _SURVEYED else 0.0
     return Line(
         *kind,
-        planned=len(tasks),
+        planned=planned,
         made=len(own),
         measured=len(known),
         cpu_s=cpu,

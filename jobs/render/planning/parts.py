@@ -6,32 +6,41 @@ out.
 Layout       what a request takes, cut into parts
 holding      names of the parts of a published plan that hold some exposures
 rows         rows of some exposures of a published plan, of whose parts no others are opened
+each         rows of a published plan, a part after the other
+chosen       what of a published plan is to be rendered, or is already
+before       what left something in the detectors of some of it
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
 from jobs.fluxes.passbands import Passband
 from jobs.render.camera import detectors
-from jobs.render.planning import planned_exposures, survey
+from jobs.render.exposure import persistence
+from jobs.render.planning import planned_exposures, preconditions, survey
 from jobs.render.planning.survey import Stretch, Taken
+from jobs.render.planning.tasks import Narrowed, in_order
 from jobs.request.schema import Request
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.store.plan import Json, Part
 from lake_schema.store.read import Version
+from lake_schema.tables.exposures import ExposureRow
 
 # So many detectors take seconds and 200 MB; a plan that has no more is one part.
 TASKS_A_PART = 100_000
 _WHOLE = "all.parquet"
 # Facts of a part: its first and last exposure; MJD before which none of them begins, and after which none does.
 _NUMBERS, _DATES = "exposures", "mjd"
+# Columns of `tasks` that say what is rendered, and when.
+_TASK = ("exposure_id", "detector", "channel", "ra", "dec", "radius", "cells", "seconds")
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,9 +193,114 @@ def rows(
     numbers: Iterable[int] = (),
     dates: tuple[float, float] | None = None,
     where: ds.Expression | None = None,
+    columns: Sequence[str] | None = None,
 ) -> pa.Table:
     """Rows of the parts of a published `exposures` or `tasks` that hold some exposures, or some of a time.
 
     version : of the table;  numbers : of exposures;  dates : MJD from and to;  where : an Arrow filter, None = all
+    columns : names, None = all
     """
-    return version.rows(parts=holding(version, numbers, dates), where=where)
+    return version.rows(columns, holding(version, numbers, dates), where)
+
+
+def of_exposures(version: Version, numbers: Collection[int], columns: Sequence[str] | None = None) -> pa.Table:
+    """Rows of some exposures of a published `exposures` or `tasks`, and no others; columns : names, None = all."""
+    return rows(version, numbers, where=_one_of(numbers), columns=columns)
+
+
+def _one_of(numbers: Collection[int]) -> ds.Expression:
+    return pc.field("exposure_id").isin(pa.array([*numbers], pa.int64()))
+
+
+def each(
+    version: Version, columns: Sequence[str] | None = None, where: ds.Expression | None = None
+) -> Iterator[pa.Table]:
+    """Rows of a published `exposures` or `tasks`, a part after the other: of a plan however large one is in memory."""
+    return (version.rows(columns, [part], where) for part in version.parts)
+
+
+# ------------------------------------------------------------------------------------------------ to be rendered
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """What of a published plan a run has to do with, and no more: a plan may be larger than memory.
+
+    exposures : rows of those that hold its detectors
+    tasks     : of the detectors that are asked for, and of the exposures that the request has images of; longest first
+    asked     : of those that are asked for
+    planned   : how many detectors that can be rendered each of its exposures has
+    """
+
+    exposures: pa.Table
+    tasks: Sequence[Json]
+    asked: Sequence[Json]
+    planned: Mapping[int, int]
+
+
+def chosen(exposures: Version, planned: Version, request: Request, held: Collection[int]) -> Chosen:
+    """What is to be rendered of a plan, and what of it there may be already.
+
+    exposures, planned : versions of the tables `exposures` and `tasks`
+    held   : exposures that the request has images of
+    Errors : BadInput where no exposure has a simulator, or the request asks for what is not planned
+    """
+    drawn = preconditions.simulated(exposures.rows(["exposure_id", "channel", "image_type"]))
+    narrowed, holders, has = Narrowed(request), {*holding(planned, held)}, pa.array([*held], pa.int64())
+    asked, others = [], []
+    numbers: dict[int, int] = {}
+    for part in planned.parts:
+        if narrowed.is_done and part not in holders:
+            continue
+        some = planned.rows(_TASK, [part])
+        some = some if drawn is None else some.filter(pc.is_in(some["exposure_id"], drawn))
+        asked.append(narrowed.of(some))
+        others.append(some.filter(pc.is_in(some["exposure_id"], has)) if narrowed.is_narrow else some.slice(0, 0))
+        own = {number for few in (asked[-1], others[-1]) for number in few["exposure_id"].unique().to_pylist()}
+        counts = some["exposure_id"].value_counts()
+        numbers |= {one["values"]: one["counts"] for one in counts.to_pylist() if one["values"] in own}
+    narrowed.refuse_unknown()
+    wanted: list[Json] = in_order(pa.concat_tables(asked)).to_pylist() if asked else []
+    every = _with(wanted, pa.concat_tables(others).to_pylist() if others else [])
+    return Chosen(of_exposures(exposures, numbers), every, wanted, numbers)
+
+
+def _with(wanted: list[Json], others: list[Json]) -> list[Json]:
+    """Tasks and others, each once, longest first."""
+    there = {(task["exposure_id"], task["detector"]) for task in wanted}
+    more = [task for task in others if (task["exposure_id"], task["detector"]) not in there]
+    if not more:
+        return wanted
+    return sorted([*wanted, *more], key=lambda task: (-task["seconds"], task["exposure_id"], task["detector"]))
+
+
+def before(
+    inputs: Mapping[str, Version],
+    exposures: pa.Table,
+    some: Iterable[Json],
+    own: Callable[[str | None], MissionConfiguration],
+) -> tuple[pa.Table, dict[tuple[int, str], list[Json]]]:
+    """What left something in the detectors of some tasks, also of exposures that nothing renders.
+
+    inputs  : versions of the tables `exposures` and `tasks`;  own : an exposure's settings -> its mission database
+    exposures, some : rows of the tables
+    returns : rows of these exposures and of those before them; tasks before each, by exposure and detector
+    """
+    kept = [row for row in map(ExposureRow.of, exposures.to_pylist()) if persistence.remembers(row)]
+    if not kept:
+        return exposures, {}
+    kinds = {(row.camera, row.settings) for row in kept}
+    days = max(persistence.window(camera, own(settings)) for camera, settings in kinds)
+    since, until = min(row.mjd for row in kept) - days, max(row.mjd for row in kept)
+    near = (pc.field("mjd") >= since) & (pc.field("mjd") <= until)
+    there = near & pc.field("camera").isin(sorted({camera for camera, _ in kinds}))
+    found = rows(inputs["exposures"], dates=(since, until), where=there)
+    numbers = found["exposure_id"].to_pylist()
+    names = sorted({task["detector"] for task in some})
+    here = _one_of(numbers) & pc.field("detector").isin(pa.array(names, pa.string()))
+    left = rows(inputs["tasks"], numbers, where=here, columns=_TASK).to_pylist()
+    earlier = persistence.earlier_of(
+        left, {row.exposure_id: row for row in map(ExposureRow.of, found.to_pylist())}, own
+    )
+    others = found.filter(pc.invert(pc.is_in(found["exposure_id"], exposures["exposure_id"].combine_chunks())))
+    return pa.concat_tables([exposures, others]), earlier

@@ -51,20 +51,29 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> N
 
 def rendered(exposures: pa.Table, tasks: pa.Table) -> pa.Table:
     """Those of the tasks whose exposures are of a kind that has a simulator; BadInput where none is."""
+    simulated(exposures)
+    return drawable(exposures, tasks)
+
+
+def simulated(exposures: pa.Table) -> pa.Array | None:
+    """Numbers of the exposures that are of a kind that has a simulator, None = all are; BadInput where none is."""
     known = _known(exposures)
     if not any(known.values()):
         raise BadInput(f"no simulator renders {', '.join(map(' '.join, known))} yet: nothing to render is planned")
-    return drawable(exposures, tasks)
+    return _drawn(exposures, known)
 
 
 def drawable(exposures: pa.Table, tasks: pa.Table) -> pa.Table:
     """As `rendered`, none where none is."""
-    known = _known(exposures)
+    wanted = _drawn(exposures, _known(exposures))
+    return tasks if wanted is None else tasks.filter(pc.is_in(tasks["exposure_id"], wanted))
+
+
+def _drawn(exposures: pa.Table, known: Mapping[tuple[str, str], bool]) -> pa.Array | None:
     if all(known.values()):
-        return tasks
+        return None
     kinds = zip(exposures["channel"].to_pylist(), exposures["image_type"].to_pylist(), strict=True)
-    wanted = exposures["exposure_id"].filter(pa.array([known[kind] for kind in kinds], pa.bool_()))
-    return tasks.filter(pc.is_in(tasks["exposure_id"], wanted.combine_chunks()))
+    return exposures["exposure_id"].filter(pa.array([known[kind] for kind in kinds], pa.bool_())).combine_chunks()
 
 
 def _known(exposures: pa.Table) -> dict[tuple[str, str], bool]:

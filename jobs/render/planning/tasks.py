@@ -114,6 +114,16 @@ class Narrowed:
         self.request, self._left = request, request.limit
         self._known: set[str] = set()
 
+    @property
+    def is_narrow(self) -> bool:
+        """Whether anything may be left out."""
+        return bool(self.request.detectors) or self.request.limit is not None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing is wanted of what comes yet."""
+        return self._left == 0 and {*self.request.detectors} <= self._known
+
     def of(self, tasks: pa.Table) -> pa.Table:
         """Rows of the request's detectors, as long as there are not too many."""
         if self.request.detectors:

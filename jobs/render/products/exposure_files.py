@@ -7,7 +7,7 @@ work   makes one of them, from files of a version of the table `products`
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,14 +39,11 @@ _OF_EXPOSURE = (
 )  # fmt: skip
 
 
-def plan(products: Plan, every: Sequence[Json]) -> Plan:
+def plan(products: Plan, planned: Mapping[int, int]) -> Plan:
     """One part an exposure, of the detectors that the products' plan has of it, by name.
 
-    products : the plan of the detectors' files;  every : rows of the table `tasks`: all that are planned
+    products : the plan of the detectors' files;  planned : how many are planned of each exposure
     """
-    planned: dict[int, int] = defaultdict(int)
-    for task in every:
-        planned[task["exposure_id"]] += 1
     held: dict[int, dict[str, str]] = defaultdict(dict)
     for part in products.parts:
         held[part.facts["exposure_id"]][part.facts["detector"]] = part.facts[reuse.PRODUCT]

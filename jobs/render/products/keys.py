@@ -1,7 +1,7 @@
 """The key of each product: a digest of everything that shapes it; and the name of its part."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
@@ -94,6 +94,11 @@ def product_keys(
 def part_name(task: Json) -> str:
     """Name of the part of `products` that a task makes."""
     return f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet"
+
+
+def exposures_of(names: Iterable[str]) -> set[int]:
+    """Numbers of the exposures of some parts of `products`."""
+    return {int(number) for name in names if (number := name.partition("-")[0]).isdigit()}
 
 
 def _beside(stars: tuple[float, Mapping[int, list[tuple[str, ...]]]], mission: MissionConfiguration) -> Beside:

@@ -19,6 +19,7 @@ from scipy.ndimage import map_coordinates
 
 from jobs.fluxes import passbands
 from jobs.render.camera import astrometry, footprints, pointing
+from jobs.render.planning.parts import of_exposures
 from jobs.render.products import read_back
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.store import read
@@ -101,12 +102,14 @@ def _rows(root: Path, request: str | None) -> list[Row]:
     """Science images of the sky with their footprints and exposures."""
     version = read.version(root, "products", request=request)
     inputs = version.manifest["facts"]["inputs"]
-    tasks = {
-        (t["exposure_id"], t["detector"]): t for t in read.version(root, "tasks", inputs["tasks"]).rows().to_pylist()
-    }
-    exposures = {e["exposure_id"]: e for e in read.version(root, "exposures", inputs["exposures"]).rows().to_pylist()}
+    made = version.rows()
+    numbers = made["exposure_id"].unique().to_pylist()
+    planned = (of_exposures(read.version(root, name, inputs[name]), numbers) for name in ("tasks", "exposures"))
+    some, exposed = (table.to_pylist() for table in planned)
+    tasks = {(task["exposure_id"], task["detector"]): task for task in some}
+    exposures = {row["exposure_id"]: row for row in exposed}
     found = []
-    for row in version.rows().to_pylist():
+    for row in made.to_pylist():
         exposure = exposures[row["exposure_id"]]
         if row["content"] == "science" and exposure["image_type"] in ("science", "deep"):
             task = tasks[row["exposure_id"], row["detector"]]

@@ -22,6 +22,7 @@ from jobs.render.effects.scene import Scene
 from jobs.render.exposure import scene_of
 from jobs.render.exposure.rendered import numbers_of
 from jobs.render.planning import variants
+from jobs.render.planning.parts import of_exposures
 from jobs.render.products import beside, read_back
 from jobs.render.reduction import amplifiers
 from lake_schema.arrays import Bool, Float, Float32
@@ -130,16 +131,15 @@ def of_lake(
     """
     version = read.version(root, "products", request=request)
     inputs = version.manifest["facts"]["inputs"]
-    planned = {
-        row.exposure_id: row
-        for row in map(ExposureRow.of, read.version(root, "exposures", inputs["exposures"]).rows().to_pylist())
-    }
+    made = version.rows()
+    held = of_exposures(read.version(root, "exposures", inputs["exposures"]), made["exposure_id"].unique().to_pylist())
+    planned = {row.exposure_id: row for row in map(ExposureRow.of, held.to_pylist())}
     mission = mission_of(read.version(root, "mission", inputs["mission"]))
     fluxes = read.version(root, "galaxy_fluxes", inputs["galaxy_fluxes"]).manifest["facts"]
     own_request, only = version.manifest["facts"]["request"], set(exposures)
     forced = dict.fromkeys(own_request["effects"]["on"], True) | dict.fromkeys(own_request["effects"]["off"], False)
     found: dict[tuple[str, str], list[Frame]] = {}
-    rows = sorted(version.rows().to_pylist(), key=lambda row: (row["exposure_id"], row["detector"]))
+    rows = sorted(made.to_pylist(), key=lambda row: (row["exposure_id"], row["detector"]))
     for row in rows:
         if row["content"] != "science" or (wanted and row["detector"] not in wanted):
             continue

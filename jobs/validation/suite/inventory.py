@@ -89,7 +89,8 @@ def _own(root: Path, name: str, request: str | None) -> read.Version:
 
 def _planned(root: Path, products: read.Version) -> dict[int, Mapping[str, Any]]:
     """Rows of the exposures that the images were made of."""
-    rows = read.version(root, "exposures", products.manifest["facts"]["inputs"]["exposures"]).rows()
+    here = pc.field("exposure_id").isin(products.rows(["exposure_id"])["exposure_id"].unique())
+    rows = read.version(root, "exposures", products.manifest["facts"]["inputs"]["exposures"]).rows(where=here)
     return {row["exposure_id"]: row for row in rows.to_pylist()}
 
 

@@ -80,7 +80,7 @@ def test_a_plan_is_mapped_from_the_lake(lake, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
     exposures, tasks = (read.version(lake, name) for name in ("exposures", "tasks"))
     assert coverage.area_of(exposures) == wanted.area
-    (depth,) = coverage.depths(exposures.rows(), tasks.rows(), wanted.area, side=120)
+    (depth,) = coverage.depths(exposures.rows(), lambda: [tasks.rows()], wanted.area, side=120)
     assert depth.seen.max() == 4
     # The short exposure and the flat are no dithers; outside the field there is nothing.
     assert (depth.seen[0] == 0).all()
