@@ -61,6 +61,14 @@ def pytest_xdist_make_scheduler(config, log):
     return Sharing(config, log)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_waiting_for_the_disc():
+    """Accidents here are of calls and processes, not of power: what is written need not have reached the disc."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
 @pytest.fixture(scope="session")
 def spark():
     """One local session for the whole run, on the Java that the environment chose."""

@@ -88,7 +88,7 @@ def test_flux_is_right_and_nothing_rings(camera, kind):
     assert image.min() > -max(1e-3 * image.max(), SURVEY.background * NOISE)
 
 
-@pytest.mark.parametrize("kind", HUGE)
+@pytest.mark.parametrize("kind", ["bulge", pytest.param("disc", marks=pytest.mark.nightly)])
 def test_the_largest_are_bounded_in_time(kind):
     compiled()
     start = time.process_time()

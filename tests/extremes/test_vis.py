@@ -39,7 +39,7 @@ def through(frame, one, kind="science", forced=None, watch=None):
     return apply_all(frame, effects, replace(one, forced=forced), lambda effect: stream(1, effect.name), watch)[0]
 
 
-@pytest.mark.parametrize("age", [0.0, 1.0])
+@pytest.mark.parametrize("age", [pytest.param(0.0, marks=pytest.mark.nightly), 1.0])
 @pytest.mark.parametrize("shape", [(SIDE, SIDE), (2, 2), (2, SIDE), (SIDE, 2)])
 def test_every_effect_on_every_frame(shape, age):
     traps_of = {"vis.cti.age": (age, "")}

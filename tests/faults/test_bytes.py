@@ -196,7 +196,7 @@ def spans(version, part):
     return [*found, ("", 0, found[-1][3], path.stat().st_size)]
 
 
-@pytest.mark.parametrize("flips", [4, pytest.param(300, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("flips", [1, pytest.param(300, marks=pytest.mark.nightly)])
 def test_of_a_large_file_what_is_read_is_compared(large, flips):
     """A flip in what is asked for is refused, also where a page's own checksum does not reach; others are not seen."""
     part = large.parts[0]

@@ -1,15 +1,40 @@
-"""The documentation site is built, without a warning, from what the clone holds."""
+"""The documentation site is made of what the clone holds; by night it is built, without a warning."""
 
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
+import pytest
+
 from jobs.render.channels import registry
+from scripts import docs_references, make_docs
 
 ROOT = Path(__file__).resolve().parents[2]
+EFFECTS = {e.name for channel in registry.CHANNELS.values() for kind in channel.effects.values() for e in kind}
 
 
+def test_its_pages(tmp_path, monkeypatch):
+    """Each is in the contents; every effect is described, with its figure, of which one is drawn by day."""
+    draw = docs_references._figure
+    monkeypatch.setattr(
+        docs_references, "_figure", lambda path, *of: path.touch() if list(path.parent.iterdir()) else draw(path, *of)
+    )
+    plt.switch_backend("Agg")
+    make_docs.pages(tmp_path, run=False)
+    contents = (tmp_path / "index.md").read_text().partition("{toctree}")[2].split()
+    pages = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.md")} - {"index.md"}
+    assert pages <= set(contents)
+    assert {f"tutorials/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")} <= pages
+    effects = (tmp_path / "effects.md").read_text()
+    assert [name for name in EFFECTS if f" {name}\n" not in effects] == []
+    # Those that need more than a small frame, or another camera, are described alone.
+    assert all((tmp_path / name).is_file() for name in re.findall(r"!\[What \w+ does[^]]*\]\(([^)]*)\)", effects))
+    assert len(re.findall(r"!\[What \w+ does", effects)) >= len(EFFECTS) - 4
+
+
+@pytest.mark.nightly
 def test_the_site(tmp_path):
     """Every page, every effect with its figure; nothing in it is fetched from elsewhere when it is read."""
     command = [sys.executable, "-m", "scripts.make_docs", "--out", str(tmp_path / "site")]
@@ -23,9 +48,8 @@ def test_the_site(tmp_path):
     for notebook in (ROOT / "notebooks").glob("*.ipynb"):
         assert (site / "tutorials" / f"{notebook.stem}.html").exists()
     effects = (site / "effects.html").read_text()
-    names = {e.name for channel in registry.CHANNELS.values() for kind in channel.effects.values() for e in kind}
-    assert all(f">{name}<" in effects for name in names)
+    assert all(f">{name}<" in effects for name in EFFECTS)
     # Those that need more than a small frame, or another camera, are described alone.
-    assert len(re.findall(r'<img alt="What \w+ does', effects)) >= len(names) - 4
+    assert len(re.findall(r'<img alt="What \w+ does', effects)) >= len(EFFECTS) - 4
     loaded = re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="(https?://[^"]*)"', home + effects)
     assert loaded == []

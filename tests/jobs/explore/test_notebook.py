@@ -21,7 +21,7 @@ SMALL = requests.shallow(23.5, 20.0) + '[fluxes]\nbands = ["euclid_vis", "lsst_r
 def field(tmp_path_factory):
     """Galaxies, stars and fluxes, made without Spark."""
     folder = tmp_path_factory.mktemp("field")
-    wanted = parse(requests.written(folder, SMALL, requests.FIELD.format(0.02), seed=5))
+    wanted = parse(requests.written(folder, SMALL, requests.FIELD.format(0.02), seed=7))
     root = layout.lake(folder / "lake")
     root.mkdir()
     for job in (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB):

@@ -279,6 +279,7 @@ def test_poles_and_the_first_meridian(universe, dust, place):
     assert 0.4 < west < 0.6 if place[1] == 0.0 else west in (0.0, 1.0)
 
 
+@pytest.mark.nightly
 def test_the_deepest_and_widest_request(dust):
     deep = galaxies.model(SEED, Universe(galaxy_limit=28.0, **SMALL))
     rows = galaxies.draw((12 << 16) - 1, deep, population.Cells(deep.population), dust)
