@@ -1,4 +1,4 @@
-"""Planning and what surrounds a render: seconds of a plan, overhead of a task, errors of the forecast, two cores.
+"""Planning: seconds of a plan, errors of the forecast.
 
 Detectors of VIS and LSST are rendered as a job renders them, of three skies: the demo's, one of few sources and one of
 many stars. What they take are the costs in jobs/render/channels.
@@ -18,13 +18,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from benchmarks import _around, report
 from benchmarks import lake as bulk
-from benchmarks import report
 from jobs.catalogue import build_galaxies, build_stars
 from jobs.fluxes import compute_fluxes
 from jobs.measured import forget_peak, peak_gb
 from jobs.render import plan_exposures, render_exposures
-from jobs.render.exposure import render, rendered, truth_maps, visible_sources
+from jobs.render.exposure import truth_maps, visible_sources
 from jobs.render.forecasting import speed
 from jobs.request.from_toml import from_table, parse
 from jobs.request.schema import Request
@@ -51,9 +51,6 @@ CALIBRATIONS = ("bias", "dark", "flat")
 _NOTES = {
     "plan_s": "wall, 331 fields x 4 dithers, every detector of VIS and NISP (target 60)",
     "plan_tasks": "their number",
-    "overhead_ms": "CPU of a task beyond its render and the reading of its sources (target 50)",
-    "speedup_2_cores": "16 detectors (target 1.85); a busy machine has no two cores to give",
-    "two_cores_cpu": "CPU of the same work on two cores over that on one: what the work itself allows is 2 over this",
     "source_read_s": "wall, a detector's sources from a cell of 1.2 million rows (target 0.3)",
     "seconds_error": "of the forecast against CPU s, the worst of all skies and channels (target 0.3)",
     "memory_error": "against the peak of a worker (target 0.3)",
@@ -75,9 +72,9 @@ def request(sky_name: str, quick: bool) -> Request:
     return from_table(table)
 
 
-def lake(folder: Path, sky_name: str, quick: bool) -> tuple[Path, Request]:
-    """A lake with catalogues, fluxes and plan."""
-    root, wanted = layout.lake(folder / sky_name), request(sky_name, quick)
+def lake(folder: Path, sky_name: str, quick: bool, own: Request | None = None) -> tuple[Path, Request]:
+    """A lake with catalogues, fluxes and plan; own : a request to take in place of that of the sky."""
+    root, wanted = layout.lake(folder / sky_name), own or request(sky_name, quick)
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures):
         for step in module.steps(root, wanted):
             publish.make(root, step.plan, step.work)
@@ -128,68 +125,6 @@ def _taken(function: Callable[[Part], Json], part: Part) -> tuple[Json, float, f
     return result, time.process_time() - started, peak_gb()
 
 
-def overhead(root: Path, wanted: Request) -> float:
-    """CPU ms, the largest of the channels'."""
-    step = render_exposures.steps(root, wanted)[0]
-    parts = {part.facts["exposure_id"]: {**step.plan.facts, **part.facts} for part in step.plan.parts}
-    return max(1e3 * _overhead(root, parts[number]) for number in range(1, len(wanted.pointings) + 1))
-
-
-def compile_all(root: Path, wanted: Request) -> None:
-    """Render once what is compiled or computed once a machine, in a process that leaves its memory when it ends."""
-    step = render_exposures.steps(root, wanted)[0]
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        list(pool.map(_one, [root] * len(step.plan.parts), [{**step.plan.facts, **p.facts} for p in step.plan.parts]))
-
-
-def _overhead(root: Path, facts: Json) -> float:
-    """CPU s of a task whose render takes none, nor the reading of its sources, which has a figure of its own."""
-    kept: list[rendered.Rendered] = []
-    draw = render.render
-    _with_render(lambda *a, **k: kept.append(draw(*a, **k)) or kept[0], root, facts)  # type: ignore[func-returns-value]
-    read_rows, rows = read.Version.in_cells, {}
-
-    def from_memory(version, *wanted):  # type: ignore[no-untyped-def]
-        if version.table not in rows:
-            rows[version.table] = read_rows(version, *wanted)
-        return rows[version.table]
-
-    read.Version.in_cells = from_memory  # type: ignore[method-assign]
-    try:
-        return report.best(lambda: _with_render(lambda *a, **k: kept[0], root, facts), 3, time.process_time)
-    finally:
-        read.Version.in_cells = read_rows  # type: ignore[method-assign]
-
-
-def _with_render(function, root: Path, facts: Json) -> None:  # type: ignore[no-untyped-def]
-    before, render.render = render.render, function
-    try:
-        render_exposures.work(root, facts)
-    finally:
-        render.render = before
-
-
-def two_cores(root: Path, wanted: Request, tasks: int) -> dict[str, float]:
-    """So many detectors one after another, over the same two at a time; both in workers that are warm."""
-    step = render_exposures.steps(root, wanted)[0]
-    part = min(step.plan.parts, key=lambda part: part.facts["exposure_id"] != len(wanted.pointings))
-    facts = [{**step.plan.facts, **part.facts}] * tasks
-    seconds, cpu = {}, {}
-    for cores in (1, 2):
-        with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
-            list(pool.map(_one, [root] * cores, facts[:cores]))
-            started = time.perf_counter()
-            cpu[cores] = sum(pool.map(_one, [root] * tasks, facts))
-            seconds[cores] = time.perf_counter() - started
-    return {"speedup_2_cores": seconds[1] / seconds[2], "two_cores_cpu": cpu[2] / cpu[1]}
-
-
-def _one(root: Path, facts: Json) -> float:
-    started = time.process_time()
-    render_exposures.work(root, facts)
-    return time.process_time() - started
-
-
 def reading(folder: Path, quick: bool) -> dict[str, float]:
     """s, wall and CPU, to read a detector's generation cells from one file."""
     rows = 100_000 if quick else CELL_ROWS
@@ -214,14 +149,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         for sky_name in ("field",) if quick else SKIES:
             root, wanted = lake(folder, sky_name, quick)
             if sky_name == "field":
-                compile_all(root, wanted)
+                _around.compile_all(root, wanted)
             figures |= rendering(root, wanted, sky_name)
         for unit, word in (("s", "seconds"), ("gb", "memory"), ("mb", "bytes")):
             figures[f"{word}_error"] = max(abs(v) for k, v in figures.items() if k.endswith(f"_{unit}_error"))
-        root, wanted = folder / "field", request("field", quick)
-        figures["overhead_ms"] = overhead(root, wanted)
-        if not quick:
-            figures |= two_cores(root, wanted, 16)
     report.finish("planner", 1, figures, _NOTES, options.json)
     return 0
 
