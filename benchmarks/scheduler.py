@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import heapq
 import json
+import math
 import resource
 import sys
 import tempfile
@@ -35,8 +36,8 @@ from lake_schema.tables.products import PRODUCTS
 
 ROOT = Path(__file__).resolve().parents[1]
 CORES = (100, 300, 1000, 3000, 10_000)
-# Cores of a machine; of which share of machines each is how much slower; hours from death to death of one, and until
-# it is back.  A machine in fifty at half speed and a death in a thousand hours are worse than what sites tell.
+# Cores of a machine; of which share of machines each is how much slower, of few machines one; hours from death to death
+# of one, and until it is back.  One in fifty at half speed and a death in a thousand hours are worse than sites tell.
 MACHINE, SLOW, SLOWER, LIVES_H, BACK_H = 32, 0.02, 2.0, 1000.0, 0.2
 # Scatter of a detector's seconds about their forecast (natural logarithm), and s of a task beside its render.
 SCATTER, OVERHEAD_S = 0.25, 0.03
@@ -54,6 +55,8 @@ _NOTES = {
     "publish_cpu_ms_a_part": "CPU of it",
     "manifest_kb_a_part": "of the published version",
     "manifest_load_ms_a_part": "CPU, once a process",
+    "manifest_held_kb_a_part": "memory of a process that has read it",
+    "manifest_peak_kb_a_part": "and while it reads",
 }
 
 
@@ -90,8 +93,11 @@ def simulated(seconds: Float, site: Site, rng: np.random.Generator) -> Outcome:
     seconds : [n] of one core, in the order that they are handed out
     """
     machines = -(-site.cores // MACHINE)
-    slow = rng.random(machines) < site.slow
+    slow = np.isin(np.arange(machines), rng.permutation(machines)[: math.ceil(site.slow * machines)])
     dies = rng.exponential(site.lives_h * 3600.0, machines)
+    if np.isfinite(site.lives_h):
+        # However short a run is, one machine dies in its midst.
+        dies[rng.integers(machines)] = 0.5 * seconds.sum() / site.cores
     free = [(0.0, core) for core in range(site.cores)]
     waiting = iter(range(len(seconds)))
     back: list[tuple[float, int]] = []
@@ -145,7 +151,7 @@ def makespans(seconds: Float, exposures: Int, rate: float, cores: Sequence[int])
             if name == "longest":
                 figures[f"again_{many}"] = found.again
         sound = simulated(
-            took[orders(seconds, exposures)["longest"]], Site(many, rate, 0.0, 1e9), np.random.default_rng(2)
+            took[orders(seconds, exposures)["longest"]], Site(many, rate, 0.0, math.inf), np.random.default_rng(2)
         )
         figures[f"hours_{many}_sound"] = sound.makespan / 3600.0
         figures[f"tasks_per_s_{many}"] = len(seconds) / sound.makespan
@@ -242,6 +248,13 @@ def publishing(folder: Path, parts: int) -> dict[str, float]:
     assert len(manifest.load(target, PRODUCTS.name)["parts"]) == parts
     figures["manifest_load_ms_a_part"] = 1e3 * (time.process_time() - started) / parts
     figures["publish_peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    gc.collect()
+    tracemalloc.start()
+    again = manifest._read(target / manifest.MANIFEST)
+    held, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    figures["manifest_held_kb_a_part"], figures["manifest_peak_kb_a_part"] = held / parts / 1e3, peak / parts / 1e3
+    assert len(again["parts"]) == parts
     return figures
 
 
@@ -264,7 +277,7 @@ _SHA256_OF_X = "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881
 
 
 def picture(figures: Json, file: Path) -> None:
-    """Hours and efficiency against cores, of the orders; file : PNG."""
+    """Hours and efficiency against cores, of the orders; file : PNG or JPEG."""
     import matplotlib
 
     matplotlib.use("Agg")
