@@ -56,9 +56,10 @@ def _beside_render(root: Path, facts: Json) -> float:
     read_rows, rows = read.Version.in_cells, {}
 
     def from_memory(version, *wanted):  # type: ignore[no-untyped-def]
-        if version.table not in rows:
-            rows[version.table] = read_rows(version, *wanted)
-        return rows[version.table]
+        which = version.table, str(wanted)
+        if which not in rows:
+            rows[which] = read_rows(version, *wanted)
+        return rows[which]
 
     read.Version.in_cells = from_memory  # type: ignore[method-assign]
     try:

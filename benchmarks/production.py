@@ -113,7 +113,7 @@ def around(quick: bool) -> dict[str, float]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Forecasts and prints."""
     options = report.options("production", __doc__ or "", argv)
-    figures = forecast(options.quick) | around(options.quick)
+    figures = around(options.quick) | forecast(options.quick)
     report.finish("production", 1, figures, _NOTES, options.json or (None if options.quick else RESULTS))
     return 0
 

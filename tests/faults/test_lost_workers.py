@@ -8,6 +8,7 @@ import subprocess
 import threading
 import time
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import pytest
 
@@ -36,8 +37,11 @@ realisations = 2
 truth = []
 """
 TASKS = 2 * 3 * len(DETECTORS)
-# A copy of a task begins elsewhere where it takes half as long again as half of the tasks did.
-SPECULATION = {
+# Nothing begins before all four are there; a copy of a task begins elsewhere where it takes half as long again as half
+# of the tasks did.
+SETTINGS = {
+    "spark.scheduler.minRegisteredResourcesRatio": "1.0",
+    "spark.scheduler.maxRegisteredResourcesWaitingTime": "600s",
     "spark.speculation": "true",
     "spark.speculation.interval": "200ms",
     "spark.speculation.multiplier": "1.5",
@@ -90,10 +94,19 @@ def tell(pids, number):
             os.kill(pid, number)
 
 
-def wait_for(receipts, lake, driver):
-    while len(list(lake.glob("products/.receipts-*/*.json"))) < receipts:
+def is_at_work(worker):
+    """Whether its executor has started Python for a task."""
+    for pid in below(worker.pid):
+        with suppress(OSError):
+            if "pyspark.daemon" in Path(f"/proc/{pid}/cmdline").read_text():
+                return True
+    return False
+
+
+def wait_for(driver, condition):
+    while not condition():
         assert driver.poll() is None, driver.communicate()
-        time.sleep(0.05)
+        time.sleep(0.1)
 
 
 def test_a_worker_is_killed_and_another_is_slow(local, request_file, tmp_path):
@@ -104,11 +117,13 @@ def test_a_worker_is_killed_and_another_is_slow(local, request_file, tmp_path):
     (tmp_path / "events").mkdir()
     with running(tmp_path, ("one", "two", "killed", "slow")) as (master, workers):
         driver = subprocess.Popen(
-            command(RENDER, lake, request_file, "--master", master, *told(tmp_path / "events", **SPECULATION)),
+            command(RENDER, lake, request_file, "--master", master, *told(tmp_path / "events", **SETTINGS)),
             cwd="/", env=environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
+        wait_for(driver, lambda: is_at_work(workers["slow"]))
         with slowed(workers["slow"]):
-            wait_for(4, lake, driver)
+            wait_for(driver, lambda: len(list(lake.glob("products/.receipts-*/*.json"))) >= 4)
+            assert is_at_work(workers["killed"])
             # The machine and all that runs on it.
             dying = {workers["killed"].pid, *below(workers["killed"].pid)}
             assert len(dying) >= 3
