@@ -135,7 +135,9 @@ sys.exit(max(shell.main(m.JOB, sys.argv[1:]) for m in (build_galaxies, build_sta
     assert manifests[0] == manifests[1]
 
 
+# Of any script by day: tests/house/test_environment.py.
 @pytest.mark.spark
+@pytest.mark.nightly
 def test_spark_submit_passes_on_the_line_and_the_status(tmp_path):
     path = tmp_path / "bad.toml"
     path.write_text(BAD[1][0])

@@ -21,7 +21,7 @@ def request(
         if kind == "dark" and count:
             blocks[-1]["exposure_time_s"] = 1000.0
     keys = f'accuracy = "draft"\n{requests.shallow(*depth)}[fluxes]\nbands = ["euclid_vis"]\n'
-    table = tomllib.loads(requests.text(keys, requests.FIELD.format(0.2), seed=11))
+    table = tomllib.loads(requests.text(keys, requests.FIELD.format(0.2), seed=7))
     mission = {"mission": {"overrides": overrides}} if overrides else {}
     products = {"products": {"truth": list(truth)}, "effects": {"off": list(off)}}
     return from_table({**table, **mission, **products, "observation": blocks})
