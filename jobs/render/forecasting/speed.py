@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import scipy.fft
 
 from jobs import cache
 from jobs.code_keys import code_key
-from jobs.render.planning.parts import of_exposures
 from jobs.render.products import run_log
 from lake_schema.arrays import Float
 from lake_schema.errors import LakeError
@@ -76,10 +77,12 @@ def _measured(lake: Folder) -> Iterator[float]:
         parts = {part["name"]: part["facts"] for part in version.manifest["parts"]}
         numbers = {facts["exposure_id"] for facts in parts.values()}
         planned = read.version(lake, "tasks", version.manifest["facts"]["inputs"]["tasks"])
-        tasks = of_exposures(planned, numbers, ("exposure_id", "detector", "seconds"))
+        rendered = pc.field("exposure_id").isin(pa.array([*numbers], pa.int64()))
+        # A part after the other: a plan may be larger than memory.
+        each = (planned.rows(("exposure_id", "detector", "seconds"), [part], rendered) for part in planned.parts)
+        foreseen = {(row["exposure_id"], row["detector"]): row["seconds"] for some in each for row in some.to_pylist()}
     except (LakeError, KeyError):
         return
-    foreseen = {(row["exposure_id"], row["detector"]): row["seconds"] for row in tasks.to_pylist()}
     for line in _lines(lake, version.key):
         facts = parts.get(str(line.get("part", "")), {})
         place = facts.get("exposure_id"), facts.get("detector")
