@@ -6,7 +6,6 @@ python -m jobs.demo [--request requests/demo.toml] [--out out/demo]
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from jobs.commands import examples, run, submit
@@ -35,4 +34,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

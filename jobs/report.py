@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -171,4 +170,4 @@ def _json(line: Line) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

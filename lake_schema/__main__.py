@@ -119,4 +119,4 @@ def _describe(version: read.Version) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

@@ -1,16 +1,19 @@
 """How a command ends: bad input in one line and exit status 2, a damaged lake or a disc that refuses in one line and 1.
 
 status    run a command's body and return its exit status
+leave     run a command and end the process with its exit status
 say       a line on stderr
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import io
 import os
 import sys
 from collections.abc import Callable
+from typing import NoReturn
 
 from lake_schema.errors import BadInput, LakeError, one_line
 
@@ -35,6 +38,27 @@ def status(name: str, body: Callable[[], int]) -> int:
         return say(name, error, 2)
     except (LakeError, OSError, MemoryError) as error:
         return say(name, error, 1)
+
+
+def leave(main: Callable[..., int], *arguments: object) -> NoReturn:
+    """Run `main(*arguments)` and end the process with what it returns.
+
+    Nobody waits for Arrow's threads: one that still closes a file of ours once Python is being taken down finds no
+    interpreter and aborts the process (apache/arrow#34314), after all the work was done. An error that `main`
+    raises ends the process as any other.
+    """
+    try:
+        code = main(*arguments)
+    except SystemExit as stop:
+        # The parser of arguments; a text is one that Python prints itself.
+        if not isinstance(stop.code, int):
+            raise
+        code = stop.code
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def say(name: str, error: object, code: int) -> int:

@@ -17,7 +17,7 @@ from jobs.catalogue.stars import gaia
 from jobs.request import universe
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
-from lake_schema import sky
+from lake_schema import command, sky
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
 from lake_schema.store.plan import Json, Output, Part, Plan
@@ -59,4 +59,4 @@ def _rows(version: read.Version, part: str, columns: list[str]) -> pa.Table:
 JOB = Job("build_gaia", "List the stars as Gaia would.", steps)
 
 if __name__ == "__main__":
-    sys.exit(main(JOB))
+    command.leave(main, JOB)

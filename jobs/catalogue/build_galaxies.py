@@ -29,6 +29,7 @@ from jobs.request.checks import check_rendered
 from jobs.request.files import Catalogue, DustMap, GivenSources, Ingest
 from jobs.request.schema import Request, Universe
 from jobs.shell import Job, Step, main
+from lake_schema import command
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.store import layout, parquet, read
 from lake_schema.store.plan import Json, Output, Part, Plan
@@ -231,4 +232,4 @@ def ingested_work(lake: Path, facts: Json, given: Catalogue, dust: DustMap | Non
 JOB = Job("build_galaxies", "Draw the halos and galaxies of a sky area.", steps)
 
 if __name__ == "__main__":
-    sys.exit(main(JOB))
+    command.leave(main, JOB)

@@ -19,6 +19,7 @@ from jobs.request.checks import check_rendered
 from jobs.request.files import DustMap, GivenSources
 from jobs.request.schema import Request, Stars
 from jobs.shell import Job, Step, main
+from lake_schema import command
 from lake_schema.store.plan import Json, Output, Plan
 from lake_schema.store.provenance import code_version
 from lake_schema.tables.stars import STARS
@@ -88,4 +89,4 @@ def work(lake: Path, facts: Json, choice: Stars, own: DustMap | None = None) -> 
 JOB = Job("build_stars", "Draw the Milky Way's stars of a sky area.", steps)
 
 if __name__ == "__main__":
-    sys.exit(main(JOB))
+    command.leave(main, JOB)

@@ -18,7 +18,7 @@ from jobs.catalogue.galaxies import strong_lenses
 from jobs.request import universe
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
-from lake_schema import places, sky
+from lake_schema import command, places, sky
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, read
 from lake_schema.store.plan import Json, Output, Part, Plan
@@ -58,4 +58,4 @@ def _all(part: str) -> list[int]:
 JOB = Job("build_strong_lenses", "Draw strong lenses and their arcs.", steps)
 
 if __name__ == "__main__":
-    sys.exit(main(JOB))
+    command.leave(main, JOB)

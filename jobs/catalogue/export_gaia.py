@@ -7,7 +7,6 @@ ldac   FITS_LDAC as SCAMP reads it (ASTREF_CATALOG FILE), with its own names of 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -135,4 +134,4 @@ def _after(rows: pa.Table, years: float) -> tuple[Any, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

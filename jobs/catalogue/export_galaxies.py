@@ -8,7 +8,6 @@ skycatalogs  LSST DESC skyCatalogs 2: galaxies, and stars where the lake has the
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -64,4 +63,4 @@ def export(lake: Path, folder: Path, form: str, request: str | None = None) -> l
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

@@ -23,6 +23,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from typing import NoReturn
 
 from jobs.commands import submit
 from lake_schema import __version__, command
@@ -102,5 +103,10 @@ def _one_after_another(start: Callable[[str, Sequence[str]], int], files: Sequen
     return next((status for file in files if (status := start(file, own))), 0)
 
 
+def entry() -> NoReturn:
+    """`truesky`, as it is installed."""
+    command.leave(main)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    entry()

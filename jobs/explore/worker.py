@@ -18,6 +18,7 @@ from typing import IO, Any
 import pyarrow as pa
 
 from jobs.explore.session import TOO_LARGE, Session
+from lake_schema import command
 from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store import layout
 
@@ -103,4 +104,4 @@ def _said(error: BaseException) -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    command.leave(main, sys.argv[1:])

@@ -29,7 +29,7 @@ from jobs.fluxes.tables.settings import COVERED, Choice, of_stars
 from jobs.request import universe
 from jobs.request.schema import Request
 from jobs.shell import Job, Step, main
-from lake_schema import places
+from lake_schema import command, places
 from lake_schema.columns import Table
 from lake_schema.store import layout, read
 from lake_schema.store.plan import Json, Output, Part, Plan
@@ -128,4 +128,4 @@ JOB = Job(
 )
 
 if __name__ == "__main__":
-    sys.exit(main(JOB))
+    command.leave(main, JOB)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import socket
-import sys
 import webbrowser
 from collections.abc import Sequence
 
@@ -107,4 +106,4 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

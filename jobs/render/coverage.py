@@ -9,7 +9,6 @@ picture    the same as maps
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -197,4 +196,4 @@ def _drawn(lake: str, name: str | None, out: Path | None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

@@ -11,7 +11,6 @@ three intensities and more) and NISP-P_euclid_y_DET22_flat.fits (of the lamps' m
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -129,4 +128,4 @@ def _of_detector(frames: Sequence[Frame], scratch: Path) -> Iterator[infrared.Ma
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

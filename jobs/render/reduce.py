@@ -11,7 +11,6 @@ A file a frame that sees the sky, with the extensions SCI (electrons, e-/s or, o
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -162,4 +161,4 @@ def _settings(options: argparse.Namespace) -> level2.Settings | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

@@ -37,6 +37,7 @@ from jobs.request import structure
 from jobs.request.schema import WRITTEN, Request
 from jobs.request.structure import Arms, Stamps
 from jobs.shell import Job, Step, common_facts, main
+from lake_schema import command
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.published import read_back
@@ -380,4 +381,4 @@ JOB = Job(
 )
 
 if __name__ == "__main__":
-    sys.exit(main(JOB))
+    command.leave(main, JOB)

@@ -10,7 +10,6 @@ variance of a pixel alone is less than 1 / WHT by the factor in the card CORRVAR
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -191,4 +190,4 @@ def _cards(found: Sequence[ImageFile], grid: Grid, scale: float, correlation: fl
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

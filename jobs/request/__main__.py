@@ -52,4 +52,4 @@ def _refuse(request: Request, alone: bool) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)

@@ -14,7 +14,6 @@ import argparse
 import math
 import os
 import shutil
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -103,4 +102,4 @@ def _of_lake(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main)
