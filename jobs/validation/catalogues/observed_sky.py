@@ -28,7 +28,11 @@ _REDDER, _WHOLE, _SHORT = 0.5, 26.0, 0.1
 
 def rows(galaxies: read.Version) -> list[Row]:
     """One a figure that observed.csv has; galaxies : of the lake."""
-    seen, cell = observed.in_version(galaxies)
+    return compared(*observed.in_version(galaxies))
+
+
+def compared(seen: Sky, cell: Int) -> list[Row]:
+    """The same of a sky; cell : the generation cell of each of its galaxies."""
     found = observed.figures(seen)
     errors = _errors(seen, cell)
     out = []

@@ -24,7 +24,7 @@ def check(of: Seen) -> list[Row]:
     stars, mas = of.measured.stars, 1000.0 * of.frame.scale
     ny, nx = of.frame.electrons.shape
     u, v = 2.0 * stars.x / nx - 1.0, 2.0 * stars.y / ny - 1.0
-    rows, left, tolerance = [], {}, TOLERANCE[of.channel]
+    rows, left, means, tolerance = [], {}, [], TOLERANCE[of.channel]
     note = f"{len(stars)} stars, windowed centroids"
     for axis, off, place in (("x", stars.dx, stars.x), ("y", stars.dy, stars.y)):
         value, error, phased = fitted(off, stars.error, u, v, place)
@@ -35,10 +35,13 @@ def check(of: Seen) -> list[Row]:
                         SOURCE, MOST, note))  # fmt: skip
         of.series[f"off_{axis}"] = mas * off
         left[axis] = off - phased
+        means.append((value[0], error[0]))
     of.series |= {"u": u, "v": v, "id": stars.id}
     # On the sky, without what the place in the pixel does.
     cd = of.frame.wcs.pixel_scale_matrix * 3.6e6
     of.series["east"], of.series["north"] = (row[0] * left["x"] + row[1] * left["y"] for row in cd)
+    (x, dx), (y, dy) = means
+    of.series["mean_off"] = np.array([(a * x + b * y, np.hypot(a * dx, b * dy)) for a, b in cd])
     return rows
 
 

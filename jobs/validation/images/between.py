@@ -12,7 +12,7 @@ import numpy as np
 
 from jobs.validation.images.astrometry import TOLERANCE
 from jobs.validation.measure.rows import Place, Row, not_applicable
-from jobs.validation.measure.seen import Result
+from jobs.validation.measure.seen import Result, Several
 from lake_schema.arrays import Float
 
 SOURCE = "Serrano et al. 2024, app. C: below 1 mas rms between images (ground cameras 5 mas), 0.02 mag"
@@ -73,3 +73,6 @@ def _mean(values: Float) -> tuple[float, float]:
     spread = 1.4826 * float(np.median(np.abs(values - middle))) + 1e-9
     kept = values[np.abs(values - middle) < 4.0 * spread]
     return float(kept.mean()), float(max(kept.std(ddof=1), 0.5 * spread) / np.sqrt(len(kept)))
+
+
+BETWEEN = Several("between_images", SOURCE, rows)

@@ -74,6 +74,15 @@ class Check:
         return [not_applicable(self.name, seen.place, why, self.source)] if why else self.rows(seen)
 
 
+@dataclass(frozen=True, slots=True)
+class Several:
+    """A check of all frames together: name, where its expectations are from, and what it makes of their results."""
+
+    name: str
+    source: str
+    rows: Callable[[Sequence[Result]], list[Row]]
+
+
 def seen(path: Path, place: Place, known: Reference, spectra: Any = None, curve: Curve | None = None) -> Seen:
     """Open a file and measure what several checks want.
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from jobs.validation.catalogues import duplicates, observed_sky, requirements
-from jobs.validation.images import between
 from jobs.validation.images.astrometry import ASTROMETRY
 from jobs.validation.images.background import BACKGROUND
+from jobs.validation.images.between import BETWEEN
 from jobs.validation.images.completeness import COMPLETENESS
 from jobs.validation.images.cosmic_rays import COSMIC_RAYS
 from jobs.validation.images.depth import DEPTH
@@ -18,8 +18,8 @@ from jobs.validation.images.psf import PSF
 from jobs.validation.images.quality import QUALITY
 from jobs.validation.images.saturation import SATURATION
 from jobs.validation.images.spectra import SPECTRA
+from jobs.validation.images.together import TOGETHER
 from jobs.validation.measure.rows import Row
-from jobs.validation.measure.seen import Result
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ OF_FRAMES = (
     SPECTRA,
 )
 # Of all frames together.
-OF_SEVERAL: tuple[Callable[[Sequence[Result]], list[Row]], ...] = (between.rows,)
+OF_SEVERAL = (BETWEEN, TOGETHER)
 # Of the lake's tables.
 OF_CATALOGUES = (
     Catalogued(observed_sky.NAME, ("galaxies",), observed_sky.rows, "observed.csv"),

@@ -49,7 +49,7 @@ def validated(held: Held, processes: int = 2) -> Found:
     """Run all checks that a lake has something for; processes : that look at frames at a time."""
     results = list(_frames(held, processes))
     rows = [row for result in results for row in result.rows]
-    together = [row for check in checks.OF_SEVERAL for row in check(results)]
+    together = [row for check in checks.OF_SEVERAL for row in check.rows(results)]
     return Found([*rows, *together, *_catalogued(held)], results)
 
 

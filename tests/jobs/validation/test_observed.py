@@ -5,11 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from jobs.catalogue.galaxies import high_redshift
 from jobs.catalogue.halos import quenching
 from jobs.validation import __main__, checks, mean_sky, observed
+from jobs.validation.catalogues import observed_sky
+from jobs.validation.measure.rows import FAIL, PASS
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, publish, read
@@ -81,6 +84,64 @@ def test_a_lake_is_compared(flat, tmp_path, capsys):
     assert {row["verdict"] for row in table} == {"undecided"}
     assert status == 0
     assert "undecided" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def patch():
+    """(a lake's sky of eight cells, the cell of each galaxy)."""
+    rows = flat_sky()
+    cell = rows["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    part = rows.filter(pa.array(cell < 2 * FEW))
+    return seen(part, 2 * FEW), cell[(cell < 2 * FEW) & (rows["kind"].to_numpy() < 2)]
+
+
+def verdicts(seen, cell):
+    return {row.quantity: row.verdict for row in observed_sky.compared(seen, cell)}
+
+
+def failed(seen, cell):
+    return {name for name, verdict in verdicts(seen, cell).items() if verdict == FAIL}
+
+
+def columns(seen, **changed):
+    """A sky with some columns multiplied (fluxes) or shifted (the others)."""
+    return replace(seen, rows={**seen.rows, **{name: change(seen.rows[name]) for name, change in changed.items()}})
+
+
+def test_a_lake_of_the_mean_sky_passes(patch):
+    found = verdicts(*patch)
+    decided = {name for name, verdict in found.items() if verdict == PASS}
+    assert {"log_i_20.25", "mass_function_10_z0.95", "main_sequence_z1.0", "halpha_nii_2e-16"} <= decided
+    assert failed(*patch) == set()
+
+
+def test_a_band_whose_magnitudes_are_shifted_in_a_lake(patch):
+    """By 0.3 mag, of which counts make 0.1 dex; the other band's are as they were."""
+    sky_, cell = patch
+    found = failed(replace(sky_, mags={**sky_.mags, "lsst_i": sky_.mags["lsst_i"] + 0.3}), cell)
+    assert found
+    assert all(name.startswith("log_i_") for name in found)
+
+
+def test_masses_rates_and_lines_that_are_off_in_a_lake(patch):
+    sky_, cell = patch
+    wrong = columns(
+        sky_,
+        log_stellar_mass=lambda values: values + 0.5,
+        log_sfr=lambda values: values - 0.6,
+        flux_halpha=lambda values: 0.5 * values,
+        flux_nii=lambda values: 0.5 * values,
+    )
+    found = failed(wrong, cell)
+    assert {"halpha_nii_2e-16", "main_sequence_z1.0", "mass_function_11_z0.95"} <= found
+
+
+def test_a_lake_that_counts_its_area_twice(patch):
+    """As where every cell's galaxies are there a second time, with places and identifiers of their own."""
+    sky_, cell = patch
+    found = failed(replace(sky_, area=0.5 * sky_.area), cell)
+    assert {"log_i_22.25", "mass_function_10_z0.65", "halpha_nii_2e-16"} <= found
+    assert "main_sequence_z1.0" not in found
 
 
 def old_metals(flat):
