@@ -125,8 +125,10 @@ class Bucket:
             if told["ContentLength"] != one.size:
                 return False
             if said := told.get("ChecksumSHA256"):
-                # Of one that came in parts it is a sum of their sums.
-                return bool(said == (_sum_of_parts(one) if "-" in told["ETag"] else _base64(one.sha256)))
+                # Of one that came in parts it is a sum of their sums, and Amazon says how many behind a hyphen.
+                whole, in_parts, _ = said.partition("-")
+                in_parts = in_parts or "-" in told["ETag"]
+                return bool(whole == (_sum_of_parts(one) if in_parts else _base64(one.sha256)))
             # Sent by another program, or kept by a service that keeps no such checksums.
             summed = hashlib.sha256()
             body = self._client.get_object(Bucket=self.place.bucket, Key=name)["Body"]
@@ -216,11 +218,12 @@ def push(root: Path, place: Address, only: Sequence[str] = (), threads: int = TH
     wanted = _merged(there, chosen, only)
     versions = {(table, key) for table, key in chosen.tables.items()}
     versions |= {(table, key) for own in chosen.names.values() for table, key in own.items()}
-    for table, key in sorted(versions):
-        yield _sent(bucket, _objects(root, table, key), table, key, threads)
-    table, key = max(versions)
-    if not bucket.knows_conditions(f"{table}/v-{key}/{MANIFEST}"):
-        raise BadInput(f"{place}: the storage takes no conditional puts: two who push could not be told apart")
+    for number, (table, key) in enumerate(sorted(versions)):
+        sent = _sent(bucket, _objects(root, table, key), table, key, threads)
+        # As soon as there is an object to ask it with, not when hours of others have been sent.
+        if number == 0 and not bucket.knows_conditions(f"{table}/v-{key}/{MANIFEST}"):
+            raise BadInput(f"{place}: the storage takes no conditional puts: two who push could not be told apart")
+        yield sent
     if (tag is None or wanted != there) and not bucket.switch(wanted, tag):
         raise Superseded(f"{place}: another push has ended since this one began: run again to replace it")
 

@@ -35,6 +35,8 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
 _KEY = re.compile(r"[0-9a-f]{16}", re.ASCII)
 _ENDPOINT = re.compile(r"https?://[^/?#@\s]+/?", re.ASCII)
 _WORDS = {"endpoint_override": "endpoint", "region": "region"}
+# In an address: who asks, and a word with its value.
+_USER, _VALUE = re.compile(r"(//)[^/@\s]*@"), re.compile(r"(?<=[?&])([^=&#]*)=[^&#]*")
 # Bytes of an object that are fetched at a time.
 _PIECE = 8 << 20
 _NAMES = "names"
@@ -65,7 +67,7 @@ class Address:
         """URL of the service where the call or the environment names one, else ""."""
         told = self.endpoint or os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
         if told and not _ENDPOINT.fullmatch(told):
-            raise BadInput(f"endpoint {told[:200]}: wanted http://HOST:PORT or https://HOST")
+            raise BadInput(f"endpoint {without_secrets(told)}: wanted http://HOST:PORT or https://HOST")
         return told.rstrip("/")
 
     def key(self, *parts: str) -> str:
@@ -78,6 +80,12 @@ def is_address(text: object) -> bool:
     return str(text).lower().startswith("s3:")
 
 
+def without_secrets(text: str) -> str:
+    """An address as a message may show it: not what stands before an @, nor values that are no endpoint or region."""
+    shown = _USER.sub(r"\1..@", text)
+    return _VALUE.sub(lambda found: found[0] if found[1] in _WORDS else f"{found[1]}=..", shown)[:200]
+
+
 def address(text: str, endpoint: str | None = None) -> Address:
     """The place that s3://BUCKET/PREFIX names.
 
@@ -87,12 +95,17 @@ def address(text: str, endpoint: str | None = None) -> Address:
     told = urlsplit(text)
     words = dict(parse_qsl(told.query))
     if told.fragment or not text.lower().startswith("s3://") or words.keys() - _WORDS.keys():
-        raise BadInput(f"lake {text[:200]}: wanted s3://BUCKET/PREFIX, maybe with ?endpoint_override=URL&region=REGION")
+        wanted = "s3://BUCKET/PREFIX, maybe with ?endpoint_override=URL&region=REGION"
+        raise BadInput(f"lake {without_secrets(text)}: wanted {wanted}")
+    if "@" in told.netloc:
+        raise BadInput(
+            f"lake {without_secrets(text)}: credentials do not stand in an address; the environment has them"
+        )
     if not _BUCKET.fullmatch(told.netloc):
-        raise BadInput(f"lake {text[:200]}: {told.netloc[:80]!r} is no name of a bucket")
+        raise BadInput(f"lake {without_secrets(text)}: {told.netloc[:80]!r} is no name of a bucket")
     prefix = told.path.strip("/")
     if not prefix.isprintable() or ({"", ".", ".."} & set(prefix.split("/")) and prefix):
-        raise BadInput(f"lake {text[:200]}: the prefix has an empty part, . or ..")
+        raise BadInput(f"lake {without_secrets(text)}: the prefix has an empty part, . or ..")
     found = Address(told.netloc, prefix, endpoint or words.get("endpoint_override", ""), words.get("region", ""))
     # Said before anything is asked of it.
     assert found.service is not None

@@ -55,7 +55,8 @@ def lake(text: str | Path) -> Path:
         raise BadInput("lake: its path is empty")
     if _REMOTE.match(str(text)):
         raise BadInput(
-            f"lake {user_files.shown(text)}: only a POSIX file system can publish by rename; mount it and give the path"
+            f"lake {user_files.shown(s3.without_secrets(str(text)))}: only a POSIX file system can publish by rename; "
+            "mount it and give the path"
             + (", and truesky push puts the lake there when it is made" if s3.is_address(text) else "")
         )
     try:

@@ -32,6 +32,25 @@ def test_an_endpoint_is_what_is_asked_for_or_named_or_in_the_environment(monkeyp
         layout.opened("/lake", "http://option")
 
 
+@pytest.mark.parametrize(
+    ("text", "endpoint"),
+    [
+        ("s3://AKIA:hidden@sky/a", None),
+        ("s3://sky/a?access_key=AKIA&secret_key=hidden&region=eu-west-1", None),
+        ("s3://sky/a?endpoint_override=https://AKIA:hidden@host", None),
+        ("s3://sky/a", "https://AKIA:hidden@host"),
+        ("s3://AKIA:hidden@sky/a/../b", None),
+    ],
+)
+def test_no_credentials_are_shown(text, endpoint):
+    for open_it in (lambda: s3.address(text, endpoint), lambda: layout.lake(text)):
+        with pytest.raises(BadInput) as refused:
+            open_it()
+        assert "hidden" not in str(refused.value)
+        assert "AKIA" not in str(refused.value)
+        assert "s3://" in str(refused.value) or "host" in str(refused.value)
+
+
 def test_what_is_published_is_written_as_it_is_read():
     told = s3.Published({"galaxies": "0" * 16}, {"demo": {"galaxies": "1" * 16}})
     assert s3.published(told.written(), "here") == told
