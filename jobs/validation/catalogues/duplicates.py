@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jobs.validation.measure.rows import Place, Row
+from jobs.validation.measure.rows import Place, Row, not_applicable
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.sky import DEEPEST
 from lake_schema.store import read
@@ -17,6 +17,8 @@ _MOST = 0.6
 def rows(catalogue: read.Version) -> list[Row]:
     """Of a catalogue; catalogue : `galaxies` or `stars`."""
     table = catalogue.rows(["id", "ra", "dec", "_healpix_29"])
+    if not table.num_rows:
+        return [not_applicable(NAME, Place(), f"table {catalogue.table} has no rows", SOURCE, catalogue.table)]
     ids, ra, dec = (table[name].to_numpy() for name in ("id", "ra", "dec"))
     place = np.stack([ra, dec], axis=1).view(np.complex128).ravel()
     out = [

@@ -36,10 +36,14 @@ def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
         return [*out, not_applicable(NAME, Place(), "galaxy_fluxes has no I_E", SOURCE)]
     light = fluxes.rows(["id", "f_nu_euclid_vis"])
     table = galaxies.rows(["id", "z_obs", "flux_halpha", "density_boost", "_healpix_29"])
-    order, match = np.argsort(light["id"].to_numpy()), table["id"].to_numpy()
-    at = order[np.searchsorted(light["id"].to_numpy()[order], match)]
+    ids, own, flux = (column.to_numpy() for column in (table["id"], light["id"], light["f_nu_euclid_vis"]))
+    order = np.argsort(own)
+    at = order[np.minimum(np.searchsorted(own[order], ids), max(len(own) - 1, 0))] if len(own) else order
+    if len(ids) and (not len(own) or (own[at] != ids).any()):
+        why = "galaxy_fluxes lacks galaxies of galaxies: it is of another request, which --name names"
+        return [*out, not_applicable(NAME, Place(), why, SOURCE)]
     with np.errstate(divide="ignore"):
-        mag = 23.9 - 2.5 * np.log10(light["f_nu_euclid_vis"].to_numpy()[at].astype(float))
+        mag = 23.9 - 2.5 * np.log10(flux[at[: len(ids)]].astype(float))
     weight = 1.0 / table["density_boost"].to_numpy().astype(float)
     z, line = (table[name].to_numpy().astype(float) for name in ("z_obs", "flux_halpha"))
     cell = table["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER)

@@ -34,22 +34,28 @@ def check(of: Seen) -> list[Row]:
     below = np.flatnonzero(known & (part < 0.5))
     faintest = [i for i in below if i > 0 and known[i - 1] and part[i - 1] >= 0.5]
     if not faintest or len(magnitude) < _LEAST:
-        return [not_applicable("completeness", of.place, "no magnitude at which half are found", SOURCE)]
+        why = "no magnitude at which half are found"
+        # Those that noise hides from nobody are to be found nevertheless.
+        return _bright(of, magnitude, found, _foreseen(of)) or [not_applicable("completeness", of.place, why, SOURCE)]
     i = faintest[0]
     slope = max(part[i - 1] - part[i], 0.05)
     limit = middle[i - 1] + _BIN * (part[i - 1] - 0.5) / slope
     error = _BIN * np.sqrt(0.25 / count[i] + 0.25 / count[i - 1]) / slope
     rows = [Row("completeness", "half", of.place, float(limit), float(error), _foreseen(of), _LIMIT, "mag", SOURCE,
                 note=note)]  # fmt: skip
+    return [*rows, *_bright(of, magnitude, found, limit)]
+
+
+def _bright(of: Seen, magnitude: Float, found: Bool, limit: float) -> list[Row]:
+    """Part of the sources one to four magnitudes above a limit that are found; nothing of too few."""
     bright = (magnitude < limit - 1.0) & (magnitude > limit - 4.0)
     n = int(bright.sum())
-    if n >= _LEAST:
-        value = float(found[bright].mean())
-        near = (found[bright].sum() + 2.0) / (n + 4.0)
-        error = np.sqrt(near * (1.0 - near) / n)
-        rows.append(Row("completeness", "bright", of.place, value, float(error), 1.0, _BRIGHT, "", SOURCE, LEAST,
-                        f"{n} sources"))  # fmt: skip
-    return rows
+    if n < _LEAST:
+        return []
+    value = float(found[bright].mean())
+    near = (found[bright].sum() + 2.0) / (n + 4.0)
+    error = float(np.sqrt(near * (1.0 - near) / n))
+    return [Row("completeness", "bright", of.place, value, error, 1.0, _BRIGHT, "", SOURCE, LEAST, f"{n} sources")]
 
 
 def searched(of: Seen) -> tuple[Float, Bool, str]:

@@ -32,7 +32,7 @@ def check(of: Seen) -> list[Row]:
         told, tolerance = _NISP * _PIXELS * float(of.frame.header["ELAPTIME"]), _NISP_MOST
     # A track is of many pixels that are hit together.
     each = hit.sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1)
-    error = float(each.std() / np.sqrt(len(each))) if hits else told / np.sqrt(pixels)
+    error = float(each.std() / np.sqrt(len(each))) if hits else float(np.sqrt(told / pixels))
     note = f"{pixels} pixels without sources, {hits} of them hit"
     return [Row("cosmic_rays", "cover", of.place, hits / pixels / told, error / told, 1.0, tolerance, "", SOURCE,
                 note=note)]  # fmt: skip

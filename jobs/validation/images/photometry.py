@@ -48,7 +48,7 @@ def check(of: Seen) -> list[Row]:
     errors = np.sqrt((inverse**2).sum(axis=1))
     of.series |= {"mag": stars.mag, "dm": off, "measured": np.where(kept, magnitude, np.nan)}
     of.series["mean_dm"] = np.array([line[0], errors[0]])
-    note = f"{int(kept.sum())} stars, I_AB {stars.mag[kept].min():.1f} to {stars.mag[kept].max():.1f}"
+    note = f"{int(kept.sum())} stars, AB {stars.mag[kept].min():.1f} to {stars.mag[kept].max():.1f}"
     place = of.place
     return [
         Row("photometry", "offset", place, line[0], errors[0], 0.0, TOLERANCE, "mag", SOURCE, note=note),

@@ -22,7 +22,7 @@ _FLAGGED = 0.03
 def check(of: Seen) -> list[Row]:
     """Median and inner quartiles of chi^2 over the expected ones; part of the pixels that do not fit."""
     quality = np.asarray(of.frame.quality)
-    if "QUALFLAG" in of.frame.header or quality.max() <= 1:
+    if "QUALFLAG" in of.frame.header:
         return [_flagged(of, quality > 0)]
     freedom = int(of.frame.header["NG"]) - 2
     edges = np.arange(257)

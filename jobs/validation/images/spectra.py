@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 
-from jobs.validation.measure.rows import Row, not_applicable
+from jobs.validation.measure.rows import LEAST, Row, not_applicable
 from jobs.validation.measure.seen import DISPERSED, Check, Seen
 from lake_schema.arrays import Float, Int
 
@@ -27,6 +27,8 @@ _HALF, _FROM, _TO = 6, 9, 15
 _LEAST_SNR, _LEAST_LINE, _OVERLAPPED, _LEAST, _MOST = 60.0, 8.0, 0.1, 5, 150
 # Pixels about a line that its light and its level are told by.
 _NEAR, _AROUND = 3, 12
+# Standard deviations from which a line is there, and the part of those foreseen that may be missed.
+_SEEN, _MISSED = 3.0, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,14 +55,34 @@ def check(of: Seen) -> list[Row]:
         if found is not None and snr > _LEAST_SNR:
             ratios.append(float(found.light.sum()) / row["drawn"])
             offs.append(found.off)
-    lines = [line for row in first for line in _lines(of, row)]
+    looked = np.array([line for row in first for line in _lines(of, row)])
+    lines = looked[np.isfinite(looked)].tolist()
     out = []
+    if len(looked) >= _LEAST:
+        # Where wavelengths are far off, nothing is left at the foreseen places that a shift could be told by.
+        part = len(lines) / len(looked)
+        near = (len(lines) + 2.0) / (len(looked) + 4.0)
+        out.append(
+            Row(
+                "spectra",
+                "lines",
+                of.place,
+                part,
+                float(np.sqrt(near * (1.0 - near) / (len(looked) + 4.0))),
+                1.0,
+                _MISSED,
+                "",
+                SOURCE,
+                LEAST,
+                f"{len(looked)} lines foreseen at S/N > {_LEAST_LINE:g}",
+            )
+        )
     for name, values, expected, tolerance, unit in (
         ("flux", ratios, 1.0, _FLUX, ""), ("trace", offs, 0.0, _TRACE, "pix"), ("wavelength", lines, 0.0, _LINE, "pix"),
     ):  # fmt: skip
         if len(values) < _LEAST:
             why = f"{name}: {len(values)} spectra or lines alone and bright enough; {_LEAST} are wanted"
-            out.append(not_applicable("spectra", of.place, why, SOURCE))
+            out.append(not_applicable("spectra", of.place, why, SOURCE, name))
             continue
         found_values = np.array(values)
         middle = float(np.median(found_values))
@@ -119,7 +141,7 @@ def _polynomial(coefficients: Float, t: Float) -> Float:
 
 
 def _lines(of: Seen, row: Mapping[str, Any]) -> list[float]:
-    """Of a spectrum's bright lines: measured place minus the foreseen one, pixels along the trace."""
+    """Of a spectrum's bright lines: measured place minus the foreseen, pixels along the trace; NaN where none is."""
     bright = [
         wavelength
         for wavelength, snr in zip(row["line_wavelength"] or (), row["line_snr"] or (), strict=True)
@@ -136,17 +158,19 @@ def _lines(of: Seen, row: Mapping[str, Any]) -> list[float]:
         others = [other for other in row["line_wavelength"] if other != line]
         if any(abs(other - line) < 2 * _NEAR * step for other in others) or around.sum() < 2 * _AROUND - 1:
             continue
-        level = np.median(found.light[around & (np.abs(pixel) > _NEAR)])
+        beside = found.light[around & (np.abs(pixel) > _NEAR)]
+        level = np.median(beside)
+        noise = 1.4826 * np.median(np.abs(beside - level))
         # About the place that was found, until it stays: light of the continuum pulls to the middle of the window.
-        centre = 0.0
+        centre, significance = 0.0, 0.0
         for _ in range(10):
             window = np.exp(-0.5 * ((pixel - centre) / 1.2) ** 2)
             above = np.where(around, found.light - level, 0.0) * window
-            if above.sum() <= 0.0:
+            significance = above.sum() / max(noise * float(np.sqrt((window[around] ** 2).sum())), 1e-9)
+            if significance <= 0.0:
                 break
             centre += float(np.clip(2.0 * (above * (pixel - centre)).sum() / above.sum(), -1.0, 1.0))
-        if abs(centre) < _NEAR:
-            out.append(centre)
+        out.append(centre if abs(centre) < _NEAR and significance > _SEEN else np.nan)
     return out
 
 

@@ -29,6 +29,7 @@ _PLACE = re.compile(
 )
 # How the plane of a ramp's chi^2 ends its name.
 _QUALITY = ".CHI2"
+_FLAGS = "QUALFLAG"
 # Of a header that is not sure of its place (FITS, paper I); the true one is then in the .head file beside it.
 _UNSURE = "CSYER1"
 # Overscan columns next to the pixels that are left out: charge that traps gave back is in them.
@@ -148,7 +149,10 @@ def _frame(units: Sequence[images.Image], path: Path) -> Frame:
         electrons[ccd] = (data - np.float32(amplifier.level)) * np.float32(amplifier.gain)
         amplifiers.append(amplifier)
     quality = next((unit for unit in planes if unit.name.endswith(_QUALITY)), None)
-    found = None if quality is None else np.asarray(quality.data)[section(_header(quality)["DATASEC"])]
+    own = {} if quality is None else _header(quality)
+    found = None if quality is None else np.asarray(quality.data)[section(own["DATASEC"])]
+    # What the plane is stands in its own header.
+    first |= {_FLAGS: own[_FLAGS]} if _FLAGS in own else {}
     return Frame(electrons, tuple(amplifiers), found, first, _wcs(_header(signal[0]), path, first))
 
 

@@ -37,6 +37,8 @@ class Catalogue:
 
     def seen(self, ids: Int, mjd: float) -> tuple[Float, Float]:
         """Where stars are at a time, deg [n]; NaN of what is not in the catalogue."""
+        if not self.id.size:
+            return np.full(len(ids), np.nan), np.full(len(ids), np.nan)
         at, known = _find(self.id, ids)
         years = _JULIAN_2000 + (mjd - _MJD_2000) / _YEAR - EPOCH
         dec = self.dec[at] + years * self.pm_dec[at] / _MAS_A_DEG

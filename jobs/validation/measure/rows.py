@@ -65,13 +65,14 @@ class Row:
         return verdict(self.value, self.error, self.expected, self.tolerance, self.kind)
 
 
-def not_applicable(check: str, place: Place, why: str, source: str) -> Row:
+def not_applicable(check: str, place: Place, why: str, source: str, quantity: str = "") -> Row:
     """A check that found nothing that it could measure.
 
     check, source : its name, and where its expectations are from;  place : where;  why : in a few words
+    quantity      : that could not be measured, "" = none of the check's
     """
     nan = math.nan
-    return Row(check, "", place, nan, nan, nan, nan, "", source, note=why, applies=False)
+    return Row(check, quantity, place, nan, nan, nan, nan, "", source, note=why, applies=False)
 
 
 def verdict(value: float, error: float, expected: float, tolerance: float, kind: str = AROUND) -> str:

@@ -58,7 +58,8 @@ def _catalogued(held: Held) -> Iterator[Row]:
     for check in checks.OF_CATALOGUES:
         missing = [name for name in check.tables if name not in held.tables]
         if missing:
-            yield not_applicable(check.name, Place(), f"the lake has no table {' and '.join(missing)}", check.source)
+            why = f"the lake has no table {' and '.join(missing)}"
+            yield not_applicable(check.name, Place(), why, check.source, check.tables[0])
         else:
             yield from check.rows(*(held.tables[name] for name in check.tables))
 

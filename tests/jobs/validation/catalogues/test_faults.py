@@ -100,6 +100,21 @@ def test_requirements_that_are_not_met(quantity, columns, mag):
     assert found[quantity] in ((FAIL,) if mag < 24.5 else (FAIL, UNDECIDED))
 
 
+def test_no_rows_pass_nothing():
+    (row,) = duplicates.rows(Version("galaxies", galaxies(per_cell=0)))
+    assert (row.verdict, row.quantity) == (NOT_APPLICABLE, "galaxies")
+    assert row.note == "table galaxies has no rows"
+
+
+@pytest.mark.parametrize("kept", [0, 5, 89])
+def test_fluxes_of_other_galaxies_are_not_taken(kept):
+    columns = galaxies(per_cell=10)
+    fluxes = light({name: values[:kept] for name, values in columns.items()})
+    rows = requirements.rows(Version("galaxies", columns), fluxes)
+    assert {row.verdict for row in rows} == {NOT_APPLICABLE}
+    assert "lacks galaxies" in rows[-1].note
+
+
 def test_without_the_band_it_says_so():
     columns = galaxies(per_cell=10)
     fluxes = Version("galaxy_fluxes", {"id": columns["id"]})

@@ -29,6 +29,13 @@ def test_sources_that_were_not_drawn(faint):
     assert made.verdicts(COMPLETENESS, wrong)["bright"] == FAIL
 
 
+def test_an_image_of_another_sky(faint):
+    """Nothing is where it should be: there is no magnitude at which half are found, and that is no excuse."""
+    known = faint.known
+    wrong = replace(faint, known=replace(known, x=known.x + 14.0), series={})
+    assert made.verdicts(COMPLETENESS, wrong) == {"bright": FAIL}
+
+
 def test_sources_that_are_fainter_than_they_should_be(faint):
     known = faint.known
     wrong = replace(faint, known=replace(known, expected=6.0 * known.expected), series={})

@@ -16,7 +16,7 @@ from jobs.validation.images.psf import PSF
 from jobs.validation.images.quality import QUALITY
 from jobs.validation.images.saturation import SATURATION
 from jobs.validation.measure import seen
-from jobs.validation.measure.rows import FAIL, NOT_APPLICABLE, PASS, Place
+from jobs.validation.measure.rows import FAIL, NOT_APPLICABLE, PASS, UNDECIDED, Place
 from tests.jobs.validation import made
 
 CHECKS = (ASTROMETRY, PHOTOMETRY, BACKGROUND, NOISE, PSF, COSMIC_RAYS, SATURATION)
@@ -110,6 +110,13 @@ def test_cosmic_rays_that_are_off_or_too_many(folder, good, hits):
     assert turned(COSMIC_RAYS, of, "cover")
 
 
+def test_no_cosmic_ray_where_one_is_expected_decides_nothing(folder, good):
+    of, _ = made.vis(folder, of=good[1], hits=0.0)
+    few = np.arange(len(of.tiles.row)) < 2
+    short = replace(of, tiles=of.tiles.where(few), frame=replace(of.frame, header={**of.frame.header, "EXPTIME": 20.0}))
+    assert made.verdicts(COSMIC_RAYS, short) == {"cover": UNDECIDED}
+
+
 def test_stars_that_do_not_saturate(good):
     """A header that promises a saturation which nothing reaches, and one that is below the sky."""
     of, _ = good
@@ -135,6 +142,9 @@ def test_ramps_that_fit_and_others(folder):
     assert turned(QUALITY, ramps(folder, 1.15 * chi2), "median")
     # Of noise that is not that of photons.
     assert turned(QUALITY, ramps(folder, scipy.stats.chi2(15).rvs((400, 400), random_state=1)), "median")
+    # Of ramps that nobody fitted.
+    assert set(made.verdicts(QUALITY, ramps(folder, 0.0 * chi2)).values()) == {FAIL, PASS}
+    assert turned(QUALITY, ramps(folder, 0.0 * chi2), "median")
     chi2[:40] = 255
     assert turned(QUALITY, ramps(folder, chi2), "not_fitting")
 

@@ -8,6 +8,9 @@ from jobs.validation.images.spectra import SPECTRA
 from jobs.validation.measure.frames import Frame
 from jobs.validation.measure.rows import FAIL, NOT_APPLICABLE, PASS, Place
 from jobs.validation.measure.seen import Seen
+from jobs.validation.suite import publishing
+from lake_schema.store import validate
+from lake_schema.tables.validation import VALIDATION
 from tests.jobs.validation import made
 
 SIDE, LONG, FIRST, LAST, LINE = 700, 500, 12_500.0, 18_500.0, 15_300.0
@@ -45,7 +48,7 @@ def made_gauss(x, middle, sigma):
 
 
 def test_spectra_as_foreseen():
-    assert made.verdicts(SPECTRA, frame()) == dict.fromkeys(("flux", "trace", "wavelength"), PASS)
+    assert made.verdicts(SPECTRA, frame()) == dict.fromkeys(("flux", "trace", "wavelength", "lines"), PASS)
 
 
 @pytest.mark.parametrize(
@@ -57,7 +60,17 @@ def test_what_is_off_is_found(wrong, quantity):
     assert set(found.values()) == {PASS}
 
 
+@pytest.mark.parametrize("redder", [5.0, 8.0, -20.0])
+def test_lines_far_from_their_places_are_missed(redder):
+    """What lies at the foreseen places then is noise, whose centroids scatter about 0."""
+    found = made.verdicts(SPECTRA, frame(redder=redder))
+    assert found["lines"] == FAIL
+    assert found["wavelength"] != PASS
+
+
 def test_too_few_are_said():
     found = SPECTRA.of(frame(n=2))
     assert [row.verdict for row in found] == [NOT_APPLICABLE] * 3
     assert found[0].note.startswith("flux: 2 spectra")
+    # They are rows of a table, whose keys differ.
+    validate.check(publishing.table(found), VALIDATION)
