@@ -15,6 +15,7 @@ from lake_schema.store import read
 
 NAME = "requirement"
 SOURCE = "requirements named by Serrano et al. 2024"
+_BAND = "euclid_vis"
 _LIMIT, _PER_ARCMIN2, _REDSHIFT = 24.5, 30.0, 0.8
 _LINE, _EMITTERS, _FROM, _TO = 2e-16, 3500.0, 0.4, 1.8
 # What a lake does not tell, and why.
@@ -32,11 +33,16 @@ _UNTOLD = (
 def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
     """Of the catalogue; galaxies, fluxes : versions of the two tables."""
     out = [_untold(name, why) for name, why in _UNTOLD]
-    if "f_nu_euclid_vis" not in fluxes.schema.names:
+    if f"f_nu_{_BAND}" not in fluxes.schema.names:
         return [*out, not_applicable(NAME, Place(), "galaxy_fluxes has no I_E", SOURCE)]
-    light = fluxes.rows(["id", "f_nu_euclid_vis"])
+    facts = galaxies.manifest.get("facts", {})
+    band, limit = facts.get("galaxy_band", _BAND), facts.get("galaxy_limit", np.inf)
+    if band != _BAND or limit < _LIMIT:
+        why = f"the catalogue ends at {limit:g} in {band}; the requirements are of {_LIMIT:g} in {_BAND}"
+        return [*out, not_applicable(NAME, Place(), why, SOURCE)]
+    light = fluxes.rows(["id", f"f_nu_{_BAND}"])
     table = galaxies.rows(["id", "z_obs", "flux_halpha", "density_boost", "_healpix_29"])
-    ids, own, flux = (column.to_numpy() for column in (table["id"], light["id"], light["f_nu_euclid_vis"]))
+    ids, own, flux = (column.to_numpy() for column in (table["id"], light["id"], light[f"f_nu_{_BAND}"]))
     order = np.argsort(own)
     at = order[np.minimum(np.searchsorted(own[order], ids), max(len(own) - 1, 0))] if len(own) else order
     if len(ids) and (not len(own) or (own[at] != ids).any()):

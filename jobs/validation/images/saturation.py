@@ -32,7 +32,7 @@ def check(of: Seen) -> list[Row]:
             value = float(full[chosen].mean())
             # Of a share, that of Agresti and Coull, which is not 0 where all are alike.
             near = (full[chosen].sum() + 2.0) / (n + 4.0)
-            error = float(np.sqrt(near * (1.0 - near) / (n + 4.0))) / 3.0
+            error = float(np.sqrt(near * (1.0 - near) / (n + 4.0)))
             out.append(Row("saturation", name, of.place, value, error, told, _WRONG, "", SOURCE, kind, f"{n} stars"))
     return out or [not_applicable("saturation", of.place, "too few stars near the full well", SOURCE)]
 

@@ -33,8 +33,8 @@ def scene(rng, n=160, faintest=21.0, side=2 * SIDE):
     x, y = (axis.ravel()[:n] for axis in np.meshgrid(*[40 + step * (np.arange(per) + 0.5)] * 2))
     x, y = (axis + 0.25 * step * (rng.random(n) - 0.5) for axis in (x, y))
     mag = 18.0 + (faintest - 18.0) * rng.random(n)
-    # Six that must be full.
-    mag[:8] = 14.0
+    # Some that must be full.
+    mag[:12] = 14.0
     return known(x, y, mag)
 
 

@@ -115,6 +115,26 @@ def test_fluxes_of_other_galaxies_are_not_taken(kept):
     assert "lacks galaxies" in rows[-1].note
 
 
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [
+        ({"galaxy_limit": 22.0}, "ends at 22 in euclid_vis"),
+        ({"galaxy_limit": 26.0, "galaxy_band": "lsst_r"}, "ends at 26 in lsst_r"),
+        ({"galaxy_limit": 24.5, "galaxy_band": "euclid_vis"}, ""),
+    ],
+)
+def test_a_catalogue_that_ends_before_the_requirements_do_does_not_fail_them(facts, words):
+    columns = galaxies()
+    version = Version("galaxies", columns)
+    version.manifest["facts"] = facts
+    rows = requirements.rows(version, light(columns))
+    if words:
+        assert {row.verdict for row in rows} == {NOT_APPLICABLE}
+        assert words in rows[-1].note
+    else:
+        assert verdicts(rows)["galaxies_24.5"] == PASS
+
+
 def test_without_the_band_it_says_so():
     columns = galaxies(per_cell=10)
     fluxes = Version("galaxy_fluxes", {"id": columns["id"]})
