@@ -320,40 +320,45 @@ def _earlier(
     here = pc.field("exposure_id").isin(list(rows)) & (pc.field("detector") == task["detector"])
     tasks = parts.rows(inputs["tasks"], rows, where=here).to_pylist()
     before = persistence.earlier_of(tasks, rows, own)[exposed.exposure_id, task["detector"]]
-    pairs = ((rows[one["exposure_id"]], one) for one in before)
-    return tuple(
-        _drawn_again(lake, inputs, exposed, row, one, own(row.settings), seed) if drawn else EarlierSky(row)
-        for row, one in pairs
-        for drawn in [persistence.is_drawn(row)]
-    )
+    pairs = [(rows[one["exposure_id"]], one) for one in before]
+    drawn = [pair for pair in pairs if persistence.is_drawn(pair[0])]
+    again = {one.exposure.exposure_id: one for one in _drawn_again(lake, inputs, exposed, drawn, own, seed)}
+    return tuple(again.get(row.exposure_id, EarlierSky(row)) for row, _ in pairs)
 
 
 def _drawn_again(
     lake: Path,
     inputs: Mapping[str, read.Version],
     exposed: ExposureRow,
-    before: ExposureRow,
-    task: Json,
-    mission: MissionConfiguration,
+    drawn: Sequence[tuple[ExposureRow, Json]],
+    mission_of: Callable[[str | None], MissionConfiguration],
     seed: int,
-) -> Earlier:
-    detector = detectors.detector(before.camera, task["detector"], mission)
-    aim = Aim.of(before, detector, passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], before.band), seed)
-    least = persistence.least_flux(exposed, before, persistence.brightest_column(aim, mission))
-    beyond = visible_spectra.beyond(before, detector, mission, aim.band, seed)
-    farther = max(beyond - aim.channel.margin(detector.section, mission), 0.0)
-    # In images their colours are taken as flat.
-    spread = aim.channel.disperses is not None
-    found = [
-        catalogue_rows.bright(inputs[rows], inputs[fluxes], task, columns, before.band, least, farther)
-        for rows, fluxes, columns in (
-            ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS if spread else visible_sources.SHAPE_COLUMNS),
-            ("stars", "star_fluxes", visible_sources.STAR_COLUMNS),
-        )
+) -> list[Earlier]:
+    """With the sources of each that leave something; drawn : earlier exposures and the tasks of the same detector."""
+    if not drawn:
+        return []
+    fluxes = inputs["galaxy_fluxes"].manifest["facts"]
+    aims, galaxies, stars = [], [], []
+    for before, task in drawn:
+        mission = mission_of(before.settings)
+        detector = detectors.detector(before.camera, task["detector"], mission)
+        aim = Aim.of(before, detector, passband_of(lake, fluxes, before.band), seed)
+        least = persistence.least_flux(exposed, before, persistence.brightest_column(aim, mission))
+        beyond = visible_spectra.beyond(before, detector, mission, aim.band, seed)
+        farther = max(beyond - aim.channel.margin(detector.section, mission), 0.0)
+        # In images their colours are taken as flat.
+        spread = aim.channel.disperses is not None
+        shapes = visible_sources.GALAXY_COLUMNS if spread else visible_sources.SHAPE_COLUMNS
+        galaxies.append(catalogue_rows.Bright(task, shapes, before.band, least, farther))
+        stars.append(replace(galaxies[-1], columns=visible_sources.STAR_COLUMNS))
+        aims.append((aim, mission))
+    library, stellar = library_of(lake, fluxes), stars_of(lake, inputs["star_fluxes"].manifest["facts"])
+    of_galaxies = catalogue_rows.bright(inputs["galaxies"], inputs["galaxy_fluxes"], galaxies)
+    of_stars = catalogue_rows.bright(inputs["stars"], inputs["star_fluxes"], stars)
+    return [
+        Earlier(aim, Rows(*some, *others, library=library, stellar=stellar), mission)
+        for (aim, mission), some, others in zip(aims, of_galaxies, of_stars, strict=True)
     ]
-    library = library_of(lake, inputs["galaxy_fluxes"].manifest["facts"])
-    stellar = stars_of(lake, inputs["star_fluxes"].manifest["facts"])
-    return Earlier(aim, Rows(*found[0], *found[1], library=library, stellar=stellar), mission)
 
 
 def truth_work(lake: Path, facts: Json) -> Output:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -80,13 +79,13 @@ def stars(inputs: Mapping[str, read.Version], aim: Aim, variant: Variant) -> tup
     if not may_show(aim, variant):
         return ()
     least = _least(scene_of.of_aim(aim, variant)) / (_PEAK * electron_rate(exposure) * exposure.exposure_time_s)
-    tables, found = (inputs["stars"], inputs["star_fluxes"]), []
-    for other in neighbours(exposure.camera, aim.detector.name, variant.mission):
-        place: dict[str, Any] = circle(exposure, other)
-        columns = visible_sources.STAR_COLUMNS
-        rows, fluxes = catalogue_rows.bright(*tables, place, columns, exposure.band, least)
-        found.append(Beside(other, rows, fluxes))
-    return tuple(found)
+    beside = neighbours(exposure.camera, aim.detector.name, variant.mission)
+    wanted = [
+        catalogue_rows.Bright(circle(exposure, other), visible_sources.STAR_COLUMNS, exposure.band, least)
+        for other in beside
+    ]
+    found = catalogue_rows.bright(inputs["stars"], inputs["star_fluxes"], wanted)
+    return tuple(Beside(other, *rows) for other, rows in zip(beside, found, strict=True))
 
 
 def _least(scene: Scene) -> float:

@@ -145,18 +145,19 @@ def _planes(
     nodes, powers = _nodes(positions), _powers(positions)
     places = [_field(detector, *place, mission) for place in ((0.0, 0.0), *nodes)]
     sampling = detector.pixel_scale / sampled.samples
-    coefficients = [centred(wavefront(*place, section, mission), waves, sampled, sampling, mission) for place in places]
+    wavefronts = np.array([wavefront(*place, section, mission) for place in places])
     blurs = [_blur_variances(detector, float(wavelength), mission) for wavelength in waves]
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
     key = cache.content_key(
         code_key(__name__),
-        np.array(coefficients),
+        wavefronts,
         waves,
         repr([(p.key, p.value, p.unit) for p in optics]),
-        repr((sampling, *blurs)),
+        repr((sampled, sampling, *blurs)),
     )
 
     def make() -> dict[str, Array]:
+        coefficients = [centred(nm, waves, sampled, sampling, mission) for nm in wavefronts]
         centre = [
             _plane(coefficients[0], w, sampled, sampling, blur, mission) for w, blur in zip(waves, blurs, strict=True)
         ]

@@ -1,6 +1,7 @@
 """The catalogue rows that a task reads: in its circle, and the bright ones beyond it; stars where they are then."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -106,29 +107,48 @@ def sources(
     return _as_asked(rows, own, columns), light, complete
 
 
-def bright(
-    catalogue: read.Version,
-    fluxes: read.Version,
-    task: Mapping[str, Any],
-    columns: Sequence[str],
-    band: str,
-    least: float,
-    farther: float = 0.0,
-) -> tuple[pa.Table, pa.Table]:
-    """(rows of a catalogue that are seen within a task's circle and shine brightly, their fluxes).
+@dataclass(frozen=True, slots=True)
+class Bright:
+    """Of a catalogue the sources that are seen within a task's circle and shine brightly.
 
-    least : microjansky; infinite where no source shows;  farther : how far beyond the circle they are seen, arcsec
-    catalogue, fluxes : versions of the two tables;  task : its row
-    columns : that are wanted;  band : whose fluxes are
+    task    : its row;  columns : that are wanted;  band : whose fluxes are
+    least   : microjansky; infinite where no source shows;  farther : how far beyond the circle they are seen, arcsec
     """
-    cells = selection.within(task, deflection_of(catalogue), farther) if np.isfinite(least) else []
-    light = fluxes.in_cells(cells, GENERATION_ORDER, ["id", f"f_nu_{band}"])
-    light = light.filter(pc.greater_equal(light[f"f_nu_{band}"], least))
+
+    task: Mapping[str, Any]
+    columns: Sequence[str]
+    band: str
+    least: float
+    farther: float = 0.0
+
+
+def bright(catalogue: read.Version, fluxes: read.Version, wanted: Sequence[Bright]) -> list[tuple[pa.Table, pa.Table]]:
+    """(rows of a catalogue, their fluxes) of each that is wanted; what several want is read once.
+
+    catalogue, fluxes : versions of the two tables
+    """
+    deflection = deflection_of(catalogue)
+    cells = [selection.within(one.task, deflection, one.farther) if np.isfinite(one.least) else [] for one in wanted]
+    every = sorted(set().union(*cells))
+    bands = dict.fromkeys(f"f_nu_{one.band}" for one in wanted)
+    light = fluxes.in_cells(every, GENERATION_ORDER, ["id", *bands, "_healpix_29"])
+    cell = sky.parent(light["_healpix_29"].to_numpy(), sky.DEEPEST, GENERATION_ORDER)
+    shows = [
+        np.isin(cell, own) & (light[f"f_nu_{one.band}"].to_numpy().astype(float) >= one.least)
+        for one, own in zip(wanted, cells, strict=True)
+    ]
+    some = light["id"].filter(pa.array(np.logical_or.reduce(shows)))
     # Fluxes are small: only the parts of the catalogue that have some of these are read.
-    parts = [part["name"] for part in catalogue.manifest["parts"] if not set(cells).isdisjoint(part["facts"][CELLS])]
+    parts = [part["name"] for part in catalogue.manifest["parts"] if not set(every).isdisjoint(part["facts"][CELLS])]
+    columns = list(dict.fromkeys(["id", *(name for one in wanted for name in one.columns)]))
     own = as_seen(catalogue, columns)
-    found = catalogue.rows(own, parts if len(light) else [], pc.field("id").isin(light["id"]))
-    return _as_asked(found, own, columns), light
+    rows = _as_asked(catalogue.rows(own, parts if len(some) else [], pc.field("id").isin(some)), own, columns)
+    found = []
+    for one, seen in zip(wanted, shows, strict=True):
+        its = light.filter(pa.array(seen)).select(["id", f"f_nu_{one.band}"])
+        here = pc.is_in(rows["id"], pc.unique(its["id"]))
+        found.append((rows.filter(here).select(list(one.columns)), its))
+    return found
 
 
 def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, farther: float, least: float) -> pa.Table:

@@ -243,6 +243,46 @@ def test_arcs_are_read_from_as_far_away_as_other_sources(farther, seen):
     assert len(catalogue_rows.lenses(table, task, 0.0, farther, np.inf)) == 0
 
 
+def test_what_several_exposures_share_is_read_once_and_each_has_its_own():
+    """Of two bands, three circles, several limits and columns, the sources that a filter of the whole finds."""
+    rng = np.random.default_rng(3)
+    task = place()
+    ra, dec = (task[name] + rng.uniform(-0.8, 0.8, 400) for name in ("ra", "dec"))
+    rows = galaxies(ra, dec)
+    cells = sky.cell_of(ra, dec, 8)
+    bands = {f"f_nu_{band}": rng.uniform(0.0, 9.0, 400).astype(np.float32) for band in ("euclid_y", "euclid_h")}
+    light = pa.table({"id": rows["id"], "_healpix_29": sky.healpix_29(ra, dec), **bands})
+    versions = Whole(rows, cells.tolist()), Whole(light, cells.tolist())
+    asked = []
+
+    def in_cells(wanted, order, columns):
+        asked.append(columns)
+        return light.filter(pa.array(np.isin(cells, wanted))).select(columns)
+
+    versions[1].in_cells = in_cells
+    least = float(bands["f_nu_euclid_h"][7])
+    aside = {**task, "dec": task["dec"] + 0.4}
+    wanted = [
+        catalogue_rows.Bright(task, ["id", "ra"], "euclid_h", least),
+        catalogue_rows.Bright(aside, ["dec", "id"], "euclid_y", 2.0, 600.0),
+        catalogue_rows.Bright(aside, ["id"], "euclid_h", np.inf),
+        catalogue_rows.Bright(task, ["ra"], "euclid_y", 100.0),
+    ]
+    found = catalogue_rows.bright(*versions, wanted)
+    assert len(asked) == 1
+    for one, (its, own) in zip(wanted, found, strict=True):
+        near = selection.within(one.task, 0.0, one.farther) if np.isfinite(one.least) else []
+        flux = bands[f"f_nu_{one.band}"].astype(float)
+        expected = np.flatnonzero(np.isin(cells, near) & (flux >= one.least))
+        assert own.equals(light.take(expected).select(["id", f"f_nu_{one.band}"]))
+        assert its.equals(rows.take(expected).select(one.columns))
+        assert len(its) == 0 or one.least < 100.0
+    assert len(found[0][0]) > 5
+    assert len(found[1][0]) > 5
+    alone = [catalogue_rows.bright(*versions, [one])[0] for one in wanted]
+    assert all(a.equals(c) and b.equals(d) for (a, b), (c, d) in zip(alone, found, strict=True))
+
+
 @dataclass
 class Files:
     """A catalogue's files, or its fluxes': each of some cells."""
