@@ -55,7 +55,10 @@ def daemon(main_class, *arguments):
 
 @contextmanager
 def running(folder, names):
-    """Address of a master, and a process a worker of one core and 1 GB; each has its name's folder below `folder`."""
+    """Address of a master, and a process a worker of one core and 1 GB; each has its name's folder below `folder`.
+
+    Each worker is a host of its own: Spark begins a second copy of a task on none that has a first one.
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -67,10 +70,11 @@ def running(folder, names):
             assert time.monotonic() < deadline, "no master"
             time.sleep(0.5)
         workers = {}
-        for name in names:
+        for number, name in enumerate(names, start=2):
             (folder / name).mkdir()
             options = ("--cores", 1, "--memory", "1g", "--work-dir", folder / name, "--webui-port", 0)
-            workers[name] = stack.enter_context(daemon("worker.Worker", "--host", "127.0.0.1", *options, master))
+            host = ("--host", f"127.0.0.{number}")
+            workers[name] = stack.enter_context(daemon("worker.Worker", *host, *options, master))
         yield master, workers
 
 
