@@ -99,7 +99,10 @@ class Planner:
         )
         files = Files(request.files == "exposure", request.readout)
         wanted, forced = self.layout.wanted(piece), variants.forced(request)
-        return tasks.table(exposures, wanted, self.mission, densities, request.truth, request.accuracy, forced, files)
+        rows = tasks.table(exposures, wanted, self.mission, densities, request.truth, request.accuracy, forced, files)
+        days = tasks.remembered(exposures, self.mission)
+        about = self.layout.about(piece, days) if days else ()
+        return tasks.remembering(rows, exposures, about, self.mission)
 
     def tables(self) -> Iterator[Plan_]:
         """Rows of `exposures` and `tasks`, a part after the other."""

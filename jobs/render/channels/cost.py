@@ -14,6 +14,7 @@ class Cost:
     base_gb      : of a worker before it draws
     held, held_sky : bytes a pixel while a frame is made, without and with a sky
     written      : bytes a pixel of the image, pre- and overscan counted
+    again_s      : s of a frame of the sky that is drawn again, for what it left in a later one
     """
 
     frame_s: float
@@ -24,3 +25,4 @@ class Cost:
     held: float
     held_sky: float
     written: float
+    again_s: float = 0.0

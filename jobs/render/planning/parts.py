@@ -26,6 +26,7 @@ from jobs.fluxes.passbands import Passband
 from jobs.render.camera import detectors
 from jobs.render.exposure import persistence
 from jobs.render.planning import planned_exposures, preconditions, survey
+from jobs.render.planning.planned_exposures import Exposure
 from jobs.render.planning.survey import Stretch, Taken
 from jobs.render.planning.tasks import Narrowed, in_order
 from jobs.request.schema import Request
@@ -113,6 +114,12 @@ class Layout:
     def wanted(self, piece: Piece) -> list[tuple[str, ...]]:
         """The detectors that are wanted of each exposure of a part, () = all."""
         return [names for run in piece.runs for names in self.stretches[run.stretch].wanted(run.first, run.last)]
+
+    def about(self, piece: Piece, days: float) -> Iterator[Exposure]:
+        """Exposures that begin while those of a part do, or up to so many days before, and some others."""
+        for stretch in self.stretches:
+            for run in stretch.about(piece.since - days, piece.until, len(stretch)):
+                yield from (exposure for exposure, _ in stretch.exposures(*run))
 
     def standing(self) -> Iterator[Taken]:
         """An exposure of every kind there is: of fields those of the first."""

@@ -1,6 +1,7 @@
 """From exposures to render tasks: one a detector, with its cells and what it will cost.
 
 table      rows of the table `tasks`, longest first
+remembering  the same, with what earlier exposures left in the detectors;  remembered  how long before those are
 in_order   those of several parts
 part       those of them that are to be rendered now
 Narrowed   the same of tasks that come a part after the other
@@ -9,7 +10,7 @@ Narrowed   the same of tasks that come a part after the other
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Any
@@ -24,9 +25,10 @@ from jobs.render.camera import amplifiers, pointing
 from jobs.render.camera import detectors as camera_detectors
 from jobs.render.channels import registry
 from jobs.render.effects.readout import adc
-from jobs.render.exposure import scene_of
+from jobs.render.exposure import persistence, scene_of
 from jobs.render.exposure.records import Variant
 from jobs.render.planning import variants
+from jobs.render.planning.planned_exposures import Exposure
 from jobs.render.planning.prices import Files, Price, price
 from jobs.render.planning.source_counts import Densities
 from jobs.request.schema import Request
@@ -80,6 +82,50 @@ def table(
     return _rows(planned, list(places.values()))
 
 
+def _remembering(exposures: pa.Table) -> set[str]:
+    """Cameras of the exposures whose detectors have something left of those before."""
+    kinds = zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True)
+    return {camera for camera, channel in dict.fromkeys(kinds) if registry.CHANNELS[channel].remembers is not None}
+
+
+def remembered(exposures: pa.Table, mission: MissionConfiguration) -> float:
+    """How long before one of the exposures another leaves something in its detectors, days; 0 where none does."""
+    return max((persistence.window(camera, mission) for camera in _remembering(exposures)), default=0.0)
+
+
+def remembering(
+    rows: pa.Table, exposures: pa.Table, plan: Iterable[Exposure], mission: MissionConfiguration
+) -> pa.Table:
+    """Rows of `tasks` with the time that it takes to draw anew what earlier exposures left in the detectors.
+
+    exposures : rows of the table `exposures`, of the tasks;  mission : the mission database
+    plan      : exposures that begin while these do, or before them as long as some are remembered
+    Error     : as if each exposure were of all detectors
+    """
+    if not (cameras := _remembering(exposures)):
+        return rows
+    left: dict[str, dict[float, float]] = {camera: {} for camera in cameras}
+    for one in plan:
+        channel = registry.CHANNELS[one.channel]
+        # Of those that begin at once one has been.
+        if one.camera in cameras and channel.sees_sky(one.image_type):
+            left[one.camera][one.mjd] = channel.cost.again_s
+    more = {}
+    # Whole microseconds: sums of a part are those of the whole.
+    for camera, dated in left.items():
+        days = persistence.window(camera, mission)
+        began = np.array(sorted(dated))
+        total = np.cumsum([0, *(round(1e6 * dated[mjd]) for mjd in began.tolist())])
+        for row in exposures.select(["exposure_id", "camera", "channel", "mjd"]).to_pylist():
+            if row["camera"] == camera and registry.CHANNELS[row["channel"]].remembers is not None:
+                first, last = np.searchsorted(began, (row["mjd"] - days, row["mjd"]))
+                more[row["exposure_id"]] = 1e-6 * float(total[last] - total[first])
+    own = [more.get(number, 0.0) for number in rows["exposure_id"].to_pylist()]
+    at = rows.schema.get_field_index("seconds")
+    seconds = pa.array(rows["seconds"].to_numpy() + np.array(own), rows.schema.field(at).type)
+    return _longest_first(rows.set_column(at, rows.schema.field(at), seconds))
+
+
 def _where(row: ExposureRow, cameras: Mapping[tuple[str, str], _Camera]) -> tuple[Any, ...]:
     """What exposures have in common whose detectors look at the same places."""
     return row.camera, cameras[row.camera, row.channel].margin, row.ra, row.dec, row.position_angle
@@ -87,8 +133,12 @@ def _where(row: ExposureRow, cameras: Mapping[tuple[str, str], _Camera]) -> tupl
 
 def in_order(tasks: pa.Table) -> pa.Table:
     """Rows of several parts, longest first; of one part they are already."""
+    return tasks.combine_chunks() if tasks["exposure_id"].num_chunks < 2 else _longest_first(tasks)
+
+
+def _longest_first(tasks: pa.Table) -> pa.Table:
     keys = [("seconds", "descending"), ("exposure_id", "ascending"), ("detector", "ascending")]
-    return tasks.combine_chunks() if tasks["exposure_id"].num_chunks < 2 else tasks.sort_by(keys).combine_chunks()
+    return tasks.sort_by(keys).combine_chunks()
 
 
 def part(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:

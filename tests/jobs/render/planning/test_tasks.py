@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from jobs.render.channels import registry
 from jobs.render.planning import tasks
 from jobs.request.from_toml import parse
 from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
 from tests.jobs.render.planning.test_survey import VIS, planned
 
 DEMO = Path(__file__).parents[4] / "requests" / "demo.toml"
@@ -43,3 +45,33 @@ def test_all_of_a_plan_unless_a_part_is_asked_for(plan):
 def test_what_is_not_in_a_plan_is_refused(plan, wanted, said):
     with pytest.raises(BadInput, match=said):
         places(plan, **wanted)
+
+
+def test_what_earlier_exposures_left_is_drawn_again_and_takes_its_time(tmp_path, monkeypatch):
+    """Of NISP each image of the sky in the window before; of VIS none, nor of frames without a sky."""
+    blocks = [
+        {"channels": ["VIS", "NISP-P", "NISP-S"], "fields": 1, "mjd": 60400.0, "short": False, "flat": False},
+        {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2},
+    ]
+    exposures, rows = planned(tmp_path, observation=blocks)
+    with monkeypatch.context() as patch:
+        patch.setattr(tasks, "remembering", lambda rows, *_: rows)
+        _, alone = planned(tmp_path, observation=blocks)
+    without = {(row["exposure_id"], row["detector"]): row["seconds"] for row in alone.to_pylist()}
+    every, days = exposures.to_pylist(), resolve().value("nisp.persistence.window", "d")
+    added = {}
+    for row in rows.to_pylist():
+        (own,) = (one for one in every if one["exposure_id"] == row["exposure_id"])
+        before = [
+            registry.CHANNELS[one["channel"]].cost.again_s
+            for one in every
+            if own["camera"] == one["camera"] == "nisp"
+            and own["mjd"] - days <= one["mjd"] < own["mjd"]
+            and one["image_type"] == "science"
+        ]
+        more = row["seconds"] - without[row["exposure_id"], row["detector"]]
+        assert more == pytest.approx(sum(before), abs=1e-6)
+        added[own["channel"], row["exposure_id"]] = more
+    assert len({round(more, 3) for more in added.values()}) > 10
+    assert max(more for (channel, _), more in added.items() if channel == "VIS") == 0.0
+    assert rows["seconds"].to_pylist() == sorted(rows["seconds"].to_pylist(), reverse=True)
