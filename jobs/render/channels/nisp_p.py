@@ -89,8 +89,8 @@ def _psf(
 
 
 # Of the demo's sky (1.2e4 predicted sources): 1.5 s of CPU and 1.2 GB on an AMD EPYC, which takes half of the time of
-# the machine that costs are of (forecasting/speed.py).  Again: the last image of a visit of four dithers takes 10.5 s of
-# CPU there, of which 0.28 s are for each of eleven images of NISP-P before it, and 0.6 s for each of four of NISP-S.
+# the machine that costs are of (forecasting/speed.py).  Again: the last image of a visit of four dithers takes 10.5 s
+# of CPU there, of which 0.28 s are for each of eleven images of NISP-P before it, and 0.6 s for each of four of NISP-S.
 COST = Cost(
     frame_s=0.05, sky_s=0.3, galaxy_s=1.3e-4, star_s=1.3e-4, base_gb=0.5, held=120.0, held_sky=160.0, written=3.0,
     again_s=0.3,
