@@ -47,8 +47,8 @@ def core_hours(name: str, sample: int = _SAMPLE) -> tuple[dict[str, float], dict
     """Of a shipped request by channel, of the ground by camera; and the exposures."""
     wanted = parse(ROOT / "requests" / f"{name}.toml")
     mission = mission_of(wanted.mission)
-    kinds = defaultdict(list)
-    for exposure, own in survey.exposures(wanted, mission):
+    kinds, plan = defaultdict(list), survey.exposures(wanted, mission)
+    for exposure, own in plan:
         kinds[exposure.channel, exposure.camera, exposure.image_type, exposure.band].append((exposure, own))
     densities = source_counts.Densities(mission, wanted.universe)
     hours: dict[str, float] = defaultdict(float)
@@ -69,6 +69,7 @@ def core_hours(name: str, sample: int = _SAMPLE) -> tuple[dict[str, float], dict
             wanted.accuracy,
             variants.forced(wanted),
         )
+        priced = tasks.remembering(priced, rows, (exposure for exposure, _ in plan), mission)
         place = camera if channel == "EXT" else channel
         hours[place] += sum(priced["seconds"].to_pylist()) / 3600.0 * len(found) / len(some)
         counts[place] += len(found)
