@@ -103,13 +103,19 @@ def of_columns(rows: Mapping[str, Array], area: float, z_max: float = matching.Z
     sed = _spectra(rows)
     z, m_r = rows["z_true"].astype(float), rows["abs_mag_r01"].astype(float)
     dustiest = _dustiest(sed)
-    plain = m_r + cosmology.distance_modulus(z)
-    mags = {b: plain + band_ratios.offset(band_ratios.load(library, b, z_max, dustiest), z, sed) for b in BANDS}
+    mags = {band: apparent(rows, band, z_max) for band in BANDS}
     seen = band_ratios.load(library, _ULTRAVIOLET_BAND, z_max, dustiest)
     curve = passbands.load(_ULTRAVIOLET_BAND)
     from_z = passbands.pivot_wavelength(curve) / _ULTRAVIOLET_AT - 1.0
     rest = m_r + band_ratios.offset(seen, np.full(z.size, from_z), sed) + 2.5 * np.log10(1.0 + from_z)
     return Sky(rows, mags, rest + 5.0 * np.log10(cosmology.HUBBLE), area)
+
+
+def apparent(rows: Mapping[str, Array], band: str, z_max: float = matching.Z_LAST) -> Float:
+    """AB[n] in a band, before lines, magnification and the Milky Way; rows, z_max : as of `of_columns`."""
+    sed, z = _spectra(rows), rows["z_true"].astype(float)
+    table = band_ratios.load(templates.galaxy_library(), band, z_max, _dustiest(sed))
+    return np.asarray(rows["abs_mag_r01"] + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed))
 
 
 def figures(seen: Sky) -> dict[str, float]:

@@ -59,7 +59,7 @@ def figures(universe: Population, count: int) -> dict[str, float]:
         _, ra, dec = sky.random_in_cell(ORDER, cell, _RANDOM, stream(universe.seed, "small_scales", cell))
         chance[row] = _pairs(ra, dec, theta) / _RANDOM**2
     expected = chance.mean(0) * number.mean() ** 2
-    ratio = (pairs / expected - 1.0) / _power_law(np.concatenate(chi), theta)
+    ratio = (pairs / expected - 1.0) / power_law(np.concatenate(chi), theta)
     names = [f"w_m20_{edge:g}" for edge in EDGES[:-1]]
     error = ratio.std(0, ddof=1) / np.sqrt(count)
     return {
@@ -74,7 +74,7 @@ def _pairs(ra: Float, dec: Float, theta: Float) -> Float:
     return np.asarray(np.diff(tree.count_neighbors(tree, 2.0 * np.sin(0.5 * theta))), float)
 
 
-def _power_law(chi: Float, theta: Float) -> Float:
+def power_law(chi: Float, theta: Float) -> Float:
     """w of xi = (r / LENGTH)^-SLOPE, mean over the pairs of each bin, of galaxies at comoving distances chi."""
     share, edges = np.histogram(chi, _BINS, density=True)
     middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]

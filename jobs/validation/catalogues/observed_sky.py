@@ -12,9 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from jobs.validation import checks, observed
+from jobs.validation.measure import field as fields
 from jobs.validation.measure.rows import AROUND, LEAST, MOST, Place, Row, not_applicable
+from jobs.validation.measure.seen import Result
 from jobs.validation.observed import Sky
-from lake_schema.arrays import Int
+from lake_schema.arrays import Float, Int
 from lake_schema.store import read
 
 NAME = "observed"
@@ -26,9 +28,41 @@ _LIMIT = re.compile(r"(?:log_)?(?:z_)?(?:i|r|vis)_([0-9.]+)")
 _REDDER, _WHOLE, _SHORT = 0.5, 26.0, 0.1
 
 
-def rows(galaxies: read.Version) -> list[Row]:
-    """One a figure that observed.csv has; galaxies : of the lake."""
-    return compared(*observed.in_version(galaxies))
+# Bins of redshift, and limits in I_E and i, of what is drawn; percentiles of colours, and galaxies that have some.
+_REDSHIFTS, _REDSHIFT_LIMIT = np.linspace(0.0, 3.0, 31), 24.5
+_COLOUR_BINS, _COLOUR_LIMIT, _LEVELS, _SOME = np.linspace(0.0, 1.2, 25), 22.5, (5, 16, 50, 84, 95), 30
+
+
+def measured(galaxies: read.Version) -> Result:
+    """A row a figure that observed.csv has; galaxies : of the lake."""
+    seen, cell = observed.in_version(galaxies)
+    return Result(Place(), compared(seen, cell), _series(seen, cell) if len(cell) else {})
+
+
+def _series(seen: Sky, cell: Int) -> dict[str, Float]:
+    """Redshifts of galaxies, arcmin-2 per unit z, and colours against redshift, with errors of the lake's patches."""
+    groups = _groups(cell)
+    patch = np.zeros(len(cell), np.int64)
+    for number, group in enumerate(groups):
+        patch[np.isin(cell, group)] = number
+    z, number = seen["z_true"], len(groups)
+    faint = seen.mags["euclid_vis"] < _REDSHIFT_LIMIT
+    low, high = _REDSHIFTS[:-1], _REDSHIFTS[1:]
+    per = seen.area * observed.ARCMIN2 * (high - low)
+    count = np.array([np.histogram(z[faint & (patch == one)], _REDSHIFTS)[0] for one in range(number)], float)
+    area = np.array([len(group) for group in groups], float)[:, None] / len(np.unique(cell))
+    without = (count.sum(0) - count) / (1.0 - area) if number > 1 else count
+    bright, colour = seen.mags["lsst_i"] < _COLOUR_LIMIT, seen.mags["lsst_r"] - seen.mags["lsst_i"]
+    place, lines = np.digitize(z, _COLOUR_BINS) - 1, []
+    for one in range(len(_COLOUR_BINS) - 1):
+        own = np.flatnonzero(bright & (place == one))
+        if len(own) >= _SOME:
+            rest = [np.median(left) for left in (colour[own[patch[own] != left_out]] for left_out in range(number))
+                    if len(left)]  # fmt: skip
+            middle = 0.5 * (_COLOUR_BINS[one] + _COLOUR_BINS[one + 1])
+            lines.append([middle, *np.percentile(colour[own], _LEVELS), float(fields.spread(rest))])
+    series = {"redshifts": np.stack([low, high, count.sum(0) / per, fields.spread(without) / per])}
+    return series | ({"colours": np.array(lines).T} if lines else {})
 
 
 def compared(seen: Sky, cell: Int) -> list[Row]:
@@ -60,10 +94,14 @@ def _needed(name: str) -> float:
     return min(float(match[1]) + _REDDER, _WHOLE) if match else _WHOLE
 
 
+def _groups(cell: Int) -> list[Int]:
+    cells = np.unique(cell)
+    return [group for group in np.array_split(cells, min(_PATCHES, len(cells))) if len(group)]
+
+
 def _errors(seen: Sky, cell: Int) -> dict[str, float]:
     """Standard error by figure; none where there are too few cells to tell."""
-    cells = np.unique(cell)
-    groups = [group for group in np.array_split(cells, min(_PATCHES, len(cells))) if len(group)]
+    cells, groups = np.unique(cell), _groups(cell)
     if len(groups) < 4:
         return {}
     found = []

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from jobs.validation.catalogues import duplicates, observed_sky, requirements
+from jobs.validation.catalogues import (
+    angular_clustering,
+    colours,
+    cosmic_shear,
+    duplicates,
+    observed_sky,
+    requirements,
+)
 from jobs.validation.images.astrometry import ASTROMETRY
 from jobs.validation.images.background import BACKGROUND
 from jobs.validation.images.between import BETWEEN
@@ -19,20 +26,26 @@ from jobs.validation.images.quality import QUALITY
 from jobs.validation.images.saturation import SATURATION
 from jobs.validation.images.spectra import SPECTRA
 from jobs.validation.images.together import TOGETHER
-from jobs.validation.measure.rows import Row
+from jobs.validation.measure.rows import Place, Row
+from jobs.validation.measure.seen import Result
 
 
 @dataclass(frozen=True, slots=True)
 class Catalogued:
     """A check of catalogues.
 
-    tables : that it wants, in the order in which `rows` takes their versions;  source : of its expectations
+    tables : that it wants, in the order in which `measured` takes their versions;  source : of its expectations
     """
 
     name: str
     tables: tuple[str, ...]
-    rows: Callable[..., list[Row]]
+    measured: Callable[..., Result]
     source: str
+
+
+def _plain(rows: Callable[..., list[Row]]) -> Callable[..., Result]:
+    """Of a check that no figure is drawn of."""
+    return lambda *versions: Result(Place(), rows(*versions), {})
 
 
 # Of one frame each.
@@ -53,8 +66,11 @@ OF_FRAMES = (
 OF_SEVERAL = (BETWEEN, TOGETHER)
 # Of the lake's tables.
 OF_CATALOGUES = (
-    Catalogued(observed_sky.NAME, ("galaxies",), observed_sky.rows, "observed.csv"),
-    Catalogued(duplicates.NAME, ("galaxies",), duplicates.rows, duplicates.SOURCE),
-    Catalogued(duplicates.NAME, ("stars",), duplicates.rows, duplicates.SOURCE),
-    Catalogued(requirements.NAME, ("galaxies", "galaxy_fluxes"), requirements.rows, requirements.SOURCE),
+    Catalogued(observed_sky.NAME, ("galaxies",), observed_sky.measured, "observed.csv"),
+    Catalogued(angular_clustering.NAME, ("galaxies",), angular_clustering.measured, angular_clustering.SOURCE),
+    Catalogued(cosmic_shear.NAME, ("galaxies",), cosmic_shear.measured, cosmic_shear.SOURCE),
+    Catalogued(colours.NAME, ("galaxies", "galaxy_fluxes"), colours.measured, colours.SOURCE),
+    Catalogued(duplicates.NAME, ("galaxies",), _plain(duplicates.rows), duplicates.SOURCE),
+    Catalogued(duplicates.NAME, ("stars",), _plain(duplicates.rows), duplicates.SOURCE),
+    Catalogued(requirements.NAME, ("galaxies", "galaxy_fluxes"), _plain(requirements.rows), requirements.SOURCE),
 )

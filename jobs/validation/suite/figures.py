@@ -15,6 +15,7 @@ import scipy.stats
 from matplotlib.figure import Figure
 
 from jobs.validation.measure.seen import Result
+from jobs.validation.suite import catalogue_figures
 from jobs.validation.suite.running import Found
 
 _WIDTH = 10.0
@@ -32,6 +33,9 @@ def drawn(found: Found) -> Iterator[tuple[str, str]]:
                 draw(figure, some)
                 figure.suptitle(channel)
                 yield f"{channel}: {text}", _encoded(figure)
+    series = {name: values for result in found.catalogues for name, values in result.series.items()}
+    for text, figure in catalogue_figures.drawn(found.rows, series):
+        yield text, _encoded(figure)
 
 
 def _encoded(figure: Figure) -> str:

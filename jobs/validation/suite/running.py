@@ -8,7 +8,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pyarrow as pa
@@ -39,10 +39,11 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """All rows of a lake, and the numbers of its frames."""
+    """All rows of a lake, and the numbers of its frames and of its catalogues that figures are drawn of."""
 
     rows: list[Row]
     results: list[Result]
+    catalogues: list[Result] = field(default_factory=list)
 
 
 def validated(held: Held, processes: int = 2) -> Found:
@@ -50,18 +51,20 @@ def validated(held: Held, processes: int = 2) -> Found:
     results = list(_frames(held, processes))
     rows = [row for result in results for row in result.rows]
     together = [row for check in checks.OF_SEVERAL for row in check.rows(results)]
-    return Found([*rows, *together, *_catalogued(held)], results)
+    catalogues = list(_catalogued(held))
+    return Found([*rows, *together, *(row for result in catalogues for row in result.rows)], results, catalogues)
 
 
-def _catalogued(held: Held) -> Iterator[Row]:
-    """Rows of the catalogues; one that says what is missing where a check has not its tables."""
+def _catalogued(held: Held) -> Iterator[Result]:
+    """Of the catalogues; a row that says what is missing where a check has not its tables."""
     for check in checks.OF_CATALOGUES:
         missing = [name for name in check.tables if name not in held.tables]
         if missing:
             why = f"the lake has no table {' and '.join(missing)}"
-            yield not_applicable(check.name, Place(), why, check.source, check.tables[0])
+            row = not_applicable(check.name, Place(), why, check.source, check.tables[0])
+            yield Result(Place(), [row], {})
         else:
-            yield from check.rows(*(held.tables[name] for name in check.tables))
+            yield check.measured(*(held.tables[name] for name in check.tables))
 
 
 def _frames(held: Held, processes: int) -> Iterator[Result]:

@@ -29,7 +29,7 @@ def test_the_power_law_is_the_integral_along_the_line_of_sight():
         return 2.0 * quad(lambda pi: (np.hypot(across, pi) / length) ** -slope, 0.0, np.inf, limit=200)[0]
 
     expected = quad(along, near, far)[0] / (far - near) ** 2
-    assert small_scales._power_law(chi, theta)[0] == pytest.approx(expected, rel=1e-3)
+    assert small_scales.power_law(chi, theta)[0] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.fixture(scope="module")

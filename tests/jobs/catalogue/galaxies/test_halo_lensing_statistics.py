@@ -15,9 +15,9 @@ from jobs.catalogue.halos.population import Cells
 from jobs.catalogue.matter import density_box
 from jobs.fluxes import cosmology, sources
 from jobs.request.schema import Universe
+from jobs.validation import theory
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
-from tests.jobs.catalogue import nonlinear
 from tests.jobs.catalogue.conftest import SEED
 from tests.jobs.catalogue.galaxies.test_halo_lensing import profile
 
@@ -167,7 +167,7 @@ def expected(ell, c_l):
     """xi+, xi- [rings] of C_l, averaged over pairs."""
     theta = np.geomspace(EDGES[0], EDGES[-1], 200)
     ring, weight = np.digitize(theta, EDGES[1:-1]), theta**2
-    both = nonlinear.shear_correlations(theta * ARCMIN, ell, c_l)
+    both = theory.shear_correlations(theta * ARCMIN, ell, c_l)
     return [np.bincount(ring, one * weight) / np.bincount(ring, weight) for one in both]
 
 
@@ -188,10 +188,12 @@ def test_correlations_of_shear_are_those_of_non_linear_theory(sample):
         for gamma in (sample.by_box + sample.by_halos, sample.by_box)
     )
     ell = np.unique(np.geomspace(5, 3e5, 500))
-    linear = nonlinear.convergence(ell, CHI, nonlinear.linear)
-    box, wanted = expected(ell, np.where(ell < 1.5 * NSIDE, linear, 0)), expected(ell, nonlinear.convergence(ell, CHI))
+    linear, whole_power = (
+        theory.convergence(ell, np.array([CHI]), np.ones(1), of) for of in (theory.linear, theory.power)
+    )
+    box, wanted = expected(ell, np.where(ell < 1.5 * NSIDE, linear, 0)), expected(ell, whole_power)
     plus, minus = (
-        (one - other + mean) / theory for one, other, mean, theory in zip(whole, of_box, box, wanted, strict=True)
+        (one - other + mean) / by_theory for one, other, mean, by_theory in zip(whole, of_box, box, wanted, strict=True)
     )
     assert np.all(np.abs(plus - 1) < [0.20, *[0.15] * 6])
     assert np.all(np.abs(minus - 1) < [*[0.25] * 4, *[0.15] * 3])

@@ -7,6 +7,7 @@ import pytest
 from jobs.validation.measure.rows import FAIL
 from jobs.validation.suite import checks
 from tests.jobs.validation import test_observed
+from tests.jobs.validation.catalogues import test_colours, test_two_points
 from tests.jobs.validation.catalogues import test_faults as catalogues
 from tests.jobs.validation.images import test_between, test_completeness, test_spectra, test_together
 from tests.jobs.validation.images import test_faults as images
@@ -31,6 +32,15 @@ FAULTS = {
     "spectra": ((test_spectra.test_what_is_off_is_found, "trace, flux and wavelength off"),),
     "between_images": ((test_between.test_the_frame_that_is_off, "one frame off by 10 mas, one by 0.05 mag"),),
     "common_offset": ((test_together.test_a_bias_that_all_detectors_share, "all detectors off by 2 mas, 0.03 mag"),),
+    "clustering": ((test_two_points.test_places_that_are_shuffled, "positions shuffled"),
+                   (test_two_points.test_galaxies_of_other_halos, "halos of another mass"),
+                   (test_two_points.test_clustering_of_luminous_galaxies_that_are_shuffled, "luminous ones shuffled")),
+    "colours": ((test_colours.test_a_band_whose_flux_is_shifted, "a band's fluxes shifted by 0.1 mag"),
+                (test_colours.test_a_band_without_light, "a band without light")),
+    "shear": ((test_two_points.test_shear_that_is_turned_by_45_degrees, "shear turned by 45 degrees"),
+              (test_two_points.test_one_component_of_shear_with_the_wrong_sign, "one component's sign"),
+              (test_two_points.test_shear_of_the_wrong_sign, "the sign of all shear"),
+              (test_two_points.test_shear_that_is_half_as_large_again, "shear too large by a half")),
     "duplicates": ((catalogues.test_a_duplicated_cell_is_found, "a duplicated cell"),),
     "observed": ((test_observed.test_a_band_whose_magnitudes_are_shifted_in_a_lake, "a band shifted by 0.3 mag"),
                  (test_observed.test_masses_rates_and_lines_that_are_off_in_a_lake, "masses, rates, lines off"),
