@@ -1,8 +1,9 @@
 """How bright stars are, against the catalogue's band fluxes: all of their light, and how it goes with magnitude.
 
-Wings fall as r^-3: what is within r lacks k / r of the light, and the sky that is taken off beside a star has some of
-the wings in it: k (1 / r + pi r^2 s) is missing, s the mean of 1 / (2 pi r^3) where the sky was taken.  k is told by
-the last apertures of the stars' mean curve of growth.
+What is beyond an aperture, and what of it was taken off as the sky beside the star, is told by the wings of the frame's
+brightest stars (measure/wings.py). Where these do not tell it, wings fall as r^-3: what is within r lacks k / r of the
+light, and k (1 / r + pi r^2 s) is missing, s the mean of 1 / (2 pi r^3) where the sky was taken; k is told by the last
+apertures of the stars' mean curve of growth.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ TOLERANCE = 0.02
 # A star's aperture is the one that holds about so much of a point's light.
 _HELD, _LEAST = 0.8, 8
 _WINGS = slice(-4, None)
+# The aperture from which the wings go on: in a wider one the error of its sky weighs more.
+_JOIN = -3
 # Part of the full well above which what the detector is not linear in shows.
 _LINEAR = 0.2
 
@@ -77,8 +80,12 @@ def curve(found: Measured) -> tuple[Float, float]:
     bright = np.argsort(-found.stars.flux, kind="stable")[: max(len(found.stars) // 2, _LEAST)]
     own = found.stars.growth[bright]
     held = np.median(own / own[:, -1:], axis=0)
+    if found.wings is not None:
+        joined = float(found.radii[_JOIN])
+        lost = found.wings.beyond(joined) + np.pi * joined**2 * float(found.wings.at(found.sky_at).mean())
+        return held, float(held[_JOIN]) / (1.0 - lost)
     radius = found.radii[_WINGS]
-    missing = 1.0 / radius + np.pi * radius**2 * found.sky_has
+    missing = 1.0 / radius + np.pi * radius**2 * float(np.mean(0.5 / np.pi / found.sky_at**3))
     total, slope = sums.least_squares(np.stack([np.ones(len(missing)), missing], axis=1), held[_WINGS])
     return held, float(total) if slope < 0.0 else float(held[-1])
 

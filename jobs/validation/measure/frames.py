@@ -87,6 +87,7 @@ class Frame:
     quality    : uint8[ny, nx] of a ramp, None = there is none
     header     : of the whole file;  wcs : of the detector's pixels, the first is (0, 0)
     curve      : of its amplifiers
+    bowl       : part of the light that the optics keep from the corner of the focal plane
     """
 
     electrons: Float32
@@ -95,6 +96,15 @@ class Frame:
     header: Mapping[str, Any]
     wcs: WCS
     curve: Curve = Curve()
+    bowl: float = 0.0
+
+    def illumination(self, x: Float, y: Float) -> Float:
+        """What of the light the optics bring to places [n] in pixels: 1 - bowl r^2, r = 1 at the corner of DETSIZE."""
+        if self.bowl == 0.0:
+            return np.ones(len(x))
+        wide, high = (axis.stop - axis.start for axis in section(self.header["DETSIZE"]))
+        across, up = x + 1.0 - self.wcs.wcs.crpix[0], y + 1.0 - self.wcs.wcs.crpix[1]
+        return np.asarray(1.0 - self.bowl * (across**2 + up**2) / (0.25 * (wide**2 + high**2)))
 
     def light(self, read: Float) -> Float:
         """e- [..] that were collected where so many were read."""
@@ -123,16 +133,16 @@ class Frame:
         return out
 
 
-def opened(path: Path, curve: Curve | None = None) -> Frame:
+def opened(path: Path, curve: Curve | None = None, bowl: float = 0.0) -> Frame:
     """A science file.
 
-    path : of it;  curve : of the amplifiers, as the lake's mission database has it; None = they are linear
+    path : of it;  curve, bowl : of `Frame`, as the lake's mission database has them; None, 0 = linear and even
 
     Errors : BadInput where its header lacks what a pipeline needs, naming the keyword
     """
     units = images.read_images(path)
     try:
-        return replace(_frame(units, path), curve=curve or Curve())
+        return replace(_frame(units, path), curve=curve or Curve(), bowl=bowl)
     except KeyError as error:
         raise BadInput(f"{path}: header without {error.args[0]}") from None
 

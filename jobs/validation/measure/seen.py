@@ -83,13 +83,15 @@ class Several:
     rows: Callable[[Sequence[Result]], list[Row]]
 
 
-def seen(path: Path, place: Place, known: Reference, spectra: Any = None, curve: Curve | None = None) -> Seen:
+def seen(
+    path: Path, place: Place, known: Reference, spectra: Any = None, curve: Curve | None = None, bowl: float = 0.0
+) -> Seen:
     """Open a file and measure what several checks want.
 
     path  : of the science file;  place : what it is of;  known : its sources;  spectra : of `Seen`
-    curve : of its amplifiers, None = they are linear
+    curve : of its amplifiers, None = they are linear;  bowl : of its optics' vignetting, 0 = there is none
     """
-    frame = frames.opened(path, curve)
+    frame = frames.opened(path, curve, bowl)
     found = Seen(place, frame, known, spectra)
     if found.sees_sky or spectra is not None:
         found.noise = blank.rough_noise(frame)

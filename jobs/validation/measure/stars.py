@@ -16,8 +16,10 @@ import sep
 from scipy.spatial import cKDTree
 
 from jobs import sums
+from jobs.validation.measure import wings
 from jobs.validation.measure.frames import Frame, pixels_of
 from jobs.validation.measure.references import Reference
+from jobs.validation.measure.wings import Wings
 from lake_schema.arrays import Bool, Float, Int
 
 FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
@@ -32,6 +34,8 @@ _BLEND_REACH = 8.0
 MOST = 400
 # Radius at which a Gaussian has fallen to a third, over half its FWHM.
 _THIRD = 1.26
+# Pixels from a star's place in which its light goes with the place in the pixel.
+_CORE = 3.0
 # Standard deviations above what other stars have there, from which a pixel is another's light.
 _HIT = 5.0
 
@@ -42,7 +46,8 @@ class Stars:
 
     x, y     : where the WCS puts them, pixels from 0;  dx, dy : windowed centroid minus that and the PSF's own offset
     error    : of either, pixels, of photons and reading;  phase_x, phase_y : of the place in its pixel
-    growth   : float[n, apertures] e- within the radii;  flux : expected e-;  mag : AB of the catalogue
+    growth   : float[n, apertures] e- within the radii, had the optics no vignetting
+    flux     : expected e-;  mag : AB of the catalogue
     size, e1, e2 : rms radius in the window, pixels, and its ellipticity
     sky, peak, snr : e- a pixel, e-, of all of it
     """
@@ -75,14 +80,15 @@ class Stars:
 class Measured:
     """Stars, radii of the apertures, half-light radius and FWHM of a point source, pixels.
 
-    sky_has : mean of 1 / (2 pi r^3) where the sky was taken, pix^-3
+    sky_at : distances from the star at which the sky was taken, pixels;  wings : None = the stars do not tell them
     """
 
     stars: Stars
     radii: Float
     half_light: float
     fwhm: float
-    sky_has: float
+    sky_at: Float
+    wings: Wings | None = None
 
 
 def chosen(frame: Frame, known: Reference, noise: float) -> Int:
@@ -125,14 +131,15 @@ def measured(frame: Frame, known: Reference, noise: float) -> Measured:
     axis = np.arange(-reach, reach + 1)
     distance = np.hypot(axis, axis[:, None])
     far = distance > _SKY_FROM * reach
-    sky = _clipped(cuts[:, far], noise)
-    cuts = _cleaned(cuts - sky[:, None, None], known.expected[index], noise)
+    others = _others(known, index, left, low, noise, 2 * reach + 1)
+    sky = _clipped(cuts[:, far], ~others[:, far], noise)
+    cuts = _cleaned(cuts - sky[:, None, None], others, known.expected[index], noise)
     peak = cuts[:, reach - 2 : reach + 3, reach - 2 : reach + 3].max(axis=(1, 2)) if len(cuts) else np.zeros(0)
     fine = (peak + sky < _MOST_FULL * frame.full) & (peak > 0.0)
     some = np.flatnonzero(fine)[:MOST]
     index, left, low = index[some], left[some], low[some]
     x, y, cuts, sky, peak = x[some], y[some], cuts[some], sky[some], peak[some]
-    growth = _growth(cuts, x - left, y - low, radii)
+    growth = _growth(cuts, x - left, y - low, radii) / frame.illumination(x, y)[:, None]
     flux = known.expected[index]
     half = _half_light(growth, flux, radii)
     window = 2.0 * half / FWHM
@@ -149,7 +156,8 @@ def measured(frame: Frame, known: Reference, noise: float) -> Measured:
     kept = np.isfinite(stars.dx) & np.isfinite(stars.dy) & np.isfinite(stars.e1)
     told = (x - left + known.psf_x[index])[kept], (y - low + known.psf_y[index])[kept]
     width = _fwhm(cuts[kept], *told, flux[kept], window)
-    return Measured(stars.where(kept), radii, half, width, float(np.mean(0.5 / np.pi / distance[far] ** 3)))
+    far_light = wings.told(frame, known, index[kept], noise, reach)
+    return Measured(stars.where(kept), radii, half, width, distance[far], far_light)
 
 
 def _cuts(image: np.ndarray, x: Float, y: Float, reach: int) -> tuple[Float, Int, Int]:
@@ -160,17 +168,35 @@ def _cuts(image: np.ndarray, x: Float, y: Float, reach: int) -> tuple[Float, Int
     return np.array(cuts, float).reshape(-1, side, side), left, low
 
 
-def _clipped(values: Float, noise: float) -> Float:
-    """Means [n] of values [n, m] but for those far from their median."""
+def _others(known: Reference, index: Int, left: Int, low: Int, noise: float, side: int) -> Bool:
+    """bool[n, side, side]: where another source shows in the cut of a star; left, low : of its first pixel."""
+    out = np.zeros((len(index), side, side), bool)
+    if not len(index):
+        return out
+    places, axis = np.stack([known.x, known.y], axis=1), np.arange(side)
+    near = cKDTree(places).query_ball_point(places[index], 1.5 * side)
+    for n, (i, around) in enumerate(zip(index, near, strict=True)):
+        found = np.array([j for j in around if j != i], int)
+        out[n] = wings.beside(known, found, left[n] + axis, low[n] + axis, noise)
+    # In the star's own core there is no telling whose light it is.
+    core = np.hypot(axis - side // 2, (axis - side // 2)[:, None]) < _CORE
+    return out & ~core
+
+
+def _clipped(values: Float, good: Bool, noise: float) -> Float:
+    """Means [n] of the good ones of values [n, m] but for those far from their median."""
     if not len(values):
         return np.zeros(0)
-    kept = np.abs(values - np.median(values, axis=1)[:, None]) < 3.0 * noise
+    # Where nothing is good, all of it has to do.
+    good = good | ~good.any(axis=1, keepdims=True)
+    middle = np.nanmedian(np.where(good, values, np.nan), axis=1)
+    kept = good & (np.abs(values - middle[:, None]) < 3.0 * noise)
     return np.asarray((values * kept).sum(axis=1) / np.maximum(kept.sum(axis=1), 1))
 
 
-def _cleaned(cuts: Float, flux: Float, noise: float) -> Float:
-    """Without what cosmic rays and faint neighbours bring: what is far above what other stars have there is put down
-    to that.
+def _cleaned(cuts: Float, others: Bool, flux: Float, noise: float) -> Float:
+    """Without what cosmic rays and neighbours bring: where others are known to shine, and what is far above what other
+    stars have there, is what these have.
     """
     if len(cuts) < 8:
         return cuts
@@ -178,9 +204,9 @@ def _cleaned(cuts: Float, flux: Float, noise: float) -> Float:
     told = flux[:, None, None] * usual
     axis = np.arange(cuts.shape[-1]) - cuts.shape[-1] // 2
     # Near the middle light depends on the place in the pixel.
-    core = np.hypot(axis, axis[:, None]) < 3.0
+    core = np.hypot(axis, axis[:, None]) < _CORE
     hit = (cuts > told + _HIT * np.sqrt(noise**2 + told) + 0.5 * told) & ~core
-    return np.where(hit, told, cuts)
+    return np.where(hit | others, told, cuts)
 
 
 def _growth(cuts: Float, x: Float, y: Float, radii: Float) -> Float:

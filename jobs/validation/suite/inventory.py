@@ -96,17 +96,30 @@ def _planned(root: Path, products: read.Version) -> dict[int, Mapping[str, Any]]
 
 def curves(held: Held) -> dict[str, Curve]:
     """Of the amplifiers of each camera that images are of, by the mission database; of all of them, their mean."""
+    told = _told(held, (*_CURVE, "adc_max"), "nonlinearity")
+    return {camera: Curve(*values) for camera, values in told.items()}
+
+
+def bowls(held: Held) -> dict[str, float]:
+    """What the optics of each camera keep from the corner of the focal plane, a part of the light."""
+    return {camera: values[0] for camera, values in _told(held, ("illumination",), "illumination").items()}
+
+
+def _told(held: Held, names: Sequence[str], effect: str) -> dict[str, list[float]]:
+    """Camera -> values of these names in the mission database that images are of; none where an effect is off."""
     if "mission" not in held.tables or "products" not in held.tables:
         return {}
-    key = held.tables["products"].manifest["facts"]["inputs"]["mission"]
-    rows = read.version(held.root, "mission", key).rows(["name", "value", "chosen"])
+    facts = held.tables["products"].manifest["facts"]
+    if effect in facts.get("request", {}).get("effects", {}).get("off", ()):
+        return {}
+    rows = read.version(held.root, "mission", facts["inputs"]["mission"]).rows(["name", "value", "chosen"])
     value = {row["name"]: row["value"] for row in rows.to_pylist() if row["chosen"]}
     found = {}
     for camera in {str(shot.exposure["camera"]) for shot in held.shots}:
         section = f"ext.{camera}" if camera in CAMERAS else camera
-        names = [f"{section}.{name}" for name in (*_CURVE, "adc_max")]
-        if all(name in value for name in names):
-            found[camera] = Curve(*(float(value[name]) for name in names))
+        own = [f"{section}.{name}" for name in names]
+        if all(name in value for name in own):
+            found[camera] = [float(value[name]) for name in own]
     return found
 
 

@@ -27,7 +27,7 @@ from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One frame: its file, what it is of, and what is known of its sources and of its amplifiers."""
+    """One frame: its file, what it is of, and what is known of its sources, its amplifiers, its optics' vignetting."""
 
     products: read.Version
     path: str
@@ -35,6 +35,7 @@ class Task:
     known: Reference
     spectra: pa.Table | None
     curve: Curve | None
+    bowl: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,21 +88,22 @@ def _tasks(held: Held) -> Sequence[Task]:
     if not held.shots:
         return []
     truth, spectra = inventory.truth(held), inventory.spectra(held)
-    stars, curves = inventory.stars_of(held, truth), inventory.curves(held)
+    stars, curves, bowls = inventory.stars_of(held, truth), inventory.curves(held), inventory.bowls(held)
     out = []
     for shot in held.shots:
         key = (int(shot.place.exposure_id or 0), str(shot.place.detector))
         known = references.reference(
             truth.get(key, RENDERED_TRUTH.empty()), stars, str(shot.exposure["band"]), float(shot.exposure["mjd"])
         )
-        curve = curves.get(str(shot.exposure["camera"]))
-        out.append(Task(held.tables["products"], shot.path, shot.place, known, spectra.get(key), curve))
+        camera = str(shot.exposure["camera"])
+        curve, bowl = curves.get(camera), bowls.get(camera, 0.0)
+        out.append(Task(held.tables["products"], shot.path, shot.place, known, spectra.get(key), curve, bowl))
     return out
 
 
 def of_frame(task: Task) -> Result:
     """Rows of one frame."""
     path: Path = task.products.file(task.path)
-    found = seen.seen(path, task.place, task.known, task.spectra, task.curve)
+    found = seen.seen(path, task.place, task.known, task.spectra, task.curve, task.bowl)
     rows = seen.all_rows(checks.OF_FRAMES, found)
     return Result(task.place, rows, found.series)

@@ -87,6 +87,18 @@ def test_a_band_whose_flux_is_shifted(good):
     assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), "offset")
 
 
+def test_optics_that_keep_light_from_the_corners(folder, good):
+    """A tenth of it, 0.03 to 0.05 mag in the mean, unless it is known."""
+    axis = np.linspace(-1.0, 1.0, 2 * made.SIDE)
+    bowl = 1.0 - 0.05 * (axis**2 + axis[:, None] ** 2)
+    of, stars = made.vis(folder, of=good[1], bright=bowl)
+    assert made.verdicts(PHOTOMETRY, of)["offset"] != PASS
+    header = {**of.frame.header, "DETSIZE": f"[1:{2 * made.SIDE},1:{2 * made.SIDE}]"}
+    told = replace(of.frame, bowl=0.1, header=header)
+    known = replace(of, frame=told, measured=seen.stars.measured(told, stars, of.noise), series={})
+    assert made.verdicts(PHOTOMETRY, known)["offset"] == PASS
+
+
 def test_magnitudes_that_are_not_linear(good):
     of, stars = good
     measured = seen.stars.measured(of.frame, replace(stars, mag=20.0 + 1.05 * (stars.mag - 20.0)), of.noise)

@@ -1,0 +1,142 @@
+"""Wings of a frame's point source, where the noise of a pixel hides them: a power law through rings about its stars.
+
+Wings   what of a point's light lies in a pixel, and beyond a radius
+told    a frame's stars -> Wings
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from jobs.validation.measure.frames import Frame
+from jobs.validation.measure.references import Reference
+from lake_schema.arrays import Bool, Float, Int
+
+# Far wings fall as r^-3 (obscured aperture) or r^-11/3 (turbulence); nearer ones, with their rings, a little less.
+_SLOPES = np.arange(2.4, 4.01, 0.05)
+_USUAL, _SPREAD = 3.0, 0.2
+# All light of a star of the ground is what lies within so many arcsec: zero points are of standard stars in apertures.
+_WHOLE = 25.0
+# Rings, from a part of the reach of a star's aperture to several times that; pixels at most; the least that tell it.
+_FROM, _TO, _MOST, _RINGS, _LEAST = 0.5, 4.0, 120, 14, 6
+# Part of itself by which a strength may be wrong. Stars that are asked, and what another nearby may have of its light.
+_WRONG, _STARS, _OTHERS = 0.3, 24, 1.0
+# Where another source's wings, r^-3 of this part of its light at a pixel, bring more than so much of the noise.
+_WING, _SHOWS, _CORE = 0.1, 0.1, 6.0
+# Standard deviations above the ring from which a pixel is hit, and how much brighter spikes are than the ring.
+_HIT, _SPIKE = 4.0, 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Wings:
+    """strength r^-slope of a point's light is in a pixel at r pixels.
+
+    whole : pixels, within which all light lies;  error : of the strength, as a part of it
+    """
+
+    strength: float
+    slope: float
+    whole: float = np.inf
+    error: float = 0.0
+
+    def at(self, radius: Float) -> Float:
+        """Part of all light in a pixel, pix^-2."""
+        return np.asarray(self.strength * radius**-self.slope)
+
+    def beyond(self, radius: float) -> float:
+        """Part of all light."""
+        power = 2.0 - self.slope
+        return float(2.0 * np.pi * self.strength * (radius**power - max(self.whole, radius) ** power) / -power)
+
+
+def told(frame: Frame, known: Reference, index: Int, noise: float, reach: int) -> Wings | None:
+    """Of the frame's brightest stars; None where these do not tell it.
+
+    known : sources of the frame;  index : of the stars in it, brightest first, none of them saturated
+    noise : e- rms of a pixel of blank sky;  reach : of the stars' apertures, pixels
+    """
+    far = min(round(_TO * reach), _MOST)
+    edges = np.geomspace(_FROM * reach, far, _RINGS + 1)
+    tree = cKDTree(np.stack([known.x, known.y], axis=1))
+    means, weights, fluxes = [], [], []
+    for i in index:
+        near = [j for j in tree.query_ball_point([known.x[i], known.y[i]], 1.5 * far) if j != i]
+        if len(near) and known.expected[near].max() > _OTHERS * known.expected[i]:
+            continue
+        mean, weight = _rings(frame, known, int(i), np.array(near, int), edges, noise)
+        if (weight > 0.0).sum() >= _LEAST:
+            means.append(mean)
+            weights.append(weight)
+            fluxes.append(known.expected[i])
+        if len(means) == _STARS:
+            break
+    if len(means) < 2:
+        return None
+    found = _fitted(np.array(means), np.array(weights), np.array(fluxes), np.sqrt(edges[1:] * edges[:-1]))
+    if found is None or found.error > _WRONG:
+        return None
+    return replace(found, whole=_WHOLE / frame.scale) if frame.header["CHANNEL"] == "EXT" else found
+
+
+def _rings(frame: Frame, known: Reference, i: int, near: Int, edges: Float, noise: float) -> tuple[Float, Float]:
+    """(e- a pixel of each ring about a source, its weight e-^-2), 0 where little of the ring is left."""
+    ny, nx = frame.electrons.shape
+    far = int(np.ceil(edges[-1]))
+    column, row = round(float(known.x[i])), round(float(known.y[i]))
+    across = np.arange(max(column - far, 0), min(column + far + 1, nx))
+    up = np.arange(max(row - far, 0), min(row + far + 1, ny))
+    cut = frame.light(frame.electrons[up[0] : up[-1] + 1, across[0] : across[-1] + 1].astype(float))
+    good = ~beside(known, near, across, up, noise) & (cut != 0.0)
+    ring = np.digitize(np.hypot(across - known.x[i], (up - known.y[i])[:, None]), edges) - 1
+    mean, weight = np.zeros(len(edges) - 1), np.zeros(len(edges) - 1)
+    for k in range(len(mean)):
+        inside = ring == k
+        values = cut[inside & good]
+        if values.size < 0.2 * inside.sum() or values.size < 8:
+            continue
+        # Spikes are light, too: only what is above them is put down to cosmic rays.
+        middle = float(np.median(values))
+        own = known.expected[i] * _WING * edges[k] ** -_USUAL
+        values = values[np.abs(values - middle) < _HIT * np.hypot(noise, np.sqrt(own)) + _SPIKE * own]
+        mean[k], weight[k] = values.mean(), values.size / (noise**2 + own)
+    return mean, weight
+
+
+def beside(known: Reference, near: Int, across: Int, up: Int, noise: float) -> Bool:
+    """bool[ny, nx]: pixels of a cut in which another source shows.
+
+    known, near : sources of the frame, and indices of those that are looked at
+    across, up  : columns [nx] and rows [ny] of the cut;  noise : e- rms of a pixel of blank sky
+    """
+    out = np.zeros((len(up), len(across)), bool)
+    reach = np.cbrt(_WING * known.expected[near] / (_SHOWS * noise))
+    for j, r in zip(near, np.where(reach > 1.0, np.maximum(reach, _CORE), 0.0), strict=True):
+        if r > 0.0:
+            out |= (across - known.x[j]) ** 2 + ((up - known.y[j]) ** 2)[:, None] < r**2
+    return out
+
+
+def _fitted(mean: Float, weight: Float, flux: Float, radius: Float) -> Wings | None:
+    """Of all stars together: mean = sky of each star + flux strength r^-slope.
+
+    mean, weight : [n, rings];  flux : [n] e-;  radius : [rings]
+    """
+    total = weight.sum(axis=1, keepdims=True)
+    # The sky of each star is what the weighted means of both leave.
+    off = mean - (weight * mean).sum(axis=1, keepdims=True) / total
+    found, left = [], []
+    for slope in _SLOPES:
+        shape = flux[:, None] * radius**-slope
+        bent = shape - (weight * shape).sum(axis=1, keepdims=True) / total
+        power = float((weight * bent**2).sum())
+        strength = float((weight * bent * off).sum()) / power
+        left.append(float((weight * (off - strength * bent) ** 2).sum()))
+        found.append(Wings(strength, float(slope), error=power**-0.5 / max(strength, 1e-30)))
+    freedom = max(int((weight > 0.0).sum()) - len(flux) - 2, 1)
+    # What rings differ by beyond their noise tells the slope no better than the noise does.
+    scale = max(min(left) / freedom, 1.0)
+    best = found[int(np.argmin(np.array(left) / scale + ((_SLOPES - _USUAL) / _SPREAD) ** 2))]
+    return replace(best, error=best.error * scale**0.5) if best.strength > 0.0 else None

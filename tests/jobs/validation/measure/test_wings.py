@@ -1,0 +1,50 @@
+"""Wings that were put into rings about stars are found again, whatever the sky below them."""
+
+import numpy as np
+import pytest
+from astropy.wcs import WCS
+
+from jobs.validation.measure import wings
+from jobs.validation.measure.frames import Amplifier, Frame
+from jobs.validation.measure.wings import Wings
+from tests.jobs.validation import made
+
+SIDE, NOISE, SKY = 700, 14.0, 175.0
+
+
+def frame(rng, strength, slope, channel="VIS"):
+    """Stars of 4e5 to 1e6 e- and faint ones, whose light is a power law from three pixels on."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(130, 570, 4)] * 2))
+    x, y = (np.concatenate([axis, rng.uniform(0, SIDE, 60)]) for axis in (x, y))
+    mag = np.concatenate([rng.uniform(17.8, 18.8, 16), np.full(60, 23.0)])
+    known = made.known(x, y, mag)
+    axis, image = np.arange(SIDE), np.zeros((SIDE, SIDE))
+    for across, up, flux in zip(known.x, known.y, known.expected, strict=True):
+        image += flux * strength * np.maximum(np.hypot(axis - across, (axis - up)[:, None]), 3.0) ** -slope
+    image += SKY + NOISE * rng.standard_normal(image.shape)
+    amplifier = Amplifier("", (slice(0, SIDE), slice(0, SIDE)), 1.0, 0.0, np.nan, 4.4, 0, 2e5)
+    header = {"CHANNEL": channel, "PIXSCALE": 0.1}
+    return Frame(image.astype(np.float32), (amplifier,), None, header, WCS(naxis=2)), known
+
+
+@pytest.mark.parametrize("slope", [2.8, 3.1])
+def test_wings_that_were_put_in(slope):
+    there = Wings(0.09, slope)
+    of, known = frame(np.random.default_rng(4), there.strength, slope)
+    found = wings.told(of, known, np.arange(16), NOISE, 20)
+    assert found.slope == pytest.approx(slope, abs=0.15)
+    assert found.beyond(9.0) == pytest.approx(there.beyond(9.0), rel=0.08)
+    assert found.error < 0.1
+
+
+def test_all_light_of_the_ground_has_an_end():
+    of, known = frame(np.random.default_rng(4), 0.09, 3.0, "EXT")
+    found = wings.told(of, known, np.arange(16), NOISE, 20)
+    assert found.whole == pytest.approx(250.0)
+    assert Wings(0.09, 3.0, whole=250.0).beyond(10.0) == pytest.approx(0.18 * np.pi * (0.1 - 0.004))
+
+
+def test_points_without_wings_tell_none():
+    of, known = frame(np.random.default_rng(4), 0.0, 3.0)
+    assert wings.told(of, known, np.arange(16), NOISE, 20) is None
+    assert wings.told(of, known, np.arange(1), NOISE, 20) is None
