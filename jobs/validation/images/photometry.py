@@ -11,13 +11,16 @@ from __future__ import annotations
 import numpy as np
 
 from jobs import sums
+from jobs.validation.measure import effective
 from jobs.validation.measure.rows import Row, not_applicable
 from jobs.validation.measure.seen import Check, Seen, wants_stars
 from jobs.validation.measure.stars import Measured
-from lake_schema.arrays import Float
+from lake_schema.arrays import Bool, Float
 
 SOURCE = "Serrano et al. 2024, app. C: below 0.02 mag, aperture and PSF photometry"
 TOLERANCE = 0.02
+# 2.5 / ln 10.
+_MAGNITUDE = 1.0857
 # A star's aperture is the one that holds about so much of a point's light.
 _HELD, _LEAST = 0.8, 8
 _WINGS = slice(-4, None)
@@ -28,17 +31,39 @@ _LINEAR = 0.2
 
 
 def check(of: Seen) -> list[Row]:
-    """Offset from the catalogue's magnitudes, and its slope with them."""
+    """Offset from the catalogue's magnitudes, and its slope with them, of apertures and of a PSF that is fitted."""
     assert of.measured is not None
-    magnitude, error = magnitudes(of.measured, float(of.frame.header["ZEROPNT"]), of.frame.seconds)
-    stars = of.measured.stars
+    stars, zero_point = of.measured.stars, float(of.frame.header["ZEROPNT"])
+    magnitude, error = magnitudes(of.measured, zero_point, of.frame.seconds)
+    linear = stars.peak + stars.sky < _LINEAR * of.frame.full
     off = magnitude - stars.mag
-    known = np.isfinite(off) & np.isfinite(error) & (stars.peak + stars.sky < _LINEAR * of.frame.full)
+    known = np.isfinite(off) & np.isfinite(error) & linear
     if known.sum() < _LEAST:
         return [not_applicable("photometry", of.place, "too few stars at which the detector is linear", SOURCE)]
+    line, errors, kept = _line(off, error, stars.mag, known)
+    of.series |= {"mag": stars.mag, "dm": off, "measured": np.where(kept, magnitude, np.nan)}
+    of.series["mean_dm"] = np.array([line[0], errors[0]])
+    beyond = _unsure(of.measured)
+    rows = _rows(of, "", line, np.hypot(errors, (beyond, 0.0)), kept)
+    whole = np.where(kept, of.frame.seconds * 10 ** (-0.4 * (magnitude - zero_point)), np.nan)
+    light, its = effective.lights(of.frame, of.measured, whole, of.noise)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = zero_point - 2.5 * np.log10(light / of.frame.seconds) - stars.mag
+        error = _MAGNITUDE * its / light
+    known = np.isfinite(off) & np.isfinite(error) & linear
+    if known.sum() < _LEAST:
+        return [*rows, not_applicable("photometry", of.place, "too few stars for a PSF", SOURCE, "psf_offset")]
+    line, errors, kept = _line(off, error, stars.mag, known)
+    return [*rows, *_rows(of, "psf_", line, np.hypot(errors, (beyond, 0.0)), kept)]
+
+
+def _line(off: Float, error: Float, mag: Float, known: Bool) -> tuple[Float, Float, Bool]:
+    """((offset at the median magnitude, slope), their errors, which of the stars [n] they are of).
+
+    off, error : of magnitudes;  mag : of the catalogue;  known : which are asked
+    """
     kept, spread, line = known, _spread(off[known]), np.zeros(2)
-    about = float(np.median(stars.mag[known]))
-    faint = stars.mag - about
+    faint = mag - float(np.median(mag[known]))
     # Stars that a cosmic ray hit are told by a line through the others.
     for _ in range(3):
         left = off - line[0] - line[1] * faint
@@ -48,15 +73,23 @@ def check(of: Seen) -> list[Row]:
         inverse = sums.least_squares(matrix * np.sqrt(weight)[:, None], np.eye(len(matrix)))
         line = (inverse * (np.sqrt(weight) * off[kept])).sum(axis=1)
         spread = _spread((off - line[0] - line[1] * faint)[kept])
-    errors = np.sqrt((inverse**2).sum(axis=1))
-    of.series |= {"mag": stars.mag, "dm": off, "measured": np.where(kept, magnitude, np.nan)}
-    of.series["mean_dm"] = np.array([line[0], errors[0]])
-    note = f"{int(kept.sum())} stars, AB {stars.mag[kept].min():.1f} to {stars.mag[kept].max():.1f}"
-    place = of.place
+    return line, np.sqrt((inverse**2).sum(axis=1)), kept
+
+
+def _rows(of: Seen, name: str, line: Float, errors: Float, kept: Bool) -> list[Row]:
+    assert of.measured is not None
+    mag = of.measured.stars.mag[kept]
+    note = f"{int(kept.sum())} stars, AB {mag.min():.1f} to {mag.max():.1f}"
     return [
-        Row("photometry", "offset", place, line[0], errors[0], 0.0, TOLERANCE, "mag", SOURCE, note=note),
-        Row("photometry", "slope", place, line[1], errors[1], 0.0, TOLERANCE, "mag/mag", SOURCE, note=note),
+        Row("photometry", f"{name}{quantity}", of.place, value, error, 0.0, TOLERANCE, unit, SOURCE, note=note)
+        for quantity, value, error, unit in zip(("offset", "slope"), line, errors, ("mag", "mag/mag"), strict=True)
     ]
+
+
+def _unsure(found: Measured) -> float:
+    """mag: where no wings were seen, what is put beyond the widest aperture is known to half of itself."""
+    held, total = curve(found)
+    return 0.0 if found.wings else 0.5 * _MAGNITUDE * (1.0 - float(held[-1]) / total)
 
 
 def _spread(values: Float) -> float:
@@ -72,7 +105,7 @@ def magnitudes(found: Measured, zero_point: float, seconds: float) -> tuple[Floa
     chosen = int(np.argmin(np.abs(held / total - _HELD)))
     light = found.stars.growth[:, chosen] * (total / held[chosen])
     with np.errstate(divide="ignore", invalid="ignore"):
-        return zero_point - 2.5 * np.log10(light / seconds), 1.0857 / found.stars.snr
+        return zero_point - 2.5 * np.log10(light / seconds), _MAGNITUDE / found.stars.snr
 
 
 def curve(found: Measured) -> tuple[Float, float]:

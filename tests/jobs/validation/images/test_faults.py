@@ -84,7 +84,8 @@ def test_a_read_noise_that_is_a_fifth_off(folder, good):
 def test_a_band_whose_flux_is_shifted(good):
     of, stars = good
     measured = seen.stars.measured(of.frame, replace(stars, mag=stars.mag + 0.05), of.noise)
-    assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), "offset")
+    for quantity in ("offset", "psf_offset"):
+        assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), quantity)
 
 
 def test_optics_that_keep_light_from_the_corners(folder, good):
@@ -102,7 +103,8 @@ def test_optics_that_keep_light_from_the_corners(folder, good):
 def test_magnitudes_that_are_not_linear(good):
     of, stars = good
     measured = seen.stars.measured(of.frame, replace(stars, mag=20.0 + 1.05 * (stars.mag - 20.0)), of.noise)
-    assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), "slope")
+    for quantity in ("slope", "psf_slope"):
+        assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), quantity)
 
 
 def test_a_sky_that_is_too_bright(folder, good):
