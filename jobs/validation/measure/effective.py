@@ -116,7 +116,8 @@ def reach_of(fwhm: float) -> float:
 def lights(frame: Frame, found: Measured, whole: Float, noise: float) -> tuple[Float, Float]:
     """(e- [n] of all light of the stars, its error), NaN where they are too few to tell a PSF.
 
-    found : stars;  whole : e- [n] of all light, of the brighter ones at least;  noise : e- rms of a pixel of blank sky
+    frame : that shows them;  found : stars;  whole : e- [n] of all light, of the brighter ones at least
+    noise : e- rms of a pixel of blank sky
     """
     stars, n = found.stars, len(found.stars)
     bright = np.flatnonzero(np.isfinite(whole) & (whole > 0.0))
