@@ -137,8 +137,9 @@ def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
 
 @pytest.mark.parametrize("channel", registry.CHANNELS)
 def test_every_channel_has_measured_costs(channel):
-    cost = registry.CHANNELS[channel].cost
-    assert min(getattr(cost, name) for name in cost.__slots__) > 0.0
+    own = registry.CHANNELS[channel]
+    assert min(getattr(own.cost, name) for name in own.cost.__slots__ if name != "again_s") > 0.0
+    assert (own.cost.again_s > 0.0) == (own.remembers is not None)
 
 
 def test_every_channel_can_be_planned():
