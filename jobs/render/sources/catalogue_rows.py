@@ -127,6 +127,8 @@ def bright(catalogue: read.Version, fluxes: read.Version, wanted: Sequence[Brigh
 
     catalogue, fluxes : versions of the two tables
     """
+    if not wanted:
+        return []
     deflection = deflection_of(catalogue)
     cells = [selection.within(one.task, deflection, one.farther) if np.isfinite(one.least) else [] for one in wanted]
     every = sorted(set().union(*cells))

@@ -279,6 +279,7 @@ def test_what_several_exposures_share_is_read_once_and_each_has_its_own():
         assert len(its) == 0 or one.least < 100.0
     assert len(found[0][0]) > 5
     assert len(found[1][0]) > 5
+    assert catalogue_rows.bright(*versions, []) == []
     alone = [catalogue_rows.bright(*versions, [one])[0] for one in wanted]
     assert all(a.equals(c) and b.equals(d) for (a, b), (c, d) in zip(alone, found, strict=True))
 
