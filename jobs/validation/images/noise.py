@@ -52,15 +52,15 @@ def _sky(of: Seen) -> list[Row]:
             continue
         level = float(np.average(own.level, weights=own.blank.sum(axis=(1, 2))))
         value, error, pixels = blank.variance(own)
-        reading = _reading(amplifier)
-        told = factor * level + reading
+        read = reading(amplifier)
+        told = factor * level + read
         note = f"{pixels} blank pixels in tiles of {blank.SIDE}, level {level:.4g} e-"
         rows.append(Row("noise", f"sky{_name(amplifier)}", of.place, np.sqrt(value / told),
                         0.5 * error / told, 1.0, _NOISE, "", SOURCE, note=note))  # fmt: skip
-        if pixels >= _LEAST_PIXELS and level <= _MOST_LEVEL and value > reading:
-            gain = factor * level / (value - reading)
-            gains.append((gain, gain * error / (value - reading)))
-            rows.append(Row("gain", f"ratio{_name(amplifier)}", of.place, gain, gain * error / (value - reading),
+        if pixels >= _LEAST_PIXELS and level <= _MOST_LEVEL and value > read:
+            gain = factor * level / (value - read)
+            gains.append((gain, gain * error / (value - read)))
+            rows.append(Row("gain", f"ratio{_name(amplifier)}", of.place, gain, gain * error / (value - read),
                             1.0, _GAIN_OF_RAMPS if of.channel in RAMPS else _GAIN, "", SOURCE, note=note))  # fmt: skip
         of.series.setdefault("noise", []).append((np.sqrt(told), np.sqrt(value)))
     if len(gains) > 1:
@@ -72,8 +72,8 @@ def _sky(of: Seen) -> list[Row]:
     return rows
 
 
-def _reading(amplifier: Amplifier) -> float:
-    """e-^2: measured where there is an overscan."""
+def reading(amplifier: Amplifier) -> float:
+    """Variance of reading a pixel, e-^2: measured where there is an overscan, else as the header has it."""
     if amplifier.samples and np.isfinite(amplifier.noise):
         return amplifier.noise**2
     return amplifier.told**2 + amplifier.gain**2 / 12.0

@@ -65,10 +65,11 @@ def rough_noise(frame: Frame) -> float:
     return float((high - low) / 1.349 / np.sqrt(2.0))
 
 
-def tiles(frame: Frame, known: Reference, noise: float) -> Tiles:
-    """Of a frame; noise : e- rms of a pixel of blank sky."""
+def tiles(frame: Frame, known: Reference, noise: float, every: int | None = None) -> Tiles:
+    """Of a frame; noise : e- rms of a pixel of blank sky;  every : of so many rows of tiles one."""
     ny, nx = frame.electrons.shape
-    every = EVERY if ny * nx > _LARGE else 1
+    if every is None:
+        every = EVERY if ny * nx > _LARGE else 1
     down, across = (np.arange(0, n - SIDE + 1, SIDE * every) for n in (ny, nx))
     row, column = (axis.ravel() for axis in np.meshgrid(down, across, indexing="ij"))
     shows = _sources(frame, known, noise)
@@ -105,6 +106,8 @@ def _sources(frame: Frame, known: Reference, noise: float) -> Bool:
     """bool[ny, nx]: pixels that a known source may show in."""
     ny, nx = frame.electrons.shape
     out = np.zeros((ny, nx), bool)
+    if not len(known.x):
+        return out
     width = float(frame.header["PSFFWHM"])
     radius = np.cbrt(_WING * np.maximum(known.expected, 0.0) * frame.scale**2 / (_SHOWS * noise))
     radius = np.maximum(radius * np.where(known.point, 1.0, _WIDER), max(2.0 * width, _LEAST))

@@ -19,12 +19,22 @@ DISPERSED = "NISP-S"
 RAMPS = ("NISP-P", "NISP-S")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Before:
+    """Another frame of the same detector: its file, its exposure, and what is known of its sources."""
+
+    path: Path
+    exposure_id: int
+    known: Reference
+
+
 @dataclass(slots=True, eq=False)
 class Seen:
     """A frame and what is known of it.
 
     noise, tiles, measured : of its blank sky and its stars; None where it does not show any
     spectra : rows of `rendered_spectra` of a dispersed frame
+    before  : another frame that the gain is told with, None where it is not
     """
 
     place: Place
@@ -34,6 +44,7 @@ class Seen:
     noise: float = 0.0
     tiles: Tiles | None = None
     measured: Measured | None = None
+    before: Before | None = None
     series: dict[str, Any] = field(default_factory=dict)
 
     @property

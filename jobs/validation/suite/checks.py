@@ -19,6 +19,7 @@ from jobs.validation.images.between import BETWEEN
 from jobs.validation.images.completeness import COMPLETENESS
 from jobs.validation.images.cosmic_rays import COSMIC_RAYS
 from jobs.validation.images.depth import DEPTH
+from jobs.validation.images.gain import GAIN
 from jobs.validation.images.noise import NOISE
 from jobs.validation.images.photometry import PHOTOMETRY
 from jobs.validation.images.psf import PSF
@@ -54,6 +55,7 @@ OF_FRAMES = (
     PHOTOMETRY,
     BACKGROUND,
     NOISE,
+    GAIN,
     PSF,
     QUALITY,
     COSMIC_RAYS,

@@ -2,12 +2,14 @@
 
 Held       its tables and its frames
 look       of a lake
+partners   frames that are looked at with another one
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from jobs.validation.measure import references
 from jobs.validation.measure.frames import Curve
 from jobs.validation.measure.references import Catalogue
 from jobs.validation.measure.rows import Place
+from jobs.validation.measure.seen import SKY_TYPES
 from lake_schema.errors import BadInput
 from lake_schema.mission.parameter import CAMERAS
 from lake_schema.store import layout, read
@@ -81,6 +84,42 @@ def look(root: Path, request: str | None = None, exposures: Sequence[int] = ()) 
         if not any(shot.place.exposure_id == number for shot in shots):
             raise BadInput(f"table products: no image of exposure {number}")
     return Held(root, found, tuple(shots), paths)
+
+
+def partners(shots: Sequence[Shot]) -> dict[str, Shot]:
+    """Path of a frame -> another one of its detector that its gain is told with, where there is one: flats of one lamp.
+
+    Of ground cameras two of the sky, too, of levels that are alike; of one band, where there are such.
+    """
+    flats: dict[tuple[Any, ...], list[Shot]] = {}
+    skies: dict[tuple[Any, ...], list[Shot]] = {}
+    for shot in shots:
+        row, place = shot.exposure, shot.place
+        if row["image_type"] == "flat":
+            lamp = (row["lamp"], row["exposure_time_s"])
+            flats.setdefault((row["camera"], place.detector, place.channel, place.band, *lamp), []).append(shot)
+        elif row["image_type"] in SKY_TYPES and place.channel == "EXT":
+            skies.setdefault((row["camera"], place.detector), []).append(shot)
+    found: dict[str, Shot] = {}
+    for own in flats.values():
+        found |= {other.path: one for one, other in list(pairwise(own))[:1]}
+    for own in skies.values():
+        by_band = sorted(own, key=lambda shot: (str(shot.place.band), _level(shot)))
+        pairs = [*pairwise(by_band), *pairwise(sorted(own, key=_level))]
+        if pairs:
+            one, other = min(pairs, key=lambda pair: (pair[0].place.band != pair[1].place.band, _apart(pair)))
+            found[other.path] = one
+    return found
+
+
+def _level(shot: Shot) -> float:
+    """Electrons of the sky."""
+    return float(shot.exposure["sky"] * shot.exposure["exposure_time_s"])
+
+
+def _apart(pair: tuple[Shot, Shot]) -> float:
+    """How unlike the sky of two frames is, in the logarithm."""
+    return abs(float(np.log(max(_level(pair[0]), 1e-9) / max(_level(pair[1]), 1e-9))))
 
 
 def _own(root: Path, name: str, request: str | None) -> read.Version:

@@ -18,16 +18,19 @@ from jobs.validation.measure import references, seen
 from jobs.validation.measure.frames import Curve
 from jobs.validation.measure.references import Reference
 from jobs.validation.measure.rows import Place, Row, not_applicable
-from jobs.validation.measure.seen import Result
+from jobs.validation.measure.seen import Before, Result
 from jobs.validation.suite import checks, inventory
-from jobs.validation.suite.inventory import Held
+from jobs.validation.suite.inventory import Held, Shot
 from lake_schema.store import read
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One frame: its file, what it is of, and what is known of its sources, its amplifiers, its optics' vignetting."""
+    """One frame: its file, what it is of, and what is known of its sources, its amplifiers, its optics' vignetting.
+
+    before : the path in `products`, exposure and sources of another frame that its gain is told with
+    """
 
     products: read.Version
     path: str
@@ -36,6 +39,7 @@ class Task:
     spectra: pa.Table | None
     curve: Curve | None
     bowl: float
+    before: tuple[str, int, Reference] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,15 +93,20 @@ def _tasks(held: Held) -> Sequence[Task]:
         return []
     truth, spectra = inventory.truth(held), inventory.spectra(held)
     stars, curves, bowls = inventory.stars_of(held, truth), inventory.curves(held), inventory.bowls(held)
-    out = []
+    partners, out = inventory.partners(held.shots), []
+
+    def known(shot: Shot) -> Reference:
+        key = (int(shot.place.exposure_id or 0), str(shot.place.detector))
+        rows, row = truth.get(key, RENDERED_TRUTH.empty()), shot.exposure
+        return references.reference(rows, stars, str(row["band"]), float(row["mjd"]))
+
     for shot in held.shots:
         key = (int(shot.place.exposure_id or 0), str(shot.place.detector))
-        known = references.reference(
-            truth.get(key, RENDERED_TRUTH.empty()), stars, str(shot.exposure["band"]), float(shot.exposure["mjd"])
-        )
-        camera = str(shot.exposure["camera"])
+        camera, other = str(shot.exposure["camera"]), partners.get(shot.path)
+        before = None if other is None else (other.path, int(other.place.exposure_id or 0), known(other))
         curve, bowl = curves.get(camera), bowls.get(camera, 0.0)
-        out.append(Task(held.tables["products"], shot.path, shot.place, known, spectra.get(key), curve, bowl))
+        products = held.tables["products"]
+        out.append(Task(products, shot.path, shot.place, known(shot), spectra.get(key), curve, bowl, before))
     return out
 
 
@@ -105,5 +114,8 @@ def of_frame(task: Task) -> Result:
     """Rows of one frame."""
     path: Path = task.products.file(task.path)
     found = seen.seen(path, task.place, task.known, task.spectra, task.curve, task.bowl)
+    if task.before is not None:
+        other, exposure_id, known = task.before
+        found.before = Before(task.products.file(other), exposure_id, known)
     rows = seen.all_rows(checks.OF_FRAMES, found)
     return Result(task.place, rows, found.series)

@@ -9,7 +9,7 @@ from jobs.validation.suite import checks
 from tests.jobs.validation import test_observed
 from tests.jobs.validation.catalogues import test_colours, test_two_points
 from tests.jobs.validation.catalogues import test_faults as catalogues
-from tests.jobs.validation.images import test_between, test_completeness, test_spectra, test_together
+from tests.jobs.validation.images import test_between, test_completeness, test_gain, test_spectra, test_together
 from tests.jobs.validation.images import test_faults as images
 
 # Check -> (test, fault).
@@ -21,6 +21,7 @@ FAULTS = {
     "background": ((images.test_a_sky_that_is_too_bright, "sky brighter by 10 %"),),
     "noise": ((images.test_a_read_noise_that_is_a_fifth_off, "read noise 20 % off"),
               (images.test_a_gain_that_is_three_percent_off, "gain 3 % off")),
+    "gain": ((test_gain.test_a_gain_that_is_off, "gain 4.5 % off"),),
     "psf": ((images.test_points_that_are_no_points, "PSF longer than wide by 1.6"),),
     "quality": ((images.test_ramps_that_fit_and_others, "ramps noisier than they say"),),
     "cosmic_rays": ((images.test_cosmic_rays_that_are_off_or_too_many, "cosmic rays off, and too many"),),
