@@ -1,11 +1,14 @@
-"""Which of the known sources a program finds in the pixels: sep, in a part of each frame."""
+"""Which of the known sources a program finds in the pixels: sep, in a part of each frame.
+
+A source is found where an object covers its place, be it one with a cosmic ray or a neighbour. Of all places objects
+cover a part c by chance: where p of the sources are covered, (p - c) / (1 - c) are found.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import sep
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from jobs.validation.measure.rows import LEAST, Row, not_applicable
 from jobs.validation.measure.seen import Check, Seen, wants_blank
@@ -17,17 +20,17 @@ _SIDE, _BIN = 1024, 0.5
 _THRESHOLD, _PIXELS = 1.5, 5
 # Of sources one to four magnitudes above where half are found; of the magnitude of that, against the noise's.
 _BRIGHT, _LIMIT = 0.15, 0.75
-# Times the noise, and arcsec about a galaxy, of a source that is found as often as not; arcsec that it may be moved by.
-_SIGMA, _GALAXY, _MOVED = 10.0, 0.5, 0.5
+# Times the noise, and arcsec about a galaxy, of a source that is found as often as not.
+_SIGMA, _GALAXY = 10.0, 0.5
 _LEAST = 20
 
 
 def check(of: Seen) -> list[Row]:
     """Magnitude at which half of the sources are found, against the noise's; part of brighter ones that are."""
-    magnitude, found, note = searched(of)
+    magnitude, found, chance, note = searched(of)
     edges = np.arange(np.floor(magnitude.min(initial=20.0)), 29.0, _BIN)
     count = np.histogram(magnitude, edges)[0].astype(float)
-    part = np.histogram(magnitude[found], edges)[0] / np.maximum(count, 1.0)
+    part = _found(np.histogram(magnitude[found], edges)[0] / np.maximum(count, 1.0), chance)
     middle = 0.5 * (edges[1:] + edges[:-1])
     known = count >= 8
     of.series["completeness"] = np.stack([middle, part, count], axis=1)
@@ -36,30 +39,36 @@ def check(of: Seen) -> list[Row]:
     if not faintest or len(magnitude) < _LEAST:
         why = "no magnitude at which half are found"
         # Those that noise hides from nobody are to be found nevertheless.
-        return _bright(of, magnitude, found, _foreseen(of)) or [not_applicable("completeness", of.place, why, SOURCE)]
+        rows = _bright(of, magnitude, found, chance, _foreseen(of))
+        return rows or [not_applicable("completeness", of.place, why, SOURCE)]
     i = faintest[0]
     slope = max(part[i - 1] - part[i], 0.05)
     limit = middle[i - 1] + _BIN * (part[i - 1] - 0.5) / slope
     error = _BIN * np.sqrt(0.25 / count[i] + 0.25 / count[i - 1]) / slope
     rows = [Row("completeness", "half", of.place, float(limit), float(error), _foreseen(of), _LIMIT, "mag", SOURCE,
                 note=note)]  # fmt: skip
-    return [*rows, *_bright(of, magnitude, found, limit)]
+    return [*rows, *_bright(of, magnitude, found, chance, limit)]
 
 
-def _bright(of: Seen, magnitude: Float, found: Bool, limit: float) -> list[Row]:
+def _found(covered: Float, chance: float) -> Float:
+    """Part that is found, of the part that is covered."""
+    return np.maximum(covered - chance, 0.0) / (1.0 - chance)
+
+
+def _bright(of: Seen, magnitude: Float, found: Bool, chance: float, limit: float) -> list[Row]:
     """Part of the sources one to four magnitudes above a limit that are found; nothing of too few."""
     bright = (magnitude < limit - 1.0) & (magnitude > limit - 4.0)
     n = int(bright.sum())
     if n < _LEAST:
         return []
-    value = float(found[bright].mean())
+    value = float(_found(np.array(found[bright].mean()), chance))
     near = (found[bright].sum() + 2.0) / (n + 4.0)
-    error = float(np.sqrt(near * (1.0 - near) / n))
+    error = float(np.sqrt(near * (1.0 - near) / n)) / (1.0 - chance)
     return [Row("completeness", "bright", of.place, value, error, 1.0, _BRIGHT, "", SOURCE, LEAST, f"{n} sources")]
 
 
-def searched(of: Seen) -> tuple[Float, Bool, str]:
-    """(magnitudes of the known sources of a part [n], which of them are found, what was searched)."""
+def searched(of: Seen) -> tuple[Float, Bool, float, str]:
+    """(magnitudes of the known sources of a part [n], which of them are covered, which part of it is, what it is)."""
     assert of.tiles is not None
     ny, nx = of.frame.electrons.shape
     # Beside the middle, where detectors that are read in parts have no pixels.
@@ -70,7 +79,9 @@ def searched(of: Seen) -> tuple[Float, Bool, str]:
     width = float(of.frame.header["PSFFWHM"]) / of.frame.scale
     axis = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
     kernel = np.exp(-4.0 * np.log(2.0) * (axis[:, None] ** 2 + axis**2) / width**2)
-    objects = sep.extract(part - level, _THRESHOLD, err=of.noise, minarea=_PIXELS, filter_kernel=kernel, mask=full)
+    objects, which = sep.extract(part - level, _THRESHOLD, err=of.noise, minarea=_PIXELS, filter_kernel=kernel,
+                                 mask=full, segmentation_map=True)  # fmt: skip
+    covered = ndimage.binary_dilation(which > 0)
     known = of.known
     inside = (known.x > left + 8) & (known.x < left + part.shape[1] - 9)
     inside &= (known.y > top + 8) & (known.y < top + part.shape[0] - 9) & (known.expected > 0.0)
@@ -78,12 +89,9 @@ def searched(of: Seen) -> tuple[Float, Bool, str]:
     good = ~full[np.rint(y).astype(int), np.rint(x).astype(int)]
     light = known.expected[inside][good]
     magnitude = float(of.frame.header["ZEROPNT"]) - 2.5 * np.log10(light / of.frame.seconds)
-    if not len(objects) or not len(light):
-        return magnitude, np.zeros(len(light), bool), "no source is found"
-    tree = cKDTree(np.stack([objects["x"], objects["y"]], axis=1))
-    distance, _ = tree.query(np.stack([x[good], y[good]], axis=1))
+    found = covered[np.rint(y[good]).astype(int), np.rint(x[good]).astype(int)]
     note = f"{len(light)} sources in {part.shape[1]} x {part.shape[0]} pixels, {len(objects)} objects"
-    return magnitude, distance < max(1.5 * width, _MOVED / of.frame.scale), note
+    return magnitude, found, float(covered[~full].mean()) if not full.all() else 0.0, note
 
 
 def _foreseen(of: Seen) -> float:

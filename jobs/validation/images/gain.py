@@ -8,26 +8,21 @@ Ref: Janesick 2007, Photon Transfer; Antilogus et al. 2014, JINST 9, C03048; Moo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from jobs.validation.images.noise import ramp_factor, reading
-from jobs.validation.measure import blank, frames
+from jobs.validation.measure import blank, covariances, frames
 from jobs.validation.measure.blank import Tiles
 from jobs.validation.measure.frames import Amplifier, Frame
+from jobs.validation.measure.references import Reference
 from jobs.validation.measure.rows import Row, not_applicable
 from jobs.validation.measure.seen import RAMPS, Check, Seen
-from lake_schema.arrays import Array, Bool, Float
+from lake_schema.arrays import Bool
 
 SOURCE = "photon transfer of two frames (Janesick 2007); covariances: Antilogus et al. 2014, JINST 9, C03048"
 TOLERANCE = 0.015
 # Pixels about one that share its charge, to either side: of the sky, and from so many e- on.
 _NEAR, _WIDE, _MUCH = 1, 2, 5000.0
-# (Rows, columns) away where offsets of rows, of columns and slopes alone are in common; of the latter two rings.
-_ROW, _COLUMN = ((0, 3), (0, 4), (0, 5)), ((3, 0), (4, 0), (5, 0))
-_INNER = tuple((i, sign * j) for i, j in ((3, 1), (3, 2), (3, 3), (2, 3), (1, 3)) for sign in (-1, 1))
-_OUTER = tuple((2 * i, 2 * j) for i, j in _INNER)
 # Levels of the two frames, one over the other, at most: of the sky, of flats, which the frames before shine through;
 # part of the full well; pixels that an amplifier wants.
 _UNLIKE, _UNLIKE_FLATS, _FULL, _LEAST = 30.0, 1.03, 0.7, 60_000
@@ -36,7 +31,7 @@ _UNLIKE, _UNLIKE_FLATS, _FULL, _LEAST = 30.0, 1.03, 0.7, 60_000
 def check(of: Seen) -> list[Row]:
     """Of each amplifier, and the mean of them."""
     assert of.before is not None
-    other = frames.opened(of.before.path, of.frame.curve, of.frame.bowl)
+    other = frames.opened(of.before.path, of.frame.instrument)
     if other.electrons.shape != of.frame.electrons.shape:
         return [not_applicable("gain", of.place, "the other frame is of another size", SOURCE)]
     unlike = _UNLIKE if of.sees_sky else _UNLIKE_FLATS
@@ -61,7 +56,7 @@ def check(of: Seen) -> list[Row]:
     return [*rows, Row("gain", "pair", of.place, mean, error, 1.0, TOLERANCE, "", SOURCE, note=note)]
 
 
-def _tiles(frame: Frame, known: blank.Reference) -> Tiles:
+def _tiles(frame: Frame, known: Reference) -> Tiles:
     return blank.tiles(frame, known, blank.rough_noise(frame), every=1)
 
 
@@ -84,7 +79,7 @@ def _of(
     ratio = level[0] / level[1]
     if not 1.0 / unlike < ratio < unlike:
         return None
-    value, error = shared_variance(light[0] - ratio * light[1], both, _WIDE if max(level) > _MUCH else _NEAR)
+    value, error = covariances.own_variance(light[0] - ratio * light[1], both, _WIDE if max(level) > _MUCH else _NEAR)
     own = value - reading(amplifiers[0]) - ratio**2 * reading(amplifiers[1])
     if own <= 0.0:
         return None
@@ -96,44 +91,6 @@ def _held(a: Tiles, b: Tiles) -> Bool:
     """bool[t] of the tiles of a: those that b has, too."""
     there = set(zip(b.row.tolist(), b.column.tolist(), strict=True))
     return np.array([place in there for place in zip(a.row.tolist(), a.column.tolist(), strict=True)], bool)
-
-
-def shared_variance(values: Array, kept: Bool, near: int) -> tuple[float, float]:
-    """(variance of a pixel with what its neighbours have of it, its standard error from the scatter of the tiles).
-
-    values : float[t, n, n];  kept : which of them count;  near : pixels to either side that share charge
-    """
-    n = kept.sum(axis=(1, 2))
-    mean = (values * kept).sum(axis=(1, 2)) / n
-    off = np.where(kept, values - mean[:, None, None], 0.0)
-    row, column, inner, outer = (
-        np.mean([_covariance(off, kept, *lag) for lag in lags], 0) for lags in (_ROW, _COLUMN, _INNER, _OUTER)
-    )
-    # What is smooth falls with the square of the distance: so much higher is it where the pixels are nearer.
-    nearer = _square(_INNER) - 2.0 * near * (near + 1) / 3.0
-    smooth = inner + (inner - outer) * nearer / (_square(_OUTER) - _square(_INNER))
-    side = 2 * near + 1
-    # Each stands for that on the other side of the pixel, too.
-    half = [(i, j) for i in range(near + 1) for j in range(-near, near + 1) if i > 0 or j > 0]
-    total = _covariance(off, kept, 0, 0) + 2.0 * np.sum([_covariance(off, kept, *lag) for lag in half], 0)
-    own = total - side * (row - inner) - side * (column - inner) - side**2 * smooth
-    weight = n / n.sum()
-    value = float((weight * own).sum())
-    return value, float(np.sqrt((weight**2 * (own - value) ** 2).sum()))
-
-
-def _square(lags: Sequence[tuple[int, int]]) -> float:
-    """Mean square of the distance."""
-    return float(np.mean([i**2 + j**2 for i, j in lags]))
-
-
-def _covariance(off: Float, kept: Bool, down: int, across: int) -> Float:
-    """float[t] of pixels that lie so many rows and columns apart; down is not negative."""
-    ny, nx = off.shape[1:]
-    first = (slice(None), slice(0, ny - down), slice(max(-across, 0), nx - max(across, 0)))
-    second = (slice(None), slice(down, ny), slice(max(across, 0), nx - max(-across, 0)))
-    pairs = np.count_nonzero(kept[first] & kept[second], axis=(1, 2))
-    return np.asarray(np.einsum("tij,tij->t", off[first], off[second]) / np.maximum(pairs, 1))
 
 
 def _applies(of: Seen) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jobs.validation.measure import blank
+from jobs.validation.measure import blank, covariances
 from jobs.validation.measure.frames import Amplifier
 from jobs.validation.measure.rows import Row
 from jobs.validation.measure.seen import RAMPS, Check, Seen, wants_blank
@@ -31,7 +31,8 @@ def check(of: Seen) -> list[Row]:
 def _overscans(of: Seen) -> list[Row]:
     rows = []
     for amplifier in of.frame.amplifiers:
-        if amplifier.samples and np.isfinite(amplifier.noise):
+        # Where no read noise is drawn, rounding to whole ADU is all there is, and no random number.
+        if amplifier.samples and np.isfinite(amplifier.noise) and amplifier.told > 0.0:
             # A header's read noise is without rounding to whole ADU.
             own = np.hypot(amplifier.told, amplifier.gain / np.sqrt(12.0))
             value = amplifier.noise / own
@@ -51,8 +52,13 @@ def _sky(of: Seen) -> list[Row]:
         if len(own.row) < 2:
             continue
         level = float(np.average(own.level, weights=own.blank.sum(axis=(1, 2))))
-        value, error, pixels = blank.variance(own)
-        read = reading(amplifier)
+        pixels, read = int(own.blank.sum()), reading(amplifier)
+        if of.channel in RAMPS:
+            value, error = blank.variance(own)
+        else:
+            value, error = covariances.own_variance(own.pixels, own.blank, 0)
+        # Pixels differ in what they make of the same light: noise of one frame, if not of the sky.
+        read += (of.frame.instrument.response * level) ** 2
         told = factor * level + read
         note = f"{pixels} blank pixels in tiles of {blank.SIDE}, level {level:.4g} e-"
         rows.append(Row("noise", f"sky{_name(amplifier)}", of.place, np.sqrt(value / told),

@@ -1,12 +1,12 @@
 """How bright stars are, against the catalogue's band fluxes: all of their light, and how it goes with magnitude.
 
 What is beyond an aperture, and what of it was taken off as the sky beside the star, is told by the wings of the frame's
-brightest stars (measure/wings.py). Where these do not tell it, wings fall as r^-3: what is within r lacks k / r of the
-light, and k (1 / r + pi r^2 s) is missing, s the mean of 1 / (2 pi r^3) where the sky was taken; k is told by the last
-apertures of the stars' mean curve of growth.
+brightest stars (measure/wings.py).
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from jobs.validation.measure import effective
 from jobs.validation.measure.rows import Row, not_applicable
 from jobs.validation.measure.seen import Check, Seen, wants_stars
 from jobs.validation.measure.stars import Measured
+from jobs.validation.measure.wings import Wings
 from lake_schema.arrays import Bool, Float
 
 SOURCE = "Serrano et al. 2024, app. C: below 0.02 mag, aperture and PSF photometry"
@@ -23,7 +24,6 @@ TOLERANCE = 0.02
 _MAGNITUDE = 1.0857
 # A star's aperture is the one that holds about so much of a point's light.
 _HELD, _LEAST = 0.8, 8
-_WINGS = slice(-4, None)
 # The aperture from which the wings go on: in a wider one the error of its sky weighs more.
 _JOIN = -3
 # Part of the full well above which what the detector is not linear in shows.
@@ -87,9 +87,14 @@ def _rows(of: Seen, name: str, line: Float, errors: Float, kept: Bool) -> list[R
 
 
 def _unsure(found: Measured) -> float:
-    """mag: where no wings were seen, what is put beyond the widest aperture is known to half of itself."""
-    held, total = curve(found)
-    return 0.0 if found.wings else 0.5 * _MAGNITUDE * (1.0 - float(held[-1]) / total)
+    """mag: the offset's error by that of the wings."""
+    return _MAGNITUDE * _lost(found, replace(found.wings, strength=found.wings.error))
+
+
+def _lost(found: Measured, wings: Wings) -> float:
+    """Part of all light that an aperture lacks: beyond it, and taken off as the sky."""
+    joined = float(found.radii[_JOIN])
+    return wings.beyond(joined) + np.pi * joined**2 * float(wings.at(found.sky_at).mean())
 
 
 def _spread(values: Float) -> float:
@@ -113,14 +118,7 @@ def curve(found: Measured) -> tuple[Float, float]:
     bright = np.argsort(-found.stars.flux, kind="stable")[: max(len(found.stars) // 2, _LEAST)]
     own = found.stars.growth[bright]
     held = np.median(own / own[:, -1:], axis=0)
-    if found.wings is not None:
-        joined = float(found.radii[_JOIN])
-        lost = found.wings.beyond(joined) + np.pi * joined**2 * float(found.wings.at(found.sky_at).mean())
-        return held, float(held[_JOIN]) / (1.0 - lost)
-    radius = found.radii[_WINGS]
-    missing = 1.0 / radius + np.pi * radius**2 * float(np.mean(0.5 / np.pi / found.sky_at**3))
-    total, slope = sums.least_squares(np.stack([np.ones(len(missing)), missing], axis=1), held[_WINGS])
-    return held, float(total) if slope < 0.0 else float(held[-1])
+    return held, float(held[_JOIN]) / (1.0 - _lost(found, found.wings))
 
 
 PHOTOMETRY = Check("photometry", SOURCE, wants_stars(_LEAST), check)

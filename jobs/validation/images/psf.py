@@ -20,12 +20,9 @@ def check(of: Seen) -> list[Row]:
     assert of.measured is not None
     found, stars = of.measured, of.measured.stars
     told = float(of.frame.header["PSFFWHM"]) / of.frame.scale
-    # As the stars' sizes scatter, so would their widths.
-    spread = 1.4826 * float(np.median(np.abs(stars.size / np.median(stars.size) - 1.0)))
     note = f"{len(stars)} stars, mean profile"
     rows = [
-        Row("psf", "fwhm", of.place, found.fwhm / told, spread * found.fwhm / told / np.sqrt(len(stars)), 1.0, _WIDTH,
-            "", SOURCE, note=note)
+        Row("psf", "fwhm", of.place, found.fwhm / told, found.fwhm_error / told, 1.0, _WIDTH, "", SOURCE, note=note)
     ]  # fmt: skip
     if of.channel != "EXT":
         mean = [float(np.median(component)) for component in (stars.e1, stars.e2)]

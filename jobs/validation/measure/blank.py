@@ -127,8 +127,8 @@ def _sources(frame: Frame, known: Reference, noise: float) -> Bool:
     return out
 
 
-def variance(found: Tiles) -> tuple[float, float, int]:
-    """(e-^2 of a blank pixel about the mean of its tile, its standard error, pixels)."""
+def variance(found: Tiles) -> tuple[float, float]:
+    """(e-^2 of a blank pixel about the mean of its tile, its standard error)."""
     blank = found.blank
     n = blank.sum(axis=(1, 2))
     off = np.where(blank, found.pixels - found.level[:, None, None], 0.0).astype(float)
@@ -137,4 +137,4 @@ def variance(found: Tiles) -> tuple[float, float, int]:
     value = float((weight * own).sum())
     # From the scatter of the tiles themselves.
     error = float(np.sqrt((weight**2 * (own - value) ** 2).sum())) if len(n) > 1 else np.inf
-    return value, error, int(n.sum())
+    return value, error

@@ -79,6 +79,19 @@ class Curve:
 
 
 @dataclass(frozen=True, slots=True)
+class Instrument:
+    """What the mission database tells of a camera, and is no error of a frame.
+
+    curve    : of its amplifiers;  response : rms by which pixels differ
+    bowl     : part of the light that the optics keep from the corner of the focal plane
+    """
+
+    curve: Curve = Curve()
+    bowl: float = 0.0
+    response: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
     """A detector of an exposure.
 
@@ -86,8 +99,7 @@ class Frame:
     amplifiers : what read them
     quality    : uint8[ny, nx] of a ramp, None = there is none
     header     : of the whole file;  wcs : of the detector's pixels, the first is (0, 0)
-    curve      : of its amplifiers
-    bowl       : part of the light that the optics keep from the corner of the focal plane
+    instrument : that took it
     """
 
     electrons: Float32
@@ -95,21 +107,20 @@ class Frame:
     quality: Array | None
     header: Mapping[str, Any]
     wcs: WCS
-    curve: Curve = Curve()
-    bowl: float = 0.0
+    instrument: Instrument = Instrument()
 
     def illumination(self, x: Float, y: Float) -> Float:
         """What of the light the optics bring to places [n] in pixels: 1 - bowl r^2, r = 1 at the corner of DETSIZE."""
-        if self.bowl == 0.0:
+        if self.instrument.bowl == 0.0:
             return np.ones(len(x))
         wide, high = (axis.stop - axis.start for axis in section(self.header["DETSIZE"]))
         across, up = x + 1.0 - self.wcs.wcs.crpix[0], y + 1.0 - self.wcs.wcs.crpix[1]
-        return np.asarray(1.0 - self.bowl * (across**2 + up**2) / (0.25 * (wide**2 + high**2)))
+        return np.asarray(1.0 - self.instrument.bowl * (across**2 + up**2) / (0.25 * (wide**2 + high**2)))
 
     def light(self, read: Float) -> Float:
         """e- [..] that were collected where so many were read."""
-        most = self.curve.range * float(np.mean([amplifier.gain for amplifier in self.amplifiers]))
-        return self.curve.light(read, most)
+        most = self.instrument.curve.range * float(np.mean([amplifier.gain for amplifier in self.amplifiers]))
+        return self.instrument.curve.light(read, most)
 
     @property
     def seconds(self) -> float:
@@ -133,16 +144,16 @@ class Frame:
         return out
 
 
-def opened(path: Path, curve: Curve | None = None, bowl: float = 0.0) -> Frame:
+def opened(path: Path, instrument: Instrument | None = None) -> Frame:
     """A science file.
 
-    path : of it;  curve, bowl : of `Frame`, as the lake's mission database has them; None, 0 = linear and even
+    path : of it;  instrument : that took it, as the lake's mission database has it; None = linear and even
 
     Errors : BadInput where its header lacks what a pipeline needs, naming the keyword
     """
     units = images.read_images(path)
     try:
-        return replace(_frame(units, path), curve=curve or Curve(), bowl=bowl)
+        return replace(_frame(units, path), instrument=instrument or Instrument())
     except KeyError as error:
         raise BadInput(f"{path}: header without {error.args[0]}") from None
 
@@ -203,11 +214,11 @@ def _amplifier(name: str, ccd: tuple[slice, slice], bias: Array | None, cards: M
         cut = int(0.5 * _SKIPPED * bias.shape[1])
         kept = bias[:, cut : bias.shape[1] - cut].astype(float)
         level = float(kept.mean())
-        # Rows have offsets of their own.
-        step = np.diff(kept, axis=1)
+        # Rows and columns have offsets of their own.
+        step = np.diff(np.diff(kept, axis=1), axis=0)
         # But for what a cosmic ray left behind.
         step = step[np.abs(step) < _FAR * 1.4826 * max(float(np.median(np.abs(step))), 1.0)]
-        noise = float(np.std(step) / np.sqrt(2.0)) * gain if step.size else np.nan
+        noise = float(np.std(step) / 2.0) * gain if step.size else np.nan
         samples = kept.size
     full = (float(cards["SATURATE"]) - (level if cards.get("BUNIT", "adu") != "electron" else 0.0)) * gain
     return Amplifier(name, ccd, gain, level, noise, told, samples, full)

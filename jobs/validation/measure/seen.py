@@ -9,7 +9,7 @@ from typing import Any
 
 from jobs.validation.measure import blank, frames, stars
 from jobs.validation.measure.blank import Tiles
-from jobs.validation.measure.frames import Curve, Frame
+from jobs.validation.measure.frames import Frame, Instrument
 from jobs.validation.measure.references import Reference
 from jobs.validation.measure.rows import Place, Row, not_applicable
 from jobs.validation.measure.stars import Measured
@@ -94,15 +94,13 @@ class Several:
     rows: Callable[[Sequence[Result]], list[Row]]
 
 
-def seen(
-    path: Path, place: Place, known: Reference, spectra: Any = None, curve: Curve | None = None, bowl: float = 0.0
-) -> Seen:
+def seen(path: Path, place: Place, known: Reference, spectra: Any = None, instrument: Instrument | None = None) -> Seen:
     """Open a file and measure what several checks want.
 
     path  : of the science file;  place : what it is of;  known : its sources;  spectra : of `Seen`
-    curve : of its amplifiers, None = they are linear;  bowl : of its optics' vignetting, 0 = there is none
+    instrument : that took it, None = linear and even
     """
-    frame = frames.opened(path, curve, bowl)
+    frame = frames.opened(path, instrument)
     found = Seen(place, frame, known, spectra)
     if found.sees_sky or spectra is not None:
         found.noise = blank.rough_noise(frame)

@@ -34,6 +34,8 @@ _BLEND_REACH = 8.0
 MOST = 400
 # Radius at which a Gaussian has fallen to a third, over half its FWHM.
 _THIRD = 1.26
+# Parts of the stars that are left out in turn for the error of the FWHM.
+_PARTS = 8
 # Pixels from a star's place in which its light goes with the place in the pixel.
 _CORE = 3.0
 # Standard deviations above what other stars have there, from which a pixel is another's light.
@@ -78,17 +80,18 @@ class Stars:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Stars, radii of the apertures, half-light radius and FWHM of a point source, pixels.
+    """Stars, radii of the apertures, half-light radius and FWHM of a point source, and the latter's error, pixels.
 
-    sky_at : distances from the star at which the sky was taken, pixels;  wings : None = the stars do not tell them
+    sky_at : distances from the star at which the sky was taken, pixels;  wings : of a point source
     """
 
     stars: Stars
     radii: Float
     half_light: float
     fwhm: float
+    fwhm_error: float
     sky_at: Float
-    wings: Wings | None = None
+    wings: Wings
 
 
 def chosen(frame: Frame, known: Reference, noise: float) -> Int:
@@ -155,9 +158,9 @@ def measured(frame: Frame, known: Reference, noise: float) -> Measured:
     )  # fmt: skip
     kept = np.isfinite(stars.dx) & np.isfinite(stars.dy) & np.isfinite(stars.e1)
     told = (x - left + known.psf_x[index])[kept], (y - low + known.psf_y[index])[kept]
-    width = _fwhm(cuts[kept], *told, flux[kept], window)
+    width, unsure = _width(cuts[kept], *told, flux[kept], window)
     far_light = wings.told(frame, known, index[kept], noise, reach)
-    return Measured(stars.where(kept), radii, half, width, distance[far], far_light)
+    return Measured(stars.where(kept), radii, half, width, unsure, distance[far], far_light)
 
 
 def _cuts(image: np.ndarray, x: Float, y: Float, reach: int) -> tuple[Float, Int, Int]:
@@ -225,17 +228,28 @@ def _half_light(growth: Float, flux: Float, radii: Float) -> float:
     return float(np.interp(0.5 * mean[-1], np.append(0.0, mean), np.append(0.0, radii)))
 
 
+def _width(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> tuple[float, float]:
+    """(FWHM, its error by leaving out parts of the stars in turn); as of `_fwhm`."""
+    bright = np.argsort(-flux, kind="stable")[: max(len(flux) // 2, 4)]
+    whole = _fwhm(cuts[bright], x[bright], y[bright], flux[bright], window)
+    parts = min(_PARTS, len(bright))
+    rest = [np.arange(len(bright)) % parts != part for part in range(parts)]
+    others = np.array([_fwhm(*(one[bright[kept]] for one in (cuts, x, y, flux)), window) for kept in rest])
+    if len(others) < 2 or not np.isfinite(others).all():
+        return whole, np.nan
+    return whole, float(np.sqrt((parts - 1) * np.mean((others - others.mean()) ** 2)))
+
+
 def _fwhm(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> float:
-    """Pixels, of the mean profile of the brighter stars, whose places in a pixel sample it finely; NaN of too few.
+    """Pixels, of the mean profile of stars, whose places in a pixel sample it finely; NaN of too few.
 
     The logarithm of the light is told by r^2 and r^4 as far as it falls to a third.
     """
-    bright = np.argsort(-flux, kind="stable")[: max(len(flux) // 2, 4)]
-    if len(bright) < 4:
+    if len(flux) < 3:
         return np.nan
     axis = np.arange(cuts.shape[-1])
-    radius = np.hypot(axis[None, None, :] - x[bright, None, None], axis[None, :, None] - y[bright, None, None])
-    light = cuts[bright] / flux[bright, None, None]
+    radius = np.hypot(axis[None, None, :] - x[:, None, None], axis[None, :, None] - y[:, None, None])
+    light = cuts / flux[:, None, None]
     near = radius < 0.5 * FWHM * window * _THIRD
     if near.sum() < 12:
         return np.nan

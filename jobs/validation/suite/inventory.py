@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from jobs.validation.measure import references
-from jobs.validation.measure.frames import Curve
+from jobs.validation.measure.frames import Curve, Instrument
 from jobs.validation.measure.references import Catalogue
 from jobs.validation.measure.rows import Place
 from jobs.validation.measure.seen import SKY_TYPES
@@ -133,15 +133,16 @@ def _planned(root: Path, products: read.Version) -> dict[int, Mapping[str, Any]]
     return {row["exposure_id"]: row for row in rows.to_pylist()}
 
 
-def curves(held: Held) -> dict[str, Curve]:
-    """Of the amplifiers of each camera that images are of, by the mission database; of all of them, their mean."""
-    told = _told(held, (*_CURVE, "adc_max"), "nonlinearity")
-    return {camera: Curve(*values) for camera, values in told.items()}
-
-
-def bowls(held: Held) -> dict[str, float]:
-    """What the optics of each camera keep from the corner of the focal plane, a part of the light."""
-    return {camera: values[0] for camera, values in _told(held, ("illumination",), "illumination").items()}
+def instruments(held: Held) -> dict[str, Instrument]:
+    """Of each camera that images are of, by the mission database; of amplifiers and pixels their mean."""
+    curves = _told(held, (*_CURVE, "adc_max"), "nonlinearity")
+    bowls, responses = _told(held, ("illumination",), "illumination"), _told(held, ("prnu",), "pixel_response")
+    return {
+        camera: Instrument(
+            Curve(*curves.get(camera, ())), *(found.get(camera, [0.0])[0] for found in (bowls, responses))
+        )
+        for camera in {str(shot.exposure["camera"]) for shot in held.shots}
+    }
 
 
 def _told(held: Held, names: Sequence[str], effect: str) -> dict[str, list[float]]:

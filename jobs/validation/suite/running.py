@@ -15,7 +15,7 @@ import pyarrow as pa
 from tqdm import tqdm
 
 from jobs.validation.measure import references, seen
-from jobs.validation.measure.frames import Curve
+from jobs.validation.measure.frames import Instrument
 from jobs.validation.measure.references import Reference
 from jobs.validation.measure.rows import Place, Row, not_applicable
 from jobs.validation.measure.seen import Before, Result
@@ -27,7 +27,7 @@ from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One frame: its file, what it is of, and what is known of its sources, its amplifiers, its optics' vignetting.
+    """One frame: its file, what it is of, and what is known of its sources and its camera.
 
     before : the path in `products`, exposure and sources of another frame that its gain is told with
     """
@@ -37,8 +37,7 @@ class Task:
     place: Place
     known: Reference
     spectra: pa.Table | None
-    curve: Curve | None
-    bowl: float
+    instrument: Instrument | None
     before: tuple[str, int, Reference] | None = None
 
 
@@ -92,7 +91,7 @@ def _tasks(held: Held) -> Sequence[Task]:
     if not held.shots:
         return []
     truth, spectra = inventory.truth(held), inventory.spectra(held)
-    stars, curves, bowls = inventory.stars_of(held, truth), inventory.curves(held), inventory.bowls(held)
+    stars, cameras = inventory.stars_of(held, truth), inventory.instruments(held)
     partners, out = inventory.partners(held.shots), []
 
     def known(shot: Shot) -> Reference:
@@ -104,16 +103,15 @@ def _tasks(held: Held) -> Sequence[Task]:
         key = (int(shot.place.exposure_id or 0), str(shot.place.detector))
         camera, other = str(shot.exposure["camera"]), partners.get(shot.path)
         before = None if other is None else (other.path, int(other.place.exposure_id or 0), known(other))
-        curve, bowl = curves.get(camera), bowls.get(camera, 0.0)
-        products = held.tables["products"]
-        out.append(Task(products, shot.path, shot.place, known(shot), spectra.get(key), curve, bowl, before))
+        products, own = held.tables["products"], spectra.get(key)
+        out.append(Task(products, shot.path, shot.place, known(shot), own, cameras.get(camera), before))
     return out
 
 
 def of_frame(task: Task) -> Result:
     """Rows of one frame."""
     path: Path = task.products.file(task.path)
-    found = seen.seen(path, task.place, task.known, task.spectra, task.curve, task.bowl)
+    found = seen.seen(path, task.place, task.known, task.spectra, task.instrument)
     if task.before is not None:
         other, exposure_id, known = task.before
         found.before = Before(task.products.file(other), exposure_id, known)

@@ -32,7 +32,7 @@ def scene(rng, n=160, faintest=21.0, side=2 * SIDE):
     step = (side - 80) / per
     x, y = (axis.ravel()[:n] for axis in np.meshgrid(*[40 + step * (np.arange(per) + 0.5)] * 2))
     x, y = (axis + 0.25 * step * (rng.random(n) - 0.5) for axis in (x, y))
-    mag = 18.0 + (faintest - 18.0) * rng.random(n)
+    mag = 18.9 + (faintest - 18.9) * rng.random(n)
     # Some that must be full.
     mag[:12] = 14.0
     return known(x, y, mag)
@@ -76,8 +76,8 @@ def vis_file(path, electrons, rng, shift=(0.0, 0.0), told=GAIN, read=GAIN, noise
     electrons : counted in each pixel;  shift : of the header's WCS;  told, read : gain of the header, and the true one
     """
     cards = {
-        "CHANNEL": "VIS", "IMAGETYP": "science", "EXPTIME": SECONDS, "PIXSCALE": SCALE, "PSFFWHM": FWHM, "FILTER": "i",
-        "ZEROPNT": zero_point, "SKYRATE": SKY, "DARKRATE": DARK, "DETECTOR": "1-1",
+        "CHANNEL": "VIS", "IMAGETYP": "science", "EXPTIME": SECONDS, "PIXSCALE": SCALE, "PSFFWHM": FWHM,
+        "FILTER": "euclid_vis", "ZEROPNT": zero_point, "SKYRATE": SKY, "DARKRATE": DARK, "DETECTOR": "1-1",
     }  # fmt: skip
     units, place = [image(None, cards)], system(shift)
     for name, (row, column) in {"E": (1, 0), "F": (1, 1), "G": (0, 1), "H": (0, 0)}.items():

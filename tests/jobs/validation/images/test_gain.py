@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
-from jobs.validation.images.gain import GAIN, shared_variance
+from jobs.validation.images.gain import GAIN
 from jobs.validation.images.noise import NOISE
 from jobs.validation.measure import references, seen
 from jobs.validation.measure.rows import FAIL, NOT_APPLICABLE, PASS, Place
@@ -71,23 +71,6 @@ def test_frames_that_are_too_unlike(tmp_path):
     lit = replace(of, frame=replace(of.frame, header={**of.frame.header, "IMAGETYP": "flat"}))
     assert {row.verdict for row in GAIN.of(lit)} == {NOT_APPLICABLE}
     assert {row.verdict for row in GAIN.of(replace(of, before=None))} == {NOT_APPLICABLE}
-
-
-@pytest.mark.parametrize("near", [1, 2])
-def test_the_variance_that_neighbours_share(near):
-    """Also where rows have offsets of their own, and a slope lies over it; half of the pixels are not looked at."""
-    rng = np.random.default_rng(5)
-    size, reach = 2 * near + 1, 0.02
-    kernel = np.full((size, size), reach / (size**2 - 1))
-    kernel[near, near] = 1.0 - reach
-    values = scipy.ndimage.convolve(rng.standard_normal((200, 64, 64)) * 7.0, kernel[None], mode="reflect")
-    values += 2.0 * rng.standard_normal((200, 64, 1)) + np.linspace(-5.0, 5.0, 64)
-    kept = rng.random(values.shape) < 0.5
-    plain = float(np.var(values[kept]))
-    value, error = shared_variance(np.where(kept, values, 1e6), kept, near)
-    assert value == pytest.approx(49.0, abs=4.0 * error)
-    assert error < 2.0
-    assert abs(plain - 49.0) > 5.0 * error
 
 
 def shot(number, band, image_type="science", channel="EXT", sky=10.0, lamp=None):
