@@ -66,7 +66,10 @@ def rough_noise(frame: Frame) -> float:
 
 
 def tiles(frame: Frame, known: Reference, noise: float, every: int | None = None) -> Tiles:
-    """Of a frame; noise : e- rms of a pixel of blank sky;  every : of so many rows of tiles one."""
+    """Of a frame.
+
+    known : its sources;  noise : e- rms of a pixel of blank sky;  every : of so many rows of tiles one
+    """
     ny, nx = frame.electrons.shape
     if every is None:
         every = EVERY if ny * nx > _LARGE else 1

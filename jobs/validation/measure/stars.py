@@ -234,7 +234,8 @@ def _width(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> tuple
     whole = _fwhm(cuts[bright], x[bright], y[bright], flux[bright], window)
     parts = min(_PARTS, len(bright))
     rest = [np.arange(len(bright)) % parts != part for part in range(parts)]
-    others = np.array([_fwhm(*(one[bright[kept]] for one in (cuts, x, y, flux)), window) for kept in rest])
+    some = [bright[kept] for kept in rest]
+    others = np.array([_fwhm(cuts[one], x[one], y[one], flux[one], window) for one in some])
     if len(others) < 2 or not np.isfinite(others).all():
         return whole, np.nan
     return whole, float(np.sqrt((parts - 1) * np.mean((others - others.mean()) ** 2)))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.stats
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from jobs.validation.measure.seen import Result
 from jobs.validation.suite import catalogue_figures
@@ -81,6 +82,10 @@ def _noise(figure: Figure, results: list[Result]) -> None:
     axis = figure.subplots()
     told, found = _together(results, "noise").T
     axis.loglog(told, found, ".", color="#1f4e79")
+    for ticks in (axis.xaxis, axis.yaxis):
+        # 14 for 1.4 x 10^1.
+        ticks.set_major_formatter(LogFormatter())
+        ticks.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
     ends = np.array([told.min() * 0.95, told.max() * 1.05])
     axis.plot(ends, ends, "k-", lw=0.7)
     axis.set(xlabel="foreseen by the header, e- rms", ylabel="blank sky, e- rms")
