@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,6 +21,7 @@ from benchmarks import _around, planner, report, scheduler
 from jobs.render.planning import planned_exposures, source_counts, survey, tasks, variants
 from jobs.render.planning.mission import mission_of, user_filters
 from jobs.request.from_toml import parse
+from jobs.validation.suite import inventory, running
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "production.json"
@@ -40,6 +42,8 @@ _NOTES = {
     "serial_share": "of the CPU of a render of 16 detectors, after Java has started (target 0.025)",
     "wall_2_cores": "16 detectors by the clock; said by a quiet machine alone",
     "two_cores_cpu": "CPU of the same work on two cores over that on one",
+    "validation_s": "wall, two processes: all checks of a field's images and of its catalogues (target 120)",
+    "validation_detectors": "of VIS, NISP-P and NISP-S that were looked at",
 }
 
 
@@ -96,7 +100,9 @@ def around(quick: bool) -> dict[str, float]:
     """What a task and a run take besides their physics."""
     with tempfile.TemporaryDirectory() as name:
         # Detectors that have next to nothing on them, and those of the demo, eight times.
-        empty = replace(planner.request("field", True), pointings=planner.request("field", quick).pointings)
+        empty = replace(
+            planner.request("field", quick), universe=planner.request("field", True).universe, observations=()
+        )
         root, _ = planner.lake(Path(name), "field", True, empty)
         own = {
             "task_ms": _around.task_ms(root, empty),
@@ -111,10 +117,24 @@ def around(quick: bool) -> dict[str, float]:
     return {**own, "overhead_ms": sum(own.get(key, 0.0) for key in ("task_ms", "hand_out_ms", "publish_ms"))}
 
 
+def validation(lake: Path) -> dict[str, float]:
+    """Seconds that the checks of a rendered field of Euclid take."""
+    held = inventory.look(lake)
+    shots = tuple(
+        shot for shot in held.shots if shot.place.channel in _EUCLID and shot.exposure["image_type"] == "science"
+    )
+    started = time.perf_counter()
+    running.validated(replace(held, shots=shots), 2)
+    return {"validation_s": time.perf_counter() - started, "validation_detectors": float(len(shots))}
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Forecasts and prints."""
-    options = report.options("production", __doc__ or "", argv)
+    told = "of a field of Euclid that is rendered, such as `make pilot` makes: its validation is timed"
+    options = report.options("production", __doc__ or "", argv, lake=told)
     figures = around(options.quick) | forecast(options.quick)
+    if options.lake is not None:
+        figures |= validation(options.lake)
     report.finish("production", 1, figures, _NOTES, options.json or (None if options.quick else RESULTS))
     return 0
 

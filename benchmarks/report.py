@@ -14,13 +14,17 @@ from typing import Any
 from lake_schema.store.provenance import git_commit
 
 
-def options(name: str, doc: str, argv: Sequence[str] | None = None, picture: bool = False) -> argparse.Namespace:
-    """The options of a benchmark: quick, json; picture : whether it can draw one."""
+def options(
+    name: str, doc: str, argv: Sequence[str] | None = None, picture: bool = False, lake: str = ""
+) -> argparse.Namespace:
+    """The options of a benchmark: quick, json; picture : whether it can draw one;  lake : what it does with one."""
     parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}", description=doc.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="little work and one repeat, for tests")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
     if picture:
         parser.add_argument("--picture", type=Path, metavar="FILE", help="draw them into this PNG")
+    if lake:
+        parser.add_argument("--lake", type=Path, metavar="LAKE", help=lake)
     return parser.parse_args(argv)
 
 

@@ -3,6 +3,7 @@
 import pytest
 
 from benchmarks import production as benchmark
+from tests.jobs.validation.suite import lakes
 
 
 def test_a_few_exposures_stand_for_all():
@@ -12,3 +13,9 @@ def test_a_few_exposures_stand_for_all():
     some, _ = benchmark.core_hours("sc8_deep", 6)
     assert few == pytest.approx(some, rel=0.03)
     assert all(hours > 0.0 for hours in few.values())
+
+
+def test_the_validation_of_a_lake_is_timed(tmp_path):
+    found = benchmark.validation(lakes.lake(tmp_path / "lake"))
+    assert found["validation_detectors"] == 2.0
+    assert found["validation_s"] > 0.0
