@@ -29,13 +29,12 @@ from jobs.compiling import jit
 from jobs.render.effects import pixel_random
 from jobs.render.effects.effect import Effect
 from jobs.render.effects.scene import Frame, Scene
+from jobs.render.effects.series import SMALL, SMALL_EXP, small_exp, small_expm1
 from lake_schema.arrays import Float32
 from lake_schema.errors import BadInput, OutOfRange
 
 # Of a pixel's second number: other bits than of its first, of which the ziggurat may take more.
 _OTHER = np.uint64(0x5851F42D4C957F2D)
-# Up to which the series of the exponential are good: of light over p2, of what a pixel's own power makes of time.
-_SMALL, _SMALL_TIME = 0.05, 1.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,44 +162,13 @@ def _leave(held: Any, p2: Any, power: Any, numbers: Any, out: Any) -> None:
     inverse = 1.0 / usual
     for i in range(len(held)):
         # Nothing that is left becomes more with time.
-        grown = _small_exp(min(power[i], steepest) * log_time)
-        out[i] = (constant + slope * held[i]) * -_small_expm1(-held[i] * inverse / p2[i]) * scale * grown
+        grown = small_exp(min(power[i], steepest) * log_time)
+        out[i] = (constant + slope * held[i]) * -small_expm1(-held[i] * inverse / p2[i]) * scale * grown
     # Most pixels are faint: a branch above would cost more than the few that are done twice.
     for i in range(len(held)):
         light, time = held[i] * inverse / p2[i], min(power[i], steepest) * log_time
-        if light > _SMALL or abs(time) > _SMALL_TIME:
+        if light > SMALL or abs(time) > SMALL_EXP:
             out[i] = (constant + slope * held[i]) * -math.expm1(-light) * scale * math.exp(time)
-
-
-@jit
-def _small_expm1(x: Any) -> Any:
-    """exp(x) - 1 by its series, to 1e-14 of it for |x| < _SMALL."""
-    out = 1.0 + x * (1.0 / 8.0)
-    out = 1.0 + x * (1.0 / 7.0) * out
-    out = 1.0 + x * (1.0 / 6.0) * out
-    out = 1.0 + x * (1.0 / 5.0) * out
-    out = 1.0 + x * (1.0 / 4.0) * out
-    out = 1.0 + x * (1.0 / 3.0) * out
-    out = 1.0 + x * (1.0 / 2.0) * out
-    return x * out
-
-
-@jit
-def _small_exp(x: Any) -> Any:
-    """exp(x) by the fourth power of the series of a quarter of it, to 1e-12 for |x| < _SMALL_TIME."""
-    x = 0.25 * x
-    out = 1.0 + x * (1.0 / 10.0)
-    out = 1.0 + x * (1.0 / 9.0) * out
-    out = 1.0 + x * (1.0 / 8.0) * out
-    out = 1.0 + x * (1.0 / 7.0) * out
-    out = 1.0 + x * (1.0 / 6.0) * out
-    out = 1.0 + x * (1.0 / 5.0) * out
-    out = 1.0 + x * (1.0 / 4.0) * out
-    out = 1.0 + x * (1.0 / 3.0) * out
-    out = 1.0 + x * (1.0 / 2.0) * out
-    out = 1.0 + x * out
-    out = out * out
-    return out * out
 
 
 def apply(frame: Frame, remembered: Frame | None, spread: float, rng: np.random.Generator) -> Frame:

@@ -15,13 +15,12 @@ import numpy as np
 from jobs.compiling import jit
 from jobs.render.effects.effect import Effect, by_pixel
 from jobs.render.effects.scene import Frame, Scene
+from jobs.render.effects.series import SMALL, small_expm1
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 
 # Newton's rule doubles the digits; the function is smooth and its slope between 1 - b and 1.
 _ITERATIONS = 6
-# Of the knee: where the series of the exponential function is exact.
-_SMALL = 0.25
 
 
 Number = float | Float
@@ -44,28 +43,12 @@ def _respond(light: Any, signal: Any, high: float, low: float, inverse: float) -
     """high : per electron, low : electrons, inverse : of the knee."""
     for i in range(len(light)):
         response = max(light[i], 0.0) / (1.0 + high * max(light[i], 0.0))
-        signal[i] = min(light[i], 0.0) + response + low * _small_expm1(-response * inverse)
+        signal[i] = min(light[i], 0.0) + response + low * small_expm1(-response * inverse)
     # Most pixels are faint: a branch above would cost more than the few that are done twice.
     for i in range(len(light)):
-        if light[i] * inverse > _SMALL:
+        if light[i] * inverse > SMALL:
             response = light[i] / (1.0 + high * light[i])
             signal[i] = response + low * np.expm1(-response * inverse)
-
-
-@jit
-def _small_expm1(x: Any) -> Any:
-    """exp(x) - 1 by its series, to 1e-14 for |x| < _SMALL."""
-    out = 1.0 + x * (1.0 / 11.0)
-    out = 1.0 + x * (1.0 / 10.0) * out
-    out = 1.0 + x * (1.0 / 9.0) * out
-    out = 1.0 + x * (1.0 / 8.0) * out
-    out = 1.0 + x * (1.0 / 7.0) * out
-    out = 1.0 + x * (1.0 / 6.0) * out
-    out = 1.0 + x * (1.0 / 5.0) * out
-    out = 1.0 + x * (1.0 / 4.0) * out
-    out = 1.0 + x * (1.0 / 3.0) * out
-    out = 1.0 + x * (1.0 / 2.0) * out
-    return x * out
 
 
 def linearised(measured: Frame, high: Number, saturation: Number, low: Number, knee: Number) -> Frame:
