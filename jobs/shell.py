@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import io
 import json
 import locale
@@ -24,6 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import IO, TYPE_CHECKING, Any
@@ -350,10 +352,18 @@ def _collect(spark: SparkSession, function: Callable[[Part], Json], parts: Seque
                 raise RuntimeError(result["error"])
             attempt = 1 if context is None else context.attemptNumber() + 1
             yield {name: value for name in _RESULT if (value := {**result, "attempt": attempt}.get(name)) is not None}
+        _settle()
 
     # A task is told its own part alone: what all of them are told is unpickled by each.
     found: list[Json] = spark.sparkContext.parallelize(parts, len(parts)).mapPartitions(run).collect()
     return found
+
+
+@cache
+def _settle() -> None:
+    """Once a worker, after its first task: its modules are no garbage.  Spark collects after each task: 22 ms else."""
+    gc.collect()
+    gc.freeze()
 
 
 def _tries(spark: SparkSession) -> int:

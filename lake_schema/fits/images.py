@@ -12,6 +12,7 @@ import io
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,13 @@ class Image:
 
 def text_of(cards: Sequence[Card]) -> str:
     """Header cards as lines of text."""
-    return "".join(f"{str(fits.Card(*card)).rstrip()}\n" for card in cards)
+    return "".join(_line(*card, repr(card[1])) for card in cards)
+
+
+@lru_cache(maxsize=4096, typed=True)
+def _line(keyword: str, value: Any, comment: str, written: str) -> str:
+    """A card, whose images of a file have most in common; written : of the value, as 0.0 and -0.0 are equal."""
+    return f"{str(fits.Card(keyword, value, comment)).rstrip()}\n"
 
 
 def cards_of_text(lines: str) -> tuple[Card, ...]:

@@ -48,6 +48,7 @@ class MissionConfiguration:
     _index: dict[str, Parameter] = field(init=False, repr=False, compare=False)
     _files: dict[str, Model] = field(init=False, repr=False, compare=False)
     _placed: dict[str, tuple[Place, ...]] = field(init=False, repr=False, compare=False)
+    _fingerprint: str = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_index", {p.key: p for p in self.parameters})
@@ -58,6 +59,12 @@ class MissionConfiguration:
             if key != name:
                 placed[key] = (*placed.get(key, ()), place)
         object.__setattr__(self, "_placed", placed)
+        lines = [f"{p.key}={p.value.hex()} {p.unit}\n" for p in self.parameters]
+        lines += [f"{m.key}={m.sha256}\n" for m in self.models]
+        object.__setattr__(self, "_fingerprint", hashlib.sha256("".join(lines).encode()).hexdigest())
+
+    def __hash__(self) -> int:
+        return hash(self._fingerprint)
 
     def parameter(self, key: str) -> Parameter:
         """The record chosen for a name; BadInput for an unknown one."""
@@ -119,9 +126,7 @@ class MissionConfiguration:
     @property
     def fingerprint(self) -> str:
         """sha256 of every name, value, unit and file, hexadecimal: equal for configurations that act alike."""
-        lines = [f"{p.key}={p.value.hex()} {p.unit}\n" for p in self.parameters]
-        lines += [f"{m.key}={m.sha256}\n" for m in self.models]
-        return hashlib.sha256("".join(lines).encode()).hexdigest()
+        return self._fingerprint
 
 
 def resolve(

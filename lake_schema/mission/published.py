@@ -7,7 +7,7 @@ read_back    a published version -> the configuration that it holds
 from __future__ import annotations
 
 import math
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from lake_schema.mission import model
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import Parameter, read_all
+from lake_schema.store import manifest
 from lake_schema.store.plan import Output
 from lake_schema.store.read import Version
 from lake_schema.tables.mission import MISSION
@@ -73,6 +74,18 @@ def read_back(version: Version) -> MissionConfiguration:
 
     Errors : Damaged where it is not the one that the manifest names
     """
+    files = [version.folder / entry["path"] for entry in version.manifest["files"]]
+    states = [manifest.state(path) for path in files if isinstance(path, Path) and path.exists()]
+    return _once(version, *states) if len(states) == len(files) else _configuration(version)
+
+
+@lru_cache(maxsize=8)
+def _once(version: Version, *states: tuple[int, ...]) -> MissionConfiguration:
+    """As long as its files stay as they are: tasks of a process read the same one."""
+    return _configuration(version)
+
+
+def _configuration(version: Version) -> MissionConfiguration:
     parameters: list[Parameter] = []
     models: list[Model] = []
     overridden = []

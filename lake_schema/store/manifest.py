@@ -2,6 +2,7 @@
 
 write     put a manifest into a version's folder
 load      read one; refused where a byte of it has changed
+state     of a file: whether it is still the one that was read
 faults    is a version what its manifest says?
 """
 
@@ -45,11 +46,7 @@ def load(folder: Folder, table: str) -> Manifest:
     """
     path = folder / MANIFEST
     try:
-        if isinstance(path, Place):
-            facts = _read(path)
-        else:
-            about = path.stat()
-            facts = _read_once(path, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns)
+        facts = _read(path) if isinstance(path, Place) else _read_once(path, *state(path))
     except (OSError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
     if facts["table"] != table or folder.name != f"v-{facts['key']}":
@@ -64,6 +61,12 @@ class Manifest(dict[str, Any]):
     def by_path(self) -> dict[str, dict[str, Any]]:
         """The entry of each file."""
         return {entry["path"]: entry for entry in self["files"]}
+
+
+def state(path: Path) -> tuple[int, int, int, int]:
+    """What differs after a file was written or replaced; what was read of one need not be read again meanwhile."""
+    about = path.stat()
+    return about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
 
 
 @lru_cache(maxsize=16)

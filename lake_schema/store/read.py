@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import lru_cache, reduce
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,9 @@ class Version:
     folder: Folder
     manifest: manifest.Manifest
     schema: pa.Schema
+
+    def __hash__(self) -> int:
+        return hash((self.folder, self.key))
 
     @property
     def table(self) -> str:
@@ -337,17 +340,27 @@ def _open(root: Folder, name: str, wanted: str, asked: bool, link: Folder) -> Ve
         if asked:
             raise BadInput(f"lake {root} has no table {name} of version {wanted}")
         raise Damaged(f"{link} leads to {folder.name}, which is missing")
-    about = manifest.load(folder, name)
-    opened = Version(folder, about, pa.schema([]))
+    opened = Version(folder, manifest.load(folder, name), pa.schema([]))
     if opened.parts:
-        first = opened._entry(opened.parts[0])
-        manifest.checked(folder, first)
-        with opened._refusing():
-            opened = replace(opened, schema=parquet.schema(folder, first))
+        first = manifest.checked(folder, opened._entry(opened.parts[0]))
+        own = _schema(opened) if isinstance(first, Place) else _schema_once(opened, *manifest.state(first))
+        opened = replace(opened, schema=own)
     known = declarations.find(name, opened.schema.names)
     return opened if known is None else as_declared(opened, known)
 
 
+@lru_cache(maxsize=64)
+def _schema_once(opened: Version, *state: int) -> pa.Schema:
+    """As long as its first part's file stays as it is: tasks of a process read the same versions."""
+    return _schema(opened)
+
+
+def _schema(opened: Version) -> pa.Schema:
+    with opened._refusing():
+        return parquet.schema(opened.folder, opened._entry(opened.parts[0]))
+
+
+@lru_cache(maxsize=64)
 def as_declared(opened: Version, table: Table) -> Version:
     """The version as `table` declares it: nullable columns that came later are filled with nulls.
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -222,6 +223,7 @@ def _parts(before: int, pixels: int, after: int, place: int, strip: int, turned:
     return found
 
 
+@lru_cache(maxsize=256)
 def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
     """The amplifiers of a detector; None of a camera that has no table of them, or whose readout is its own.
 
@@ -271,6 +273,7 @@ def full_size(detector: Detector, mission: MissionConfiguration) -> tuple[int, i
 _RELATIVE = {"gain": 0, "read_noise": 1}
 
 
+@lru_cache(maxsize=1024)
 def values(key: str, unit: str, detector: Detector, mission: MissionConfiguration, own: Layout) -> float | Float:
     """A parameter of each amplifier [q]; one number where all agree.
 
@@ -290,6 +293,7 @@ def values(key: str, unit: str, detector: Detector, mission: MissionConfiguratio
             deviation = float(rng.stream(0, name, detector.name, amplifier.name).standard_normal())
             relative = amplifier.relative[_RELATIVE[key]] if key in _RELATIVE else 1.0
             found[number] = relative * found[number] + rms * float(np.clip(deviation, -_MOST_SPREAD, _MOST_SPREAD))
+    found.setflags(write=False)
     return found if np.ptp(found) > 0.0 else float(found[0])
 
 

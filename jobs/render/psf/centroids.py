@@ -31,13 +31,13 @@ def offsets(psf: Psf, weights: Float) -> tuple[Float, Float]:
               as a tenth more of a window moves the centroid by 1.2 mas
     """
     planes, samples = _sampled(psf)
-    if psf.intra_pixel is not None:
-        # With the pixel, which all that is measured has in it.
-        planes = [_averaged(plane, samples) for plane in planes]
-    # Apertures take the light of a pixel as even in it.
-    smeared = _averaged(np.sum(planes[: _colours(psf)], axis=0), samples)
-    window = _half_light_diameter(smeared, samples) / _FWHM
-    moments = np.stack([_moments(plane, samples, window) for plane in planes])
+    # With the pixel, which all that is measured has in it; apertures take its light as even in it.
+    inside = 0 if psf.intra_pixel is None else 1
+    seen = np.sum(planes[: _colours(psf)], axis=0)
+    for _ in range(1 + inside):
+        seen = _averaged(_averaged(seen, samples, 0), samples, 1)
+    window = _half_light_diameter(seen, samples) / _FWHM
+    moments = np.stack([_moments(plane, samples, window, inside) for plane in planes])
     zeroth, x, y, xx, xy, yy = sums.product(weights, moments).T
     # How fast the window's first moments fall where it is moved.
     a, b, c = zeroth - xx / window**2, -xy / window**2, zeroth - yy / window**2
@@ -61,13 +61,11 @@ def _middle(plane: Array, reach: int) -> Array:
     return plane[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
 
 
-def _averaged(plane: Array, samples: int) -> Float:
+def _averaged(plane: Array, samples: int, axis: int) -> Float:
     """Over a pixel about each sample; of an even number of samples the outermost count half."""
     weights = np.full(samples + 1 - samples % 2, 1.0 / samples)
     weights[[0, -1]] *= 1.0 if samples % 2 else 0.5
-    for axis in (0, 1):
-        plane = correlate1d(np.asarray(plane, float), weights, axis)
-    return np.asarray(plane)
+    return np.asarray(correlate1d(np.asarray(plane, float), weights, axis))
 
 
 def _colours(psf: Psf) -> int:
@@ -83,14 +81,17 @@ def _half_light_diameter(plane: Array, samples: int) -> float:
     return 2.0 * float(radius.ravel()[order][np.searchsorted(grown, 0.5 * grown[-1])])
 
 
-def _moments(plane: Array, samples: int, window: float) -> Float:
-    """In a Gaussian window about the middle: 0th, along x and y, along xx, xy and yy; pixels."""
+def _moments(plane: Array, samples: int, window: float, inside: int) -> Float:
+    """In a Gaussian window about the middle: 0th, along x and y, along xx, xy and yy; pixels.
+
+    inside : 1 where the plane is averaged over pixels first. The average is even, so that the window may be averaged
+             instead, which is a product of one axis' and the other's.
+    """
     axis = (np.arange(len(plane)) - len(plane) // 2) / samples
-    one = np.exp(-0.5 * (axis / window) ** 2)
-    seen = plane * one * one[:, None]
-    along_x, along_y = seen.sum(axis=0), seen.sum(axis=1)
-    crossed = float(((seen * axis).sum(axis=1) * axis).sum())
-    return np.array([
-        along_x.sum(), (along_x * axis).sum(), (along_y * axis).sum(),
-        (along_x * axis**2).sum(), crossed, (along_y * axis**2).sum(),
-    ])  # fmt: skip
+    powers = np.exp(-0.5 * (axis / window) ** 2) * axis ** np.arange(3)[:, None]
+    if inside:
+        powers = _averaged(powers, samples, 1)
+    # [3, 3] along y, along x.
+    along_x = (np.asarray(plane, float) * powers[:, None]).sum(axis=2)
+    m = (powers[:, None] * along_x).sum(axis=2)
+    return np.array([m[0, 0], m[0, 1], m[1, 0], m[0, 2], m[1, 1], m[2, 0]])

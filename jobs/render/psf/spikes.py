@@ -150,9 +150,13 @@ def reach(edges: Edges, electrons: Float, least: float) -> Float:
     share = 1.0 / edges.wavelength.size
     cycles = edges.pixel_scale * ARCSEC / (edges.wavelength.ravel() * 1e-7)
     across, blur = STEP * np.arange(2 * round(WIDE / STEP)), edges.blur / edges.pixel_scale
+    # What the blur takes of each place into the middle, of both sides.
+    taken = np.fft.irfft(_passed(2 * len(across) - 1, blur), 2 * len(across) - 1)[: len(across)]
+    taken[1:] *= 2.0
     # Of fringes whose mean is half of r^-2.
     middle = [
-        float(_blurred(np.sinc(length * cycles[:, None] * across) ** 2, blur, np.full((1, len(cycles)), share))[0, 0])
+        share
+        * float(np.maximum((np.sinc(length * cycles[:, None] * across) ** 2 * taken).sum(axis=1), 0.0).sum())
         * (length / np.pi) ** 2
         / (2.0 * edges.area)
         for _, _, length in edges.bars
@@ -164,7 +168,12 @@ def reach(edges: Edges, electrons: Float, least: float) -> Float:
 def _blurred(lines: Float, blur: float, along: Float) -> Float:
     """Sum of the lines [w, t], t >= 0, through jitter, diffusion and pixel: [r, t] up to _WIDE."""
     both = np.concatenate([lines[:, :0:-1], lines], axis=1)
-    k = 2.0 * np.pi * np.fft.rfftfreq(both.shape[1], STEP)
-    passed = np.fft.rfft(both, axis=1) * np.exp(-0.5 * (blur * k) ** 2) * np.sinc(k / (2.0 * np.pi))
+    passed = np.fft.rfft(both, axis=1) * _passed(both.shape[1], blur)
     smooth = np.fft.irfft(passed, both.shape[1], axis=1)[:, lines.shape[1] - 1 :]
     return np.asarray(sums.product(along, np.maximum(smooth[:, : round(WIDE / STEP) + 2], 0.0)))
+
+
+def _passed(many: int, blur: float) -> Float:
+    """Of each frequency of so many samples, what jitter, diffusion and pixel leave."""
+    k = 2.0 * np.pi * np.fft.rfftfreq(many, STEP)
+    return np.asarray(np.exp(-0.5 * (blur * k) ** 2) * np.sinc(k / (2.0 * np.pi)))

@@ -13,6 +13,7 @@ position: circles are widened by how far a source may be seen from where its cel
 from __future__ import annotations
 
 from collections.abc import Mapping, Set
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -64,9 +65,13 @@ def beyond(task: Mapping[str, Any], deflection: float, farther: float, drawn: Se
 
 
 def _cells(task: Mapping[str, Any], wider: float) -> list[int]:
-    radius = min(float(task["radius"]) + wider + _ROUNDING, 180.0)
-    found: list[int] = sky.cells_in_cone(float(task["ra"]), float(task["dec"]), radius, GENERATION_ORDER).tolist()
-    return found
+    return list(_in_circle(float(task["ra"]), float(task["dec"]), float(task["radius"]) + wider + _ROUNDING))
+
+
+@lru_cache(maxsize=256)
+def _in_circle(ra: float, dec: float, radius: float) -> tuple[int, ...]:
+    """Of each detector the same few circles are asked for by every table."""
+    return tuple(sky.cells_in_cone(ra, dec, min(radius, 180.0), GENERATION_ORDER).tolist())
 
 
 def near(ra: Float, dec: Float, centre: tuple[float, float], radius: float | Float) -> Bool:
