@@ -26,6 +26,8 @@ from lake_schema.errors import BadInput, OutOfRange
 DEEPEST = 29
 # Of three neighbouring vertices (unit vectors) the triple product at which healpy sees no corner any more.
 _FLATTEST = 1e-10
+# Cells of a circle's cover are about this part of its radius wide: finer ones skip few rows more.
+_CELLS_A_RADIUS = 4
 # Added to a distance that decides: more than the rounding of any.
 _ROUNDING_DEG = 1e-9
 
@@ -166,6 +168,13 @@ def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
     found = _hp().query_disc(1 << fine, centre, np.radians(min(radius + cell_radius(fine), 180.0)), nest=True)
     own = cell_of([ra], [dec], order)
     return np.unique(np.concatenate([parent(found, fine, order), own]))
+
+
+def cover_order(radius: float) -> int:
+    """Order of cells that suit the cover of a circle of `radius` deg."""
+    wanted = max(radius / _CELLS_A_RADIUS, 1e-7)
+    order = int(np.ceil(np.log2(np.sqrt(cell_area(0)) / wanted)))
+    return min(max(order, 0), DEEPEST - 3)
 
 
 def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike, order: int) -> list[Int]:

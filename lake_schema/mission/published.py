@@ -75,8 +75,11 @@ def read_back(version: Version) -> MissionConfiguration:
     Errors : Damaged where it is not the one that the manifest names
     """
     files = [version.folder / entry["path"] for entry in version.manifest["files"]]
-    states = [manifest.state(path) for path in files if isinstance(path, Path) and path.exists()]
-    return _once(version, *states) if len(states) == len(files) else _configuration(version)
+    try:
+        return _once(version, *(manifest.state(path) for path in files if isinstance(path, Path)))
+    except FileNotFoundError:
+        # Which one is missing is said by whoever reads it.
+        return _configuration(version)
 
 
 @lru_cache(maxsize=8)

@@ -4,11 +4,9 @@ version(root, name)     a published version (resolved once: a later publication 
 for_request             the one that a request's next table is made of
 Version.dataset         its files as an Arrow dataset
 Version.rows            rows of some columns or parts
-Version.beside          rows of a Parquet file that belongs to the version, though not to its table
-Version.file            any other file, such as an image
+Version.beside, .file   rows of a Parquet file that is not of its table; any other file, such as an image
 Version.margin          rows just outside a part's cell
-Version.in_cells        rows inside HEALPix cells
-Version.cone            rows inside a circle, by observed or true position
+Version.in_cells, .cone rows inside HEALPix cells; inside a circle, by observed or true position
 verify                  is a version what its manifest says?
 """
 
@@ -35,8 +33,6 @@ from lake_schema.s3 import Folder, Place
 from lake_schema.store import layout, manifest, names, parquet
 from lake_schema.store.provenance import digest
 
-# Cells of a cone's cover are about this part of its radius wide: finer ones skip few rows more.
-_CELLS_A_RADIUS = 4
 # So many stretches of _healpix_29 go into the filter of one file; the rest of its rows are left out after reading.
 _MOST_RANGES = 16
 # Added to a padded radius: more than the rounding of the largest deflection.
@@ -221,7 +217,7 @@ class Version:
         place = self.place(on)
         self._own([*place, "_healpix_29"])
         padded = radius + self.padding(on)
-        order = cover_order(padded)
+        order = sky.cover_order(padded)
         names = None if columns is None else list(dict.fromkeys([*columns, *place]))
         rows = self.in_cells(sky.cells_in_cone(ra, dec, min(padded, 180.0), order).tolist(), order, names)
         lon, lat = (rows[name].to_numpy() for name in place)
@@ -241,13 +237,6 @@ class Version:
         if "deflection_deg" not in self.manifest:
             raise BadInput(f"table {self.table}: version {self.key} does not say how far positions are lensed")
         return float(self.manifest["deflection_deg"])
-
-
-def cover_order(radius: float) -> int:
-    """Order of cells that suit the cover of a circle of `radius` deg."""
-    wanted = max(radius / _CELLS_A_RADIUS, 1e-7)
-    order = int(np.ceil(np.log2(np.sqrt(sky.cell_area(0)) / wanted)))
-    return min(max(order, 0), sky.DEEPEST - 3)
 
 
 def _as_asked(rows: pa.Table, own: Sequence[str], asked: Sequence[str]) -> pa.Table:
@@ -343,21 +332,17 @@ def _open(root: Folder, name: str, wanted: str, asked: bool, link: Folder) -> Ve
     opened = Version(folder, manifest.load(folder, name), pa.schema([]))
     if opened.parts:
         first = manifest.checked(folder, opened._entry(opened.parts[0]))
-        own = _schema(opened) if isinstance(first, Place) else _schema_once(opened, *manifest.state(first))
-        opened = replace(opened, schema=own)
+        with opened._refusing():
+            state = () if isinstance(first, Place) else manifest.state(first)
+            opened = replace(opened, schema=_schema(opened, *state))
     known = declarations.find(name, opened.schema.names)
     return opened if known is None else as_declared(opened, known)
 
 
 @lru_cache(maxsize=64)
-def _schema_once(opened: Version, *state: int) -> pa.Schema:
+def _schema(opened: Version, *state: int) -> pa.Schema:
     """As long as its first part's file stays as it is: tasks of a process read the same versions."""
-    return _schema(opened)
-
-
-def _schema(opened: Version) -> pa.Schema:
-    with opened._refusing():
-        return parquet.schema(opened.folder, opened._entry(opened.parts[0]))
+    return parquet.schema(opened.folder, opened._entry(opened.parts[0]))
 
 
 @lru_cache(maxsize=64)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 import sep
-from scipy import ndimage
 
+from jobs.validation.measure import masks
 from jobs.validation.measure.rows import LEAST, Row, not_applicable
 from jobs.validation.measure.seen import Check, Seen, wants_blank
 from lake_schema.arrays import Bool, Float
@@ -75,13 +75,13 @@ def searched(of: Seen) -> tuple[Float, Bool, float, str]:
     top, left = (max(min(n // 2 + 8, n - _SIDE), 0) for n in (ny, nx))
     part = np.ascontiguousarray(of.frame.electrons[top : top + _SIDE, left : left + _SIDE], np.float64)
     level = float(np.median(of.tiles.level))
-    full = ndimage.binary_dilation(part >= of.frame.full, iterations=4)
+    full = masks.grown(part >= of.frame.full, times=4)
     width = float(of.frame.header["PSFFWHM"]) / of.frame.scale
     axis = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
     kernel = np.exp(-4.0 * np.log(2.0) * (axis[:, None] ** 2 + axis**2) / width**2)
     objects, which = sep.extract(part - level, _THRESHOLD, err=of.noise, minarea=_PIXELS, filter_kernel=kernel,
                                  mask=full, segmentation_map=True)  # fmt: skip
-    covered = ndimage.binary_dilation(which > 0)
+    covered = masks.grown(which > 0)
     known = of.known
     inside = (known.x > left + 8) & (known.x < left + part.shape[1] - 9)
     inside &= (known.y > top + 8) & (known.y < top + part.shape[0] - 9) & (known.expected > 0.0)

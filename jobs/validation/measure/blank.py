@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 
+from jobs.validation.measure import masks
 from jobs.validation.measure.frames import Amplifier, Frame
 from jobs.validation.measure.references import Reference
 from lake_schema.arrays import Array, Bool, Float, Int
@@ -25,6 +25,8 @@ _SHOWS, _WIDER, _LEAST = 0.1, 1.5, 1.0
 _MOST_RADIUS = 400
 # Standard deviations from a tile's median beyond which a pixel is an outlier, and tiles want so many pixels.
 _CLIP, _LEAST_PIXELS = 5.0, 400
+# Every how many rows and columns a pixel is looked at for the first level.
+_SOME = 4
 # Standard deviations above its tile from which a pixel is hit.
 _HIT = 8.0
 
@@ -92,8 +94,9 @@ def tiles(frame: Frame, known: Reference, noise: float, every: int | None = None
 def _grown(pixels: Array, hidden: Bool, noise: float) -> Bool:
     """What is no blank sky: sources, outliers and what touches them, pixels that nobody reads."""
     bad = hidden | (pixels == 0.0)
-    # Sources are a minor part of most tiles: their median is where the level is first looked for.
-    middle = np.median(np.where(bad, np.median(pixels), pixels), axis=(1, 2))
+    # Sources are a minor part of most tiles: their median is where the level is first looked for, in a part of them.
+    some = pixels[:, ::_SOME, ::_SOME]
+    middle = np.median(np.where(bad[:, ::_SOME, ::_SOME], np.median(some), some), axis=(1, 2))
     spread = np.full(len(pixels), noise)
     for _ in range(3):
         out = np.abs(pixels - middle[:, None, None]) > (_CLIP * spread)[:, None, None]
@@ -101,8 +104,7 @@ def _grown(pixels: Array, hidden: Bool, noise: float) -> Bool:
         n = np.maximum(kept.sum(axis=(1, 2)), 1)
         middle = (pixels * kept).sum(axis=(1, 2)) / n
         spread = np.sqrt((kept * (pixels - middle[:, None, None]) ** 2).sum(axis=(1, 2)) / n)
-    touched = ndimage.binary_dilation(out & ~hidden, structure=np.ones((1, 3, 3), bool))
-    return np.asarray(bad | out | touched)
+    return np.asarray(bad | out | masks.grown(out & ~hidden, corners=True))
 
 
 def _sources(frame: Frame, known: Reference, noise: float) -> Bool:
@@ -116,17 +118,7 @@ def _sources(frame: Frame, known: Reference, noise: float) -> Bool:
     radius = np.maximum(radius * np.where(known.point, 1.0, _WIDER), max(2.0 * width, _LEAST))
     # What nobody could see even where it is brightest stays: its light is part of the sky's noise.
     radius[known.expected * frame.scale**2 < _SHOWS * noise * width**2] = 0.0
-    pixels = np.minimum(np.ceil(radius / frame.scale), _MOST_RADIUS).astype(int)
-    discs: dict[int, Bool] = {}
-    for x, y, r in zip(np.rint(known.x).astype(int), np.rint(known.y).astype(int), pixels, strict=True):
-        if r == 0 or not (-r <= x < nx + r and -r <= y < ny + r):
-            continue
-        axis = np.arange(-r, r + 1)
-        disc = discs.setdefault(int(r), np.hypot(axis, axis[:, None]) <= r)
-        top, left = max(y - r, 0), max(x - r, 0)
-        bottom, right = min(y + r + 1, ny), min(x + r + 1, nx)
-        if top < bottom and left < right:
-            out[top:bottom, left:right] |= disc[top - y + r : bottom - y + r, left - x + r : right - x + r]
+    masks.discs(known.x, known.y, np.minimum(radius / frame.scale, _MOST_RADIUS), out)
     return out
 
 

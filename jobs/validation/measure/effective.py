@@ -9,6 +9,7 @@ Ref : Anderson & King 2000, PASP 112, 1360 (effective PSF); Stetson 1987, PASP 9
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +17,12 @@ import numpy as np
 from jobs import sums
 from jobs.validation.measure.frames import Frame
 from jobs.validation.measure.stars import Measured
-from lake_schema.arrays import Float
+from lake_schema.arrays import Bool, Float
 
 # FWHM on either side of a star, and at least pixels; knots a FWHM, and pixels between them at least.
 _REACH, _LEAST_REACH, _KNOTS, _FINEST = 2.0, 3.0, 4.0, 1.0 / 3.0
-# Of the mean weight of a coefficient, by which second differences are kept small; rounds of its solution.
-_SMOOTH, _SOLVED = 1e-5, 200
+# Of the mean weight of a coefficient, by which second differences are kept small.
+_SMOOTH = 1e-5
 # Stars that it is built from, at least; how much the PSF differs from star to star, of itself and of its peak;
 # deviations of an outlier.
 LEAST, _DIFFERS, _FLOOR, _OUTLIER = 8, 0.03, 3e-3, 5.0
@@ -82,30 +83,23 @@ def built(x: Float, y: Float, value: Float, weight: Float, fwhm: float) -> Effec
 
 
 def _solved(index: np.ndarray, basis: Float, value: Float, weight: Float, k: int) -> Float:
-    """Coefficients [k k] by conjugate gradients."""
-
-    def back(pixels: Float) -> Float:
-        return np.asarray(np.bincount(index.ravel(), (basis * (weight * pixels)[:, None]).ravel(), k * k), float)
-
-    smooth = _SMOOTH * np.bincount(index.ravel(), (basis**2 * weight[:, None]).ravel(), k * k).mean()
-
-    def applied(c: Float) -> Float:
-        square, rough = c.reshape(k, k), np.zeros((k, k))
-        for axis in (0, 1):
-            pad = [(2, 2) if axis == a else (0, 0) for a in (0, 1)]
-            rough += np.diff(np.pad(np.diff(square, 2, axis), pad), 2, axis)
-        return np.asarray(back((basis * c[index]).sum(axis=1)) + smooth * rough.ravel())
-
-    out = np.zeros(k * k)
-    left = back(value)
-    along, size = left, float((left**2).sum())
-    for _ in range(_SOLVED):
-        turned = applied(along)
-        length = size / max(float((along * turned).sum()), 1e-300)
-        out, left = out + length * along, left - length * turned
-        new = float((left**2).sum())
-        along, size = left + new / max(size, 1e-300) * along, new
-    return out
+    """Coefficients [k k]: least squares with small second differences, its matrix a band, as splines overlap."""
+    heavy, width = basis * weight[:, None], 3 * k + 3
+    band = np.zeros((width + 1, k * k))
+    for i in range(16):
+        for j in range(16):
+            apart = index[0, i] - index[0, j]
+            if apart >= 0:
+                band[apart] += np.bincount(index[:, j], heavy[:, i] * basis[:, j], k * k)
+    smooth = _SMOOTH * band[0].mean()
+    for step in (1, k):
+        # Second differences of three neighbours along a row, or a column.
+        middle = np.arange(k * k).reshape(k, k)
+        first = (middle[:, :-2] if step == 1 else middle[:-2]).ravel()
+        for i, a in enumerate((1.0, -2.0, 1.0)):
+            for j, c in enumerate((1.0, -2.0, 1.0)[: i + 1]):
+                band[(i - j) * step] += smooth * a * c * np.bincount(first + j * step, minlength=k * k)
+    return sums.of_band(band, np.asarray(np.bincount(index.ravel(), (heavy * value[:, None]).ravel(), k * k), float))
 
 
 def reach_of(fwhm: float) -> float:
@@ -122,9 +116,8 @@ def lights(frame: Frame, found: Measured, whole: Float, noise: float) -> tuple[F
     stars, n = found.stars, len(found.stars)
     bright = np.flatnonzero(np.isfinite(whole) & (whole > 0.0))
     bright = bright[np.argsort(-whole[bright], kind="stable")][: max(len(bright) // 2, LEAST)]
-    out, error = np.full(n, np.nan), np.full(n, np.nan)
     if len(bright) < LEAST or not np.isfinite(found.fwhm):
-        return out, error
+        return np.full(n, np.nan), np.full(n, np.nan)
     pixels = [_pixels(frame, found, i) for i in range(n)]
     parts = [np.stack([u, v, cut / whole[i], whole[i] ** 2 / (noise**2 + np.maximum(cut, 0.0))])
              for i, (u, v, cut) in ((i, pixels[i]) for i in bright)]  # fmt: skip
@@ -132,9 +125,13 @@ def lights(frame: Frame, found: Measured, whole: Float, noise: float) -> tuple[F
     # Without a floor the many pixels of the wings would outweigh the few of the core.
     variance = 1.0 / weight + (_DIFFERS * value) ** 2 + (_FLOOR * value.max()) ** 2
     psf = built(u, v, value, 1.0 / variance, found.fwhm)
-    for i in range(n):
-        out[i], error[i] = _fitted(psf, *pixels[i], float(stars.flux[i]), noise)
-    return out, error
+    # As many pixels of each: what is too many of some lies far off, and counts for nothing.
+    most = max(len(cut) for *_, cut in pixels)
+    u, v, cut, there = (np.zeros((n, most)) for _ in range(4))
+    for i, own in enumerate(pixels):
+        m = len(own[2])
+        u[i, :m], v[i, :m], cut[i, :m], there[i, :m] = *own, 1.0
+    return _fitted(psf, (u, v), cut, there > 0.0, stars.flux, noise)
 
 
 def _pixels(frame: Frame, found: Measured, i: int) -> tuple[Float, Float, Float]:
@@ -148,22 +145,43 @@ def _pixels(frame: Frame, found: Measured, i: int) -> tuple[Float, Float, Float]
     return u.ravel(), v.ravel(), cut.ravel() / float(frame.illumination(stars.x[i : i + 1], stars.y[i : i + 1])[0])
 
 
-def _fitted(psf: Effective, x: Float, y: Float, cut: Float, flux: float, noise: float) -> tuple[float, float]:
-    """(e-, its error) of one star; flux : where to begin."""
-    u, v, good = 0.0, 0.0, np.ones(len(cut), bool)
-    weight = np.ones(len(cut))
-    value = weight
+def _fitted(
+    psf: Effective, place: tuple[Float, Float], cut: Float, there: Bool, flux: Float, noise: float
+) -> tuple[Float, Float]:
+    """(e- [n], its error) of stars, NaN where too few pixels are good.
+
+    place : x, y [n, m] of pixels;  cut : e- [n, m];  there : whether there is such a pixel;  flux : where to begin
+    """
+    flux, good = flux.astype(float), there
+    u, v = np.zeros_like(flux), np.zeros_like(flux)
     for n in range(_ROUNDS):
-        value, rise, climb = psf.at(x - u, y - v)
-        told = np.maximum(flux * value, 0.0)
+        x, y = place[0] - u[:, None], place[1] - v[:, None]
+        value, rise, climb = (part.reshape(cut.shape) for part in psf.at(x.ravel(), y.ravel()))
+        told = np.maximum(flux[:, None] * value, 0.0)
         weight = 1.0 / (noise**2 + told)
-        left = cut - flux * value
+        left = cut - flux[:, None] * value
         if n > 1:
-            good = np.abs(left) < _OUTLIER * np.sqrt(1.0 / weight + (3.0 * _DIFFERS * told) ** 2)
-        if good.sum() < LEAST:
-            return np.nan, np.nan
-        root = np.sqrt(weight * good)
-        matrix = np.stack([value, -flux * rise, -flux * climb], axis=1) * root[:, None]
-        more, du, dv = sums.least_squares(matrix, left * root)
-        flux, u, v = flux + float(more), *(float(np.clip(a + b, -2 * _STEP, 2 * _STEP)) for a, b in ((u, du), (v, dv)))
-    return flux, float((weight * good * value**2).sum() ** -0.5)
+            good = there & (np.abs(left) < _OUTLIER * np.sqrt(1.0 / weight + (3.0 * _DIFFERS * told) ** 2))
+        heavy = weight * good
+        # In units of the flux, so that light and place weigh alike.
+        more, du, dv = _step((value, -rise, -climb), heavy, left / flux[:, None])
+        u, v = (np.clip(a + b, -2 * _STEP, 2 * _STEP) for a, b in ((u, du), (v, dv)))
+        flux = flux * (1.0 + more)
+    few = good.sum(axis=1) < LEAST
+    error = np.where(few, 1.0, (heavy * value**2).sum(axis=1)) ** -0.5
+    return np.where(few, np.nan, flux), np.where(few, np.nan, error)
+
+
+def _step(columns: Sequence[Float], weight: Float, left: Float) -> list[Float]:
+    """Of each star [n] the three numbers by which its columns [n, m] explain what is left, by Cramer's rule.
+
+    Their matrix is far from singular: a PSF and its slopes along two axes are nearly orthogonal.
+    """
+    (a, b, c), (d, e), (f,) = ([(weight * columns[i] * columns[j]).sum(axis=1) for j in range(i, 3)] for i in range(3))
+    p, q, r = ((weight * column * left).sum(axis=1) for column in columns)
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
+    whole = a * aa + b * bb + c * cc
+    # Where no pixel is good there is no step.
+    whole = np.where(whole > 0.0, whole, np.inf)
+    return [(aa * p + bb * q + cc * r) / whole, (bb * p + dd * q + ee * r) / whole, (cc * p + ee * q + ff * r) / whole]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from jobs.validation.measure import masks
 from jobs.validation.measure.frames import Frame
 from jobs.validation.measure.references import Reference
 from lake_schema.arrays import Bool, Float, Int
@@ -137,9 +138,8 @@ def beside(known: Reference, near: Int, across: Int, up: Int, noise: float) -> B
     """
     out = np.zeros((len(up), len(across)), bool)
     reach = np.cbrt(_WING * known.expected[near] / (_SHOWS * noise))
-    for j, r in zip(near, np.where(reach > 1.0, np.maximum(reach, _CORE), 0.0), strict=True):
-        if r > 0.0:
-            out |= (across - known.x[j]) ** 2 + ((up - known.y[j]) ** 2)[:, None] < r**2
+    radius = np.where(reach > 1.0, np.maximum(reach, _CORE), 0.0)
+    masks.discs(known.x[near] - across[0], known.y[near] - up[0], radius, out)
     return out
 
 
