@@ -1,4 +1,4 @@
-"""All checks of a lake: frames in several processes, then what needs them together, then its catalogues.
+"""All checks of a lake: of its catalogues and of each frame in several processes, then what needs frames together.
 
 validated   a lake -> rows and what figures are drawn of
 """
@@ -51,40 +51,39 @@ class Found:
 
 
 def validated(held: Held, processes: int = 2) -> Found:
-    """Run all checks that a lake has something for; processes : that look at frames at a time."""
-    results = list(_frames(held, processes))
+    """Run all checks that a lake has something for; processes : at a time, for frames and checks of catalogues."""
+    if processes <= 1:
+        catalogues, results = [*map(of_catalogues, _catalogued(held))], [*_shown(map(of_frame, _tasks(held)), held)]
+    else:
+        with ProcessPoolExecutor(processes, multiprocessing.get_context("forkserver")) as pool:
+            # A few that take long: begun while the frames' sources are looked up.
+            begun = [pool.submit(of_catalogues, one) for one in _catalogued(held)]
+            results = [*_shown(pool.map(of_frame, _tasks(held)), held)]
+            catalogues = [one.result() for one in begun]
     rows = [row for result in results for row in result.rows]
     together = [row for check in checks.OF_SEVERAL for row in check.rows(results)]
-    catalogues = list(_catalogued(held))
     return Found([*rows, *together, *(row for result in catalogues for row in result.rows)], results, catalogues)
 
 
-def _catalogued(held: Held) -> Iterator[Result]:
-    """Of the catalogues; a row that says what is missing where a check has not its tables."""
-    for check in checks.OF_CATALOGUES:
-        missing = [name for name in check.tables if name not in held.tables]
-        if missing:
-            why = f"the lake has no table {' and '.join(missing)}"
-            row = not_applicable(check.name, Place(), why, check.source, check.tables[0])
-            yield Result(Place(), [row], {})
-        else:
-            yield check.measured(*(held.tables[name] for name in check.tables))
+def _shown(results: Iterator[Result], held: Held) -> Iterator[Result]:
+    """The results of frames, under a bar that counts them."""
+    return iter(tqdm(results, total=len(held.shots), unit="detector", desc="validation", disable=None))
 
 
-def _frames(held: Held, processes: int) -> Iterator[Result]:
-    tasks = _tasks(held)
-    bar = tqdm(total=len(tasks), unit="detector", desc="validation", disable=None)
-    with bar:
-        if processes <= 1 or len(tasks) <= 1:
-            for task in tasks:
-                yield of_frame(task)
-                bar.update()
-            return
-        context = multiprocessing.get_context("forkserver")
-        with ProcessPoolExecutor(min(processes, len(tasks)), context) as pool:
-            for result in pool.map(of_frame, tasks):
-                yield result
-                bar.update()
+def _catalogued(held: Held) -> list[tuple[int, tuple[read.Version | None, ...]]]:
+    """Each check of catalogues by its number, and the tables that it wants, None where the lake has not one."""
+    return [(n, tuple(map(held.tables.get, check.tables))) for n, check in enumerate(checks.OF_CATALOGUES)]
+
+
+def of_catalogues(wanted: tuple[int, tuple[read.Version | None, ...]]) -> Result:
+    """What a check of catalogues measures; a row that says what is missing where it has not its tables."""
+    number, versions = wanted
+    check = checks.OF_CATALOGUES[number]
+    missing = [name for name, version in zip(check.tables, versions, strict=True) if version is None]
+    if not missing:
+        return check.measured(*versions)
+    why = f"the lake has no table {' and '.join(missing)}"
+    return Result(Place(), [not_applicable(check.name, Place(), why, check.source, check.tables[0])], {})
 
 
 def _tasks(held: Held) -> Sequence[Task]:

@@ -1,0 +1,62 @@
+"""Figures of a report of `truesky validate`, side by side: python -m scripts.report_pictures REPORT [FILE].
+
+Those of VIS and of the galaxies that docs/pilot.md shows. FILE : JPEG, docs/pilot_validation.jpg where none is named.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import sys
+from collections.abc import Sequence
+from html import unescape
+from pathlib import Path
+
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[1]
+# How their captions begin, in rows of two; pixels that each is wide, and between rows.
+SHOWN = (
+    "VIS: positions", "VIS: magnitudes", "VIS: noise", "VIS: sources that are found",
+    "NISP-P: positions", "NISP-P: magnitudes", "galaxies: counts", "galaxies: how they cluster",
+)  # fmt: skip
+_WIDE, _BETWEEN = 760, 14
+_FIGURE = re.compile(r"<img alt='[^']*' src='data:image/png;base64,([^']+)'><figcaption>(.*?)</figcaption>", re.DOTALL)
+
+
+def figures(report: str) -> dict[str, Image.Image]:
+    """Caption -> picture of a report's HTML."""
+    found = _FIGURE.findall(report)
+    return {unescape(text): Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB") for data, text in found}
+
+
+def side_by_side(pictures: Sequence[Image.Image]) -> Image.Image:
+    """In rows of two, as wide as each other."""
+    scaled = [one.resize((_WIDE, round(one.height * _WIDE / one.width)), Image.Resampling.LANCZOS) for one in pictures]
+    rows = [scaled[i : i + 2] for i in range(0, len(scaled), 2)]
+    heights = [max(one.height for one in row) + _BETWEEN for row in rows]
+    out, top = Image.new("RGB", (2 * _WIDE, sum(heights)), "white"), 0
+    for row, height in zip(rows, heights, strict=True):
+        for i, one in enumerate(row):
+            out.paste(one, (i * _WIDE, top + (height - one.height) // 2))
+        top += height
+    return out
+
+
+def main(argv: Sequence[str]) -> int:
+    """Exit status: 0, 2 where the report lacks one of the figures."""
+    held = figures(Path(argv[0]).read_text(encoding="utf-8"))
+    chosen = [next((held[text] for text in held if text.startswith(name)), None) for name in SHOWN]
+    pictures = [one for one in chosen if one is not None]
+    if len(pictures) < len(SHOWN):
+        lacking = ", ".join(name for name, one in zip(SHOWN, chosen, strict=True) if one is None)
+        print(f"{argv[0]}: no figure of {lacking}", file=sys.stderr)
+        return 2
+    target = Path(argv[1]) if len(argv) > 1 else ROOT / "docs" / "pilot_validation.jpg"
+    side_by_side(pictures).save(target, quality=82, optimize=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
