@@ -76,10 +76,12 @@ def read_back(version: Version) -> MissionConfiguration:
     """
     files = [version.folder / entry["path"] for entry in version.manifest["files"]]
     try:
-        return _once(version, *(manifest.state(path) for path in files if isinstance(path, Path)))
+        states = [manifest.state(path) for path in files if isinstance(path, Path)]
     except FileNotFoundError:
         # Which one is missing is said by whoever reads it.
-        return _configuration(version)
+        states = []
+    # Copies of files on object storage go with their store.
+    return _once(version, *states) if len(states) == len(files) else _configuration(version)
 
 
 @lru_cache(maxsize=8)

@@ -2,11 +2,9 @@
 
 version(root, name)     a published version (resolved once: a later publication does not mix in)
 for_request             the one that a request's next table is made of
-Version.dataset         its files as an Arrow dataset
-Version.rows            rows of some columns or parts
+Version.dataset, .rows  its files as an Arrow dataset; rows of some columns or parts
 Version.beside, .file   rows of a Parquet file that is not of its table; any other file, such as an image
-Version.margin          rows just outside a part's cell
-Version.in_cells, .cone rows inside HEALPix cells; inside a circle, by observed or true position
+Version.margin, .in_cells, .cone  rows just outside a part's cell, in HEALPix cells, in a circle by either position
 verify                  is a version what its manifest says?
 """
 
@@ -333,19 +331,19 @@ def _open(root: Folder, name: str, wanted: str, asked: bool, link: Folder) -> Ve
     if opened.parts:
         first = manifest.checked(folder, opened._entry(opened.parts[0]))
         with opened._refusing():
-            state = () if isinstance(first, Place) else manifest.state(first)
-            opened = replace(opened, schema=_schema(opened, *state))
+            own = _schema_once(opened, *manifest.state(first)) if isinstance(first, Path) else _schema(opened)
+        opened = replace(opened, schema=own)
     known = declarations.find(name, opened.schema.names)
-    return opened if known is None else as_declared(opened, known)
+    if known is None:
+        return opened
+    # Places on object storage that are equal may be of two stores.
+    return _declared_once(opened, known) if isinstance(folder, Path) else as_declared(opened, known)
 
 
-@lru_cache(maxsize=64)
 def _schema(opened: Version, *state: int) -> pa.Schema:
-    """As long as its first part's file stays as it is: tasks of a process read the same versions."""
     return parquet.schema(opened.folder, opened._entry(opened.parts[0]))
 
 
-@lru_cache(maxsize=64)
 def as_declared(opened: Version, table: Table) -> Version:
     """The version as `table` declares it: nullable columns that came later are filled with nulls.
 
@@ -361,6 +359,10 @@ def as_declared(opened: Version, table: Table) -> Version:
             f"table {table.name}: version {was} of its declaration is in the lake, this is version {now}: {fault}"
         )
     return replace(opened, schema=table.arrow())
+
+
+# Tasks of a process open the same versions: their schemas stay as long as the first part's file stays as it is.
+_schema_once, _declared_once = lru_cache(maxsize=64)(_schema), lru_cache(maxsize=64)(as_declared)
 
 
 def _difference(stored: pa.Schema, table: Table, was: int) -> str:
