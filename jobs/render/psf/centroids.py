@@ -73,12 +73,25 @@ def _colours(psf: Psf) -> int:
 
 
 def _half_light_diameter(plane: Array, samples: int) -> float:
-    """Pixels, of the light of a plane."""
+    """Pixels, of the light of a plane.
+
+    Error : 0.5 % with five samples a pixel, 1.4 % with three: one at the edge counts as far as it is inside, along the
+            radius
+    """
     axis = (np.arange(len(plane)) - len(plane) // 2) / samples
-    radius = np.hypot(axis, axis[:, None])
-    order = np.argsort(radius, axis=None)
-    grown = np.cumsum(plane.ravel()[order])
-    return 2.0 * float(radius.ravel()[order][np.searchsorted(grown, 0.5 * grown[-1])])
+    radius, light = np.hypot(axis, axis[:, None]).ravel(), np.asarray(plane, float).ravel()
+    order = np.argsort(radius, kind="stable")
+    grown = np.cumsum(light[order])
+    half, near = 0.5 * grown[-1], float(radius[order][np.searchsorted(grown, 0.5 * grown[-1])])
+    # What is farther from the edge is inside or outside, however far the edge is moved.
+    low, high = max(near - 1.0 / samples, 0.0), near + 1.0 / samples
+    edge = (radius > low - 1.0 / samples) & (radius < high + 1.0 / samples)
+    inside, radius, light = float(light[radius <= low - 1.0 / samples].sum()), radius[edge], light[edge]
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        held = inside + float((light * np.clip((middle - radius) * samples + 0.5, 0.0, 1.0)).sum())
+        low, high = (middle, high) if held < half else (low, middle)
+    return low + high
 
 
 def _moments(plane: Array, samples: int, window: float, inside: int) -> Float:

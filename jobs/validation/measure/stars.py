@@ -225,7 +225,9 @@ def _half_light(growth: Float, flux: Float, radii: Float) -> float:
     if not len(growth):
         return float(radii[4])
     mean = np.median(growth / flux[:, None], axis=0)
-    return float(np.interp(0.5 * mean[-1], np.append(0.0, mean), np.append(0.0, radii)))
+    # Of a Gaussian's light the part outside is exp(-r^2 / 2 sigma^2): its logarithm is nearly straight in r^2.
+    outside = np.minimum.accumulate(np.clip(1.0 - mean / mean[-1], 1e-6, 1.0))
+    return float(np.sqrt(np.interp(np.log(2.0), np.append(0.0, -np.log(outside)), np.append(0.0, radii**2))))
 
 
 def _width(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> tuple[float, float]:

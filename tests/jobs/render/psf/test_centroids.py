@@ -8,7 +8,7 @@ import sep
 
 from jobs.render.drawing import transfer
 from jobs.render.products import truth_table
-from jobs.render.psf import model, seeing
+from jobs.render.psf import centroids, model, seeing
 from jobs.render.psf.centroids import offsets
 from tests.jobs.render import nominal
 from tests.jobs.render.fields import small
@@ -27,6 +27,14 @@ def psf_of(*planes, drift=(), samples=3):
     return model.sampled(
         model.Planes(waves, images, more, (50.0, 50.0), ((1, 0, 0),) * len(drift), samples), 0.1, False, 24
     )
+
+
+@pytest.mark.parametrize(("samples", "error"), [(3, 0.014), (5, 0.005)])
+def test_half_of_the_light_of_a_gaussian(samples, error):
+    """Of any width: not in steps of the samples."""
+    for sigma in np.linspace(0.5, 1.5, 23):
+        found = centroids._half_light_diameter(shifted(0.0, 0.0, sigma, samples=samples), samples)
+        assert found == pytest.approx(2.0 * sigma * np.sqrt(2.0 * np.log(2.0)), rel=error)
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3, 4])
