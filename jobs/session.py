@@ -6,12 +6,16 @@ spark-defaults.conf.  Where the master is not local, no path and no address of t
 
 from __future__ import annotations
 
+import atexit
 import os
 import re
+import shutil
 import signal
 import sys
+import tempfile
 import threading
 import warnings
+from functools import cache
 from pathlib import Path
 
 from py4j.protocol import Py4JError
@@ -20,8 +24,8 @@ from pyspark.sql import SparkSession
 
 # What nobody from outside may reach, wherever the configuration says nothing else.
 _CLOSED = {"spark.ui.enabled": "false"}
-# Between Java and a machine's Python workers; through TCP, acknowledgements that are put off cost each task 40 ms.
-_QUICK = {"spark.python.unix.domain.socket.enabled": "true"}
+# Settings of sockets of the Unix domain, and characters of a folder in which one with Spark's name fits (108 in all).
+_SOCKETS, _LONGEST = "spark.python.unix.domain.socket", 60
 # Spark makes a secret of its own for a local master; a cluster's is told to all of its machines (docs/cluster.md).
 _LOCAL = re.compile(r"local(\[[^\]]*\])?")
 _CLOSED_LOCAL = {
@@ -42,10 +46,12 @@ def session(name: str) -> SparkSession:
     SparkContext._ensure_initialized()
     conf = SparkConf()
     builder = SparkSession.builder.appName(name)
-    wanted = {**_CLOSED, **_QUICK}
+    wanted = dict(_CLOSED)
     local = _LOCAL.fullmatch(conf.get("spark.master", "local")) is not None
     if local:
         wanted |= {**_CLOSED_LOCAL, "spark.executorEnv.PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+        if len(sockets()) <= _LONGEST:
+            wanted |= {f"{_SOCKETS}.enabled": "true", f"{_SOCKETS}.dir": sockets()}
     # PySpark looks for its workers' Python in this variable alone, and would take any `python3` that is on PATH. On
     # this machine it is our own, whatever the variable says; on others the one that was named, else of the same path.
     named = conf.get("spark.pyspark.python") or (None if local else os.environ.get("PYSPARK_PYTHON"))
@@ -58,6 +64,23 @@ def session(name: str) -> SparkSession:
         # PySpark's own handler calls Java from wherever the interrupt finds it, and fails.
         signal.signal(signal.SIGINT, before)
     return running
+
+
+@cache
+def sockets() -> str:
+    """A folder of this process that nobody else may enter, for sockets between Java and its Python workers.
+
+    Through TCP, delayed acknowledgements cost each task 40 ms.
+    """
+    folder = tempfile.mkdtemp(prefix="truesky-")
+    atexit.register(remove_sockets)
+    return folder
+
+
+def remove_sockets() -> None:
+    """Remove the folder of sockets, if there is one."""
+    if sockets.cache_info().currsize:
+        shutil.rmtree(sockets(), ignore_errors=True)
 
 
 def _say_nothing(listener: object, request: object, client_address: object) -> None:

@@ -174,6 +174,8 @@ def _stoppable(job: Job) -> Iterator[None]:
     """Ctrl-C and SIGTERM end the process at once: whatever it was doing, the lake is whole and the next run goes on."""
 
     def stop(signum: int, frame: FrameType | None) -> None:
+        if (running := sys.modules.get("jobs.session")) is not None:
+            running.remove_sockets()
         os._exit(command.say(job.name, f"stopped; {_AGAIN}", 128 + signum))
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -361,7 +363,7 @@ def _collect(spark: SparkSession, function: Callable[[Part], Json], parts: Seque
 
 @cache
 def _settle() -> None:
-    """Once a worker, after its first task: its modules are no garbage.  Spark collects after each task: 22 ms else."""
+    """Once a worker, after its first task: Spark collects garbage after each, which takes 22 ms with all modules."""
     gc.collect()
     gc.freeze()
 

@@ -74,12 +74,12 @@ def read_back(version: Version) -> MissionConfiguration:
 
     Errors : Damaged where it is not the one that the manifest names
     """
-    files = [version.folder / entry["path"] for entry in version.manifest["files"]]
     try:
+        files = [version.folder / f"dataset/{part}" for part in version.parts]
         states = [manifest.state(path) for path in files if isinstance(path, Path)]
-    except FileNotFoundError:
-        # Which one is missing is said by whoever reads it.
-        states = []
+    except OSError:
+        # What is wrong with it is said by whoever reads it.
+        return _configuration(version)
     # Copies of files on object storage go with their store.
     return _once(version, *states) if len(states) == len(files) else _configuration(version)
 

@@ -62,9 +62,17 @@ class Manifest(dict[str, Any]):
         """The entry of each file."""
         return {entry["path"]: entry for entry in self["files"]}
 
+    @cached_property
+    def schemas(self) -> dict[tuple[int, ...], pa.Schema]:
+        """That of its first part, by the `state` of the file; whoever reads it puts it there."""
+        return {}
+
 
 def state(path: Path) -> tuple[int, int, int, int]:
-    """What differs after a file was written or replaced; what was read of one need not be read again meanwhile."""
+    """Inode, bytes, times of modification and of change, ns: while they are the same a file need not be read again.
+
+    Errors : OSError
+    """
     about = path.stat()
     return about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
 

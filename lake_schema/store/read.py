@@ -329,19 +329,15 @@ def _open(root: Folder, name: str, wanted: str, asked: bool, link: Folder) -> Ve
         raise Damaged(f"{link} leads to {folder.name}, which is missing")
     opened = Version(folder, manifest.load(folder, name), pa.schema([]))
     if opened.parts:
-        first = manifest.checked(folder, opened._entry(opened.parts[0]))
+        entry = opened._entry(opened.parts[0])
+        first = manifest.checked(folder, entry)
         with opened._refusing():
-            own = _schema_once(opened, *manifest.state(first)) if isinstance(first, Path) else _schema(opened)
+            state = manifest.state(first) if isinstance(first, Path) else ()
+            if (own := opened.manifest.schemas.get(state)) is None:
+                own = opened.manifest.schemas[state] = parquet.schema(folder, entry)
         opened = replace(opened, schema=own)
     known = declarations.find(name, opened.schema.names)
-    if known is None:
-        return opened
-    # Places on object storage that are equal may be of two stores.
-    return _declared_once(opened, known) if isinstance(folder, Path) else as_declared(opened, known)
-
-
-def _schema(opened: Version, *state: int) -> pa.Schema:
-    return parquet.schema(opened.folder, opened._entry(opened.parts[0]))
+    return opened if known is None else as_declared(opened, known)
 
 
 def as_declared(opened: Version, table: Table) -> Version:
@@ -351,18 +347,19 @@ def as_declared(opened: Version, table: Table) -> Version:
 
     Errors : VersionMismatch, naming both versions and the first column that differs
     """
-    was, now = int(opened.manifest["version"]), table.version
+    return replace(opened, schema=_declared(opened.schema, int(opened.manifest["version"]), table))
+
+
+@lru_cache(maxsize=64)
+def _declared(stored: pa.Schema, was: int, table: Table) -> pa.Schema:
+    now = table.version
     if table.earlier is not None and was <= table.earlier.version:
         table = table.earlier
-    if fault := _difference(opened.schema, table, was):
+    if fault := _difference(stored, table, was):
         raise VersionMismatch(
             f"table {table.name}: version {was} of its declaration is in the lake, this is version {now}: {fault}"
         )
-    return replace(opened, schema=table.arrow())
-
-
-# Tasks of a process open the same versions: their schemas stay as long as the first part's file stays as it is.
-_schema_once, _declared_once = lru_cache(maxsize=64)(_schema), lru_cache(maxsize=64)(as_declared)
+    return table.arrow()
 
 
 def _difference(stored: pa.Schema, table: Table, was: int) -> str:

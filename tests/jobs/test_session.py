@@ -1,5 +1,7 @@
 """The Spark session: one, and it reads a lake's files as every other reader does."""
 
+from pathlib import Path
+
 import duckdb
 import psutil
 import pytest
@@ -29,6 +31,10 @@ def test_nobody_else_can_reach_it(spark):
     processes = psutil.Process().children(recursive=True)
     ends = {end.laddr.ip for p in processes for end in p.net_connections("inet") if end.status == psutil.CONN_LISTEN}
     assert {end.removeprefix("::ffff:") for end in ends} == {"127.0.0.1"}
+    # Sockets without an address lie where only their owner may look.
+    places = {Path(end.laddr) for p in processes for end in p.net_connections("unix") if end.laddr.endswith(".sock")}
+    assert places
+    assert {place.parent.stat().st_mode & 0o777 for place in places} == {0o700}
     conf = spark.sparkContext.getConf()
     assert (conf.get("spark.authenticate"), conf.get("spark.ui.enabled")) == ("true", "false")
 

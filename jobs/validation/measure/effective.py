@@ -77,13 +77,15 @@ def built(x: Float, y: Float, value: Float, weight: Float, fwhm: float) -> Effec
     basis = (second[:, :, None] * first[:, None, :]).reshape(-1, 16)
     solution = np.zeros(k * k)
     for _ in range(2):
+        if not kept.any():
+            break
         solution = _solved(index[kept], basis[kept], value[kept], weight[kept], k)
         kept = np.abs(value - (basis * solution[index]).sum(axis=1)) < _OUTLIER / np.sqrt(weight)
     return Effective(solution.reshape(k, k), step, reach)
 
 
 def _solved(index: np.ndarray, basis: Float, value: Float, weight: Float, k: int) -> Float:
-    """Coefficients [k k]: least squares with small second differences, its matrix a band, as splines overlap."""
+    """Coefficients [k k]: least squares with small second differences, by a banded normal matrix."""
     heavy, width = basis * weight[:, None], 3 * k + 3
     band = np.zeros((width + 1, k * k))
     for i in range(16):
@@ -125,7 +127,9 @@ def lights(frame: Frame, found: Measured, whole: Float, noise: float) -> tuple[F
     # Without a floor the many pixels of the wings would outweigh the few of the core.
     variance = 1.0 / weight + (_DIFFERS * value) ** 2 + (_FLOOR * value.max()) ** 2
     psf = built(u, v, value, 1.0 / variance, found.fwhm)
-    # As many pixels of each: what is too many of some lies far off, and counts for nothing.
+    if not np.isfinite(psf.coefficients).all():
+        return np.full(n, np.nan), np.full(n, np.nan)
+    # As many pixels of each: those that some have not count for nothing.
     most = max(len(cut) for *_, cut in pixels)
     u, v, cut, there = (np.zeros((n, most)) for _ in range(4))
     for i, own in enumerate(pixels):
@@ -153,7 +157,7 @@ def _fitted(
     place : x, y [n, m] of pixels;  cut : e- [n, m];  there : whether there is such a pixel;  flux : where to begin
     """
     flux, good = flux.astype(float), there
-    u, v = np.zeros_like(flux), np.zeros_like(flux)
+    u, v, lost = np.zeros_like(flux), np.zeros_like(flux), np.zeros(len(flux), bool)
     for n in range(_ROUNDS):
         x, y = place[0] - u[:, None], place[1] - v[:, None]
         value, rise, climb = (part.reshape(cut.shape) for part in psf.at(x.ravel(), y.ravel()))
@@ -162,14 +166,14 @@ def _fitted(
         left = cut - flux[:, None] * value
         if n > 1:
             good = there & (np.abs(left) < _OUTLIER * np.sqrt(1.0 / weight + (3.0 * _DIFFERS * told) ** 2))
-        heavy = weight * good
+        lost |= (good.sum(axis=1) < LEAST) | ~(flux > 0.0)
+        heavy = weight * (good & ~lost[:, None])
         # In units of the flux, so that light and place weigh alike.
-        more, du, dv = _step((value, -rise, -climb), heavy, left / flux[:, None])
+        more, du, dv = _step((value, -rise, -climb), heavy, left / np.where(lost, 1.0, flux)[:, None])
         u, v = (np.clip(a + b, -2 * _STEP, 2 * _STEP) for a, b in ((u, du), (v, dv)))
         flux = flux * (1.0 + more)
-    few = good.sum(axis=1) < LEAST
-    error = np.where(few, 1.0, (heavy * value**2).sum(axis=1)) ** -0.5
-    return np.where(few, np.nan, flux), np.where(few, np.nan, error)
+    error = np.where(lost, 1.0, (heavy * value**2).sum(axis=1)) ** -0.5
+    return np.where(lost, np.nan, flux), np.where(lost, np.nan, error)
 
 
 def _step(columns: Sequence[Float], weight: Float, left: Float) -> list[Float]:
