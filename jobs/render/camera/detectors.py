@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -76,7 +75,6 @@ class Detector:
         return 0.5 * self.pixel_scale * float(np.hypot(self.nx, self.ny))
 
 
-@lru_cache(maxsize=64)
 def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
     """The detectors of a camera, in the order of its layout: "vis", "nisp" or a ground camera.
 
