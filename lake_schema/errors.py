@@ -31,6 +31,11 @@ class OutOfRange(BadInput):
 
     def __init__(self, name: str, value: object, lo: object, hi: object) -> None:
         super().__init__(f"{name} = {value} is outside [{lo}, {hi}]")
+        self._given = name, value, lo, hi
+
+    def __reduce__(self) -> tuple[type[OutOfRange], tuple[object, ...]]:
+        # An exception comes back from another process by the arguments that it was made with.
+        return OutOfRange, self._given
 
 
 class Damaged(LakeError):

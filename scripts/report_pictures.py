@@ -1,6 +1,6 @@
 """Figures of a report of `truesky validate`, side by side: python -m scripts.report_pictures REPORT [FILE].
 
-Those of VIS and of the galaxies that docs/pilot.md shows. FILE : JPEG, docs/pilot_validation.jpg where none is named.
+Those of VIS, NISP-P and the galaxies that docs/pilot.md shows. FILE : JPEG, else docs/pilot_validation.jpg.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ def side_by_side(pictures: Sequence[Image.Image]) -> Image.Image:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Exit status: 0, 2 where the report lacks one of the figures."""
+    """Exit status: 0, 2 where there is no report, or where it lacks one of the figures."""
+    if not argv or not Path(argv[0]).is_file():
+        print(f"{' '.join(argv) or 'report_pictures'}: no report of truesky validate", file=sys.stderr)
+        return 2
     held = figures(Path(argv[0]).read_text(encoding="utf-8"))
     chosen = [next((held[text] for text in held if text.startswith(name)), None) for name in SHOWN]
     pictures = [one for one in chosen if one is not None]

@@ -1,5 +1,7 @@
 """Refusals: one line that anybody can print, however long and strange what it names."""
 
+import pickle
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -29,3 +31,11 @@ def test_a_short_refusal_says_what_it_was_given(text):
 
 def test_line_breaks_and_what_no_terminal_shows_are_spelt():
     assert str(errors.BadInput("a\n  b\x1b[0m \ud800")) == r"a b\x1b[0m \ud800"
+
+
+@pytest.mark.parametrize(
+    "refusal", [errors.BadInput("no band u"), errors.OutOfRange("radius", 200.0, 0.0, 180.0), errors.Damaged("f")]
+)
+def test_a_refusal_comes_back_from_another_process(refusal):
+    back = pickle.loads(pickle.dumps(refusal))
+    assert (type(back), str(back)) == (type(refusal), str(refusal))

@@ -37,7 +37,7 @@ def published(
     """The table of a lake, made where it is not there yet.
 
     root      : of the lake;  request : whose tables, where it has those of several
-    exposures : only these, () = all;  processes : that look at frames at a time
+    exposures : only these, () = all;  processes : that look at frames and catalogues at a time
     Errors    : as of `inventory.look`
     """
     held = inventory.look(root, request, exposures)

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.fits import external, tables, write
-from lake_schema.fits.images import Image, read_images, write_images
+from lake_schema.fits.images import Image, read_images, text_of, write_images
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
 from tests.universe import rows_of
@@ -63,6 +63,25 @@ def test_what_is_packed_is_read_as_it_was(tmp_path_factory, data):
             if image.data is not None:
                 assert image.data.dtype == data.dtype
                 np.testing.assert_array_equal(image.data, data)
+
+
+@pytest.mark.parametrize("shape", [(1, 7), (15, 7), (16, 7), (33, 7), (2, 17, 7), (3, 1, 1)])
+def test_tiles_are_sixteen_rows_or_what_is_left_of_an_image(tmp_path, shape):
+    data = np.arange(np.prod(shape), dtype=np.uint16).reshape(shape) * 211
+    write_images(tmp_path / "a.fits", [Image(data)], rice=True)
+    with astropy_fits.open(tmp_path / "a.fits", disable_image_compression=True) as units:
+        tile = [units[1].header[f"ZTILE{axis + 1}"] for axis in range(len(shape))]
+    assert tile == [shape[-1], min(16, shape[-2]), *[1] * (len(shape) - 2)]
+    (back,) = read_images(tmp_path / "a.fits")
+    assert (back.data == data).all()
+
+
+def test_cards_that_are_equal_are_written_each_as_it_is():
+    """0.0 and -0.0, 1, 1.0 and True are equal to Python: none stands in for another."""
+    values = (0.0, -0.0, 1, 1.0, True, "1", -0.0, True, 1.0, 1, 0.0)
+    lines = text_of([("A", value, "") for value in values]).splitlines()
+    assert lines == [str(astropy_fits.Card("A", value, "")).rstrip() for value in values]
+    assert len(set(lines)) == 6
 
 
 def test_packed_images_are_small_sound_and_the_same_every_time(tmp_path):

@@ -63,6 +63,22 @@ def test_records_that_the_package_no_longer_has_come_back_too(tmp_path):
     assert back.fingerprint == old.fingerprint
 
 
+def test_it_is_read_once_as_long_as_its_file_stays(tmp_path):
+    """A second reader gets the same; one of a file that has been changed or is gone is refused as the first would."""
+    version = put(tmp_path, resolve())
+    assert published.read_back(read.version(tmp_path, "mission")) is published.read_back(version)
+    file = version.folder / "dataset" / "all.parquet"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-50] + bytes(50))
+    with pytest.raises(Damaged, match=r"all\.parquet"):
+        published.read_back(version)
+    file.write_bytes(whole)
+    assert published.read_back(version).fingerprint == resolve().fingerprint
+    file.unlink()
+    with pytest.raises(Damaged, match="missing"):
+        published.read_back(version)
+
+
 def test_one_that_is_not_what_its_manifest_says_is_refused(tmp_path):
     with pytest.raises(Damaged, match="is not the configuration 0000"):
         published.read_back(put(tmp_path, resolve(), mission="0" * 64))
