@@ -347,11 +347,13 @@ def as_declared(opened: Version, table: Table) -> Version:
 
     Errors : VersionMismatch, naming both versions and the first column that differs
     """
-    return replace(opened, schema=_declared(opened.schema, int(opened.manifest["version"]), table))
+    # To Arrow schemas are equal whatever their units.
+    units = tuple((own.metadata or {}).get(b"unit", b"") for own in opened.schema)
+    return replace(opened, schema=_declared(opened.schema, units, int(opened.manifest["version"]), table))
 
 
 @lru_cache(maxsize=64)
-def _declared(stored: pa.Schema, was: int, table: Table) -> pa.Schema:
+def _declared(stored: pa.Schema, units: tuple[bytes, ...], was: int, table: Table) -> pa.Schema:
     now = table.version
     if table.earlier is not None and was <= table.earlier.version:
         table = table.earlier

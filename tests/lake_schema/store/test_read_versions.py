@@ -107,3 +107,15 @@ def test_a_lake_is_read_as_declared_without_being_asked(lake, monkeypatch):
     monkeypatch.setattr("lake_schema.tables.galaxies.GALAXIES", narrower)
     with pytest.raises(VersionMismatch, match="table galaxies: version 1"):
         read.version(OLD_LAKE, "galaxies")
+
+
+def test_a_unit_is_refused_after_the_right_one_was_read(lake):
+    """Of the same columns and types: what a process has read before does not stand in for it."""
+    publish.make(lake, plain_plan(), plain_work)
+    version = read.version(lake, "plain")
+    assert read.as_declared(version, PLAIN).schema.names == version.schema.names
+    own = version.schema.field(0)
+    other = version.schema.set(0, own.with_metadata({**(own.metadata or {}), b"unit": b"furlong"}))
+    assert other == version.schema
+    with pytest.raises(VersionMismatch, match="unit 'furlong'"):
+        read.as_declared(replace(version, schema=other), PLAIN)
