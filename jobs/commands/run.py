@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from jobs import cache
 from jobs.catalogue.stars import gaia
 from jobs.commands import space
 from jobs.render import plan_exposures
@@ -29,6 +30,7 @@ from lake_schema.store import layout, read
 
 # A picture takes some 3 s to draw.
 _PICTURES = 12
+_FIRST = "on this machine truesky is not compiled yet: the first detectors take up to half a minute longer, once"
 # Status of a job: its file, its arguments.
 Start = Callable[[str, Sequence[str]], int]
 
@@ -144,9 +146,11 @@ def _foretell(
     hours, cores = seconds / 3600.0, catalogue_forecast.WORKERS
     print(
         f"forecast: {count:,} detectors, {hours:.2f} core-hours of this machine ({machine.source}), "
-        f"{hours / cores:.2f} h on {cores} cores; {wanted_gb:.2f} GB to write, {free_gb:.2f} GB are free\n",
-        flush=True,
+        f"{hours / cores:.2f} h on {cores} cores; {wanted_gb:.2f} GB to write, {free_gb:.2f} GB are free"
     )
+    if not any(cache.machine_code_dir().rglob("*.nbi")):
+        print(_FIRST)
+    print(flush=True)
 
 
 def _table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], total: float) -> None:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from py4j.protocol import Py4JNetworkError
@@ -195,6 +196,25 @@ def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
     assert [result["part"] for result in results] == [part.name for part in parts]
     assert [result for result in results if "error" in result] == [{"part": "700", "error": "its worker died"}]
     assert len(runs) <= 2 * 10 + 1
+
+
+def test_a_worker_s_modules_are_left_out_of_its_collections_once(monkeypatch):
+    """After its first task: what later tasks leave behind is collected as ever."""
+    frozen = []
+    monkeypatch.setattr(shell.gc, "freeze", lambda: frozen.append(True))
+    shell._settle.cache_clear()
+    spark = SimpleNamespace(
+        sparkContext=SimpleNamespace(
+            master="local[2]",
+            parallelize=lambda parts, n: SimpleNamespace(
+                mapPartitions=lambda run: SimpleNamespace(collect=lambda: [one for p in parts for one in run([p])])
+            ),
+        )
+    )
+    parts = [Part(name, {}) for name in "abc"]
+    found = shell._collect(spark, lambda part: {"part": part.name}, parts)
+    assert [one["part"] for one in found] == ["a", "b", "c"]
+    assert frozen == [True]
 
 
 def test_the_bar_counts_receipts(run, monkeypatch, capsys):

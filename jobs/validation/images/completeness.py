@@ -1,7 +1,8 @@
 """Which of the known sources a program finds in the pixels: sep, in a part of each frame.
 
 A source is found where an object covers its place, be it one with a cosmic ray or a neighbour. Of all places objects
-cover a part c by chance: where p of the sources are covered, (p - c) / (1 - c) are found.
+cover a part c by chance: where p of the sources are covered, (p - c) / (1 - c) are found. Where they cover most of
+the places that says nothing.
 """
 
 from __future__ import annotations
@@ -23,11 +24,22 @@ _BRIGHT, _LIMIT = 0.15, 0.75
 # Times the noise, and arcsec about a galaxy, of a source that is found as often as not.
 _SIGMA, _GALAXY = 10.0, 0.5
 _LEAST = 20
+# Part of the pixels that objects may cover.
+_CROWDED = 0.8
+
+
+class Crowded(Exception):
+    """More pixels of objects than sep holds."""
 
 
 def check(of: Seen) -> list[Row]:
     """Magnitude at which half of the sources are found, against the noise's; part of brighter ones that are."""
-    magnitude, found, chance, note = searched(of)
+    try:
+        magnitude, found, chance, note = searched(of)
+    except Crowded as crowd:
+        return [not_applicable("completeness", of.place, f"sep: {crowd}", SOURCE)]
+    if chance > _CROWDED:
+        return [not_applicable("completeness", of.place, f"objects cover {chance:.0%} of the pixels", SOURCE)]
     edges = np.arange(np.floor(magnitude.min(initial=20.0)), 29.0, _BIN)
     count = np.histogram(magnitude, edges)[0].astype(float)
     part = _found(np.histogram(magnitude[found], edges)[0] / np.maximum(count, 1.0), chance)
@@ -68,7 +80,10 @@ def _bright(of: Seen, magnitude: Float, found: Bool, chance: float, limit: float
 
 
 def searched(of: Seen) -> tuple[Float, Bool, float, str]:
-    """(magnitudes of the known sources of a part [n], which of them are covered, which part of it is, what it is)."""
+    """(magnitudes of the known sources of a part [n], which of them are covered, which part of it is, what it is).
+
+    Errors : Crowded
+    """
     assert of.tiles is not None
     ny, nx = of.frame.electrons.shape
     # Beside the middle, where detectors that are read in parts have no pixels.
@@ -79,8 +94,14 @@ def searched(of: Seen) -> tuple[Float, Bool, float, str]:
     width = float(of.frame.header["PSFFWHM"]) / of.frame.scale
     axis = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
     kernel = np.exp(-4.0 * np.log(2.0) * (axis[:, None] ** 2 + axis**2) / width**2)
-    objects, which = sep.extract(part - level, _THRESHOLD, err=of.noise, minarea=_PIXELS, filter_kernel=kernel,
-                                 mask=full, segmentation_map=True)  # fmt: skip
+    try:
+        objects, which = sep.extract(part - level, _THRESHOLD, err=of.noise, minarea=_PIXELS, filter_kernel=kernel,
+                                     mask=full, segmentation_map=True)  # fmt: skip
+    except Exception as error:
+        # It has no class of its own, and a limit of the pixels of objects.
+        if "full" not in str(error) and "overflow" not in str(error):
+            raise
+        raise Crowded(str(error).partition(".")[0]) from None
     covered = masks.grown(which > 0)
     known = of.known
     inside = (known.x > left + 8) & (known.x < left + part.shape[1] - 9)

@@ -56,10 +56,15 @@ def validated(held: Held, processes: int = 2) -> Found:
         catalogues, results = [*map(of_catalogues, _catalogued(held))], [*_shown(map(of_frame, _tasks(held)), held)]
     else:
         with ProcessPoolExecutor(processes, multiprocessing.get_context("forkserver")) as pool:
-            # A few that take long: begun while the frames' sources are looked up.
-            begun = [pool.submit(of_catalogues, one) for one in _catalogued(held)]
-            results = [*_shown(pool.map(of_frame, _tasks(held)), held)]
-            catalogues = [one.result() for one in begun]
+            try:
+                # A few that take long: begun while the frames' sources are looked up.
+                begun = [pool.submit(of_catalogues, one) for one in _catalogued(held)]
+                results = [*_shown(pool.map(of_frame, _tasks(held)), held)]
+                catalogues = [one.result() for one in begun]
+            except BaseException:
+                # What fails is told at once, not after all that is left.
+                pool.shutdown(cancel_futures=True)
+                raise
     rows = [row for result in results for row in result.rows]
     together = [row for check in checks.OF_SEVERAL for row in check.rows(results)]
     return Found([*rows, *together, *(row for result in catalogues for row in result.rows)], results, catalogues)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from jobs import cache
 from jobs.commands import run, space
 from jobs.request.from_toml import parse
 from lake_schema.errors import BadInput
@@ -77,8 +78,13 @@ def test_what_an_earlier_run_of_the_name_left_is_no_room(lake, monkeypatch):
         space.check(lake, request, run.plan_exposures.plan(lake, request)[1:])
 
 
-def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys):
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys, monkeypatch, compiled):
     started = []
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "code"))
+    if compiled:
+        (folder := cache.machine_code_dir() / "jobs").mkdir(parents=True)
+        (folder / "some.nbi").touch()
 
     def start(file, arguments):
         started.append((Path(file).stem, *arguments))
@@ -88,14 +94,17 @@ def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys):
     assert run.main([str(DEMO), "--lake", str(root)], start) == 3
     told = ("--lake", str(root), "--request", str(DEMO))
     assert started == [("build_galaxies", *told), ("build_stars", *told)]
-    first, blank, *jobs = capsys.readouterr().out.splitlines()
+    first, *others = capsys.readouterr().out.splitlines()
     # What it will take is said first.
     assert re.fullmatch(
         r"forecast: 2 detectors, 0\.\d\d core-hours of this machine \(.*\), 0\.\d\d h on 2 cores; 0\.\d\d GB to write, "
         r"[\d.]+ GB are free",
         first,
     )
-    assert (blank, jobs) == ("", ["build_galaxies ...", "build_stars ..."])
+    # And that it takes longer the first time.
+    if not compiled:
+        assert "not compiled yet" in others.pop(0)
+    assert others == ["", "build_galaxies ...", "build_stars ..."]
 
 
 def test_what_a_later_job_would_refuse_is_refused_first(tmp_path, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jobs.validation.images.completeness import COMPLETENESS
-from jobs.validation.measure.rows import FAIL, PASS
+from jobs.validation.measure.rows import FAIL, NOT_APPLICABLE, PASS
 from tests.jobs.validation import made
 
 
@@ -40,3 +40,13 @@ def test_sources_that_are_fainter_than_they_should_be(faint):
     known = faint.known
     wrong = replace(faint, known=replace(known, expected=6.0 * known.expected), series={})
     assert made.verdicts(COMPLETENESS, wrong)["half"] == FAIL
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("noise", [0.05, 0.01])
+def test_objects_that_cover_everything_tell_nothing(faint, noise):
+    """Of a noise that is too small most pixels are of objects, and of one that is far too small more than sep holds."""
+    wrong = replace(faint, noise=noise * faint.noise, series={})
+    (row,) = COMPLETENESS.of(wrong)
+    assert row.verdict == NOT_APPLICABLE
+    assert "pixels" in row.note
