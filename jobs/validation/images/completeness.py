@@ -15,7 +15,9 @@ from jobs.validation.measure.rows import LEAST, Row, not_applicable
 from jobs.validation.measure.seen import Check, Seen, wants_blank
 from lake_schema.arrays import Bool, Float
 
-SOURCE = "sep (Barbary 2016) as SourceExtractor: 5 pixels above 1.5 sigma after a filter of the PSF's width"
+SOURCE = (
+    "sep (Barbary 2016) as SourceExtractor: 5 pixels above 1.5 sigma after a filter of the PSF's width, not deblended"
+)
 # Side of the part that is searched, pixels; magnitudes of a bin.
 _SIDE, _BIN = 1024, 0.5
 _THRESHOLD, _PIXELS = 1.5, 5
@@ -94,9 +96,10 @@ def searched(of: Seen) -> tuple[Float, Bool, float, str]:
     width = float(of.frame.header["PSFFWHM"]) / of.frame.scale
     axis = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
     kernel = np.exp(-4.0 * np.log(2.0) * (axis[:, None] ** 2 + axis**2) / width**2)
+    # Those that touch are not told apart: pixels that objects cover are the same to 0.5 %, in a third of the time.
     try:
         objects, which = sep.extract(part - level, _THRESHOLD, err=of.noise, minarea=_PIXELS, filter_kernel=kernel,
-                                     mask=full, segmentation_map=True)  # fmt: skip
+                                     deblend_nthresh=1, mask=full, segmentation_map=True)  # fmt: skip
     except Exception as error:
         # It has no class of its own, and a limit of the pixels of objects.
         if "full" not in str(error) and "overflow" not in str(error):

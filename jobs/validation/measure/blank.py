@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jobs.compiling import exact_jit
 from jobs.validation.measure import masks
 from jobs.validation.measure.frames import Amplifier, Frame
 from jobs.validation.measure.references import Reference
@@ -97,14 +98,31 @@ def _grown(pixels: Array, hidden: Bool, noise: float) -> Bool:
     # Sources are a minor part of most tiles: their median is where the level is first looked for, in a part of them.
     some = pixels[:, ::_SOME, ::_SOME]
     middle = np.median(np.where(bad[:, ::_SOME, ::_SOME], np.median(some), some), axis=(1, 2))
-    spread = np.full(len(pixels), noise)
-    for _ in range(3):
-        out = np.abs(pixels - middle[:, None, None]) > (_CLIP * spread)[:, None, None]
-        kept = ~(bad | out)
-        n = np.maximum(kept.sum(axis=(1, 2)), 1)
-        middle = (pixels * kept).sum(axis=(1, 2)) / n
-        spread = np.sqrt((kept * (pixels - middle[:, None, None]) ** 2).sum(axis=(1, 2)) / n)
+    out = np.empty(pixels.shape, bool)
+    _outliers(pixels, bad, middle, noise, out)
     return np.asarray(bad | out | masks.grown(out & ~hidden, corners=True))
+
+
+@exact_jit
+def _outliers(pixels: Array, bad: Bool, middle: Float, noise: float, out: Bool) -> None:
+    """Mark what is far from the mean of its tile's other pixels [t, ny, nx], which is found in three rounds.
+
+    bad : no blank sky;  middle : [t] e-, where the first round looks;  noise : e- rms, of the first round
+    """
+    tiles, ny, nx = pixels.shape
+    for t in range(tiles):
+        mean, spread = middle[t], noise
+        for _ in range(3):
+            most, n, first, second = _CLIP * spread, 0, 0.0, 0.0
+            for i in range(ny):
+                for j in range(nx):
+                    off = pixels[t, i, j] - mean
+                    out[t, i, j] = far = abs(off) > most
+                    if not (far or bad[t, i, j]):
+                        n, first, second = n + 1, first + off, second + off * off
+            # About the old mean, which is near the new one: no digits are lost.
+            step = first / max(n, 1)
+            mean, spread = mean + step, np.sqrt(max(second / max(n, 1) - step * step, 0.0))
 
 
 def _sources(frame: Frame, known: Reference, noise: float) -> Bool:

@@ -18,6 +18,8 @@ from lake_schema.store import read
 from lake_schema.tables.stars import EPOCH
 
 POINT = 0
+# Columns of `rendered_truth` that a reference is made of.
+TRUTH = ("id", "x", "y", "expected", "method", "psf_x", "psf_y")
 # Microjansky of AB magnitude 0, as a magnitude.
 ZERO = 23.9
 _JULIAN_2000, _MJD_2000, _YEAR, _MAS_A_DEG = 2000.0, 51544.5, 365.25, 3.6e6

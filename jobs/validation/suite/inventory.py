@@ -164,21 +164,25 @@ def _told(held: Held, names: Sequence[str], effect: str) -> dict[str, list[float
 
 
 def truth(held: Held) -> dict[tuple[int, str], pa.Table]:
-    """Rows of `rendered_truth` by exposure and detector."""
-    return _by_frame(held, "rendered_truth")
+    """Rows of `rendered_truth` by exposure and detector, of it what references are made of."""
+    return _by_frame(held, "rendered_truth", references.TRUTH)
 
 
 def spectra(held: Held) -> dict[tuple[int, str], pa.Table]:
-    """The same of `rendered_spectra`."""
-    return _by_frame(held, "rendered_spectra")
+    """The same of `rendered_spectra`: of first orders, which are measured."""
+    return _by_frame(held, "rendered_spectra", where=pc.field("order") == 1)
 
 
-def _by_frame(held: Held, name: str) -> dict[tuple[int, str], pa.Table]:
+def _by_frame(
+    held: Held, name: str, columns: Sequence[str] | None = None, where: pc.Expression | None = None
+) -> dict[tuple[int, str], pa.Table]:
     if name not in held.tables:
         return {}
     wanted = {(shot.place.exposure_id, shot.place.detector) for shot in held.shots}
+    here = pc.field("exposure_id").isin(sorted({number for number, _ in wanted if number}))
     rows = held.tables[name].rows(
-        where=pc.field("exposure_id").isin(sorted({number for number, _ in wanted if number}))
+        None if columns is None else ["exposure_id", "detector", *columns],
+        where=here if where is None else here & where,
     )
     if not len(rows):
         return {}
