@@ -52,6 +52,7 @@ def session(name: str) -> SparkSession:
         wanted |= {**_CLOSED_LOCAL, "spark.executorEnv.PYTHONPATH": str(Path(__file__).resolve().parents[1])}
         if len(sockets()) <= _LONGEST:
             wanted |= {f"{_SOCKETS}.enabled": "true", f"{_SOCKETS}.dir": sockets()}
+            wanted["spark.python.daemon.module"] = "jobs.spark_workers"
     # PySpark looks for its workers' Python in this variable alone, and would take any `python3` that is on PATH. On
     # this machine it is our own, whatever the variable says; on others the one that was named, else of the same path.
     named = conf.get("spark.pyspark.python") or (None if local else os.environ.get("PYSPARK_PYTHON"))

@@ -1,0 +1,15 @@
+"""The process that Spark forks its Python workers of on this machine: python -m jobs.spark_workers pyspark.worker.
+
+It is PySpark's own. Java drops a worker that has been idle for a minute; the worker answers into a socket that is
+closed, which in one of the Unix domain is an error at once, and would print a traceback. Here it ends without a word.
+"""
+
+from __future__ import annotations
+
+import signal
+
+from pyspark import daemon
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    daemon.manager()
