@@ -83,7 +83,7 @@ def test_a_render_that_is_killed_half_way_ends_with_the_same_bytes(local, reques
         command(script, lake, request_file, "--master", "local[1]"),
         cwd="/", start_new_session=True, env=environment(), stdout=subprocess.DEVNULL,
     )  # fmt: skip
-    while not list(lake.glob("products/.receipts-*/*.json")):
+    while not list(lake.glob("products/.receipts-*/[!.]*.json")):
         assert driver.poll() is None
         time.sleep(0.05)
     os.killpg(driver.pid, signal.SIGKILL)

@@ -122,7 +122,7 @@ def test_a_worker_is_killed_and_another_is_slow(local, request_file, tmp_path):
         )  # fmt: skip
         wait_for(driver, lambda: is_at_work(workers["slow"]))
         with slowed(workers["slow"]):
-            wait_for(driver, lambda: len(list(lake.glob("products/.receipts-*/*.json"))) >= 4)
+            wait_for(driver, lambda: len(list(lake.glob("products/.receipts-*/[!.]*.json"))) >= 4)
             assert is_at_work(workers["killed"])
             # The machine and all that runs on it.
             dying = {workers["killed"].pid, *below(workers["killed"].pid)}
