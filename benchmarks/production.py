@@ -35,7 +35,7 @@ _NOTES = {
     "deep_core_hours": "30 observations",
     "pilot_core_hours": "with its calibrations",
     "overhead_ms": "CPU of a task outside of its physics, the sum of the next three (target 30)",
-    "task_ms": "beyond its render and reading its sources; best of 15 of one detector, with what a worker keeps",
+    "task_ms": "beyond its render and reading its sources, of the dearest detector; best of 15, in a warm worker",
     "hand_out_ms": "wall, of an empty part through Spark with its Python workers",
     "publish_ms": "CPU: its receipt read, its files listed in the manifest; of 2,000",
     "speedup_2_cores": "what its serial share leaves of two cores (target 1.95)",

@@ -1,7 +1,8 @@
-"""The process that Spark forks its Python workers of on this machine: python -m jobs.spark_workers pyspark.worker.
+"""The process from which Spark forks its Python workers on this machine: python -m jobs.spark_workers pyspark.worker.
 
-It is PySpark's own. Java drops a worker that has been idle for a minute; the worker answers into a socket that is
-closed, which in one of the Unix domain is an error at once, and would print a traceback. Here it ends without a word.
+It is PySpark's own. Java drops a worker that has been idle for a minute; the worker writes to a closed socket, which
+in the Unix domain is an error at once, and would print a traceback. Here it ends without a word, as it does where any
+other pipe or socket that it writes to is closed.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from lake_schema.store import layout, read
 
 # A picture takes some 3 s to draw.
 _PICTURES = 12
-_FIRST = "on this machine truesky is not compiled yet: the first detectors take up to half a minute longer, once"
+_FIRST = "the renderer has not been compiled on this machine yet: the first detectors take about a minute longer, once"
 # Status of a job: its file, its arguments.
 Start = Callable[[str, Sequence[str]], int]
 
@@ -112,6 +112,8 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
     """
     # Whatever is wrong with the request, or with the room on the disc, is said before the first job runs.
     universe.refuse_others(root, request)
+    # Asked before anything is planned, which compiles a little.
+    compiled = any(cache.machine_code_dir().glob("kernels_*/*.nbi"))
     rendered = wanted[-1].name == IMAGES[-1].name
     plan = None
     if rendered:
@@ -119,7 +121,8 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
     else:
         plan_exposures.check_catalogues(request)
     wanted_gb, free_gb = space.check(root, request, plan)
-    _foretell(root, request, plan, wanted_gb, free_gb)
+    count = _foretell(root, request, plan, wanted_gb, free_gb)
+    print(f"{_FIRST}\n" if count and not compiled else "", flush=True)
     rows, began = [], time.perf_counter()
     for stage in wanted:
         started = time.perf_counter()
@@ -135,8 +138,8 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
 
 def _foretell(
     root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None, wanted_gb: float, free_gb: float
-) -> None:
-    """Says what all of it will take; what the lake has already is taken off the room alone."""
+) -> int:
+    """Detectors. Says what all of it will take; what the lake has already is taken off the room alone."""
     machine = speed.of_machine(root)
     seconds = sum(line.seconds for line in catalogue_forecast.of_request(request, machine.factor))
     count = 0
@@ -148,9 +151,7 @@ def _foretell(
         f"forecast: {count:,} detectors, {hours:.2f} core-hours of this machine ({machine.source}), "
         f"{hours / cores:.2f} h on {cores} cores; {wanted_gb:.2f} GB to write, {free_gb:.2f} GB are free"
     )
-    if not any(cache.machine_code_dir().rglob("*.nbi")):
-        print(_FIRST)
-    print(flush=True)
+    return count
 
 
 def _table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], total: float) -> None:

@@ -35,6 +35,8 @@ def test_nobody_else_can_reach_it(spark):
     places = {Path(end.laddr) for p in processes for end in p.net_connections("unix") if end.laddr.endswith(".sock")}
     assert places
     assert {place.parent.stat().st_mode & 0o777 for place in places} == {0o700}
+    # Nor do its workers print a traceback where they are dropped.
+    assert any("jobs.spark_workers" in p.cmdline() for p in processes)
     conf = spark.sparkContext.getConf()
     assert (conf.get("spark.authenticate"), conf.get("spark.ui.enabled")) == ("true", "false")
 

@@ -199,9 +199,9 @@ def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
 
 
 def test_a_worker_s_modules_are_left_out_of_its_collections_once(monkeypatch):
-    """After its first task: what later tasks leave behind is collected as ever."""
-    frozen = []
-    monkeypatch.setattr(shell.gc, "freeze", lambda: frozen.append(True))
+    """After its first task."""
+    done = []
+    monkeypatch.setattr(shell.gc, "freeze", lambda: done.append("frozen"))
     shell._settle.cache_clear()
     spark = SimpleNamespace(
         sparkContext=SimpleNamespace(
@@ -212,9 +212,10 @@ def test_a_worker_s_modules_are_left_out_of_its_collections_once(monkeypatch):
         )
     )
     parts = [Part(name, {}) for name in "abc"]
-    found = shell._collect(spark, lambda part: {"part": part.name}, parts)
+    found = shell._collect(spark, lambda part: done.append(part.name) or {"part": part.name}, parts)
+    shell._settle.cache_clear()
     assert [one["part"] for one in found] == ["a", "b", "c"]
-    assert frozen == [True]
+    assert done == ["a", "frozen", "b", "c"]
 
 
 def test_the_bar_counts_receipts(run, monkeypatch, capsys):

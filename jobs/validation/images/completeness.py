@@ -27,11 +27,11 @@ _BRIGHT, _LIMIT = 0.15, 0.75
 _SIGMA, _GALAXY = 10.0, 0.5
 _LEAST = 20
 # Part of the pixels that objects may cover.
-_CROWDED = 0.8
+_CROWDED = 0.75
 
 
 class Crowded(Exception):
-    """More pixels of objects than sep holds."""
+    """More pixels of objects than sep holds at a time."""
 
 
 def check(of: Seen) -> list[Row]:
@@ -101,8 +101,8 @@ def searched(of: Seen) -> tuple[Float, Bool, float, str]:
         objects, which = sep.extract(part - level, _THRESHOLD, err=of.noise, minarea=_PIXELS, filter_kernel=kernel,
                                      deblend_nthresh=1, mask=full, segmentation_map=True)  # fmt: skip
     except Exception as error:
-        # It has no class of its own, and a limit of the pixels of objects.
-        if "full" not in str(error) and "overflow" not in str(error):
+        # Of sep's own errors, which have no class: its limit of pixels.
+        if "pixel buffer full" not in str(error):
             raise
         raise Crowded(str(error).partition(".")[0]) from None
     covered = masks.grown(which > 0)

@@ -42,7 +42,7 @@ class Extracted:
 
 def check(of: Seen) -> list[Row]:
     """Of a frame's first orders."""
-    # Of other orders the overlap is null.
+    # Of other orders, where they are among the rows, the overlap is null.
     kept = (pc.field("order") == 1) & (pc.field("overlapped") < _OVERLAPPED)
     first = of.spectra.filter(kept).to_pylist()
     points = set(of.known.id[of.known.point].tolist())
@@ -177,7 +177,7 @@ def _lines(of: Seen, row: Mapping[str, Any]) -> list[float]:
 def _applies(of: Seen) -> str:
     if of.channel != DISPERSED:
         return "no spectra"
-    return "" if of.spectra is not None and len(of.spectra) else "the lake has no rendered_spectra of it"
+    return "" if of.spectra is not None and len(of.spectra) else "the lake's rendered_spectra have no first order on it"
 
 
 SPECTRA = Check("spectra", SOURCE, _applies, check)

@@ -33,7 +33,7 @@ class Seen:
     """A frame and what is known of it.
 
     noise, tiles, measured : of its blank sky and its stars; None where it does not show any
-    spectra : rows of `rendered_spectra` of a dispersed frame
+    spectra : rows of `rendered_spectra` of a dispersed frame, of first orders at least
     before  : another frame that the gain is told with, None where it is not
     """
 

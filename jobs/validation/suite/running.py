@@ -62,7 +62,7 @@ def validated(held: Held, processes: int = 2) -> Found:
                 results = [*_shown(pool.map(of_frame, _tasks(held)), held)]
                 catalogues = [one.result() for one in begun]
             except BaseException:
-                # What fails is told at once, not after all that is left.
+                # Of what has not begun nothing begins.
                 pool.shutdown(cancel_futures=True)
                 raise
     rows = [row for result in results for row in result.rows]

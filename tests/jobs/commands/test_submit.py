@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -62,8 +63,8 @@ def test_a_command_that_is_stopped_stops_its_job(tmp_path, number, name, module,
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, cwd=tmp_path, env=environment, **pipes) as running:
         # After the forecast and an empty line.
-        said = list(iter(running.stdout.readline, "\n"))
-        assert said[0].startswith("forecast: ")
+        said = list(takewhile(str.strip, running.stdout))
+        assert "".join(said).startswith("forecast: ")
         assert running.stdout.readline() == "build_galaxies ...\n"
         pid = running.stdout.readline().strip()
         running.send_signal(number)
