@@ -77,7 +77,7 @@ def _held(pid: int) -> dict[str, float]:
             held = int(Path(f"/proc/{own}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e9
         except (OSError, IndexError):
             continue
-        if "pyspark.daemon" in name:
+        if "jobs.spark_workers" in name:
             worker = max(worker, held)
         elif "plan_exposures.py" in name and "java" in name.split(" ")[0]:
             java += held
