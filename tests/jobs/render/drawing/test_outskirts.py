@@ -162,15 +162,16 @@ def test_light_far_from_the_centre_is_where_it_belongs(shape, mag, place):
 @example(EDGE_ON, 10.0, (HALF, 400.0), "lsstcam")
 @example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 5.9), 6.0, (HALF, 0.0), "vis")
 @example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 57.0), 6.0, (HALF, -HALF), "vis")
-@example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 13.0), 6.0, (HALF, -HALF), "vis")
+@example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 13.0), 6.0, (HALF, -HALF), "vis").xfail(
+    raises=AssertionError, reason="rings by 5.93e-10 of its light beyond the corner into which its ridge runs"
+)
 def test_any_large_galaxy_is_drawn_to_its_outskirts(shape, mag, place, camera):
     found, expected, size = drawn_and_expected(camera, psf_of(camera), shape, mag, place, 1)
     # What a smaller stamp does not hold is below what the settings leave out.
     share = 0.1 if size == stamp_sizes.SIZES[-1] else 0.2
-    # The largest stamps are followed only as far as memory holds them: beyond the corner into which its ridge runs an
-    # edge-on disc rings by up to 5.93e-10 of its light (all angles about the corner, by tenths of a degree), which is
-    # more than a tenth of the noise of VIS for galaxies brighter than 9.5 mag.
-    least = max(share * NOISE[camera], 6e-10 * BRIGHT[camera] * 10 ** (-0.4 * mag))
+    # The largest stamps are followed only as far as memory holds them: an edge-on disc may ring by 2e-10 of its light.
+    # At a corner into which its ridge runs it rings by up to 5.93e-10 (angles by tenths of a degree): known to fail.
+    least = max(share * NOISE[camera], 2e-10 * BRIGHT[camera] * 10 ** (-0.4 * mag))
     np.testing.assert_allclose(found, expected, rtol=4e-3, atol=least)
 
 
