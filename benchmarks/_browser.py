@@ -32,7 +32,7 @@ _MOVE = """async ([kind, facts]) => {
 def missing() -> str:
     """What there is not, "" where there is a browser."""
     if importlib.util.find_spec("playwright") is None:
-        return "playwright is not installed (make .venv/installed-browser)"
+        return "playwright is not installed (make .venv/installed-test)"
     return "" if CHROMIUM else "there is no chromium (Debian: apt install chromium)"
 
 

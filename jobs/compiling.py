@@ -7,11 +7,13 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from jobs import cache
+from lake_schema import instruction_set
 
-# numba reads this when it is imported, and processes begun from here have it.
+# numba reads these when it is imported, and processes begun from here have them.
+instruction_set.limit_numba()
 os.environ["NUMBA_CACHE_DIR"] = str(cache.machine_code_dir())
 
-import numba
+import numba  # noqa: E402
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

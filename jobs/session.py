@@ -22,10 +22,13 @@ from py4j.protocol import Py4JError
 from pyspark import SparkConf, SparkContext, accumulators
 from pyspark.sql import SparkSession
 
+from lake_schema import instruction_set
+
 # What nobody from outside may reach, wherever the configuration says nothing else.
 _CLOSED = {"spark.ui.enabled": "false"}
-# Settings of sockets of the Unix domain, and characters of a folder in which one with Spark's name fits (108 in all).
-_SOCKETS, _LONGEST = "spark.python.unix.domain.socket", 60
+# Prefix of Spark's settings of Unix domain sockets, and the longest folder name that leaves room for Spark's own name:
+# a socket's path has at most 104 characters on macOS and 108 on Linux. A longer one falls back to TCP.
+_SOCKETS, _LONGEST = "spark.python.unix.domain.socket", 56
 # Spark makes a secret of its own for a local master; a cluster's is told to all of its machines (docs/cluster.md).
 _LOCAL = re.compile(r"local(\[[^\]]*\])?")
 _CLOSED_LOCAL = {
@@ -47,6 +50,8 @@ def session(name: str) -> SparkSession:
     conf = SparkConf()
     builder = SparkSession.builder.appName(name)
     wanted = dict(_CLOSED)
+    # A worker's Python may import numpy before any module of ours.
+    wanted |= {f"spark.executorEnv.{name}": value for name, value in instruction_set.variables().items()}
     local = _LOCAL.fullmatch(conf.get("spark.master", "local")) is not None
     if local:
         wanted |= {**_CLOSED_LOCAL, "spark.executorEnv.PYTHONPATH": str(Path(__file__).resolve().parents[1])}

@@ -36,11 +36,11 @@ from jobs.measured import Measured
 from jobs.request import checks, universe
 from jobs.request.from_toml import parse
 from jobs.request.schema import Request
-from lake_schema import __version__, command, user_files
+from lake_schema import __version__, command, instruction_set, user_files
 from lake_schema.errors import BadInput, LakeError, PartsFailed
 from lake_schema.store import layout, publish, read, stage
 from lake_schema.store.plan import Json, Part, Plan, Work
-from lake_schema.store.provenance import code_version, git_commit
+from lake_schema.store.provenance import code_version, git_commit, machine
 
 if TYPE_CHECKING:
     from pyspark.sql import SparkSession
@@ -111,6 +111,8 @@ def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
 
     job     : its steps;  root : folder of the lake;  request : checked;  verbose : whether progress is shown
     """
+    if difference := instruction_set.check():
+        command.say(job.name, difference, 0)
     universe.refuse_others(root, request)
     started, cpu = time.time(), time.process_time()
     steps = job.steps(root, request)
@@ -218,9 +220,9 @@ def _run(job: Job, step: Step, root: Path, request: Request, verbose: bool, took
     version = read.version(root, plan.table.name, plan.key)
     _summary(version, len(results), time.time() - started, before)
     machines = version.manifest.get("machines", [])
-    if len(machines) > 1:
-        about = f"table {plan.table.name}: the machines that it was made on differ, and so may last bits"
-        command.say(job.name, f"{about}: {'; '.join(machines)}", 0)
+    if machines and set(machines) != {machine()}:
+        about = f"table {plan.table.name}: made on machines of other kinds than this one, so last bits may differ"
+        command.say(job.name, f"{about}: here {machine()}, made on {'; '.join(machines)}", 0)
     if step.after is not None:
         step.after(version)
 

@@ -5,6 +5,11 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from lake_schema import instruction_set
+
+# Before anything imports numpy.
+instruction_set.limit()
+
 if TYPE_CHECKING:
     from lake_schema.store import layout, read
 

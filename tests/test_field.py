@@ -3,6 +3,8 @@
 The five jobs run once, in the shared session, on the demo's request; everything else looks at what they published.
 """
 
+import hashlib
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +32,7 @@ from jobs.request.from_toml import parse
 from lake_schema import sky
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import layout, read
+from lake_schema.store.provenance import libraries, machine
 from tests.jobs.render import calibrated
 from tests.jobs.render.exposure.test_render import render as small
 
@@ -73,6 +76,28 @@ def field(spark, tmp_path_factory):
     for job in JOBS:
         shell.run(job, root, wanted)
     return root
+
+
+def published_digests():
+    """sha256 by table, as docs/promises.md lists them."""
+    text = (Path(__file__).parents[1] / "docs" / "promises.md").read_text(encoding="utf-8")
+    return {table: digest for digest, table in re.findall(r"^([0-9a-f]{64})  (\w+)$", text, re.MULTILINE)}
+
+
+def test_the_tables_are_those_that_the_documentation_lists(field):
+    """On machines of the documented kind with the pinned packages; elsewhere last bits may differ."""
+    pins = (Path(__file__).parents[1] / "requirements" / "run.txt").read_text(encoding="utf-8")
+    versions = {name: version for name, version in libraries().items() if name != "python"}
+    others = [name for name, version in versions.items() if f"\n{name}=={version} ".lower() not in pins.lower()]
+    if machine() != "x86-64-v3 glibc 2.36" or others:
+        pytest.skip(f"computed on {machine()} with other versions than the pinned ones: {others}")
+    found = {}
+    for table in published_digests():
+        folder = read.version(field, table).folder / table / "dataset"
+        content = b"".join(path.read_bytes() for path in sorted(folder.glob("Norder=*/Dir=*/Npix=*.parquet")))
+        found[table] = hashlib.sha256(content).hexdigest()
+    assert len(found) == 5
+    assert found == published_digests(), "where a change of the results is intended, update docs/promises.md"
 
 
 def product(field, channel, content):

@@ -3,6 +3,8 @@
 import json
 import os
 import platform
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,13 +12,25 @@ from pathlib import Path
 import pytest
 
 from jobs import cache
+from lake_schema.store.provenance import machine
 
 ROOT = Path(__file__).parents[1]
 # OpenBLAS chooses its kernels by processor; any x86-64 of today runs these two.
 KERNELS = ("Nehalem", "Haswell") if platform.machine() in ("x86_64", "AMD64") else ("", "")
 
 
-def digests(what, folder, cached, threads, kernel, python=sys.executable):
+on_avx2 = pytest.mark.skipif(
+    not machine().startswith("x86-64-v3"), reason="compares with the standard kind of machine, which this is not"
+)
+
+
+def environment(setting):
+    """This process's variables with others of the instruction set."""
+    chosen = ("TRUESKY_CPU", "NPY_", "NUMBA_CPU", "ARROW_USER")
+    return {**{name: value for name, value in os.environ.items() if not name.startswith(chosen)}, **setting}
+
+
+def digests(what, folder, cached, threads, kernel, python=sys.executable, setting=()):
     """Of what tests/chain.py makes in a process of its own; the compiled code is this process's."""
     folder.mkdir(exist_ok=True)
     variables = {
@@ -27,7 +41,9 @@ def digests(what, folder, cached, threads, kernel, python=sys.executable):
         "NUMBA_CACHE_DIR": str(cache.machine_code_dir()),
     }
     command = [python, "-m", "tests.chain", what, str(folder)]
-    done = subprocess.run(command, env={**os.environ, **variables}, cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        command, env={**environment(dict(setting)), **variables}, cwd=ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -55,6 +71,47 @@ def test_the_whole_chain(tmp_path):
     ):
         again = digests("whole", tmp_path / f"{number + 1}", tmp_path / cached, threads, kernel)
         assert differing(first, again) == [], (cached, threads, kernel)
+
+
+def emulator():
+    """The command of an emulator of x86-64 CPUs; the test is skipped without one.
+
+    qemu 7.2 crashes in numpy's AVX2 sorts.
+    """
+    command = os.environ.get("TRUESKY_QEMU") or shutil.which("qemu-x86_64")
+    if command is None:
+        pytest.skip("no qemu-x86_64 (Debian 13: apt install qemu-user; another's path in $TRUESKY_QEMU)")
+    told = subprocess.run([command, "--version"], capture_output=True, text=True, check=True).stdout
+    if int(re.search(r"version (\d+)", told)[1]) < 10:
+        pytest.skip(f"{told.splitlines()[0]} is older than 10")
+    return command
+
+
+@on_avx2
+@pytest.mark.parametrize("setting", [{}, {"TRUESKY_CPU": "native"}, {"NPY_DISABLE_CPU_FEATURES": "X86_V3"}])
+def test_only_the_standard_kind_keeps_the_promise(tmp_path, setting):
+    """numpy without AVX2 stands for another kind: it is reported as one, and its results do differ."""
+    command = [sys.executable, "-c", "from lake_schema.store.provenance import machine; print(machine())"]
+    kind = subprocess.run(command, env=environment(setting), capture_output=True, text=True, check=True).stdout.strip()
+    first = digests("quick", tmp_path / "1", tmp_path / "cache 1", 1, KERNELS[0])
+    again = digests("quick", tmp_path / "2", tmp_path / "cache 2", 1, KERNELS[0], setting=setting)
+    if kind == machine():
+        assert differing(first, again) == []
+    else:
+        assert not kind.startswith("x86-64-v3")
+        assert "galaxy_table" in differing(first, again)
+
+
+@pytest.mark.nightly
+@on_avx2
+@pytest.mark.parametrize("cpu", ["Haswell-v4", "EPYC-v3"])
+def test_emulated_cpus_compute_the_same(tmp_path, cpu):
+    first = digests("quick", tmp_path / "1", tmp_path / "cache 1", 1, KERNELS[0])
+    program = tmp_path / "python"
+    program.write_text(f'#!/bin/sh\nexec {emulator()} -cpu {cpu} {sys.executable} "$@" 2>/dev/null\n')
+    program.chmod(0o755)
+    again = digests("quick", tmp_path / "2", tmp_path / "cache 2", 1, KERNELS[0], str(program))
+    assert differing(first, again) == []
 
 
 @pytest.mark.nightly

@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import resource
 import sys
 from collections.abc import Iterator, Sequence
 from typing import IO, Any
@@ -35,8 +34,8 @@ def main(argv: Sequence[str]) -> int:
            opened, TABLE=@FILE of rows in an Arrow file
     """
     root, memory = layout.opened(argv[0]), int(argv[1])
-    resource.setrlimit(resource.RLIMIT_DATA, (memory + _BASE_BYTES, memory + _BASE_BYTES))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    command.limit_resource("RLIMIT_DATA", memory + _BASE_BYTES)
+    command.limit_resource("RLIMIT_CORE", 0)
     session = Session(root, dict(entry.split("=", 1) for entry in argv[2:]), memory)
     # Whatever a library prints must not get between the answers.
     out = os.fdopen(os.dup(1), "wb")

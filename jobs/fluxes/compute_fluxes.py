@@ -13,6 +13,8 @@ from pathlib import Path
 if __name__ == "__main__":
     # spark-submit puts this folder first, where our modules would hide the standard library's.
     sys.path[0] = str(Path(__file__).resolve().parents[2])
+    # Limits numpy, before it is imported below.
+    import lake_schema  # noqa: F401
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict

@@ -16,9 +16,9 @@ from jobs import sums
 from jobs.request.toml_values import Toml, boolean, checked_number, integer, number, pair, table_of
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float
-from lake_schema.ecliptic import ecliptic, tile_corners, tile_count
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
+from lake_schema.sky.ecliptic import ecliptic, tile_corners, tile_count
 
 _FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
 # The wide survey leaves out what lies nearer to the Galactic and the ecliptic plane, deg: limits that leave about the

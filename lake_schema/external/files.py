@@ -10,7 +10,6 @@ and hands over plain Arrow batches: python -m lake_schema.external.files FILE NE
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 from collections import Counter
@@ -22,7 +21,7 @@ from typing import IO, Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lake_schema import user_files
+from lake_schema import command, user_files
 from lake_schema.errors import BadInput
 
 _MAGIC = b"PAR1"
@@ -106,9 +105,9 @@ def main(argv: Sequence[str], sender: Callable[[Path, Sequence[str], Sequence[st
     """
     path, needed, columns = Path(argv[0]), int(argv[1]), list(argv[2:])
     seconds = _LEAST_SECONDS + path.stat().st_size // _BYTES_A_SECOND
-    resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    command.limit_resource("RLIMIT_AS", _MOST_MEMORY)
+    command.limit_resource("RLIMIT_CPU", seconds)
+    command.limit_resource("RLIMIT_CORE", 0)
     pa.set_cpu_count(1)
     try:
         with os.fdopen(1, "wb", closefd=False) as out:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import subprocess
 from collections.abc import Mapping
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from lake_schema import instruction_set
 from lake_schema.s3 import Folder
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -68,19 +67,9 @@ def libraries() -> Mapping[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}
 
 
-@cache
 def machine() -> str:
-    """What of this machine may change the last bit of a number: its kind, its processor as numba compiles for it, the
-    instruction sets that numpy chose among, the C library; recorded, never part of a version's key.
-    """
-    import llvmlite.binding
-    from numpy.lib import introspect
-
-    chosen = {kind["current"] for kinds in introspect.opt_func_info().values() for kind in kinds.values()}
-    processor = os.environ.get("NUMBA_CPU_NAME") or llvmlite.binding.get_host_cpu_name()
-    features = os.environ.get("NUMBA_CPU_FEATURES", "")
-    words = [platform.machine(), processor, features, *sorted(chosen), *platform.libc_ver()]
-    return " ".join(word for word in words if word)
+    """Kind of this machine, as recorded in receipts and manifests; never part of a version's key."""
+    return instruction_set.kind()
 
 
 def git_commit(root: Path = _ROOT) -> str:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[2])
+    # Limits numpy, before it is imported below.
+    import lake_schema  # noqa: F401
 
 
 from jobs.shell import Job, Step, main

@@ -132,7 +132,7 @@ def pinned(name: str) -> list[tuple[Requirement, list[str]]]:
     return found
 
 
-LISTS = ("build", "run", "test", "bench", "browser")
+LISTS = ("build", "run", "test", "bench")
 
 
 def pins() -> dict[str, str]:

@@ -219,9 +219,10 @@ def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
     np.testing.assert_array_equal(read_back.frame(path).data, one.science)
 
 
-@pytest.mark.parametrize("name", [name for name in dict(CHANNELS) if name not in registry.CHANNELS])
-def test_a_channel_that_nothing_renders_has_no_effects(name):
-    assert registry.effects_or_none(name, "science") is None
+def test_a_channel_that_nothing_renders_has_no_effects():
+    others = [name for name in (*dict(CHANNELS), "RADIO") if name not in registry.CHANNELS]
+    assert "RADIO" in others
+    assert [registry.effects_or_none(name, "science") for name in others] == [None] * len(others)
 
 
 def test_an_effect_without_a_cost_is_refused():

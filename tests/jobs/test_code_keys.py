@@ -133,7 +133,7 @@ def test_tables_that_are_opened_are_in_the_key(tmp_path, more):
 KEEPING = {
     "jobs.cache.cache_dir", "jobs.cache.cached_arrays", "jobs.cache.content_key", "jobs.code_keys.code_key",
     "lake_schema.store.layout", "lake_schema.store.read", "lake_schema.store.provenance.canonical",
-    "lake_schema.store.provenance.file_sha256", "lake_schema.store.provenance.machine",
+    "lake_schema.errors.one_line", "lake_schema.store.provenance.file_sha256", "lake_schema.store.provenance.machine",
 }  # fmt: skip
 RECORDS = {
     "jobs.request.files.Curves", "jobs.request.files.DustMap", "jobs.request.files.UserCurves",

@@ -15,7 +15,7 @@ from py4j.protocol import Py4JNetworkError
 
 from jobs import shell
 from jobs.shell import Job, Step
-from lake_schema import __version__
+from lake_schema import __version__, instruction_set
 from lake_schema.store import layout, locks, names, publish, read, stage
 from lake_schema.store.plan import Part, Plan
 from tests import requests
@@ -266,3 +266,35 @@ def test_what_a_job_makes_belongs_to_its_request(run, lake, tmp_path):
     file = requests.written(other, name="other", seed=3)
     assert shell.main(job_of(plain_work), ["--lake", str(lake), "--request", str(file)]) == 0
     assert names.holders(lake, "plain") == {"other": plain_plan(3).key, "small": plain_plan(2).key}
+
+
+# ------------------------------------------------------------------------------------------------ kinds of machines
+
+
+def test_a_process_that_breaks_the_promise_makes_nothing(run, lake, monkeypatch, capsys):
+    """As a notebook's that imported numpy first, on a CPU with AVX-512."""
+    monkeypatch.setattr(instruction_set, "_has_level", lambda: True)
+    monkeypatch.setattr(instruction_set, "_numpy_in_use", lambda: ("X86_V3", "X86_V4"))
+    monkeypatch.delenv("TRUESKY_CPU", raising=False)
+    assert run(plain_work) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("toy_job: numpy uses X86_V4, so the results would differ from those of other machines")
+    assert list(lake.iterdir()) == []
+
+
+def test_a_choice_of_the_user_is_reported_once(run, monkeypatch, capsys):
+    monkeypatch.setattr(instruction_set, "check", lambda: "last bits may differ from those of other machines")
+    assert run(plain_work) == 0
+    assert capsys.readouterr().err == "toy_job: last bits may differ from those of other machines\n"
+
+
+@pytest.mark.parametrize("kinds", [["here"], ["there"], ["here", "there"]])
+def test_a_worker_of_another_kind_is_reported(run, monkeypatch, capsys, kinds):
+    """One kind that is not the driver's is as much another as two are."""
+    told = iter(kinds * 3)
+    monkeypatch.setattr(shell, "machine", lambda: "here")
+    monkeypatch.setattr(stage, "machine", lambda: next(told))
+    assert run(plain_work) == 0
+    about = "toy_job: table plain: made on machines of other kinds than this one, so last bits may differ: here here, "
+    expected = "" if kinds == ["here"] else f"{about}made on {'; '.join(kinds)}\n"
+    assert capsys.readouterr().err == expected

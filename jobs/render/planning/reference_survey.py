@@ -21,9 +21,9 @@ from jobs.render.sky.solar_aspect import next_allowed, position_angle
 from jobs.request.area import Area
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
-from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.sky.ecliptic import ecliptic, equatorial
 
 # Half the diagonal of the field of view, deg: fields whose centre is nearer to an area than this may see it.
 _REACH = 0.52

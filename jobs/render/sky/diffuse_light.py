@@ -22,10 +22,10 @@ from jobs.fluxes.passbands import Passband
 from jobs.render.camera.detectors import Detector
 from jobs.render.sky import thermal
 from lake_schema.arrays import Float
-from lake_schema.ecliptic import ecliptic
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.sky import galactic
+from lake_schema.sky.ecliptic import ecliptic
 from lake_schema.units import LIGHT_ANGSTROM_S, PLANCK_ERG_S
 
 _MJD_J2000 = 51544.5

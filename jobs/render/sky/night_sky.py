@@ -22,9 +22,9 @@ from jobs.render.sky.diffuse_light import SkyBand
 from jobs.render.sky.observatory import Site
 from lake_schema import units
 from lake_schema.arrays import Float
-from lake_schema.ecliptic import equatorial
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.sky import separation
+from lake_schema.sky.ecliptic import equatorial
 
 # Where zodiacal light is least, deg; the airglow has at least this part of a dark sky.
 _POLE, _LEAST_AIRGLOW = 90.0, 0.2

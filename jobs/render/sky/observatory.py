@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from jobs.render.sky.diffuse_light import sun_longitude
 from lake_schema.arrays import Bool, Float
-from lake_schema.ecliptic import equatorial
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.sky import separation
+from lake_schema.sky.ecliptic import equatorial
 
 _MJD_J2000 = 51544.5
 # Earth rotation angle, turns (IAU 2000): its zero moves with the equinox, as right ascensions of ICRS do not.

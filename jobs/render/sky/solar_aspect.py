@@ -20,9 +20,9 @@ from jobs.render.camera import pointing
 from jobs.render.sky.diffuse_light import sun_longitude
 from lake_schema import sky
 from lake_schema.arrays import Float
-from lake_schema.ecliptic import equatorial
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.sky.ecliptic import equatorial
 
 # The low-precision Sun is good to 0.02 deg.
 _TOLERANCE = 0.05

@@ -24,10 +24,10 @@ import pyarrow.compute as pc
 from jobs.render.sources.solar_system import KIND, Population
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
-from lake_schema.ecliptic import equatorial
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
 from lake_schema.ids import GENERATION_ORDER, source_id
+from lake_schema.sky.ecliptic import equatorial
 
 # Columns, and the smallest and largest value of each. A day has to fit into an identifier.
 KEYS = {

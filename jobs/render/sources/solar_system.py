@@ -28,9 +28,9 @@ from jobs.render.sources.galaxy_shapes import Shapes
 from jobs.render.sources.source_list import Sources
 from lake_schema import sky, units
 from lake_schema.arrays import Bool, Float, Int
-from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER, source_id
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.sky.ecliptic import ecliptic, equatorial
 
 # Kind of an identifier; its member is the day.
 KIND = 6

@@ -280,7 +280,8 @@ def page_of_a_plan(tmp_path_factory):
 @pytest.fixture(scope="module")
 def browser():
     """A chromium of the system's."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra browser)")
+    from playwright import sync_api as playwright
+
     chromium = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
     if chromium is None:
         pytest.skip("no chromium (Debian: apt install chromium)")

@@ -17,9 +17,9 @@ from jobs.render.camera import detectors
 from jobs.render.products import read_back
 from jobs.render.sources import solar_system
 from jobs.request.from_toml import from_table
-from lake_schema.ecliptic import ecliptic
 from lake_schema.errors import BadInput
 from lake_schema.ids import kind_of
+from lake_schema.sky.ecliptic import ecliptic
 from lake_schema.store import layout, publish, read
 from tests import requests
 

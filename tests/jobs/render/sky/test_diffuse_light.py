@@ -16,9 +16,10 @@ from jobs.fluxes.passbands import Passband
 from jobs.render.camera import detectors
 from jobs.render.psf import sub_bands
 from jobs.render.sky import diffuse_light
-from lake_schema import ecliptic, units
+from lake_schema import units
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import resolve
+from lake_schema.sky import ecliptic
 
 MISSION = resolve()
 J2000 = "J2000"

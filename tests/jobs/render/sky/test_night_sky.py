@@ -8,9 +8,9 @@ import pytest
 from jobs.render.camera import detectors
 from jobs.render.sky import diffuse_light, night_sky, observatory
 from jobs.render.sky.night_sky import Night
-from lake_schema.ecliptic import equatorial
 from lake_schema.mission.configuration import resolve
 from lake_schema.sky import separation
+from lake_schema.sky.ecliptic import equatorial
 
 MISSION = resolve()
 CAMERAS = ("lsstcam", "megacam", "jpcam", "decam", "hsc", "gpc1")

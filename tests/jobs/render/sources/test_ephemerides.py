@@ -18,10 +18,10 @@ from jobs.render.sources import ephemerides, solar_system
 from jobs.request import from_toml as requests
 from jobs.request.from_toml import parse
 from lake_schema import sky
-from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
 from lake_schema.ids import kind_of
+from lake_schema.sky.ecliptic import ecliptic, equatorial
 from tests.jobs.render import fields, nominal
 from tests.jobs.render.fields import MISSION, aimed, small
 

@@ -17,9 +17,9 @@ from jobs.render.products import truth_table
 from jobs.render.sources import solar_system
 from jobs.render.sources.source_list import Sources
 from lake_schema import sky
-from lake_schema.ecliptic import ecliptic, equatorial
 from lake_schema.ids import kind_of
 from lake_schema.mission.configuration import resolve
+from lake_schema.sky.ecliptic import ecliptic, equatorial
 from tests.jobs.render import fields
 from tests.jobs.render.fields import MISSION, fluxes, galaxies, one_source, psf_of, small, stars
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from jobs.request import area
 from lake_schema import sky
-from lake_schema.ecliptic import ecliptic, equatorial, tile_corners, tile_count, tile_of
 from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.sky.ecliptic import ecliptic, equatorial, tile_corners, tile_count, tile_of
 
 
 def everywhere(n, seed=1):
